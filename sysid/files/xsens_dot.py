@@ -1,0 +1,72 @@
+"""Xsens DOT wireless inertial units: their CSV export."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sysid.errors import InputError
+from sysid.structure import Array
+
+_TIME = "SampleTimeFine"
+_ACCELERATION = ("Acc_X", "Acc_Y", "Acc_Z")
+_ROTATION = ("Gyr_X", "Gyr_Y", "Gyr_Z")
+
+
+@dataclass(frozen=True, eq=False)
+class UnitRecord:
+    """One unit's record.
+
+    Attributes
+    ----------
+    time : (n,)
+        s, on the clock that the units share.
+    acceleration : (3, n)
+        m/s² along the unit's own axes, gravity included.
+    rotation_rate : (3, n)
+        rad/s.
+    """
+
+    time: Array
+    acceleration: Array
+    rotation_rate: Array
+
+
+def read(path: str | Path) -> UnitRecord:
+    """Read one unit's CSV file.
+
+    The first row of a record holds zeros where accelerations should be, and is dropped.
+
+    Raises
+    ------
+    InputError
+        A file that is missing, cut off, has other columns, or samples that are not finite or not in order of time.
+    """
+    file = Path(path)
+    try:
+        lines = file.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read {file}: {getattr(error, 'strerror', None) or error}") from None
+    header = next((i for i, line in enumerate(lines) if _TIME in line.split(",")), None)
+    if header is None:
+        raise InputError(f"{file} has no header line with {_TIME}: is it an Xsens DOT export?")
+    columns = lines[header].split(",")
+    missing = [name for name in (*_ACCELERATION, *_ROTATION) if name not in columns]
+    if missing:
+        raise InputError(f"{file} lacks the columns {', '.join(missing)}")
+    try:
+        table = np.loadtxt(lines[header + 1 :], delimiter=",", ndmin=2)
+    except ValueError as error:
+        raise InputError(f"{file}: {error}") from None
+    if table.shape[0] < 3 or table.shape[1] != len(columns):
+        raise InputError(f"{file} has {table.shape[0]} rows of {table.shape[1]} values under {len(columns)} column names")
+    pick = lambda names: table[1:, [columns.index(name) for name in names]].T  # noqa: E731
+    time = pick((_TIME,))[0] * 1e-6
+    acceleration, rotation = pick(_ACCELERATION), np.deg2rad(pick(_ROTATION))
+    if not all(np.all(np.isfinite(values)) for values in (time, acceleration, rotation)):
+        raise InputError(f"{file} holds NaN or infinite samples")
+    if np.any(np.diff(time) <= 0):
+        raise InputError(f"{file}: {_TIME} does not rise at row {int(np.argmax(np.diff(time) <= 0)) + 2}")
+    return UnitRecord(time, acceleration, rotation)

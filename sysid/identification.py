@@ -1,0 +1,209 @@
+"""The result of an identification."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sysid.errors import InputError
+from sysid.measurement import Measurement
+from sysid.problem import Problem
+from sysid.structure import Array, ComplexArray, Structure
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What rebuilds a problem elsewhere: its module and what was passed to ``problem()``.
+
+    Attributes
+    ----------
+    module : str
+        As given on the command line: a name, a path, or a dotted module.
+    data : str or None
+    rng : int
+    """
+
+    module: str
+    data: str | None = None
+    rng: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """What ran, phase by phase; residuals are relative, NaN where a phase did not run.
+
+    Attributes
+    ----------
+    start, swarm, refinement, local : float
+        Residual of the best candidate after each phase: the Latin hypercube (or the start that was
+        given), the swarm, the eigenvalue refinement, the local phase.
+    swarm_curve, local_curve : ndarray
+        Best residual after each iteration of the swarm, and residual of each local iterate. With a
+        measured force both count it too (root of the sum of both squared relative residuals).
+    refinement_error : float
+        Largest relative difference of a refined eigenvalue (w²) from the one that was given.
+    states : tuple of (str, int)
+        How often the swarm was in each evolutionary state.
+    evaluations : int
+        Candidates that the swarm evaluated.
+    wall_time : float
+        s.
+    log : tuple of str
+        What ran, one line a step.
+    """
+
+    start: float = np.nan
+    swarm: float = np.nan
+    refinement: float = np.nan
+    local: float = np.nan
+    swarm_curve: Array = None  # type: ignore[assignment]
+    local_curve: Array = None  # type: ignore[assignment]
+    refinement_error: float = np.nan
+    states: tuple[tuple[str, int], ...] = ()
+    evaluations: int = 0
+    wall_time: float = 0.0
+    log: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("swarm_curve", "local_curve"):
+            value = getattr(self, name)
+            object.__setattr__(self, name, np.zeros(0) if value is None else np.asarray(value, dtype=float))
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """A structure identified from a base-shake test, and how far it can be trusted.
+
+    Attributes
+    ----------
+    structure : Structure
+    problem : Problem
+    x : (n_variables,)
+        The problem's unknowns that stand for the structure.
+    strategy : str
+    seed : int or None
+    success : bool
+        The last solver's status is good, and the residual meets the goal where one is given.
+    message : str
+    history : History
+    determined : bool
+        Every entry of M_SS, K_SS and C is fixed by the data and the stated model.
+    closed_by, undetermined : tuple of str
+        What fixes it, and what is open, in sentences.
+    interrupted : bool
+        The search was stopped by Ctrl-C, and this is the best until then.
+    recipe : Recipe or None
+        Set where the problem came from a module.
+    """
+
+    structure: Structure
+    problem: Problem
+    x: Array
+    strategy: str
+    seed: int | None
+    success: bool
+    message: str
+    history: History
+    determined: bool
+    closed_by: tuple[str, ...]
+    undetermined: tuple[str, ...]
+    interrupted: bool = False
+    recipe: Recipe | None = None
+
+    @property
+    def measurement(self) -> Measurement:
+        """The test that was fitted."""
+        return self.problem.measurement
+
+    @property
+    def residual(self) -> float:
+        """``‖predicted - measured‖ / ‖measured‖`` over relative accelerations of all runs, sensors and lines."""
+        return self.measurement.residual(self.structure)
+
+    @property
+    def force_residual(self) -> float | None:
+        """The same over the base force; None where none was measured."""
+        return self.measurement.force_residual(self.structure)
+
+    def predict(self, measurement: Measurement) -> ComplexArray:
+        """Relative accelerations under another test's base motion, (runs, n_sensors, n_freq)."""
+        return measurement.predict(self.structure)
+
+    @property
+    def mac_label(self) -> str:
+        """What `mac` compares with."""
+        return "reference" if self.problem.reference is not None else "itself"
+
+    @property
+    def mac(self) -> Array:
+        """Modal assurance criterion against the reference where one is known, else against itself."""
+        other = self.problem.reference or self.structure
+        return modal_assurance(self.structure.mode_shapes, other.mode_shapes)
+
+    def summary(self) -> str:
+        """Table of the result, for a terminal."""
+        s = self.structure
+        lines = [
+            f"{'success' if self.success else 'no success'}: {self.message}",
+            f"strategy {self.strategy}, seed {self.seed}, {self.history.wall_time:.1f} s",
+            f"relative residual {self.residual:.3e}"
+            + ("" if self.force_residual is None else f", base force {self.force_residual:.3e}"),
+            f"rigid-body mass {_numbers(np.diag(s.rigid_body_mass))} kg ({', '.join(self.measurement.base_axes or ())})",
+            "",
+            "mode   frequency [Hz]   damping [%]   effective mass [% of rigid-body mass]",
+        ]
+        rigid = np.diag(s.rigid_body_mass)
+        for k, (f, zeta) in enumerate(zip(s.natural_frequencies, s.damping_ratios, strict=True)):
+            share = 100 * np.diag(s.effective_masses[k]) / np.where(rigid > 0, rigid, np.inf)
+            lines.append(f"{k + 1:4d}   {f:14.5g}   {100 * zeta:11.4g}   " + " ".join(f"{v:6.1f}" for v in share))
+        lines.append("")
+        if self.determined:
+            lines.append("Determined: this is the mass and stiffness, within the stated model.")
+            lines += [f"  - {sentence}" for sentence in self.closed_by]
+        else:
+            lines.append("Not determined: this is one of many models that explain the data.")
+            lines += [f"  - {sentence}" for sentence in self.undetermined]
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The figures of ``summary.json``."""
+        from sysid import __version__
+
+        return {
+            "problem": self.recipe.module if self.recipe else None,
+            "strategy": self.strategy,
+            "seed": self.seed,
+            "success": bool(self.success),
+            "message": self.message,
+            "residual": self.residual,
+            "force_residual": self.force_residual,
+            "natural_frequencies_hz": self.structure.natural_frequencies.tolist(),
+            "damping_ratios": self.structure.damping_ratios.tolist(),
+            "total_mass_kg": np.diag(self.structure.rigid_body_mass).tolist(),
+            "determined": bool(self.determined),
+            "closed_by": list(self.closed_by),
+            "undetermined": list(self.undetermined),
+            "evaluations": int(self.history.evaluations),
+            "wall_time_s": float(self.history.wall_time),
+            "version": __version__,
+        }
+
+    def save(self, path: str | Path) -> Path:
+        """Write everything to an HDF5 file (no pickle inside); `sysid.load` reads it back."""
+        from sysid.storage import save  # storage builds Identifications, so it cannot be above this room
+
+        return save(self, path)
+
+
+def modal_assurance(phi: Array, other: Array) -> Array:
+    """``|phi_i' phi_j|² / (phi_i' phi_i · phi_j' phi_j)``, (modes, other modes)."""
+    if phi.shape[0] != other.shape[0]:
+        raise InputError(f"mode shapes at {phi.shape[0]} and {other.shape[0]} sensors cannot be compared")
+    return (phi.T @ other) ** 2 / np.outer(np.sum(phi**2, axis=0), np.sum(other**2, axis=0))
+
+
+def _numbers(values: Array) -> str:
+    return ", ".join(f"{v:.6g}" for v in values)

@@ -1,0 +1,346 @@
+"""Mass matrices as CasADi expressions: full with healing (Cerini et al. 2024, section 3.2.3), lumped, known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sysid.errors import InputError
+from sysid.structure import Array
+from sysid.variables import Variable
+
+# A Cholesky diagonal of zero makes the mode shapes infinite; one of 1e-3 already spans a
+# condition number of 1e6, more than any test resolves.
+FACTOR_FLOOR = 1e-3
+_ROW_EXPECTATION = 1.0  # the paper's c
+_NEWTON_STEPS = 12  # for the coupled scales of the rigid-body healing; quadratic from a good start
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """What a mass model must know of a test.
+
+    Parameters
+    ----------
+    rigid_body : ndarray, shape (n, d)
+        G, motion of the sensors for unit base motion.
+    translational : ndarray of bool, shape (d,)
+        Which base directions are translations.
+    weighed : ndarray, shape (d,), optional
+        Rigid-body mass a direction that a measured base force suggests. A total that is not
+        stated is then an unknown, searched around it.
+    """
+
+    rigid_body: Array
+    translational: Array
+    weighed: Array | None = None
+
+    @property
+    def n(self) -> int:
+        """Number of sensors."""
+        return int(self.rigid_body.shape[0])
+
+    @property
+    def d(self) -> int:
+        """Number of base directions."""
+        return int(self.rigid_body.shape[1])
+
+    @property
+    def directions(self) -> Array:
+        """Base direction of each row of the full mass matrix, (n + d,); -1 for none.
+
+        A sensor belongs to the translation that moves it most, the first on a tie; a sensor that
+        no translation moves belongs to none. A base row belongs to its own direction.
+        """
+        strength = np.abs(self.rigid_body) * self.translational
+        # Direction cosines that differ by round-off are a tie.
+        ties = strength >= strength.max(axis=1, keepdims=True) * (1 - 1e-9)
+        groups = np.where(strength.max(axis=1) > 0, np.argmax(ties, axis=1), -1)
+        return np.concatenate([groups, np.arange(self.d)])
+
+    def total_variables(self, total_mass: ArrayLike | None) -> tuple[Variable, ...]:
+        """The totals as unknowns, where they are not stated and the base force tells them."""
+        if total_mass is not None or self.weighed is None:
+            return ()
+        return (Variable("total_mass", self.weighed / 2, self.weighed * 2, unit="kg"),)
+
+    def split_totals(self, total_mass: ArrayLike | None, y: ca.SX) -> tuple[ca.SX | Array, ca.SX]:
+        """Totals, stated or the first of the unknowns `y`, and the unknowns left."""
+        if self.total_variables(total_mass):
+            return y[: self.d], y[self.d :]
+        return self.totals(total_mass), y
+
+    def totals(self, total_mass: ArrayLike | None) -> Array:
+        """Total mass in each base direction, (d,): kg, or kg m² where the direction is a rotation."""
+        if total_mass is None and self.weighed is not None:
+            return self.weighed
+        if total_mass is None:
+            # Unit mass; a rotation carries it at the radius of gyration of the sensors.
+            lever = np.sqrt(np.mean(self.rigid_body**2, axis=0))
+            return np.where(self.translational, 1.0, np.where(lever > 0, lever**2, 1.0))
+        given = np.asarray(total_mass, dtype=float)
+        if given.ndim == 0:
+            if not np.all(self.translational):
+                raise InputError(
+                    f"total_mass = {given:g} kg is one number but the base also rotates; "
+                    f"give {self.d} numbers, kg for translations and kg m² for rotations"
+                )
+            given = np.full(self.d, float(given))
+        if given.shape != (self.d,):
+            raise InputError(f"total_mass has shape {given.shape}; one number or ({self.d},) is needed")
+        if not np.all(np.isfinite(given)) or np.any(given <= 0):
+            raise InputError(f"total_mass = {np.array2string(given)}: masses must be positive and finite")
+        return given
+
+
+class MassBlocks(NamedTuple):
+    """CasADi expressions: Cholesky factor of M_SS (n, n), M_S0 (n, d), M_00 (d, d)."""
+
+    factor: ca.SX
+    coupling: ca.SX
+    base: ca.SX
+
+
+def sampling_exponent(k: int, c: float = _ROW_EXPECTATION) -> float:
+    """Exponent alpha of eq. 18 for a row of k entries (eq. 20, with its misprinted 2 mended to 4).
+
+    It is the root of eq. 19, ``∫_{-1}^{1} y² dx = c / k``: every row of the Cholesky factor then has the
+    same expected squared norm.
+
+    >>> round(sampling_exponent(1), 4)
+    1.7808
+    """
+    return (3 * c + np.sqrt(c**2 + 16 * c * k)) / (4 * (2 * k - c))
+
+
+def spread_rows(x: ca.SX | Array, exponents: Array) -> ca.SX | Array:
+    """Eq. 18: ``y = sgn(x) (1 - (1 - |x|)^alpha)``, from the swarm's uniform coordinates to factor entries."""
+    if isinstance(x, np.ndarray):
+        return np.sign(x) * (1 - (1 - np.minimum(np.abs(x), 1.0)) ** exponents)
+    size = ca.fmin(ca.fabs(x), 1.0)  # a round-off beyond 1 would be a power of a negative number
+    return ca.sign(x) * (1 - (1 - size) ** exponents)
+
+
+def gather_rows(y: Array, exponents: Array) -> Array:
+    """Inverse of `spread_rows` on numbers."""
+    return np.sign(y) * (1 - (1 - np.minimum(np.abs(y), 1.0)) ** (1 / exponents))
+
+
+@dataclass(frozen=True, eq=False)
+class FullMass:
+    """A full mass matrix over sensors and base, through its Cholesky factor.
+
+    Parameters
+    ----------
+    total_mass : float or array_like (d,), optional
+        kg a base direction (kg m² where it is a rotation). Without it, and without a measured base force, masses are
+        normalised to 1 kg a direction, and the result says that they are not determined.
+    healing : {"trace", "rigid_body"}
+        What the total is: "trace", the sum of diag M over the direction's sensors and its base row
+        (eq. 21-22 of the paper: right for lumped masses on orthogonal axes); "rigid_body", the
+        physical ``M_rb[i, i]``.
+
+    References
+    ----------
+    Cerini, Yotov, Aglietti, Mech. Syst. Signal Process. 209 (2024) 111084, eq. 17-25.
+    """
+
+    total_mass: ArrayLike | None = None
+    healing: Literal["trace", "rigid_body"] = "trace"
+
+    def __post_init__(self) -> None:
+        if self.healing not in ("trace", "rigid_body"):
+            raise InputError(f"healing {self.healing!r} is unknown; give 'trace' or 'rigid_body'")
+
+    def variables(self, layout: Layout) -> tuple[Variable, ...]:
+        """Entries of the factor's lower triangle, row by row, in [-1, 1] (eq. 35)."""
+        size = layout.n + layout.d
+        rows, columns = np.tril_indices(size)
+        exponents = np.array([sampling_exponent(k) for k in range(1, size + 1)])[rows]
+        lower = np.where(rows == columns, FACTOR_FLOOR, -1.0)
+        return (
+            *layout.total_variables(self.total_mass),
+            Variable(
+                "mass_factor",
+                lower,
+                np.ones(rows.size),
+                sampling=lambda x: ca.fmax(spread_rows(x, exponents), lower),
+                unsampling=lambda y: gather_rows(y, exponents),
+            ),
+        )
+
+    def blocks(self, layout: Layout, y: ca.SX) -> MassBlocks:
+        """Healed mass blocks of the factor entries `y`; positive definite for every `y` in the box."""
+        n = layout.n
+        totals, entries = layout.split_totals(self.total_mass, y)
+        healed = heal(lower_triangle(entries, n + layout.d), layout, totals, self.healing)
+        L, low, base = healed[:n, :n], healed[n:, :n], healed[n:, n:]
+        return MassBlocks(L, L @ low.T, low @ low.T + base @ base.T)
+
+    def values(self, layout: Layout, mass: Array) -> Array:
+        """Factor entries that `blocks` takes back to `mass`, (n + d, n + d), which has the stated totals."""
+        n = layout.n
+        L = np.linalg.cholesky(mass[:n, :n])
+        low = np.linalg.solve(L, mass[:n, n:]).T
+        remainder = mass[n:, n:] - low @ low.T
+        lam, vectors = np.linalg.eigh((remainder + remainder.T) / 2)
+        # A semidefinite remainder has a triangular factor too: by QR of any square root.
+        root = (vectors * np.sqrt(np.maximum(lam, 0.0))).T
+        base = np.linalg.qr(root)[1].T
+        base = base * np.where(np.diag(base) < 0, -1.0, 1.0)
+        factor = np.block([[L, np.zeros((n, layout.d))], [low, base]])
+        entries = factor[np.tril_indices(n + layout.d)]
+        entries = entries / np.abs(entries).max()
+        if not layout.total_variables(self.total_mass):
+            return entries
+        return np.concatenate([self.total(layout, mass), entries])
+
+    def total(self, layout: Layout, mass: Array) -> Array:
+        """What this healing calls the total of `mass`, (d,)."""
+        if self.healing == "rigid_body":
+            rigid = np.vstack([layout.rigid_body, np.eye(layout.d)])
+            return np.einsum("ni,nm,mi->i", rigid, mass, rigid)
+        return np.array([mass.diagonal()[layout.directions == i].sum() for i in range(layout.d)])
+
+
+@dataclass(frozen=True, eq=False)
+class LumpedMass:
+    """A diagonal mass matrix on the sensors, without coupling to the base and without base mass.
+
+    Parameters
+    ----------
+    total_mass : float or array_like (d,), optional
+        kg summed over the sensors of a direction; normalised to 1 kg, and said so, where None.
+    """
+
+    total_mass: ArrayLike | None = None
+
+    def variables(self, layout: Layout) -> tuple[Variable, ...]:
+        """Shares of the masses, scaled afterwards to their direction's total."""
+        share = Variable("mass_share", np.full(layout.n, FACTOR_FLOOR), np.ones(layout.n))
+        return (*layout.total_variables(self.total_mass), share)
+
+    def blocks(self, layout: Layout, y: ca.SX) -> MassBlocks:
+        """Diagonal blocks; the base rows are zero."""
+        groups = layout.directions[: layout.n]
+        totals, share = layout.split_totals(self.total_mass, y)
+        scales = {i: totals[i] / ca.sum1(share[np.flatnonzero(groups == i).tolist()]) for i in set(groups.tolist()) - {-1}}
+        free = sum(scales.values()) / max(len(scales), 1) if scales else 1.0
+        masses = [share[j] * scales.get(g, free) for j, g in enumerate(groups.tolist())]
+        return MassBlocks(
+            ca.diag(ca.sqrt(ca.vertcat(*masses))), ca.SX(layout.n, layout.d), ca.SX(layout.d, layout.d)
+        )
+
+    def values(self, layout: Layout, mass: Array) -> Array:
+        """Shares that `blocks` takes back to `mass`."""
+        m, groups = np.diag(mass)[: layout.n], layout.directions[: layout.n]
+        if not layout.total_variables(self.total_mass):
+            return m / m.max()
+        totals = [m[groups == i].sum() or layout.totals(None)[i] for i in range(layout.d)]
+        return np.concatenate([totals, m / m.max()])
+
+
+@dataclass(frozen=True, eq=False)
+class KnownMass:
+    """A mass matrix that is known, kg: (n + d, n + d), or (n, n) with no mass on the base rows."""
+
+    matrix: ArrayLike
+
+    def variables(self, layout: Layout) -> tuple[Variable, ...]:
+        """No unknowns."""
+        return ()
+
+    def blocks(self, layout: Layout, y: ca.SX) -> MassBlocks:
+        """Constant blocks."""
+        full = self.full(layout)
+        n = layout.n
+        try:
+            L = np.linalg.cholesky(full[:n, :n])
+        except np.linalg.LinAlgError:
+            raise InputError("the known mass matrix is not positive definite over the sensors") from None
+        return MassBlocks(ca.SX(ca.sparsify(ca.DM(L))), ca.SX(full[:n, n:]), ca.SX(full[n:, n:]))
+
+    def values(self, layout: Layout, mass: Array) -> Array:
+        """Nothing to tell."""
+        return np.zeros(0)
+
+    def full(self, layout: Layout) -> Array:
+        """The matrix over sensors and base, (n + d, n + d)."""
+        matrix = np.asarray(self.matrix, dtype=float)
+        n, size = layout.n, layout.n + layout.d
+        if matrix.shape == (n, n):
+            matrix = np.pad(matrix, (0, layout.d))
+        if matrix.shape != (size, size):
+            raise InputError(f"the known mass matrix is {matrix.shape}; ({n}, {n}) or ({size}, {size}) is needed")
+        if not np.all(np.isfinite(matrix)) or np.abs(matrix - matrix.T).max() > 1e-9 * np.abs(matrix).max():
+            raise InputError("the known mass matrix must be finite and symmetric")
+        return matrix
+
+
+MassModel = FullMass | LumpedMass | KnownMass
+
+
+def lower_triangle(entries: ca.SX, size: int) -> ca.SX:
+    """Lower-triangular matrix from its entries, row by row."""
+    rows, columns = np.tril_indices(size)
+    matrix = ca.SX(ca.Sparsity.lower(size))
+    for at, (i, j) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True)):
+        matrix[i, j] = entries[at]
+    return matrix
+
+
+def heal(factor: ca.SX, layout: Layout, totals: Array, kind: str) -> ca.SX:
+    """Scale the factor's rows, one scale a base direction, so that M has the stated totals (eq. 21-22).
+
+    Rows of no direction take the mean of the scales: their mass has no total to obey.
+    """
+    d, groups = layout.d, layout.directions
+    members = [np.flatnonzero(groups == i).tolist() for i in range(d)]
+    if kind == "trace":
+        scales = [ca.sqrt(totals[i] / ca.sumsqr(factor[rows, :])) for i, rows in enumerate(members)]
+    else:
+        scales = _rigid_body_scales(factor, layout, totals, members)
+    free = sum(scales) / d
+    by_row = ca.vertcat(*(scales[g] if g >= 0 else free for g in groups.tolist()))
+    return ca.diag(by_row) @ factor
+
+
+def _rigid_body_scales(factor: ca.SX, layout: Layout, totals: Array, members: list[list[int]]) -> list:
+    """Scales s with ``r_i' D(s) M D(s) r_i = totals[i]`` for every direction i, r_i column i of [G; I].
+
+    Where no sensor's row of G has two entries the equations are uncoupled and closed. Otherwise
+    they are d quadratics, solved by Newton's method inside the expression; where that has not
+    converged the scales are NaN, and the candidate counts as impossible.
+    """
+    d, groups = layout.d, layout.directions
+    rigid = np.vstack([layout.rigid_body, np.eye(d)])
+    free = np.flatnonzero(groups < 0).tolist()
+    # Total i is |sum_a s_a row_a|² with row_a = (part of r_i in group a)' L; Gram matrices hold all.
+    grams = []
+    for i in range(d):
+        parts = []
+        for rows in members:
+            part = ca.SX(rigid[rows, i]).T @ factor[rows, :]
+            if free:
+                part = part + ca.SX(rigid[free, i]).T @ factor[free, :] / d
+            parts.append(part)
+        stacked = ca.vertcat(*parts)
+        grams.append(stacked @ stacked.T / totals[i])
+    own = ca.vertcat(*(1 / ca.sqrt(gram[i, i]) for i, gram in enumerate(grams)))
+    if not any(np.any(rigid[groups != i, i]) for i in range(d)):
+        return ca.vertsplit(own)
+    s, q = ca.SX.sym("s", d), ca.SX.sym("q", d, d * d)
+    miss = ca.vertcat(*(s.T @ gram @ s - 1 for gram in ca.horzsplit(q, d)))
+    step = ca.Function("newton", [s, q], [s - ca.solve(ca.jacobian(miss, s), miss)])
+    error = ca.Function("miss", [s, q], [ca.norm_inf(miss)])
+    # One scale for all is where a mass with the right totals starts, and stays.
+    uniform = ca.sqrt(d / sum(ca.sum1(ca.sum2(gram)) for gram in grams))
+    given, scale = ca.horzcat(*grams), ca.repmat(uniform, d, 1)
+    for _ in range(_NEWTON_STEPS):
+        scale = step(scale, given)
+    converged = ca.logic_and(error(scale, given) < 1e-10, ca.mmin(scale) > 0)
+    return ca.vertsplit(ca.if_else(converged, scale, np.nan))

@@ -1,0 +1,159 @@
+"""Stiffness matrices as CasADi expressions: by their spectrum (Cerini et al. 2024, section 3.2.4), or a chain of springs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sysid.errors import InputError
+from sysid.mass import FACTOR_FLOOR, Layout, lower_triangle
+from sysid.structure import Array
+from sysid.variables import Variable
+
+
+@dataclass(frozen=True, eq=False)
+class SpectralStiffness:
+    """A full stiffness matrix through ``H = L^-1 K_SS L^-T = L_H L_H'``, L the Cholesky factor of M_SS.
+
+    The spectrum of H is the structure's squared frequencies, so it can be searched without
+    knowing the size of any stiffness, and replaced by the measured spectrum (refinement).
+
+    Parameters
+    ----------
+    natural_frequencies : array_like, optional
+        Hz, the measured ones in ascending order; repeated ones repeated.
+    max_frequency : float, optional
+        Hz, at or above the highest of *all* frequencies that the model has; the highest given
+        one by default, which supposes that all n are given.
+
+    References
+    ----------
+    Cerini, Yotov, Aglietti, Mech. Syst. Signal Process. 209 (2024) 111084, eq. 26-32 (28b mended), 36-37.
+    """
+
+    natural_frequencies: ArrayLike | None = None
+    max_frequency: float | None = None
+
+    @property
+    def targets(self) -> Array:
+        """Measured circular frequencies, rad/s, ascending."""
+        if self.natural_frequencies is None:
+            raise InputError(
+                "SpectralStiffness needs natural_frequencies (Hz): finding them in the data is not yet part of sysid; "
+                "read them off the peaks of the transmissibility"
+            )
+        given = np.atleast_1d(np.asarray(self.natural_frequencies, dtype=float))
+        if given.ndim != 1 or given.size == 0 or not np.all(np.isfinite(given)) or np.any(given <= 0):
+            raise InputError("natural_frequencies must be a list of positive numbers in Hz")
+        if np.any(np.diff(given) < 0):
+            raise InputError("natural_frequencies must be in ascending order")
+        return 2 * np.pi * given
+
+    def limit(self, n: int) -> float:
+        """Bound on the frequencies of an n-degree-of-freedom model, rad/s (w_lim of eq. 37)."""
+        targets = self.targets
+        if targets.size > n:
+            raise InputError(f"{targets.size} natural frequencies are given for {n} sensors; at most {n} can be matched")
+        if self.max_frequency is None:
+            if targets.size < n:
+                raise InputError(
+                    f"{targets.size} natural frequencies are given for {n} sensors: state max_frequency (Hz), at or above "
+                    "the highest frequency of the whole model"
+                )
+            return float(targets[-1])
+        limit = 2 * np.pi * float(self.max_frequency)
+        if not np.isfinite(limit) or limit < targets[-1]:
+            raise InputError(
+                f"max_frequency = {self.max_frequency:g} Hz is below the given natural frequency "
+                f"{targets[-1] / (2 * np.pi):g} Hz: the truth would lie outside the search space"
+            )
+        return limit
+
+    def variables(self, layout: Layout) -> tuple[Variable, ...]:
+        """Entries of L_H, row by row, rad/s (eq. 37)."""
+        rows, columns = np.tril_indices(layout.n)
+        limit = self.limit(layout.n)
+        lower = np.where(rows == columns, FACTOR_FLOOR * limit, -limit)
+        return (Variable("stiffness_factor", lower, np.full(rows.size, limit), unit="rad/s"),)
+
+    def normalised(self, layout: Layout, y: ca.SX, factor: ca.SX) -> ca.SX:
+        """``H`` (n, n), rad²/s², whatever the mass is."""
+        L = lower_triangle(y, layout.n)
+        return L @ L.T
+
+    def values(self, layout: Layout, H: Array, stiffness: Array) -> Array:
+        """Entries of L_H for a given positive definite `H`."""
+        return np.linalg.cholesky(H)[np.tril_indices(layout.n)]
+
+
+@dataclass(frozen=True, eq=False)
+class ChainStiffness:
+    """Springs in series from the base to the last sensor, one chain a base direction.
+
+    The sensors of a direction stand in the order of the chain, the one nearest the base first.
+
+    Parameters
+    ----------
+    lower, upper : array_like, scalar or (n,)
+        Search space of the spring stiffnesses, N/m, positive; searched on a logarithmic scale.
+    """
+
+    lower: ArrayLike
+    upper: ArrayLike
+
+    def variables(self, layout: Layout) -> tuple[Variable, ...]:
+        """One spring a sensor, N/m."""
+        low, high = (np.broadcast_to(np.asarray(v, dtype=float), (layout.n,)) for v in (self.lower, self.upper))
+        if not (np.all(np.isfinite(high)) and np.all(low > 0) and np.all(low < high)):
+            raise InputError("ChainStiffness: bounds must be finite with 0 < lower < upper (N/m)")
+        span, width = np.log(high / low), high - low
+        return (
+            Variable(
+                "spring", low, high, unit="N/m",
+                sampling=lambda s: low * ca.exp((s - low) / width * span),
+                unsampling=lambda k: low + width * np.log(k / low) / span,
+            ),
+        )  # fmt: skip
+
+    def normalised(self, layout: Layout, y: ca.SX, factor: ca.SX) -> ca.SX:
+        """``H = L^-1 K_SS L^-T`` (n, n), with L the Cholesky factor of M_SS."""
+        K = _chain_pattern(layout)
+        K_SS = sum((y[i] * ca.SX(ca.sparsify(ca.DM(K[i]))) for i in range(layout.n)), ca.SX(layout.n, layout.n))
+        half = ca.solve(factor, K_SS)
+        return ca.solve(factor, half.T)
+
+    def values(self, layout: Layout, H: Array, stiffness: Array) -> Array:
+        """Spring stiffnesses of a chain's stiffness matrix."""
+        return np.array([_own_spring(layout, stiffness, i) for i in range(layout.n)])
+
+
+StiffnessModel = SpectralStiffness | ChainStiffness
+
+
+def _previous(layout: Layout) -> list[int]:
+    """The sensor below each one in its chain; -1 for the base."""
+    groups = layout.directions[: layout.n].tolist()
+    if -1 in groups:
+        raise InputError(f"ChainStiffness: sensor {groups.index(-1)} is moved by no base direction; a chain cannot hold it")
+    return [max((j for j in range(i) if groups[j] == groups[i]), default=-1) for i in range(layout.n)]
+
+
+def _chain_pattern(layout: Layout) -> Array:
+    """Stiffness of each unit spring, (n, n, n)."""
+    patterns = np.zeros((layout.n,) * 3)
+    for i, below in enumerate(_previous(layout)):
+        elongation = np.zeros(layout.n)
+        elongation[i] = 1.0
+        if below >= 0:
+            elongation[below] = -1.0
+        patterns[i] = np.outer(elongation, elongation)
+    return patterns
+
+
+def _own_spring(layout: Layout, stiffness: Array, i: int) -> float:
+    """Spring i of a chain: minus the coupling to the one below, or what the row adds up to at the base."""
+    below = _previous(layout)[i]
+    return float(stiffness[i, : layout.n].sum() if below < 0 else -stiffness[i, below])

@@ -1,0 +1,333 @@
+"""A structure as numbers: mass, stiffness, damping, and every response that follows from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import ArrayLike, NDArray
+
+from sysid.errors import InputError
+
+if TYPE_CHECKING:
+    from scipy.signal import StateSpace
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+_TOLERANCE = 1e-8  # relative; looser than round-off in a condensation, tighter than any instrument
+
+
+class Structure:
+    r"""A linear structure on a moving base.
+
+    The degrees of freedom are partitioned ``[S, 0]``: `n` of the structure first, then `d` of the
+    base. With ``G = -K_SS^-1 K_S0`` and ``v = u_S - G u_0`` the motion relative to the base obeys
+
+    .. math:: M_{SS} \ddot v + C \dot v + K_{SS} v = -B \ddot u_0, \qquad B = M_{SS} G + M_{S0}.
+
+    Parameters
+    ----------
+    mass, stiffness : array_like, shape (n + d, n + d)
+        Symmetric, kg and N/m (kg m, kg m² and N, N m where a rotation is involved). ``M_SS`` and
+        ``K_SS`` positive definite, ``M`` positive semidefinite, and ``K`` with the rigid-body
+        motions ``[G; I]`` as its null space (a statically determinate base).
+    damping_ratios : array_like, shape (n,), optional
+        Fractions of critical damping, in ascending order of frequency.
+    n_base : int
+        Number `d` of base directions.
+    damping_matrix : array_like, shape (n, n), optional
+        Symmetric viscous damping on the relative motion, N s/m. Exactly one of `damping_ratios`
+        and `damping_matrix` is given.
+    rigid_body : array_like, shape (n_sensors, d), optional
+        Motion of the sensors for unit base motion. Follows from the stiffness unless `recovery`
+        is given; a stated one that disagrees is an error.
+    recovery : array_like, shape (n_sensors, n), optional
+        Takes the degrees of freedom to the sensors; the identity by default.
+    sensors : sequence, optional
+        Descriptions of the sensors (`sysid.Sensor`), carried along for tables and pictures.
+
+    Attributes
+    ----------
+    mass, stiffness : (n + d, n + d)
+    damping : (n, n)
+        Physical damping on the relative motion; from ratios it is
+        ``M Phi diag(2 zeta w) Phi' M`` (Cerini et al. 2024, eq. 33).
+    damping_ratios : (n,)
+        As given, or ``diag(Phi' C Phi) / 2 w``.
+    natural_frequencies : (n,)
+        Hz, ascending, of the structure on a fixed base.
+    mode_shapes : (n_sensors, n)
+        Mass-normalised, at the sensors.
+    participation : (n, d)
+        ``Phi' B``, one row a mode.
+    effective_masses : (n, d, d)
+        ``gamma_k' gamma_k`` of each mode.
+    rigid_body_mass : (d, d)
+        ``[G; I]' M [G; I]``.
+
+    Raises
+    ------
+    InputError
+        Where a matrix is not what the list above demands; the message says by how much.
+
+    Notes
+    -----
+    Frequencies at this surface are in Hz, spectra follow ``exp(+i w t)``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sysid
+    >>> m, k = 2.0, 800.0
+    >>> one = sysid.Structure(np.diag([m, 0.0]), k * np.array([[1, -1], [-1, 1]]), [0.01], n_base=1)
+    >>> bool(np.isclose(one.natural_frequencies[0], np.sqrt(k / m) / (2 * np.pi)))
+    True
+    """
+
+    def __init__(
+        self,
+        mass: ArrayLike,
+        stiffness: ArrayLike,
+        damping_ratios: ArrayLike | None = None,
+        *,
+        n_base: int,
+        damping_matrix: ArrayLike | None = None,
+        rigid_body: ArrayLike | None = None,
+        recovery: ArrayLike | None = None,
+        sensors: Sequence[Any] | None = None,
+    ) -> None:
+        self.mass = _square("mass", mass)
+        self.stiffness = _square("stiffness", stiffness)
+        if self.mass.shape != self.stiffness.shape:
+            raise InputError(f"mass is {self.mass.shape} but stiffness is {self.stiffness.shape}; both are (n+d, n+d)")
+        self.n_base = int(n_base)
+        self.n = self.mass.shape[0] - self.n_base
+        if self.n_base < 1 or self.n < 1:
+            raise InputError(
+                f"n_base = {n_base} leaves {self.n} structural degrees of freedom of {self.mass.shape[0]}; "
+                "at least one of each is needed"
+            )
+        n = self.n
+        self._rigid_body_dofs = self._check_matrices()
+
+        lam, phi = scipy.linalg.eigh(self.stiffness[:n, :n], self.mass[:n, :n])
+        self._omega = np.sqrt(lam)
+        # A mode's sign is arbitrary: the entry of largest magnitude is made positive, so that the
+        # same structure always prints the same shapes.
+        self._phi = phi * np.sign(phi[np.argmax(np.abs(phi), axis=0), np.arange(n)])
+        self.natural_frequencies: Array = self._omega / (2 * np.pi)
+        self._set_damping(damping_ratios, damping_matrix)
+
+        self.recovery: Array = np.eye(n) if recovery is None else _matrix("recovery", recovery, (None, n))
+        self.rigid_body: Array = self._sensor_rigid_body(rigid_body, recovery is not None)
+        self.sensors = None if sensors is None else tuple(sensors)
+        if self.sensors is not None and len(self.sensors) != self.n_sensors:
+            raise InputError(f"{len(self.sensors)} sensors are described but the structure has {self.n_sensors}")
+
+        G = self._rigid_body_dofs
+        B = self.mass[:n, :n] @ G + self.mass[:n, n:]
+        rigid = np.vstack([G, np.eye(self.n_base)])
+        self.mode_shapes: Array = self.recovery @ self._phi
+        self.participation: Array = self._phi.T @ B
+        self.effective_masses: Array = np.einsum("ki,kj->kij", self.participation, self.participation)
+        self.rigid_body_mass: Array = rigid.T @ self.mass @ rigid
+        self._coupling = B
+
+    @property
+    def n_sensors(self) -> int:
+        """Number of sensors, the rows of `recovery`."""
+        return int(self.recovery.shape[0])
+
+    def __repr__(self) -> str:
+        low, high = self.natural_frequencies[[0, -1]]
+        return f"<Structure: n = {self.n}, d = {self.n_base}, {low:.4g} to {high:.4g} Hz>"
+
+    def relative_acceleration(self, freq: ArrayLike) -> ComplexArray:
+        """Acceleration of the sensors relative to the base, per unit base acceleration.
+
+        Parameters
+        ----------
+        freq : array_like, shape (n_freq,)
+            Hz.
+
+        Returns
+        -------
+        ndarray, complex, shape (n_sensors, d, n_freq)
+        """
+        return np.einsum("sn,ndf->sdf", self.recovery, self._relative(freq))
+
+    def transmissibility(self, freq: ArrayLike) -> ComplexArray:
+        """Absolute acceleration of the sensors per unit base acceleration, (n_sensors, d, n_freq)."""
+        return self.relative_acceleration(freq) + self.rigid_body[:, :, None]
+
+    def base_force(self, freq: ArrayLike) -> ComplexArray:
+        """Force of the base on the structure per unit base acceleration (apparent mass), kg.
+
+        ``f_0 = B' a + M_rb``: exact for any damping that acts on the relative motion.
+
+        Returns
+        -------
+        ndarray, complex, shape (d, d, n_freq)
+            [force direction, base direction, line].
+        """
+        return np.einsum("nd,nef->def", self._coupling, self._relative(freq)) + self.rigid_body_mass[:, :, None]
+
+    def to_state_space(self) -> StateSpace:
+        """Continuous-time state space from base accelerations to absolute sensor accelerations.
+
+        Returns
+        -------
+        scipy.signal.StateSpace
+            2n states ``[v, v']`` (the relative motion of the degrees of freedom), d inputs, n_sensors outputs.
+        """
+        from scipy.signal import StateSpace
+
+        n, R = self.n, self.recovery
+        M_inv = scipy.linalg.inv(self.mass[:n, :n])
+        acceleration = np.hstack([-M_inv @ self.stiffness[:n, :n], -M_inv @ self.damping])
+        feed = -M_inv @ self._coupling
+        A = np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), acceleration])
+        return StateSpace(
+            A, np.vstack([np.zeros((n, self.n_base)), feed]), R @ acceleration, R @ feed + self.rigid_body
+        )
+
+    def _relative(self, freq: ArrayLike) -> ComplexArray:
+        """Relative acceleration of the degrees of freedom, (n, d, n_freq)."""
+        omega = 2 * np.pi * check_frequencies(freq, increasing=False)
+        if self._modal_damping:
+            lam = self._omega[:, None]
+            g = omega**2 / (lam**2 - omega**2 + 2j * self.damping_ratios[:, None] * lam * omega)
+            return np.einsum("nk,kd,kf->ndf", self._phi, self.participation, g)
+        n = self.n
+        w = omega[:, None, None]
+        dynamic = -(w**2) * self.mass[:n, :n] + 1j * w * self.damping + self.stiffness[:n, :n]
+        return np.moveaxis(np.linalg.solve(dynamic, w**2 * self._coupling), 0, -1)
+
+    def _check_matrices(self) -> Array:
+        """Check mass and stiffness; return G of the degrees of freedom."""
+        n = self.n
+        for name, matrix in (("mass", self.mass), ("stiffness", self.stiffness)):
+            _check_positive_definite(f"the structure's block of {name} ({n} x {n})", matrix[:n, :n])
+        # Each row in units of its own diagonal, so that kg and kg m² can be judged together.
+        scale = np.sqrt(np.maximum(np.diag(self.mass), 0.0))
+        scale[scale == 0] = scale.max()
+        lowest = np.linalg.eigvalsh(self.mass / np.outer(scale, scale))[0]
+        if lowest < -_TOLERANCE:
+            raise InputError(
+                f"mass is not positive semidefinite: its lowest eigenvalue is {lowest:.3g} of its diagonal; "
+                "the base rows need M_00 >= M_S0' M_SS^-1 M_S0"
+            )
+        G = -scipy.linalg.solve(self.stiffness[:n, :n], self.stiffness[:n, n:], assume_a="pos")
+        expected = G.T @ self.stiffness[:n, :n] @ G
+        size = np.sqrt(np.abs(np.diag(expected)))
+        # A direction that strains nothing has no stiffness of its own to be compared with.
+        allowed = 1e-6 * np.outer(size, size) + 1e-10 * np.max(np.abs(self.stiffness))
+        residue = np.abs(self.stiffness[n:, n:] - expected)
+        if np.any(residue > allowed):
+            worst = 1e-6 * np.max(residue / allowed)
+            raise InputError(
+                f"stiffness does not let the base move as a rigid body: K_00 differs from G' K_SS G by {worst:.3g} "
+                "(relative); K must have the null space [G; I]"
+            )
+        return G
+
+    def _set_damping(self, ratios: ArrayLike | None, matrix: ArrayLike | None) -> None:
+        n = self.n
+        if (ratios is None) == (matrix is None):
+            raise InputError("give exactly one of damping_ratios (n,) and damping_matrix (n, n)")
+        self._modal_damping = ratios is not None
+        if ratios is not None:
+            self.damping_ratios: Array = _finite("damping_ratios", ratios)
+            if self.damping_ratios.shape != (n,):
+                raise InputError(
+                    f"damping_ratios has shape {self.damping_ratios.shape}; one ratio a mode is ({n},) (fractions)"
+                )
+            if np.any(self.damping_ratios < 0):
+                raise InputError(f"damping ratio {self.damping_ratios.min():.3g} is negative")
+            momentum = self.mass[:n, :n] @ self._phi
+            self.damping: Array = (momentum * (2 * self.damping_ratios * self._omega)) @ momentum.T
+        else:
+            assert matrix is not None
+            self.damping = _square("damping_matrix", matrix)
+            if self.damping.shape != (n, n):
+                raise InputError(f"damping_matrix has shape {self.damping.shape}; on the relative motion it is ({n}, {n})")
+            modal = self._phi.T @ self.damping @ self._phi
+            if np.linalg.eigvalsh(modal)[0] < -_TOLERANCE * np.abs(modal).max():
+                raise InputError("damping_matrix is not positive semidefinite: the structure would feed energy in")
+            self.damping_ratios = np.diag(modal) / (2 * self._omega)
+
+    def _sensor_rigid_body(self, given: ArrayLike | None, recovered: bool) -> Array:
+        shape = (self.recovery.shape[0], self.n_base)
+        if recovered:
+            if given is None:
+                raise InputError("a structure with a recovery matrix needs rigid_body (n_sensors, d): geometry tells it")
+            return _matrix("rigid_body", given, shape)
+        G = self._rigid_body_dofs
+        if given is not None:
+            stated = _matrix("rigid_body", given, shape)
+            worst = np.max(np.abs(stated - G))
+            if worst > 1e-6 * max(1.0, float(np.max(np.abs(G)))):
+                raise InputError(
+                    f"rigid_body differs from -K_SS^-1 K_S0 by up to {worst:.3g}; leave it out, or check axes and signs"
+                )
+        return G
+
+
+def check_frequencies(freq: ArrayLike, *, increasing: bool = True) -> Array:
+    """Frequency lines in Hz as a finite, nonnegative (strictly increasing) one-dimensional array."""
+    lines = np.atleast_1d(_finite("freq", freq))
+    if lines.ndim != 1 or lines.size == 0:
+        raise InputError(f"freq has shape {lines.shape}; a list of lines in Hz is needed")
+    if np.any(lines < 0):
+        raise InputError(f"freq holds a negative line ({lines.min():g} Hz)")
+    if increasing and np.any(np.diff(lines) <= 0):
+        at = int(np.argmax(np.diff(lines) <= 0))
+        raise InputError(
+            f"freq must rise strictly: line {at + 1} is {lines[at + 1]:g} Hz after {lines[at]:g} Hz; "
+            "sort the lines and drop repeated ones"
+        )
+    return lines
+
+
+def _finite(name: str, value: ArrayLike) -> Array:
+    try:
+        array = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} is not an array of real numbers") from None
+    if not np.all(np.isfinite(array)):
+        raise InputError(f"{name} holds NaN or infinite entries ({int(np.sum(~np.isfinite(array)))} of {array.size})")
+    return array
+
+
+def _matrix(name: str, value: ArrayLike, shape: tuple[int | None, int]) -> Array:
+    array = _finite(name, value)
+    if array.ndim != 2 or array.shape[1] != shape[1] or (shape[0] is not None and array.shape[0] != shape[0]):
+        rows = "n_sensors" if shape[0] is None else shape[0]
+        raise InputError(f"{name} has shape {array.shape}; it is ({rows}, {shape[1]})")
+    return array
+
+
+def _square(name: str, value: ArrayLike) -> Array:
+    array = _finite(name, value)
+    if array.ndim != 2 or array.shape[0] != array.shape[1]:
+        raise InputError(f"{name} has shape {array.shape}; a square matrix is needed")
+    scale = np.sqrt(np.abs(np.diag(array)))
+    asymmetry = np.abs(array - array.T)
+    if np.any(asymmetry > _TOLERANCE * np.outer(scale, scale) + 1e-12 * np.max(np.abs(array), initial=0.0)):
+        i, j = np.unravel_index(int(np.argmax(asymmetry)), array.shape)
+        raise InputError(f"{name} is not symmetric: [{i}, {j}] is {array[i, j]:.6g} and [{j}, {i}] is {array[j, i]:.6g}")
+    return (array + array.T) / 2
+
+
+def _check_positive_definite(name: str, matrix: Array) -> None:
+    diagonal = np.diag(matrix)
+    if np.any(diagonal <= 0):
+        at = int(np.argmin(diagonal))
+        raise InputError(f"{name} is not positive definite: diagonal entry {at} is {diagonal[at]:.6g}")
+    scale = np.sqrt(diagonal)
+    lowest = np.linalg.eigvalsh(matrix / np.outer(scale, scale))[0]
+    if lowest <= 0:
+        raise InputError(f"{name} is not positive definite: its lowest eigenvalue is {lowest:.3g} of its diagonal")

@@ -1,0 +1,20 @@
+"""Adaptive particle swarm: minimises any batched function over a box.
+
+`minimize_swarm` runs a whole search; `ParticleSwarm` is the same search in ask and tell form, for callers that
+evaluate the costs themselves, stop, store and go on.
+"""
+
+from .adaptation import EvolutionaryState
+from .minimize import SwarmProgress, minimize_swarm
+from .particles import ParticleSwarm
+from .settings import SwarmSettings
+from .stop import StopReason
+
+__all__ = [
+    "EvolutionaryState",
+    "ParticleSwarm",
+    "StopReason",
+    "SwarmProgress",
+    "SwarmSettings",
+    "minimize_swarm",
+]

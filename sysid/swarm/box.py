@@ -1,0 +1,115 @@
+"""The search box: between the caller's units and coordinates scaled to the range of each variable."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sysid.errors import InputError
+
+FloatArray = NDArray[np.float64]
+
+
+class Box:
+    """Lower and upper bounds, and the unit cube of the variables that are free between them.
+
+    The swarm lives in the unit cube of the free variables alone; a fixed variable (lower == upper) has no range to
+    be scaled with, takes no part in distances, and comes back exactly.
+
+    Parameters
+    ----------
+    bounds : (n_dim, 2) array-like or scipy.optimize.Bounds
+        Lower and upper bound of each variable, finite.
+
+    Attributes
+    ----------
+    lower, upper : (n_dim,) array
+    free : (n_free,) array of int
+        Indices of the variables with lower < upper.
+
+    Raises
+    ------
+    InputError
+        If the shape is wrong, a bound is not finite, or a lower bound is above its upper bound.
+    """
+
+    def __init__(self, bounds: Any) -> None:
+        self.lower, self.upper = _lower_and_upper(bounds)
+        self.free = np.flatnonzero(self.upper > self.lower)
+        self._span = self.upper[self.free] - self.lower[self.free]
+
+    @property
+    def n_dim(self) -> int:
+        """Number of variables, the fixed ones included."""
+        return self.lower.size
+
+    @property
+    def n_free(self) -> int:
+        """Number of variables that are not fixed."""
+        return self.free.size
+
+    def to_rows(self, unit: FloatArray) -> FloatArray:
+        """Points of the unit cube (k, n_free) as rows in the caller's units (k, n_dim), inside the bounds."""
+        rows = np.repeat(self.lower[None, :], len(unit), axis=0)
+        rows[:, self.free] += unit * self._span
+        # lower + 1.0 * (upper - lower) can lie a rounding above upper.
+        return np.clip(rows, self.lower, self.upper)
+
+    def scaled(self, vectors: FloatArray) -> FloatArray:
+        """Differences in the unit cube (k, n_free) as differences in the caller's units (k, n_dim)."""
+        rows = np.zeros((len(vectors), self.n_dim))
+        rows[:, self.free] = vectors * self._span
+        return rows
+
+    def to_unit(self, x: FloatArray) -> FloatArray:
+        """One point in the caller's units (n_dim,) as a point of the unit cube (n_free,)."""
+        unit: FloatArray = (x[self.free] - self.lower[self.free]) / self._span
+        return np.clip(unit, 0.0, 1.0)
+
+    def clip(self, x: FloatArray) -> FloatArray:
+        """Return the nearest point inside the bounds."""
+        return np.clip(x, self.lower, self.upper)
+
+    def point(self, x: ArrayLike, name: str) -> FloatArray:
+        """Return a copy of `x` as an (n_dim,) array, once it is known to be one inside the bounds."""
+        try:
+            point = np.array(x, dtype=float)
+        except (TypeError, ValueError):
+            raise InputError(f"{name} is not an array of numbers; give one number a variable.") from None
+        if point.shape != self.lower.shape:
+            raise InputError(f"{name} has shape {point.shape}; give one number a variable, shape ({self.n_dim},).")
+        outside = np.flatnonzero(~((point >= self.lower) & (point <= self.upper)))
+        if outside.size:
+            i = outside[0]
+            raise InputError(
+                f"{name}[{i}] = {point[i]} is outside its bounds [{self.lower[i]}, {self.upper[i]}]; "
+                "move it inside or widen the bounds."
+            )
+        return point
+
+
+def _lower_and_upper(bounds: Any) -> tuple[FloatArray, FloatArray]:
+    if hasattr(bounds, "lb") and hasattr(bounds, "ub"):
+        pairs = np.stack(np.broadcast_arrays(np.atleast_1d(bounds.lb), np.atleast_1d(bounds.ub)), axis=-1)
+    else:
+        try:
+            pairs = np.asarray(bounds, dtype=float)
+        except (TypeError, ValueError):
+            raise InputError("bounds is not an array of numbers; give one pair (lower, upper) a variable.") from None
+    if pairs.ndim != 2 or pairs.shape[1] != 2 or pairs.shape[0] == 0:
+        raise InputError(f"bounds has shape {pairs.shape}; give one pair (lower, upper) a variable, shape (n_dim, 2).")
+    lower, upper = pairs[:, 0].astype(float), pairs[:, 1].astype(float)
+    with np.errstate(over="ignore", invalid="ignore"):
+        endless = np.flatnonzero(~np.isfinite(upper - lower))
+    if endless.size:
+        i = endless[0]
+        raise InputError(
+            f"bounds[{i}] = ({lower[i]}, {upper[i]}) has no finite range to sample; give two finite numbers."
+        )
+    reversed_ = np.flatnonzero(lower > upper)
+    if reversed_.size:
+        i = reversed_[0]
+        raise InputError(f"bounds[{i}] = ({lower[i]}, {upper[i]}) has its lower above its upper; exchange the two.")
+    return lower, upper

@@ -1,0 +1,217 @@
+"""A whole search with the swarm: budgets, stop rules, refinement of the best, the result."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sysid.errors import InputError
+
+from .adaptation import EvolutionaryState
+from .checks import RandomSource, checked_costs, whole_number
+from .particles import ParticleSwarm
+from .settings import SwarmSettings
+from .stop import StopReason, StopRules
+
+if TYPE_CHECKING:
+    from scipy.optimize import OptimizeResult
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class SwarmProgress:
+    """What a callback is given after each iteration.
+
+    Attributes
+    ----------
+    x : (n_dim,) array
+        The best point so far (a copy).
+    fun : float
+        Its cost; inf while no finite cost is known.
+    nit, nfev : int
+        Iterations and evaluations so far.
+    state : EvolutionaryState
+        The present evolutionary state of the swarm.
+    """
+
+    x: FloatArray
+    fun: float
+    nit: int
+    nfev: int
+    state: EvolutionaryState
+
+
+def minimize_swarm(
+    fun: Callable[[FloatArray], ArrayLike],
+    bounds: Any,
+    *,
+    rng: RandomSource = None,
+    n_particles: int | None = None,
+    max_iterations: int = 1000,
+    max_evaluations: int | None = None,
+    max_time: float | None = None,
+    target: float | None = None,
+    stall_iterations: int | None = 100,
+    stall_tolerance: float = 1e-8,
+    callback: Callable[[SwarmProgress], object] | None = None,
+    improve: Callable[[FloatArray], ArrayLike] | None = None,
+    improve_every: int = 0,
+    x0: ArrayLike | None = None,
+    settings: SwarmSettings | None = None,
+) -> OptimizeResult:
+    """Minimise a batched function over a box with the adaptive particle swarm.
+
+    The algorithm is that of `ParticleSwarm` (Cerini et al. 2024, MSSP 209, 111084, section 2.2; Zhan et al. 2009,
+    IEEE Trans. SMC-B 39(6), 1362-1381); this function adds the stop rules and the refinement of the best.
+
+    Parameters
+    ----------
+    fun : callable
+        Cost of each row of an array (k, n_dim): returns (k,) real numbers. k is the number of particles, one more when
+        elitist learning offers a row, and 1 after `improve`. Costs that are not finite are counted and read as +inf.
+    bounds : (n_dim, 2) array-like or scipy.optimize.Bounds
+        Lower and upper bound of each variable, finite; lower == upper fixes the variable.
+    rng : int, numpy.random.Generator, numpy.random.SeedSequence or None
+        Source of random numbers. The same seed gives the same bits, unless `max_time` ends the search.
+    n_particles : int, optional
+        At least 2; five for each free variable by default.
+    max_iterations : int
+        Largest number of iterations; the Latin hypercube sample is the first.
+    max_evaluations : int, optional
+        Largest number of rows given to `fun`, never passed; evaluations inside `improve` are not seen. At least
+        `n_particles`.
+    max_time : float, optional
+        Seconds after which no further iteration starts.
+    target : float, optional
+        Stop as soon as the best cost is at or below this.
+    stall_iterations : int or None
+        Stop when the best cost has not fallen by more than `stall_tolerance` times itself over so many iterations;
+        None never stops for this.
+    stall_tolerance : float
+        See above.
+    callback : callable, optional
+        Called with a `SwarmProgress` after each iteration; StopIteration from it ends the search with the best so far.
+    improve : callable, optional
+        Takes the best point (n_dim,) to a better one (n_dim,), by exact gradients for instance. Its answer is clipped
+        to the bounds, evaluated with `fun`, and becomes the global best if it is better; an answer that is not finite
+        is dropped. It is not called again for a best that it has already seen.
+    improve_every : int
+        Iterations between two calls of `improve`; 0 is never.
+    x0 : (n_dim,) array-like, optional
+        A start guess inside the bounds: it takes the place of the first row of the sample.
+    settings : SwarmSettings, optional
+        The constants of the swarm.
+
+    Returns
+    -------
+    scipy.optimize.OptimizeResult
+        `x` (n_dim,) and `fun`: the best point and its cost, inf if no cost was finite; `nfev`, `nit`; `success`: some
+        cost was finite, the target was reached where one was given, and the callback did not cut the search short (a
+        swarm has no test of optimality, so a spent budget is its normal end); `message`; `reason`, a `StopReason`;
+        `history` (nit,), the best cost after each iteration; `n_nan`, the number of costs that were not finite;
+        `n_improved`, how often `improve` gave a better point; `state_counts`, a dict from `EvolutionaryState` to the
+        iterations moved in it.
+
+    Raises
+    ------
+    InputError
+        If an argument cannot be used, or `fun` or `improve` returns the wrong shape.
+
+    Notes
+    -----
+    Any other exception of `fun`, `improve` or `callback`, and KeyboardInterrupt, goes through to the caller. To keep
+    the best so far then, keep the last `SwarmProgress` that the callback was given, or drive a `ParticleSwarm`.
+
+    Elitist learning narrows over `max_iterations`, or over what `max_evaluations` leaves of them.
+
+    Examples
+    --------
+    >>> def paraboloid(rows):
+    ...     return ((rows - [1, 2]) ** 2).sum(axis=1)
+    >>> result = minimize_swarm(paraboloid, [(-5, 5), (-5, 5)], rng=0, target=1e-6)
+    >>> result.success, result.reason.value, result.x.round(2).tolist()
+    (True, 'target', [1.0, 2.0])
+    """
+    from scipy.optimize import OptimizeResult
+
+    rules = StopRules(
+        max_iterations=max_iterations,
+        max_evaluations=max_evaluations,
+        max_time=max_time,
+        target=target,
+        stall_iterations=stall_iterations,
+        stall_tolerance=stall_tolerance,
+    )
+    improve_every = whole_number(improve_every, "improve_every", at_least=0)
+    if improve_every and improve is None:
+        raise InputError(f"improve_every is {improve_every} but improve is not given; give improve, or leave both out.")
+    swarm = ParticleSwarm(bounds, rng=rng, n_particles=n_particles, horizon=max_iterations, x0=x0, settings=settings)
+    if max_evaluations is not None:
+        if max_evaluations < swarm.n_particles:
+            raise InputError(
+                f"max_evaluations is {max_evaluations}, too few for the first {swarm.n_particles} particles; "
+                "raise it or lower n_particles."
+            )
+        swarm.horizon = min(max_iterations, max_evaluations // swarm.n_particles)
+
+    started = time.perf_counter()
+    n_improved = 0
+    refined: FloatArray | None = None
+    reason = None
+    while reason is None:
+        rows = swarm.ask()
+        if not rules.room_for(len(rows), swarm.nfev):
+            reason = StopReason.MAX_EVALUATIONS
+            break
+        swarm.tell(checked_costs(fun(rows), len(rows), "that fun returned"))
+
+        due = improve_every > 0 and swarm.nit % improve_every == 0 and math.isfinite(swarm.best_cost)
+        seen = refined is not None and np.array_equal(refined, swarm.best_x)
+        if improve is not None and due and not seen and rules.room_for(1, swarm.nfev):
+            n_improved += _refine(swarm, fun, improve)
+            refined = swarm.best_x
+
+        reason = rules.reason(swarm, time.perf_counter() - started)
+        if callback is not None:
+            try:
+                callback(SwarmProgress(swarm.best_x, swarm.best_cost, swarm.nit, swarm.nfev, swarm.state))
+            except StopIteration:
+                # A search that had ended anyway was not cut short.
+                reason = reason or StopReason.CALLBACK
+
+    found = math.isfinite(swarm.best_cost)
+    reached = target is None or swarm.best_cost <= target
+    return OptimizeResult(
+        x=swarm.best_x,
+        fun=swarm.best_cost,
+        nfev=swarm.nfev,
+        nit=swarm.nit,
+        success=found and reached and reason is not StopReason.CALLBACK,
+        message=rules.message(reason, swarm),
+        reason=reason,
+        history=np.array(swarm.history),
+        n_nan=swarm.n_nan,
+        n_improved=n_improved,
+        state_counts=dict(swarm.state_counts),
+    )
+
+
+def _refine(
+    swarm: ParticleSwarm, fun: Callable[[FloatArray], ArrayLike], improve: Callable[[FloatArray], ArrayLike]
+) -> bool:
+    """Offer the swarm the improved best; whether it was better."""
+    point = np.asarray(improve(swarm.best_x), dtype=float)
+    if point.shape != swarm.best_x.shape:
+        raise InputError(f"improve returned shape {point.shape}; return one point, shape {swarm.best_x.shape}.")
+    if not np.isfinite(point).all():
+        return False
+    point = swarm.box.clip(point)
+    cost = checked_costs(fun(point[None, :].copy()), 1, "that fun returned")[0]
+    return swarm.inject(point, float(cost))

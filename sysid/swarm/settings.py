@@ -1,0 +1,63 @@
+"""The swarm's constants, in one immutable object."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+from sysid.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class SwarmSettings:
+    """Constants of the adaptive swarm; the defaults are those of the sources.
+
+    Attributes
+    ----------
+    max_velocity : float
+        Largest step of a particle in one iteration, in parts of a variable's range. Essential: without it
+        c1 + c2 = 4 is unstable in mean square.
+    inertia_b1, inertia_b2 : float
+        Constants of the inertia weight (Cerini et al. 2024, eq. 11).
+    acceleration_start : float
+        c1 and c2 at the start (Zhan et al. 2009).
+    acceleration_lower, acceleration_upper : float
+        Interval to which c1 and c2 are clamped.
+    acceleration_sum : float
+        Largest c1 + c2.
+    acceleration_step_lower, acceleration_step_upper : float
+        The step of c1 and c2 is uniform between these.
+    elitist_sigma_start, elitist_sigma_end : float
+        Standard deviation of elitist learning at the start and end of the run, in parts of the range.
+
+    Raises
+    ------
+    InputError
+        If a number is negative or not finite, or an upper number lies below its lower one.
+    """
+
+    max_velocity: float = 0.4
+    inertia_b1: float = 0.3
+    inertia_b2: float = 0.2
+    acceleration_start: float = 2.0
+    acceleration_lower: float = 1.5
+    acceleration_upper: float = 2.5
+    acceleration_sum: float = 4.0
+    acceleration_step_lower: float = 0.05
+    acceleration_step_upper: float = 0.1
+    elitist_sigma_start: float = 1.0
+    elitist_sigma_end: float = 0.1
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (math.isfinite(value) and value >= 0):
+                raise InputError(f"SwarmSettings.{field.name} is {value!r}; give a finite number, zero or above.")
+        if self.max_velocity == 0:
+            raise InputError("SwarmSettings.max_velocity is 0, so no particle could move; give a number above zero.")
+        for name in ("acceleration", "acceleration_step"):
+            lower, upper = getattr(self, f"{name}_lower"), getattr(self, f"{name}_upper")
+            if lower > upper:
+                raise InputError(
+                    f"SwarmSettings.{name}_lower = {lower} is above {name}_upper = {upper}; exchange the two."
+                )

@@ -1,0 +1,111 @@
+"""When a search ends, and what is said about it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+from sysid.errors import InputError
+
+from .checks import whole_number
+from .particles import ParticleSwarm
+
+
+class StopReason(Enum):
+    """Why a search ended."""
+
+    TARGET = "target"
+    STALL = "stall"
+    MAX_ITERATIONS = "max_iterations"
+    MAX_EVALUATIONS = "max_evaluations"
+    MAX_TIME = "max_time"
+    CALLBACK = "callback"
+
+
+@dataclass(frozen=True, kw_only=True)
+class StopRules:
+    """The stop rules of one search; see `minimize_swarm` for each.
+
+    Raises
+    ------
+    InputError
+        If a rule cannot be used.
+    """
+
+    max_iterations: int
+    max_evaluations: int | None
+    max_time: float | None
+    target: float | None
+    stall_iterations: int | None
+    stall_tolerance: float
+
+    def __post_init__(self) -> None:
+        whole_number(self.max_iterations, "max_iterations", at_least=1)
+        if self.max_evaluations is not None:
+            whole_number(self.max_evaluations, "max_evaluations", at_least=1)
+        if self.stall_iterations is not None:
+            whole_number(self.stall_iterations, "stall_iterations", at_least=1)
+        if self.max_time is not None and not self.max_time >= 0:
+            raise InputError(f"max_time is {self.max_time!r}; give seconds, zero or above, or None for no limit.")
+        if self.target is not None and math.isnan(self.target):
+            raise InputError("target is NaN, which no cost can reach; give a number, or None for no target.")
+        if not 0 <= self.stall_tolerance < 1:
+            raise InputError(f"stall_tolerance is {self.stall_tolerance!r}; give a part of the cost, in [0, 1).")
+
+    def room_for(self, n_rows: int, nfev: int) -> bool:
+        """Whether so many further rows may be evaluated."""
+        return self.max_evaluations is None or nfev + n_rows <= self.max_evaluations
+
+    def reason(self, swarm: ParticleSwarm, seconds: float) -> StopReason | None:
+        """Return the first rule that ends the search after an iteration, or None to go on."""
+        if self.target is not None and math.isfinite(swarm.best_cost) and swarm.best_cost <= self.target:
+            return StopReason.TARGET
+        if self.stall_iterations is not None and stalled(swarm.history, self.stall_iterations, self.stall_tolerance):
+            return StopReason.STALL
+        if swarm.nit >= self.max_iterations:
+            return StopReason.MAX_ITERATIONS
+        if self.max_time is not None and seconds >= self.max_time:
+            return StopReason.MAX_TIME
+        return None
+
+    def message(self, reason: StopReason, swarm: ParticleSwarm) -> str:
+        """Say what happened, and what to do about it."""
+        if math.isinf(swarm.best_cost):
+            return (
+                f"None of the {swarm.nfev} costs was finite: evaluate fun at a point that should work, "
+                "and narrow the bounds to where it is defined."
+            )
+        happened = {
+            StopReason.TARGET: f"Reached the target {self.target}.",
+            StopReason.STALL: (
+                f"The best cost has not fallen by more than {self.stall_tolerance} of itself in "
+                f"{self.stall_iterations} iterations: refine x locally, or start again with another rng "
+                "or more particles."
+            ),
+            StopReason.MAX_ITERATIONS: (
+                f"Spent max_iterations = {self.max_iterations}: if the history still falls, raise it, "
+                "or refine x locally."
+            ),
+            StopReason.MAX_EVALUATIONS: (
+                f"Spent max_evaluations = {self.max_evaluations}, as far as whole iterations fit: if the history "
+                "still falls, raise it, or refine x locally."
+            ),
+            StopReason.MAX_TIME: (
+                f"Spent max_time = {self.max_time} s: if the history still falls, raise it, or refine x locally."
+            ),
+            StopReason.CALLBACK: "The callback stopped the search; x is the best point until then.",
+        }[reason]
+        if self.target is not None and reason is not StopReason.TARGET:
+            happened += f" The target {self.target} was not reached; the best cost is {swarm.best_cost:.6g}."
+        return happened
+
+
+def stalled(history: list[float], iterations: int, tolerance: float) -> bool:
+    """Whether the best cost fell by no more than `tolerance` times itself over the last `iterations`."""
+    if len(history) <= iterations:
+        return False
+    before, now = history[-1 - iterations], history[-1]
+    if math.isinf(before):
+        return math.isinf(now)
+    return before - now <= tolerance * abs(before)
