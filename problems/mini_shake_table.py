@@ -42,7 +42,7 @@ def problem(*, data=None, rng=0):
     fitted, unseen = (event(Path(folder) / name) for name in ("sine_1p5", "sine_2p0"))
     return sysid.Problem(
         fitted,
-        mass=sysid.FullMass(),
+        mass=sysid.FullMass(healing="rigid_body"),
         stiffness=sysid.SpectralStiffness([3.75, 11.2, 16.6]),
         damping=sysid.ModalDamping(0.0005, 0.05),
         validation=[unseen],

@@ -151,7 +151,7 @@ class Identification:
             f"strategy {self.strategy}, seed {self.seed}, {self.history.wall_time:.1f} s",
             f"relative residual {self.residual:.3e}"
             + ("" if self.force_residual is None else f", base force {self.force_residual:.3e}"),
-            f"rigid-body mass {_numbers(np.diag(s.rigid_body_mass))} kg ({', '.join(self.measurement.base_axes or ())})",
+            f"rigid-body mass {_numbers(np.diag(s.rigid_body_mass))} kg ({' '.join(self.measurement.base_axes or ())})",
             "",
             "mode   frequency [Hz]   damping [%]   effective mass [% of rigid-body mass]",
         ]

@@ -148,7 +148,7 @@ def _seed(rng: int | np.random.Generator | None) -> tuple[int, np.random.SeedSeq
     return seed, np.random.SeedSequence(seed)
 
 
-class _Stop(Exception):
+class _Stop(Exception):  # noqa: N818 - not an error
     """The callback asked to stop, or Ctrl-C did."""
 
 
@@ -323,7 +323,7 @@ class _Run:
         after = self.residual(answer.x)
         self.note(f"local phase: {answer.message} after {answer.iterations} iterations, residual {after:.4e}")
         self.record(local=after, local_curve=answer.curve)
-        if after < before or self.problem.measurement.force is not None and answer.success:
+        if after < before or (answer.success and self.problem.measurement.force is not None):
             self.x = answer.x
         elif answer.success:
             self.note(f"the local phase did not improve on {before:.4e}; its start is kept")
@@ -339,5 +339,7 @@ def _as_unknowns(problem: Problem, start: ArrayLike | Structure) -> Array:
         return problem.values(start)
     x = np.asarray(start, dtype=float)
     if x.shape != (problem.n_variables,) or not np.all(np.isfinite(x)):
-        raise InputError(f"start has shape {x.shape}; ({problem.n_variables},) finite unknowns, or a Structure, is needed")
+        raise InputError(
+            f"start has shape {x.shape}; ({problem.n_variables},) finite unknowns, or a Structure, is needed"
+        )
     return x

@@ -129,7 +129,7 @@ def solve(
     nlp = {"x": symbols, "f": _OBJECTIVE_SCALE * ca.sumsqr(miss), "g": ca.vertcat(*z.ties) if z.ties else ca.MX(0, 1)}
     curve: list[float] = []
     watch = _Watch(nlp, curve, monitor)
-    limits = {"max_iter": max_iterations}
+    limits: dict[str, float] = {"max_iter": max_iterations}
     if max_time is not None:
         limits["max_wall_time"] = max(max_time, 0.1)
     options = {
@@ -216,7 +216,9 @@ def _spectrum(problem: Problem, start: Structure, z: _Coordinates) -> tuple[ca.M
     (variable,) = damping.variables(problem.layout)
     if isinstance(damping, ModalDamping):
         guess = np.clip(start.damping_ratios, variable.lower, variable.upper)
-        log = z.add("damping ratio", np.zeros(guess.size), np.log(variable.lower / guess), np.log(variable.upper / guess))
+        log = z.add(
+            "damping ratio", np.zeros(guess.size), np.log(variable.lower / guess), np.log(variable.upper / guess)
+        )
         return omega, ca.DM(guess) * ca.exp(log), center
     guess = np.clip(damping.values(start.damping_ratios, own), variable.lower, variable.upper)
     y = z.add("Rayleigh factor", guess / variable.upper, variable.lower / variable.upper, 1.0)
@@ -227,11 +229,11 @@ def _modal(problem: Problem, start: Structure) -> _Model:
     """Full mass, spectral stiffness: mode shapes and participations are free."""
     z, layout, mass = _Coordinates(), problem.layout, problem.mass
     assert isinstance(mass, FullMass)
-    n, d, G = layout.n, layout.d, layout.rigid_body
+    d, G = layout.d, layout.rigid_body
     unit = np.sqrt(problem.totals.max())  # kg^½: makes shapes and participations of order one
     phi = z.add("mode shape", start.mode_shapes * unit) / unit
     gamma = z.add("participation", start.participation / unit) * unit
-    omega, ratios, center = _spectrum(problem, start, z)
+    omega, ratios, _ = _spectrum(problem, start, z)
     remainder = start.rigid_body_mass - start.participation.T @ start.participation
     rigid, root = None, None
     if problem.target.force is not None:
@@ -323,7 +325,9 @@ def _structured(problem: Problem, x: Array, start: Structure) -> _Model:
         # Each unknown in units of its start, or of its range where that is smaller.
         unit = np.maximum(np.abs(values), 0.05 * (variable.upper - variable.lower))
         fixed = np.where(unit > 0, unit, 1.0)
-        pieces.append(z.add(variable.name, values / fixed, variable.lower / fixed, variable.upper / fixed) * ca.DM(fixed))
+        pieces.append(
+            z.add(variable.name, values / fixed, variable.lower / fixed, variable.upper / fixed) * ca.DM(fixed)
+        )
     L_inv, L, M_S0, M_00, H = expand(ca.vertcat(*pieces))
 
     omega, ratios, center = _spectrum(problem, start, z)

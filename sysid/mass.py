@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError
 from sysid.structure import Array
@@ -36,7 +36,7 @@ class Layout:
     """
 
     rigid_body: Array
-    translational: Array
+    translational: NDArray[np.bool_]
     weighed: Array | None = None
 
     @property
@@ -228,12 +228,12 @@ class LumpedMass:
         """Diagonal blocks; the base rows are zero."""
         groups = layout.directions[: layout.n]
         totals, share = layout.split_totals(self.total_mass, y)
-        scales = {i: totals[i] / ca.sum1(share[np.flatnonzero(groups == i).tolist()]) for i in set(groups.tolist()) - {-1}}
+        scales = {
+            i: totals[i] / ca.sum1(share[np.flatnonzero(groups == i).tolist()]) for i in set(groups.tolist()) - {-1}
+        }
         free = sum(scales.values()) / max(len(scales), 1) if scales else 1.0
         masses = [share[j] * scales.get(g, free) for j, g in enumerate(groups.tolist())]
-        return MassBlocks(
-            ca.diag(ca.sqrt(ca.vertcat(*masses))), ca.SX(layout.n, layout.d), ca.SX(layout.d, layout.d)
-        )
+        return MassBlocks(ca.diag(ca.sqrt(ca.vertcat(*masses))), ca.SX(layout.n, layout.d), ca.SX(layout.d, layout.d))
 
     def values(self, layout: Layout, mass: Array) -> Array:
         """Shares that `blocks` takes back to `mass`."""
@@ -293,7 +293,7 @@ def lower_triangle(entries: ca.SX, size: int) -> ca.SX:
     return matrix
 
 
-def heal(factor: ca.SX, layout: Layout, totals: Array, kind: str) -> ca.SX:
+def heal(factor: ca.SX, layout: Layout, totals: ca.SX | Array, kind: str) -> ca.SX:
     """Scale the factor's rows, one scale a base direction, so that M has the stated totals (eq. 21-22).
 
     Rows of no direction take the mean of the scales: their mass has no total to obey.
@@ -309,7 +309,7 @@ def heal(factor: ca.SX, layout: Layout, totals: Array, kind: str) -> ca.SX:
     return ca.diag(by_row) @ factor
 
 
-def _rigid_body_scales(factor: ca.SX, layout: Layout, totals: Array, members: list[list[int]]) -> list:
+def _rigid_body_scales(factor: ca.SX, layout: Layout, totals: ca.SX | Array, members: list[list[int]]) -> list:
     """Scales s with ``r_i' D(s) M D(s) r_i = totals[i]`` for every direction i, r_i column i of [G; I].
 
     Where no sensor's row of G has two entries the equations are uncoupled and closed. Otherwise

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -292,9 +292,13 @@ class Measurement:
         lines = check_frequencies(freq)
         H = _records("frf", frf, lines.size)
         d = H.shape[1]
-        by_run = lambda value, like: (  # noqa: E731 - base direction first: it becomes the run
-            None if value is None else np.moveaxis(np.broadcast_to(np.asarray(value), like.shape), 1, 0)
-        )
+
+        def by_run(value: ArrayLike | None, like: ComplexArray | None) -> Any:
+            """Base direction first: it becomes the run."""
+            if value is None or like is None:
+                return None
+            return np.moveaxis(np.broadcast_to(np.asarray(value), like.shape), 1, 0)
+
         F = None if force is None else _records("force", force, lines.size)
         if F is not None and F.shape[:2] != (d, d):
             raise InputError(f"force is {F.shape}; with {d} base directions it is ({d}, {d}, {lines.size})")
@@ -410,9 +414,7 @@ def unit_runs(d: int, n_freq: int) -> ComplexArray:
     return np.repeat(np.eye(d, dtype=complex)[:, :, None], n_freq, axis=2)
 
 
-def _with_noise(
-    record: ComplexArray, noise: float, random: np.random.Generator
-) -> tuple[ComplexArray, Array | None]:
+def _with_noise(record: ComplexArray, noise: float, random: np.random.Generator) -> tuple[ComplexArray, Array | None]:
     if noise == 0:
         return record, None
     std = noise * np.sqrt(np.mean(np.abs(record) ** 2))
@@ -420,9 +422,9 @@ def _with_noise(
     return record + error * std / np.sqrt(2), np.array(std)
 
 
-def _checked(name: str, value: ArrayLike, kind: type) -> NDArray:
+def _checked(name: str, value: ArrayLike, kind: type) -> NDArray[Any]:
     try:
-        array = np.array(value, dtype=kind)
+        array: NDArray[Any] = np.array(value, dtype=kind)
     except (TypeError, ValueError):
         raise InputError(f"{name} is not an array of numbers") from None
     bad = ~np.isfinite(array)

@@ -50,7 +50,7 @@ def determination(problem: Problem, structure: Structure) -> Determination:
             f"the base moves in only {rank} of {test.n_base} independent directions: responses to the others are open"
         )
     strength = np.linalg.norm(structure.participation, axis=1) / np.sqrt(problem.totals.max())
-    hidden = np.flatnonzero(strength < _INVISIBLE * strength.max())
+    hidden = np.flatnonzero(strength < _INVISIBLE * strength.max()).tolist()
     for k in hidden:
         open_.append(f"{_mode(structure, k)} is not moved by the base: nothing in these data tells its mass")
 
@@ -67,7 +67,9 @@ def determination(problem: Problem, structure: Structure) -> Determination:
     if missing:
         free = _open_modes(system, n)
         names = ", ".join(_mode(structure, k) for k in free)
-        what = f"{missing} of the {n} modal masses are open ({names})" if missing < n else f"all {n} modal masses are open"
+        what = (
+            f"{missing} of the {n} modal masses are open ({names})" if missing < n else f"all {n} modal masses are open"
+        )
         open_.append(f"{what}: other mass and stiffness matrices answer identically")
         if _unit_missing(problem):
             open_.append("no number with a unit of mass is given: masses are normalised to 1 kg in each base direction")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import casadi as ca
@@ -90,7 +91,9 @@ class Problem:
             put("mass", KnownMass(_as_matrix("mass", self.mass)))
         for name, kinds in (("stiffness", StiffnessModel), ("damping", DampingModel)):
             if not isinstance(getattr(self, name), kinds):
-                raise InputError(f"Problem: {name} is a {type(getattr(self, name)).__name__}, not a {name} model of sysid")
+                raise InputError(
+                    f"Problem: {name} is a {type(getattr(self, name)).__name__}, not a {name} model of sysid"
+                )
         if self.goal is not None and not 0 < self.goal < np.inf:
             raise InputError(f"goal = {self.goal}: a positive relative residual is needed")
         test = self.measurement
@@ -129,15 +132,13 @@ class Problem:
     def parts(self) -> Parts:
         """Slices of x that belong to each matrix."""
         ends = np.cumsum([0, *(count for _, count in self.unknowns)]).tolist()
-        return Parts(*(slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)))
+        return Parts(*(slice(a, b) for a, b in pairwise(ends)))
 
     @property
     def unknowns(self) -> tuple[tuple[str, int], ...]:
         """Number of unknowns a matrix: the paper's Table 1, with the n·d entries of M_S0 that it leaves out."""
         names = ("mass", "stiffness", "damping")
-        return tuple(
-            (name, sum(v.size for v in group)) for name, group in zip(names, self._groups(), strict=True)
-        )
+        return tuple((name, sum(v.size for v in group)) for name, group in zip(names, self._groups(), strict=True))
 
     @property
     def totals(self) -> Array:
@@ -270,7 +271,7 @@ class SwarmCost:
     def _chunk(self, particles: Array) -> Array:
         count = len(particles)
         padded = np.concatenate([particles, np.repeat(particles[-1:], _CHUNK - count, axis=0)])
-        n, d = self.problem.layout.n, self.problem.layout.d
+        n = self.problem.layout.n
         flat = [np.asarray(block) for block in self._expand(padded.T)]
         L_inverse, push, H = (_stack(block, n) for block in flat[:3])
         # A candidate that is no structure must not stop the eigensolver for the others.

@@ -1,4 +1,4 @@
-"""Stiffness matrices as CasADi expressions: by their spectrum (Cerini et al. 2024, section 3.2.4), or a chain of springs."""
+"""Stiffness matrices as CasADi expressions: by their spectrum (Cerini et al. 2024, 3.2.4), or a chain of springs."""
 
 from __future__ import annotations
 
@@ -56,12 +56,14 @@ class SpectralStiffness:
         """Bound on the frequencies of an n-degree-of-freedom model, rad/s (w_lim of eq. 37)."""
         targets = self.targets
         if targets.size > n:
-            raise InputError(f"{targets.size} natural frequencies are given for {n} sensors; at most {n} can be matched")
+            raise InputError(
+                f"{targets.size} natural frequencies are given for {n} sensors; at most {n} can be matched"
+            )
         if self.max_frequency is None:
             if targets.size < n:
                 raise InputError(
-                    f"{targets.size} natural frequencies are given for {n} sensors: state max_frequency (Hz), at or above "
-                    "the highest frequency of the whole model"
+                    f"{targets.size} natural frequencies are given for {n} sensors: state max_frequency (Hz), at or "
+                    "above the highest frequency of the whole model"
                 )
             return float(targets[-1])
         limit = 2 * np.pi * float(self.max_frequency)
@@ -137,7 +139,9 @@ def _previous(layout: Layout) -> list[int]:
     """The sensor below each one in its chain; -1 for the base."""
     groups = layout.directions[: layout.n].tolist()
     if -1 in groups:
-        raise InputError(f"ChainStiffness: sensor {groups.index(-1)} is moved by no base direction; a chain cannot hold it")
+        raise InputError(
+            f"ChainStiffness: sensor {groups.index(-1)} is moved by no base direction; a chain cannot hold it"
+        )
     return [max((j for j in range(i) if groups[j] == groups[i]), default=-1) for i in range(layout.n)]
 
 

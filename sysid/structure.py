@@ -14,8 +14,8 @@ from sysid.errors import InputError
 if TYPE_CHECKING:
     from scipy.signal import StateSpace
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
+Array = NDArray[np.floating[Any]]
+ComplexArray = NDArray[np.complexfloating[Any]]
 
 _TOLERANCE = 1e-8  # relative; looser than round-off in a condensation, tighter than any instrument
 
@@ -204,7 +204,8 @@ class Structure:
         n = self.n
         w = omega[:, None, None]
         dynamic = -(w**2) * self.mass[:n, :n] + 1j * w * self.damping + self.stiffness[:n, :n]
-        return np.moveaxis(np.linalg.solve(dynamic, w**2 * self._coupling), 0, -1)
+        answer = np.linalg.solve(dynamic, w**2 * self._coupling)
+        return np.moveaxis(answer, 0, -1).astype(complex, copy=False)
 
     def _check_matrices(self) -> Array:
         """Check mass and stiffness; return G of the degrees of freedom."""
@@ -253,7 +254,9 @@ class Structure:
             assert matrix is not None
             self.damping = _square("damping_matrix", matrix)
             if self.damping.shape != (n, n):
-                raise InputError(f"damping_matrix has shape {self.damping.shape}; on the relative motion it is ({n}, {n})")
+                raise InputError(
+                    f"damping_matrix has shape {self.damping.shape}; on the relative motion it is ({n}, {n})"
+                )
             modal = self._phi.T @ self.damping @ self._phi
             if np.linalg.eigvalsh(modal)[0] < -_TOLERANCE * np.abs(modal).max():
                 raise InputError("damping_matrix is not positive semidefinite: the structure would feed energy in")
@@ -263,7 +266,9 @@ class Structure:
         shape = (self.recovery.shape[0], self.n_base)
         if recovered:
             if given is None:
-                raise InputError("a structure with a recovery matrix needs rigid_body (n_sensors, d): geometry tells it")
+                raise InputError(
+                    "a structure with a recovery matrix needs rigid_body (n_sensors, d): geometry tells it"
+                )
             return _matrix("rigid_body", given, shape)
         G = self._rigid_body_dofs
         if given is not None:
@@ -318,7 +323,9 @@ def _square(name: str, value: ArrayLike) -> Array:
     asymmetry = np.abs(array - array.T)
     if np.any(asymmetry > _TOLERANCE * np.outer(scale, scale) + 1e-12 * np.max(np.abs(array), initial=0.0)):
         i, j = np.unravel_index(int(np.argmax(asymmetry)), array.shape)
-        raise InputError(f"{name} is not symmetric: [{i}, {j}] is {array[i, j]:.6g} and [{j}, {i}] is {array[j, i]:.6g}")
+        raise InputError(
+            f"{name} is not symmetric: [{i}, {j}] is {array[i, j]:.6g} and [{j}, {i}] is {array[j, i]:.6g}"
+        )
     return (array + array.T) / 2
 
 

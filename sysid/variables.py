@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import casadi as ca
 import numpy as np
@@ -55,4 +56,4 @@ class Variable:
 def split(variables: Sequence[Variable], x: ca.SX | Array) -> list:
     """Cut a vector of all unknowns into one piece a variable."""
     ends = np.cumsum([0, *(variable.size for variable in variables)])
-    return [x[int(a) : int(b)] for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    return [x[int(a) : int(b)] for a, b in pairwise(ends)]

@@ -61,7 +61,9 @@ def read(path: str | Path) -> UnitRecord:
     except ValueError as error:
         raise InputError(f"{file}: {error}") from None
     if table.shape[0] < 3 or table.shape[1] != len(columns):
-        raise InputError(f"{file} has {table.shape[0]} rows of {table.shape[1]} values under {len(columns)} column names")
+        raise InputError(
+            f"{file} has {table.shape[0]} rows of {table.shape[1]} values under {len(columns)} column names"
+        )
     pick = lambda names: table[1:, [columns.index(name) for name in names]].T  # noqa: E731
     time = pick((_TIME,))[0] * 1e-6
     acceleration, rotation = pick(_ACCELERATION), np.deg2rad(pick(_ROTATION))

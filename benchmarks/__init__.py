@@ -1,0 +1,1 @@
+"""Measured claims: what each capability must reach, and what it does reach."""

@@ -1,0 +1,112 @@
+"""A static page from pieces: text, tables, pictures; nothing that runs, nothing from elsewhere."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sysid.plot import to_png
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from sysid.structure import Array
+
+STYLE = """
+:root { --ink: #1f2430; --soft: #5a6472; --line: #dde2e7; --good: #0a7d5a; --warn: #b36b00; --bad: #b3261e; }
+* { box-sizing: border-box; }
+body { margin: 0 auto; padding: 2rem 1.5rem 4rem; max-width: 1120px; color: var(--ink); background: #fff;
+  font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", "DejaVu Sans", sans-serif; }
+h1 { font-size: 1.7rem; margin: 0 0 .2rem; overflow-wrap: anywhere; }
+h2 { font-size: 1.25rem; margin: 2.6rem 0 .6rem; padding-bottom: .25rem; border-bottom: 1px solid var(--line); }
+h3 { font-size: 1rem; margin: 1.4rem 0 .4rem; }
+p { margin: .5rem 0; max-width: 72ch; } ul { margin: .3rem 0; padding-left: 1.3rem; max-width: 72ch; }
+.soft, caption, figcaption { color: var(--soft); font-size: .9rem; }
+.verdict { border: 1px solid var(--line); border-left: 6px solid var(--soft); border-radius: 4px; padding: .7rem 1rem;
+  margin: 1rem 0; overflow-wrap: anywhere; }
+.verdict strong { font-size: 1.1rem; }
+.good { border-left-color: var(--good); } .warn { border-left-color: var(--warn); }
+.bad { border-left-color: var(--bad); }
+.scroll { overflow-x: auto; margin: .6rem 0 1rem; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .88rem; }
+caption { text-align: left; padding-bottom: .3rem; }
+th, td { padding: .2rem .65rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
+thead th { border-bottom: 1.5px solid var(--soft); vertical-align: bottom; font-weight: 600; }
+th:first-child, td:first-child { text-align: left; font-weight: 500; }
+figure { margin: .8rem 0 1.2rem; break-inside: avoid; } img { max-width: 100%; height: auto; display: block; }
+pre { background: #f5f7f9; padding: .8rem 1rem; overflow-x: auto; font-size: .82rem; line-height: 1.45; }
+nav { margin: .8rem 0; font-size: .9rem; } nav a { color: #0b5c96; margin-right: 1rem; white-space: nowrap; }
+@media print { body { max-width: none; padding: 0; font-size: 10pt; } nav { display: none; }
+  .scroll { overflow: visible; } table { font-size: 7.5pt; } th, td { padding: .1rem .3rem; }
+  h2 { break-after: avoid; } pre { white-space: pre-wrap; } }
+"""
+
+
+def text(value: object) -> str:
+    """Escape anything for use inside an element or a quoted attribute."""
+    return html.escape(str(value), quote=True)
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """Write a number with so many significant digits; a dash for what is not there."""
+    if value is None or not np.isfinite(value):
+        return "–"
+    return f"{value:.{digits}g}"
+
+
+def paragraph(value: object, kind: str = "") -> str:
+    """Set a paragraph of plain text."""
+    return f"<p{_class(kind)}>{text(value)}</p>"
+
+
+def bullets(sentences: Iterable[object]) -> str:
+    """Set a list of plain sentences; nothing where there are none."""
+    items = "".join(f"<li>{text(s)}</li>" for s in sentences)
+    return f"<ul>{items}</ul>" if items else ""
+
+
+def table(head: Sequence[object], rows: Iterable[Sequence[object]], caption: object = "") -> str:
+    """Set a table of plain cells in a box that scrolls."""
+    above = f"<caption>{text(caption)}</caption>" if caption else ""
+    names = "".join(f'<th scope="col">{text(cell)}</th>' for cell in head)
+    body = "".join("<tr>" + "".join(f"<td>{text(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    return f'<div class="scroll"><table>{above}<thead><tr>{names}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def matrix(values: Array, rows: Sequence[object], columns: Sequence[object], caption: object) -> str:
+    """Set a matrix with named rows and columns, four significant digits."""
+    lines = ([name, *(number(v) for v in line)] for name, line in zip(rows, values.tolist(), strict=True))
+    return table(["", *columns], lines, caption)
+
+
+def picture(figure: Figure, alt: object, caption: object = "", *, dpi: float = 130) -> str:
+    """Embed a figure as PNG; shown at 92 pixels an inch, so that it is sharp on paper and on dense screens."""
+    width = round(92 * float(figure.get_size_inches()[0]))
+    data = base64.b64encode(to_png(figure, dpi=dpi, colours=64)).decode("ascii")
+    below = f"<figcaption>{text(caption)}</figcaption>" if caption else ""
+    return f'<figure><img width="{width}" alt="{text(alt)}" src="data:image/png;base64,{data}">{below}</figure>'
+
+
+def page(title: object, head: str, sections: Iterable[tuple[str, str]]) -> str:
+    """Join the sections, (heading, content), to a page with links to each; empty ones are left out."""
+    kept = [(name, content) for name, content in sections if content]
+    links = "".join(f'<a href="#s{i}">{text(name)}</a>' for i, (name, _) in enumerate(kept))
+    body = "\n".join(
+        f'<section><h2 id="s{i}">{text(name)}</h2>\n{content}\n</section>' for i, (name, content) in enumerate(kept)
+    )
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta http-equiv="Content-Security-Policy" '
+        "content=\"default-src 'none'; img-src data:; style-src 'unsafe-inline'\">\n"
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{text(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
+        f"<h1>{text(title)}</h1>\n{head}\n<nav>{links}</nav>\n{body}\n</body>\n</html>\n"
+    )
+
+
+def _class(kind: str) -> str:
+    return f' class="{kind}"' if kind else ""

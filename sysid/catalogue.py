@@ -1,0 +1,227 @@
+"""Problem modules: where they are, what they are called, and how one becomes a `Problem`."""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import importlib
+import importlib.machinery
+import importlib.util
+import inspect
+import os
+import sys
+import traceback
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+from sysid.errors import InputError
+from sysid.identification import Recipe
+from sysid.problem import Problem
+
+_SIGNATURE = "def problem(*, data=None, rng=0) -> sysid.Problem"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A problem that can be run by its name.
+
+    Attributes
+    ----------
+    name : str
+    path : Path
+    bundled : bool
+        It comes with the package, and is not one of the user's own ``./problems``.
+    description : str
+        First line of the module's docstring.
+    """
+
+    name: str
+    path: Path
+    bundled: bool
+    description: str
+
+
+def bundled_folder() -> Path:
+    """Folder of the problems that come with the package.
+
+    An installed wheel has them inside the package, a checkout beside it.
+    """
+    package = Path(__file__).parent
+    inside = package / "bundled_problems"
+    return inside if inside.is_dir() else package.parent / "problems"
+
+
+def own_folder() -> Path:
+    """Folder of the user's own problems: ``./problems``."""
+    return Path("problems")
+
+
+def entries() -> tuple[Entry, ...]:
+    """Problems that can be run by name, alphabetically; the user's own hide bundled ones of the same name.
+
+    Modules are read, not imported.
+    """
+    found: dict[str, Entry] = {}
+    for folder in (bundled_folder(), own_folder()):
+        for path in _modules(folder):
+            found[path.stem] = Entry(path.stem, path, _is_bundled(path), _first_line(path))
+    return tuple(found[name] for name in sorted(found))
+
+
+def short_name(problem: str) -> str:
+    """Name for a folder of results: the stem of a file, the last part of a dotted module."""
+    if _is_path(problem):
+        return Path(problem).stem
+    return problem.rpartition(".")[2]
+
+
+def build(recipe: Recipe) -> Problem:
+    """Load a problem module and call its ``problem()``.
+
+    Parameters
+    ----------
+    recipe : Recipe
+        ``module`` is a path to a module (it ends in .py or holds a separator), else a module in
+        ``./problems``, else a bundled problem, else a dotted module that Python can import.
+        ``data`` reaches ``problem()`` as a `pathlib.Path`, or as None.
+
+    Raises
+    ------
+    InputError
+        Whatever is wrong with the module, its data or what it gives; an InputError from inside the
+        module passes as it is, any other exception is told with its line of the module.
+    """
+    if recipe.data is not None and not (recipe.data and _exists(Path(recipe.data))):
+        raise InputError(f"data {recipe.data!r}: there is no such file or folder")
+    module, path = _load(recipe.module)
+    function = getattr(module, "problem", None)
+    if not callable(function):
+        raise InputError(f"{path} has no function problem(); it needs one: {_SIGNATURE}")
+    data = None if recipe.data is None else Path(recipe.data)
+    try:
+        inspect.signature(function).bind(data=data, rng=recipe.rng)
+    except TypeError as error:
+        raise InputError(f"{path}: problem() does not take data and rng ({error}); write {_SIGNATURE}") from None
+    with _telling_the_line(path):
+        problem = function(data=data, rng=recipe.rng)
+    if not isinstance(problem, Problem):
+        raise InputError(f"{path}: problem() gives a {type(problem).__name__}, not a sysid.Problem")
+    return problem
+
+
+def _load(name: str) -> tuple[ModuleType, Path]:
+    """Import a problem module; also the path that messages call it by."""
+    if _is_path(name):
+        return _load_file(Path(name))
+    for folder in (own_folder(), bundled_folder()):
+        path = folder / f"{name}.py"
+        if path in _modules(folder):
+            return _load_file(path)
+    parts = name.split(".")
+    if len(parts) > 1 and all(part.isidentifier() for part in parts):
+        return _load_dotted(name)
+    raise _unknown(name)
+
+
+def _load_file(path: Path) -> tuple[ModuleType, Path]:
+    """Run a file as a module of a private name; no ``__pycache__`` is left beside it."""
+    try:
+        source = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"problem {path} cannot be read: {error.strerror or error}") from None
+    full = path.absolute()
+    name = f"_sysid_problem_{zlib.crc32(os.fsencode(full)):08x}_{path.stem}"
+    loader = importlib.machinery.SourceFileLoader(name, str(full))
+    spec = importlib.util.spec_from_file_location(name, full, loader=loader)
+    assert spec is not None
+    module = importlib.util.module_from_spec(spec)
+    # Dataclasses and pickles look their module up by its name.
+    sys.modules[name] = module
+    try:
+        with _telling_the_line(path):
+            # dont_inherit: this file's own __future__ imports are not the module's.
+            exec(compile(source, str(full), "exec", dont_inherit=True), module.__dict__)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module, path
+
+
+def _load_dotted(name: str) -> tuple[ModuleType, Path]:
+    """Import a module by its dotted name, as Python does."""
+    with _telling_the_line(Path(name)):  # finding a.b.c imports a and a.b
+        try:
+            spec = importlib.util.find_spec(name)
+        except ModuleNotFoundError as error:
+            if error.name is None or not f"{name}.".startswith(f"{error.name}."):
+                raise
+            spec = None
+    if spec is None:
+        raise _unknown(name)
+    path = Path(spec.origin) if spec.has_location and spec.origin else Path(name)
+    with _telling_the_line(path):
+        return importlib.import_module(name), path
+
+
+@contextmanager
+def _telling_the_line(path: Path) -> Iterator[None]:
+    """Turn an exception of the user's module at `path` into an InputError that tells its line."""
+    full = str(path.absolute())
+    try:
+        yield
+    except InputError:
+        raise
+    except (Exception, SystemExit) as error:
+        if isinstance(error, SyntaxError) and error.filename == full:
+            raise InputError(f"{path}, line {error.lineno}: syntax error: {error.msg}") from None
+        lines = [line for frame, line in traceback.walk_tb(error.__traceback__) if frame.f_code.co_filename == full]
+        where = f"{path}, line {lines[-1]}" if lines else f"{path}"
+        text = f": {error}" if str(error) else ""
+        raise InputError(f"{where}: {type(error).__name__}{text}") from error
+
+
+def _unknown(name: str) -> InputError:
+    names = [entry.name for entry in entries()]
+    close = difflib.get_close_matches(name, names, n=1)
+    hint = f"did you mean {close[0]!r}? " if close else ""
+    known = ", ".join(names) if names else "none"
+    return InputError(f"problem {name!r} is unknown: {hint}known are {known}; a path to a module does as well")
+
+
+def _is_path(name: str) -> bool:
+    return name.endswith(".py") or os.sep in name or (os.altsep is not None and os.altsep in name)
+
+
+def _modules(folder: Path) -> list[Path]:
+    """Files of `folder` that can be problems."""
+    try:
+        return sorted(p for p in folder.glob("*.py") if not p.name.startswith("_"))
+    except OSError:
+        return []
+
+
+def _is_bundled(path: Path) -> bool:
+    return path.resolve().parent == bundled_folder().resolve()
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:
+        return False
+
+
+def _first_line(path: Path) -> str:
+    try:
+        text = ast.get_docstring(ast.parse(path.read_bytes())) or ""
+    except OSError as error:
+        return f"(cannot be read: {error.strerror})"
+    except SyntaxError as error:
+        return f"(syntax error in line {error.lineno})"
+    except ValueError as error:
+        return f"(no Python source: {error})"
+    return text.strip().partition("\n")[0]

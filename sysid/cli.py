@@ -1,0 +1,518 @@
+"""The command line: ``sysid list``, ``sysid run PROBLEM``, ``sysid report RESULT``.
+
+Exit status: 0 success; 1 the search did not reach its goal; 2 a mistake in what was given, told in
+one line; 130 interrupted, with the best so far saved; 70 an error of sysid itself, told in one line
+with the traceback in a log file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import functools
+import json
+import math
+import os
+import signal
+import sys
+import tempfile
+import threading
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any, NoReturn, cast
+
+import sysid
+from sysid import catalogue
+from sysid.errors import InputError, SolverError
+from sysid.identification import Identification, Recipe
+from sysid.identify import STRATEGIES, Progress
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+SUCCESS, NOT_REACHED, MISTAKE, BUG, INTERRUPTED = 0, 1, 2, 70, 130
+
+_PLAIN_EVERY = 5.0  # s between lines where the display is no terminal
+_LOG = "sysid-error.log"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Arguments; those of the process by default.
+
+    Returns
+    -------
+    int
+        Exit status.
+    """
+    out = _Output(sys.stdout)
+    # Whatever argparse, a problem module or CasADi prints passes through it too.
+    with contextlib.redirect_stdout(cast(IO[str], out)):
+        status = _run_command(argv, out)
+    out.flush()
+    if out.failed is not None:
+        # What is left in the interpreter's own buffer would fail once more at exit.
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(out.failed, BrokenPipeError):  # a reader that has seen enough is no mistake
+            _complain(f"standard output cannot be written: {out.failed.strerror}")
+            status = status or MISTAKE
+    return status
+
+
+def _run_command(argv: Sequence[str] | None, out: _Output) -> int:
+    """Parse and run; every exception becomes one line and a status."""
+    try:
+        options = _parser().parse_args(argv)
+        with _collected_warnings() as remarks:
+            status = int(options.command(options, out))
+        for remark in remarks:
+            _complain(f"warning: {remark}")
+        return status
+    except SystemExit as end:  # argparse, after --help or --version
+        return int(end.code or 0)
+    except InputError as error:
+        _complain(error)
+        return MISTAKE
+    except SolverError as error:
+        _complain(error)
+        return NOT_REACHED
+    except KeyboardInterrupt:
+        _complain("interrupted; nothing was saved")
+        return INTERRUPTED
+    except Exception as error:
+        log = _write_log()
+        _complain(f"an error of sysid itself ({type(error).__name__}: {error}); {log}")
+        return BUG
+
+
+# -- the commands -------------------------------------------------------------------------------
+
+
+def _list(options: argparse.Namespace, out: _Output) -> int:
+    entries = catalogue.entries()
+    width = max((len(entry.name) for entry in entries), default=0)
+    for entry in entries:
+        own = "" if entry.bundled else f"  ({entry.path})"
+        out.write(f"{entry.name:{width}}  {entry.description}{own}\n")
+    if not entries:
+        out.write("no problems found; a path to a module does as well: sysid run PATH\n")
+    return SUCCESS
+
+
+def _run(options: argparse.Namespace, out: _Output) -> int:
+    recipe = Recipe(options.problem, options.data)
+    folder = Path("results") / catalogue.short_name(recipe.module) if options.out is None else Path(options.out)
+    problem = catalogue.build(recipe)
+    _check_folder(folder)
+    test = problem.measurement
+    out.write(
+        f"{recipe.module}: {test.n_sensors} sensors, base moving along {' '.join(test.base_axes or ())}, "
+        f"{test.freq.size} lines from {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz, "
+        f"{problem.n_variables} unknowns, seed {options.seed}\n"
+    )
+    with _Display(out) as display, _patient_ctrl_c(display) as check:
+        result = sysid.identify(
+            problem,
+            strategy=options.strategy,
+            rng=options.seed,
+            max_time=options.max_time,
+            callback=check,
+            progress=display,
+        )
+    result = replace(result, recipe=recipe)
+    _show(result, out)
+    try:
+        _save(result, folder, out)
+    except KeyboardInterrupt:
+        _complain(f"interrupted while saving; not every file is in {folder}")
+        return INTERRUPTED
+    if result.interrupted:
+        _complain(f"interrupted; the best so far is in {folder}")
+        return INTERRUPTED
+    return SUCCESS if result.success else NOT_REACHED
+
+
+def _report(options: argparse.Namespace, out: _Output) -> int:
+    from sysid import report
+
+    source = Path(options.result)
+    result = sysid.load(source)
+    folder = source if source.is_dir() else source.parent
+    out.write(f"{report.write(result, folder / report.FILE_NAME)}\n")
+    return SUCCESS
+
+
+# -- arguments ----------------------------------------------------------------------------------
+
+
+class _Parser(argparse.ArgumentParser):
+    """Mistakes become an InputError, so that they are one line like all others."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"{message} (see '{self.prog} --help')")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="sysid",
+        description="Mass, stiffness and damping matrices of a structure from shaker-table tests.",
+        epilog="Exit status: 0 success, 1 the search did not reach its goal, 2 a mistake in what was given, "
+        "130 interrupted (the best so far is saved), 70 an error of sysid itself.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=f"sysid {sysid.__version__}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    command = functools.partial(commands.add_parser, allow_abbrev=False)
+
+    lister = command("list", help="list the problems that can be run by name")
+    lister.set_defaults(command=_list)
+
+    run = command(
+        "run",
+        help="identify the structure of a problem",
+        description="Identify the structure of a problem. Writes result.h5, summary.json and report.html.",
+    )
+    run.add_argument(
+        "problem",
+        metavar="PROBLEM",
+        help="a path to a module, else a module in ./problems, else a bundled problem, else a dotted module",
+    )
+    run.add_argument(
+        "--seed",
+        type=_seed,
+        default=0,
+        metavar="N",
+        help="of the search, 0 by default: the same seed gives the same result. The simulated noise of a problem is "
+        "part of the problem and does not change with it",
+    )
+    run.add_argument(
+        "--strategy", choices=STRATEGIES, default="auto", metavar="S", help=f"{', '.join(STRATEGIES)}; auto by default"
+    )
+    run.add_argument("--data", metavar="PATH", help="file or folder of records, for problems that read some")
+    run.add_argument("--out", metavar="DIR", help="folder of the results, results/NAME by default")
+    run.add_argument("--max-time", type=_seconds, metavar="S", help="end the search after about so many seconds")
+    run.set_defaults(command=_run)
+
+    report = command("report", help="write report.html again, beside a result")
+    report.add_argument("result", metavar="RESULT", help="a result.h5, or the folder that holds it")
+    report.set_defaults(command=_report)
+    return parser
+
+
+def _seed(text: str) -> int:
+    try:
+        seed = int(text)
+    except ValueError:
+        seed = -1
+    if seed < 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a nonnegative integer")
+    return seed
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not 0 < seconds < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number of seconds")
+    return seconds
+
+
+# -- files --------------------------------------------------------------------------------------
+
+
+def _check_folder(folder: Path) -> None:
+    """Refuse a folder of results that cannot be written, before the search and without making it."""
+    try:
+        place = folder
+        while not place.exists() and place != place.parent:
+            place = place.parent
+        if not place.is_dir():
+            raise InputError(f"folder of results {folder}: {place} is not a folder")
+    except OSError as error:
+        raise InputError(f"folder of results {folder}: {error.strerror or error}") from None
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise InputError(f"folder of results {folder}: {place} cannot be written")
+
+
+def _save(result: Identification, folder: Path, out: _Output) -> None:
+    """Write the three files, each whole or not at all; a folder made for nothing is taken away again."""
+    from sysid.storage import FILE_NAME, atomically
+
+    missing = [place for place in (folder, *folder.parents) if not place.exists()]
+    try:
+        out.write(f"result   {result.save(folder / FILE_NAME)}\n")
+        summary = folder / "summary.json"
+        with atomically(summary) as temporary:
+            temporary.write_text(_summary(result), encoding="utf-8")
+        out.write(f"summary  {summary}\n")
+        from sysid import report
+
+        out.write(f"report   {report.write(result, folder / report.FILE_NAME)}\n")
+    except BaseException:
+        with contextlib.suppress(OSError):
+            for place in missing:
+                place.rmdir()  # only where it is empty
+        raise
+
+
+def _summary(result: Identification) -> str:
+    """``summary.json``: strict JSON, null for what is not a number."""
+    return json.dumps(_finite(result.to_dict()), indent=2, allow_nan=False) + "\n"
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _write_log() -> str:
+    """Write the traceback of the exception at hand; what to tell about it."""
+    text = f"sysid {sysid.__version__}, Python {sys.version}\n{sys.argv}\n\n{traceback.format_exc()}"
+    for folder in (Path(), Path(tempfile.gettempdir())):
+        log = folder / _LOG
+        with contextlib.suppress(OSError):
+            log.write_text(text, encoding="utf-8", errors="backslashreplace")
+            return f"the traceback is in {log.absolute()}"
+    return "no log file could be written"
+
+
+# -- what the user sees -------------------------------------------------------------------------
+
+
+class _Output:
+    """A text stream that takes any character and never raises.
+
+    A closed pipe or a full disk must not end a search whose result goes elsewhere; `failed` keeps
+    the first such error.
+    """
+
+    def __init__(self, stream: IO[str]) -> None:
+        self._stream = stream
+        self.encoding = getattr(stream, "encoding", None) or "utf-8"
+        self.failed: OSError | None = None
+
+    def write(self, text: str) -> int:
+        if self.failed is None:
+            try:
+                self._stream.write(text.encode(self.encoding, "replace").decode(self.encoding))
+            except OSError as error:
+                self.failed = error
+        return len(text)
+
+    def flush(self) -> None:
+        if self.failed is None:
+            try:
+                self._stream.flush()
+            except OSError as error:
+                self.failed = error
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def _complain(message: object) -> None:
+    """One line on standard error, whatever the message holds."""
+    with contextlib.suppress(OSError):
+        print("sysid:", " ".join(str(message).split()), file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def _collected_warnings() -> Iterator[list[str]]:
+    """Keep warnings for the end: they would tear the live display, or stand beside the one line of a mistake."""
+    lines: list[str] = []
+    with warnings.catch_warnings():
+        # An assignment, and not record=True: warnings that are errors stay so.
+        warnings.showwarning = lambda message, category, filename, lineno, file=None, line=None: lines.append(
+            f"{filename}:{lineno}: {category.__name__}: {message}"
+        )
+        yield lines
+
+
+@contextlib.contextmanager
+def _patient_ctrl_c(display: _Display) -> Iterator[Callable[[Progress], None]]:
+    """Let Ctrl-C wait until the search next reports; a second one, or one before any news, acts at once.
+
+    Inside CasADi a KeyboardInterrupt can come out as some other exception, and the best so far be lost.
+
+    Yields
+    ------
+    callable
+        For `identify`, as its callback.
+    """
+    raised = False
+
+    def on_signal(number: int, frame: object) -> None:
+        nonlocal raised
+        if display.stopping or not display.has_news:
+            raised = True
+            raise KeyboardInterrupt
+        display.stopping = True
+
+    def check(progress: Progress) -> None:
+        if display.stopping:
+            raise KeyboardInterrupt
+
+    # Only the main thread may set handlers; one that ignores Ctrl-C (nohup, a job in the background) stays.
+    if (
+        threading.current_thread() is not threading.main_thread()
+        or signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+    ):
+        yield check
+        return
+    signal.signal(signal.SIGINT, on_signal)
+    try:
+        yield check
+    except Exception as error:
+        if raised:
+            raise KeyboardInterrupt from error
+        raise
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _console(out: _Output) -> Console:
+    """Console without markup; no control codes unless it is a terminal, whatever the environment asks."""
+    from rich.console import Console
+
+    terminal = out.isatty()
+    return Console(
+        file=cast(IO[str], out), force_terminal=terminal, force_jupyter=False, width=None if terminal else 100,
+        markup=False, emoji=False, highlight=False,
+    )  # fmt: skip
+
+
+class _Display:
+    """Live progress: a table that updates in a terminal, elsewhere a line at times.
+
+    Attributes
+    ----------
+    stopping : bool
+        Ctrl-C was pressed, and the search ends when it next reports.
+    """
+
+    def __init__(self, out: _Output) -> None:
+        from rich.live import Live
+
+        self._out = out
+        self._phases: dict[str, Progress] = {}
+        self._begun = time.perf_counter()
+        self._printed, self._pending = -math.inf, False
+        self.stopping = False
+        console = _console(out)
+        live = console.is_terminal and not console.is_dumb_terminal
+        self._live = Live(get_renderable=self._table, console=console, refresh_per_second=8) if live else None
+
+    def __enter__(self) -> _Display:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        if self._live is not None:
+            self._live.stop()
+        elif self._pending:
+            self._print(next(reversed(self._phases.values())))
+
+    def __call__(self, progress: Progress) -> None:
+        """Take the news."""
+        if self._live is None:
+            last = next(reversed(self._phases.values()), None)
+            changed = last is None or last.phase != progress.phase
+            if changed and last is not None and self._pending:
+                self._print(last)
+            self._pending = True
+            if changed or progress.seconds - self._printed >= _PLAIN_EVERY:
+                self._print(progress)
+        self._phases[progress.phase] = progress
+
+    @property
+    def has_news(self) -> bool:
+        """Whether the search has had a candidate."""
+        return bool(self._phases)
+
+    def _print(self, progress: Progress) -> None:
+        self._printed, self._pending = progress.seconds, False
+        self._out.write(f"{progress}\n")
+        self._out.flush()
+
+    def _table(self) -> Table:
+        from rich import box
+        from rich.table import Table
+
+        caption = "interrupted: ends after this iteration (Ctrl-C again: at once)" if self.stopping else None
+        table = Table(box=box.SIMPLE, pad_edge=False, caption=caption)
+        table.add_column("phase", min_width=12)
+        for name, width in (("iteration", 10), ("residual", 10), ("time", 8)):
+            table.add_column(name, justify="right", min_width=width, no_wrap=True)
+        rows = list(self._phases.values())
+        for p in rows:
+            # The clock of the phase at work runs on between its news.
+            seconds = p.seconds if p is not rows[-1] or not self._running else time.perf_counter() - self._begun
+            count = f"{p.iteration} / {p.of}" if p.of else f"{p.iteration}"
+            table.add_row(p.phase, count, f"{p.residual:.3e}", f"{seconds:.1f} s")
+        if not rows:
+            table.add_row("preparation", "", "", f"{time.perf_counter() - self._begun:.1f} s")
+        return table
+
+    @property
+    def _running(self) -> bool:
+        return self._live is not None and self._live.is_started
+
+
+def _show(result: Identification, out: _Output) -> None:
+    """Print the final table and the verdict."""
+    import numpy as np
+    from rich import box
+    from rich.table import Table
+
+    s, axes = result.structure, result.measurement.base_axes or ()
+    rigid = np.diag(s.rigid_body_mass)
+    share = 100 * np.diagonal(s.effective_masses, axis1=1, axis2=2) / np.where(rigid > 0, rigid, np.inf)
+    table = Table(box=box.SIMPLE, pad_edge=False, show_footer=True)
+    table.add_column("mode", justify="right", footer="sum")
+    table.add_column("frequency, Hz", justify="right", no_wrap=True)
+    table.add_column("damping, %", justify="right", no_wrap=True)
+    for axis, total in zip(axes, share.sum(axis=0), strict=True):
+        table.add_column(f"eff. mass {axis}, %", justify="right", footer=f"{total:.1f}")
+    for k, (f, zeta) in enumerate(zip(s.natural_frequencies, s.damping_ratios, strict=True)):
+        table.add_row(str(k + 1), f"{f:.5g}", f"{100 * zeta:.4g}", *(f"{value:.1f}" for value in share[k]))
+    _console(out).print(table)
+
+    problem = result.problem
+    goal = "" if problem.goal is None else f" (goal {problem.goal:.3g})"
+    force = "" if result.force_residual is None else f", of the base force {result.force_residual:.3e}"
+    verdict = "success" if result.success else "no success"
+    lines = [
+        f"{verdict}: {result.message}",
+        f"relative residual {result.residual:.3e}{goal}{force}, {result.history.wall_time:.1f} s",
+        "rigid-body mass " + ", ".join(f"{axis} {m:.6g} {_unit(axis)}" for axis, m in zip(axes, rigid, strict=True)),
+    ]
+    for i, test in enumerate(problem.validation, start=1):
+        lines.append(f"test {i} of {len(problem.validation)} never fitted: relative residual {test.residual(s):.3e}")
+    if result.determined:
+        lines.append("Determined: this is the mass and stiffness, within the stated model.")
+        lines += [f"  - {sentence}" for sentence in result.closed_by]
+    else:
+        lines.append("Not determined: this is one of many models that explain the data.")
+        lines += [f"  - {sentence}" for sentence in result.undetermined]
+    out.write("\n".join([*lines, "", ""]))
+    out.flush()
+
+
+def _unit(axis: str) -> str:
+    return "kg m²" if axis.startswith("r") else "kg"

@@ -1,0 +1,217 @@
+"""Problem modules are found where the rules say, and every mistake in one is told with its place."""
+
+import ast
+import sys
+
+import pytest
+
+import sysid
+from sysid import catalogue
+from sysid.identification import Recipe
+
+CHAIN = '''"""Two masses in a row."""
+
+import numpy as np
+
+import sysid
+
+
+def problem(*, data=None, rng=0):
+    mass, k = np.diag([2.0, 1.0, 0.5]), 4e3
+    stiffness = k * np.array([[2.0, -1.0, -1.0], [-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
+    truth = sysid.Structure(mass, stiffness, [0.01, 0.02], n_base=1)
+    return sysid.Problem(
+        sysid.simulate(truth, np.linspace(1.0, 20.0, 40), rng=rng),
+        mass=sysid.FullMass(3.5),
+        stiffness=sysid.SpectralStiffness(truth.natural_frequencies),
+    )
+'''
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """Work in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def refused(module, **options):
+    """Build `module` and return the message of the InputError that this raises."""
+    with pytest.raises(sysid.InputError) as caught:
+        catalogue.build(Recipe(str(module), **options))
+    return str(caught.value)
+
+
+def test_bundled_problems_are_listed_with_the_first_line_of_their_docstrings(here):
+    found = {entry.name: entry for entry in catalogue.entries()}
+    assert {path.stem for path in catalogue.bundled_folder().glob("[!_]*.py")} == set(found)
+    for entry in found.values():
+        assert entry.bundled
+        docstring = ast.get_docstring(ast.parse(entry.path.read_text(encoding="utf-8")))
+        assert entry.description == docstring.splitlines()[0]
+
+
+def test_listing_imports_nothing_and_survives_modules_that_cannot_be_read(here):
+    (here / "problems").mkdir()
+    (here / "problems" / "loud.py").write_text('"""It shouts.\n\nLong."""\nraise RuntimeError("imported")\n')
+    (here / "problems" / "broken.py").write_text("def (:\n")
+    (here / "problems" / "silent.py").write_text("x = 1\n")
+    (here / "problems" / "binary.py").write_bytes(b"\0\xff\n")
+    (here / "problems" / "_private.py").write_text("x = 1\n")
+    own = {entry.name: entry.description for entry in catalogue.entries() if not entry.bundled}
+    assert own["loud"] == "It shouts."
+    assert own["broken"] == "(syntax error in line 1)"
+    assert own["silent"] == ""
+    assert set(own) == {"loud", "broken", "silent", "binary"}
+
+
+def test_bundled_problems_are_inside_an_installed_package_and_beside_a_checkout(tmp_path, monkeypatch):
+    package = tmp_path / "sysid"
+    monkeypatch.setattr(catalogue, "__file__", str(package / "catalogue.py"))
+    assert catalogue.bundled_folder() == tmp_path / "problems"
+    (package / "bundled_problems").mkdir(parents=True)
+    assert catalogue.bundled_folder() == package / "bundled_problems"
+
+
+def test_a_path_an_own_problem_a_dotted_module_and_the_order_among_them(here, monkeypatch):
+    (here / "chain.py").write_text(CHAIN)
+    assert catalogue.build(Recipe("chain.py")).layout.n == 2
+    assert catalogue.build(Recipe("./chain.py")).layout.n == 2
+    assert "unknown" in refused("chain")
+
+    (here / "problems").mkdir()
+    (here / "problems" / "chain.py").write_text(CHAIN)
+    assert catalogue.build(Recipe("chain")).layout.n == 2
+    # The user's own problem hides a bundled one of its name.
+    hidden = next(entry.name for entry in catalogue.entries() if entry.bundled)
+    (here / "problems" / f"{hidden}.py").write_text(CHAIN)
+    assert catalogue.build(Recipe(hidden)).layout.n == 2
+    assert [entry.bundled for entry in catalogue.entries() if entry.name == hidden] == [False]
+
+    package = here / "lab_of_chains"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "second.py").write_text("from lab_of_chains.first import problem\n")
+    (package / "first.py").write_text(CHAIN)
+    monkeypatch.syspath_prepend(str(here))
+    assert catalogue.build(Recipe("lab_of_chains.second")).layout.n == 2
+    assert "unknown" in refused("lab_of_chains.third")
+    assert "unknown" in refused("no_such_lab.first")
+    (package / "lame.py").write_text("\nimport no_such_module_at_all\n")
+    message = refused("lab_of_chains.lame")
+    assert "lame.py, line 2" in message
+    assert "no_such_module_at_all" in message
+
+
+def test_the_name_for_results_is_the_stem_of_the_module():
+    assert catalogue.short_name("a/b/tower.py") == "tower"
+    assert catalogue.short_name("tower.py") == "tower"
+    assert catalogue.short_name("tower") == "tower"
+    assert catalogue.short_name("lab.problems.tower") == "tower"
+
+
+def test_data_and_rng_reach_the_module(here):
+    (here / "records").mkdir()
+    (here / "echo.py").write_text(
+        "def problem(*, data=None, rng=0):\n    raise ValueError(f'{data.is_dir()} {data.name} {rng}')\n"
+    )
+    assert "ValueError: True records 7" in refused("echo.py", data="records", rng=7)
+
+
+def test_loading_leaves_nothing_behind_and_reads_the_file_anew(here):
+    module = here / "chain.py"
+    module.write_text(CHAIN)
+    before = set(sys.modules)
+    catalogue.build(Recipe("chain.py"))
+    (added,) = (name for name in set(sys.modules) - before if "chain" in name)
+    assert added.startswith("_sysid_problem_")  # a private name: it hides no module of the user's
+    # Same size, same second: a cached compilation would be taken for this one.
+    module.write_text(CHAIN.replace("FullMass(3.5)", "FullMass(4.5)"))
+    assert catalogue.build(Recipe("chain.py")).totals == pytest.approx([4.5])
+    assert [path.name for path in here.iterdir()] == ["chain.py"]
+
+
+def test_a_module_may_define_dataclasses_under_postponed_annotations(here):
+    head = "from __future__ import annotations\nimport dataclasses\n@dataclasses.dataclass\nclass A:\n    x: int = 0\n"
+    (here / "chain.py").write_text(head + CHAIN)
+    assert catalogue.build(Recipe("chain.py")).layout.n == 2
+
+
+def test_a_module_does_not_inherit_this_packages_future_imports(here):
+    (here / "eager.py").write_text(
+        "def f(x: 1 + 1):\n    pass\n\ndef problem(*, data=None, rng=0):\n    return f.__annotations__['x'] * 1.0\n"
+    )
+    assert "gives a float" in refused("eager.py")
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("x = 1\ndef problem(:\n", ["bad.py, line 2", "syntax error"]),
+        ("import no_such_module_at_all\n", ["bad.py, line 1", "no_such_module_at_all"]),
+        ("x = 1\n\ny = x / 0\n", ["bad.py, line 3", "ZeroDivisionError: division by zero"]),
+        ("def problem(*, data=None, rng=0):\n    return {}['key']\n", ["bad.py, line 2", "KeyError: 'key'"]),
+        (
+            "import json\ndef problem(*, data=None, rng=0):\n    json.loads('{')\n",
+            ["bad.py, line 3", "JSONDecodeError"],  # the module's own line, not the library's
+        ),
+        ("import sys\nsys.exit('enough')\n", ["bad.py, line 2", "SystemExit: enough"]),
+        ("eval('1 +')\n", ["bad.py, line 1", "SyntaxError"]),
+        ("def problem(*, data=None, rng=0):\n    open('nowhere')\n", ["line 2", "FileNotFoundError", "nowhere"]),
+        ("x = '\xff'\n".encode("latin-1"), ["bad.py"]),
+        (b"x = 1\0\n", ["bad.py", "null bytes"]),
+        ("x = 1\n", ["bad.py", "has no function problem()", "def problem(*, data=None, rng=0)"]),
+        ("problem = 3\n", ["has no function problem()"]),
+        ("def problem():\n    return 1\n", ["does not take data and rng"]),
+        ("def problem(data, rng, /):\n    return 1\n", ["does not take data and rng"]),
+        ("def problem(*, data=None, rng=0):\n    return {'mass': 1}\n", ["gives a dict, not a sysid.Problem"]),
+        ("def problem(*, data=None, rng=0):\n    pass\n", ["gives a NoneType, not a sysid.Problem"]),
+    ],
+)
+def test_a_mistake_in_a_module_is_told_with_its_place(here, text, told):
+    (here / "bad.py").write_bytes(text if isinstance(text, bytes) else text.encode())
+    message = refused("bad.py")
+    for words in told:
+        assert words in message
+
+
+def test_an_input_error_from_inside_passes_as_it_is(here):
+    (here / "bad.py").write_text(
+        "import sysid\ndef problem(*, data=None, rng=0):\n    raise sysid.InputError('no records on Sundays')\n"
+    )
+    assert refused("bad.py") == "no records on Sundays"
+
+
+def test_ctrl_c_inside_a_module_is_no_mistake_of_the_module(here):
+    (here / "slow.py").write_text("raise KeyboardInterrupt\n")
+    with pytest.raises(KeyboardInterrupt):
+        catalogue.build(Recipe("slow.py"))
+    assert not any("slow" in name for name in sys.modules if name.startswith("_sysid_problem_"))
+
+
+def test_an_unknown_name_lists_the_known_ones_and_the_closest(here):
+    (here / "problems").mkdir()
+    (here / "problems" / "my_tower.py").write_text(CHAIN)
+    message = refused("my_towr")
+    assert "did you mean 'my_tower'?" in message
+    for entry in catalogue.entries():
+        assert entry.name in message
+    assert "did you mean" not in refused("zzz")
+    assert "unknown" in refused("")
+    assert "unknown" in refused("..")
+
+
+def test_a_file_that_is_not_there_or_not_a_file(here):
+    assert "nowhere.py cannot be read: No such file" in refused("nowhere.py")
+    assert "No such file" in refused("some/where/chain")
+    (here / "folder.py").mkdir()
+    assert "folder.py cannot be read" in refused("folder.py")
+    assert "cannot be read" in refused("x" * 5000 + ".py")
+
+
+def test_data_that_is_not_there_is_refused_before_the_module_runs(here):
+    (here / "loud.py").write_text("raise RuntimeError('ran')\n")
+    for data in ("nowhere", ""):
+        message = refused("loud.py", data=data)
+        assert f"data {data!r}" in message
+        assert "no such file or folder" in message

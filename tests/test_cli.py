@@ -1,0 +1,584 @@
+"""The command line: what each command shows and writes, and one line and a status for every way it can end."""
+
+import contextlib
+import io
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sysid
+from sysid import cli, report
+
+FREQUENCIES = "truth.natural_frequencies"
+MODULE = '''"""Two masses on one moving base, each on its own spring and tied to each other."""
+
+import numpy as np
+
+import sysid
+
+
+def problem(*, data=None, rng=0):
+    mass, k = np.diag([2.0, 1.0, 0.5]), 4e3
+    stiffness = k * np.array([[2.0, -1.0, -1.0], [-1.0, 1.5, -0.5], [-1.0, -0.5, 1.5]])
+    truth = sysid.Structure(mass, stiffness, [0.01, 0.02], n_base=1)
+    test = sysid.simulate(truth, np.linspace(1.0, 25.0, 60), noise=0.0, rng=rng)
+    freq, base, response, G = test.freq.copy(), test.base.copy(), test.response.copy(), test.rigid_body
+    # a mistake goes here
+    return sysid.Problem(
+        sysid.Measurement(freq, base, response, rigid_body=G),
+        mass=sysid.FullMass(3.5, healing="rigid_body"),
+        stiffness=sysid.SpectralStiffness(truth.natural_frequencies),
+        goal=1e-6,
+    )
+'''
+KEYS = {
+    "problem", "strategy", "seed", "success", "message", "residual", "natural_frequencies_hz", "damping_ratios",
+    "total_mass_kg", "determined", "evaluations", "wall_time_s", "version",
+}  # fmt: skip
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """Work in an empty folder that is the temporary one too."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pair.py").write_text(MODULE)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """Run the pair once: its folder of results."""
+    folder = tmp_path_factory.mktemp("finished")
+    (folder / "pair.py").write_text(MODULE)
+    with contextlib.redirect_stdout(io.StringIO()):
+        assert cli.main(["run", str(folder / "pair.py"), "--out", str(folder / "out")]) == 0
+    return folder / "out"
+
+
+def complaint(capsys):
+    """Return the one line on standard error."""
+    error = capsys.readouterr().err
+    assert error.startswith("sysid: ")
+    assert error.count("\n") == 1
+    assert error.endswith("\n")
+    assert "Traceback" not in error
+    return error
+
+
+def files(folder):
+    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
+
+
+def process(*arguments, **options):
+    return subprocess.run(
+        [sys.executable, "-m", "sysid", *map(str, arguments)], capture_output=True, timeout=120, **options
+    )
+
+
+# -- success ------------------------------------------------------------------------------------
+
+
+def test_run_writes_three_files_under_the_name_of_the_module_and_tells_where(here, capsys):
+    assert cli.main(["run", "pair.py", "--seed", "3"]) == 0
+    out, error = capsys.readouterr()
+    assert error == ""
+    assert files(here) == {"pair.py", "results", "results/pair"} | {
+        f"results/pair/{name}" for name in ("result.h5", "summary.json", "report.html")
+    }
+    for name in ("result.h5", "summary.json", "report.html"):
+        assert f"results/pair/{name}\n" in out
+    # The frequencies of the structure in the module, from SciPy's generalised eigenproblem.
+    from scipy.linalg import eigh
+
+    K = 4e3 * np.array([[2.0, -1.0], [-1.0, 1.5]])
+    exact = np.sqrt(eigh(K, np.diag([2.0, 1.0]), eigvals_only=True)) / (2 * np.pi)
+    for frequency in exact:
+        assert f"{frequency:.5g}" in out
+    assert "success: " in out
+    assert "determined" in out.lower()
+
+    summary = json.loads((here / "results/pair/summary.json").read_text(), parse_constant=pytest.fail)
+    assert set(summary) >= KEYS
+    assert summary["problem"] == "pair.py"
+    assert summary["seed"] == 3
+    assert summary["success"] is True
+    assert summary["residual"] <= 1e-6
+    assert summary["natural_frequencies_hz"] == pytest.approx(exact, rel=1e-5)
+    assert summary["total_mass_kg"] == pytest.approx([3.5], rel=1e-9)
+    assert summary["version"] == sysid.__version__
+
+    result = sysid.load(here / "results/pair")
+    assert result.recipe == sysid.Recipe("pair.py", None, 0)
+    assert result.residual == summary["residual"]
+
+
+def test_the_same_seed_gives_the_same_figures_and_the_default_seed_is_zero(here, finished):
+    again = {}
+    for out, seed in (("a", ["--seed", "0"]), ("b", ["--seed", "1"])):
+        assert cli.main(["run", "pair.py", "--out", out, *seed]) == 0
+        again[out] = json.loads((here / out / "summary.json").read_text())
+    first = json.loads((finished / "summary.json").read_text())
+    drop = ("wall_time_s", "problem")  # the module had another path
+    strip = lambda summary: {key: value for key, value in summary.items() if key not in drop}  # noqa: E731
+    assert strip(first) == strip(again["a"])
+    assert strip(first) != strip(again["b"])
+
+
+def test_report_is_written_again_from_the_file_or_its_folder(finished, capsys):
+    target = finished / "report.html"
+    for given in (finished, finished / "result.h5"):
+        target.unlink()
+        assert cli.main(["report", str(given)]) == 0
+        assert capsys.readouterr().out == f"{target}\n"
+        assert target.stat().st_size > 1000
+
+
+def test_list_names_each_bundled_problem_on_a_line(here, capsys):
+    assert cli.main(["list"]) == 0
+    out = capsys.readouterr().out
+    names = [line.split()[0] for line in out.splitlines()]
+    assert names == sorted(names)
+    assert {"cantilever_tower", "spacecraft_dummy", "shear_building", "mini_shake_table"} <= set(names)
+
+
+def test_version_and_help_end_with_zero(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"sysid {sysid.__version__}\n"
+    for command in ([], ["run"], ["list"], ["report"]):
+        assert cli.main([*command, "--help"]) == 0
+        assert "usage: sysid" in capsys.readouterr().out
+
+
+def test_plain_output_has_no_control_codes_whatever_the_environment_asks(here):
+    environment = os.environ | {"FORCE_COLOR": "1", "TTY_COMPATIBLE": "1", "PYTHONIOENCODING": "ascii", "COLUMNS": "40"}
+    done = process("run", "pair.py", env=environment, cwd=here)
+    assert done.returncode == 0
+    assert done.stderr == b""
+    assert b"\x1b" not in done.stdout
+    assert b"\r" not in done.stdout.replace(os.linesep.encode(), b"\n")
+    text = done.stdout.decode("ascii")
+    for phase in ("swarm", "refinement", "local phase"):
+        assert re.search(rf"^{phase} +iteration +\d+ +residual +\S+ +[\d.]+ s$", text, re.M)
+
+
+def test_what_the_module_prints_cannot_end_the_run_by_its_letters(here):
+    (here / "pair.py").write_text("print('ζ²')\n" + MODULE)
+    done = process("run", "pair.py", env=os.environ | {"PYTHONIOENCODING": "ascii"}, cwd=here)
+    assert done.returncode == 0
+    assert done.stdout.startswith(b"??")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pseudo-terminals")
+def test_a_terminal_sees_a_table_that_updates(here):
+    import pty
+
+    main_end, process_end = pty.openpty()
+    environment = os.environ | {"TERM": "xterm", "COLUMNS": "100", "LINES": "40"}
+    command = [sys.executable, "-m", "sysid", "run", "pair.py"]
+    running = subprocess.Popen(command, cwd=here, env=environment, stdout=process_end, stderr=process_end)
+    os.close(process_end)
+    shown = b""
+    with contextlib.suppress(OSError):  # the end of a pseudo-terminal is an error
+        while chunk := os.read(main_end, 65536):
+            shown += chunk
+    os.close(main_end)
+    assert running.wait(60) == 0
+    text = shown.decode()
+    assert "\x1b[" in text
+    for word in ("phase", "iteration", "residual", "swarm", "local phase", "report.html"):
+        assert word in text
+
+
+def test_a_closed_pipe_and_a_full_disk_behind_standard_output(here):
+    command = f"{sys.executable} -m sysid list | head -c 1; echo ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, timeout=60, check=True)
+    assert done.stderr == b""
+    assert done.stdout.endswith(b"0\n")
+    # The search goes on without a reader: its result is in the files.
+    done = process("run", "pair.py", cwd=here, preexec_fn=_closed_standard_output)
+    assert done.returncode == 0
+    assert done.stderr == b""
+    assert (here / "results/pair/report.html").exists()
+    if Path("/dev/full").exists():
+        with Path("/dev/full").open("w") as full:
+            done = subprocess.run(
+                [sys.executable, "-m", "sysid", "list"], stdout=full, stderr=subprocess.PIPE, timeout=60, check=False
+            )
+        assert done.returncode == 2
+        assert done.stderr.count(b"\n") == 1
+        assert b"No space left" in done.stderr
+
+
+def _closed_standard_output():
+    """Make standard output a pipe that nobody reads."""
+    reader, writer = os.pipe()
+    os.dup2(writer, 1)
+    os.close(reader)
+    os.close(writer)
+
+
+def test_warnings_are_told_after_the_run_a_line_each_and_not_beside_a_mistake(here, capsys):
+
+    warned = MODULE.replace("# a mistake goes here", "import warnings; warnings.warn('thin\\nice')")
+    (here / "pair.py").write_text(warned)
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        assert cli.main(["run", "pair.py"]) == 0
+        error = complaint(capsys)
+        assert "pair.py:" in error
+        assert "thin ice" in error
+        (here / "pair.py").write_text(warned.replace("thin\\nice')", "thin'); freq[3] = np.nan"))
+        assert cli.main(["run", "pair.py"]) == 2
+        assert "thin" not in complaint(capsys)
+
+
+# -- mistakes -----------------------------------------------------------------------------------
+
+IN_THE_MODULE = {
+    "NaN samples": ("response[0, 1, 5] = np.nan", "response holds 1 NaN"),
+    "infinite samples": ("base = base * 1.0; base[0, 0, 5] = np.inf", "base holds 1 NaN or infinite"),
+    "NaN frequency": ("freq[3] = np.nan", "freq holds NaN"),
+    "unsorted frequencies": ("freq[[3, 4]] = freq[[4, 3]]", "freq must rise strictly"),
+    "repeated frequencies": ("freq[4] = freq[3]", "drop repeated ones"),
+    "fewer lines than samples": ("freq = freq[:-1]", "response has shape|base has shape"),
+    "another number of runs": ("response = np.concatenate([response, response])", "runs"),
+    "another number of sensors": ("G = np.ones((3, 1))", "rigid_body is"),
+    "a mass of zero": ("FullMass(3.5", "FullMass(0.0", "masses must be positive"),
+    "a negative mass": ("FullMass(3.5", "FullMass(-3.5", "masses must be positive"),
+    "a mass that is no number": ("FullMass(3.5", "FullMass(np.nan", "masses must be positive"),
+    "w_lim below a given frequency": (
+        f"({FREQUENCIES})", f"({FREQUENCIES}, max_frequency=0.9 * {FREQUENCIES}[-1])",
+        "is below the given natural frequency",
+    ),
+    "unsorted natural frequencies": (f"({FREQUENCIES})", f"({FREQUENCIES}[::-1])", "ascending"),
+    "a missing file": ("np.loadtxt('nowhere.csv')", r"pair.py, line 14: FileNotFoundError: .*nowhere.csv"),
+    "an unreadable file": ("np.load(__file__)", "pair.py, line 14: "),
+    "an exception of many lines": ("raise ValueError('one\\n\\ntwo')", "line 14: ValueError: one two$"),
+    "a syntax error": ("return (", "pair.py, line 1[0-9]: syntax error"),
+    "no problem()": ("def problem(", "def another(", r"has no function problem\(\)"),
+    "problem() without its arguments": ("(*, data=None, rng=0)", "()", "does not take data and rng"),
+    "problem() that gives something else": ("return sysid.Problem(", "return dict(measurement=", "gives a dict, not a"),
+    "an array as stiffness": (f"sysid.SpectralStiffness({FREQUENCIES})", "np.eye(2)", "not a stiffness model"),
+}
+
+
+@pytest.mark.parametrize("case", IN_THE_MODULE)
+def test_a_mistake_in_the_problem_is_one_line_and_nothing_is_written(here, capsys, case):
+    *change, message = IN_THE_MODULE[case]
+    old, new = change if len(change) == 2 else ("# a mistake goes here", change[0])
+    assert old in MODULE
+    text = MODULE.replace(old, new)
+    if new.startswith("return dict("):
+        text = text.replace("rigid_body=G),\n        mass", "rigid_body=G), mass")
+    (here / "pair.py").write_text(text)
+    assert cli.main(["run", "pair.py"]) == 2
+    assert re.search(message, complaint(capsys).rstrip())
+    assert files(here) == {"pair.py"}
+
+
+ON_THE_LINE = {
+    "no command": ([], "COMMAND"),
+    "unknown command": (["rum", "pair.py"], "invalid choice: 'rum'"),
+    "no problem": (["run"], "PROBLEM"),
+    "an option cut short": (["run", "pair.py", "--se", "1"], "--se"),
+    "unknown option": (["list", "--all"], "--all"),
+    "unknown problem": (["run", "cantilever_towr"], "did you mean 'cantilever_tower'.*shear_building"),
+    "unknown strategy": (["run", "pair.py", "--strategy", "simplex"], "'simplex'.*swarm"),
+    "a strategy to come": (["run", "pair.py", "--strategy", "modal"], "modal"),
+    "missing module": (["run", "nowhere.py"], "nowhere.py cannot be read: No such file"),
+    "missing module of a folder": (["run", "some/where"], "No such file"),
+    "missing data": (["run", "pair.py", "--data", "nowhere"], "'nowhere': there is no such file or folder"),
+    "negative seed": (["run", "pair.py", "--seed", "-1"], "--seed"),
+    "seed that is no integer": (["run", "pair.py", "--seed", "1.5"], "'1.5' is not a nonnegative integer"),
+    "no time": (["run", "pair.py", "--max-time", "0"], "'0' is not a positive number of seconds"),
+    "time that is no number": (["run", "pair.py", "--max-time", "nan"], "--max-time"),
+    "results in a file": (["run", "pair.py", "--out", "pair.py/out"], "pair.py is not a folder"),
+    "missing result": (["report", "nowhere"], "nowhere"),
+    "a folder without a result": (["report", "."], "result.h5"),
+    "a result that is none": (["report", "pair.py"], "pair.py"),
+}
+
+
+@pytest.mark.parametrize("case", ON_THE_LINE)
+def test_a_mistake_on_the_line_is_one_line_and_nothing_is_written(here, capsys, case):
+    if case == "a strategy to come" and getattr(sysid, "Modal", None) is not None:
+        pytest.skip("it has come")
+    arguments, message = ON_THE_LINE[case]
+    assert cli.main(arguments) == 2
+    assert re.search(message, complaint(capsys))
+    assert files(here) == {"pair.py"}
+
+
+def test_a_mistake_in_a_process_is_one_line_too(here):
+    (here / "pair.py").write_text(MODULE.replace("# a mistake goes here", "response[0, 1, 5] = np.nan"))
+    done = process("run", "pair.py", cwd=here)
+    assert done.returncode == 2
+    assert done.stderr.count(b"\n") == 1
+    assert b"Traceback" not in done.stderr
+    assert files(here) == {"pair.py"}
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_cannot_be_written_is_refused_before_the_search(here, capsys):
+    locked = here / "locked"
+    locked.mkdir(mode=0o500)
+    assert cli.main(["run", "pair.py", "--out", "locked/out"]) == 2
+    assert "locked cannot be written" in complaint(capsys)
+
+
+def test_a_file_that_cannot_be_read_is_refused(here, capsys, monkeypatch):
+    def refuse(self):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    assert cli.main(["run", "pair.py"]) == 2
+    assert "pair.py cannot be read: Permission denied" in complaint(capsys)
+
+
+def test_a_disk_that_is_full_is_one_line_and_leaves_no_half_file(here, capsys, monkeypatch):
+    def full(self, *arguments, **options):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "mkdir", full)
+    assert cli.main(["run", "pair.py"]) == 2
+    assert "No space left on device" in complaint(capsys)
+    assert files(here) == {"pair.py"}
+
+
+def test_a_summary_that_cannot_be_written_takes_no_result_away(here, capsys, monkeypatch):
+    def full(self, *arguments, **options):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    assert cli.main(["run", "pair.py"]) == 2
+    assert "summary.json cannot be written: No space left on device" in complaint(capsys)
+    assert files(here) == {"pair.py", "results", "results/pair", "results/pair/result.h5"}
+
+
+# -- other ends ---------------------------------------------------------------------------------
+
+
+def test_a_goal_that_is_not_reached_ends_with_one_and_writes_all(here, capsys):
+    (here / "pair.py").write_text(MODULE.replace("noise=0.0", "noise=0.05"))
+    assert cli.main(["run", "pair.py"]) == 1
+    out, error = capsys.readouterr()
+    assert error == ""
+    assert "no success: " in out
+    assert "above the goal" in out
+    summary = json.loads((here / "results/pair/summary.json").read_text())
+    assert summary["success"] is False
+    assert (here / "results/pair/report.html").exists()
+
+
+def test_a_search_without_a_candidate_ends_with_one_and_writes_nothing(here, capsys, monkeypatch):
+    def identify(*arguments, **options):
+        raise sysid.SolverError("no candidate\nat all")
+
+    monkeypatch.setattr(sysid, "identify", identify)
+    assert cli.main(["run", "pair.py"]) == 1
+    assert complaint(capsys) == "sysid: no candidate at all\n"
+    assert files(here) == {"pair.py"}
+
+
+def test_an_error_of_ours_is_one_line_and_its_traceback_is_in_the_log(here, capsys, monkeypatch):
+    def identify(*arguments, **options):
+        raise RuntimeError("two\nlines")
+
+    monkeypatch.setattr(sysid, "identify", identify)
+    assert cli.main(["run", "pair.py"]) == 70
+    error = complaint(capsys)
+    assert "RuntimeError: two lines" in error
+    assert str(here / "sysid-error.log") in error
+    log = (here / "sysid-error.log").read_text()
+    assert "Traceback" in log
+    assert "in identify" in log
+    assert sysid.__version__ in log
+    assert files(here) == {"pair.py", "sysid-error.log"}
+
+
+def test_the_log_goes_to_the_temporary_folder_where_the_current_one_cannot_be_written(
+    here, capsys, monkeypatch, tmp_path_factory
+):
+    def identify(*arguments, **options):
+        raise RuntimeError("a bug")
+
+    elsewhere = tmp_path_factory.mktemp("temporary")
+    (here / "sysid-error.log").mkdir()
+    monkeypatch.setattr(sysid, "identify", identify)
+    monkeypatch.setattr("tempfile.gettempdir", lambda: str(elsewhere))
+    assert cli.main(["run", "pair.py"]) == 70
+    assert str(elsewhere / "sysid-error.log") in complaint(capsys)
+    assert "a bug" in (elsewhere / "sysid-error.log").read_text()
+    (elsewhere / "sysid-error.log").unlink()
+    (elsewhere / "sysid-error.log").mkdir()
+    assert cli.main(["run", "pair.py"]) == 70
+    assert "no log file could be written" in complaint(capsys)
+
+
+def test_a_report_that_fails_takes_no_result_away(here, capsys, monkeypatch):
+    def write(*arguments, **options):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(report, "write", write)
+    assert cli.main(["run", "pair.py"]) == 70
+    assert "result.h5" in capsys.readouterr().out
+    assert sysid.load(here / "results/pair").success
+
+
+def test_an_interrupted_search_saves_the_best_so_far_and_ends_with_130(here, capsys, monkeypatch):
+    original = sysid.identify
+
+    def identify(*arguments, **options):
+        def interrupt(progress):
+            if progress.iteration == 3:
+                raise KeyboardInterrupt
+
+        return original(*arguments, **(options | {"callback": interrupt}))
+
+    monkeypatch.setattr(sysid, "identify", identify)
+    assert cli.main(["run", "pair.py"]) == 130
+    assert "the best so far is in results/pair" in complaint(capsys)
+    assert sysid.load(here / "results/pair").interrupted
+    assert json.loads((here / "results/pair/summary.json").read_text())["success"] is False
+    assert (here / "results/pair/report.html").exists()
+
+
+def test_ctrl_c_before_any_candidate_writes_nothing(here, capsys, monkeypatch):
+    def identify(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sysid, "identify", identify)
+    assert cli.main(["run", "pair.py"]) == 130
+    assert complaint(capsys) == "sysid: interrupted; nothing was saved\n"
+    assert files(here) == {"pair.py"}
+
+
+def test_ctrl_c_while_saving_says_that_files_are_missing(here, capsys, monkeypatch):
+    def write(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(report, "write", write)
+    assert cli.main(["run", "pair.py"]) == 130
+    assert "not every file is in results/pair" in complaint(capsys)
+    assert not [name for name in files(here) if name.endswith(".tmp")]
+
+
+ENDLESS = """
+import sysid
+from sysid import cli, identify
+
+endless = sysid.Swarm(10**6, stall_iterations=10**6)
+sysid.identify = lambda *a, strategy, **k: identify(*a, **k, strategy=endless)
+raise SystemExit(cli.main(["run", "free.py"]))
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+@pytest.mark.parametrize("delay", [0.0, 0.1, 0.27])
+def test_the_signal_itself_saves_the_best_so_far_wherever_it_strikes(here, delay):
+    (here / "endless.py").write_text(ENDLESS)
+    (here / "free.py").write_text(MODULE.replace("goal=1e-6", "goal=1e-30"))
+    running = interruptible("endless.py", cwd=here)
+    with running:
+        for line in running.stdout:
+            if line.startswith("swarm"):
+                break
+        time.sleep(delay)
+        running.send_signal(signal.SIGINT)
+        out, error = running.communicate(timeout=60)
+    assert error == "sysid: interrupted; the best so far is in results/free\n"
+    assert running.returncode == 130
+    assert "no success: interrupted" in out
+    assert sysid.load(here / "results/free").interrupted
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_the_signal_before_any_candidate_writes_nothing(here):
+    (here / "pair.py").write_text("import time\nprint('here', flush=True)\ntime.sleep(60)\n")
+    running = interruptible("-m", "sysid", "run", "pair.py", cwd=here)
+    with running:
+        assert running.stdout.readline() == "here\n"
+        running.send_signal(signal.SIGINT)
+        _, error = running.communicate(timeout=60)
+    assert error == "sysid: interrupted; nothing was saved\n"
+    assert running.returncode == 130
+    assert files(here) == {"pair.py"}
+
+
+def interruptible(*arguments, **options):
+    """Start Python with Ctrl-C as a terminal has it, however these tests were started."""
+    return subprocess.Popen(
+        [sys.executable, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL), **options,
+    )  # fmt: skip
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_a_second_ctrl_c_acts_at_once_and_what_it_breaks_is_no_error_of_ours(here, capsys, monkeypatch):
+    """As CasADi does it, the interrupt comes out as another exception."""
+    original = signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def identify(*arguments, progress, callback, **options):
+        news = sysid.Progress("swarm", 1, 9, 0.5, 0.1)
+        progress(news)
+        signal.raise_signal(signal.SIGINT)  # the first waits for the next news
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt as error:
+            raise SystemError("returned a result with an exception set") from error
+
+    monkeypatch.setattr(sysid, "identify", identify)
+    try:
+        assert cli.main(["run", "pair.py"]) == 130
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, original)
+    assert complaint(capsys) == "sysid: interrupted; nothing was saved\n"
+    assert files(here) == {"pair.py"}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_a_run_that_was_told_to_ignore_ctrl_c_ignores_it(here, monkeypatch):
+    original = sysid.identify
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def identify(*arguments, **options):
+        signal.raise_signal(signal.SIGINT)
+        return original(*arguments, **options)
+
+    monkeypatch.setattr(sysid, "identify", identify)
+    try:
+        assert cli.main(["run", "pair.py"]) == 0
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_what_is_not_a_number_is_null_in_the_summary(finished):
+    result = sysid.load(finished)
+    history = replace(result.history, wall_time=np.nan)
+    assert json.loads(cli._summary(replace(result, history=history)), parse_constant=pytest.fail)["wall_time_s"] is None
+    assert cli._finite({"a": [np.nan, 1.0, (float("inf"), "x")], "b": None, "c": True}) == {
+        "a": [None, 1.0, [None, "x"]], "b": None, "c": True,
+    }  # fmt: skip
+
+
+@pytest.mark.skipif(os.name != "posix", reason="limits of POSIX")
+def test_files_that_cannot_grow_are_one_line(here):
+    import resource
+
+    limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))  # noqa: E731
+    done = process("run", "pair.py", cwd=here, preexec_fn=limit)
+    assert done.returncode == 2
+    assert done.stderr.count(b"\n") == 1
+    assert files(here) == {"pair.py"}

@@ -1,0 +1,261 @@
+"""Results on disk: exact, plain, and whole or not at all."""
+
+import dataclasses
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+import sysid
+from sysid import storage
+
+
+def building(damping_matrix: bool = False, sensors: bool = True) -> sysid.Structure:
+    """Three masses, two base directions, a random coupling."""
+    random = np.random.default_rng(5)
+    n, d = 3, 2
+    root = random.standard_normal((n + d, n + d))
+    mass = root @ root.T + 5 * np.eye(n + d)
+    G = np.array([[1.0, 0.0], [0.6, 0.8], [0.0, 1.0]])
+    spring = random.standard_normal((n, n))
+    K = 4e4 * (spring @ spring.T + np.eye(n))
+    stiffness = np.block([[K, -K @ G], [-G.T @ K, G.T @ K @ G]])
+    described = (
+        sysid.Sensor("top, +x", (0.0, 0.0, 3.0), "x"),
+        sysid.Sensor("Stütze 2 – schräg", (0.1, 0.2, 2.0), (0.6, 0.8, 0.0)),
+        sysid.Sensor("tip", (0.0, 0.0, 1.0), "-y"),
+    )
+    return sysid.Structure(
+        mass,
+        stiffness,
+        None if damping_matrix else [0.01, 0.02, 0.015],
+        n_base=d,
+        damping_matrix=random.uniform(1, 2, 3) * np.eye(n) if damping_matrix else None,
+        sensors=described if sensors else None,
+    )
+
+
+MASSES = {
+    "full": sysid.FullMass([30.0, 31.0], healing="rigid_body"),
+    "full, unknown total": sysid.FullMass(),
+    "lumped": sysid.LumpedMass(12.5),
+    "known": sysid.KnownMass(np.diag([1.0, 2.0, 3.0])),
+}
+STIFFNESSES = {
+    "spectral": sysid.SpectralStiffness([10.0, 20.0], max_frequency=90.0),
+    "chain": sysid.ChainStiffness(1e3, [1e5, 2e5, 3e5]),
+}
+DAMPINGS = {
+    "modal": sysid.ModalDamping(0.001, 0.1),
+    "proportional": sysid.ProportionalDamping((0.0, 0.5), (0.0, 1e-3)),
+}
+
+
+def identification(
+    mass: str = "full", stiffness: str = "spectral", damping: str = "modal", **changes: object
+) -> sysid.Identification:
+    """Make a result that no search has produced, with everything that one can have."""
+    truth = building()
+    freq = np.linspace(2.0, 60.0, 40)
+    test = sysid.simulate(truth, freq, noise=0.02, force=True, rng=1, base_axes="yx")
+    other = sysid.simulate(truth, freq[::2], noise=0.02, rng=2, base_axes="yx")
+    problem = sysid.Problem(
+        test, mass=MASSES[mass], stiffness=STIFFNESSES[stiffness], damping=DAMPINGS[damping],
+        reference=building(damping_matrix=True, sensors=False), validation=[other, test], goal=0.05,
+    )  # fmt: skip
+    history = sysid.History(
+        start=0.9, swarm=0.1 + 0.2, refinement=float("nan"), local=1e-300,
+        swarm_curve=np.array([0.9, 0.3]), local_curve=np.zeros(0), refinement_error=1e-12,
+        states=(("exploration", 3), ("jumping out", 0)), evaluations=12345, wall_time=1.25,
+        log=("    0.00 s  swarm – α", "    1.00 s  done"),
+    )  # fmt: skip
+    made = sysid.Identification(
+        truth, problem, np.pi * np.arange(problem.n_variables), "swarm", 2**62 + 1, True, "Solve_Succeeded; ζ",
+        history, False, (), ("mode 1 is open", "no unit"), True, sysid.Recipe("problems/häuser.py", None, 3),
+    )  # fmt: skip
+    return dataclasses.replace(made, **changes)
+
+
+def assert_same(a: object, b: object, at: str = "result") -> None:
+    """Equal to the bit, through every public attribute."""
+    if isinstance(a, np.ndarray):
+        assert isinstance(b, np.ndarray) and a.dtype == b.dtype and a.shape == b.shape, at
+        assert a.tobytes() == b.tobytes(), at
+    elif isinstance(a, sysid.Structure):
+        for name in vars(a):
+            assert_same(getattr(a, name), getattr(b, name), f"{at}.{name}")
+    elif isinstance(a, tuple(type(model) for model in (*MASSES.values(), *STIFFNESSES.values()))):
+        assert type(a) is type(b), at
+        for field in dataclasses.fields(a):
+            mine, other = getattr(a, field.name), getattr(b, field.name)
+            if isinstance(mine, str) or mine is None:
+                assert mine == other, f"{at}.{field.name}"
+            else:  # a list becomes an array
+                assert_same(np.asarray(mine, float), np.asarray(other, float), f"{at}.{field.name}")
+    elif isinstance(a, sysid.Variable):
+        assert_same(a.lower, b.lower, at)
+        assert_same(a.upper, b.upper, at)
+    elif dataclasses.is_dataclass(a):
+        assert type(a) is type(b), at
+        for field in dataclasses.fields(a):
+            assert_same(getattr(a, field.name), getattr(b, field.name), f"{at}.{field.name}")
+    elif isinstance(a, tuple):
+        assert isinstance(b, tuple) and len(a) == len(b), at
+        for i, (mine, other) in enumerate(zip(a, b, strict=True)):
+            assert_same(mine, other, f"{at}[{i}]")
+    elif isinstance(a, float) and np.isnan(a):
+        assert isinstance(b, float) and np.isnan(b), at
+    else:
+        assert type(a) is type(b) and a == b, at
+
+
+@pytest.mark.parametrize("mass", MASSES)
+@pytest.mark.parametrize("stiffness", STIFFNESSES)
+@pytest.mark.parametrize("damping", DAMPINGS)
+def test_round_trip_is_exact_for_every_model(tmp_path, mass, stiffness, damping):
+    original = identification(mass, stiffness, damping)
+    assert_same(original, sysid.load(original.save(tmp_path / "a.h5")))
+
+
+def test_round_trip_keeps_what_is_absent(tmp_path):
+    truth = building(damping_matrix=True, sensors=False)
+    problem = sysid.Problem(
+        sysid.simulate(truth, [1.0, 2.0, 3.0]), mass=sysid.FullMass(), stiffness=STIFFNESSES["spectral"]
+    )
+    original = identification(
+        structure=truth, problem=problem, x=np.zeros(problem.n_variables), seed=None, recipe=None, undetermined=(),
+        determined=True, interrupted=False, history=sysid.History(),
+    )  # fmt: skip
+    assert_same(original, sysid.load(original.save(tmp_path / "a.h5")))
+
+
+def test_round_trip_keeps_a_recovery_to_more_sensors(tmp_path):
+    full = building()
+    recovery = np.vstack([np.eye(3), [0.5, 0.5, 0.0]])
+    G = np.vstack([full.rigid_body, [0.8, 0.4]])
+    wide = sysid.Structure(
+        full.mass, full.stiffness, full.damping_ratios, n_base=2, recovery=recovery, rigid_body=G, sensors=None
+    )
+    original = identification(structure=wide)
+    assert_same(wide, sysid.load(original.save(tmp_path / "a.h5")).structure)
+
+
+def test_a_path_is_a_file_or_a_folder(tmp_path):
+    original = identification()
+    assert storage.save(original, tmp_path / "deep" / "run.v2") == tmp_path / "deep" / "run.v2" / "result.h5"
+    assert storage.save(original, str(tmp_path / "x.hdf5")) == tmp_path / "x.hdf5"
+    for path in (tmp_path / "deep" / "run.v2", str(tmp_path / "deep" / "run.v2" / "result.h5"), tmp_path / "x.hdf5"):
+        assert storage.load(path).seed == original.seed
+
+
+def test_same_result_same_bytes(tmp_path):
+    first, second = (identification().save(tmp_path / name) for name in ("a.h5", "b.h5"))
+    assert first.read_bytes() == second.read_bytes()
+    again = sysid.load(first).save(tmp_path / "c.h5")
+    assert again.read_bytes() == first.read_bytes()
+
+
+def test_the_file_holds_numbers_and_text_only(tmp_path):
+    seen = []
+
+    def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        kinds = [value.dtype for value in item.attrs.values() if hasattr(value, "dtype")]
+        if isinstance(item, h5py.Dataset):
+            kinds.append(item.dtype)
+        seen.extend((name, kind) for kind in kinds)
+
+    with h5py.File(identification().save(tmp_path), "r") as file:
+        file.visititems(visit)
+        assert file.attrs["sysid_version"].decode() == sysid.__version__
+        assert file["problem/measurement/response"].dtype == complex
+    assert len(seen) > 40
+    for name, kind in seen:
+        assert kind.kind in "biufcS", name
+
+
+def test_a_text_keeps_every_character(tmp_path):
+    text = "a\nb\t<&\"'> \u2028 \U0001f527 \udcff"
+    original = identification(message=text, undetermined=("", text), closed_by=("",))
+    back = sysid.load(original.save(tmp_path))
+    assert (back.message, back.undetermined, back.closed_by) == (text, ("", text), ("",))
+
+
+def test_a_huge_seed_survives(tmp_path):
+    assert sysid.load(identification(seed=2**127 + 1).save(tmp_path)).seed == 2**127 + 1
+
+
+@pytest.mark.parametrize("failure", [RuntimeError, KeyboardInterrupt])
+def test_a_failure_while_writing_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch, failure):
+    path = identification().save(tmp_path)
+    before = path.read_bytes()
+
+    def fail(*_: object) -> None:
+        raise failure("now")
+
+    monkeypatch.setattr(storage, "_write_measurement", fail)
+    with pytest.raises(failure):
+        identification(seed=1).save(tmp_path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_cannot_be_stored_leaves_nothing(tmp_path):
+    truth = sysid.Structure(building().mass, building().stiffness, [0.01] * 3, n_base=2, sensors=["a", "b", "c"])
+    with pytest.raises(sysid.InputError, match=r"only a sysid\.Sensor"):
+        identification(structure=truth).save(tmp_path / "a.h5")
+    assert not list(tmp_path.iterdir())
+
+
+def change(path: Path, edit: object) -> Path:
+    with h5py.File(path, "r+") as file:
+        edit(file)
+    return path
+
+
+def test_each_wrong_file_gets_its_own_sentence(tmp_path):
+    good = identification().save(tmp_path / "good.h5")
+
+    with pytest.raises(sysid.InputError, match="no result at"):
+        sysid.load(tmp_path / "nowhere.h5")
+    with pytest.raises(sysid.InputError, match=r"no result at .*result\.h5"):
+        sysid.load(tmp_path)
+    text = tmp_path / "text.h5"
+    text.write_text("not this")
+    with pytest.raises(sysid.InputError, match="not an HDF5 file"):
+        sysid.load(text)
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["data"] = [1, 2]
+    with pytest.raises(sysid.InputError, match="not a result of sysid"):
+        sysid.load(tmp_path / "other.h5")
+    cut = tmp_path / "cut.h5"
+    cut.write_bytes(good.read_bytes()[:20000])
+    with pytest.raises(sysid.InputError, match="cannot be read"):
+        sysid.load(cut)
+    with pytest.raises(sysid.InputError, match="a later sysid is needed"):
+        sysid.load(change(good, lambda file: file.attrs.modify("format", storage.FORMAT + 1)))
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        lambda file: file.pop("structure/mass"),
+        lambda file: file.pop("problem"),
+        lambda file: file["problem/mass"].attrs.modify("kind", "os.system"),
+        lambda file: file["problem/measurement/freq"].write_direct(np.zeros(40)),
+        lambda file: file["history"].pop("states"),
+    ],
+)
+def test_a_damaged_file_is_called_damaged(tmp_path, edit):
+    path = change(identification().save(tmp_path), edit)
+    with pytest.raises(sysid.InputError, match="is damaged"):
+        sysid.load(path)
+
+
+def test_a_place_that_cannot_be_written_gets_one_sentence(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(sysid.InputError, match=r"ends in \.h5"):
+        identification().save(tmp_path / "notes.txt")
+    with pytest.raises(sysid.InputError, match="cannot be written"):
+        identification().save(tmp_path / "notes.txt" / "a.h5")
+    assert (tmp_path / "notes.txt").read_text() == "mine"
