@@ -39,7 +39,10 @@ def problem(*, data=None, rng=0):
     folder = data or os.environ.get("SYSID_DATA")
     if not folder:
         raise sysid.InputError("mini_shake_table needs its records: --data FOLDER, with sine_1p5 and sine_2p0 in it")
-    fitted, unseen = (event(Path(folder) / name) for name in ("sine_1p5", "sine_2p0"))
+    events = [Path(folder) / name for name in ("sine_1p5", "sine_2p0")]
+    if not all(path.is_dir() for path in events):
+        raise sysid.InputError(f"{folder} does not hold the folders sine_1p5 and sine_2p0: --data names the one that does")
+    fitted, unseen = map(event, events)
     return sysid.Problem(
         fitted,
         mass=sysid.FullMass(healing="rigid_body"),

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
     from sysid.structure import Array
 
+ROUND_OFF = 1e-12
+_WIDE = 11  # columns beyond which a table is printed smaller
+
 STYLE = """
 :root { --ink: #1f2430; --soft: #5a6472; --line: #dde2e7; --good: #0a7d5a; --warn: #b36b00; --bad: #b3261e; }
 * { box-sizing: border-box; }
@@ -25,23 +28,25 @@ h1 { font-size: 1.7rem; margin: 0 0 .2rem; overflow-wrap: anywhere; }
 h2 { font-size: 1.25rem; margin: 2.6rem 0 .6rem; padding-bottom: .25rem; border-bottom: 1px solid var(--line); }
 h3 { font-size: 1rem; margin: 1.4rem 0 .4rem; }
 p { margin: .5rem 0; max-width: 72ch; } ul { margin: .3rem 0; padding-left: 1.3rem; max-width: 72ch; }
-.soft, caption, figcaption { color: var(--soft); font-size: .9rem; }
+.soft, figcaption { color: var(--soft); font-size: .9rem; }
 .verdict { border: 1px solid var(--line); border-left: 6px solid var(--soft); border-radius: 4px; padding: .7rem 1rem;
   margin: 1rem 0; overflow-wrap: anywhere; }
 .verdict strong { font-size: 1.1rem; }
 .good { border-left-color: var(--good); } .warn { border-left-color: var(--warn); }
 .bad { border-left-color: var(--bad); }
-.scroll { overflow-x: auto; margin: .6rem 0 1rem; }
+.scroll { overflow-x: auto; margin: .6rem 0 1rem; break-inside: auto; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .88rem; }
-caption { text-align: left; padding-bottom: .3rem; }
 th, td { padding: .2rem .65rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
-thead th { border-bottom: 1.5px solid var(--soft); vertical-align: bottom; font-weight: 600; }
+thead th { border-bottom: 1.5px solid var(--soft); vertical-align: bottom; font-weight: 600;
+  white-space: normal; max-width: 9em; }
+.words td, .words th { text-align: left; }
 th:first-child, td:first-child { text-align: left; font-weight: 500; }
 figure { margin: .8rem 0 1.2rem; break-inside: avoid; } img { max-width: 100%; height: auto; display: block; }
 pre { background: #f5f7f9; padding: .8rem 1rem; overflow-x: auto; font-size: .82rem; line-height: 1.45; }
 nav { margin: .8rem 0; font-size: .9rem; } nav a { color: #0b5c96; margin-right: 1rem; white-space: nowrap; }
 @media print { body { max-width: none; padding: 0; font-size: 10pt; } nav { display: none; }
-  .scroll { overflow: visible; } table { font-size: 7.5pt; } th, td { padding: .1rem .3rem; }
+  .scroll { overflow: visible; } table { font-size: 7.5pt; } .wide { font-size: 5.5pt; }
+  th, td { padding: .1rem .3rem; }
   h2 { break-after: avoid; } pre { white-space: pre-wrap; } }
 """
 
@@ -69,24 +74,29 @@ def bullets(sentences: Iterable[object]) -> str:
     return f"<ul>{items}</ul>" if items else ""
 
 
-def table(head: Sequence[object], rows: Iterable[Sequence[object]], caption: object = "") -> str:
-    """Set a table of plain cells in a box that scrolls."""
-    above = f"<caption>{text(caption)}</caption>" if caption else ""
+def table(
+    head: Sequence[object], rows: Iterable[Sequence[object]], caption: object = "", *, words: bool = False
+) -> str:
+    """Set a table of plain cells in a box that scrolls: numbers to the right, or words to the left."""
+    above = f"<figcaption>{text(caption)}</figcaption>" if caption else ""
+    kind = _class("words" if words else "wide" if len(head) > _WIDE else "")
     names = "".join(f'<th scope="col">{text(cell)}</th>' for cell in head)
     body = "".join("<tr>" + "".join(f"<td>{text(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-    return f'<div class="scroll"><table>{above}<thead><tr>{names}</tr></thead><tbody>{body}</tbody></table></div>'
+    top = f"<thead><tr>{names}</tr></thead>" if any(head) else ""
+    return f'<figure class="scroll">{above}<table{kind}>{top}<tbody>{body}</tbody></table></figure>'
 
 
 def matrix(values: Array, rows: Sequence[object], columns: Sequence[object], caption: object) -> str:
-    """Set a matrix with named rows and columns, four significant digits."""
+    """Set a matrix with named rows and columns, four significant digits; what is round-off beside the largest is 0."""
+    values = np.where(np.abs(values) > ROUND_OFF * np.abs(values).max(), values, 0.0)
     lines = ([name, *(number(v) for v in line)] for name, line in zip(rows, values.tolist(), strict=True))
     return table(["", *columns], lines, caption)
 
 
-def picture(figure: Figure, alt: object, caption: object = "", *, dpi: float = 130) -> str:
+def picture(figure: Figure, alt: object, caption: object = "", *, dpi: float = 130, colours: int | None = 128) -> str:
     """Embed a figure as PNG; shown at 92 pixels an inch, so that it is sharp on paper and on dense screens."""
     width = round(92 * float(figure.get_size_inches()[0]))
-    data = base64.b64encode(to_png(figure, dpi=dpi, colours=64)).decode("ascii")
+    data = base64.b64encode(to_png(figure, dpi=dpi, colours=colours)).decode("ascii")
     below = f"<figcaption>{text(caption)}</figcaption>" if caption else ""
     return f'<figure><img width="{width}" alt="{text(alt)}" src="data:image/png;base64,{data}">{below}</figure>'
 
@@ -94,7 +104,7 @@ def picture(figure: Figure, alt: object, caption: object = "", *, dpi: float = 1
 def page(title: object, head: str, sections: Iterable[tuple[str, str]]) -> str:
     """Join the sections, (heading, content), to a page with links to each; empty ones are left out."""
     kept = [(name, content) for name, content in sections if content]
-    links = "".join(f'<a href="#s{i}">{text(name)}</a>' for i, (name, _) in enumerate(kept))
+    links = " ".join(f'<a href="#s{i}">{text(name)}</a>' for i, (name, _) in enumerate(kept))
     body = "\n".join(
         f'<section><h2 id="s{i}">{text(name)}</h2>\n{content}\n</section>' for i, (name, content) in enumerate(kept)
     )

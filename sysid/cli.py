@@ -13,14 +13,12 @@ import functools
 import json
 import math
 import os
-import signal
 import sys
 import tempfile
-import threading
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, NoReturn, cast
@@ -120,14 +118,9 @@ def _run(options: argparse.Namespace, out: _Output) -> int:
         f"{test.freq.size} lines from {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz, "
         f"{problem.n_variables} unknowns, seed {options.seed}\n"
     )
-    with _Display(out) as display, _patient_ctrl_c(display) as check:
+    with _Display(out) as display:
         result = sysid.identify(
-            problem,
-            strategy=options.strategy,
-            rng=options.seed,
-            max_time=options.max_time,
-            callback=check,
-            progress=display,
+            problem, strategy=options.strategy, rng=options.seed, max_time=options.max_time, progress=display
         )
     result = replace(result, recipe=recipe)
     _show(result, out)
@@ -343,48 +336,6 @@ def _collected_warnings() -> Iterator[list[str]]:
         yield lines
 
 
-@contextlib.contextmanager
-def _patient_ctrl_c(display: _Display) -> Iterator[Callable[[Progress], None]]:
-    """Let Ctrl-C wait until the search next reports; a second one, or one before any news, acts at once.
-
-    Inside CasADi a KeyboardInterrupt can come out as some other exception, and the best so far be lost.
-
-    Yields
-    ------
-    callable
-        For `identify`, as its callback.
-    """
-    raised = False
-
-    def on_signal(number: int, frame: object) -> None:
-        nonlocal raised
-        if display.stopping or not display.has_news:
-            raised = True
-            raise KeyboardInterrupt
-        display.stopping = True
-
-    def check(progress: Progress) -> None:
-        if display.stopping:
-            raise KeyboardInterrupt
-
-    # Only the main thread may set handlers; one that ignores Ctrl-C (nohup, a job in the background) stays.
-    if (
-        threading.current_thread() is not threading.main_thread()
-        or signal.getsignal(signal.SIGINT) is not signal.default_int_handler
-    ):
-        yield check
-        return
-    signal.signal(signal.SIGINT, on_signal)
-    try:
-        yield check
-    except Exception as error:
-        if raised:
-            raise KeyboardInterrupt from error
-        raise
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
 def _console(out: _Output) -> Console:
     """Console without markup; no control codes unless it is a terminal, whatever the environment asks."""
     from rich.console import Console
@@ -397,13 +348,7 @@ def _console(out: _Output) -> Console:
 
 
 class _Display:
-    """Live progress: a table that updates in a terminal, elsewhere a line at times.
-
-    Attributes
-    ----------
-    stopping : bool
-        Ctrl-C was pressed, and the search ends when it next reports.
-    """
+    """Live progress: a table that updates in a terminal, elsewhere a line at times."""
 
     def __init__(self, out: _Output) -> None:
         from rich.live import Live
@@ -412,7 +357,6 @@ class _Display:
         self._phases: dict[str, Progress] = {}
         self._begun = time.perf_counter()
         self._printed, self._pending = -math.inf, False
-        self.stopping = False
         console = _console(out)
         live = console.is_terminal and not console.is_dumb_terminal
         self._live = Live(get_renderable=self._table, console=console, refresh_per_second=8) if live else None
@@ -440,11 +384,6 @@ class _Display:
                 self._print(progress)
         self._phases[progress.phase] = progress
 
-    @property
-    def has_news(self) -> bool:
-        """Whether the search has had a candidate."""
-        return bool(self._phases)
-
     def _print(self, progress: Progress) -> None:
         self._printed, self._pending = progress.seconds, False
         self._out.write(f"{progress}\n")
@@ -454,8 +393,7 @@ class _Display:
         from rich import box
         from rich.table import Table
 
-        caption = "interrupted: ends after this iteration (Ctrl-C again: at once)" if self.stopping else None
-        table = Table(box=box.SIMPLE, pad_edge=False, caption=caption)
+        table = Table(box=box.SIMPLE, pad_edge=False)
         table.add_column("phase", min_width=12)
         for name, width in (("iteration", 10), ("residual", 10), ("time", 8)):
             table.add_column(name, justify="right", min_width=width, no_wrap=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -122,8 +124,9 @@ def identify(
     """
     options, name = _strategy(strategy)
     seed, random = _seed(rng)
-    with threadpool_limits(limits=1):
-        return _Run(problem, options, callback, progress, max_time, max_evaluations).run(name, seed, random, start)
+    with threadpool_limits(limits=1), _DeferredInterrupt() as interrupt:
+        run = _Run(problem, options, callback, progress, max_time, max_evaluations, interrupt)
+        return run.run(name, seed, random, start)
 
 
 def _strategy(strategy: str | Swarm) -> tuple[Swarm, str]:
@@ -148,6 +151,44 @@ def _seed(rng: int | np.random.Generator | None) -> tuple[int, np.random.SeedSeq
     return seed, np.random.SeedSequence(seed)
 
 
+class _DeferredInterrupt:
+    """Hold Ctrl-C back until the search next reports: raised inside compiled code it would lose the best so far.
+
+    A second Ctrl-C acts at once. Where somebody else handles the signal, or outside the main thread, nothing changes.
+    """
+
+    def __init__(self) -> None:
+        self.asked = False
+        self.raised = False
+        self.ours = False
+
+    def __enter__(self) -> _DeferredInterrupt:
+        self.ours = (
+            threading.current_thread() is threading.main_thread()
+            and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        )
+        if self.ours:
+            signal.signal(signal.SIGINT, self._hold)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+        if self.ours:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        # CasADi turns a KeyboardInterrupt that strikes inside it into some other exception.
+        if self.raised and isinstance(error, Exception):
+            raise KeyboardInterrupt from error
+
+    def _hold(self, number: int, frame: object) -> None:
+        if self.asked:
+            self.raised = True
+            raise KeyboardInterrupt
+        self.asked = True
+
+    def check(self) -> None:
+        if self.asked:
+            raise KeyboardInterrupt
+
+
 class _Stop(Exception):  # noqa: N818 - not an error
     """The callback asked to stop, or Ctrl-C did."""
 
@@ -163,12 +204,14 @@ class _Run:
         progress: Callable[[Progress], object] | None,
         max_time: float | None,
         max_evaluations: int | None,
+        interrupt: _DeferredInterrupt,
     ) -> None:
         if max_time is not None and not max_time > 0:
             raise InputError(f"max_time = {max_time}: a positive number of seconds is needed")
         self.problem, self.options = problem, options
         self.listeners = [f for f in (progress, callback) if f is not None]
         self.max_time, self.max_evaluations = max_time, max_evaluations
+        self.interrupt = interrupt
         self.begun = time.perf_counter()
         self.x: Array | None = None
         self.raw: Array = np.zeros(0)
@@ -186,6 +229,7 @@ class _Run:
         self.history = replace(self.history, **figures)  # type: ignore[arg-type]
 
     def tell(self, phase: Literal["swarm", "refinement", "local phase"], iteration: int, of: int, cost: float) -> None:
+        self.interrupt.check()
         for listener in self.listeners:
             try:
                 listener(Progress(phase, iteration, of, cost, self.seconds))

@@ -194,9 +194,9 @@ class _Watch(ca.Callback):
 
     def eval(self, arg: list) -> list:
         """Record the iterate and its residual; a nonzero answer stops IPOPT."""
-        self.z = np.asarray(arg[0]).ravel()
-        self.curve.append(float(np.sqrt(max(float(arg[1]), 0.0) / _OBJECTIVE_SCALE)))
         try:
+            self.z = np.asarray(arg[0]).ravel()
+            self.curve.append(float(np.sqrt(max(float(arg[1]), 0.0) / _OBJECTIVE_SCALE)))
             return [int(self.monitor is not None and self.monitor(len(self.curve) - 1, self.curve[-1]))]
         except KeyboardInterrupt:  # must not unwind through IPOPT
             self.interrupted = True

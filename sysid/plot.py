@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import io
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MEASURED: dict[str, Any] = {"color": "#1f2430", "linewidth": 1.0, "label": "measured"}
-IDENTIFIED: dict[str, Any] = {"color": "#D55E00", "linewidth": 1.6, "linestyle": (0, (4, 1.8)), "label": "identified"}
+IDENTIFIED: dict[str, Any] = {"color": "#D55E00", "linewidth": 1.6, "linestyle": (0, (3, 2.2)), "label": "identified"}
 RESIDUAL: dict[str, Any] = {"color": "#b4bfca", "linewidth": 0.8, "label": "difference", "zorder": 1}
 # Okabe and Ito's palette: told apart with any colour vision.
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
@@ -34,6 +34,7 @@ COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
 _INK, _FAINT, _GRID = "#3c4450", "#8a94a0", "#e4e8ec"
 _ROUND_OFF = 1e-10  # of the largest channel: below it a response is arithmetic, not motion
 _COLUMNS = 3
+_PANEL_WIDTHS = (6.4, 5.6, 4.0)  # in, of one, two and three columns
 _MAX_NUMBERS = 12  # modes up to which a MAC's cells carry their numbers
 _MAX_SHAPES = 6
 
@@ -274,7 +275,7 @@ def matrices(identification: Identification, ax: Sequence[Axes] | None = None) -
         image = one.imshow(normalised(matrix), cmap="RdBu_r", vmin=-1, vmax=1)
         _cells(one, matrix.shape)
         _dress(one, name, "sensor", "sensor" if one is ax[0] else "", grid=False, math=True)
-    _scale(image, list(ax), r"$m_{ij} / \sqrt{m_{ii} m_{jj}}$ [–]")
+    _scale(image, list(ax), r"$a_{ij} / \sqrt{a_{ii} a_{jj}}$ [–]")
     return ax if figure is None else figure
 
 
@@ -303,7 +304,7 @@ def mode_shapes(identification: Identification, modes: Sequence[int] | None = No
         raise InputError(f"modes {list(chosen)}: this structure has modes 1 to {structure.n}")
     columns = min(len(chosen), 6)
     rows = -(-len(chosen) // columns)
-    figure = _figure(max(1.9 * columns, 3.0), 3.1 * rows)
+    figure = _figure(max(1.9 * columns, 3.0), 2.7 * rows)
     extent = np.ptp(points, axis=0)
     box = np.maximum(extent, 0.35 * extent.max())
     centre = (points.max(axis=0) + points.min(axis=0)) / 2
@@ -318,7 +319,7 @@ def mode_shapes(identification: Identification, modes: Sequence[int] | None = No
             for i, j in sticks:
                 ax.plot(*where[[i, j]].T, **style)
         for name, middle, size in zip("xyz", centre, box, strict=True):
-            getattr(ax, f"set_{name}lim")(middle - 0.62 * size, middle + 0.62 * size)
+            getattr(ax, f"set_{name}lim")(middle - 0.7 * size, middle + 0.7 * size)
             getattr(ax, f"set_{name}label")(f"{name} [m]", fontsize=7, labelpad=-6, color=_INK)
             axis = getattr(ax, f"{name}axis")
             axis.set_pane_color((1, 1, 1, 0))
@@ -327,7 +328,7 @@ def mode_shapes(identification: Identification, modes: Sequence[int] | None = No
             if size < 0.5 * box.max():
                 getattr(ax, f"set_{name}ticks")([])  # no room for numbers
         ax.grid(False)
-        ax.set_box_aspect(box.tolist(), zoom=0.9)  # a list: an array would be scaled in place
+        ax.set_box_aspect(box.tolist(), zoom=1.05)  # a list: an array would be scaled in place
         ax.view_init(elev=20, azim=-50)
         ax.set_title(f"mode {k}: {structure.natural_frequencies[k - 1]:.4g} Hz", fontsize=9, color=_INK)
     return figure
@@ -357,7 +358,7 @@ def overview(identification: Identification, *, title: str | None = None) -> Fig
         if column:
             for ax in above[:, column]:
                 ax.set_ylabel("")
-    above[0, 0].legend(frameon=False, fontsize="small")
+    above[0, 0].legend(handles=_key(above[0, 0]), frameon=False, fontsize="small")
     below = bottom.subplots(1, 3, width_ratios=[1.15, 1, 1.25])
     convergence(identification, below[0])
     mac(identification, below[1])
@@ -470,8 +471,8 @@ def _channel(
     assert test.base_axes is not None
     # The scale of a spectrum (a line, per Hz, one-sided) is the record's own affair.
     return Channel(
-        test.freq, measured, predicted, test.base[run, moved], title, f"{what} spectrum [{unit}, record's scale]",
-        f"phase to base {test.base_axes[moved]} [°]", negligible,
+        test.freq, measured, predicted, test.base[run, moved], title, f"{what} spectrum\n[{unit}, own scale]",
+        f"phase to\nbase {test.base_axes[moved]} [°]", negligible,
     )  # fmt: skip
 
 
@@ -484,29 +485,34 @@ def _place(ax: Axes | Sequence[Axes] | None, channel: Channel) -> Any:
 
 def _panels(channels: Sequence[Channel]) -> Figure:
     """Magnitude above phase, a column a channel, at most three columns."""
+    from matplotlib.ticker import NullLocator
+
     columns = min(len(channels), _COLUMNS)
     blocks = -(-len(channels) // columns)
-    width, height = (4.0 * columns, 3.5 * blocks) if columns > 1 else (6.4, 4.2)
+    width, height = _PANEL_WIDTHS[columns - 1] * columns, 3.5 * blocks + 0.25
     figure = _figure(width, height, layout=None)  # as regular as these panels are, and three times as fast
-    axes = figure.subplots(2 * blocks, columns, height_ratios=[2.2, 1] * blocks, squeeze=False)
-    figure.subplots_adjust(
-        left=0.72 / width, right=1 - 0.12 / width, bottom=0.5 / height, top=1 - 0.32 / height, wspace=0.24,
-        hspace=0.12 if blocks == 1 else 0.42,
+    left = 0.92 if "\n" in channels[0].quantity else 0.72
+    grid = figure.add_gridspec(
+        blocks, columns, left=left / width, right=1 - 0.12 / width, bottom=0.75 / height, top=1 - 0.3 / height,
+        wspace=0.24, hspace=0.3,
     )  # fmt: skip
     for at, channel in enumerate(channels):
-        row, column = 2 * (at // columns), at % columns
-        _draw(axes[row : row + 2, column], channel)
+        axes: Any = grid[divmod(at, columns)].subgridspec(2, 1, height_ratios=[2.2, 1], hspace=0.12).subplots()
+        _draw(axes, channel)
+        axes[0].yaxis.set_minor_locator(NullLocator())  # most of the time goes into ticks
         # What is shared along a row is said once.
-        if column and channel.quantity == channels[at - 1].quantity:
-            axes[row, column].set_ylabel("")
-        if column and channel.phase == channels[at - 1].phase:
-            axes[row + 1, column].set_ylabel("")
-    for at in range(len(channels), blocks * columns):
-        row, column = 2 * (at // columns), at % columns
-        axes[row, column].set_visible(False)
-        axes[row + 1, column].set_visible(False)
-    axes[0, 0].legend(frameon=False, fontsize="small")
+        if at % columns and channel.quantity == channels[at - 1].quantity:
+            axes[0].set_ylabel("")
+        if at % columns and channel.phase == channels[at - 1].phase:
+            axes[1].set_ylabel("")
+    figure.legend(handles=_key(axes[0]), loc="lower center", ncols=3, frameon=False, fontsize="small")
     return figure
+
+
+def _key(magnitude: Axes) -> list[Any]:
+    """Give the lines of a legend in the order in which they are told."""
+    lines = {line.get_label(): line for line in magnitude.get_lines()}
+    return [lines[style["label"]] for style in (MEASURED, IDENTIFIED, RESIDUAL)]
 
 
 def _draw(axes: Any, channel: Channel) -> None:
@@ -620,7 +626,7 @@ def _figure_class() -> type[Figure]:
     return Picture
 
 
-def _figure(width: float, height: float, layout: str | None = "constrained") -> Figure:
+def _figure(width: float, height: float, layout: Literal["constrained"] | None = "constrained") -> Figure:
     return _figure_class()(figsize=(width, height), layout=layout)
 
 

@@ -104,9 +104,10 @@ def _title(it: Identification) -> str:
 
 def _verdict(it: Identification) -> str:
     test, n, d = it.measurement, it.structure.n, it.structure.n_base
+    runs = f"{test.n_runs} run{'s' if test.n_runs > 1 else ''}"
     head = paragraph(
         f"{n} degrees of freedom, {d} base direction{'s' if d > 1 else ''} ({', '.join(test.base_axes or ())}), "
-        f"{test.n_runs} run{'s' if test.n_runs > 1 else ''}, {test.freq.size} lines from {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz",
+        f"{runs}, {test.freq.size} lines from {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz",
         "soft",
     )
     word = "Interrupted: the best until then" if it.interrupted else "Success" if it.success else "No success"
@@ -222,7 +223,7 @@ def _validation(it: Identification) -> str:
 def _score_table(it: Identification, test: Measurement) -> str:
     rows = zip(test.sensor_names, *scores(it.structure, test), strict=True)
     return table(
-        ["sensor", "relative acceleration", "absolute acceleration", "“the sensors move with the base”, absolute"],
+        ["sensor", "relative acceleration", "absolute acceleration", "“moves with the base”, absolute"],
         ([name, *(f"{v:.3f}" if np.isfinite(v) else "–" for v in values)] for name, *values in rows),
         "Score: 1 − ‖predicted − measured‖ / ‖measured‖ over all runs and lines; 1 is perfect.",
     )
@@ -230,17 +231,18 @@ def _score_table(it: Identification, test: Measurement) -> str:
 
 def _convergence(it: Identification) -> str:
     history = it.history
+    steps = max(history.local_curve.size - 1, 0)
     rows = [
         ["start", number(history.start), "best of the first candidates, or the start given"],
         ["swarm", number(history.swarm), f"{history.evaluations} candidates in {history.swarm_curve.size} iterations"],
         ["refinement", number(history.refinement), "eigenvalues replaced by those given"],
-        ["local phase", number(history.local), f"{max(history.local_curve.size - 1, 0)} iterations, exact derivatives"],
+        ["local phase", number(history.local), f"{steps} iteration{'' if steps == 1 else 's'}, exact derivatives"],
     ]
     if np.isfinite(history.refinement_error):
         rows[2][2] += f", within {history.refinement_error:.1e} (relative, ω²)"
     parts = [
         picture(plot.convergence(it), "residual through swarm, refinement and local phase"),
-        table(["after", "relative residual", ""], rows),
+        table(["after", "relative residual", ""], rows, words=True),
     ]
     if history.states:
         parts.append(table(["state of the swarm", "iterations"], history.states))
@@ -255,13 +257,11 @@ def _mac(it: Identification) -> str:
         else "Mode shapes against each other (no reference is known): off-diagonal entries near 1 tell modes that "
         "these sensors cannot tell apart."
     )
-    return paragraph(words, "soft") + picture(plot.mac(it), "modal assurance criterion")
+    return paragraph(words, "soft") + picture(plot.mac(it), "modal assurance criterion", colours=None)
 
 
 def _effective_masses(it: Identification) -> str:
-    words = (
-        "Bars: each mode; lines: their running sum. What is missing to 100 % is base mass and modes not in the model."
-    )
+    words = "Bars: each mode; lines: their running sum. What is missing to 100 % moves with the base."
     return paragraph(words, "soft") + picture(plot.effective_masses(it), "effective masses by mode and base direction")
 
 
@@ -283,8 +283,12 @@ def _matrices(it: Identification) -> str:
     base = "kg, kg m, kg m²" if turns else "kg"
     M, K = structure.mass, structure.stiffness
     parts = [
-        paragraph("Heat maps: each entry over the root of its two diagonal entries.", "soft"),
-        picture(plot.matrices(it), "heat maps of the mass, stiffness and damping matrices"),
+        paragraph(
+            "Heat maps: each entry over the root of its two diagonal entries. Tables: entries below 1e-12 of a "
+            "matrix's largest are round-off, and stand as 0.",
+            "soft",
+        ),
+        picture(plot.matrices(it), "heat maps of the mass, stiffness and damping matrices", colours=None),
         matrix(M[:n, :n], names, names, f"Mass M_SS, kg{scale}"),
         matrix(M[:n, n:], names, axes, f"Coupling mass M_S0, {coupling}{scale}"),
         matrix(M[n:, n:], axes, axes, f"Base mass M_00, {base}{scale}"),
@@ -312,7 +316,7 @@ def _what_ran(it: Identification) -> str:
     counts = [*problem.unknowns, ("together", problem.n_variables)]
     log = f"<h3>Log</h3><pre>{text(chr(10).join(it.history.log))}</pre>" if it.history.log else ""
     return (
-        table(["", ""], facts)
+        table(["", ""], facts, words=True)
         + table(["matrix", "unknowns"], counts, "Unknowns of the search, matrix by matrix.")
         + log
     )

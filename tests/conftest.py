@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import sysid
+from sysid.mass import Layout
 
 
 def _geometry(rng, n, d):
@@ -45,6 +46,70 @@ def _structure(rng, n=4, d=2, *, damping="ratios", ratios=None, **options):
     x = L @ rng.normal(size=(n, n))
     C = x @ x.T * 2 * 0.02 * 2 * np.pi * 20 / n + 1e-4 * K[:n, :n]
     return sysid.Structure(M, K, n_base=d, damping_matrix=(C + C.T) / 2)
+
+
+def _chain(springs, groups, G):
+    """K of springs in series, one chain a direction, over sensors and base."""
+    n = len(springs)
+    T = np.zeros((n, n + G.shape[1]))
+    for i in range(n):
+        below = [j for j in range(i) if groups[j] == groups[i]]
+        T[i, i] = 1.0
+        if below:
+            T[i, below[-1]] = -1.0
+        else:
+            T[i, n:] = -G[i]
+    return T.T @ np.diag(springs) @ T
+
+
+def _case(rng, mass="trace", stiffness="spectral", damping="modal", *, n=4, d=2, force=False, total=True, noise=0.0):
+    """A truth that the named models can hold, its simulated test, and the problem: (truth, problem).
+
+    `mass`: "trace" or "rigid_body" (a full mass and that healing), "lumped", "known"; `stiffness`: "spectral", "chain";
+    `damping`: "modal", "proportional".
+    """
+    groups = np.arange(n) % d
+    along = mass == "lumped" or stiffness == "chain"
+    M, K, G = _blocks(rng, n, d, G=np.eye(d)[groups] if along else None)
+    if mass == "lumped":
+        M = np.diag([*rng.uniform(0.5, 3, n), *np.zeros(d)])
+        L = np.sqrt(M[:n, :n])
+        half = L @ _orthogonal(rng, n)
+        K_SS = (half * (2 * np.pi * np.sort(rng.uniform(4, 60, n))) ** 2) @ half.T
+        K = np.block([[K_SS, -K_SS @ G], [-(K_SS @ G).T, G.T @ K_SS @ G]])
+    if stiffness == "chain":
+        K = _chain(rng.uniform(2e4, 1e5, n), groups, G)
+    K = (K + K.T) / 2
+    omega = 2 * np.pi * sysid.Structure(M, K, np.zeros(n), n_base=d).natural_frequencies
+    ratios = rng.uniform(0.008, 0.03, n)
+    if damping == "proportional":
+        ratios = rng.uniform(0.5, 2) / (2 * omega) + rng.uniform(5e-5, 2e-4) * omega / 2
+    truth = sysid.Structure(M, K, ratios, n_base=d)
+    lines = np.geomspace(0.5 * omega[0], 1.2 * omega[-1], 80) / (2 * np.pi)
+    test = sysid.simulate(truth, lines, force=force, noise=noise, rng=rng)
+
+    if mass == "lumped":
+        model = sysid.LumpedMass([np.diag(M)[:n][groups == i].sum() for i in range(d)] if total else None)
+    elif mass == "known":
+        model = sysid.KnownMass(M)
+    else:
+        layout = Layout(G, np.ones(d, bool))
+        stated = sysid.FullMass(healing=mass).total(layout, M)
+        model = sysid.FullMass(stated if total else None, healing=mass)
+    frequencies = truth.natural_frequencies
+    stiff = {
+        "spectral": sysid.SpectralStiffness(frequencies, max_frequency=1.05 * frequencies[-1]),
+        "chain": sysid.ChainStiffness(5e3, 5e5),
+    }[stiffness]
+    damp = {
+        "modal": sysid.ModalDamping(0.005, 0.05), "proportional": sysid.ProportionalDamping((0.0, 5.0), (0.0, 1e-3))
+    }[damping]  # fmt: skip
+    return truth, sysid.Problem(test, mass=model, stiffness=stiff, damping=damp, reference=truth)
+
+
+@pytest.fixture
+def random_case():
+    return _case
 
 
 @pytest.fixture

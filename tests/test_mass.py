@@ -1,0 +1,424 @@
+"""Mass models: the sampling transform by quadrature, healing to exact totals, block form, round trips, refusals."""
+
+import casadi as ca
+import numpy as np
+import pytest
+import scipy.integrate
+
+from sysid import FullMass, InputError, KnownMass, LumpedMass
+from sysid.mass import (
+    FACTOR_FLOOR,
+    Layout,
+    gather_rows,
+    sampling_exponent,
+    spread_rows,
+)
+
+SEEDS = range(4)
+HEALINGS = ("trace", "rigid_body")
+
+
+def layout_of(G, translational=None):
+    G = np.asarray(G, dtype=float)
+    return Layout(G, np.ones(G.shape[1], bool) if translational is None else np.asarray(translational))
+
+
+def evaluate(model, layout):
+    """A function from the model's unknowns to the full matrix (n + d, n + d) and L."""
+    size = sum(v.size for v in model.variables(layout))
+    y = ca.SX.sym("y", size)
+    f = ca.Function("blocks", [y], list(model.blocks(layout, y)))
+
+    def full(values):
+        L, M_S0, M_00 = (np.asarray(block) for block in f(values))
+        return np.block([[L @ L.T, M_S0], [M_S0.T, M_00]]), L
+
+    return full
+
+
+def box(model, layout):
+    variables = model.variables(layout)
+    return np.concatenate([v.lower for v in variables]), np.concatenate([v.upper for v in variables])
+
+
+def candidates(rng, model, layout, count):
+    """Random candidates as the swarm draws them: uniform in its box, then through the sampling transform."""
+    (variable,) = model.variables(layout)
+    s = ca.SX.sym("s", variable.size)
+    transform = ca.Function("sampling", [s], [variable.sampling(s)])
+    for row in rng.uniform(variable.lower, variable.upper, (count, variable.size)):
+        yield np.asarray(transform(row)).ravel()
+
+
+def rigid_totals(M, G):
+    R = np.vstack([G, np.eye(np.shape(G)[1])])
+    return np.diag(R.T @ M @ R)
+
+
+def turned(n, angle):
+    """Sensor pairs in the plane of two base directions, turned by an angle."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.tile([[c, s], [-s, c]], (n // 2, 1))
+
+
+class TestSampling:
+    @pytest.mark.parametrize("k", range(1, 31))
+    def test_exponent_meets_eq_19_by_quadrature(self, k):
+        alpha = sampling_exponent(k)
+        # y² over [-1, 1], u = 1 - |x|; the power of u is integrable whatever alpha > 0.
+        integral, error = scipy.integrate.quad(lambda u: (1 - u**alpha) ** 2, 0, 1, epsabs=1e-13, epsrel=1e-13)
+        assert error < 1e-9
+        assert 2 * integral == pytest.approx(1 / k, rel=1e-9)
+
+    @pytest.mark.parametrize("c", [0.3, 0.7, 1.0])
+    def test_exponent_for_other_levels(self, c):
+        for k in (1, 4, 9):
+            alpha = sampling_exponent(k, c)
+            integral, _ = scipy.integrate.quad(lambda u, a=alpha: (1 - u**a) ** 2, 0, 1)
+            assert 2 * integral == pytest.approx(c / k, rel=1e-7)
+
+    def test_every_row_has_the_same_expected_squared_norm(self):
+        """E of row k is c / 2 = 1/2 (the diagonal entry has half the range and the same mean square), by Monte Carlo."""
+        rng, count = np.random.default_rng(0), 40000
+        for k in range(1, 13):
+            x = rng.uniform(-1, 1, (count, k))
+            x[:, -1] = np.abs(x[:, -1])
+            squares = np.sum(spread_rows(x, np.full(k, sampling_exponent(k))) ** 2, axis=1)
+            assert np.mean(squares) == pytest.approx(0.5, abs=4.5 * np.std(squares) / np.sqrt(count))
+
+    @pytest.mark.parametrize("k", [1, 2, 3, 7, 20])
+    def test_spread_and_gather_are_inverse_odd_monotone_and_stay_in_the_box(self, k):
+        alpha = np.array(sampling_exponent(k))
+        x = np.linspace(-1, 1, 2001)
+        y = spread_rows(x, alpha)
+        assert (y[0], y[1000], y[-1]) == (-1, 0, 1)
+        assert np.all(np.diff(y) > 0)
+        np.testing.assert_allclose(y, -y[::-1], atol=1e-15)
+        # 1 - |y| = (1 - |x|)^alpha loses digits only through the slope of its inverse.
+        np.testing.assert_allclose(gather_rows(y, alpha), x, atol=1e-12)
+        # The other way round, 1 - |x| = (1 - |y|)^(1 / alpha) is below round-off close to the bounds of long rows.
+        inner = x[np.abs(x) <= 0.9]
+        np.testing.assert_allclose(spread_rows(gather_rows(inner, alpha), alpha), inner, atol=1e-9)
+
+    def test_expression_and_numbers_agree_also_a_round_off_outside(self):
+        x = np.array([-1 - 1e-15, -1, -0.3, 0, 1e-9, 0.999, 1, 1 + 1e-15])
+        alpha = np.array([sampling_exponent(k) for k in range(1, 9)])
+        s = ca.SX.sym("s", 8)
+        out = np.asarray(ca.Function("f", [s], [spread_rows(s, alpha)])(x)).ravel()
+        np.testing.assert_allclose(out, spread_rows(x, alpha), atol=1e-15)
+        assert np.all(np.abs(out) <= 1)
+
+    def test_the_model_samples_row_by_row_and_keeps_the_diagonal_off_zero(self):
+        layout = layout_of(np.zeros((3, 2)) + [1, 0])
+        (variable,) = FullMass(1.0).variables(layout)
+        s = ca.SX.sym("s", variable.size)
+        y = np.asarray(ca.Function("f", [s], [variable.sampling(s)])(variable.lower)).ravel()
+        rows, columns = np.tril_indices(5)
+        assert np.all(y[rows == columns] >= FACTOR_FLOOR)
+        assert np.all(y[rows == columns] < 2 * FACTOR_FLOOR)
+        assert np.all(y[rows != columns] == -1)
+        x = np.random.default_rng(0).uniform(0.1, 0.9, variable.size)
+        y = np.asarray(ca.Function("f", [s], [variable.sampling(s)])(x)).ravel()
+        expected = [1 - (1 - v) ** sampling_exponent(int(row) + 1) for v, row in zip(x, rows, strict=True)]
+        np.testing.assert_allclose(y, expected, rtol=1e-12)
+        np.testing.assert_allclose(variable.unsampling(y), x, rtol=1e-10)
+
+
+class TestFullMass:
+    @pytest.mark.parametrize("healing", HEALINGS)
+    @pytest.mark.parametrize("seed", SEEDS)
+    def test_block_form_is_the_cholesky_factorization_of_the_full_matrix(self, random_geometry, healing, seed):
+        """L_M is (n + d, n + d), S first (eq. 17, 24): its leading block is L and M = L_M L_M'."""
+        rng = np.random.default_rng(seed)
+        layout = layout_of(np.eye(2)[rng.integers(0, 2, 5)])
+        model = FullMass([30.0, 50.0], healing=healing)
+        full = evaluate(model, layout)
+        low, high = box(model, layout)
+        y = rng.uniform(low, high)
+        M, L = full(y)
+        factor = np.linalg.cholesky(M)
+        np.testing.assert_allclose(factor[:5, :5], L, atol=1e-9)
+        # The rows of the unscaled factor, each times its direction's scale.
+        raw = np.zeros((7, 7))
+        raw[np.tril_indices(7)] = y
+        scales = np.linalg.norm(factor, axis=1) / np.linalg.norm(raw, axis=1)
+        np.testing.assert_allclose(factor, scales[:, None] * raw, atol=1e-8)
+        for i in range(2):
+            rows = layout.directions == i
+            np.testing.assert_allclose(scales[rows], scales[rows][0], rtol=1e-7)
+
+    @pytest.mark.parametrize("seed", SEEDS)
+    @pytest.mark.parametrize("d", [1, 2, 3, 6])
+    def test_trace_healing_makes_each_directions_trace_its_total(self, random_geometry, seed, d):
+        rng = np.random.default_rng(seed)
+        layout = layout_of(random_geometry(rng, 6, d), np.arange(d) < 3)
+        totals = rng.uniform(0.5, 200, d)
+        full = evaluate(FullMass(totals), layout)
+        for y in candidates(rng, FullMass(totals), layout, 20):
+            M, _ = full(y)
+            traces = [np.trace(M[np.ix_(layout.directions == i, layout.directions == i)]) for i in range(d)]
+            np.testing.assert_allclose(traces, totals, rtol=1e-12)
+
+    @pytest.mark.parametrize("seed", SEEDS)
+    @pytest.mark.parametrize("d", [1, 2, 3])
+    def test_rigid_body_healing_of_sensors_along_the_base_axes_never_fails(self, seed, d):
+        rng = np.random.default_rng(seed)
+        G = np.eye(d)[rng.integers(0, d, 6)] * rng.choice([-1, 1], (6, 1))
+        layout, totals = layout_of(G), rng.uniform(0.5, 200, d)
+        model = FullMass(totals, healing="rigid_body")
+        full = evaluate(model, layout)
+        for y in candidates(rng, model, layout, 30):
+            np.testing.assert_allclose(rigid_totals(full(y)[0], G), totals, rtol=1e-11)
+
+    @pytest.mark.parametrize("angle", [0.1, 0.3, 0.5, np.pi / 4])
+    @pytest.mark.parametrize("n", [4, 10])
+    def test_coupled_rigid_body_healing_is_exact_or_says_that_it_has_no_answer(self, n, angle, record_property):
+        """Turned sensors: the scales obey d quadratics. Each candidate has the exact totals, or is not a number; and
+        nearly always the latter only where no positive scales exist.
+
+        For d = 2 the two ellipses s'A s = 1 and s'B s = 1 meet in the positive quadrant exactly where s'(A - B)s
+        vanishes along a positive direction.
+        """
+        G, totals = turned(n, angle), np.array([40.0, 60.0])
+        layout, model = layout_of(G), FullMass(totals, healing="rigid_body")
+        full = evaluate(model, layout)
+        rigid = np.vstack([G, np.eye(2)])
+        healed, missed, impossible = 0, 0, 0
+        for y in candidates(np.random.default_rng(n), model, layout, 300):
+            M, _ = full(y)
+            raw = np.zeros((n + 2, n + 2))
+            raw[np.tril_indices(n + 2)] = y
+            forms = []
+            for i in range(2):
+                parts = np.array([rigid[layout.directions == a, i] @ raw[layout.directions == a] for a in range(2)])
+                forms.append(parts @ parts.T / totals[i])
+            D = forms[0] - forms[1]
+            ratio = np.roots([D[1, 1], 2 * D[0, 1], D[0, 0]])
+            exists = np.any((np.abs(ratio.imag) < 1e-12) & (ratio.real > 0))
+            if np.all(np.isfinite(M)):
+                np.testing.assert_allclose(rigid_totals(M, G), totals, rtol=1e-9)
+                assert exists
+                healed += 1
+            else:
+                assert np.all(np.isnan(M[:n, :n]))
+                missed, impossible = missed + bool(exists), impossible + (not exists)
+        record_property("healed, missed, impossible", f"{healed}, {missed}, {impossible}")
+        assert missed <= 0.1 * (healed + missed)
+        assert healed > 100
+
+    @pytest.mark.parametrize("d", [2, 3])
+    @pytest.mark.parametrize("seed", SEEDS)
+    def test_healing_of_sensors_along_random_axes_is_exact_or_not_a_number(self, random_geometry, d, seed):
+        rng = np.random.default_rng(seed)
+        G, totals = random_geometry(rng, 6, d), rng.uniform(20, 80, d)
+        model, layout = FullMass(totals, healing="rigid_body"), layout_of(G)
+        full = evaluate(model, layout)
+        healed = 0
+        for y in candidates(rng, model, layout, 100):
+            M, _ = full(y)
+            if np.all(np.isfinite(M)):
+                np.testing.assert_allclose(rigid_totals(M, G), totals, rtol=1e-9)
+                healed += 1
+            else:
+                assert np.all(np.isnan(M[:6, :6]))
+        assert healed >= 20
+
+    @pytest.mark.parametrize("columns", [(0, 4), (0, 1, 5), range(6)])
+    def test_healing_under_a_base_that_also_rotates_finds_candidates(self, random_blocks, columns):
+        """With totals that a real structure has, a fair share of the random candidates can be healed (and exactly)."""
+        columns = list(columns)
+        d, n, share = len(columns), 6, []
+        for seed in SEEDS:
+            rng = np.random.default_rng(seed)
+            M, _, G = random_blocks(rng, n, 6)
+            keep = [*range(n), *(n + c for c in columns)]
+            G = G[:, columns]
+            totals = rigid_totals(M[np.ix_(keep, keep)], G)
+            layout = layout_of(G, np.array(columns) < 3)
+            model = FullMass(totals, healing="rigid_body")
+            full, healed = evaluate(model, layout), 0
+            for y in candidates(rng, model, layout, 100):
+                candidate, _ = full(y)
+                if np.all(np.isfinite(candidate)):
+                    np.testing.assert_allclose(rigid_totals(candidate, G), totals, rtol=1e-9)
+                    healed += 1
+            share.append(healed / 100)
+            assert candidate.shape == (n + d, n + d)
+        assert min(share) >= 0.02
+
+    @pytest.mark.parametrize("healing", HEALINGS)
+    @pytest.mark.parametrize("where", ["uniform", "lower", "upper", "corner"])
+    def test_positive_definite_everywhere_in_the_box(self, healing, where):
+        rng = np.random.default_rng(0)
+        layout = layout_of(np.eye(2)[[0, 1, 0, 1, 0]])
+        model = FullMass([10.0, 20.0], healing=healing)
+        full, (low, high) = evaluate(model, layout), box(model, layout)
+        for _ in range(20):
+            corner = np.where(rng.random(low.size) < 0.5, low, high)
+            y = {"uniform": rng.uniform(low, high), "lower": low, "upper": high, "corner": corner}[where]
+            M, L = full(y)
+            assert np.all(np.isfinite(M))
+            # L L' for a factor with a positive diagonal is positive definite however small its lowest eigenvalue.
+            assert np.all(np.diag(L) > 0)
+            assert np.linalg.eigvalsh(M)[0] > -1e-12 * np.trace(M)
+
+    @pytest.mark.parametrize("healing", HEALINGS)
+    @pytest.mark.parametrize("seed", SEEDS)
+    @pytest.mark.parametrize("d", [1, 2, 3, 6])
+    @pytest.mark.parametrize("base_mass", [0.0, 1.0])
+    def test_values_are_the_inverse_of_blocks(self, random_blocks, healing, seed, d, base_mass):
+        """Also for coupled geometry, rotations, and where the base adds nothing beyond its least mass."""
+        M, _, G = random_blocks(np.random.default_rng(seed), 5, d, base_mass=base_mass)
+        layout = layout_of(G, np.arange(d) < 3)
+        totals = FullMass(healing=healing).total(layout, M)
+        model = FullMass(totals, healing=healing)
+        y = model.values(layout, M)
+        np.testing.assert_allclose(np.abs(y).max(), 1)
+        again, _ = evaluate(model, layout)(y)
+        np.testing.assert_allclose(again, M, atol=1e-9 * np.abs(M).max())
+
+    def test_values_of_a_massless_base(self, random_blocks):
+        M, _, G = random_blocks(np.random.default_rng(1), 4, 2)
+        M[4:], M[:, 4:] = 0, 0
+        layout = layout_of(G)
+        for healing in HEALINGS:
+            model = FullMass(FullMass(healing=healing).total(layout, M), healing=healing)
+            again, _ = evaluate(model, layout)(model.values(layout, M))
+            np.testing.assert_allclose(again, M, atol=1e-10)
+
+    @pytest.mark.parametrize("seed", SEEDS)
+    def test_what_each_healing_calls_the_total(self, random_blocks, seed):
+        M, _, G = random_blocks(np.random.default_rng(seed), 5, 2)
+        layout = layout_of(G)
+        np.testing.assert_allclose(FullMass(healing="rigid_body").total(layout, M), rigid_totals(M, G), rtol=1e-12)
+        trace = FullMass(healing="trace").total(layout, M)
+        assert trace.sum() == pytest.approx(np.trace(M))
+
+    def test_a_weighed_total_is_an_unknown_around_what_was_weighed(self):
+        layout = Layout(np.eye(2)[[0, 1, 0]], np.ones(2, bool), np.array([40.0, 60.0]))
+        for healing in HEALINGS:
+            total, factor = FullMass(healing=healing).variables(layout)
+            np.testing.assert_array_equal([total.lower, total.upper], [[20, 30], [80, 120]])
+            assert factor.size == 15
+            assert len(FullMass(1.0, healing=healing).variables(layout)) == 1
+            model = FullMass(healing=healing)
+            y = np.concatenate([[33.0, 77.0], np.random.default_rng(0).uniform(0.1, 1, 15)])
+            M, _ = evaluate(model, layout)(y)
+            np.testing.assert_allclose(model.total(layout, M), [33, 77], rtol=1e-12)
+            np.testing.assert_allclose(model.values(layout, M)[:2], [33, 77], rtol=1e-12)
+
+    def test_without_a_total_each_direction_has_one_kilogram(self):
+        layout = layout_of(np.eye(2)[[0, 1, 0]])
+        M, _ = evaluate(FullMass(healing="rigid_body"), layout)(np.random.default_rng(0).uniform(0.1, 1, 15))
+        np.testing.assert_allclose(rigid_totals(M, layout.rigid_body), 1, rtol=1e-12)
+
+
+class TestDirections:
+    def test_the_strongest_translation_the_first_on_a_tie_none_for_a_row_of_zeros(self):
+        h = np.sqrt(0.5)
+        G = [[0.9, 0.1, 5], [-0.2, -0.9, 0], [h, h, 0], [h, -h, 9], [0, 0, 3], [np.cos(np.pi / 4), np.sin(np.pi / 4), 0]]
+        layout = layout_of(G, [True, True, False])
+        np.testing.assert_array_equal(layout.directions, [0, 1, 0, 0, -1, 0, 0, 1, 2])
+
+    @pytest.mark.parametrize("first", [0, 1])
+    def test_a_tie_up_to_round_off_is_a_tie(self, first):
+        G = np.full((1, 2), np.sqrt(0.5))
+        G[0, first] *= 1 + 4e-16
+        assert layout_of(G).directions[0] == 0
+
+    def test_a_rotation_holds_no_sensor(self):
+        np.testing.assert_array_equal(layout_of([[3.0, 0.1]], [False, True]).directions, [1, 0, 1])
+        np.testing.assert_array_equal(layout_of([[3.0], [1.0]], [False]).directions, [-1, -1, 0])
+
+    def test_a_sensor_of_no_direction_keeps_a_positive_definite_mass(self):
+        layout = layout_of([[1, 0], [0, 0], [0, 1]])
+        for healing in HEALINGS:
+            model = FullMass([5.0, 7.0], healing=healing)
+            for y in candidates(np.random.default_rng(0), model, layout, 10):
+                M, _ = evaluate(model, layout)(y)
+                assert np.linalg.eigvalsh(M)[0] > 0
+                np.testing.assert_allclose(model.total(layout, M), [5, 7], rtol=1e-10)
+
+
+class TestTotals:
+    def test_a_scalar_stands_for_every_translation(self):
+        np.testing.assert_array_equal(layout_of(np.zeros((2, 3))).totals(12.0), [12, 12, 12])
+
+    def test_a_scalar_is_refused_where_the_base_rotates(self):
+        with pytest.raises(InputError, match="one number but the base also rotates"):
+            layout_of(np.zeros((2, 2)), [True, False]).totals(12.0)
+
+    @pytest.mark.parametrize("bad", [0, -1.0, np.nan, np.inf, [1.0, 0.0], [1.0, -2.0], [1.0, np.nan]])
+    def test_masses_that_are_none(self, bad):
+        with pytest.raises(InputError, match="positive and finite"):
+            layout_of(np.zeros((2, 2))).totals(bad)
+
+    @pytest.mark.parametrize("bad", [[1.0], [1.0, 2.0, 3.0], [[1.0, 2.0]]])
+    def test_number_of_totals(self, bad):
+        with pytest.raises(InputError, match="total_mass has shape"):
+            layout_of(np.zeros((2, 2))).totals(bad)
+
+    @pytest.mark.parametrize("bad", ["heavy", [1.0, "x"], [[1.0], [1.0, 2.0]]])
+    def test_totals_that_are_no_numbers(self, bad):
+        with pytest.raises(InputError, match="total_mass"):
+            layout_of(np.zeros((2, 2))).totals(bad)
+
+    def test_healing_that_is_unknown(self):
+        with pytest.raises(InputError, match="'magic' is unknown"):
+            FullMass(healing="magic")
+
+
+class TestLumpedMass:
+    @pytest.mark.parametrize("seed", SEEDS)
+    def test_diagonal_without_coupling_with_the_totals_on_the_sensors(self, seed):
+        rng = np.random.default_rng(seed)
+        groups = np.array([0, 1, 0, 1, 1])
+        layout, totals = layout_of(np.eye(2)[groups]), rng.uniform(1, 100, 2)
+        model = LumpedMass(totals)
+        y = rng.uniform(*box(model, layout))
+        M, _ = evaluate(model, layout)(y)
+        assert np.all(M[5:] == 0)
+        np.testing.assert_array_equal(M, np.diag(np.diag(M)))
+        for i in range(2):
+            share = y[groups == i]
+            np.testing.assert_allclose(np.diag(M)[:5][groups == i], totals[i] * share / share.sum(), rtol=1e-12)
+        again, _ = evaluate(model, layout)(model.values(layout, M))
+        np.testing.assert_allclose(again, M, rtol=1e-12)
+
+    def test_weighed_totals_are_unknowns(self):
+        layout = Layout(np.eye(2)[[0, 1, 0]], np.ones(2, bool), np.array([40.0, 60.0]))
+        model = LumpedMass()
+        y = np.array([30.0, 90.0, 0.2, 0.5, 0.6])
+        M, _ = evaluate(model, layout)(y)
+        np.testing.assert_allclose(np.diag(M), [7.5, 90, 22.5, 0, 0], rtol=1e-12)
+        np.testing.assert_allclose(evaluate(model, layout)(model.values(layout, M))[0], M, rtol=1e-12)
+
+    def test_a_sensor_of_no_direction_has_a_positive_mass(self):
+        layout = layout_of([[1, 0], [0, 0], [0, 1]])
+        M, _ = evaluate(LumpedMass([5.0, 7.0]), layout)(np.array([0.5, 0.5, 0.5]))
+        np.testing.assert_allclose(np.diag(M)[[0, 2]], [5, 7], rtol=1e-12)
+        assert M[1, 1] > 0
+
+
+class TestKnownMass:
+    def test_full_or_over_the_sensors(self, random_blocks):
+        M, _, G = random_blocks(np.random.default_rng(0), 4, 2)
+        layout = layout_of(G)
+        assert KnownMass(M).variables(layout) == ()
+        np.testing.assert_allclose(evaluate(KnownMass(M), layout)(np.zeros(0))[0], M, rtol=1e-12, atol=1e-13)
+        small, _ = evaluate(KnownMass(M[:4, :4]), layout)(np.zeros(0))
+        np.testing.assert_allclose(small, np.pad(M[:4, :4], (0, 2)), rtol=1e-12, atol=1e-13)
+
+    def test_refusals(self, random_blocks):
+        M, _, G = random_blocks(np.random.default_rng(0), 4, 2)
+        layout, y = layout_of(G), ca.SX(0, 1)
+        with pytest.raises(InputError, match=r"is \(5, 5\)"):
+            KnownMass(M[:5, :5]).blocks(layout, y)
+        asymmetric, infinite = M.copy(), M.copy()
+        asymmetric[0, 1] += 0.1
+        infinite[0, 0] = np.nan
+        for bad in (asymmetric, infinite):
+            with pytest.raises(InputError, match="finite and symmetric"):
+                KnownMass(bad).blocks(layout, y)
+        with pytest.raises(InputError, match="not positive definite over the sensors"):
+            KnownMass(np.diag([1.0, 1, -1, 1])).blocks(layout, y)

@@ -1,0 +1,246 @@
+"""Pictures: they show the arrays that they say, need no display, and leave nothing open."""
+
+import dataclasses
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import sysid
+from sysid import plot
+
+FREQ = np.linspace(1.0, 40.0, 60)
+
+
+@pytest.fixture
+def truth(random_structure):
+    return random_structure(np.random.default_rng(8), 3, 2, G=np.array([[1.0, 0.0], [0.6, 0.8], [0.0, 1.0]]))
+
+
+@pytest.fixture
+def guess(truth):
+    """The truth with a stiffness 3 % off."""
+    return sysid.Structure(truth.mass, 1.03 * truth.stiffness, truth.damping_ratios, n_base=2)
+
+
+def result(structure, test, *, goal=None, validation=(), **history):
+    """Stand in for what `identify` gives."""
+    problem = sysid.Problem(
+        test,
+        mass=sysid.FullMass(),
+        stiffness=sysid.SpectralStiffness(structure.natural_frequencies),
+        goal=goal,
+        validation=validation,
+    )
+    x = problem.values(structure)
+    return sysid.Identification(
+        structure, problem, x, "swarm", 0, True, "made by hand", sysid.History(**history), False, (), ("all is open",)
+    )
+
+
+@pytest.fixture
+def unit(truth, guess):
+    sensors = [
+        sysid.Sensor("low", (0, 0, 1.0), "x"),
+        sysid.Sensor("$middle_", (0, 0, 2.0), (0.6, 0.8, 0.0)),
+        sysid.Sensor("tip", (0, 0, 3.0), "y"),
+    ]
+    test = sysid.simulate(truth, FREQ, noise=0.01, force=True, rng=3)
+    test = dataclasses.replace(test, sensors=sensors)
+    return result(
+        guess,
+        test,
+        start=0.9,
+        swarm=0.5,
+        refinement=0.4,
+        local=0.01,
+        swarm_curve=[0.9, 0.7, 0.5],
+        local_curve=[0.4, 0.1, 0.02, 0.01],
+    )
+
+
+@pytest.fixture
+def runs(truth, guess):
+    """Two runs in which both base directions move."""
+    random = np.random.default_rng(4)
+    base = random.standard_normal((2, 2, FREQ.size)) + 1j * random.standard_normal((2, 2, FREQ.size))
+    base[1, 0] *= 5
+    response = np.einsum("sdf,rdf->rsf", truth.transmissibility(FREQ), base)
+    force = np.einsum("edf,rdf->ref", truth.base_force(FREQ), base)
+    return result(guess, sysid.Measurement(FREQ, base, response, rigid_body=truth.rigid_body, force=force))
+
+
+def lines(ax):
+    return {line.get_label(): line for line in ax.get_lines()}
+
+
+def kept(line):
+    """Data of a curve without the breaks at its wraps."""
+    return line.get_ydata()[~np.isnan(line.get_ydata())]
+
+
+def test_transmissibility_shows_measured_and_identified_magnitude_and_phase(unit, guess):
+    figure = plot.transmissibility(unit, sensor="tip", run="x")
+    magnitude, phase = figure.axes
+    measured, identified = unit.measurement.response[0, 2], guess.transmissibility(FREQ)[2, 0]
+    np.testing.assert_array_equal(lines(magnitude)["measured"].get_xdata(), FREQ)
+    np.testing.assert_array_equal(lines(magnitude)["measured"].get_ydata(), np.abs(measured))
+    np.testing.assert_allclose(lines(magnitude)["identified"].get_ydata(), np.abs(identified), rtol=1e-9)
+    np.testing.assert_allclose(lines(magnitude)["difference"].get_ydata(), np.abs(identified - measured), rtol=1e-7)
+    np.testing.assert_allclose(kept(lines(phase)["measured"]), np.angle(measured, deg=True))
+    np.testing.assert_allclose(kept(lines(phase)["identified"]), np.angle(identified, deg=True), atol=1e-9)
+    assert magnitude.get_title() == "tip, base x"
+    assert magnitude.get_ylabel() == "transmissibility [–]" and phase.get_ylabel() == "phase [°]"
+    assert phase.get_xlabel() == "frequency [Hz]"
+
+
+def test_runs_that_are_not_unit_runs_are_called_spectra(runs, guess):
+    magnitude, phase = plot.transmissibility(runs, sensor=1, run=1).axes
+    test = runs.measurement
+    identified = np.einsum("df,df->f", guess.transmissibility(FREQ)[1], test.base[1])
+    np.testing.assert_allclose(lines(magnitude)["identified"].get_ydata(), np.abs(identified), rtol=1e-9)
+    np.testing.assert_allclose(
+        kept(lines(phase)["measured"]), np.angle(test.response[1, 1] / test.base[1, 0], deg=True), atol=1e-9
+    )
+    assert magnitude.get_title() == "sensor 2, run 2"
+    assert "spectrum\n[m/s²" in magnitude.get_ylabel() and "transmissibility" not in magnitude.get_ylabel()
+    assert phase.get_ylabel() == "phase to\nbase x [°]"
+
+
+def test_axes_that_are_given_are_drawn_into_and_returned(unit):
+    figure = Figure()
+    above, below = figure.subplots(2, 1)
+    assert plot.transmissibility(unit, above) is above
+    assert lines(above) and not lines(below) and above.get_xlabel() == "frequency [Hz]"
+    pair = figure.subplots(2, 1)
+    assert plot.transmissibility(unit, pair) is pair
+    assert all(lines(ax) for ax in pair)
+    for draw in (plot.convergence, plot.mac, plot.effective_masses):
+        ax = figure.add_subplot()
+        assert draw(unit, ax) is ax
+
+
+def test_the_default_channel_is_the_strongest(unit):
+    energy = np.linalg.norm(unit.measurement.relative, axis=-1)
+    run, sensor = np.unravel_index(np.argmax(energy), energy.shape)
+    title = plot.transmissibility(unit).axes[0].get_title()
+    assert title == f"{unit.measurement.sensor_names[sensor]}, base {'xy'[run]}"
+    chosen = plot.strongest(unit.measurement, 3)
+    assert sorted(s for s, _ in chosen) == [0, 1, 2]
+
+
+def test_base_force_shows_the_apparent_mass(unit, guess):
+    magnitude = plot.base_force(unit, direction="y", run="x").axes[0]
+    np.testing.assert_array_equal(lines(magnitude)["measured"].get_ydata(), np.abs(unit.measurement.force[0, 1]))
+    np.testing.assert_allclose(
+        lines(magnitude)["identified"].get_ydata(), np.abs(guess.base_force(FREQ)[1, 0]), rtol=1e-10
+    )
+    assert magnitude.get_ylabel() == "apparent mass [kg]"
+    assert len(plot.base_forces(unit, 0).axes) == 4
+
+
+def test_moments_have_their_units(random_structure):
+    G = np.array([[1.0, 2.0], [1.0, 4.0], [1.0, 7.0]])
+    truth = random_structure(np.random.default_rng(2), 3, 2, G=G)
+    it = result(truth, sysid.simulate(truth, FREQ, force=True, base_axes=["x", "ry"]))
+    labels = [[plot.base_force(it, direction=i, run=r).axes[0].get_ylabel() for r in ("x", "ry")] for i in ("x", "ry")]
+    assert labels == [["apparent mass [kg]", "apparent mass [kg m]"], ["apparent mass [kg m]", "apparent mass [kg m²]"]]
+    assert plot.base_force(it, direction="ry", run="x").axes[0].get_title() == "moment about y, base x"
+    assert plot.transmissibility(it, run="ry").axes[0].get_ylabel() == "transmissibility [m]"
+
+
+def test_responses_have_a_panel_a_run_however_many(truth, guess):
+    random = np.random.default_rng(1)
+    base = random.standard_normal((5, 2, FREQ.size)) + 0j
+    response = np.einsum("sdf,rdf->rsf", truth.transmissibility(FREQ), base)
+    it = result(guess, sysid.Measurement(FREQ, base, response, rigid_body=truth.rigid_body))
+    figure = plot.responses(it, 0)
+    assert [ax.get_title() for ax in figure.axes if ax.get_title()] == [f"sensor 1, run {r + 1}" for r in range(5)]
+
+
+def test_convergence_joins_both_curves_and_marks_the_refinement(unit):
+    ax = plot.convergence(unit).axes[0]
+    swarm, local, mark = (lines(ax)[name] for name in ("swarm (best so far)", "local phase", "after refinement"))
+    np.testing.assert_array_equal(swarm.get_ydata(), [0.9, 0.7, 0.5])
+    np.testing.assert_array_equal(local.get_xdata(), [2, 3, 4, 5])
+    np.testing.assert_array_equal(local.get_ydata(), [0.4, 0.1, 0.02, 0.01])
+    assert (mark.get_xdata()[0], mark.get_ydata()[0]) == (2, 0.4)
+    assert ax.get_yscale() == "log" and "force" in ax.get_ylabel()
+
+
+def test_convergence_without_a_search_says_so(runs):
+    ax = plot.convergence(runs).axes[0]
+    assert [text.get_text() for text in ax.texts] == ["no search is recorded"]
+
+
+def test_mac_and_matrices_show_the_matrices(unit, guess):
+    figure = plot.mac(unit)
+    np.testing.assert_array_equal(figure.axes[0].images[0].get_array(), unit.mac)
+    assert figure.axes[0].get_title() == "AutoMAC"
+    against = dataclasses.replace(unit, problem=dataclasses.replace(unit.problem, reference=guess))
+    assert plot.mac(against).axes[0].get_title() == "MAC against the reference"
+    shown = [ax.images[0].get_array() for ax in plot.matrices(unit).axes[:3]]
+    for image, matrix in zip(shown, (guess.mass[:3, :3], guess.stiffness[:3, :3], guess.damping), strict=True):
+        np.testing.assert_allclose(np.diag(image), 1)
+        np.testing.assert_allclose(image[0, 1], matrix[0, 1] / np.sqrt(matrix[0, 0] * matrix[1, 1]))
+
+
+def test_effective_masses_are_shares_of_the_rigid_body_mass(unit, guess):
+    ax = plot.effective_masses(unit).axes[0]
+    bars = np.reshape([bar.get_height() for bar in ax.patches], (2, 3))
+    expected = 100 * guess.participation.T**2 / np.diag(guess.rigid_body_mass)[:, None]
+    np.testing.assert_allclose(bars, expected)
+    np.testing.assert_allclose(ax.get_lines()[1].get_ydata(), np.cumsum(expected[1]))
+
+
+def test_mode_shapes_need_positions(unit, runs):
+    figure = plot.mode_shapes(unit, [1, 3])
+    assert [ax.get_title().split(":")[0] for ax in figure.axes] == ["mode 1", "mode 3"]
+    with pytest.raises(sysid.InputError, match="not described"):
+        plot.mode_shapes(runs)
+    with pytest.raises(sysid.InputError, match="modes 1 to 3"):
+        plot.mode_shapes(unit, [0])
+
+
+def test_what_is_not_there_is_refused(unit):
+    with pytest.raises(sysid.InputError, match="sensor 'nose' is unknown"):
+        plot.transmissibility(unit, sensor="nose")
+    with pytest.raises(sysid.InputError, match="run 2 is out of range"):
+        plot.transmissibility(unit, run=2)
+    silent = dataclasses.replace(unit.measurement, force=None, force_std=None)
+    with pytest.raises(sysid.InputError, match="no base force"):
+        plot.base_force(unit, measurement=silent)
+
+
+@pytest.mark.parametrize("freq", [[5.0], [0.0, 5.0, 10.0]])
+def test_every_picture_is_drawn_without_a_warning(unit, runs, truth, freq):
+    exact = result(truth, sysid.simulate(truth, freq), goal=1e-6, swarm_curve=[0.5], swarm=0.5)
+    for it in (unit, runs, exact):
+        for draw in (plot.overview, plot.transmissibility, plot.convergence, plot.mac, plot.effective_masses):
+            assert plot.to_png(draw(it), dpi=40).startswith(b"\x89PNG")
+    assert plot.to_png(plot.mode_shapes(unit), dpi=40, colours=16).startswith(b"\x89PNG")
+
+
+def test_a_response_of_round_off_is_called_that(truth):
+    test = sysid.simulate(truth, FREQ)
+    quiet = test.response.copy()
+    quiet[1, 0] = 1e-17
+    it = result(truth, dataclasses.replace(test, response=quiet))
+    texts = plot.transmissibility(it, sensor=0, run="y").axes[0].texts
+    assert [text.get_text() for text in texts] == ["round-off: no response"]
+
+
+def test_the_overview_is_1200_pixels_wide(unit):
+    png = plot.to_png(plot.overview(unit))
+    assert int.from_bytes(png[16:20], "big") == 1200
+
+
+def test_a_notebook_can_show_a_figure_without_pyplot(unit):
+    assert plot.convergence(unit)._repr_png_().startswith(b"\x89PNG")
+
+
+def test_importing_draws_in_neither_matplotlib_nor_a_display():
+    code = "import sys, sysid.plot, sysid.report; sys.exit('matplotlib' in sys.modules or 'h5py' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,139 @@
+"""Eigenvalue refinement: both ways reach the target; the closed form is the nearest and stays in the box."""
+
+import numpy as np
+import pytest
+
+from sysid import InputError
+from sysid.refinement import by_ipopt, closed_form, replace_spectrum
+
+SIZES = range(3, 13)
+PER_SIZE = 10  # 100 candidates over n = 3 to 12
+
+
+def factor_in_the_box(rng, n, limit):
+    """As the swarm draws it: uniform, with the floor on the diagonal."""
+    L = np.tril(rng.uniform(-limit, limit, (n, n)))
+    np.fill_diagonal(L, rng.uniform(1e-3 * limit, limit, n))
+    return L
+
+
+def candidate(rng, n, case):
+    """A random candidate and targets: all distinct, pairs repeated, or fewer than n."""
+    low = 2 * np.pi * rng.uniform(0.5, 5)
+    targets = np.sort(low * 10 ** rng.uniform(0, 1.3, n))
+    if case == "repeated":
+        for i in range(0, n - 1, 2):
+            targets[i + 1] = targets[i]
+    if case == "triple":
+        targets[:3] = targets[0]
+    limit = targets[-1] * 1.05
+    if case == "fewer":
+        targets = targets[: max(1, n - int(rng.integers(1, 3)))]
+    return factor_in_the_box(rng, n, limit), targets, limit
+
+
+CASES = ("distinct", "repeated", "triple", "fewer")
+
+
+@pytest.mark.parametrize("way", [closed_form, by_ipopt])
+@pytest.mark.parametrize("n", SIZES)
+def test_reaches_the_target_spectrum_from_random_candidates(way, n):
+    """Relative error of each given eigenvalue of L_H L_H' <= 1e-8, by singular values of the factor."""
+    for index in range(PER_SIZE):
+        rng = np.random.default_rng([n, index])
+        L, targets, _ = candidate(rng, n, CASES[index % 4])
+        answer = way(L, targets)
+        own = np.sort(np.linalg.svd(answer.factor, compute_uv=False))
+        error = np.max(np.abs((own[: targets.size] / targets) ** 2 - 1))
+        assert error <= 1e-8, (index, CASES[index % 4], answer.message)
+        assert answer.success
+        assert answer.error == pytest.approx(error, abs=1e-12)
+        assert answer.replaced == tuple(range(targets.size))
+        np.testing.assert_allclose(answer.frequencies, own / (2 * np.pi), rtol=1e-9)
+        np.testing.assert_array_equal(answer.factor, np.tril(answer.factor))
+        assert np.all(np.diag(answer.factor) > 0)
+
+
+@pytest.mark.parametrize("way", [closed_form, by_ipopt])
+@pytest.mark.parametrize("case", ["distinct", "repeated"])
+def test_a_candidate_whose_own_eigenvalues_repeat(random_orthogonal, way, case):
+    """H with a triple eigenvalue: its eigenvectors are not unique, the target is reached all the same."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        q = random_orthogonal(rng, 5)
+        H = (q * np.array([1.0, 4, 4, 4, 9]) * 100) @ q.T
+        _, targets, _ = candidate(rng, 5, case)
+        answer = way(np.linalg.cholesky((H + H.T) / 2), targets)
+        own = np.sort(np.linalg.svd(answer.factor, compute_uv=False))
+        np.testing.assert_allclose(own**2, targets**2, rtol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("case", ["distinct", "repeated", "triple"])
+def test_the_closed_form_is_the_nearest_matrix_of_that_spectrum(random_orthogonal, seed, case):
+    """Hoffman-Wielandt: no matrix with this spectrum is nearer than sqrt(sum (lam_i - t_i)²), both sorted."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(3, 9))
+    L, targets, _ = candidate(rng, n, case)
+    H, answer = L @ L.T, closed_form(L, targets).factor
+    distance = np.linalg.norm(answer @ answer.T - H)
+    bound = np.linalg.norm(np.linalg.eigvalsh(H) - targets**2)
+    assert distance == pytest.approx(bound, rel=1e-9)
+    _, psi = np.linalg.eigh(H)
+    for _ in range(50):
+        angle = rng.choice([1e-3, 1e-1, 10.0])
+        q = psi @ np.linalg.qr(np.eye(n) + angle * rng.normal(size=(n, n)))[0]
+        assert np.linalg.norm((q * targets**2) @ q.T - H) >= distance * (1 - 1e-12)
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("case", CASES)
+def test_the_closed_form_stays_in_the_box(seed, case):
+    """Its rows have norm sqrt(H_ii) <= the highest frequency (eq. 37)."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(3, 10))
+    L, targets, limit = candidate(rng, n, case)
+    answer = closed_form(L, targets)
+    if case == "fewer":
+        limit = max(limit, np.linalg.svd(L, compute_uv=False)[0])  # what is not replaced keeps its size
+    assert np.all(np.abs(answer.factor) <= limit * (1 + 1e-12))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_target_that_is_met_already_changes_nothing(seed):
+    rng = np.random.default_rng(seed)
+    L = factor_in_the_box(rng, 5, 100.0)
+    own = np.sort(np.linalg.svd(L, compute_uv=False))
+    answer = closed_form(L, own).factor
+    np.testing.assert_allclose(answer @ answer.T, L @ L.T, atol=1e-9 * own[-1] ** 2)
+
+
+@pytest.mark.parametrize("way", [closed_form, by_ipopt])
+@pytest.mark.parametrize("seed", range(4))
+def test_with_fewer_targets_the_replaced_are_the_lowest(way, seed):
+    """Also where the candidate's others lie below the targets: they are lifted to the highest of them."""
+    rng = np.random.default_rng(seed)
+    L = factor_in_the_box(rng, 6, 100.0)
+    own = np.sort(np.linalg.svd(L, compute_uv=False))
+    for targets in (own[:3] * 0.9, own[[2, 4, 5]] * 1.01, own[:1] * 3):
+        found = np.sort(np.linalg.svd(way(L, targets).factor, compute_uv=False))
+        np.testing.assert_allclose(found[: targets.size], targets, rtol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_replace_spectrum_leaves_the_others_alone(seed):
+    rng = np.random.default_rng(seed)
+    lam = np.sort(rng.uniform(1, 100, (7, 5)), axis=1)
+    targets = np.array([0.5, 0.9])
+    out = replace_spectrum(lam, targets)
+    np.testing.assert_allclose(out[:, :2], [[0.25, 0.81]] * 7)
+    np.testing.assert_array_equal(out[:, 2:], lam[:, 2:])
+    lifted = replace_spectrum(lam, np.array([3.0, 20.0]))
+    assert np.all(np.diff(lifted, axis=1) >= 0)
+    np.testing.assert_array_equal(lifted[:, 2:], 400.0)
+
+
+@pytest.mark.parametrize("way", [closed_form, by_ipopt])
+def test_more_targets_than_eigenvalues(way):
+    with pytest.raises(InputError, match="4 target frequencies for a model with 3"):
+        way(np.eye(3), np.arange(1.0, 5))

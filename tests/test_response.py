@@ -1,0 +1,140 @@
+"""The residual expression against Structure, and its derivatives against a complex step and differences."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from sysid.response import Target, residual
+
+SEEDS = range(4)
+
+
+def random_target(rng, structure, *, runs=3, force=True, lines=15):
+    """Runs of complex base motion in all directions at once, and records that no structure fits."""
+    n, d = structure.n, structure.n_base
+    normal = lambda *shape: rng.normal(size=shape) + 1j * rng.normal(size=shape)  # noqa: E731
+    freq = np.sort(rng.uniform(2, 70, lines))
+    return Target(
+        freq, normal(runs, d, lines), 3 * normal(runs, n, lines), 50 * normal(runs, d, lines) if force else None
+    )
+
+
+def modal(structure):
+    """Arguments of `residual` for a structure, as one vector, and the way back."""
+    n, d = structure.n, structure.n_base
+    pieces = [
+        structure.mode_shapes, structure.participation, 2 * np.pi * structure.natural_frequencies,
+        structure.damping_ratios, structure.rigid_body_mass,
+    ]  # fmt: skip
+    shapes = [(n, n), (n, d), (n, 1), (n, 1), (d, d)]
+    return np.concatenate([p.ravel(order="F") for p in pieces]), shapes
+
+
+def expression(target, shapes):
+    z = ca.MX.sym("z", sum(a * b for a, b in shapes))
+    ends = np.cumsum([0, *(a * b for a, b in shapes)]).tolist()
+    parts = [ca.reshape(z[a:b], *shape) for a, b, shape in zip(ends[:-1], ends[1:], shapes, strict=True)]
+    return z, residual(target, *parts)
+
+
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("runs", [1, 3])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_residual_is_the_relative_error_of_the_structures_responses(random_structure, seed, runs, force):
+    rng = np.random.default_rng(seed)
+    s = random_structure(rng, n=4, d=int(rng.integers(1, 4)))
+    target = random_target(rng, s, runs=runs, force=force)
+    values, shapes = modal(s)
+    z, miss = expression(target, shapes)
+    out = np.asarray(ca.Function("miss", [z], [miss])(values)).ravel()
+
+    A = s.relative_acceleration(target.freq)
+    error = [np.einsum("sdf,rdf->rsf", A, target.base) - target.relative]
+    error[0] = error[0] / np.linalg.norm(target.relative)
+    if force:
+        F = s.base_force(target.freq)
+        error.append((np.einsum("edf,rdf->ref", F, target.base) - target.force) / np.linalg.norm(target.force))
+    assert out.size == 2 * sum(e.size for e in error)
+    assert np.sum(out**2) == pytest.approx(sum(np.linalg.norm(e) ** 2 for e in error), rel=1e-11)
+    # Entry by entry, real parts then imaginary parts of each record, in any order inside.
+    at = 0
+    for e in error:
+        for part in (e.real, e.imag):
+            piece = out[at : at + e.size]
+            at += e.size
+            np.testing.assert_allclose(np.sort(piece), np.sort(part.ravel()), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_it_vanishes_at_the_truth(random_structure, seed):
+    rng = np.random.default_rng(seed)
+    s = random_structure(rng, n=4, d=2)
+    target = random_target(rng, s)
+    a = np.einsum("sdf,rdf->rsf", s.relative_acceleration(target.freq), target.base)
+    f = np.einsum("edf,rdf->ref", s.base_force(target.freq), target.base)
+    values, shapes = modal(s)
+    z, miss = expression(Target(target.freq, target.base, a, f), shapes)
+    assert np.linalg.norm(np.asarray(ca.Function("miss", [z], [miss])(values))) < 1e-13
+
+
+def numpy_cost(target, shapes):
+    """The same sum of squares in NumPy, real records apart, so that it can be stepped into the complex plane."""
+    ends = np.cumsum([0, *(a * b for a, b in shapes)])
+
+    def cost(z):
+        phi, gamma, omega, zeta, rigid = (
+            z[a:b].reshape(shape, order="F") for a, b, shape in zip(ends[:-1], ends[1:], shapes, strict=True)
+        )
+        w = 2 * np.pi * target.freq
+        size = w**2 / ((omega**2 - w**2) ** 2 + (2 * zeta * omega * w) ** 2)
+        g = size * (omega**2 - w**2), -size * 2 * zeta * omega * w
+        total = 0
+        for run in range(len(target.base)):
+            u = target.base[run].real, target.base[run].imag
+            push = gamma @ u[0], gamma @ u[1]
+            q = g[0] * push[0] - g[1] * push[1], g[0] * push[1] + g[1] * push[0]
+            for k, part in enumerate((np.real, np.imag)):
+                e = (phi @ q[k] - part(target.relative[run])) / np.linalg.norm(target.relative)
+                f = (gamma.T @ q[k] + rigid @ u[k] - part(target.force[run])) / np.linalg.norm(target.force)
+                total = total + np.sum(e**2) + np.sum(f**2)
+        return total
+
+    return cost
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_gradient_is_exact_by_complex_step(random_structure, seed):
+    rng = np.random.default_rng(seed)
+    s = random_structure(rng, n=3, d=2)
+    target = random_target(rng, s)
+    values, shapes = modal(s)
+    z, miss = expression(target, shapes)
+    f = ca.sumsqr(miss)
+    gradient = np.asarray(ca.Function("g", [z], [ca.gradient(f, z)])(values)).ravel()
+    cost, h = numpy_cost(target, shapes), 1e-30
+    expected = [cost(values + 1j * h * row).imag / h for row in np.eye(values.size)]
+    assert float(ca.Function("f", [z], [f])(values)) == pytest.approx(cost(values), rel=1e-12)
+    np.testing.assert_allclose(gradient, expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_hessian_is_the_difference_of_exact_gradients_with_error_of_second_order(random_structure, seed):
+    rng = np.random.default_rng(seed)
+    s = random_structure(rng, n=3, d=2)
+    target = random_target(rng, s)
+    values, shapes = modal(s)
+    z, miss = expression(target, shapes)
+    hessian = np.asarray(ca.Function("H", [z], [ca.hessian(ca.sumsqr(miss), z)[0]])(values))
+    np.testing.assert_allclose(hessian, hessian.T, rtol=1e-12, atol=1e-14 * np.abs(hessian).max())
+    cost, tiny = numpy_cost(target, shapes), 1e-30
+    slope = lambda at, direction: cost(at + 1j * tiny * direction).imag / tiny  # noqa: E731
+    unit = np.maximum(np.abs(values), 0.1)
+    a, b = rng.normal(size=(2, values.size)) * unit
+    exact = a @ hessian @ b
+    errors = [
+        abs((slope(values + h * b, a) - slope(values - h * b, a)) / (2 * h) - exact) for h in (1e-5, 1e-6)
+    ]
+    size = np.abs(a) @ np.abs(hessian) @ np.abs(b)
+    assert errors[1] < 1e-8 * size
+    # A tenth of the step, a hundredth of the error, until round-off.
+    assert errors[1] < max(errors[0] / 30, 1e-10 * size)
