@@ -2,6 +2,7 @@
 
 import casadi as _casadi
 
+from sysid import plot
 from sysid.damping import ModalDamping, ProportionalDamping
 from sysid.errors import InputError, SolverError, SysidError
 from sysid.identification import History, Identification, Recipe
@@ -25,6 +26,6 @@ if hasattr(_casadi.GlobalOptions, "setNumpyMode"):
 __all__ = [
     "ChainStiffness", "FullMass", "History", "Identification", "InputError", "KnownMass", "LumpedMass", "Measurement",
     "ModalDamping", "Problem", "Progress", "ProportionalDamping", "Recipe", "Sensor", "SolverError",
-    "SpectralStiffness", "Structure", "Swarm", "SysidError", "Variable", "identify", "load", "minimize_swarm",
+    "SpectralStiffness", "Structure", "Swarm", "SysidError", "Variable", "identify", "load", "minimize_swarm", "plot",
     "resample", "rigid_body", "simulate",
 ]  # fmt: skip

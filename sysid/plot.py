@@ -34,9 +34,10 @@ COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
 _INK, _FAINT, _GRID = "#3c4450", "#8a94a0", "#e4e8ec"
 _ROUND_OFF = 1e-10  # of the largest channel: below it a response is arithmetic, not motion
 _COLUMNS = 3
-_PANEL_WIDTHS = (6.4, 5.6, 4.0)  # in, of one, two and three columns
+_PANEL_WIDTHS = {2: 5.6, 3: 4.0}  # in, by the number of columns
 _MAX_NUMBERS = 12  # modes up to which a MAC's cells carry their numbers
 _MAX_SHAPES = 6
+_DENSE = 800  # lines beyond which curves are drawn thinner
 
 
 class Channel(NamedTuple):
@@ -98,7 +99,7 @@ def responses(identification: Identification, sensor: int | str, *, measurement:
     """All runs of one sensor side by side; see `transmissibility`."""
     test = identification.measurement if measurement is None else measurement
     s = _sensor_index(test, sensor)
-    return _panels([_response(identification, test, s, r) for r in range(test.n_runs)])
+    return _panels([_response(identification, test, s, r) for r in range(test.n_runs)], alone=10.0)
 
 
 def base_force(
@@ -137,7 +138,7 @@ def base_forces(identification: Identification, run: int | str, *, measurement: 
     """All directions of the base force of one run side by side; see `base_force`."""
     test = _with_force(identification.measurement if measurement is None else measurement)
     r = _run_index(test, run)
-    return _panels([_force(identification, test, i, r) for i in range(test.n_base)])
+    return _panels([_force(identification, test, i, r) for i in range(test.n_base)], alone=10.0)
 
 
 def convergence(identification: Identification, ax: Axes | None = None) -> Any:
@@ -483,13 +484,13 @@ def _place(ax: Axes | Sequence[Axes] | None, channel: Channel) -> Any:
     return ax
 
 
-def _panels(channels: Sequence[Channel]) -> Figure:
-    """Magnitude above phase, a column a channel, at most three columns."""
+def _panels(channels: Sequence[Channel], *, alone: float = 6.4) -> Figure:
+    """Magnitude above phase, a column a channel, at most three columns; `alone` is the width of one, in."""
     from matplotlib.ticker import NullLocator
 
     columns = min(len(channels), _COLUMNS)
     blocks = -(-len(channels) // columns)
-    width, height = _PANEL_WIDTHS[columns - 1] * columns, 3.5 * blocks + 0.25
+    width, height = alone if columns == 1 else _PANEL_WIDTHS[columns] * columns, 3.5 * blocks + 0.25
     figure = _figure(width, height, layout=None)  # as regular as these panels are, and three times as fast
     left = 0.92 if "\n" in channels[0].quantity else 0.72
     grid = figure.add_gridspec(
@@ -519,10 +520,13 @@ def _draw(axes: Any, channel: Channel) -> None:
     """Draw magnitude into the first of `axes` and phase into the second, where there is one."""
     freq, measured, identified = channel.freq, channel.measured, channel.identified
     magnitude = axes[0]
+    # Whole-record spectra have thousands of lines, which at full width would hide each other.
+    thin = {"linewidth": 0.7} if freq.size > _DENSE else {}
+    shown, answered = MEASURED | thin, IDENTIFIED | thin
     size, error = _positive(np.abs(measured)), _positive(np.abs(identified - measured))
     magnitude.plot(freq, error, **RESIDUAL)
-    magnitude.plot(freq, size, **MEASURED)
-    magnitude.plot(freq, _positive(np.abs(identified)), **IDENTIFIED)
+    magnitude.plot(freq, size, **shown)
+    magnitude.plot(freq, _positive(np.abs(identified)), **answered)
     lowest, highest = _span(size, _positive(np.abs(identified)), error)
     if highest > 0:
         magnitude.set_yscale("log")
@@ -540,7 +544,7 @@ def _draw(axes: Any, channel: Channel) -> None:
     if len(axes) > 1:
         magnitude.tick_params(which="both", labelbottom=False)
         phase = axes[1]
-        for record, style in ((measured, MEASURED), (identified, IDENTIFIED)):
+        for record, style in ((measured, shown), (identified, answered)):
             phase.plot(*_wrapped(freq, np.angle(record * np.conj(channel.against), deg=True)), **style)
         phase.set_ylim(-190, 190)
         phase.set_yticks([-180, -90, 0, 90, 180], ["−180", "", "0", "", "180"])

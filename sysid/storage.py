@@ -14,6 +14,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import secrets
 from collections.abc import Iterator, Sequence
@@ -72,8 +73,12 @@ def save(identification: Identification, path: str | Path) -> Path:
         if target.is_file():
             raise InputError(f"{target} is some other file: give a name that ends in .h5, or a folder")
         target = target / FILE_NAME
-    with atomically(target) as temporary, h5py.File(temporary, "w") as file:
+    # Built in memory: on a full disk HDF5 loses the error when it closes, or takes the process down.
+    image = io.BytesIO()
+    with h5py.File(image, "w") as file:
         _write(file, identification)
+    with atomically(target) as temporary:
+        temporary.write_bytes(image.getbuffer())
     return target
 
 

@@ -205,10 +205,11 @@ def test_scores_follow_their_definition(complete, truth, page):
         assert f"{name} {score:.3f}" in text
 
 
-def test_write_gives_a_file_named_or_in_a_folder(plain, tmp_path):
+def test_write_gives_a_file_named_or_in_a_folder(plain, tmp_path, monkeypatch):
+    monkeypatch.setattr(report, "render", lambda it: f"residual {it.residual} – \udcff")
     assert report.write(plain, tmp_path / "new" / "run.1") == tmp_path / "new" / "run.1" / "report.html"
     path = report.write(plain, str(tmp_path / "page.html"))
-    assert path.read_text(encoding="utf-8") == report.render(plain)
+    assert path.read_text(encoding="utf-8") == f"residual {plain.residual} – ?"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["new", "page.html"]
 
 
