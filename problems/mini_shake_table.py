@@ -41,7 +41,9 @@ def problem(*, data=None, rng=0):
         raise sysid.InputError("mini_shake_table needs its records: --data FOLDER, with sine_1p5 and sine_2p0 in it")
     events = [Path(folder) / name for name in ("sine_1p5", "sine_2p0")]
     if not all(path.is_dir() for path in events):
-        raise sysid.InputError(f"{folder} does not hold the folders sine_1p5 and sine_2p0: --data names the one that does")
+        raise sysid.InputError(
+            f"{folder} does not hold the folders sine_1p5 and sine_2p0: --data names the one that does"
+        )
     fitted, unseen = map(event, events)
     return sysid.Problem(
         fitted,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sysid.plot import to_png
+from sysid._canvas import to_png
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

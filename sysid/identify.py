@@ -45,7 +45,9 @@ class Swarm:
     local_phase : bool
         Whether the local phase follows.
     settings : SwarmSettings
-        Constants of the swarm itself.
+        Constants of the swarm itself. The paper leaves b1 and b2 of its eq. 11 to the user; with the
+        usual 0.3 and 0.2 and c1 + c2 up to 4 (``SwarmSettings()``) the swarm of this problem contracts
+        too early. These keep it moving: see the swarm lines of ``benchmarks/lines_2.py`` for both.
     """
 
     max_iterations: int = 150
@@ -55,7 +57,7 @@ class Swarm:
     refine: bool = True
     gradient_every: int = 0
     local_phase: bool = True
-    settings: SwarmSettings | None = None
+    settings: SwarmSettings = SwarmSettings(inertia_b1=0.8, inertia_b2=0.6, acceleration_sum=3.0)
 
 
 @dataclass(frozen=True, eq=False)

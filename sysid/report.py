@@ -9,6 +9,7 @@ import numpy as np
 
 from sysid import plot
 from sysid._html import bullets, matrix, number, page, paragraph, picture, table, text
+from sysid._panels import is_unit, run_names
 from sysid.errors import InputError
 from sysid.identification import Identification
 from sysid.mass import FullMass, LumpedMass
@@ -178,7 +179,7 @@ def _rigid_body_mass(it: Identification) -> str:
 
 
 def _responses(it: Identification, test: Measurement) -> str:
-    if plot.is_unit(test):
+    if is_unit(test):
         words = (
             "Absolute acceleration of each sensor per unit base acceleration (transmissibility), magnitude and phase. "
             "The difference of the two is drawn faint."
@@ -191,7 +192,7 @@ def _responses(it: Identification, test: Measurement) -> str:
     dpi = 130 if test.n_sensors * test.n_runs <= _MANY_PANELS else 92
     parts = [paragraph(words, "soft")]
     for s, name in enumerate(test.sensor_names):
-        alt = f"{name}: measured and identified response, {', '.join(plot.run_names(test))}"
+        alt = f"{name}: measured and identified response, {', '.join(run_names(test))}"
         parts.append(picture(plot.responses(it, s, measurement=test), alt, dpi=dpi))
     return "\n".join(parts)
 
@@ -201,7 +202,7 @@ def _base_force(it: Identification, test: Measurement) -> str:
         return ""
     residual = number(test.force_residual(it.structure))
     parts = [paragraph(f"Force of the base on the structure. Relative residual over all of it: {residual}.", "soft")]
-    for r, name in enumerate(plot.run_names(test)):
+    for r, name in enumerate(run_names(test)):
         alt = f"measured and identified base force, {name}"
         parts.append(picture(plot.base_forces(it, r, measurement=test), alt))
     return "\n".join(parts)

@@ -257,7 +257,8 @@ IN_THE_MODULE = {
     "a negative mass": ("FullMass(3.5", "FullMass(-3.5", "masses must be positive"),
     "a mass that is no number": ("FullMass(3.5", "FullMass(np.nan", "masses must be positive"),
     "w_lim below a given frequency": (
-        f"({FREQUENCIES})", f"({FREQUENCIES}, max_frequency=0.9 * {FREQUENCIES}[-1])",
+        f"({FREQUENCIES})",
+        f"({FREQUENCIES}, max_frequency=0.9 * {FREQUENCIES}[-1])",
         "is below the given natural frequency",
     ),
     "unsorted natural frequencies": (f"({FREQUENCIES})", f"({FREQUENCIES}[::-1])", "ascending"),

@@ -316,7 +316,14 @@ class TestFullMass:
 class TestDirections:
     def test_the_strongest_translation_the_first_on_a_tie_none_for_a_row_of_zeros(self):
         h = np.sqrt(0.5)
-        G = [[0.9, 0.1, 5], [-0.2, -0.9, 0], [h, h, 0], [h, -h, 9], [0, 0, 3], [np.cos(np.pi / 4), np.sin(np.pi / 4), 0]]
+        G = [
+            [0.9, 0.1, 5],
+            [-0.2, -0.9, 0],
+            [h, h, 0],
+            [h, -h, 9],
+            [0, 0, 3],
+            [np.cos(np.pi / 4), np.sin(np.pi / 4), 0],
+        ]
         layout = layout_of(G, [True, True, False])
         np.testing.assert_array_equal(layout.directions, [0, 1, 0, 0, -1, 0, 0, 1, 2])
 

@@ -219,9 +219,7 @@ class TestFromFrf:
     @pytest.mark.parametrize("kind", ["ratios", "matrix"])
     def test_it_holds_what_simulate_holds(self, random_structure, kind):
         s = random_structure(np.random.default_rng(0), n=4, d=3, damping=kind)
-        by_frf = Measurement.from_frf(
-            FREQ, s.transmissibility(FREQ), rigid_body=s.rigid_body, force=s.base_force(FREQ)
-        )
+        by_frf = Measurement.from_frf(FREQ, s.transmissibility(FREQ), rigid_body=s.rigid_body, force=s.base_force(FREQ))
         simulated = simulate(s, FREQ, force=True)
         for name in ("freq", "base", "response", "force", "rigid_body", "relative"):
             np.testing.assert_array_equal(getattr(by_frf, name), getattr(simulated, name))

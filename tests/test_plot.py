@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 import sysid
 from sysid import plot
+from sysid._canvas import to_png
 
 FREQ = np.linspace(1.0, 40.0, 60)
 
@@ -219,8 +220,8 @@ def test_every_picture_is_drawn_without_a_warning(unit, runs, truth, freq):
     exact = result(truth, sysid.simulate(truth, freq), goal=1e-6, swarm_curve=[0.5], swarm=0.5)
     for it in (unit, runs, exact):
         for draw in (plot.overview, plot.transmissibility, plot.convergence, plot.mac, plot.effective_masses):
-            assert plot.to_png(draw(it), dpi=40).startswith(b"\x89PNG")
-    assert plot.to_png(plot.mode_shapes(unit), dpi=40, colours=16).startswith(b"\x89PNG")
+            assert to_png(draw(it), dpi=40).startswith(b"\x89PNG")
+    assert to_png(plot.mode_shapes(unit), dpi=40, colours=16).startswith(b"\x89PNG")
 
 
 def test_a_response_of_round_off_is_called_that(truth):
@@ -233,7 +234,7 @@ def test_a_response_of_round_off_is_called_that(truth):
 
 
 def test_the_overview_is_1200_pixels_wide(unit):
-    png = plot.to_png(plot.overview(unit))
+    png = to_png(plot.overview(unit))
     assert int.from_bytes(png[16:20], "big") == 1200
 
 

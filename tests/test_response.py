@@ -131,9 +131,7 @@ def test_hessian_is_the_difference_of_exact_gradients_with_error_of_second_order
     unit = np.maximum(np.abs(values), 0.1)
     a, b = rng.normal(size=(2, values.size)) * unit
     exact = a @ hessian @ b
-    errors = [
-        abs((slope(values + h * b, a) - slope(values - h * b, a)) / (2 * h) - exact) for h in (1e-5, 1e-6)
-    ]
+    errors = [abs((slope(values + h * b, a) - slope(values - h * b, a)) / (2 * h) - exact) for h in (1e-5, 1e-6)]
     size = np.abs(a) @ np.abs(hessian) @ np.abs(b)
     assert errors[1] < 1e-8 * size
     # A tenth of the step, a hundredth of the error, until round-off.

@@ -1,0 +1,250 @@
+"""The local phase: what it reaches, what it keeps, and what it says."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+
+import sysid
+from sysid import FullMass, SpectralStiffness, local
+from sysid.problem import SwarmCost
+
+MASSES, DAMPINGS = ("trace", "rigid_body", "lumped", "known"), ("modal", "proportional")
+
+
+def random_start(rng, problem):
+    """A random candidate of the swarm with the measured spectrum."""
+    cost = SwarmCost(problem)
+    for row in rng.uniform(problem.lower, problem.upper, (50, problem.n_variables)):
+        if np.isfinite(cost(row[None])[0]):
+            return cost.refined(row)
+    raise AssertionError("no random candidate is a structure")
+
+
+def near(rng, problem, truth, by):
+    """The truth, every unknown off by up to a fraction, with the measured spectrum."""
+    x = problem.values(truth) * rng.uniform(1 - by, 1 + by, problem.n_variables)
+    return SwarmCost(problem).refined(problem.to_sampling(x))
+
+
+def total_error(problem, structure):
+    mass = problem.mass
+    if isinstance(mass, FullMass):
+        got = mass.total(problem.layout, structure.mass)
+    else:
+        got = np.diag(structure.rigid_body_mass)
+    return np.max(np.abs(got / problem.totals - 1))
+
+
+def sound(problem, answer):
+    """Whatever the solver's end: a structure (Structure checks M, K), finite, with the stated totals."""
+    structure = problem.structure(answer.x)
+    n = structure.n
+    assert np.all(np.isfinite(answer.x))
+    assert np.linalg.eigvalsh(structure.mass[:n, :n])[0] > 0
+    assert np.linalg.eigvalsh(structure.stiffness[:n, :n])[0] > 0
+    assert total_error(problem, structure) < 1e-9
+    assert answer.success == any(good in answer.message for good in local.GOOD)
+    return problem.measurement.residual(structure)
+
+
+@pytest.mark.parametrize(("mass", "damping"), list(itertools.product(MASSES, DAMPINGS)))
+def test_from_random_starts_most_searches_end_at_the_truth_of_a_noise_free_test(
+    random_case, mass, damping, record_property
+):
+    """A spectral stiffness, n = 4 to 6. The problem is not convex: some starts end in another minimum."""
+    residuals = []
+    for n, seed in itertools.product((4, 5, 6), range(2)):
+        rng = np.random.default_rng([seed, n])
+        _, problem = random_case(rng, mass, "spectral", damping, n=n)
+        answer = local.solve(problem, random_start(rng, problem), max_iterations=300)
+        residuals.append(sound(problem, answer))
+    record_property("residuals", " ".join(f"{r:.0e}" for r in residuals))
+    assert sum(r < 1e-6 for r in residuals) >= 4
+    assert sum(r < 1e-8 for r in residuals) >= 3
+
+
+@pytest.mark.parametrize(("mass", "damping", "force"), list(itertools.product(MASSES, DAMPINGS, (False, True))))
+def test_from_near_the_truth_every_search_of_a_spectral_stiffness_ends_there(random_case, mass, damping, force):
+    for seed in range(2):
+        rng = np.random.default_rng([seed, 5])
+        truth, problem = random_case(rng, mass, "spectral", damping, n=5, force=force)
+        answer = local.solve(problem, near(rng, problem, truth, 0.05), max_iterations=300)
+        assert sound(problem, answer) < 1e-8
+        if force:
+            assert problem.measurement.force_residual(problem.structure(answer.x)) < 1e-8
+
+
+@pytest.mark.parametrize(("mass", "damping"), list(itertools.product(MASSES, DAMPINGS)))
+def test_from_near_the_truth_every_search_of_a_chain_ends_there(random_case, mass, damping):
+    for seed in range(2):
+        rng = np.random.default_rng([seed, 4])
+        truth, problem = random_case(rng, mass, "chain", damping, n=4)
+        answer = local.solve(problem, near(rng, problem, truth, 0.01), max_iterations=300)
+        assert sound(problem, answer) < 1e-6
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_damping_that_ends_on_a_bound_is_still_a_structure(random_case, seed):
+    """Proportional damping, the truth nearly undamped: alpha ends at 0 and must not come back below it."""
+    rng = np.random.default_rng(seed)
+    truth, problem = random_case(rng, "lumped", "spectral", "proportional", n=4)
+    bare = sysid.Structure(truth.mass, truth.stiffness, np.full(4, 1e-9), n_base=2)
+    test = sysid.simulate(bare, problem.measurement.freq)
+    problem = dataclasses.replace(problem, measurement=test, reference=None)
+    answer = local.solve(problem, near(rng, problem, truth, 0.01), max_iterations=100)
+    assert np.all(problem.structure(answer.x).damping_ratios >= 0)
+    assert np.all(answer.x[problem.parts.damping] >= 0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_determined_problem_gives_the_true_matrices(random_case, seed):
+    rng = np.random.default_rng(seed)
+    for mass, force in (("rigid_body", True), ("lumped", False), ("known", False)):
+        truth, problem = random_case(rng, mass, n=4, force=force)
+        answer = local.solve(problem, near(rng, problem, truth, 0.05))
+        structure = problem.structure(answer.x)
+        for name in ("mass", "stiffness", "damping"):
+            a, b = getattr(structure, name)[:4, :4], getattr(truth, name)[:4, :4]
+            assert np.linalg.norm(a - b) < 1e-6 * np.linalg.norm(b), (mass, name)
+
+
+@pytest.mark.parametrize("healing", ["trace", "rigid_body"])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_stated_total_is_kept_where_the_force_says_otherwise(random_case, healing, seed):
+    rng = np.random.default_rng(seed)
+    truth, problem = random_case(rng, healing, n=4, force=True)
+    stated = problem.totals * [1.05, 0.97]
+    problem = dataclasses.replace(problem, mass=FullMass(stated, healing=healing))
+    answer = local.solve(problem, random_start(rng, problem))
+    structure = problem.structure(answer.x)
+    np.testing.assert_allclose(problem.mass.total(problem.layout, structure.mass), stated, rtol=1e-9)
+    assert problem.measurement.force_residual(structure) > 1e-4  # the two cannot both be right
+    assert truth.n == 4
+
+
+@pytest.mark.parametrize("healing", ["trace", "rigid_body"])
+def test_a_total_that_is_not_stated_is_the_forces(random_case, healing):
+    rng = np.random.default_rng(0)
+    truth, problem = random_case(rng, healing, n=4, force=True, total=False)
+    answer = local.solve(problem, near(rng, problem, truth, 0.05))
+    structure = problem.structure(answer.x)
+    np.testing.assert_allclose(structure.rigid_body_mass, truth.rigid_body_mass, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(("factor", "side"), [(1.2, "lower"), (0.8, "upper")])
+@pytest.mark.parametrize("mass", ["rigid_body", "lumped"])
+def test_a_given_frequency_that_is_20_percent_wrong_is_said(random_case, mass, factor, side):
+    rng = np.random.default_rng(3)
+    truth, problem = random_case(rng, mass, n=4)
+    given = truth.natural_frequencies.copy()
+    given[0] *= factor
+    given = np.sort(given)
+    stiffness = SpectralStiffness(given, max_frequency=1.3 * given[-1])
+    wrong = dataclasses.replace(problem, stiffness=stiffness)
+    answer = local.solve(wrong, near(rng, problem, truth, 0.02))
+    assert "ended on a bound" in answer.message
+    assert f"frequency {1 + list(given).index(truth.natural_frequencies[0] * factor)} ({side})" in answer.message
+    assert problem.measurement.residual(problem.structure(answer.x)) > 1e-3
+
+
+def test_a_damping_ratio_outside_its_bounds_is_said(random_case):
+    rng = np.random.default_rng(0)
+    truth, problem = random_case(rng, "rigid_body", n=4)
+    narrow = dataclasses.replace(problem, damping=sysid.ModalDamping(0.04, 0.05))
+    answer = local.solve(narrow, near(rng, problem, truth, 0.02))
+    assert "damping ratio 1 (lower)" in answer.message
+
+
+def test_a_solution_inside_says_nothing_of_bounds(random_case):
+    rng = np.random.default_rng(0)
+    truth, problem = random_case(rng, "rigid_body", n=4)
+    answer = local.solve(problem, near(rng, problem, truth, 0.05))
+    assert answer.success
+    assert "bound" not in answer.message
+
+
+class TestControl:
+    @pytest.fixture
+    def start(self, random_case):
+        rng = np.random.default_rng(1)
+        _, problem = random_case(rng, "rigid_body", n=4)
+        return problem, random_start(rng, problem)
+
+    def test_the_curve_starts_at_the_start_and_ends_at_the_answer(self, start):
+        problem, x = start
+        answer = local.solve(problem, x)
+        residual = lambda at: problem.measurement.residual(problem.structure(at))  # noqa: E731
+        assert answer.curve.shape == (answer.iterations + 1,)
+        # The start is moved a little off its bounds by the interior point.
+        assert answer.curve[0] == pytest.approx(residual(x), rel=1e-2)
+        assert answer.curve[-1] == pytest.approx(residual(answer.x), rel=1e-3, abs=1e-9)
+        assert answer.curve[-1] < answer.curve[0]
+
+    def test_its_bits_repeat(self, start):
+        problem, x = start
+        first, again = local.solve(problem, x), local.solve(problem, x)
+        np.testing.assert_array_equal(first.x, again.x)
+        np.testing.assert_array_equal(first.curve, again.curve)
+
+    @pytest.mark.parametrize("mass", ["rigid_body", "lumped"])
+    def test_a_spent_budget_is_no_success_and_is_said(self, random_case, mass):
+        rng = np.random.default_rng(1)
+        _, problem = random_case(rng, mass, n=4)
+        answer = local.solve(problem, random_start(rng, problem), max_iterations=3)
+        assert not answer.success
+        assert "Maximum_Iterations_Exceeded" in answer.message
+        assert answer.iterations == 3
+        assert total_error(problem, problem.structure(answer.x)) < 1e-9
+
+    @pytest.mark.parametrize("mass", ["rigid_body", "lumped"])
+    def test_a_monitor_sees_every_iteration_and_can_stop_it(self, random_case, mass):
+        rng = np.random.default_rng(1)
+        _, problem = random_case(rng, mass, n=4)
+        seen = []
+
+        def monitor(iteration, residual):
+            seen.append((iteration, residual))
+            return iteration == 4
+
+        answer = local.solve(problem, random_start(rng, problem), monitor=monitor)
+        assert [iteration for iteration, _ in seen] == [0, 1, 2, 3, 4]
+        np.testing.assert_array_equal([residual for _, residual in seen], answer.curve)
+        assert not answer.success
+        assert "User_Requested_Stop" in answer.message
+        assert not answer.interrupted
+        assert total_error(problem, problem.structure(answer.x)) < 1e-9
+
+    def test_a_keyboard_interrupt_leaves_the_best_so_far(self, start):
+        problem, x = start
+
+        def monitor(iteration, residual):
+            if iteration == 5:
+                raise KeyboardInterrupt
+            return False
+
+        answer = local.solve(problem, x, monitor=monitor)
+        assert answer.interrupted
+        assert not answer.success
+        assert "interrupted" in answer.message
+        assert problem.measurement.residual(problem.structure(answer.x)) == pytest.approx(answer.curve[-1], rel=1e-6)
+
+    def test_a_mistake_in_the_monitor_is_not_swallowed(self, start):
+        problem, x = start
+
+        def monitor(iteration, residual):
+            raise ZeroDivisionError("mine")
+
+        with pytest.raises(ZeroDivisionError, match="mine"):
+            local.solve(problem, x, monitor=monitor)
+
+    def test_time_runs_out(self, start):
+        problem, x = start
+        import time
+
+        begun = time.perf_counter()
+        answer = local.solve(problem, x, max_time=0.1, monitor=lambda *_: time.sleep(0.05))
+        assert not answer.success
+        assert "Maximum_WallTime_Exceeded" in answer.message
+        assert time.perf_counter() - begun < 5
