@@ -23,6 +23,7 @@ from sysid.stiffness import SpectralStiffness
 from sysid.structure import Array, Structure
 from sysid.swarm import SwarmProgress, SwarmSettings, minimize_swarm
 
+_SETTINGS = SwarmSettings(inertia_b1=0.8, inertia_b2=0.6, acceleration_sum=3.0)
 STRATEGIES = ("auto", "swarm", "modal")
 
 
@@ -57,7 +58,7 @@ class Swarm:
     refine: bool = True
     gradient_every: int = 0
     local_phase: bool = True
-    settings: SwarmSettings = SwarmSettings(inertia_b1=0.8, inertia_b2=0.6, acceleration_sum=3.0)
+    settings: SwarmSettings = _SETTINGS
 
 
 @dataclass(frozen=True, eq=False)

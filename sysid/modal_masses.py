@@ -71,7 +71,7 @@ def determination(problem: Problem, structure: Structure) -> Determination:
             f"{missing} of the {n} modal masses are open ({names})" if missing < n else f"all {n} modal masses are open"
         )
         open_.append(f"{what}: other mass and stiffness matrices answer identically")
-        if _unit_missing(problem):
+        if problem.normalised:
             open_.append("no number with a unit of mass is given: masses are normalised to 1 kg in each base direction")
     return Determination(not open_, tuple(closed) if not missing else (), tuple(open_))
 
@@ -122,11 +122,6 @@ def _open_modes(system: Array, n: int) -> list[int]:
     _, s, vt = np.linalg.svd(system)
     null = vt[np.sum(s > _RANK_TOLERANCE) :]
     return [int(k) for k in np.flatnonzero(np.abs(null).max(axis=0) > 1e-6)]
-
-
-def _unit_missing(problem: Problem) -> bool:
-    mass = problem.mass
-    return isinstance(mass, FullMass | LumpedMass) and mass.total_mass is None and problem.measurement.force is None
 
 
 def _mode(structure: Structure, k: int) -> str:

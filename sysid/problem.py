@@ -149,6 +149,12 @@ class Problem:
         return self.layout.totals(self.mass.total_mass)
 
     @property
+    def normalised(self) -> bool:
+        """Whether no number with a unit of mass is given, so that masses are normalised to 1 kg a direction."""
+        unstated = not isinstance(self.mass, KnownMass) and self.mass.total_mass is None
+        return unstated and self.measurement.force is None
+
+    @property
     def target(self) -> Target:
         """The records that the residual compares with."""
         test = self.measurement

@@ -12,7 +12,7 @@ from sysid._html import bullets, matrix, number, page, paragraph, picture, table
 from sysid._panels import is_unit, run_names
 from sysid.errors import InputError
 from sysid.identification import Identification
-from sysid.mass import FullMass, LumpedMass
+from sysid.mass import FullMass
 from sysid.measurement import Measurement
 from sysid.storage import atomically
 from sysid.structure import Array, ComplexArray, Structure
@@ -164,7 +164,7 @@ def _rigid_body_mass(it: Identification) -> str:
     axes, turns = it.measurement.base_axes or (), ~it.measurement.translational
     rigid, reference = it.structure.rigid_body_mass, it.problem.reference
     parts = []
-    if normalised_mass(it):
+    if it.problem.normalised:
         parts.append(
             paragraph(
                 "No mass is stated and no base force was measured: the masses are normalised to 1 kg in each base "
@@ -278,7 +278,7 @@ def _matrices(it: Identification) -> str:
     structure, test = it.structure, it.measurement
     n, axes = structure.n, test.base_axes or ()
     names = test.sensor_names if n == test.n_sensors else tuple(f"{i + 1}" for i in range(n))
-    scale = "; masses normalised to 1 kg" if normalised_mass(it) else ""
+    scale = "; masses normalised to 1 kg" if it.problem.normalised else ""
     turns = not test.translational.all()
     coupling = "kg, kg m in columns of a rotation" if turns else "kg"
     base = "kg, kg m, kg m²" if turns else "kg"
@@ -321,12 +321,6 @@ def _what_ran(it: Identification) -> str:
         + table(["matrix", "unknowns"], counts, "Unknowns of the search, matrix by matrix.")
         + log
     )
-
-
-def normalised_mass(it: Identification) -> bool:
-    """Whether no number with a unit of mass was given, so that masses are normalised to 1 kg."""
-    mass = it.problem.mass
-    return isinstance(mass, FullMass | LumpedMass) and mass.total_mass is None and it.measurement.force is None
 
 
 def _score(predicted: ComplexArray, measured: ComplexArray) -> Array:

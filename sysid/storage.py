@@ -225,7 +225,7 @@ def _read(file: Any) -> Identification:
 
 
 def _write_structure(group: Any, structure: Structure) -> None:
-    modal = structure._modal_damping  # which of the two was given; the other follows from it
+    modal = structure.modal_damping  # which of the two was given; the other follows from it
     damping = {"damping_ratios": structure.damping_ratios} if modal else {"damping_matrix": structure.damping}
     _put(group.attrs, n_base=structure.n_base)
     _put(

@@ -57,6 +57,8 @@ class Structure:
         ``M Phi diag(2 zeta w) Phi' M`` (Cerini et al. 2024, eq. 33).
     damping_ratios : (n,)
         As given, or ``diag(Phi' C Phi) / 2 w``.
+    modal_damping : bool
+        Whether ratios were given, so that responses are modal sums; else they are direct solves.
     natural_frequencies : (n,)
         Hz, ascending, of the structure on a fixed base.
     mode_shapes : (n_sensors, n)
@@ -197,7 +199,7 @@ class Structure:
     def _relative(self, freq: ArrayLike) -> ComplexArray:
         """Relative acceleration of the degrees of freedom, (n, d, n_freq)."""
         omega = 2 * np.pi * check_frequencies(freq, increasing=False)
-        if self._modal_damping:
+        if self.modal_damping:
             lam = self._omega[:, None]
             g = omega**2 / (lam**2 - omega**2 + 2j * self.damping_ratios[:, None] * lam * omega)
             return np.einsum("nk,kd,kf->ndf", self._phi, self.participation, g)
@@ -239,7 +241,7 @@ class Structure:
         n = self.n
         if (ratios is None) == (matrix is None):
             raise InputError("give exactly one of damping_ratios (n,) and damping_matrix (n, n)")
-        self._modal_damping = ratios is not None
+        self.modal_damping = ratios is not None
         if ratios is not None:
             self.damping_ratios: Array = _finite("damping_ratios", ratios)
             if self.damping_ratios.shape != (n,):
