@@ -381,8 +381,9 @@ class _Run:
 
 def _as_unknowns(problem: Problem, start: ArrayLike | Structure) -> Array:
     if isinstance(start, Structure):
-        if start.mass.shape[0] != problem.layout.n + problem.layout.d:
-            raise InputError("start: the structure has other degrees of freedom than the problem")
+        layout = problem.layout
+        if (start.n, start.n_base, start.n_sensors) != (layout.n, layout.d, layout.n):
+            raise InputError("start: the structure has other degrees of freedom or base directions than the problem")
         return problem.values(start)
     x = np.asarray(start, dtype=float)
     if x.shape != (problem.n_variables,) or not np.all(np.isfinite(x)):

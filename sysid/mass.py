@@ -82,7 +82,10 @@ class Layout:
             # Unit mass; a rotation carries it at the radius of gyration of the sensors.
             lever = np.sqrt(np.mean(self.rigid_body**2, axis=0))
             return np.where(self.translational, 1.0, np.where(lever > 0, lever**2, 1.0))
-        given = np.asarray(total_mass, dtype=float)
+        try:
+            given = np.asarray(total_mass, dtype=float)
+        except (TypeError, ValueError):
+            raise InputError(f"total_mass = {total_mass!r} is not a number or an array of numbers (kg)") from None
         if given.ndim == 0:
             if not np.all(self.translational):
                 raise InputError(
@@ -278,6 +281,11 @@ class KnownMass:
             raise InputError(f"the known mass matrix is {matrix.shape}; ({n}, {n}) or ({size}, {size}) is needed")
         if not np.all(np.isfinite(matrix)) or np.abs(matrix - matrix.T).max() > 1e-9 * np.abs(matrix).max():
             raise InputError("the known mass matrix must be finite and symmetric")
+        scale = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
+        if np.any(np.diag(matrix)[:n] <= 0) or np.linalg.eigvalsh(matrix / np.outer(scale, scale))[0] < -1e-8:
+            raise InputError(
+                "the known mass matrix is not positive semidefinite (M_00 >= M_S0' M_SS^-1 M_S0), or a sensor has no mass"
+            )
         return matrix
 
 

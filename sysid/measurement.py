@@ -65,10 +65,11 @@ def rigid_body(
     >>> rigid_body([[0, 0, 2.0]], ["x"], base_axes=["x", "ry"])
     array([[1., 2.]])
     """
-    r = np.atleast_2d(np.asarray(positions, dtype=float)) - np.asarray(origin, dtype=float)
+    points = np.atleast_2d(_checked("positions", positions, float))
     e = np.array([axis_vector(axis) for axis in axes])
-    if r.shape != e.shape:
-        raise InputError(f"positions {r.shape} and axes {e.shape} disagree; both have one row of three a sensor")
+    if points.shape != e.shape:
+        raise InputError(f"positions {points.shape} and axes {e.shape} disagree; both have one row of three a sensor")
+    r = points - np.asarray(origin, dtype=float)
     full = np.hstack([e, np.cross(r, e)])
     return full[:, [_BASE_AXES.index(name) for name in base_axis_names(base_axes)]]
 
@@ -92,7 +93,7 @@ def base_axis_names(base_axes: str | Sequence[str]) -> tuple[str, ...]:
 def axis_vector(axis: str | Sequence[float]) -> Array:
     """Unit vector of "x", "-y", ... or of a direction vector."""
     if isinstance(axis, str):
-        letter = axis.lstrip("+-")
+        letter = axis[1:] if axis[:1] in ("+", "-") else axis
         if letter not in _AXES:
             raise InputError(f"axis {axis!r}: give x, y or z with an optional sign, or a vector")
         vector = np.zeros(3)
@@ -293,19 +294,26 @@ class Measurement:
         H = _records("frf", frf, lines.size)
         d = H.shape[1]
 
-        def by_run(value: ArrayLike | None, like: ComplexArray | None) -> Any:
+        def by_run(name: str, value: ArrayLike | None, like: ComplexArray | None) -> Any:
             """Base direction first: it becomes the run."""
-            if value is None or like is None:
+            if value is None:
                 return None
-            return np.moveaxis(np.broadcast_to(np.asarray(value), like.shape), 1, 0)
+            if like is None:
+                raise InputError(f"{name} is given without its record")
+            try:
+                return np.moveaxis(np.broadcast_to(np.asarray(value), like.shape), 1, 0)
+            except ValueError:
+                raise InputError(
+                    f"{name} {np.shape(value)} does not broadcast to its record {like.shape}"
+                ) from None
 
         F = None if force is None else _records("force", force, lines.size)
         if F is not None and F.shape[:2] != (d, d):
             raise InputError(f"force is {F.shape}; with {d} base directions it is ({d}, {d}, {lines.size})")
         return cls(
-            lines, unit_runs(d, lines.size), by_run(H, H), rigid_body=np.asarray(rigid_body), force=by_run(F, F),
+            lines, unit_runs(d, lines.size), by_run("frf", H, H), rigid_body=np.asarray(rigid_body), force=by_run("force", F, F),
             sensors=None if sensors is None else tuple(sensors),
-            response_std=by_run(response_std, H), force_std=by_run(force_std, F),
+            response_std=by_run("response_std", response_std, H), force_std=by_run("force_std", force_std, F),
             base_axes=None if base_axes is None else base_axis_names(base_axes),
         )  # fmt: skip
 
@@ -423,6 +431,8 @@ def _with_noise(record: ComplexArray, noise: float, random: np.random.Generator)
 
 
 def _checked(name: str, value: ArrayLike, kind: type) -> NDArray[Any]:
+    if kind is float and np.iscomplexobj(value):
+        raise InputError(f"{name} is complex; real numbers are needed")
     try:
         array: NDArray[Any] = np.array(value, dtype=kind)
     except (TypeError, ValueError):

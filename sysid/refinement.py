@@ -6,7 +6,7 @@ the paper's nonlinear programme, through IPOPT with exact derivatives.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import casadi as ca
@@ -14,6 +14,9 @@ import numpy as np
 
 from sysid.errors import InputError
 from sysid.structure import Array
+
+
+_REACHED = 1e-8  # relative error of an eigenvalue up to which it counts as the target
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,13 +90,20 @@ def by_ipopt(factor: Array, targets: Array) -> Refinement:
     scale = unit[-1]
     rows = np.tril_indices(n)
     start = np.concatenate([(factor / scale)[rows], psi.ravel(order="F"), lam / unit**2])
-    lower = np.concatenate([np.where(rows[0] == rows[1], 1e-6, -np.inf), np.full(n * n + n, -np.inf)])
+    lower = np.concatenate(
+        [
+            np.where(rows[0] == rows[1], 1e-6, -np.inf),
+            np.full(n * n + m, -np.inf),
+            (targets[-1] / unit[m:]) ** 2,  # what is not replaced stays above what is
+        ]
+    )
     solver = _programme(n, m)
-    answer = solver(x0=start, lbx=lower, ubx=np.inf, lbg=0, ubg=0, p=np.concatenate([unit / scale, unit]))
+    solution = solver(x0=start, lbx=lower, ubx=np.inf, lbg=0, ubg=0, p=np.concatenate([unit / scale, unit]))
     status = solver.stats()["return_status"]
     refined = np.zeros((n, n))
-    refined[rows] = np.asarray(answer["x"]).ravel()[: rows[0].size] * scale
-    return _finish(refined, targets, status in ("Solve_Succeeded", "Solved_To_Acceptable_Level"), f"IPOPT: {status}")
+    refined[rows] = np.asarray(solution["x"]).ravel()[: rows[0].size] * scale
+    answer = _finish(refined, targets, status in ("Solve_Succeeded", "Solved_To_Acceptable_Level"), f"IPOPT: {status}")
+    return answer if answer.error < _REACHED else replace(answer, success=False)
 
 
 def _check(factor: Array, targets: Array) -> Array:

@@ -231,6 +231,8 @@ def resample(
     out = []
     for t, x, own in zip(clocks, samples, rates, strict=True):
         if own > 1.1 * rate:
+            if t.size < 60:
+                raise InputError(f"record {index}: {t.size} samples are too few to low-pass before resampling")
             x = sosfiltfilt(butter(8, 0.8 * rate / own, output="sos"), x, axis=-1)
         out.append(np.asarray(CubicSpline(t, x, axis=-1)(np.minimum(time, t[-1]))))
     return time, out

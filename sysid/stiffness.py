@@ -108,7 +108,10 @@ class ChainStiffness:
 
     def variables(self, layout: Layout) -> tuple[Variable, ...]:
         """One spring a sensor, N/m."""
-        low, high = (np.broadcast_to(np.asarray(v, dtype=float), (layout.n,)) for v in (self.lower, self.upper))
+        try:
+            low, high = (np.broadcast_to(np.asarray(v, dtype=float), (layout.n,)) for v in (self.lower, self.upper))
+        except (TypeError, ValueError):
+            raise InputError(f"ChainStiffness: bounds are one number, or one a sensor ({layout.n}), in N/m") from None
         if not (np.all(np.isfinite(high)) and np.all(low > 0) and np.all(low < high)):
             raise InputError("ChainStiffness: bounds must be finite with 0 < lower < upper (N/m)")
         span, width = np.log(high / low), high - low

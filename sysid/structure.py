@@ -300,6 +300,8 @@ def check_frequencies(freq: ArrayLike, *, increasing: bool = True) -> Array:
 
 
 def _finite(name: str, value: ArrayLike) -> Array:
+    if np.iscomplexobj(value):
+        raise InputError(f"{name} is complex; real numbers are needed")
     try:
         array = np.array(value, dtype=float)
     except (TypeError, ValueError):
@@ -338,5 +340,5 @@ def _check_positive_definite(name: str, matrix: Array) -> None:
         raise InputError(f"{name} is not positive definite: diagonal entry {at} is {diagonal[at]:.6g}")
     scale = np.sqrt(diagonal)
     lowest = np.linalg.eigvalsh(matrix / np.outer(scale, scale))[0]
-    if lowest <= 0:
+    if lowest <= 10 * len(matrix) * np.finfo(float).eps:  # below that a factorisation finds only round-off
         raise InputError(f"{name} is not positive definite: its lowest eigenvalue is {lowest:.3g} of its diagonal")

@@ -1,4 +1,4 @@
-"""Random structures that the tests share, built from modes and geometry so that their properties are known beforehand."""
+"""Random structures that the tests share, built from modes and geometry: their properties are known beforehand."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def _orthogonal(rng, n):
 
 
 def _blocks(rng, n, d, *, frequencies=None, base_mass=1.0, G=None):
-    """Full M and K, and G: M_SS well conditioned, frequencies as asked, M_00 = its least + base_mass · (a random SPD)."""
+    """Full M, K and G: M_SS well conditioned, frequencies as asked, M_00 its least plus base_mass · (a random SPD)."""
     G = _geometry(rng, n, d) if G is None else G
     if frequencies is None:
         frequencies = np.sort(rng.uniform(4, 60, n))

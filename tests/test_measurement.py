@@ -31,7 +31,7 @@ def records():
 class TestRigidBody:
     @pytest.mark.parametrize("seed", range(5))
     def test_rows_are_the_derivative_of_a_finite_rigid_motion(self, seed):
-        """Displacement along the axis of a body moved by d and turned by theta about the origin, by central differences."""
+        """Displacement along the axis, of a body moved and turned about the origin, by central differences."""
         rng = np.random.default_rng(seed)
         r, e, origin = rng.normal(size=(6, 3)), rng.normal(size=(6, 3)), rng.normal(size=3)
         unit = e / np.linalg.norm(e, axis=1, keepdims=True)

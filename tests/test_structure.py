@@ -1,4 +1,4 @@
-"""Structure against direct solves of the partitioned equations, closed forms, SciPy, and its own construction checks."""
+"""Structure against direct solves of the partitioned equations, closed forms and SciPy; its construction checks."""
 
 import numpy as np
 import pytest

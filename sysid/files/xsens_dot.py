@@ -56,6 +56,8 @@ def read(path: str | Path) -> UnitRecord:
     missing = [name for name in (*_ACCELERATION, *_ROTATION) if name not in columns]
     if missing:
         raise InputError(f"{file} lacks the columns {', '.join(missing)}")
+    if not any(line.strip() for line in lines[header + 1 :]):
+        raise InputError(f"{file} has a header but no rows")
     try:
         table = np.loadtxt(lines[header + 1 :], delimiter=",", ndmin=2)
     except ValueError as error:
