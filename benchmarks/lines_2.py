@@ -18,8 +18,8 @@ from benchmarks.bad_input import CASES, outcome
 from benchmarks.line import Line, above, below
 from benchmarks.modules import ROOT, load_module
 from benchmarks.shake_amplitude import unseen_scores_with_amplitude
-from sysid.problem import SwarmCost
 from sysid.swarm import SwarmSettings
+from sysid.swarm_cost import SwarmCost
 
 SEEDS = range(5)
 

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from sysid.errors import InputError
-from sysid.mass import Layout
+from sysid.layout import Layout
 from sysid.structure import Array
 from sysid.variables import Variable
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -35,14 +35,15 @@ class Recipe:
 class History:
     """What ran, phase by phase; residuals are relative, NaN where a phase did not run.
 
+    Where a base force was measured they count it too: the root of the sum of both squared relative residuals.
+
     Attributes
     ----------
     start, swarm, refinement, local : float
         Residual of the best candidate after each phase: the Latin hypercube (or the start that was
         given), the swarm, the eigenvalue refinement, the local phase.
     swarm_curve, local_curve : ndarray
-        Best residual after each iteration of the swarm, and residual of each local iterate. With a
-        measured force both count it too (root of the sum of both squared relative residuals).
+        Best residual after each iteration of the swarm, and residual of each local iterate.
     refinement_error : float
         Largest relative difference of a refined eigenvalue (w²) from the one that was given.
     states : tuple of (str, int)
@@ -59,18 +60,13 @@ class History:
     swarm: float = np.nan
     refinement: float = np.nan
     local: float = np.nan
-    swarm_curve: Array = None  # type: ignore[assignment]
-    local_curve: Array = None  # type: ignore[assignment]
+    swarm_curve: Array = field(default_factory=lambda: np.zeros(0))
+    local_curve: Array = field(default_factory=lambda: np.zeros(0))
     refinement_error: float = np.nan
     states: tuple[tuple[str, int], ...] = ()
     evaluations: int = 0
     wall_time: float = 0.0
     log: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        for name in ("swarm_curve", "local_curve"):
-            value = getattr(self, name)
-            object.__setattr__(self, name, np.zeros(0) if value is None else np.asarray(value, dtype=float))
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,11 +127,6 @@ class Identification:
     def predict(self, measurement: Measurement) -> ComplexArray:
         """Relative accelerations under another test's base motion, (runs, n_sensors, n_freq)."""
         return measurement.predict(self.structure)
-
-    @property
-    def mac_label(self) -> str:
-        """What `mac` compares with."""
-        return "reference" if self.problem.reference is not None else "itself"
 
     @property
     def mac(self) -> Array:

@@ -16,15 +16,17 @@ from threadpoolctl import threadpool_limits
 from sysid import local
 from sysid.errors import InputError, SolverError
 from sysid.identification import History, Identification
+from sysid.layout import triangle, triangle_entries
 from sysid.modal_masses import determination
-from sysid.problem import Problem, SwarmCost
+from sysid.problem import Problem
 from sysid.refinement import by_ipopt, closed_form
 from sysid.stiffness import SpectralStiffness
 from sysid.structure import Array, Structure
 from sysid.swarm import SwarmProgress, SwarmSettings, minimize_swarm
+from sysid.swarm_cost import SwarmCost
 
-_SETTINGS = SwarmSettings(inertia_b1=0.8, inertia_b2=0.6, acceleration_sum=3.0)
-STRATEGIES = ("auto", "swarm", "modal")
+_SETTINGS = SwarmSettings(inertia_b1=0.8, inertia_b2=0.5, acceleration_sum=3.0)
+STRATEGIES = ("auto", "swarm")
 
 
 @dataclass(frozen=True)
@@ -125,21 +127,19 @@ def identify(
     Identification
         Also where Ctrl-C stopped the search, with `interrupted` set.
     """
-    options, name = _strategy(strategy)
+    options = _options(strategy)
     seed, random = _seed(rng)
     with threadpool_limits(limits=1), _DeferredInterrupt() as interrupt:
         run = _Run(problem, options, callback, progress, max_time, max_evaluations, interrupt)
-        return run.run(name, seed, random, start)
+        return run.run(seed, random, start)
 
 
-def _strategy(strategy: str | Swarm) -> tuple[Swarm, str]:
+def _options(strategy: str | Swarm) -> Swarm:
     if isinstance(strategy, Swarm):
-        return strategy, "swarm"
-    if strategy == "modal":
-        raise InputError("strategy 'modal' is not yet part of sysid; use 'swarm'")
+        return strategy
     if strategy not in STRATEGIES:
         raise InputError(f"strategy {strategy!r} is unknown; give one of {', '.join(map(repr, STRATEGIES))}")
-    return Swarm(), "swarm"
+    return Swarm()
 
 
 def _seed(rng: int | np.random.Generator | None) -> tuple[int, np.random.SeedSequence]:
@@ -239,9 +239,7 @@ class _Run:
             except StopIteration:
                 raise _Stop("the callback stopped the search") from None
 
-    def run(
-        self, name: str, seed: int, random: np.random.SeedSequence, start: ArrayLike | Structure | None
-    ) -> Identification:
+    def run(self, seed: int, random: np.random.SeedSequence, start: ArrayLike | Structure | None) -> Identification:
         success, message, interrupted = False, "", False
         try:
             self.swarm(random, start)
@@ -268,12 +266,14 @@ class _Run:
         self.record(log=tuple(self.log), wall_time=self.seconds)
         known = determination(self.problem, structure)
         return Identification(
-            structure, self.problem, self.x, name, seed, success, message, self.history,
+            structure, self.problem, self.x, "swarm", seed, success, message, self.history,
             known.determined, known.closed_by, known.undetermined, interrupted,
         )  # fmt: skip
 
-    def residual(self, x: Array) -> float:
-        return self.problem.measurement.residual(self.problem.structure(x))
+    def misfit(self, x: Array) -> float:
+        """What all phases minimise: root of the sum of the squared relative residuals of accelerations and force."""
+        structure, test = self.problem.structure(x), self.problem.measurement
+        return float(np.hypot(test.residual(structure), test.force_residual(structure) or 0.0))
 
     def swarm(self, random: np.random.SeedSequence, start: ArrayLike | Structure | None) -> None:
         problem, options = self.problem, self.options
@@ -331,51 +331,42 @@ class _Run:
 
     def refine(self) -> None:
         """Refine the swarm's best from its own L_H through IPOPT, as the paper does, beside the closed form."""
-        stiffness, layout = self.problem.stiffness, self.problem.layout
+        stiffness, n = self.problem.stiffness, self.problem.layout.n
         if not (isinstance(stiffness, SpectralStiffness) and self.options.refine):
             return
         assert self.x is not None
         self.tell("refinement", 0, 1, self.history.swarm)
         part = self.problem.parts.stiffness
-        factor = np.zeros((layout.n, layout.n))
-        factor[np.tril_indices(layout.n)] = self.raw[part]
-        refined = by_ipopt(factor, stiffness.targets)
+        factor = triangle(self.raw[part], n)
+        chosen, solved = closed_form(factor, stiffness.targets), by_ipopt(factor, stiffness.targets)
         x = self.x.copy()
-        x[part] = refined.factor[np.tril_indices(layout.n)]
-        closed, solved = self.residual(self.x), self.residual(x)
+        x[part] = triangle_entries(solved.factor)
+        misfit, other = self.misfit(self.x), self.misfit(x)
         self.note(
-            f"refinement of eigenvalues 1 to {len(refined.replaced)} of {layout.n}: {refined.message}, within "
-            f"{refined.error:.1e} of the given ones, residual {solved:.4e} (closed form {closed:.4e})"
+            f"refinement of eigenvalues 1 to {stiffness.targets.size} of {n}: {solved.message}, within "
+            f"{solved.error:.1e} of the given ones, residual {other:.4e} (closed form {misfit:.4e})"
         )
-        if refined.success and solved < closed:
-            self.x = x
-        else:
-            refined = closed_form(factor, stiffness.targets)
-        self.record(refinement=min(solved, closed) if refined.success else closed, refinement_error=refined.error)
+        if solved.success and other < misfit:
+            self.x, chosen, misfit = x, solved, other
+        self.record(refinement=misfit, refinement_error=chosen.error)
 
     def local(self) -> tuple[bool, str]:
-        """The local phase; its answer is kept where it is better."""
+        """Run the local phase; keep its answer where it is better."""
         assert self.x is not None
         left = None if self.max_time is None else max(self.max_time - self.seconds, 1.0)
-
-        def monitor(iteration: int, residual: float) -> bool:
-            try:
-                self.tell("local phase", iteration, 0, residual)
-            except _Stop:
-                return True
-            return False
-
-        before = self.residual(self.x)
-        answer = local.solve(self.problem, self.x, max_time=left, monitor=monitor)
-        after = self.residual(answer.x)
-        self.note(f"local phase: {answer.message} after {answer.iterations} iterations, residual {after:.4e}")
-        self.record(local=after, local_curve=answer.curve)
-        if after < before or (answer.success and self.problem.measurement.force is not None):
+        before = self.misfit(self.x)
+        answer = local.solve(
+            self.problem, self.x, max_time=left, monitor=lambda i, cost: self.tell("local phase", i, 0, cost)
+        )
+        after = self.misfit(answer.x)
+        self.note(f"local phase: {answer.message}, {answer.curve.size} iterates, residual {after:.4e}")
+        if after < before:
             self.x = answer.x
-        elif answer.success:
+        else:
             self.note(f"the local phase did not improve on {before:.4e}; its start is kept")
-        if answer.interrupted:
-            raise KeyboardInterrupt
+        self.record(local=min(after, before), local_curve=answer.curve)
+        if answer.stopped is not None:
+            raise answer.stopped
         return answer.success, answer.message
 
 

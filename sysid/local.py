@@ -5,30 +5,38 @@ The response is bilinear in mode shapes and participations, so these are the unk
 
 - A full mass with a spectral stiffness is free in them: every regular Phi gives a positive definite
   ``M_SS = (Phi Phi')^-1`` and ``K_SS = M_SS Phi diag(w²) Phi' M_SS``, and participations give the coupling.
+  A local minimum shows: with frequencies and damping as they ended, the best residues are a linear
+  least-squares problem, and where that fits clearly better, the search starts again from there.
 - A structured mass or stiffness keeps its own unknowns. ``Phi = L^-T Psi``, and Psi is held orthogonal
   and, for a structured stiffness, diagonalises H: polynomial equality constraints.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from sysid.damping import ModalDamping
+from sysid.layout import lower_entries, lower_triangle, triangle_entries
 from sysid.mass import FullMass
+from sysid.measurement import Measurement
 from sysid.problem import Problem, assemble
-from sysid.response import residual
+from sysid.refinement import SOLVED
+from sysid.response import columns, residual
 from sysid.stiffness import SpectralStiffness
 from sysid.structure import Array, Structure
+from sysid.variables import split
 
 FREQUENCY_WINDOW = 0.05  # relative; what a frequency read off a peak may be wrong by
 _OPEN_WINDOW = 20.0  # factor either way for a frequency that nobody gave
 _SPARE = 1e-3  # least share of a total mass that is left to the base
 _OBJECTIVE_SCALE = 1e3  # lifts a residual of 1e-8 above IPOPT's tolerance
-GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+_SUSPECT = 1.05  # a residual so many times that of free residues at the same poles is a local minimum
+_EXACT = 1e-8  # a residual that needs no second look
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,23 +51,31 @@ class LocalResult:
         IPOPT's status is Solve_Succeeded or Solved_To_Acceptable_Level.
     message : str
         IPOPT's status and what else the user must know, such as a bound that the solution ends on.
-    iterations : int
-    curve : (iterations + 1,)
-        Relative residual of the fitted records after each iteration (root of the objective).
-    interrupted : bool
-        Ctrl-C stopped IPOPT; `x` is the best iterate until then.
+    curve : (iterations,)
+        Residual of each iterate, over all attempts (root of the sum of the squared relative
+        residuals of accelerations and, where measured, of the force).
+    stopped : BaseException or None
+        What the monitor raised, or Ctrl-C; `x` is then the last iterate.
     """
 
     x: Array
     success: bool
     message: str
-    iterations: int
     curve: Array
-    interrupted: bool = False
+    stopped: BaseException | None = None
+
+
+class Modes(NamedTuple):
+    """A modal model as numbers: shapes (n, m), participations (m, d), rad/s (m,), ratios (m,)."""
+
+    phi: Array
+    gamma: Array
+    omega: Array
+    ratios: Array
 
 
 class _Coordinates:
-    """Unknowns z of the nonlinear programme, collected piece by piece."""
+    """Unknowns z of the nonlinear programme, collected piece by piece, and the equalities that tie them."""
 
     def __init__(self) -> None:
         self.symbols: list[ca.MX] = []
@@ -68,8 +84,6 @@ class _Coordinates:
         self.lower: list[Array] = []
         self.upper: list[Array] = []
         self.ties: list[ca.MX] = []
-        self.tie_lower: list[Array] = []
-        self.tie_upper: list[Array] = []
 
     def add(self, name: str, start: Array, lower: Array | float = -np.inf, upper: Array | float = np.inf) -> ca.MX:
         shape = start.shape if start.ndim == 2 else (start.size, 1)
@@ -81,11 +95,6 @@ class _Coordinates:
         self.upper.append(np.broadcast_to(upper, start.shape).ravel(order="F"))
         return symbol
 
-    def tie(self, expression: ca.MX, lower: float = 0.0, upper: float = 0.0) -> None:
-        self.ties.append(expression)
-        self.tie_lower.append(np.full(expression.numel(), lower))
-        self.tie_upper.append(np.full(expression.numel(), upper))
-
 
 @dataclass(frozen=True, eq=False)
 class _Model:
@@ -96,8 +105,16 @@ class _Model:
     gamma: ca.MX
     omega: ca.MX
     ratios: ca.MX
-    rigid: ca.MX | None
+    rigid: ca.MX
     back: Callable[[Callable[[ca.MX], Array]], Array]
+
+
+class _Attempt(NamedTuple):
+    x: Array
+    modes: Modes
+    residual: float
+    status: str
+    bounds: str
 
 
 def solve(
@@ -106,7 +123,7 @@ def solve(
     *,
     max_iterations: int = 500,
     max_time: float | None = None,
-    monitor: Callable[[int, float], bool] | None = None,
+    monitor: Callable[[int, float], object] | None = None,
 ) -> LocalResult:
     """Minimise the residual from the unknowns `x`.
 
@@ -115,77 +132,156 @@ def solve(
     problem : Problem
     x : ndarray, shape (n_variables,)
     max_iterations : int
+        Of each attempt.
     max_time : float, optional
-        s.
+        s, of each attempt.
     monitor : callable, optional
-        Called with (iteration, relative residual) after each iteration; True stops the solver.
+        Called with (iteration, residual) after each iteration; whatever it raises stops the solver
+        and is handed back in `stopped`.
     """
     start = problem.structure(x)
+    watch = _Watch(monitor)
     free = isinstance(problem.mass, FullMass) and isinstance(problem.stiffness, SpectralStiffness)
-    model = _modal(problem, start) if free else _structured(problem, x, start)
+    if not free:
+        best = _attempt(problem, _structured(problem, x, start), watch, max_iterations, max_time)
+        tried = 1
+    else:
+        first = _modes(start)
+        remainder = start.rigid_body_mass - start.participation.T @ start.participation
+        best = _attempt(problem, _modal(problem, first, remainder), watch, max_iterations, max_time)
+        tried = 1
+        for again in _linear_starts(problem.measurement, best, first):
+            if watch.stopped is not None or best.residual <= _EXACT:
+                break
+            answer = _attempt(problem, _modal(problem, again, remainder), watch, max_iterations, max_time)
+            tried += 1
+            if answer.residual < best.residual:
+                best = answer
+    message = f"IPOPT: {best.status}"
+    if best.bounds:
+        message += f"; ended on a bound: {best.bounds}"
+    if tried > 1:
+        message += f"; best of {tried} starts, as the first ended in a local minimum"
+    return LocalResult(best.x, best.status in SOLVED, message, np.array(watch.curve), watch.stopped)
+
+
+def linear_residues(test: Measurement, omega: Array, ratios: Array) -> tuple[Array, float]:
+    """Residues of given poles by linear least squares, whatever their rank.
+
+    Returns
+    -------
+    residues : (m, n, d)
+    residual : float
+        Relative residual that they leave: no modal model with these poles has a smaller one.
+    """
+    w = 2 * np.pi * test.freq
+    g = w**2 / (omega[:, None] ** 2 - w**2 + 2j * (ratios * omega)[:, None] * w)
+    u = columns(test.base)
+    design = (np.tile(g, test.n_runs)[:, None] * u[None]).reshape(-1, u.shape[1]).T
+    records = columns(test.relative).T
+    stack = lambda block: np.vstack([block.real, block.imag])  # noqa: E731
+    answer = np.linalg.lstsq(stack(design), stack(records), rcond=None)[0]
+    left = np.linalg.norm(stack(design) @ answer - stack(records)) / np.linalg.norm(records)
+    return answer.reshape(omega.size, test.n_base, -1).transpose(0, 2, 1), float(left)
+
+
+def _linear_starts(test: Measurement, ended: _Attempt, first: Modes) -> Iterator[Modes]:
+    """New starts where free residues fit clearly better than what was reached: at its poles, then at the first ones."""
+    _, possible = linear_residues(test, ended.modes.omega, ended.modes.ratios)
+    if ended.residual <= _SUSPECT * possible:
+        return
+    for poles in (ended.modes, first):
+        residues, _ = linear_residues(test, poles.omega, poles.ratios)
+        u, s, vt = np.linalg.svd(residues)
+        # The split of a residue between shape and participation is free: the shapes keep their size.
+        size = np.linalg.norm(poles.phi, axis=0)
+        shapes = u[:, :, 0].T * size
+        yield Modes(shapes, vt[:, 0] * (s[:, 0] / size)[:, None], poles.omega, poles.ratios)
+
+
+def _attempt(problem: Problem, model: _Model, watch: _Watch, max_iterations: int, max_time: float | None) -> _Attempt:
+    """One run of IPOPT."""
     z = model.z
     symbols = ca.vertcat(*z.symbols)
-    miss = residual(problem.target, model.phi, model.gamma, model.omega, model.ratios, model.rigid)
-    nlp = {"x": symbols, "f": _OBJECTIVE_SCALE * ca.sumsqr(miss), "g": ca.vertcat(*z.ties) if z.ties else ca.MX(0, 1)}
-    curve: list[float] = []
-    watch = _Watch(nlp, curve, monitor)
+    miss = residual(problem.measurement, model.phi, model.gamma, model.omega, model.ratios, model.rigid)
+    ties = ca.vertcat(*z.ties) if z.ties else ca.MX(0, 1)
+    nlp = {"x": symbols, "f": _OBJECTIVE_SCALE * ca.sumsqr(miss), "g": ties}
+    lower, upper = np.concatenate(z.lower), np.concatenate(z.upper)
+    start = np.clip(np.concatenate(z.start), lower, upper)
     limits: dict[str, float] = {"max_iter": max_iterations}
     if max_time is not None:
-        limits["max_wall_time"] = max(max_time, 0.1)
+        limits["max_wall_time"] = max_time
     options = {
         "print_time": False,
-        "iteration_callback": watch,
+        "iteration_callback": watch.callback(start, ties.numel()),
         "ipopt": {
-            "print_level": 0, "sb": "yes", "tol": 1e-11, "acceptable_tol": 1e-8, "acceptable_iter": 5,
+            "print_level": 0, "sb": "yes", "tol": 1e-11, "acceptable_tol": 1e-9, "acceptable_iter": 5,
             "constr_viol_tol": 1e-11, "mu_strategy": "adaptive", **limits,
         },
     }  # fmt: skip
     solver = ca.nlpsol("local", "ipopt", nlp, options)
-    join = lambda pieces: np.concatenate(pieces) if pieces else np.zeros(0)  # noqa: E731
-    lower, upper = join(z.lower), join(z.upper)
     try:
-        answer = solver(
-            x0=np.clip(join(z.start), lower, upper), lbx=lower, ubx=upper, lbg=join(z.tie_lower), ubg=join(z.tie_upper)
-        )
-        stats = solver.stats()
-        status, best = stats["return_status"], np.asarray(answer["x"]).ravel()
-    except KeyboardInterrupt:
-        watch.interrupted, status, best = True, "interrupted", watch.z
-    if watch.interrupted:
-        status, best = "interrupted", watch.z
+        answer = solver(x0=start, lbx=lower, ubx=upper, lbg=0, ubg=0)
+        status, best = solver.stats()["return_status"], np.asarray(answer["x"]).ravel()
+    except KeyboardInterrupt as interrupt:
+        watch.stopped = interrupt
+    if watch.stopped is not None:
+        status, best = "stopped", watch.z
     value = lambda expression: np.asarray(ca.Function("value", [symbols], [expression])(best))  # noqa: E731
-    message = f"IPOPT: {status}"
-    ended = _on_bounds(z.names, best, lower, upper)
-    if ended:
-        message += f"; ended on a bound: {ended}"
-    return LocalResult(model.back(value), status in GOOD, message, len(curve) - 1, np.array(curve), watch.interrupted)
+    omega, ratios = value(model.omega).ravel(), value(model.ratios).ravel()
+    modes = Modes(value(model.phi), value(model.gamma), omega, ratios)
+    size = float(np.linalg.norm(value(miss)))
+    return _Attempt(model.back(value), modes, size, status, _on_bounds(z.names, best, lower, upper))
 
 
-class _Watch(ca.Callback):
-    """IPOPT's iteration callback: keeps the curve and lets the caller stop."""
+class _Watch:
+    """What happens between the iterations of all attempts: the curve, the monitor, and its wish to stop."""
 
-    def __init__(self, nlp: dict, curve: list[float], monitor: Callable[[int, float], bool] | None) -> None:
+    def __init__(self, monitor: Callable[[int, float], object] | None) -> None:
+        self.monitor = monitor
+        self.curve: list[float] = []
+        self.stopped: BaseException | None = None
+        self.z: Array = np.zeros(0)
+
+    def callback(self, start: Array, n_ties: int) -> ca.Callback:
+        self.z = start
+        return _IterationCallback(self, start.size, n_ties)
+
+    def take(self, z: Array, objective: float) -> bool:
+        """Take an iterate; whether to stop."""
+        try:
+            self.z = z
+            self.curve.append(float(np.sqrt(max(objective, 0.0) / _OBJECTIVE_SCALE)))
+            if self.monitor is not None:
+                self.monitor(len(self.curve) - 1, self.curve[-1])
+        except BaseException as error:  # must not unwind through IPOPT; the caller raises it again
+            self.stopped = error
+        return self.stopped is not None
+
+
+class _IterationCallback(ca.Callback):
+    """CasADi's shape of an iteration callback."""
+
+    def __init__(self, watch: _Watch, n: int, n_ties: int) -> None:
         ca.Callback.__init__(self)
-        self.sizes = {"x": nlp["x"].numel(), "f": 1, "g": nlp["g"].numel(), "lam_x": nlp["x"].numel()}
-        self.sizes |= {"lam_g": self.sizes["g"], "lam_p": 0}
-        self.curve, self.monitor = curve, monitor
-        self.interrupted, self.z = False, np.zeros(0)
-        self.construct("watch", {})
+        self.watch = watch
+        self.sizes = {"x": n, "f": 1, "g": n_ties, "lam_x": n, "lam_g": n_ties, "lam_p": 0}
+        self.construct("iteration", {})
 
     def get_n_in(self) -> int:
-        """Number of outputs of an nlpsol."""
+        """Count the outputs of an nlpsol."""
         return int(ca.nlpsol_n_out())
 
     def get_n_out(self) -> int:
-        """One flag."""
+        """Give one flag."""
         return 1
 
     def get_name_in(self, i: int) -> str:
-        """Name of an nlpsol output."""
+        """Name an nlpsol output."""
         return str(ca.nlpsol_out(i))
 
     def get_name_out(self, i: int) -> str:
-        """Name of the flag."""
+        """Name the flag."""
         return "stop"
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
@@ -193,66 +289,67 @@ class _Watch(ca.Callback):
         return ca.Sparsity.dense(self.sizes[ca.nlpsol_out(i)], 1)
 
     def eval(self, arg: list) -> list:
-        """Record the iterate and its residual; a nonzero answer stops IPOPT."""
-        try:
-            self.z = np.asarray(arg[0]).ravel()
-            self.curve.append(float(np.sqrt(max(float(arg[1]), 0.0) / _OBJECTIVE_SCALE)))
-            return [int(self.monitor is not None and self.monitor(len(self.curve) - 1, self.curve[-1]))]
-        except KeyboardInterrupt:  # must not unwind through IPOPT
-            self.interrupted = True
-            return [1]
+        """Hand the iterate on; a nonzero answer stops IPOPT."""
+        return [int(self.watch.take(np.asarray(arg[0]).ravel(), float(arg[1])))]
 
 
-def _spectrum(problem: Problem, start: Structure, z: _Coordinates) -> tuple[ca.MX, ca.MX, Array]:
+def _modes(structure: Structure) -> Modes:
+    return Modes(
+        structure.mode_shapes,
+        structure.participation,
+        2 * np.pi * structure.natural_frequencies,
+        structure.damping_ratios,
+    )
+
+
+def _spectrum(problem: Problem, start: Modes, z: _Coordinates) -> tuple[ca.MX, ca.MX, Array]:
     """Frequencies and damping ratios as expressions; circular frequencies that they are relative to."""
-    own = 2 * np.pi * start.natural_frequencies
-    center, window = own.copy(), np.full(own.size, np.log(_OPEN_WINDOW))
+    center, window = start.omega.copy(), np.full(start.omega.size, np.log(_OPEN_WINDOW))
     if isinstance(problem.stiffness, SpectralStiffness):
         targets = problem.stiffness.targets
         center[: targets.size], window[: targets.size] = targets, np.log1p(FREQUENCY_WINDOW)
-    shift = z.add("frequency", np.clip(np.log(own / center), -window, window), -window, window)
+    shift = z.add("frequency", np.clip(np.log(start.omega / center), -window, window), -window, window)
     omega = ca.DM(center) * ca.exp(shift)
     damping = problem.damping
     (variable,) = damping.variables(problem.layout)
     if isinstance(damping, ModalDamping):
-        guess = np.clip(start.damping_ratios, variable.lower, variable.upper)
-        log = z.add(
-            "damping ratio", np.zeros(guess.size), np.log(variable.lower / guess), np.log(variable.upper / guess)
-        )
-        return omega, ca.DM(guess) * ca.exp(log), center
-    guess = np.clip(damping.values(start.damping_ratios, own), variable.lower, variable.upper)
+        guess = np.clip(start.ratios, variable.lower, variable.upper)
+        low, high = np.log(variable.lower / guess), np.log(variable.upper / guess)
+        return omega, ca.DM(guess) * ca.exp(z.add("damping ratio", np.zeros(guess.size), low, high)), center
+    guess = np.clip(damping.values(start.ratios, start.omega), variable.lower, variable.upper)
     y = z.add("Rayleigh factor", guess / variable.upper, variable.lower / variable.upper, 1.0)
     return omega, damping.ratios(y * ca.DM(variable.upper), omega), center
 
 
-def _modal(problem: Problem, start: Structure) -> _Model:
+def _damping_values(problem: Problem, ratios: Array, omega: Array) -> Array:
+    """The damping's unknowns, inside the bounds that IPOPT may leave by its tolerance."""
+    (variable,) = problem.damping.variables(problem.layout)
+    return np.clip(problem.damping.values(ratios, omega), variable.lower, variable.upper)
+
+
+def _modal(problem: Problem, start: Modes, remainder: Array) -> _Model:
     """Full mass, spectral stiffness: mode shapes and participations are free."""
-    z, layout, mass = _Coordinates(), problem.layout, problem.mass
+    z, layout, mass, test = _Coordinates(), problem.layout, problem.mass, problem.measurement
     assert isinstance(mass, FullMass)
-    d, G = layout.d, layout.rigid_body
-    unit = np.sqrt(problem.totals.max())  # kg^½: makes shapes and participations of order one
-    phi = z.add("mode shape", start.mode_shapes * unit) / unit
-    gamma = z.add("participation", start.participation / unit) * unit
+    d, G, totals = layout.d, layout.rigid_body, problem.totals
+    unit = np.sqrt(totals.max())  # kg^½: makes shapes and participations of order one
+    phi = z.add("mode shape", start.phi * unit) / unit
+    gamma = z.add("participation", start.gamma / unit) * unit
     omega, ratios, _ = _spectrum(problem, start, z)
-    remainder = start.rigid_body_mass - start.participation.T @ start.participation
-    rigid, root = None, None
-    if problem.target.force is not None:
-        totals = problem.totals
+    rigid = gamma.T @ gamma
+    if test.force is not None:
         root = np.linalg.cholesky(remainder + 1e-6 * np.diag(totals)) / np.sqrt(totals)[:, None]
-        entries = z.add("base mass", root[np.tril_indices(d)])
-        factor = ca.MX(ca.Sparsity.lower(d))
-        for at, (i, j) in enumerate(zip(*(index.tolist() for index in np.tril_indices(d)), strict=True)):
-            factor[i, j] = entries[at] * np.sqrt(totals[i])
-        rigid = gamma.T @ gamma + factor @ factor.T
+        factor = ca.diag(ca.DM(np.sqrt(totals))) @ lower_triangle(z.add("base mass", triangle_entries(root)), d)
+        rigid = rigid + factor @ factor.T
         if mass.total_mass is not None:
             _tie_totals(z, problem, phi, gamma, rigid)
 
     def back(value: Callable[[ca.MX], Array]) -> Array:
-        shapes, pushes, w = value(phi), value(gamma), value(omega).ravel()
+        w = value(omega).ravel()
         order = np.argsort(w)
-        shapes, pushes, w, zeta = shapes[:, order], pushes[order], w[order], value(ratios).ravel()[order]
-        P = np.linalg.inv(shapes)
-        if rigid is None:
+        pushes, w, zeta = value(gamma)[order], w[order], value(ratios).ravel()[order]
+        P = np.linalg.inv(value(phi)[:, order])
+        if test.force is None:
             t, left = _fit_totals(problem, P, pushes, remainder)
             P, pushes = P * np.sqrt(t), pushes * np.sqrt(t)
         else:
@@ -260,8 +357,11 @@ def _modal(problem: Problem, start: Structure) -> _Model:
         M_SS = P.T @ P
         M_S0 = P.T @ pushes - M_SS @ G
         low = np.linalg.solve(np.linalg.cholesky(M_SS), M_S0)
+        zeta = np.maximum(zeta, 0.0)  # Rayleigh factors may leave their bounds by IPOPT's tolerance
         structure = assemble(M_SS, M_S0, low.T @ low + left, (P.T * w**2) @ P, zeta, G)
-        return problem.values(structure)
+        x = problem.values(structure)
+        x[problem.parts.damping] = _damping_values(problem, zeta, w)
+        return x
 
     return _Model(z, phi, gamma, omega, ratios, rigid, back)
 
@@ -271,7 +371,7 @@ def _tie_totals(z: _Coordinates, problem: Problem, phi: ca.MX, gamma: ca.MX, rig
     layout, mass, totals = problem.layout, problem.mass, problem.totals
     assert isinstance(mass, FullMass)
     if mass.healing == "rigid_body":
-        z.tie(ca.diag(rigid) / totals - 1)
+        z.ties.append(ca.diag(rigid) / totals - 1)
         return
     P = ca.inv(phi)
     G = ca.DM(layout.rigid_body)
@@ -280,7 +380,8 @@ def _tie_totals(z: _Coordinates, problem: Problem, phi: ca.MX, gamma: ca.MX, rig
     base = ca.diag(rigid - gamma.T @ gamma + delta.T @ delta)
     groups = layout.directions[: layout.n]
     for i in range(layout.d):
-        z.tie((ca.sum1(rows[np.flatnonzero(groups == i).tolist()]) + base[i]) / totals[i] - 1)
+        own = ca.sum1(rows[np.flatnonzero(groups == i).tolist()])
+        z.ties.append((own + base[i]) / totals[i] - 1)
 
 
 def _fit_totals(problem: Problem, P: Array, gamma: Array, remainder: Array) -> tuple[float, Array]:
@@ -305,65 +406,54 @@ def _fit_totals(problem: Problem, P: Array, gamma: Array, remainder: Array) -> t
 
 def _structured(problem: Problem, x: Array, start: Structure) -> _Model:
     """Mass or stiffness with unknowns of their own."""
-    z, layout = _Coordinates(), problem.layout
+    z, layout, parts = _Coordinates(), problem.layout, problem.parts
     n, G = layout.n, ca.DM(layout.rigid_body)
     symbols = ca.SX.sym("x", problem.n_variables)
     blocks = problem.matrices(symbols)
     L_inverse = ca.solve(blocks.factor, ca.SX.eye(n))
-    expand = ca.Function("expand", [symbols], [ca.densify(b) for b in (L_inverse, *blocks[:4])])
+    outputs = [ca.densify(b) for b in (L_inverse, blocks.factor, blocks.coupling, blocks.base, blocks.mass_normalised)]
+    expand = ca.Function("expand", [symbols], outputs)
 
-    held = isinstance(problem.stiffness, SpectralStiffness)  # its unknowns are the modes themselves
+    # The modes themselves stand for a spectral stiffness and for the damping.
+    held = isinstance(problem.stiffness, SpectralStiffness)
+    searched = parts.mass.stop if held else parts.stiffness.stop
     pieces: list[ca.MX] = []
     at = 0
-    names = [*(v.name for v in problem.mass.variables(layout)), *(v.name for v in problem.stiffness.variables(layout))]
-    for variable in problem.variables:
-        values = np.clip(x[at : at + variable.size], variable.lower, variable.upper)
-        at += variable.size
-        if variable.name not in names or (held and variable.name == "stiffness_factor"):
+    for variable, given in zip(problem.variables, split(problem.variables, x), strict=True):
+        values = np.clip(given, variable.lower, variable.upper)
+        if at < searched:
+            # Each unknown in units of its start, or of its range where that is smaller.
+            unit = np.maximum(np.abs(values), 0.05 * (variable.upper - variable.lower))
+            pieces.append(
+                z.add(variable.name, values / unit, variable.lower / unit, variable.upper / unit) * ca.DM(unit)
+            )
+        else:
             pieces.append(ca.MX(ca.DM(values)))
-            continue
-        # Each unknown in units of its start, or of its range where that is smaller.
-        unit = np.maximum(np.abs(values), 0.05 * (variable.upper - variable.lower))
-        fixed = np.where(unit > 0, unit, 1.0)
-        pieces.append(
-            z.add(variable.name, values / fixed, variable.lower / fixed, variable.upper / fixed) * ca.DM(fixed)
-        )
+        at += variable.size
     L_inv, L, M_S0, M_00, H = expand(ca.vertcat(*pieces))
 
-    omega, ratios, center = _spectrum(problem, start, z)
+    omega, ratios, center = _spectrum(problem, _modes(start), z)
     psi = z.add("mode shape", np.linalg.cholesky(start.mass[:n, :n]).T @ start.mode_shapes)
-    z.tie(_lower(psi.T @ psi - ca.MX.eye(n)))
+    z.ties.append(lower_entries(psi.T @ psi - ca.MX.eye(n)))
     if not held:
         scaled = psi @ ca.diag(1 / ca.DM(center))
-        z.tie(_lower(scaled.T @ H @ scaled - ca.diag((omega / ca.DM(center)) ** 2)))
+        z.ties.append(lower_entries(scaled.T @ H @ scaled - ca.diag((omega / ca.DM(center)) ** 2)))
     phi = L_inv.T @ psi
     push = L @ (L.T @ G) + M_S0
-    rigid = None
-    if problem.target.force is not None:
-        rigid = G.T @ push + M_S0.T @ G + M_00
+    rigid = G.T @ push + M_S0.T @ G + M_00
 
     def back(value: Callable[[ca.MX], Array]) -> Array:
         unknowns = value(ca.vertcat(*pieces)).ravel()
-        w, zeta = value(omega).ravel(), value(ratios).ravel()
+        w = value(omega).ravel()
         order = np.argsort(w)
-        ends = np.cumsum([v.size for v in problem.variables])
-        damping = problem.damping.values(zeta[order], w[order])
-        unknowns[ends[-1] - damping.size :] = damping
+        unknowns[parts.damping] = _damping_values(problem, value(ratios).ravel()[order], w[order])
         if held:
             u, _, vt = np.linalg.svd(value(psi)[:, order])  # exactly orthogonal
             shapes = u @ vt
-            spectral = problem.stiffness.values(layout, (shapes * w[order] ** 2) @ shapes.T, np.zeros((n, n)))
-            unknowns[ends[-1] - damping.size - spectral.size : ends[-1] - damping.size] = spectral
+            unknowns[parts.stiffness] = triangle_entries(np.linalg.cholesky((shapes * w[order] ** 2) @ shapes.T))
         return unknowns
 
     return _Model(z, phi, phi.T @ push, omega, ratios, rigid, back)
-
-
-def _lower(matrix: ca.MX) -> ca.MX:
-    """Entries of the lower triangle of a symmetric matrix, as a column."""
-    n = matrix.size1()
-    rows, columns = np.tril_indices(n)
-    return ca.vec(matrix)[(columns * n + rows).tolist()]
 
 
 def _on_bounds(names: list[str], z: Array, lower: Array, upper: Array) -> str:

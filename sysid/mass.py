@@ -7,97 +7,15 @@ from typing import Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sysid.errors import InputError
-from sysid.structure import Array
+from sysid.layout import FACTOR_FLOOR, Layout, lower_triangle, triangle_entries
+from sysid.structure import Array, finite_array
 from sysid.variables import Variable
 
-# A Cholesky diagonal of zero makes the mode shapes infinite; one of 1e-3 already spans a
-# condition number of 1e6, more than any test resolves.
-FACTOR_FLOOR = 1e-3
 _ROW_EXPECTATION = 1.0  # the paper's c
 _NEWTON_STEPS = 12  # for the coupled scales of the rigid-body healing; quadratic from a good start
-
-
-@dataclass(frozen=True, eq=False)
-class Layout:
-    """What a mass model must know of a test.
-
-    Parameters
-    ----------
-    rigid_body : ndarray, shape (n, d)
-        G, motion of the sensors for unit base motion.
-    translational : ndarray of bool, shape (d,)
-        Which base directions are translations.
-    weighed : ndarray, shape (d,), optional
-        Rigid-body mass a direction that a measured base force suggests. A total that is not
-        stated is then an unknown, searched around it.
-    """
-
-    rigid_body: Array
-    translational: NDArray[np.bool_]
-    weighed: Array | None = None
-
-    @property
-    def n(self) -> int:
-        """Number of sensors."""
-        return int(self.rigid_body.shape[0])
-
-    @property
-    def d(self) -> int:
-        """Number of base directions."""
-        return int(self.rigid_body.shape[1])
-
-    @property
-    def directions(self) -> Array:
-        """Base direction of each row of the full mass matrix, (n + d,); -1 for none.
-
-        A sensor belongs to the translation that moves it most, the first on a tie; a sensor that
-        no translation moves belongs to none. A base row belongs to its own direction.
-        """
-        strength = np.abs(self.rigid_body) * self.translational
-        # Direction cosines that differ by round-off are a tie.
-        ties = strength >= strength.max(axis=1, keepdims=True) * (1 - 1e-9)
-        groups = np.where(strength.max(axis=1) > 0, np.argmax(ties, axis=1), -1)
-        return np.concatenate([groups, np.arange(self.d)])
-
-    def total_variables(self, total_mass: ArrayLike | None) -> tuple[Variable, ...]:
-        """The totals as unknowns, where they are not stated and the base force tells them."""
-        if total_mass is not None or self.weighed is None:
-            return ()
-        return (Variable("total_mass", self.weighed / 2, self.weighed * 2, unit="kg"),)
-
-    def split_totals(self, total_mass: ArrayLike | None, y: ca.SX) -> tuple[ca.SX | Array, ca.SX]:
-        """Totals, stated or the first of the unknowns `y`, and the unknowns left."""
-        if self.total_variables(total_mass):
-            return y[: self.d], y[self.d :]
-        return self.totals(total_mass), y
-
-    def totals(self, total_mass: ArrayLike | None) -> Array:
-        """Total mass in each base direction, (d,): kg, or kg m² where the direction is a rotation."""
-        if total_mass is None and self.weighed is not None:
-            return self.weighed
-        if total_mass is None:
-            # Unit mass; a rotation carries it at the radius of gyration of the sensors.
-            lever = np.sqrt(np.mean(self.rigid_body**2, axis=0))
-            return np.where(self.translational, 1.0, np.where(lever > 0, lever**2, 1.0))
-        try:
-            given = np.asarray(total_mass, dtype=float)
-        except (TypeError, ValueError):
-            raise InputError(f"total_mass = {total_mass!r} is not a number or an array of numbers (kg)") from None
-        if given.ndim == 0:
-            if not np.all(self.translational):
-                raise InputError(
-                    f"total_mass = {given:g} kg is one number but the base also rotates; "
-                    f"give {self.d} numbers, kg for translations and kg m² for rotations"
-                )
-            given = np.full(self.d, float(given))
-        if given.shape != (self.d,):
-            raise InputError(f"total_mass has shape {given.shape}; one number or ({self.d},) is needed")
-        if not np.all(np.isfinite(given)) or np.any(given <= 0):
-            raise InputError(f"total_mass = {np.array2string(given)}: masses must be positive and finite")
-        return given
 
 
 class MassBlocks(NamedTuple):
@@ -176,6 +94,10 @@ class FullMass:
             ),
         )
 
+    def totals(self, layout: Layout) -> Array:
+        """Total mass in each base direction, (d,)."""
+        return layout.totals(self.total_mass)
+
     def blocks(self, layout: Layout, y: ca.SX) -> MassBlocks:
         """Healed mass blocks of the factor entries `y`; positive definite for every `y` in the box."""
         n = layout.n
@@ -196,8 +118,9 @@ class FullMass:
         base = np.linalg.qr(root)[1].T
         base = base * np.where(np.diag(base) < 0, -1.0, 1.0)
         factor = np.block([[L, np.zeros((n, layout.d))], [low, base]])
-        entries = factor[np.tril_indices(n + layout.d)]
-        entries = entries / np.abs(entries).max()
+        entries = triangle_entries(factor)
+        # Half the box: near its edge the sampling transform loses what it is given to round-off.
+        entries = entries / (2 * np.abs(entries).max())
         if not layout.total_variables(self.total_mass):
             return entries
         return np.concatenate([self.total(layout, mass), entries])
@@ -205,8 +128,7 @@ class FullMass:
     def total(self, layout: Layout, mass: Array) -> Array:
         """What this healing calls the total of `mass`, (d,)."""
         if self.healing == "rigid_body":
-            rigid = np.vstack([layout.rigid_body, np.eye(layout.d)])
-            return np.einsum("ni,nm,mi->i", rigid, mass, rigid)
+            return rigid_body_masses(layout, mass)
         return np.array([mass.diagonal()[layout.directions == i].sum() for i in range(layout.d)])
 
 
@@ -226,6 +148,10 @@ class LumpedMass:
         """Shares of the masses, scaled afterwards to their direction's total."""
         share = Variable("mass_share", np.full(layout.n, FACTOR_FLOOR), np.ones(layout.n))
         return (*layout.total_variables(self.total_mass), share)
+
+    def totals(self, layout: Layout) -> Array:
+        """Total mass in each base direction, (d,)."""
+        return layout.totals(self.total_mass)
 
     def blocks(self, layout: Layout, y: ca.SX) -> MassBlocks:
         """Diagonal blocks; the base rows are zero."""
@@ -257,6 +183,10 @@ class KnownMass:
         """No unknowns."""
         return ()
 
+    def totals(self, layout: Layout) -> Array:
+        """Rigid-body mass in each base direction, (d,)."""
+        return rigid_body_masses(layout, self.full(layout))
+
     def blocks(self, layout: Layout, y: ca.SX) -> MassBlocks:
         """Constant blocks."""
         full = self.full(layout)
@@ -273,18 +203,19 @@ class KnownMass:
 
     def full(self, layout: Layout) -> Array:
         """The matrix over sensors and base, (n + d, n + d)."""
-        matrix = np.asarray(self.matrix, dtype=float)
+        matrix = finite_array("the known mass matrix", self.matrix)
         n, size = layout.n, layout.n + layout.d
         if matrix.shape == (n, n):
             matrix = np.pad(matrix, (0, layout.d))
         if matrix.shape != (size, size):
             raise InputError(f"the known mass matrix is {matrix.shape}; ({n}, {n}) or ({size}, {size}) is needed")
-        if not np.all(np.isfinite(matrix)) or np.abs(matrix - matrix.T).max() > 1e-9 * np.abs(matrix).max():
-            raise InputError("the known mass matrix must be finite and symmetric")
+        if np.abs(matrix - matrix.T).max() > 1e-9 * np.abs(matrix).max():
+            raise InputError("the known mass matrix is not symmetric")
         scale = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
         if np.any(np.diag(matrix)[:n] <= 0) or np.linalg.eigvalsh(matrix / np.outer(scale, scale))[0] < -1e-8:
             raise InputError(
-                "the known mass matrix is not positive semidefinite (M_00 >= M_S0' M_SS^-1 M_S0), or a sensor has no mass"
+                "the known mass matrix is not positive semidefinite (M_00 >= M_S0' M_SS^-1 M_S0), "
+                "or a sensor has no mass"
             )
         return matrix
 
@@ -292,13 +223,10 @@ class KnownMass:
 MassModel = FullMass | LumpedMass | KnownMass
 
 
-def lower_triangle(entries: ca.SX, size: int) -> ca.SX:
-    """Lower-triangular matrix from its entries, row by row."""
-    rows, columns = np.tril_indices(size)
-    matrix = ca.SX(ca.Sparsity.lower(size))
-    for at, (i, j) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True)):
-        matrix[i, j] = entries[at]
-    return matrix
+def rigid_body_masses(layout: Layout, mass: Array) -> Array:
+    """Diagonal of ``[G; I]' M [G; I]``, (d,)."""
+    rigid = np.vstack([layout.rigid_body, np.eye(layout.d)])
+    return np.einsum("ni,nm,mi->i", rigid, mass, rigid)
 
 
 def heal(factor: ca.SX, layout: Layout, totals: ca.SX | Array, kind: str) -> ca.SX:

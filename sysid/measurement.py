@@ -303,15 +303,14 @@ class Measurement:
             try:
                 return np.moveaxis(np.broadcast_to(np.asarray(value), like.shape), 1, 0)
             except ValueError:
-                raise InputError(
-                    f"{name} {np.shape(value)} does not broadcast to its record {like.shape}"
-                ) from None
+                raise InputError(f"{name} {np.shape(value)} does not broadcast to its record {like.shape}") from None
 
         F = None if force is None else _records("force", force, lines.size)
         if F is not None and F.shape[:2] != (d, d):
             raise InputError(f"force is {F.shape}; with {d} base directions it is ({d}, {d}, {lines.size})")
         return cls(
-            lines, unit_runs(d, lines.size), by_run("frf", H, H), rigid_body=np.asarray(rigid_body), force=by_run("force", F, F),
+            lines, unit_runs(d, lines.size), by_run("frf", H, H), rigid_body=np.asarray(rigid_body),
+            force=by_run("force", F, F),
             sensors=None if sensors is None else tuple(sensors),
             response_std=by_run("response_std", response_std, H), force_std=by_run("force_std", force_std, F),
             base_axes=None if base_axes is None else base_axis_names(base_axes),

@@ -13,9 +13,10 @@ import casadi as ca
 import numpy as np
 
 from sysid.errors import InputError
+from sysid.layout import lower_entries, lower_triangle, triangle, triangle_entries
 from sysid.structure import Array
 
-
+SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")  # IPOPT's statuses that count as success
 _REACHED = 1e-8  # relative error of an eigenvalue up to which it counts as the target
 
 
@@ -27,21 +28,15 @@ class Refinement:
     ----------
     factor : (n, n)
         Lower-triangular L_H, rad/s.
-    frequencies : (n,)
-        Its model's natural frequencies, Hz.
     error : float
         Largest relative difference of the replaced eigenvalues from their targets.
-    replaced : tuple of int
-        Which eigenvalues were replaced, counted from the lowest; the others were left as they are.
     success : bool
     message : str
         The solver's status, or how the closed form went.
     """
 
     factor: Array
-    frequencies: Array
     error: float
-    replaced: tuple[int, ...]
     success: bool
     message: str
 
@@ -89,20 +84,19 @@ def by_ipopt(factor: Array, targets: Array) -> Refinement:
     unit = _units(np.sqrt(np.maximum(lam, np.finfo(float).tiny)), targets)
     scale = unit[-1]
     rows = np.tril_indices(n)
-    start = np.concatenate([(factor / scale)[rows], psi.ravel(order="F"), lam / unit**2])
+    start = np.concatenate([triangle_entries(factor) / scale, psi.ravel(order="F"), lam / unit**2])
     lower = np.concatenate(
         [
             np.where(rows[0] == rows[1], 1e-6, -np.inf),
             np.full(n * n + m, -np.inf),
-            (targets[-1] / unit[m:]) ** 2,  # what is not replaced stays above what is
+            (1 + 1e-6) * (targets[-1] / unit[m:]) ** 2,  # what is not replaced stays above what is
         ]
     )
     solver = _programme(n, m)
     solution = solver(x0=start, lbx=lower, ubx=np.inf, lbg=0, ubg=0, p=np.concatenate([unit / scale, unit]))
     status = solver.stats()["return_status"]
-    refined = np.zeros((n, n))
-    refined[rows] = np.asarray(solution["x"]).ravel()[: rows[0].size] * scale
-    answer = _finish(refined, targets, status in ("Solve_Succeeded", "Solved_To_Acceptable_Level"), f"IPOPT: {status}")
+    refined = triangle(np.asarray(solution["x"]).ravel()[: rows[0].size], n) * scale
+    answer = _finish(refined, targets, status in SOLVED, f"IPOPT: {status}")
     return answer if answer.error < _REACHED else replace(answer, success=False)
 
 
@@ -124,12 +118,8 @@ def _programme(n: int, m: int) -> ca.Function:
     x = ca.SX.sym("x", n * (n + 1) // 2)
     psi, lam = ca.SX.sym("psi", n, n), ca.SX.sym("lam", n)
     relative, unit = ca.SX.sym("relative", n), ca.SX.sym("unit", n)
-    L = ca.SX(ca.Sparsity.lower(n))
-    for at, (i, j) in enumerate(zip(*(index.tolist() for index in np.tril_indices(n)), strict=True)):
-        L[i, j] = x[at]
-    half = L.T @ psi @ ca.diag(1 / relative)
-    lower = lambda matrix: ca.vertcat(*(matrix[i, j] for i in range(n) for j in range(i + 1)))  # noqa: E731
-    ties = ca.vertcat(lower(psi.T @ psi - ca.SX.eye(n)), lower(half.T @ half - ca.diag(lam)))
+    half = lower_triangle(x, n).T @ psi @ ca.diag(1 / relative)
+    ties = ca.vertcat(lower_entries(psi.T @ psi - ca.SX.eye(n)), lower_entries(half.T @ half - ca.diag(lam)))
     nlp = {
         "x": ca.vertcat(x, ca.vec(psi), lam),
         "p": ca.vertcat(relative, unit),
@@ -148,4 +138,4 @@ def _finish(factor: Array, targets: Array, success: bool, message: str) -> Refin
     # Singular values, not eigenvalues of L L': full relative accuracy needs no squares.
     own = np.sort(np.linalg.svd(factor, compute_uv=False))
     error = float(np.max(np.abs((own[: targets.size] / targets) ** 2 - 1)))
-    return Refinement(factor, own / (2 * np.pi), error, tuple(range(targets.size)), success, message)
+    return Refinement(factor, error, success, message)

@@ -164,7 +164,7 @@ def _rigid_body_mass(it: Identification) -> str:
     axes, turns = it.measurement.base_axes or (), ~it.measurement.translational
     rigid, reference = it.structure.rigid_body_mass, it.problem.reference
     parts = []
-    if it.problem.normalised:
+    if it.problem.unit_mass:
         parts.append(
             paragraph(
                 "No mass is stated and no base force was measured: the masses are normalised to 1 kg in each base "
@@ -278,7 +278,7 @@ def _matrices(it: Identification) -> str:
     structure, test = it.structure, it.measurement
     n, axes = structure.n, test.base_axes or ()
     names = test.sensor_names if n == test.n_sensors else tuple(f"{i + 1}" for i in range(n))
-    scale = "; masses normalised to 1 kg" if it.problem.normalised else ""
+    scale = "; masses normalised to 1 kg" if it.problem.unit_mass else ""
     turns = not test.translational.all()
     coupling = "kg, kg m in columns of a rotation" if turns else "kg"
     base = "kg, kg m, kg m²" if turns else "kg"

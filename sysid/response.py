@@ -2,41 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import casadi as ca
 import numpy as np
 
+from sysid.measurement import Measurement
 from sysid.structure import Array, ComplexArray
 
 
-@dataclass(frozen=True, eq=False)
-class Target:
-    """What a model must reproduce: relative accelerations, and the base force where it was measured.
-
-    Attributes
-    ----------
-    freq : (n_freq,) Hz
-    base : complex (runs, d, n_freq)
-    relative : complex (runs, n, n_freq)
-    force : complex (runs, d, n_freq) or None
-    """
-
-    freq: Array
-    base: ComplexArray
-    relative: ComplexArray
-    force: ComplexArray | None = None
-
-
-def _columns(record: ComplexArray) -> ComplexArray:
-    """(runs, channels, n_freq) → (channels, runs * n_freq)."""
+def columns(record: ComplexArray) -> ComplexArray:
+    """All runs side by side: (runs, channels, n_freq) → (channels, runs * n_freq)."""
     return np.moveaxis(record, 0, 1).reshape(record.shape[1], -1)
 
 
 def _parts(record: ComplexArray) -> tuple[ca.DM, ca.DM]:
     """Real and imaginary part; zeros are structural, so that real unit runs cost no imaginary arithmetic."""
-    columns = _columns(record)
-    return ca.sparsify(ca.DM(columns.real)), ca.sparsify(ca.DM(columns.imag))
+    flat = columns(record)
+    return ca.sparsify(ca.DM(flat.real)), ca.sparsify(ca.DM(flat.imag))
 
 
 def modal_gains(omega: ca.MX, ratios: ca.MX, freq: Array) -> tuple[ca.MX, ca.MX]:
@@ -49,14 +30,12 @@ def modal_gains(omega: ca.MX, ratios: ca.MX, freq: Array) -> tuple[ca.MX, ca.MX]
     return size * detuning, -size * loss
 
 
-def residual(
-    target: Target, phi: ca.MX, gamma: ca.MX, omega: ca.MX, ratios: ca.MX, rigid_body_mass: ca.MX | None = None
-) -> ca.MX:
+def residual(test: Measurement, phi: ca.MX, gamma: ca.MX, omega: ca.MX, ratios: ca.MX, rigid_body_mass: ca.MX) -> ca.MX:
     """Relative residuals, stacked: their sum of squares is the squared relative error of each record.
 
     Parameters
     ----------
-    target : Target
+    test : Measurement
     phi : (n, m)
         Mode shapes at the sensors.
     gamma : (m, d)
@@ -64,7 +43,7 @@ def residual(
     omega, ratios : (m, 1)
         Circular frequencies, rad/s, and damping ratios.
     rigid_body_mass : (d, d), kg
-        Needed where the target has a force.
+        Read only where the test has a force.
 
     Returns
     -------
@@ -72,20 +51,19 @@ def residual(
         ``(A_estimated - A_target) / ‖A_target‖`` (eq. 15), real then imaginary parts, then the
         same of the base force.
     """
-    runs = target.base.shape[0]
-    g_re, g_im = modal_gains(omega, ratios, target.freq)
+    runs = test.base.shape[0]
+    g_re, g_im = modal_gains(omega, ratios, test.freq)
     if runs > 1:
         g_re, g_im = ca.repmat(g_re, 1, runs), ca.repmat(g_im, 1, runs)
-    u_re, u_im = _parts(target.base)
+    u_re, u_im = _parts(test.base)
     push_re, push_im = gamma @ u_re, gamma @ u_im
     q_re, q_im = g_re * push_re - g_im * push_im, g_re * push_im + g_im * push_re
-    scale = np.linalg.norm(target.relative)
-    a_re, a_im = _parts(target.relative)
+    scale = np.linalg.norm(test.relative)
+    a_re, a_im = _parts(test.relative)
     pieces = [(phi @ q_re - a_re) / scale, (phi @ q_im - a_im) / scale]
-    if target.force is not None:
-        assert rigid_body_mass is not None
-        scale = np.linalg.norm(target.force)
-        f_re, f_im = _parts(target.force)
+    if test.force is not None:
+        scale = np.linalg.norm(test.force)
+        f_re, f_im = _parts(test.force)
         pieces += [
             (gamma.T @ q_re + rigid_body_mass @ u_re - f_re) / scale,
             (gamma.T @ q_im + rigid_body_mass @ u_im - f_im) / scale,

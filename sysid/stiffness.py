@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError
-from sysid.mass import FACTOR_FLOOR, Layout, lower_triangle
-from sysid.structure import Array
+from sysid.layout import FACTOR_FLOOR, Layout, lower_triangle, triangle_entries
+from sysid.structure import Array, finite_array
 from sysid.variables import Variable
 
 
@@ -45,8 +45,8 @@ class SpectralStiffness:
                 "SpectralStiffness needs natural_frequencies (Hz): finding them in the data is not yet part of sysid; "
                 "read them off the peaks of the transmissibility"
             )
-        given = np.atleast_1d(np.asarray(self.natural_frequencies, dtype=float))
-        if given.ndim != 1 or given.size == 0 or not np.all(np.isfinite(given)) or np.any(given <= 0):
+        given = np.atleast_1d(finite_array("natural_frequencies", self.natural_frequencies))
+        if given.ndim != 1 or given.size == 0 or np.any(given <= 0):
             raise InputError("natural_frequencies must be a list of positive numbers in Hz")
         if np.any(np.diff(given) < 0):
             raise InputError("natural_frequencies must be in ascending order")
@@ -81,14 +81,14 @@ class SpectralStiffness:
         lower = np.where(rows == columns, FACTOR_FLOOR * limit, -limit)
         return (Variable("stiffness_factor", lower, np.full(rows.size, limit), unit="rad/s"),)
 
-    def normalised(self, layout: Layout, y: ca.SX, factor: ca.SX) -> ca.SX:
+    def mass_normalised(self, layout: Layout, y: ca.SX, factor: ca.SX) -> ca.SX:
         """``H`` (n, n), rad²/s², whatever the mass is."""
         L = lower_triangle(y, layout.n)
         return L @ L.T
 
     def values(self, layout: Layout, H: Array, stiffness: Array) -> Array:
         """Entries of L_H for a given positive definite `H`."""
-        return np.linalg.cholesky(H)[np.tril_indices(layout.n)]
+        return triangle_entries(np.linalg.cholesky(H))
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +123,7 @@ class ChainStiffness:
             ),
         )  # fmt: skip
 
-    def normalised(self, layout: Layout, y: ca.SX, factor: ca.SX) -> ca.SX:
+    def mass_normalised(self, layout: Layout, y: ca.SX, factor: ca.SX) -> ca.SX:
         """``H = L^-1 K_SS L^-T`` (n, n), with L the Cholesky factor of M_SS."""
         K = _chain_pattern(layout)
         K_SS = sum((y[i] * ca.SX(ca.sparsify(ca.DM(K[i]))) for i in range(layout.n)), ca.SX(layout.n, layout.n))
@@ -132,7 +132,11 @@ class ChainStiffness:
 
     def values(self, layout: Layout, H: Array, stiffness: Array) -> Array:
         """Spring stiffnesses of a chain's stiffness matrix."""
-        return np.array([_own_spring(layout, stiffness, i) for i in range(layout.n)])
+        springs = []
+        for i, below in enumerate(_previous(layout)):
+            # A spring is minus the coupling to the sensor below, or what the row adds up to at the base.
+            springs.append(stiffness[i, : layout.n].sum() if below < 0 else -stiffness[i, below])
+        return np.array(springs)
 
 
 StiffnessModel = SpectralStiffness | ChainStiffness
@@ -158,9 +162,3 @@ def _chain_pattern(layout: Layout) -> Array:
             elongation[below] = -1.0
         patterns[i] = np.outer(elongation, elongation)
     return patterns
-
-
-def _own_spring(layout: Layout, stiffness: Array, i: int) -> float:
-    """Spring i of a chain: minus the coupling to the one below, or what the row adds up to at the base."""
-    below = _previous(layout)[i]
-    return float(stiffness[i, : layout.n].sum() if below < 0 else -stiffness[i, below])

@@ -243,7 +243,7 @@ class Structure:
             raise InputError("give exactly one of damping_ratios (n,) and damping_matrix (n, n)")
         self.modal_damping = ratios is not None
         if ratios is not None:
-            self.damping_ratios: Array = _finite("damping_ratios", ratios)
+            self.damping_ratios: Array = finite_array("damping_ratios", ratios)
             if self.damping_ratios.shape != (n,):
                 raise InputError(
                     f"damping_ratios has shape {self.damping_ratios.shape}; one ratio a mode is ({n},) (fractions)"
@@ -285,7 +285,7 @@ class Structure:
 
 def check_frequencies(freq: ArrayLike, *, increasing: bool = True) -> Array:
     """Frequency lines in Hz as a finite, nonnegative (strictly increasing) one-dimensional array."""
-    lines = np.atleast_1d(_finite("freq", freq))
+    lines = np.atleast_1d(finite_array("freq", freq))
     if lines.ndim != 1 or lines.size == 0:
         raise InputError(f"freq has shape {lines.shape}; a list of lines in Hz is needed")
     if np.any(lines < 0):
@@ -299,20 +299,21 @@ def check_frequencies(freq: ArrayLike, *, increasing: bool = True) -> Array:
     return lines
 
 
-def _finite(name: str, value: ArrayLike) -> Array:
+def finite_array(name: str, value: ArrayLike) -> Array:
+    """Real, finite numbers as an array of their own; what is wrong, by name, where they are not."""
     if np.iscomplexobj(value):
         raise InputError(f"{name} is complex; real numbers are needed")
     try:
         array = np.array(value, dtype=float)
     except (TypeError, ValueError):
-        raise InputError(f"{name} is not an array of real numbers") from None
+        raise InputError(f"{name} = {value!r} is not an array of real numbers") from None
     if not np.all(np.isfinite(array)):
         raise InputError(f"{name} holds NaN or infinite entries ({int(np.sum(~np.isfinite(array)))} of {array.size})")
     return array
 
 
 def _matrix(name: str, value: ArrayLike, shape: tuple[int | None, int]) -> Array:
-    array = _finite(name, value)
+    array = finite_array(name, value)
     if array.ndim != 2 or array.shape[1] != shape[1] or (shape[0] is not None and array.shape[0] != shape[0]):
         rows = "n_sensors" if shape[0] is None else shape[0]
         raise InputError(f"{name} has shape {array.shape}; it is ({rows}, {shape[1]})")
@@ -320,7 +321,7 @@ def _matrix(name: str, value: ArrayLike, shape: tuple[int | None, int]) -> Array
 
 
 def _square(name: str, value: ArrayLike) -> Array:
-    array = _finite(name, value)
+    array = finite_array(name, value)
     if array.ndim != 2 or array.shape[0] != array.shape[1]:
         raise InputError(f"{name} has shape {array.shape}; a square matrix is needed")
     scale = np.sqrt(np.abs(np.diag(array)))

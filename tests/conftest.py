@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.mass import Layout
+from sysid.layout import Layout
 
 
 def _geometry(rng, n, d):

@@ -6,7 +6,7 @@ import pytest
 
 from sysid import InputError, ModalDamping, ProportionalDamping
 from sysid.damping import physical_damping
-from sysid.mass import Layout
+from sysid.layout import Layout
 
 SEEDS = range(5)
 LAYOUT = Layout(np.ones((4, 1)), np.ones(1, bool))

@@ -6,13 +6,8 @@ import pytest
 import scipy.integrate
 
 from sysid import FullMass, InputError, KnownMass, LumpedMass
-from sysid.mass import (
-    FACTOR_FLOOR,
-    Layout,
-    gather_rows,
-    sampling_exponent,
-    spread_rows,
-)
+from sysid.layout import FACTOR_FLOOR, Layout
+from sysid.mass import gather_rows, sampling_exponent, spread_rows
 
 SEEDS = range(4)
 HEALINGS = ("trace", "rigid_body")
@@ -272,7 +267,7 @@ class TestFullMass:
         totals = FullMass(healing=healing).total(layout, M)
         model = FullMass(totals, healing=healing)
         y = model.values(layout, M)
-        np.testing.assert_allclose(np.abs(y).max(), 1)
+        np.testing.assert_allclose(np.abs(y).max(), 1 / 2)  # away from the box's edge, where sampling loses digits
         again, _ = evaluate(model, layout)(y)
         np.testing.assert_allclose(again, M, atol=1e-9 * np.abs(M).max())
 
@@ -354,9 +349,14 @@ class TestTotals:
         with pytest.raises(InputError, match="one number but the base also rotates"):
             layout_of(np.zeros((2, 2)), [True, False]).totals(12.0)
 
-    @pytest.mark.parametrize("bad", [0, -1.0, np.nan, np.inf, [1.0, 0.0], [1.0, -2.0], [1.0, np.nan]])
+    @pytest.mark.parametrize("bad", [0, -1.0, [1.0, 0.0], [1.0, -2.0]])
     def test_masses_that_are_none(self, bad):
-        with pytest.raises(InputError, match="positive and finite"):
+        with pytest.raises(InputError, match="total_mass = .* must be positive"):
+            layout_of(np.zeros((2, 2))).totals(bad)
+
+    @pytest.mark.parametrize("bad", [np.nan, np.inf, [1.0, np.nan]])
+    def test_masses_that_are_not_finite(self, bad):
+        with pytest.raises(InputError, match="total_mass holds NaN or infinite"):
             layout_of(np.zeros((2, 2))).totals(bad)
 
     @pytest.mark.parametrize("bad", [[1.0], [1.0, 2.0, 3.0], [[1.0, 2.0]]])
@@ -423,8 +423,8 @@ class TestKnownMass:
         asymmetric, infinite = M.copy(), M.copy()
         asymmetric[0, 1] += 0.1
         infinite[0, 0] = np.nan
-        for bad in (asymmetric, infinite):
-            with pytest.raises(InputError, match="finite and symmetric"):
+        for match, bad in (("mass matrix is not symmetric", asymmetric), ("mass matrix holds NaN or inf", infinite)):
+            with pytest.raises(InputError, match=match):
                 KnownMass(bad).blocks(layout, y)
         with pytest.raises(InputError, match="not positive definite over the sensors"):
             KnownMass(np.diag([1.0, 1, -1, 1])).blocks(layout, y)

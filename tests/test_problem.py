@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid import FullMass, InputError, KnownMass, Measurement, Problem, SpectralStiffness
-from sysid.problem import SwarmCost
+from sysid import FullMass, InputError, KnownMass, Measurement, Problem, SpectralStiffness, swarm_cost
 from sysid.refinement import closed_form
+from sysid.swarm_cost import SwarmCost
 
 SEEDS = range(3)
 MASSES = ("trace", "rigid_body", "lumped", "known")
@@ -82,13 +82,15 @@ def test_with_refinement_it_is_the_cost_of_the_closed_form(random_case, seed):
 
 
 @pytest.mark.parametrize(("mass", "stiffness"), [("rigid_body", "spectral"), ("lumped", "chain")])
-def test_bits_do_not_depend_on_the_batch_or_the_threads(random_case, mass, stiffness):
+def test_bits_do_not_depend_on_the_batch_or_the_threads(random_case, monkeypatch, mass, stiffness):
     rng = np.random.default_rng(0)
     _, problem = random_case(rng, mass, stiffness, n=4, force=True)
     rows = particles(rng, problem, 200)
-    whole = SwarmCost(problem, threads=2)(rows)
-    np.testing.assert_array_equal(SwarmCost(problem, threads=1)(rows), whole)
-    cost = SwarmCost(problem, threads=3)
+    whole = SwarmCost(problem)(rows)
+    for threads in (1, 3):
+        monkeypatch.setattr(swarm_cost, "_THREADS", threads)
+        cost = SwarmCost(problem)
+        np.testing.assert_array_equal(cost(rows), whole)
     for count in (1, 63, 64, 65, 127, 129, 200):
         np.testing.assert_array_equal(cost(rows[:count]), whole[:count])
     order = rng.permutation(200)

@@ -48,8 +48,6 @@ def test_reaches_the_target_spectrum_from_random_candidates(way, n):
         assert error <= 1e-8, (index, CASES[index % 4], answer.message)
         assert answer.success
         assert answer.error == pytest.approx(error, abs=1e-12)
-        assert answer.replaced == tuple(range(targets.size))
-        np.testing.assert_allclose(answer.frequencies, own / (2 * np.pi), rtol=1e-9)
         np.testing.assert_array_equal(answer.factor, np.tril(answer.factor))
         assert np.all(np.diag(answer.factor) > 0)
 

@@ -4,18 +4,25 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from sysid.response import Target, residual
+from sysid import Measurement
+from sysid.response import residual
 
 SEEDS = range(4)
 
 
-def random_target(rng, structure, *, runs=3, force=True, lines=15):
+def measurement(structure, freq, base, relative, force=None):
+    """A test of which the *relative* accelerations are given."""
+    response = relative + np.einsum("sd,rdf->rsf", structure.rigid_body, base)
+    return Measurement(freq, base, response, rigid_body=structure.rigid_body, force=force)
+
+
+def random_test(rng, structure, *, runs=3, force=True, lines=15):
     """Runs of complex base motion in all directions at once, and records that no structure fits."""
     n, d = structure.n, structure.n_base
     normal = lambda *shape: rng.normal(size=shape) + 1j * rng.normal(size=shape)  # noqa: E731
     freq = np.sort(rng.uniform(2, 70, lines))
-    return Target(
-        freq, normal(runs, d, lines), 3 * normal(runs, n, lines), 50 * normal(runs, d, lines) if force else None
+    return measurement(
+        structure, freq, normal(runs, d, lines), 3 * normal(runs, n, lines), 50 * normal(runs, d, lines) if force else None
     )
 
 
@@ -30,11 +37,11 @@ def modal(structure):
     return np.concatenate([p.ravel(order="F") for p in pieces]), shapes
 
 
-def expression(target, shapes):
+def expression(test, shapes):
     z = ca.MX.sym("z", sum(a * b for a, b in shapes))
     ends = np.cumsum([0, *(a * b for a, b in shapes)]).tolist()
     parts = [ca.reshape(z[a:b], *shape) for a, b, shape in zip(ends[:-1], ends[1:], shapes, strict=True)]
-    return z, residual(target, *parts)
+    return z, residual(test, *parts)
 
 
 @pytest.mark.parametrize("force", [False, True])
@@ -43,17 +50,17 @@ def expression(target, shapes):
 def test_residual_is_the_relative_error_of_the_structures_responses(random_structure, seed, runs, force):
     rng = np.random.default_rng(seed)
     s = random_structure(rng, n=4, d=int(rng.integers(1, 4)))
-    target = random_target(rng, s, runs=runs, force=force)
+    test = random_test(rng, s, runs=runs, force=force)
     values, shapes = modal(s)
-    z, miss = expression(target, shapes)
+    z, miss = expression(test, shapes)
     out = np.asarray(ca.Function("miss", [z], [miss])(values)).ravel()
 
-    A = s.relative_acceleration(target.freq)
-    error = [np.einsum("sdf,rdf->rsf", A, target.base) - target.relative]
-    error[0] = error[0] / np.linalg.norm(target.relative)
+    A = s.relative_acceleration(test.freq)
+    error = [np.einsum("sdf,rdf->rsf", A, test.base) - test.relative]
+    error[0] = error[0] / np.linalg.norm(test.relative)
     if force:
-        F = s.base_force(target.freq)
-        error.append((np.einsum("edf,rdf->ref", F, target.base) - target.force) / np.linalg.norm(target.force))
+        F = s.base_force(test.freq)
+        error.append((np.einsum("edf,rdf->ref", F, test.base) - test.force) / np.linalg.norm(test.force))
     assert out.size == 2 * sum(e.size for e in error)
     assert np.sum(out**2) == pytest.approx(sum(np.linalg.norm(e) ** 2 for e in error), rel=1e-11)
     # Entry by entry, real parts then imaginary parts of each record, in any order inside.
@@ -69,15 +76,15 @@ def test_residual_is_the_relative_error_of_the_structures_responses(random_struc
 def test_it_vanishes_at_the_truth(random_structure, seed):
     rng = np.random.default_rng(seed)
     s = random_structure(rng, n=4, d=2)
-    target = random_target(rng, s)
-    a = np.einsum("sdf,rdf->rsf", s.relative_acceleration(target.freq), target.base)
-    f = np.einsum("edf,rdf->ref", s.base_force(target.freq), target.base)
+    test = random_test(rng, s)
+    a = np.einsum("sdf,rdf->rsf", s.relative_acceleration(test.freq), test.base)
+    f = np.einsum("edf,rdf->ref", s.base_force(test.freq), test.base)
     values, shapes = modal(s)
-    z, miss = expression(Target(target.freq, target.base, a, f), shapes)
+    z, miss = expression(measurement(s, test.freq, test.base, a, f), shapes)
     assert np.linalg.norm(np.asarray(ca.Function("miss", [z], [miss])(values))) < 1e-13
 
 
-def numpy_cost(target, shapes):
+def numpy_cost(test, shapes):
     """The same sum of squares in NumPy, real records apart, so that it can be stepped into the complex plane."""
     ends = np.cumsum([0, *(a * b for a, b in shapes)])
 
@@ -85,17 +92,17 @@ def numpy_cost(target, shapes):
         phi, gamma, omega, zeta, rigid = (
             z[a:b].reshape(shape, order="F") for a, b, shape in zip(ends[:-1], ends[1:], shapes, strict=True)
         )
-        w = 2 * np.pi * target.freq
+        w = 2 * np.pi * test.freq
         size = w**2 / ((omega**2 - w**2) ** 2 + (2 * zeta * omega * w) ** 2)
         g = size * (omega**2 - w**2), -size * 2 * zeta * omega * w
         total = 0
-        for run in range(len(target.base)):
-            u = target.base[run].real, target.base[run].imag
+        for run in range(len(test.base)):
+            u = test.base[run].real, test.base[run].imag
             push = gamma @ u[0], gamma @ u[1]
             q = g[0] * push[0] - g[1] * push[1], g[0] * push[1] + g[1] * push[0]
             for k, part in enumerate((np.real, np.imag)):
-                e = (phi @ q[k] - part(target.relative[run])) / np.linalg.norm(target.relative)
-                f = (gamma.T @ q[k] + rigid @ u[k] - part(target.force[run])) / np.linalg.norm(target.force)
+                e = (phi @ q[k] - part(test.relative[run])) / np.linalg.norm(test.relative)
+                f = (gamma.T @ q[k] + rigid @ u[k] - part(test.force[run])) / np.linalg.norm(test.force)
                 total = total + np.sum(e**2) + np.sum(f**2)
         return total
 
@@ -106,12 +113,12 @@ def numpy_cost(target, shapes):
 def test_gradient_is_exact_by_complex_step(random_structure, seed):
     rng = np.random.default_rng(seed)
     s = random_structure(rng, n=3, d=2)
-    target = random_target(rng, s)
+    test = random_test(rng, s)
     values, shapes = modal(s)
-    z, miss = expression(target, shapes)
+    z, miss = expression(test, shapes)
     f = ca.sumsqr(miss)
     gradient = np.asarray(ca.Function("g", [z], [ca.gradient(f, z)])(values)).ravel()
-    cost, h = numpy_cost(target, shapes), 1e-30
+    cost, h = numpy_cost(test, shapes), 1e-30
     expected = [cost(values + 1j * h * row).imag / h for row in np.eye(values.size)]
     assert float(ca.Function("f", [z], [f])(values)) == pytest.approx(cost(values), rel=1e-12)
     np.testing.assert_allclose(gradient, expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
@@ -121,12 +128,12 @@ def test_gradient_is_exact_by_complex_step(random_structure, seed):
 def test_hessian_is_the_difference_of_exact_gradients_with_error_of_second_order(random_structure, seed):
     rng = np.random.default_rng(seed)
     s = random_structure(rng, n=3, d=2)
-    target = random_target(rng, s)
+    test = random_test(rng, s)
     values, shapes = modal(s)
-    z, miss = expression(target, shapes)
+    z, miss = expression(test, shapes)
     hessian = np.asarray(ca.Function("H", [z], [ca.hessian(ca.sumsqr(miss), z)[0]])(values))
     np.testing.assert_allclose(hessian, hessian.T, rtol=1e-12, atol=1e-14 * np.abs(hessian).max())
-    cost, tiny = numpy_cost(target, shapes), 1e-30
+    cost, tiny = numpy_cost(test, shapes), 1e-30
     slope = lambda at, direction: cost(at + 1j * tiny * direction).imag / tiny  # noqa: E731
     unit = np.maximum(np.abs(values), 0.1)
     a, b = rng.normal(size=(2, values.size)) * unit
