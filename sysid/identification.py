@@ -152,7 +152,7 @@ class Identification:
             lines.append(f"{k + 1:4d}   {f:14.5g}   {100 * zeta:11.4g}   " + " ".join(f"{v:6.1f}" for v in share))
         lines.append("")
         if self.determined:
-            lines.append("Determined: this is the mass and stiffness, within the stated model.")
+            lines.append("Determined: data and stated model leave one mass and one stiffness matrix.")
             lines += [f"  - {sentence}" for sentence in self.closed_by]
         else:
             lines.append("Not determined: this is one of many models that explain the data.")

@@ -17,15 +17,17 @@ from sysid import local
 from sysid.errors import InputError, SolverError
 from sysid.identification import History, Identification
 from sysid.layout import triangle, triangle_entries
+from sysid.mass import KnownMass
 from sysid.modal_masses import determination
 from sysid.problem import Problem
 from sysid.refinement import by_ipopt, closed_form
+from sysid.response import weighed_mass
 from sysid.stiffness import SpectralStiffness
 from sysid.structure import Array, Structure
 from sysid.swarm import SwarmProgress, SwarmSettings, minimize_swarm
 from sysid.swarm_cost import SwarmCost
 
-_SETTINGS = SwarmSettings(inertia_b1=0.8, inertia_b2=0.5, acceleration_sum=3.0)
+_SETTINGS = SwarmSettings(inertia_b1=0.8, inertia_b2=0.5, acceleration_lower=0.5, acceleration_sum=3.0)
 STRATEGIES = ("auto", "swarm")
 
 
@@ -46,7 +48,9 @@ class Swarm:
     gradient_every : int
         Refine the swarm's best by a few iterations of the local phase every so many iterations; 0: never.
     local_phase : bool
-        Whether the local phase follows.
+        Whether the local phase follows. Without it no solver vouches for the result, and `success` is False.
+    restarts : int
+        How many further swarms may follow where the problem has a goal and it is missed.
     settings : SwarmSettings
         Constants of the swarm itself. The paper leaves b1 and b2 of its eq. 11 to the user; with the
         usual 0.3 and 0.2 and c1 + c2 up to 4 (``SwarmSettings()``) the swarm of this problem contracts
@@ -60,6 +64,7 @@ class Swarm:
     refine: bool = True
     gradient_every: int = 0
     local_phase: bool = True
+    restarts: int = 4
     settings: SwarmSettings = _SETTINGS
 
 
@@ -129,9 +134,13 @@ def identify(
     """
     options = _options(strategy)
     seed, random = _seed(rng)
+    if max_time is not None and not max_time > 0:
+        raise InputError(f"max_time = {max_time}: a positive number of seconds is needed")
+    listeners = [f for f in (progress, callback) if f is not None]
     with threadpool_limits(limits=1), _DeferredInterrupt() as interrupt:
-        run = _Run(problem, options, callback, progress, max_time, max_evaluations, interrupt)
-        return run.run(seed, random, start)
+        desk = _Desk(listeners, interrupt, max_time)
+        best, stopped = _best_of_searches(problem, options, desk, random, start, max_evaluations)
+        return _finish(problem, best, stopped, seed, desk)
 
 
 def _options(strategy: str | Swarm) -> Swarm:
@@ -193,43 +202,30 @@ class _DeferredInterrupt:
 
 
 class _Stop(Exception):  # noqa: N818 - not an error
-    """The callback asked to stop, or Ctrl-C did."""
+    """The callback asked to stop."""
 
 
-class _Run:
-    """State of one identification: the best so far, the clock, the log."""
+class _Desk:
+    """The clock, the log, and the listeners of an identification."""
 
     def __init__(
-        self,
-        problem: Problem,
-        options: Swarm,
-        callback: Callable[[Progress], object] | None,
-        progress: Callable[[Progress], object] | None,
-        max_time: float | None,
-        max_evaluations: int | None,
-        interrupt: _DeferredInterrupt,
+        self, listeners: list[Callable[[Progress], object]], interrupt: _DeferredInterrupt, max_time: float | None
     ) -> None:
-        if max_time is not None and not max_time > 0:
-            raise InputError(f"max_time = {max_time}: a positive number of seconds is needed")
-        self.problem, self.options = problem, options
-        self.listeners = [f for f in (progress, callback) if f is not None]
-        self.max_time, self.max_evaluations = max_time, max_evaluations
-        self.interrupt = interrupt
+        self.listeners, self.interrupt, self.max_time = listeners, interrupt, max_time
         self.begun = time.perf_counter()
-        self.x: Array | None = None
-        self.raw: Array = np.zeros(0)
-        self.history = History()
         self.log: list[str] = []
 
     @property
     def seconds(self) -> float:
         return time.perf_counter() - self.begun
 
+    @property
+    def left(self) -> float | None:
+        """Seconds that are left, at least one; None without a limit."""
+        return None if self.max_time is None else max(self.max_time - self.seconds, 1.0)
+
     def note(self, line: str) -> None:
         self.log.append(f"{self.seconds:8.2f} s  {line}")
-
-    def record(self, **figures: object) -> None:
-        self.history = replace(self.history, **figures)  # type: ignore[arg-type]
 
     def tell(self, phase: Literal["swarm", "refinement", "local phase"], iteration: int, of: int, cost: float) -> None:
         self.interrupt.check()
@@ -239,86 +235,168 @@ class _Run:
             except StopIteration:
                 raise _Stop("the callback stopped the search") from None
 
-    def run(self, seed: int, random: np.random.SeedSequence, start: ArrayLike | Structure | None) -> Identification:
-        success, message, interrupted = False, "", False
-        try:
-            self.swarm(random, start)
-            self.refine()
-            if self.options.local_phase:
-                success, message = self.local()
-            else:
-                success, message = True, "ended before the local phase, as asked"
-        except _Stop as stop:
-            message = str(stop)
-        except KeyboardInterrupt:
-            if self.x is None:
-                raise
-            message, interrupted = "interrupted", True
-        if self.x is None:
-            raise SolverError("the search ended before it had a single candidate; give it more time")
-        structure = self.problem.structure(self.x)
-        residual = self.problem.measurement.residual(structure)
-        goal = self.problem.goal
-        if goal is not None and residual > goal:
-            success = False
-            message += f"; the residual {residual:.3g} is above the goal {goal:.3g}"
-        self.note(f"done: residual {residual:.4e}, {message}")
-        self.record(log=tuple(self.log), wall_time=self.seconds)
-        known = determination(self.problem, structure)
-        return Identification(
-            structure, self.problem, self.x, "swarm", seed, success, message, self.history,
-            known.determined, known.closed_by, known.undetermined, interrupted,
-        )  # fmt: skip
 
-    def misfit(self, x: Array) -> float:
-        """What all phases minimise: root of the sum of the squared relative residuals of accelerations and force."""
+def _best_of_searches(
+    problem: Problem,
+    options: Swarm,
+    desk: _Desk,
+    random: np.random.SeedSequence,
+    start: ArrayLike | Structure | None,
+    max_evaluations: int | None,
+) -> tuple[_Search, BaseException | None]:
+    """Search, and again from another swarm while the goal is missed; the best, and what stopped it early."""
+    best: _Search | None = None
+    evaluations = 0
+    for child in random.spawn(1 + options.restarts):
+        search = _Search(problem, options, desk)
+        stopped: BaseException | None = None
+        try:
+            search.run(child, start, None if max_evaluations is None else max_evaluations - evaluations)
+        except (_Stop, KeyboardInterrupt) as stop:
+            stopped, search.success, search.message = stop, False, str(stop) or "interrupted"
+        evaluations += search.history.evaluations
+        if search.x is not None and (best is None or search.misfit < best.misfit):
+            best = search
+        if best is None:
+            if isinstance(stopped, KeyboardInterrupt):
+                raise stopped
+            raise SolverError("the search ended before it had a single candidate; give it more time")
+        late = desk.max_time is not None and desk.seconds > desk.max_time / 2
+        spent = max_evaluations is not None and 2 * evaluations > max_evaluations
+        if stopped or late or spent or not options.local_phase or best.meets_goal is not False:
+            break
+        desk.note(f"the goal {problem.goal:.3g} is missed at {best.misfit:.4g}")
+    assert best is not None
+    if stopped is not None:
+        best.success, best.message = False, str(stopped) or "interrupted"
+    best.history = replace(best.history, evaluations=evaluations)
+    return best, stopped
+
+
+def _finish(problem: Problem, best: _Search, stopped: BaseException | None, seed: int, desk: _Desk) -> Identification:
+    """Judge the best candidate, and say what it is worth."""
+    assert best.x is not None
+    structure = problem.structure(best.x)
+    success, message = best.success, best.message
+    if best.meets_goal is False:
+        success = False
+        residual = problem.measurement.residual(structure)
+        message += f"; the residual {residual:.3g} is above the goal {problem.goal:.3g}"
+    message += _disagreement(problem, structure)
+    desk.note(f"done: residual {best.misfit:.4e}, {message}")
+    known = determination(problem, structure)
+    open_ = known.undetermined
+    if not success:
+        open_ = ("the search did not end in a fit, so this is not yet any structure that explains the data", *open_)
+    return Identification(
+        structure=structure,
+        problem=problem,
+        x=best.x,
+        strategy="swarm",
+        seed=seed,
+        success=success,
+        message=message,
+        history=replace(best.history, log=tuple(desk.log), wall_time=desk.seconds),
+        determined=known.determined and success,
+        closed_by=known.closed_by if success else (),
+        undetermined=open_,
+        interrupted=isinstance(stopped, KeyboardInterrupt),
+    )
+
+
+def _disagreement(problem: Problem, structure: Structure) -> str:
+    """What the base force weighs, where a stated mass says otherwise."""
+    test = problem.measurement
+    if test.force is None or (not isinstance(problem.mass, KnownMass) and problem.mass.total_mass is None):
+        return ""
+    poles = 2 * np.pi * structure.natural_frequencies, structure.damping_ratios
+    weighed, stated = np.diag(weighed_mass(test, *poles)), np.diag(structure.rigid_body_mass)
+    off = np.abs(weighed / stated - 1)
+    if np.all(off < max(0.01, 3 * (test.force_residual(structure) or 0.0) / np.sqrt(test.freq.size))):
+        return ""
+    given, told = (", ".join(f"{m:.4g}" for m in masses) for masses in (stated, weighed))
+    return f"; the stated mass makes {given} kg in the base directions, but the base force weighs {told} kg"
+
+
+class _Search:
+    """One swarm, its refinement and its local phase: the best so far and its history."""
+
+    def __init__(self, problem: Problem, options: Swarm, desk: _Desk) -> None:
+        self.problem, self.options, self.desk = problem, options, desk
+        self.x: Array | None = None
+        self.raw: Array = np.zeros(0)
+        self.history = History()
+        self.success, self.message = False, "ended before the local phase, as asked"
+
+    @property
+    def misfit(self) -> float:
+        """What all phases minimise, at the best so far."""
+        assert self.x is not None
+        return self.misfit_of(self.x)
+
+    @property
+    def meets_goal(self) -> bool | None:
+        """Whether the residual is at or below the goal; None where none is given."""
+        if self.problem.goal is None or self.x is None:
+            return None
+        return self.problem.measurement.residual(self.problem.structure(self.x)) <= self.problem.goal
+
+    def misfit_of(self, x: Array) -> float:
+        """Root of the sum of the squared relative residuals of accelerations and force."""
         structure, test = self.problem.structure(x), self.problem.measurement
         return float(np.hypot(test.residual(structure), test.force_residual(structure) or 0.0))
 
-    def swarm(self, random: np.random.SeedSequence, start: ArrayLike | Structure | None) -> None:
-        problem, options = self.problem, self.options
+    def run(
+        self, random: np.random.SeedSequence, start: ArrayLike | Structure | None, max_evaluations: int | None
+    ) -> None:
+        self.swarm(random, start, max_evaluations)
+        self.refine()
+        if self.options.local_phase:
+            self.local()
+
+    def swarm(
+        self, random: np.random.SeedSequence, start: ArrayLike | Structure | None, max_evaluations: int | None
+    ) -> None:
+        problem, options, desk = self.problem, self.options, self.desk
         cost = SwarmCost(problem, refine=options.refine)
         x0 = None if start is None else problem.to_sampling(_as_unknowns(problem, start))
         unknowns = ", ".join(f"{name} {count}" for name, count in problem.unknowns)
-        self.note(f"swarm over {problem.n_variables} unknowns ({unknowns})")
+        desk.note(f"swarm over {problem.n_variables} unknowns ({unknowns})")
+        curve: list[float] = []
 
         def watch(state: SwarmProgress) -> None:
             if np.isfinite(state.fun):
                 self.raw, self.x = cost.unknowns(state.x), cost.refined(state.x)
             curve.append(state.fun)
-            self.tell("swarm", state.nit, options.max_iterations, state.fun)
-
-        curve: list[float] = []
-        try:
-            result = minimize_swarm(
-                cost,
-                np.column_stack([problem.lower, problem.upper]),
-                rng=np.random.default_rng(random.spawn(1)[0]),
-                n_particles=options.n_particles,
-                max_iterations=options.max_iterations,
-                max_evaluations=self.max_evaluations,
-                max_time=None if self.max_time is None else self.max_time * 2 / 3,
-                target=problem.goal,
-                stall_iterations=options.stall_iterations,
-                stall_tolerance=options.stall_tolerance,
-                callback=watch,
-                improve=self.improver(cost) if options.gradient_every else None,
-                improve_every=options.gradient_every,
-                x0=x0,
-                settings=options.settings,
+            self.history = replace(
+                self.history, start=curve[0], swarm=curve[-1], swarm_curve=np.array(curve), evaluations=state.nfev
             )
-        finally:
-            if curve:
-                self.record(start=curve[0], swarm=curve[-1], swarm_curve=np.array(curve))
+            desk.tell("swarm", state.nit, options.max_iterations, state.fun)
+
+        result = minimize_swarm(
+            cost,
+            np.column_stack([problem.lower, problem.upper]),
+            rng=np.random.default_rng(random),
+            n_particles=options.n_particles,
+            max_iterations=options.max_iterations,
+            max_evaluations=max_evaluations,
+            max_time=None if desk.left is None else desk.left * 2 / 3,
+            target=problem.goal,
+            stall_iterations=options.stall_iterations,
+            stall_tolerance=options.stall_tolerance,
+            callback=watch,
+            improve=self.improver(cost) if options.gradient_every else None,
+            improve_every=options.gradient_every,
+            x0=x0,
+            settings=options.settings,
+        )
         if self.x is None:
             raise SolverError(f"the swarm found no candidate that is a structure: {result.message}")
-        self.record(
-            evaluations=int(result.nfev),
-            states=tuple((state.name.lower().replace("_", " "), int(n)) for state, n in result.state_counts.items()),
-        )
-        self.note(f"swarm ended after {result.nit} iterations at {result.fun:.4e}: {result.message}")
+        states = tuple((state.name.lower().replace("_", " "), int(n)) for state, n in result.state_counts.items())
+        self.history = replace(self.history, states=states)
+        desk.note(f"swarm ended after {result.nit} iterations at {result.fun:.4e}: {result.message}")
         if result.n_nan:
-            self.note(f"{result.n_nan} of {result.nfev} candidates were no structure (not a number)")
+            desk.note(f"{result.n_nan} of {result.nfev} candidates were no structure (not a number)")
 
     def improver(self, cost: SwarmCost) -> Callable[[Array], Array]:
         """The exact-gradient refinement of the swarm's best, in the swarm's coordinates."""
@@ -335,39 +413,43 @@ class _Run:
         if not (isinstance(stiffness, SpectralStiffness) and self.options.refine):
             return
         assert self.x is not None
-        self.tell("refinement", 0, 1, self.history.swarm)
+        self.desk.tell("refinement", 0, 1, self.history.swarm)
         part = self.problem.parts.stiffness
         factor = triangle(self.raw[part], n)
         chosen, solved = closed_form(factor, stiffness.targets), by_ipopt(factor, stiffness.targets)
         x = self.x.copy()
         x[part] = triangle_entries(solved.factor)
-        misfit, other = self.misfit(self.x), self.misfit(x)
-        self.note(
+        misfit, other = self.misfit, self.misfit_of(x)
+        self.desk.note(
             f"refinement of eigenvalues 1 to {stiffness.targets.size} of {n}: {solved.message}, within "
             f"{solved.error:.1e} of the given ones, residual {other:.4e} (closed form {misfit:.4e})"
         )
         if solved.success and other < misfit:
             self.x, chosen, misfit = x, solved, other
-        self.record(refinement=misfit, refinement_error=chosen.error)
+        self.history = replace(self.history, refinement=misfit, refinement_error=chosen.error)
 
-    def local(self) -> tuple[bool, str]:
+    def local(self) -> None:
         """Run the local phase; keep its answer where it is better."""
         assert self.x is not None
-        left = None if self.max_time is None else max(self.max_time - self.seconds, 1.0)
-        before = self.misfit(self.x)
+        before = self.misfit
         answer = local.solve(
-            self.problem, self.x, max_time=left, monitor=lambda i, cost: self.tell("local phase", i, 0, cost)
+            self.problem,
+            self.x,
+            max_time=self.desk.left,
+            monitor=lambda i, cost: self.desk.tell("local phase", i, 0, cost),
         )
-        after = self.misfit(answer.x)
-        self.note(f"local phase: {answer.message}, {answer.curve.size} iterates, residual {after:.4e}")
+        after = self.misfit_of(answer.x)
+        self.desk.note(f"local phase: {answer.message}, {answer.curve.size} iterates, residual {after:.4e}")
+        self.success, self.message = answer.success, answer.message
         if after < before:
             self.x = answer.x
         else:
-            self.note(f"the local phase did not improve on {before:.4e}; its start is kept")
-        self.record(local=min(after, before), local_curve=answer.curve)
+            # A start that meets the goal needs no improvement; any other was not made by a solver that succeeded.
+            self.success = self.meets_goal is True
+            self.message += f"; it did not improve on {before:.3g}, so its start is kept"
+        self.history = replace(self.history, local=min(after, before), local_curve=answer.curve)
         if answer.stopped is not None:
             raise answer.stopped
-        return answer.success, answer.message
 
 
 def _as_unknowns(problem: Problem, start: ArrayLike | Structure) -> Array:

@@ -63,7 +63,9 @@ class Layout:
         """The totals as unknowns, where they are not stated and the base force tells them."""
         if total_mass is not None or self.weighed is None:
             return ()
-        return (Variable("total_mass", self.weighed / 2, self.weighed * 2, unit="kg"),)
+        # Skew sensors may all belong to one direction, which then carries what the force weighs in all.
+        upper = np.where(self.translational, self.weighed[self.translational].sum(), self.weighed)
+        return (Variable("total_mass", self.weighed / 4, upper * 4, unit="kg"),)
 
     def split_totals(self, total_mass: ArrayLike | None, y: ca.SX) -> tuple[ca.SX | Array, ca.SX]:
         """Totals, stated or the first of the unknowns `y`, and the unknowns left."""

@@ -26,7 +26,7 @@ from sysid.mass import FullMass
 from sysid.measurement import Measurement
 from sysid.problem import Problem, assemble
 from sysid.refinement import SOLVED
-from sysid.response import columns, residual
+from sysid.response import linear_residues, residual
 from sysid.stiffness import SpectralStiffness
 from sysid.structure import Array, Structure
 from sysid.variables import split
@@ -163,26 +163,6 @@ def solve(
     if tried > 1:
         message += f"; best of {tried} starts, as the first ended in a local minimum"
     return LocalResult(best.x, best.status in SOLVED, message, np.array(watch.curve), watch.stopped)
-
-
-def linear_residues(test: Measurement, omega: Array, ratios: Array) -> tuple[Array, float]:
-    """Residues of given poles by linear least squares, whatever their rank.
-
-    Returns
-    -------
-    residues : (m, n, d)
-    residual : float
-        Relative residual that they leave: no modal model with these poles has a smaller one.
-    """
-    w = 2 * np.pi * test.freq
-    g = w**2 / (omega[:, None] ** 2 - w**2 + 2j * (ratios * omega)[:, None] * w)
-    u = columns(test.base)
-    design = (np.tile(g, test.n_runs)[:, None] * u[None]).reshape(-1, u.shape[1]).T
-    records = columns(test.relative).T
-    stack = lambda block: np.vstack([block.real, block.imag])  # noqa: E731
-    answer = np.linalg.lstsq(stack(design), stack(records), rcond=None)[0]
-    left = np.linalg.norm(stack(design) @ answer - stack(records)) / np.linalg.norm(records)
-    return answer.reshape(omega.size, test.n_base, -1).transpose(0, 2, 1), float(left)
 
 
 def _linear_starts(test: Measurement, ended: _Attempt, first: Modes) -> Iterator[Modes]:

@@ -15,7 +15,7 @@ from sysid.structure import Array, finite_array
 from sysid.variables import Variable
 
 _ROW_EXPECTATION = 1.0  # the paper's c
-_NEWTON_STEPS = 12  # for the coupled scales of the rigid-body healing; quadratic from a good start
+_NEWTON_STEPS = 20  # for the coupled scales of the rigid-body healing; quadratic from a good start
 
 
 class MassBlocks(NamedTuple):
@@ -250,7 +250,7 @@ def _rigid_body_scales(factor: ca.SX, layout: Layout, totals: ca.SX | Array, mem
 
     Where no sensor's row of G has two entries the equations are uncoupled and closed. Otherwise
     they are d quadratics, solved by Newton's method inside the expression; where that has not
-    converged the scales are NaN, and the candidate counts as impossible.
+    converged, mostly because no positive scales exist, they are NaN, and the candidate is passed over.
     """
     d, groups = layout.d, layout.directions
     rigid = np.vstack([layout.rigid_body, np.eye(d)])
@@ -269,14 +269,16 @@ def _rigid_body_scales(factor: ca.SX, layout: Layout, totals: ca.SX | Array, mem
     own = ca.vertcat(*(1 / ca.sqrt(gram[i, i]) for i, gram in enumerate(grams)))
     if not any(np.any(rigid[groups != i, i]) for i in range(d)):
         return ca.vertsplit(own)
-    s, q = ca.SX.sym("s", d), ca.SX.sym("q", d, d * d)
-    miss = ca.vertcat(*(s.T @ gram @ s - 1 for gram in ca.horzsplit(q, d)))
-    step = ca.Function("newton", [s, q], [s - ca.solve(ca.jacobian(miss, s), miss)])
-    error = ca.Function("miss", [s, q], [ca.norm_inf(miss)])
+    z, q = ca.SX.sym("z", d), ca.SX.sym("q", d, d * d)
+    # In logarithms scales stay positive and the equations are nearly linear; long steps are cut.
+    s = ca.exp(z)
+    miss = ca.vertcat(*(ca.log(s.T @ gram @ s) for gram in ca.horzsplit(q, d)))
+    change = ca.solve(ca.jacobian(miss, z), miss)
+    step = ca.Function("newton", [z, q], [z - change / ca.fmax(1, ca.norm_inf(change))])
+    error = ca.Function("miss", [z, q], [ca.norm_inf(miss)])
     # One scale for all is where a mass with the right totals starts, and stays.
     uniform = ca.sqrt(d / sum(ca.sum1(ca.sum2(gram)) for gram in grams))
-    given, scale = ca.horzcat(*grams), ca.repmat(uniform, d, 1)
+    given, log_scale = ca.horzcat(*grams), ca.repmat(ca.log(uniform), d, 1)
     for _ in range(_NEWTON_STEPS):
-        scale = step(scale, given)
-    converged = ca.logic_and(error(scale, given) < 1e-10, ca.mmin(scale) > 0)
-    return ca.vertsplit(ca.if_else(converged, scale, np.nan))
+        log_scale = step(log_scale, given)
+    return ca.vertsplit(ca.if_else(error(log_scale, given) < 1e-10, ca.exp(log_scale), np.nan))

@@ -181,10 +181,10 @@ class Measurement:
             return names
         if d > 6:
             raise InputError(f"base has {d} directions; a rigid base has at most six")
-        if d <= 3 and np.any(np.abs(self.rigid_body) > 1 + 1e-6):
+        if d <= 3 and np.any(np.linalg.norm(self.rigid_body, axis=1) > 1 + 1e-6):
             raise InputError(
-                "rigid_body has entries above 1, as only a rotation gives: state base_axes, such as ['x', 'ry'] "
-                "(a translation moves a sensor by at most its own size)"
+                "rigid_body has rows longer than 1, as only a rotation gives (a unit axis under translations has a row "
+                "of at most 1): state base_axes, such as ['x', 'ry']"
             )
         return _BASE_AXES[:d]
 
@@ -252,6 +252,10 @@ class Measurement:
             raise InputError(
                 f"no line between {low:g} and {high:g} Hz; the record has {self.freq[0]:g} to {self.freq[-1]:g} Hz"
             )
+        return self.at(keep)
+
+    def at(self, keep: NDArray[np.bool_]) -> Measurement:
+        """The lines where `keep`, (n_freq,), is true."""
         cut = lambda record: None if record is None else record[..., keep]  # noqa: E731
         return Measurement(
             self.freq[keep], self.base[..., keep], self.response[..., keep], rigid_body=self.rigid_body,
@@ -279,7 +283,8 @@ class Measurement:
         freq : array_like, shape (n_freq,)
             Hz.
         frf : array_like, complex, shape (n_sensors, d, n_freq)
-            Transmissibility: absolute acceleration per unit base acceleration.
+            Transmissibility: absolute acceleration per unit base acceleration. With one base
+            direction (n_sensors, n_freq) will do.
         rigid_body : array_like, shape (n_sensors, d)
         force : array_like, complex, shape (d, d, n_freq), optional
             Apparent mass, kg: [force direction, base direction] per unit base acceleration.
@@ -291,7 +296,8 @@ class Measurement:
         base_axes : str or sequence of str, optional
         """
         lines = check_frequencies(freq)
-        H = _records("frf", frf, lines.size)
+        one_direction = np.ndim(frf) == 2  # (n_sensors, n_freq)
+        H = _records("frf", np.expand_dims(np.asarray(frf), 1) if one_direction else frf, lines.size)
         d = H.shape[1]
 
         def by_run(name: str, value: ArrayLike | None, like: ComplexArray | None) -> Any:

@@ -8,19 +8,23 @@ What a measured force or a stated model adds is linear in t, so its rank tells w
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
 import numpy as np
 
 from sysid.mass import KnownMass, LumpedMass
+from sysid.measurement import Measurement
 from sysid.problem import Problem
 from sysid.response import columns
 from sysid.stiffness import ChainStiffness
 from sysid.structure import Array, Structure
 
 _RANK_TOLERANCE = 1e-7
-_SAME_POLE = 1e-9
+_SAME_POLE = 1e-6  # relative distance of poles that count as one even without a misfit
+_UNRESOLVED = 20.0  # misfits, in parts of the half-power half-width, by which resolved poles differ
+_CLEAR = 3.0  # misfits above which a mode's share of the responses is seen
 _INVISIBLE = 1e-6  # of the strongest mode's participation
 
 
@@ -46,20 +50,20 @@ class Determination:
 
 
 def determination(problem: Problem, structure: Structure) -> Determination:
-    """Which modal masses of `structure` the measurement and the stated models of `problem` fix."""
-    test = problem.measurement
-    closed, open_ = [], []
-    base = columns(test.base)
-    rank = np.linalg.matrix_rank(base, tol=1e-9 * np.linalg.norm(base))
-    if rank < test.n_base:
-        open_.append(
-            f"the base moves in only {rank} of {test.n_base} independent directions: responses to the others are open"
-        )
-    strength = np.linalg.norm(structure.participation, axis=1)
-    for k in np.flatnonzero(strength < _INVISIBLE * strength.max()).tolist():
-        open_.append(f"{_mode(structure, k)} is not moved by the base: nothing in these data tells its mass")
+    """Which modal masses of `structure` the measurement and the stated models of `problem` fix.
 
-    clusters = _clusters(structure)
+    What counts as seen is judged against the misfit that the structure leaves: a mode whose share of
+    the records is not clearly above it, poles that it cannot tell apart, and base directions that
+    differ by less than it are not taken as known.
+    """
+    test = problem.measurement
+    misfit = test.residual(structure)
+    closed, open_ = [], list(_unseen(problem, structure, misfit))
+    clusters = _clusters(structure, misfit)
+    for cluster in clusters:
+        if len(cluster) > 1:
+            names = " and ".join(_mode(structure, k) for k in cluster)
+            open_.append(f"{names} are too close to be told apart: only the sum of their residues is known")
     unknowns = [pair for cluster in clusters for pair in combinations_with_replacement(cluster, 2)]
     system, sentence = _model_equations(problem, structure, unknowns)
     if sentence:
@@ -67,23 +71,67 @@ def determination(problem: Problem, structure: Structure) -> Determination:
     if test.force is not None:
         system = np.vstack([system, _force_equations(structure, clusters, unknowns)])
         closed.append("the measured base force weighs each mode that the base moves")
-    free = _open_modes(system, unknowns)
+    null = _null_space(system)
+    taking_part = np.abs(null).max(axis=0, initial=0.0) > 1e-6
+    free = sorted({k for pair, part in zip(unknowns, taking_part, strict=True) if part for k in pair})
     if free:
         n = structure.n
         names = ", ".join(_mode(structure, k) for k in free)
-        what = f"all {n} modal masses are open" if len(free) == n else f"modal masses are open ({names})"
+        if len(null) == 1 and len(free) == n > 1:
+            what = "one common scale of mass, stiffness and damping is open"
+        else:
+            what = "all modal masses are open" if len(free) == n else f"modal masses are open ({names})"
         open_.append(f"{what}: other mass and stiffness matrices answer identically")
         if problem.unit_mass:
             open_.append("no number with a unit of mass is given: masses are normalised to 1 kg in each base direction")
+    elif all(len(cluster) == 1 for cluster in clusters) or test.force is not None:
+        # Equations on a cluster as a block were enough: its modes need not be told apart.
+        open_ = [sentence for sentence in open_ if "too close" not in sentence]
     return Determination(not open_, () if free else tuple(closed), tuple(open_))
 
 
-def _clusters(structure: Structure) -> list[list[int]]:
-    """Modes of the same frequency and damping: only the sum of their residues is seen."""
+def _unseen(problem: Problem, structure: Structure, misfit: float) -> Iterator[str]:
+    """What the records do not show, in sentences."""
+    test = problem.measurement
+    base = columns(test.base)
+    sizes = np.linalg.norm(base, axis=1, keepdims=True)
+    spread = np.linalg.svd(base / np.where(sizes > 0, sizes, 1.0), compute_uv=False)
+    rank = int(np.count_nonzero(spread > max(1e-9, min(misfit, 0.5)) * spread[0]))
+    if rank < test.n_base:
+        yield f"the base moves in only {rank} of {test.n_base} independent directions: responses to the others are open"
+    if 2 * test.response.size < problem.n_variables:
+        yield f"{2 * test.response.size} measured numbers cannot fix {problem.n_variables} unknowns"
+    share, force_share = _shares(test, structure)
+    for k in range(structure.n):
+        f = structure.natural_frequencies[k]
+        if share[k] < max(_INVISIBLE, _CLEAR * misfit):
+            yield f"{_mode(structure, k)} is not moved by the base, or not above the misfit: its mass is not known"
+        elif not test.freq[0] <= f <= test.freq[-1]:
+            yield f"{_mode(structure, k)} lies outside the lines ({test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz)"
+        elif force_share is not None and force_share[k] < (test.force_residual(structure) or 0.0):
+            yield f"{_mode(structure, k)} does not stand out of the misfit of the base force: its mass is not weighed"
+
+
+def _shares(test: Measurement, structure: Structure) -> tuple[Array, Array | None]:
+    """Relative size of each mode's part in the responses and in the base force, (n,) each."""
+    w, omega = 2 * np.pi * test.freq, 2 * np.pi * structure.natural_frequencies[:, None]
+    g = w**2 / (omega**2 - w**2 + 2j * structure.damping_ratios[:, None] * omega * w)
+    push = np.einsum("kd,rdf->rkf", structure.participation, test.base) * g
+    size = np.linalg.norm(push, axis=(0, 2))
+    share = size * np.linalg.norm(structure.mode_shapes, axis=0) / np.linalg.norm(test.relative)
+    if test.force is None:
+        return share, None
+    return share, size * np.linalg.norm(structure.participation, axis=1) / np.linalg.norm(test.force)
+
+
+def _clusters(structure: Structure, misfit: float) -> list[list[int]]:
+    """Modes that the misfit cannot tell apart: of them only the sum of the residues is seen."""
     poles = structure.natural_frequencies * (1 + 1j * structure.damping_ratios)
     clusters = [[0]]
     for k in range(1, structure.n):
-        if abs(poles[k] - poles[clusters[-1][-1]]) < _SAME_POLE * abs(poles[k]):
+        apart = abs(poles[k] - poles[clusters[-1][-1]])
+        width = structure.damping_ratios[k] * structure.natural_frequencies[k]
+        if apart < max(_SAME_POLE * abs(poles[k]), _UNRESOLVED * misfit * width):
             clusters[-1].append(k)
         else:
             clusters.append([k])
@@ -144,18 +192,20 @@ def _model_equations(problem: Problem, structure: Structure, unknowns: Pairs) ->
         stiff = np.sqrt(np.diag(structure.stiffness)[:n])
         springs = _forms(P * omega / stiff, P * omega / stiff, unknowns)
         rows.append(springs[np.abs(structure.stiffness[:n, :n]) <= 1e-9 * np.outer(stiff, stiff)])
+        # A floor that no spring ties to the base is at rest in a rigid motion.
+        at_base = _forms(P * omega / stiff, P @ G * omega / np.linalg.norm(P @ G * omega, axis=0), unknowns)
+        rigid = structure.stiffness[:n, :n] @ G
+        rows.append(at_base[np.abs(rigid) <= 1e-9 * stiff[:, None] * stiff.max()])
         sentences.append("the stiffness is stated to be a chain")
     system = np.vstack(rows) if rows else np.zeros((0, len(unknowns)))
     return system, "; ".join(sentences)
 
 
-def _open_modes(system: Array, unknowns: Pairs) -> list[int]:
-    """Modes whose mass takes part in a direction that the equations leave open."""
-    padded = np.vstack([system, np.zeros((1, len(unknowns)))])
+def _null_space(system: Array) -> Array:
+    """Directions of the unknowns that the equations leave open, one a row."""
+    padded = np.vstack([system, np.zeros((1, system.shape[1]))])
     _, s, vt = np.linalg.svd(padded)
-    null = vt[np.count_nonzero(s > _RANK_TOLERANCE) :]
-    taking_part = np.abs(null).max(axis=0, initial=0.0) > 1e-6
-    return sorted({k for pair, part in zip(unknowns, taking_part, strict=True) if part for k in pair})
+    return vt[np.count_nonzero(s > _RANK_TOLERANCE) :]
 
 
 def _mode(structure: Structure, k: int) -> str:

@@ -16,7 +16,7 @@ from sysid.errors import InputError
 from sysid.layout import Layout
 from sysid.mass import FullMass, KnownMass, LumpedMass, MassModel
 from sysid.measurement import Measurement
-from sysid.response import columns
+from sysid.response import columns, weighed_mass
 from sysid.stiffness import SpectralStiffness, StiffnessModel
 from sysid.structure import Array, Structure, finite_array
 from sysid.variables import Variable, split
@@ -101,7 +101,9 @@ class Problem:
             raise InputError(f"goal = {self.goal}: a positive relative residual is needed")
         test = self.measurement
         layout = Layout(test.rigid_body, test.translational)
-        if test.force is not None:
+        if np.linalg.norm(test.relative) <= 1e-12 * np.linalg.norm(test.response):
+            raise InputError("no sensor moves relative to the base: there is nothing to identify from")
+        if test.force is not None and not isinstance(self.mass, KnownMass) and self.mass.total_mass is None:
             layout = replace(layout, weighed=_weigh(test, self.stiffness))
         put("layout", layout)
         put("validation", tuple(self.validation))
@@ -226,22 +228,19 @@ def _as_matrix(name: str, value: object) -> Array:
 
 
 def _weigh(test: Measurement, stiffness: StiffnessModel) -> Array:
-    """Rough rigid-body mass of each base direction from the force at the lowest lines, (d,).
-
-    Well below the first mode ``f_0 = (M_rb + w² E) u_0''``; it only places the search.
-    """
+    """Rough rigid-body mass of each base direction from the base force, (d,): it only places the search."""
     assert test.force is not None
-    first = stiffness.targets[0] / (2 * np.pi) if isinstance(stiffness, SpectralStiffness) else 0.0
-    below = max(np.count_nonzero(test.freq < first / 2), 2 * test.n_base)
-    u, f = columns(test.base[..., :below]), columns(test.force[..., :below])
-    freq = test.freq[:below]
-    w2 = np.tile((freq / freq[-1]) ** 2, test.n_runs)
-    basis = np.vstack([u, u * w2])
-    solution = np.linalg.lstsq(basis.T, f.T, rcond=None)[0]
-    mass = np.diag(solution[: test.n_base].real)
-    if np.any(mass <= 0):
+    omega = stiffness.targets if isinstance(stiffness, SpectralStiffness) else np.zeros(0)
+    freq = omega / (2 * np.pi)
+    # Away from resonance the damping, which is not known yet, hardly matters.
+    away = np.all(np.abs(test.freq / freq[:, None] - 1) > 0.1, axis=0)
+    quiet = test if np.count_nonzero(away) < 2 * (freq.size + 1) else test.at(away)
+    mass = np.diag(weighed_mass(quiet, omega, np.full(omega.size, 0.01)))
+    if np.all(mass > 0):
+        return mass
+    if freq.size and test.freq[0] < 0.3 * freq[0]:
         raise InputError(
-            f"the base force at the lowest lines gives a mass of {mass.min():.3g} kg: check its sign (the force is the "
-            "base's on the structure, in phase with the base acceleration at low frequency) and its unit"
+            f"the base force gives a mass of {mass.min():.3g} kg, with lines well below the first mode: check its sign "
+            "(it is the base's on the structure, in phase with the base acceleration at low frequency) and its unit"
         )
-    return mass
+    return np.linalg.norm(columns(test.force), axis=1) / np.linalg.norm(columns(test.base), axis=1)

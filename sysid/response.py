@@ -69,3 +69,44 @@ def residual(test: Measurement, phi: ca.MX, gamma: ca.MX, omega: ca.MX, ratios: 
             (gamma.T @ q_im + rigid_body_mass @ u_im - f_im) / scale,
         ]
     return ca.vertcat(*(ca.vec(ca.densify(piece)) for piece in pieces))
+
+
+def linear_residues(test: Measurement, omega: Array, ratios: Array) -> tuple[Array, float]:
+    """Residues of given poles by linear least squares, whatever their rank.
+
+    Parameters
+    ----------
+    test : Measurement
+    omega, ratios : (m,)
+        Circular frequencies, rad/s, and damping ratios.
+
+    Returns
+    -------
+    residues : (m, n, d)
+    residual : float
+        Relative residual that they leave: no modal model with these poles has a smaller one.
+    """
+    design, records = _modal_basis(test, omega, ratios), columns(test.relative).T
+    answer = _real_least_squares(design, records)
+    left = np.linalg.norm(design @ answer - records) / np.linalg.norm(records)
+    return answer.reshape(omega.size, test.n_base, -1).transpose(0, 2, 1), float(left)
+
+
+def weighed_mass(test: Measurement, omega: Array, ratios: Array) -> Array:
+    """Rigid-body mass (d, d) that the base force tells, its modal part free at the given poles; kg."""
+    assert test.force is not None
+    design = np.hstack([columns(test.base).T, _modal_basis(test, omega, ratios)])
+    return _real_least_squares(design, columns(test.force).T)[: test.n_base].T
+
+
+def _modal_basis(test: Measurement, omega: Array, ratios: Array) -> ComplexArray:
+    """Response of each mode to each base direction, (runs * n_freq, m * d)."""
+    w = 2 * np.pi * test.freq
+    g = w**2 / (omega[:, None] ** 2 - w**2 + 2j * (ratios * omega)[:, None] * w)
+    u = columns(test.base)
+    return (np.tile(g, test.n_runs)[:, None] * u[None]).reshape(-1, u.shape[1]).T
+
+
+def _real_least_squares(design: ComplexArray, records: ComplexArray) -> Array:
+    stacked = np.vstack([design.real, design.imag])
+    return np.linalg.lstsq(stacked, np.vstack([records.real, records.imag]), rcond=None)[0]

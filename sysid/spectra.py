@@ -184,8 +184,9 @@ def resample(
     records : sequence of (time, samples)
         Time (n,) in s, strictly increasing and on one origin; samples (channels, n) or (n,).
     sample_rate : float, optional
-        Hz; the slowest instrument's mean rate by default. A record whose own rate is higher than
-        that is low-passed first (zero phase), so that nothing folds into the band.
+        Hz; the slowest instrument's mean rate by default. Where an instrument is faster than that,
+        all records are low-passed alike (zero phase, to about 0.35 of the rate), so that nothing
+        folds into the band and ratios of records keep their size.
 
     Returns
     -------
@@ -229,8 +230,9 @@ def resample(
         raise InputError("the records have no time in common; check that their clocks have one origin")
     time = start + np.arange(count) / rate
     out = []
-    for t, x, own in zip(clocks, samples, rates, strict=True):
-        if own > 1.1 * rate:
+    folding = bool(np.any(rates > 1.1 * rate))
+    for index, (t, x, own) in enumerate(zip(clocks, samples, rates, strict=True)):
+        if folding:
             if t.size < 60:
                 raise InputError(f"record {index}: {t.size} samples are too few to low-pass before resampling")
             x = sosfiltfilt(butter(8, 0.8 * rate / own, output="sos"), x, axis=-1)

@@ -95,7 +95,8 @@ class SpectralStiffness:
 class ChainStiffness:
     """Springs in series from the base to the last sensor, one chain a base direction.
 
-    The sensors of a direction stand in the order of the chain, the one nearest the base first.
+    The sensors of a direction stand in the order of the chain, the one nearest the base first, each
+    along the direction or against it.
 
     Parameters
     ----------
@@ -132,33 +133,43 @@ class ChainStiffness:
 
     def values(self, layout: Layout, H: Array, stiffness: Array) -> Array:
         """Spring stiffnesses of a chain's stiffness matrix."""
-        springs = []
-        for i, below in enumerate(_previous(layout)):
-            # A spring is minus the coupling to the sensor below, or what the row adds up to at the base.
-            springs.append(stiffness[i, : layout.n].sum() if below < 0 else -stiffness[i, below])
-        return np.array(springs)
+        n, arms = layout.n, _arms(layout)
+        K = stiffness[:n, :n] * np.outer(arms, arms)
+        # A spring is minus the coupling to the sensor below, or what the row adds up to at the base.
+        return np.array([K[i].sum() if below < 0 else -K[i, below] for i, below in enumerate(_previous(layout))])
 
 
 StiffnessModel = SpectralStiffness | ChainStiffness
 
 
+def _arms(layout: Layout) -> Array:
+    """Motion of each sensor for unit motion of its floor along the chain, (n,): 1, or -1 where it points back."""
+    groups = layout.directions[: layout.n]
+    if np.any(groups < 0):
+        at = int(np.argmax(groups < 0))
+        raise InputError(f"ChainStiffness: sensor {at + 1} is moved by no base direction; a chain cannot hold it")
+    arms = layout.rigid_body[np.arange(layout.n), groups]
+    rest = np.linalg.norm(layout.rigid_body, axis=1) - np.abs(arms)
+    if np.any(np.abs(np.abs(arms) - 1) > 1e-6) or np.any(rest > 1e-6):
+        raise InputError(
+            "ChainStiffness: each sensor must point along one base direction (entries 1 or -1 in rigid_body)"
+        )
+    return arms
+
+
 def _previous(layout: Layout) -> list[int]:
     """The sensor below each one in its chain; -1 for the base."""
     groups = layout.directions[: layout.n].tolist()
-    if -1 in groups:
-        raise InputError(
-            f"ChainStiffness: sensor {groups.index(-1)} is moved by no base direction; a chain cannot hold it"
-        )
     return [max((j for j in range(i) if groups[j] == groups[i]), default=-1) for i in range(layout.n)]
 
 
 def _chain_pattern(layout: Layout) -> Array:
     """Stiffness of each unit spring, (n, n, n)."""
-    patterns = np.zeros((layout.n,) * 3)
+    patterns, arms = np.zeros((layout.n,) * 3), _arms(layout)
     for i, below in enumerate(_previous(layout)):
         elongation = np.zeros(layout.n)
-        elongation[i] = 1.0
+        elongation[i] = arms[i]
         if below >= 0:
-            elongation[below] = -1.0
+            elongation[below] = -arms[below]
         patterns[i] = np.outer(elongation, elongation)
     return patterns
