@@ -27,7 +27,9 @@ def main() -> int:
     options = parser.parse_args()
     try:
         lines = importlib.import_module(f"benchmarks.lines_{options.number}")
-    except ModuleNotFoundError:
+    except ModuleNotFoundError as error:
+        if error.name != f"benchmarks.lines_{options.number}":
+            raise
         print(f"no lines are written for {options.number}", file=sys.stderr)
         return 2
     return 1 if show(lines.lines(options.reduced, options.data, options.only)) else 0

@@ -14,7 +14,7 @@ from sysid.spectra import resample
 from sysid.stiffness import ChainStiffness, SpectralStiffness
 from sysid.storage import load
 from sysid.structure import Structure
-from sysid.swarm import minimize_swarm
+from sysid.swarm import SwarmSettings, minimize_swarm
 from sysid.variables import Variable
 
 __version__ = "0.1.0"
@@ -26,6 +26,6 @@ if hasattr(_casadi.GlobalOptions, "setNumpyMode"):
 __all__ = [
     "ChainStiffness", "FullMass", "History", "Identification", "InputError", "KnownMass", "LumpedMass", "Measurement",
     "ModalDamping", "Problem", "Progress", "ProportionalDamping", "Recipe", "Sensor", "SolverError",
-    "SpectralStiffness", "Structure", "Swarm", "SysidError", "Variable", "identify", "load", "minimize_swarm", "plot",
-    "resample", "rigid_body", "simulate",
+    "SpectralStiffness", "Structure", "Swarm", "SwarmSettings", "SysidError", "Variable", "identify", "load",
+    "minimize_swarm", "plot", "resample", "rigid_body", "simulate",
 ]  # fmt: skip

@@ -123,7 +123,8 @@ def _run(options: argparse.Namespace, out: _Output) -> int:
             problem, strategy=options.strategy, rng=options.seed, max_time=options.max_time, progress=display
         )
     result = replace(result, recipe=recipe)
-    _show(result, out)
+    out.write(f"\n{result.summary()}\n\n")
+    out.flush()
     try:
         _save(result, folder, out)
     except KeyboardInterrupt:
@@ -410,47 +411,3 @@ class _Display:
     @property
     def _running(self) -> bool:
         return self._live is not None and self._live.is_started
-
-
-def _show(result: Identification, out: _Output) -> None:
-    """Print the final table and the verdict."""
-    import numpy as np
-    from rich import box
-    from rich.table import Table
-
-    s, axes = result.structure, result.measurement.base_axes or ()
-    rigid = np.diag(s.rigid_body_mass)
-    share = 100 * np.diagonal(s.effective_masses, axis1=1, axis2=2) / np.where(rigid > 0, rigid, np.inf)
-    table = Table(box=box.SIMPLE, pad_edge=False, show_footer=True)
-    table.add_column("mode", justify="right", footer="sum")
-    table.add_column("frequency, Hz", justify="right", no_wrap=True)
-    table.add_column("damping, %", justify="right", no_wrap=True)
-    for axis, total in zip(axes, share.sum(axis=0), strict=True):
-        table.add_column(f"eff. mass {axis}, %", justify="right", footer=f"{total:.1f}")
-    for k, (f, zeta) in enumerate(zip(s.natural_frequencies, s.damping_ratios, strict=True)):
-        table.add_row(str(k + 1), f"{f:.5g}", f"{100 * zeta:.4g}", *(f"{value:.1f}" for value in share[k]))
-    _console(out).print(table)
-
-    problem = result.problem
-    goal = "" if problem.goal is None else f" (goal {problem.goal:.3g})"
-    force = "" if result.force_residual is None else f", of the base force {result.force_residual:.3e}"
-    verdict = "success" if result.success else "no success"
-    lines = [
-        f"{verdict}: {result.message}",
-        f"relative residual {result.residual:.3e}{goal}{force}, {result.history.wall_time:.1f} s",
-        "rigid-body mass " + ", ".join(f"{axis} {m:.6g} {_unit(axis)}" for axis, m in zip(axes, rigid, strict=True)),
-    ]
-    for i, test in enumerate(problem.validation, start=1):
-        lines.append(f"test {i} of {len(problem.validation)} never fitted: relative residual {test.residual(s):.3e}")
-    if result.determined:
-        lines.append("Determined: this is the mass and stiffness, within the stated model.")
-        lines += [f"  - {sentence}" for sentence in result.closed_by]
-    else:
-        lines.append("Not determined: this is one of many models that explain the data.")
-        lines += [f"  - {sentence}" for sentence in result.undetermined]
-    out.write("\n".join([*lines, "", ""]))
-    out.flush()
-
-
-def _unit(axis: str) -> str:
-    return "kg m²" if axis.startswith("r") else "kg"

@@ -29,23 +29,19 @@ from sysid._beam import (
     Matrix,
     Scalar,
     WeightedSum,
-    base_columns,
     block,
-    cross_matrix,
     inertia_entries,
     is_number,
     joined,
     local_axes,
     mass_patterns,
     placed_rows,
-    rigid_motion,
     scalar,
-    sensor_row,
     solve,
     stiffness_patterns,
     symmetric,
-    vector3,
 )
+from sysid.axes import base_columns, cross_matrix, rigid_motion, sensor_row, vector3
 from sysid.errors import InputError
 from sysid.structure import Structure
 

@@ -136,28 +136,34 @@ class Identification:
 
     def summary(self) -> str:
         """Table of the result, for a terminal."""
-        s = self.structure
-        lines = [
-            f"{'success' if self.success else 'no success'}: {self.message}",
-            f"strategy {self.strategy}, seed {self.seed}, {self.history.wall_time:.1f} s",
-            f"relative residual {self.residual:.3e}"
-            + ("" if self.force_residual is None else f", base force {self.force_residual:.3e}"),
-            f"rigid-body mass {_numbers(np.diag(s.rigid_body_mass))} kg ({' '.join(self.measurement.base_axes or ())})",
-            "",
-            "mode   frequency [Hz]   damping [%]   effective mass [% of rigid-body mass]",
-        ]
-        rigid = np.diag(s.rigid_body_mass)
+        s, axes, problem = self.structure, self.measurement.base_axes or (), self.problem
+        heads = [f"eff. mass {axis}, %" for axis in axes]
+        share = s.effective_mass_percent
+        lines = ["mode  frequency, Hz  damping, %  " + "  ".join(heads)]
         for k, (f, zeta) in enumerate(zip(s.natural_frequencies, s.damping_ratios, strict=True)):
-            share = 100 * np.diag(s.effective_masses[k]) / np.where(rigid > 0, rigid, np.inf)
-            lines.append(f"{k + 1:4d}   {f:14.5g}   {100 * zeta:11.4g}   " + " ".join(f"{v:6.1f}" for v in share))
-        lines.append("")
+            shares = "  ".join(f"{v:{len(head)}.1f}" for v, head in zip(share[k], heads, strict=True))
+            lines.append(f"{k + 1:4d}  {f:13.5g}  {100 * zeta:10.4g}  {shares}")
+        sums = "  ".join(f"{v:{len(head)}.1f}" for v, head in zip(share.sum(axis=0), heads, strict=True))
+        lines += [f" sum  {'':13}  {'':10}  {sums}", ""]
+
+        goal = "" if problem.goal is None else f" (goal {problem.goal:.3g})"
+        force = "" if self.force_residual is None else f", of the base force {self.force_residual:.3e}"
+        rigid = zip(axes, np.diag(s.rigid_body_mass), strict=True)
+        lines += [
+            f"{'success' if self.success else 'no success'}: {self.message}",
+            f"relative residual {self.residual:.3e}{goal}{force}; seed {self.seed}, {self.history.wall_time:.1f} s",
+            "rigid-body mass "
+            + ", ".join(f"{axis} {m:.6g} {'kg m²' if axis[0] == 'r' else 'kg'}" for axis, m in rigid),
+        ]
+        for i, test in enumerate(problem.validation, start=1):
+            lines.append(
+                f"test {i} of {len(problem.validation)} never fitted: relative residual {test.residual(s):.3e}"
+            )
         if self.determined:
             lines.append("Determined: data and stated model leave one mass and one stiffness matrix.")
-            lines += [f"  - {sentence}" for sentence in self.closed_by]
         else:
             lines.append("Not determined: this is one of many models that explain the data.")
-            lines += [f"  - {sentence}" for sentence in self.undetermined]
-        return "\n".join(lines)
+        return "\n".join([*lines, *(f"  - {sentence}" for sentence in self.closed_by + self.undetermined)])
 
     def to_dict(self) -> dict[str, Any]:
         """The figures of ``summary.json``."""
@@ -194,7 +200,3 @@ def modal_assurance(phi: Array, other: Array) -> Array:
     if phi.shape[0] != other.shape[0]:
         raise InputError(f"mode shapes at {phi.shape[0]} and {other.shape[0]} sensors cannot be compared")
     return (phi.T @ other) ** 2 / np.outer(np.sum(phi**2, axis=0), np.sum(other**2, axis=0))
-
-
-def _numbers(values: Array) -> str:
-    return ", ".join(f"{v:.6g}" for v in values)

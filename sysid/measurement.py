@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sysid import spectra
+from sysid.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
 from sysid.errors import InputError
 from sysid.structure import Array, ComplexArray, Structure, check_frequencies
-
-_AXES = {"x": 0, "y": 1, "z": 2}
 
 
 @dataclass(frozen=True)
@@ -66,44 +65,27 @@ def rigid_body(
     array([[1., 2.]])
     """
     points = np.atleast_2d(_checked("positions", positions, float))
-    e = np.array([axis_vector(axis) for axis in axes])
-    if points.shape != e.shape:
-        raise InputError(f"positions {points.shape} and axes {e.shape} disagree; both have one row of three a sensor")
-    r = points - np.asarray(origin, dtype=float)
-    full = np.hstack([e, np.cross(r, e)])
-    return full[:, [_BASE_AXES.index(name) for name in base_axis_names(base_axes)]]
-
-
-_BASE_AXES = ("x", "y", "z", "rx", "ry", "rz")
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) != len(axes):
+        raise InputError(f"positions {points.shape} and {len(axes)} axes disagree; both have one row of three a sensor")
+    columns = base_columns(base_axes)
+    motion = rigid_motion(points, origin).reshape(len(points), 6, 6)
+    rows = [axis_vector(axis, f"sensor {i}") @ motion[i, :3] for i, axis in enumerate(axes)]
+    return np.array(rows)[:, columns]
 
 
 def base_axis_names(base_axes: str | Sequence[str]) -> tuple[str, ...]:
     """Spell out base axes: "xyz" → ("x", "y", "z"); "x rz" → ("x", "rz")."""
-    if isinstance(base_axes, str):
-        words = base_axes.replace(",", " ").split()
-        names = words if len(words) > 1 or words[:1] in (["rx"], ["ry"], ["rz"]) else list(base_axes.strip())
-    else:
-        names = list(base_axes)
-    unknown = [name for name in names if name not in _BASE_AXES]
-    if unknown or not names or len(set(names)) != len(names):
-        raise InputError(f"base axes {base_axes!r}: give some of {' '.join(_BASE_AXES)}, each once")
-    return tuple(names)
+    return tuple(BASE_AXES[column] for column in base_columns(base_axes))
 
 
-def axis_vector(axis: str | Sequence[float]) -> Array:
+def axis_vector(axis: str | Sequence[float], label: str = "a sensor") -> Array:
     """Unit vector of "x", "-y", ... or of a direction vector."""
-    if isinstance(axis, str):
-        letter = axis[1:] if axis[:1] in ("+", "-") else axis
-        if letter not in _AXES:
-            raise InputError(f"axis {axis!r}: give x, y or z with an optional sign, or a vector")
-        vector = np.zeros(3)
-        vector[_AXES[letter]] = -1.0 if axis.startswith("-") else 1.0
-        return vector
-    vector = np.asarray(axis, dtype=float)
-    length = np.linalg.norm(vector) if vector.shape == (3,) else 0.0
-    if not np.isfinite(length) or length == 0:
-        raise InputError(f"axis {axis!r}: a direction vector has three finite components, not all zero")
-    return vector / length
+    row = sensor_row(axis, label)
+    if np.any(row[3:]):
+        raise InputError(
+            f"the axis of {label} is the rotation {axis!r}; an accelerometer measures x, y or z, or a vector"
+        )
+    return row[:3]
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,13 +168,13 @@ class Measurement:
                 "rigid_body has rows longer than 1, as only a rotation gives (a unit axis under translations has a row "
                 "of at most 1): state base_axes, such as ['x', 'ry']"
             )
-        return _BASE_AXES[:d]
+        return BASE_AXES[:d]
 
     @property
     def translational(self) -> NDArray[np.bool_]:
         """Which base directions are translations, (d,)."""
         assert self.base_axes is not None
-        return np.array([name in _AXES for name in self.base_axes])
+        return np.array([name in BASE_AXES[:3] for name in self.base_axes])
 
     @property
     def n_runs(self) -> int:

@@ -228,7 +228,7 @@ def effective_masses(identification: Identification, ax: Axes | None = None) -> 
     """
     structure = identification.structure
     names = identification.measurement.base_axes or ()
-    share = mass_shares(structure)
+    share = structure.effective_mass_percent
     modes = np.arange(1, structure.n + 1)
     figure, ax = new_axes(ax, min(5.0 + 0.18 * structure.n, 9.0), 3.6)
     width = 0.8 / structure.n_base
@@ -243,7 +243,7 @@ def effective_masses(identification: Identification, ax: Axes | None = None) -> 
             last = i == structure.n_base - 1
             size = max(80 / (structure.n * structure.n_base), 4)
             label = "reference" if last else None
-            ax.plot(at, mass_shares(reference)[:, i], "_", color=INK, markersize=size, label=label)
+            ax.plot(at, reference.effective_mass_percent[:, i], "_", color=INK, markersize=size, label=label)
     ax.axhline(100, color=FAINT, linewidth=0.8, linestyle=":")
     ax.set_ylim(0, max(105.0, 1.05 * float(np.cumsum(share, axis=0).max())))
     count_modes(ax, structure.n)
@@ -389,12 +389,6 @@ def strongest(
         free.remove(s)
         chosen.append((s, r))
     return chosen
-
-
-def mass_shares(structure: Any) -> Array:
-    """Effective masses in % of the rigid-body mass, (n, d); zero where a direction has no mass."""
-    rigid = np.diag(structure.rigid_body_mass)
-    return 100 * np.einsum("kii->ki", structure.effective_masses) / np.where(rigid > 0, rigid, np.inf)
 
 
 def normalised(matrix: Array) -> Array:

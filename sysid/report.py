@@ -144,7 +144,7 @@ def _verdict(it: Identification) -> str:
 def _modes(it: Identification) -> str:
     structure, reference = it.structure, it.problem.reference
     axes = it.measurement.base_axes or ()
-    share = plot.mass_shares(structure)
+    share = structure.effective_mass_percent
     head = ["mode", "frequency [Hz]", "damping [%]", *(f"effective mass {a} [%]" for a in axes)]
     known = reference if reference is not None and reference.n == structure.n else None
     if known is not None:

@@ -143,6 +143,12 @@ class Structure:
         """Number of sensors, the rows of `recovery`."""
         return int(self.recovery.shape[0])
 
+    @property
+    def effective_mass_percent(self) -> Array:
+        """Effective mass of each mode in each base direction, in % of the rigid-body mass, (n, d)."""
+        rigid = np.diag(self.rigid_body_mass)
+        return 100 * self.participation**2 / np.where(rigid > 0, rigid, np.inf)
+
     def __repr__(self) -> str:
         low, high = self.natural_frequencies[[0, -1]]
         return f"<Structure: n = {self.n}, d = {self.n_base}, {low:.4g} to {high:.4g} Hz>"

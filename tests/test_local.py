@@ -9,7 +9,8 @@ import pytest
 
 import sysid
 from sysid import FullMass, SpectralStiffness, local
-from sysid.problem import SwarmCost
+from sysid.refinement import SOLVED
+from sysid.swarm_cost import SwarmCost
 
 MASSES, DAMPINGS = ("trace", "rigid_body", "lumped", "known"), ("modal", "proportional")
 
@@ -46,21 +47,52 @@ def sound(problem, answer):
     assert np.linalg.eigvalsh(structure.mass[:n, :n])[0] > 0
     assert np.linalg.eigvalsh(structure.stiffness[:n, :n])[0] > 0
     assert total_error(problem, structure) < 1e-9
-    assert answer.success == any(good in answer.message for good in local.GOOD)
+    assert answer.success == any(good in answer.message for good in SOLVED)
     return problem.measurement.residual(structure)
 
 
+# Of twelve random starts, how many at least end below 1e-6 and below 1e-8. Over 120 other starts each (48 where the
+# mass is structured) the rates are 0.97 and 0.87 (full, modal), 0.86 and 0.83 (full, proportional), 0.94 and 0.94
+# (structured, modal), 0.79 and 0.79 (structured, proportional): each bound fails by chance once in a hundred at most.
+LEAST = {
+    ("full", "modal"): (10, 8), ("full", "proportional"): (7, 7),
+    ("structured", "modal"): (8, 8), ("structured", "proportional"): (6, 6),
+}  # fmt: skip
+
+
 @pytest.mark.parametrize(("mass", "damping"), list(itertools.product(MASSES, DAMPINGS)))
-def test_from_random_starts_half_of_the_searches_end_at_the_truth_of_a_noise_free_test(random_case, mass, damping):
+def test_from_random_starts_most_searches_end_at_the_truth_of_a_noise_free_test(random_case, mass, damping):
     """A spectral stiffness, n = 4 to 6. The problem is not convex: some starts end in another minimum."""
     residuals = []
-    for n, seed in itertools.product((4, 5, 6), range(2)):
+    for n, seed in [*itertools.product((4, 5), range(5)), (6, 0), (6, 1)]:
         rng = np.random.default_rng([seed, n])
         _, problem = random_case(rng, mass, "spectral", damping, n=n)
         answer = local.solve(problem, random_start(rng, problem), max_iterations=300)
         residuals.append(sound(problem, answer))
-    assert sum(r < 1e-6 for r in residuals) >= 3, residuals
-    assert sum(r < 1e-8 for r in residuals) >= 2, residuals
+    found, exact = LEAST["full" if mass in ("trace", "rigid_body") else "structured", damping]
+    assert sum(r < 1e-6 for r in residuals) >= found, residuals
+    assert sum(r < 1e-8 for r in residuals) >= exact, residuals
+
+
+@pytest.mark.parametrize("mass", ["trace", "rigid_body"])
+def test_a_local_minimum_of_the_residues_is_seen_and_left(random_case, mass):
+    """With all poles free a search from random shapes may end where linear least squares at its own poles fits better:
+    then further attempts are made, the curve spans them all, and the best of them is the answer."""
+    again = []
+    for seed in range(20):
+        rng = np.random.default_rng([seed, 4])
+        _, problem = random_case(rng, mass, "spectral", "modal", n=4)
+        seen = []
+        answer = local.solve(problem, random_start(rng, problem), monitor=lambda *args, to=seen: to.append(args))
+        assert [iteration for iteration, _ in seen] == list(range(answer.curve.size))
+        np.testing.assert_array_equal([residual for _, residual in seen], answer.curve)
+        residual = sound(problem, answer)
+        assert residual == pytest.approx(answer.curve.min(), rel=1e-2, abs=1e-9)
+        if "as the first ended in a local minimum" in answer.message:
+            assert any(f"best of {count} starts" in answer.message for count in (2, 3))
+            again.append(residual)
+    assert len(again) >= 2
+    assert np.median(again) < 1e-6, again
 
 
 @pytest.mark.parametrize(("mass", "damping", "force"), list(itertools.product(MASSES, DAMPINGS, (False, True))))
@@ -177,11 +209,12 @@ class TestControl:
         problem, x = start
         answer = local.solve(problem, x)
         residual = lambda at: problem.measurement.residual(problem.structure(at))  # noqa: E731
-        assert answer.curve.shape == (answer.iterations + 1,)
+        assert answer.curve.ndim == 1
         # The start is moved a little off its bounds by the interior point.
         assert answer.curve[0] == pytest.approx(residual(x), rel=1e-2)
         assert answer.curve[-1] == pytest.approx(residual(answer.x), rel=1e-3, abs=1e-9)
         assert answer.curve[-1] < answer.curve[0]
+        assert answer.stopped is None
 
     def test_its_bits_repeat(self, start):
         problem, x = start
@@ -196,7 +229,10 @@ class TestControl:
         answer = local.solve(problem, random_start(rng, problem), max_iterations=3)
         assert not answer.success
         assert "Maximum_Iterations_Exceeded" in answer.message
-        assert answer.iterations == 3
+        if mass == "lumped":
+            assert answer.curve.size == 4  # the start, and three iterations
+        else:
+            assert answer.curve.size in (4, 8, 12)  # of each attempt
         assert total_error(problem, problem.structure(answer.x)) < 1e-9
 
     @pytest.mark.parametrize("mass", ["rigid_body", "lumped"])
@@ -207,45 +243,46 @@ class TestControl:
 
         def monitor(iteration, residual):
             seen.append((iteration, residual))
-            return iteration == 4
+            if iteration == 4:
+                raise StopIteration
 
         answer = local.solve(problem, random_start(rng, problem), monitor=monitor)
         assert [iteration for iteration, _ in seen] == [0, 1, 2, 3, 4]
         np.testing.assert_array_equal([residual for _, residual in seen], answer.curve)
         assert not answer.success
-        assert "User_Requested_Stop" in answer.message
-        assert not answer.interrupted
+        assert answer.message.startswith("IPOPT: stopped")
+        assert isinstance(answer.stopped, StopIteration)
         assert total_error(problem, problem.structure(answer.x)) < 1e-9
 
-    def test_a_keyboard_interrupt_leaves_the_best_so_far(self, start):
+    def test_what_the_monitor_returns_changes_nothing(self, start):
         problem, x = start
+        quiet, answer = local.solve(problem, x), local.solve(problem, x, monitor=lambda iteration, residual: True)
+        np.testing.assert_array_equal(quiet.x, answer.x)
+        assert answer.stopped is None
+
+    @pytest.mark.parametrize("error", [KeyboardInterrupt, ZeroDivisionError, SystemExit])
+    @pytest.mark.parametrize("at", [0, 5])
+    def test_whatever_the_monitor_raises_is_handed_back_with_the_last_iterate(self, start, capfd, error, at):
+        problem, x = start
+        mine = error("mine")
 
         def monitor(iteration, residual):
-            if iteration == 5:
-                raise KeyboardInterrupt
-            return False
+            if iteration == at:
+                raise mine
 
         answer = local.solve(problem, x, monitor=monitor)
-        assert answer.interrupted
+        assert answer.stopped is mine
         assert not answer.success
-        assert "interrupted" in answer.message
+        assert answer.message.startswith("IPOPT: stopped")
+        assert answer.curve.size == at + 1
         assert problem.measurement.residual(problem.structure(answer.x)) == pytest.approx(answer.curve[-1], rel=1e-6)
-
-    def test_a_mistake_in_the_monitor_is_not_swallowed(self, start):
-        problem, x = start
-
-        def monitor(iteration, residual):
-            raise ZeroDivisionError("mine")
-
-        with pytest.raises(ZeroDivisionError, match="mine"):
-            local.solve(problem, x, monitor=monitor)
+        assert capfd.readouterr() == ("", "")  # CasADi's own account of it reaches nobody
 
     def test_time_runs_out(self, start):
         problem, x = start
 
         def monitor(iteration, residual):
             time.sleep(0.05)
-            return False
 
         begun = time.perf_counter()
         answer = local.solve(problem, x, max_time=0.1, monitor=monitor)

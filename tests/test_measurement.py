@@ -24,7 +24,7 @@ def records():
         "base": complex_normal(rng, 3, 2, 5),
         "response": complex_normal(rng, 3, 4, 5),
         "force": complex_normal(rng, 3, 2, 5),
-        "rigid_body": rng.uniform(-1, 1, (4, 2)),
+        "rigid_body": rng.uniform(-0.7, 0.7, (4, 2)),
     }
 
 
@@ -75,9 +75,9 @@ class TestRigidBody:
         with pytest.raises(InputError, match="axis"):
             rigid_body([[0, 0, 0]], [axis])
 
-    @pytest.mark.parametrize("base_axes", ["", "w", "xx", "xrz", [], ["x", "x"], ["r"], "x rw"])
+    @pytest.mark.parametrize("base_axes", ["", "w", "xx", [], ["x", "x"], ["r"], "x rw"])
     def test_base_axes_that_are_none(self, base_axes):
-        with pytest.raises(InputError, match="base axes"):
+        with pytest.raises(InputError, match="base_axes"):
             rigid_body([[0, 0, 0]], ["x"], base_axes=base_axes)
 
     @pytest.mark.parametrize("positions", [[[0, 0, 0], [1, 1, 1]], [[0, 0]], [[1.0]], [[0, 0, 0, 0]]])
@@ -168,7 +168,7 @@ class TestBaseAxes:
     def test_refusals(self, records):
         with pytest.raises(InputError, match="names 3 directions but base has 2"):
             Measurement(**records, base_axes="xyz")
-        with pytest.raises(InputError, match="base axes"):
+        with pytest.raises(InputError, match="base_axes"):
             Measurement(**records, base_axes="xq")
         with pytest.raises(InputError, match="at most six"):
             Measurement(records["freq"], np.ones((1, 7, 5)), records["response"][:1], rigid_body=np.zeros((4, 7)))

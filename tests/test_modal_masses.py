@@ -25,6 +25,13 @@ def member(structure, t):
     return Structure((M + M.T) / 2, (K + K.T) / 2, structure.damping_ratios, n_base=G.shape[1])
 
 
+def is_lumped(structure):
+    """Diagonal over the sensors, and not coupled to the base."""
+    n, M = structure.n, structure.mass
+    off = np.hstack([M[:n, :n] - np.diag(np.diag(M)[:n]), M[:n, n:]])
+    return bool(np.abs(off).max() < 1e-9 * np.diag(M)[:n].max())
+
+
 def problem_of(structure, mass, *, force=False, stiffness=None, test=None):
     test = sysid.simulate(structure, FREQ, force=force) if test is None else test
     return Problem(test, mass=mass, stiffness=stiffness or SpectralStiffness(structure.natural_frequencies))
@@ -66,7 +73,8 @@ class TestVerdict:
     def test_a_full_mass_needs_the_force(self, full, healing):
         """A total with M_00 free bounds the modal masses and fixes none."""
         for total in (None, 50.0):
-            self.check(determination(problem_of(full, FullMass(total, healing=healing)), full), False, says="all 4")
+            verdict = determination(problem_of(full, FullMass(total, healing=healing)), full)
+            self.check(verdict, False, says="all modal masses are open")
             forced = problem_of(full, FullMass(total, healing=healing), force=True)
             self.check(determination(forced, full), True, says="base force weighs")
 
@@ -83,9 +91,12 @@ class TestVerdict:
 
     @pytest.mark.parametrize("seed", range(3))
     def test_without_its_total_a_coupled_lumped_mass_leaves_one_scale(self, random_case, seed):
+        """Modal masses in one proportion keep the mass lumped, and no others do."""
         truth, _ = random_case(np.random.default_rng(seed), "lumped", n=5, d=1)
         verdict = determination(problem_of(truth, LumpedMass()), truth)
-        self.check(verdict, False, says="1 of the 5 modal masses")
+        self.check(verdict, False, says="one common scale of mass, stiffness and damping is open")
+        assert is_lumped(member(truth, np.full(5, 3.0)))
+        assert not is_lumped(member(truth, np.array([3.0, 3.0, 3.0, 3.0, 2.9])))
 
     def test_uncoupled_directions_leave_a_scale_each(self):
         """x and y shake independently: lumped mass without a total leaves two scales, and one total closes one."""
@@ -97,7 +108,12 @@ class TestVerdict:
         M = np.diag([2.0, 1, 1, 3, 0, 0])
         K = np.block([[K_SS, -K_SS @ G], [-(K_SS @ G).T, G.T @ K_SS @ G]])
         truth = Structure(M, K, np.full(4, 0.01), n_base=2)
-        self.check(determination(problem_of(truth, LumpedMass()), truth), False, says="2 of the 4 modal masses")
+        self.check(determination(problem_of(truth, LumpedMass()), truth), False, says="all modal masses are open")
+        along_x = np.abs(truth.participation[:, 0]) > np.abs(truth.participation[:, 1])
+        other = member(truth, np.where(along_x, 3.0, 0.5))
+        assert is_lumped(other)
+        a, b = truth.transmissibility(FREQ), other.transmissibility(FREQ)
+        assert np.linalg.norm(a - b) < 1e-10 * np.linalg.norm(a)
         self.check(determination(problem_of(truth, LumpedMass([3.0, 4.0])), truth), True)
 
     def test_a_known_mass_determines_all(self, full):
@@ -114,6 +130,7 @@ class TestVerdict:
         for force in (False, True):
             verdict = determination(problem_of(truth, FullMass(3.0), force=force), truth)
             self.check(verdict, False, says=["mode 2", "is not moved by the base"])
+        self.check(verdict, False, says="modal masses are open (mode 2 (")  # the force weighs mode 1 alone
 
     @pytest.mark.parametrize("force", [False, True])
     def test_one_run_of_a_fixed_direction_leaves_the_other_open(self, full, force):
@@ -173,3 +190,16 @@ class TestVerdict:
             assert np.linalg.norm(a - b) < 1e-9 * np.linalg.norm(a)
         assert np.linalg.norm(M_SS - truth.mass[:3, :3]) > 0.1 * np.linalg.norm(M_SS)
         assert not determination(problem_of(truth, FullMass(), force=True), truth).determined
+
+    @pytest.mark.parametrize(("d", "multiplicity", "determined"), [(2, 2, True), (3, 3, True), (2, 3, False)])
+    def test_a_force_in_as_many_directions_as_a_pole_repeats_weighs_its_modes(
+        self, random_blocks, d, multiplicity, determined
+    ):
+        """The force gives d (d + 1) / 2 numbers a pole; m modes at one pole have m (m + 1) / 2 of them to know."""
+        for seed in range(3):
+            frequencies = [10.0] * multiplicity + [25.0, 40.0]
+            M, K, _ = random_blocks(np.random.default_rng(seed), len(frequencies), d, frequencies=frequencies)
+            truth = Structure(M, K, [0.02] * multiplicity + [0.01, 0.015], n_base=d)
+            verdict = determination(problem_of(truth, FullMass(), force=True), truth)
+            self.check(verdict, determined, says="base force weighs" if determined else "mode 2")
+            self.check(determination(problem_of(truth, FullMass(20.0)), truth), False)

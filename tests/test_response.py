@@ -1,11 +1,11 @@
-"""The residual expression against Structure, and its derivatives against a complex step and differences."""
+"""The residual expression against Structure, its derivatives against a complex step, and linear fits at known poles."""
 
 import casadi as ca
 import numpy as np
 import pytest
 
 from sysid import Measurement
-from sysid.response import residual
+from sysid.response import linear_residues, residual, weighed_mass
 
 SEEDS = range(4)
 
@@ -143,3 +143,37 @@ def test_hessian_is_the_difference_of_exact_gradients_with_error_of_second_order
     assert errors[1] < 1e-8 * size
     # A tenth of the step, a hundredth of the error, until round-off.
     assert errors[1] < max(errors[0] / 30, 1e-10 * size)
+
+
+def exact_test(rng, s):
+    """Runs of complex base motion with the structure's own answers."""
+    test = random_test(rng, s, lines=40)
+    a = np.einsum("sdf,rdf->rsf", s.relative_acceleration(test.freq), test.base)
+    f = np.einsum("edf,rdf->ref", s.base_force(test.freq), test.base)
+    return measurement(s, test.freq, test.base, a, f)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_at_the_true_poles_linear_least_squares_gives_residues_and_mass(random_structure, seed):
+    rng = np.random.default_rng(seed)
+    s = random_structure(rng, n=4, d=int(rng.integers(1, 4)))
+    test, omega = exact_test(rng, s), 2 * np.pi * s.natural_frequencies
+    residues, left = linear_residues(test, omega, s.damping_ratios)
+    expected = np.einsum("sk,kd->ksd", s.mode_shapes, s.participation)
+    assert left < 1e-12
+    np.testing.assert_allclose(residues, expected, atol=1e-9 * np.abs(expected).max())
+    rigid = s.rigid_body_mass
+    np.testing.assert_allclose(weighed_mass(test, omega, s.damping_ratios), rigid, atol=1e-8 * np.abs(rigid).max())
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_no_modal_model_with_the_same_poles_fits_better_than_its_free_residues(random_structure, seed):
+    rng = np.random.default_rng(seed)
+    s = random_structure(rng, n=4, d=2)
+    test = random_test(rng, s, lines=40)
+    _, left = linear_residues(test, 2 * np.pi * s.natural_frequencies, s.damping_ratios)
+    assert 0 < left < 1
+    for _ in range(20):
+        other = random_structure(rng, n=4, d=2, frequencies=s.natural_frequencies, ratios=s.damping_ratios)
+        A = np.einsum("sdf,rdf->rsf", other.relative_acceleration(test.freq), test.base)
+        assert np.linalg.norm(A - test.relative) > left * np.linalg.norm(test.relative)
