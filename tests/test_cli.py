@@ -255,7 +255,7 @@ IN_THE_MODULE = {
     "another number of sensors": ("G = np.ones((3, 1))", "rigid_body is"),
     "a mass of zero": ("FullMass(3.5", "FullMass(0.0", "masses must be positive"),
     "a negative mass": ("FullMass(3.5", "FullMass(-3.5", "masses must be positive"),
-    "a mass that is no number": ("FullMass(3.5", "FullMass(np.nan", "masses must be positive"),
+    "a mass that is no number": ("FullMass(3.5", "FullMass(np.nan", "total_mass holds NaN or infinite"),
     "w_lim below a given frequency": (
         f"({FREQUENCIES})",
         f"({FREQUENCIES}, max_frequency=0.9 * {FREQUENCIES}[-1])",

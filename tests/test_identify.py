@@ -40,7 +40,7 @@ class TestStrategy:
         assert result.strategy == "swarm"
         assert result.seed == 0
         assert result.success
-        assert "Solve" in result.message
+        assert result.message.startswith("IPOPT: ")
         assert result.residual < 1e-6
         assert result.structure.natural_frequencies == pytest.approx(problem.reference.natural_frequencies, rel=1e-6)
 

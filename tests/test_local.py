@@ -47,8 +47,11 @@ def sound(problem, answer):
     assert np.linalg.eigvalsh(structure.mass[:n, :n])[0] > 0
     assert np.linalg.eigvalsh(structure.stiffness[:n, :n])[0] > 0
     assert total_error(problem, structure) < 1e-9
-    assert answer.success == any(good in answer.message for good in SOLVED)
-    return problem.measurement.residual(structure)
+    residual, solved = problem.measurement.residual(structure), any(good in answer.message for good in SOLVED)
+    assert answer.success or not solved
+    # At round-off IPOPT may find no further step and call that a failure.
+    assert solved or not answer.success or residual < 1e-8
+    return residual
 
 
 # Of twelve random starts, how many at least end below 1e-6 and below 1e-8. Over 120 other starts each (48 where the

@@ -57,8 +57,8 @@ def unit(truth, guess):
         swarm=0.5,
         refinement=0.4,
         local=0.01,
-        swarm_curve=[0.9, 0.7, 0.5],
-        local_curve=[0.4, 0.1, 0.02, 0.01],
+        swarm_curve=np.array([0.9, 0.7, 0.5]),
+        local_curve=np.array([0.4, 0.1, 0.02, 0.01]),
     )
 
 
@@ -217,7 +217,7 @@ def test_what_is_not_there_is_refused(unit):
 
 @pytest.mark.parametrize("freq", [[5.0], [0.0, 5.0, 10.0]])
 def test_every_picture_is_drawn_without_a_warning(unit, runs, truth, freq):
-    exact = result(truth, sysid.simulate(truth, freq), goal=1e-6, swarm_curve=[0.5], swarm=0.5)
+    exact = result(truth, sysid.simulate(truth, freq), goal=1e-6, swarm_curve=np.array([0.5]), swarm=0.5)
     for it in (unit, runs, exact):
         for draw in (plot.overview, plot.transmissibility, plot.convergence, plot.mac, plot.effective_masses):
             assert to_png(draw(it), dpi=40).startswith(b"\x89PNG")

@@ -21,9 +21,8 @@ def random_test(rng, structure, *, runs=3, force=True, lines=15):
     n, d = structure.n, structure.n_base
     normal = lambda *shape: rng.normal(size=shape) + 1j * rng.normal(size=shape)  # noqa: E731
     freq = np.sort(rng.uniform(2, 70, lines))
-    return measurement(
-        structure, freq, normal(runs, d, lines), 3 * normal(runs, n, lines), 50 * normal(runs, d, lines) if force else None
-    )
+    base, relative, pull = normal(runs, d, lines), 3 * normal(runs, n, lines), 50 * normal(runs, d, lines)
+    return measurement(structure, freq, base, relative, pull if force else None)
 
 
 def modal(structure):

@@ -370,6 +370,8 @@ class TestResample:
         with pytest.raises(InputError, match=match):
             resample(records, rate)
 
-    def test_a_fast_record_too_short_for_the_filter_is_refused(self):
-        with pytest.raises(InputError, match="record 1"):
-            resample([(np.arange(9.0), np.ones(9)), (np.arange(0, 4, 0.3), np.ones(14))])
+    @pytest.mark.parametrize(("match", "slow"), [("record 0: 9 samples are too few", 9), ("record 1: 14", 99)])
+    def test_a_record_too_short_for_the_filter_is_refused(self, match, slow):
+        """Where one is faster all are low-passed alike, the slow one too."""
+        with pytest.raises(InputError, match=match):
+            resample([(np.arange(float(slow)), np.ones(slow)), (np.arange(0, 4, 0.3), np.ones(14))])

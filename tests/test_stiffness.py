@@ -168,5 +168,5 @@ class TestChain:
 
     def test_a_sensor_that_no_direction_moves(self):
         layout = layout_of([[1, 0], [0, 0], [0, 1]])
-        with pytest.raises(InputError, match="sensor 1 is moved by no base direction"):
+        with pytest.raises(InputError, match="sensor 2 is moved by no base direction"):
             mass_normalised(ChainStiffness(1.0, 2.0), layout, np.ones(3), np.eye(3))

@@ -330,7 +330,7 @@ class TestConstructionChecks:
         self.refuse(good, "recovery has shape", recovery=np.ones((2, 4)), rigid_body=np.ones((2, 2)))
         self.refuse(good, "rigid_body has shape", rigid_body=np.ones((2, 2)))
         self.refuse(good, "rigid_body has shape", recovery=np.ones((2, 3)), rigid_body=np.ones((3, 2)))
-        self.refuse(good, "mass is not an array of real numbers", mass="heavy")
+        self.refuse(good, "mass = 'heavy' is not an array of real numbers", mass="heavy")
 
     def test_complex_matrices_are_refused(self, good):
         self.refuse(good, "real", stiffness=good["stiffness"].astype(complex) * (1 + 0.01j))
