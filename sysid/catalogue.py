@@ -186,6 +186,8 @@ def _telling_the_line(path: Path) -> Iterator[None]:
 
 def _unknown(name: str) -> InputError:
     names = [entry.name for entry in entries()]
+    if Path(f"{name}.py").is_file():
+        return InputError(f"problem {name!r} is unknown, but there is a {name}.py here: sysid run {name}.py")
     close = difflib.get_close_matches(name, names, n=1)
     hint = f"did you mean {close[0]!r}? " if close else ""
     known = ", ".join(names) if names else "none"

@@ -69,7 +69,7 @@ class History:
     log: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Identification:
     """A structure identified from a base-shake test, and how far it can be trusted.
 
@@ -82,7 +82,8 @@ class Identification:
     strategy : str
     seed : int or None
     success : bool
-        The last solver's status is good, and the residual meets the goal where one is given.
+        The last solver's status is good, and the residual meets the goal; where none is given it must
+        at least be below one half.
     message : str
     history : History
     determined : bool
@@ -108,6 +109,11 @@ class Identification:
     undetermined: tuple[str, ...]
     interrupted: bool = False
     recipe: Recipe | None = None
+
+    def __repr__(self) -> str:
+        word = "success" if self.success else "no success"
+        known = "determined" if self.determined else "not determined"
+        return f"<Identification: {word}, residual {self.residual:.3g}, {known}; {self.structure!r}>"
 
     @property
     def measurement(self) -> Measurement:

@@ -28,6 +28,8 @@ from sysid.swarm import SwarmProgress, SwarmSettings, minimize_swarm
 from sysid.swarm_cost import SwarmCost
 
 _SETTINGS = SwarmSettings(inertia_b1=0.8, inertia_b2=0.5, acceleration_lower=0.5, acceleration_sum=3.0)
+_NO_FIT = 0.5  # relative residual above which nothing is explained
+_DOUBTFUL = 0.1  # relative residual above which a structured problem is searched again
 STRATEGIES = ("auto", "swarm")
 
 
@@ -50,7 +52,8 @@ class Swarm:
     local_phase : bool
         Whether the local phase follows. Without it no solver vouches for the result, and `success` is False.
     restarts : int
-        How many further swarms may follow where the problem has a goal and it is missed.
+        How many further swarms may follow where the goal is missed, or, without a goal and with a structured
+        mass or stiffness, the residual is above 0.1.
     settings : SwarmSettings
         Constants of the swarm itself. The paper leaves b1 and b2 of its eq. 11 to the user; with the
         usual 0.3 and 0.2 and c1 + c2 up to 4 (``SwarmSettings()``) the swarm of this problem contracts
@@ -263,9 +266,9 @@ def _best_of_searches(
             raise SolverError("the search ended before it had a single candidate; give it more time")
         late = desk.max_time is not None and desk.seconds > desk.max_time / 2
         spent = max_evaluations is not None and 2 * evaluations > max_evaluations
-        if stopped or late or spent or not options.local_phase or best.meets_goal is not False:
+        if stopped or late or spent or not options.local_phase or best.good_enough:
             break
-        desk.note(f"the goal {problem.goal:.3g} is missed at {best.misfit:.4g}")
+        desk.note(f"{best.misfit:.4g} is no good fit: another swarm")
     assert best is not None
     if stopped is not None:
         best.success, best.message = False, str(stopped) or "interrupted"
@@ -278,14 +281,22 @@ def _finish(problem: Problem, best: _Search, stopped: BaseException | None, seed
     assert best.x is not None
     structure = problem.structure(best.x)
     success, message = best.success, best.message
+    residual = problem.measurement.residual(structure)
     if best.meets_goal is False:
         success = False
-        residual = problem.measurement.residual(structure)
         message += f"; the residual {residual:.3g} is above the goal {problem.goal:.3g}"
-    message += _disagreement(problem, structure)
+    elif success and problem.goal is None and residual > _NO_FIT:
+        success = False
+        message += (
+            f"; the residual {residual:.3g} is no fit: are the frequencies in Hz, the responses absolute and complex "
+            "with exp(+iwt), the axes and signs of rigid_body right, the bounds wide enough?"
+        )
     desk.note(f"done: residual {best.misfit:.4e}, {message}")
     known = determination(problem, structure)
     open_ = known.undetermined
+    if disagreement := _disagreement(problem, structure):
+        open_ = (disagreement, *open_)
+        message += f"; {disagreement}"
     if not success:
         open_ = ("the search did not end in a fit, so this is not yet any structure that explains the data", *open_)
     return Identification(
@@ -297,8 +308,8 @@ def _finish(problem: Problem, best: _Search, stopped: BaseException | None, seed
         success=success,
         message=message,
         history=replace(best.history, log=tuple(desk.log), wall_time=desk.seconds),
-        determined=known.determined and success,
-        closed_by=known.closed_by if success else (),
+        determined=not open_,
+        closed_by=() if open_ else known.closed_by,
         undetermined=open_,
         interrupted=isinstance(stopped, KeyboardInterrupt),
     )
@@ -315,7 +326,7 @@ def _disagreement(problem: Problem, structure: Structure) -> str:
     if np.all(off < max(0.01, 3 * (test.force_residual(structure) or 0.0) / np.sqrt(test.freq.size))):
         return ""
     given, told = (", ".join(f"{m:.4g}" for m in masses) for masses in (stated, weighed))
-    return f"; the stated mass makes {given} kg in the base directions, but the base force weighs {told} kg"
+    return f"the stated mass makes {given} kg in the base directions, but the base force weighs {told} kg"
 
 
 class _Search:
@@ -340,6 +351,14 @@ class _Search:
         if self.problem.goal is None or self.x is None:
             return None
         return self.problem.measurement.residual(self.problem.structure(self.x)) <= self.problem.goal
+
+    @property
+    def good_enough(self) -> bool:
+        """Whether another swarm is not worth its time."""
+        if self.problem.goal is not None:
+            return self.meets_goal is True
+        # Without a goal: modal coordinates notice their local minima themselves, structured ones cannot.
+        return local.is_modal(self.problem) or self.misfit <= _DOUBTFUL
 
     def misfit_of(self, x: Array) -> float:
         """Root of the sum of the squared relative residuals of accelerations and force."""

@@ -13,6 +13,7 @@ The response is bilinear in mode shapes and participations, so these are the unk
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -48,7 +49,7 @@ class LocalResult:
     x : (n_variables,)
         The problem's unknowns; not held by the box where the coordinates are modal.
     success : bool
-        IPOPT's status is Solve_Succeeded or Solved_To_Acceptable_Level.
+        IPOPT's status is Solve_Succeeded or Solved_To_Acceptable_Level, or the fit is exact to round-off.
     message : str
         IPOPT's status and what else the user must know, such as a bound that the solution ends on.
     curve : (iterations,)
@@ -117,6 +118,11 @@ class _Attempt(NamedTuple):
     bounds: str
 
 
+def is_modal(problem: Problem) -> bool:
+    """Whether mode shapes and participations are free, so that the coordinates are modal."""
+    return isinstance(problem.mass, FullMass) and isinstance(problem.stiffness, SpectralStiffness)
+
+
 def solve(
     problem: Problem,
     x: Array,
@@ -134,26 +140,25 @@ def solve(
     max_iterations : int
         Of each attempt.
     max_time : float, optional
-        s, of each attempt.
+        s, for all attempts.
     monitor : callable, optional
         Called with (iteration, residual) after each iteration; whatever it raises stops the solver
         and is handed back in `stopped`.
     """
     start = problem.structure(x)
-    watch = _Watch(monitor)
-    free = isinstance(problem.mass, FullMass) and isinstance(problem.stiffness, SpectralStiffness)
-    if not free:
-        best = _attempt(problem, _structured(problem, x, start), watch, max_iterations, max_time)
+    watch = _Watch(monitor, np.inf if max_time is None else time.perf_counter() + max_time)
+    if not is_modal(problem):
+        best = _attempt(problem, _structured(problem, x, start), watch, max_iterations)
         tried = 1
     else:
         first = _modes(start)
         remainder = start.rigid_body_mass - start.participation.T @ start.participation
-        best = _attempt(problem, _modal(problem, first, remainder), watch, max_iterations, max_time)
+        best = _attempt(problem, _modal(problem, first, remainder), watch, max_iterations)
         tried = 1
         for again in _linear_starts(problem.measurement, best, first):
-            if watch.stopped is not None or best.residual <= _EXACT:
+            if watch.stopped is not None or best.residual <= _EXACT or watch.left < 1.0:
                 break
-            answer = _attempt(problem, _modal(problem, again, remainder), watch, max_iterations, max_time)
+            answer = _attempt(problem, _modal(problem, again, remainder), watch, max_iterations)
             tried += 1
             if answer.residual < best.residual:
                 best = answer
@@ -162,16 +167,17 @@ def solve(
         message += f"; ended on a bound: {best.bounds}"
     if tried > 1:
         message += f"; best of {tried} starts, as the first ended in a local minimum"
-    return LocalResult(best.x, best.status in SOLVED, message, np.array(watch.curve), watch.stopped)
+    # At round-off IPOPT runs out of steps rather than of gradient.
+    success = best.status in SOLVED or best.residual <= _EXACT
+    return LocalResult(best.x, success, message, np.array(watch.curve), watch.stopped)
 
 
 def _linear_starts(test: Measurement, ended: _Attempt, first: Modes) -> Iterator[Modes]:
     """New starts where free residues fit clearly better than what was reached: at its poles, then at the first ones."""
-    _, possible = linear_residues(test, ended.modes.omega, ended.modes.ratios)
-    if ended.residual <= _SUSPECT * possible:
+    fits = [(poles, *linear_residues(test, poles.omega, poles.ratios)) for poles in (ended.modes, first)]
+    if ended.residual <= _SUSPECT * min(possible for _, _, possible in fits):
         return
-    for poles in (ended.modes, first):
-        residues, _ = linear_residues(test, poles.omega, poles.ratios)
+    for poles, residues, _ in fits:
         u, s, vt = np.linalg.svd(residues)
         # The split of a residue between shape and participation is free: the shapes keep their size.
         size = np.linalg.norm(poles.phi, axis=0)
@@ -179,7 +185,7 @@ def _linear_starts(test: Measurement, ended: _Attempt, first: Modes) -> Iterator
         yield Modes(shapes, vt[:, 0] * (s[:, 0] / size)[:, None], poles.omega, poles.ratios)
 
 
-def _attempt(problem: Problem, model: _Model, watch: _Watch, max_iterations: int, max_time: float | None) -> _Attempt:
+def _attempt(problem: Problem, model: _Model, watch: _Watch, max_iterations: int) -> _Attempt:
     """One run of IPOPT."""
     z = model.z
     symbols = ca.vertcat(*z.symbols)
@@ -189,8 +195,8 @@ def _attempt(problem: Problem, model: _Model, watch: _Watch, max_iterations: int
     lower, upper = np.concatenate(z.lower), np.concatenate(z.upper)
     start = np.clip(np.concatenate(z.start), lower, upper)
     limits: dict[str, float] = {"max_iter": max_iterations}
-    if max_time is not None:
-        limits["max_wall_time"] = max_time
+    if np.isfinite(watch.left):
+        limits["max_wall_time"] = max(watch.left, 0.1)
     options = {
         "print_time": False,
         "iteration_callback": watch.callback(start, ties.numel()),
@@ -217,11 +223,16 @@ def _attempt(problem: Problem, model: _Model, watch: _Watch, max_iterations: int
 class _Watch:
     """What happens between the iterations of all attempts: the curve, the monitor, and its wish to stop."""
 
-    def __init__(self, monitor: Callable[[int, float], object] | None) -> None:
-        self.monitor = monitor
+    def __init__(self, monitor: Callable[[int, float], object] | None, deadline: float) -> None:
+        self.monitor, self.deadline = monitor, deadline
         self.curve: list[float] = []
         self.stopped: BaseException | None = None
         self.z: Array = np.zeros(0)
+
+    @property
+    def left(self) -> float:
+        """Seconds until the deadline."""
+        return self.deadline - time.perf_counter()
 
     def callback(self, start: Array, n_ties: int) -> ca.Callback:
         self.z = start

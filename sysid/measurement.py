@@ -88,7 +88,7 @@ def axis_vector(axis: str | Sequence[float], label: str = "a sensor") -> Array:
     return row[:3]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Measurement:
     """Spectra of a base-shake test.
 
@@ -175,6 +175,14 @@ class Measurement:
         """Which base directions are translations, (d,)."""
         assert self.base_axes is not None
         return np.array([name in BASE_AXES[:3] for name in self.base_axes])
+
+    def __repr__(self) -> str:
+        axes = " ".join(self.base_axes or ())
+        force = ", force" if self.force is not None else ""
+        return (
+            f"<Measurement: {self.n_sensors} sensors, base {axes}, {self.n_runs} runs, {self.freq.size} lines from "
+            f"{self.freq[0]:.4g} to {self.freq[-1]:.4g} Hz{force}>"
+        )
 
     @property
     def n_runs(self) -> int:
@@ -332,7 +340,9 @@ class Measurement:
             on the base) average over segments and runs by Welch's method and give d unit runs;
             "h1" solves for several base directions at once and gives standard deviations from the coherence.
         segment : int, optional
-            Samples a segment of "h1" and "h2"; an eighth of the shortest record by default.
+            Samples a segment of "h1" and "h2"; a quarter of the shortest record by default. Its lines must be
+            several times closer than the narrowest resonance is wide (rate / segment well below 2 zeta f), else
+            leakage flattens the peak, and damping and masses come out wrong.
         band : (low, high), optional
             Hz, both ends included; all lines but zero by default.
         sensors : sequence of Sensor, optional

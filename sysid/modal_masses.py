@@ -104,8 +104,13 @@ def _unseen(problem: Problem, structure: Structure, misfit: float) -> Iterator[s
     share, force_share = _shares(test, structure)
     for k in range(structure.n):
         f = structure.natural_frequencies[k]
-        if share[k] < max(_INVISIBLE, _CLEAR * misfit):
-            yield f"{_mode(structure, k)} is not moved by the base, or not above the misfit: its mass is not known"
+        if share[k] < _INVISIBLE:
+            yield f"{_mode(structure, k)} is not moved by the base: nothing in these data tells its mass"
+        elif share[k] < _CLEAR * misfit:
+            yield (
+                f"{_mode(structure, k)} makes {100 * share[k]:.2g} % of the response, which does not stand out of the "
+                f"misfit of {100 * misfit:.2g} %: its mass is not known"
+            )
         elif not test.freq[0] <= f <= test.freq[-1]:
             yield f"{_mode(structure, k)} lies outside the lines ({test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz)"
         elif force_share is not None and force_share[k] < (test.force_residual(structure) or 0.0):
@@ -131,7 +136,7 @@ def _clusters(structure: Structure, misfit: float) -> list[list[int]]:
     for k in range(1, structure.n):
         apart = abs(poles[k] - poles[clusters[-1][-1]])
         width = structure.damping_ratios[k] * structure.natural_frequencies[k]
-        if apart < max(_SAME_POLE * abs(poles[k]), _UNRESOLVED * misfit * width):
+        if apart < max(_SAME_POLE * abs(poles[k]), min(_UNRESOLVED * misfit, 1.0) * width):
             clusters[-1].append(k)
         else:
             clusters.append([k])

@@ -44,7 +44,7 @@ class Matrices(NamedTuple):
     damping: ca.SX | Array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Problem:
     """What to identify, and from what.
 
@@ -115,6 +115,10 @@ class Problem:
         put("variables", tuple(v for group in self._groups() for v in group))
         # A total mass that does not fit is refused here, not in the search.
         put("totals", self.mass.totals(layout))
+
+    def __repr__(self) -> str:
+        models = ", ".join(type(model).__name__ for model in (self.mass, self.stiffness, self.damping))
+        return f"<Problem: {models}; {self.n_variables} unknowns; {self.measurement!r}>"
 
     def _groups(self) -> tuple[tuple[Variable, ...], ...]:
         return tuple(model.variables(self.layout) for model in (self.mass, self.stiffness, self.damping))
@@ -223,7 +227,7 @@ def _as_matrix(name: str, value: object) -> Array:
     except (TypeError, ValueError):
         matrix = np.zeros(0)
     if matrix.ndim != 2:
-        raise InputError(f"Problem: {name} is a {type(value).__name__}; give a model of sysid or a matrix")
+        raise InputError(f"Problem: {name} is a {type(value).__name__}; give a model such as FullMass(kg) or a matrix")
     return matrix
 
 

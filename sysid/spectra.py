@@ -114,7 +114,7 @@ def averaged(runs: Sequence[Run], sample_rate: float, *, kind: str, segment: int
     if kind == "h2" and d > 1:
         raise InputError("'h2' divides by one input; with several base directions use 'h1'")
     shortest = min(run.base.shape[1] for run in runs)
-    length = max(shortest // 8, 2) if segment is None else int(segment)
+    length = max(shortest // 4, 2) if segment is None else int(segment)
     if not 2 <= length <= shortest:
         raise InputError(f"segment = {segment}: between 2 and the {shortest} samples of the shortest run are needed")
     window = signal.get_window("hann", length)

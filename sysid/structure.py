@@ -239,7 +239,7 @@ class Structure:
             worst = 1e-6 * np.max(residue / allowed)
             raise InputError(
                 f"stiffness does not let the base move as a rigid body: K_00 differs from G' K_SS G by {worst:.3g} "
-                "(relative); K must have the null space [G; I]"
+                "(relative); K must have the null space [G; I] (are its last n_base rows those of the base?)"
             )
         return G
 
@@ -307,12 +307,13 @@ def check_frequencies(freq: ArrayLike, *, increasing: bool = True) -> Array:
 
 def finite_array(name: str, value: ArrayLike) -> Array:
     """Real, finite numbers as an array of their own; what is wrong, by name, where they are not."""
-    if np.iscomplexobj(value):
-        raise InputError(f"{name} is complex; real numbers are needed")
     try:
-        array = np.array(value, dtype=float)
+        given = np.array(value)
+        array = given.real.astype(float)
     except (TypeError, ValueError):
         raise InputError(f"{name} = {value!r} is not an array of real numbers") from None
+    if np.iscomplexobj(given):
+        raise InputError(f"{name} is complex; real numbers are needed")
     if not np.all(np.isfinite(array)):
         raise InputError(f"{name} holds NaN or infinite entries ({int(np.sum(~np.isfinite(array)))} of {array.size})")
     return array

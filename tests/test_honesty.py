@@ -164,3 +164,42 @@ def test_sensors_that_move_with_the_base_are_refused():
     test = sysid.Measurement(freq, base, np.ones((1, 2, 20)), rigid_body=np.ones((2, 1)))
     with pytest.raises(sysid.InputError, match="no sensor moves relative"):
         sysid.Problem(test, mass=sysid.FullMass(1.0), stiffness=sysid.SpectralStiffness([2.0, 3.0]))
+
+
+@pytest.mark.parametrize("mistake", ["rad/s", "conjugated", "flipped sensor"])
+def test_a_solver_that_converged_to_no_fit_is_no_success(mistake):
+    """Without a goal the solver's good status alone must not read as a result; the message names the usual causes."""
+    truth = chain([3.0, 4.0], [4000.0, 3000.0], [0.01, 0.012])
+    test = sysid.simulate(truth, np.linspace(1.0, 10.0, 120))
+    given, response = truth.natural_frequencies, test.response.copy()
+    if mistake == "rad/s":
+        given = given * 2 * np.pi
+    elif mistake == "conjugated":
+        response = response.conj()
+    else:
+        response[:, 0] *= -1
+    wrong = sysid.Measurement(test.freq, test.base, response, rigid_body=test.rigid_body)
+    problem = sysid.Problem(wrong, mass=sysid.LumpedMass(7.0), stiffness=sysid.SpectralStiffness(given))
+    result = sysid.identify(problem, rng=0, strategy=QUICK)
+    assert not result.success
+    assert not result.determined
+    assert "is no fit" in result.message
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_wide_box_for_a_chain_is_searched_again_until_it_fits(seed):
+    """Two decades of stiffness hold local minima; without a goal the search must not end in one and call it a fit."""
+    truth = chain([12.0, 9.0], [6000.0, 4000.0], [0.02, 0.03])
+    test = sysid.simulate(truth, np.linspace(0.5, 8.0, 150), noise=0.01, rng=seed)
+    problem = sysid.Problem(test, mass=sysid.LumpedMass(21.0), stiffness=sysid.ChainStiffness(500.0, 50000.0))
+    result = sysid.identify(problem, rng=seed)
+    assert result.success
+    assert result.residual < 0.05
+
+
+def test_results_print_as_one_line():
+    truth = chain([3.0, 4.0], [4000.0, 3000.0], [0.01, 0.012])
+    result = solve(truth, mass=sysid.LumpedMass(7.0), band=(1.0, 10.0))
+    for thing in (result, result.problem, result.measurement, result.structure):
+        assert len(repr(thing)) < 200
+        assert "\n" not in repr(thing)

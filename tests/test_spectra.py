@@ -212,11 +212,11 @@ class TestAveraged:
         h2 = Measurement.from_time([(x, y, None)], RATE, rigid_body=[[1], [1]], estimator="h2", segment=200)
         np.testing.assert_allclose(h2.response[0], (S_yy / S_xy.conj())[:, 1:], rtol=1e-9)
 
-    def test_an_eighth_of_the_shortest_record_by_default(self):
+    def test_a_quarter_of_the_shortest_record_by_default(self):
         rng = np.random.default_rng(6)
         runs = [(white(rng, 1, n), white(rng, 1, n), None) for n in (1600, 900)]
         test = Measurement.from_time(runs, RATE, rigid_body=[[1]], estimator="h1")
-        assert test.freq[0] == pytest.approx(RATE / 112)
+        assert test.freq[0] == pytest.approx(RATE / 225)
 
     def test_effective_averages_of_a_hann_window_at_half_overlap(self):
         """Welch 1967: segments at half overlap with Hann correlate by 1/6, so their variance is 1/18 more, nearly."""
