@@ -380,6 +380,11 @@ class _Search:
         cost = SwarmCost(problem, refine=options.refine)
         x0 = None if start is None else problem.to_sampling(_as_unknowns(problem, start))
         unknowns = ", ".join(f"{name} {count}" for name, count in problem.unknowns)
+        if problem.poles is not None:
+            found = ", ".join(f"{f:.4g}" for f in problem.poles.omega / (2 * np.pi))
+            desk.note(
+                f"natural frequencies found in the data: {found} Hz (modal fit within {problem.poles.residual:.2e})"
+            )
         desk.note(f"swarm over {problem.n_variables} unknowns ({unknowns})")
         curve: list[float] = []
 

@@ -16,6 +16,7 @@ from sysid.errors import InputError
 from sysid.layout import Layout
 from sysid.mass import FullMass, KnownMass, LumpedMass, MassModel
 from sysid.measurement import Measurement
+from sysid.poles import Poles, find_poles
 from sysid.response import columns, weighed_mass
 from sysid.stiffness import SpectralStiffness, StiffnessModel
 from sysid.structure import Array, Structure, finite_array
@@ -72,6 +73,8 @@ class Problem:
         Total mass in each base direction: stated, else weighed by the base force, else 1 kg.
     layout : Layout
         Geometry of the test, as the matrix models see it.
+    poles : Poles or None
+        What was found in the data where a spectral stiffness came without natural frequencies.
     """
 
     measurement: Measurement
@@ -85,6 +88,7 @@ class Problem:
     layout: Layout = field(init=False, repr=False)
     variables: tuple[Variable, ...] = field(init=False, repr=False)
     totals: Array = field(init=False, repr=False)
+    poles: Poles | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 - a frozen class fills itself
@@ -100,6 +104,10 @@ class Problem:
         if self.goal is not None and not finite_array("goal", self.goal) > 0:
             raise InputError(f"goal = {self.goal}: a positive relative residual is needed")
         test = self.measurement
+        if isinstance(self.stiffness, SpectralStiffness) and self.stiffness.natural_frequencies is None:
+            put("poles", find_poles(test))
+            assert self.poles is not None
+            put("stiffness", replace(self.stiffness, natural_frequencies=self.poles.omega / (2 * np.pi)))
         layout = Layout(test.rigid_body, test.translational)
         if np.linalg.norm(test.relative) <= 1e-12 * np.linalg.norm(test.response):
             raise InputError("no sensor moves relative to the base: there is nothing to identify from")

@@ -24,7 +24,8 @@ class SpectralStiffness:
     Parameters
     ----------
     natural_frequencies : array_like, optional
-        Hz, the measured ones in ascending order; repeated ones repeated.
+        Hz, the measured ones in ascending order; repeated ones repeated. Without them a Problem finds
+        those that stand out of its measurement.
     max_frequency : float, optional
         Hz, at or above the highest of *all* frequencies that the model has; the highest given
         one by default, which supposes that all n are given.
@@ -41,10 +42,7 @@ class SpectralStiffness:
     def targets(self) -> Array:
         """Measured circular frequencies, rad/s, ascending."""
         if self.natural_frequencies is None:
-            raise InputError(
-                "SpectralStiffness needs natural_frequencies (Hz): finding them in the data is not yet part of sysid; "
-                "read them off the peaks of the transmissibility"
-            )
+            raise InputError("no natural_frequencies (Hz): state them, or let a Problem find them in its data")
         given = np.atleast_1d(finite_array("natural_frequencies", self.natural_frequencies))
         if given.ndim != 1 or given.size == 0 or np.any(given <= 0):
             raise InputError("natural_frequencies must be a list of positive numbers in Hz")
@@ -56,14 +54,12 @@ class SpectralStiffness:
         """Bound on the frequencies of an n-degree-of-freedom model, rad/s (w_lim of eq. 37)."""
         targets = self.targets
         if targets.size > n:
-            raise InputError(
-                f"{targets.size} natural frequencies are given for {n} sensors; at most {n} can be matched"
-            )
+            raise InputError(f"{targets.size} natural frequencies are given or found for {n} sensors; at most {n} fit")
         if self.max_frequency is None:
             if targets.size < n:
                 raise InputError(
-                    f"{targets.size} natural frequencies are given for {n} sensors: state max_frequency (Hz), at or "
-                    "above the highest frequency of the whole model"
+                    f"{targets.size} natural frequencies are given or found for {n} sensors: "
+                    "state max_frequency (Hz), at or above the highest frequency of the whole model"
                 )
             return float(targets[-1])
         limit = 2 * np.pi * float(self.max_frequency)

@@ -202,7 +202,7 @@ class TestMistakes:
             ("stiffness is a ndarray", {"stiffness": np.eye(3)}),
             ("stiffness is a ModalDamping", {"stiffness": sysid.ModalDamping()}),
             ("damping is a float", {"damping": 0.02}),
-            ("needs natural_frequencies", {"stiffness": SpectralStiffness()}),
+            ("too few to look for", {"stiffness": SpectralStiffness()}),
             ("below the given natural frequency", {"stiffness": SpectralStiffness([1.0, 2, 3], max_frequency=2.0)}),
             ("4 natural frequencies", {"stiffness": SpectralStiffness([1.0, 2, 3, 4])}),
             ("goal", {"goal": 0.0}),

@@ -88,14 +88,14 @@ class TestSpectral:
     @pytest.mark.parametrize(
         ("match", "frequencies", "limit"),
         [
-            ("needs natural_frequencies", None, None),
+            ("no natural_frequencies", None, None),
             ("positive numbers", [0.0, 1], None),
             ("positive numbers", [-1.0, 1], None),
             ("natural_frequencies holds NaN", [np.nan, 1], None),
             ("positive numbers", [], None),
             ("positive numbers", [[1.0, 2.0, 3.0]], None),
             ("ascending order", [2.0, 1, 3], None),
-            ("4 natural frequencies are given for 3 sensors", [1.0, 2, 3, 4], None),
+            ("4 natural frequencies are given or found for 3 sensors", [1.0, 2, 3, 4], None),
             ("state max_frequency", [1.0, 2], None),
             ("max_frequency = 2.5 Hz is below the given natural frequency 3 Hz", [1.0, 2, 3], 2.5),
             ("max_frequency", [1.0, 2, 3], np.nan),
