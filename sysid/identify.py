@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import signal
-import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
 from sysid import local
+from sysid._desk import DeferredInterrupt, Desk, Progress, Stop
 from sysid.errors import InputError, SolverError
 from sysid.identification import History, Identification
 from sysid.layout import triangle, triangle_entries
 from sysid.mass import KnownMass
+from sysid.modal import modes_from_data
 from sysid.modal_masses import determination
 from sysid.problem import Problem
 from sysid.refinement import by_ipopt, closed_form
@@ -30,7 +28,7 @@ from sysid.swarm_cost import SwarmCost
 _SETTINGS = SwarmSettings(inertia_b1=0.8, inertia_b2=0.5, acceleration_lower=0.5, acceleration_sum=3.0)
 _NO_FIT = 0.5  # relative residual above which nothing is explained
 _DOUBTFUL = 0.1  # relative residual above which a structured problem is searched again
-STRATEGIES = ("auto", "swarm")
+STRATEGIES = ("auto", "swarm", "modal")
 
 
 @dataclass(frozen=True)
@@ -71,32 +69,6 @@ class Swarm:
     settings: SwarmSettings = _SETTINGS
 
 
-@dataclass(frozen=True, eq=False)
-class Progress:
-    """What a callback sees.
-
-    Attributes
-    ----------
-    phase : str
-        "swarm", "refinement" or "local phase".
-    iteration, of : int
-        The iteration, and the most there can be (0: not known).
-    residual : float
-        Relative residual of the best candidate so far.
-    seconds : float
-        Since the start.
-    """
-
-    phase: Literal["swarm", "refinement", "local phase"]
-    iteration: int
-    of: int
-    residual: float
-    seconds: float
-
-    def __str__(self) -> str:
-        return f"{self.phase:11s}  iteration {self.iteration:4d}  residual {self.residual:.3e}  {self.seconds:6.1f} s"
-
-
 def identify(
     problem: Problem,
     *,
@@ -114,8 +86,10 @@ def identify(
     ----------
     problem : Problem
     strategy : str or Swarm
-        "swarm" is the paper's hPSO-LS; "auto" chooses, and at present always chooses "swarm". A
-        `Swarm` object is strategy "swarm" with other settings.
+        "swarm" is the paper's hPSO-LS, and a `Swarm` object is that with other settings. "modal" takes
+        the poles and residues from the data, needs no swarm and no frequencies, and takes a second;
+        it is for a full mass with spectral stiffness and modal damping, with as many modes as
+        sensors in the lines. "auto" at present always takes "swarm".
     rng : int, numpy Generator or None
         The same seed gives the same bits. None draws one, which the result reports.
     start : array_like (n_variables,) or Structure, optional
@@ -140,9 +114,12 @@ def identify(
     if max_time is not None and not max_time > 0:
         raise InputError(f"max_time = {max_time}: a positive number of seconds is needed")
     listeners = [f for f in (progress, callback) if f is not None]
-    with threadpool_limits(limits=1), _DeferredInterrupt() as interrupt:
-        desk = _Desk(listeners, interrupt, max_time)
-        best, stopped = _best_of_searches(problem, options, desk, random, start, max_evaluations)
+    with threadpool_limits(limits=1), DeferredInterrupt() as interrupt:
+        desk = Desk(listeners, interrupt, max_time)
+        if strategy == "modal":
+            best, stopped = _modal_search(problem, desk)
+        else:
+            best, stopped = _best_of_searches(problem, options, desk, random, start, max_evaluations)
         return _finish(problem, best, stopped, seed, desk)
 
 
@@ -166,83 +143,10 @@ def _seed(rng: int | np.random.Generator | None) -> tuple[int, np.random.SeedSeq
     return seed, np.random.SeedSequence(seed)
 
 
-class _DeferredInterrupt:
-    """Hold Ctrl-C back until the search next reports: raised inside compiled code it would lose the best so far.
-
-    A second Ctrl-C acts at once. Where somebody else handles the signal, or outside the main thread, nothing changes.
-    """
-
-    def __init__(self) -> None:
-        self.asked = False
-        self.raised = False
-        self.ours = False
-
-    def __enter__(self) -> _DeferredInterrupt:
-        self.ours = (
-            threading.current_thread() is threading.main_thread()
-            and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-        )
-        if self.ours:
-            signal.signal(signal.SIGINT, self._hold)
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
-        if self.ours:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-        # CasADi turns a KeyboardInterrupt that strikes inside it into some other exception.
-        if self.raised and isinstance(error, Exception):
-            raise KeyboardInterrupt from error
-
-    def _hold(self, number: int, frame: object) -> None:
-        if self.asked:
-            self.raised = True
-            raise KeyboardInterrupt
-        self.asked = True
-
-    def check(self) -> None:
-        if self.asked:
-            raise KeyboardInterrupt
-
-
-class _Stop(Exception):  # noqa: N818 - not an error
-    """The callback asked to stop."""
-
-
-class _Desk:
-    """The clock, the log, and the listeners of an identification."""
-
-    def __init__(
-        self, listeners: list[Callable[[Progress], object]], interrupt: _DeferredInterrupt, max_time: float | None
-    ) -> None:
-        self.listeners, self.interrupt, self.max_time = listeners, interrupt, max_time
-        self.begun = time.perf_counter()
-        self.log: list[str] = []
-
-    @property
-    def seconds(self) -> float:
-        return time.perf_counter() - self.begun
-
-    @property
-    def left(self) -> float | None:
-        """Seconds that are left, at least one; None without a limit."""
-        return None if self.max_time is None else max(self.max_time - self.seconds, 1.0)
-
-    def note(self, line: str) -> None:
-        self.log.append(f"{self.seconds:8.2f} s  {line}")
-
-    def tell(self, phase: Literal["swarm", "refinement", "local phase"], iteration: int, of: int, cost: float) -> None:
-        self.interrupt.check()
-        for listener in self.listeners:
-            try:
-                listener(Progress(phase, iteration, of, cost, self.seconds))
-            except StopIteration:
-                raise _Stop("the callback stopped the search") from None
-
-
 def _best_of_searches(
     problem: Problem,
     options: Swarm,
-    desk: _Desk,
+    desk: Desk,
     random: np.random.SeedSequence,
     start: ArrayLike | Structure | None,
     max_evaluations: int | None,
@@ -255,7 +159,7 @@ def _best_of_searches(
         stopped: BaseException | None = None
         try:
             search.run(child, start, None if max_evaluations is None else max_evaluations - evaluations)
-        except (_Stop, KeyboardInterrupt) as stop:
+        except (Stop, KeyboardInterrupt) as stop:
             stopped, search.success, search.message = stop, False, str(stop) or "interrupted"
         evaluations += search.history.evaluations
         if search.x is not None and (best is None or search.misfit < best.misfit):
@@ -276,7 +180,29 @@ def _best_of_searches(
     return best, stopped
 
 
-def _finish(problem: Problem, best: _Search, stopped: BaseException | None, seed: int, desk: _Desk) -> Identification:
+def _modal_search(problem: Problem, desk: Desk) -> tuple[_Search, BaseException | None]:
+    """Modes from the data, and the fit in modal coordinates."""
+    modes, remainder = modes_from_data(problem)
+    desk.note(f"{modes.omega.size} modes found in the data")
+    search = _Search(problem, Swarm(), desk)
+    search.strategy = "modal"
+    answer = local.fit_modes(
+        problem, modes, remainder, held=False, max_time=desk.left,
+        monitor=lambda i, cost: desk.tell("local phase", i, 0, cost),
+    )  # fmt: skip
+    search.x, search.success, search.message = answer.x, answer.success, answer.message
+    curve = answer.curve
+    search.history = replace(search.history, start=float(curve[0]), local=search.misfit, local_curve=curve)
+    desk.note(f"local phase: {answer.message}, {curve.size} iterates, residual {search.misfit:.4e}")
+    stopped = answer.stopped
+    if stopped is not None:
+        if not isinstance(stopped, Stop | KeyboardInterrupt):
+            raise stopped
+        search.success, search.message = False, str(stopped) or "interrupted"
+    return search, stopped
+
+
+def _finish(problem: Problem, best: _Search, stopped: BaseException | None, seed: int, desk: Desk) -> Identification:
     """Judge the best candidate, and say what it is worth."""
     assert best.x is not None
     structure = problem.structure(best.x)
@@ -303,7 +229,7 @@ def _finish(problem: Problem, best: _Search, stopped: BaseException | None, seed
         structure=structure,
         problem=problem,
         x=best.x,
-        strategy="swarm",
+        strategy=best.strategy,
         seed=seed,
         success=success,
         message=message,
@@ -332,8 +258,9 @@ def _disagreement(problem: Problem, structure: Structure) -> str:
 class _Search:
     """One swarm, its refinement and its local phase: the best so far and its history."""
 
-    def __init__(self, problem: Problem, options: Swarm, desk: _Desk) -> None:
+    def __init__(self, problem: Problem, options: Swarm, desk: Desk) -> None:
         self.problem, self.options, self.desk = problem, options, desk
+        self.strategy = "swarm"
         self.x: Array | None = None
         self.raw: Array = np.zeros(0)
         self.history = History()

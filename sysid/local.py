@@ -13,7 +13,6 @@ The response is bilinear in mode shapes and participations, so these are the unk
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -21,6 +20,7 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
+from sysid._watch import OBJECTIVE_SCALE, Watch
 from sysid.damping import ModalDamping
 from sysid.layout import lower_entries, lower_triangle, triangle_entries
 from sysid.mass import FullMass
@@ -35,7 +35,7 @@ from sysid.variables import split
 FREQUENCY_WINDOW = 0.05  # relative; what a frequency read off a peak may be wrong by
 _OPEN_WINDOW = 20.0  # factor either way for a frequency that nobody gave
 _SPARE = 1e-3  # least share of a total mass that is left to the base
-_OBJECTIVE_SCALE = 1e3  # lifts a residual of 1e-8 above IPOPT's tolerance
+_TOLERANCE = 1e-9  # of IPOPT
 _SUSPECT = 1.05  # a residual so many times that of free residues at the same poles is a local minimum
 _EXACT = 1e-8  # a residual that needs no second look
 
@@ -146,22 +146,55 @@ def solve(
         and is handed back in `stopped`.
     """
     start = problem.structure(x)
-    watch = _Watch(monitor, np.inf if max_time is None else time.perf_counter() + max_time)
-    if not is_modal(problem):
-        best = _attempt(problem, _structured(problem, x, start), watch, max_iterations)
-        tried = 1
-    else:
-        first = _modes(start)
+    if is_modal(problem):
         remainder = start.rigid_body_mass - start.participation.T @ start.participation
-        best = _attempt(problem, _modal(problem, first, remainder), watch, max_iterations)
-        tried = 1
-        for again in _linear_starts(problem.measurement, best, first):
-            if watch.stopped is not None or best.residual <= _EXACT or watch.left < 1.0:
-                break
-            answer = _attempt(problem, _modal(problem, again, remainder), watch, max_iterations)
-            tried += 1
-            if answer.residual < best.residual:
-                best = answer
+        return fit_modes(
+            problem, _modes(start), remainder, max_iterations=max_iterations, max_time=max_time, monitor=monitor
+        )
+    watch = Watch(monitor, max_time)
+    best = _attempt(problem, _structured(problem, x, start), watch, max_iterations)
+    return _result(best, 1, watch)
+
+
+def fit_modes(
+    problem: Problem,
+    first: Modes,
+    remainder: Array,
+    *,
+    held: bool = True,
+    max_iterations: int = 500,
+    max_time: float | None = None,
+    monitor: Callable[[int, float], object] | None = None,
+) -> LocalResult:
+    """Minimise the residual of a full mass with spectral stiffness, from a modal model.
+
+    Parameters
+    ----------
+    problem : Problem
+        One for which `is_modal` holds.
+    first : Modes
+        n modes at the n sensors.
+    remainder : (d, d)
+        Part of the rigid-body mass that no mode carries; positive semidefinite.
+    held : bool
+        Whether the damping keeps inside its search space.
+    max_iterations, max_time, monitor :
+        As in `solve`.
+    """
+    watch = Watch(monitor, max_time)
+    best = _attempt(problem, _modal(problem, first, remainder, held), watch, max_iterations)
+    tried = 1
+    for again in _linear_starts(problem.measurement, best, first):
+        if watch.stopped is not None or best.residual <= _EXACT or watch.left < 1.0:
+            break
+        answer = _attempt(problem, _modal(problem, again, remainder, held), watch, max_iterations)
+        tried += 1
+        if answer.residual < best.residual:
+            best = answer
+    return _result(best, tried, watch)
+
+
+def _result(best: _Attempt, tried: int, watch: Watch) -> LocalResult:
     message = f"IPOPT: {best.status}"
     if best.bounds:
         message += f"; ended on a bound: {best.bounds}"
@@ -178,37 +211,47 @@ def _linear_starts(test: Measurement, ended: _Attempt, first: Modes) -> Iterator
     if ended.residual <= _SUSPECT * min(possible for _, _, possible in fits):
         return
     for poles, residues, _ in fits:
-        u, s, vt = np.linalg.svd(residues)
-        # The split of a residue between shape and participation is free: the shapes keep their size.
-        size = np.linalg.norm(poles.phi, axis=0)
-        shapes = u[:, :, 0].T * size
-        yield Modes(shapes, vt[:, 0] * (s[:, 0] / size)[:, None], poles.omega, poles.ratios)
+        yield rank_one(residues, poles.omega, poles.ratios, np.linalg.norm(poles.phi, axis=0))
 
 
-def _attempt(problem: Problem, model: _Model, watch: _Watch, max_iterations: int) -> _Attempt:
+def rank_one(residues: Array, omega: Array, ratios: Array, size: Array) -> Modes:
+    """Modal model nearest to residues (m, n, d); `size` (m,) of the shapes, as the split of a residue is free."""
+    u, s, vt = np.linalg.svd(residues)
+    return Modes(u[:, :, 0].T * size, vt[:, 0] * (s[:, 0] / size)[:, None], omega, ratios)
+
+
+def _attempt(problem: Problem, model: _Model, watch: Watch, max_iterations: int) -> _Attempt:
     """One run of IPOPT."""
     z = model.z
     symbols = ca.vertcat(*z.symbols)
     miss = residual(problem.measurement, model.phi, model.gamma, model.omega, model.ratios, model.rigid)
     ties = ca.vertcat(*z.ties) if z.ties else ca.MX(0, 1)
-    nlp = {"x": symbols, "f": _OBJECTIVE_SCALE * ca.sumsqr(miss), "g": ties}
+    nlp = {"x": symbols, "f": OBJECTIVE_SCALE * ca.sumsqr(miss), "g": ties}
     lower, upper = np.concatenate(z.lower), np.concatenate(z.upper)
     start = np.clip(np.concatenate(z.start), lower, upper)
-    limits: dict[str, float] = {"max_iter": max_iterations}
-    if np.isfinite(watch.left):
-        limits["max_wall_time"] = max(watch.left, 0.1)
-    options = {
-        "print_time": False,
-        "iteration_callback": watch.callback(start, ties.numel()),
-        "ipopt": {
-            "print_level": 0, "sb": "yes", "tol": 1e-11, "acceptable_tol": 1e-9, "acceptable_iter": 5,
-            "constr_viol_tol": 1e-11, "mu_strategy": "adaptive", **limits,
-        },
-    }  # fmt: skip
-    solver = ca.nlpsol("local", "ipopt", nlp, options)
+    call = watch.callback(start, ties.numel())
+
+    def run(at: Array, tolerance: float) -> tuple[str, Array]:
+        limits: dict[str, float] = {"max_iter": max_iterations}
+        if np.isfinite(watch.left):
+            limits["max_wall_time"] = max(watch.left, 0.1)
+        options = {
+            "print_time": False,
+            "iteration_callback": call,
+            "ipopt": {
+                "print_level": 0, "sb": "yes", "tol": tolerance, "acceptable_tol": 100 * tolerance,
+                "acceptable_iter": 5, "constr_viol_tol": 1e-11, "mu_strategy": "adaptive", **limits,
+            },
+        }  # fmt: skip
+        solver = ca.nlpsol("local", "ipopt", nlp, options)
+        answer = solver(x0=at, lbx=lower, ubx=upper, lbg=0, ubg=0)
+        return solver.stats()["return_status"], np.asarray(answer["x"]).ravel()
+
     try:
-        answer = solver(x0=start, lbx=lower, ubx=upper, lbg=0, ubg=0)
-        status, best = solver.stats()["return_status"], np.asarray(answer["x"]).ravel()
+        status, best = run(start, _TOLERANCE)
+        if status == "Search_Direction_Becomes_Too_Small" and watch.stopped is None:
+            # Noise can leave the gradient's round-off above the tolerance: the same point is judged by a wider one.
+            status, best = run(best, 1e3 * _TOLERANCE)
     except KeyboardInterrupt as interrupt:
         watch.stopped = interrupt
     if watch.stopped is not None:
@@ -220,70 +263,6 @@ def _attempt(problem: Problem, model: _Model, watch: _Watch, max_iterations: int
     return _Attempt(model.back(value), modes, size, status, _on_bounds(z.names, best, lower, upper))
 
 
-class _Watch:
-    """What happens between the iterations of all attempts: the curve, the monitor, and its wish to stop."""
-
-    def __init__(self, monitor: Callable[[int, float], object] | None, deadline: float) -> None:
-        self.monitor, self.deadline = monitor, deadline
-        self.curve: list[float] = []
-        self.stopped: BaseException | None = None
-        self.z: Array = np.zeros(0)
-
-    @property
-    def left(self) -> float:
-        """Seconds until the deadline."""
-        return self.deadline - time.perf_counter()
-
-    def callback(self, start: Array, n_ties: int) -> ca.Callback:
-        self.z = start
-        return _IterationCallback(self, start.size, n_ties)
-
-    def take(self, z: Array, objective: float) -> bool:
-        """Take an iterate; whether to stop."""
-        try:
-            self.z = z
-            self.curve.append(float(np.sqrt(max(objective, 0.0) / _OBJECTIVE_SCALE)))
-            if self.monitor is not None:
-                self.monitor(len(self.curve) - 1, self.curve[-1])
-        except BaseException as error:  # must not unwind through IPOPT; the caller raises it again
-            self.stopped = error
-        return self.stopped is not None
-
-
-class _IterationCallback(ca.Callback):
-    """CasADi's shape of an iteration callback."""
-
-    def __init__(self, watch: _Watch, n: int, n_ties: int) -> None:
-        ca.Callback.__init__(self)
-        self.watch = watch
-        self.sizes = {"x": n, "f": 1, "g": n_ties, "lam_x": n, "lam_g": n_ties, "lam_p": 0}
-        self.construct("iteration", {})
-
-    def get_n_in(self) -> int:
-        """Count the outputs of an nlpsol."""
-        return int(ca.nlpsol_n_out())
-
-    def get_n_out(self) -> int:
-        """Give one flag."""
-        return 1
-
-    def get_name_in(self, i: int) -> str:
-        """Name an nlpsol output."""
-        return str(ca.nlpsol_out(i))
-
-    def get_name_out(self, i: int) -> str:
-        """Name the flag."""
-        return "stop"
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Shapes of the nlpsol outputs."""
-        return ca.Sparsity.dense(self.sizes[ca.nlpsol_out(i)], 1)
-
-    def eval(self, arg: list) -> list:
-        """Hand the iterate on; a nonzero answer stops IPOPT."""
-        return [int(self.watch.take(np.asarray(arg[0]).ravel(), float(arg[1])))]
-
-
 def _modes(structure: Structure) -> Modes:
     return Modes(
         structure.mode_shapes,
@@ -293,7 +272,7 @@ def _modes(structure: Structure) -> Modes:
     )
 
 
-def _spectrum(problem: Problem, start: Modes, z: _Coordinates) -> tuple[ca.MX, ca.MX, Array]:
+def _spectrum(problem: Problem, start: Modes, z: _Coordinates, held: bool = True) -> tuple[ca.MX, ca.MX, Array]:
     """Frequencies and damping ratios as expressions; circular frequencies that they are relative to."""
     center, window = start.omega.copy(), np.full(start.omega.size, np.log(_OPEN_WINDOW))
     if isinstance(problem.stiffness, SpectralStiffness):
@@ -303,6 +282,8 @@ def _spectrum(problem: Problem, start: Modes, z: _Coordinates) -> tuple[ca.MX, c
     omega = ca.DM(center) * ca.exp(shift)
     damping = problem.damping
     (variable,) = damping.variables(problem.layout)
+    if isinstance(damping, ModalDamping) and not held:
+        return omega, ca.DM(start.ratios) * ca.exp(z.add("damping ratio", np.zeros(start.ratios.size))), center
     if isinstance(damping, ModalDamping):
         guess = np.clip(start.ratios, variable.lower, variable.upper)
         low, high = np.log(variable.lower / guess), np.log(variable.upper / guess)
@@ -318,7 +299,7 @@ def _damping_values(problem: Problem, ratios: Array, omega: Array) -> Array:
     return np.clip(problem.damping.values(ratios, omega), variable.lower, variable.upper)
 
 
-def _modal(problem: Problem, start: Modes, remainder: Array) -> _Model:
+def _modal(problem: Problem, start: Modes, remainder: Array, held: bool) -> _Model:
     """Full mass, spectral stiffness: mode shapes and participations are free."""
     z, layout, mass, test = _Coordinates(), problem.layout, problem.mass, problem.measurement
     assert isinstance(mass, FullMass)
@@ -326,7 +307,7 @@ def _modal(problem: Problem, start: Modes, remainder: Array) -> _Model:
     unit = np.sqrt(totals.max())  # kg^½: makes shapes and participations of order one
     phi = z.add("mode shape", start.phi * unit) / unit
     gamma = z.add("participation", start.gamma / unit) * unit
-    omega, ratios, _ = _spectrum(problem, start, z)
+    omega, ratios, _ = _spectrum(problem, start, z, held)
     rigid = gamma.T @ gamma
     if test.force is not None:
         root = np.linalg.cholesky(remainder + 1e-6 * np.diag(totals)) / np.sqrt(totals)[:, None]
@@ -351,7 +332,8 @@ def _modal(problem: Problem, start: Modes, remainder: Array) -> _Model:
         zeta = np.maximum(zeta, 0.0)  # Rayleigh factors may leave their bounds by IPOPT's tolerance
         structure = assemble(M_SS, M_S0, low.T @ low + left, (P.T * w**2) @ P, zeta, G)
         x = problem.values(structure)
-        x[problem.parts.damping] = _damping_values(problem, zeta, w)
+        if held:
+            x[problem.parts.damping] = _damping_values(problem, zeta, w)
         return x
 
     return _Model(z, phi, gamma, omega, ratios, rigid, back)
@@ -453,9 +435,12 @@ def _on_bounds(names: list[str], z: Array, lower: Array, upper: Array) -> str:
         near = 1e-6 * np.where(np.isfinite(upper - lower), upper - lower, 1.0)
         low, high = np.isfinite(lower) & (z - lower < near), np.isfinite(upper) & (upper - z < near)
     seen: dict[str, int] = {}
-    words = []
+    ended: dict[str, list[str]] = {}
     for name, is_low, is_high in zip(names, low, high, strict=True):
         seen[name] = seen.get(name, 0) + 1
         if is_low or is_high:
-            words.append(f"{name} {seen[name]} ({'lower' if is_low else 'upper'})")
-    return ", ".join(words[:6]) + (f" and {len(words) - 6} more" if len(words) > 6 else "")
+            ended.setdefault(name, []).append(f"{seen[name]} ({'lower' if is_low else 'upper'})")
+    return "; ".join(
+        f"{name} {', '.join(which[:4])}" + (f" and {len(which) - 4} more" if len(which) > 4 else "")
+        for name, which in ended.items()
+    )

@@ -84,11 +84,16 @@ def linear_residues(test: Measurement, omega: Array, ratios: Array) -> tuple[Arr
     -------
     residues : (m, n, d)
     residual : float
-        Relative residual that they leave: no modal model with these poles has a smaller one.
+        Relative residual that they leave, with that of the base force (its residues free too) as in
+        `residual`: no modal model with these poles has a smaller one.
     """
     design, records = _modal_basis(test, omega, ratios), columns(test.relative).T
     answer = _real_least_squares(design, records)
     left = np.linalg.norm(design @ answer - records) / np.linalg.norm(records)
+    if test.force is not None:
+        weighing, force = np.hstack([columns(test.base).T, design]), columns(test.force).T
+        missed = weighing @ _real_least_squares(weighing, force) - force
+        left = np.hypot(left, np.linalg.norm(missed) / np.linalg.norm(force))
     return answer.reshape(omega.size, test.n_base, -1).transpose(0, 2, 1), float(left)
 
 

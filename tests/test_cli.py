@@ -295,7 +295,6 @@ ON_THE_LINE = {
     "unknown option": (["list", "--all"], "--all"),
     "unknown problem": (["run", "cantilever_towr"], "did you mean 'cantilever_tower'.*shear_building"),
     "unknown strategy": (["run", "pair.py", "--strategy", "simplex"], "'simplex'.*swarm"),
-    "a strategy to come": (["run", "pair.py", "--strategy", "modal"], "modal"),
     "missing module": (["run", "nowhere.py"], "nowhere.py cannot be read: No such file"),
     "missing module of a folder": (["run", "some/where"], "No such file"),
     "missing data": (["run", "pair.py", "--data", "nowhere"], "'nowhere': there is no such file or folder"),

@@ -1,0 +1,109 @@
+"""What surrounds a search: its news, its clock and log, and how it is stopped."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True, eq=False)
+class Progress:
+    """What a callback sees.
+
+    Attributes
+    ----------
+    phase : str
+        "swarm", "refinement" or "local phase".
+    iteration, of : int
+        The iteration, and the most there can be (0: not known).
+    residual : float
+        Relative residual of the best candidate so far.
+    seconds : float
+        Since the start.
+    """
+
+    phase: Literal["swarm", "refinement", "local phase"]
+    iteration: int
+    of: int
+    residual: float
+    seconds: float
+
+    def __str__(self) -> str:
+        return f"{self.phase:11s}  iteration {self.iteration:4d}  residual {self.residual:.3e}  {self.seconds:6.1f} s"
+
+
+class DeferredInterrupt:
+    """Hold Ctrl-C back until the search next reports: raised inside compiled code it would lose the best so far.
+
+    A second Ctrl-C acts at once. Where somebody else handles the signal, or outside the main thread, nothing changes.
+    """
+
+    def __init__(self) -> None:
+        self.asked = False
+        self.raised = False
+        self.ours = False
+
+    def __enter__(self) -> DeferredInterrupt:
+        self.ours = (
+            threading.current_thread() is threading.main_thread()
+            and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        )
+        if self.ours:
+            signal.signal(signal.SIGINT, self._hold)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+        if self.ours:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        # CasADi turns a KeyboardInterrupt that strikes inside it into some other exception.
+        if self.raised and isinstance(error, Exception):
+            raise KeyboardInterrupt from error
+
+    def _hold(self, number: int, frame: object) -> None:
+        if self.asked:
+            self.raised = True
+            raise KeyboardInterrupt
+        self.asked = True
+
+    def check(self) -> None:
+        if self.asked:
+            raise KeyboardInterrupt
+
+
+class Stop(Exception):  # noqa: N818 - not an error
+    """The callback asked to stop."""
+
+
+class Desk:
+    """The clock, the log, and the listeners of an identification."""
+
+    def __init__(
+        self, listeners: list[Callable[[Progress], object]], interrupt: DeferredInterrupt, max_time: float | None
+    ) -> None:
+        self.listeners, self.interrupt, self.max_time = listeners, interrupt, max_time
+        self.begun = time.perf_counter()
+        self.log: list[str] = []
+
+    @property
+    def seconds(self) -> float:
+        return time.perf_counter() - self.begun
+
+    @property
+    def left(self) -> float | None:
+        """Seconds that are left, at least one; None without a limit."""
+        return None if self.max_time is None else max(self.max_time - self.seconds, 1.0)
+
+    def note(self, line: str) -> None:
+        self.log.append(f"{self.seconds:8.2f} s  {line}")
+
+    def tell(self, phase: Literal["swarm", "refinement", "local phase"], iteration: int, of: int, cost: float) -> None:
+        self.interrupt.check()
+        for listener in self.listeners:
+            try:
+                listener(Progress(phase, iteration, of, cost, self.seconds))
+            except StopIteration:
+                raise Stop("the callback stopped the search") from None
