@@ -9,7 +9,7 @@ from sysid.errors import InputError
 from sysid.local import Modes, is_modal, rank_one
 from sysid.poles import find_poles
 from sysid.problem import Problem
-from sysid.response import columns, linear_residues
+from sysid.response import columns, gains, linear_residues
 from sysid.structure import Array
 
 _LEAST = 1e-3  # of the largest modal mass: none may vanish, or M_SS would be singular
@@ -55,9 +55,9 @@ def _weigh(problem: Problem, modes: Modes) -> tuple[Array, Array]:
 
     test, d = problem.measurement, problem.layout.d
     assert test.force is not None
-    w, n = 2 * np.pi * test.freq, modes.omega.size
+    n = modes.omega.size
     base = columns(test.base)
-    g = np.tile(w**2 / (modes.omega[:, None] ** 2 - w**2 + 2j * (modes.ratios * modes.omega)[:, None] * w), test.n_runs)
+    g = np.tile(gains(test.freq, modes.omega, modes.ratios), test.n_runs)
     parts = [np.outer(modes.gamma[k], modes.gamma[k]) @ (base * g[k]) for k in range(n)]
     pairs = [(i, j) for i in range(d) for j in range(i, d)]
     for i, j in pairs:

@@ -17,7 +17,7 @@ import numpy as np
 from sysid.mass import KnownMass, LumpedMass
 from sysid.measurement import Measurement
 from sysid.problem import Problem
-from sysid.response import columns
+from sysid.response import columns, gains
 from sysid.stiffness import ChainStiffness
 from sysid.structure import Array, Structure
 
@@ -119,8 +119,7 @@ def _unseen(problem: Problem, structure: Structure, misfit: float) -> Iterator[s
 
 def _shares(test: Measurement, structure: Structure) -> tuple[Array, Array | None]:
     """Relative size of each mode's part in the responses and in the base force, (n,) each."""
-    w, omega = 2 * np.pi * test.freq, 2 * np.pi * structure.natural_frequencies[:, None]
-    g = w**2 / (omega**2 - w**2 + 2j * structure.damping_ratios[:, None] * omega * w)
+    g = gains(test.freq, 2 * np.pi * structure.natural_frequencies, structure.damping_ratios)
     push = np.einsum("kd,rdf->rkf", structure.participation, test.base) * g
     size = np.linalg.norm(push, axis=(0, 2))
     share = size * np.linalg.norm(structure.mode_shapes, axis=0) / np.linalg.norm(test.relative)

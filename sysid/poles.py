@@ -10,13 +10,13 @@ real residues.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.linalg
 
 from sysid.errors import InputError
 from sysid.measurement import Measurement
+from sysid.response import columns, gains
 from sysid.structure import Array, ComplexArray
 
 _SPARE = 6  # poles beyond the number of sensors: without spare ones noise moves true poles
@@ -115,10 +115,9 @@ class _Records:
     """The relative accelerations, real and imaginary parts stacked, and fits of them."""
 
     def __init__(self, test: Measurement) -> None:
-        self.w = 2 * np.pi * test.freq
+        self.freq, self.w = test.freq, 2 * np.pi * test.freq
         self.runs = test.n_runs
-        self.base = np.moveaxis(test.base, 1, 0).reshape(test.n_base, -1)
-        relative = np.moveaxis(test.relative, 1, 0).reshape(test.n_sensors, -1)
+        self.base, relative = columns(test.base), columns(test.relative)
         self.data = np.vstack([relative.T.real, relative.T.imag])
         self.size = float(np.sum(self.data**2))
 
@@ -129,7 +128,7 @@ class _Records:
         return np.vstack([columns.real, columns.imag])
 
     def fit(self, omega: Array, ratios: Array) -> _Fit:
-        X = self.stack(_gains(self.w, omega, ratios))
+        X = self.stack(gains(self.freq, omega, ratios))
         scale = np.linalg.norm(X, axis=0)
         scale[scale == 0] = 1.0
         Q, R = np.linalg.qr(X / scale)
@@ -144,14 +143,10 @@ class _Records:
         return _Fit(Q, (beta / scale[:, None]).reshape(m, d, -1), self.data - Q @ y, gain)
 
 
-def _gains(w: Array, omega: Array, ratios: Array) -> Any:
-    return w**2 / (omega[:, None] ** 2 - w**2 + 2j * (ratios * omega)[:, None] * w)
-
-
 def _relocate(test: Measurement, omega: Array, ratios: Array) -> tuple[Array, Array]:
     """One step of relaxed vector fitting: the zeros of sigma in ``sigma a = sum of (r_1 + r_2 i w) g``."""
     w, m = 2 * np.pi * test.freq, omega.size
-    g = _gains(w, omega, ratios)
+    g = gains(test.freq, omega, ratios)
     numerators = np.concatenate([g, 1j * w / omega[:, None] * g])
     partial = (omega[:, None] / w) ** 2 * g  # w_k² over the same denominator
     sigma = np.concatenate([np.ones((1, w.size)), partial, 1j * w / omega[:, None] * partial]).T
@@ -243,7 +238,7 @@ def _projected(records: _Records, p: Array) -> tuple[float, Array, Array]:
     m = p.size // 2
     omega, ratios = np.exp(p[:m]), np.exp(p[m:])
     fit, w = records.fit(omega, ratios), records.w
-    g = _gains(w, omega, ratios)
+    g = gains(records.freq, omega, ratios)
     over = g / w**2  # one over the denominator
     loss = 2j * (ratios * omega)[:, None] * w
     slopes = records.stack(np.concatenate([-g * over * (2 * omega[:, None] ** 2 + loss), -g * over * loss]))

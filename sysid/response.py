@@ -104,10 +104,15 @@ def weighed_mass(test: Measurement, omega: Array, ratios: Array) -> Array:
     return _real_least_squares(design, columns(test.force).T)[: test.n_base].T
 
 
+def gains(freq: Array, omega: Array, ratios: Array) -> ComplexArray:
+    """Numbers of ``g_k = w² / (w_k² - w² + 2 i zeta_k w_k w)`` at lines in Hz, (m, n_freq)."""
+    w = 2 * np.pi * freq
+    return w**2 / (omega[:, None] ** 2 - w**2 + 2j * (ratios * omega)[:, None] * w)
+
+
 def _modal_basis(test: Measurement, omega: Array, ratios: Array) -> ComplexArray:
     """Response of each mode to each base direction, (runs * n_freq, m * d)."""
-    w = 2 * np.pi * test.freq
-    g = w**2 / (omega[:, None] ** 2 - w**2 + 2j * (ratios * omega)[:, None] * w)
+    g = gains(test.freq, omega, ratios)
     u = columns(test.base)
     return (np.tile(g, test.n_runs)[:, None] * u[None]).reshape(-1, u.shape[1]).T
 
