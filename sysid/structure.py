@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +19,25 @@ Array = NDArray[np.floating[Any]]
 ComplexArray = NDArray[np.complexfloating[Any]]
 
 _TOLERANCE = 1e-8  # relative; looser than round-off in a condensation, tighter than any instrument
+
+
+@dataclass(frozen=True, eq=False)
+class CraigBampton:
+    """A structure in modal coordinates q (n) and base motions u_0 (d): ``M z'' + C z' + K z = [0; f_0]``, z = [q; u_0].
+
+    Attributes
+    ----------
+    mass, stiffness, damping : (n + d, n + d)
+        ``[[I, Gamma], [Gamma', M_rb]]``, ``diag(w², 0)`` and the modal damping, ``diag(2 zeta w, 0)`` where it is
+        classical; modes mass-normalised, in ascending order of frequency.
+    recovery : (n_sensors, n + d)
+        ``[Phi, G]``: takes z to the absolute motion of the sensors.
+    """
+
+    mass: Array
+    stiffness: Array
+    damping: Array
+    recovery: Array
 
 
 class Structure:
@@ -63,6 +83,10 @@ class Structure:
         Hz, ascending, of the structure on a fixed base.
     mode_shapes : (n_sensors, n)
         Mass-normalised, at the sensors.
+    normal_modes : (n, n)
+        The same at the degrees of freedom: ``mode_shapes = recovery @ normal_modes``.
+    rigid_body_dofs : (n, d)
+        G, motion of the degrees of freedom for unit base motion.
     participation : (n, d)
         ``Phi' B``, one row a mode.
     effective_masses : (n, d, d)
@@ -113,13 +137,13 @@ class Structure:
                 "at least one of each is needed"
             )
         n = self.n
-        self._rigid_body_dofs = self._check_matrices()
+        self.rigid_body_dofs: Array = self._check_matrices()
 
         lam, phi = scipy.linalg.eigh(self.stiffness[:n, :n], self.mass[:n, :n])
         self._omega = np.sqrt(lam)
         # A mode's sign is arbitrary: the entry of largest magnitude is made positive, so that the
         # same structure always prints the same shapes.
-        self._phi = phi * np.sign(phi[np.argmax(np.abs(phi), axis=0), np.arange(n)])
+        self.normal_modes: Array = phi * np.sign(phi[np.argmax(np.abs(phi), axis=0), np.arange(n)])
         self.natural_frequencies: Array = self._omega / (2 * np.pi)
         self._set_damping(damping_ratios, damping_matrix)
 
@@ -129,11 +153,11 @@ class Structure:
         if self.sensors is not None and len(self.sensors) != self.n_sensors:
             raise InputError(f"{len(self.sensors)} sensors are described but the structure has {self.n_sensors}")
 
-        G = self._rigid_body_dofs
+        G = self.rigid_body_dofs
         B = self.mass[:n, :n] @ G + self.mass[:n, n:]
         rigid = np.vstack([G, np.eye(self.n_base)])
-        self.mode_shapes: Array = self.recovery @ self._phi
-        self.participation: Array = self._phi.T @ B
+        self.mode_shapes: Array = self.recovery @ self.normal_modes
+        self.participation: Array = self.normal_modes.T @ B
         self.effective_masses: Array = np.einsum("ki,kj->kij", self.participation, self.participation)
         self.rigid_body_mass: Array = rigid.T @ self.mass @ rigid
         self._coupling = B
@@ -202,13 +226,36 @@ class Structure:
             A, np.vstack([np.zeros((n, self.n_base)), feed]), R @ acceleration, R @ feed + self.rigid_body
         )
 
+    def to_craig_bampton(self) -> CraigBampton:
+        """Fixed-base modal coordinates beside the base's own degrees of freedom.
+
+        Base-shake tests see a structure through nothing but this form, and with the base force measured they
+        determine all of it, whatever the number of sensors.
+
+        References
+        ----------
+        R. R. Craig, M. C. C. Bampton, AIAA J. 6 (1968) 1313-1319.
+        """
+        if not self.modal_damping:
+            damping = self.normal_modes.T @ self.damping @ self.normal_modes
+        else:
+            damping = np.diag(2 * self.damping_ratios * self._omega)
+        n, d = self.n, self.n_base
+        none, base = np.zeros((n, d)), np.zeros((d, d))
+        return CraigBampton(
+            mass=np.block([[np.eye(n), self.participation], [self.participation.T, self.rigid_body_mass]]),
+            stiffness=np.block([[np.diag(self._omega**2), none], [none.T, base]]),
+            damping=np.block([[damping, none], [none.T, base]]),
+            recovery=np.hstack([self.mode_shapes, self.rigid_body]),
+        )
+
     def _relative(self, freq: ArrayLike) -> ComplexArray:
         """Relative acceleration of the degrees of freedom, (n, d, n_freq)."""
         omega = 2 * np.pi * check_frequencies(freq, increasing=False)
         if self.modal_damping:
             lam = self._omega[:, None]
             g = omega**2 / (lam**2 - omega**2 + 2j * self.damping_ratios[:, None] * lam * omega)
-            return np.einsum("nk,kd,kf->ndf", self._phi, self.participation, g)
+            return np.einsum("nk,kd,kf->ndf", self.normal_modes, self.participation, g)
         n = self.n
         w = omega[:, None, None]
         dynamic = -(w**2) * self.mass[:n, :n] + 1j * w * self.damping + self.stiffness[:n, :n]
@@ -256,7 +303,7 @@ class Structure:
                 )
             if np.any(self.damping_ratios < 0):
                 raise InputError(f"damping ratio {self.damping_ratios.min():.3g} is negative")
-            momentum = self.mass[:n, :n] @ self._phi
+            momentum = self.mass[:n, :n] @ self.normal_modes
             self.damping: Array = (momentum * (2 * self.damping_ratios * self._omega)) @ momentum.T
         else:
             assert matrix is not None
@@ -265,7 +312,7 @@ class Structure:
                 raise InputError(
                     f"damping_matrix has shape {self.damping.shape}; on the relative motion it is ({n}, {n})"
                 )
-            modal = self._phi.T @ self.damping @ self._phi
+            modal = self.normal_modes.T @ self.damping @ self.normal_modes
             if np.linalg.eigvalsh(modal)[0] < -_TOLERANCE * np.abs(modal).max():
                 raise InputError("damping_matrix is not positive semidefinite: the structure would feed energy in")
             self.damping_ratios = np.diag(modal) / (2 * self._omega)
@@ -278,7 +325,7 @@ class Structure:
                     "a structure with a recovery matrix needs rigid_body (n_sensors, d): geometry tells it"
                 )
             return _matrix("rigid_body", given, shape)
-        G = self._rigid_body_dofs
+        G = self.rigid_body_dofs
         if given is not None:
             stated = _matrix("rigid_body", given, shape)
             worst = np.max(np.abs(stated - G))

@@ -357,3 +357,37 @@ class TestConstructionChecks:
     def test_frequencies_at_which_a_response_is_asked(self, good, freq):
         with pytest.raises(InputError, match="freq"):
             Structure(**good).transmissibility(freq)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_craig_bampton_form_answers_as_the_structure_does(random_structure, seed, kind):
+    rng = np.random.default_rng(seed)
+    s = random_structure(rng, n=4, d=3, damping=kind)
+    recovery = rng.normal(size=(6, 4))
+    C = {"damping_ratios": s.damping_ratios} if s.modal_damping else {"damping_matrix": s.damping}
+    s = Structure(s.mass, s.stiffness, n_base=3, recovery=recovery, rigid_body=recovery @ s.rigid_body, **C)
+    form, n = s.to_craig_bampton(), s.n
+    freq = rng.uniform(1, 80, 10)
+    a, f = [], []
+    for w in 2 * np.pi * freq:
+        # Accelerations z'' for unit base accelerations; the first n rows of the equation of motion have no load.
+        Z = form.mass + form.damping / (1j * w) - form.stiffness / w**2
+        z = np.vstack([np.linalg.solve(Z[:n, :n], -Z[:n, n:]), np.eye(3)])
+        a.append(form.recovery @ z)
+        f.append((Z @ z)[n:])
+    close(np.moveaxis(a, 0, -1), s.transmissibility(freq), 1e-9)
+    close(np.moveaxis(f, 0, -1), s.base_force(freq), 1e-9)
+    close(form.mass[n:, n:], s.rigid_body_mass, 1e-12)
+
+
+def test_mode_shapes_at_the_sensors_are_recovered_from_those_at_the_degrees_of_freedom(random_structure):
+    rng = np.random.default_rng(0)
+    s = random_structure(rng, n=4, d=2)
+    recovery = rng.normal(size=(3, 4))
+    t = Structure(
+        s.mass, s.stiffness, s.damping_ratios, n_base=2, recovery=recovery, rigid_body=recovery @ s.rigid_body
+    )
+    close(t.mode_shapes, recovery @ t.normal_modes, 1e-14)
+    close(t.normal_modes.T @ s.mass[:4, :4] @ t.normal_modes, np.eye(4), 1e-12)
+    close(t.rigid_body_dofs, s.rigid_body, 1e-12)
