@@ -1,0 +1,169 @@
+"""Lines of capability 3: errors against the Cramér-Rao bound, and whether 95 % intervals hold the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+
+import sysid
+from benchmarks.attempt import identified, named
+from benchmarks.cramer_rao import CramerRao, cramer_rao
+from benchmarks.line import Line, below
+from benchmarks.random_structures import lines, random_structure
+from benchmarks.spread import spread
+
+NOISE, LEVEL = 0.01, 0.95
+RATIO, POOLED, EACH = 1.2, (0.93, 0.97), (0.90, 0.99)
+KINDS = {
+    "natural_frequencies": "frequencies",
+    "damping_ratios": "damping ratios",
+    "mass": "entries of M_SS",
+    "stiffness": "entries of K_SS",
+    "damping": "entries of C",
+    "effective_masses": "effective masses",
+}
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One noisy test.
+
+    Attributes
+    ----------
+    structure : int
+        Seed of the structure.
+    found : int
+        Modes found; the rest stays empty where they are not all.
+    squared : dict
+        Squared Frobenius errors of M_SS and K_SS.
+    held : dict
+        A kind of quantity: how many of its intervals hold the truth, and how many there are.
+    said : str
+        The error, where there was one.
+    """
+
+    structure: int
+    found: int = 0
+    squared: dict[str, float] = field(default_factory=dict)
+    held: dict[str, tuple[int, int]] = field(default_factory=dict)
+    said: str = ""
+
+
+def bound(structures: range, draws: int, printed: bool) -> Iterator[Line]:
+    """RMS errors and coverage over noise draws of some structures; only printed where they are few."""
+    tasks = [(seed, number) for seed in structures for number in range(draws)]
+    answers = spread(draw, tasks)
+    what = f"1 % noise, base force, {len(structures)} structures x {draws} draws: "
+    complete = [a for a in answers if a.held]
+    missing = []
+    for seed in structures:
+        reasons = [a.said or f"{a.found} modes" for a in answers if a.structure == seed and not a.held]
+        if reasons:
+            missing.append(f"structure {seed}, n = {random_structure(seed).n}: {_tally(reasons)}")
+    yield Line(
+        what + f"draws without a result of all n modes, left out of what follows ({'; '.join(missing) or 'none'})",
+        f"{len(answers) - len(complete)} of {len(answers)}",
+    )
+    if not complete:
+        yield Line(what + "nothing to compare", "no complete draw", "", False)
+        return
+    for name, label in (("mass", "M_SS"), ("stiffness", "K_SS")):
+        ratios = {}
+        for seed in structures:
+            squared = [a.squared[name] for a in complete if a.structure == seed]
+            if squared:
+                least = float(np.linalg.norm(getattr(_setting(seed)[2], name)))
+                ratios[seed] = np.sqrt(np.mean(squared)) / least
+        text = what + f"largest ratio of rms error to the Cramér-Rao bound, {label} (" + ", ".join(
+            f"{seed}: {ratio:.3f} of {100 * _relative_bound(seed, name):.2g} %" for seed, ratio in ratios.items()
+        ) + ")"  # fmt: skip
+        worst = max(ratios.values())
+        yield Line(text, f"{worst:.3f}") if printed else below(text, float(worst), RATIO)
+    shares = {label: _share(complete, [name]) for name, label in KINDS.items()}
+    text = what + "share of 95 % intervals that hold the truth, "
+    yield _coverage(text + "pooled", _share(complete, [*KINDS]), POOLED, printed)
+    for label, share in shares.items():
+        yield _coverage(text + label, share, EACH, printed)
+    products = _share(complete, ["effective_mass_products"])
+    yield Line(what + "the same for the products of two participations (off the diagonals)", f"{products:.4f}")
+    lowest = {
+        (seed, label): _share([a for a in complete if a.structure == seed], [name])
+        for seed in {a.structure for a in complete}
+        for name, label in KINDS.items()
+    }
+    worst_at = min(lowest, key=lambda key: lowest[key])
+    yield Line(
+        what + f"lowest share of one kind in one structure (structure {worst_at[0]}, {worst_at[1]})",
+        f"{lowest[worst_at]:.4f}",
+    )
+
+
+def _tally(reasons: list[str]) -> str:
+    return ", ".join(f"{reasons.count(reason)} x {reason}" for reason in sorted(set(reasons)))
+
+
+def _coverage(text: str, share: float, bounds: tuple[float, float], printed: bool) -> Line:
+    asked = f"{bounds[0]:.2f} to {bounds[1]:.2f}"
+    return Line(text, f"{share:.4f}", "" if printed else asked, None if printed else bounds[0] <= share <= bounds[1])
+
+
+def _share(answers: list[Draw], names: list[str]) -> float:
+    held = np.sum([a.held[name] for a in answers for name in names], axis=0)
+    return float(held[0] / held[1]) if held[1] else np.nan
+
+
+def _relative_bound(seed: int, name: str) -> float:
+    truth, _, best = _setting(seed)
+    n = truth.n
+    return float(np.linalg.norm(getattr(best, name)) / np.linalg.norm(getattr(truth, name)[:n, :n]))
+
+
+@cache
+def _setting(seed: int) -> tuple[sysid.Structure, np.ndarray, CramerRao]:
+    """Structure, lines, and the bound in its test; the noise's standard deviation is the same in every draw."""
+    truth = random_structure(seed)
+    freq = lines(truth)
+    return truth, freq, cramer_rao(truth, sysid.simulate(truth, freq, noise=NOISE, force=True, rng=0))
+
+
+def draw(task: tuple[int, int]) -> Draw:
+    """One draw of the noise on the test of one structure: seed of the structure, number of the draw."""
+    try:
+        return _draw(*task)
+    except Exception as error:  # a crash is an answer too, and must not end the others
+        return Draw(task[0], said=named(error))
+
+
+def _draw(seed: int, number: int) -> Draw:
+    truth = random_structure(seed)
+    n, d = truth.n, truth.n_base
+    test = sysid.simulate(truth, lines(truth), noise=NOISE, force=True, rng=np.random.default_rng((seed, number)))
+    result = identified(test)
+    found = result.structure
+    if found.n != n:
+        return Draw(seed, found.n)
+    if result.uncertainty is None:
+        return Draw(seed, found.n, said="no uncertainty")
+    blocks = {name: (getattr(found, name)[:n, :n], getattr(truth, name)[:n, :n]) for name in ("mass", "stiffness")}
+    below_diagonal, diagonal = np.tril_indices(n), np.arange(d)
+    held = {}
+    for name in KINDS:
+        low, high = result.uncertainty.interval(name, level=LEVEL)
+        exact = getattr(truth, name)
+        exact = exact[:n, :n] if name in blocks else exact
+        inside = (low <= exact) & (exact <= high)
+        if name == "effective_masses":
+            held["effective_mass_products"] = _count(inside[:, *np.triu_indices(d, 1)])
+            inside = inside[:, diagonal, diagonal]
+        elif inside.ndim == 2:
+            inside = inside[below_diagonal]  # each entry of a symmetric matrix once
+        held[name] = _count(inside)
+    squared = {name: float(np.sum((a - b) ** 2)) for name, (a, b) in blocks.items()}
+    return Draw(seed, found.n, squared, held)
+
+
+def _count(inside: np.ndarray) -> tuple[int, int]:
+    return int(np.count_nonzero(inside)), int(inside.size)

@@ -1,0 +1,85 @@
+"""Lines of capability 3 on large tests: time and memory, each in a process of its own.
+
+``python -m benchmarks.large N D LINES`` runs one and prints its figures as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+import sysid
+from benchmarks.attempt import identified
+from benchmarks.exact import distance
+from benchmarks.line import Line, below
+from benchmarks.modules import ROOT
+from benchmarks.random_structures import lines, random_structure
+
+SIZES = ((50, 3, 1000, 10.0), (100, 3, 2000, 90.0))  # n, d, lines, s
+MEMORY = 4.0  # GiB
+
+
+def large(reduced: bool) -> Iterator[Line]:
+    """Noise-free tests with base force."""
+    for n, d, count, seconds in SIZES[: 1 if reduced else None]:
+        what = f"no noise, base force, n = {n}, d = {d}, {count} lines: "
+        figures = _in_own_process(n, d, count)
+        if "said" in figures:
+            yield Line(what + figures["said"], "no result", f"<= {seconds:g} s", False)
+            continue
+        yield below(what + "seconds", figures["seconds"], seconds)
+        yield below(what + "peak memory, GiB", figures["memory"], MEMORY)
+        shown = ", ".join(f"{figures[name]:.1e}" for name in ("residual", "force_residual", "matrices"))
+        yield Line(
+            what + "residual, residual of the force, relative distance of M_SS, K_SS and C, modes found",
+            f"{shown}, {figures['found']}",
+        )
+
+
+def _in_own_process(n: int, d: int, count: int) -> dict:
+    command = [sys.executable, "-m", "benchmarks.large", str(n), str(d), str(count)]
+    paths = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, cwd=ROOT, env={**os.environ, "PYTHONPATH": paths}
+    )
+    if done.returncode:
+        return {"said": (done.stderr.strip().splitlines() or ["no output"])[-1]}
+    figures: dict = json.loads(done.stdout.strip().splitlines()[-1])
+    return figures
+
+
+def main() -> None:
+    """Run one, and print its figures."""
+    n, d, count = (int(a) for a in sys.argv[1:])
+    truth = random_structure(0, n=n, d=d)
+    test = sysid.simulate(truth, lines(truth, count), force=True)
+    begun = time.perf_counter()
+    try:
+        result = identified(test)
+    except sysid.SysidError as error:
+        print(json.dumps({"said": str(error)}))
+        return
+    seconds = time.perf_counter() - begun
+    unit = 2**10 if sys.platform.startswith("linux") else 1  # ru_maxrss is in KiB there, in bytes on macOS
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**30
+    found = result.structure
+    figures = {
+        "seconds": seconds,
+        "memory": peak,
+        "residual": result.residual,
+        "force_residual": result.force_residual,
+        "matrices": distance(found, truth) if found.n == n else np.inf,
+        "found": found.n,
+    }
+    print(json.dumps(figures))
+
+
+if __name__ == "__main__":
+    main()
