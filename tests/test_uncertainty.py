@@ -1,0 +1,586 @@
+"""Standard deviations and intervals against dense finite-difference Jacobians, Monte Carlo, and closed forms."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.stats
+
+import sysid
+from sysid import FullMass, InputError, LumpedMass, Measurement, Problem, SpectralStiffness, Structure
+from sysid.uncertainty import uncertainty
+
+FREQ = np.linspace(2, 66, 90)
+NAMES = (
+    "natural_frequencies", "damping_ratios", "mode_shapes", "participation", "effective_masses", "rigid_body_mass",
+    "mass", "stiffness", "damping",
+)  # fmt: skip
+
+
+class Dense:
+    """The records and all quantities as plain functions of theta, and their Jacobians by central differences."""
+
+    def __init__(self, structure, test, rows_of_T=None):
+        self.test, self.s, self.m, self.d = test, structure.n_sensors, structure.n, structure.n_base
+        self.upper = np.triu_indices(self.d)
+        omega = 2 * np.pi * structure.natural_frequencies
+        parts = [
+            structure.mode_shapes, structure.participation, np.log(omega), np.log(structure.damping_ratios),
+            structure.rigid_body_mass[self.upper],
+        ]  # fmt: skip
+        self.at = np.concatenate([part.ravel() for part in parts])
+        self.T = structure.normal_modes
+        self.rows_of_T = range(self.m) if rows_of_T is None else rows_of_T  # the sensor of each; None: it stands still
+
+    def split(self, theta):
+        s, m, d = self.s, self.m, self.d
+        phi, gamma, log_w, log_z, upper = np.split(theta, np.cumsum([s * m, m * d, m, m]))
+        rigid = np.zeros((d, d))
+        rigid[self.upper] = upper
+        return phi.reshape(s, m), gamma.reshape(m, d), np.exp(log_w), np.exp(log_z), rigid + np.triu(rigid, 1).T
+
+    def spectra(self, theta, freq):
+        phi, gamma, omega, zeta, rigid = self.split(theta)
+        w = 2 * np.pi * freq
+        g = w**2 / (omega[:, None] ** 2 - w**2 + 2j * (zeta * omega)[:, None] * w)
+        response = np.einsum("sk,kf,kj->sjf", phi, g, gamma)
+        return response, np.einsum("ki,kf,kj->ijf", gamma, g, gamma) + rigid[:, :, None]
+
+    def records(self, theta):
+        response, force = self.spectra(theta, self.test.freq)
+        parts = [np.einsum("sjf,rjf->rsf", response, self.test.base).ravel()]
+        if self.test.force is not None:
+            parts.append(np.einsum("ijf,rjf->rif", force, self.test.base).ravel())
+        stacked = np.concatenate(parts)
+        return np.concatenate([stacked.real, stacked.imag])
+
+    def quantities(self, theta):
+        phi, gamma, omega, zeta, rigid = self.split(theta)
+        T = np.array([old if row is None else phi[row] for row, old in zip(self.rows_of_T, self.T, strict=True)])
+        P = np.linalg.inv(T)
+        effective = np.einsum("ki,kj->kij", gamma, gamma)
+        M, K, C = ((P.T * diagonal) @ P for diagonal in (np.ones(self.m), omega**2, 2 * zeta * omega))
+        return (omega / (2 * np.pi), zeta, phi, gamma, effective, rigid, M, K, C)
+
+    def jacobian(self, function):
+        columns = []
+        for p, value in enumerate(self.at):
+            step = np.zeros(self.at.size)
+            step[p] = 1e-6 * max(abs(value), 0.1)
+            columns.append((function(self.at + step) - function(self.at - step)) / (2 * step[p]))
+        return np.stack(columns, axis=-1)
+
+    def noise(self):
+        parts = [self.test.response_std.ravel()] + ([] if self.test.force is None else [self.test.force_std.ravel()])
+        return np.tile(np.concatenate(parts), 2) / np.sqrt(2)  # of a real or imaginary part
+
+    def covariance(self, weights=None, tangent=None):
+        """Of weighted least squares; on the columns of `tangent` only, where given."""
+        J, noise = self.jacobian(self.records), self.noise()
+        Z = np.eye(self.at.size) if tangent is None else tangent
+        W = (1 / noise if weights is None else weights)[:, None]
+        J = J @ Z
+        scale = np.maximum(np.linalg.norm(W * J, axis=0), 1e-30)  # what no record shows is left out
+        inverse = np.linalg.pinv(W * J / scale, rcond=1e-7) / scale[:, None]
+        half = Z @ inverse * (W[:, 0] * noise)
+        return half @ half.T
+
+    def stds(self, covariance):
+        """Of each quantity, in the order of NAMES."""
+        answer = []
+        for at in range(len(NAMES)):
+            rows = self.jacobian(lambda theta, at=at: self.quantities(theta)[at])
+            answer.append(np.sqrt(np.einsum("...p,pq,...q->...", rows, covariance, rows)))
+        return dict(zip(NAMES, answer, strict=True))
+
+
+def problem_of(structure, test, mass=None, **options):
+    s = test.n_sensors
+    stiffness = SpectralStiffness(structure.natural_frequencies[:s], max_frequency=500.0)
+    return Problem(test, mass=FullMass() if mass is None else mass, stiffness=stiffness, **options)
+
+
+def shaken(structure, rng, *, force, runs=2, noise=0.01):
+    """Runs of random base motion instead of unit ones."""
+    base = rng.normal(size=(runs, structure.n_base, FREQ.size)) + 1j * rng.normal(
+        size=(runs, structure.n_base, FREQ.size)
+    )
+    response = np.einsum("sdf,rdf->rsf", structure.transmissibility(FREQ), base)
+    push = np.einsum("edf,rdf->ref", structure.base_force(FREQ), base)
+    level = lambda record: noise * np.sqrt(np.mean(np.abs(record) ** 2))  # noqa: E731
+    return Measurement(
+        FREQ, base, response, rigid_body=structure.rigid_body, response_std=level(response),
+        force=push if force else None, force_std=level(push) if force else None,
+    )  # fmt: skip
+
+
+def check(u, expected, names=NAMES, rtol=2e-6):
+    for name in names:
+        np.testing.assert_allclose(
+            getattr(u, name), expected[name], rtol=rtol, atol=1e-9 * expected[name].max(), err_msg=name
+        )
+
+
+FREE = tuple(name for name in NAMES if name != "effective_masses")
+
+
+class TestAgainstTheDenseJacobian:
+    @pytest.mark.parametrize("random_base", [False, True])
+    @pytest.mark.parametrize(("n", "d"), [(3, 1), (4, 2)])
+    def test_with_force_everything_is_known(self, random_structure, n, d, random_base):
+        rng = np.random.default_rng(n)
+        truth = random_structure(rng, n, d)
+        test = (
+            shaken(truth, rng, force=True)
+            if random_base
+            else sysid.simulate(truth, FREQ, noise=0.01, force=True, rng=1)
+        )
+        u = uncertainty(problem_of(truth, test), truth)
+        dense = Dense(truth, test)
+        covariance = dense.covariance()
+        expected = dense.stds(covariance)
+        check(u, expected, FREE)
+        assert u.inflation == 1.0
+        # of products of normals: E(xy) has second-order terms too
+        at = slice(n * n, n * n + n * d)
+        blocks = covariance[at, at].reshape(n, d, n, d)
+        for k in range(n):
+            own, s = blocks[k, :, k], u.participation[k]
+            second = np.outer(s, s) ** 2 + own**2
+            np.testing.assert_allclose(
+                u.effective_masses[k] ** 2, expected["effective_masses"][k] ** 2 + second, rtol=1e-5
+            )
+        rows = np.concatenate([np.arange(at.stop, at.stop + 2 * n), np.arange(at.start, at.stop)])
+        scale = np.concatenate([truth.natural_frequencies, truth.damping_ratios, np.ones(n * d)])
+        wanted = covariance[np.ix_(rows, rows)] * np.outer(scale, scale)
+        size = np.sqrt(np.diag(wanted))
+        np.testing.assert_allclose(u.covariance / np.outer(size, size), wanted / np.outer(size, size), atol=1e-5)
+        assert u.parameters[0] == "frequency 1, Hz" and u.parameters[n] == "damping ratio 1"
+        assert u.parameters[2 * n] == "participation 1 x" and len(u.parameters) == len(wanted)
+
+    @pytest.mark.parametrize("random_base", [False, True])
+    def test_without_force_only_what_no_modal_mass_changes(self, random_structure, random_base):
+        rng = np.random.default_rng(5)
+        truth = random_structure(rng, 4, 2)
+        test = shaken(truth, rng, force=False) if random_base else sysid.simulate(truth, FREQ, noise=0.01, rng=1)
+        u = uncertainty(problem_of(truth, test), truth)
+        expected = Dense(truth, test).stds(Dense(truth, test).covariance())
+        check(u, expected, ("natural_frequencies", "damping_ratios"))
+        for name in set(NAMES) - {"natural_frequencies", "damping_ratios"}:
+            assert np.all(np.isnan(getattr(u, name))), name
+        assert np.all(np.isnan(u.base_force(FREQ[:3])))
+        assert len(u.parameters) == 8 and np.all(np.isfinite(u.covariance))
+
+    @pytest.mark.parametrize("force", [False, True])
+    def test_spectra(self, random_structure, force):
+        truth = random_structure(np.random.default_rng(6), 3, 2)
+        test = sysid.simulate(truth, FREQ, noise=0.01, force=force, rng=1)
+        u, dense, lines = uncertainty(problem_of(truth, test), truth), Dense(truth, test), np.array([3.0, 17.0, 40.0])
+        covariance = dense.covariance()
+        for which, got in enumerate((u.transmissibility(lines), u.base_force(lines) if force else None)):
+            if got is not None:
+                rows = dense.jacobian(lambda theta, which=which: dense.spectra(theta, lines)[which])
+                wanted = np.sqrt(np.einsum("...p,pq,...q->...", rows, covariance, rows.conj()).real)
+                np.testing.assert_allclose(got, wanted, rtol=1e-5)
+
+    @pytest.mark.parametrize("separable", [True, False])
+    def test_noise_that_varies(self, random_structure, separable):
+        """Weights are one number a sensor times one a line: the noise's own where it is of this kind, else geometric
+        means of it, and the covariance is then the sandwich."""
+        rng = np.random.default_rng(7)
+        truth = random_structure(rng, 3, 2)
+        clean = sysid.simulate(truth, FREQ, force=True)
+        shape, push = clean.response.shape, clean.force.shape
+        std = 0.01 * rng.uniform(0.5, 2, (1, shape[1], 1)) * rng.uniform(0.5, 2, (shape[0], 1, shape[2]))
+        force_std = np.full(push, 0.02)
+        if not separable:
+            std, force_std = std * rng.uniform(0.3, 3, shape), force_std * rng.uniform(0.3, 3, push)
+        test = dataclasses.replace(clean, response_std=std, force_std=force_std)
+        u, dense = uncertainty(problem_of(truth, test), truth), Dense(truth, test)
+        weights = []
+        for part in (std, force_std):
+            log = np.log(part)
+            fitted = log.mean(axis=(0, 2), keepdims=True) + log.mean(axis=1, keepdims=True) - log.mean()
+            weights.append(np.exp(-fitted).ravel())
+        expected = dense.stds(dense.covariance(np.tile(np.concatenate(weights), 2)))
+        check(u, expected, FREE)
+        best = dense.stds(dense.covariance())["stiffness"]
+        assert np.all(u.stiffness >= best * (1 - 1e-6))
+        assert separable or np.max(u.stiffness / best) > 1.05
+
+    @pytest.mark.parametrize("healing", ["trace", "rigid_body"])
+    def test_a_stated_total_is_held(self, random_structure, healing):
+        truth = random_structure(np.random.default_rng(8), 3, 2)
+        test = sysid.simulate(truth, FREQ, noise=0.01, force=True, rng=1)
+        model = FullMass(healing=healing)
+        total = model.total(problem_of(truth, test).layout, truth.mass)
+        u = uncertainty(problem_of(truth, test, FullMass(total, healing=healing)), truth)
+        dense = Dense(truth, test)
+        layout, G = problem_of(truth, test).layout, truth.rigid_body
+
+        def totals(theta):
+            phi, gamma, _, _, rigid = dense.split(theta)
+            if healing == "rigid_body":
+                return np.diag(rigid)
+            M = np.linalg.inv(phi @ phi.T)
+            M_S0 = np.linalg.inv(phi).T @ gamma - M @ G
+            M_00 = rigid - G.T @ M @ G - G.T @ M_S0 - M_S0.T @ G
+            return np.array([np.diag(M)[layout.directions[:3] == i].sum() + M_00[i, i] for i in range(2)])
+
+        np.testing.assert_allclose(totals(dense.at), total, rtol=1e-8)
+        scale = np.abs(dense.at)
+        tangent = scale[:, None] * scipy.linalg.null_space(dense.jacobian(totals) * scale)
+        check(u, dense.stds(dense.covariance(tangent=tangent)), FREE, rtol=1e-5)
+
+    def test_proportional_damping_ties_the_ratios(self, random_case):
+        truth, problem = random_case(
+            np.random.default_rng(9), damping="proportional", n=3, force=True, total=False, noise=0.01
+        )
+        dense = Dense(truth, problem.measurement)
+        omega, z = 2 * np.pi * truth.natural_frequencies, truth.damping_ratios
+        beta, alpha = np.linalg.lstsq(np.column_stack([omega / 2, 1 / (2 * omega)]), z, rcond=None)[0]
+        unknowns = np.eye(dense.at.size)
+        at = 3 * 3 + 3 * 2
+        unknowns[at + 3 : at + 6] = 0
+        unknowns[at + 3 : at + 6, at : at + 3] = np.diag((beta * omega / 2 - alpha / (2 * omega)) / z)
+        unknowns[at + 3 : at + 6, at + 3] = omega / 2 / z
+        unknowns[at + 3 : at + 6, at + 4] = 1 / (2 * omega) / z
+        tangent = np.delete(unknowns, at + 5, axis=1)
+        u = uncertainty(problem, truth)
+        check(u, dense.stds(dense.covariance(tangent=tangent)), FREE, rtol=1e-5)
+
+
+def with_modes(full, keep, sensors, T_rows):
+    """The modes `keep` of a structure seen at `sensors`; degrees of freedom at these (by number) or None: modal."""
+    phi, gamma = full.mode_shapes[np.ix_(sensors, keep)], full.participation[keep]
+    m, G = len(keep), full.rigid_body[sensors]
+    modal = iter(np.eye(m))
+    T = np.array([next(modal) if row is None else phi[row] for row in T_rows])
+    at_dofs = np.array([np.zeros(full.n_base) if row is None else G[row] for row in T_rows])
+    P = np.linalg.inv(T)
+    M, K = P.T @ P, (P.T * (2 * np.pi * full.natural_frequencies[keep]) ** 2) @ P
+    M_S0 = P.T @ gamma - M @ at_dofs
+    rigid = full.rigid_body_mass
+    M_00 = rigid - at_dofs.T @ M @ at_dofs - at_dofs.T @ M_S0 - M_S0.T @ at_dofs
+    K_S0 = -K @ at_dofs
+    return Structure(
+        np.block([[M, M_S0], [M_S0.T, M_00]]), np.block([[K, K_S0], [K_S0.T, -at_dofs.T @ K_S0]]),
+        full.damping_ratios[keep], n_base=full.n_base, recovery=phi @ P, rigid_body=G,
+    )  # fmt: skip
+
+
+class TestOtherSensorsThanModes:
+    @pytest.mark.parametrize(
+        ("keep", "sensors", "rows"),
+        [([0, 2, 3], [0, 1, 2, 3, 4], [4, 0, 2]), ([0, 1, 2, 3, 4], [1, 3, 4], [0, None, 1, 2, None])],
+    )
+    def test_against_the_dense_jacobian(self, random_structure, keep, sensors, rows):
+        """Fewer modes than sensors: sensors chosen as degrees of freedom; more: modal coordinates beside them."""
+        full = random_structure(np.random.default_rng(10), 5, 2)
+        truth = with_modes(full, keep, sensors, rows)
+        test = sysid.simulate(truth, FREQ, noise=0.01, force=True, rng=1)
+        u = uncertainty(problem_of(truth, test), truth)
+        dense = Dense(truth, test, rows)
+        expected = dense.stds(dense.covariance())
+        check(u, expected, FREE, rtol=1e-5)
+        assert u.transmissibility(FREQ[:2]).shape == (len(sensors), 2, 2)
+
+    def test_coordinates_that_are_not_measured_have_unknown_matrices(self, random_structure):
+        full = random_structure(np.random.default_rng(10), 4, 2)
+        truth = Structure(
+            full.mass, full.stiffness, full.damping_ratios, n_base=2, recovery=0.5 * np.eye(4) + 0.1,
+            rigid_body=full.rigid_body,
+        )  # fmt: skip
+        u = uncertainty(problem_of(truth, sysid.simulate(truth, FREQ, noise=0.01, force=True, rng=1)), truth)
+        assert np.all(np.isnan(u.mass)) and np.all(np.isfinite(u.mode_shapes)) and np.all(np.isfinite(u.participation))
+
+
+class TestWhatTheDataDoNotShow:
+    def symmetric_pair(self):
+        """One base direction and a symmetric pair: the antisymmetric mode does not take part."""
+        k, c = 1e4, 3e3
+        K_SS = np.array([[k + c, -c], [-c, k + c]])
+        G = np.ones((2, 1))
+        K = np.block([[K_SS, -K_SS @ G], [-(K_SS @ G).T, G.T @ K_SS @ G]])
+        return Structure(np.diag([1.0, 1.0, 0.5]), K, [0.01, 0.02], n_base=1)
+
+    def test_a_mode_that_the_base_does_not_move(self):
+        truth = self.symmetric_pair()
+        u = uncertainty(problem_of(truth, sysid.simulate(truth, FREQ, noise=0.01, force=True, rng=1)), truth)
+        for name in ("natural_frequencies", "damping_ratios", "participation", "effective_masses"):
+            value = getattr(u, name)
+            assert np.all(np.isfinite(value[0])) and np.all(np.isnan(value[1])), name
+        assert np.all(np.isnan(u.mass)) and np.all(np.isnan(u.stiffness))
+        assert np.all(np.isfinite(u.rigid_body_mass)) and np.all(np.isfinite(u.transmissibility(FREQ)))
+
+    def test_one_run_in_one_direction(self, random_structure):
+        """Without force the participation across it is open; with force each mode's whole participation shows in it."""
+        truth = random_structure(np.random.default_rng(11), 3, 2)
+        unit = sysid.simulate(truth, FREQ, force=True)
+        mix = lambda record: np.einsum("r,rcf->cf", [0.6, 0.8], record)[None]  # noqa: E731
+        test = Measurement(
+            FREQ, mix(unit.base), mix(unit.response), rigid_body=truth.rigid_body, force=mix(unit.force),
+            response_std=0.01, force_std=0.01,
+        )  # fmt: skip
+        u = uncertainty(problem_of(truth, test), truth)
+        assert np.all(np.isfinite(u.natural_frequencies)) and np.all(np.isfinite(u.mass))
+        assert np.all(np.isnan(u.rigid_body_mass))
+        blind = dataclasses.replace(test, force=None, force_std=None)
+        v = uncertainty(problem_of(truth, blind), truth)
+        assert np.all(np.isfinite(v.natural_frequencies)) and np.all(np.isnan(v.transmissibility(FREQ[10:12])))
+
+    def test_too_few_lines(self, random_structure):
+        truth = random_structure(np.random.default_rng(12), 4, 1)
+        few = np.array([truth.natural_frequencies[0], truth.natural_frequencies[2]])
+        test = sysid.simulate(truth, few, force=True)
+        u = uncertainty(problem_of(truth, test), truth)
+        assert np.isnan(u.inflation) and np.all(np.isnan(u.mass)) and np.all(np.isnan(u.natural_frequencies))
+        stated = uncertainty(problem_of(truth, dataclasses.replace(test, response_std=0.1, force_std=0.1)), truth)
+        assert stated.inflation == 1.0 and np.all(np.isnan(stated.mass))
+
+    def test_repeated_frequencies_are_the_limit_of_close_ones(self, random_blocks):
+        truths = []
+        for apart in (0.0, 2e-4):
+            M, K, _ = random_blocks(np.random.default_rng(13), 3, 2, frequencies=[10.0, 10.0 * (1 + apart), 25.0])
+            truths.append(Structure(M, K, [0.02, 0.02, 0.01], n_base=2))
+        tests = [sysid.simulate(truth, FREQ, noise=0.01, force=True, rng=1) for truth in truths]
+        one, close = (uncertainty(problem_of(t, test), t) for t, test in zip(truths, tests, strict=True))
+        expected = Dense(truths[1], tests[1]).stds(Dense(truths[1], tests[1]).covariance())
+        for name in ("mass", "stiffness"):
+            np.testing.assert_allclose(getattr(close, name), expected[name], rtol=1e-4)
+            np.testing.assert_allclose(getattr(one, name), expected[name], rtol=2e-2)
+
+
+def by_unknowns(problem, truth, unknowns, build, names):
+    """Standard deviations by a finite-difference Fisher matrix in any unknowns, `build` taking them to a structure."""
+    test = problem.measurement
+
+    def records(structure):
+        parts = [(test.predict(structure) / test.response_std).ravel()]
+        if test.force is not None:
+            parts.append((test.predict_force(structure) / test.force_std).ravel())
+        stacked = np.concatenate(parts)
+        return np.concatenate([stacked.real, stacked.imag]) * np.sqrt(2)
+
+    def cut(structure, name):
+        value = getattr(structure, name)
+        return value[: truth.n, : truth.n] if name in ("mass", "stiffness", "damping") else value
+
+    J, Q = [], {name: [] for name in names}
+    for p, value in enumerate(unknowns):
+        step = np.zeros(unknowns.size)
+        step[p] = 1e-6 * max(abs(value), 0.1 * np.abs(unknowns).min())
+        low, high = build(unknowns - step), build(unknowns + step)
+        J.append((records(high) - records(low)) / (2 * step[p]))
+        for name in names:
+            Q[name].append((cut(high, name) - cut(low, name)) / (2 * step[p]))
+    J = np.array(J).T
+    scale = np.maximum(np.linalg.norm(J, axis=0), 1e-30)
+    inverse = np.linalg.pinv(J / scale, rcond=1e-7) / scale[:, None]
+    covariance = inverse @ inverse.T
+    return {name: np.sqrt(np.einsum("p...,pq,q...->...", Q[name], covariance, Q[name])) for name in names}
+
+
+class TestStructuredModels:
+    NAMES = ("natural_frequencies", "damping_ratios", "mass", "stiffness", "damping", "participation")
+
+    def lumped_unknowns(self, problem, truth, *, total):
+        """m_i (all but the last, where the total ties it), entries of K_SS, damping ratios."""
+        n, G = truth.n, truth.rigid_body
+        low = np.tril_indices(n)
+        m = np.diag(truth.mass)[:n]
+        fixed = 1 if total else 0
+
+        def build(x):
+            masses, entries, ratios = np.split(x, [n - fixed, n - fixed + low[0].size])
+            masses = np.append(masses, m.sum() - masses.sum()) if total else masses
+            K = np.zeros((n, n))
+            K[low] = entries
+            K = K + np.tril(K, -1).T
+            full = np.block([[K, -K @ G], [-(K @ G).T, G.T @ K @ G]])
+            return Structure(np.diag([*masses, *np.zeros(G.shape[1])]), full, ratios, n_base=G.shape[1])
+
+        at = np.concatenate([m[: n - fixed], truth.stiffness[:n, :n][low], truth.damping_ratios])
+        return by_unknowns(problem, truth, at, build, self.NAMES)
+
+    @pytest.mark.parametrize("force", [False, True])
+    def test_lumped_mass_in_its_own_unknowns(self, random_case, force):
+        truth, problem = random_case(
+            np.random.default_rng(14), "lumped", n=4, d=1, force=force, total=not force, noise=0.01
+        )
+        expected = self.lumped_unknowns(problem, truth, total=not force)
+        u = uncertainty(problem, truth)
+        check(u, expected, self.NAMES, rtol=1e-5)
+        assert np.all(np.isfinite(u.mass)) and np.all(u.mass[np.tril_indices(4, -1)] < 1e-9 * u.mass[0, 0])
+
+    @pytest.mark.parametrize("stiffness", ["spectral", "chain"])
+    def test_without_any_mass_the_scale_is_open(self, random_case, stiffness):
+        """Frequencies and what no common scale changes stay known."""
+        truth, problem = random_case(np.random.default_rng(15), "lumped", stiffness, n=4, d=1, total=False, noise=0.01)
+        u = uncertainty(problem, truth)
+        assert np.all(np.isnan(np.diag(u.mass))) and np.all(np.isnan(np.diag(u.stiffness)))
+        assert np.all(np.isnan(np.diag(u.damping))) and np.all(np.isnan(u.participation))
+        assert np.all(np.isnan(u.mode_shapes)) and np.all(np.isnan(u.rigid_body_mass))
+        assert np.all(np.isfinite(u.natural_frequencies)) and np.all(np.isfinite(u.transmissibility(FREQ)))
+        if stiffness == "spectral":
+            total = np.diag(truth.mass)[:4].sum()
+            with_total = dataclasses.replace(problem, mass=LumpedMass(total))
+            expected = self.lumped_unknowns(with_total, truth, total=True)
+            check(u, expected, ("natural_frequencies", "damping_ratios"), rtol=1e-5)
+
+    @pytest.mark.parametrize(
+        ("mass", "stiffness", "damping", "force", "total"),
+        [
+            ("lumped", "chain", "proportional", False, True),
+            ("lumped", "spectral", "proportional", True, False),
+            ("known", "spectral", "modal", False, True),
+            ("trace", "chain", "modal", True, True),
+            ("rigid_body", "chain", "proportional", True, False),
+        ],
+    )
+    def test_in_the_unknowns_of_the_problem(self, random_case, mass, stiffness, damping, force, total):
+        truth, problem = random_case(
+            np.random.default_rng(16), mass, stiffness, damping, n=3, d=2, force=force, total=total, noise=0.01
+        )
+        expected = by_unknowns(problem, truth, problem.values(truth), problem.structure, self.NAMES)
+        u = uncertainty(problem, truth)
+        names = [name for name in self.NAMES if mass != "known" or name != "mass"]
+        check(u, expected, names, rtol=1e-4)
+        if mass == "known":
+            assert np.all(u.mass < 1e-10 * np.diag(truth.mass).max())
+
+
+def noisy(structure, clean, rng):
+    """Another draw of the noise that `clean` states."""
+    add = lambda x, s: x + s / np.sqrt(2) * (rng.standard_normal(x.shape) + 1j * rng.standard_normal(x.shape))  # noqa: E731
+    return dataclasses.replace(
+        clean, response=add(clean.response, clean.response_std), force=add(clean.force, clean.force_std)
+    )
+
+
+def refit(dense, inverse, test):
+    """Gauss-Newton with the weighted Jacobian of the truth, whose pseudo-inverse is given."""
+    measured = np.concatenate([test.relative.ravel(), test.force.ravel()])
+    measured = np.concatenate([measured.real, measured.imag])
+    theta = dense.at.copy()
+    for _ in range(12):
+        theta = theta + inverse @ (measured - dense.records(theta))
+    return theta
+
+
+def assembled(dense, theta, G):
+    phi, gamma, omega, zeta, rigid = dense.split(theta)
+    P = np.linalg.inv(phi)
+    M, K = P.T @ P, (P.T * omega**2) @ P
+    M_S0, K_S0 = P.T @ gamma - M @ G, -K @ G
+    M_00 = rigid - G.T @ M @ G - G.T @ M_S0 - M_S0.T @ G
+    full = np.block([[M, M_S0], [M_S0.T, M_00]])
+    return Structure(full, np.block([[K, K_S0], [K_S0.T, -G.T @ K_S0]]), zeta, n_base=G.shape[1])
+
+
+def test_monte_carlo(random_structure):
+    """Spread of 200 fits of noisy draws, and the share of 95 % intervals that hold the truth."""
+    rng = np.random.default_rng(17)
+    truth = random_structure(rng, 3, 2, ratios=[0.01, 0.02, 0.015], frequencies=[9.0, 21.0, 40.0])
+    bare = sysid.simulate(truth, FREQ, force=True)
+    stated = sysid.simulate(truth, FREQ, force=True, noise=0.01, rng=0)
+    clean = dataclasses.replace(bare, response_std=stated.response_std, force_std=stated.force_std)
+    dense = Dense(truth, clean)
+    noise = dense.noise()[:, None]
+    inverse = np.linalg.pinv(dense.jacobian(dense.records) / noise) / noise.T
+    expected = uncertainty(problem_of(truth, clean), truth)
+    found, hits = {name: [] for name in NAMES}, {name: [] for name in NAMES}
+    for _ in range(200):
+        test = noisy(truth, clean, rng)
+        fit = assembled(dense, refit(dense, inverse, test), truth.rigid_body)
+        u = uncertainty(problem_of(truth, test), fit)
+        assert u.inflation == 1.0
+        for name in NAMES:
+            value, true = (getattr(s, name) for s in (fit, truth))
+            if name in ("mass", "stiffness", "damping"):
+                value, true = value[:3, :3], true[:3, :3]
+            low, high = u.interval(name)
+            found[name].append(value)
+            hits[name].append(((low <= true) & (true <= high)).ravel())
+    for name in NAMES:
+        ratio = np.std(found[name], axis=0) / getattr(expected, name)
+        assert np.all(np.abs(ratio - 1) < 4 / np.sqrt(2 * 200)), name  # four standard deviations of a sample's
+        assert 0.90 < np.mean(hits[name]) < 0.99, name
+    assert 0.93 < np.mean(np.concatenate([np.concatenate(h) for h in hits.values()])) < 0.97
+
+
+class TestNoiseLevel:
+    def case(self, random_structure, **stated):
+        truth = random_structure(np.random.default_rng(18), 4, 2)
+        test = sysid.simulate(truth, np.linspace(2, 66, 300), noise=0.01, force=True, rng=3)
+        changed = {name: factor and getattr(test, name) * factor for name, factor in stated.items()}
+        return uncertainty(problem_of(truth, dataclasses.replace(test, **changed)), truth)
+
+    def test_unstated_it_is_the_misfit(self, random_structure):
+        u = self.case(random_structure)
+        estimated = self.case(random_structure, response_std=None, force_std=None)
+        assert estimated.inflation == 1.0
+        for name in NAMES:
+            np.testing.assert_allclose(getattr(estimated, name), getattr(u, name), rtol=0.05)
+
+    def test_stated_too_small_it_is_raised(self, random_structure):
+        u = self.case(random_structure)
+        low = self.case(random_structure, response_std=0.5, force_std=0.5)
+        assert low.inflation == pytest.approx(2.0, rel=0.03)
+        for name in FREE:
+            np.testing.assert_allclose(getattr(low, name), low.inflation / 2 * getattr(u, name), rtol=1e-9)
+        high = self.case(random_structure, response_std=2.0, force_std=2.0)
+        assert high.inflation == 1.0
+
+    def test_no_noise_at_all(self, random_structure):
+        truth = random_structure(np.random.default_rng(18), 4, 2)
+        u = uncertainty(problem_of(truth, sysid.simulate(truth, FREQ, force=True)), truth)
+        assert np.all(u.natural_frequencies < 1e-10 * truth.natural_frequencies)
+        assert np.all(np.isfinite(u.stiffness)) and np.all(u.mass < 1e-9)
+
+    def test_no_damping(self, random_structure):
+        """A ratio of zero is known as well as any other."""
+        truth = random_structure(np.random.default_rng(18), 3, 1, ratios=[0.0, 0.02, 0.01])
+        u = uncertainty(problem_of(truth, sysid.simulate(truth, FREQ, noise=0.01, force=True, rng=1)), truth)
+        assert np.all(u.damping_ratios > 0) and np.all(np.isfinite(u.damping))
+        low, high = u.interval("damping_ratios")
+        assert low[0] < 0 < high[0] and np.all(low[1:] > 0)
+
+
+class TestInterval:
+    @pytest.fixture
+    def u(self, random_structure):
+        truth = random_structure(np.random.default_rng(19), 3, 2)
+        return uncertainty(problem_of(truth, sysid.simulate(truth, FREQ, noise=0.03, force=True, rng=1)), truth)
+
+    def test_ends(self, u):
+        z = scipy.stats.norm.ppf(0.95)
+        off = u.interval("stiffness", 0.9)
+        K, s = u.structure.stiffness[:3, :3], u.stiffness
+        np.testing.assert_allclose(off[1, 0, 1], K[0, 1] + z * s[0, 1])
+        np.testing.assert_allclose(np.log(off[:, 2, 2] / K[2, 2]), [-z * s[2, 2] / K[2, 2], z * s[2, 2] / K[2, 2]])
+        f = u.interval("natural_frequencies", 0.9)
+        np.testing.assert_allclose(np.sqrt(f[0] * f[1]), u.structure.natural_frequencies)
+        p, e = u.interval("participation", 0.9), u.interval("effective_masses", 0.9)
+        crossing = (p[0] < 0) & (p[1] > 0)
+        squares = np.sort(p**2, axis=0)
+        for i in range(2):
+            np.testing.assert_allclose(e[1, :, i, i], squares[1, :, i])
+            np.testing.assert_allclose(e[0, :, i, i], np.where(crossing[:, i], 0, squares[0, :, i]))
+        assert u.interval("mode_shapes").shape == (2, 3, 3) and np.all(u.interval("mass")[0][np.eye(3, dtype=bool)] > 0)
+
+    def test_what_is_hardly_known_stays_positive(self, u):
+        vague = dataclasses.replace(u, mass=1e6 * u.mass)
+        low, high = vague.interval("mass")
+        own = np.eye(3, dtype=bool)
+        assert np.all(low[own] >= 0) and np.all(high[own] > 1e3 * u.structure.mass[:3, :3][own])
+
+    def test_mistakes(self, u):
+        with pytest.raises(InputError, match="no uncertainty of 'masses'"):
+            u.interval("masses")
+        with pytest.raises(InputError, match="level = 95"):
+            u.interval("mass", 95)
+
+    def test_repr(self, u):
+        assert "masses known" in repr(u)
