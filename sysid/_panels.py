@@ -17,6 +17,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_BAND: dict[str, Any] = {
+    "color": IDENTIFIED["color"],
+    "alpha": 0.25,
+    "linewidth": 0,
+    "label": "95 % band",
+    "zorder": 1.5,
+}
+_DEVIATES = 1.96  # of the normal law on either side of 95 %
 _ROUND_OFF = 1e-10  # of the largest channel: below it a response is arithmetic, not motion
 _COLUMNS = 3
 _PANEL_WIDTHS = {2: 5.6, 3: 4.0}  # in, by the number of columns
@@ -34,6 +42,7 @@ class Channel(NamedTuple):
     quantity: str
     phase: str
     negligible: bool
+    std: Array | None = None  # of the identified spectrum
 
 
 def is_unit(test: Measurement) -> bool:
@@ -48,13 +57,20 @@ def run_names(test: Measurement) -> tuple[str, ...]:
     return tuple(f"run {r + 1}" for r in range(test.n_runs))
 
 
-def response_channel(identification: Identification, test: Measurement, sensor: int, run: int) -> Channel:
+def response_channel(
+    identification: Identification, test: Measurement, sensor: int, run: int, *, band: Array | None = None
+) -> Channel:
+    """Response of one sensor in one run; `band`: std of the complex transmissibility, (n_sensors, d, n_freq)."""
     predicted = test.predict(identification.structure)[run, sensor] + test.rigid_body[sensor] @ test.base[run]
     title = f"{test.sensor_names[sensor]}, {run_names(test)[run]}"
     largest = np.abs(test.response).max()
     lever = "" if test.translational[run % test.n_base] else "m"
     words = ("transmissibility", lever) if is_unit(test) else ("acceleration", "m/s²")
-    return _channel(test, test.response[run, sensor], predicted, run, title, *words, largest)
+    channel = _channel(test, test.response[run, sensor], predicted, run, title, *words, largest)
+    if band is None:
+        return channel
+    # Errors of different directions may add up whatever their phases: the sum is never too small.
+    return channel._replace(std=np.sum(band[sensor] * np.abs(test.base[run]), axis=0))
 
 
 def force_channel(identification: Identification, test: Measurement, direction: int, run: int) -> Channel:
@@ -116,14 +132,16 @@ def panels(channels: Sequence[Channel], *, alone: float = 6.4) -> Figure:
             axes[0].set_ylabel("")
         if at % columns and channel.phase == channels[at - 1].phase:
             axes[1].set_ylabel("")
-    figure.legend(handles=key(axes[0]), loc="lower center", ncols=3, frameon=False, fontsize="small")
+    figure.legend(handles=key(axes[0]), loc="lower center", ncols=4, frameon=False, fontsize="small")
     return figure
 
 
 def key(magnitude: Axes) -> list[Any]:
-    """Give the lines of a legend in the order in which they are told."""
-    lines = {line.get_label(): line for line in magnitude.get_lines()}
-    return [lines[style["label"]] for style in (MEASURED, IDENTIFIED, RESIDUAL)]
+    """Give the entries of a legend in the order in which they are told."""
+    handles, labels = magnitude.get_legend_handles_labels()
+    entries = dict(zip(labels, handles, strict=True))
+    told = (style["label"] for style in (MEASURED, IDENTIFIED, _BAND, RESIDUAL))
+    return [entries[label] for label in told if label in entries]
 
 
 def draw(axes: Any, channel: Channel) -> None:
@@ -137,6 +155,11 @@ def draw(axes: Any, channel: Channel) -> None:
     magnitude.plot(freq, error, **RESIDUAL)
     magnitude.plot(freq, size, **shown)
     magnitude.plot(freq, positive(np.abs(identified)), **answered)
+    if channel.std is not None:
+        # The magnitude strays no further than the complex value; to zero, a logarithmic axis cannot follow.
+        reach = _DEVIATES * channel.std
+        lower = np.maximum(np.abs(identified) - reach, 1e-3 * np.abs(identified))
+        magnitude.fill_between(freq, lower, np.abs(identified) + reach, **_BAND)
     lowest, highest = _span(size, positive(np.abs(identified)), error)
     if highest > 0:
         magnitude.set_yscale("log")

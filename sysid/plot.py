@@ -26,6 +26,7 @@ from sysid._canvas import (
     new_figure,
     plain_log,
 )  # fmt: skip
+from sysid._modal_panels import draw_cmif, draw_stabilisation
 from sysid._panels import (
     draw,
     force_channel,
@@ -332,6 +333,55 @@ def mode_shapes(identification: Identification, modes: Sequence[int] | None = No
         ax.view_init(elev=20, azim=-50)
         ax.set_title(f"mode {k}: {structure.natural_frequencies[k - 1]:.4g} Hz", fontsize=9, color=INK)
     return figure
+
+
+def stabilisation(subject: Identification | Measurement, ax: Axes | None = None) -> Any:
+    """Stabilisation diagram: poles of models of rising order (pLSCF), a second opinion beside the modes found.
+
+    A mode is a column of poles that stay where they are; behind them stands the largest singular value of the FRFs of
+    relative acceleration. Dashed lines are the modes of the result or, for a measurement alone, those that vector
+    fitting finds. Where no FRF follows from the runs, the spectra and the modes are shown without poles, and why.
+
+    Parameters
+    ----------
+    subject : Identification or Measurement
+    ax : Axes, optional
+
+    Returns
+    -------
+    Figure or Axes
+
+    See Also
+    --------
+    sysid.stabilisation.stabilisation : The same as numbers.
+    """
+    figure, ax = new_axes(ax, 6.4, 4.2)
+    draw_stabilisation(ax, subject)
+    return ax if figure is None else figure
+
+
+def cmif(subject: Identification | Measurement, ax: Axes | None = None) -> Any:
+    """Complex mode indicator function: singular values of the FRFs of relative acceleration over frequency.
+
+    Two that peak at one line are two modes there. Dashed lines as in `stabilisation`. Where no FRF follows from the
+    runs, the singular values are those of the runs' own spectra, and the picture says so.
+
+    Parameters
+    ----------
+    subject : Identification or Measurement
+    ax : Axes, optional
+
+    Returns
+    -------
+    Figure or Axes
+
+    See Also
+    --------
+    sysid.stabilisation.cmif : The same as numbers.
+    """
+    figure, ax = new_axes(ax, 6.4, 3.8)
+    draw_cmif(ax, subject)
+    return ax if figure is None else figure
 
 
 def overview(identification: Identification, *, title: str | None = None) -> Figure:

@@ -11,6 +11,8 @@ from matplotlib.figure import Figure
 import sysid
 from sysid import plot
 from sysid._canvas import to_png
+from sysid._panels import draw, key, response_channel
+from sysid.stabilisation import LEVELS, cmif, stabilisation
 
 FREQ = np.linspace(1.0, 40.0, 60)
 
@@ -118,9 +120,9 @@ def test_axes_that_are_given_are_drawn_into_and_returned(unit):
     pair = figure.subplots(2, 1)
     assert plot.transmissibility(unit, pair) is pair
     assert all(lines(ax) for ax in pair)
-    for draw in (plot.convergence, plot.mac, plot.effective_masses):
+    for picture in (plot.convergence, plot.mac, plot.effective_masses, plot.stabilisation, plot.cmif):
         ax = figure.add_subplot()
-        assert draw(unit, ax) is ax
+        assert picture(unit, ax) is ax
 
 
 def test_the_default_channel_is_the_strongest(unit):
@@ -205,6 +207,75 @@ def test_mode_shapes_need_positions(unit, runs):
         plot.mode_shapes(unit, [0])
 
 
+def modes_drawn(ax, label):
+    """Where vertical lines stand, of which the first carries the label."""
+    upright = [line for line in ax.get_lines() if len(line.get_xdata()) == 2 and np.ptp(line.get_xdata()) == 0]
+    assert upright[0].get_label() == label
+    return [line.get_xdata()[0] for line in upright]
+
+
+def test_the_stabilisation_diagram_shows_every_pole_before_the_singular_value(unit, guess):
+    figure = plot.stabilisation(unit)
+    ax, behind = figure.axes
+    diagram = stabilisation(unit.measurement)
+    names = ["new pole", *(f"stable: {what}" for what in LEVELS[1:])]
+    for level, name in enumerate(names):
+        shown = lines(ax)[name]
+        np.testing.assert_array_equal(shown.get_xdata(), diagram.frequency[diagram.stable == level])
+        np.testing.assert_array_equal(shown.get_ydata(), diagram.order[diagram.stable == level])
+    (curve,) = behind.get_lines()
+    np.testing.assert_array_equal(curve.get_ydata(), cmif(unit.measurement)[0])
+    f = guess.natural_frequencies
+    np.testing.assert_array_equal(modes_drawn(ax, "identified mode"), f[f < FREQ[-1]])
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("frequency [Hz]", "order [modes]")
+    assert behind.get_ylabel() == "largest singular value [–]"
+    told = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert told == [*reversed(names), "identified mode"]
+
+
+def test_the_cmif_shows_every_singular_value(unit, truth):
+    ax = plot.cmif(unit.measurement).axes[0]
+    first, second = cmif(unit.measurement)
+    np.testing.assert_array_equal(lines(ax)["first"].get_ydata(), first)
+    np.testing.assert_array_equal(lines(ax)["second"].get_ydata(), second)
+    assert (ax.get_xlabel(), ax.get_ylabel(), ax.get_yscale()) == ("frequency [Hz]", "singular value [–]", "log")
+    found = modes_drawn(ax, "vector fitting")
+    assert np.abs(np.array(found)[:, None] / truth.natural_frequencies - 1).min(axis=1).max() < 0.05
+
+
+def test_without_an_frf_the_pictures_of_the_modes_say_so(runs):
+    test = runs.measurement
+    one = sysid.Measurement(FREQ, test.base[:1], test.response[:1], rigid_body=test.rigid_body)
+    alone = dataclasses.replace(runs, problem=dataclasses.replace(runs.problem, measurement=one))
+    ax, behind = plot.stabilisation(alone).axes
+    (curve,) = behind.get_lines()
+    np.testing.assert_allclose(curve.get_ydata(), np.linalg.norm(one.relative[0], axis=0))
+    assert "new pole" not in lines(ax) and lines(ax)["identified mode"]
+    assert "No poles are shown: the one run does not move the base" in ax.texts[0].get_text().replace("\n", " ")
+    ax = plot.cmif(alone).axes[0]
+    np.testing.assert_allclose(lines(ax)["first"].get_ydata(), curve.get_ydata())
+    assert ax.texts[0].get_text().startswith("Singular values of the runs' own spectra: the one run")
+    assert ax.get_ylabel() == "singular value\n[m/s², own scale]"
+
+
+def test_a_band_is_the_interval_of_the_identified_magnitude(unit, runs):
+    std = 0.01 * (1 + np.random.default_rng(0).random((3, 2, FREQ.size)))
+    for it, expected in (
+        (unit, std[1, 1]),
+        (runs, np.abs(runs.measurement.base[1, 0]) * std[1, 0] + np.abs(runs.measurement.base[1, 1]) * std[1, 1]),
+    ):
+        channel = response_channel(it, it.measurement, 1, 1, band=std)
+        ax = Figure().subplots()
+        draw([ax], channel)
+        edges = ax.collections[0].get_paths()[0].vertices
+        size = np.abs(channel.identified)
+        for line, middle, reach in zip(FREQ, size, 1.96 * expected, strict=True):
+            low, high = np.sort(edges[edges[:, 0] == line, 1])[[0, -1]]
+            assert high == pytest.approx(middle + reach)
+            assert low == pytest.approx(max(middle - reach, 1e-3 * middle))
+        assert [entry.get_label() for entry in key(ax)] == ["measured", "identified", "95 % band", "difference"]
+
+
 def test_what_is_not_there_is_refused(unit):
     with pytest.raises(sysid.InputError, match="sensor 'nose' is unknown"):
         plot.transmissibility(unit, sensor="nose")
@@ -219,8 +290,11 @@ def test_what_is_not_there_is_refused(unit):
 def test_every_picture_is_drawn_without_a_warning(unit, runs, truth, freq):
     exact = result(truth, sysid.simulate(truth, freq), goal=1e-6, swarm_curve=np.array([0.5]), swarm=0.5)
     for it in (unit, runs, exact):
-        for draw in (plot.overview, plot.transmissibility, plot.convergence, plot.mac, plot.effective_masses):
-            assert to_png(draw(it), dpi=40).startswith(b"\x89PNG")
+        for picture in (plot.overview, plot.transmissibility, plot.convergence, plot.mac, plot.effective_masses):
+            assert to_png(picture(it), dpi=40).startswith(b"\x89PNG")
+    for picture in (plot.stabilisation, plot.cmif):
+        for subject in (unit, runs, exact, exact.measurement):
+            assert to_png(picture(subject), dpi=40).startswith(b"\x89PNG")
     assert to_png(plot.mode_shapes(unit), dpi=40, colours=16).startswith(b"\x89PNG")
 
 
