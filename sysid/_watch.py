@@ -28,6 +28,11 @@ class Watch:
         """Seconds until the deadline."""
         return self.deadline - time.perf_counter()
 
+    @property
+    def taken(self) -> int:
+        """Iterates so far."""
+        return len(self.curve)
+
     def callback(self, start: Array, n_ties: int) -> ca.Callback:
         self.z = start
         return _IterationCallback(self, start.size, n_ties)

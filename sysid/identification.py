@@ -77,8 +77,8 @@ class Identification:
     ----------
     structure : Structure
     problem : Problem
-    x : (n_variables,)
-        The problem's unknowns that stand for the structure.
+    x : (n_variables,) or None
+        The problem's unknowns that stand for the structure, where it has one degree of freedom a sensor.
     strategy : str
     seed : int or None
     success : bool
@@ -90,6 +90,8 @@ class Identification:
         Every entry of M_SS, K_SS and C is fixed by the data and the stated model.
     closed_by, undetermined : tuple of str
         What fixes it, and what is open, in sentences.
+    remarks : tuple of str
+        How it was done, and why so, in sentences.
     interrupted : bool
         The search was stopped by Ctrl-C, and this is the best until then.
     recipe : Recipe or None
@@ -98,7 +100,7 @@ class Identification:
 
     structure: Structure
     problem: Problem
-    x: Array
+    x: Array | None
     strategy: str
     seed: int | None
     success: bool
@@ -107,6 +109,7 @@ class Identification:
     determined: bool
     closed_by: tuple[str, ...]
     undetermined: tuple[str, ...]
+    remarks: tuple[str, ...] = ()
     interrupted: bool = False
     recipe: Recipe | None = None
 

@@ -1,97 +1,440 @@
-"""The modal strategy: poles from the data, residues by linear least squares, modal masses by what is known."""
+"""The modal strategy: poles from the data, the fit in modal coordinates, modal masses by what is known, the structure.
+
+No swarm and no start are needed: residues at given poles are a linear least-squares problem, a residue of rank one is
+shape times participation, and what remains is the scale of each mode, its modal mass (`modal_masses`). As many
+degrees of freedom as modes are chosen from the sensors; the other sensors follow by a recovery matrix, and where there
+are more modes than sensors, modal coordinates stand beside them.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
 import numpy as np
+import scipy.linalg
 
-from sysid.damping import ModalDamping
+from sysid._coordinates import Coordinates
+from sysid._watch import Watch
 from sysid.errors import InputError
-from sysid.local import Modes, is_modal, rank_one
-from sysid.poles import find_poles
+from sysid.layout import triangle_entries
+from sysid.mass import FullMass, KnownMass
+from sysid.measurement import Measurement
+from sysid.modal_fit import ModalFit, Modes, Spectrum, Ties, fit_modes
+from sysid.poles import Poles, find_poles, poles_near
 from sysid.problem import Problem
-from sysid.response import columns, gains, linear_residues
-from sysid.structure import Array
+from sysid.residues import Records, linear_residues
+from sysid.response import columns, gains
+from sysid.stiffness import SpectralStiffness
+from sysid.structure import Array, Structure
 
-_LEAST = 1e-3  # of the largest modal mass: none may vanish, or M_SS would be singular
+_DEVIATIONS = 12.0  # of the chi-squared law, by which a misfit must exceed noise to mean something
+_ROUND_OFF = 1e-11  # of the records: what counts as noise where there is none
+_DEPENDENT = 1e-6  # of the largest singular value of the shapes: below, sensors move alike in all modes
+FREQUENCY_WINDOW = 0.05  # relative; what a frequency read off a peak may be wrong by
+_SPARE = 1e-3  # least share of a total mass that is left to the base
+_LEAST = 0.1  # of an equal share of the mass, that each mode keeps where nothing tells modal masses
 
 
-def modes_from_data(problem: Problem) -> tuple[Modes, Array]:
-    """Modal model that the data suggest, and the rigid-body mass (d, d) that its modes do not carry.
+@dataclass(frozen=True)
+class Modal:
+    """Strategy "modal" with its settings.
+
+    Parameters
+    ----------
+    sensors : sequence of str or int, optional
+        Sensors (names, or numbers from 0) whose motions are the physical degrees of freedom where there are fewer modes
+        than sensors, one a mode; chosen by a pivoted QR of the mode shapes where none are given.
+    max_iterations : int
+        Of IPOPT, in each fit.
+    """
+
+    sensors: Sequence[str | int] | None = None
+    max_iterations: int = 200
+
+
+@dataclass(frozen=True, eq=False)
+class DegreesOfFreedom:
+    """What the degrees of freedom of a modal model are.
+
+    Attributes
+    ----------
+    sensors : (k,) of int
+        The physical ones: sensors, ascending.
+    modes : (m - k,) of int
+        Modal coordinates beside them, modes counted from 0.
+    """
+
+    sensors: Array
+    modes: Array
+
+
+def fit(test: Measurement, poles: Poles, unit: Array, ties: Ties | None, watch: Watch, max_iterations: int) -> ModalFit:
+    """Fit of rank-one modes at `poles`; a pole whose residue needs it stands for several modes.
+
+    Parameters
+    ----------
+    unit : (d,)
+        Size of participations, kg^½, m kg^½ for rotations.
+    ties : callable, optional
+        As in `fit_modes`.
+    """
+    records = Records(test)
+    multiplicity = np.ones(poles.omega.size, dtype=int)
+    best = _fit_with(test, poles, multiplicity, unit, ties, watch, max_iterations)
+    while watch.stopped is None:
+        lacking = _lacking_rank(records, best, multiplicity)
+        if lacking is None:
+            break
+        more = multiplicity.copy()
+        more[lacking] += 1
+        again = _fit_with(test, poles, more, unit, ties, watch, max_iterations)
+        each = test.n_sensors + test.n_base
+        gained = (best.residual**2 - again.residual**2) * records.size
+        if gained < (each + _DEVIATIONS * np.sqrt(2 * each)) * _noise(records, again.residual, more.sum()):
+            break
+        best, multiplicity = again, more
+    order = np.argsort(best.modes.omega, kind="stable")
+    m = best.modes
+    modes = Modes(m.phi[:, order], m.gamma[order], m.omega[order], m.ratios[order])
+    return ModalFit(modes, best.rigid, best.residual, best.status, best.bounds)
+
+
+def _noise(records: Records, residual: float, m: int) -> float:
+    """Variance of a real number of the records about a fit of m modes."""
+    freedom = max(records.data.size - m * (records.n_sensors + records.n_base + 1), 1)
+    return max(residual**2 * records.size / freedom, _ROUND_OFF**2 * records.size / records.data.size)
+
+
+def _lacking_rank(records: Records, best: ModalFit, multiplicity: Array) -> int | None:
+    """The pole whose free residue most lacks in the modes that it has; None where none does."""
+    first = np.concatenate([[0], np.cumsum(multiplicity)[:-1]])
+    omega, ratios = best.modes.omega[first], best.modes.ratios[first]
+    free = records.fit(omega, ratios)
+    n, d = records.n_sensors, records.n_base
+    if n < 2 or d < 2:
+        return None
+    freedom = float(np.sum((n - multiplicity) * (d - multiplicity)))
+    excess = best.residual**2 * records.size - free.squared_error
+    noise = max(free.squared_error / records.data.size, _ROUND_OFF**2 * records.size / records.data.size)
+    if excess < noise * (freedom + _DEVIATIONS * np.sqrt(2 * freedom)):
+        return None
+    residues = free.whitened.reshape(omega.size, -1, n)
+    s = np.linalg.svd(residues, compute_uv=False)
+    left = np.array([np.sum(row[r:] ** 2) for row, r in zip(s, multiplicity, strict=True)])
+    left[multiplicity >= min(n, d)] = 0.0
+    return int(np.argmax(left)) if left.max() > 0 else None
+
+
+def _fit_with(
+    test: Measurement,
+    poles: Poles,
+    multiplicity: Array,
+    unit: Array,
+    ties: Ties | None,
+    watch: Watch,
+    max_iterations: int,
+) -> ModalFit:
+    residues, _ = linear_residues(test, poles.omega, poles.ratios)
+    pole = np.repeat(np.arange(poles.omega.size), multiplicity)
+    rank = np.concatenate([np.arange(r) for r in multiplicity])
+    u, s, vt = np.linalg.svd(residues * unit)  # participations of order one whatever the direction's unit
+    root = np.sqrt(s[pole, rank])
+    phi, gamma = u[pole, :, rank].T * root, vt[pole, rank] * root[:, None] / unit
+    modes = Modes(phi, gamma, poles.omega[pole], poles.ratios[pole])
+    rigid = np.diag(unit**2)
+    if test.force is not None:
+        t, rigid = weigh(test, modes)
+        modes = modes._replace(phi=modes.phi / np.sqrt(t), gamma=modes.gamma * np.sqrt(t)[:, None])
+    lam, vectors = np.linalg.eigh((rigid - modes.gamma.T @ modes.gamma) / np.outer(unit, unit))
+    remainder = (vectors * np.maximum(lam, 0.0)) @ vectors.T * np.outer(unit, unit)
+    return fit_modes(
+        test, modes, _free_spectrum(poles, pole), unit=unit, remainder=remainder, ties=ties, watch=watch,
+        max_iterations=max_iterations,
+    )  # fmt: skip
+
+
+def _free_spectrum(poles: Poles, pole: Array) -> Spectrum:
+    """Frequencies and damping ratios of each pole without bounds; modes of one pole share them."""
+
+    def spectrum(z: Coordinates) -> tuple[ca.MX, ca.MX]:
+        # In units of the half-power half-width, which is what frequencies are known in.
+        shift = z.add("frequency", np.zeros(poles.omega.size)) * ca.DM(poles.ratios)
+        loss = z.add("damping ratio", np.zeros(poles.omega.size))
+        omega, ratios = ca.DM(poles.omega) * ca.exp(shift), ca.DM(poles.ratios) * ca.exp(loss)
+        return omega[pole.tolist()], ratios[pole.tolist()]
+
+    return spectrum
+
+
+def weigh(test: Measurement, modes: Modes) -> tuple[Array, Array]:
+    """Modal masses t (m,) > 0 and rigid-body mass (d, d): the base force is linear in both.
 
     Raises
     ------
     InputError
-        For models that are not full mass, spectral stiffness and modal damping, and where other than
-        n modes stand out of the data of n sensors.
+        Where the force wants negative masses: a wrong sign.
     """
-    if not (is_modal(problem) and isinstance(problem.damping, ModalDamping)):
-        raise InputError(
-            "strategy 'modal' needs FullMass, SpectralStiffness and ModalDamping; use 'swarm' for this problem"
-        )
-    test, n = problem.measurement, problem.layout.n
-    poles = problem.poles or find_poles(test)
-    if poles.omega.size != n:
-        found = ", ".join(f"{f:.4g}" for f in poles.omega / (2 * np.pi))
-        raise InputError(
-            f"strategy 'modal': {poles.omega.size} modes stand out of the data ({found} Hz) for {n} sensors; "
-            "as many modes as sensors are needed: leave sensors out, add some, or use 'swarm'"
-        )
-    residues, _ = linear_residues(test, poles.omega, poles.ratios)
-    modes = rank_one(residues, poles.omega, poles.ratios, np.full(n, 1 / np.sqrt(problem.totals.max())))
-    if test.force is None:
-        t = _nearest_lumped(problem, modes)
-        remainder = np.diag(problem.totals)
-    else:
-        t, rigid = _weigh(problem, modes)
-        lam, vectors = np.linalg.eigh(rigid - (modes.gamma.T * t) @ modes.gamma)
-        remainder = (vectors * np.maximum(lam, 0.0)) @ vectors.T
-    root = np.sqrt(t)
-    return modes._replace(phi=modes.phi / root, gamma=modes.gamma * root[:, None]), remainder
-
-
-def _weigh(problem: Problem, modes: Modes) -> tuple[Array, Array]:
-    """Modal masses t (n,) > 0 and rigid-body mass (d, d): the base force is linear in both."""
     from scipy.optimize import lsq_linear
 
-    test, d = problem.measurement, problem.layout.d
+    d, m = test.n_base, modes.omega.size
     assert test.force is not None
-    n = modes.omega.size
-    base = columns(test.base)
+    base, force = columns(test.base), columns(test.force)
     g = np.tile(gains(test.freq, modes.omega, modes.ratios), test.n_runs)
-    parts = [np.outer(modes.gamma[k], modes.gamma[k]) @ (base * g[k]) for k in range(n)]
     pairs = [(i, j) for i in range(d) for j in range(i, d)]
+    pushes = (modes.gamma @ base) * g
+    parts = [np.outer(modes.gamma[k], pushes[k]) for k in range(m)]
     for i, j in pairs:
         unit = np.zeros((d, d))
         unit[i, j] = unit[j, i] = 1.0
         parts.append(unit @ base)
-    design = np.array([part.ravel() for part in parts]).T
-    force = columns(test.force).ravel()
+    # Moments and forces count in units of their own records.
+    size = np.linalg.norm(force, axis=1, keepdims=True)
+    size[size == 0] = 1.0
+    design = np.array([(part / size).ravel() for part in parts]).T
+    wanted = (force / size).ravel()
     scale = np.linalg.norm(design, axis=0)
+    scale[scale == 0] = 1.0
     stacked = np.vstack([design.real, design.imag]) / scale
-    lower = np.concatenate([np.zeros(n), np.full(len(pairs), -np.inf)])
-    answer = lsq_linear(stacked, np.concatenate([force.real, force.imag]), (lower, np.inf), tol=1e-14).x / scale
+    target = np.concatenate([wanted.real, wanted.imag])
+    lower = np.concatenate([np.zeros(m), np.full(len(pairs), -np.inf)])
+    # The triangular factor stands for all lines.
+    Q, R = np.linalg.qr(stacked)
+    plain = Q.T @ target
+    free = np.linalg.lstsq(R, plain, rcond=None)[0]
+    strength = np.abs(free[:m])
+    if np.sum(free[:m] * strength) < -0.5 * np.sum(strength**2):
+        raise InputError(
+            "the base force answers to the modes with negative masses: check its sign (it is the base's on the "
+            "structure, in phase with the base acceleration at low frequency)"
+        )
+    answer = (free if np.all(free[:m] > 0) else lsq_linear(R, plain, (lower, np.inf), tol=1e-14).x) / scale
     rigid = np.zeros((d, d))
-    for (i, j), mass in zip(pairs, answer[n:], strict=True):
+    for (i, j), mass in zip(pairs, answer[m:], strict=True):
         rigid[i, j] = rigid[j, i] = mass
-    t = answer[:n]
+    t = answer[:m]
     return np.maximum(t, 1e-9 * t.max()), rigid
 
 
-def _nearest_lumped(problem: Problem, modes: Modes) -> Array:
-    """Modal masses whose mass matrix is nearest to a lumped, uncoupled one: nothing else tells them."""
+def degrees_of_freedom(problem: Problem, modes: Modes, stated: Sequence[str | int] | None) -> DegreesOfFreedom:
+    """Sensors, and modal coordinates where they do not suffice, whose motions tell all modes' apart.
+
+    Sensors by a pivoted QR of the mode shapes, each mode in units of its own size, so that the chosen rows are
+    best conditioned. With more modes than independent sensors the modes that the sensors tell least become coordinates.
+    """
+    n, m = modes.phi.shape
+    shapes = modes.phi / np.linalg.norm(modes.phi, axis=0)
+    s = np.linalg.svd(shapes, compute_uv=False)
+    rank = int(np.count_nonzero(s > _DEPENDENT * s[0]))
+    if stated is not None:
+        sensors = _by_name(problem.measurement, stated)
+        if sensors.size > m or np.linalg.svd(shapes[sensors], compute_uv=False)[-1] < _DEPENDENT:
+            raise InputError(
+                f"{sensors.size} sensors are stated as degrees of freedom, but the {m} modes do not tell them apart "
+                f"(at most {rank} move independently)"
+            )
+    elif rank == n:
+        sensors = np.arange(n)
+    else:
+        sensors = np.sort(scipy.linalg.qr(shapes.T, pivoting=True, mode="r")[1][:rank])
+    order = scipy.linalg.qr(shapes[sensors], pivoting=True, mode="r")[1]
+    return DegreesOfFreedom(sensors, np.sort(order[sensors.size :]))
+
+
+def _by_name(test: Measurement, stated: Sequence[str | int]) -> Array:
+    names = test.sensor_names
+    chosen = []
+    for one in stated:
+        at = names.index(one) if one in names else one
+        if not isinstance(at, int | np.integer) or not 0 <= at < len(names):
+            raise InputError(f"Modal: {one!r} is no sensor; the sensors are {', '.join(names)}")
+        chosen.append(int(at))
+    if len(set(chosen)) < len(chosen):
+        raise InputError("Modal: a sensor is named twice")
+    return np.sort(np.array(chosen, dtype=int))
+
+
+def build(problem: Problem, modes: Modes, remainder: Array, chosen: DegreesOfFreedom, *, to_totals: bool) -> Structure:
+    """Structure of a modal model; `remainder` (d, d) is the rigid-body mass that no mode carries.
+
+    With `to_totals` all modal masses take one factor, and the remainder what is left, so that stated totals are met.
+    """
+    layout = problem.layout
+    T = np.vstack([modes.phi[chosen.sensors], np.eye(modes.omega.size)[chosen.modes]])
+    P = np.linalg.inv(T)
+    G = np.vstack([layout.rigid_body[chosen.sensors], np.zeros((chosen.modes.size, layout.d))])
+    recovery = modes.phi @ P
+    # Exact where a degree of freedom is a sensor.
+    recovery[chosen.sensors] = np.eye(T.shape[0])[: chosen.sensors.size]
+    gamma = modes.gamma
+    if to_totals:
+        groups = np.concatenate([layout.directions[chosen.sensors], np.full(chosen.modes.size, -1)])
+        t, remainder = to_stated_totals(problem, P, gamma, G, groups, remainder)
+        P, gamma = P * np.sqrt(t), gamma * np.sqrt(t)
+    M_SS, K_SS = P.T @ P, (P.T * modes.omega**2) @ P
+    M_S0 = P.T @ gamma - M_SS @ G
+    delta = gamma - P @ G
+    K_S0 = -K_SS @ G
+    plain = chosen.modes.size == 0 and chosen.sensors.size == layout.n
+    return Structure(
+        np.block([[M_SS, M_S0], [M_S0.T, delta.T @ delta + remainder]]),
+        np.block([[K_SS, K_S0], [K_S0.T, -G.T @ K_S0]]),
+        modes.ratios,
+        n_base=layout.d,
+        recovery=None if plain else recovery,
+        rigid_body=None if plain else layout.rigid_body,
+        sensors=problem.measurement.sensors,
+    )
+
+
+def to_stated_totals(
+    problem: Problem, P: Array, gamma: Array, G: Array, groups: Array, remainder: Array
+) -> tuple[float, Array]:
+    """Common modal-mass factor t and base remainder (d, d) with which a full mass has the stated totals.
+
+    Scaling all modal masses by one t changes no response; the remainder is invisible in accelerations. It keeps its
+    correlations, and takes what mass the modes leave.
+
+    Parameters
+    ----------
+    P : (m, m)
+        Inverse of the mode shapes at the degrees of freedom.
+    gamma, G : (m, d)
+        Participations, and rigid motion of the degrees of freedom.
+    groups : (m,)
+        Base direction of each degree of freedom, -1 for none.
+    """
+    if isinstance(problem.mass, FullMass) and problem.mass.healing == "rigid_body":
+        used = np.sum(gamma**2, axis=0)
+    else:
+        rows = np.sum(P**2, axis=0)
+        own = [rows[groups == i].sum() for i in range(G.shape[1])]
+        used = np.array(own) + np.sum((gamma - P @ G) ** 2, axis=0)
+    t = min(1.0, float(np.min((1 - _SPARE) * problem.totals / used)))
+    share = np.sqrt((problem.totals - t * used) / np.maximum(np.diag(remainder), np.finfo(float).tiny))
+    return t, remainder * np.outer(share, share)
+
+
+def stated_totals(problem: Problem) -> Ties | None:
+    """Equalities that hold the stated total mass where the base force would set another."""
+    layout, mass, totals = problem.layout, problem.mass, problem.totals
+    if problem.measurement.force is None or not isinstance(mass, FullMass) or mass.total_mass is None:
+        return None
+
+    def ties(phi: ca.MX, gamma: ca.MX, rigid: ca.MX) -> list[ca.MX]:
+        if mass.healing == "rigid_body" or phi.size1() != phi.size2():
+            return [ca.diag(rigid) / totals - 1]
+        P = ca.inv(phi)
+        delta = gamma - P @ ca.DM(layout.rigid_body)
+        rows = ca.diag(P.T @ P)
+        base = ca.diag(rigid - gamma.T @ gamma + delta.T @ delta)
+        groups = layout.directions[: layout.n]
+        own = [ca.sum1(rows[np.flatnonzero(groups == i).tolist()]) for i in range(layout.d)]
+        return [(own[i] + base[i]) / totals[i] - 1 for i in range(layout.d)]
+
+    return ties
+
+
+def nearest_lumped(problem: Problem, P: Array, gamma: Array, G: Array, groups: Array) -> Array:
+    """Modal masses (m,) whose mass matrix is nearest to a lumped, uncoupled one with the stated totals.
+
+    Parameters
+    ----------
+    P, gamma, G, groups :
+        As in `to_stated_totals`.
+    """
     from scipy.optimize import lsq_linear
 
-    G, n = problem.layout.rigid_body, modes.omega.size
-    P = np.linalg.inv(modes.phi)
-    delta = modes.gamma - P @ G
-    below = np.tril_indices(n, -1)
-    off = np.einsum("ki,kj->ijk", P, P)[below]
-    coupling = np.einsum("ki,kj->ijk", P, delta).reshape(-1, n)
-    # The sum of the diagonal sets the scale; the totals are fitted afterwards.
-    trace = np.sum(P**2, axis=1)
-    rows = np.vstack([off, coupling, 10.0 * trace[None]])
+    m = len(P)
+    delta = gamma - P @ G
+    off = np.einsum("ki,kj->ijk", P, P)[np.tril_indices(m, -1)]
+    coupling = np.einsum("ki,kj->ijk", P, delta).reshape(-1, m)
+    totals = [(np.sum(P[:, groups == i] ** 2, axis=1), problem.totals[i]) for i in range(G.shape[1])]
+    known = [(row, total) for row, total in totals if np.any(row > 0)] or [(np.sum(P**2, axis=1), 1.0)]
+    weight = max(total for _, total in known)
+    rows = np.vstack([off, coupling, *(row[None] * weight / total for row, total in known)])
     wanted = np.zeros(len(rows))
-    wanted[-1] = 10.0 * problem.totals.max()
-    size = np.linalg.norm(rows, axis=0)
-    t = lsq_linear(rows / size, wanted, (0.0, np.inf)).x / size
-    return np.maximum(t, _LEAST * t.max())
+    wanted[-len(known) :] = weight
+    size = np.maximum(np.linalg.norm(rows, axis=0), np.finfo(float).tiny)
+    # No modal mass vanishes, or M_SS would be singular: each keeps a share of what it could be by itself.
+    most = weight / np.max([row * weight / total for row, total in known], axis=0)
+    least = _LEAST / m * most * size
+    return np.maximum(lsq_linear(rows / size, wanted, (least, np.inf), tol=1e-14).x, least) / size
+
+
+def modal_structure(
+    problem: Problem, options: Modal, watch: Watch
+) -> tuple[Structure, ModalFit, DegreesOfFreedom, Poles]:
+    """Structure that the data suggest without any search, and how it was fitted.
+
+    With a lumped or known mass it is where the structured local phase starts; its modal masses come from the model.
+
+    Raises
+    ------
+    InputError
+        Where a stated frequency is none of the data's, the base force has the wrong sign, or stated
+        sensors do not tell the modes apart.
+    """
+    test, layout = problem.measurement, problem.layout
+    poles = problem.poles or _stated_poles(problem)
+    end = fit(test, poles, np.sqrt(problem.totals), stated_totals(problem), watch, options.max_iterations)
+    chosen = degrees_of_freedom(problem, end.modes, options.sensors)
+    modes, remainder = end.modes, end.rigid - end.modes.gamma.T @ end.modes.gamma
+    lumped_or_known = not isinstance(problem.mass, FullMass)
+    if test.force is None:
+        k = chosen.modes.size
+        P = np.linalg.inv(np.vstack([modes.phi[chosen.sensors], np.eye(modes.omega.size)[chosen.modes]]))
+        G = np.vstack([layout.rigid_body[chosen.sensors], np.zeros((k, layout.d))])
+        groups = np.concatenate([layout.directions[chosen.sensors], np.full(k, -1)])
+        if isinstance(problem.mass, KnownMass) and len(P) == layout.n:
+            t = _of_known_mass(problem.mass.full(layout), P, modes.gamma, G)
+        else:
+            t = nearest_lumped(problem, P, modes.gamma, G, groups)
+        modes = modes._replace(phi=modes.phi / np.sqrt(t), gamma=modes.gamma * np.sqrt(t)[:, None])
+        remainder = np.diag(problem.totals)
+    structure = build(problem, modes, remainder, chosen, to_totals=test.force is None and not lumped_or_known)
+    return structure, end, chosen, poles
+
+
+def _of_known_mass(mass: Array, P: Array, gamma: Array, G: Array) -> Array:
+    """Modal masses (n,) with which the modes have a known mass matrix (n + d, n + d)."""
+    from scipy.optimize import nnls
+
+    n = len(P)
+    rows = np.concatenate([P, gamma - P @ G], axis=1)[:, None, :] * P[:, :, None]
+    t = nnls(rows.reshape(n, -1).T, mass[:n].ravel())[0]
+    return np.maximum(t, np.finfo(float).eps * t.max())
+
+
+def held_by_model(problem: Problem, structure: Structure) -> Array:
+    """Unknowns (n_variables,) of a lumped or known mass that are nearest to a modal model.
+
+    Its mass, its poles, and the orthogonal shapes nearest to its own.
+    """
+    n = problem.layout.n
+    x = problem.values(structure)
+    L = np.linalg.cholesky(problem.structure(x).mass[:n, :n])
+    u, _, vt = np.linalg.svd(L.T @ structure.mode_shapes)
+    shapes = u @ vt
+    omega = 2 * np.pi * structure.natural_frequencies
+    x[problem.parts.stiffness] = triangle_entries(np.linalg.cholesky((shapes * omega**2) @ shapes.T))
+    return x
+
+
+def _stated_poles(problem: Problem) -> Poles:
+    """Poles for the stated frequencies; with others looked for where the model is said to have more."""
+    stiffness, test = problem.stiffness, problem.measurement
+    assert isinstance(stiffness, SpectralStiffness)
+    stated = stiffness.targets
+    if stated.size == test.n_sensors:
+        return poles_near(test, stated, FREQUENCY_WINDOW)
+    found = find_poles(test)
+    missed = [w for w in stated if np.min(np.abs(np.log(found.omega / w))) > np.log1p(FREQUENCY_WINDOW)]
+    if missed:
+        raise InputError(
+            f"the stated natural frequency {missed[0] / (2 * np.pi):.5g} Hz does not stand out of the data; found are "
+            + ", ".join(f"{w / (2 * np.pi):.5g}" for w in found.omega)
+            + " Hz"
+        )
+    return found

@@ -12,19 +12,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
+from threadpoolctl import threadpool_limits
 
 from sysid.errors import InputError
 from sysid.measurement import Measurement
-from sysid.response import columns, gains
+from sysid.residues import Records, ResidueFit, independent, stacked
+from sysid.response import gain_slopes, gains
 from sysid.structure import Array, ComplexArray
 
-_SPARE = 6  # poles beyond the number of sensors: without spare ones noise moves true poles
+_SPARE = 6  # poles beyond those expected: without spare ones noise moves true poles
 _RELOCATIONS = 6
-_ROUNDS = 4
-_STEPS = 20
+_STEPS = 100
 _DEVIATIONS = 12.0  # of the chi-squared law, by which a pole must lower the squared error to stay
 _ROUND_OFF = 1e-11  # of the records: what counts as noise where there is none
+_EXACT = 1e-13  # relative residual that no further step betters
+_GUESS = 0.01  # damping ratio to begin with
 _DAMPED = 0.5  # a pole with more damping than this is no mode of a structure
 _EDGE = 0.1  # how far outside the lines a mode may lie, as a fraction of their ends
 
@@ -35,7 +37,7 @@ class Poles:
 
     Attributes
     ----------
-    omega, ratios : (m,)
+    omega, ratios : (p,)
         Circular frequencies, rad/s, ascending, and damping ratios.
     residual : float
         Relative residual of the modal model with these poles and free real residues.
@@ -54,7 +56,7 @@ def find_poles(test: Measurement, *, spare: int = _SPARE) -> Poles:
     test : Measurement
         Its lines must hold the modes; lines closer than the half-power bandwidth.
     spare : int
-        Poles to begin with beyond the number of sensors.
+        Poles to begin with beyond the number of modes that the records suggest.
 
     Raises
     ------
@@ -66,106 +68,179 @@ def find_poles(test: Measurement, *, spare: int = _SPARE) -> Poles:
     B. Gustavsen, A. Semlyen, IEEE Trans. Power Delivery 14 (1999) 1052-1061; B. Gustavsen, ibid. 21 (2006)
     1587-1592. G. H. Golub, V. Pereyra, SIAM J. Numer. Anal. 10 (1973) 413-432, with Kaufman's Jacobian (1975).
     """
-    count = test.n_sensors + spare
-    w = 2 * np.pi * test.freq[test.freq > 0]
-    if 2 * w.size < 4 * count + 2:
-        raise InputError(
-            f"{w.size} lines are too few to look for {count} poles: state natural_frequencies or add lines"
-        )
-    records = _Records(test)
-    omega, ratios = np.geomspace(w[0], w[-1], count), np.full(count, 0.01)
-    for _ in range(_RELOCATIONS):
-        omega, ratios = _relocate(test, omega, ratios)
-    for round_ in range(_ROUNDS):
-        before = omega.size
-        omega, ratios = _prune(records, omega, ratios)
-        if omega.size == 0:
+    with threadpool_limits(limits=1):  # the same bits whatever the machine does beside
+        return _find(Records(test), test.n_sensors, spare)
+
+
+def _find(records: Records, n: int, spare: int) -> Poles:
+    count = max(n, _independent(records)) + spare
+    while True:
+        if 2 * np.count_nonzero(records.freq) < 4 * count + 2:
             raise InputError(
-                "no mode stands out of the noise between these lines: state natural_frequencies or widen them"
+                f"{records.freq.size} lines are too few to look for {count} poles: state natural_frequencies or add "
+                "lines"
             )
-        if round_ == 0 or records.fit(omega, ratios).squared_error < 1e-16 * records.size:
-            for _ in range(3):
-                omega, ratios = _relocate(test, omega, ratios)
-        omega, ratios = _polish(records, omega, ratios)
-        if round_ > 0 and omega.size == before:
+        omega, ratios = _search(records, count)
+        if omega.size <= count - spare // 2:
             break
-    order = np.argsort(omega)
-    left = np.sqrt(records.fit(omega, ratios).squared_error / records.size)
-    return Poles(omega[order], ratios[order], float(left))
+        count += max(count // 2, spare)  # too few were spare
+    if omega.size == 0:
+        raise InputError("no mode stands out of the noise between these lines: state natural_frequencies or widen them")
+    return _in_order(records, omega, ratios)
 
 
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """Linear least squares of the records on given poles.
+def poles_near(test: Measurement, omega: Array, window: float) -> Poles:
+    """Poles for frequencies that somebody states, rad/s: polished from there, each held within `window` (relative).
 
-    ``Q`` spans the basis; ``residues`` (m, d, n); ``left`` the error; ``gain`` (m,) how much each pole lowers it.
+    Raises
+    ------
+    InputError
+        Where a stated frequency is none of the data's.
     """
-
-    Q: Array
-    residues: Array
-    left: Array
-    gain: Array
-
-    @property
-    def squared_error(self) -> float:
-        return float(np.sum(self.left**2))
-
-
-class _Records:
-    """The relative accelerations, real and imaginary parts stacked, and fits of them."""
-
-    def __init__(self, test: Measurement) -> None:
-        self.freq, self.w = test.freq, 2 * np.pi * test.freq
-        self.runs = test.n_runs
-        self.base, relative = columns(test.base), columns(test.relative)
-        self.data = np.vstack([relative.T.real, relative.T.imag])
-        self.size = float(np.sum(self.data**2))
-
-    def stack(self, gains: ComplexArray) -> Array:
-        """Columns of gains (m, n_freq) times base motions, real parts above imaginary, (rows, m * d)."""
-        block = np.tile(gains, self.runs)[:, None] * self.base[None]
-        columns = block.reshape(-1, self.base.shape[1]).T
-        return np.vstack([columns.real, columns.imag])
-
-    def fit(self, omega: Array, ratios: Array) -> _Fit:
-        X = self.stack(gains(self.freq, omega, ratios))
-        scale = np.linalg.norm(X, axis=0)
-        scale[scale == 0] = 1.0
-        Q, R = np.linalg.qr(X / scale)
-        y = Q.T @ self.data
-        beta = scipy.linalg.solve_triangular(R, y)
-        d, m = self.base.shape[0], omega.size
-        inverse = scipy.linalg.solve_triangular(R, np.eye(R.shape[0]))
-        blocks = beta.reshape(m, d, -1)
-        # Leaving pole k out raises the squared error by beta_k' [(X'X)^-1]_kk^-1 beta_k.
-        covariance = np.einsum("kir,kjr->kij", inverse.reshape(m, d, -1), inverse.reshape(m, d, -1))
-        gain = np.einsum("kin,kin->k", blocks, np.linalg.solve(covariance, blocks))
-        return _Fit(Q, (beta / scale[:, None]).reshape(m, d, -1), self.data - Q @ y, gain)
+    records = Records(test)
+    distinct = np.unique(omega)
+    found, ratios = _polish(records, distinct, np.full(distinct.size, _GUESS))
+    off = np.abs(np.log(found / distinct))
+    if np.any(off > np.log1p(window)):
+        worst = int(np.argmax(off))
+        raise InputError(
+            f"the stated natural frequency {distinct[worst] / (2 * np.pi):.5g} Hz is none of the data's: "
+            f"a fit from there ends at {found[worst] / (2 * np.pi):.5g} Hz"
+        )
+    return _in_order(records, found, ratios)
 
 
-def _relocate(test: Measurement, omega: Array, ratios: Array) -> tuple[Array, Array]:
+def _independent(records: Records) -> int:
+    """Number of independent functions of frequency in the channels, where it stands out of the noise."""
+    sizes = np.linalg.svd(records.data, compute_uv=False)
+    return int(np.count_nonzero(sizes > max(1.5 * np.median(sizes), 1e-9 * sizes[0])))
+
+
+def _search(records: Records, count: int) -> tuple[Array, Array]:
+    """Poles that earn their place, from `count` that are spread over the lines."""
+    lines = 2 * np.pi * records.freq[records.freq > 0]
+    omega, ratios = np.geomspace(lines[0], lines[-1], count), np.full(count, _GUESS)
+    channels = _principal(records, count)
+    error = np.inf
+    for _ in range(_RELOCATIONS):
+        omega, ratios = _relocate(records, channels, omega, ratios)
+        before, error = error, records.fit(omega, ratios).squared_error
+        if error < _EXACT**2 * records.size or error > 0.999 * before:
+            break
+    # A pole of a structure with other than classical damping needs its velocity too, or others would stand in for it.
+    omega, ratios = _prune(records, omega, ratios, velocity=True)
+    omega, ratios = _settled(records, omega, ratios)
+    for _ in range(count):
+        more = _with_another(records, omega, ratios) if omega.size else None
+        if more is None:
+            break
+        omega, ratios = more
+    return _merged(records, omega, ratios)
+
+
+def _merged(records: Records, omega: Array, ratios: Array) -> tuple[Array, Array]:
+    """Poles without those that a neighbour, once it may move, stands in for: close poles trade their residues."""
+    order = np.argsort(omega)
+    omega, ratios = omega[order], ratios[order]
+    k = 0
+    while k < omega.size:
+        neighbours = np.delete(np.abs(np.log(omega / omega[k])), k)
+        if neighbours.size and neighbours.min() < ratios[k]:
+            fit = records.fit(omega, ratios)
+            each = fit.whitened[0].size + 2
+            fewer = _polish(records, np.delete(omega, k), np.delete(ratios, k))
+            rise = records.fit(*fewer).squared_error - fit.squared_error
+            if rise <= (each + _DEVIATIONS * np.sqrt(2 * each)) * _noise(records, fit, omega.size):
+                omega, ratios = fewer
+                continue
+        k += 1
+    return omega, ratios
+
+
+def _settled(records: Records, omega: Array, ratios: Array) -> tuple[Array, Array]:
+    """Poles polished, and pruned until all that stay earn their place."""
+    while omega.size:
+        size = omega.size
+        omega, ratios = _polish(records, omega, ratios)
+        omega, ratios = _prune(records, omega, ratios)
+        if omega.size == size:
+            break
+    return omega, ratios
+
+
+def _with_another(records: Records, omega: Array, ratios: Array) -> tuple[Array, Array] | None:
+    """The poles and one more, settled; None where what they leave calls for none.
+
+    Candidates lie beside each pole, for two modes that share it, and between the poles. Damping that is not classical
+    calls for no pole: one more must answer what the velocities of the poles cannot, or more than they all can.
+    """
+    shift = np.concatenate([1 + ratios, 1 - ratios, 1 + 3 * ratios, 1 - 3 * ratios])
+    between = np.geomspace(omega.min(), omega.max(), 4 * omega.size)
+    at = np.concatenate([np.tile(omega, 4) * shift, between])
+    loss = np.concatenate([np.tile(ratios, 4), np.full(between.size, np.median(ratios))])
+    plain = records.basis(gains(records.freq, at, loss))
+    size = np.linalg.norm(plain, axis=0)
+    with_velocity = records.fit(omega, ratios, velocity=True)
+    for fit, to_beat in ((with_velocity, np.inf), (records.fit(omega, ratios), with_velocity.squared_error)):
+        trial = plain - fit.Q @ (fit.Q.T @ plain)
+        left = np.linalg.norm(trial, axis=0)
+        trial = trial / np.where(left > 1e-6 * size, left, np.inf)
+        gain = np.sum((trial.T @ fit.left) ** 2, axis=1).reshape(at.size, -1).sum(axis=1)
+        best, each = int(np.argmax(gain)), records.n_base * records.n_sensors + 2
+        if gain[best] <= (each + _DEVIATIONS * np.sqrt(2 * each)) * _noise(records, fit, omega.size):
+            continue
+        more = _settled(records, np.append(omega, at[best]), np.append(ratios, loss[best]))
+        if more[0].size > omega.size and records.fit(*more).squared_error < to_beat:
+            return more
+    return None
+
+
+def _in_order(records: Records, omega: Array, ratios: Array) -> Poles:
+    order = np.argsort(omega)
+    left = float(np.sqrt(records.fit(omega, ratios).squared_error / records.size))
+    return Poles(omega[order], ratios[order], left)
+
+
+def _noise(records: Records, fit: ResidueFit, m: int) -> float:
+    """Variance of a record's real number about the fit of m poles."""
+    freedom = max(records.data.size - m * (fit.whitened[0].size + 2), 1)
+    return max(fit.squared_error / freedom, _ROUND_OFF**2 * records.size / records.data.size)
+
+
+def _principal(records: Records, count: int) -> list[tuple[ComplexArray, Array]]:
+    """Base and principal channels of each block: at most as many as there are poles, whatever the channels."""
+    out = []
+    for base, channels in records.blocks:
+        moving = independent(base[None]).T @ base  # a run moves the base in fewer directions than all together
+        left, sizes, _ = np.linalg.svd(stacked(channels), full_matrices=False)
+        keep = np.flatnonzero(sizes > 1e-14 * sizes[0])[:count]
+        principal = left[:, keep] * sizes[keep]
+        n = base.shape[1]
+        out.append((moving, principal[:n].T + 1j * principal[n:].T))
+    return out
+
+
+def _relocate(
+    records: Records, blocks: list[tuple[ComplexArray, Array]], omega: Array, ratios: Array
+) -> tuple[Array, Array]:
     """One step of relaxed vector fitting: the zeros of sigma in ``sigma a = sum of (r_1 + r_2 i w) g``."""
-    w, m = 2 * np.pi * test.freq, omega.size
-    g = gains(test.freq, omega, ratios)
+    w, m = 2 * np.pi * records.freq, omega.size
+    g = gains(records.freq, omega, ratios)
     numerators = np.concatenate([g, 1j * w / omega[:, None] * g])
-    partial = (omega[:, None] / w) ** 2 * g  # w_k² over the same denominator
-    sigma = np.concatenate([np.ones((1, w.size)), partial, 1j * w / omega[:, None] * partial]).T
-    relative = test.relative
+    with np.errstate(divide="ignore", invalid="ignore"):
+        partial = np.where(w > 0, (omega[:, None] / w) ** 2 * g, 1.0)  # w_k² over the same denominator
+    sigma = np.concatenate([np.ones((1, w.size)), partial, 1j * w / omega[:, None] * partial])
     rows = []
-    for run in range(test.n_runs):
-        moving = np.flatnonzero(np.any(test.base[run] != 0, axis=1))
-        basis = (numerators[:, None] * test.base[run, moving]).reshape(-1, w.size).T
-        basis = np.vstack([basis.real, basis.imag])
+    for base, channels in blocks:
+        basis = stacked((numerators[:, None] * base).reshape(-1, w.size))
         Q = np.linalg.qr(basis / np.maximum(np.linalg.norm(basis, axis=0), np.finfo(float).tiny))[0]
-        for record in relative[run]:
-            product = record[:, None] * sigma
-            stacked = np.vstack([product.real, product.imag])
-            stacked = stacked - Q @ (Q.T @ stacked)
-            stacked = stacked - Q @ (Q.T @ stacked)  # twice is enough
-            rows.append(np.linalg.qr(stacked, mode="r"))
+        for record in channels:
+            product = stacked(record * sigma)
+            product = product - Q @ (Q.T @ product)
+            rows.append(np.linalg.qr(product, mode="r"))
     # Relaxation: the sum of Re sigma over the lines is fixed instead of its constant term.
-    weight = np.linalg.norm(relative) / w.size
-    system = np.vstack([*rows, weight * sigma.real.sum(axis=0)])
+    weight = np.sqrt(records.size) / w.size
+    system = np.vstack([*rows, weight * sigma.real.sum(axis=1)])
     wanted = np.zeros(len(system))
     wanted[-1] = weight * w.size
     scale = np.maximum(np.linalg.norm(system, axis=0), np.finfo(float).tiny)
@@ -192,17 +267,15 @@ def _as_modes(eigenvalues: ComplexArray) -> tuple[Array, Array]:
     return omega[keep][order], np.clip(ratios[keep][order], 1e-5, 0.99)
 
 
-def _prune(records: _Records, omega: Array, ratios: Array) -> tuple[Array, Array]:
+def _prune(records: Records, omega: Array, ratios: Array, *, velocity: bool = False) -> tuple[Array, Array]:
     """Remove poles, the least useful first, until each that stays lowers the error by far more than noise would."""
-    low, high = (1 - _EDGE) * records.w[0], (1 + _EDGE) * records.w[-1]
-    inside = (omega > low) & (omega < high) & (ratios < _DAMPED)
+    lines = 2 * np.pi * records.freq[records.freq > 0]
+    inside = (omega > (1 - _EDGE) * lines[0]) & (omega < (1 + _EDGE) * lines[-1]) & (ratios < _DAMPED)
     while omega.size:
-        fit = records.fit(omega, ratios)
-        each = fit.residues[0].size + 2  # real parameters that come with a pole
-        freedom = max(records.data.size - omega.size * each, 1)
-        noise = max(fit.squared_error / freedom, _ROUND_OFF**2 * records.size / records.data.size)
+        fit = records.fit(omega, ratios, velocity=velocity)
+        each = fit.whitened[0].size + 2  # real parameters that come with a pole
         # What is no mode goes first, whatever it explains.
-        worth = np.where(inside, fit.gain / noise, -1.0)
+        worth = np.where(inside, fit.gain / _noise(records, fit, omega.size), -1.0)
         least = int(np.argmin(worth))
         if worth[least] > each + _DEVIATIONS * np.sqrt(2 * each):
             break
@@ -210,19 +283,21 @@ def _prune(records: _Records, omega: Array, ratios: Array) -> tuple[Array, Array
     return omega, ratios
 
 
-def _polish(records: _Records, omega: Array, ratios: Array) -> tuple[Array, Array]:
+def _polish(records: Records, omega: Array, ratios: Array) -> tuple[Array, Array]:
     """Variable projection: Levenberg-Marquardt steps over (log w, log zeta), the residues eliminated."""
     m = omega.size
     p = np.log(np.concatenate([omega, ratios]))
     damping = 1e-3
     error, H, slope = _projected(records, p)
     for _ in range(_STEPS):
+        if error < _EXACT**2 * records.size:
+            break
         step = np.linalg.solve(H + damping * np.diag(np.diag(H)), slope)
         trial = p + np.clip(step, -0.5, 0.5)
         trial[m:] = np.clip(trial[m:], np.log(1e-6), np.log(0.99))
         lower, *model = _projected(records, trial)
         if lower < error:
-            done = error - lower < 1e-12 * error
+            done = error - lower < 1e-9 * error
             p, error, (H, slope), damping = trial, lower, model, max(damping / 10, 1e-12)
             if done:
                 break
@@ -233,15 +308,12 @@ def _polish(records: _Records, omega: Array, ratios: Array) -> tuple[Array, Arra
     return np.exp(p[:m]), np.exp(p[m:])
 
 
-def _projected(records: _Records, p: Array) -> tuple[float, Array, Array]:
+def _projected(records: Records, p: Array) -> tuple[float, Array, Array]:
     """Squared error, Gauss-Newton matrix (2m, 2m) and descent direction of the projected problem at log poles `p`."""
     m = p.size // 2
     omega, ratios = np.exp(p[:m]), np.exp(p[m:])
-    fit, w = records.fit(omega, ratios), records.w
-    g = gains(records.freq, omega, ratios)
-    over = g / w**2  # one over the denominator
-    loss = 2j * (ratios * omega)[:, None] * w
-    slopes = records.stack(np.concatenate([-g * over * (2 * omega[:, None] ** 2 + loss), -g * over * loss]))
+    fit = records.fit(omega, ratios)
+    slopes = records.basis(gain_slopes(records.freq, omega, ratios))
     slopes = slopes - fit.Q @ (fit.Q.T @ slopes)
     residues = np.concatenate([fit.residues, fit.residues]).reshape(slopes.shape[1], -1)
     d = slopes.shape[1] // (2 * m)

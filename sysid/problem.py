@@ -107,7 +107,10 @@ class Problem:
         if isinstance(self.stiffness, SpectralStiffness) and self.stiffness.natural_frequencies is None:
             put("poles", find_poles(test))
             assert self.poles is not None
-            put("stiffness", replace(self.stiffness, natural_frequencies=self.poles.omega / (2 * np.pi)))
+            found, n = self.poles.omega / (2 * np.pi), test.n_sensors
+            # With fewer modes than sensors the model's other frequencies are anybody's guess.
+            limit = self.stiffness.max_frequency or (None if found.size >= n else max(test.freq[-1], found[-1]))
+            put("stiffness", SpectralStiffness(found[:n], limit))
         layout = Layout(test.rigid_body, test.translational)
         if np.linalg.norm(test.relative) <= 1e-12 * np.linalg.norm(test.response):
             raise InputError("no sensor moves relative to the base: there is nothing to identify from")

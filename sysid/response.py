@@ -71,32 +71,6 @@ def residual(test: Measurement, phi: ca.MX, gamma: ca.MX, omega: ca.MX, ratios: 
     return ca.vertcat(*(ca.vec(ca.densify(piece)) for piece in pieces))
 
 
-def linear_residues(test: Measurement, omega: Array, ratios: Array) -> tuple[Array, float]:
-    """Residues of given poles by linear least squares, whatever their rank.
-
-    Parameters
-    ----------
-    test : Measurement
-    omega, ratios : (m,)
-        Circular frequencies, rad/s, and damping ratios.
-
-    Returns
-    -------
-    residues : (m, n, d)
-    residual : float
-        Relative residual that they leave, with that of the base force (its residues free too) as in
-        `residual`: no modal model with these poles has a smaller one.
-    """
-    design, records = _modal_basis(test, omega, ratios), columns(test.relative).T
-    answer = _real_least_squares(design, records)
-    left = np.linalg.norm(design @ answer - records) / np.linalg.norm(records)
-    if test.force is not None:
-        weighing, force = np.hstack([columns(test.base).T, design]), columns(test.force).T
-        missed = weighing @ _real_least_squares(weighing, force) - force
-        left = np.hypot(left, np.linalg.norm(missed) / np.linalg.norm(force))
-    return answer.reshape(omega.size, test.n_base, -1).transpose(0, 2, 1), float(left)
-
-
 def weighed_mass(test: Measurement, omega: Array, ratios: Array) -> Array:
     """Rigid-body mass (d, d) that the base force tells, its modal part free at the given poles; kg."""
     assert test.force is not None
@@ -108,6 +82,16 @@ def gains(freq: Array, omega: Array, ratios: Array) -> ComplexArray:
     """Numbers of ``g_k = w² / (w_k² - w² + 2 i zeta_k w_k w)`` at lines in Hz, (m, n_freq)."""
     w = 2 * np.pi * freq
     return w**2 / (omega[:, None] ** 2 - w**2 + 2j * (ratios * omega)[:, None] * w)
+
+
+def gain_slopes(freq: Array, omega: Array, ratios: Array) -> ComplexArray:
+    """Derivatives of `gains` by log w_k, then by log zeta_k, (2m, n_freq)."""
+    w = 2 * np.pi * freq
+    g = gains(freq, omega, ratios)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        over = np.where(w > 0, g / w**2, 0.0)  # one over the denominator; at rest nothing moves
+    loss = 2j * (ratios * omega)[:, None] * w
+    return np.concatenate([-g * over * (2 * omega[:, None] ** 2 + loss), -g * over * loss])
 
 
 def _modal_basis(test: Measurement, omega: Array, ratios: Array) -> ComplexArray:

@@ -213,8 +213,8 @@ class TestControl:
         answer = local.solve(problem, x)
         residual = lambda at: problem.measurement.residual(problem.structure(at))  # noqa: E731
         assert answer.curve.ndim == 1
-        # The start is moved a little off its bounds by the interior point.
-        assert answer.curve[0] == pytest.approx(residual(x), rel=1e-2)
+        # Shapes follow from the rest, so the first iterate already has better ones than its start.
+        assert answer.curve[0] < residual(x)
         assert answer.curve[-1] == pytest.approx(residual(answer.x), rel=1e-3, abs=1e-9)
         assert answer.curve[-1] < answer.curve[0]
         assert answer.stopped is None
@@ -229,13 +229,13 @@ class TestControl:
     def test_a_spent_budget_is_no_success_and_is_said(self, random_case, mass):
         rng = np.random.default_rng(1)
         _, problem = random_case(rng, mass, n=4)
-        answer = local.solve(problem, random_start(rng, problem), max_iterations=3)
+        answer = local.solve(problem, random_start(rng, problem), max_iterations=1)
         assert not answer.success
         assert "Maximum_Iterations_Exceeded" in answer.message
         if mass == "lumped":
-            assert answer.curve.size == 4  # the start, and three iterations
+            assert answer.curve.size == 2  # the start, and one iteration
         else:
-            assert answer.curve.size in (4, 8, 12)  # of each attempt
+            assert answer.curve.size in (2, 4, 6)  # of each attempt
         assert total_error(problem, problem.structure(answer.x)) < 1e-9
 
     @pytest.mark.parametrize("mass", ["rigid_body", "lumped"])

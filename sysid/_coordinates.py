@@ -1,0 +1,100 @@
+"""Unknowns of a nonlinear programme, collected piece by piece, and one run of IPOPT over them."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from sysid._watch import OBJECTIVE_SCALE, Watch
+from sysid.structure import Array
+
+_TOLERANCE = 1e-9  # of IPOPT
+
+
+class Coordinates:
+    """Unknowns z of the nonlinear programme, and the equalities that tie them."""
+
+    def __init__(self) -> None:
+        self.pieces: list[ca.MX] = []
+        self.names: list[str] = []
+        self.start: list[Array] = []
+        self.lower: list[Array] = []
+        self.upper: list[Array] = []
+        self.ties: list[ca.MX] = []
+
+    @property
+    def z(self) -> ca.MX:
+        """All unknowns, (p, 1)."""
+        return ca.vertcat(*self.pieces)
+
+    def add(self, name: str, start: Array, lower: Array | float = -np.inf, upper: Array | float = np.inf) -> ca.MX:
+        """Further unknowns of the shape of `start`."""
+        shape = start.shape if start.ndim == 2 else (start.size, 1)
+        symbol = ca.MX.sym(name, *shape)
+        self.pieces.append(ca.vec(symbol))
+        self.names += [name] * start.size
+        self.start.append(start.ravel(order="F"))
+        self.lower.append(np.broadcast_to(lower, start.shape).ravel(order="F"))
+        self.upper.append(np.broadcast_to(upper, start.shape).ravel(order="F"))
+        return symbol
+
+    def minimize(
+        self, objective: ca.MX, watch: Watch, max_iterations: int, derivatives: dict[str, ca.Function] | None = None
+    ) -> tuple[Array, str]:
+        """Run IPOPT on `objective`, which is 1 where nothing is explained; the unknowns at its end, and its status.
+
+        `derivatives` are functions in the place of CasADi's own, as `nlpsol` names them. Where the watch was stopped
+        the status is "stopped", and the unknowns are the last iterate's.
+        """
+        z = self.z
+        ties = ca.vertcat(*self.ties) if self.ties else ca.MX(0, 1)
+        nlp = {"x": z, "f": OBJECTIVE_SCALE * objective, "g": ties}
+        lower, upper = np.concatenate(self.lower), np.concatenate(self.upper)
+        start = np.clip(np.concatenate(self.start), lower, upper)
+        call = watch.callback(start, ties.numel())
+
+        def run(at: Array, tolerance: float) -> tuple[str, Array]:
+            limits: dict[str, float] = {"max_iter": max_iterations}
+            if np.isfinite(watch.left):
+                limits["max_wall_time"] = max(watch.left, 0.1)
+            options = {
+                "print_time": False,
+                "iteration_callback": call,
+                "ipopt": {
+                    "print_level": 0, "sb": "yes", "tol": tolerance, "acceptable_tol": 100 * tolerance,
+                    "acceptable_iter": 5, "constr_viol_tol": 1e-11, "mu_strategy": "adaptive", **limits,
+                },
+                **(derivatives or {}),
+            }  # fmt: skip
+            solver = ca.nlpsol("local", "ipopt", nlp, options)
+            answer = solver(x0=at, lbx=lower, ubx=upper, lbg=0, ubg=0)
+            return solver.stats()["return_status"], np.asarray(answer["x"]).ravel()
+
+        try:
+            status, best = run(start, _TOLERANCE)
+            if status == "Search_Direction_Becomes_Too_Small" and watch.stopped is None:
+                # Noise can leave the gradient's round-off above the tolerance: the same point is judged by a wider one.
+                status, best = run(best, 1e3 * _TOLERANCE)
+        except KeyboardInterrupt as interrupt:
+            watch.stopped = interrupt
+        if watch.stopped is not None:
+            return watch.z, "stopped"
+        return best, status
+
+    def on_bounds(self, at: Array) -> str:
+        """Which unknowns press against a finite bound at a solution, in words."""
+        lower, upper = np.concatenate(self.lower), np.concatenate(self.upper)
+        free = upper > lower  # what is held fixed rests on no bound
+        with np.errstate(invalid="ignore"):
+            near = 1e-6 * np.where(np.isfinite(upper - lower), upper - lower, 1.0)
+            low, high = np.isfinite(lower) & (at - lower < near), np.isfinite(upper) & (upper - at < near)
+        seen: dict[str, int] = {}
+        ended: dict[str, list[str]] = {}
+        for name, is_low, is_high in zip(self.names, low & free, high & free, strict=True):
+            seen[name] = seen.get(name, 0) + 1
+            if is_low or is_high:
+                ended.setdefault(name, []).append(f"{seen[name]} ({'lower' if is_low else 'upper'})")
+        return "; ".join(
+            f"{name} {', '.join(which[:4])}" + (f" and {len(which) - 4} more" if len(which) > 4 else "")
+            for name, which in ended.items()
+        )

@@ -1,0 +1,100 @@
+"""Checks of a fit against its records: signs that the model is not the structure's, whatever its residual."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from sysid.mass import KnownMass
+from sysid.measurement import Measurement
+from sysid.problem import Problem
+from sysid.residues import Records, force_residual_left
+from sysid.response import weighed_mass
+from sysid.structure import Array, Structure
+
+_DEVIATIONS = 12.0  # of the chi-squared law, by which a misfit must exceed noise to mean something
+_ROUND_OFF = 1e-8  # of the records: what counts as noise where there is none
+_SAME_POLE = 1e-6  # relative distance of poles that count as one
+_ALIKE = 3.0  # misfits by which two records must differ to be of two sensors
+_FORCE_MISFIT = 1.5  # times what free residues leave, beyond which the force is not that of these modes
+
+
+def doubts(problem: Problem, structure: Structure) -> tuple[str, ...]:
+    """What speaks against the identified structure, in sentences; nothing counts as determined beside one."""
+    return tuple(
+        (
+            *_stated_mass(problem, structure),
+            *_force(problem.measurement, structure),
+            *_damping(problem.measurement, structure),
+            *_twins(problem.measurement, structure),
+        )
+    )
+
+
+def _poles(structure: Structure) -> tuple[Array, Array]:
+    """Distinct poles, rad/s and ratios."""
+    omega = 2 * np.pi * structure.natural_frequencies
+    poles = omega * (1 + 1j * structure.damping_ratios)
+    first = np.concatenate([[True], np.abs(np.diff(poles)) > _SAME_POLE * omega[1:]])
+    return omega[first], structure.damping_ratios[first]
+
+
+def _stated_mass(problem: Problem, structure: Structure) -> Iterator[str]:
+    """What the base force weighs, where a stated mass says otherwise."""
+    test = problem.measurement
+    if test.force is None or (not isinstance(problem.mass, KnownMass) and problem.mass.total_mass is None):
+        return
+    weighed, stated = np.diag(weighed_mass(test, *_poles(structure))), np.diag(structure.rigid_body_mass)
+    off = np.abs(weighed / stated - 1)
+    if np.any(off >= max(0.01, 3 * (test.force_residual(structure) or 0.0) / np.sqrt(test.freq.size))):
+        given, told = (", ".join(f"{m:.4g}" for m in masses) for masses in (stated, weighed))
+        yield (
+            f"the stated mass makes {given} kg in the base directions, but the base force weighs {told} kg: one of "
+            "them, or the unit of the force, is wrong"
+        )
+
+
+def _force(test: Measurement, structure: Structure) -> Iterator[str]:
+    """Whether the base force is that of the modes that the accelerations show."""
+    misfit = test.force_residual(structure)
+    if misfit is None:
+        return
+    possible = max(force_residual_left(test, *_poles(structure)), _ROUND_OFF)
+    if misfit > max(_FORCE_MISFIT * possible, 1e-6):
+        yield (
+            f"the base force misses what the modes of the accelerations make of it by {100 * misfit:.3g} % "
+            f"(free residues leave {100 * possible:.3g} %): check its sign, unit, axes and point of reference"
+        )
+
+
+def _damping(test: Measurement, structure: Structure) -> Iterator[str]:
+    """Whether residues in quadrature, which normal modes have not, stand out: on the basis {g, i w g}."""
+    records, poles = Records(test), _poles(structure)
+    if records.data.shape[0] <= 4 * poles[0].size * records.n_base:
+        return
+    real, both = records.fit(*poles), records.fit(*poles, velocity=True)
+    extra = poles[0].size * records.n_base * records.n_sensors
+    freedom = max(records.data.size - 2 * extra, 1)
+    noise = max(both.squared_error / freedom, _ROUND_OFF**2 * records.size / records.data.size)
+    gained = real.squared_error - both.squared_error
+    if gained > noise * (extra + _DEVIATIONS * np.sqrt(2 * extra)):
+        yield (
+            f"residues in quadrature explain {100 * np.sqrt(gained / records.size):.2g} % of the response: the damping "
+            "is not classical, or a mode is missing; modal damping ratios are then an approximation"
+        )
+
+
+def _twins(test: Measurement, structure: Structure) -> Iterator[str]:
+    """Sensors that record one motion."""
+    relative = np.moveaxis(test.relative, 0, 1).reshape(test.n_sensors, -1)
+    misfit = np.linalg.norm(np.moveaxis(test.predict(structure), 0, 1).reshape(test.n_sensors, -1) - relative, axis=1)
+    size, names = np.linalg.norm(relative, axis=1), test.sensor_names
+    for i in range(test.n_sensors):
+        for j in range(i):
+            bound = _ALIKE * np.hypot(misfit[i], misfit[j]) + 1e-9 * max(size[i], size[j])
+            apart = min(np.linalg.norm(relative[i] - relative[j]), np.linalg.norm(relative[i] + relative[j]))
+            if size[i] > bound and apart <= bound:
+                yield (
+                    f"sensors {names[j]} and {names[i]} record one motion and are one degree of freedom: leave one out"
+                )

@@ -1,0 +1,159 @@
+"""Residues of given poles: weighted linear least squares of the relative accelerations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from sysid.measurement import Measurement, unit_runs
+from sysid.response import columns, gains
+from sysid.structure import Array, ComplexArray
+from sysid.weights import separable
+
+_DEPENDENT = 1e-9  # of the largest singular value of the base records
+
+
+@dataclass(frozen=True, eq=False)
+class ResidueFit:
+    """Records fitted on given poles.
+
+    Attributes
+    ----------
+    Q : (rows, columns)
+        Orthonormal basis of what the poles can answer.
+    residues : (m, inputs, channels)
+    left : (rows, channels)
+        What they leave.
+    whitened : (m, inputs, channels)
+        Residues in units of what white noise of unit variance would scatter them by: the sum of squares of pole
+        k is what the squared error would rise by without it.
+    """
+
+    Q: Array
+    residues: Array
+    left: Array
+    whitened: Array
+
+    @property
+    def squared_error(self) -> float:
+        """Sum of squares of what is left."""
+        return float(np.sum(self.left**2))
+
+    @property
+    def gain(self) -> Array:
+        """What the squared error would rise by without each pole, (m,)."""
+        return np.sum(self.whitened**2, axis=(1, 2))
+
+
+class Records:
+    """Weighted relative accelerations of a test, or its base force; real parts above imaginary ones.
+
+    Each record is ``sum over inputs of residue · gain · base``. Where each run moves the base in
+    one direction of its own with unit acceleration, all runs have the same basis, and every pair of sensor and
+    direction is one channel of a test with a single input.
+    """
+
+    def __init__(self, test: Measurement, *, force: bool = False) -> None:
+        self.freq = test.freq
+        record, std = (test.force, test.force_std) if force else (test.relative, test.response_std)
+        assert record is not None
+        self.n_sensors, self.n_base = record.shape[1], test.n_base
+        channel, line = separable(std, record.shape)
+        relative = record * channel[:, None]
+        self.unit = test.n_runs == test.n_base and np.array_equal(test.base, unit_runs(test.n_base, test.freq.size))
+        if self.unit:
+            size = np.exp(np.log(line).mean(axis=1, keepdims=True))  # of each run
+            shared = np.exp(np.log(line / size).mean(axis=0))
+            blocks = [(shared[None].astype(complex), (relative * size[:, None] * shared).reshape(-1, test.freq.size))]
+            self.channel = (size * channel).ravel()
+        else:
+            self.moving = independent(test.base)
+            base = np.einsum("di,rdf->rif", self.moving, test.base * line[:, None])
+            blocks = list(zip(base, relative * line[:, None], strict=True))
+            self.channel = channel
+        self.blocks = blocks
+        self.base = np.concatenate([base for base, _ in blocks], axis=1)
+        self.data = stacked(np.concatenate([records for _, records in blocks], axis=1))
+        self.size = float(np.sum(self.data**2))
+
+    def basis(self, gains: ComplexArray) -> Array:
+        """Columns of gains (k, n_freq) times base motions, (rows, k * inputs)."""
+        block = np.tile(gains, len(self.blocks))[:, None] * self.base[None]
+        return stacked(block.reshape(-1, self.base.shape[1]))
+
+    def fit(self, omega: Array, ratios: Array, *, velocity: bool = False) -> ResidueFit:
+        """Best real residues of ``g``; with `velocity` those of ``i w / w_k g`` too, as further inputs."""
+        g = gains(self.freq, omega, ratios)
+        if velocity:
+            g = np.stack([g, 2j * np.pi * self.freq / omega[:, None] * g], axis=1).reshape(-1, self.freq.size)
+        X = self.basis(g)
+        scale = np.linalg.norm(X, axis=0)
+        scale[scale == 0] = 1.0
+        Q, R = np.linalg.qr(X / scale)
+        y = Q.T @ self.data
+        inverse = scipy.linalg.solve_triangular(R, np.eye(R.shape[0]), check_finite=False)
+        m = omega.size
+        beta = (inverse @ y).reshape(m, -1, self.data.shape[1])
+        spread = inverse.reshape(m, beta.shape[1], -1)
+        factor = np.linalg.cholesky(np.einsum("kir,kjr->kij", spread, spread))
+        whitened = np.linalg.solve(factor, beta)
+        return ResidueFit(Q, beta / scale.reshape(m, -1, 1), self.data - Q @ y, whitened)
+
+    def by_sensor(self, residues: Array) -> Array:
+        """Residues (m, inputs, channels) of `fit` in the test's own units, (m, n_sensors, d).
+
+        Directions in which the base does not move have none.
+        """
+        if self.unit:
+            plain = (residues / self.channel).reshape(len(residues), self.n_base, self.n_sensors)
+            return plain.transpose(0, 2, 1)
+        return np.einsum("mic,di->mcd", residues / self.channel, self.moving)
+
+
+def independent(base: ComplexArray) -> Array:
+    """Combinations D (d, r) of base records (runs, d, n_freq) that are independent inputs ``D' u_0``.
+
+    Each direction counts in units of its own size. What r < d inputs answer is taken to be due to the directions
+    that move: residues R by base direction follow as ``R D'``.
+    """
+    flat = stacked(columns(base))
+    size = np.linalg.norm(flat, axis=0)
+    size[size == 0] = 1.0
+    left, s, _ = np.linalg.svd((flat / size).T, full_matrices=False)
+    return left[:, s > _DEPENDENT * s[0]] / size[:, None]
+
+
+def stacked(record: ComplexArray) -> Array:
+    """Channels (c, rows) as columns, real parts above imaginary ones, (2 rows, c)."""
+    return np.vstack([record.real.T, record.imag.T])
+
+
+def linear_residues(test: Measurement, omega: Array, ratios: Array) -> tuple[Array, float]:
+    """Residues of given poles by linear least squares, whatever their rank.
+
+    Parameters
+    ----------
+    test : Measurement
+    omega, ratios : (m,)
+        Circular frequencies, rad/s, and damping ratios; no two modes with one pole.
+
+    Returns
+    -------
+    residues : (m, n_sensors, d)
+    residual : float
+        Relative residual that they leave: no modal model with these poles has a smaller one.
+    """
+    records = Records(test)
+    fit = records.fit(omega, ratios)
+    return records.by_sensor(fit.residues), float(np.sqrt(fit.squared_error / records.size))
+
+
+def force_residual_left(test: Measurement, omega: Array, ratios: Array) -> float:
+    """Relative residual of the base force with its own residues and rigid-body mass free at given poles."""
+    records = Records(test, force=True)
+    g = np.concatenate([np.ones((1, test.freq.size)), gains(test.freq, omega, ratios)])
+    basis = records.basis(g)
+    Q = np.linalg.qr(basis / np.maximum(np.linalg.norm(basis, axis=0), np.finfo(float).tiny))[0]
+    return float(np.linalg.norm(records.data - Q @ (Q.T @ records.data)) / np.sqrt(records.size))
