@@ -24,13 +24,14 @@ from benchmarks.random_structures import lines, random_structure
 
 SIZES = ((50, 3, 1000, 10.0), (100, 3, 2000, 90.0))  # n, d, lines, s
 MEMORY = 4.0  # GiB
+PATIENCE = 5.0  # times the bound on the seconds, after which a run is ended
 
 
 def large(reduced: bool) -> Iterator[Line]:
     """Noise-free tests with base force."""
     for n, d, count, seconds in SIZES[: 1 if reduced else None]:
         what = f"no noise, base force, n = {n}, d = {d}, {count} lines: "
-        figures = _in_own_process(n, d, count)
+        figures = _in_own_process(n, d, count, PATIENCE * seconds)
         if "said" in figures:
             yield Line(what + figures["said"], "no result", f"<= {seconds:g} s", False)
             continue
@@ -43,12 +44,16 @@ def large(reduced: bool) -> Iterator[Line]:
         )
 
 
-def _in_own_process(n: int, d: int, count: int) -> dict:
+def _in_own_process(n: int, d: int, count: int, patience: float) -> dict:
     command = [sys.executable, "-m", "benchmarks.large", str(n), str(d), str(count)]
     paths = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=False, cwd=ROOT, env={**os.environ, "PYTHONPATH": paths}
-    )
+    environment = {**os.environ, "PYTHONPATH": paths}
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=False, cwd=ROOT, env=environment, timeout=patience
+        )
+    except subprocess.TimeoutExpired:
+        return {"said": f"not done after {patience:g} s"}
     if done.returncode:
         return {"said": (done.stderr.strip().splitlines() or ["no output"])[-1]}
     figures: dict = json.loads(done.stdout.strip().splitlines()[-1])
