@@ -1,34 +1,36 @@
 """What the data determine: the modal-mass cone.
 
 Base and response accelerations fix frequencies, damping ratios and rank-one residues, and nothing
-else. All models that explain them are ``M_SS = P' diag(t) P``, ``K_SS = P' diag(t w²) P``,
-``M_S0 = P' diag(t) (Gamma - P G)``, one modal mass t_k > 0 a mode (P the inverse of the mode shapes).
-What a measured force or a stated model adds is linear in t, so its rank tells what stays open.
+else. All models that explain them are ``M_SS = P' T P``, ``K_SS = P' W T W P``, ``M_S0 = P' T (Gamma - P G)``,
+with ``T = diag(t)``, one modal mass t_k > 0 a mode (P the inverse of the mode shapes, W the circular frequencies),
+and a positive definite block of T for modes at one pole. What a measured force or a stated model adds is linear in T:
+its rank tells what stays open (`determination`), and how far that may go is a convex problem (`intervals`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import combinations_with_replacement
+from typing import NamedTuple
 
 import numpy as np
 
-from sysid.mass import KnownMass, LumpedMass
+from sysid.cone import Cone, Pairs, forms, null_space, unknowns
+from sysid.layout import Layout
+from sysid.mass import FullMass, KnownMass, LumpedMass
 from sysid.measurement import Measurement
 from sysid.problem import Problem
 from sysid.response import columns, gains
 from sysid.stiffness import ChainStiffness
 from sysid.structure import Array, Structure
 
-_RANK_TOLERANCE = 1e-7
 _SAME_POLE = 1e-6  # relative distance of poles that count as one even without a misfit
 _UNRESOLVED = 20.0  # misfits, in parts of the half-power half-width, by which resolved poles differ
 _CLEAR = 3.0  # misfits above which a mode's share of the responses is seen
 _INVISIBLE = 1e-6  # of the strongest mode's participation
-
-
-Pairs = list[tuple[int, int]]
+_NOTHING = 5e-7  # of an entry's range: ends below it are zero
+_ROUND_OFF = 1e-13
+_AT_ONCE = 100  # entries whose ends are sought together: enough for speed, few enough for memory
 
 
 @dataclass(frozen=True)
@@ -59,35 +61,209 @@ def determination(problem: Problem, structure: Structure) -> Determination:
     test = problem.measurement
     misfit = test.residual(structure)
     closed, open_ = [], list(_unseen(problem, structure, misfit))
-    clusters = _clusters(structure, misfit)
-    for cluster in clusters:
+    known = _known(problem, structure, misfit)
+    for cluster in known.clusters:
         if len(cluster) > 1:
             names = " and ".join(_mode(structure, k) for k in cluster)
             open_.append(f"{names} are too close to be told apart: only the sum of their residues is known")
-    unknowns = [pair for cluster in clusters for pair in combinations_with_replacement(cluster, 2)]
-    system, sentence = _model_equations(problem, structure, unknowns)
-    if sentence:
-        closed.append(sentence)
+    if known.sentence:
+        closed.append(known.sentence)
     if test.force is not None:
-        system = np.vstack([system, _force_equations(structure, clusters, unknowns)])
         closed.append("the measured base force weighs each mode that the base moves")
-    null = _null_space(system)
-    taking_part = np.abs(null).max(axis=0, initial=0.0) > 1e-6
-    free = sorted({k for pair, part in zip(unknowns, taking_part, strict=True) if part for k in pair})
+    free, common = _open_modes(known)
     if free:
-        n = structure.n
-        names = ", ".join(_mode(structure, k) for k in free)
-        if len(null) == 1 and len(free) == n > 1:
+        if common:
             what = "one common scale of mass, stiffness and damping is open"
+        elif len(free) == structure.n:
+            what = "all modal masses are open"
         else:
-            what = "all modal masses are open" if len(free) == n else f"modal masses are open ({names})"
+            masses = [f"the modal mass of {_mode(structure, k)}" for k in free]
+            listed = masses if len(masses) == 1 else [", ".join(masses[:-1]), masses[-1]]
+            what = " and ".join(listed) + (" is open" if len(masses) == 1 else " are open")
         open_.append(f"{what}: other mass and stiffness matrices answer identically")
         if problem.unit_mass:
             open_.append("no number with a unit of mass is given: masses are normalised to 1 kg in each base direction")
-    elif all(len(cluster) == 1 for cluster in clusters) or test.force is not None:
+    elif all(len(cluster) == 1 for cluster in known.clusters) or test.force is not None:
         # Equations on a cluster as a block were enough: its modes need not be told apart.
         open_ = [sentence for sentence in open_ if "too close" not in sentence]
+    if structure.n != structure.n_sensors:
+        how_far = "completely" if test.force is not None and not free else "up to the modal masses"
+        open_.append(
+            f"{structure.n} modes stand out for {structure.n_sensors} sensors: the mass and stiffness matrices hold "
+            "for the stated degrees of freedom only; the Craig-Bampton form (modal and base coordinates) is what the "
+            f"data determine, {how_far}"
+        )
     return Determination(not open_, () if free else tuple(closed), tuple(open_))
+
+
+@dataclass(frozen=True, eq=False)
+class Intervals:
+    """Extremes of the entries of M_SS and K_SS over all models that explain the data and what was stated.
+
+    Attributes
+    ----------
+    mass, stiffness : (2, n, n)
+        kg and N/m (kg m, kg m² and N, N m where a rotation is involved): lower ends, then upper ends.
+        Infinite where there is none.
+    """
+
+    mass: Array
+    stiffness: Array
+
+
+def intervals(problem: Problem, structure: Structure) -> Intervals:
+    """How far each entry of M_SS and K_SS may go over the modal-mass cone.
+
+    Parameters
+    ----------
+    problem : Problem
+    structure : Structure
+        A member of the cone, and one that the models of `problem` can hold: what is known is taken to be equal to what
+        it has, so that misfit closes nothing. Its poles, residues and mode shapes are kept, also the shape of a mode
+        that the base does not move, of which the data tell nothing.
+
+    Returns
+    -------
+    Intervals
+        Each end is attained by a member, or approached by members where a modal mass of zero attains it.
+    """
+    n = structure.n
+    known = _known(problem, structure, problem.measurement.residual(structure))
+    matrices = structure.mass[:n, :n], structure.stiffness[:n, :n]
+    if not _open_modes(known)[0]:
+        return Intervals(*(np.stack([matrix, matrix]) for matrix in matrices))
+    cone = _cone(problem, structure, known)
+    P = np.linalg.inv(structure.normal_modes)
+    omega = 2 * np.pi * structure.natural_frequencies[:, None]
+    return Intervals(*(_entries(cone, rows, own) for rows, own in zip((P, P * omega), matrices, strict=True)))
+
+
+def _entries(cone: Cone, rows: Array, own: Array) -> Array:
+    """Ends of the entries of ``rows' T rows``, (2, n, n); `own` is its value for T = I."""
+    size = np.linalg.norm(rows, axis=0)
+    unit = (rows / size).T
+    ends = np.empty((2, *own.shape))
+    upper = np.array(np.triu_indices(len(own)))
+    for i, j in np.array_split(upper, -(-upper.shape[1] // _AT_ONCE), axis=1):
+        functions = unit[i][:, :, None] * unit[j][:, None, :]
+        functions = (functions + np.swapaxes(functions, 1, 2)) / 2
+        values, _ = cone.largest(np.concatenate([-functions, functions]))
+        values = values.reshape(2, -1)
+        largest = np.where(np.isfinite(values), np.abs(values), 1.0).max(axis=0)
+        values = np.where(np.abs(values) < _NOTHING * largest + _ROUND_OFF, 0.0, values) * size[i] * size[j]
+        ends[0, i, j] = ends[0, j, i] = np.minimum(-values[0], own[i, j])
+        ends[1, i, j] = ends[1, j, i] = np.maximum(values[1], own[i, j])
+    return ends
+
+
+class _Known(NamedTuple):
+    """What holds linear functions of T equal to what they are for T = I.
+
+    Attributes
+    ----------
+    clusters : list of list of int
+        Modes that the misfit cannot tell apart.
+    weighed : list of (n, w)
+        Directions W of a cluster that the base force weighs: ``W' T W`` is known.
+    equations : (e, m)
+        Rows of linear equations in the unknowns, scaled to order one, that the stated models add.
+    signs : (p, m) or None
+        Masses or springs that the models leave, as functions of the unknowns.
+    sentence : str
+        Which models those are.
+    """
+
+    clusters: list[list[int]]
+    weighed: list[Array]
+    equations: Array
+    signs: Array | None
+    sentence: str
+
+
+def _known(problem: Problem, structure: Structure, misfit: float) -> _Known:
+    clusters = _clusters(structure, misfit)
+    weighed = _weighed(problem.measurement, structure, clusters)
+    return _Known(clusters, weighed, *_model_equations(problem, structure, unknowns(clusters)))
+
+
+def _open_modes(known: _Known) -> tuple[list[int], bool]:
+    """Modes whose modal mass is open, and whether only one scale that is common to all modes is."""
+    pairs = unknowns(known.clusters)
+    rows = [forms(W, W, pairs).reshape(-1, len(pairs)) for W in known.weighed]
+    null = null_space(np.vstack([known.equations, *rows]))
+    taking_part = np.abs(null).max(axis=0, initial=0.0) > 1e-6
+    free = sorted({k for pair, part in zip(pairs, taking_part, strict=True) if part for k in pair})
+    return free, len(null) == 1 and len(free) == sum(map(len, known.clusters)) > 1
+
+
+def _cone(problem: Problem, structure: Structure, known: _Known) -> Cone:
+    """The modal-mass cone, with the bounds that a total mass or a rigid-body mass puts on it."""
+    mass, n = problem.mass, structure.n
+    visible = sum((W @ (W.T @ structure.participation) for W in _moved(structure, known.clusters)), np.zeros((n, 1)))
+    traces, matrices = [], []
+    if problem.measurement.force is not None:
+        matrices.append(_below(visible, structure.rigid_body_mass))
+    if isinstance(mass, FullMass) and mass.total_mass is not None:
+        if np.ndim(mass.total_mass) == 2:
+            matrices.append(_below(visible, np.asarray(mass.total_mass, dtype=float)))
+        elif mass.healing == "rigid_body":
+            traces += [
+                _at_most(column[:, None], total) for column, total in zip(visible.T, problem.totals, strict=True)
+            ]
+        elif _at_sensors(structure):
+            traces += [
+                _at_most(W, total)
+                for W, total in zip(_by_direction(problem.layout, structure), problem.totals, strict=True)
+            ]
+    return Cone(known.clusters, known.weighed, traces, matrices, known.equations, known.signs)
+
+
+def _by_direction(layout: Layout, structure: Structure) -> list[Array]:
+    """Weights of each direction's part of trace M, its sensors' and, of M_00, what M cannot do without."""
+    P = np.linalg.inv(structure.normal_modes)
+    delta = structure.participation - P @ structure.rigid_body_dofs
+    groups = layout.directions[: layout.n]
+    return [np.hstack([P[:, groups == i], delta[:, [i]]]) for i in range(layout.d)]
+
+
+def _at_most(weights: Array, total: float) -> Array:
+    """Weights W for ``trace(W' T W) <= 1``; what the structure itself has is never too much."""
+    return weights / np.sqrt(max(total, float(np.sum(weights**2))) or 1.0)
+
+
+def _below(weights: Array, bound: Array) -> Array:
+    """Weights W for ``W' T W <= I``, of ``weights' T weights <= bound``; what the structure has is never too much."""
+    own = weights.T @ weights
+    size = np.sqrt(np.maximum(np.diag(own), np.diag(bound)))
+    size[size == 0] = 1.0
+    lam, V = np.linalg.eigh((bound - own) / np.outer(size, size))
+    lam, V = np.linalg.eigh(own / np.outer(size, size) + (V * np.maximum(lam, 0.0)) @ V.T)
+    some = lam > 1e-12 * lam[-1]
+    return weights / size @ V[:, some] / np.sqrt(lam[some])
+
+
+def _moved(structure: Structure, clusters: list[list[int]]) -> list[Array]:
+    """For each cluster the directions that the base moves, orthonormal, (n, w)."""
+    size = np.sqrt(np.diag(structure.rigid_body_mass))
+    gamma = structure.participation / np.where(size > 0, size, 1.0)  # kg and kg m² can be compared
+    strongest = np.linalg.norm(gamma, axis=1).max()
+    moved: list[Array] = []
+    for cluster in clusters:
+        U, s, _ = np.linalg.svd(gamma[cluster], full_matrices=False)
+        W = np.zeros((structure.n, np.count_nonzero(s > _INVISIBLE * strongest)))
+        W[cluster] = U[:, : W.shape[1]]
+        moved.append(W)
+    return moved
+
+
+def _weighed(test: Measurement, structure: Structure, clusters: list[list[int]]) -> list[Array]:
+    """The same for the clusters that stand out of the misfit of the base force."""
+    _, share = _shares(test, structure)
+    if share is None:
+        return []
+    misfit = test.force_residual(structure) or 0.0
+    seen = [bool(np.any(share[cluster] >= misfit)) for cluster in clusters]
+    return [W for W, yes in zip(_moved(structure, clusters), seen, strict=True) if yes and W.shape[1]]
 
 
 def _unseen(problem: Problem, structure: Structure, misfit: float) -> Iterator[str]:
@@ -142,44 +318,40 @@ def _clusters(structure: Structure, misfit: float) -> list[list[int]]:
     return clusters
 
 
-def _forms(left: Array, right: Array, unknowns: Pairs) -> Array:
-    """Coefficients of the unknowns t in ``left' T right``, (rows of left', columns of right, unknowns).
-
-    T is symmetric, with one entry for each pair of modes in `unknowns`.
-    """
-    one = np.stack([np.outer(left[k], right[m]) for k, m in unknowns], axis=-1)
-    other = np.stack([np.outer(left[m], right[k]) * (k != m) for k, m in unknowns], axis=-1)
-    return one + other
+def _at_sensors(structure: Structure) -> bool:
+    """Whether the degrees of freedom are the sensors, of whose masses the mass models speak."""
+    return structure.n == structure.n_sensors and np.array_equal(structure.recovery, np.eye(structure.n))
 
 
-def _force_equations(structure: Structure, clusters: list[list[int]], unknowns: Pairs) -> Array:
-    """The force fixes ``Gamma' T Gamma`` of each cluster by itself."""
-    gamma = structure.participation
-    gamma = gamma / np.linalg.norm(gamma, axis=1).max()
-    strength = np.linalg.norm(gamma, axis=1, keepdims=True)
-    # A weak mode is weighed badly, not never: what counts here is whether it is seen at all.
-    gamma = np.where(strength < _INVISIBLE, 0.0, gamma / np.maximum(strength, _INVISIBLE))
-    rows = []
-    for cluster in clusters:
-        mine = np.zeros((structure.n, 1))
-        mine[cluster] = 1.0
-        rows.append(_forms(gamma * mine, gamma * mine, unknowns).reshape(-1, len(unknowns)))
-    return np.vstack(rows)
-
-
-def _model_equations(problem: Problem, structure: Structure, unknowns: Pairs) -> tuple[Array, str]:
-    """Rows of linear equations in t, scaled to order one, that the stated models add."""
-    n, G = structure.n, structure.rigid_body
-    P = np.linalg.inv(structure.mode_shapes)
+def _model_equations(problem: Problem, structure: Structure, pairs: Pairs) -> tuple[Array, Array | None, str]:
+    """What the stated models add: `_Known.equations`, `signs` and `sentence`."""
+    n, G = structure.n, structure.rigid_body_dofs
+    nothing = np.zeros((0, len(pairs)))
+    if not _at_sensors(structure):
+        return nothing, None, ""
+    P = np.linalg.inv(structure.normal_modes)
     delta = structure.participation - P @ G
     size = np.linalg.norm(P, axis=0)
-    mass_entries = _forms(P / size, P / size, unknowns)
-    coupling = _forms(P / size, delta / (np.linalg.norm(delta) + size.max()), unknowns)
+    mass_entries = forms(P / size, P / size, pairs)
+    coupling = forms(P / size, delta / (np.linalg.norm(delta) + size.max()), pairs)
     rows: list[Array] = []
+    signs = None
     sentences = []
     layout, mass = problem.layout, problem.mass
+    if isinstance(problem.stiffness, ChainStiffness):
+        omega = 2 * np.pi * structure.natural_frequencies[:, None]
+        stiff = np.sqrt(np.diag(structure.stiffness)[:n])
+        scaled = forms(P * omega / stiff, P * omega / stiff, pairs)
+        rows.append(scaled[np.abs(structure.stiffness[:n, :n]) <= 1e-9 * np.outer(stiff, stiff)])
+        # A floor that no spring ties to the base is at rest in a rigid motion.
+        at_base = forms(P * omega / stiff, P @ G * omega / np.linalg.norm(P @ G * omega, axis=0), pairs)
+        rigid = structure.stiffness[:n, :n] @ G
+        rows.append(at_base[np.abs(rigid) <= 1e-9 * stiff[:, None] * stiff.max()])
+        stiffness = np.moveaxis(scaled * np.outer(stiff, stiff)[:, :, None], -1, 0)
+        signs = np.array([problem.stiffness.values(layout, np.eye(n), K) for K in stiffness]).T
+        sentences.append("the stiffness is stated to be a chain")
     if isinstance(mass, LumpedMass):
-        rows += [mass_entries[np.tril_indices(n, -1)], coupling.reshape(-1, len(unknowns))]
+        rows += [mass_entries[np.tril_indices(n, -1)], coupling.reshape(-1, len(pairs))]
         if mass.total_mass is None:
             sentences.append("the mass is stated to be lumped on the sensors")
         else:
@@ -187,29 +359,13 @@ def _model_equations(problem: Problem, structure: Structure, unknowns: Pairs) ->
             for i in range(layout.d):
                 own = P[:, layout.directions[:n] == i]
                 if own.size:
-                    rows.append(np.einsum("iiu->u", _forms(own, own, unknowns))[None] / np.sum(own**2))
+                    rows.append(np.einsum("iiu->u", forms(own, own, pairs))[None] / np.sum(own**2))
     elif isinstance(mass, KnownMass):
-        rows += [mass_entries.reshape(-1, len(unknowns)), coupling.reshape(-1, len(unknowns))]
+        rows += [mass_entries.reshape(-1, len(pairs)), coupling.reshape(-1, len(pairs))]
         sentences.append("the mass matrix is known")
-    if isinstance(problem.stiffness, ChainStiffness):
-        omega = 2 * np.pi * structure.natural_frequencies[:, None]
-        stiff = np.sqrt(np.diag(structure.stiffness)[:n])
-        springs = _forms(P * omega / stiff, P * omega / stiff, unknowns)
-        rows.append(springs[np.abs(structure.stiffness[:n, :n]) <= 1e-9 * np.outer(stiff, stiff)])
-        # A floor that no spring ties to the base is at rest in a rigid motion.
-        at_base = _forms(P * omega / stiff, P @ G * omega / np.linalg.norm(P @ G * omega, axis=0), unknowns)
-        rigid = structure.stiffness[:n, :n] @ G
-        rows.append(at_base[np.abs(rigid) <= 1e-9 * stiff[:, None] * stiff.max()])
-        sentences.append("the stiffness is stated to be a chain")
-    system = np.vstack(rows) if rows else np.zeros((0, len(unknowns)))
-    return system, "; ".join(sentences)
-
-
-def _null_space(system: Array) -> Array:
-    """Directions of the unknowns that the equations leave open, one a row."""
-    padded = np.vstack([system, np.zeros((1, system.shape[1]))])
-    _, s, vt = np.linalg.svd(padded)
-    return vt[np.count_nonzero(s > _RANK_TOLERANCE) :]
+    if isinstance(mass, LumpedMass | KnownMass):
+        signs = np.einsum("iiu->iu", mass_entries)
+    return np.vstack([nothing, *rows]), signs, "; ".join(reversed(sentences))
 
 
 def _mode(structure: Structure, k: int) -> str:

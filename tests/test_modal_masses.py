@@ -130,7 +130,7 @@ class TestVerdict:
         for force in (False, True):
             verdict = determination(problem_of(truth, FullMass(3.0), force=force), truth)
             self.check(verdict, False, says=["mode 2", "is not moved by the base"])
-        self.check(verdict, False, says="modal masses are open (mode 2 (")  # the force weighs mode 1 alone
+        self.check(verdict, False, says="the modal mass of mode 2 (20.13 Hz) is open")  # the force weighs mode 1 alone
 
     @pytest.mark.parametrize("force", [False, True])
     def test_one_run_of_a_fixed_direction_leaves_the_other_open(self, full, force):
