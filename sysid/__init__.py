@@ -6,7 +6,7 @@ from sysid import plot
 from sysid.damping import ModalDamping, ProportionalDamping
 from sysid.errors import InputError, SolverError, SysidError
 from sysid.identification import History, Identification, Recipe
-from sysid.identify import Progress, Swarm, identify
+from sysid.identify import Modal, Progress, Swarm, identify
 from sysid.mass import FullMass, KnownMass, LumpedMass
 from sysid.measurement import Measurement, Sensor, rigid_body, simulate
 from sysid.problem import Problem
@@ -24,7 +24,7 @@ if hasattr(_casadi.GlobalOptions, "setNumpyMode"):
 
 __all__ = [
     "ChainStiffness", "FullMass", "History", "Identification", "InputError", "KnownMass", "LumpedMass", "Measurement",
-    "ModalDamping", "Problem", "Progress", "ProportionalDamping", "Recipe", "Sensor", "SolverError",
+    "Modal", "ModalDamping", "Problem", "Progress", "ProportionalDamping", "Recipe", "Sensor", "SolverError",
     "SpectralStiffness", "Structure", "Swarm", "SwarmSettings", "SysidError", "identify", "load",
     "minimize_swarm", "plot", "resample", "rigid_body", "simulate",
 ]  # fmt: skip

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,6 +13,10 @@ from sysid.errors import InputError
 from sysid.measurement import Measurement
 from sysid.problem import Problem
 from sysid.structure import Array, ComplexArray, Structure
+
+if TYPE_CHECKING:
+    from sysid.modal_masses import Intervals
+    from sysid.uncertainty import Uncertainty
 
 
 @dataclass(frozen=True)
@@ -136,6 +141,40 @@ class Identification:
     def predict(self, measurement: Measurement) -> ComplexArray:
         """Relative accelerations under another test's base motion, (runs, n_sensors, n_freq)."""
         return measurement.predict(self.structure)
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty:
+        """Standard deviations and intervals that the measured noise makes; computed when first asked for.
+
+        They hold where the fit is one: for the members that the data leave open see `mass_interval`.
+        """
+        from sysid.uncertainty import uncertainty
+
+        return uncertainty(self.problem, self.structure)
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of ``uncertainty.parameters``, (p, p)."""
+        return self.uncertainty.covariance
+
+    @property
+    def mass_interval(self) -> Array:
+        """Least and largest M_SS, entry by entry, over all models that explain the data and keep to what was stated.
+
+        (2, n, n), kg; infinite where unbounded, equal where determined. Noise is not in it: see `uncertainty`.
+        """
+        return self._intervals.mass
+
+    @property
+    def stiffness_interval(self) -> Array:
+        """The same of K_SS, (2, n, n), N/m."""
+        return self._intervals.stiffness
+
+    @cached_property
+    def _intervals(self) -> Intervals:
+        from sysid.modal_masses import intervals
+
+        return intervals(self.problem, self.structure)
 
     @property
     def mac(self) -> Array:

@@ -30,6 +30,7 @@ from sysid.stiffness import SpectralStiffness
 from sysid.structure import Array, Structure
 
 _DEVIATIONS = 12.0  # of the chi-squared law, by which a misfit must exceed noise to mean something
+_EXACT = 1e-8  # relative residual that needs no second look
 _ROUND_OFF = 1e-11  # of the records: what counts as noise where there is none
 _DEPENDENT = 1e-6  # of the largest singular value of the shapes: below, sensors move alike in all modes
 FREQUENCY_WINDOW = 0.05  # relative; what a frequency read off a peak may be wrong by
@@ -113,7 +114,7 @@ def _lacking_rank(records: Records, best: ModalFit, multiplicity: Array) -> int 
     omega, ratios = best.modes.omega[first], best.modes.ratios[first]
     free = records.fit(omega, ratios)
     n, d = records.n_sensors, records.n_base
-    if n < 2 or d < 2:
+    if n < 2 or d < 2 or best.residual <= _EXACT:
         return None
     freedom = float(np.sum((n - multiplicity) * (d - multiplicity)))
     excess = best.residual**2 * records.size - free.squared_error
@@ -358,8 +359,8 @@ def nearest_lumped(problem: Problem, P: Array, gamma: Array, G: Array, groups: A
     wanted[-len(known) :] = weight
     size = np.maximum(np.linalg.norm(rows, axis=0), np.finfo(float).tiny)
     # No modal mass vanishes, or M_SS would be singular: each keeps a share of what it could be by itself.
-    most = weight / np.max([row * weight / total for row, total in known], axis=0)
-    least = _LEAST / m * most * size
+    share = np.max([row / total for row, total in known], axis=0)
+    least = _LEAST / m * size / np.maximum(share, 1e-9 * share.max())
     return np.maximum(lsq_linear(rows / size, wanted, (least, np.inf), tol=1e-14).x, least) / size
 
 

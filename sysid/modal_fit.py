@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from sysid._coordinates import Coordinates
 from sysid._watch import OBJECTIVE_SCALE, Watch
@@ -106,10 +107,9 @@ def fit_modes(
     z = Coordinates()
     m, d = first.gamma.shape
     weighed = test.force is not None
-    gauge, pivots = (first.gamma / unit, None) if weighed else _gauge(first, unit)
+    gauge, held = _gauge(first, unit, weighed)
     low, high = np.full((m, d), -np.inf), np.full((m, d), np.inf)
-    if pivots is not None:
-        low[pivots], high[pivots] = gauge[pivots], gauge[pivots]
+    low[held], high[held] = gauge[held], gauge[held]
     gamma = z.add("participation", gauge, low, high) @ ca.diag(ca.DM(unit))
     omega, ratios = spectrum(z)
     rigid = gamma.T @ gamma
@@ -129,19 +129,26 @@ def fit_modes(
     return ModalFit(modes, values[4], float(np.sqrt(values[5].item())), status, z.on_bounds(best))
 
 
-def _gauge(first: Modes, unit: Array) -> tuple[Array, tuple[Array, Array]]:
-    """Participations of a scale that accelerations leave open, and which of them are held to fix it.
+def _gauge(first: Modes, unit: Array, weighed: bool) -> tuple[Array, NDArray[np.bool_]]:
+    """Participations in one of the forms that answer alike, and which of them are held to keep it.
 
-    The largest one of each mode; of modes that share a pole, as many columns as there are modes, held to a unit matrix.
+    Accelerations leave the scale of each mode open: its largest participation is held. Of modes that share a pole they
+    leave every mixture open, and the block in as many directions is held to a unit matrix; a force leaves only
+    rotations of these modes into each other, and the block is held triangular.
     """
-    gauge, rows, at = first.gamma / unit, [], []
+    gauge, held = first.gamma / unit, np.zeros(first.gamma.shape, dtype=bool)
     _, start = np.unique(first.omega + 1j * first.ratios, return_index=True)
     for same in np.split(np.arange(first.omega.size), np.sort(start)[1:]):
-        picked = _pivots(gauge[same])
-        gauge[same] = np.linalg.solve(gauge[np.ix_(same, picked)], gauge[same])
-        rows.append(np.repeat(same, same.size))
-        at.append(np.tile(picked, same.size))
-    return gauge, (np.concatenate(rows), np.concatenate(at))
+        block = np.ix_(same, _pivots(gauge[same]))
+        if weighed:
+            gauge[same] = np.linalg.qr(gauge[block])[0].T @ gauge[same]
+            lower = np.tril(np.ones((same.size, same.size), dtype=bool), -1)
+            gauge[block] = np.where(lower, 0.0, gauge[block])
+            held[block] = lower
+        else:
+            gauge[same] = np.linalg.solve(gauge[block], gauge[same])
+            held[block] = True
+    return gauge, held
 
 
 def _pivots(block: Array) -> Array:

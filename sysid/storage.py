@@ -161,7 +161,7 @@ def _write(file: Any, identification: Identification) -> None:
         file.attrs, strategy=it.strategy, seed=it.seed, success=it.success, message=it.message,
         determined=it.determined, interrupted=it.interrupted,
     )  # fmt: skip
-    _put(file, x=it.x, closed_by=list(it.closed_by), undetermined=list(it.undetermined))
+    _put(file, x=it.x, closed_by=list(it.closed_by), undetermined=list(it.undetermined), remarks=list(it.remarks))
     _write_structure(file.create_group("structure"), it.structure)
 
     problem = file.create_group("problem")
@@ -210,7 +210,7 @@ def _read(file: Any) -> Identification:
     return Identification(
         structure=_read_structure(file["structure"]),
         problem=problem,
-        x=file["x"][()],
+        x=_get(file, "x"),
         strategy=_get(attrs, "strategy"),
         seed=None if seed is None else int(seed),
         success=_get(attrs, "success"),
@@ -219,6 +219,7 @@ def _read(file: Any) -> Identification:
         determined=_get(attrs, "determined"),
         closed_by=_get(file, "closed_by"),
         undetermined=_get(file, "undetermined"),
+        remarks=_get(file, "remarks") or (),  # the first files of this format have none
         interrupted=_get(attrs, "interrupted"),
         recipe=None if recipe is None else Recipe(*(_get(recipe.attrs, f.name) for f in fields(Recipe))),
     )

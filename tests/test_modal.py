@@ -88,13 +88,84 @@ def test_other_models_are_refused_by_name():
         sysid.identify(problem, strategy="modal")
 
 
-def test_as_many_modes_as_sensors_are_demanded():
-    truth = structure(2, 5, 1)
-    full = sysid.simulate(truth, lines(truth))
-    few = sysid.Measurement(full.freq, full.base, full.response[:, :3], rigid_body=full.rigid_body[:3])
-    stiffness = sysid.SpectralStiffness(truth.natural_frequencies[:3])
-    with pytest.raises(sysid.InputError, match="5 modes stand out of the data .* for 3 sensors"):
-        sysid.identify(sysid.Problem(few, mass=sysid.FullMass(10.0), stiffness=stiffness), strategy="modal")
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("d", [1, 2])
+def test_more_modes_than_sensors_stand_as_modal_coordinates_beside_them(d, force):
+    truth = structure(2, 5, d)
+    full = sysid.simulate(truth, lines(truth), force=force)
+    few = sysid.Measurement(
+        full.freq, full.base, full.response[:, :3], rigid_body=full.rigid_body[:3], force=full.force,
+        base_axes=full.base_axes,
+    )  # fmt: skip
+    result = sysid.identify(sysid.Problem(few, mass=sysid.FullMass()), strategy="modal")
+    s = result.structure
+    assert result.success and not result.determined and result.x is None
+    assert (s.n, s.n_sensors) == (5, 3)
+    assert result.residual < 1e-10
+    np.testing.assert_array_equal(s.recovery, np.eye(3, 5))
+    np.testing.assert_allclose(s.natural_frequencies, truth.natural_frequencies, rtol=1e-9)
+    if force:
+        assert result.force_residual < 1e-10
+        np.testing.assert_allclose(s.rigid_body_mass, truth.rigid_body_mass, rtol=1e-8)
+        same = truth.to_craig_bampton().mass, s.to_craig_bampton().mass
+        np.testing.assert_allclose(np.abs(same[1]), np.abs(same[0]), rtol=1e-7, atol=1e-9 * np.abs(same[0]).max())
+    assert any("coordinate of mode" in remark for remark in result.remarks)
+
+
+@pytest.mark.parametrize("chosen", [None, ["s2", "s4", 5]])
+def test_fewer_modes_than_sensors_are_recovered_from_the_sensors_chosen(chosen):
+    """Eight sensors on a structure whose motion three modes make: the five others follow exactly."""
+    truth, rng = structure(3, 3, 2), np.random.default_rng(0)
+    recovery = np.vstack([np.eye(3), rng.normal(size=(5, 3))])
+    wide = sysid.Structure(
+        truth.mass, truth.stiffness, truth.damping_ratios, n_base=2, recovery=recovery,
+        rigid_body=np.clip(recovery @ truth.rigid_body, -0.7, 0.7),
+        sensors=[sysid.Sensor(f"s{i}", (0, 0, float(i)), "x") for i in range(8)],
+    )  # fmt: skip
+    test = sysid.simulate(wide, lines(truth), force=True)
+    strategy = sysid.Modal(sensors=chosen)
+    result = sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), strategy=strategy)
+    s = result.structure
+    assert result.success and not result.determined
+    assert (s.n, s.n_sensors) == (3, 8)
+    assert result.residual < 1e-10 and result.force_residual < 1e-10
+    at = [int(np.flatnonzero((s.recovery == row).all(axis=1))[0]) for row in np.eye(3)]
+    if chosen is not None:
+        assert at == [2, 4, 5]
+    np.testing.assert_allclose(s.recovery, recovery @ np.linalg.inv(recovery[at]), atol=1e-9)
+    # The mass over the chosen sensors is the truth's in those coordinates.
+    T = np.linalg.inv(recovery[at])
+    np.testing.assert_allclose(s.mass[:3, :3], T.T @ truth.mass[:3, :3] @ T, rtol=1e-7, atol=1e-9)
+
+
+def test_sensors_that_do_not_tell_the_modes_apart_are_refused():
+    truth = structure(2, 4, 1)
+    problem = sysid.Problem(sysid.simulate(truth, lines(truth)), mass=sysid.FullMass())
+    for stated, words in ((["no such"], "is no sensor"), ([0, 0], "twice")):
+        with pytest.raises(sysid.InputError, match=words):
+            sysid.identify(problem, strategy=sysid.Modal(sensors=stated))
+
+
+def test_a_repeated_pole_is_two_modes_where_the_base_force_weighs_them():
+    """Two equal oscillators along x and y: one pole, a residue of rank two."""
+    truth = structure(1, 4, 2)
+    omega = 2 * np.pi * truth.natural_frequencies
+    omega[2] = omega[1]
+    ratios = truth.damping_ratios.copy()
+    ratios[2] = ratios[1]
+    L, G = np.linalg.cholesky(truth.mass[:4, :4]), truth.rigid_body
+    K = L @ (L.T @ truth.normal_modes * omega**2) @ (L.T @ truth.normal_modes).T @ L.T
+    full = np.block([[K, -K @ G], [-(K @ G).T, G.T @ K @ G]])
+    truth = sysid.Structure(truth.mass, (full + full.T) / 2, ratios, n_base=2)
+    result = sysid.identify(
+        sysid.Problem(sysid.simulate(truth, lines(truth), force=True), mass=sysid.FullMass()), strategy="modal"
+    )
+    assert result.success and result.determined, result.undetermined
+    assert result.residual < 1e-10
+    np.testing.assert_allclose(result.structure.mass, truth.mass, rtol=1e-6, atol=1e-8 * truth.mass.max())
+    np.testing.assert_allclose(
+        result.structure.stiffness, truth.stiffness, rtol=1e-6, atol=1e-8 * truth.stiffness.max()
+    )
 
 
 def test_a_callback_can_stop_it():
