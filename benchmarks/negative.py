@@ -1,7 +1,7 @@
 """Lines of capability 3: tests that cannot tell what is asked of them, and whether the result says so.
 
 What counts is an `InputError` with a sentence that names the cause, or a result with ``determined`` False and such a
-sentence in ``undetermined`` or ``remarks``. A sound test must draw no such sentence.
+sentence in ``undetermined``. A sound test must draw no such sentence.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def outcome(case: Case) -> tuple[tuple[str, ...], bool, str]:
     """Sentences about what is wrong, whether one names the cause, and how the run ended."""
     try:
         result = sysid.identify(case.problem(), strategy="modal")
-        said: tuple[str, ...] = (*result.undetermined, *result.remarks)
+        said: tuple[str, ...] = result.undetermined
     except sysid.InputError as error:
         said = (str(error),)
         return said, _names(said, case.cause), "InputError"

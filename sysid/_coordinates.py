@@ -59,6 +59,7 @@ class Coordinates:
                 limits["max_wall_time"] = max(watch.left, 0.1)
             options = {
                 "print_time": False,
+                "show_eval_warnings": False,  # a step too long is IPOPT's to shorten
                 "iteration_callback": call,
                 "ipopt": {
                     "print_level": 0, "sb": "yes", "tol": tolerance, "acceptable_tol": 100 * tolerance,

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.local import Modes
 from sysid.measurement import Measurement
+from sysid.modal_fit import Modes
 from sysid.response import columns, gain_slopes, gains
 from sysid.structure import Array, ComplexArray, Structure
 from sysid.weights import separable

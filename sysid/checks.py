@@ -45,9 +45,10 @@ def _stated_mass(problem: Problem, structure: Structure) -> Iterator[str]:
     test = problem.measurement
     if test.force is None or (not isinstance(problem.mass, KnownMass) and problem.mass.total_mass is None):
         return
-    weighed, stated = np.diag(weighed_mass(test, *_poles(structure))), np.diag(structure.rigid_body_mass)
+    poles = _poles(structure)
+    weighed, stated = np.diag(weighed_mass(test, *poles)), np.diag(structure.rigid_body_mass)
     off = np.abs(weighed / stated - 1)
-    if np.any(off >= max(0.01, 3 * (test.force_residual(structure) or 0.0) / np.sqrt(test.freq.size))):
+    if np.any(off >= max(0.01, 3 * force_residual_left(test, *poles) / np.sqrt(test.freq.size))):
         given, told = (", ".join(f"{m:.4g}" for m in masses) for masses in (stated, weighed))
         yield (
             f"the stated mass makes {given} kg in the base directions, but the base force weighs {told} kg: one of "

@@ -18,7 +18,7 @@ from sysid.damping import ModalDamping
 from sysid.errors import InputError
 from sysid.identification import History, Identification
 from sysid.mass import FullMass
-from sysid.modal import Modal, held_by_model, modal_structure
+from sysid.modal import Modal, NotModalError, held_by_model, modal_structure
 from sysid.modal_masses import determination
 from sysid.problem import Problem
 from sysid.refinement import SOLVED
@@ -79,8 +79,8 @@ def identify(
         if isinstance(options, Modal):
             try:
                 return _finish(problem, _by_modes(problem, options, desk), why, seed, desk)
-            except InputError as error:
-                if strategy != "auto" or problem.poles is not None:
+            except NotModalError as error:
+                if strategy != "auto":
                     raise
                 why = f"strategy 'swarm': the modal one does not apply ({error})"
                 options = Swarm()
@@ -110,7 +110,7 @@ def _options(
 def _by_modes(problem: Problem, options: Modal, desk: Desk) -> Outcome:
     """Modes from the data, and the structure that they make."""
     if not (isinstance(problem.stiffness, SpectralStiffness) and isinstance(problem.damping, ModalDamping)):
-        raise InputError("strategy 'modal' needs SpectralStiffness and ModalDamping; use 'swarm' for this problem")
+        raise NotModalError("strategy 'modal' needs SpectralStiffness and ModalDamping; use 'swarm' for this problem")
     watch = Watch(lambda i, cost: desk.tell("local phase", i, 0, cost), desk.left)
     structure, end, chosen, poles = modal_structure(problem, options, watch)
     test, n = problem.measurement, problem.layout.n
@@ -139,7 +139,7 @@ def _by_modes(problem: Problem, options: Modal, desk: Desk) -> Outcome:
             x, success, message, stopped = answer.x, answer.success, answer.message, answer.stopped
             structure = problem.structure(x)
     elif not isinstance(problem.mass, FullMass):
-        raise InputError(
+        raise NotModalError(
             f"{structure.n} modes stand out of the data of {n} sensors: a lumped or known mass needs as many modes as "
             "sensors in the lines; leave sensors out or widen the lines"
         )

@@ -25,8 +25,9 @@ from sysid.damping import ModalDamping
 from sysid.layout import lower_entries, triangle_entries
 from sysid.mass import FullMass
 from sysid.measurement import Measurement
-from sysid.modal import FREQUENCY_WINDOW, stated_totals, to_stated_totals
+from sysid.modal import FREQUENCY_WINDOW
 from sysid.modal_fit import ModalFit, Modes, fit_modes, rank_one
+from sysid.modal_scales import stated_totals, to_stated_totals
 from sysid.problem import Problem, assemble
 from sysid.refinement import SOLVED
 from sysid.residues import force_residual_left, linear_residues

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 import scipy.linalg
+from numpy.typing import NDArray
 
 from sysid._coordinates import Coordinates
 from sysid._watch import Watch
@@ -21,21 +22,27 @@ from sysid.errors import InputError
 from sysid.layout import triangle_entries
 from sysid.mass import FullMass, KnownMass
 from sysid.measurement import Measurement
-from sysid.modal_fit import ModalFit, Modes, Spectrum, Ties, fit_modes
+from sysid.modal_fit import ModalFit, Modes, Spectrum, fit_modes
+from sysid.modal_scales import nearest_lumped, of_known_mass, stated_totals, to_stated_totals, weigh
 from sysid.poles import Poles, find_poles, poles_near
 from sysid.problem import Problem
-from sysid.residues import Records, linear_residues
-from sysid.response import columns, gains
+from sysid.refinement import SOLVED
+from sysid.residues import Records, independent, linear_residues
 from sysid.stiffness import SpectralStiffness
 from sysid.structure import Array, Structure
+
+Integers = NDArray[np.intp]
 
 _DEVIATIONS = 12.0  # of the chi-squared law, by which a misfit must exceed noise to mean something
 _EXACT = 1e-8  # relative residual that needs no second look
 _ROUND_OFF = 1e-11  # of the records: what counts as noise where there is none
 _DEPENDENT = 1e-6  # of the largest singular value of the shapes: below, sensors move alike in all modes
 FREQUENCY_WINDOW = 0.05  # relative; what a frequency read off a peak may be wrong by
-_SPARE = 1e-3  # least share of a total mass that is left to the base
-_LEAST = 0.1  # of an equal share of the mass, that each mode keeps where nothing tells modal masses
+_AGREES = 0.01  # relative; a stated total that the base force weighs within this is held in the fit
+
+
+class NotModalError(InputError):
+    """The modal strategy does not apply to a problem; another may."""
 
 
 @dataclass(frozen=True)
@@ -67,38 +74,53 @@ class DegreesOfFreedom:
         Modal coordinates beside them, modes counted from 0.
     """
 
-    sensors: Array
-    modes: Array
+    sensors: Integers
+    modes: Integers
 
 
-def fit(test: Measurement, poles: Poles, unit: Array, ties: Ties | None, watch: Watch, max_iterations: int) -> ModalFit:
+def fit(test: Measurement, poles: Poles, unit: Array, watch: Watch, max_iterations: int) -> ModalFit:
     """Fit of rank-one modes at `poles`; a pole whose residue needs it stands for several modes.
 
     Parameters
     ----------
     unit : (d,)
         Size of participations, kg^½, m kg^½ for rotations.
-    ties : callable, optional
-        As in `fit_modes`.
+
+    Raises
+    ------
+    NotModalError
+        Fewer measured numbers than unknowns, or base directions that do not move by themselves.
     """
     records = Records(test)
-    multiplicity = np.ones(poles.omega.size, dtype=int)
-    best = _fit_with(test, poles, multiplicity, unit, ties, watch, max_iterations)
+    moving = independent(test.base).shape[1]
+    if moving < test.n_base:
+        raise NotModalError(
+            f"the base moves in only {moving} of {test.n_base} independent directions: add runs that move the others, "
+            "or describe the test by the directions that move"
+        )
+    m, n, d = poles.omega.size, test.n_sensors, test.n_base
+    if 2 * test.response.size < m * (n + d + 1) or len(records.data) < m * len(records.base):
+        raise NotModalError(
+            f"{test.freq.size} lines ({2 * test.response.size} measured numbers) cannot fix {m * (n + d + 1)} "
+            "unknowns: add lines or runs"
+        )
+    multiplicity = np.ones(m, dtype=int)
+    best = _fit_with(test, poles, multiplicity, unit, watch, max_iterations)
     while watch.stopped is None:
         lacking = _lacking_rank(records, best, multiplicity)
         if lacking is None:
             break
         more = multiplicity.copy()
         more[lacking] += 1
-        again = _fit_with(test, poles, more, unit, ties, watch, max_iterations)
+        again = _fit_with(test, poles, more, unit, watch, max_iterations)
         each = test.n_sensors + test.n_base
         gained = (best.residual**2 - again.residual**2) * records.size
         if gained < (each + _DEVIATIONS * np.sqrt(2 * each)) * _noise(records, again.residual, more.sum()):
             break
         best, multiplicity = again, more
     order = np.argsort(best.modes.omega, kind="stable")
-    m = best.modes
-    modes = Modes(m.phi[:, order], m.gamma[order], m.omega[order], m.ratios[order])
+    end = best.modes
+    modes = Modes(end.phi[:, order], end.gamma[order], end.omega[order], end.ratios[order])
     return ModalFit(modes, best.rigid, best.residual, best.status, best.bounds)
 
 
@@ -108,7 +130,7 @@ def _noise(records: Records, residual: float, m: int) -> float:
     return max(residual**2 * records.size / freedom, _ROUND_OFF**2 * records.size / records.data.size)
 
 
-def _lacking_rank(records: Records, best: ModalFit, multiplicity: Array) -> int | None:
+def _lacking_rank(records: Records, best: ModalFit, multiplicity: Integers) -> int | None:
     """The pole whose free residue most lacks in the modes that it has; None where none does."""
     first = np.concatenate([[0], np.cumsum(multiplicity)[:-1]])
     omega, ratios = best.modes.omega[first], best.modes.ratios[first]
@@ -131,9 +153,8 @@ def _lacking_rank(records: Records, best: ModalFit, multiplicity: Array) -> int 
 def _fit_with(
     test: Measurement,
     poles: Poles,
-    multiplicity: Array,
+    multiplicity: Integers,
     unit: Array,
-    ties: Ties | None,
     watch: Watch,
     max_iterations: int,
 ) -> ModalFit:
@@ -151,71 +172,41 @@ def _fit_with(
     lam, vectors = np.linalg.eigh((rigid - modes.gamma.T @ modes.gamma) / np.outer(unit, unit))
     remainder = (vectors * np.maximum(lam, 0.0)) @ vectors.T * np.outer(unit, unit)
     return fit_modes(
-        test, modes, _free_spectrum(poles, pole), unit=unit, remainder=remainder, ties=ties, watch=watch,
+        test, modes, _free_spectrum(poles, pole), unit=unit, remainder=remainder, watch=watch,
         max_iterations=max_iterations,
     )  # fmt: skip
 
 
-def _free_spectrum(poles: Poles, pole: Array) -> Spectrum:
+def held_to_totals(problem: Problem, end: ModalFit, watch: Watch, max_iterations: int) -> ModalFit | None:
+    """The same fit with stated totals held, where what the base force weighs agrees with them; else None."""
+    ties, test = stated_totals(problem), problem.measurement
+    if ties is None or np.any(np.abs(np.diag(end.rigid) / problem.totals - 1) > _AGREES):
+        return None
+    modes = end.modes
+    poles = Poles(modes.omega, modes.ratios, end.residual)
+    held = fit_modes(
+        test, modes, _free_spectrum(poles, np.arange(modes.omega.size)), unit=np.sqrt(problem.totals),
+        remainder=end.rigid - modes.gamma.T @ modes.gamma, ties=ties, watch=watch, max_iterations=max_iterations,
+    )  # fmt: skip
+    return held if held.status in SOLVED else None
+
+
+def _free_spectrum(poles: Poles, pole: Integers) -> Spectrum:
     """Frequencies and damping ratios of each pole without bounds; modes of one pole share them."""
 
     def spectrum(z: Coordinates) -> tuple[ca.MX, ca.MX]:
         # In units of the half-power half-width, which is what frequencies are known in.
-        shift = z.add("frequency", np.zeros(poles.omega.size)) * ca.DM(poles.ratios)
-        loss = z.add("damping ratio", np.zeros(poles.omega.size))
+        # Cut off where no step of use leads.
+        shift = _within(z.add("frequency", np.zeros(poles.omega.size)) * ca.DM(poles.ratios), 1.0)
+        loss = _within(z.add("damping ratio", np.zeros(poles.omega.size)), 10.0)
         omega, ratios = ca.DM(poles.omega) * ca.exp(shift), ca.DM(poles.ratios) * ca.exp(loss)
         return omega[pole.tolist()], ratios[pole.tolist()]
 
     return spectrum
 
 
-def weigh(test: Measurement, modes: Modes) -> tuple[Array, Array]:
-    """Modal masses t (m,) > 0 and rigid-body mass (d, d): the base force is linear in both.
-
-    Raises
-    ------
-    InputError
-        Where the force wants negative masses: a wrong sign.
-    """
-    from scipy.optimize import lsq_linear
-
-    d, m = test.n_base, modes.omega.size
-    assert test.force is not None
-    base, force = columns(test.base), columns(test.force)
-    g = np.tile(gains(test.freq, modes.omega, modes.ratios), test.n_runs)
-    pairs = [(i, j) for i in range(d) for j in range(i, d)]
-    pushes = (modes.gamma @ base) * g
-    parts = [np.outer(modes.gamma[k], pushes[k]) for k in range(m)]
-    for i, j in pairs:
-        unit = np.zeros((d, d))
-        unit[i, j] = unit[j, i] = 1.0
-        parts.append(unit @ base)
-    # Moments and forces count in units of their own records.
-    size = np.linalg.norm(force, axis=1, keepdims=True)
-    size[size == 0] = 1.0
-    design = np.array([(part / size).ravel() for part in parts]).T
-    wanted = (force / size).ravel()
-    scale = np.linalg.norm(design, axis=0)
-    scale[scale == 0] = 1.0
-    stacked = np.vstack([design.real, design.imag]) / scale
-    target = np.concatenate([wanted.real, wanted.imag])
-    lower = np.concatenate([np.zeros(m), np.full(len(pairs), -np.inf)])
-    # The triangular factor stands for all lines.
-    Q, R = np.linalg.qr(stacked)
-    plain = Q.T @ target
-    free = np.linalg.lstsq(R, plain, rcond=None)[0]
-    strength = np.abs(free[:m])
-    if np.sum(free[:m] * strength) < -0.5 * np.sum(strength**2):
-        raise InputError(
-            "the base force answers to the modes with negative masses: check its sign (it is the base's on the "
-            "structure, in phase with the base acceleration at low frequency)"
-        )
-    answer = (free if np.all(free[:m] > 0) else lsq_linear(R, plain, (lower, np.inf), tol=1e-14).x) / scale
-    rigid = np.zeros((d, d))
-    for (i, j), mass in zip(pairs, answer[m:], strict=True):
-        rigid[i, j] = rigid[j, i] = mass
-    t = answer[:m]
-    return np.maximum(t, 1e-9 * t.max()), rigid
+def _within(value: ca.MX, limit: float) -> ca.MX:
+    return ca.fmin(ca.fmax(value, -limit), limit)
 
 
 def degrees_of_freedom(problem: Problem, modes: Modes, stated: Sequence[str | int] | None) -> DegreesOfFreedom:
@@ -243,7 +234,7 @@ def degrees_of_freedom(problem: Problem, modes: Modes, stated: Sequence[str | in
     return DegreesOfFreedom(sensors, np.sort(order[sensors.size :]))
 
 
-def _by_name(test: Measurement, stated: Sequence[str | int]) -> Array:
+def _by_name(test: Measurement, stated: Sequence[str | int]) -> Integers:
     names = test.sensor_names
     chosen = []
     for one in stated:
@@ -289,81 +280,6 @@ def build(problem: Problem, modes: Modes, remainder: Array, chosen: DegreesOfFre
     )
 
 
-def to_stated_totals(
-    problem: Problem, P: Array, gamma: Array, G: Array, groups: Array, remainder: Array
-) -> tuple[float, Array]:
-    """Common modal-mass factor t and base remainder (d, d) with which a full mass has the stated totals.
-
-    Scaling all modal masses by one t changes no response; the remainder is invisible in accelerations. It keeps its
-    correlations, and takes what mass the modes leave.
-
-    Parameters
-    ----------
-    P : (m, m)
-        Inverse of the mode shapes at the degrees of freedom.
-    gamma, G : (m, d)
-        Participations, and rigid motion of the degrees of freedom.
-    groups : (m,)
-        Base direction of each degree of freedom, -1 for none.
-    """
-    if isinstance(problem.mass, FullMass) and problem.mass.healing == "rigid_body":
-        used = np.sum(gamma**2, axis=0)
-    else:
-        rows = np.sum(P**2, axis=0)
-        own = [rows[groups == i].sum() for i in range(G.shape[1])]
-        used = np.array(own) + np.sum((gamma - P @ G) ** 2, axis=0)
-    t = min(1.0, float(np.min((1 - _SPARE) * problem.totals / used)))
-    share = np.sqrt((problem.totals - t * used) / np.maximum(np.diag(remainder), np.finfo(float).tiny))
-    return t, remainder * np.outer(share, share)
-
-
-def stated_totals(problem: Problem) -> Ties | None:
-    """Equalities that hold the stated total mass where the base force would set another."""
-    layout, mass, totals = problem.layout, problem.mass, problem.totals
-    if problem.measurement.force is None or not isinstance(mass, FullMass) or mass.total_mass is None:
-        return None
-
-    def ties(phi: ca.MX, gamma: ca.MX, rigid: ca.MX) -> list[ca.MX]:
-        if mass.healing == "rigid_body" or phi.size1() != phi.size2():
-            return [ca.diag(rigid) / totals - 1]
-        P = ca.inv(phi)
-        delta = gamma - P @ ca.DM(layout.rigid_body)
-        rows = ca.diag(P.T @ P)
-        base = ca.diag(rigid - gamma.T @ gamma + delta.T @ delta)
-        groups = layout.directions[: layout.n]
-        own = [ca.sum1(rows[np.flatnonzero(groups == i).tolist()]) for i in range(layout.d)]
-        return [(own[i] + base[i]) / totals[i] - 1 for i in range(layout.d)]
-
-    return ties
-
-
-def nearest_lumped(problem: Problem, P: Array, gamma: Array, G: Array, groups: Array) -> Array:
-    """Modal masses (m,) whose mass matrix is nearest to a lumped, uncoupled one with the stated totals.
-
-    Parameters
-    ----------
-    P, gamma, G, groups :
-        As in `to_stated_totals`.
-    """
-    from scipy.optimize import lsq_linear
-
-    m = len(P)
-    delta = gamma - P @ G
-    off = np.einsum("ki,kj->ijk", P, P)[np.tril_indices(m, -1)]
-    coupling = np.einsum("ki,kj->ijk", P, delta).reshape(-1, m)
-    totals = [(np.sum(P[:, groups == i] ** 2, axis=1), problem.totals[i]) for i in range(G.shape[1])]
-    known = [(row, total) for row, total in totals if np.any(row > 0)] or [(np.sum(P**2, axis=1), 1.0)]
-    weight = max(total for _, total in known)
-    rows = np.vstack([off, coupling, *(row[None] * weight / total for row, total in known)])
-    wanted = np.zeros(len(rows))
-    wanted[-len(known) :] = weight
-    size = np.maximum(np.linalg.norm(rows, axis=0), np.finfo(float).tiny)
-    # No modal mass vanishes, or M_SS would be singular: each keeps a share of what it could be by itself.
-    share = np.max([row / total for row, total in known], axis=0)
-    least = _LEAST / m * size / np.maximum(share, 1e-9 * share.max())
-    return np.maximum(lsq_linear(rows / size, wanted, (least, np.inf), tol=1e-14).x, least) / size
-
-
 def modal_structure(
     problem: Problem, options: Modal, watch: Watch
 ) -> tuple[Structure, ModalFit, DegreesOfFreedom, Poles]:
@@ -373,39 +289,34 @@ def modal_structure(
 
     Raises
     ------
+    NotModalError
+        Where a stated frequency is none of the data's, or these do not suffice.
     InputError
-        Where a stated frequency is none of the data's, the base force has the wrong sign, or stated
-        sensors do not tell the modes apart.
+        Where the base force has the wrong sign, or stated sensors do not tell the modes apart.
     """
     test, layout = problem.measurement, problem.layout
     poles = problem.poles or _stated_poles(problem)
-    end = fit(test, poles, np.sqrt(problem.totals), stated_totals(problem), watch, options.max_iterations)
+    end = fit(test, poles, np.sqrt(problem.totals), watch, options.max_iterations)
+    held = held_to_totals(problem, end, watch, options.max_iterations)
+    end = held or end
     chosen = degrees_of_freedom(problem, end.modes, options.sensors)
     modes, remainder = end.modes, end.rigid - end.modes.gamma.T @ end.modes.gamma
-    lumped_or_known = not isinstance(problem.mass, FullMass)
     if test.force is None:
         k = chosen.modes.size
         P = np.linalg.inv(np.vstack([modes.phi[chosen.sensors], np.eye(modes.omega.size)[chosen.modes]]))
         G = np.vstack([layout.rigid_body[chosen.sensors], np.zeros((k, layout.d))])
         groups = np.concatenate([layout.directions[chosen.sensors], np.full(k, -1)])
         if isinstance(problem.mass, KnownMass) and len(P) == layout.n:
-            t = _of_known_mass(problem.mass.full(layout), P, modes.gamma, G)
+            t = of_known_mass(problem.mass.full(layout), P, modes.gamma, G)
         else:
             t = nearest_lumped(problem, P, modes.gamma, G, groups)
         modes = modes._replace(phi=modes.phi / np.sqrt(t), gamma=modes.gamma * np.sqrt(t)[:, None])
         remainder = np.diag(problem.totals)
-    structure = build(problem, modes, remainder, chosen, to_totals=test.force is None and not lumped_or_known)
+    # A stated total is kept, even where the base force weighs another.
+    mass = problem.mass
+    unmet = isinstance(mass, FullMass) and (test.force is None or (mass.total_mass is not None and held is None))
+    structure = build(problem, modes, remainder, chosen, to_totals=unmet)
     return structure, end, chosen, poles
-
-
-def _of_known_mass(mass: Array, P: Array, gamma: Array, G: Array) -> Array:
-    """Modal masses (n,) with which the modes have a known mass matrix (n + d, n + d)."""
-    from scipy.optimize import nnls
-
-    n = len(P)
-    rows = np.concatenate([P, gamma - P @ G], axis=1)[:, None, :] * P[:, :, None]
-    t = nnls(rows.reshape(n, -1).T, mass[:n].ravel())[0]
-    return np.maximum(t, np.finfo(float).eps * t.max())
 
 
 def held_by_model(problem: Problem, structure: Structure) -> Array:
@@ -429,11 +340,14 @@ def _stated_poles(problem: Problem) -> Poles:
     assert isinstance(stiffness, SpectralStiffness)
     stated = stiffness.targets
     if stated.size == test.n_sensors:
-        return poles_near(test, stated, FREQUENCY_WINDOW)
+        try:
+            return poles_near(test, stated, FREQUENCY_WINDOW)
+        except InputError as error:
+            raise NotModalError(str(error)) from error
     found = find_poles(test)
     missed = [w for w in stated if np.min(np.abs(np.log(found.omega / w))) > np.log1p(FREQUENCY_WINDOW)]
     if missed:
-        raise InputError(
+        raise NotModalError(
             f"the stated natural frequency {missed[0] / (2 * np.pi):.5g} Hz does not stand out of the data; found are "
             + ", ".join(f"{w / (2 * np.pi):.5g}" for w in found.omega)
             + " Hz"

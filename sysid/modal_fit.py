@@ -27,6 +27,7 @@ from sysid.structure import Array, ComplexArray
 from sysid.weights import separable
 
 _RIDGE = 1e-14  # of the modes' own size
+_LEAST_MASS = 1e-6  # of the rigid-body mass; the least remainder that a fit starts with
 _LEAST_MISFIT = 1e-9  # relative; records that fit better than this weigh alike
 
 
@@ -114,17 +115,19 @@ def fit_modes(
     omega, ratios = spectrum(z)
     rigid = gamma.T @ gamma
     if weighed:
-        spare = 1e-6 * np.diag(unit**2)  # a factor of zero has no slope
-        low_mass = np.linalg.eigvalsh(remainder / np.outer(unit, unit))[0] < 1e-6
-        root = np.linalg.cholesky(remainder + spare if low_mass else remainder) / unit[:, None]
+        lam, vectors = np.linalg.eigh(remainder / np.outer(unit, unit))
+        # A factor of zero has no slope.
+        root = np.linalg.cholesky((vectors * np.maximum(lam, _LEAST_MASS * max(1.0, lam[-1]))) @ vectors.T)
         factor = ca.diag(ca.DM(unit)) @ lower_triangle(z.add("base mass", triangle_entries(root)), d)
         rigid = rigid + factor @ factor.T
     error = _Error(test, gamma, omega, ratios, rigid, first)
     if ties is not None:
         z.ties += ties(error.phi, gamma, rigid)
     best, status = z.minimize(error.value, watch, max_iterations, _derivatives(z, error, gamma, omega, ratios, rigid))
-    names = (error.phi, gamma, omega, ratios, rigid, error.value)
-    values = [np.asarray(v) for v in ca.Function("end", [z.z], list(names))(best)]
+    end = ca.Function("end", [z.z], [error.phi, gamma, omega, ratios, rigid, error.value])
+    values = [np.asarray(v) for v in end(best)]
+    if not all(np.all(np.isfinite(v)) for v in values):
+        values = [np.asarray(v) for v in end(np.concatenate(z.start))]
     modes = Modes(values[0], values[1], values[2].ravel(), values[3].ravel())
     return ModalFit(modes, values[4], float(np.sqrt(values[5].item())), status, z.on_bounds(best))
 
@@ -167,7 +170,7 @@ class _Error:
         self.gamma, self.rigid = gamma, rigid
         channel, line = separable(test.response_std, test.response.shape)
         target = _flat(test.relative * channel[:, None] * line[:, None])
-        size = np.linalg.norm(target)
+        size = float(np.linalg.norm(target))
         self.motion = _Motion(test, line, gamma, omega, ratios)
         q = self.motion.q
         # Rows of very different size would spoil the solve.
@@ -238,7 +241,7 @@ class _Motion:
     def __init__(self, test: Measurement, line: Array, gamma: ca.MX, omega: ca.MX, ratios: ca.MX) -> None:
         base = test.base * line[:, None]
         # Zeros are structural, so that unit runs cost no imaginary arithmetic and no other direction's.
-        u_re, u_im = (ca.sparsify(ca.DM(columns(part))) for part in (base.real, base.imag))
+        u_re, u_im = (ca.sparsify(ca.DM(part)) for part in (columns(base).real, columns(base).imag))
         w = ca.DM(np.tile(2 * np.pi * test.freq, test.n_runs)).T
         m, d = gamma.shape
         squared, ones = ca.repmat(w**2, m, 1), ca.DM.ones(1, w.numel())

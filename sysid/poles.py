@@ -104,8 +104,8 @@ def poles_near(test: Measurement, omega: Array, window: float) -> Poles:
     if np.any(off > np.log1p(window)):
         worst = int(np.argmax(off))
         raise InputError(
-            f"the stated natural frequency {distinct[worst] / (2 * np.pi):.5g} Hz is none of the data's: "
-            f"a fit from there ends at {found[worst] / (2 * np.pi):.5g} Hz"
+            f"the stated natural frequency {distinct[worst] / (2 * np.pi):.5g} Hz does not stand out of the data (a "
+            f"fit from there ends at {found[worst] / (2 * np.pi):.5g} Hz): the base may not move this mode"
         )
     return _in_order(records, found, ratios)
 
@@ -128,14 +128,30 @@ def _search(records: Records, count: int) -> tuple[Array, Array]:
         if error < _EXACT**2 * records.size or error > 0.999 * before:
             break
     # A pole of a structure with other than classical damping needs its velocity too, or others would stand in for it.
-    omega, ratios = _prune(records, omega, ratios, velocity=True)
-    omega, ratios = _settled(records, omega, ratios)
+    first = _prune(records, omega, ratios, velocity=True)
+    if first[0].size == 0:
+        return first
+    omega, ratios = _settled(records, *first)
     for _ in range(count):
         more = _with_another(records, omega, ratios) if omega.size else None
         if more is None:
             break
         omega, ratios = more
-    return _merged(records, omega, ratios)
+    omega, ratios = _merged(records, omega, ratios)
+    with_velocity = _settled(records, *first, velocity=True)
+    if _explains(records, with_velocity, True) < _explains(records, (omega, ratios), False):
+        return with_velocity
+    return omega, ratios
+
+
+def _explains(records: Records, poles: tuple[Array, Array], velocity: bool) -> float:
+    """How badly poles explain the records for the unknowns they take: Schwarz's criterion."""
+    if poles[0].size == 0:
+        return np.inf
+    fit = records.fit(*poles, velocity=velocity)
+    unknowns = poles[0].size * (fit.whitened[0].size + 2)
+    error = max(fit.squared_error / records.size, _ROUND_OFF**2)
+    return float(records.data.size * np.log(error) + unknowns * np.log(records.data.size))
 
 
 def _merged(records: Records, omega: Array, ratios: Array) -> tuple[Array, Array]:
@@ -157,12 +173,12 @@ def _merged(records: Records, omega: Array, ratios: Array) -> tuple[Array, Array
     return omega, ratios
 
 
-def _settled(records: Records, omega: Array, ratios: Array) -> tuple[Array, Array]:
+def _settled(records: Records, omega: Array, ratios: Array, *, velocity: bool = False) -> tuple[Array, Array]:
     """Poles polished, and pruned until all that stay earn their place."""
     while omega.size:
         size = omega.size
-        omega, ratios = _polish(records, omega, ratios)
-        omega, ratios = _prune(records, omega, ratios)
+        omega, ratios = _polish(records, omega, ratios, velocity=velocity)
+        omega, ratios = _prune(records, omega, ratios, velocity=velocity)
         if omega.size == size:
             break
     return omega, ratios
@@ -283,19 +299,19 @@ def _prune(records: Records, omega: Array, ratios: Array, *, velocity: bool = Fa
     return omega, ratios
 
 
-def _polish(records: Records, omega: Array, ratios: Array) -> tuple[Array, Array]:
+def _polish(records: Records, omega: Array, ratios: Array, *, velocity: bool = False) -> tuple[Array, Array]:
     """Variable projection: Levenberg-Marquardt steps over (log w, log zeta), the residues eliminated."""
     m = omega.size
     p = np.log(np.concatenate([omega, ratios]))
     damping = 1e-3
-    error, H, slope = _projected(records, p)
+    error, H, slope = _projected(records, p, velocity)
     for _ in range(_STEPS):
         if error < _EXACT**2 * records.size:
             break
         step = np.linalg.solve(H + damping * np.diag(np.diag(H)), slope)
         trial = p + np.clip(step, -0.5, 0.5)
         trial[m:] = np.clip(trial[m:], np.log(1e-6), np.log(0.99))
-        lower, *model = _projected(records, trial)
+        lower, *model = _projected(records, trial, velocity)
         if lower < error:
             done = error - lower < 1e-9 * error
             p, error, (H, slope), damping = trial, lower, model, max(damping / 10, 1e-12)
@@ -308,12 +324,17 @@ def _polish(records: Records, omega: Array, ratios: Array) -> tuple[Array, Array
     return np.exp(p[:m]), np.exp(p[m:])
 
 
-def _projected(records: Records, p: Array) -> tuple[float, Array, Array]:
+def _projected(records: Records, p: Array, velocity: bool) -> tuple[float, Array, Array]:
     """Squared error, Gauss-Newton matrix (2m, 2m) and descent direction of the projected problem at log poles `p`."""
     m = p.size // 2
     omega, ratios = np.exp(p[:m]), np.exp(p[m:])
-    fit = records.fit(omega, ratios)
-    slopes = records.basis(gain_slopes(records.freq, omega, ratios))
+    fit = records.fit(omega, ratios, velocity=velocity)
+    by_pole = gain_slopes(records.freq, omega, ratios)[:, None]
+    if velocity:
+        turn = 2j * np.pi * records.freq / np.tile(omega, 2)[:, None]
+        moved = np.concatenate([gains(records.freq, omega, ratios), np.zeros((m, records.freq.size))])
+        by_pole = np.concatenate([by_pole, (turn * (by_pole[:, 0] - moved))[:, None]], axis=1)
+    slopes = records.basis(by_pole.reshape(-1, records.freq.size))
     slopes = slopes - fit.Q @ (fit.Q.T @ slopes)
     residues = np.concatenate([fit.residues, fit.residues]).reshape(slopes.shape[1], -1)
     d = slopes.shape[1] // (2 * m)

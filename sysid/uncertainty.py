@@ -19,8 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 from sysid._information import Index, Path, gains_of, inflation_of, information, records_of, spectra_of, spread
 from sysid.damping import ModalDamping
 from sysid.errors import InputError
-from sysid.local import Modes, is_modal
+from sysid.local import is_modal
 from sysid.mass import FullMass
+from sysid.modal_fit import Modes
 from sysid.problem import Problem
 from sysid.structure import Array, Structure, check_frequencies
 from sysid.variables import Variable
