@@ -9,7 +9,7 @@ are more modes than sensors, modal coordinates stand beside them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -114,14 +114,14 @@ def fit(test: Measurement, poles: Poles, unit: Array, watch: Watch, max_iteratio
         more[lacking] += 1
         again = _fit_with(test, poles, more, unit, watch, max_iterations)
         each = test.n_sensors + test.n_base
-        gained = (best.residual**2 - again.residual**2) * records.size
-        if gained < (each + _DEVIATIONS * np.sqrt(2 * each)) * _noise(records, again.residual, more.sum()):
+        gained = (best.of_accelerations**2 - again.of_accelerations**2) * records.size
+        if gained < (each + _DEVIATIONS * np.sqrt(2 * each)) * _noise(records, again.of_accelerations, more.sum()):
             break
         best, multiplicity = again, more
     order = np.argsort(best.modes.omega, kind="stable")
     end = best.modes
     modes = Modes(end.phi[:, order], end.gamma[order], end.omega[order], end.ratios[order])
-    return ModalFit(modes, best.rigid, best.residual, best.status, best.bounds)
+    return replace(best, modes=modes)
 
 
 def _noise(records: Records, residual: float, m: int) -> float:
@@ -136,10 +136,10 @@ def _lacking_rank(records: Records, best: ModalFit, multiplicity: Integers) -> i
     omega, ratios = best.modes.omega[first], best.modes.ratios[first]
     free = records.fit(omega, ratios)
     n, d = records.n_sensors, records.n_base
-    if n < 2 or d < 2 or best.residual <= _EXACT:
+    if n < 2 or d < 2 or best.of_accelerations <= _EXACT:
         return None
     freedom = float(np.sum((n - multiplicity) * (d - multiplicity)))
-    excess = best.residual**2 * records.size - free.squared_error
+    excess = best.of_accelerations**2 * records.size - free.squared_error
     noise = max(free.squared_error / records.data.size, _ROUND_OFF**2 * records.size / records.data.size)
     if excess < noise * (freedom + _DEVIATIONS * np.sqrt(2 * freedom)):
         return None

@@ -56,7 +56,9 @@ class ModalFit:
     rigid : (d, d)
         Rigid-body mass; of no meaning where no force was measured.
     residual : float
-        Root of the weighted squared error, in units of the weighted accelerations.
+        Root of the weighted squared error of all records, in units of the weighted accelerations.
+    of_accelerations : float
+        That of the accelerations alone.
     status : str
         IPOPT's.
     bounds : str
@@ -66,6 +68,7 @@ class ModalFit:
     modes: Modes
     rigid: Array
     residual: float
+    of_accelerations: float
     status: str
     bounds: str
 
@@ -124,12 +127,13 @@ def fit_modes(
     if ties is not None:
         z.ties += ties(error.phi, gamma, rigid)
     best, status = z.minimize(error.value, watch, max_iterations, _derivatives(z, error, gamma, omega, ratios, rigid))
-    end = ca.Function("end", [z.z], [error.phi, gamma, omega, ratios, rigid, error.value])
+    end = ca.Function("end", [z.z], [error.phi, gamma, omega, ratios, rigid, error.value, ca.norm_fro(error.left)])
     values = [np.asarray(v) for v in end(best)]
     if not all(np.all(np.isfinite(v)) for v in values):
         values = [np.asarray(v) for v in end(np.concatenate(z.start))]
     modes = Modes(values[0], values[1], values[2].ravel(), values[3].ravel())
-    return ModalFit(modes, values[4], float(np.sqrt(values[5].item())), status, z.on_bounds(best))
+    left = float(np.sqrt(values[5].item())), float(values[6].item())
+    return ModalFit(modes, values[4], *left, status, z.on_bounds(best))
 
 
 def _gauge(first: Modes, unit: Array, weighed: bool) -> tuple[Array, NDArray[np.bool_]]:
@@ -304,6 +308,12 @@ def _derivatives(
     plain = ca.vertcat(ca.vec(gamma), ca.log(omega), ca.log(ratios), ca.vec(rigid))
     chain = ca.jacobian(plain, unknowns)
     gradient, hessian = error.slopes()
+    # Where the data want less base mass than none its factor ends at zero, where it has no slope, only curvature.
+    d = rigid.size1()
+    slope = ca.MX.sym("slope", d, d)
+    bend = ca.substitute(
+        ca.hessian(ca.dot(slope, rigid - gamma.T @ gamma), unknowns)[0], slope, ca.reshape(gradient[-d * d :], d, d)
+    )
     p, factor, multipliers = ca.MX.sym("p", 0), ca.MX.sym("factor"), ca.MX.sym("multipliers", sum(
         tie.numel() for tie in z.ties
     ))  # fmt: skip
@@ -314,7 +324,7 @@ def _derivatives(
         ),
         "hess_lag": ca.Function(
             "hessian", [unknowns, p, factor, multipliers],
-            [ca.triu(factor * OBJECTIVE_SCALE * (chain.T @ hessian @ chain))],
+            [ca.triu(factor * OBJECTIVE_SCALE * (chain.T @ hessian @ chain + bend))],
             ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"],
         ),
     }  # fmt: skip

@@ -22,11 +22,13 @@ from sysid.measurement import Measurement
 from sysid.problem import Problem
 from sysid.response import columns, gains
 from sysid.stiffness import ChainStiffness
-from sysid.structure import Array, Structure
+from sysid.structure import Array, ComplexArray, Structure
 
 _SAME_POLE = 1e-6  # relative distance of poles that count as one even without a misfit
 _UNRESOLVED = 20.0  # misfits, in parts of the half-power half-width, by which resolved poles differ
 _CLEAR = 3.0  # misfits above which a mode's share of the responses is seen
+_AS_STATED = 1.2  # times the stated noise, to which a misfit may be noise alone
+_RESOLVED = 10.0  # standard deviations of a mode's amplitude at which it is known, to a tenth
 _INVISIBLE = 1e-6  # of the strongest mode's participation
 _NOTHING = 5e-7  # of an entry's range: ends below it are zero
 _ROUND_OFF = 1e-13
@@ -261,8 +263,8 @@ def _weighed(test: Measurement, structure: Structure, clusters: list[list[int]])
     _, share = _shares(test, structure)
     if share is None:
         return []
-    misfit = test.force_residual(structure) or 0.0
-    seen = [bool(np.any(share[cluster] >= misfit)) for cluster in clusters]
+    level = _force_level(test, structure)
+    seen = [bool(np.any(share[cluster] >= level)) for cluster in clusters]
     return [W for W, yes in zip(_moved(structure, clusters), seen, strict=True) if yes and W.shape[1]]
 
 
@@ -278,19 +280,36 @@ def _unseen(problem: Problem, structure: Structure, misfit: float) -> Iterator[s
     if 2 * test.response.size < problem.n_variables:
         yield f"{2 * test.response.size} measured numbers cannot fix {problem.n_variables} unknowns"
     share, force_share = _shares(test, structure)
+    level = _level(_CLEAR * misfit, test.relative, test.response_std, _CLEAR)
     for k in range(structure.n):
         f = structure.natural_frequencies[k]
         if share[k] < _INVISIBLE:
             yield f"{_mode(structure, k)} is not moved by the base: nothing in these data tells its mass"
-        elif share[k] < _CLEAR * misfit:
+        elif share[k] < level:
             yield (
                 f"{_mode(structure, k)} makes {100 * share[k]:.2g} % of the response, which does not stand out of the "
                 f"misfit of {100 * misfit:.2g} %: its mass is not known"
             )
         elif not test.freq[0] <= f <= test.freq[-1]:
             yield f"{_mode(structure, k)} lies outside the lines ({test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz)"
-        elif force_share is not None and force_share[k] < (test.force_residual(structure) or 0.0):
+        elif force_share is not None and force_share[k] < _force_level(test, structure):
             yield f"{_mode(structure, k)} does not stand out of the misfit of the base force: its mass is not weighed"
+
+
+def _level(misfit: float, record: ComplexArray, std: Array | None, times: float = 1.0) -> float:
+    """Size of a mode's part, relative to the record, below which its amplitude is not known.
+
+    A misfit of unknown origin may look like a mode as large. Where it is no more than the stated noise, all lines
+    together tell an amplitude, and `_RESOLVED` of its standard deviations will do. `misfit` comes as `times` itself.
+    """
+    if std is None or misfit > times * _AS_STATED * np.linalg.norm(std) / np.linalg.norm(record):
+        return misfit
+    return float(_RESOLVED * misfit / times / np.sqrt(2 * record.size))
+
+
+def _force_level(test: Measurement, structure: Structure) -> float:
+    assert test.force is not None
+    return _level(test.force_residual(structure) or 0.0, test.force, test.force_std)
 
 
 def _shares(test: Measurement, structure: Structure) -> tuple[Array, Array | None]:

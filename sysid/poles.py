@@ -25,6 +25,7 @@ _RELOCATIONS = 6
 _STEPS = 100
 _DEVIATIONS = 12.0  # of the chi-squared law, by which a pole must lower the squared error to stay
 _ROUND_OFF = 1e-11  # of the records: what counts as noise where there is none
+_SETTLED = 1e-6  # fall of the squared error, relative, at which poles are polished: far below what noise moves it by
 _EXACT = 1e-13  # relative residual that no further step betters
 _GUESS = 0.01  # damping ratio to begin with
 _DAMPED = 0.5  # a pole with more damping than this is no mode of a structure
@@ -125,7 +126,7 @@ def _search(records: Records, count: int) -> tuple[Array, Array]:
     for _ in range(_RELOCATIONS):
         omega, ratios = _relocate(records, channels, omega, ratios)
         before, error = error, records.fit(omega, ratios).squared_error
-        if error < _EXACT**2 * records.size or error > 0.999 * before:
+        if error < _EXACT**2 * records.size or error > 0.97 * before:
             break
     # A pole of a structure with other than classical damping needs its velocity too, or others would stand in for it.
     first = _prune(records, omega, ratios, velocity=True)
@@ -138,9 +139,10 @@ def _search(records: Records, count: int) -> tuple[Array, Array]:
             break
         omega, ratios = more
     omega, ratios = _merged(records, omega, ratios)
-    with_velocity = _settled(records, *first, velocity=True)
-    if _explains(records, with_velocity, True) < _explains(records, (omega, ratios), False):
-        return with_velocity
+    if omega.size and _explains(records, (omega, ratios), True) < _explains(records, (omega, ratios), False):
+        with_velocity = _settled(records, *first, velocity=True)
+        if _explains(records, with_velocity, True) < _explains(records, (omega, ratios), False):
+            return with_velocity
     return omega, ratios
 
 
@@ -161,7 +163,7 @@ def _merged(records: Records, omega: Array, ratios: Array) -> tuple[Array, Array
     k = 0
     while k < omega.size:
         neighbours = np.delete(np.abs(np.log(omega / omega[k])), k)
-        if neighbours.size and neighbours.min() < ratios[k]:
+        if neighbours.size and neighbours.min() < ratios[k] / 2:
             fit = records.fit(omega, ratios)
             each = fit.whitened[0].size + 2
             fewer = _polish(records, np.delete(omega, k), np.delete(ratios, k))
@@ -313,7 +315,7 @@ def _polish(records: Records, omega: Array, ratios: Array, *, velocity: bool = F
         trial[m:] = np.clip(trial[m:], np.log(1e-6), np.log(0.99))
         lower, *model = _projected(records, trial, velocity)
         if lower < error:
-            done = error - lower < 1e-9 * error
+            done = error - lower < _SETTLED * error
             p, error, (H, slope), damping = trial, lower, model, max(damping / 10, 1e-12)
             if done:
                 break
