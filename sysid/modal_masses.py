@@ -281,6 +281,7 @@ def _unseen(problem: Problem, structure: Structure, misfit: float) -> Iterator[s
         yield f"{2 * test.response.size} measured numbers cannot fix {problem.n_variables} unknowns"
     share, force_share = _shares(test, structure)
     level = _level(_CLEAR * misfit, test.relative, test.response_std, _CLEAR)
+    force_level = 0.0 if force_share is None else _force_level(test, structure)
     for k in range(structure.n):
         f = structure.natural_frequencies[k]
         if share[k] < _INVISIBLE:
@@ -292,7 +293,7 @@ def _unseen(problem: Problem, structure: Structure, misfit: float) -> Iterator[s
             )
         elif not test.freq[0] <= f <= test.freq[-1]:
             yield f"{_mode(structure, k)} lies outside the lines ({test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz)"
-        elif force_share is not None and force_share[k] < _force_level(test, structure):
+        elif force_share is not None and force_share[k] < force_level:
             yield f"{_mode(structure, k)} does not stand out of the misfit of the base force: its mass is not weighed"
 
 

@@ -27,6 +27,7 @@ _DEVIATIONS = 12.0  # of the chi-squared law, by which a pole must lower the squ
 _ROUND_OFF = 1e-11  # of the records: what counts as noise where there is none
 _SETTLED = 1e-6  # fall of the squared error, relative, at which poles are polished: far below what noise moves it by
 _EXACT = 1e-13  # relative residual that no further step betters
+_FAR = 100.0  # times the error that may be, from which moving other poles too does not save a pole less
 _GUESS = 0.01  # damping ratio to begin with
 _DAMPED = 0.5  # a pole with more damping than this is no mode of a structure
 _EDGE = 0.1  # how far outside the lines a mode may lie, as a fraction of their ends
@@ -162,13 +163,17 @@ def _merged(records: Records, omega: Array, ratios: Array) -> tuple[Array, Array
     omega, ratios = omega[order], ratios[order]
     k = 0
     while k < omega.size:
-        neighbours = np.delete(np.abs(np.log(omega / omega[k])), k)
-        if neighbours.size and neighbours.min() < ratios[k] / 2:
+        close = np.flatnonzero(np.abs(np.log(omega / omega[k])) < ratios[k] / 2)
+        if close.size > 1:
             fit = records.fit(omega, ratios)
             each = fit.whitened[0].size + 2
+            allowed = (each + _DEVIATIONS * np.sqrt(2 * each)) * _noise(records, fit, omega.size)
+            if fit.rise_with_one_less(close) > _FAR * allowed:
+                k += 1
+                continue
             fewer = _polish(records, np.delete(omega, k), np.delete(ratios, k))
             rise = records.fit(*fewer).squared_error - fit.squared_error
-            if rise <= (each + _DEVIATIONS * np.sqrt(2 * each)) * _noise(records, fit, omega.size):
+            if rise <= allowed:
                 omega, ratios = fewer
                 continue
         k += 1

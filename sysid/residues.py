@@ -29,12 +29,15 @@ class ResidueFit:
     whitened : (m, inputs, channels)
         Residues in units of what white noise of unit variance would scatter them by: the sum of squares of pole
         k is what the squared error would rise by without it.
+    spread : (m, inputs, columns)
+        Residues that one unit of each column of Q makes: scatter of the residues is ``spread @ spread'``.
     """
 
     Q: Array
     residues: Array
     left: Array
     whitened: Array
+    spread: Array
 
     @property
     def squared_error(self) -> float:
@@ -45,6 +48,17 @@ class ResidueFit:
     def gain(self) -> Array:
         """What the squared error would rise by without each pole, (m,)."""
         return np.sum(self.whitened**2, axis=(1, 2))
+
+    def rise_with_one_less(self, poles: Array) -> float:
+        """What the squared error would at least rise by if one pole less answered for these, and all others stayed.
+
+        A pole answers with one function of frequency for each input, whatever its place.
+        """
+        spread = self.spread[poles].reshape(-1, self.spread.shape[-1])
+        beta = self.residues[poles].reshape(len(spread), -1)
+        both = np.linalg.solve(np.linalg.qr(spread.T, mode="r").T, beta)
+        kept = len(both) - self.residues.shape[1]
+        return float(np.sum(np.linalg.svd(both, compute_uv=False)[kept:] ** 2))
 
 
 class Records:
@@ -95,11 +109,12 @@ class Records:
         y = Q.T @ self.data
         inverse = scipy.linalg.solve_triangular(R, np.eye(R.shape[0]), check_finite=False)
         m = omega.size
+        inverse /= scale[:, None]
         beta = (inverse @ y).reshape(m, -1, self.data.shape[1])
         spread = inverse.reshape(m, beta.shape[1], -1)
         factor = np.linalg.cholesky(np.einsum("kir,kjr->kij", spread, spread))
         whitened = np.linalg.solve(factor, beta)
-        return ResidueFit(Q, beta / scale.reshape(m, -1, 1), self.data - Q @ y, whitened)
+        return ResidueFit(Q, beta, self.data - Q @ y, whitened, spread)
 
     def by_sensor(self, residues: Array) -> Array:
         """Residues (m, inputs, channels) of `fit` in the test's own units, (m, n_sensors, d).
