@@ -13,6 +13,7 @@ from sysid._desk import Desk, Stop
 from sysid.errors import InputError, SolverError
 from sysid.identification import History
 from sysid.layout import triangle, triangle_entries
+from sysid.mass import FullMass
 from sysid.problem import Problem
 from sysid.refinement import by_ipopt, closed_form
 from sysid.stiffness import SpectralStiffness
@@ -107,6 +108,11 @@ def by_swarm(
     InputError
         Where more modes were found in the data than sensors.
     """
+    if isinstance(problem.mass, FullMass) and not problem.mass.healable:
+        raise InputError(
+            "the swarm cannot hold known entries of the mass or a whole rigid-body mass: state their diagonals as "
+            "total_mass only, or take strategy 'modal'"
+        )
     _check_modes(problem)
     best: _Search | None = None
     evaluations = 0

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from sysid.mass import KnownMass
+from sysid.mass import FullMass, KnownMass
 from sysid.measurement import Measurement
 from sysid.problem import Problem
 from sysid.residues import Records, force_residual_left
@@ -25,6 +25,7 @@ def doubts(problem: Problem, structure: Structure) -> tuple[str, ...]:
     return tuple(
         (
             *_stated_mass(problem, structure),
+            *_known_entries(problem, structure),
             *_force(problem.measurement, structure),
             *_damping(problem.measurement, structure),
             *_twins(problem.measurement, structure),
@@ -54,6 +55,33 @@ def _stated_mass(problem: Problem, structure: Structure) -> Iterator[str]:
             f"the stated mass makes {given} kg in the base directions, but the base force weighs {told} kg: one of "
             "them, or the unit of the force, is wrong"
         )
+
+
+def _known_entries(problem: Problem, structure: Structure) -> Iterator[str]:
+    """Whether the identified mass has the entries that were stated, and leaves the base what is left of the total."""
+    n, known, mass = problem.layout.n, problem.known_mass, problem.mass
+    stated = np.isfinite(known)
+    if not np.any(stated):
+        return
+    assert isinstance(mass, FullMass)
+    if structure.n != n or structure.n_sensors != n or not np.array_equal(structure.recovery, np.eye(n)):
+        yield "the known entries of the mass are not used: the degrees of freedom are not the sensors alone"
+        return
+    size = np.sqrt(np.diag(structure.mass))
+    scale = np.outer(size[:n], np.where(size > 0, size, size.max()))
+    off = np.where(stated, np.abs(structure.mass[:n] - known) / scale, 0.0)
+    if off.max() > max(_ROUND_OFF, _ALIKE * problem.measurement.residual(structure)):
+        i, j = np.unravel_index(np.argmax(off), off.shape)
+        name = problem.measurement.sensor_names[i]
+        yield (
+            f"the known entries of the mass cannot all be met: row {name}, column {j + 1} is {structure.mass[i, j]:.4g} "
+            f"in place of {known[i, j]:.4g}"
+        )
+    if mass.total_mass is not None:
+        makes = mass.total(problem.layout, structure.mass)
+        if np.any(makes > problem.totals * (1 + 1e-6)):
+            given, told = (", ".join(f"{m:.4g}" for m in masses) for masses in (problem.totals, makes))
+            yield f"the known entries of the mass make {told} kg or more, and {given} kg are stated in all"
 
 
 def _force(test: Measurement, structure: Structure) -> Iterator[str]:

@@ -81,7 +81,8 @@ class Layout:
             # Unit mass; a rotation carries it at the radius of gyration of the sensors.
             lever = np.sqrt(np.mean(self.rigid_body**2, axis=0))
             return np.where(self.translational, 1.0, np.where(lever > 0, lever**2, 1.0))
-        given = finite_array("total_mass", total_mass)
+        whole = self.rigid_total(total_mass)
+        given = finite_array("total_mass", total_mass) if whole is None else np.diag(whole)
         if given.ndim == 0:
             if not np.all(self.translational):
                 raise InputError(
@@ -90,9 +91,26 @@ class Layout:
                 )
             given = np.full(self.d, float(given))
         if given.shape != (self.d,):
-            raise InputError(f"total_mass has shape {given.shape}; one number or ({self.d},) is needed")
+            raise InputError(
+                f"total_mass has shape {given.shape}; one number, ({self.d},) or ({self.d}, {self.d}) is needed"
+            )
         if np.any(given <= 0):
             raise InputError(f"total_mass = {np.array2string(given)}: masses must be positive")
+        return given
+
+    def rigid_total(self, total_mass: ArrayLike | None) -> Array | None:
+        """The rigid-body mass (d, d) where all of it is stated, else None."""
+        if total_mass is None or np.ndim(total_mass) < 2:
+            return None
+        given = finite_array("total_mass", total_mass)
+        if given.shape != (self.d, self.d):
+            raise InputError(f"total_mass has shape {given.shape}; ({self.d}, {self.d}) is needed of a rigid-body mass")
+        if np.any(np.diag(given) <= 0):
+            raise InputError(f"total_mass = {np.array2string(np.diag(given))} on its diagonal: masses must be positive")
+        size = np.sqrt(np.diag(given))
+        scaled = given / np.outer(size, size)
+        if np.abs(scaled - scaled.T).max() > 1e-9 or np.linalg.eigvalsh(scaled)[0] <= 0:
+            raise InputError("total_mass is no rigid-body mass: it must be symmetric and positive definite")
         return given
 
 

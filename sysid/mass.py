@@ -57,13 +57,18 @@ class FullMass:
 
     Parameters
     ----------
-    total_mass : float or array_like (d,), optional
-        kg a base direction (kg m² where it is a rotation). Without it, and without a measured base force, masses are
-        normalised to 1 kg a direction, and the result says that they are not determined.
+    total_mass : float, array_like (d,) or (d, d), optional
+        kg a base direction (kg m² where it is a rotation); a matrix is the whole rigid-body mass, from a mass
+        properties report. Without it, and without a measured base force, masses are normalised to 1 kg a
+        direction, and the result says that they are not determined.
     healing : {"trace", "rigid_body"}
         What the total is: "trace", the sum of diag M over the direction's sensors and its base row
         (eq. 21-22 of the paper: right for lumped masses on orthogonal axes); "rigid_body", the
-        physical ``M_rb[i, i]``.
+        physical ``M_rb[i, i]``; the only one for a matrix.
+    known : array_like (n, n) or (n, n + d), optional
+        Entries of ``M_SS``, or of ``[M_SS, M_S0]``, that are known, NaN where they are not: weighed parts, zeros between
+        what cannot be coupled. The modal strategy holds them, and the result says what they close; the
+        swarm cannot.
 
     References
     ----------
@@ -72,10 +77,41 @@ class FullMass:
 
     total_mass: ArrayLike | None = None
     healing: Literal["trace", "rigid_body"] = "trace"
+    known: ArrayLike | None = None
 
     def __post_init__(self) -> None:
         if self.healing not in ("trace", "rigid_body"):
             raise InputError(f"healing {self.healing!r} is unknown; give 'trace' or 'rigid_body'")
+        if self.total_mass is not None and np.ndim(self.total_mass) == 2 and self.healing != "rigid_body":
+            raise InputError("a matrix of total mass is the rigid-body mass: state healing='rigid_body' with it")
+
+    @property
+    def healable(self) -> bool:
+        """Whether scaling the rows of a factor meets all that is stated."""
+        return self.known is None and (self.total_mass is None or np.ndim(self.total_mass) < 2)
+
+    def known_entries(self, layout: Layout) -> Array:
+        """What is known of ``[M_SS, M_S0]``, (n, n + d); NaN where nothing is."""
+        n, d = layout.n, layout.d
+        entries = np.full((n, n + d), np.nan)
+        if self.known is None:
+            return entries
+        try:
+            given = np.asarray(self.known, dtype=float)
+        except (TypeError, ValueError):
+            raise InputError("FullMass: known must hold numbers, NaN where an entry is not known") from None
+        if given.shape not in ((n, n), (n, n + d)):
+            raise InputError(f"FullMass: known is {given.shape}; ({n}, {n}) or ({n}, {n + d}) is needed")
+        entries[:, : given.shape[1]] = given
+        across = np.where(np.isnan(entries[:, :n]), entries[:, :n].T, entries[:, :n])
+        if np.any(np.isinf(entries)) or np.nanmax(np.abs(across - across.T), initial=0.0) > 1e-9 * np.nanmax(
+            np.abs(across), initial=0.0
+        ):
+            raise InputError("FullMass: known is infinite somewhere, or not symmetric over the sensors")
+        if np.nanmin(np.diag(across), initial=np.inf) <= 0:
+            raise InputError("FullMass: known masses must be positive")
+        entries[:, :n] = across
+        return entries
 
     def variables(self, layout: Layout) -> tuple[Variable, ...]:
         """Entries of the factor's lower triangle, row by row, in [-1, 1] (eq. 35)."""

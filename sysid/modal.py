@@ -182,6 +182,10 @@ def held_to_totals(problem: Problem, end: ModalFit, watch: Watch, max_iterations
     ties, test = stated_totals(problem), problem.measurement
     if ties is None or np.any(np.abs(np.diag(end.rigid) / problem.totals - 1) > _AGREES):
         return None
+    size = np.sqrt(problem.totals)
+    total = problem.rigid_total
+    if total is not None and np.any(np.abs(end.rigid - total) > _AGREES * np.outer(size, size)):
+        return None
     modes = end.modes
     poles = Poles(modes.omega, modes.ratios, end.residual)
     held = fit_modes(
@@ -262,7 +266,8 @@ def build(problem: Problem, modes: Modes, remainder: Array, chosen: DegreesOfFre
     gamma = modes.gamma
     if to_totals:
         groups = np.concatenate([layout.directions[chosen.sensors], np.full(chosen.modes.size, -1)])
-        t, remainder = to_stated_totals(problem, P, gamma, G, groups, remainder)
+        known = chosen.modes.size == 0 and chosen.sensors.size == layout.n and bool(np.nansum(problem.known_mass > 0))
+        t, remainder = to_stated_totals(problem, P, gamma, G, groups, remainder, scaled=known)
         P, gamma = P * np.sqrt(t), gamma * np.sqrt(t)
     M_SS, K_SS = P.T @ P, (P.T * modes.omega**2) @ P
     M_S0 = P.T @ gamma - M_SS @ G
@@ -309,7 +314,9 @@ def modal_structure(
         if isinstance(problem.mass, KnownMass) and len(P) == layout.n:
             t = of_known_mass(problem.mass.full(layout), P, modes.gamma, G)
         else:
-            t = nearest_lumped(problem, P, modes.gamma, G, groups)
+            # Known entries are those of the sensors' own mass matrix.
+            known = problem.known_mass if len(P) == layout.n and k == 0 else None
+            t = nearest_lumped(problem, P, modes.gamma, G, groups, known)
         modes = modes._replace(phi=modes.phi / np.sqrt(t), gamma=modes.gamma * np.sqrt(t)[:, None])
         remainder = np.diag(problem.totals)
     # A stated total is kept, even where the base force weighs another.

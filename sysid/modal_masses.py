@@ -206,8 +206,8 @@ def _cone(problem: Problem, structure: Structure, known: _Known) -> Cone:
     if problem.measurement.force is not None:
         matrices.append(_below(visible, structure.rigid_body_mass))
     if isinstance(mass, FullMass) and mass.total_mass is not None:
-        if np.ndim(mass.total_mass) == 2:
-            matrices.append(_below(visible, np.asarray(mass.total_mass, dtype=float)))
+        if problem.rigid_total is not None:
+            matrices.append(_below(visible, problem.rigid_total))
         elif mass.healing == "rigid_body":
             traces += [
                 _at_most(column[:, None], total) for column, total in zip(visible.T, problem.totals, strict=True)
@@ -292,7 +292,7 @@ def _unseen(problem: Problem, structure: Structure, misfit: float) -> Iterator[s
                 f"misfit of {100 * misfit:.2g} %: its mass is not known"
             )
         elif not test.freq[0] <= f <= test.freq[-1]:
-            yield f"{_mode(structure, k)} lies outside the lines ({test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz)"
+            yield f"{_mode(structure, k)} lies outside the lines ({test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz) and answers for all modes there"
         elif force_share is not None and force_share[k] < force_level:
             yield f"{_mode(structure, k)} does not stand out of the misfit of the base force: its mass is not weighed"
 
@@ -380,6 +380,14 @@ def _model_equations(problem: Problem, structure: Structure, pairs: Pairs) -> tu
                 own = P[:, layout.directions[:n] == i]
                 if own.size:
                     rows.append(np.einsum("iiu->u", forms(own, own, pairs))[None] / np.sum(own**2))
+    elif isinstance(mass, FullMass):
+        known = np.isfinite(problem.known_mass)
+        rows += [mass_entries[known[:, :n]], coupling[known[:, n:]]]
+        if np.any(known):
+            count = np.count_nonzero(np.triu(known[:, :n])) + np.count_nonzero(known[:, n:])
+            sentences.append(f"{count} {'entry' if count == 1 else 'entries'} of the mass matrix stated to be known")
+            # Modes that share a block have no such rows: their intervals do without the equations.
+            signs = np.eye(len(pairs)) if len(pairs) == n else None
     elif isinstance(mass, KnownMass):
         rows += [mass_entries.reshape(-1, len(pairs)), coupling.reshape(-1, len(pairs))]
         sentences.append("the mass matrix is known")

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
+import scipy.linalg
 
 from sysid.errors import InputError
+from sysid.layout import lower_entries
 from sysid.mass import FullMass
 from sysid.measurement import Measurement
 from sysid.modal_fit import Modes, Ties
@@ -17,6 +19,7 @@ from sysid.problem import Problem
 from sysid.response import columns, gains
 from sysid.structure import Array
 
+_HELD = 1e5  # weight of known entries beside what is only likely
 _SPARE = 1e-3  # least share of a total mass that is left to the base
 _LEAST = 0.1  # of an equal share of the mass, that each mode keeps where nothing tells modal masses
 
@@ -77,6 +80,10 @@ def stated_totals(problem: Problem) -> Ties | None:
         return None
 
     def ties(phi: ca.MX, gamma: ca.MX, rigid: ca.MX) -> list[ca.MX]:
+        if problem.rigid_total is not None:
+            size = np.sqrt(totals)
+            off = (rigid - ca.DM(problem.rigid_total)) / ca.DM(np.outer(size, size))
+            return [lower_entries(off)]
         if mass.healing == "rigid_body" or phi.size1() != phi.size2():
             return [ca.diag(rigid) / totals - 1]
         P = ca.inv(phi)
@@ -91,7 +98,7 @@ def stated_totals(problem: Problem) -> Ties | None:
 
 
 def to_stated_totals(
-    problem: Problem, P: Array, gamma: Array, G: Array, groups: Array, remainder: Array
+    problem: Problem, P: Array, gamma: Array, G: Array, groups: Array, remainder: Array, *, scaled: bool = False
 ) -> tuple[float, Array]:
     """Common modal-mass factor t and base remainder (d, d) with which a full mass has the stated totals.
 
@@ -106,25 +113,42 @@ def to_stated_totals(
         Participations, and rigid motion of the degrees of freedom.
     groups : (m,)
         Base direction of each degree of freedom, -1 for none.
+    scaled : bool
+        Whether known masses set the modal masses already, so that t is one; a total that is not stated, or
+        less than they make, is then what they make.
     """
+    if problem.rigid_total is not None:
+        size = np.sqrt(problem.totals)
+        own, total = ((part / np.outer(size, size)) for part in (gamma.T @ gamma, problem.rigid_total))
+        t = 1.0 if scaled else min(1.0, (1 - _SPARE) / float(scipy.linalg.eigvalsh(own, total)[-1]))
+        lam, vectors = np.linalg.eigh(total - t * own)
+        return t, (vectors * np.maximum(lam, 0.0)) @ vectors.T * np.outer(size, size)
     if isinstance(problem.mass, FullMass) and problem.mass.healing == "rigid_body":
         used = np.sum(gamma**2, axis=0)
     else:
         rows = np.sum(P**2, axis=0)
         own = [rows[groups == i].sum() for i in range(G.shape[1])]
         used = np.array(own) + np.sum((gamma - P @ G) ** 2, axis=0)
-    t = min(1.0, float(np.min((1 - _SPARE) * problem.totals / used)))
-    share = np.sqrt((problem.totals - t * used) / np.maximum(np.diag(remainder), np.finfo(float).tiny))
+    totals = problem.totals
+    if scaled:
+        stated = isinstance(problem.mass, FullMass) and problem.mass.total_mass is not None
+        totals = np.maximum(totals if stated else 0.0, (1 + _SPARE) * used)
+    t = 1.0 if scaled else min(1.0, float(np.min((1 - _SPARE) * totals / used)))
+    share = np.sqrt((totals - t * used) / np.maximum(np.diag(remainder), np.finfo(float).tiny))
     return t, remainder * np.outer(share, share)
 
 
-def nearest_lumped(problem: Problem, P: Array, gamma: Array, G: Array, groups: Array) -> Array:
+def nearest_lumped(
+    problem: Problem, P: Array, gamma: Array, G: Array, groups: Array, known: Array | None = None
+) -> Array:
     """Modal masses (m,) whose mass matrix is nearest to a lumped, uncoupled one with the stated totals.
 
     Parameters
     ----------
     P, gamma, G, groups :
         As in `to_stated_totals`.
+    known : (m, m + d), optional
+        Entries of [M_SS, M_S0] to be met, NaN where there is none; where they fix all modal masses nothing else counts.
     """
     from scipy.optimize import lsq_linear
 
@@ -132,17 +156,35 @@ def nearest_lumped(problem: Problem, P: Array, gamma: Array, G: Array, groups: A
     delta = gamma - P @ G
     off = np.einsum("ki,kj->ijk", P, P)[np.tril_indices(m, -1)]
     coupling = np.einsum("ki,kj->ijk", P, delta).reshape(-1, m)
-    totals = [(np.sum(P[:, groups == i] ** 2, axis=1), problem.totals[i]) for i in range(G.shape[1])]
-    known = [(row, total) for row, total in totals if np.any(row > 0)] or [(np.sum(P**2, axis=1), 1.0)]
-    weight = max(total for _, total in known)
-    rows = np.vstack([off, coupling, *(row[None] * weight / total for row, total in known)])
-    wanted = np.zeros(len(rows))
-    wanted[-len(known) :] = weight
+    entries, values = _entries(P, delta, np.full((m, m + G.shape[1]), np.nan) if known is None else known)
+    scaled = np.flatnonzero(values > 0)
+    if scaled.size and np.linalg.matrix_rank(entries / np.linalg.norm(entries, axis=1, keepdims=True), 1e-9) == m:
+        unit = np.linalg.norm(entries, axis=0)
+        weights = 1 / np.where(values == 0, values.max(), np.abs(values))[:, None]
+        t = lsq_linear(entries * weights / unit, (values * weights[:, 0]), (0.0, np.inf), tol=1e-14).x
+        return np.maximum(t, 1e-9 * t.max()) / unit
+    # Known masses set the scale, or else the totals do.
+    totals = [(entries[i], values[i]) for i in scaled if np.all(entries[i] >= 0)] or [
+        (np.sum(P[:, groups == i] ** 2, axis=1), problem.totals[i]) for i in range(G.shape[1])
+    ]
+    told = [(row, total) for row, total in totals if np.any(row > 0)] or [(np.sum(P**2, axis=1), 1.0)]
+    weight = max(total for _, total in told)
+    held = _HELD * weight / np.where(values == 0, weight, np.abs(values))
+    rows = np.vstack([off, coupling, *(row[None] * weight / total for row, total in told), entries * held[:, None]])
+    wanted = np.concatenate([np.zeros(len(off) + len(coupling)), np.full(len(told), weight), values * held])
     size = np.maximum(np.linalg.norm(rows, axis=0), np.finfo(float).tiny)
     # No modal mass vanishes, or M_SS would be singular: each keeps a share of what it could be by itself.
-    share = np.max([row / total for row, total in known], axis=0)
+    share = np.max([row / total for row, total in told], axis=0)
     least = _LEAST / m * size / np.maximum(share, 1e-9 * share.max())
     return np.maximum(lsq_linear(rows / size, wanted, (least, np.inf), tol=1e-14).x, least) / size
+
+
+def _entries(P: Array, delta: Array, known: Array) -> tuple[Array, Array]:
+    """Rows (e, m) of modal masses that make the known entries (e,) of [M_SS, M_S0]."""
+    i, j = np.nonzero(np.isfinite(known))
+    once = j >= i
+    i, j = i[once], j[once]
+    return (P[:, i] * np.hstack([P, delta])[:, j]).T, known[i, j]
 
 
 def of_known_mass(mass: Array, P: Array, gamma: Array, G: Array) -> Array:

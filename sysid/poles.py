@@ -30,7 +30,8 @@ _EXACT = 1e-13  # relative residual that no further step betters
 _FAR = 100.0  # times the error that may be, from which moving other poles too does not save a pole less
 _GUESS = 0.01  # damping ratio to begin with
 _DAMPED = 0.5  # a pole with more damping than this is no mode of a structure
-_EDGE = 0.1  # how far outside the lines a mode may lie, as a fraction of their ends
+_EDGE = 10.0  # times their ends, how far outside the lines a mode may lie: it answers for all that are there
+_BESIDE = 0.1  # how far outside the lines a mode alone may lie, as a fraction of their ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +87,8 @@ def _find(records: Records, n: int, spare: int) -> Poles:
         if omega.size <= count - spare // 2:
             break
         count += max(count // 2, spare)  # too few were spare
-    if omega.size == 0:
+    lines = 2 * np.pi * records.freq
+    if not np.any((omega > (1 - _BESIDE) * lines[0]) & (omega < (1 + _BESIDE) * lines[-1])):
         raise InputError("no mode stands out of the noise between these lines: state natural_frequencies or widen them")
     return _in_order(records, omega, ratios)
 
@@ -293,7 +295,7 @@ def _as_modes(eigenvalues: ComplexArray) -> tuple[Array, Array]:
 def _prune(records: Records, omega: Array, ratios: Array, *, velocity: bool = False) -> tuple[Array, Array]:
     """Remove poles, the least useful first, until each that stays lowers the error by far more than noise would."""
     lines = 2 * np.pi * records.freq[records.freq > 0]
-    inside = (omega > (1 - _EDGE) * lines[0]) & (omega < (1 + _EDGE) * lines[-1]) & (ratios < _DAMPED)
+    inside = (omega > lines[0] / _EDGE) & (omega < _EDGE * lines[-1]) & (ratios < _DAMPED)
     while omega.size:
         fit = records.fit(omega, ratios, velocity=velocity)
         each = fit.whitened[0].size + 2  # real parameters that come with a pole

@@ -126,6 +126,7 @@ class Problem:
         put("variables", tuple(v for group in self._groups() for v in group))
         # A total mass that does not fit is refused here, not in the search.
         put("totals", self.mass.totals(layout))
+        _ = self.known_mass  # so are known entries
 
     def __repr__(self) -> str:
         models = ", ".join(type(model).__name__ for model in (self.mass, self.stiffness, self.damping))
@@ -165,7 +166,20 @@ class Problem:
     def unit_mass(self) -> bool:
         """Whether no number with a unit of mass is given, so that masses are normalised to 1 kg a direction."""
         unstated = not isinstance(self.mass, KnownMass) and self.mass.total_mass is None
-        return unstated and self.measurement.force is None
+        weighed = self.measurement.force is not None or np.nansum(np.abs(self.known_mass)) > 0
+        return unstated and not weighed
+
+    @property
+    def known_mass(self) -> Array:
+        """Entries of ``[M_SS, M_S0]`` that a full mass states to be known, (n, n + d); NaN elsewhere."""
+        if isinstance(self.mass, FullMass):
+            return self.mass.known_entries(self.layout)
+        return np.full((self.layout.n, self.layout.n + self.layout.d), np.nan)
+
+    @property
+    def rigid_total(self) -> Array | None:
+        """Rigid-body mass (d, d) where a full mass states all of it, else None."""
+        return self.layout.rigid_total(self.mass.total_mass) if isinstance(self.mass, FullMass) else None
 
     def matrices(self, x: ca.SX) -> Matrices:
         """Expressions of the blocks that the unknowns `x` stand for."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+from numpy.typing import NDArray
 
 from sysid.measurement import Measurement, unit_runs
 from sysid.response import columns, gains
@@ -49,14 +50,15 @@ class ResidueFit:
         """What the squared error would rise by without each pole, (m,)."""
         return np.sum(self.whitened**2, axis=(1, 2))
 
-    def rise_with_one_less(self, poles: Array) -> float:
+    def rise_with_one_less(self, poles: NDArray[np.intp]) -> float:
         """What the squared error would at least rise by if one pole less answered for these, and all others stayed.
 
         A pole answers with one function of frequency for each input, whatever its place.
         """
         spread = self.spread[poles].reshape(-1, self.spread.shape[-1])
         beta = self.residues[poles].reshape(len(spread), -1)
-        both = np.linalg.solve(np.linalg.qr(spread.T, mode="r").T, beta)
+        _, triangle = np.linalg.qr(spread.T)
+        both = np.linalg.solve(triangle.T, beta)
         kept = len(both) - self.residues.shape[1]
         return float(np.sum(np.linalg.svd(both, compute_uv=False)[kept:] ** 2))
 

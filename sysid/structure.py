@@ -168,6 +168,20 @@ class Structure:
         return int(self.recovery.shape[0])
 
     @property
+    def dof_sensors(self) -> NDArray[np.intp]:
+        """The sensor that records each degree of freedom alone, (n,); -1 where there is none."""
+        R = self.recovery
+        alone = (np.abs(R - 1) < 1e-6) & (np.abs(R).sum(axis=1, keepdims=True) < 1 + 1e-6)
+        return np.where(alone.any(axis=0), alone.argmax(axis=0), -1)
+
+    @property
+    def dof_modes(self) -> NDArray[np.intp]:
+        """The mode whose coordinate a degree of freedom is, (n,); -1 where several modes move it."""
+        size = np.abs(self.normal_modes)
+        one = np.isclose(size.max(axis=1), np.linalg.norm(size, axis=1), rtol=1e-9)
+        return np.where(one, size.argmax(axis=1), -1)
+
+    @property
     def effective_mass_percent(self) -> Array:
         """Effective mass of each mode in each base direction, in % of the rigid-body mass, (n, d)."""
         rigid = np.diag(self.rigid_body_mass)
@@ -189,7 +203,7 @@ class Structure:
         -------
         ndarray, complex, shape (n_sensors, d, n_freq)
         """
-        return np.einsum("sn,ndf->sdf", self.recovery, self._relative(freq))
+        return np.einsum("sn,ndf->sdf", self.recovery, self._relative(freq), optimize=True)
 
     def transmissibility(self, freq: ArrayLike) -> ComplexArray:
         """Absolute acceleration of the sensors per unit base acceleration, (n_sensors, d, n_freq)."""
@@ -205,7 +219,8 @@ class Structure:
         ndarray, complex, shape (d, d, n_freq)
             [force direction, base direction, line].
         """
-        return np.einsum("nd,nef->def", self._coupling, self._relative(freq)) + self.rigid_body_mass[:, :, None]
+        elastic = np.einsum("nd,nef->def", self._coupling, self._relative(freq), optimize=True)
+        return elastic + self.rigid_body_mass[:, :, None]
 
     def to_state_space(self) -> StateSpace:
         """Continuous-time state space from base accelerations to absolute sensor accelerations.
@@ -255,7 +270,7 @@ class Structure:
         if self.modal_damping:
             lam = self._omega[:, None]
             g = omega**2 / (lam**2 - omega**2 + 2j * self.damping_ratios[:, None] * lam * omega)
-            return np.einsum("nk,kd,kf->ndf", self.normal_modes, self.participation, g)
+            return np.einsum("nk,kd,kf->ndf", self.normal_modes, self.participation, g, optimize=True)
         n = self.n
         w = omega[:, None, None]
         dynamic = -(w**2) * self.mass[:n, :n] + 1j * w * self.damping + self.stiffness[:n, :n]

@@ -413,10 +413,10 @@ def _matrix_std(structure: Structure, moves: _Moves, diagonal: Array, change: Ar
     """Of ``T^-T diag(diagonal) T^-1``, T the modes at the degrees of freedom, where `diagonal` (m,) changes too."""
     T = structure.normal_modes
     dT = np.zeros((*T.shape, change.shape[1]))
-    for j, sensor in enumerate(_sensors_of(structure)):
+    for j, (sensor, mode) in enumerate(zip(structure.dof_sensors, structure.dof_modes, strict=True)):
         if sensor >= 0:
             dT[j] = moves.phi[sensor]
-        elif not np.isclose(np.abs(T[j]).max(), np.linalg.norm(T[j]), rtol=1e-9):
+        elif mode < 0:
             return np.full(T.shape, np.nan)
     P = np.linalg.inv(T)
     X = (P.T * diagonal) @ P
@@ -424,10 +424,3 @@ def _matrix_std(structure: Structure, moves: _Moves, diagonal: Array, change: Ar
     own = np.einsum("ki,kc,kj->ijc", P, change, P, optimize=True)
     size = np.sqrt(np.diag(X))
     return moves.std(own - half - half.swapaxes(0, 1), np.outer(size, size))
-
-
-def _sensors_of(structure: Structure) -> NDArray[np.intp]:
-    """The sensor at each degree of freedom, (n,); -1 for none."""
-    R = structure.recovery
-    alone = (np.abs(R - 1) < 1e-6) & (np.abs(R).sum(axis=1, keepdims=True) < 1 + 1e-6)
-    return np.where(alone.any(axis=0), alone.argmax(axis=0), -1)
