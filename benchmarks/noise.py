@@ -36,6 +36,8 @@ class Run:
         Modes that count and have no partner in the result.
     spurious : int
         Modes of the result that have no partner in the structure.
+    certain : int
+        Those of them that no sentence of the result puts in doubt by their number.
     nonsense : str
         What is wrong and was not said; empty where nothing is.
     said : str
@@ -48,6 +50,7 @@ class Run:
     counting: int = 0
     missed: int = 0
     spurious: int = 0
+    certain: int = 0
     nonsense: str = ""
     said: str = ""
 
@@ -86,7 +89,8 @@ def _lines(what: str, runs: list[Run], asked: bool) -> Iterator[Line]:
         f"{strict} of {len(runs)}",
     )
     spurious = [run for run in runs if run.spurious]
-    yield below(what + f"modes found that are none ({_list(spurious)})", sum(run.spurious for run in runs), 0)
+    yield Line(what + f"modes found that are none ({_list(spurious)})", str(sum(run.spurious for run in runs)))
+    yield below(what + "modes found that are none, reported as certain", sum(run.certain for run in runs), 0)
     nonsense = [f"{run.name}: {run.nonsense}" for run in runs if run.nonsense]
     yield below(what + f"runs that end in nonsense unflagged ({'; '.join(nonsense) or 'none'})", len(nonsense), 0)
 
@@ -119,10 +123,16 @@ def run(task: tuple[int, float, bool]) -> Run:
             found=result.structure.n,
             missed=int(np.count_nonzero(counts & ~np.isin(np.arange(truth.n), partner))),
             spurious=int(np.count_nonzero(partner < 0)),
+            certain=sum(not _doubted(result, k) for k in np.flatnonzero(partner < 0).tolist()),
             nonsense=nonsense(result, truth),
         )
     except Exception as error:  # a crash is an answer too, and must not end the others
         return Run(**answer, missed=answer["counting"], said=named(error))
+
+
+def _doubted(result: sysid.Identification, k: int) -> bool:
+    """Whether a sentence about what is not known names mode k, counted from 0."""
+    return any(f"mode {k + 1} (" in sentence for sentence in result.undetermined)
 
 
 def strength(truth: sysid.Structure, test: sysid.Measurement) -> np.ndarray:
