@@ -194,6 +194,8 @@ def uncertainty(problem: Problem, structure: Structure) -> Uncertainty:
     if not all(record.shared for record in records):
         B = information(modes, index, [record.sandwich_grams(spectra) for record in records])
     normals, unseen = spread(A, B, path)
+    if _masses_known(problem, structure):
+        normals, unseen = (_held(problem, modes, index, path, part) for part in (normals, unseen))
     inflation = inflation_of(test, records, unknowns)
     moves = _Moves(*index.split(np.hstack([inflation * normals, unseen])), normals.shape[1])
     return _quantities(problem, structure, modes, moves, inflation)
@@ -261,6 +263,41 @@ def _tied_masses(problem: Problem, modes: Modes, index: Index) -> Iterator[tuple
             row[index.phi] = by_phi.ravel()
             row[index.gamma].reshape(gamma.shape)[:, i] = 2 * (gamma[:, i] - delta)
         yield at, row
+
+
+def _masses_known(problem: Problem, structure: Structure) -> bool:
+    """Whether known entries of a full mass, not a force, set the scale of the modes."""
+    stated = is_modal(problem) and problem.measurement.force is None and np.any(np.isfinite(problem.known_mass))
+    return bool(stated and structure.n == structure.n_sensors == np.count_nonzero(structure.dof_sensors >= 0))
+
+
+def _held(problem: Problem, modes: Modes, index: Index, path: Path, moves: Array) -> Array:
+    """Moves of theta (size of theta, moves) with the scale of each mode moved so that known entries of the mass stay.
+
+    With P the inverse of Phi the entries are those of ``M_SS = P' P`` and ``M_S0 = P' (Gamma - P G)``.
+    """
+    phi, gamma, _, _ = modes
+    n, G, known = len(phi), problem.layout.rigid_body, problem.known_mass
+    P = np.linalg.inv(phi)
+    M, push = P.T @ P, P.T @ gamma
+    size = np.sqrt(np.diag(M))
+    rows = []
+    for i, j in np.argwhere(np.isfinite(known)):
+        row = np.zeros(index.size)
+        if j < n:
+            by_phi = -(np.outer(M[i], P[:, j]) + np.outer(M[j], P[:, i]))
+        else:
+            # M_S0 = P' Gamma - M G
+            by_phi = (
+                -np.outer(push[:, j - n], P[:, i])
+                + np.outer(M[i], P @ G[:, j - n])
+                + np.outer(M @ G[:, j - n], P[:, i])
+            )
+            row[index.gamma].reshape(gamma.shape)[:, j - n] = P[:, i]
+        row[index.phi] = by_phi.ravel()
+        rows.append(row / (size[i] * (size[j] if j < n else size.max())))
+    C, gauge = np.array(rows), path.slope @ path.gauge
+    return moves - gauge @ (np.linalg.pinv(C @ gauge, rcond=1e-9) @ (C @ moves))
 
 
 def _damping_slopes(problem: Problem, modes: Modes) -> tuple[Array, Array, Array]:
@@ -379,7 +416,7 @@ def _quantities(problem: Problem, structure: Structure, modes: Modes, moves: _Mo
         (loss, loss[:, None] * (moves.log_omega + moves.log_ratios)),
     )
     mass, stiffness, damping = (_matrix_std(structure, moves, diagonal, change) for diagonal, change in diagonals)
-    if is_modal(problem) and problem.measurement.force is None:
+    if is_modal(problem) and problem.measurement.force is None and not _masses_known(problem, structure):
         mass, stiffness, damping = np.full((3, n, n), np.nan)  # zeros that a decoupled structure keeps included
 
     known = np.isfinite(push_std)

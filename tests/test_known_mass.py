@@ -70,6 +70,38 @@ def test_no_coupling_to_the_base_says_nothing_where_the_data_show_that_there_is_
     assert any("all modal masses are open" in sentence for sentence in result.undetermined)
 
 
+def test_what_known_masses_leave_uncertain_is_what_scatters():
+    truth = building(2.0)
+    known = with_entries(*((i, i, m) for i, m in enumerate(MASSES)))
+    draws = [
+        identify(Problem(simulate(truth, FREQ, noise=0.02, rng=seed), mass=FullMass(known=known)), strategy="modal")
+        for seed in range(60)
+    ]
+    u, n = draws[0].uncertainty, 3
+    for name, std in (("mass", u.mass), ("stiffness", u.stiffness)):
+        scatter = np.std([getattr(draw.structure, name)[:n, :n] for draw in draws], axis=0, ddof=1)
+        moving = scatter > 1e-9 * scatter.max()
+        assert np.all(np.isfinite(std))
+        # 60 draws tell a standard deviation to 9 %.
+        np.testing.assert_allclose(std[moving], scatter[moving], rtol=0.35)
+        assert np.all(std[~moving] < 1e-6 * std.max())
+    scatter = np.std([draw.structure.participation[:, 0] for draw in draws], axis=0, ddof=1)
+    np.testing.assert_allclose(u.participation[:, 0], scatter, rtol=0.35)
+
+
+def test_known_coupling_gives_uncertainties_too(random_structure):
+    truth = random_structure(np.random.default_rng(3), 4, 1)
+    freq = np.geomspace(0.5 * truth.natural_frequencies[0], 1.5 * truth.natural_frequencies[-1], 400)
+    known = np.full((4, 5), np.nan)
+    known[:, 4] = truth.mass[:4, 4]
+    draws = [
+        identify(Problem(simulate(truth, freq, noise=0.001, rng=seed), mass=FullMass(known=known)), strategy="modal")
+        for seed in range(60)
+    ]
+    scatter = np.std([draw.structure.mass[:4, :4] for draw in draws], axis=0, ddof=1)
+    np.testing.assert_allclose(draws[0].uncertainty.mass, scatter, rtol=0.35)
+
+
 def test_one_weighed_floor_is_met_and_leaves_the_rest_open_within_intervals():
     truth = building()
     known = with_entries((1, 1, MASSES[1]))
