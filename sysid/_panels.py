@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sysid._canvas import FAINT, IDENTIFIED, MEASURED, RESIDUAL, dress, new_figure, plain_log
+from sysid._summary import DEVIATES
 from sysid.errors import InputError
 from sysid.identification import Identification
 from sysid.measurement import Measurement, unit_runs
@@ -24,7 +26,7 @@ _BAND: dict[str, Any] = {
     "label": "95 % band",
     "zorder": 1.5,
 }
-_DEVIATES = 1.96  # of the normal law on either side of 95 %
+_VISIBLE = 2e-3  # of the magnitude: a narrower band hides behind the curve
 _ROUND_OFF = 1e-10  # of the largest channel: below it a response is arithmetic, not motion
 _COLUMNS = 3
 _PANEL_WIDTHS = {2: 5.6, 3: 4.0}  # in, by the number of columns
@@ -67,13 +69,13 @@ def response_channel(
     lever = "" if test.translational[run % test.n_base] else "m"
     words = ("transmissibility", lever) if is_unit(test) else ("acceleration", "m/s²")
     channel = _channel(test, test.response[run, sensor], predicted, run, title, *words, largest)
-    if band is None:
-        return channel
-    # Errors of different directions may add up whatever their phases: the sum is never too small.
-    return channel._replace(std=np.sum(band[sensor] * np.abs(test.base[run]), axis=0))
+    return channel._replace(std=_std(test, run, None if band is None else band[sensor]))
 
 
-def force_channel(identification: Identification, test: Measurement, direction: int, run: int) -> Channel:
+def force_channel(
+    identification: Identification, test: Measurement, direction: int, run: int, *, band: Array | None = None
+) -> Channel:
+    """Base force in one direction in one run; `band`: std of the complex apparent mass, (d, d, n_freq)."""
     assert test.force is not None and test.base_axes is not None
     predicted = test.predict_force(identification.structure)[run, direction]
     turns = not test.translational[direction]
@@ -83,7 +85,24 @@ def force_channel(identification: Identification, test: Measurement, direction: 
     if is_unit(test):
         words = ("apparent mass", ("kg", "kg m", "kg m²")[int(turns) + int(not test.translational[run])])
     largest = np.abs(test.force[:, direction]).max()
-    return _channel(test, test.force[run, direction], predicted, run, title, *words, largest)
+    channel = _channel(test, test.force[run, direction], predicted, run, title, *words, largest)
+    return channel._replace(std=_std(test, run, None if band is None else band[direction]))
+
+
+def band_of(test: Measurement, band: ArrayLike | None, rows: int) -> Array | None:
+    """Check standard deviations of a test's spectra, (rows, d, n_freq)."""
+    if band is None:
+        return None
+    std, shape = np.asarray(band, float), (rows, test.n_base, test.freq.size)
+    if std.shape != shape:
+        raise InputError(f"band has shape {std.shape}; standard deviations at the test's lines are {shape}")
+    return std
+
+
+def _std(test: Measurement, run: int, band: Array | None) -> Array | None:
+    """Of a spectrum in one run, `band` (d, n_freq) being that of the answer to each direction alone."""
+    # Errors of different directions may add up whatever their phases: the sum is never too small.
+    return None if band is None else np.sum(band * np.abs(test.base[run]), axis=0)
 
 
 def _channel(
@@ -155,9 +174,9 @@ def draw(axes: Any, channel: Channel) -> None:
     magnitude.plot(freq, error, **RESIDUAL)
     magnitude.plot(freq, size, **shown)
     magnitude.plot(freq, positive(np.abs(identified)), **answered)
-    if channel.std is not None:
+    reach = np.zeros(freq.size) if channel.std is None else DEVIATES * channel.std
+    if np.any(reach > _VISIBLE * np.abs(identified)):
         # The magnitude strays no further than the complex value; to zero, a logarithmic axis cannot follow.
-        reach = _DEVIATES * channel.std
         lower = np.maximum(np.abs(identified) - reach, 1e-3 * np.abs(identified))
         magnitude.fill_between(freq, lower, np.abs(identified) + reach, **_BAND)
     lowest, highest = _span(size, positive(np.abs(identified)), error)

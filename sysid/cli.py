@@ -190,7 +190,12 @@ def _parser() -> argparse.ArgumentParser:
         "part of the problem and does not change with it",
     )
     run.add_argument(
-        "--strategy", choices=STRATEGIES, default="auto", metavar="S", help=f"{', '.join(STRATEGIES)}; auto by default"
+        "--strategy",
+        choices=STRATEGIES,
+        default="auto",
+        metavar="S",
+        help="modal: modes from the data, without a search; swarm: the particle swarm and its refinement; "
+        "auto, by default: modal where the models of the problem allow it, else swarm",
     )
     run.add_argument("--data", metavar="PATH", help="file or folder of records, for problems that read some")
     run.add_argument("--out", metavar="DIR", help="folder of the results, results/NAME by default")

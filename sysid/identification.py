@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from sysid.modal_masses import Intervals
     from sysid.uncertainty import Uncertainty
 
+_QUICK_SHAPES = 1000  # entries of the mode shapes up to which uncertainty takes a second or less
+_QUICK_DOFS = 20  # degrees of freedom up to which intervals take a few seconds or less
+
 
 @dataclass(frozen=True)
 class Recipe:
@@ -182,41 +185,38 @@ class Identification:
         other = self.problem.reference or self.structure
         return modal_assurance(self.structure.mode_shapes, other.mode_shapes)
 
+    @property
+    def degrees_of_freedom(self) -> tuple[str, ...]:
+        """What the rows of M_SS, K_SS and C stand for: a sensor's name, or "coordinate of mode 7"."""
+        names, structure = self.measurement.sensor_names, self.structure
+        return tuple(
+            names[sensor] if sensor >= 0 else f"coordinate of mode {mode + 1}" if mode >= 0 else f"coordinate {j + 1}"
+            for j, (sensor, mode) in enumerate(zip(structure.dof_sensors, structure.dof_modes, strict=True))
+        )
+
+    @property
+    def quick_uncertainty(self) -> Uncertainty | None:
+        """`uncertainty` where it is known already or takes no longer than about a second; else None."""
+        known = "uncertainty" in self.__dict__
+        return self.uncertainty if known or self.structure.mode_shapes.size <= _QUICK_SHAPES else None
+
+    @property
+    def quick_intervals(self) -> Intervals | None:
+        """Both intervals where they are known already or take no longer than a few seconds; else None."""
+        known = "_intervals" in self.__dict__
+        return self._intervals if known or self.structure.n <= _QUICK_DOFS else None
+
     def summary(self) -> str:
         """Table of the result, for a terminal."""
-        s, axes, problem = self.structure, self.measurement.base_axes or (), self.problem
-        heads = [f"eff. mass {axis}, %" for axis in axes]
-        share = s.effective_mass_percent
-        lines = ["mode  frequency, Hz  damping, %  " + "  ".join(heads)]
-        for k, (f, zeta) in enumerate(zip(s.natural_frequencies, s.damping_ratios, strict=True)):
-            shares = "  ".join(f"{v:{len(head)}.1f}" for v, head in zip(share[k], heads, strict=True))
-            lines.append(f"{k + 1:4d}  {f:13.5g}  {100 * zeta:10.4g}  {shares}")
-        sums = "  ".join(f"{v:{len(head)}.1f}" for v, head in zip(share.sum(axis=0), heads, strict=True))
-        lines += [f" sum  {'':13}  {'':10}  {sums}", ""]
+        from sysid._summary import summary  # it reads Identifications, so it cannot be above this room
 
-        goal = "" if problem.goal is None else f" (goal {problem.goal:.3g})"
-        force = "" if self.force_residual is None else f", of the base force {self.force_residual:.3e}"
-        rigid = zip(axes, np.diag(s.rigid_body_mass), strict=True)
-        lines += [
-            f"{'success' if self.success else 'no success'}: {self.message}",
-            f"relative residual {self.residual:.3e}{goal}{force}; seed {self.seed}, {self.history.wall_time:.1f} s",
-            "rigid-body mass "
-            + ", ".join(f"{axis} {m:.6g} {'kg m²' if axis[0] == 'r' else 'kg'}" for axis, m in rigid),
-        ]
-        for i, test in enumerate(problem.validation, start=1):
-            lines.append(
-                f"test {i} of {len(problem.validation)} never fitted: relative residual {test.residual(s):.3e}"
-            )
-        if self.determined:
-            lines.append("Determined: data and stated model leave one mass and one stiffness matrix.")
-        else:
-            lines.append("Not determined: this is one of many models that explain the data.")
-        return "\n".join([*lines, *(f"  - {sentence}" for sentence in self.closed_by + self.undetermined)])
+        return summary(self)
 
     def to_dict(self) -> dict[str, Any]:
         """The figures of ``summary.json``."""
         from sysid import __version__
 
+        u, n = self.quick_uncertainty, self.structure.n
         return {
             "problem": self.recipe.module if self.recipe else None,
             "strategy": self.strategy,
@@ -226,11 +226,14 @@ class Identification:
             "residual": self.residual,
             "force_residual": self.force_residual,
             "natural_frequencies_hz": self.structure.natural_frequencies.tolist(),
+            "natural_frequencies_std_hz": _known(None if u is None else u.natural_frequencies, n),
             "damping_ratios": self.structure.damping_ratios.tolist(),
+            "damping_ratios_std": _known(None if u is None else u.damping_ratios, n),
             "total_mass_kg": np.diag(self.structure.rigid_body_mass).tolist(),
             "determined": bool(self.determined),
             "closed_by": list(self.closed_by),
             "undetermined": list(self.undetermined),
+            "remarks": list(self.remarks),
             "evaluations": int(self.history.evaluations),
             "wall_time_s": float(self.history.wall_time),
             "version": __version__,
@@ -248,3 +251,7 @@ def modal_assurance(phi: Array, other: Array) -> Array:
     if phi.shape[0] != other.shape[0]:
         raise InputError(f"mode shapes at {phi.shape[0]} and {other.shape[0]} sensors cannot be compared")
     return (phi.T @ other) ** 2 / np.outer(np.sum(phi**2, axis=0), np.sum(other**2, axis=0))
+
+
+def _known(std: Array | None, n: int) -> list[float | None]:
+    return [None] * n if std is None else [value if np.isfinite(value) else None for value in std.tolist()]

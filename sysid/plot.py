@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sysid._canvas import (
     COLOURS,
@@ -28,6 +29,7 @@ from sysid._canvas import (
 )  # fmt: skip
 from sysid._modal_panels import draw_cmif, draw_stabilisation
 from sysid._panels import (
+    band_of,
     draw,
     force_channel,
     index_of,
@@ -60,6 +62,7 @@ def transmissibility(
     sensor: int | str | None = None,
     run: int | str | None = None,
     measurement: Measurement | None = None,
+    band: ArrayLike | None = None,
 ) -> Any:
     """Measured against identified absolute response of one sensor, magnitude and phase.
 
@@ -78,6 +81,9 @@ def transmissibility(
         Index; of unit runs also the base direction's name, such as "x".
     measurement : Measurement, optional
         Another test of the same sensors to predict, such as a validation; the one fitted by default.
+    band : array_like, shape (n_sensors, d, n_freq), optional
+        Standard deviation of the transmissibility at the test's lines, such as `Uncertainty.transmissibility` gives:
+        the 95 % interval of the magnitude is shaded where it is wide enough to be seen.
 
     Returns
     -------
@@ -88,18 +94,25 @@ def transmissibility(
     >>> import numpy as np
     >>> import sysid
     >>> result = sysid.load("results/cantilever_tower")  # doctest: +SKIP
-    >>> sysid.plot.transmissibility(result, sensor="tip x", run="x")  # doctest: +SKIP
+    >>> band = result.uncertainty.transmissibility(result.measurement.freq)  # doctest: +SKIP
+    >>> sysid.plot.transmissibility(result, sensor="x5", run="x", band=band)  # doctest: +SKIP
     """
     test = identification.measurement if measurement is None else measurement
     chosen = strongest(test, 1, sensor=sensor, run=run)[0]
-    return place(ax, response_channel(identification, test, *chosen))
+    return place(ax, response_channel(identification, test, *chosen, band=band_of(test, band, test.n_sensors)))
 
 
-def responses(identification: Identification, sensor: int | str, *, measurement: Measurement | None = None) -> Figure:
+def responses(
+    identification: Identification,
+    sensor: int | str,
+    *,
+    measurement: Measurement | None = None,
+    band: ArrayLike | None = None,
+) -> Figure:
     """All runs of one sensor side by side; see `transmissibility`."""
     test = identification.measurement if measurement is None else measurement
-    s = sensor_index(test, sensor)
-    return panels([response_channel(identification, test, s, r) for r in range(test.n_runs)], alone=10.0)
+    s, std = sensor_index(test, sensor), band_of(test, band, test.n_sensors)
+    return panels([response_channel(identification, test, s, r, band=std) for r in range(test.n_runs)], alone=10.0)
 
 
 def base_force(
@@ -109,6 +122,7 @@ def base_force(
     direction: int | str = 0,
     run: int | str | None = None,
     measurement: Measurement | None = None,
+    band: ArrayLike | None = None,
 ) -> Any:
     """Measured against identified force of the base on the structure, magnitude and phase.
 
@@ -123,6 +137,8 @@ def base_force(
     run : int or str, optional
         Index or, of unit runs, name; by default the run in which the base moves most in `direction`.
     measurement : Measurement, optional
+    band : array_like, shape (d, d, n_freq), optional
+        Standard deviation of the apparent mass at the test's lines, kg, such as `Uncertainty.base_force` gives.
 
     Returns
     -------
@@ -131,18 +147,24 @@ def base_force(
     test = with_force(identification.measurement if measurement is None else measurement)
     i = index_of("base direction", direction, test.base_axes or ())
     r = int(np.argmax(np.linalg.norm(test.base[:, i], axis=-1))) if run is None else run_index(test, run)
-    return place(ax, force_channel(identification, test, i, r))
+    return place(ax, force_channel(identification, test, i, r, band=band_of(test, band, test.n_base)))
 
 
-def base_forces(identification: Identification, run: int | str, *, measurement: Measurement | None = None) -> Figure:
+def base_forces(
+    identification: Identification,
+    run: int | str,
+    *,
+    measurement: Measurement | None = None,
+    band: ArrayLike | None = None,
+) -> Figure:
     """All directions of the base force of one run side by side; see `base_force`."""
     test = with_force(identification.measurement if measurement is None else measurement)
-    r = run_index(test, run)
-    return panels([force_channel(identification, test, i, r) for i in range(test.n_base)], alone=10.0)
+    r, std = run_index(test, run), band_of(test, band, test.n_base)
+    return panels([force_channel(identification, test, i, r, band=std) for i in range(test.n_base)], alone=10.0)
 
 
 def convergence(identification: Identification, ax: Axes | None = None) -> Any:
-    """Residual through the phases: the swarm's best, the refinement, each iterate of the local phase.
+    """Residual through the phases that ran: the swarm's best, the refinement, each iterate of the local phase.
 
     With a measured force both curves count it too; what is marked after the refinement does not.
 
@@ -155,6 +177,8 @@ def convergence(identification: Identification, ax: Axes | None = None) -> Any:
     -------
     Figure or Axes
     """
+    from matplotlib.ticker import MaxNLocator
+
     figure, ax = new_axes(ax, 6.0, 3.6)
     history = identification.history
     swarm, local = positive(history.swarm_curve), positive(history.local_curve)
@@ -162,7 +186,10 @@ def convergence(identification: Identification, ax: Axes | None = None) -> Any:
     if swarm.size:
         ax.plot(np.arange(swarm.size), swarm, color=COLOURS[0], linewidth=1.6, label="swarm (best so far)")
     if local.size:
-        ax.plot(end + np.arange(local.size), local, color=COLOURS[5], linewidth=1.6, label="local phase")
+        # Without a swarm the iterates are few, and may be a single one.
+        marker = None if swarm.size else "o"
+        iterate = end + np.arange(local.size)
+        ax.plot(iterate, local, color=COLOURS[5], linewidth=1.6, marker=marker, markersize=3.5, label="local phase")
     if swarm.size and local.size:
         ax.axvline(end, color=FAINT, linewidth=0.8, linestyle=":")
     if history.refinement > 0:
@@ -172,16 +199,22 @@ def convergence(identification: Identification, ax: Axes | None = None) -> Any:
         ax.axhline(goal, color=FAINT, linewidth=0.8, linestyle="--", label=f"goal {goal:.3g}")
     values = np.concatenate([swarm, local, [history.refinement, goal or np.nan]])
     if np.any(values > 0):
+        low, high = np.nanmin(values[values > 0]), np.nanmax(values)
         ax.set_yscale("log")
-        ax.margins(y=0.08)
-        if np.nanmax(values) < 30 * np.nanmin(values):
+        # A curve that hardly falls is shown as flat as it is.
+        ax.set_ylim(min(low / (high / low) ** 0.08, 0.6 * low), max(high * (high / low) ** 0.08, 1.6 * high))
+        if high < 30 * low:
             plain_log(ax.yaxis)
     if ax.get_legend_handles_labels()[0]:
         ax.legend(frameon=False, fontsize="small")
     else:
         ax.text(0.5, 0.5, "no search is recorded", transform=ax.transAxes, ha="center", color=FAINT)
     both = " (with the force)" if identification.measurement.force is not None else ""
-    dress(ax, "Convergence", "iteration, swarm then local phase", f"relative residual{both} [–]")
+    if not swarm.size:
+        ax.set_xlim(-0.5, max(local.size, 2) - 0.5)
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    told = "iteration, swarm then local phase" if swarm.size else "iteration"
+    dress(ax, "Convergence", told, f"relative residual{both} [–]")
     return ax if figure is None else figure
 
 
@@ -275,7 +308,7 @@ def matrices(identification: Identification, ax: Sequence[Axes] | None = None) -
     for one, (name, matrix) in zip(ax, blocks.items(), strict=True):
         image = one.imshow(normalised(matrix), cmap="RdBu_r", vmin=-1, vmax=1)
         count_cells(one, matrix.shape)
-        dress(one, name, "sensor", "sensor" if one is ax[0] else "", grid=False, math=True)
+        dress(one, name, "degree of freedom", "degree of freedom" if one is ax[0] else "", grid=False, math=True)
     colour_bar(image, list(ax), r"$a_{ij} / \sqrt{a_{ii} a_{jj}}$ [–]")
     return ax if figure is None else figure
 

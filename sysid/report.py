@@ -8,18 +8,24 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid import plot
-from sysid._html import bullets, matrix, number, page, paragraph, picture, table, text
+from sysid._html import Cell, beside, bullets, fold, matrix, number, page, paragraph, picture, table, text
 from sysid._panels import is_unit, run_names
+from sysid._summary import half_width, is_one_of_many, mass_percent_std
 from sysid.errors import InputError
 from sysid.identification import Identification
 from sysid.mass import FullMass
 from sysid.measurement import Measurement
-from sysid.storage import atomically
+from sysid.storage import atomically, file_or_folder
 from sysid.structure import Array, ComplexArray, Structure
 
 FILE_NAME = "report.html"
 _SUFFIXES = (".html", ".htm")
 _MANY_PANELS = 40  # beyond which the pictures are drawn with fewer pixels
+_ONE_OF_MANY, _CHOSEN = "one of many", "as the modal masses were chosen"
+_SAME = 1e-9  # of a value: a smaller difference is round-off
+
+
+Lines = list[list[tuple[str, ...]]]  # below each entry of a matrix
 
 
 class Scores(NamedTuple):
@@ -65,11 +71,7 @@ def write(identification: Identification, path: str | Path) -> Path:
     InputError
         Where the file cannot be written.
     """
-    target = Path(path)
-    if target.suffix.lower() not in _SUFFIXES:
-        if target.is_file():
-            raise InputError(f"{target} is some other file: give a name that ends in .html, or a folder")
-        target = target / FILE_NAME
+    target = file_or_folder(path, FILE_NAME, _SUFFIXES)
     content = render(identification).encode("utf-8", "replace")
     with atomically(target) as temporary:
         temporary.write_bytes(content)
@@ -88,6 +90,7 @@ def render(identification: Identification) -> str:
             ("Measured against identified", _responses(it, it.measurement)),
             ("Base force", _base_force(it, it.measurement)),
             ("Validation", _validation(it)),
+            ("Poles in the data", _poles(it)),
             ("Convergence", _convergence(it)),
             ("Modal assurance criterion", _mac(it)),
             ("Effective masses", _effective_masses(it)),
@@ -105,10 +108,12 @@ def _title(it: Identification) -> str:
 
 def _verdict(it: Identification) -> str:
     test, n, d = it.measurement, it.structure.n, it.structure.n_base
+    sensors = "" if n == test.n_sensors else f" seen by {test.n_sensors} sensors"
     runs = f"{test.n_runs} run{'s' if test.n_runs > 1 else ''}"
     head = paragraph(
-        f"{n} degrees of freedom, {d} base direction{'s' if d > 1 else ''} ({', '.join(test.base_axes or ())}), "
-        f"{runs}, {test.freq.size} lines from {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz",
+        f"{n} degrees of freedom{sensors}, {d} base direction{'s' if d > 1 else ''} "
+        f"({', '.join(test.base_axes or ())}), {runs}, "
+        f"{test.freq.size} lines from {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz",
         "soft",
     )
     word = "Interrupted: the best until then" if it.interrupted else "Success" if it.success else "No success"
@@ -138,26 +143,45 @@ def _verdict(it: Identification) -> str:
     elif it.closed_by:
         lines.append(paragraph("What fixes it:"))
     lines.append(bullets(_sentence(s) for s in it.closed_by))
-    return head + f'<div class="verdict {kind}">{"".join(lines)}</div>'
+    head += f'<div class="verdict {kind}">{"".join(lines)}</div>'
+    return head + "".join(paragraph(_sentence(remark), "soft") for remark in it.remarks)
 
 
 def _modes(it: Identification) -> str:
-    structure, reference = it.structure, it.problem.reference
+    structure, reference, u = it.structure, it.problem.reference, it.quick_uncertainty
     axes = it.measurement.base_axes or ()
-    share = structure.effective_mass_percent
-    head = ["mode", "frequency [Hz]", "damping [%]", *(f"effective mass {a} [%]" for a in axes)]
+    share, share_std, many = structure.effective_mass_percent, mass_percent_std(it), is_one_of_many(it)
+    frequencies, ratios = structure.natural_frequencies, structure.damping_ratios
+    head = ["mode", "frequency [Hz]", "±", "damping [%]", "±", *(f"effective mass {a} [%]" for a in axes)]
+    if u is None:
+        del head[4], head[2]
     known = reference if reference is not None and reference.n == structure.n else None
     if known is not None:
         head += ["reference [Hz]", "difference [%]", "reference damping [%]", "difference [%]"]
     rows = []
-    for k, (f, zeta) in enumerate(zip(structure.natural_frequencies, structure.damping_ratios, strict=True)):
-        row = [k + 1, number(f, 6), number(100 * zeta), *(f"{v:.2f}" for v in share[k])]
+    for k, (f, zeta) in enumerate(zip(frequencies, ratios, strict=True)):
+        row: list[object] = [k + 1, number(f, 6), number(100 * zeta)]
+        if u is not None:
+            row.insert(2, half_width(u.natural_frequencies[k], f))
+            row.append(half_width(100 * u.damping_ratios[k], 100 * zeta))
+        for value, std, one_of_many in zip(share[k], share_std[k], many[k], strict=True):
+            width = half_width(std, 100.0)
+            below = (f"± {width}",) if width not in ("open", "0") else ()
+            row.append(Cell(f"{'~' if one_of_many else ''}{value:.2f}", below))
         if known is not None:
             f0, zeta0 = known.natural_frequencies[k], known.damping_ratios[k]
             row += [number(f0, 6), _difference(f, f0), number(100 * zeta0), _difference(zeta, zeta0)]
         rows.append(row)
-    rows.append(["sum", "", "", *(f"{v:.2f}" for v in share.sum(axis=0)), *[""] * (4 if known is not None else 0)])
-    return table(head, rows, "Effective mass in % of the rigid-body mass of its base direction.")
+    sums = (f"{'~' if many[:, i].any() else ''}{total:.2f}" for i, total in enumerate(share.sum(axis=0)))
+    rows.append(["sum", *[""] * (2 if u is None else 4), *sums, *[""] * (4 if known is not None else 0)])
+    notes = ["Effective mass in % of the rigid-body mass of its base direction."]
+    if u is not None:
+        notes.append("±: half of the 95 % interval that the noise of the records makes; 0 where it is round-off.")
+        if it.measurement.response_std is None:
+            notes.append("No noise is stated, so the misfit is taken for it.")
+    if many.any():
+        notes.append("~: one of many values that explain the data.")
+    return table(head, rows, " ".join(notes))
 
 
 def _rigid_body_mass(it: Identification) -> str:
@@ -172,7 +196,9 @@ def _rigid_body_mass(it: Identification) -> str:
             )
         )
     unit = "kg" if not turns.any() else "kg; kg m where one axis is a rotation, kg m² where both are"
-    parts.append(matrix(rigid, axes, axes, f"Total mass M_rb = [G; I]' M [G; I], {unit}."))
+    u = it.quick_uncertainty
+    below = None if u is None or it.problem.unit_mass else _half_widths(rigid, u.rigid_body_mass, _stated(it))
+    parts.append(matrix(rigid, axes, axes, f"Total mass M_rb = [G; I]' M [G; I], {unit}.", below=below))
     if reference is not None:
         parts.append(matrix(reference.rigid_body_mass, axes, axes, f"Of the reference, {unit}."))
     return "".join(parts)
@@ -189,11 +215,17 @@ def _responses(it: Identification, test: Measurement) -> str:
             "Spectra of each sensor's absolute acceleration in each run, as the base moved: not transmissibilities. "
             "The phase is told against the base direction that moved most. The difference of the two is drawn faint."
         )
+    u = it.quick_uncertainty
+    band = None if u is None else u.transmissibility(test.freq)
+    if band is not None:
+        words += " The shade around the identified curve, where it is wide enough to be seen, is its 95 % interval."
     dpi = 130 if test.n_sensors * test.n_runs <= _MANY_PANELS else 92
     parts = [paragraph(words, "soft")]
-    for s, name in enumerate(test.sensor_names):
+    for s, (name, score) in enumerate(zip(test.sensor_names, scores(it.structure, test).relative, strict=True)):
         alt = f"{name}: measured and identified response, {', '.join(run_names(test))}"
-        parts.append(picture(plot.responses(it, s, measurement=test), alt, dpi=dpi))
+        drawn = picture(plot.responses(it, s, measurement=test, band=band), alt, dpi=dpi)
+        heading = f"{name}: relative residual {number(1 - score, 3)}" if np.isfinite(score) else name
+        parts.append(fold(heading, drawn, opened=s == 0))
     return "\n".join(parts)
 
 
@@ -202,9 +234,11 @@ def _base_force(it: Identification, test: Measurement) -> str:
         return ""
     residual = number(test.force_residual(it.structure))
     parts = [paragraph(f"Force of the base on the structure. Relative residual over all of it: {residual}.", "soft")]
+    u = it.quick_uncertainty
+    band = None if u is None else u.base_force(test.freq)
     for r, name in enumerate(run_names(test)):
         alt = f"measured and identified base force, {name}"
-        parts.append(picture(plot.base_forces(it, r, measurement=test), alt))
+        parts.append(picture(plot.base_forces(it, r, measurement=test, band=band), alt))
     return "\n".join(parts)
 
 
@@ -230,21 +264,34 @@ def _score_table(it: Identification, test: Measurement) -> str:
     )
 
 
+def _poles(it: Identification) -> str:
+    words = (
+        "What the records show without the model. Left: poles of models of rising order, over the largest singular "
+        "value of the FRFs; a mode is a column of poles that stay where they are. Right: all singular values; two that "
+        "peak at one line are two modes there."
+    )
+    return paragraph(words, "soft") + beside(
+        picture(plot.stabilisation(it), "stabilisation diagram"),
+        picture(plot.cmif(it), "complex mode indicator function"),
+    )
+
+
 def _convergence(it: Identification) -> str:
-    history = it.history
+    history, swarm = it.history, it.history.swarm_curve.size > 0
     steps = max(history.local_curve.size - 1, 0)
-    rows = [
-        ["start", number(history.start), "best of the first candidates, or the start given"],
-        ["swarm", number(history.swarm), f"{history.evaluations} candidates in {history.swarm_curve.size} iterations"],
-        ["refinement", number(history.refinement), "eigenvalues replaced by those given"],
-        ["local phase", number(history.local), f"{steps} iteration{'' if steps == 1 else 's'}, exact derivatives"],
-    ]
+    refined = "eigenvalues replaced by those given"
     if np.isfinite(history.refinement_error):
-        rows[2][2] += f", within {history.refinement_error:.1e} (relative, ω²)"
-    parts = [
-        picture(plot.convergence(it), "residual through swarm, refinement and local phase"),
-        table(["after", "relative residual", ""], rows, words=True),
+        refined += f", within {history.refinement_error:.1e} (relative, ω²)"
+    rows = [
+        ("start", history.start, "best of the first candidates, or the start given" if swarm else "modes of the data"),
+        ("swarm", history.swarm, f"{history.evaluations} candidates in {history.swarm_curve.size} iterations"),
+        ("refinement", history.refinement, refined),
+        ("local phase", history.local, f"{steps} iteration{'' if steps == 1 else 's'}, exact derivatives"),
     ]
+    ran = [[phase, number(residual), words] for phase, residual, words in rows if np.isfinite(residual)]
+    parts = [picture(plot.convergence(it), f"residual through {', '.join(phase for phase, *_ in ran) or 'no search'}")]
+    if ran:
+        parts.append(table(["after", "relative residual", ""], ran, words=True))
     if history.states:
         parts.append(table(["state of the swarm", "iterations"], history.states))
     return "".join(parts)
@@ -263,7 +310,11 @@ def _mac(it: Identification) -> str:
 
 def _effective_masses(it: Identification) -> str:
     words = "Bars: each mode; lines: their running sum. What is missing to 100 % moves with the base."
-    return paragraph(words, "soft") + picture(plot.effective_masses(it), "effective masses by mode and base direction")
+    drawn = plot.effective_masses(it)
+    many = bool(is_one_of_many(it).any())
+    label, caption = (_ONE_OF_MANY, _CHOSEN) if many else ("", "")
+    alt = "effective masses by mode and base direction"
+    return paragraph(words, "soft") + picture(drawn, alt, caption, label=label)
 
 
 def _mode_shapes(it: Identification) -> str:
@@ -277,26 +328,92 @@ def _mode_shapes(it: Identification) -> str:
 def _matrices(it: Identification) -> str:
     structure, test = it.structure, it.measurement
     n, axes = structure.n, test.base_axes or ()
-    names = test.sensor_names if n == test.n_sensors else tuple(f"{i + 1}" for i in range(n))
+    names = it.degrees_of_freedom
     scale = "; masses normalised to 1 kg" if it.problem.unit_mass else ""
     turns = not test.translational.all()
     coupling = "kg, kg m in columns of a rotation" if turns else "kg"
     base = "kg, kg m, kg m²" if turns else "kg"
-    M, K = structure.mass, structure.stiffness
+    M, K, C = structure.mass, structure.stiffness, structure.damping
+    u, ends = it.quick_uncertainty, None if it.determined else it.quick_intervals
+    label = "" if it.determined or (u is not None and np.all(np.isfinite(u.mass))) else _ONE_OF_MANY
+    words = (
+        "Heat maps: each entry over the root of its two diagonal entries. Tables: entries below 10⁻¹² of a matrix's "
+        "largest are round-off, and stand as 0."
+    )
+    lower: list[Lines | None] = [None, None, None]
+    if u is not None:
+        lower = [_half_widths(a, std) for a, std in ((M[:n, :n], u.mass), (K[:n, :n], u.stiffness), (C, u.damping))]
+    if any(lines is not None for lines in lower):
+        words += " ±: half of the 95 % interval, from the noise of the records; open: the data do not tell."
+    if label:
+        lower[2] = None  # half-widths about one choice tell less than its mark
+    if ends is not None:
+        lower[:2] = [_ranges(own, lines) for own, lines in zip((ends.mass, ends.stiffness), lower[:2], strict=True)]
+    if label and ends is not None:
+        words += (
+            " Below an entry of M_SS and K_SS: the least … and the … greatest value that it takes in any model that "
+            "explains the data and holds what was stated."
+        )
+    elif label:
+        words += " How far the entries may go is in the result's mass_interval and stiffness_interval."
     parts = [
-        paragraph(
-            "Heat maps: each entry over the root of its two diagonal entries. Tables: entries below 1e-12 of a "
-            "matrix's largest are round-off, and stand as 0.",
-            "soft",
+        paragraph(words, "soft"),
+        picture(
+            plot.matrices(it),
+            "heat maps of the mass, stiffness and damping matrices",
+            _CHOSEN if label else "",
+            colours=None,
+            label=label,
         ),
-        picture(plot.matrices(it), "heat maps of the mass, stiffness and damping matrices", colours=None),
-        matrix(M[:n, :n], names, names, f"Mass M_SS, kg{scale}"),
-        matrix(M[:n, n:], names, axes, f"Coupling mass M_S0, {coupling}{scale}"),
-        matrix(M[n:, n:], axes, axes, f"Base mass M_00, {base}{scale}"),
-        matrix(K[:n, :n], names, names, f"Stiffness K_SS, N/m{scale}"),
-        matrix(structure.damping, names, names, f"Damping C on the motion relative to the base, N s/m{scale}"),
+        matrix(M[:n, :n], names, names, f"Mass M_SS, kg{scale}", below=lower[0], label=label),
+        matrix(M[:n, n:], names, axes, f"Coupling mass M_S0, {coupling}{scale}", label=label),
+        matrix(M[n:, n:], axes, axes, f"Base mass M_00, {base}{scale}", label=label),
+        matrix(K[:n, :n], names, names, f"Stiffness K_SS, N/m{scale}", below=lower[1], label=label),
+        matrix(
+            C, names, names, f"Damping C on the motion relative to the base, N s/m{scale}", below=lower[2], label=label
+        ),
     ]
     return "".join(parts)
+
+
+def _half_widths(values: Array, std: Array, stated: Array | None = None) -> Lines | None:
+    """Lines below the entries of a matrix: half of the 95 % interval, or "open"; nothing where it is round-off.
+
+    None where all is open.
+    """
+    stated = np.zeros(std.shape, dtype=bool) if stated is None else stated
+    if not np.any(np.isfinite(std) | stated):
+        return None
+    size = np.sqrt(np.abs(np.diag(values)))
+    scale = np.outer(size, size)
+    lines: Lines = [[()] * std.shape[1] for _ in std]
+    for i, j in np.ndindex(*std.shape):
+        width = half_width(float(std[i, j]), float(scale[i, j]))
+        if stated[i, j]:
+            lines[i][j] = ("stated",)
+        elif width != "0":
+            lines[i][j] = (width if width == "open" else f"± {width}",)
+    return lines
+
+
+def _stated(it: Identification) -> Array:
+    """Which entries of the rigid-body mass were stated, (d, d) of bool."""
+    mass, d = it.problem.mass, it.structure.n_base
+    if not isinstance(mass, FullMass) or mass.total_mass is None or mass.healing != "rigid_body":
+        return np.zeros((d, d), dtype=bool)
+    return np.ones((d, d), dtype=bool) if np.ndim(mass.total_mass) == 2 else np.eye(d, dtype=bool)
+
+
+def _ranges(ends: Array, otherwise: Lines | None) -> Lines:
+    """Lines below the entries of a matrix: both ends of their range (2, n, n), or `otherwise` where they are one."""
+    n = ends.shape[1]
+    lines: Lines = [[()] * n for _ in range(n)] if otherwise is None else [list(line) for line in otherwise]
+    for i, j in np.ndindex(n, n):
+        low, high = ends[:, i, j]
+        if not np.isclose(low, high, rtol=_SAME, atol=0.0):
+            least, most = (number(end, 3) if np.isfinite(end) else "unbounded" for end in (low, high))
+            lines[i][j] = (f"{least} …", f"… {most}")
+    return lines
 
 
 def _what_ran(it: Identification) -> str:
@@ -330,7 +447,10 @@ def _score(predicted: ComplexArray, measured: ComplexArray) -> Array:
 
 
 def _difference(value: float, reference: float) -> str:
-    return f"{100 * (value / reference - 1):+.2g}" if reference else "–"
+    if not reference:
+        return "–"
+    share = value / reference - 1
+    return f"{100 * share:+.2g}" if abs(share) > _SAME else "0"
 
 
 def _sentence(words: str) -> str:
@@ -340,4 +460,7 @@ def _sentence(words: str) -> str:
 
 def _model(model: object) -> str:
     kind = type(model).__name__
-    return f"{kind} ({model.healing} healing)" if isinstance(model, FullMass) else kind
+    if not isinstance(model, FullMass):
+        return kind
+    known = "" if model.known is None else ", known entries"
+    return f"{kind} ({model.healing} healing{known})"

@@ -68,11 +68,7 @@ def save(identification: Identification, path: str | Path) -> Path:
     """
     import h5py
 
-    target = Path(path)
-    if target.suffix.lower() not in _SUFFIXES:
-        if target.is_file():
-            raise InputError(f"{target} is some other file: give a name that ends in .h5, or a folder")
-        target = target / FILE_NAME
+    target = file_or_folder(path, FILE_NAME, _SUFFIXES)
     # Built in memory: on a full disk HDF5 loses the error when it closes, or takes the process down.
     image = io.BytesIO()
     with h5py.File(image, "w") as file:
@@ -123,6 +119,34 @@ def load(path: str | Path) -> Identification:
                 raise InputError(f"{source} is damaged: {error.args[0] if error.args else error}") from error
     except OSError as error:
         raise InputError(f"{source} cannot be read: {error.strerror or error}") from error
+
+
+def file_or_folder(path: str | Path, name: str, suffixes: Sequence[str]) -> Path:
+    """Give the file to write where a path may be that file or the folder for it.
+
+    Parameters
+    ----------
+    path : str or Path
+    name : str
+        What the file is called in a folder.
+    suffixes : sequence of str
+        Endings that tell a file from a folder, the usual one first.
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    InputError
+        Where `path` is a file with another ending, which is somebody else's.
+    """
+    target = Path(path)
+    if target.suffix.lower() in suffixes:
+        return target
+    if target.is_file():
+        raise InputError(f"{target} is some other file: give a name that ends in {suffixes[0]}, or a folder")
+    return target / name
 
 
 @contextlib.contextmanager

@@ -173,6 +173,18 @@ def test_convergence_joins_both_curves_and_marks_the_refinement(unit):
     assert ax.get_yscale() == "log" and "force" in ax.get_ylabel()
 
 
+def test_convergence_without_a_swarm_marks_each_iterate(unit):
+    history = sysid.History(start=0.3, local=0.3 * (1 - 1e-9), local_curve=np.array([0.3, 0.3 * (1 - 1e-9)]))
+    ax = plot.convergence(dataclasses.replace(unit, history=history)).axes[0]
+    (curve,) = ax.get_lines()
+    np.testing.assert_array_equal(curve.get_xdata(), [0, 1])
+    assert curve.get_marker() == "o" and ax.get_xlabel() == "iteration"
+    low, high = ax.get_ylim()  # wide enough for a plain number, and for a fall of nothing to look like one
+    assert low < 0.2 < 0.3 < high
+    single = sysid.History(start=0.3, local=0.3, local_curve=np.array([0.3]))
+    assert plot.convergence(dataclasses.replace(unit, history=single)).axes[0].get_xlim() == (-0.5, 1.5)
+
+
 def test_convergence_without_a_search_says_so(runs):
     ax = plot.convergence(runs).axes[0]
     assert [text.get_text() for text in ax.texts] == ["no search is recorded"]
@@ -274,6 +286,36 @@ def test_a_band_is_the_interval_of_the_identified_magnitude(unit, runs):
             assert high == pytest.approx(middle + reach)
             assert low == pytest.approx(max(middle - reach, 1e-3 * middle))
         assert [entry.get_label() for entry in key(ax)] == ["measured", "identified", "95 % band", "difference"]
+
+
+def test_every_picture_of_responses_takes_a_band(unit):
+    u = unit.uncertainty
+    of_responses, of_force = u.transmissibility(FREQ), u.base_force(FREQ)
+    for figure in (
+        plot.transmissibility(unit, sensor=1, run=1, band=of_responses),
+        plot.responses(unit, 1, band=of_responses),
+        plot.base_force(unit, direction=1, run=1, band=of_force),
+        plot.base_forces(unit, 1, band=of_force),
+    ):
+        std = of_responses[1, 1] if "transmissibility" in figure.axes[0].get_ylabel() else of_force[1, 1]
+        shade = figure.axes[2 if len(figure.axes) == 4 else 0]
+        size = lines(shade)["identified"].get_ydata()
+        top = shade.collections[0].get_paths()[0].vertices
+        at = int(np.argmax(std))
+        assert top[top[:, 0] == FREQ[at], 1].max() == pytest.approx(size[at] + 1.96 * std[at])
+    assert not plot.transmissibility(unit, sensor=1, run=1).axes[0].collections
+    with pytest.raises(sysid.InputError, match=r"band has shape \(3, 2, 59\); .* are \(3, 2, 60\)"):
+        plot.responses(unit, 0, band=of_responses[..., 1:])
+    with pytest.raises(sysid.InputError, match=r"are \(2, 2, 60\)"):
+        plot.base_force(unit, band=of_responses)
+
+
+def test_a_band_that_is_not_known_leaves_a_gap(unit):
+    band = np.full((3, 2, FREQ.size), np.nan)
+    assert not plot.transmissibility(unit, band=band).axes[0].collections
+    band[..., :20] = 0.1
+    (shade,) = plot.transmissibility(unit, band=band).axes[0].collections
+    assert shade.get_paths()[0].vertices[:, 0].max() == FREQ[19]
 
 
 def test_what_is_not_there_is_refused(unit):

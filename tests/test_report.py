@@ -7,6 +7,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 import sysid
 from sysid import plot, report
@@ -22,6 +23,7 @@ class Page(HTMLParser):
     def __init__(self, page):
         super().__init__()
         self.open, self.tags, self.links, self.alts, self.words, self.headings = [], [], [], [], [], []
+        self.tables, self.folds = [], []  # of each table its rows of cells, of each fold whether it is open
         self.feed(page)
         self.close()
         assert not self.open
@@ -31,6 +33,16 @@ class Page(HTMLParser):
         self.links += [value for name, value in attrs if name in ("src", "href", "data", "action")]
         self.alts += [value for name, value in attrs if name == "alt"]
         assert not [name for name, _ in attrs if name.startswith("on")]
+        if tag == "table":
+            self.tables.append([])
+        elif tag == "tr":
+            self.tables[-1].append([])
+        elif tag in ("td", "th"):
+            self.tables[-1][-1].append("")
+        elif tag == "small":
+            self.tables[-1][-1][-1] += "|"
+        elif tag == "details":
+            self.folds.append(("open", None) in attrs)
         if tag not in VOID:
             self.open.append(tag)
 
@@ -41,6 +53,8 @@ class Page(HTMLParser):
         self.words.append(data)
         if self.open and self.open[-1] == "h2":
             self.headings.append(data)
+        if self.open and self.open[-1] in ("td", "th", "small"):
+            self.tables[-1][-1][-1] += data
 
     @property
     def text(self):
@@ -86,8 +100,8 @@ def complete(truth):
     )
     return sysid.Identification(
         guess, problem, problem.values(guess), "swarm", 42, True, "Solve_Succeeded; damping_ratio[1] ends on its bound",
-        history, False, ("the force weighs 2 modes",), ("the mass of mode 3 is open",), False,
-        sysid.Recipe("problems/tower.py", "data/x", 1),
+        history, False, ("the force weighs 2 modes",), ("the mass of mode 3 is open",),
+        ("strategy 'swarm', as asked",), False, sysid.Recipe("problems/tower.py", "data/x", 1),
     )  # fmt: skip
 
 
@@ -112,22 +126,31 @@ def plain(truth):
     )
     return sysid.Identification(
         truth, problem, problem.values(truth), "swarm", None, False, "interrupted", sysid.History(), True,
-        ("the mass matrix is known",), (), True,
+        ("the mass matrix is known",), (), (), True,
     )  # fmt: skip
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Leave the pictures out, which take most of the time."""
+    monkeypatch.setattr(
+        report, "picture", lambda figure, alt, caption="", *, label="", **_: f"<p>{label} {caption}</p>"
+    )
 
 
 def test_the_report_has_every_part_in_order(complete, page):
     page = Page(page)
     assert page.headings == [
-        "Modes", "Rigid-body mass", "Measured against identified", "Base force", "Validation", "Convergence",
-        "Modal assurance criterion", "Effective masses", "Mode shapes", "Matrices", "What ran",
+        "Modes", "Rigid-body mass", "Measured against identified", "Base force", "Validation", "Poles in the data",
+        "Convergence", "Modal assurance criterion", "Effective masses", "Mode shapes", "Matrices", "What ran",
     ]  # fmt: skip
-    assert page.text.index("Solve_Succeeded; damping_ratio[1] ends on its bound") < page.text.index("Modes")
+    for words in ("Solve_Succeeded; damping_ratio[1] ends on its bound", "Strategy 'swarm', as asked."):
+        assert page.text.index(words) < page.text.index("Modes")
     for words in (
         "Success", f"Relative residual {complete.residual:.3e}", f"Of the base force: {complete.force_residual:.3e}",
         "one of many models that explain the data", "The mass of mode 3 is open.", "The force weighs 2 modes.",
         "exploration 7", "777 candidates", "swarm over 27 unknowns", "problems/tower.py", "42", sysid.__version__,
-        "Unknowns of the search",
+        "Unknowns of the search", "Strategy 'swarm', as asked.",
     ):  # fmt: skip
         assert words in page.text
 
@@ -141,7 +164,7 @@ def test_every_sensor_of_every_test_has_its_picture(complete, page):
         "measured and identified base force, base x",
         "measured and identified base force, base y",
     ]
-    assert page.tags.count("img") == 6 + 2 + 5
+    assert page.tags.count("img") == 6 + 2 + 2 + 5
 
 
 def test_the_page_is_self_contained_and_runs_nothing(page):
@@ -171,11 +194,11 @@ def test_modes_and_their_reference_are_told(complete, page):
             assert f"{value:.4g}" in text
 
 
-def test_what_is_absent_leaves_no_section(plain):
+def test_what_is_absent_leaves_no_section(plain, no_pictures):
     page = Page(report.render(plain))
     assert page.headings == [
-        "Modes", "Rigid-body mass", "Measured against identified", "Convergence", "Modal assurance criterion",
-        "Effective masses", "Matrices", "What ran",
+        "Modes", "Rigid-body mass", "Measured against identified", "Poles in the data", "Convergence",
+        "Modal assurance criterion", "Effective masses", "Matrices", "What ran",
     ]  # fmt: skip
     assert "normalised to 1 kg" in page.text
     assert "Determined: this is the mass and stiffness" in page.text and "The mass matrix is known." in page.text
@@ -214,7 +237,7 @@ def test_write_gives_a_file_named_or_in_a_folder(plain, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("failure", [RuntimeError, KeyboardInterrupt])
-def test_a_failure_while_writing_leaves_the_old_page(plain, tmp_path, monkeypatch, failure):
+def test_a_failure_while_writing_leaves_the_old_page(plain, tmp_path, monkeypatch, no_pictures, failure):
     (tmp_path / "report.html").write_text("old")
 
     def fail(*_):
@@ -224,6 +247,7 @@ def test_a_failure_while_writing_leaves_the_old_page(plain, tmp_path, monkeypatc
     with pytest.raises(failure):
         report.write(plain, tmp_path)
     monkeypatch.undo()
+    monkeypatch.setattr(report, "render", lambda it: "new")
     monkeypatch.setattr("pathlib.Path.write_bytes", fail)
     with pytest.raises(failure):
         report.write(plain, tmp_path)
@@ -231,7 +255,7 @@ def test_a_failure_while_writing_leaves_the_old_page(plain, tmp_path, monkeypatc
     assert (tmp_path / "report.html").read_text() == "old"
 
 
-def test_a_place_that_cannot_be_written_gets_one_sentence(plain, tmp_path):
+def test_a_place_that_cannot_be_written_gets_one_sentence(plain, tmp_path, no_pictures):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(sysid.InputError, match=r"ends in \.html"):
         report.write(plain, tmp_path / "notes.txt")
@@ -244,6 +268,138 @@ def test_a_report_of_a_loaded_result_is_the_same(complete, page, tmp_path):
     assert report.render(sysid.load(complete.save(tmp_path))) == page
 
 
+@pytest.fixture
+def modal(truth):
+    """Identify `truth` by its modes, with force or without."""
+
+    def identified(force, mass=None, **changes):
+        test = dataclasses.replace(sysid.simulate(truth, 3 * FREQ, noise=0.01, force=force, rng=3), **changes)
+        return sysid.identify(sysid.Problem(test, mass=mass or sysid.FullMass()), strategy="modal", rng=0)
+
+    return identified
+
+
+def half(std):
+    return f"{norm.ppf(0.975) * std:.2g}"
+
+
+def test_what_is_determined_stands_with_half_of_its_95_percent_interval(modal, no_pictures):
+    it = modal(force=True)
+    assert it.determined
+    tables = Page(report.render(it)).tables
+    modes, rigid = tables[:2]
+    u, s = it.uncertainty, it.structure
+    percent = 100 / np.diag(s.rigid_body_mass)
+    for k in range(3):
+        cells = modes[k + 1]
+        assert cells[1:3] == [f"{s.natural_frequencies[k]:.6g}", half(u.natural_frequencies[k])]
+        assert cells[3:5] == [f"{100 * s.damping_ratios[k]:.4g}", half(100 * u.damping_ratios[k])]
+        for i in range(2):
+            mass, std = percent[i] * s.effective_masses[k, i, i], percent[i] * u.effective_masses[k, i, i]
+            assert cells[5 + i] == f"{mass:.2f}|± {half(std)}"
+    assert rigid[1][2] == f"{s.rigid_body_mass[0, 1]:.4g}|± {half(u.rigid_body_mass[0, 1])}"
+    names = list(it.measurement.sensor_names)
+    square = [table for table in tables if table[0] == ["", *names]]
+    M, K = s.mass[:3, :3], s.stiffness[:3, :3]
+    for table, values, std in zip(square, (M, K, s.damping), (u.mass, u.stiffness, u.damping), strict=True):
+        for name, row, own, wide in zip(names, table[1:], values, std, strict=True):
+            assert row == [name, *(f"{v:.4g}|± {half(w)}" for v, w in zip(own, wide, strict=True))]
+
+
+def test_what_is_not_determined_stands_with_its_range_and_a_mark(modal, truth, no_pictures):
+    total = np.diag(truth.rigid_body_mass)
+    it = modal(force=False, mass=sysid.FullMass(total, healing="rigid_body"))
+    assert not it.determined
+    page = Page(report.render(it))
+    modes, rigid = page.tables[:2]
+    assert all(cell.startswith("~") and "±" not in cell for row in modes[1:] for cell in row[5:])
+    assert all(float(row[2]) > 0 and float(row[4]) > 0 for row in modes[1:-1])
+    assert rigid[1][1:] == [f"{total[0]:.4g}|stated", f"{it.structure.rigid_body_mass[0, 1]:.4g}|open"]
+    square = [table for table in page.tables if table[0][1:] == list(it.measurement.sensor_names)]
+    assert len(square) == 3
+    for table, ends in zip(square, (it.mass_interval, it.stiffness_interval), strict=False):
+        for i, j in np.ndindex(3, 3):
+            low, high = (f"{end + 0.0:.3g}" for end in ends[:, i, j])
+            assert table[i + 1][j + 1].split("|")[1:] == [f"{low} …", f"… {high}"]
+    assert not any("|" in cell for row in square[2] for cell in row)  # no half-widths about one choice
+    assert page.words.count("one of many") == 5  # matrices; pictures are left out here
+    assert page.text.count("one of many as the modal masses were chosen") == 2
+
+
+def test_an_entry_without_an_end_is_called_unbounded(modal, no_pictures):
+    it = modal(force=False)
+    upper = it.mass_interval[1]
+    assert np.isinf(upper).all()  # nothing with a unit of mass was given
+    square = next(t for t in Page(report.render(it)).tables if t[0][1:] == list(it.measurement.sensor_names))
+    assert all(cell.endswith("|… unbounded") for row in square[1:] for cell in row[1:])
+    assert square[1][1].split("|")[1] == "0 …"
+
+
+def test_matrices_carry_the_names_of_their_degrees_of_freedom(modal, truth, no_pictures):
+    test = sysid.simulate(truth, 3 * FREQ, noise=0.01, force=True, rng=3)
+    two = [0, 2]
+    it = modal(
+        force=True, response=test.response[:, two], rigid_body=test.rigid_body[two], response_std=None,
+        sensors=[sysid.Sensor(name, (0, 0, 1), "x") for name in ("low", "tip")],
+    )  # fmt: skip
+    assert it.structure.n == 3
+    page = Page(report.render(it))
+    names = it.degrees_of_freedom
+    assert names[:2] == ("low", "tip") and names[2].startswith("coordinate of mode ")
+    assert [table[0][1:] for table in page.tables].count(list(names)) == 3
+    assert "3 degrees of freedom seen by 2 sensors" in page.text
+    assert "one of many as" not in page.text  # the force weighs all modes
+
+
+def test_the_panels_of_the_sensors_are_folded_but_the_first(page):
+    assert Page(page).folds == [True, False, False] * 2  # the test that was fitted, and the validation
+
+
+def test_the_pictures_get_the_band_of_their_own_lines(complete, monkeypatch, no_pictures):
+    given = []
+    for name in ("responses", "base_forces"):
+        monkeypatch.setattr(plot, name, lambda it, at, *, measurement, band: given.append((measurement, band)))
+    report.render(complete)
+    u, test, (unseen,) = complete.uncertainty, complete.measurement, complete.problem.validation
+    assert len(given) == 3 + 2 + 3
+    for measurement, band in given[:3] + given[5:]:
+        np.testing.assert_array_equal(band, u.transmissibility(measurement.freq))
+    assert [m is test for m, _ in given] == [True] * 5 + [False] * 3 and given[-1][0] is unseen
+    for _, band in given[3:5]:
+        np.testing.assert_array_equal(band, u.base_force(test.freq))
+
+
+def test_convergence_tells_only_what_ran(modal, complete, plain, no_pictures):
+    def rows(it):
+        content = report._convergence(it)
+        return [row[:2] for table in Page(content).tables for row in table if len(row) == 3][1:]
+
+    it = modal(force=False)
+    assert rows(it) == [["start", f"{it.history.start:.4g}"], ["local phase", f"{it.history.local:.4g}"]]
+    assert [name for name, _ in rows(complete)] == ["start", "swarm", "refinement", "local phase"]
+    assert rows(plain) == []
+
+
+def test_a_large_structure_is_told_without_what_takes_long(modal, monkeypatch, no_pictures):
+    it = modal(force=False)
+    monkeypatch.setattr("sysid.identification._QUICK_SHAPES", 0)
+    monkeypatch.setattr("sysid.identification._QUICK_DOFS", 0)
+    page = Page(report.render(it))
+    assert not {"uncertainty", "_intervals"} & set(vars(it))
+    assert page.tables[0][0][1:3] == ["frequency [Hz]", "damping [%]"] and "±" not in page.text
+    assert "How far the entries may go is in the result's mass_interval" in page.text
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e6])
+def test_what_is_no_fit_at_all_has_its_page(complete, factor, no_pictures):
+    truth = complete.problem.reference
+    far = sysid.Structure(truth.mass, factor * truth.stiffness, 0 * truth.damping_ratios, n_base=2)
+    it = dataclasses.replace(complete, structure=far)
+    text = Page(report.render(it)).text
+    assert "nan" not in text.lower()
+    assert it.summary()
+
+
 @pytest.mark.slow
 def test_a_page_of_36_panels_stays_below_3_megabytes(random_structure, tmp_path):
     truth = random_structure(np.random.default_rng(1), 12, 3)
@@ -253,6 +409,6 @@ def test_a_page_of_36_panels_stays_below_3_megabytes(random_structure, tmp_path)
         stiffness=sysid.SpectralStiffness(truth.natural_frequencies),
     )
     it = sysid.Identification(
-        truth, problem, problem.values(truth), "swarm", 0, True, "", sysid.History(), False, (), ()
+        truth, problem, problem.values(truth), "swarm", 0, True, "", sysid.History(), False, (), (), ()
     )
     assert report.write(it, tmp_path).stat().st_size < 3e6

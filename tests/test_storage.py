@@ -40,6 +40,11 @@ def building(damping_matrix: bool = False, sensors: bool = True) -> sysid.Struct
 MASSES = {
     "full": sysid.FullMass([30.0, 31.0], healing="rigid_body"),
     "full, unknown total": sysid.FullMass(),
+    "full, known entries": sysid.FullMass(
+        [[30.0, 1.0], [1.0, 31.0]],
+        healing="rigid_body",
+        known=[[2.0, np.nan, 0.0], [np.nan, np.nan, np.nan], [0.0, np.nan, np.nan]],
+    ),
     "lumped": sysid.LumpedMass(12.5),
     "known": sysid.KnownMass(np.diag([1.0, 2.0, 3.0])),
 }
@@ -73,7 +78,8 @@ def identification(
     )  # fmt: skip
     made = sysid.Identification(
         truth, problem, np.pi * np.arange(problem.n_variables), "swarm", 2**62 + 1, True, "Solve_Succeeded; ζ",
-        history, False, (), ("mode 1 is open", "no unit"), True, sysid.Recipe("problems/häuser.py", None, 3),
+        history, False, (), ("mode 1 is open", "no unit"), ("strategy 'swarm', as asked", "degrés de liberté: β"), True,
+        sysid.Recipe("problems/häuser.py", None, 3),
     )  # fmt: skip
     return dataclasses.replace(made, **changes)
 
@@ -148,6 +154,15 @@ def test_a_path_is_a_file_or_a_folder(tmp_path):
     assert storage.save(original, str(tmp_path / "x.hdf5")) == tmp_path / "x.hdf5"
     for path in (tmp_path / "deep" / "run.v2", str(tmp_path / "deep" / "run.v2" / "result.h5"), tmp_path / "x.hdf5"):
         assert storage.load(path).seed == original.seed
+
+
+def test_a_path_to_write_is_a_file_by_its_ending_or_else_a_folder(tmp_path):
+    endings = (".h5", ".hdf5")
+    assert storage.file_or_folder(str(tmp_path / "A.HDF5"), "result.h5", endings) == tmp_path / "A.HDF5"
+    assert storage.file_or_folder(tmp_path / "run.v2", "result.h5", endings) == tmp_path / "run.v2" / "result.h5"
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(sysid.InputError, match=r"notes.txt is some other file: give a name that ends in \.h5"):
+        storage.file_or_folder(tmp_path / "notes.txt", "result.h5", endings)
 
 
 def test_same_result_same_bytes(tmp_path):

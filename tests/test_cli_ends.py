@@ -1,0 +1,245 @@
+"""How the command line ends where it does not succeed: goals missed, errors of ours, Ctrl-C, files that cannot grow."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import sysid
+import sysid._swarm_search
+from sysid import cli, report
+
+MODULE = Path(__file__).with_name("pair_problem.py").read_text()
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """Work in an empty folder that is the temporary one too."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pair.py").write_text(MODULE)
+    return tmp_path
+
+
+def complaint(capsys):
+    """Return the one line on standard error."""
+    error = capsys.readouterr().err
+    assert error.startswith("sysid: ")
+    assert error.count("\n") == 1
+    assert error.endswith("\n")
+    assert "Traceback" not in error
+    return error
+
+
+def files(folder):
+    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
+
+
+def test_a_goal_that_is_not_reached_ends_with_one_and_writes_all(here, capsys):
+    (here / "pair.py").write_text(MODULE.replace("noise=0.0", "noise=0.05"))
+    assert cli.main(["run", "pair.py"]) == 1
+    out, error = capsys.readouterr()
+    assert error == ""
+    assert "no success: " in out
+    assert "above the goal" in out
+    summary = json.loads((here / "results/pair/summary.json").read_text())
+    assert summary["success"] is False
+    assert (here / "results/pair/report.html").exists()
+
+
+def test_a_search_without_a_candidate_ends_with_one_and_writes_nothing(here, capsys, monkeypatch):
+    def identify(*arguments, **options):
+        raise sysid.SolverError("no candidate\nat all")
+
+    monkeypatch.setattr(sysid, "identify", identify)
+    assert cli.main(["run", "pair.py"]) == 1
+    assert complaint(capsys) == "sysid: no candidate at all\n"
+    assert files(here) == {"pair.py"}
+
+
+def test_an_error_of_ours_is_one_line_and_its_traceback_is_in_the_log(here, capsys, monkeypatch):
+    def identify(*arguments, **options):
+        raise RuntimeError("two\nlines")
+
+    monkeypatch.setattr(sysid, "identify", identify)
+    assert cli.main(["run", "pair.py"]) == 70
+    error = complaint(capsys)
+    assert "RuntimeError: two lines" in error
+    assert str(here / "sysid-error.log") in error
+    log = (here / "sysid-error.log").read_text()
+    assert "Traceback" in log
+    assert "in identify" in log
+    assert sysid.__version__ in log
+    assert files(here) == {"pair.py", "sysid-error.log"}
+
+
+def test_the_log_goes_to_the_temporary_folder_where_the_current_one_cannot_be_written(
+    here, capsys, monkeypatch, tmp_path_factory
+):
+    def identify(*arguments, **options):
+        raise RuntimeError("a bug")
+
+    elsewhere = tmp_path_factory.mktemp("temporary")
+    (here / "sysid-error.log").mkdir()
+    monkeypatch.setattr(sysid, "identify", identify)
+    monkeypatch.setattr("tempfile.gettempdir", lambda: str(elsewhere))
+    assert cli.main(["run", "pair.py"]) == 70
+    assert str(elsewhere / "sysid-error.log") in complaint(capsys)
+    assert "a bug" in (elsewhere / "sysid-error.log").read_text()
+    (elsewhere / "sysid-error.log").unlink()
+    (elsewhere / "sysid-error.log").mkdir()
+    assert cli.main(["run", "pair.py"]) == 70
+    assert "no log file could be written" in complaint(capsys)
+
+
+def test_a_report_that_fails_takes_no_result_away(here, capsys, monkeypatch):
+    def write(*arguments, **options):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(report, "write", write)
+    assert cli.main(["run", "pair.py"]) == 70
+    assert "result.h5" in capsys.readouterr().out
+    assert sysid.load(here / "results/pair").success
+
+
+def test_an_interrupted_search_saves_the_best_so_far_and_ends_with_130(here, capsys, monkeypatch):
+    original = sysid.identify
+
+    def identify(*arguments, **options):
+        def interrupt(progress):
+            if progress.iteration == 3:
+                raise KeyboardInterrupt
+
+        return original(*arguments, **(options | {"callback": interrupt}))
+
+    monkeypatch.setattr(sysid, "identify", identify)
+    assert cli.main(["run", "pair.py", "--strategy", "swarm"]) == 130
+    assert "the best so far is in results/pair" in complaint(capsys)
+    assert sysid.load(here / "results/pair").interrupted
+    assert json.loads((here / "results/pair/summary.json").read_text())["success"] is False
+    assert (here / "results/pair/report.html").exists()
+
+
+def test_ctrl_c_before_any_candidate_writes_nothing(here, capsys, monkeypatch):
+    def identify(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sysid, "identify", identify)
+    assert cli.main(["run", "pair.py"]) == 130
+    assert complaint(capsys) == "sysid: interrupted; nothing was saved\n"
+    assert files(here) == {"pair.py"}
+
+
+def test_ctrl_c_while_saving_says_that_files_are_missing(here, capsys, monkeypatch):
+    def write(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(report, "write", write)
+    assert cli.main(["run", "pair.py"]) == 130
+    assert "not every file is in results/pair" in complaint(capsys)
+    assert not [name for name in files(here) if name.endswith(".tmp")]
+
+
+ENDLESS = """
+import sysid
+from sysid import cli, identify
+
+endless = sysid.Swarm(10**6, stall_iterations=10**6)
+sysid.identify = lambda *a, strategy, **k: identify(*a, **k, strategy=endless)
+raise SystemExit(cli.main(["run", "free.py"]))
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+@pytest.mark.parametrize("delay", [0.0, 0.1, 0.27])
+def test_the_signal_itself_saves_the_best_so_far_wherever_it_strikes(here, delay):
+    (here / "endless.py").write_text(ENDLESS)
+    (here / "free.py").write_text(MODULE.replace("goal=1e-6", "goal=1e-30"))
+    running = interruptible("endless.py", cwd=here)
+    with running:
+        for line in running.stdout:
+            if line.startswith("swarm"):
+                break
+        time.sleep(delay)
+        running.send_signal(signal.SIGINT)
+        out, error = running.communicate(timeout=60)
+    assert error == "sysid: interrupted; the best so far is in results/free\n"
+    assert running.returncode == 130
+    assert "no success: interrupted" in out
+    assert sysid.load(here / "results/free").interrupted
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_the_signal_before_any_candidate_writes_nothing(here):
+    (here / "pair.py").write_text("import time\nprint('here', flush=True)\ntime.sleep(60)\n")
+    running = interruptible("-m", "sysid", "run", "pair.py", cwd=here)
+    with running:
+        assert running.stdout.readline() == "here\n"
+        running.send_signal(signal.SIGINT)
+        _, error = running.communicate(timeout=60)
+    assert error == "sysid: interrupted; nothing was saved\n"
+    assert running.returncode == 130
+    assert files(here) == {"pair.py"}
+
+
+def interruptible(*arguments, **options):
+    """Start Python with Ctrl-C as a terminal has it, however these tests were started."""
+    return subprocess.Popen(
+        [sys.executable, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL), **options,
+    )  # fmt: skip
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_a_second_ctrl_c_acts_at_once_and_what_it_breaks_is_no_error_of_ours(here, capsys, monkeypatch):
+    """As CasADi does it, the interrupt comes out as another exception."""
+    original = signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def expand(self, s):
+        signal.raise_signal(signal.SIGINT)  # the first waits for the next news
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt as error:
+            raise SystemError("returned a result with an exception set") from error
+
+    monkeypatch.setattr(sysid._swarm_search.SwarmCost, "__call__", expand)
+    try:
+        assert cli.main(["run", "pair.py", "--strategy", "swarm"]) == 130
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, original)
+    assert complaint(capsys) == "sysid: interrupted; nothing was saved\n"
+    assert files(here) == {"pair.py"}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_a_run_that_was_told_to_ignore_ctrl_c_ignores_it(here, monkeypatch):
+    original = sysid.identify
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def identify(*arguments, **options):
+        signal.raise_signal(signal.SIGINT)
+        return original(*arguments, **options)
+
+    monkeypatch.setattr(sysid, "identify", identify)
+    try:
+        assert cli.main(["run", "pair.py"]) == 0
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="limits of POSIX")
+def test_files_that_cannot_grow_are_one_line(here):
+    import resource
+
+    limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))  # noqa: E731
+    command = [sys.executable, "-m", "sysid", "run", "pair.py"]
+    done = subprocess.run(command, capture_output=True, timeout=120, check=False, cwd=here, preexec_fn=limit)
+    assert done.returncode == 2
+    assert done.stderr.count(b"\n") == 1
+    assert files(here) == {"pair.py"}

@@ -1,0 +1,143 @@
+"""The summary for a terminal, and the figures of summary.json."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+import sysid
+
+FREQ = np.linspace(3.0, 120.0, 60)
+
+
+@pytest.fixture
+def truth(random_structure):
+    return random_structure(np.random.default_rng(8), 3, 2, G=np.array([[1.0, 0.0], [0.6, 0.8], [0.0, 1.0]]))
+
+
+@pytest.fixture
+def modal(truth):
+    """Identify `truth` by its modes, with force or without."""
+
+    def identified(force, mass=None, noise=0.01, **changes):
+        test = dataclasses.replace(sysid.simulate(truth, FREQ, noise=noise, force=force, rng=3), **changes)
+        return sysid.identify(sysid.Problem(test, mass=mass or sysid.FullMass()), strategy="modal", rng=0)
+
+    return identified
+
+
+def rows(it):
+    """Cells of the table of modes."""
+    table = it.summary().split("\n+- half")[0]
+    return [line.split() for line in table.splitlines()]
+
+
+def half(std):
+    return f"{norm.ppf(0.975) * std:.2g}"
+
+
+def test_the_table_of_modes_has_half_of_each_95_percent_interval(modal):
+    it = modal(force=True)
+    u, s = it.uncertainty, it.structure
+    percent = 100 / np.diag(s.rigid_body_mass)
+    for k, row in enumerate(rows(it)[1:4]):
+        assert row[:3] == [str(k + 1), f"{s.natural_frequencies[k]:.5g}", half(u.natural_frequencies[k])]
+        assert row[3:5] == [f"{100 * s.damping_ratios[k]:.4g}", half(100 * u.damping_ratios[k])]
+        for i in range(2):
+            mass, std = percent[i] * s.effective_masses[k, i, i], percent[i] * u.effective_masses[k, i, i]
+            assert row[5 + 2 * i : 7 + 2 * i] == [f"{mass:.1f}", half(std)]
+    assert "~" not in it.summary()
+    mass = s.rigid_body_mass[0, 0]
+    assert f"rigid-body mass x {mass:.6g} +- {half(u.rigid_body_mass[0, 0])} kg" in it.summary()
+
+
+def test_no_noise_leaves_a_half_width_of_zero(modal):
+    for row in rows(modal(force=True, noise=0.0))[1:4]:
+        assert [row[2], row[4], row[6], row[8]] == ["0"] * 4
+
+
+def test_masses_that_are_one_choice_are_marked_and_their_range_is_told(modal, truth):
+    it = modal(force=False, mass=sysid.FullMass(np.diag(truth.rigid_body_mass), healing="rigid_body"))
+    assert all(cell.startswith("~") for row in rows(it)[1:4] for cell in row[5:])
+    told = []
+    for matrix, (lower, upper) in (
+        (it.structure.mass[:3, :3], it.mass_interval),
+        (it.structure.stiffness[:3, :3], it.stiffness_interval),
+    ):
+        share = np.array([np.diag(end) / np.diag(matrix) for end in (lower, upper)])
+        told.append(f"{abs(share.min()):.3g} to {share.max():.3g} times those of this")
+    text = " ".join(it.summary().split())
+    assert f"over all these models the diagonal entries are {told[0]} M_SS, {told[1]} K_SS" in text
+
+
+def test_a_range_without_an_end_is_no_number(modal):
+    text = " ".join(modal(force=False).summary().split())
+    assert "entries are 0 to any number of times those of this M_SS" in text and "inf" not in text
+
+
+def test_no_line_is_wider_than_120_columns(random_structure):
+    wide = random_structure(np.random.default_rng(1), 4, 6, frequencies=[5.0, 9.0, 14.0, 22.0])
+    for force in (True, False):
+        test = sysid.simulate(wide, np.linspace(2, 30, 80), noise=0.01, force=force, rng=2)
+        it = sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), strategy="modal", rng=0)
+        it = dataclasses.replace(it, message="word " * 60, remarks=("remark " * 40,))
+        assert max(map(len, it.summary().splitlines())) <= 120
+        assert all(remark.strip() in " ".join(it.summary().split()) for remark in it.remarks)
+
+
+def test_degrees_of_freedom_are_sensors_or_modal_coordinates(modal, truth):
+    it = modal(force=True)
+    assert it.degrees_of_freedom == it.measurement.sensor_names == ("sensor 1", "sensor 2", "sensor 3")
+    # Another choice of coordinates for the same structure: a sensor and two modal coordinates, then a mixture.
+    one, phi = np.eye(3), truth.normal_modes
+    mixed = np.linalg.inv(np.column_stack([one[1], phi[:, 0], phi[:, 2]]))  # modes 1 and 3 leave the first at rest
+    for rows_of, names in (
+        (np.linalg.inv(phi), ("coordinate of mode 1", "coordinate of mode 2", "coordinate of mode 3")),
+        (np.vstack([one[1], np.linalg.inv(phi)[[0, 2]]]), ("sensor 2", "coordinate of mode 1", "coordinate of mode 3")),
+        (mixed, ("coordinate of mode 2", "coordinate 2", "coordinate 3")),
+    ):
+        back = np.linalg.inv(rows_of)
+        full = np.block([[back, np.zeros((3, 2))], [np.zeros((2, 3)), np.eye(2)]])
+        turned = sysid.Structure(
+            full.T @ truth.mass @ full, full.T @ truth.stiffness @ full, truth.damping_ratios, n_base=2,
+            recovery=back, rigid_body=truth.rigid_body,
+        )  # fmt: skip
+        np.testing.assert_allclose(turned.transmissibility(FREQ), truth.transmissibility(FREQ), rtol=1e-8, atol=1e-8)
+        assert dataclasses.replace(it, structure=turned).degrees_of_freedom == names
+
+
+def test_what_takes_long_is_asked_for_only_where_it_is_known(modal, monkeypatch):
+    it = modal(force=False)
+    monkeypatch.setattr("sysid.identification._QUICK_SHAPES", 0)
+    monkeypatch.setattr("sysid.identification._QUICK_DOFS", 0)
+    assert it.quick_uncertainty is None and it.quick_intervals is None
+    assert "+-" not in it.summary() and "diagonal entries" not in it.summary()
+    assert it.to_dict()["natural_frequencies_std_hz"] == [None] * 3
+    known, ends = it.uncertainty, it.mass_interval
+    assert it.quick_uncertainty is known and it.quick_intervals.mass is ends
+    assert "+-" in it.summary() and "diagonal entries" in it.summary()
+
+
+def test_the_figures_are_json_with_null_for_what_is_open(modal, truth):
+    it = modal(force=False)
+    figures = json.loads(json.dumps(it.to_dict(), allow_nan=False))
+    assert figures["natural_frequencies_std_hz"] == it.uncertainty.natural_frequencies.tolist()
+    assert figures["damping_ratios_std"] == it.uncertainty.damping_ratios.tolist()
+    assert figures["remarks"] == list(it.remarks) and "as asked" in figures["remarks"][0]
+    # A mode with no momentum along any base direction answers nothing.
+    phi = truth.normal_modes
+    blind = truth.mass.copy()
+    push = blind[:3, :3] @ truth.rigid_body + blind[:3, 3:]
+    push -= np.outer(blind[:3, :3] @ phi[:, 1], phi[:, 1] @ push)
+    blind[:3, 3:] = push - blind[:3, :3] @ truth.rigid_body
+    blind[3:, :3] = blind[:3, 3:].T
+    blind[3:, 3:] += 100 * np.eye(2)
+    unseen = sysid.Structure(blind, truth.stiffness, truth.damping_ratios, n_base=2)
+    test = sysid.simulate(unseen, FREQ, noise=0.01, rng=1)
+    problem = sysid.Problem(test, mass=sysid.FullMass())
+    it = dataclasses.replace(it, structure=unseen, problem=problem)
+    std = it.to_dict()["natural_frequencies_std_hz"]
+    assert [value is None for value in std] == [False, True, False]
+    assert rows(it)[2][2::2][:2] == ["open", "open"]
