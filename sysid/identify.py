@@ -147,10 +147,7 @@ def _by_modes(problem: Problem, options: Modal, desk: Desk) -> Outcome:
         names = test.sensor_names
         coordinates = [names[i] for i in chosen.sensors] + [f"the coordinate of mode {k + 1}" for k in chosen.modes]
         remarks.append(f"degrees of freedom are {', '.join(coordinates)}")
-    history = replace(
-        History(), start=float(watch.curve[0]) if watch.curve else np.nan, local=_misfit(problem, structure),
-        local_curve=np.array(watch.curve),
-    )  # fmt: skip
+    history = replace(History(), local=_misfit(problem, structure), local_curve=np.array(watch.curve))
     desk.note(f"local phase: {message}, {len(watch.curve)} iterates, residual {history.local:.4e}")
     if stopped is not None:
         if not isinstance(stopped, Stop | KeyboardInterrupt):
@@ -191,7 +188,8 @@ def _finish(problem: Problem, end: Outcome, why: str, seed: int, desk: Desk) -> 
         )
     desk.note(f"done: residual {residual:.4e}, {message}")
     known = determination(problem, structure)
-    doubtful = doubts(problem, structure)
+    # What was stopped on its way has misfits of another kind.
+    doubtful = doubts(problem, structure) if end.stopped is None else ()
     open_ = (*doubtful, *known.undetermined)
     if doubtful:
         message += "; " + "; ".join(doubtful)

@@ -212,10 +212,9 @@ def _unknowns(problem: Problem, modes: Modes, rigid: Array, remainder: Array) ->
 
 
 def _regular_inverse(phi: Array) -> Array:
-    """Inverse of the shapes; where a bad fit has made some alike, of the nearest ones that are not."""
-    size = np.linalg.norm(phi, axis=0)
-    u, s, vt = np.linalg.svd(phi / size)
-    return (vt.T / np.maximum(s, _LEAST_SHAPE * s[0])) @ u.T / size[:, None]
+    """Inverse of the shapes; where a bad fit has made some alike or next to nothing, of near ones that are not."""
+    u, s, vt = np.linalg.svd(phi)
+    return (vt.T / np.maximum(s, _LEAST_SHAPE * s[0])) @ u.T
 
 
 @dataclass(frozen=True, eq=False)

@@ -66,9 +66,9 @@ class FullMass:
         (eq. 21-22 of the paper: right for lumped masses on orthogonal axes); "rigid_body", the
         physical ``M_rb[i, i]``; the only one for a matrix.
     known : array_like (n, n) or (n, n + d), optional
-        Entries of ``M_SS``, or of ``[M_SS, M_S0]``, that are known, NaN where they are not: weighed parts, zeros between
-        what cannot be coupled. The modal strategy holds them, and the result says what they close; the
-        swarm cannot.
+        Entries of ``M_SS``, or of ``[M_SS, M_S0]``, that are known, NaN where they are not: weighed parts, zeros
+        between what cannot be coupled. The modal strategy holds them, or checks them where a base force was
+        measured, and the result says what they close; the swarm cannot.
 
     References
     ----------

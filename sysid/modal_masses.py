@@ -292,7 +292,10 @@ def _unseen(problem: Problem, structure: Structure, misfit: float) -> Iterator[s
                 f"misfit of {100 * misfit:.2g} %: its mass is not known"
             )
         elif not test.freq[0] <= f <= test.freq[-1]:
-            yield f"{_mode(structure, k)} lies outside the lines ({test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz) and answers for all modes there"
+            yield (
+                f"{_mode(structure, k)} lies outside the lines ({test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz) and "
+                "answers for all modes there"
+            )
         elif force_share is not None and force_share[k] < force_level:
             yield f"{_mode(structure, k)} does not stand out of the misfit of the base force: its mass is not weighed"
 

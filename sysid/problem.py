@@ -259,6 +259,13 @@ def _as_matrix(name: str, value: object) -> Array:
 def _weigh(test: Measurement, stiffness: StiffnessModel) -> Array:
     """Rough rigid-body mass of each base direction from the base force, (d,): it only places the search."""
     assert test.force is not None
+    moved = np.linalg.norm(columns(test.base), axis=1)
+    if np.any(moved == 0):
+        raise InputError(
+            f"the base moves in only {np.count_nonzero(moved)} of {test.n_base} independent directions: the base force "
+            "weighs nothing in the others; add runs that move them, describe the test by the directions that move, "
+            "or state total_mass"
+        )
     omega = stiffness.targets if isinstance(stiffness, SpectralStiffness) else np.zeros(0)
     freq = omega / (2 * np.pi)
     # Away from resonance the damping, which is not known yet, hardly matters.
@@ -272,4 +279,4 @@ def _weigh(test: Measurement, stiffness: StiffnessModel) -> Array:
             f"the base force gives a mass of {mass.min():.3g} kg, with lines well below the first mode: check its sign "
             "(it is the base's on the structure, in phase with the base acceleration at low frequency) and its unit"
         )
-    return np.linalg.norm(columns(test.force), axis=1) / np.linalg.norm(columns(test.base), axis=1)
+    return np.linalg.norm(columns(test.force), axis=1) / moved

@@ -291,7 +291,7 @@ class Structure:
                 f"mass is not positive semidefinite: its lowest eigenvalue is {lowest:.3g} of its diagonal; "
                 "the base rows need M_00 >= M_S0' M_SS^-1 M_S0"
             )
-        G = -scipy.linalg.solve(self.stiffness[:n, :n], self.stiffness[:n, n:], assume_a="pos")
+        G = -scipy.linalg.cho_solve(scipy.linalg.cho_factor(self.stiffness[:n, :n]), self.stiffness[:n, n:])
         expected = G.T @ self.stiffness[:n, :n] @ G
         size = np.sqrt(np.abs(np.diag(expected)))
         # A direction that strains nothing has no stiffness of its own to be compared with.
