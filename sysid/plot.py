@@ -418,7 +418,7 @@ def cmif(subject: Identification | Measurement, ax: Axes | None = None) -> Any:
 
 
 def overview(identification: Identification, *, title: str | None = None) -> Figure:
-    """One figure that tells the result: three responses, convergence, MAC, effective masses.
+    """One figure that tells the result: three responses, convergence or poles, MAC, effective masses.
 
     Parameters
     ----------
@@ -443,7 +443,10 @@ def overview(identification: Identification, *, title: str | None = None) -> Fig
                 ax.set_ylabel("")
     above[0, 0].legend(handles=key(above[0, 0]), frameon=False, fontsize="small")
     below = bottom.subplots(1, 3, width_ratios=[1.15, 1, 1.25])
-    convergence(identification, below[0])
+    if identification.history.swarm_curve.size:
+        convergence(identification, below[0])
+    else:
+        stabilisation(identification, below[0])
     mac(identification, below[1])
     effective_masses(identification, below[2])
     if title is None:
