@@ -100,9 +100,11 @@ class Layout:
 
     def rigid_total(self, total_mass: ArrayLike | None) -> Array | None:
         """The rigid-body mass (d, d) where all of it is stated, else None."""
-        if total_mass is None or np.ndim(total_mass) < 2:
+        if total_mass is None:
             return None
         given = finite_array("total_mass", total_mass)
+        if given.ndim < 2:
+            return None
         if given.shape != (self.d, self.d):
             raise InputError(f"total_mass has shape {given.shape}; ({self.d}, {self.d}) is needed of a rigid-body mass")
         if np.any(np.diag(given) <= 0):

@@ -21,6 +21,7 @@ from sysid.structure import Array
 
 _HELD = 1e5  # weight of known entries beside what is only likely
 _SPARE = 1e-3  # least share of a total mass that is left to the base
+_SHARE = 1e-3  # of the largest share of a mode in a total; a smaller one would make its modal mass beyond measure
 _LEAST = 0.1  # of an equal share of the mass, that each mode keeps where nothing tells modal masses
 
 
@@ -175,7 +176,7 @@ def nearest_lumped(
     size = np.maximum(np.linalg.norm(rows, axis=0), np.finfo(float).tiny)
     # No modal mass vanishes, or M_SS would be singular: each keeps a share of what it could be by itself.
     share = np.max([row / total for row, total in told], axis=0)
-    least = _LEAST / m * size / np.maximum(share, 1e-9 * share.max())
+    least = _LEAST / m * size / np.maximum(share, _SHARE * share.max())
     return np.maximum(lsq_linear(rows / size, wanted, (least, np.inf), tol=1e-14).x, least) / size
 
 

@@ -33,11 +33,11 @@ def same_bits(a, b):
 
 
 class TestStrategy:
-    @pytest.mark.parametrize("strategy", ["swarm", "auto"])
-    def test_the_named_strategies_run_the_whole_way(self, problem, strategy):
+    @pytest.mark.parametrize(("strategy", "taken"), [("swarm", "swarm"), ("modal", "modal"), ("auto", "modal")])
+    def test_the_named_strategies_run_the_whole_way(self, problem, strategy, taken):
         result = identify(problem, strategy=strategy, rng=0)
         assert isinstance(result, Identification)
-        assert result.strategy == "swarm"
+        assert result.strategy == taken
         assert result.seed == 0
         assert result.success
         assert result.message.startswith("IPOPT: ")
@@ -82,6 +82,81 @@ class TestStrategy:
         assert not any("refinement" in line for line in result.history.log)
         assert result.residual < 1e-6
         np.testing.assert_allclose(result.structure.stiffness[:2, :2], truth.stiffness[:2, :2], rtol=1e-4)
+
+
+class TestAuto:
+    """Which strategy is taken, and that the result says why."""
+
+    @staticmethod
+    def at_once(problem, **options):
+        """Stopped with the first news: what is taken shows by then."""
+
+        def stop(progress):
+            raise StopIteration
+
+        return identify(problem, rng=0, callback=stop, **options)
+
+    @pytest.mark.parametrize("mass", ["trace", "rigid_body", "lumped", "known"])
+    def test_modal_for_full_lumped_and_known_mass(self, random_case, mass):
+        _, problem = random_case(np.random.default_rng(1), mass, n=3, d=1)
+        result = identify(problem, rng=0)
+        assert result.strategy == "modal"
+        assert result.remarks[0].startswith("strategy 'modal': ")
+        assert any(result.remarks[0] in line for line in [*result.summary().splitlines(), *result.remarks])
+        assert result.residual < 1e-10
+
+    @pytest.mark.parametrize(
+        ("stiffness", "damping", "reason"),
+        [
+            ("chain", "modal", "stiffness has a form of its own"),
+            ("spectral", "proportional", "damping has a form of its own"),
+        ],
+    )
+    def test_swarm_where_a_model_has_a_form_of_its_own(self, random_case, stiffness, damping, reason):
+        _, problem = random_case(np.random.default_rng(1), "lumped", stiffness, damping, n=3, d=1)
+        result = self.at_once(problem)
+        assert result.strategy == "swarm"
+        assert result.remarks == (f"strategy 'swarm': the {reason}",)
+        with pytest.raises(InputError, match="'modal' needs SpectralStiffness and ModalDamping"):
+            identify(problem, strategy="modal")
+
+    def test_swarm_with_a_start(self, case):
+        truth, problem = case
+        result = self.at_once(problem, start=truth)
+        assert result.strategy == "swarm"
+        assert result.remarks == ("strategy 'swarm': a start was given",)
+
+    @pytest.mark.parametrize("mass", ["lumped", "known"])
+    def test_swarm_where_a_structured_mass_has_other_than_one_mode_a_sensor(self, random_case, mass):
+        """Lines that end above the first mode: the model is said to have four, the data hide the others in noise."""
+        truth, problem = random_case(np.random.default_rng(1), mass, n=4, d=2, noise=0.05)
+        f, test = truth.natural_frequencies, problem.measurement
+        low = Problem(
+            test.in_band(0.0, np.sqrt(f[0] * f[1])), mass=problem.mass,
+            stiffness=sysid.SpectralStiffness(f[:1], max_frequency=1.1 * f[-1]),
+        )  # fmt: skip
+        result = self.at_once(low)
+        assert result.strategy == "swarm"
+        assert "the modal one does not apply" in result.remarks[0]
+        assert "modes stand out of the data of 4 sensors" in result.remarks[0]
+        assert any(result.remarks[0] in line for line in result.history.log)
+        with pytest.raises(InputError, match="as many modes as sensors"):
+            identify(low, strategy="modal")
+
+    def test_swarm_where_a_stated_frequency_is_none_of_the_datas(self, random_case):
+        truth, problem = random_case(np.random.default_rng(1), "rigid_body", n=3, d=1)
+        given = truth.natural_frequencies * [1.0, 1.0, 1.4]
+        wrong = Problem(problem.measurement, mass=problem.mass, stiffness=sysid.SpectralStiffness(given))
+        result = self.at_once(wrong)
+        assert result.strategy == "swarm"
+        assert f"{given[2]:.5g} Hz does not stand out" in result.remarks[0]
+
+    @pytest.mark.parametrize("asked", ["modal", "swarm", sysid.Modal(), QUICK])
+    def test_what_was_asked_is_said_to_be_so(self, problem, asked):
+        result = self.at_once(problem, strategy=asked)
+        name = asked if isinstance(asked, str) else type(asked).__name__.lower()
+        assert result.strategy == name
+        assert result.remarks[0] == f"strategy {name!r}, as asked"
 
 
 class TestSeeds:
@@ -208,6 +283,13 @@ class TestGoal:
 
 
 class TestStopping:
+    @pytest.fixture(autouse=True)
+    def interruptible(self):
+        """Python's own answer to Ctrl-C, which a suite that runs in the background has not."""
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
+        yield
+        signal.signal(signal.SIGINT, before)
+
     @staticmethod
     def stop_at(phase, iteration, error):
         seen = []
@@ -318,7 +400,7 @@ class TestResult:
         assert h.wall_time > 0
         assert any("swarm over" in line for line in h.log)
         assert any("local phase" in line for line in h.log)
-        assert f"{problem.n_variables} unknowns" in h.log[0]
+        assert any(f"swarm over {problem.n_variables} unknowns" in line for line in h.log)
 
     def test_residuals_are_those_of_the_measurement(self, done, random_case):
         test = done.measurement
@@ -337,7 +419,9 @@ class TestResult:
             result = identify(problem, strategy=strategy, rng=0)
             both, h = np.hypot(result.residual, result.force_residual), result.history
             assert (h.refinement if strategy is SWARM_ONLY else h.local) == pytest.approx(both, rel=1e-9)
-        assert h.local_curve[-1] == pytest.approx(both, rel=1e-6)
+        # The curve counts it by its noise beside that of the accelerations: here 1 % of each, so nearly alike.
+        assert h.local_curve[-1] == pytest.approx(both, rel=0.3)
+        assert h.local_curve[-1] > 1.01 * result.residual
 
     def test_x_stands_for_the_structure(self, done, problem):
         again = problem.structure(done.x)
@@ -361,7 +445,9 @@ class TestResult:
         rows = [line for line in text.splitlines() if line[:4].strip().isdigit()]
         frequencies = [float(line.split()[1]) for line in rows]
         np.testing.assert_allclose(frequencies, done.structure.natural_frequencies, rtol=1e-4)
-        shares = [float(line.split()[3]) for line in rows]
+        heads = next(line for line in text.splitlines() if line.startswith("mode"))
+        end = heads.index("mass x, %") + len("mass x, %")
+        shares = [float(line[:end].split()[-1].lstrip("~")) for line in rows]
         expected = 100 * done.structure.effective_masses[:, 0, 0] / done.structure.rigid_body_mass[0, 0]
         np.testing.assert_allclose(shares, expected, atol=0.06)
         assert "Not determined" in text

@@ -178,3 +178,142 @@ def test_a_callback_can_stop_it():
     result = sysid.identify(problem, strategy="modal", callback=stop)
     assert not result.success
     assert result.message == "the callback stopped the search"
+
+
+def within(result, truth, by):
+    """Whether mass, stiffness and damping are those of the truth, relative to the largest entry of each."""
+    for name in ("mass", "stiffness", "damping"):
+        true, found = getattr(truth, name), getattr(result.structure, name)
+        np.testing.assert_allclose(found, true, atol=by * np.abs(true).max(), err_msg=name)
+
+
+class TestStructuredMass:
+    """Lumped and known masses: through the modes to the model as it stands."""
+
+    @staticmethod
+    def problem(random_case, mass, n, d, *, noise, given, seed=0):
+        truth, made = random_case(np.random.default_rng([seed, n, d]), mass, n=n, d=d)
+        f = truth.natural_frequencies
+        test = sysid.simulate(truth, np.geomspace(0.5 * f[0], 1.2 * f[-1], 60 * n), noise=noise, rng=seed)
+        stiffness = made.stiffness if given else sysid.SpectralStiffness()
+        return truth, sysid.Problem(test, mass=made.mass, stiffness=stiffness)
+
+    @pytest.mark.parametrize("given", [False, True])
+    @pytest.mark.parametrize("mass", ["lumped", "known"])
+    @pytest.mark.parametrize(("n", "d"), [(4, 1), (6, 2), (6, 3)])
+    def test_without_noise_it_is_exact(self, random_case, n, d, mass, given):
+        truth, problem = self.problem(random_case, mass, n, d, noise=0.0, given=given)
+        result = sysid.identify(problem, rng=0)
+        assert result.strategy == "modal"
+        assert result.success and result.determined, result.undetermined
+        assert result.residual < 1e-10
+        within(result, truth, 1e-9)
+
+    @pytest.mark.parametrize("mass", ["lumped", "known"])
+    @pytest.mark.parametrize("seed", range(3))
+    def test_with_noise_it_ends_at_the_floor(self, random_case, seed, mass):
+        """Least squares leave less than the truth does, and less by no more than as many unknowns can take."""
+        truth, problem = self.problem(random_case, mass, 4, 2, noise=0.01, given=False, seed=seed)
+        result = sysid.identify(problem, rng=0)
+        assert result.success and result.determined, result.undetermined
+        test, p = problem.measurement, problem.n_variables
+        floor = test.residual(truth)
+        taken = (p + 6 * np.sqrt(2 * p)) / (2 * test.response.size)
+        assert floor * np.sqrt(1 - taken) < result.residual < floor
+        within(result, truth, 0.05)
+
+
+@pytest.mark.parametrize("n", [6, 8])
+@pytest.mark.parametrize("seed", range(2))
+def test_six_base_directions_with_force_give_the_whole_structure(random_structure, seed, n):
+    """Rotations too: moments, products of inertia, the coupling of every sensor to all six."""
+    truth = random_structure(np.random.default_rng(seed), n=n, d=6)
+    test = sysid.simulate(truth, lines(truth), force=True)
+    result = sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), rng=0)
+    assert result.strategy == "modal"
+    assert result.success and result.determined, result.undetermined
+    assert result.residual < 1e-11 and result.force_residual < 1e-11
+    within(result, truth, 1e-9)
+    rigid = truth.rigid_body_mass
+    np.testing.assert_allclose(result.structure.rigid_body_mass, rigid, atol=1e-10 * np.abs(rigid).max())
+
+
+def complex_noise(rng, shape):
+    return (rng.normal(size=shape) + 1j * rng.normal(size=shape)) / np.sqrt(2)
+
+
+@pytest.mark.parametrize("runs", [2, 3])
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_runs_that_move_the_base_in_all_directions_at_once(random_structure, noise, runs):
+    rng = np.random.default_rng(runs)
+    truth = random_structure(rng, n=5, d=2)
+    freq = lines(truth)
+    base = complex_noise(rng, (runs, 2, freq.size))
+    response = np.einsum("sdf,rdf->rsf", truth.transmissibility(freq), base)
+    force = np.einsum("edf,rdf->ref", truth.base_force(freq), base)
+    response, force = (
+        x + noise * np.sqrt(np.mean(np.abs(x) ** 2)) * complex_noise(rng, x.shape) for x in (response, force)
+    )
+    test = sysid.Measurement(freq, base, response, rigid_body=truth.rigid_body, force=force)
+    result = sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), rng=0)
+    assert result.success and result.determined, result.undetermined
+    assert result.residual <= test.residual(truth) + 1e-11
+    within(result, truth, max(1e-9, 3 * noise))
+
+
+def test_a_sensor_that_is_stated_to_be_noisy_spoils_nothing(random_structure):
+    """One of four with 100 times the noise: errors as small as their bound, and an order larger where it is not stated.
+
+    Frequencies and damping ratios of eight structures; the root mean square of 64 normal numbers.
+    """
+    stated, unstated, bound = [], [], []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        truth = random_structure(rng, n=4, d=2)
+        clean = sysid.simulate(truth, lines(truth))
+        std = 0.003 * np.sqrt(np.mean(np.abs(clean.relative) ** 2)) * np.array([[1.0], [100.0], [1.0], [1.0]])
+        response = clean.response + std * complex_noise(rng, clean.response.shape)
+        poles = np.concatenate([truth.natural_frequencies, truth.damping_ratios])
+        for given, errors in ((std, stated), (None, unstated)):
+            test = sysid.Measurement(clean.freq, clean.base, response, rigid_body=truth.rigid_body, response_std=given)
+            result = sysid.identify(sysid.Problem(test, mass=sysid.FullMass(10.0)), rng=0)
+            assert result.structure.n == 4
+            found = np.concatenate([result.structure.natural_frequencies, result.structure.damping_ratios])
+            errors.append(found / poles - 1)
+            if given is not None:
+                u = result.uncertainty
+                bound.append(np.concatenate([u.natural_frequencies, u.damping_ratios]) / poles)
+    in_bounds = np.array(stated) / np.array(bound)
+    assert 0.7 < np.sqrt(np.mean(in_bounds**2)) < 1.35
+    rms = [np.sqrt(np.mean(np.array(errors) ** 2, axis=0)) for errors in (stated, unstated)]
+    assert np.all(rms[1] > 5 * rms[0])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_time_records_of_a_random_test_with_force(random_structure, seed):
+    """H1 from records in steady state, 1 % noise, lines a tenth of the narrowest half-power width apart.
+
+    Frequencies read off the peaks are stated: the bias of H1 there, more than its scatter, would pass for more modes.
+    """
+    rng = np.random.default_rng(seed)
+    truth = random_structure(rng, n=3, d=2, ratios=[0.04, 0.03, 0.03], frequencies=np.array([4.0, 7.0, 11.0]))
+    rate, count = 64.0, 64 * 480
+    freq = np.fft.rfftfreq(count, 1 / rate)[1:]
+    paths = truth.transmissibility(freq), truth.base_force(freq)
+    runs = []
+    for _ in range(2):
+        shake = np.fft.rfft(rng.normal(size=(2, count)))[:, 1:]
+        spectra = [shake, *(np.einsum("sdf,df->sf", path, shake) for path in paths)]
+        base, *answers = (np.fft.irfft(np.pad(s, ((0, 0), (1, 0))), count) for s in spectra)
+        runs.append((base, *(a + 0.01 * a.std() * rng.normal(size=a.shape) for a in answers)))
+    test = sysid.Measurement.from_time(
+        runs, rate, rigid_body=truth.rigid_body, estimator="h1", segment=64 * 40, band=(2.5, 15.0)
+    )
+    stiffness = sysid.SpectralStiffness([4.02, 6.97, 11.05])
+    result = sysid.identify(sysid.Problem(test, mass=sysid.FullMass(), stiffness=stiffness), rng=0)
+    assert result.strategy == "modal"
+    assert result.success
+    assert result.structure.n == 3
+    np.testing.assert_allclose(result.structure.natural_frequencies, truth.natural_frequencies, rtol=1e-3)
+    np.testing.assert_allclose(result.structure.damping_ratios, truth.damping_ratios, rtol=0.05)
+    within(result, truth, 0.03)

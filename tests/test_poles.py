@@ -5,7 +5,7 @@ import pytest
 
 import sysid
 from sysid import InputError, Measurement, Problem, simulate
-from sysid.poles import find_poles
+from sysid.poles import find_poles, poles_near
 
 
 def structure(rng, n, d, *, near=0.0):
@@ -91,3 +91,83 @@ def test_too_few_lines_are_refused():
     truth = structure(np.random.default_rng(5), 4, 1)
     with pytest.raises(InputError, match="too few"):
         find_poles(simulate(truth, np.linspace(1, 60, 12)))
+
+
+def building(dashpot):
+    """Three storeys with 1 % in all modes, and a dashpot between floors 2 and 3, N s/m."""
+    m, k = 4.0, 5000.0
+    K = k * np.array([[2.0, -1, 0], [-1, 2, -1], [0, -1, 1]])
+    full = np.block([[K, -K.sum(axis=1, keepdims=True)], [-K.sum(axis=1)[None], K.sum(keepdims=True)]])
+    M = np.diag([m, m, m, 0.0])
+    plain = sysid.Structure(M, full, np.full(3, 0.01), n_base=1)
+    between = np.array([0.0, -1.0, 1.0])
+    return sysid.Structure(M, full, n_base=1, damping_matrix=plain.damping + dashpot * np.outer(between, between))
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.001, 0.01])
+@pytest.mark.parametrize("dashpot", [1.0, 5.0, 25.0, 60.0])
+def test_damping_that_is_not_classical_does_not_multiply_poles(dashpot, noise):
+    """Three poles: those of the state matrix."""
+    truth = building(dashpot)
+    values = np.linalg.eigvals(truth.to_state_space().A)
+    values = values[values.imag > 0]
+    values = values[np.argsort(np.abs(values))]
+    f = truth.natural_frequencies
+    test = simulate(truth, np.geomspace(0.5 * f[0], 1.3 * f[-1], 240), noise=noise, rng=0)
+    found = find_poles(test)
+    assert found.omega.size == 3
+    np.testing.assert_allclose(found.omega, np.abs(values), rtol=noise + 1e-10)
+    np.testing.assert_allclose(found.ratios, -values.real / np.abs(values), rtol=5 * noise + 1e-9)
+
+
+@pytest.mark.parametrize(("n", "d"), [(4, 2), (6, 2), (6, 3)])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_pair_of_modes_much_closer_than_they_are_wide_is_told_apart(seed, n, d):
+    """0.3 % apart at 0.1 % noise, with damping ratios of 0.4 to 4 %."""
+    truth = structure(np.random.default_rng([seed, n, d]), n, d, near=0.003)
+    found = find_poles(simulate(truth, lines(truth), noise=0.001, rng=seed))
+    assert found.omega.size == n
+    np.testing.assert_allclose(found.omega, 2 * np.pi * truth.natural_frequencies, rtol=3e-4)
+    np.testing.assert_allclose(found.ratios, truth.damping_ratios, rtol=0.05)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize("sensors", [1, 2, 3])
+def test_more_modes_than_sensors(sensors, noise):
+    truth = structure(np.random.default_rng(11), 6, 2)
+    test = simulate(truth, lines(truth), noise=noise, rng=0)
+    few = Measurement(
+        test.freq, test.base, test.response[:, :sensors], rigid_body=test.rigid_body[:sensors], base_axes=test.base_axes
+    )
+    found = find_poles(few)
+    assert found.omega.size == 6
+    np.testing.assert_allclose(found.omega, 2 * np.pi * truth.natural_frequencies, rtol=max(1e-9, noise))
+    if noise == 0:
+        np.testing.assert_allclose(found.ratios, truth.damping_ratios, rtol=1e-7)
+
+
+class TestPolesNear:
+    @pytest.mark.parametrize("noise", [0.0, 0.001])
+    @pytest.mark.parametrize("seed", range(3))
+    def test_frequencies_read_off_a_picture_are_polished_to_the_poles(self, seed, noise):
+        truth = structure(np.random.default_rng(seed), 5, 2)
+        omega = 2 * np.pi * truth.natural_frequencies
+        off = 1 + 0.5 * truth.damping_ratios * np.array([1, -1, 1, -1, 1])
+        test = simulate(truth, lines(truth), noise=noise, rng=seed)
+        found = poles_near(test, omega * off, 0.05)
+        np.testing.assert_allclose(found.omega, omega, rtol=noise + 1e-10)
+        np.testing.assert_allclose(found.ratios, truth.damping_ratios, rtol=50 * noise + 1e-9)
+        assert found.residual < 2 * noise + 1e-10
+
+    @pytest.mark.parametrize("seed", [0, 2, 3, 4, 5])
+    def test_one_from_which_a_fit_ends_elsewhere_is_named(self, seed):
+        truth = structure(np.random.default_rng(seed), 4, 2)
+        stated = truth.natural_frequencies * [1.0, 1.2, 1.0, 1.0]
+        with pytest.raises(InputError, match=f"the stated natural frequency {stated[1]:.5g} Hz does not stand out"):
+            poles_near(simulate(truth, lines(truth)), 2 * np.pi * stated, 0.02)
+
+    def test_frequencies_stated_twice_count_once(self):
+        truth = structure(np.random.default_rng(1), 3, 1)
+        omega = 2 * np.pi * truth.natural_frequencies
+        found = poles_near(simulate(truth, lines(truth)), omega[[0, 1, 1, 2]], 0.05)
+        np.testing.assert_allclose(found.omega, omega, rtol=1e-10)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from sysid import Measurement
-from sysid.response import linear_residues, residual, weighed_mass
+from sysid.residues import linear_residues
+from sysid.response import residual, weighed_mass
 
 SEEDS = range(4)
 

@@ -1,0 +1,163 @@
+"""Each doubt about a fit is said where it must be, and only there."""
+
+import numpy as np
+import pytest
+
+import sysid
+from sysid import FullMass, KnownMass, LumpedMass, Measurement, Problem, Structure, simulate
+from sysid.checks import doubts
+
+
+def lines(truth, count=240):
+    f = truth.natural_frequencies
+    return np.geomspace(0.5 * f[0], 1.3 * f[-1], count)
+
+
+def building(dashpot=0.0):
+    """Three storeys on a light foundation; N s/m of a dashpot between floors 2 and 3 beside 1 % in all modes."""
+    m, k = 4.0, 5000.0
+    K = k * np.array([[2.0, -1, 0], [-1, 2, -1], [0, -1, 1]])
+    full = np.block([[K, -K.sum(axis=1, keepdims=True)], [-K.sum(axis=1)[None], K.sum(keepdims=True)]])
+    M = np.diag([m, m, m, 1.0])
+    plain = Structure(M, full, np.full(3, 0.01), n_base=1)
+    between = np.array([0.0, -1.0, 1.0])
+    return Structure(M, full, n_base=1, damping_matrix=plain.damping + dashpot * np.outer(between, between))
+
+
+def changed(test, **changes):
+    values = {
+        "response": test.response, "force": test.force, "rigid_body": test.rigid_body,
+        "response_std": test.response_std, "force_std": test.force_std,
+    } | changes  # fmt: skip
+    return Measurement(test.freq, test.base, values.pop("response"), base_axes=test.base_axes, **values)
+
+
+def said(test, structure, mass=None):
+    given = sysid.SpectralStiffness(structure.natural_frequencies, max_frequency=2 * structure.natural_frequencies[-1])
+    return doubts(Problem(test, mass=FullMass() if mass is None else mass, stiffness=given), structure)
+
+
+def modal_twin(truth):
+    """The same with the modal damping ratios that it has."""
+    return Structure(truth.mass, truth.stiffness, truth.damping_ratios, n_base=truth.n_base)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.001, 0.01, 0.1])
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_good_fit_of_a_structure_of_the_models_kind_leaves_none(random_structure, seed, force, noise):
+    rng = np.random.default_rng(seed)
+    truth = random_structure(rng, n=4, d=int(rng.integers(1, 4)))
+    assert said(simulate(truth, lines(truth), noise=noise, force=force, rng=rng), truth) == ()
+
+
+class TestDamping:
+    @pytest.mark.parametrize("noise", [0.0, 0.001, 0.01])
+    def test_a_dashpot_between_floors_is_told(self, noise):
+        truth = building(dashpot=25.0)
+        (doubt,) = said(simulate(truth, lines(truth), noise=noise, rng=0), modal_twin(truth))
+        assert "quadrature" in doubt and "not classical" in doubt
+
+    @pytest.mark.parametrize("noise", [0.0, 0.001, 0.01])
+    def test_a_damping_matrix_that_is_modal_is_not(self, noise):
+        truth = building()
+        assert said(simulate(truth, lines(truth), noise=noise, rng=0), modal_twin(truth)) == ()
+
+    def test_what_noise_hides_is_not_told(self):
+        truth = building(dashpot=0.05)
+        assert said(simulate(truth, lines(truth), noise=0.05, rng=0), modal_twin(truth)) == ()
+
+    def test_the_identified_structure_is_doubted_and_not_called_known(self):
+        truth = building(dashpot=25.0)
+        test = simulate(truth, lines(truth), noise=0.001, force=True, rng=0)
+        result = sysid.identify(Problem(test, mass=FullMass()), rng=0)
+        assert result.structure.n == 3
+        assert not result.determined
+        assert any("not classical" in sentence for sentence in result.undetermined)
+        assert "not classical" in result.message
+
+
+class TestForce:
+    @pytest.mark.parametrize("noise", [0.0, 0.01])
+    @pytest.mark.parametrize("factor", [0.001, 1 / 9.81, 9.81])
+    def test_another_unit_is_told(self, random_structure, factor, noise):
+        """Modes and rigid-body mass of the structure are right, its force is in kN or kgf."""
+        truth = random_structure(np.random.default_rng(0), n=3, d=2)
+        test = simulate(truth, lines(truth), noise=noise, force=True, rng=1)
+        (doubt,) = said(changed(test, force=test.force * factor, force_std=None), truth)
+        assert "base force misses" in doubt
+
+    def test_so_is_another_axis(self, random_structure):
+        truth = random_structure(np.random.default_rng(0), n=3, d=2)
+        test = simulate(truth, lines(truth), noise=0.01, force=True, rng=1)
+        assert any("check its sign, unit, axes" in s for s in said(changed(test, force=test.force[:, ::-1]), truth))
+
+    @pytest.mark.parametrize("mass", ["full", "lumped", "known"])
+    @pytest.mark.parametrize("noise", [0.0, 0.01])
+    def test_a_stated_mass_that_it_contradicts_is_told(self, mass, noise):
+        truth = modal_twin(building())
+        test = simulate(truth, lines(truth), noise=noise, force=True, rng=2)
+        heavy = Structure(2 * truth.mass, 2 * truth.stiffness, truth.damping_ratios, n_base=1)
+        model = {
+            "full": FullMass(26.0, healing="rigid_body"), "lumped": LumpedMass(24.0), "known": KnownMass(heavy.mass)
+        }[mass]  # fmt: skip
+        stated = [s for s in said(test, heavy, model) if "the stated mass makes" in s]
+        assert len(stated) == 1
+        assert "26 kg" in stated[0]
+        told = float(stated[0].split("weighs ")[1].split(" kg")[0])
+        assert told == pytest.approx(13.0, rel=max(1e-3, noise))
+
+    @pytest.mark.parametrize("noise", [0.0, 0.01, 0.1])
+    def test_one_that_it_agrees_with_is_not(self, noise):
+        truth = modal_twin(building())
+        test = simulate(truth, lines(truth), noise=noise, force=True, rng=2)
+        for model in (FullMass(13.0, healing="rigid_body"), FullMass(13.0), KnownMass(truth.mass)):
+            assert said(test, truth, model) == ()
+
+    @pytest.mark.parametrize("seed", range(4))
+    def test_nor_is_noise_that_is_stated_to_gather_at_the_peaks(self, random_structure, seed):
+        """As that of an estimate by segments does: there the truth misses most, and rightly."""
+        rng = np.random.default_rng(seed)
+        truth = random_structure(rng, n=4, d=2)
+        clean = simulate(truth, lines(truth), noise=0.01, rng=rng, force=True)
+        size = np.linalg.norm(clean.force, axis=(0, 1))
+        std = np.broadcast_to(0.05 * size**2 / size.max(), clean.force.shape)
+        noise = std * (rng.normal(size=std.shape) + 1j * rng.normal(size=std.shape)) / np.sqrt(2)
+        noisy = changed(clean, force=clean.force + noise, force_std=std)
+        assert said(noisy, truth) == ()
+        wrong = changed(noisy, force=noisy.force / 9.81, force_std=std / 9.81)
+        assert len(said(wrong, truth)) == 1
+
+
+class TestTwins:
+    @staticmethod
+    def with_twin(sign, noise, *, apart=0.0):
+        """Four sensors of the building, the last beside the third, of either polarity; noise on each of its own."""
+        truth = modal_twin(building())
+        recovery = np.vstack([np.eye(3), [0.0, apart, sign * (1 - apart)]])
+        wide = Structure(
+            truth.mass, truth.stiffness, truth.damping_ratios, n_base=1, recovery=recovery,
+            rigid_body=recovery @ truth.rigid_body,
+        )  # fmt: skip
+        return simulate(wide, lines(truth), noise=noise, rng=3), wide
+
+    @pytest.mark.parametrize("sign", [1, -1])
+    @pytest.mark.parametrize("noise", [0.0, 0.001, 0.03])
+    def test_two_sensors_that_are_one_are_named(self, sign, noise):
+        test, structure = self.with_twin(sign, noise)
+        twins = [s for s in said(test, structure) if "record one motion" in s]
+        assert twins == ["sensors sensor 3 and sensor 4 record one motion and are one degree of freedom: leave one out"]
+
+    @pytest.mark.parametrize("noise", [0.0, 0.001, 0.01])
+    def test_neighbours_are_not(self, noise):
+        test, structure = self.with_twin(1, noise, apart=0.2)
+        assert not [s for s in said(test, structure) if "record one motion" in s]
+
+    def test_nor_are_sensors_that_both_record_nothing_but_noise(self):
+        test, structure = self.with_twin(1, 0.001)
+        rng = np.random.default_rng(0)
+        response = test.response.copy()
+        noise = 1e-3 * (rng.normal(size=(2, test.freq.size)) + 1j * rng.normal(size=(2, test.freq.size)))
+        # Two feet of the frame, which move with the base.
+        response[0, [0, 3]] = test.rigid_body[[0, 3]] * test.base[0] + noise
+        assert not [s for s in said(changed(test, response=response), structure) if "record one motion" in s]

@@ -1,0 +1,322 @@
+"""The fit in modal coordinates: its derivatives against CasADi's own, its gauges, and where it ends."""
+
+from types import SimpleNamespace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from sysid import Measurement, Structure
+from sysid._coordinates import Coordinates
+from sysid._watch import OBJECTIVE_SCALE, Watch
+from sysid.layout import lower_triangle, triangle_entries
+from sysid.measurement import unit_runs
+from sysid.modal_fit import Modes, _derivatives, _Error, fit_modes, rank_one
+from sysid.refinement import SOLVED
+
+
+def modes_of(structure):
+    return Modes(
+        structure.mode_shapes, structure.participation, 2 * np.pi * structure.natural_frequencies,
+        structure.damping_ratios,
+    )  # fmt: skip
+
+
+def trial(rng, structure, *, force=False, general=False, noise=0.0, stated=False, lines=40):
+    """A test of `structure`: unit runs, or two more runs than directions, of any motion; noise relative.
+
+    With `stated` deviations, of other lines for the force than for the motion: the harder case.
+    """
+    f, n, d = structure.natural_frequencies, structure.n_sensors, structure.n_base
+    freq = np.geomspace(0.6 * f[0], 1.3 * f[-1], lines)
+    normal = lambda *shape: rng.normal(size=shape) + 1j * rng.normal(size=shape)  # noqa: E731
+    base = normal(d + 2, d, lines) if general else unit_runs(d, lines)
+    response = np.einsum("sdf,rdf->rsf", structure.transmissibility(freq), base)
+    pull = np.einsum("edf,rdf->ref", structure.base_force(freq), base)
+    response, pull = (r + noise * np.sqrt(np.mean(np.abs(r) ** 2) / 2) * normal(*r.shape) for r in (response, pull))
+    std, force_std = (rng.uniform(0.3, 3, (channels, 1)) * rng.uniform(0.3, 3, lines) for channels in (n, d))
+    return Measurement(
+        freq, base, response, rigid_body=structure.rigid_body, force=pull if force else None,
+        response_std=std if stated else None, force_std=force_std if stated and force else None,
+    )  # fmt: skip
+
+
+def relative_spectrum(omega, ratios):
+    """Poles as logarithms about given ones."""
+
+    def spectrum(z):
+        shift, loss = (z.add(name, np.zeros(len(omega))) for name in ("frequency", "damping ratio"))
+        return ca.DM(omega) * ca.exp(shift), ca.DM(ratios) * ca.exp(loss)
+
+    return spectrum
+
+
+def graph(test, structure):
+    """The error about `structure`, its unknowns free of any gauge, and its derivatives as IPOPT gets them."""
+    first, d, z = modes_of(structure), structure.n_base, Coordinates()
+    gamma = z.add("participation", first.gamma)
+    omega, ratios = relative_spectrum(first.omega, first.ratios)(z)
+    rigid = gamma.T @ gamma
+    if test.force is not None:
+        root = np.linalg.cholesky(structure.rigid_body_mass - first.gamma.T @ first.gamma)
+        factor = lower_triangle(z.add("base mass", triangle_entries(root)), d)
+        rigid = rigid + factor @ factor.T
+    error = _Error(test, gamma, omega, ratios, rigid, first)
+    functions = _derivatives(z, error, gamma, omega, ratios, rigid)
+
+    def derivatives(at):
+        value, gradient = functions["grad_f"](at, [])
+        upper = np.asarray(functions["hess_lag"](at, [], 1.0, []))
+        hessian = upper + np.triu(upper, 1).T
+        return float(value) / OBJECTIVE_SCALE, np.asarray(gradient).ravel() / OBJECTIVE_SCALE, hessian / OBJECTIVE_SCALE
+
+    def numbers(at, *expressions):
+        return [np.asarray(v) for v in ca.Function("numbers", [z.z], list(expressions)).call([at])]
+
+    return SimpleNamespace(
+        test=test, z=z.z, start=np.concatenate(z.start), error=error, model=(gamma, omega, ratios, rigid),
+        derivatives=derivatives, numbers=numbers,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("d", "force", "general", "stated"),
+    [
+        (1, False, False, False), (2, False, False, True), (3, False, True, False), (2, False, True, True),
+        (1, True, False, True), (2, True, False, False), (2, True, True, True), (3, True, True, False),
+    ],
+)  # fmt: skip
+class TestDerivatives:
+    """At a point off the truth, with records that it does not answer."""
+
+    @pytest.fixture
+    def made(self, random_structure, d, force, general, stated):
+        rng = np.random.default_rng(10 * d + force)
+        structure = random_structure(rng, n=4, d=d)
+        made = graph(trial(rng, structure, force=force, general=general, noise=0.3, stated=stated), structure)
+        made.at = made.start * rng.uniform(0.8, 1.2, made.start.size) + 0.05 * rng.normal(size=made.start.size)
+        return made
+
+    def test_value_is_the_error_that_the_best_shapes_leave(self, made):
+        """The shapes by numpy, sensor by sensor."""
+        test = made.test
+        gamma, omega, ratios, rigid, phi, value = made.numbers(made.at, *made.model, made.error.phi, made.error.value)
+        w = 2 * np.pi * test.freq
+        q = w**2 / (omega**2 - w**2 + 2j * ratios * omega * w) * np.einsum("kd,rdf->rkf", gamma, test.base)
+        std = np.ones(test.response.shape) if test.response_std is None else test.response_std
+        squared = 0.0
+        for s in range(test.n_sensors):
+            design = np.moveaxis(q / std[:, [s]], 1, 2).reshape(-1, len(gamma))
+            record = (test.relative[:, s] / std[:, s]).ravel()
+            stacked, wanted = np.vstack([design.real, design.imag]), np.concatenate([record.real, record.imag])
+            answer = np.linalg.lstsq(stacked, wanted, rcond=None)[0]
+            np.testing.assert_allclose(phi[s], answer, atol=1e-6 * np.abs(answer).max())
+            squared += np.sum((stacked @ answer - wanted) ** 2)
+        size = np.sum(np.abs(test.relative / std) ** 2)
+        expected = squared / size
+        if test.force is not None:
+            miss = np.einsum("kd,rkf->rdf", gamma, q) + np.einsum("de,ref->rdf", rigid, test.base) - test.force
+            if test.force_std is None:
+                expected += np.sum(np.abs(np.asarray(made.error.force_channel) * miss) ** 2)
+            else:
+                expected += np.sum(np.abs(miss / test.force_std) ** 2) / size
+        assert value.item() == pytest.approx(expected, rel=1e-9)
+
+    def test_gradient_is_casadis_own(self, made):
+        value, gradient = made.numbers(made.at, made.error.value, ca.gradient(made.error.value, made.z))
+        got_value, got, _ = made.derivatives(made.at)
+        assert got_value == pytest.approx(value.item(), rel=1e-12)
+        np.testing.assert_allclose(got, gradient.ravel(), atol=1e-8 * np.abs(gradient).max())
+
+    def test_hessian_is_the_gauss_newton_one_of_kaufmans_jacobian(self, made, d):
+        """Slopes of the motions times the shapes, less what other shapes could answer; the whole slope of the force."""
+        q = made.error.motion.q
+        shapes, values, slopes = made.numbers(made.at, made.error.shapes, q, ca.jacobian(q, made.z))
+        slopes = slopes.reshape(*values.shape, -1, order="F")
+        onto = np.linalg.qr(values.T)[0]
+        slopes = slopes - np.einsum("ab,kbz->kaz", onto @ onto.T, slopes)
+        J = np.einsum("nk,kaz->naz", shapes, slopes).reshape(-1, slopes.shape[2])
+        expected = 2 * J.T @ J
+        if made.test.force is not None:
+            (F,) = made.numbers(made.at, ca.jacobian(ca.vec(made.error.force_left), made.z))
+            expected += 2 * F.T @ F
+            # The factor of the base mass ends at zero where the data want less than none: there its curvature is all.
+            base = slice(made.start.size - d * (d + 1) // 2, None)
+            expected[base, base] = made.numbers(made.at, ca.hessian(made.error.value, made.z)[0])[0][base, base]
+        np.testing.assert_allclose(made.derivatives(made.at)[2], expected, atol=1e-8 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("general", [False, True])
+@pytest.mark.parametrize("force", [False, True])
+def test_where_nothing_is_left_the_hessian_is_the_exact_one(random_structure, force, general):
+    rng = np.random.default_rng(3)
+    structure = random_structure(rng, n=3, d=2)
+    made = graph(trial(rng, structure, force=force, general=general), structure)
+    value, gradient, hessian = made.derivatives(made.start)
+    assert value < 1e-20
+    (exact,) = made.numbers(made.start, ca.hessian(made.error.value, made.z)[0])
+    size = np.abs(exact).max()
+    np.testing.assert_allclose(hessian, exact, atol=1e-6 * size)
+    np.testing.assert_allclose(gradient, 0.0, atol=1e-9 * size)
+
+
+def test_a_force_whose_deviation_is_not_stated_weighs_by_the_noise_that_it_has(random_structure):
+    rng = np.random.default_rng(4)
+    structure = random_structure(rng, n=4, d=2)
+    clean, noisy = (trial(rng, structure, force=True, noise=noise, lines=600) for noise in (0.0, 0.02))
+    error = graph(noisy, structure).error
+    motion, pull = (np.std(getattr(noisy, name) - getattr(clean, name)) for name in ("response", "force"))
+    weight = np.asarray(error.force_channel).ravel() * np.linalg.norm(noisy.relative)
+    np.testing.assert_allclose(weight, motion / pull, rtol=0.05)
+
+
+def fitted(test, first, spectrum=None, *, watch=None):
+    """The fit from `first`, in participations of order one, its base mass from anywhere."""
+    unit = np.full(test.n_base, np.linalg.norm(first.gamma) / np.sqrt(first.gamma.size))
+    spectrum = relative_spectrum(first.omega, first.ratios) if spectrum is None else spectrum
+    watch = Watch(None, None) if watch is None else watch
+    return fit_modes(test, first, spectrum, unit=unit, remainder=np.diag(unit**2), watch=watch)
+
+
+def residues(modes):
+    return np.einsum("nk,kd->knd", modes.phi, modes.gamma)
+
+
+def near(rng, modes, by):
+    off = lambda value: value * (1 + by * rng.uniform(-1, 1, value.shape))  # noqa: E731
+    return Modes(modes.phi, off(modes.gamma), modes.omega * (1 + by * modes.ratios), off(modes.ratios))
+
+
+class TestFit:
+    @pytest.mark.parametrize("general", [False, True])
+    @pytest.mark.parametrize("force", [False, True])
+    @pytest.mark.parametrize("d", [1, 2, 3])
+    def test_from_near_the_truth_it_is_reached_with_quadratic_convergence(self, random_structure, d, force, general):
+        """Each last step squares the error; IPOPT may call it an end one step before round-off."""
+        rng = np.random.default_rng(d)
+        structure = random_structure(rng, n=4, d=d)
+        truth, test = modes_of(structure), trial(rng, structure, force=force, general=general, lines=200)
+        watch = Watch(None, None)
+        end = fitted(test, near(rng, truth, 0.2), watch=watch)
+        assert end.status in SOLVED
+        assert end.residual < 1e-9
+        assert end.of_accelerations < 1e-10
+        assert len(watch.curve) < 15
+        assert watch.curve[-1] < max(1e-12, 1e4 * watch.curve[-2] ** 2)
+        assert end.bounds == ""
+        np.testing.assert_allclose(end.modes.omega, truth.omega, rtol=1e-11)
+        np.testing.assert_allclose(end.modes.ratios, truth.ratios, rtol=1e-9)
+        whole = residues(truth)
+        np.testing.assert_allclose(residues(end.modes), whole, atol=1e-9 * np.abs(whole).max())
+        if force:  # it sets the scale of each mode too
+            np.testing.assert_allclose(np.abs(end.modes.phi), np.abs(truth.phi), atol=1e-8 * np.abs(truth.phi).max())
+            rigid = structure.rigid_body_mass
+            np.testing.assert_allclose(end.rigid, rigid, atol=1e-8 * np.abs(rigid).max())
+
+    def test_without_a_force_the_scale_of_each_mode_is_held(self, random_structure):
+        rng = np.random.default_rng(7)
+        structure = random_structure(rng, n=4, d=2)
+        first = modes_of(structure)._replace(gamma=rng.normal(size=(4, 2)))
+        end = fitted(trial(rng, structure), first)
+        # One participation of each mode is held at the size of all (`unit` of `fitted`), the one that was largest.
+        unit = np.linalg.norm(first.gamma) / np.sqrt(8)
+        largest = np.argmax(np.abs(first.gamma), axis=1)
+        np.testing.assert_allclose(end.modes.gamma[np.arange(4), largest], unit, rtol=1e-12)
+
+    @pytest.mark.parametrize("force", [False, True])
+    def test_noise_is_fitted_to_a_point_without_slope_that_is_better_than_the_truth(self, random_structure, force):
+        rng = np.random.default_rng(8)
+        structure = random_structure(rng, n=4, d=2)
+        test = trial(rng, structure, force=force, noise=0.02, lines=150)
+        truth = modes_of(structure)
+        end = fitted(test, near(rng, truth, 0.1))
+        assert end.status in SOLVED
+        made = graph(test, structure)
+        # Its own participations and poles, in the ungauged unknowns of `graph`.
+        at = [end.modes.gamma.ravel(order="F"), np.log(end.modes.omega / truth.omega)]
+        at.append(np.log(end.modes.ratios / truth.ratios))
+        if force:
+            at.append(triangle_entries(np.linalg.cholesky(end.rigid - end.modes.gamma.T @ end.modes.gamma)))
+        # The force's weight is the first poles' to say, so that both graphs have to a percent the same one.
+        value, gradient, hessian = made.derivatives(np.concatenate(at))
+        assert value < made.derivatives(made.start)[0]
+        if not force:
+            assert end.residual == pytest.approx(np.sqrt(value), rel=1e-9)
+            assert np.abs(gradient).max() < 1e-6 * np.abs(hessian).max() * np.sqrt(value)
+
+
+@pytest.mark.parametrize("d", [1, 2, 3])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_base_without_mass_is_no_trouble_to_a_noisy_force(random_orthogonal, seed, d):
+    """Noise wants some of its mass negative; the least that there can be is nothing, and the fit ends there."""
+    rng = np.random.default_rng(seed)
+    G = np.eye(d)[np.arange(4) % d]
+    half = random_orthogonal(rng, 4)
+    K = (half * (2 * np.pi * np.array([5.0, 9.0, 14.0, 21.0])) ** 2) @ half.T
+    full = np.block([[K, -K @ G], [-(K @ G).T, G.T @ K @ G]])
+    structure = Structure(np.diag([*np.ones(4), *np.zeros(d)]), (full + full.T) / 2, np.full(4, 0.01), n_base=d)
+    test = trial(rng, structure, force=True, noise=0.005, lines=200)
+    watch = Watch(None, None)
+    end = fitted(test, near(rng, modes_of(structure), 0.05), watch=watch)
+    assert end.status in SOLVED
+    assert len(watch.curve) < 40
+    remainder = np.linalg.eigvalsh(end.rigid - end.modes.gamma.T @ end.modes.gamma)
+    assert remainder[0] > -1e-12
+    assert remainder[-1] < 0.02
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("d", [2, 3])
+def test_modes_that_share_a_pole_are_fitted_in_a_gauge_of_their_own(random_structure, d, force, noise):
+    """Their mixtures are open: in any without a force, by rotations with one. The sum of their residues is known."""
+    rng = np.random.default_rng(d)
+    other = random_structure(rng, n=5, d=d)
+    n, G = other.n, other.rigid_body
+    ratios = other.damping_ratios.copy()
+    ratios[2] = ratios[1]
+    omega = 2 * np.pi * other.natural_frequencies
+    omega[2] = omega[1]
+    momentum = other.mass[:n, :n] @ other.normal_modes
+    K = (momentum * omega**2) @ momentum.T
+    full = np.block([[K, -K @ G], [-(K @ G).T, G.T @ K @ G]])
+    structure = Structure(other.mass, (full + full.T) / 2, ratios, n_base=d)
+    truth, test = modes_of(structure), trial(rng, structure, force=force, noise=noise, lines=200)
+    pole = [0, 1, 1, 2, 3]
+    apart = [0, 1, 3, 4]
+
+    def spectrum(z):
+        values = relative_spectrum(omega[apart] * (1 + 0.1 * ratios[apart]), 1.1 * ratios[apart])(z)
+        return tuple(value[pole] for value in values)
+
+    # Poles that are one must be so to the last bit in the start too.
+    first = near(rng, truth, 0.2)._replace(omega=(omega[apart] * (1 + 0.1 * ratios[apart]))[pole])
+    first = first._replace(ratios=(1.1 * ratios[apart])[pole])
+    end = fitted(test, first, spectrum)
+    assert end.status in SOLVED
+    summed, whole = ([r[0], r[1] + r[2], r[3], r[4]] for r in (residues(end.modes), residues(truth)))
+    if noise == 0:
+        assert end.residual < 1e-11
+        np.testing.assert_allclose(summed, whole, atol=1e-8 * np.abs(whole).max())
+        if force:
+            block = truth.gamma[1:3].T @ truth.gamma[1:3]
+            np.testing.assert_allclose(
+                end.modes.gamma[1:3].T @ end.modes.gamma[1:3], block, atol=1e-7 * np.abs(block).max()
+            )
+    else:
+        assert end.residual < 2 * noise * np.linalg.norm(test.response) / np.linalg.norm(test.relative)
+
+
+def test_residues_of_rank_one_are_split_into_shapes_of_any_size():
+    rng = np.random.default_rng(0)
+    phi, gamma, size = rng.normal(size=(4, 3)), rng.normal(size=(3, 2)), rng.uniform(0.1, 9, 3)
+    whole = np.einsum("nk,kd->knd", phi, gamma)
+    modes = rank_one(whole, np.arange(1.0, 4), np.full(3, 0.01), size)
+    np.testing.assert_allclose(residues(modes), whole, atol=1e-13)
+    np.testing.assert_allclose(np.linalg.norm(modes.phi, axis=0), size)
+    # Of any rank: the nearest.
+    any_rank = rng.normal(size=(1, 4, 3))
+    modes = rank_one(any_rank, np.ones(1), np.ones(1), np.ones(1))
+    assert np.linalg.norm(residues(modes) - any_rank) == pytest.approx(
+        np.linalg.norm(np.linalg.svd(any_rank[0], compute_uv=False)[1:])
+    )
