@@ -15,7 +15,7 @@ from sysid._swarm_search import Outcome, Swarm, by_swarm
 from sysid._watch import Watch
 from sysid.checks import doubts
 from sysid.damping import ModalDamping
-from sysid.errors import InputError
+from sysid.errors import InputError, SolverError
 from sysid.identification import History, Identification
 from sysid.mass import FullMass
 from sysid.modal import Modal, NotModalError, held_by_model, modal_structure
@@ -112,7 +112,14 @@ def _by_modes(problem: Problem, options: Modal, desk: Desk) -> Outcome:
     if not (isinstance(problem.stiffness, SpectralStiffness) and isinstance(problem.damping, ModalDamping)):
         raise NotModalError("strategy 'modal' needs SpectralStiffness and ModalDamping; use 'swarm' for this problem")
     watch = Watch(lambda i, cost: desk.tell("local phase", i, 0, cost), desk.left)
-    structure, end, chosen, poles = modal_structure(problem, options, watch)
+    try:
+        structure, end, chosen, poles = modal_structure(problem, options, watch)
+    except NotModalError:
+        if watch.stopped is None:
+            raise
+        if not isinstance(watch.stopped, Stop | KeyboardInterrupt):
+            raise watch.stopped from None
+        raise SolverError("stopped before there was a first fit: nothing is identified") from None
     test, n = problem.measurement, problem.layout.n
     desk.note(
         f"{poles.omega.size} poles found in the data, {structure.n} modes: "

@@ -30,7 +30,7 @@ from sysid.modal_fit import ModalFit, Modes, fit_modes, rank_one
 from sysid.modal_scales import stated_totals, to_stated_totals
 from sysid.problem import Problem, assemble
 from sysid.refinement import SOLVED
-from sysid.residues import force_residual_left, linear_residues
+from sysid.residues import linear_residues
 from sysid.response import residual
 from sysid.stiffness import SpectralStiffness
 from sysid.structure import Array, Structure
@@ -142,18 +142,11 @@ def _result(x: Array, end: ModalFit | _End, watch: Watch, message: str = "") -> 
 
 def _linear_starts(test: Measurement, ended: ModalFit, first: Modes) -> Iterator[Modes]:
     """New starts where free residues fit clearly better than what was reached: at its poles, then at the first ones."""
-    fits = [(poles, *_free_fit(test, poles)) for poles in (ended.modes, first)]
-    if ended.residual <= _SUSPECT * min(possible for _, _, possible in fits):
+    fits = [(poles, *linear_residues(test, poles.omega, poles.ratios)) for poles in (ended.modes, first)]
+    if ended.of_accelerations <= _SUSPECT * min(possible for _, _, possible in fits):
         return
     for poles, residues, _ in fits:
         yield rank_one(residues, poles.omega, poles.ratios, np.linalg.norm(poles.phi, axis=0))
-
-
-def _free_fit(test: Measurement, modes: Modes) -> tuple[Array, float]:
-    """Free residues of given poles, and the root of the summed squares that they leave of all records."""
-    residues, left = linear_residues(test, modes.omega, modes.ratios)
-    force = 0.0 if test.force is None else force_residual_left(test, modes.omega, modes.ratios)
-    return residues, float(np.hypot(left, force))
 
 
 def _modes(structure: Structure) -> Modes:

@@ -322,8 +322,10 @@ def modal_structure(
     # A stated total is kept, even where the base force weighs another.
     mass = problem.mass
     unmet = isinstance(mass, FullMass) and (test.force is None or (mass.total_mass is not None and held is None))
-    structure = build(problem, modes, remainder, chosen, to_totals=unmet)
-    return structure, end, chosen, poles
+    try:
+        return build(problem, modes, remainder, chosen, to_totals=unmet), end, chosen, poles
+    except InputError as error:
+        raise NotModalError(f"the shapes of the modes found are too much alike at the sensors: {error}") from None
 
 
 def held_by_model(problem: Problem, structure: Structure) -> Array:

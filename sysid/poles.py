@@ -105,8 +105,11 @@ def poles_near(test: Measurement, omega: Array, window: float) -> Poles:
     distinct = np.unique(omega)
     found, ratios = _polish(records, distinct, np.full(distinct.size, _GUESS))
     off = np.abs(np.log(found / distinct))
-    if np.any(off > np.log1p(window)):
-        worst = int(np.argmax(off))
+    fit = records.fit(found, ratios)
+    # How far from being a mode of the data each is: by its place, or by what the fit would lose without it.
+    lacking = np.maximum(off / np.log1p(window), _least_gain(fit) * _noise(records, fit, found.size) / fit.gain)
+    if np.any(lacking > 1):
+        worst = int(np.argmax(lacking))
         raise InputError(
             f"the stated natural frequency {distinct[worst] / (2 * np.pi):.5g} Hz does not stand out of the data (a "
             f"fit from there ends at {found[worst] / (2 * np.pi):.5g} Hz): the base may not move this mode"
@@ -168,8 +171,7 @@ def _merged(records: Records, omega: Array, ratios: Array) -> tuple[Array, Array
         close = np.flatnonzero(np.abs(np.log(omega / omega[k])) < ratios[k] / 2)
         if close.size > 1:
             fit = records.fit(omega, ratios)
-            each = fit.whitened[0].size + 2
-            allowed = (each + _DEVIATIONS * np.sqrt(2 * each)) * _noise(records, fit, omega.size)
+            allowed = _least_gain(fit) * _noise(records, fit, omega.size)
             if fit.rise_with_one_less(close) > _FAR * allowed:
                 k += 1
                 continue
@@ -224,6 +226,12 @@ def _in_order(records: Records, omega: Array, ratios: Array) -> Poles:
     order = np.argsort(omega)
     left = float(np.sqrt(records.fit(omega, ratios).squared_error / records.size))
     return Poles(omega[order], ratios[order], left)
+
+
+def _least_gain(fit: ResidueFit) -> float:
+    """What a pole must lower the squared error by to earn its place, in units of the noise's variance."""
+    each = fit.whitened[0].size + 2  # real parameters that come with a pole
+    return float(each + _DEVIATIONS * np.sqrt(2 * each))
 
 
 def _noise(records: Records, fit: ResidueFit, m: int) -> float:
@@ -298,11 +306,10 @@ def _prune(records: Records, omega: Array, ratios: Array, *, velocity: bool = Fa
     inside = (omega > lines[0] / _EDGE) & (omega < _EDGE * lines[-1]) & (ratios < _DAMPED)
     while omega.size:
         fit = records.fit(omega, ratios, velocity=velocity)
-        each = fit.whitened[0].size + 2  # real parameters that come with a pole
         # What is no mode goes first, whatever it explains.
         worth = np.where(inside, fit.gain / _noise(records, fit, omega.size), -1.0)
         least = int(np.argmin(worth))
-        if worth[least] > each + _DEVIATIONS * np.sqrt(2 * each):
+        if worth[least] > _least_gain(fit):
             break
         omega, ratios, inside = (np.delete(values, least) for values in (omega, ratios, inside))
     return omega, ratios

@@ -7,6 +7,7 @@ import numpy as np
 
 from sysid.measurement import Measurement
 from sysid.structure import Array, ComplexArray
+from sysid.weights import separable
 
 
 def columns(record: ComplexArray) -> ComplexArray:
@@ -72,10 +73,14 @@ def residual(test: Measurement, phi: ca.MX, gamma: ca.MX, omega: ca.MX, ratios: 
 
 
 def weighed_mass(test: Measurement, omega: Array, ratios: Array) -> Array:
-    """Rigid-body mass (d, d) that the base force tells, its modal part free at the given poles; kg."""
+    """Rigid-body mass (d, d) that the base force tells, its modal part free at the given poles; kg.
+
+    Lines weigh by what is stated of the force's noise.
+    """
     assert test.force is not None
+    weight = separable(test.force_std, test.force.shape)[1].ravel()[:, None]
     design = np.hstack([columns(test.base).T, _modal_basis(test, omega, ratios)])
-    return _real_least_squares(design, columns(test.force).T)[: test.n_base].T
+    return _real_least_squares(weight * design, weight * columns(test.force).T)[: test.n_base].T
 
 
 def gains(freq: Array, omega: Array, ratios: Array) -> ComplexArray:
