@@ -106,13 +106,15 @@ def poles_near(test: Measurement, omega: Array, window: float) -> Poles:
     found, ratios = _polish(records, distinct, np.full(distinct.size, _GUESS))
     off = np.abs(np.log(found / distinct))
     fit = records.fit(found, ratios)
-    # How far from being a mode of the data each is: by its place, or by what the fit would lose without it.
-    lacking = np.maximum(off / np.log1p(window), _least_gain(fit) * _noise(records, fit, found.size) / fit.gain)
-    if np.any(lacking > 1):
-        worst = int(np.argmax(lacking))
+    # By its place, or by what the fit would lose without it.
+    lacking = (off > np.log1p(window)) | (fit.gain < _least_gain(fit) * _noise(records, fit, found.size))
+    if np.any(lacking):
+        stated, ends = (
+            ", ".join(f"{value:.5g}" for value in values[lacking] / (2 * np.pi)) for values in (distinct, found)
+        )
         raise InputError(
-            f"the stated natural frequency {distinct[worst] / (2 * np.pi):.5g} Hz does not stand out of the data (a "
-            f"fit from there ends at {found[worst] / (2 * np.pi):.5g} Hz): the base may not move this mode"
+            f"of the stated natural frequencies {stated} Hz does not stand out of the data (a fit from there ends at "
+            f"{ends} Hz): the base may not move this mode"
         )
     return _in_order(records, found, ratios)
 

@@ -150,6 +150,7 @@ class TestAuto:
         result = self.at_once(wrong)
         assert result.strategy == "swarm"
         assert f"{given[2]:.5g} Hz does not stand out" in result.remarks[0]
+        assert "of the stated natural frequencies" in result.remarks[0]
 
     @pytest.mark.parametrize("asked", ["modal", "swarm", sysid.Modal(), QUICK])
     def test_what_was_asked_is_said_to_be_so(self, problem, asked):

@@ -163,7 +163,7 @@ class TestPolesNear:
     def test_one_from_which_a_fit_ends_elsewhere_is_named(self, seed):
         truth = structure(np.random.default_rng(seed), 4, 2)
         stated = truth.natural_frequencies * [1.0, 1.2, 1.0, 1.0]
-        with pytest.raises(InputError, match=f"the stated natural frequency {stated[1]:.5g} Hz does not stand out"):
+        with pytest.raises(InputError, match=f"stated natural frequencies .*{stated[1]:.5g}.* Hz does not stand out"):
             poles_near(simulate(truth, lines(truth)), 2 * np.pi * stated, 0.02)
 
     def test_frequencies_stated_twice_count_once(self):
