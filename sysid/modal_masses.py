@@ -29,6 +29,7 @@ _UNRESOLVED = 20.0  # misfits, in parts of the half-power half-width, by which r
 _CLEAR = 3.0  # misfits above which a mode's share of the responses is seen
 _AS_STATED = 1.2  # times the stated noise, to which a misfit may be noise alone
 _RESOLVED = 10.0  # standard deviations of a mode's amplitude at which it is known, to a tenth
+_QUIET = 1e-9  # of a channel's own size: noise below it is round-off
 _INVISIBLE = 1e-6  # of the strongest mode's participation
 _NOTHING = 5e-7  # of an entry's range: ends below it are zero
 _ROUND_OFF = 1e-13
@@ -64,15 +65,20 @@ def determination(problem: Problem, structure: Structure) -> Determination:
     misfit = test.residual(structure)
     closed, open_ = [], list(_unseen(problem, structure, misfit))
     known = _known(problem, structure, misfit)
+    free, common = _open_modes(known)
+    responses = _responses(test, structure)
     for cluster in known.clusters:
         if len(cluster) > 1:
             names = " and ".join(_mode(structure, k) for k in cluster)
-            open_.append(f"{names} are too close to be told apart: only the sum of their residues is known")
+            seen = _seen(test, structure, cluster, structure.mode_shapes, responses).shape[1]
+            if seen < len(cluster):
+                open_.append(f"{names} are too close to be told apart, and the data show {seen} of them only")
+            elif not set(cluster).isdisjoint(free):
+                open_.append(f"{names} are too close to be told apart: only the sum of their residues is known")
     if known.sentence:
         closed.append(known.sentence)
     if test.force is not None:
         closed.append("the measured base force weighs each mode that the base moves")
-    free, common = _open_modes(known)
     if free:
         if common:
             what = "one common scale of mass, stiffness and damping is open"
@@ -85,13 +91,11 @@ def determination(problem: Problem, structure: Structure) -> Determination:
         open_.append(f"{what}: other mass and stiffness matrices answer identically")
         if problem.unit_mass:
             open_.append("no number with a unit of mass is given: masses are normalised to 1 kg in each base direction")
-    elif all(len(cluster) == 1 for cluster in known.clusters) or test.force is not None:
-        # Equations on a cluster as a block were enough: its modes need not be told apart.
-        open_ = [sentence for sentence in open_ if "too close" not in sentence]
-    if structure.n != structure.n_sensors:
+    if not _at_sensors(structure):
         how_far = "completely" if test.force is not None and not free else "up to the modal masses"
+        alike = ", which do not all move independently" if structure.n == structure.n_sensors else ""
         open_.append(
-            f"{structure.n} modes stand out for {structure.n_sensors} sensors: the mass and stiffness matrices hold "
+            f"{structure.n} modes stand out for {structure.n_sensors} sensors{alike}: the mass and stiffness matrices hold "
             "for the stated degrees of freedom only; the Craig-Bampton form (modal and base coordinates) is what the "
             f"data determine, {how_far}"
         )
@@ -195,7 +199,9 @@ def _open_modes(known: _Known) -> tuple[list[int], bool]:
     null = null_space(np.vstack([known.equations, *rows]))
     taking_part = np.abs(null).max(axis=0, initial=0.0) > 1e-6
     free = sorted({k for pair, part in zip(pairs, taking_part, strict=True) if part for k in pair})
-    return free, len(null) == 1 and len(free) == sum(map(len, known.clusters)) > 1
+    own = np.array([float(k == m) for k, m in pairs])  # T = I, which a common scale multiplies
+    common = len(null) == 1 and abs(null[0] @ own) > (1 - 1e-6) * np.linalg.norm(null[0]) * np.linalg.norm(own)
+    return free, bool(common) and sum(map(len, known.clusters)) > 1
 
 
 def _cone(problem: Problem, structure: Structure, known: _Known) -> Cone:
@@ -259,13 +265,75 @@ def _moved(structure: Structure, clusters: list[list[int]]) -> list[Array]:
 
 
 def _weighed(test: Measurement, structure: Structure, clusters: list[list[int]]) -> list[Array]:
-    """The same for the clusters that stand out of the misfit of the base force."""
-    _, share = _shares(test, structure)
-    if share is None:
+    """The same for what stands out of the misfit of the base force."""
+    record = _forces(test, structure)
+    if record is None:
         return []
-    level = _force_level(test, structure)
-    seen = [bool(np.any(share[cluster] >= level)) for cluster in clusters]
-    return [W for W, yes in zip(_moved(structure, clusters), seen, strict=True) if yes and W.shape[1]]
+    weighed = [_seen(test, structure, cluster, structure.participation.T, record) for cluster in clusters]
+    return [W for W in weighed if W.shape[1]]
+
+
+class _Record(NamedTuple):
+    """A record beside what a structure leaves of it, all channels in units of their noise.
+
+    Attributes
+    ----------
+    weight : (channels,)
+    size : float
+        Norm of the weighted record.
+    misfit : float
+        Relative.
+    level : float
+        Part of the record that a mode must exceed to be known.
+    """
+
+    weight: Array
+    size: float
+    misfit: float
+    level: float
+
+
+def _record(record: ComplexArray, predicted: ComplexArray, std: Array | None, times: float) -> _Record:
+    """Weigh a record; `times` the misfit is what may look like a mode where its origin is unknown.
+
+    Where the misfit is no more than the stated noise, all lines together tell an amplitude, and `_RESOLVED` of
+    its standard deviations will do.
+    """
+    rms = lambda x: np.sqrt(np.mean(np.abs(x) ** 2, axis=(0, 2)))  # noqa: E731
+    noise = rms(record - predicted) if std is None else rms(std)
+    own = rms(record)
+    weight = 1 / np.maximum(noise, _QUIET * np.where(own > 0, own, own.max()))
+    by_channel = weight[:, None]
+    size = float(np.linalg.norm(record * by_channel))
+    misfit = float(np.linalg.norm((record - predicted) * by_channel)) / size
+    level = times * misfit
+    if std is not None and misfit <= _AS_STATED * np.linalg.norm(std * by_channel) / size:
+        level = float(_RESOLVED * misfit / np.sqrt(2 * record.size))
+    return _Record(weight, size, misfit, level)
+
+
+def _responses(test: Measurement, structure: Structure) -> _Record:
+    return _record(test.relative, test.predict(structure), test.response_std, _CLEAR)
+
+
+def _forces(test: Measurement, structure: Structure) -> _Record | None:
+    if test.force is None:
+        return None
+    return _record(test.force, test.predict_force(structure), test.force_std, 1.0)
+
+
+def _shares(test: Measurement, structure: Structure, k: int, rows: Array, push: Array, record: _Record) -> Array:
+    """Relative size of what motions `rows` (channels, w) at mode k's pole make of a record, pushed by `push` (w, d)."""
+    g = gains(test.freq, 2 * np.pi * structure.natural_frequencies[[k]], structure.damping_ratios[[k]])
+    moved = np.linalg.norm(np.einsum("wd,rdf->wrf", push, test.base) * g, axis=(1, 2))
+    return moved * np.linalg.norm(record.weight[:, None] * rows, axis=0) / record.size
+
+
+def _seen(test: Measurement, structure: Structure, cluster: list[int], rows: Array, record: _Record) -> Array:
+    """Directions of a cluster that stand out of a record in which the modes move `rows` (channels, n), (n, w)."""
+    (W,) = _moved(structure, [cluster])
+    shares = _shares(test, structure, cluster[0], rows @ W, W.T @ structure.participation, record)
+    return W[:, shares >= record.level]
 
 
 def _unseen(problem: Problem, structure: Structure, misfit: float) -> Iterator[str]:
@@ -279,52 +347,25 @@ def _unseen(problem: Problem, structure: Structure, misfit: float) -> Iterator[s
         yield f"the base moves in only {rank} of {test.n_base} independent directions: responses to the others are open"
     if 2 * test.response.size < problem.n_variables:
         yield f"{2 * test.response.size} measured numbers cannot fix {problem.n_variables} unknowns"
-    share, force_share = _shares(test, structure)
-    level = _level(_CLEAR * misfit, test.relative, test.response_std, _CLEAR)
-    force_level = 0.0 if force_share is None else _force_level(test, structure)
+    responses, forces = _responses(test, structure), _forces(test, structure)
+    level = responses.level
     for k in range(structure.n):
-        f = structure.natural_frequencies[k]
-        if share[k] < _INVISIBLE:
+        f, push = structure.natural_frequencies[k], structure.participation[[k]]
+        (share,) = _shares(test, structure, k, structure.mode_shapes[:, [k]], push, responses)
+        if share < _INVISIBLE:
             yield f"{_mode(structure, k)} is not moved by the base: nothing in these data tells its mass"
-        elif share[k] < level:
+        elif share < level:
             yield (
-                f"{_mode(structure, k)} makes {100 * share[k]:.2g} % of the response, which does not stand out of the "
-                f"misfit of {100 * misfit:.2g} %: its mass is not known"
+                f"{_mode(structure, k)} makes {100 * share:.2g} % of the response, which does not stand out of the "
+                f"misfit of {100 * responses.misfit:.2g} %: its mass is not known"
             )
         elif not test.freq[0] <= f <= test.freq[-1]:
             yield (
                 f"{_mode(structure, k)} lies outside the lines ({test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz) and "
                 "answers for all modes there"
             )
-        elif force_share is not None and force_share[k] < force_level:
+        elif forces and _shares(test, structure, k, push.T, push, forces)[0] < forces.level:
             yield f"{_mode(structure, k)} does not stand out of the misfit of the base force: its mass is not weighed"
-
-
-def _level(misfit: float, record: ComplexArray, std: Array | None, times: float = 1.0) -> float:
-    """Size of a mode's part, relative to the record, below which its amplitude is not known.
-
-    A misfit of unknown origin may look like a mode as large. Where it is no more than the stated noise, all lines
-    together tell an amplitude, and `_RESOLVED` of its standard deviations will do. `misfit` comes as `times` itself.
-    """
-    if std is None or misfit > times * _AS_STATED * np.linalg.norm(std) / np.linalg.norm(record):
-        return misfit
-    return float(_RESOLVED * misfit / times / np.sqrt(2 * record.size))
-
-
-def _force_level(test: Measurement, structure: Structure) -> float:
-    assert test.force is not None
-    return _level(test.force_residual(structure) or 0.0, test.force, test.force_std)
-
-
-def _shares(test: Measurement, structure: Structure) -> tuple[Array, Array | None]:
-    """Relative size of each mode's part in the responses and in the base force, (n,) each."""
-    g = gains(test.freq, 2 * np.pi * structure.natural_frequencies, structure.damping_ratios)
-    push = np.einsum("kd,rdf->rkf", structure.participation, test.base) * g
-    size = np.linalg.norm(push, axis=(0, 2))
-    share = size * np.linalg.norm(structure.mode_shapes, axis=0) / np.linalg.norm(test.relative)
-    if test.force is None:
-        return share, None
-    return share, size * np.linalg.norm(structure.participation, axis=1) / np.linalg.norm(test.force)
 
 
 def _clusters(structure: Structure, misfit: float) -> list[list[int]]:
