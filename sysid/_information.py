@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 
 from sysid.measurement import Measurement
 from sysid.modal_fit import Modes
@@ -175,9 +176,7 @@ def spread(A: Array, B: Array | None, path: Path) -> tuple[Array, Array]:
     fixed = gauge[seen] * size[seen, None]
     fixed = fixed / np.linalg.norm(fixed, axis=0)
     size = size[seen]
-    lam, vectors = np.linalg.eigh(A[np.ix_(seen, seen)] / np.outer(size, size) + fixed @ fixed.T)
-    known = lam > lam.size * np.finfo(float).eps * lam[-1]
-    factor = vectors[:, known] / np.sqrt(lam[known])
+    factor, lost = _inverse_factor(A[np.ix_(seen, seen)] / np.outer(size, size) + fixed @ fixed.T)
     factor = factor - fixed @ (fixed.T @ factor)
     if B is not None:
         B = slope.T @ B @ slope
@@ -185,8 +184,21 @@ def spread(A: Array, B: Array | None, path: Path) -> tuple[Array, Array]:
         factor = (factor @ turn) * np.sqrt(np.maximum(variances, 0.0))
     normals = np.zeros((unit.size, factor.shape[1]))
     normals[seen] = factor / size[:, None] / np.sqrt(2)
-    blind = np.zeros((unit.size, np.count_nonzero(~known)))
-    blind[seen] = vectors[:, ~known] / size[:, None]
+    blind = np.zeros((unit.size, lost.shape[1]))
+    blind[seen] = lost / size[:, None]
     unseen = np.hstack([blind, np.eye(unit.size)[:, ~seen], gauge])
     unseen = unseen / np.linalg.norm(unseen / unit[:, None], axis=0)
     return slope @ normals, slope @ unseen
+
+
+def _inverse_factor(matrix: Array) -> tuple[Array, Array]:
+    """F with ``F F'`` the inverse of a semidefinite matrix on its range, and an orthonormal basis of the rest."""
+    least = len(matrix) * np.finfo(float).eps
+    triangle, singular = scipy.linalg.lapack.dpotrf(matrix, lower=1)
+    # Where it is regular this takes a tenth of the time of eigenvalues.
+    if not singular and scipy.linalg.lapack.dpocon(triangle, np.linalg.norm(matrix, 1), uplo="L")[0] > least:
+        inverse = scipy.linalg.solve_triangular(triangle, np.eye(len(matrix)), lower=True, check_finite=False)
+        return inverse.T, np.zeros((len(matrix), 0))
+    lam, vectors = np.linalg.eigh(matrix)
+    known = lam > least * lam[-1]
+    return vectors[:, known] / np.sqrt(lam[known]), vectors[:, ~known]

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sysid.mass import FullMass, KnownMass
+from sysid.mass import FullMass, KnownMass, LumpedMass
 from sysid.measurement import Measurement
 from sysid.problem import Problem
 from sysid.residues import Records, force_residual_left
@@ -27,6 +27,7 @@ def doubts(problem: Problem, structure: Structure) -> tuple[str, ...]:
         (
             *_stated_mass(problem, structure),
             *_known_entries(problem, structure),
+            *_lumped_total(problem, structure),
             *_force(problem.measurement, structure),
             *_damping(problem.measurement, structure),
             *_twins(problem.measurement, structure),
@@ -83,6 +84,21 @@ def _known_entries(problem: Problem, structure: Structure) -> Iterator[str]:
         if np.any(makes > problem.totals * (1 + 1e-6)):
             given, told = (", ".join(f"{m:.4g}" for m in masses) for masses in (problem.totals, makes))
             yield f"the known entries of the mass make {told} kg or more, and {given} kg are stated in all"
+
+
+def _lumped_total(problem: Problem, structure: Structure) -> Iterator[str]:
+    """Whether the total of a lumped mass, a sum over the sensors of a direction, is what moves in that direction."""
+    mass, layout = problem.mass, problem.layout
+    if not isinstance(mass, LumpedMass) or mass.total_mass is None:
+        return
+    own, groups = np.diag(structure.mass)[: layout.n], layout.directions[: layout.n]
+    moves = np.einsum("j,ji->i", own, layout.rigid_body**2)
+    for i in np.flatnonzero(layout.translational):
+        if np.any(groups == i) and abs(moves[i] / problem.totals[i] - 1) > 1e-6:
+            yield (
+                f"{problem.totals[i]:.4g} kg are stated over the sensors of base direction {i + 1}, but their masses "
+                f"make {moves[i]:.4g} kg in it: a lumped mass needs sensors along the base directions, not skew ones"
+            )
 
 
 def _force(test: Measurement, structure: Structure) -> Iterator[str]:

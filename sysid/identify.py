@@ -25,6 +25,7 @@ from sysid.refinement import SOLVED
 from sysid.stiffness import SpectralStiffness
 from sysid.structure import Structure
 
+_KNOWN = 0.1  # of the diagonals; a larger standard deviation of an entry is no knowledge of it
 _NO_FIT = 0.5  # relative residual above which nothing is explained
 STRATEGIES = ("auto", "swarm", "modal")
 
@@ -202,18 +203,41 @@ def _finish(problem: Problem, end: Outcome, why: str, seed: int, desk: Desk) -> 
         message += "; " + "; ".join(doubtful)
     if not success:
         open_ = ("the search did not end in a fit, so this is not yet any structure that explains the data", *open_)
-    return Identification(
-        structure=structure,
-        problem=problem,
-        x=end.x,
-        strategy=end.strategy,
-        seed=seed,
-        success=success,
-        message=message,
-        history=replace(end.history, log=tuple(desk.log), wall_time=desk.seconds),
-        determined=not open_,
-        closed_by=() if open_ else known.closed_by,
-        undetermined=open_,
-        remarks=(why, *end.remarks),
-        interrupted=isinstance(end.stopped, KeyboardInterrupt),
+    return _as_certain(
+        Identification(
+            structure=structure,
+            problem=problem,
+            x=end.x,
+            strategy=end.strategy,
+            seed=seed,
+            success=success,
+            message=message,
+            history=replace(end.history, log=tuple(desk.log), wall_time=desk.seconds),
+            determined=not open_,
+            closed_by=() if open_ else known.closed_by,
+            undetermined=open_,
+            remarks=(why, *end.remarks),
+            interrupted=isinstance(end.stopped, KeyboardInterrupt),
+        )
     )
+
+
+def _as_certain(it: Identification) -> Identification:
+    """The same; not determined where noise leaves matrices open that are fixed without it.
+
+    Null directions of exact records are closed by their noise, and show as large standard deviations only.
+    """
+    if not it.determined or max(it.residual, it.force_residual or 0.0) < local.EXACT:
+        return it
+    s, u = it.structure, it.uncertainty
+    n, open_ = s.n, []
+    pairs = ("M_SS", s.mass[:n, :n], u.mass), ("K_SS", s.stiffness[:n, :n], u.stiffness), ("C", s.damping, u.damping)
+    for name, matrix, std in pairs:
+        size = np.sqrt(np.diag(matrix))
+        relative = std / np.outer(size, size)
+        if not np.all(relative <= _KNOWN):
+            told = (
+                "open" if np.any(np.isnan(relative)) else f"with standard deviations up to {100 * relative.max():.2g} %"
+            )
+            open_.append(f"noise leaves entries of {name} {told}")
+    return replace(it, determined=False, closed_by=(), undetermined=tuple(open_)) if open_ else it

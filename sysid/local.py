@@ -257,7 +257,7 @@ def _structured(problem: Problem, x: Array, start: Structure, watch: Watch, max_
     push = L @ (L.T @ G) + M_S0
     rigid = G.T @ push + M_S0.T @ G + M_00
 
-    miss = residual(problem.measurement, phi, phi.T @ push, omega, ratios, rigid)
+    miss = residual(problem.measurement, phi, phi.T @ push, omega, ratios, rigid, weighted=True)
     best, status = z.minimize(ca.sumsqr(miss), watch, max_iterations)
 
     names = (ca.vertcat(*pieces), psi, omega, ratios, ca.norm_2(miss))

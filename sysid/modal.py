@@ -36,8 +36,10 @@ Integers = NDArray[np.intp]
 _DEVIATIONS = 12.0  # of the chi-squared law, by which a misfit must exceed noise to mean something
 _EXACT = 1e-8  # relative residual that needs no second look
 _ROUND_OFF = 1e-11  # of the records: what counts as noise where there is none
+_SCATTER = 5.0  # times the misfit of all lines together: what noise makes of the shapes' singular values
 _DEPENDENT = 1e-6  # of the largest singular value of the shapes: below, sensors move alike in all modes
 FREQUENCY_WINDOW = 0.05  # relative; what a frequency read off a peak may be wrong by
+_AS_GOOD = 1.02  # times the residual without it, that a stated total may leave
 _AGREES = 0.01  # relative; a stated total that the base force weighs within this is held in the fit
 
 
@@ -179,20 +181,19 @@ def _fit_with(
 
 def held_to_totals(problem: Problem, end: ModalFit, watch: Watch, max_iterations: int) -> ModalFit | None:
     """The same fit with stated totals held, where what the base force weighs agrees with them; else None."""
-    ties, test = stated_totals(problem), problem.measurement
-    if ties is None or np.any(np.abs(np.diag(end.rigid) / problem.totals - 1) > _AGREES):
+    ties, test, modes = stated_totals(problem), problem.measurement, end.modes
+    if ties is None:
         return None
-    size = np.sqrt(problem.totals)
-    total = problem.rigid_total
-    if total is not None and np.any(np.abs(end.rigid - total) > _AGREES * np.outer(size, size)):
+    off = ca.vertcat(*ties(ca.DM(modes.phi), ca.DM(modes.gamma), ca.DM(end.rigid)))
+    if np.any(np.abs(np.asarray(off)) > _AGREES):
         return None
-    modes = end.modes
     poles = Poles(modes.omega, modes.ratios, end.residual)
     held = fit_modes(
         test, modes, _free_spectrum(poles, np.arange(modes.omega.size)), unit=np.sqrt(problem.totals),
         remainder=end.rigid - modes.gamma.T @ modes.gamma, ties=ties, watch=watch, max_iterations=max_iterations,
     )  # fmt: skip
-    return held if held.status in SOLVED else None
+    agrees = held.residual <= _AS_GOOD * end.residual + _EXACT
+    return held if agrees and held.status in SOLVED else None
 
 
 def _free_spectrum(poles: Poles, pole: Integers) -> Spectrum:
@@ -213,16 +214,20 @@ def _within(value: ca.MX, limit: float) -> ca.MX:
     return ca.fmin(ca.fmax(value, -limit), limit)
 
 
-def degrees_of_freedom(problem: Problem, modes: Modes, stated: Sequence[str | int] | None) -> DegreesOfFreedom:
+def degrees_of_freedom(
+    problem: Problem, modes: Modes, residual: float, stated: Sequence[str | int] | None
+) -> DegreesOfFreedom:
     """Sensors, and modal coordinates where they do not suffice, whose motions tell all modes' apart.
 
     Sensors by a pivoted QR of the mode shapes, each mode in units of its own size, so that the chosen rows are
     best conditioned. With more modes than independent sensors the modes that the sensors tell least become coordinates.
+    The relative `residual` of the fit tells how well shapes are known, and so what is independent.
     """
     n, m = modes.phi.shape
     shapes = modes.phi / np.linalg.norm(modes.phi, axis=0)
     s = np.linalg.svd(shapes, compute_uv=False)
-    rank = int(np.count_nonzero(s > _DEPENDENT * s[0]))
+    least = max(_DEPENDENT, _SCATTER * residual / np.sqrt(problem.measurement.freq.size))
+    rank = int(np.count_nonzero(s > least * s[0]))
     if stated is not None:
         sensors = _by_name(problem.measurement, stated)
         if sensors.size > m or np.linalg.svd(shapes[sensors], compute_uv=False)[-1] < _DEPENDENT:
@@ -304,7 +309,7 @@ def modal_structure(
     end = fit(test, poles, np.sqrt(problem.totals), watch, options.max_iterations)
     held = held_to_totals(problem, end, watch, options.max_iterations)
     end = held or end
-    chosen = degrees_of_freedom(problem, end.modes, options.sensors)
+    chosen = degrees_of_freedom(problem, end.modes, end.of_accelerations, options.sensors)
     modes, remainder = end.modes, end.rigid - end.modes.gamma.T @ end.modes.gamma
     if test.force is None:
         k = chosen.modes.size

@@ -95,9 +95,9 @@ def determination(problem: Problem, structure: Structure) -> Determination:
         how_far = "completely" if test.force is not None and not free else "up to the modal masses"
         alike = ", which do not all move independently" if structure.n == structure.n_sensors else ""
         open_.append(
-            f"{structure.n} modes stand out for {structure.n_sensors} sensors{alike}: the mass and stiffness matrices hold "
-            "for the stated degrees of freedom only; the Craig-Bampton form (modal and base coordinates) is what the "
-            f"data determine, {how_far}"
+            f"{structure.n} modes stand out for {structure.n_sensors} sensors{alike}: the mass and stiffness matrices "
+            "hold for the stated degrees of freedom only; the Craig-Bampton form (modal and base coordinates) is what "
+            f"the data determine, {how_far}"
         )
     return Determination(not open_, () if free else tuple(closed), tuple(open_))
 

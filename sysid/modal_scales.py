@@ -118,10 +118,11 @@ def to_stated_totals(
         Whether known masses set the modal masses already, so that t is one; a total that is not stated, or
         less than they make, is then what they make.
     """
+    spare = 0.0 if problem.measurement.force is not None else _SPARE  # a force tells what the base has
     if problem.rigid_total is not None:
         size = np.sqrt(problem.totals)
         own, total = ((part / np.outer(size, size)) for part in (gamma.T @ gamma, problem.rigid_total))
-        t = 1.0 if scaled else min(1.0, (1 - _SPARE) / float(scipy.linalg.eigvalsh(own, total)[-1]))
+        t = 1.0 if scaled else min(1.0, (1 - spare) / float(scipy.linalg.eigvalsh(own, total)[-1]))
         lam, vectors = np.linalg.eigh(total - t * own)
         return t, (vectors * np.maximum(lam, 0.0)) @ vectors.T * np.outer(size, size)
     if isinstance(problem.mass, FullMass) and problem.mass.healing == "rigid_body":
@@ -133,9 +134,9 @@ def to_stated_totals(
     totals = problem.totals
     if scaled:
         stated = isinstance(problem.mass, FullMass) and problem.mass.total_mass is not None
-        totals = np.maximum(totals if stated else 0.0, (1 + _SPARE) * used)
-    t = 1.0 if scaled else min(1.0, float(np.min((1 - _SPARE) * totals / used)))
-    share = np.sqrt((totals - t * used) / np.maximum(np.diag(remainder), np.finfo(float).tiny))
+        totals = np.maximum(totals if stated else 0.0, (1 + spare) * used)
+    t = 1.0 if scaled else min(1.0, float(np.min((1 - spare) * totals / used)))
+    share = np.sqrt(np.maximum(totals - t * used, 0.0) / np.maximum(np.diag(remainder), np.finfo(float).tiny))
     return t, remainder * np.outer(share, share)
 
 

@@ -31,7 +31,16 @@ def modal_gains(omega: ca.MX, ratios: ca.MX, freq: Array) -> tuple[ca.MX, ca.MX]
     return size * detuning, -size * loss
 
 
-def residual(test: Measurement, phi: ca.MX, gamma: ca.MX, omega: ca.MX, ratios: ca.MX, rigid_body_mass: ca.MX) -> ca.MX:
+def residual(
+    test: Measurement,
+    phi: ca.MX,
+    gamma: ca.MX,
+    omega: ca.MX,
+    ratios: ca.MX,
+    rigid_body_mass: ca.MX,
+    *,
+    weighted: bool = False,
+) -> ca.MX:
     """Relative residuals, stacked: their sum of squares is the squared relative error of each record.
 
     Parameters
@@ -45,6 +54,9 @@ def residual(test: Measurement, phi: ca.MX, gamma: ca.MX, omega: ca.MX, ratios: 
         Circular frequencies, rad/s, and damping ratios.
     rigid_body_mass : (d, d), kg
         Read only where the test has a force.
+    weighted : bool
+        Channels and lines weigh by their stated noise, and accelerations and force by each other's where both are
+        stated.
 
     Returns
     -------
@@ -59,17 +71,26 @@ def residual(test: Measurement, phi: ca.MX, gamma: ca.MX, omega: ca.MX, ratios: 
     u_re, u_im = _parts(test.base)
     push_re, push_im = gamma @ u_re, gamma @ u_im
     q_re, q_im = g_re * push_re - g_im * push_im, g_re * push_im + g_im * push_re
-    scale = np.linalg.norm(test.relative)
+    weight, scale = _weights(test.relative, test.response_std if weighted else None)
     a_re, a_im = _parts(test.relative)
-    pieces = [(phi @ q_re - a_re) / scale, (phi @ q_im - a_im) / scale]
+    pieces = [weight * (phi @ q_re - a_re) / scale, weight * (phi @ q_im - a_im) / scale]
     if test.force is not None:
-        scale = np.linalg.norm(test.force)
+        weight, force_scale = _weights(test.force, test.force_std if weighted else None)
+        if not weighted or test.response_std is None or test.force_std is None:
+            scale = force_scale
         f_re, f_im = _parts(test.force)
         pieces += [
-            (gamma.T @ q_re + rigid_body_mass @ u_re - f_re) / scale,
-            (gamma.T @ q_im + rigid_body_mass @ u_im - f_im) / scale,
+            weight * (gamma.T @ q_re + rigid_body_mass @ u_re - f_re) / scale,
+            weight * (gamma.T @ q_im + rigid_body_mass @ u_im - f_im) / scale,
         ]
     return ca.vertcat(*(ca.vec(ca.densify(piece)) for piece in pieces))
+
+
+def _weights(record: ComplexArray, std: Array | None) -> tuple[ca.DM, float]:
+    """Weights of a record's channels and lines as `columns` has them, and the size of the weighted record."""
+    channel, line = separable(std, record.shape)
+    weight = channel[:, None] * line.ravel()
+    return ca.DM(weight), float(np.linalg.norm(weight * columns(record)))
 
 
 def weighed_mass(test: Measurement, omega: Array, ratios: Array) -> Array:
