@@ -19,6 +19,7 @@ import scipy.linalg
 
 from sysid.measurement import Measurement
 from sysid.modal_fit import Modes
+from sysid.residues import line_correlation
 from sysid.response import columns, gain_slopes, gains
 from sysid.structure import Array, ComplexArray, Structure
 from sysid.weights import separable
@@ -96,13 +97,20 @@ def _measured(test: Measurement) -> int:
 
 
 def inflation_of(test: Measurement, records: list[Record], unknowns: int) -> float:
-    """Factor by which the misfit exceeds what the stated noise explains; NaN where nothing tells the noise."""
+    """Factor by which errors exceed what the stated noise explains; NaN where nothing tells the noise.
+
+    By the misfit's size, and by what neighbouring lines share of it, as lines of averaged spectra do.
+    """
     freedom = _measured(test) - unknowns
     if freedom <= 0:
         stated = test.response_std is not None and (test.force is None or test.force_std is not None)
         return 1.0 if stated else np.nan
     reduced = 2 * sum(np.sum(np.abs(record.misfit / record.std) ** 2) for record in records) / freedom
-    return float(np.sqrt(reduced)) if reduced > max(_SUSPECT, 1 + _DEVIATIONS * np.sqrt(2 / freedom)) else 1.0
+    beyond = reduced if reduced > max(_SUSPECT, 1 + _DEVIATIONS * np.sqrt(2 / freedom)) else 1.0
+    shared = line_correlation(
+        np.concatenate([(r.misfit / r.std).reshape(-1, test.n_runs, test.freq.size) for r in records])
+    )
+    return float(np.sqrt(beyond * shared))
 
 
 def gains_of(freq: Array, modes: Modes) -> tuple[ComplexArray, ComplexArray]:

@@ -10,7 +10,7 @@ import numpy as np
 from sysid.mass import FullMass, KnownMass, LumpedMass
 from sysid.measurement import Measurement
 from sysid.problem import Problem
-from sysid.residues import Records, force_residual_left
+from sysid.residues import Records, force_residual_left, linear_residues
 from sysid.response import weighed_mass
 from sysid.structure import Array, Structure
 
@@ -18,21 +18,40 @@ _DEVIATIONS = 12.0  # of the chi-squared law, by which a misfit must exceed nois
 _ROUND_OFF = 1e-8  # of the records: what counts as noise where there is none
 _SAME_POLE = 1e-6  # relative distance of poles that count as one
 _ALIKE = 3.0  # misfits by which two records must differ to be of two sensors
+_MISFIT = 1.5  # times what free residues leave, beyond which a structure is not what the modes are of
 _FORCE_MISFIT = 1.5  # times what free residues leave, beyond which the force is not that of these modes
 
 
 def doubts(problem: Problem, structure: Structure) -> tuple[str, ...]:
     """What speaks against the identified structure, in sentences; nothing counts as determined beside one."""
+    test = problem.measurement
+    no_fit = tuple(_no_fit(problem, structure))
     return tuple(
         (
             *_stated_mass(problem, structure),
             *_known_entries(problem, structure),
             *_lumped_total(problem, structure),
-            *_force(problem.measurement, structure),
-            *_damping(problem.measurement, structure),
-            *_twins(problem.measurement, structure),
+            *no_fit,
+            *_force(test, structure),
+            *_damping(test, structure),
+            # Beside a large misfit any two records are alike.
+            *(() if no_fit else _twins(test, structure)),
         )
     )
+
+
+def _no_fit(problem: Problem, structure: Structure) -> Iterator[str]:
+    """Whether the structure leaves what modes without it would not."""
+    test = problem.measurement
+    left = replace(test, response=test.response - test.predict(structure))
+    misfit = float(np.sqrt(Records(left).size / Records(test).size))
+    possible = max(linear_residues(test, *_poles(structure))[1], _ROUND_OFF)
+    if misfit > _MISFIT * possible:
+        model = "the structure" if isinstance(problem.mass, FullMass) else "the stated mass model"
+        yield (
+            f"{model} misses {100 * misfit:.3g} % of the accelerations, its poles with free residues "
+            f"{100 * possible:.3g} %: the model, a sign or axis in rigid_body, or a record is not what it is said to be"
+        )
 
 
 def _poles(structure: Structure) -> tuple[Array, Array]:
@@ -125,6 +144,7 @@ def _damping(test: Measurement, structure: Structure) -> Iterator[str]:
     extra = poles[0].size * records.n_base * records.n_sensors
     freedom = max(records.data.size - 2 * extra, 1)
     noise = max(both.squared_error / freedom, _ROUND_OFF**2 * records.size / records.data.size)
+    noise *= records.line_correlation(both.left)
     gained = real.squared_error - both.squared_error
     if gained > noise * (extra + _DEVIATIONS * np.sqrt(2 * extra)):
         yield (

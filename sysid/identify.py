@@ -84,7 +84,12 @@ def identify(
                 if strategy != "auto":
                     raise
                 why = f"strategy 'swarm': the modal one does not apply ({error})"
-                options = Swarm()
+                desk.note(why)
+                try:
+                    end = by_swarm(problem, Swarm(), desk, random, start, max_evaluations)
+                except InputError as other:
+                    raise InputError(f"strategy 'modal' does not apply: {error}; nor does the swarm: {other}") from None
+                return _finish(problem, end, why, seed, desk)
         desk.note(why)
         return _finish(problem, by_swarm(problem, options, desk, random, start, max_evaluations), why, seed, desk)
 

@@ -27,7 +27,7 @@ from sysid.modal_scales import nearest_lumped, of_known_mass, stated_totals, to_
 from sysid.poles import Poles, find_poles, poles_near
 from sysid.problem import Problem
 from sysid.refinement import SOLVED
-from sysid.residues import Records, independent, linear_residues
+from sysid.residues import Records, ResidueFit, independent, linear_residues
 from sysid.stiffness import SpectralStiffness
 from sysid.structure import Array, Structure
 
@@ -106,7 +106,7 @@ def fit(test: Measurement, poles: Poles, unit: Array, watch: Watch, max_iteratio
             f"{test.freq.size} lines ({2 * test.response.size} measured numbers) cannot fix {m * (n + d + 1)} "
             "unknowns: add lines or runs"
         )
-    multiplicity = np.ones(m, dtype=int)
+    multiplicity = _ranks(records, poles)
     best = _fit_with(test, poles, multiplicity, unit, watch, max_iterations)
     while watch.stopped is None:
         lacking = _lacking_rank(records, best, multiplicity)
@@ -132,6 +132,26 @@ def _noise(records: Records, residual: float, m: int) -> float:
     return max(residual**2 * records.size / freedom, _ROUND_OFF**2 * records.size / records.data.size)
 
 
+def _ranks(records: Records, poles: Poles) -> Integers:
+    """Number of modes at each pole, as many as its free residue needs to be known to within its noise."""
+    n, d = records.n_sensors, records.n_base
+    free = records.fit(poles.omega, poles.ratios)
+    noise = _free_noise(records, free)
+    s = np.linalg.svd(free.whitened.reshape(poles.omega.size, -1, n), compute_uv=False)
+    ranks = np.ones(poles.omega.size, dtype=int)
+    for r in range(1, min(n, d)):
+        freedom = (n - r) * (d - r)
+        more = np.sum(s[:, r:] ** 2, axis=1) > noise * (freedom + _DEVIATIONS * np.sqrt(2 * freedom))
+        ranks[more & (ranks == r)] += 1
+    return ranks
+
+
+def _free_noise(records: Records, free: ResidueFit) -> float:
+    """Variance of a real number of the records about free residues, as smooth functions of frequency feel it."""
+    variance = records.line_correlation(free.left) * free.squared_error / records.data.size
+    return max(variance, _ROUND_OFF**2 * records.size / records.data.size)
+
+
 def _lacking_rank(records: Records, best: ModalFit, multiplicity: Integers) -> int | None:
     """The pole whose free residue most lacks in the modes that it has; None where none does."""
     first = np.concatenate([[0], np.cumsum(multiplicity)[:-1]])
@@ -142,7 +162,7 @@ def _lacking_rank(records: Records, best: ModalFit, multiplicity: Integers) -> i
         return None
     freedom = float(np.sum((n - multiplicity) * (d - multiplicity)))
     excess = best.of_accelerations**2 * records.size - free.squared_error
-    noise = max(free.squared_error / records.data.size, _ROUND_OFF**2 * records.size / records.data.size)
+    noise = _free_noise(records, free)
     if excess < noise * (freedom + _DEVIATIONS * np.sqrt(2 * freedom)):
         return None
     residues = free.whitened.reshape(omega.size, -1, n)
@@ -330,7 +350,10 @@ def modal_structure(
     try:
         return build(problem, modes, remainder, chosen, to_totals=unmet), end, chosen, poles
     except InputError as error:
-        raise NotModalError(f"the shapes of the modes found are too much alike at the sensors: {error}") from None
+        raise NotModalError(
+            "the modes found are too much alike at the sensors, as where a sensor's sign, gain or axis in rigid_body is "
+            f"wrong, or the responses are not absolute accelerations ({error})"
+        ) from None
 
 
 def held_by_model(problem: Problem, structure: Structure) -> Array:

@@ -29,6 +29,7 @@ _UNRESOLVED = 20.0  # misfits, in parts of the half-power half-width, by which r
 _CLEAR = 3.0  # misfits above which a mode's share of the responses is seen
 _AS_STATED = 1.2  # times the stated noise, to which a misfit may be noise alone
 _RESOLVED = 10.0  # standard deviations of a mode's amplitude at which it is known, to a tenth
+_GAIN = 0.02  # of the base's motion; a smaller error of a sensor's gain is not told from a mode below the lines
 _QUIET = 1e-9  # of a channel's own size: noise below it is round-off
 _INVISIBLE = 1e-6  # of the strongest mode's participation
 _NOTHING = 5e-7  # of an entry's range: ends below it are zero
@@ -293,6 +294,21 @@ class _Record(NamedTuple):
     level: float
 
 
+def _like_rigid(problem: Problem, structure: Structure, k: int) -> str:
+    """What else a mode below the lines may be: far above it, it moves sensors by a constant times the base's motion."""
+    test, G = problem.measurement, problem.measurement.rigid_body
+    moved = -np.outer(structure.mode_shapes[:, k], structure.participation[k])
+    reach = np.abs(G).max(axis=0)
+    wrong = np.abs(moved) / np.where(reach > 0, reach, np.inf)
+    i, j = np.unravel_index(np.argmax(wrong), wrong.shape)
+    if wrong[i, j] < _GAIN:
+        return ""
+    return (
+        f"; or sign, gain or axis of {test.sensor_names[i]} are wrong, which in all these lines moves by "
+        f"{moved[i, j]:.2g} times base direction {j + 1} beside what its row of rigid_body says"
+    )
+
+
 def _record(record: ComplexArray, predicted: ComplexArray, std: Array | None, times: float) -> _Record:
     """Weigh a record; `times` the misfit is what may look like a mode where its origin is unknown.
 
@@ -363,7 +379,7 @@ def _unseen(problem: Problem, structure: Structure, misfit: float) -> Iterator[s
             yield (
                 f"{_mode(structure, k)} lies outside the lines ({test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz) and "
                 "answers for all modes there"
-            )
+            ) + (_like_rigid(problem, structure, k) if f < test.freq[0] else "")
         elif forces and _shares(test, structure, k, push.T, push, forces)[0] < forces.level:
             yield f"{_mode(structure, k)} does not stand out of the misfit of the base force: its mass is not weighed"
 

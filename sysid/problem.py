@@ -112,6 +112,12 @@ class Problem:
             limit = self.stiffness.max_frequency or (None if found.size >= n else max(test.freq[-1], found[-1]))
             put("stiffness", SpectralStiffness(found[:n], limit))
         layout = Layout(test.rigid_body, test.translational)
+        if test.force is not None and not np.all(np.any(test.force, axis=(0, 2))):
+            at = np.flatnonzero(~np.any(test.force, axis=(0, 2)))
+            names = ", ".join(test.base_axes[i] if test.base_axes else f"direction {i + 1}" for i in at)
+            raise InputError(
+                f"the base force is zero in {names}: is a load cell dead? Leave the force or that axis out"
+            )
         if np.linalg.norm(test.relative) <= 1e-12 * np.linalg.norm(test.response):
             raise InputError("no sensor moves relative to the base: there is nothing to identify from")
         if test.force is not None and not isinstance(self.mass, KnownMass) and self.mass.total_mass is None:

@@ -13,6 +13,8 @@ from sysid.response import columns, gains
 from sysid.structure import Array, ComplexArray
 from sysid.weights import separable
 
+_NEIGHBOURS = 3  # lines on either side that may share their noise
+_CHANCE = 5.0  # standard deviations of the correlation of white noise
 _DEPENDENT = 1e-9  # of the largest singular value of the base records
 
 
@@ -118,6 +120,15 @@ class Records:
         whitened = np.linalg.solve(factor, beta)
         return ResidueFit(Q, beta, self.data - Q @ y, whitened, spread)
 
+    def line_correlation(self, left: Array) -> float:
+        """Factor by which noise weighs more on smooth functions as neighbouring lines share it; one for white noise.
+
+        Windows of averaged spectra smear each error over some lines: Hann's make it 2.7.
+        """
+        rows = len(left) // 2
+        error = (left[:rows] + 1j * left[rows:]).reshape(-1, self.freq.size, left.shape[1])
+        return line_correlation(np.moveaxis(error, 1, 2))
+
     def by_sensor(self, residues: Array) -> Array:
         """Residues (m, inputs, channels) of `fit` in the test's own units, (m, n_sensors, d).
 
@@ -127,6 +138,20 @@ class Records:
             plain = (residues / self.channel).reshape(len(residues), self.n_base, self.n_sensors)
             return plain.transpose(0, 2, 1)
         return np.einsum("mic,di->mcd", residues / self.channel, self.moving)
+
+
+def line_correlation(error: ComplexArray) -> float:
+    """Sum of the correlations of errors (..., n_freq) with those of their neighbours, where these are no chance."""
+    power = float(np.sum(np.abs(error) ** 2))
+    if power == 0 or error.shape[-1] <= 2 * _NEIGHBOURS:
+        return 1.0
+    factor = 1.0
+    for lag in range(1, _NEIGHBOURS + 1):
+        shared = float(np.sum(error[..., lag:] * error[..., :-lag].conj()).real) / power
+        if shared < _CHANCE / np.sqrt(2 * error.size):
+            break
+        factor += 2 * shared
+    return factor
 
 
 def independent(base: ComplexArray) -> Array:

@@ -7,7 +7,7 @@ import sysid
 
 def problem(*, data=None, rng=0):
     mass, k = np.diag([2.0, 1.0, 0.5]), 4e3
-    stiffness = k * np.array([[2.0, -1.0, -1.0], [-1.0, 1.5, -0.5], [-1.0, -0.5, 1.5]])
+    stiffness = k * np.array([[2.0, -1.0, -1.0], [-1.0, 2.5, -1.5], [-1.0, -1.5, 2.5]])
     truth = sysid.Structure(mass, stiffness, [0.01, 0.02], n_base=1)
     test = sysid.simulate(truth, np.linspace(1.0, 25.0, 60), noise=0.0, rng=rng)
     freq, base, response, G = test.freq.copy(), test.base.copy(), test.response.copy(), test.rigid_body

@@ -79,7 +79,7 @@ def test_run_writes_three_files_under_the_name_of_the_module_and_tells_where(her
     # The frequencies of the structure in the module, from SciPy's generalised eigenproblem.
     from scipy.linalg import eigh
 
-    K = 4e3 * np.array([[2.0, -1.0], [-1.0, 1.5]])
+    K = 4e3 * np.array([[2.0, -1.0], [-1.0, 2.5]])
     exact = np.sqrt(eigh(K, np.diag([2.0, 1.0]), eigvals_only=True)) / (2 * np.pi)
     for frequency in exact:
         assert f"{frequency:.5g}" in out
