@@ -351,7 +351,7 @@ def modal_structure(
         return build(problem, modes, remainder, chosen, to_totals=unmet), end, chosen, poles
     except InputError as error:
         raise NotModalError(
-            "the modes found are too much alike at the sensors, as where a sensor's sign, gain or axis in rigid_body is "
+            "the modes found are too much alike at the sensors, as where a sign, gain or axis in rigid_body is "
             f"wrong, or the responses are not absolute accelerations ({error})"
         ) from None
 
