@@ -19,13 +19,15 @@ _ROUND_OFF = 1e-8  # of the records: what counts as noise where there is none
 _SAME_POLE = 1e-6  # relative distance of poles that count as one
 _ALIKE = 3.0  # misfits by which two records must differ to be of two sensors
 _MISFIT = 1.5  # times what free residues leave, beyond which a structure is not what the modes are of
+_MIMICKED = 1e-2  # of a constant; less of it is left where a mode far below the lines answers like one
+_GAIN = 0.03  # of the base's motion; smaller errors of a sensor's gain are usual
 _FORCE_MISFIT = 1.5  # times what free residues leave, beyond which the force is not that of these modes
 
 
 def doubts(problem: Problem, structure: Structure) -> tuple[str, ...]:
     """What speaks against the identified structure, in sentences; nothing counts as determined beside one."""
     test = problem.measurement
-    no_fit = tuple(_no_fit(problem, structure))
+    no_fit, rigid = tuple(_no_fit(problem, structure)), tuple(_rigid(test, structure))
     return tuple(
         (
             *_stated_mass(problem, structure),
@@ -33,9 +35,10 @@ def doubts(problem: Problem, structure: Structure) -> tuple[str, ...]:
             *_lumped_total(problem, structure),
             *no_fit,
             *_force(test, structure),
-            *_damping(test, structure),
-            # Beside a large misfit any two records are alike.
-            *(() if no_fit else _twins(test, structure)),
+            *rigid,
+            # Beside what those say, quadrature and likeness mean nothing.
+            *(() if rigid else _damping(test, structure)),
+            *(() if rigid or no_fit else _twins(test, structure)),
         )
     )
 
@@ -132,6 +135,40 @@ def _force(test: Measurement, structure: Structure) -> Iterator[str]:
         yield (
             f"the base force misses what the modes of the accelerations make of it by {100 * misfit:.3g} % "
             f"(free residues leave {100 * possible:.3g} %): check its sign, unit, axes and point of reference"
+        )
+
+
+def _rigid(test: Measurement, structure: Structure) -> Iterator[str]:
+    """Whether sensors move in a constant proportion to the base beside their modes: G is not what it is said to be."""
+    records = Records(test)
+    fit = records.fit(*_poles(structure))
+    ones = records.basis(np.ones((1, test.freq.size)))
+    extra = ones - fit.Q @ (fit.Q.T @ ones)
+    if np.linalg.norm(extra) < _MIMICKED * np.linalg.norm(ones):
+        return
+    Q, R = np.linalg.qr(extra)
+    along = Q.T @ fit.left
+    left = fit.left - Q @ along
+    gained = np.sum(along**2, axis=0)
+    if records.unit:
+        gained = gained.reshape(test.n_base, test.n_sensors).sum(axis=0)
+    freedom = max(left.size - fit.residues.size - along.size, 1)
+    noise = records.line_correlation(left) * float(np.sum(left**2)) / freedom
+    noise = max(noise, _ROUND_OFF**2 * records.size / records.data.size)
+    moved = records.by_sensor(np.linalg.solve(R, along)[None])[0]
+    reach = np.abs(test.rigid_body).max(axis=0)
+    moved /= np.where(reach > 0, reach, np.inf)
+    clear = gained > noise * (test.n_base + _DEVIATIONS * np.sqrt(2 * test.n_base))
+    wrong = np.flatnonzero(clear & (np.abs(moved).max(axis=1) > _GAIN))
+    if wrong.size:
+        worst = wrong[np.argsort(-np.abs(moved[wrong]).max(axis=1))][:3]
+        told = []
+        for i in worst:
+            j = int(np.argmax(np.abs(moved[i])))
+            told.append(f"{test.sensor_names[i]} by {moved[i, j]:.2g} times base direction {j + 1}")
+        yield (
+            f"{wrong.size} of {test.n_sensors} sensors move with the base beside their modes and what rigid_body says "
+            f"({', '.join(told)}): their sign, gain or axis is wrong, or their accelerations are not absolute"
         )
 
 

@@ -1,0 +1,153 @@
+"""What noise, dependent sensors and wrong records must not be taken for: knowledge."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+
+from sysid import FullMass, InputError, LumpedMass, Measurement, Problem, Structure, identify, simulate
+from sysid.residues import line_correlation
+
+FREQ = np.linspace(2.0, 30.0, 500)
+
+
+def on_springs(M_SS, K_SS, G, ratios) -> Structure:
+    """Masses without coupling to the base; the base rows of K follow from rigid motion."""
+    d, K_S0 = G.shape[1], -K_SS @ G
+    return Structure(
+        np.pad(M_SS, (0, d)), np.block([[K_SS, K_S0], [K_S0.T, G.T @ K_SS @ G]]), ratios, n_base=d, rigid_body=None
+    )
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-4, 1e-3, 1e-2])
+def test_noise_does_not_tell_how_two_uncoupled_chains_share_a_total(noise):
+    K = block_diag([[7000.0, -3000.0], [-3000.0, 3000.0]], [[14000.0, -5000.0], [-5000.0, 5000.0]])
+    truth = on_springs(np.diag([1.0, 2.0, 1.5, 0.7]), K, np.ones((4, 1)), [0.01] * 4)
+    problem = Problem(simulate(truth, FREQ, noise=noise, rng=1), mass=LumpedMass(total_mass=5.2))
+    result = identify(problem, rng=0)
+    assert not result.determined
+    if noise:
+        assert any("noise leaves entries of M_SS" in sentence for sentence in result.undetermined)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3, 1e-2])
+def test_a_sensor_that_is_the_mean_of_two_others_is_no_degree_of_freedom(random_structure, noise):
+    """Three accelerometers on a rigid part, beside a fourth; four modes and the force."""
+    truth = random_structure(np.random.default_rng(4), 4, 1)
+    freq = np.geomspace(0.5 * truth.natural_frequencies[0], 1.5 * truth.natural_frequencies[-1], 500)
+    test = simulate(truth, freq, force=True)
+    mean = 0.5 * (test.response[:, :1] + test.response[:, 1:2])
+    response = np.concatenate([test.response[:, :2], mean, test.response[:, 3:]], axis=1)
+    G = np.vstack([test.rigid_body[:2], 0.5 * test.rigid_body[:1] + 0.5 * test.rigid_body[1:2], test.rigid_body[3:]])
+    rng, size = np.random.default_rng(0), np.sqrt(np.mean(np.abs(response) ** 2) / 2)
+    draw = lambda shape, scale: noise * scale * (rng.normal(size=shape) + 1j * rng.normal(size=shape))  # noqa: E731
+    force = test.force + draw(test.force.shape, np.sqrt(np.mean(np.abs(test.force) ** 2) / 2))
+    dependent = Measurement(freq, test.base, response + draw(response.shape, size), rigid_body=G, force=force)
+    result = identify(Problem(dependent, mass=FullMass()), rng=0)
+    assert not result.determined
+    assert any("do not all move independently" in sentence for sentence in result.undetermined)
+    assert result.residual < 1.1 * noise + 1e-9
+    assert np.linalg.cond(result.structure.mass[:4, :4]) < 1e6
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_lumped_total_on_skew_sensors_is_told(force):
+    """Two points with sensors at ± 45 degrees: the sum over four sensors is twice what moves in one direction."""
+    c = np.sqrt(0.5)
+    G = np.array([[c, c], [c, -c], [c, c], [c, -c]])
+    K = np.array([[9e3, 5e2, -3e3, 0], [5e2, 12e3, 0, -4e3], [-3e3, 0, 5e3, 2e2], [0, -4e3, 2e2, 7e3]])
+    truth = on_springs(np.diag([3.0, 3.0, 2.0, 2.0]), K, G, [0.01] * 4)
+    test = simulate(truth, FREQ, force=force)
+    result = identify(Problem(test, mass=LumpedMass(total_mass=5.0)), rng=0)
+    assert not result.determined
+    assert any("sensors along the base directions" in sentence for sentence in result.undetermined)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("force", [False, True])
+def test_a_repeated_pole_among_weak_modes_is_found_without_noise(random_structure, seed, force):
+    rng = np.random.default_rng([9, seed])
+    n = int(rng.integers(4, 10))
+    f = np.sort(10 ** rng.uniform(0.7, 2.0, n))
+    pair = int(rng.integers(0, n - 1))
+    f[pair + 1] = f[pair]
+    ratios = rng.uniform(0.003, 0.05, n)
+    ratios[pair + 1] = ratios[pair]
+    truth = random_structure(rng, n, 2, frequencies=f, ratios=ratios)
+    test = simulate(truth, np.linspace(0.6 * f[0], 1.2 * f[-1], 60 * n), force=force)
+    result = identify(Problem(test, mass=FullMass(None if force else 10.0)), rng=0)
+    assert result.structure.n == n
+    assert result.residual < 1e-10
+    if force:
+        scale = np.abs(truth.mass[:n, :n]).max()
+        np.testing.assert_allclose(result.structure.mass[:n, :n], truth.mass[:n, :n], atol=1e-8 * scale)
+
+
+def test_a_dead_load_cell_is_named(random_structure):
+    truth = random_structure(np.random.default_rng(0), 4, 2)
+    test = simulate(truth, np.geomspace(1.0, 1.5 * truth.natural_frequencies[-1], 300), force=True)
+    with pytest.raises(InputError, match="force is zero in y"):
+        Problem(replace(test, force=test.force * np.array([1.0, 0.0])[None, :, None]), mass=FullMass())
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize(("mistake", "factor"), [("sign", -1.0), ("gain", 1.2), ("axis", 0.0)])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_sensor_of_wrong_sign_gain_or_axis_is_named(random_structure, seed, mistake, factor, noise):
+    truth = random_structure(np.random.default_rng(seed), 6, 2)
+    f = truth.natural_frequencies
+    test = simulate(truth, np.geomspace(0.4 * f[0], 1.3 * f[-1], 500), noise=noise, rng=0)
+    response, G = test.response.copy(), test.rigid_body.copy()
+    if mistake == "axis":
+        G[2] = 0.5 * G[2, ::-1]
+    else:
+        response[:, 2] *= factor
+    wrong = replace(test, response=response, rigid_body=G)
+    said = " ".join(identify(Problem(wrong, mass=FullMass(10.0)), strategy="modal").undetermined)
+    assert "sensor 3 by " in said or "sign, gain or axis of sensor 3" in said
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_relative_accelerations_are_told_from_absolute_ones(random_structure, seed):
+    truth = random_structure(np.random.default_rng(seed), 6, 2)
+    f = truth.natural_frequencies
+    test = simulate(truth, np.geomspace(0.4 * f[0], 1.3 * f[-1], 500))
+    wrong = replace(test, response=test.relative)
+    result = identify(Problem(wrong, mass=FullMass(10.0)), strategy="modal")
+    assert not result.determined
+    assert any("accelerations are not absolute" in sentence for sentence in result.undetermined)
+
+
+class TestLineCorrelation:
+    def test_white_noise_shares_nothing(self):
+        rng = np.random.default_rng(0)
+        assert line_correlation(rng.normal(size=(6, 500)) + 1j * rng.normal(size=(6, 500))) == 1.0
+
+    def test_a_hann_window_smears_over_its_main_lobe(self):
+        """Its lines are (-1, 2, -1)/4 of those without a window: neighbours correlate by -2/3 and 1/6.
+
+        Errors of cross spectra are products of two such, whose correlations are the squares.
+        """
+        rng = np.random.default_rng(0)
+
+        def windowed():
+            white = rng.normal(size=(20, 4002)) + 1j * rng.normal(size=(20, 4002))
+            return 2 * white[:, 1:-1] - white[:, 2:] - white[:, :-2]
+
+        assert line_correlation(windowed().conj() * windowed()) == pytest.approx(1 + 2 * (4 / 9 + 1 / 36), rel=0.03)
+
+    def test_h1_of_long_records_has_it(self):
+        """White noise on a rigid body: the error of H1 is all there is beside one."""
+        rng = np.random.default_rng(0)
+        base = rng.normal(size=(1, 100_000))
+        test = Measurement.from_time(
+            [(base, base + rng.normal(size=(1, 100_000)), None)],
+            100.0,
+            rigid_body=[[1.0]],
+            estimator="h1",
+            segment=1000,
+        )
+        assert line_correlation(test.relative) == pytest.approx(1.94, rel=0.2)
