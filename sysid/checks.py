@@ -142,7 +142,7 @@ def _rigid(test: Measurement, structure: Structure) -> Iterator[str]:
     """Whether sensors move in a constant proportion to the base beside their modes: G is not what it is said to be."""
     records = Records(test)
     fit = records.fit(*_poles(structure))
-    ones = records.basis(np.ones((1, test.freq.size)))
+    ones = records.basis(np.ones((1, test.freq.size), dtype=complex))
     extra = ones - fit.Q @ (fit.Q.T @ ones)
     if np.linalg.norm(extra) < _MIMICKED * np.linalg.norm(ones):
         return
