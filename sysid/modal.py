@@ -133,17 +133,14 @@ def _noise(records: Records, residual: float, m: int) -> float:
 
 
 def _ranks(records: Records, poles: Poles) -> Integers:
-    """Number of modes at each pole, as many as its free residue needs to be known to within its noise."""
+    """Number of modes at each pole: singular values of its free residue that stand out of the noise."""
     n, d = records.n_sensors, records.n_base
     free = records.fit(poles.omega, poles.ratios)
     noise = _free_noise(records, free)
     s = np.linalg.svd(free.whitened.reshape(poles.omega.size, -1, n), compute_uv=False)
-    ranks = np.ones(poles.omega.size, dtype=int)
-    for r in range(1, min(n, d)):
-        freedom = (n - r) * (d - r)
-        more = np.sum(s[:, r:] ** 2, axis=1) > noise * (freedom + _DEVIATIONS * np.sqrt(2 * freedom))
-        ranks[more & (ranks == r)] += 1
-    return ranks
+    each = n + d  # unknowns that come with a further mode
+    needed = np.count_nonzero(s > np.sqrt(noise * (each + _DEVIATIONS * np.sqrt(2 * each))), axis=1)
+    return np.clip(needed, 1, min(n, d))
 
 
 def _free_noise(records: Records, free: ResidueFit) -> float:

@@ -272,8 +272,8 @@ def test_a_report_of_a_loaded_result_is_the_same(complete, page, tmp_path):
 def modal(truth):
     """Identify `truth` by its modes, with force or without."""
 
-    def identified(force, mass=None, **changes):
-        test = dataclasses.replace(sysid.simulate(truth, 3 * FREQ, noise=0.01, force=force, rng=3), **changes)
+    def identified(force, mass=None, noise=0.01, **changes):
+        test = dataclasses.replace(sysid.simulate(truth, 3 * FREQ, noise=noise, force=force, rng=3), **changes)
         return sysid.identify(sysid.Problem(test, mass=mass or sysid.FullMass()), strategy="modal", rng=0)
 
     return identified
@@ -284,7 +284,7 @@ def half(std):
 
 
 def test_what_is_determined_stands_with_half_of_its_95_percent_interval(modal, no_pictures):
-    it = modal(force=True)
+    it = modal(force=True, noise=0.001)
     assert it.determined
     tables = Page(report.render(it)).tables
     modes, rigid = tables[:2]
