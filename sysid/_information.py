@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
+import scipy.sparse
 
 from sysid.measurement import Measurement
 from sysid.modal_fit import Modes
@@ -175,7 +176,7 @@ def spread(A: Array, B: Array | None, path: Path) -> tuple[Array, Array]:
     The first are a factor of the covariance: ``A^-1 / 2``, or ``A^-1 B A^-1 / 2`` where the weights are not those of
     the noise (half, as half of a complex error's variance is in its real part). The second are steps of order one.
     """
-    slope, unit, gauge = path
+    slope, unit, gauge = scipy.sparse.csr_array(path.slope), path.unit, path.gauge  # mostly an identity
     A = slope.T @ A @ slope
     size = np.sqrt(np.maximum(np.diag(A), 0.0))
     seen = size * unit > _UNSEEN * np.max(size * unit)

@@ -10,41 +10,37 @@ import numpy as np
 from sysid.mass import FullMass, KnownMass, LumpedMass
 from sysid.measurement import Measurement
 from sysid.problem import Problem
-from sysid.residues import Records, force_residual_left, linear_residues
+from sysid.residues import Records, beyond_chance, force_residual_left, linear_residues
 from sysid.response import weighed_mass
 from sysid.structure import Array, Structure
 
-_DEVIATIONS = 12.0  # of the chi-squared law, by which a misfit must exceed noise to mean something
 _ROUND_OFF = 1e-8  # of the records: what counts as noise where there is none
 _SAME_POLE = 1e-6  # relative distance of poles that count as one
 _ALIKE = 3.0  # misfits by which two records must differ to be of two sensors
-_MISFIT = 1.5  # times what free residues leave, beyond which a structure is not what the modes are of
+_MISFIT = 1.5  # times what free residues leave, beyond which a record is not what the modes make of it
 _MIMICKED = 1e-2  # of a constant; less of it is left where a mode far below the lines answers like one
 _GAIN = 0.03  # of the base's motion; smaller errors of a sensor's gain are usual
-_FORCE_MISFIT = 1.5  # times what free residues leave, beyond which the force is not that of these modes
 
 
 def doubts(problem: Problem, structure: Structure) -> tuple[str, ...]:
     """What speaks against the identified structure, in sentences; nothing counts as determined beside one."""
     test = problem.measurement
     no_fit, rigid = tuple(_no_fit(problem, structure)), tuple(_rigid(test, structure))
-    return tuple(
-        (
-            *_stated_mass(problem, structure),
-            *_known_entries(problem, structure),
-            *_lumped_total(problem, structure),
-            *no_fit,
-            *_force(test, structure),
-            *rigid,
-            # Beside what those say, quadrature and likeness mean nothing.
-            *(() if rigid else _damping(test, structure)),
-            *(() if rigid or no_fit else _twins(test, structure)),
-        )
+    return (
+        *_stated_mass(problem, structure),
+        *_known_entries(problem, structure),
+        *_lumped_total(problem, structure),
+        *no_fit,
+        *_force(test, structure),
+        *rigid,
+        # Beside what those say, quadrature and likeness mean nothing.
+        *(() if rigid else _damping(test, structure)),
+        *(() if rigid or no_fit else _twins(test, structure)),
     )
 
 
 def _no_fit(problem: Problem, structure: Structure) -> Iterator[str]:
-    """Whether the structure leaves what modes without it would not."""
+    """Whether the structure leaves clearly more of the accelerations than free residues at its own poles."""
     test = problem.measurement
     left = replace(test, response=test.response - test.predict(structure))
     misfit = float(np.sqrt(Records(left).size / Records(test).size))
@@ -88,7 +84,7 @@ def _known_entries(problem: Problem, structure: Structure) -> Iterator[str]:
     if not np.any(stated):
         return
     assert isinstance(mass, FullMass)
-    if structure.n != n or structure.n_sensors != n or not np.array_equal(structure.recovery, np.eye(n)):
+    if not structure.at_sensors:
         yield "the known entries of the mass are not used: the degrees of freedom are not the sensors alone"
         return
     size = np.sqrt(np.diag(structure.mass))
@@ -131,7 +127,7 @@ def _force(test: Measurement, structure: Structure) -> Iterator[str]:
     left = replace(test, force=test.force - test.predict_force(structure))
     misfit = float(np.sqrt(Records(left, force=True).size / Records(test, force=True).size))
     possible = max(force_residual_left(test, *_poles(structure)), _ROUND_OFF)
-    if misfit > max(_FORCE_MISFIT * possible, 1e-6):
+    if misfit > max(_MISFIT * possible, 1e-6):
         yield (
             f"the base force misses what the modes of the accelerations make of it by {100 * misfit:.3g} % "
             f"(free residues leave {100 * possible:.3g} %): check its sign, unit, axes and point of reference"
@@ -152,13 +148,11 @@ def _rigid(test: Measurement, structure: Structure) -> Iterator[str]:
     gained = np.sum(along**2, axis=0)
     if records.unit:
         gained = gained.reshape(test.n_base, test.n_sensors).sum(axis=0)
-    freedom = max(left.size - fit.residues.size - along.size, 1)
-    noise = records.line_correlation(left) * float(np.sum(left**2)) / freedom
-    noise = max(noise, _ROUND_OFF**2 * records.size / records.data.size)
+    noise = records.noise(left, fit.residues.size + along.size, least=_ROUND_OFF)
     moved = records.by_sensor(np.linalg.solve(R, along)[None])[0]
     reach = np.abs(test.rigid_body).max(axis=0)
     moved /= np.where(reach > 0, reach, np.inf)
-    clear = gained > noise * (test.n_base + _DEVIATIONS * np.sqrt(2 * test.n_base))
+    clear = gained > noise * beyond_chance(test.n_base)
     wrong = np.flatnonzero(clear & (np.abs(moved).max(axis=1) > _GAIN))
     if wrong.size:
         worst = wrong[np.argsort(-np.abs(moved[wrong]).max(axis=1))][:3]
@@ -179,11 +173,9 @@ def _damping(test: Measurement, structure: Structure) -> Iterator[str]:
         return
     real, both = records.fit(*poles), records.fit(*poles, velocity=True)
     extra = poles[0].size * records.n_base * records.n_sensors
-    freedom = max(records.data.size - 2 * extra, 1)
-    noise = max(both.squared_error / freedom, _ROUND_OFF**2 * records.size / records.data.size)
-    noise *= records.line_correlation(both.left)
+    noise = records.noise(both.left, 2 * extra, least=_ROUND_OFF)
     gained = real.squared_error - both.squared_error
-    if gained > noise * (extra + _DEVIATIONS * np.sqrt(2 * extra)):
+    if gained > noise * beyond_chance(extra):
         yield (
             f"residues in quadrature explain {100 * np.sqrt(gained / records.size):.2g} % of the response: the damping "
             "is not classical, or a mode is missing; modal damping ratios are then an approximation"

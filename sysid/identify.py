@@ -139,7 +139,7 @@ def _by_modes(problem: Problem, options: Modal, desk: Desk) -> Outcome:
     )
     remarks = []
     x = None
-    if structure.n_sensors == structure.n and np.array_equal(structure.recovery, np.eye(n)):
+    if structure.at_sensors:
         if isinstance(problem.mass, FullMass):
             x = problem.values(structure)
         elif stopped is None:

@@ -27,15 +27,13 @@ from sysid.modal_scales import nearest_lumped, of_known_mass, stated_totals, to_
 from sysid.poles import Poles, find_poles, poles_near
 from sysid.problem import Problem
 from sysid.refinement import SOLVED
-from sysid.residues import Records, ResidueFit, independent, linear_residues
+from sysid.residues import Records, ResidueFit, beyond_chance, independent, linear_residues
 from sysid.stiffness import SpectralStiffness
 from sysid.structure import Array, Structure
 
 Integers = NDArray[np.intp]
 
-_DEVIATIONS = 12.0  # of the chi-squared law, by which a misfit must exceed noise to mean something
-_EXACT = 1e-8  # relative residual that needs no second look
-_ROUND_OFF = 1e-11  # of the records: what counts as noise where there is none
+EXACT = 1e-8  # relative residual that needs no second look
 _SCATTER = 5.0  # times the misfit of all lines together: what noise makes of the shapes' singular values
 _DEPENDENT = 1e-6  # of the largest singular value of the shapes: below, sensors move alike in all modes
 FREQUENCY_WINDOW = 0.05  # relative; what a frequency read off a peak may be wrong by
@@ -106,7 +104,36 @@ def fit(test: Measurement, poles: Poles, unit: Array, watch: Watch, max_iteratio
             f"{test.freq.size} lines ({2 * test.response.size} measured numbers) cannot fix {m * (n + d + 1)} "
             "unknowns: add lines or runs"
         )
-    multiplicity = _ranks(records, poles)
+    best = _grown(records, test, poles, np.ones(m, dtype=int), unit, watch, max_iterations)
+    # Modes of rank one may have dragged poles away from where several modes share one.
+    free = records.fit(poles.omega, poles.ratios)
+    noise = records.noise(free.left, free.residues.size)
+    excess = best.of_accelerations**2 * records.size - free.squared_error
+    ranks = _ranks(free, noise, n, d)
+    wanting = excess > noise * beyond_chance(m * (n - 1) * (d - 1)) or ranks.sum() < best.modes.omega.size
+    if watch.stopped is None and wanting and np.any(ranks > 1):
+        other = _grown(records, test, poles, ranks, unit, watch, max_iterations)
+        more = other.modes.omega.size - best.modes.omega.size
+        gained = (best.of_accelerations**2 - other.of_accelerations**2) * records.size / noise
+        if gained > (beyond_chance(more * (n + d)) if more > 0 else -beyond_chance(-more * (n + d))):
+            best = other
+    order = np.argsort(best.modes.omega, kind="stable")
+    end = best.modes
+    modes = Modes(end.phi[:, order], end.gamma[order], end.omega[order], end.ratios[order])
+    return replace(best, modes=modes)
+
+
+def _grown(
+    records: Records,
+    test: Measurement,
+    poles: Poles,
+    multiplicity: Integers,
+    unit: Array,
+    watch: Watch,
+    max_iterations: int,
+) -> ModalFit:
+    """Fit with so many modes at each pole, and with more where their free residues call for it."""
+    n, d = test.n_sensors, test.n_base
     best = _fit_with(test, poles, multiplicity, unit, watch, max_iterations)
     while watch.stopped is None:
         lacking = _lacking_rank(records, best, multiplicity)
@@ -115,38 +142,25 @@ def fit(test: Measurement, poles: Poles, unit: Array, watch: Watch, max_iteratio
         more = multiplicity.copy()
         more[lacking] += 1
         again = _fit_with(test, poles, more, unit, watch, max_iterations)
-        each = test.n_sensors + test.n_base
         gained = (best.of_accelerations**2 - again.of_accelerations**2) * records.size
-        if gained < (each + _DEVIATIONS * np.sqrt(2 * each)) * _noise(records, again.of_accelerations, more.sum()):
+        if gained < beyond_chance(n + d) * _noise(records, again, more):
             break
         best, multiplicity = again, more
-    order = np.argsort(best.modes.omega, kind="stable")
-    end = best.modes
-    modes = Modes(end.phi[:, order], end.gamma[order], end.omega[order], end.ratios[order])
-    return replace(best, modes=modes)
+    return best
 
 
-def _noise(records: Records, residual: float, m: int) -> float:
-    """Variance of a real number of the records about a fit of m modes."""
-    freedom = max(records.data.size - m * (records.n_sensors + records.n_base + 1), 1)
-    return max(residual**2 * records.size / freedom, _ROUND_OFF**2 * records.size / records.data.size)
+def _noise(records: Records, end: ModalFit, multiplicity: Integers) -> float:
+    """Variance of a real number of the records about free residues at a fit's poles."""
+    first = np.concatenate([[0], np.cumsum(multiplicity)[:-1]])
+    free = records.fit(end.modes.omega[first], end.modes.ratios[first])
+    return records.noise(free.left, free.residues.size)
 
 
-def _ranks(records: Records, poles: Poles) -> Integers:
+def _ranks(free: ResidueFit, noise: float, n: int, d: int) -> Integers:
     """Number of modes at each pole: singular values of its free residue that stand out of the noise."""
-    n, d = records.n_sensors, records.n_base
-    free = records.fit(poles.omega, poles.ratios)
-    noise = _free_noise(records, free)
-    s = np.linalg.svd(free.whitened.reshape(poles.omega.size, -1, n), compute_uv=False)
-    each = n + d  # unknowns that come with a further mode
-    needed = np.count_nonzero(s > np.sqrt(noise * (each + _DEVIATIONS * np.sqrt(2 * each))), axis=1)
+    s = np.linalg.svd(free.whitened.reshape(len(free.whitened), -1, n), compute_uv=False)
+    needed = np.count_nonzero(s**2 > noise * beyond_chance(n + d), axis=1)  # unknowns of a further mode, at most
     return np.clip(needed, 1, min(n, d))
-
-
-def _free_noise(records: Records, free: ResidueFit) -> float:
-    """Variance of a real number of the records about free residues, as smooth functions of frequency feel it."""
-    variance = records.line_correlation(free.left) * free.squared_error / records.data.size
-    return max(variance, _ROUND_OFF**2 * records.size / records.data.size)
 
 
 def _lacking_rank(records: Records, best: ModalFit, multiplicity: Integers) -> int | None:
@@ -155,12 +169,12 @@ def _lacking_rank(records: Records, best: ModalFit, multiplicity: Integers) -> i
     omega, ratios = best.modes.omega[first], best.modes.ratios[first]
     free = records.fit(omega, ratios)
     n, d = records.n_sensors, records.n_base
-    if n < 2 or d < 2 or best.of_accelerations <= _EXACT:
+    if n < 2 or d < 2 or best.of_accelerations <= EXACT:
         return None
     freedom = float(np.sum((n - multiplicity) * (d - multiplicity)))
     excess = best.of_accelerations**2 * records.size - free.squared_error
-    noise = _free_noise(records, free)
-    if excess < noise * (freedom + _DEVIATIONS * np.sqrt(2 * freedom)):
+    noise = records.noise(free.left, free.residues.size)
+    if excess < noise * beyond_chance(freedom):
         return None
     residues = free.whitened.reshape(omega.size, -1, n)
     s = np.linalg.svd(residues, compute_uv=False)
@@ -209,7 +223,7 @@ def held_to_totals(problem: Problem, end: ModalFit, watch: Watch, max_iterations
         test, modes, _free_spectrum(poles, np.arange(modes.omega.size)), unit=np.sqrt(problem.totals),
         remainder=end.rigid - modes.gamma.T @ modes.gamma, ties=ties, watch=watch, max_iterations=max_iterations,
     )  # fmt: skip
-    agrees = held.residual <= _AS_GOOD * end.residual + _EXACT
+    agrees = held.residual <= _AS_GOOD * end.residual + EXACT
     return held if agrees and held.status in SOLVED else None
 
 
@@ -288,7 +302,11 @@ def build(problem: Problem, modes: Modes, remainder: Array, chosen: DegreesOfFre
     gamma = modes.gamma
     if to_totals:
         groups = np.concatenate([layout.directions[chosen.sensors], np.full(chosen.modes.size, -1)])
-        known = chosen.modes.size == 0 and chosen.sensors.size == layout.n and bool(np.nansum(problem.known_mass > 0))
+        known = (
+            chosen.modes.size == 0
+            and chosen.sensors.size == layout.n
+            and bool(np.nansum(np.abs(problem.known_mass)) > 0)
+        )
         t, remainder = to_stated_totals(problem, P, gamma, G, groups, remainder, scaled=known)
         P, gamma = P * np.sqrt(t), gamma * np.sqrt(t)
     M_SS, K_SS = P.T @ P, (P.T * modes.omega**2) @ P
@@ -379,11 +397,10 @@ def _stated_poles(problem: Problem) -> Poles:
         except InputError as error:
             raise NotModalError(str(error)) from error
     found = find_poles(test)
-    missed = [w for w in stated if np.min(np.abs(np.log(found.omega / w))) > np.log1p(FREQUENCY_WINDOW)]
-    if missed:
+    missed = np.array([w for w in stated if np.min(np.abs(np.log(found.omega / w))) > np.log1p(FREQUENCY_WINDOW)])
+    if missed.size:
+        told, others = (", ".join(f"{w / (2 * np.pi):.5g}" for w in omega) for omega in (missed, found.omega))
         raise NotModalError(
-            f"the stated natural frequency {missed[0] / (2 * np.pi):.5g} Hz does not stand out of the data; found are "
-            + ", ".join(f"{w / (2 * np.pi):.5g}" for w in found.omega)
-            + " Hz"
+            f"of the stated natural frequencies {told} Hz does not stand out of the data; found are {others} Hz"
         )
     return found

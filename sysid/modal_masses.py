@@ -92,7 +92,7 @@ def determination(problem: Problem, structure: Structure) -> Determination:
         open_.append(f"{what}: other mass and stiffness matrices answer identically")
         if problem.unit_mass:
             open_.append("no number with a unit of mass is given: masses are normalised to 1 kg in each base direction")
-    if not _at_sensors(structure):
+    if not structure.at_sensors:
         how_far = "completely" if test.force is not None and not free else "up to the modal masses"
         alike = ", which do not all move independently" if structure.n == structure.n_sensors else ""
         open_.append(
@@ -219,7 +219,7 @@ def _cone(problem: Problem, structure: Structure, known: _Known) -> Cone:
             traces += [
                 _at_most(column[:, None], total) for column, total in zip(visible.T, problem.totals, strict=True)
             ]
-        elif _at_sensors(structure):
+        elif structure.at_sensors:
             traces += [
                 _at_most(W, total)
                 for W, total in zip(_by_direction(problem.layout, structure), problem.totals, strict=True)
@@ -398,16 +398,11 @@ def _clusters(structure: Structure, misfit: float) -> list[list[int]]:
     return clusters
 
 
-def _at_sensors(structure: Structure) -> bool:
-    """Whether the degrees of freedom are the sensors, of whose masses the mass models speak."""
-    return structure.n == structure.n_sensors and np.array_equal(structure.recovery, np.eye(structure.n))
-
-
 def _model_equations(problem: Problem, structure: Structure, pairs: Pairs) -> tuple[Array, Array | None, str]:
     """What the stated models add: `_Known.equations`, `signs` and `sentence`."""
     n, G = structure.n, structure.rigid_body_dofs
     nothing = np.zeros((0, len(pairs)))
-    if not _at_sensors(structure):
+    if not structure.at_sensors:
         return nothing, None, ""
     P = np.linalg.inv(structure.normal_modes)
     delta = structure.participation - P @ G

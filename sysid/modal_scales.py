@@ -159,14 +159,14 @@ def nearest_lumped(
     off = np.einsum("ki,kj->ijk", P, P)[np.tril_indices(m, -1)]
     coupling = np.einsum("ki,kj->ijk", P, delta).reshape(-1, m)
     entries, values = _entries(P, delta, np.full((m, m + G.shape[1]), np.nan) if known is None else known)
-    scaled = np.flatnonzero(values > 0)
+    scaled = np.flatnonzero(values)
     if scaled.size and np.linalg.matrix_rank(entries / np.linalg.norm(entries, axis=1, keepdims=True), 1e-9) == m:
         unit = np.linalg.norm(entries, axis=0)
-        weights = 1 / np.where(values == 0, values.max(), np.abs(values))[:, None]
-        t = lsq_linear(entries * weights / unit, (values * weights[:, 0]), (0.0, np.inf), tol=1e-14).x
+        weights = 1 / np.where(values == 0, np.abs(values).max(), np.abs(values))[:, None]
+        t = lsq_linear(entries * weights / unit, values * weights[:, 0], (0.0, np.inf), tol=1e-14).x
         return np.maximum(t, 1e-9 * t.max()) / unit
     # Known masses set the scale, or else the totals do.
-    totals = [(entries[i], values[i]) for i in scaled if np.all(entries[i] >= 0)] or [
+    totals = [(entries[i], values[i]) for i in scaled if values[i] > 0 and np.all(entries[i] >= 0)] or [
         (np.sum(P[:, groups == i] ** 2, axis=1), problem.totals[i]) for i in range(G.shape[1])
     ]
     told = [(row, total) for row, total in totals if np.any(row > 0)] or [(np.sum(P**2, axis=1), 1.0)]

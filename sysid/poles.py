@@ -3,8 +3,8 @@
 Relaxed vector fitting of the relative accelerations with common poles (Gustavsen and Semlyen 1999; Gustavsen
 2006), in the basis ``g_k = w² / (w_k² - w² + 2 i zeta_k w_k w)`` so that errors weigh as accelerations, from more
 poles than there can be modes. Those that do not earn their place are removed one by one (the rise of the squared error
-without a pole against the noise), and what stays is polished by variable projection over (log w, log zeta) with
-real residues.
+without a pole against the noise), what stays is polished by variable projection over (log w, log zeta) with real
+residues, further poles are tried beside and between them, and close ones that one can stand for are merged.
 """
 
 from __future__ import annotations
@@ -16,15 +16,13 @@ from threadpoolctl import threadpool_limits
 
 from sysid.errors import InputError
 from sysid.measurement import Measurement
-from sysid.residues import Records, ResidueFit, independent, stacked
+from sysid.residues import ROUND_OFF, Records, ResidueFit, beyond_chance, independent, stacked
 from sysid.response import gain_slopes, gains
 from sysid.structure import Array, ComplexArray
 
 _SPARE = 6  # poles beyond those expected: without spare ones noise moves true poles
 _RELOCATIONS = 6
 _STEPS = 100
-_DEVIATIONS = 12.0  # of the chi-squared law, by which a pole must lower the squared error to stay
-_ROUND_OFF = 1e-11  # of the records: what counts as noise where there is none
 _SETTLED = 1e-6  # fall of the squared error, relative, at which poles are polished: far below what noise moves it by
 _EXACT = 1e-13  # relative residual that no further step betters
 _FAR = 100.0  # times the error that may be, from which moving other poles too does not save a pole less
@@ -52,15 +50,13 @@ class Poles:
     residual: float
 
 
-def find_poles(test: Measurement, *, spare: int = _SPARE) -> Poles:
+def find_poles(test: Measurement) -> Poles:
     """Find the modes that stand out of the noise.
 
     Parameters
     ----------
     test : Measurement
         Its lines must hold the modes; lines closer than the half-power bandwidth.
-    spare : int
-        Poles to begin with beyond the number of modes that the records suggest.
 
     Raises
     ------
@@ -73,11 +69,11 @@ def find_poles(test: Measurement, *, spare: int = _SPARE) -> Poles:
     1587-1592. G. H. Golub, V. Pereyra, SIAM J. Numer. Anal. 10 (1973) 413-432, with Kaufman's Jacobian (1975).
     """
     with threadpool_limits(limits=1):  # the same bits whatever the machine does beside
-        return _find(Records(test), test.n_sensors, spare)
+        return _find(Records(test))
 
 
-def _find(records: Records, n: int, spare: int) -> Poles:
-    count = max(n, _independent(records)) + spare
+def _find(records: Records) -> Poles:
+    count = max(records.n_sensors, _independent(records)) + _SPARE
     while True:
         if 2 * np.count_nonzero(records.freq) < 4 * count + 2:
             raise InputError(
@@ -85,9 +81,9 @@ def _find(records: Records, n: int, spare: int) -> Poles:
                 "lines"
             )
         omega, ratios = _search(records, count)
-        if omega.size <= count - spare // 2:
+        if omega.size <= count - _SPARE // 2:
             break
-        count += max(count // 2, spare)  # too few were spare
+        count += max(count // 2, _SPARE)  # too few were spare
     lines = 2 * np.pi * records.freq
     if not np.any((omega > (1 - _BESIDE) * lines[0]) & (omega < (1 + _BESIDE) * lines[-1])):
         raise InputError("no mode stands out of the noise between these lines: state natural_frequencies or widen them")
@@ -161,7 +157,7 @@ def _explains(records: Records, poles: tuple[Array, Array], velocity: bool) -> f
         return np.inf
     fit = records.fit(*poles, velocity=velocity)
     unknowns = poles[0].size * (fit.whitened[0].size + 2)
-    error = max(fit.squared_error / records.size, _ROUND_OFF**2)
+    error = max(fit.squared_error / records.size, ROUND_OFF**2)
     return float(records.data.size * np.log(error) + unknowns * np.log(records.data.size))
 
 
@@ -210,14 +206,15 @@ def _with_another(records: Records, omega: Array, ratios: Array) -> tuple[Array,
     loss = np.concatenate([np.tile(ratios, 4), np.full(between.size, np.median(ratios))])
     plain = records.basis(gains(records.freq, at, loss))
     size = np.linalg.norm(plain, axis=0)
-    with_velocity = records.fit(omega, ratios, velocity=True)
-    for fit, to_beat in ((with_velocity, np.inf), (records.fit(omega, ratios), with_velocity.squared_error)):
+    own, with_velocity = records.fit(omega, ratios), records.fit(omega, ratios, velocity=True)
+    least = _least_gain(own)
+    for fit, to_beat in ((with_velocity, np.inf), (own, with_velocity.squared_error)):
         trial = plain - fit.Q @ (fit.Q.T @ plain)
         left = np.linalg.norm(trial, axis=0)
         trial = trial / np.where(left > 1e-6 * size, left, np.inf)
         gain = np.sum((trial.T @ fit.left) ** 2, axis=1).reshape(at.size, -1).sum(axis=1)
-        best, each = int(np.argmax(gain)), records.n_base * records.n_sensors + 2
-        if gain[best] <= (each + _DEVIATIONS * np.sqrt(2 * each)) * _noise(records, fit, omega.size):
+        best = int(np.argmax(gain))
+        if gain[best] <= least * _noise(records, fit, omega.size):
             continue
         more = _settled(records, np.append(omega, at[best]), np.append(ratios, loss[best]))
         if more[0].size > omega.size and records.fit(*more).squared_error < to_beat:
@@ -233,17 +230,12 @@ def _in_order(records: Records, omega: Array, ratios: Array) -> Poles:
 
 def _least_gain(fit: ResidueFit) -> float:
     """What a pole must lower the squared error by to earn its place, in units of the noise's variance."""
-    each = fit.whitened[0].size + 2  # real parameters that come with a pole
-    return float(each + _DEVIATIONS * np.sqrt(2 * each))
+    return beyond_chance(fit.whitened[0].size + 2)  # real parameters that come with a pole
 
 
 def _noise(records: Records, fit: ResidueFit, m: int) -> float:
-    """Variance of a record's real number about the fit of m poles, as smooth functions of frequency feel it."""
-    freedom = max(records.data.size - m * (fit.whitened[0].size + 2), 1)
-    return max(
-        records.line_correlation(fit.left) * fit.squared_error / freedom,
-        _ROUND_OFF**2 * records.size / records.data.size,
-    )
+    """Variance of a record's real number about the fit of m poles."""
+    return records.noise(fit.left, m * (fit.whitened[0].size + 2))
 
 
 def _principal(records: Records, count: int) -> list[tuple[ComplexArray, Array]]:

@@ -1,4 +1,4 @@
-"""Residues of given poles: weighted linear least squares of the relative accelerations."""
+"""Residues of given poles: weighted linear least squares of the relative accelerations, or of the base force."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from sysid.response import columns, gains
 from sysid.structure import Array, ComplexArray
 from sysid.weights import separable
 
+_DEVIATIONS = 12.0  # of the chi-squared law, by which a squared error must fall to mean something
+ROUND_OFF = 1e-11  # of the records: what counts as noise where there is none
 _NEIGHBOURS = 3  # lines on either side that may share their noise
 _CHANCE = 5.0  # standard deviations of the correlation of white noise
 _DEPENDENT = 1e-9  # of the largest singular value of the base records
@@ -120,6 +122,12 @@ class Records:
         whitened = np.linalg.solve(factor, beta)
         return ResidueFit(Q, beta, self.data - Q @ y, whitened, spread)
 
+    def noise(self, left: Array, unknowns: int, *, least: float = ROUND_OFF) -> float:
+        """Variance of a real number of the records about a fit of so many unknowns, as smooth functions feel it."""
+        freedom = max(self.data.size - unknowns, 1)
+        variance = self.line_correlation(left) * float(np.sum(left**2)) / freedom
+        return max(variance, least**2 * self.size / self.data.size)
+
     def line_correlation(self, left: Array) -> float:
         """Factor by which noise weighs more on smooth functions as neighbouring lines share it; one for white noise.
 
@@ -138,6 +146,11 @@ class Records:
             plain = (residues / self.channel).reshape(len(residues), self.n_base, self.n_sensors)
             return plain.transpose(0, 2, 1)
         return np.einsum("mic,di->mcd", residues / self.channel, self.moving)
+
+
+def beyond_chance(freedom: float) -> float:
+    """Squared size, in units of the noise's variance, that so many numbers of noise alone do not reach."""
+    return float(freedom + _DEVIATIONS * np.sqrt(2 * freedom))
 
 
 def line_correlation(error: ComplexArray) -> float:

@@ -175,6 +175,11 @@ class Structure:
         return np.where(alone.any(axis=0), alone.argmax(axis=0), -1)
 
     @property
+    def at_sensors(self) -> bool:
+        """Whether the degrees of freedom are the sensors, one each and in their order."""
+        return self.n == self.n_sensors and np.array_equal(self.recovery, np.eye(self.n))
+
+    @property
     def dof_modes(self) -> NDArray[np.intp]:
         """The mode whose coordinate a degree of freedom is, (n,); -1 where several modes move it."""
         size = np.abs(self.normal_modes)

@@ -252,9 +252,8 @@ def _tied_masses(problem: Problem, modes: Modes, index: Index) -> Iterator[tuple
         row = np.zeros(index.size)
         if i != j and not every:
             continue
-        if mass.healing == "trace":
-            if phi.shape[0] != phi.shape[1]:
-                return  # a sum over sensors says nothing of other degrees of freedom
+        # With other degrees of freedom than the sensors the fit ties M_rb itself.
+        if mass.healing == "trace" and phi.shape[0] == phi.shape[1]:
             # M_rb,ii = total - sum of the sensors' M_jj - (delta' delta)_ii + (Gamma' Gamma)_ii, delta = Gamma - P G
             P, own = np.linalg.inv(phi), layout.directions[: layout.n] == i
             drawn = P @ layout.rigid_body[:, i]
@@ -268,7 +267,7 @@ def _tied_masses(problem: Problem, modes: Modes, index: Index) -> Iterator[tuple
 def _masses_known(problem: Problem, structure: Structure) -> bool:
     """Whether known entries of a full mass, not a force, set the scale of the modes."""
     stated = is_modal(problem) and problem.measurement.force is None and np.any(np.isfinite(problem.known_mass))
-    return bool(stated and structure.n == structure.n_sensors == np.count_nonzero(structure.dof_sensors >= 0))
+    return bool(stated and structure.at_sensors)
 
 
 def _held(problem: Problem, modes: Modes, index: Index, path: Path, moves: Array) -> Array:
