@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from sysid.identification import Identification
+from sysid.modal_masses import open_masses
 from sysid.structure import Array
 
 DEVIATES = 1.96  # standard deviations on either side of 95 % of a normal law
@@ -30,14 +31,33 @@ def summary(it: Identification) -> str:
     ]
     for i, test in enumerate(problem.validation, start=1):
         lines.append(f"test {i} of {len(problem.validation)} never fitted: relative residual {test.residual(s):.3e}")
-    if it.determined:
-        lines.append("Determined: data and stated model leave one mass and one stiffness matrix.")
-    else:
-        lines.append("Not determined: this is one of many models that explain the data.")
+    lines.append(f"{verdict(it)}.")
     lines += [f"  - {sentence}" for sentence in it.closed_by + it.undetermined]
     if not it.determined:
         lines += _ranges(it)
+    lines += [f"  > {sentence}" for sentence in next_steps(it)]
     return "\n".join(_folded(line) for line in lines)
+
+
+def verdict(it: Identification) -> str:
+    """What the matrices are worth, in one sentence."""
+    if it.determined:
+        return "Determined: data and stated model leave one mass and one stiffness matrix"
+    if open_masses(it.problem, it.structure):
+        return "Not determined: this is one of many models that explain the data"
+    return "Not determined: something speaks against this model, or is not known well enough"
+
+
+def next_steps(it: Identification) -> list[str]:
+    """What would close open modal masses, in sentences."""
+    if it.determined or not open_masses(it.problem, it.structure):
+        return []
+    if it.measurement.force is not None:
+        return ["to weigh these modes: more force at their frequencies, longer records, or another base direction"]
+    return [
+        "to close it: measure the force between table and structure; or state what is known of the mass, where it is "
+        "true: LumpedMass, or FullMass(known=...); a total mass alone only bounds it"
+    ]
 
 
 def half_width(std: float, value: float) -> str:

@@ -106,7 +106,7 @@ def by_swarm(
     Raises
     ------
     InputError
-        Where more modes were found in the data than sensors.
+        Where more modes were found in the data than sensors, or known entries or a whole rigid-body mass are stated.
     """
     if isinstance(problem.mass, FullMass) and not problem.mass.healable:
         raise InputError(

@@ -31,7 +31,7 @@ def doubts(problem: Problem, structure: Structure) -> tuple[str, ...]:
         *_known_entries(problem, structure),
         *_lumped_total(problem, structure),
         *no_fit,
-        *_force(test, structure),
+        *_force(problem, structure),
         *rigid,
         # Beside what those say, quadrature and likeness mean nothing.
         *(() if rigid else _damping(test, structure)),
@@ -119,10 +119,13 @@ def _lumped_total(problem: Problem, structure: Structure) -> Iterator[str]:
             )
 
 
-def _force(test: Measurement, structure: Structure) -> Iterator[str]:
+def _force(problem: Problem, structure: Structure) -> Iterator[str]:
     """Whether the base force is that of the modes that the accelerations show."""
+    test = problem.measurement
     if test.force is None:
         return
+    lumped = isinstance(problem.mass, LumpedMass)
+    fixture = ", and mass below the sensors (base ring, fixture), which a lumped mass has not" if lumped else ""
     # Both misfits in units of the stated noise: what is left at a noisy peak speaks against nothing.
     left = replace(test, force=test.force - test.predict_force(structure))
     misfit = float(np.sqrt(Records(left, force=True).size / Records(test, force=True).size))
@@ -130,7 +133,7 @@ def _force(test: Measurement, structure: Structure) -> Iterator[str]:
     if misfit > max(_MISFIT * possible, 1e-6):
         yield (
             f"the base force misses what the modes of the accelerations make of it by {100 * misfit:.3g} % "
-            f"(free residues leave {100 * possible:.3g} %): check its sign, unit, axes and point of reference"
+            f"(free residues leave {100 * possible:.3g} %): check its sign, unit, axes and point of reference{fixture}"
         )
 
 

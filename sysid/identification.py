@@ -44,6 +44,7 @@ class History:
     """What ran, phase by phase; residuals are relative, NaN where a phase did not run.
 
     Where a base force was measured they count it too: the root of the sum of both squared relative residuals.
+    The modal strategy has the local phase only.
 
     Attributes
     ----------
@@ -51,7 +52,8 @@ class History:
         Residual of the best candidate after each phase: the Latin hypercube (or the start that was
         given), the swarm, the eigenvalue refinement, the local phase.
     swarm_curve, local_curve : ndarray
-        Best residual after each iteration of the swarm, and residual of each local iterate.
+        Best residual after each iteration of the swarm, and residual of each local iterate as IPOPT saw it, the
+        records weighed by stated noise.
     refinement_error : float
         Largest relative difference of a refined eigenvalue (w²) from the one that was given.
     states : tuple of (str, int)
@@ -95,9 +97,10 @@ class Identification:
     message : str
     history : History
     determined : bool
-        Every entry of M_SS, K_SS and C is fixed by the data and the stated model.
+        Every entry of M_SS, K_SS and C is fixed by the data and the stated model, nothing speaks against the fit, and
+        noise leaves each entry known to a tenth of the root of its two diagonal entries (standard deviation).
     closed_by, undetermined : tuple of str
-        What fixes it, and what is open, in sentences.
+        What fixes it, empty where anything is open; and what is open, in sentences.
     remarks : tuple of str
         How it was done, and why so, in sentences.
     interrupted : bool

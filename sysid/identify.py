@@ -25,7 +25,7 @@ from sysid.refinement import SOLVED
 from sysid.stiffness import SpectralStiffness
 from sysid.structure import Structure
 
-_KNOWN = 0.1  # of the diagonals; a larger standard deviation of an entry is no knowledge of it
+_KNOWN = 0.1  # of the root of two diagonal entries; an entry with a larger standard deviation is not known
 _NO_FIT = 0.5  # relative residual above which nothing is explained
 STRATEGIES = ("auto", "swarm", "modal")
 
@@ -48,9 +48,10 @@ def identify(
     problem : Problem
     strategy : str, Swarm or Modal
         "modal" takes poles and residues from the data and polishes them in modal coordinates: no swarm, no
-        frequencies needed, a second or less. "swarm" is the paper's hPSO-LS. A `Modal` or `Swarm` object is that with
-        other settings. "auto" takes modal for a full, lumped or known mass with spectral stiffness
-        and modal damping, else the swarm; the result's remarks say which and why.
+        frequencies needed, mostly within a second or two. "swarm" is the paper's hPSO-LS. A `Modal` or `Swarm` object
+        is that with other settings. "auto" takes modal for a full, lumped or known mass with spectral stiffness and
+        modal damping, else, or where the modal one turns out not to apply, the swarm; the result's remarks say which
+        and why.
     rng : int, numpy Generator or None
         The same seed gives the same bits. None draws one, which the result reports.
     start : array_like (n_variables,) or Structure, optional

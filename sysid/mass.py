@@ -59,8 +59,8 @@ class FullMass:
     ----------
     total_mass : float, array_like (d,) or (d, d), optional
         kg a base direction (kg m² where it is a rotation); a matrix is the whole rigid-body mass, from a mass
-        properties report. Without it, and without a measured base force, masses are normalised to 1 kg a
-        direction, and the result says that they are not determined.
+        properties report. All that moves with the base counts, base mass too. Without it, and without a measured
+        base force or a known mass, masses are normalised to 1 kg a direction, and the result says so.
     healing : {"trace", "rigid_body"}
         What the total is: "trace", the sum of diag M over the direction's sensors and its base row
         (eq. 21-22 of the paper: right for lumped masses on orthogonal axes); "rigid_body", the
@@ -68,7 +68,8 @@ class FullMass:
     known : array_like (n, n) or (n, n + d), optional
         Entries of ``M_SS``, or of ``[M_SS, M_S0]``, that are known, NaN where they are not: weighed parts, zeros
         between what cannot be coupled. The modal strategy holds them, or checks them where a base force was
-        measured, and the result says what they close; the swarm cannot.
+        measured, and the result says what they close; the swarm cannot. More entries than the data
+        leave open are met in the least-squares sense. They need one mode a sensor.
 
     References
     ----------

@@ -53,7 +53,8 @@ class Modal:
     ----------
     sensors : sequence of str or int, optional
         Sensors (names, or numbers from 0) whose motions are the physical degrees of freedom where there are fewer modes
-        than sensors, one a mode; chosen by a pivoted QR of the mode shapes where none are given.
+        than sensors, at most one a mode (modal coordinates make up the rest); chosen by a pivoted QR of the mode shapes
+        where none are given.
     max_iterations : int
         Of IPOPT, in each fit.
     """
@@ -205,7 +206,7 @@ def _fit_with(
     lam, vectors = np.linalg.eigh((rigid - modes.gamma.T @ modes.gamma) / np.outer(unit, unit))
     remainder = (vectors * np.maximum(lam, 0.0)) @ vectors.T * np.outer(unit, unit)
     return fit_modes(
-        test, modes, _free_spectrum(poles, pole), unit=unit, remainder=remainder, watch=watch,
+        test, modes, _free_spectrum(poles.omega, poles.ratios, pole), unit=unit, remainder=remainder, watch=watch,
         max_iterations=max_iterations,
     )  # fmt: skip
 
@@ -218,25 +219,25 @@ def held_to_totals(problem: Problem, end: ModalFit, watch: Watch, max_iterations
     off = ca.vertcat(*ties(ca.DM(modes.phi), ca.DM(modes.gamma), ca.DM(end.rigid)))
     if np.any(np.abs(np.asarray(off)) > _AGREES):
         return None
-    poles = Poles(modes.omega, modes.ratios, end.residual)
+    _, first, pole = np.unique(modes.omega + 1j * modes.ratios, return_index=True, return_inverse=True)
     held = fit_modes(
-        test, modes, _free_spectrum(poles, np.arange(modes.omega.size)), unit=np.sqrt(problem.totals),
+        test, modes, _free_spectrum(modes.omega[first], modes.ratios[first], pole), unit=np.sqrt(problem.totals),
         remainder=end.rigid - modes.gamma.T @ modes.gamma, ties=ties, watch=watch, max_iterations=max_iterations,
     )  # fmt: skip
     agrees = held.residual <= _AS_GOOD * end.residual + EXACT
     return held if agrees and held.status in SOLVED else None
 
 
-def _free_spectrum(poles: Poles, pole: Integers) -> Spectrum:
+def _free_spectrum(omega: Array, ratios: Array, pole: Integers) -> Spectrum:
     """Frequencies and damping ratios of each pole without bounds; modes of one pole share them."""
 
     def spectrum(z: Coordinates) -> tuple[ca.MX, ca.MX]:
         # In units of the half-power half-width, which is what frequencies are known in.
         # Cut off where no step of use leads.
-        shift = _within(z.add("frequency", np.zeros(poles.omega.size)) * ca.DM(poles.ratios), 1.0)
-        loss = _within(z.add("damping ratio", np.zeros(poles.omega.size)), 10.0)
-        omega, ratios = ca.DM(poles.omega) * ca.exp(shift), ca.DM(poles.ratios) * ca.exp(loss)
-        return omega[pole.tolist()], ratios[pole.tolist()]
+        shift = _within(z.add("frequency", np.zeros(omega.size)) * ca.DM(ratios), 1.0)
+        loss = _within(z.add("damping ratio", np.zeros(omega.size)), 10.0)
+        moved, lossy = ca.DM(omega) * ca.exp(shift), ca.DM(ratios) * ca.exp(loss)
+        return moved[pole.tolist()], lossy[pole.tolist()]
 
     return spectrum
 
@@ -335,7 +336,8 @@ def modal_structure(
     Raises
     ------
     NotModalError
-        Where a stated frequency is none of the data's, or these do not suffice.
+        Where a stated frequency is none of the data's, these do not suffice, or the modes are too much alike at the
+        sensors.
     InputError
         Where the base force has the wrong sign, or stated sensors do not tell the modes apart.
     """

@@ -73,7 +73,7 @@ def determination(problem: Problem, structure: Structure) -> Determination:
             names = " and ".join(_mode(structure, k) for k in cluster)
             seen = _seen(test, structure, cluster, structure.mode_shapes, responses).shape[1]
             if seen < len(cluster):
-                open_.append(f"{names} are too close to be told apart, and the data show {seen} of them only")
+                open_.append(f"{names} are too close to be told apart, and the data show {seen or 'none'} of them only")
             elif not set(cluster).isdisjoint(free):
                 open_.append(f"{names} are too close to be told apart: only the sum of their residues is known")
     if known.sentence:
@@ -89,7 +89,8 @@ def determination(problem: Problem, structure: Structure) -> Determination:
             masses = [f"the modal mass of {_mode(structure, k)}" for k in free]
             listed = masses if len(masses) == 1 else [", ".join(masses[:-1]), masses[-1]]
             what = " and ".join(listed) + (" is open" if len(masses) == 1 else " are open")
-        open_.append(f"{what}: other mass and stiffness matrices answer identically")
+        bounded = ", within what is stated" if len(known.equations) else ""
+        open_.append(f"{what}: other mass and stiffness matrices answer identically{bounded}")
         if problem.unit_mass:
             open_.append("no number with a unit of mass is given: masses are normalised to 1 kg in each base direction")
     if not structure.at_sensors:
@@ -97,10 +98,15 @@ def determination(problem: Problem, structure: Structure) -> Determination:
         alike = ", which do not all move independently" if structure.n == structure.n_sensors else ""
         open_.append(
             f"{structure.n} modes stand out for {structure.n_sensors} sensors{alike}: the mass and stiffness matrices "
-            "hold for the stated degrees of freedom only; the Craig-Bampton form (modal and base coordinates) is what "
-            f"the data determine, {how_far}"
+            "hold for the stated degrees of freedom only; the Craig-Bampton form (to_craig_bampton(), modal and base "
+            f"coordinates) is what the data determine, {how_far}"
         )
     return Determination(not open_, () if free else tuple(closed), tuple(open_))
+
+
+def open_masses(problem: Problem, structure: Structure) -> list[int]:
+    """Modes, counted from 0, whose modal mass neither the records nor the stated models fix."""
+    return _open_modes(_known(problem, structure, problem.measurement.residual(structure)))[0]
 
 
 @dataclass(frozen=True, eq=False)

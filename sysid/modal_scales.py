@@ -1,7 +1,8 @@
 """The scale of each mode, its modal mass, by whatever is known: each a small linear problem.
 
 Accelerations leave all modal masses open (the modal-mass cone, see `modal_masses`). A measured base force, a known
-mass matrix or a lumped one with its total fix them; with nothing known the member nearest to a lumped mass is taken.
+mass matrix, enough known entries of one, or a lumped one with its total fix them; otherwise the member nearest to a
+lumped mass is taken.
 """
 
 from __future__ import annotations

@@ -86,7 +86,10 @@ def _find(records: Records) -> Poles:
         count += max(count // 2, _SPARE)  # too few were spare
     lines = 2 * np.pi * records.freq
     if not np.any((omega > (1 - _BESIDE) * lines[0]) & (omega < (1 + _BESIDE) * lines[-1])):
-        raise InputError("no mode stands out of the noise between these lines: state natural_frequencies or widen them")
+        raise InputError(
+            "no mode stands out of the noise between these lines: state natural_frequencies or widen them, unless base "
+            "and sensors are in different units (g and m/s²) or the spectra follow exp(-iwt) (take the conjugate)"
+        )
     return _in_order(records, omega, ratios)
 
 

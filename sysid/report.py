@@ -10,7 +10,7 @@ import numpy as np
 from sysid import plot
 from sysid._html import Cell, beside, bullets, fold, matrix, number, page, paragraph, picture, table, text
 from sysid._panels import is_unit, run_names
-from sysid._summary import half_width, is_one_of_many, mass_percent_std
+from sysid._summary import half_width, is_one_of_many, mass_percent_std, next_steps, verdict
 from sysid.errors import InputError
 from sysid.identification import Identification
 from sysid.mass import FullMass
@@ -125,24 +125,19 @@ def _verdict(it: Identification) -> str:
     if it.force_residual is not None:
         lines.append(paragraph(f"Of the base force: {it.force_residual:.3e}."))
     head += f'<div class="verdict {"good" if it.success else "bad"}">{"".join(lines)}</div>'
-    if it.determined:
-        kind, word = "good", "Determined: this is the mass and stiffness, within the stated model"
-    else:
-        kind, word = "warn", "Not determined: this is one of many models that explain the data"
-    lines = [f"<strong>{word}</strong>"]
-    if not it.determined:
+    kind, steps = "good" if it.determined else "warn", next_steps(it)
+    lines = [f"<strong>{text(verdict(it))}</strong>"]
+    if it.closed_by:
+        lines.append(paragraph("What fixes it:"))
+    if steps:
         lines.append(
             paragraph(
                 "Frequencies, damping ratios and the responses to base motion hold for all of them; the mass, "
                 "stiffness and damping matrices below are one choice. What is open:"
             )
         )
-        lines.append(bullets(_sentence(s) for s in it.undetermined))
-        if it.closed_by:
-            lines.append(paragraph("What is fixed:"))
-    elif it.closed_by:
-        lines.append(paragraph("What fixes it:"))
-    lines.append(bullets(_sentence(s) for s in it.closed_by))
+    lines.append(bullets(_sentence(s) for s in it.closed_by + it.undetermined))
+    lines += [paragraph(_sentence(step)) for step in steps]
     head += f'<div class="verdict {kind}">{"".join(lines)}</div>'
     return head + "".join(paragraph(_sentence(remark), "soft") for remark in it.remarks)
 

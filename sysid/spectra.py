@@ -100,7 +100,7 @@ def averaged(runs: Sequence[Run], sample_rate: float, *, kind: str, segment: int
     H1 solves ``S_yx = H S_xx`` for all base directions together; H2 is ``S_yy / S_xy``, for one
     base direction. The variance of an estimate from n_e effective averages is
     ``(1 - coherence) S_yy [S_xx^-1]_ii / n_e`` (Bendat and Piersol, *Random Data*, ch. 9), n_e
-    counting the overlap as in Welch (1967).
+    counting the overlap as in Welch (1967). What the window blurs (`_smoothing`) is added.
 
     Raises
     ------

@@ -22,6 +22,7 @@ from sysid.errors import InputError
 from sysid.local import is_modal
 from sysid.mass import FullMass
 from sysid.modal_fit import Modes
+from sysid.modal_masses import open_masses
 from sysid.problem import Problem
 from sysid.structure import Array, Structure, check_frequencies
 from sysid.variables import Variable
@@ -415,8 +416,10 @@ def _quantities(problem: Problem, structure: Structure, modes: Modes, moves: _Mo
         (loss, loss[:, None] * (moves.log_omega + moves.log_ratios)),
     )
     mass, stiffness, damping = (_matrix_std(structure, moves, diagonal, change) for diagonal, change in diagonals)
-    if is_modal(problem) and problem.measurement.force is None and not _masses_known(problem, structure):
-        mass, stiffness, damping = np.full((3, n, n), np.nan)  # zeros that a decoupled structure keeps included
+    if is_modal(problem) and (open_ := open_masses(problem, structure)):
+        # Also where only noise of the force hides a modal mass, and zeros that a decoupled structure keeps.
+        mass, stiffness, damping = np.full((3, n, n), np.nan)
+        shape_std[:, open_], push_std[open_], effective[open_] = np.nan, np.nan, np.nan
 
     known = np.isfinite(push_std)
     changes = np.concatenate([d_frequencies, d_ratios, moves.gamma[known]])[:, : moves.normals]
