@@ -153,10 +153,8 @@ def partners(result: sysid.Identification, truth: sysid.Structure, counts: np.nd
     """
     f, found = truth.natural_frequencies, result.structure.natural_frequencies
     near = NEAR * truth.damping_ratios * f
-    allowed = np.broadcast_to(near, (found.size, f.size))
-    if result.uncertainty is not None:
-        std = np.nan_to_num(result.uncertainty.natural_frequencies, nan=0.0, posinf=0.0)
-        allowed = np.maximum(near, DEVIATIONS * std[:, None])
+    std = np.nan_to_num(result.uncertainty.natural_frequencies, nan=0.0, posinf=0.0)
+    allowed = np.maximum(near, DEVIATIONS * std[:, None])
     off = np.abs(found[:, None] - f) / allowed
     cost = np.where(off < 1, off - 1e3 - 1e3 * counts, 0.0)
     rows, columns = linear_sum_assignment(cost)
@@ -176,13 +174,10 @@ def nonsense(result: sysid.Identification, truth: sysid.Structure) -> str:
         claims.append(f"determined with {result.structure.n} modes of {n}")
     elif result.determined:
         error = np.abs(result.structure.mass[:n, :n] - truth.mass[:n, :n])
-        if result.uncertainty is None:
-            claims.append("determined, but with no uncertainty")
-        else:
-            with warnings.catch_warnings(), np.errstate(all="ignore"):
-                off = error / result.uncertainty.mass
-            # An entry without a number is no claim.
-            worst = float(np.nanmax(off, initial=0.0))
-            if worst > WRONG:
-                claims.append(f"determined with M_SS wrong by {worst:.3g} of its standard deviations")
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            off = error / result.uncertainty.mass
+        # An entry without a number is no claim.
+        worst = float(np.nanmax(off, initial=0.0))
+        if worst > WRONG:
+            claims.append(f"determined with M_SS wrong by {worst:.3g} of its standard deviations")
     return ", ".join(claims)
