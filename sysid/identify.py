@@ -26,6 +26,7 @@ from sysid.stiffness import SpectralStiffness
 from sysid.structure import Structure
 
 _KNOWN = 0.1  # of the root of two diagonal entries; an entry with a larger standard deviation is not known
+_LARGE = 4000  # entries of the mode shapes, beyond which the covariance takes minutes and gigabytes
 _NO_FIT = 0.5  # relative residual above which nothing is explained
 STRATEGIES = ("auto", "swarm", "modal")
 
@@ -235,6 +236,9 @@ def _as_certain(it: Identification) -> Identification:
     """
     if not it.determined or max(it.residual, it.force_residual or 0.0) < local.EXACT:
         return it
+    if it.structure.mode_shapes.size > _LARGE:
+        told = "whether noise leaves each entry known was not judged, as that takes minutes: see uncertainty"
+        return replace(it, remarks=(*it.remarks, told))
     s, u = it.structure, it.uncertainty
     n, open_ = s.n, []
     pairs = ("M_SS", s.mass[:n, :n], u.mass), ("K_SS", s.stiffness[:n, :n], u.stiffness), ("C", s.damping, u.damping)
