@@ -23,7 +23,7 @@ from sysid.structure import Array
 _HELD = 1e5  # weight of known entries beside what is only likely
 _SPARE = 1e-3  # least share of a total mass that is left to the base
 _SHARE = 1e-3  # of the largest share of a mode in a total; a smaller one would make its modal mass beyond measure
-_LEAST = 0.1  # of an equal share of the mass, that each mode keeps where nothing tells modal masses
+_LEAST = 0.5  # of an equal share of the mass, that each mode keeps where nothing tells modal masses
 
 
 def weigh(test: Measurement, modes: Modes) -> tuple[Array, Array]:
