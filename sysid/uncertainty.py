@@ -416,10 +416,8 @@ def _quantities(problem: Problem, structure: Structure, modes: Modes, moves: _Mo
         (loss, loss[:, None] * (moves.log_omega + moves.log_ratios)),
     )
     mass, stiffness, damping = (_matrix_std(structure, moves, diagonal, change) for diagonal, change in diagonals)
-    if is_modal(problem) and (open_ := open_masses(problem, structure)):
-        # Also where only noise of the force hides a modal mass, and zeros that a decoupled structure keeps.
-        mass, stiffness, damping = np.full((3, n, n), np.nan)
-        shape_std[:, open_], push_std[open_], effective[open_] = np.nan, np.nan, np.nan
+    if is_modal(problem) and problem.measurement.force is None and open_masses(problem, structure):
+        mass, stiffness, damping = np.full((3, n, n), np.nan)  # zeros that a decoupled structure keeps included
 
     known = np.isfinite(push_std)
     changes = np.concatenate([d_frequencies, d_ratios, moves.gamma[known]])[:, : moves.normals]
