@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from sysid.identification import Identification
-from sysid.modal_masses import open_masses
 from sysid.structure import Array
 
 DEVIATES = 1.96  # standard deviations on either side of 95 % of a normal law
@@ -43,14 +42,14 @@ def verdict(it: Identification) -> str:
     """What the matrices are worth, in one sentence."""
     if it.determined:
         return "Determined: data and stated model leave one mass and one stiffness matrix"
-    if open_masses(it.problem, it.structure):
+    if it.open_masses:
         return "Not determined: this is one of many models that explain the data"
     return "Not determined: something speaks against this model, or is not known well enough"
 
 
 def next_steps(it: Identification) -> list[str]:
     """What would close open modal masses, in sentences."""
-    if it.determined or not open_masses(it.problem, it.structure):
+    if it.determined or not it.open_masses:
         return []
     if it.measurement.force is not None:
         return ["to weigh these modes: more force at their frequencies, longer records, or another base direction"]

@@ -10,7 +10,7 @@ import numpy as np
 from sysid.mass import FullMass, KnownMass, LumpedMass
 from sysid.measurement import Measurement
 from sysid.problem import Problem
-from sysid.residues import Records, beyond_chance, force_residual_left, linear_residues
+from sysid.residues import Records, ResidueFit, beyond_chance, force_residual_left
 from sysid.response import weighed_mass
 from sysid.structure import Array, Structure
 
@@ -25,7 +25,9 @@ _GAIN = 0.03  # of the base's motion; smaller errors of a sensor's gain are usua
 def doubts(problem: Problem, structure: Structure) -> tuple[str, ...]:
     """What speaks against the identified structure, in sentences; nothing counts as determined beside one."""
     test = problem.measurement
-    no_fit, rigid = tuple(_no_fit(problem, structure)), tuple(_rigid(test, structure))
+    records, poles = Records(test), _poles(structure)
+    free = records.fit(*poles)
+    no_fit, rigid = tuple(_no_fit(problem, structure, records, free)), tuple(_rigid(test, records, free))
     return (
         *_stated_mass(problem, structure),
         *_known_entries(problem, structure),
@@ -34,17 +36,17 @@ def doubts(problem: Problem, structure: Structure) -> tuple[str, ...]:
         *_force(problem, structure),
         *rigid,
         # Beside what those say, quadrature and likeness mean nothing.
-        *(() if rigid else _damping(test, structure)),
+        *(() if rigid else _damping(records, poles, free)),
         *(() if rigid or no_fit else _twins(test, structure)),
     )
 
 
-def _no_fit(problem: Problem, structure: Structure) -> Iterator[str]:
+def _no_fit(problem: Problem, structure: Structure, records: Records, free: ResidueFit) -> Iterator[str]:
     """Whether the structure leaves clearly more of the accelerations than free residues at its own poles."""
     test = problem.measurement
     left = replace(test, response=test.response - test.predict(structure))
-    misfit = float(np.sqrt(Records(left).size / Records(test).size))
-    possible = max(linear_residues(test, *_poles(structure))[1], _ROUND_OFF)
+    misfit = float(np.sqrt(Records(left).size / records.size))
+    possible = max(float(np.sqrt(free.squared_error / records.size)), _ROUND_OFF)
     if misfit > _MISFIT * possible:
         model = "the structure" if isinstance(problem.mass, FullMass) else "the stated mass model"
         yield (
@@ -137,21 +139,19 @@ def _force(problem: Problem, structure: Structure) -> Iterator[str]:
         )
 
 
-def _rigid(test: Measurement, structure: Structure) -> Iterator[str]:
+def _rigid(test: Measurement, records: Records, free: ResidueFit) -> Iterator[str]:
     """Whether sensors move in a constant proportion to the base beside their modes: G is not what it is said to be."""
-    records = Records(test)
-    fit = records.fit(*_poles(structure))
     ones = records.basis(np.ones((1, test.freq.size), dtype=complex))
-    extra = ones - fit.Q @ (fit.Q.T @ ones)
+    extra = ones - free.Q @ (free.Q.T @ ones)
     if np.linalg.norm(extra) < _MIMICKED * np.linalg.norm(ones):
         return
     Q, R = np.linalg.qr(extra)
-    along = Q.T @ fit.left
-    left = fit.left - Q @ along
+    along = Q.T @ free.left
+    left = free.left - Q @ along
     gained = np.sum(along**2, axis=0)
     if records.unit:
         gained = gained.reshape(test.n_base, test.n_sensors).sum(axis=0)
-    noise = records.noise(left, fit.residues.size + along.size, least=_ROUND_OFF)
+    noise = records.noise(left, free.residues.size + along.size, least=_ROUND_OFF)
     moved = records.by_sensor(np.linalg.solve(R, along)[None])[0]
     reach = np.abs(test.rigid_body).max(axis=0)
     moved /= np.where(reach > 0, reach, np.inf)
@@ -169,15 +169,14 @@ def _rigid(test: Measurement, structure: Structure) -> Iterator[str]:
         )
 
 
-def _damping(test: Measurement, structure: Structure) -> Iterator[str]:
+def _damping(records: Records, poles: tuple[Array, Array], free: ResidueFit) -> Iterator[str]:
     """Whether residues in quadrature, which normal modes have not, stand out: on the basis {g, i w g}."""
-    records, poles = Records(test), _poles(structure)
     if records.data.shape[0] <= 4 * poles[0].size * records.n_base:
         return
-    real, both = records.fit(*poles), records.fit(*poles, velocity=True)
+    both = records.fit(*poles, velocity=True)
     extra = poles[0].size * records.n_base * records.n_sensors
     noise = records.noise(both.left, 2 * extra, least=_ROUND_OFF)
-    gained = real.squared_error - both.squared_error
+    gained = free.squared_error - both.squared_error
     if gained > noise * beyond_chance(extra):
         yield (
             f"residues in quadrature explain {100 * np.sqrt(gained / records.size):.2g} % of the response: the damping "

@@ -177,6 +177,13 @@ class Identification:
         return self._intervals.stiffness
 
     @cached_property
+    def open_masses(self) -> tuple[int, ...]:
+        """Modes, counted from 0, whose modal mass neither the records nor the stated models fix."""
+        from sysid.modal_masses import open_masses
+
+        return tuple(open_masses(self.problem, self.structure))
+
+    @cached_property
     def _intervals(self) -> Intervals:
         from sysid.modal_masses import intervals
 

@@ -272,13 +272,13 @@ def _poles(it: Identification) -> str:
 
 
 def _convergence(it: Identification) -> str:
-    history, swarm = it.history, it.history.swarm_curve.size > 0
+    history = it.history
     steps = max(history.local_curve.size - 1, 0)
     refined = "eigenvalues replaced by those given"
     if np.isfinite(history.refinement_error):
         refined += f", within {history.refinement_error:.1e} (relative, ω²)"
     rows = [
-        ("start", history.start, "best of the first candidates, or the start given" if swarm else "modes of the data"),
+        ("start", history.start, "best of the first candidates, or the start given"),
         ("swarm", history.swarm, f"{history.evaluations} candidates in {history.swarm_curve.size} iterations"),
         ("refinement", history.refinement, refined),
         ("local phase", history.local, f"{steps} iteration{'' if steps == 1 else 's'}, exact derivatives"),
