@@ -301,20 +301,16 @@ def build(problem: Problem, modes: Modes, remainder: Array, chosen: DegreesOfFre
     # Exact where a degree of freedom is a sensor.
     recovery[chosen.sensors] = np.eye(T.shape[0])[: chosen.sensors.size]
     gamma = modes.gamma
+    plain = chosen.modes.size == 0 and chosen.sensors.size == layout.n
     if to_totals:
         groups = np.concatenate([layout.directions[chosen.sensors], np.full(chosen.modes.size, -1)])
-        known = (
-            chosen.modes.size == 0
-            and chosen.sensors.size == layout.n
-            and bool(np.nansum(np.abs(problem.known_mass)) > 0)
-        )
+        known = plain and bool(np.nansum(np.abs(problem.known_mass)) > 0)
         t, remainder = to_stated_totals(problem, P, gamma, G, groups, remainder, scaled=known)
         P, gamma = P * np.sqrt(t), gamma * np.sqrt(t)
     M_SS, K_SS = P.T @ P, (P.T * modes.omega**2) @ P
     M_S0 = P.T @ gamma - M_SS @ G
     delta = gamma - P @ G
     K_S0 = -K_SS @ G
-    plain = chosen.modes.size == 0 and chosen.sensors.size == layout.n
     return Structure(
         np.block([[M_SS, M_S0], [M_S0.T, delta.T @ delta + remainder]]),
         np.block([[K_SS, K_S0], [K_S0.T, -G.T @ K_S0]]),
