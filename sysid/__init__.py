@@ -15,6 +15,7 @@ from sysid.stiffness import ChainStiffness, SpectralStiffness
 from sysid.storage import load
 from sysid.structure import Structure
 from sysid.swarm import SwarmSettings, minimize_swarm
+from sysid.variables import Variable
 
 __version__ = "0.1.0"
 
@@ -25,6 +26,6 @@ if hasattr(_casadi.GlobalOptions, "setNumpyMode"):
 __all__ = [
     "ChainStiffness", "FullMass", "History", "Identification", "InputError", "KnownMass", "LumpedMass", "Measurement",
     "Modal", "ModalDamping", "Problem", "Progress", "ProportionalDamping", "Recipe", "Sensor", "SolverError",
-    "SpectralStiffness", "Structure", "Swarm", "SwarmSettings", "SysidError", "identify", "load",
+    "SpectralStiffness", "Structure", "Swarm", "SwarmSettings", "SysidError", "Variable", "identify", "load",
     "minimize_swarm", "plot", "resample", "rigid_body", "simulate",
 ]  # fmt: skip

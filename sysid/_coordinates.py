@@ -12,7 +12,7 @@ _TOLERANCE = 1e-9  # of IPOPT
 
 
 class Coordinates:
-    """Unknowns z of the nonlinear programme, and the equalities that tie them."""
+    """Unknowns z of the nonlinear programme, and the equalities and inequalities that tie them."""
 
     def __init__(self) -> None:
         self.pieces: list[ca.MX] = []
@@ -21,6 +21,8 @@ class Coordinates:
         self.lower: list[Array] = []
         self.upper: list[Array] = []
         self.ties: list[ca.MX] = []
+        self._tie_lower: list[Array] = []
+        self._tie_upper: list[Array] = []
 
     @property
     def z(self) -> ca.MX:
@@ -38,6 +40,12 @@ class Coordinates:
         self.upper.append(np.broadcast_to(upper, start.shape).ravel(order="F"))
         return symbol
 
+    def tie(self, expression: ca.MX, lower: Array | float = 0.0, upper: Array | float = 0.0) -> None:
+        """Hold an expression, a column, between bounds; at zero by default."""
+        self.ties.append(expression)
+        self._tie_lower.append(np.broadcast_to(lower, expression.numel()))
+        self._tie_upper.append(np.broadcast_to(upper, expression.numel()))
+
     def minimize(
         self, objective: ca.MX, watch: Watch, max_iterations: int, derivatives: dict[str, ca.Function] | None = None
     ) -> tuple[Array, str]:
@@ -50,6 +58,7 @@ class Coordinates:
         ties = ca.vertcat(*self.ties) if self.ties else ca.MX(0, 1)
         nlp = {"x": z, "f": OBJECTIVE_SCALE * objective, "g": ties}
         lower, upper = np.concatenate(self.lower), np.concatenate(self.upper)
+        tie_lower, tie_upper = (np.concatenate([np.zeros(0), *part]) for part in (self._tie_lower, self._tie_upper))
         start = np.clip(np.concatenate(self.start), lower, upper)
         call = watch.callback(start, ties.numel())
 
@@ -68,7 +77,7 @@ class Coordinates:
                 **(derivatives or {}),
             }  # fmt: skip
             solver = ca.nlpsol("local", "ipopt", nlp, options)
-            answer = solver(x0=at, lbx=lower, ubx=upper, lbg=0, ubg=0)
+            answer = solver(x0=at, lbx=lower, ubx=upper, lbg=tie_lower, ubg=tie_upper)
             return solver.stats()["return_status"], np.asarray(answer["x"]).ravel()
 
         try:

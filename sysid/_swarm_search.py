@@ -166,7 +166,7 @@ class _Search:
 
     @property
     def misfit(self) -> float:
-        """What all phases minimise, at the best so far."""
+        """At the best so far."""
         assert self.x is not None
         return self.misfit_of(self.x)
 
@@ -186,9 +186,8 @@ class _Search:
         return local.is_modal(self.problem) or self.misfit <= _DOUBTFUL
 
     def misfit_of(self, x: Array) -> float:
-        """Root of the sum of the squared relative residuals of accelerations and force."""
-        structure, test = self.problem.structure(x), self.problem.measurement
-        return float(np.hypot(test.residual(structure), test.force_residual(structure) or 0.0))
+        """What all phases minimise."""
+        return self.problem.misfit_of(x)
 
     def run(
         self, random: np.random.SeedSequence, start: ArrayLike | Structure | None, max_evaluations: int | None

@@ -10,7 +10,7 @@ import numpy as np
 from sysid.errors import InputError
 from sysid.layout import Layout
 from sysid.structure import Array
-from sysid.variables import Variable
+from sysid.variables import Block
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,11 +20,11 @@ class ModalDamping:
     lower: float = 0.005
     upper: float = 0.05
 
-    def variables(self, layout: Layout) -> tuple[Variable, ...]:
+    def variables(self, layout: Layout) -> tuple[Block, ...]:
         """Damping ratios, in ascending order of frequency."""
         if not 0 < self.lower < self.upper < 1:
             raise InputError(f"ModalDamping: 0 < lower < upper < 1 is needed, not {self.lower} and {self.upper}")
-        return (Variable("damping_ratio", np.full(layout.n, self.lower), np.full(layout.n, self.upper)),)
+        return (Block("damping_ratio", np.full(layout.n, self.lower), np.full(layout.n, self.upper)),)
 
     def ratios(self, y: ca.SX, omega: ca.SX) -> ca.SX:
         """Damping ratios (n,) at the circular frequencies `omega`."""
@@ -48,13 +48,13 @@ class ProportionalDamping:
     alpha: tuple[float, float]
     beta: tuple[float, float]
 
-    def variables(self, layout: Layout) -> tuple[Variable, ...]:
+    def variables(self, layout: Layout) -> tuple[Block, ...]:
         """The two factors; alpha in 1/s, beta in s."""
         for name, (low, high) in (("alpha", self.alpha), ("beta", self.beta)):
             if not 0 <= low < high < np.inf:
                 raise InputError(f"ProportionalDamping: {name} needs 0 <= lower < upper, not ({low}, {high})")
         lower, upper = np.array([self.alpha, self.beta], dtype=float).T
-        return (Variable("rayleigh", lower, upper, unit="1/s, s"),)
+        return (Block("rayleigh_factor", lower, upper, unit="1/s, s"),)
 
     def ratios(self, y: ca.SX, omega: ca.SX) -> ca.SX:
         """Damping ratios (n,) at the circular frequencies `omega`."""

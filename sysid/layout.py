@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError
 from sysid.structure import Array, finite_array
-from sysid.variables import Variable
+from sysid.variables import Block
 
 # A Cholesky diagonal of zero makes the mode shapes infinite; one of 1e-3 already spans a
 # condition number of 1e6, more than any test resolves.
@@ -59,13 +59,13 @@ class Layout:
         groups = np.where(strength.max(axis=1) > 0, np.argmax(ties, axis=1), -1)
         return np.concatenate([groups, np.arange(self.d)])
 
-    def total_variables(self, total_mass: ArrayLike | None) -> tuple[Variable, ...]:
+    def total_variables(self, total_mass: ArrayLike | None) -> tuple[Block, ...]:
         """The totals as unknowns, where they are not stated and the base force tells them."""
         if total_mass is not None or self.weighed is None:
             return ()
         # Skew sensors may all belong to one direction, which then carries what the force weighs in all.
         upper = np.where(self.translational, self.weighed[self.translational].sum(), self.weighed)
-        return (Variable("total_mass", self.weighed / 4, upper * 4, unit="kg"),)
+        return (Block("total_mass", self.weighed / 4, upper * 4, unit="kg"),)
 
     def split_totals(self, total_mass: ArrayLike | None, y: ca.SX) -> tuple[ca.SX | Array, ca.SX]:
         """Totals, stated or the first of the unknowns `y`, and the unknowns left."""

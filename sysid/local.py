@@ -7,8 +7,7 @@ The response is bilinear in mode shapes and participations, so these are the unk
   ``M_SS = (Phi Phi')^-1`` and ``K_SS = M_SS Phi diag(w²) Phi' M_SS``, and participations give the coupling.
   A local minimum shows: with frequencies and damping as they ended, the best residues are a linear
   least-squares problem, and where that fits clearly better, the search starts again from there.
-- A structured mass or stiffness keeps its own unknowns. ``Phi = L^-T Psi``, and Psi is held orthogonal
-  and, for a structured stiffness, diagonalises H: polynomial equality constraints.
+- A structured mass or stiffness keeps its own unknowns (`local_structured`).
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ import numpy as np
 from sysid._coordinates import Coordinates
 from sysid._watch import Watch
 from sysid.damping import ModalDamping
-from sysid.layout import lower_entries, triangle_entries
+from sysid.local_structured import StructuredFit, fit_structured
 from sysid.mass import FullMass
 from sysid.measurement import Measurement
 from sysid.modal import FREQUENCY_WINDOW
@@ -31,10 +30,8 @@ from sysid.modal_scales import stated_totals, to_stated_totals
 from sysid.problem import Problem, assemble
 from sysid.refinement import SOLVED
 from sysid.residues import linear_residues
-from sysid.response import residual
 from sysid.stiffness import SpectralStiffness
 from sysid.structure import Array, Structure
-from sysid.variables import split
 
 _OPEN_WINDOW = 20.0  # factor either way for a frequency that nobody gave
 _SUSPECT = 1.05  # a residual so many times that of free residues at the same poles is a local minimum
@@ -98,7 +95,8 @@ def solve(
     start, watch = problem.structure(x), Watch(monitor, max_time)
     if is_modal(problem):
         return _in_modal_coordinates(problem, start, watch, max_iterations)
-    return _structured(problem, x, start, watch, max_iterations)
+    end = fit_structured(problem, x, start, watch, max_iterations)
+    return _result(end.x, end, watch)
 
 
 def _in_modal_coordinates(problem: Problem, start: Structure, watch: Watch, max_iterations: int) -> LocalResult:
@@ -129,7 +127,7 @@ def _in_modal_coordinates(problem: Problem, start: Structure, watch: Watch, max_
     return _result(_unknowns(problem, modes, best.rigid, remainder), best, watch, message)
 
 
-def _result(x: Array, end: ModalFit | _End, watch: Watch, message: str = "") -> LocalResult:
+def _result(x: Array, end: ModalFit | StructuredFit, watch: Watch, message: str = "") -> LocalResult:
     words = [f"IPOPT: {end.status}"]
     if end.bounds:
         words.append(f"ended on a bound: {end.bounds}")
@@ -173,7 +171,7 @@ def _spectrum(problem: Problem, start: Modes, z: Coordinates) -> tuple[ca.MX, ca
         low, high = np.log(variable.lower / guess), np.log(variable.upper / guess)
         return omega, ca.DM(guess) * ca.exp(z.add("damping ratio", np.zeros(guess.size), low, high)), center
     guess = np.clip(damping.values(start.ratios, start.omega), variable.lower, variable.upper)
-    y = z.add("Rayleigh factor", guess / variable.upper, variable.lower / variable.upper, 1.0)
+    y = z.add("rayleigh factor", guess / variable.upper, variable.lower / variable.upper, 1.0)
     return omega, damping.ratios(y * ca.DM(variable.upper), omega), center
 
 
@@ -208,65 +206,3 @@ def _regular_inverse(phi: Array) -> Array:
     """Inverse of the shapes; where a bad fit has made some alike or next to nothing, of near ones that are not."""
     u, s, vt = np.linalg.svd(phi)
     return (vt.T / np.maximum(s, _LEAST_SHAPE * s[0])) @ u.T
-
-
-@dataclass(frozen=True, eq=False)
-class _End:
-    """Where IPOPT ended in the structure's own unknowns; as in `ModalFit`."""
-
-    residual: float
-    status: str
-    bounds: str
-
-
-def _structured(problem: Problem, x: Array, start: Structure, watch: Watch, max_iterations: int) -> LocalResult:
-    """Mass or stiffness with unknowns of their own."""
-    z, layout, parts = Coordinates(), problem.layout, problem.parts
-    n, G = layout.n, ca.DM(layout.rigid_body)
-    symbols = ca.SX.sym("x", problem.n_variables)
-    blocks = problem.matrices(symbols)
-    L_inverse = ca.solve(blocks.factor, ca.SX.eye(n))
-    outputs = [ca.densify(b) for b in (L_inverse, blocks.factor, blocks.coupling, blocks.base, blocks.mass_normalised)]
-    expand = ca.Function("expand", [symbols], outputs)
-
-    # The modes themselves stand for a spectral stiffness and for the damping.
-    held = isinstance(problem.stiffness, SpectralStiffness)
-    searched = parts.mass.stop if held else parts.stiffness.stop
-    pieces: list[ca.MX] = []
-    at = 0
-    for variable, given in zip(problem.variables, split(problem.variables, x), strict=True):
-        values = np.clip(given, variable.lower, variable.upper)
-        if at < searched:
-            # Each unknown in units of its start, or of its range where that is smaller.
-            unit = np.maximum(np.abs(values), 0.05 * (variable.upper - variable.lower))
-            pieces.append(
-                z.add(variable.name, values / unit, variable.lower / unit, variable.upper / unit) * ca.DM(unit)
-            )
-        else:
-            pieces.append(ca.MX(ca.DM(values)))
-        at += variable.size
-    L_inv, L, M_S0, M_00, H = expand(ca.vertcat(*pieces))
-
-    omega, ratios, center = _spectrum(problem, _modes(start), z)
-    psi = z.add("mode shape", np.linalg.cholesky(start.mass[:n, :n]).T @ start.mode_shapes)
-    z.ties.append(lower_entries(psi.T @ psi - ca.MX.eye(n)))
-    if not held:
-        scaled = psi @ ca.diag(1 / ca.DM(center))
-        z.ties.append(lower_entries(scaled.T @ H @ scaled - ca.diag((omega / ca.DM(center)) ** 2)))
-    phi = L_inv.T @ psi
-    push = L @ (L.T @ G) + M_S0
-    rigid = G.T @ push + M_S0.T @ G + M_00
-
-    miss = residual(problem.measurement, phi, phi.T @ push, omega, ratios, rigid, weighted=True)
-    best, status = z.minimize(ca.sumsqr(miss), watch, max_iterations)
-
-    names = (ca.vertcat(*pieces), psi, omega, ratios, ca.norm_2(miss))
-    values = [np.asarray(v) for v in ca.Function("end", [z.z], list(names))(best)]
-    unknowns, w = values[0].ravel(), values[2].ravel()
-    order = np.argsort(w)
-    unknowns[parts.damping] = _damping_values(problem, values[3].ravel()[order], w[order])
-    if held:
-        u, _, vt = np.linalg.svd(values[1][:, order])  # exactly orthogonal
-        shapes = u @ vt
-        unknowns[parts.stiffness] = triangle_entries(np.linalg.cholesky((shapes * w[order] ** 2) @ shapes.T))
-    return _result(unknowns, _End(float(values[4].item()), status, z.on_bounds(best)), watch)

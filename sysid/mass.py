@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from sysid.errors import InputError
 from sysid.layout import FACTOR_FLOOR, Layout, lower_triangle, triangle_entries
 from sysid.structure import Array, finite_array
-from sysid.variables import Variable
+from sysid.variables import Block
 
 _ROW_EXPECTATION = 1.0  # the paper's c
 _NEWTON_STEPS = 20  # for the coupled scales of the rigid-body healing; quadratic from a good start
@@ -114,7 +114,7 @@ class FullMass:
         entries[:, :n] = across
         return entries
 
-    def variables(self, layout: Layout) -> tuple[Variable, ...]:
+    def variables(self, layout: Layout) -> tuple[Block, ...]:
         """Entries of the factor's lower triangle, row by row, in [-1, 1] (eq. 35)."""
         size = layout.n + layout.d
         rows, columns = np.tril_indices(size)
@@ -122,7 +122,7 @@ class FullMass:
         lower = np.where(rows == columns, FACTOR_FLOOR, -1.0)
         return (
             *layout.total_variables(self.total_mass),
-            Variable(
+            Block(
                 "mass_factor",
                 lower,
                 np.ones(rows.size),
@@ -181,9 +181,9 @@ class LumpedMass:
 
     total_mass: ArrayLike | None = None
 
-    def variables(self, layout: Layout) -> tuple[Variable, ...]:
+    def variables(self, layout: Layout) -> tuple[Block, ...]:
         """Shares of the masses, scaled afterwards to their direction's total."""
-        share = Variable("mass_share", np.full(layout.n, FACTOR_FLOOR), np.ones(layout.n))
+        share = Block("mass_share", np.full(layout.n, FACTOR_FLOOR), np.ones(layout.n))
         return (*layout.total_variables(self.total_mass), share)
 
     def totals(self, layout: Layout) -> Array:
@@ -216,7 +216,7 @@ class KnownMass:
 
     matrix: ArrayLike
 
-    def variables(self, layout: Layout) -> tuple[Variable, ...]:
+    def variables(self, layout: Layout) -> tuple[Block, ...]:
         """No unknowns."""
         return ()
 

@@ -125,7 +125,8 @@ def fit_modes(
         rigid = rigid + factor @ factor.T
     error = _Error(test, gamma, omega, ratios, rigid, first)
     if ties is not None:
-        z.ties += ties(error.phi, gamma, rigid)
+        for tie in ties(error.phi, gamma, rigid):
+            z.tie(tie)
     best, status = z.minimize(error.value, watch, max_iterations, _derivatives(z, error, gamma, omega, ratios, rigid))
     end = ca.Function("end", [z.z], [error.phi, gamma, omega, ratios, rigid, error.value, ca.norm_fro(error.left)])
     values = [np.asarray(v) for v in end(best)]

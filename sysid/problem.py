@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
-from typing import NamedTuple
+from types import FrameType
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sysid._declaration import check_constraints, check_matrices, points_of, unused
+from sysid._written import Given, is_expression
 from sysid.damping import DampingModel, ModalDamping
 from sysid.errors import InputError
+from sysid.formulation import Formulation, formulate
 from sysid.layout import Layout
-from sysid.mass import FullMass, KnownMass, LumpedMass, MassModel
+from sysid.mass import FullMass, KnownMass, LumpedMass, MassBlocks, MassModel
 from sysid.measurement import Measurement
 from sysid.poles import Poles, find_poles
 from sysid.response import columns, weighed_mass
 from sysid.stiffness import SpectralStiffness, StiffnessModel
 from sysid.structure import Array, Structure, finite_array
-from sysid.variables import Variable, split
+from sysid.variables import Block, Variable, call_site, split, user_frame
 
 
 class Parts(NamedTuple):
@@ -52,10 +58,29 @@ class Problem:
     Parameters
     ----------
     measurement : Measurement
-    mass : FullMass, LumpedMass, KnownMass or array_like
-        An array is a known mass matrix.
-    stiffness : SpectralStiffness or ChainStiffness
-    damping : ModalDamping or ProportionalDamping
+    mass : FullMass, LumpedMass, KnownMass, array_like or expression
+        An array is a known mass matrix. An expression is written in `Variable` s, (n, n) or with the base's rows last
+        (n + d, n + d).
+    stiffness : SpectralStiffness, ChainStiffness, array_like or expression
+        A matrix is (n, n) or (n + d, n + d).
+    damping : ModalDamping, ProportionalDamping, array_like or expression
+        (n, n) is C on the motion relative to the base; (n,) is one damping ratio a mode, in ascending frequency.
+    residuals : sequence of expressions
+        Minimised in the least-squares sense beside the misfit of the measurement, whose norm is 1 where nothing is
+        explained: a second test (`sysid.misfit`), or what is known to some accuracy.
+    constraints : sequence of relations
+        Such as ``k[0] <= k[1]`` or ``ca.sum1(m) == 900``. IPOPT holds them exactly; in the swarm a candidate that
+        breaks them less is better, whatever its residual, and any that keeps them is better than these.
+    misfit : expression, optional
+        What is minimised in the place of the misfit of the measurement: a column of relative residuals.
+    recovery : array_like (n_sensors, n), optional
+        Takes n degrees of freedom to the sensors, where they are not one and the same.
+    rigid_body_dofs : array_like (n, d), optional
+        Motion of the degrees of freedom with a rigid base; needed beside `recovery` where the stiffness has no base
+        columns to tell it.
+    healing : mapping of Variable to expression
+        What each candidate of the swarm passes through: the way to meet an equality before IPOPT does, such as
+        ``{m: 900 * m / ca.sum1(m)}``.
     reference : Structure, optional
         The truth, where it is known: for scores and pictures only.
     validation : sequence of Measurement
@@ -65,28 +90,37 @@ class Problem:
 
     Attributes
     ----------
-    variables : tuple of Variable
-        Of the mass, the stiffness and the damping, in this order (eq. 34).
+    variables : tuple of Block or Variable
+        Of the models of mass, stiffness and damping, in this order (eq. 34), then those of expressions as declared.
     lower, upper : (n_variables,)
         The search space, in the variables' own units.
     totals : (d,)
         Total mass in each base direction: stated, else weighed by the base force, else 1 kg.
     layout : Layout
         Geometry of the test, as the matrix models see it.
+    tolerance : (rows,)
+        By how much a candidate of the swarm may break each row of the constraints.
     poles : Poles or None
         What was found in the data where a spectral stiffness came without natural frequencies.
     """
 
     measurement: Measurement
-    mass: MassModel = field(kw_only=True)
-    stiffness: StiffnessModel = field(default_factory=SpectralStiffness, kw_only=True)
-    damping: DampingModel = field(default_factory=ModalDamping, kw_only=True)
+    mass: MassModel | Any = field(kw_only=True)
+    stiffness: StiffnessModel | Any = field(default_factory=SpectralStiffness, kw_only=True)
+    damping: DampingModel | Any = field(default_factory=ModalDamping, kw_only=True)
+    residuals: Sequence[Any] = field(default=(), kw_only=True)
+    constraints: Sequence[Any] = field(default=(), kw_only=True)
+    misfit: Any = field(default=None, kw_only=True)
+    recovery: ArrayLike | None = field(default=None, kw_only=True)
+    rigid_body_dofs: ArrayLike | None = field(default=None, kw_only=True)
+    healing: Mapping[Variable, Any] = field(default_factory=dict, kw_only=True)
     reference: Structure | None = field(default=None, kw_only=True)
     validation: Sequence[Measurement] = field(default=(), kw_only=True)
     goal: float | None = field(default=None, kw_only=True)
 
     layout: Layout = field(init=False, repr=False)
-    variables: tuple[Variable, ...] = field(init=False, repr=False)
+    tolerance: Array = field(init=False, repr=False, default_factory=lambda: np.zeros(0))
+    variables: tuple[Block | Variable, ...] = field(init=False, repr=False)
     totals: Array = field(init=False, repr=False)
     poles: Poles | None = field(init=False, default=None)
 
@@ -94,13 +128,18 @@ class Problem:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 - a frozen class fills itself
         if not isinstance(self.measurement, Measurement):
             raise InputError(f"Problem: measurement is a {type(self.measurement).__name__}, not a sysid.Measurement")
-        if not isinstance(self.mass, FullMass | LumpedMass | KnownMass):
+        if not isinstance(self.mass, FullMass | LumpedMass | KnownMass) and not is_expression(self.mass):
             put("mass", KnownMass(_as_matrix("mass", self.mass)))
         for name, kinds in (("stiffness", StiffnessModel), ("damping", DampingModel)):
-            if not isinstance(getattr(self, name), kinds):
-                raise InputError(
-                    f"Problem: {name} is a {type(getattr(self, name)).__name__}, not a {name} model of sysid"
-                )
+            given = getattr(self, name)
+            if not (isinstance(given, kinds) or is_expression(given)):
+                least = 1 if name == "damping" else 2
+                put(name, _as_matrix(name, given, f"a {name} model of sysid, an expression or a matrix", least))
+        for name in ("residuals", "constraints"):
+            given = getattr(self, name)
+            if not isinstance(given, list | tuple):
+                raise InputError(f"Problem: {name} is a {type(given).__name__}; give a list of them: {name}=[...]")
+            put(name, tuple(given))
         if self.goal is not None and not finite_array("goal", self.goal) > 0:
             raise InputError(f"goal = {self.goal}: a positive relative residual is needed")
         test = self.measurement
@@ -120,7 +159,7 @@ class Problem:
             )
         if np.linalg.norm(test.relative) <= 1e-12 * np.linalg.norm(test.response):
             raise InputError("no sensor moves relative to the base: there is nothing to identify from")
-        if test.force is not None and not isinstance(self.mass, KnownMass) and self.mass.total_mass is None:
+        if test.force is not None and isinstance(self.mass, FullMass | LumpedMass) and self.mass.total_mass is None:
             layout = replace(layout, weighed=_weigh(test, self.stiffness))
         put("layout", layout)
         put("validation", tuple(self.validation))
@@ -129,27 +168,75 @@ class Problem:
                 raise InputError("a validation measurement has other sensors or base directions than the one fitted")
         if self.reference is not None and self.reference.rigid_body.shape != test.rigid_body.shape:
             raise InputError("the reference structure has other sensors or base directions than the measurement")
+        if self.is_written:
+            self._check_written(user_frame())
+            put("variables", self.formulation.variables)
+            M, M_S0, M_00, *_ = self.formulation.numbers(self.formulation.guess)
+            G = self.formulation.rigid_body_dofs
+            put("totals", np.diag(G.T @ M @ G + G.T @ M_S0 + M_S0.T @ G + M_00).copy())
+            return
         put("variables", tuple(v for group in self._groups() for v in group))
         # A total mass that does not fit is refused here, not in the search.
         put("totals", self.mass.totals(layout))
         _ = self.known_mass  # so are known entries
 
+    @property
+    def is_written(self) -> bool:
+        """Whether anything is written in expressions or numbers, beyond the models of the matrices."""
+        models = isinstance(self.mass, FullMass | LumpedMass | KnownMass)
+        models = models and isinstance(self.stiffness, StiffnessModel) and isinstance(self.damping, DampingModel)
+        return (
+            not models
+            or bool(self.residuals or self.constraints or self.healing)
+            or any(given is not None for given in (self.misfit, self.recovery, self.rigid_body_dofs))
+        )
+
+    @cached_property
+    def formulation(self) -> Formulation:
+        """Matrices, residuals and constraints as CasADi functions of the unknowns."""
+        given = Given(
+            self.mass, self.stiffness, self.damping, self.residuals, self.constraints, self.misfit, self.recovery,
+            self.rigid_body_dofs, self.healing, call_site(user_frame()),
+        )  # fmt: skip
+        return formulate(given, self.layout, self.measurement)
+
+    def _check_written(self, frame: FrameType | None) -> None:
+        """Refuse what cannot be searched, before anything runs."""
+        if isinstance(self.mass, FullMass) and not self.mass.healable:
+            raise InputError("known entries of a FullMass go with the modal strategy only: write them as constraints")
+        formulation, site = self.formulation, call_site(frame)
+        points = points_of(formulation)
+        check_matrices(formulation, points, formulation.declarations)
+        tolerance = check_constraints(formulation, points, site) if formulation.constraints else np.zeros(0)
+        object.__setattr__(self, "tolerance", tolerance)
+        for variable in (*formulation.variables, *formulation.fixed):
+            if isinstance(variable, Variable):
+                variable.used = True
+        idle = unused(frame, formulation)
+        if idle:
+            told = ", ".join(f"{v.name!r} ({v.declared})" for v in idle)
+            told = f"variable {told} enters no matrix, residual or constraint of this problem ({site})"
+            assert frame is not None
+            if frame.f_code.co_name != "<module>":
+                raise InputError(f"{told}: use it, or take it out")
+            warnings.warn(told, stacklevel=2)  # a notebook may keep it for a problem to come
+
     def __repr__(self) -> str:
         models = ", ".join(type(model).__name__ for model in (self.mass, self.stiffness, self.damping))
         return f"<Problem: {models}; {self.n_variables} unknowns; {self.measurement!r}>"
 
-    def _groups(self) -> tuple[tuple[Variable, ...], ...]:
+    def _groups(self) -> tuple[tuple[Block, ...], ...]:
         return tuple(model.variables(self.layout) for model in (self.mass, self.stiffness, self.damping))
 
     @property
     def lower(self) -> Array:
         """Lower bounds, (n_variables,)."""
-        return np.concatenate([v.lower for v in self.variables])
+        return np.concatenate([np.zeros(0), *(v.lower for v in self.variables)])
 
     @property
     def upper(self) -> Array:
         """Upper bounds, (n_variables,)."""
-        return np.concatenate([v.upper for v in self.variables])
+        return np.concatenate([np.zeros(0), *(v.upper for v in self.variables)])
 
     @property
     def n_variables(self) -> int:
@@ -165,12 +252,17 @@ class Problem:
     @property
     def unknowns(self) -> tuple[tuple[str, int], ...]:
         """Number of unknowns a matrix: the paper's Table 1, with the n·d entries of M_S0 that it leaves out."""
+        if self.is_written:
+            sizes = {v.name: v.size for v in self.variables}
+            return tuple((name, sum(sizes[v] for v in members)) for name, members in self.formulation.members)
         names = ("mass", "stiffness", "damping")
         return tuple((name, sum(v.size for v in group)) for name, group in zip(names, self._groups(), strict=True))
 
     @property
     def unit_mass(self) -> bool:
         """Whether no number with a unit of mass is given, so that masses are normalised to 1 kg a direction."""
+        if not isinstance(self.mass, FullMass | LumpedMass | KnownMass):
+            return False
         unstated = not isinstance(self.mass, KnownMass) and self.mass.total_mass is None
         weighed = self.measurement.force is not None or np.nansum(np.abs(self.known_mass)) > 0
         return unstated and not weighed
@@ -190,7 +282,7 @@ class Problem:
     def matrices(self, x: ca.SX) -> Matrices:
         """Expressions of the blocks that the unknowns `x` stand for."""
         y_mass, y_stiffness, y_damping = (x[part] for part in self.parts)
-        blocks = self.mass.blocks(self.layout, y_mass)
+        blocks: MassBlocks = self.mass.blocks(self.layout, y_mass)
         H = self.stiffness.mass_normalised(self.layout, y_stiffness, blocks.factor)
         return Matrices(*blocks, H, y_damping)
 
@@ -199,6 +291,8 @@ class Problem:
         values = np.asarray(x, dtype=float)
         if values.shape != (self.n_variables,):
             raise InputError(f"x has shape {values.shape}; this problem has ({self.n_variables},) unknowns")
+        if self.is_written:
+            return self.formulation.structure(values, self.measurement)
         symbols = ca.SX.sym("x", self.n_variables)
         function = ca.Function("matrices", [symbols], list(self.matrices(symbols)))
         L, coupling, base, H, c = (np.asarray(m) for m in function(values))
@@ -210,6 +304,8 @@ class Problem:
 
     def values(self, structure: Structure) -> Array:
         """Unknowns that stand for `structure`, (n_variables,); inverse of `structure` where the models can hold it."""
+        if self.is_written:
+            raise InputError("a problem written in expressions has no inverse: give the unknowns, not a Structure")
         n = self.layout.n
         L = np.linalg.cholesky(structure.mass[:n, :n])
         half = np.linalg.solve(L, structure.stiffness[:n, :n])
@@ -222,6 +318,17 @@ class Problem:
                 self.damping.values(structure.damping_ratios, omega),
             ]
         )
+
+    def misfit_of(self, x: Array) -> float:
+        """Root of the sum of squares of all relative residuals: of accelerations, force, and what else was stated."""
+        if self.is_written and self.formulation.misfit is not None:
+            own = float(np.linalg.norm(self.formulation.misfit(x)))
+        else:
+            structure, test = self.structure(x), self.measurement
+            own = float(np.hypot(test.residual(structure), test.force_residual(structure) or 0.0))
+        if not self.is_written or self.formulation.residuals is None:
+            return own
+        return float(np.hypot(own, np.linalg.norm(self.formulation.residuals(x))))
 
     def from_sampling(self, s: ca.SX) -> ca.SX:
         """Unknowns of the swarm's coordinates, which have the same bounds (eq. 18)."""
@@ -252,13 +359,15 @@ def assemble(
     )
 
 
-def _as_matrix(name: str, value: object) -> Array:
+def _as_matrix(
+    name: str, value: object, wanted: str = "a model such as FullMass(kg) or a matrix", least: int = 2
+) -> Array:
     try:
         matrix = np.asarray(value, dtype=float)
     except (TypeError, ValueError):
-        matrix = np.zeros(0)
-    if matrix.ndim != 2:
-        raise InputError(f"Problem: {name} is a {type(value).__name__}; give a model such as FullMass(kg) or a matrix")
+        matrix = np.zeros(())
+    if not least <= matrix.ndim <= 2:
+        raise InputError(f"Problem: {name} is a {type(value).__name__}; give {wanted}")
     return matrix
 
 

@@ -15,7 +15,7 @@ def columns(record: ComplexArray) -> ComplexArray:
     return np.moveaxis(record, 0, 1).reshape(record.shape[1], -1)
 
 
-def _parts(record: ComplexArray) -> tuple[ca.DM, ca.DM]:
+def parts_of(record: ComplexArray) -> tuple[ca.DM, ca.DM]:
     """Real and imaginary part; zeros are structural, so that real unit runs cost no imaginary arithmetic."""
     flat = columns(record)
     return ca.sparsify(ca.DM(flat.real)), ca.sparsify(ca.DM(flat.imag))
@@ -68,17 +68,17 @@ def residual(
     g_re, g_im = modal_gains(omega, ratios, test.freq)
     if runs > 1:
         g_re, g_im = ca.repmat(g_re, 1, runs), ca.repmat(g_im, 1, runs)
-    u_re, u_im = _parts(test.base)
+    u_re, u_im = parts_of(test.base)
     push_re, push_im = gamma @ u_re, gamma @ u_im
     q_re, q_im = g_re * push_re - g_im * push_im, g_re * push_im + g_im * push_re
-    weight, scale = _weights(test.relative, test.response_std if weighted else None)
-    a_re, a_im = _parts(test.relative)
+    weight, scale = weights_of(test.relative, test.response_std if weighted else None)
+    a_re, a_im = parts_of(test.relative)
     pieces = [weight * (phi @ q_re - a_re) / scale, weight * (phi @ q_im - a_im) / scale]
     if test.force is not None:
-        weight, force_scale = _weights(test.force, test.force_std if weighted else None)
+        weight, force_scale = weights_of(test.force, test.force_std if weighted else None)
         if not weighted or test.response_std is None or test.force_std is None:
             scale = force_scale
-        f_re, f_im = _parts(test.force)
+        f_re, f_im = parts_of(test.force)
         pieces += [
             weight * (gamma.T @ q_re + rigid_body_mass @ u_re - f_re) / scale,
             weight * (gamma.T @ q_im + rigid_body_mass @ u_im - f_im) / scale,
@@ -86,7 +86,7 @@ def residual(
     return ca.vertcat(*(ca.vec(ca.densify(piece)) for piece in pieces))
 
 
-def _weights(record: ComplexArray, std: Array | None) -> tuple[ca.DM, float]:
+def weights_of(record: ComplexArray, std: Array | None) -> tuple[ca.DM, float]:
     """Weights of a record's channels and lines as `columns` has them, and the size of the weighted record."""
     channel, line = separable(std, record.shape)
     weight = channel[:, None] * line.ravel()

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from sysid.errors import InputError
 from sysid.layout import FACTOR_FLOOR, Layout, lower_triangle, triangle_entries
 from sysid.structure import Array, finite_array
-from sysid.variables import Variable
+from sysid.variables import Block
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,12 +70,12 @@ class SpectralStiffness:
             )
         return limit
 
-    def variables(self, layout: Layout) -> tuple[Variable, ...]:
+    def variables(self, layout: Layout) -> tuple[Block, ...]:
         """Entries of L_H, row by row, rad/s (eq. 37)."""
         rows, columns = np.tril_indices(layout.n)
         limit = self.limit(layout.n)
         lower = np.where(rows == columns, FACTOR_FLOOR * limit, -limit)
-        return (Variable("stiffness_factor", lower, np.full(rows.size, limit), unit="rad/s"),)
+        return (Block("stiffness_factor", lower, np.full(rows.size, limit), unit="rad/s"),)
 
     def mass_normalised(self, layout: Layout, y: ca.SX, factor: ca.SX) -> ca.SX:
         """``H`` (n, n), rad²/s², whatever the mass is."""
@@ -103,7 +103,7 @@ class ChainStiffness:
     lower: ArrayLike
     upper: ArrayLike
 
-    def variables(self, layout: Layout) -> tuple[Variable, ...]:
+    def variables(self, layout: Layout) -> tuple[Block, ...]:
         """One spring a sensor, N/m."""
         try:
             low, high = (np.broadcast_to(np.asarray(v, dtype=float), (layout.n,)) for v in (self.lower, self.upper))
@@ -113,7 +113,7 @@ class ChainStiffness:
             raise InputError("ChainStiffness: bounds must be finite with 0 < lower < upper (N/m)")
         span, width = np.log(high / low), high - low
         return (
-            Variable(
+            Block(
                 "spring", low, high, unit="N/m",
                 sampling=lambda s: low * ca.exp((s - low) / width * span),
                 unsampling=lambda k: low + width * np.log(k / low) / span,

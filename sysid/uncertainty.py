@@ -25,7 +25,7 @@ from sysid.modal_fit import Modes
 from sysid.modal_masses import open_masses
 from sysid.problem import Problem
 from sysid.structure import Array, Structure, check_frequencies
-from sysid.variables import Variable
+from sysid.variables import Block
 
 _MOVED = 1e-6  # of a quantity's size, by which an unseen move of order one must change it to count
 _SAME = 1e-6  # relative distance that is put between repeated frequencies
@@ -312,7 +312,7 @@ def _damping_slopes(problem: Problem, modes: Modes) -> tuple[Array, Array, Array
     return by_unknowns, by_omega * omega, _steps((variable,), at)
 
 
-def _steps(variables: Iterable[Variable], x: Array) -> Array:
+def _steps(variables: Iterable[Block], x: Array) -> Array:
     """A large step of each unknown: its own size, or a part of its range where that is larger."""
     width = np.concatenate([variable.upper - variable.lower for variable in variables])
     return np.maximum(np.abs(x), 0.05 * width)

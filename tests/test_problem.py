@@ -199,7 +199,7 @@ class TestMistakes:
             ("masses must be positive", {"mass": FullMass(-1.0)}),
             ("masses must be positive", {"mass": sysid.LumpedMass(0.0)}),
             ("total_mass has shape", {"mass": FullMass([1.0, 2.0, 3.0])}),
-            ("stiffness is a ndarray", {"stiffness": np.eye(3)}),
+            ("stiffness is a str", {"stiffness": "soft"}),
             ("stiffness is a ModalDamping", {"stiffness": sysid.ModalDamping()}),
             ("damping is a float", {"damping": 0.02}),
             ("too few to look for", {"stiffness": SpectralStiffness()}),

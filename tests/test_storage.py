@@ -9,7 +9,7 @@ import pytest
 
 import sysid
 from sysid import storage
-from sysid.variables import Variable
+from sysid.variables import Block
 
 
 def building(damping_matrix: bool = False, sensors: bool = True) -> sysid.Structure:
@@ -100,7 +100,7 @@ def assert_same(a: object, b: object, at: str = "result") -> None:
                 assert mine == other, f"{at}.{field.name}"
             else:  # a list becomes an array
                 assert_same(np.asarray(mine, float), np.asarray(other, float), f"{at}.{field.name}")
-    elif isinstance(a, Variable):
+    elif isinstance(a, Block):
         assert_same(a.lower, b.lower, at)
         assert_same(a.upper, b.upper, at)
     elif dataclasses.is_dataclass(a):

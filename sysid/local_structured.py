@@ -1,0 +1,146 @@
+"""The local phase in a problem's own unknowns: structured models, and whatever is written in expressions.
+
+- Where C is an expression the response is a direct solve, and the unknowns are all there is: a least-squares problem
+  with exact Jacobian, whose Hessian is taken as ``J'J`` (Gauss-Newton) plus that of the constraints.
+- Where damping is by ratios the response needs the modes. They are further unknowns: ``Phi = L_0^-T Psi`` with L_0 the
+  factor of the mass at the start, and ``Phi' M Phi = I``, ``Phi' K Phi = diag(w²)`` are polynomial equalities, so that
+  no eigenvector routine is left in the graph.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from sysid._coordinates import Coordinates
+from sysid._watch import OBJECTIVE_SCALE, Watch
+from sysid.damping import ProportionalDamping
+from sysid.direct import relative_misfit
+from sysid.layout import lower_entries, triangle_entries
+from sysid.modal import FREQUENCY_WINDOW
+from sysid.problem import Problem
+from sysid.response import residual
+from sysid.stiffness import SpectralStiffness
+from sysid.structure import Array, Structure
+from sysid.variables import split
+
+_OPEN_WINDOW = 20.0  # factor either way for a frequency that nobody gave
+_RANGE = 0.05  # of the search space: the least unit of an unknown
+
+
+@dataclass(frozen=True, eq=False)
+class StructuredFit:
+    """Where IPOPT ended: unknowns (n_variables,), root of the squared error, status, and bounds in words."""
+
+    x: Array
+    residual: float
+    status: str
+    bounds: str
+
+
+def fit_structured(problem: Problem, x: Array, start: Structure, watch: Watch, max_iterations: int) -> StructuredFit:
+    """Minimise the residuals of a problem over its own unknowns, from `x`, which stands for `start`."""
+    z, formulation = Coordinates(), problem.formulation
+    by_modes = formulation.by_ratios or isinstance(problem.damping, ProportionalDamping)
+    modal = by_modes and formulation.misfit is None
+    # The modes themselves stand for a spectral stiffness.
+    held = modal and isinstance(problem.stiffness, SpectralStiffness)
+    pieces: list[ca.MX] = []
+    factors = ca.MX(0, 1)
+    for variable, given in zip(problem.variables, split(problem.variables, x), strict=True):
+        values = np.clip(given, variable.lower, variable.upper)
+        if held and variable.name == "stiffness_factor":
+            pieces.append(ca.MX(ca.DM(values)))
+            continue
+        # Each unknown in units of its start, or of its range where that is larger.
+        unit = np.maximum(np.abs(values), _RANGE * (variable.upper - variable.lower))
+        unit = np.where(unit > 0, unit, 1.0) if variable.name != "rayleigh_factor" else variable.upper
+        name = variable.name.replace("_", " ")
+        pieces.append(z.add(name, values / unit, variable.lower / unit, variable.upper / unit) * ca.DM(unit))
+        factors = pieces[-1] if variable.name == "rayleigh_factor" else factors
+    unknowns = ca.vertcat(*pieces)
+
+    constraints = formulation.constraints
+    if constraints is not None:
+        broken = constraints.function(unknowns)
+        # In units of what the swarm lets pass, which is a small part of what the constraint makes over the box.
+        unit = np.where(problem.tolerance > 0, problem.tolerance, 1.0) / 1e-2
+        z.tie(broken / ca.DM(unit), constraints.lower / unit, constraints.upper / unit)
+    own = [] if formulation.residuals is None else [formulation.residuals(unknowns)]
+    if modal:
+        miss, psi, omega = _in_modes(problem, unknowns, factors, start, z, held=held)
+    else:
+        psi = omega = ca.MX(0, 1)
+        if formulation.misfit is not None:
+            miss = formulation.misfit(unknowns)
+        else:
+            miss = relative_misfit(problem.measurement, formulation.motion(unknowns), weighted=True)
+    miss = ca.vertcat(miss, *own)
+    derivatives = None if modal else {"hess_lag": _gauss_newton(z, miss)}
+    best, status = z.minimize(ca.sumsqr(miss), watch, max_iterations, derivatives)
+
+    values = [np.asarray(v) for v in ca.Function("end", [z.z], [unknowns, psi, omega, ca.norm_2(miss)])(best)]
+    ended = values[0].ravel()
+    if held:
+        w = values[2].ravel()
+        order = np.argsort(w)
+        # Psi = L' Phi with the mass as it ended, exactly orthogonal.
+        factor = np.linalg.cholesky(formulation.numbers(ended).mass)
+        phi = np.linalg.solve(np.linalg.cholesky(start.mass[: start.n, : start.n]).T, values[1])
+        u, _, vt = np.linalg.svd(factor.T @ phi[:, order])
+        ended[problem.parts.stiffness] = triangle_entries(np.linalg.cholesky((u @ vt * w[order] ** 2) @ (u @ vt).T))
+        ratios = ended[problem.parts.damping]
+        ended[problem.parts.damping] = ratios[order] if ratios.size == order.size else ratios
+    ended = np.clip(ended, problem.lower, problem.upper)
+    return StructuredFit(ended, float(values[3].item()), status, z.on_bounds(best))
+
+
+def _in_modes(
+    problem: Problem, unknowns: ca.MX, factors: ca.MX, start: Structure, z: Coordinates, *, held: bool
+) -> tuple[ca.MX, ca.MX, ca.MX]:
+    """Misfit in mode shapes and frequencies, tied to the matrices; ``Psi`` and w beside it.
+
+    `factors` are those of a proportional damping.
+    """
+    motion = problem.formulation.motion(unknowns)
+    n = start.n
+    center = 2 * np.pi * start.natural_frequencies
+    window = np.full(n, np.log(_OPEN_WINDOW))
+    if isinstance(problem.stiffness, SpectralStiffness):
+        targets = problem.stiffness.targets
+        center[: targets.size], window[: targets.size] = targets, np.log1p(FREQUENCY_WINDOW)
+    shift = np.clip(np.log(2 * np.pi * start.natural_frequencies / center), -window, window)
+    omega = ca.DM(center) * ca.exp(z.add("frequency", shift, -window, window))
+    L = np.linalg.cholesky(start.mass[:n, :n])
+    inverse = ca.DM(np.linalg.inv(L))
+    psi = z.add("mode shape", L.T @ start.normal_modes)
+    z.tie(lower_entries(psi.T @ (inverse @ motion.mass @ inverse.T) @ psi - ca.MX.eye(n)))
+    if not held:
+        scaled = psi @ ca.diag(1 / ca.DM(center))
+        H = inverse @ motion.stiffness @ inverse.T
+        z.tie(lower_entries(scaled.T @ H @ scaled - ca.diag((omega / ca.DM(center)) ** 2)))
+    phi = inverse.T @ psi
+    shapes = ca.DM(motion.recovery) @ phi
+    damping = problem.damping
+    ratios = damping.ratios(factors, omega) if isinstance(damping, ProportionalDamping) else motion.damping
+    miss = residual(
+        problem.measurement, shapes, phi.T @ motion.push, omega, ratios, motion.rigid_body_mass, weighted=True
+    )
+    return miss, psi, omega
+
+
+def _gauss_newton(z: Coordinates, miss: ca.MX) -> ca.Function:
+    """Hessian of the Lagrangian with ``2 J'J`` for that of the objective, as nlpsol's `hess_lag`."""
+    at = z.z
+    J = ca.densify(ca.jacobian(miss, at))
+    ties = ca.vertcat(ca.MX(0, 1), *z.ties)
+    p, factor, multipliers = ca.MX.sym("p", 0), ca.MX.sym("factor"), ca.MX.sym("multipliers", ties.numel())
+    hessian = 2 * OBJECTIVE_SCALE * factor * (J.T @ J)
+    if ties.numel():
+        hessian = hessian + ca.hessian(ca.dot(multipliers, ties), at)[0]
+    return ca.Function(
+        "hessian", [at, p, factor, multipliers], [ca.triu(hessian)],
+        ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"],
+    )  # fmt: skip

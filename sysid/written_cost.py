@@ -1,0 +1,165 @@
+"""The swarm's cost of a problem in its own unknowns: many candidates at once."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from sysid._declaration import violation_of
+from sysid.problem import Problem
+from sysid.response import columns, gains, weights_of
+from sysid.structure import Array, ComplexArray
+from sysid.variables import split
+
+_CHUNK = 64  # candidates a compiled call: fixed, so that the bits do not depend on the swarm's size
+_WORST = 1e6  # a residual that no candidate passes that keeps the constraints
+
+
+class WrittenCost:
+    """Root of the squared relative residuals of a whole swarm at once: (n_particles, n_variables) → (n_particles,).
+
+    Matrices are a compiled CasADi function of all candidates; responses follow from LAPACK's batched eigensolvers, of
+    the undamped structure or, for a damping matrix, of its state space.
+
+    Parameters
+    ----------
+    problem : Problem
+        Written in expressions; its healing is applied, and its constraints count by the feasibility rules of Deb
+        (Comput. Methods Appl. Mech. Eng. 186 (2000) 311-338): whatever keeps them comes before what does not.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        f = problem.formulation
+        s = ca.MX.sym("s", f.size)
+        pieces = [
+            p if v.sampling is None else _as_function(v)(p)
+            for v, p in zip(f.variables, split(f.variables, s), strict=True)
+        ]
+        x = ca.vertcat(*pieces)
+        if f.healing is not None:
+            x = ca.fmin(ca.fmax(f.healing(x), ca.DM(f.lower)), ca.DM(f.upper))
+        self._unknowns = ca.Function("unknowns", [s], [x])
+        motion = f.motion(x)
+        parts = [motion.mass, motion.stiffness, motion.damping, motion.push, motion.rigid_body_mass]
+        self._expand = _expanded(ca.Function("expand", [s], [ca.densify(part) for part in parts])).map(_CHUNK)
+        self._own = None if f.misfit is None else ca.Function("misfit", [s], [ca.norm_2(f.misfit(x))])
+        self._residuals = None if f.residuals is None else ca.Function("residuals", [s], [ca.norm_2(f.residuals(x))])
+        self._constraints = (
+            None if f.constraints is None else ca.Function("constraints", [s], [ca.densify(f.constraints.function(x))])
+        )
+        test = problem.measurement
+        self._base = columns(test.base)
+        self._targets: list[tuple[ComplexArray, Array, float]] = []
+        for record, std in ((test.relative, test.response_std), (test.force, test.force_std)):
+            if record is not None:
+                weight, scale = weights_of(record, std)
+                self._targets.append((columns(record), np.asarray(weight), scale))
+
+    def __call__(self, particles: Array) -> Array:
+        """Cost of each row; NaN where a candidate is no structure."""
+        chunks = range(0, len(particles), _CHUNK)
+        return np.concatenate([self._chunk(particles[start : start + _CHUNK]) for start in chunks])
+
+    def unknowns(self, s: Array) -> Array:
+        """The unknowns x that the swarm coordinates `s` stand for, healed."""
+        return np.asarray(self._unknowns(s)).ravel()
+
+    def refined(self, s: Array) -> Array:
+        """The same: nothing of a written problem is replaced by what was measured."""
+        return self.unknowns(s)
+
+    def _chunk(self, particles: Array) -> Array:
+        count = len(particles)
+        squared = self._misfits(particles) ** 2 if self._own is None else _each(self._own, particles) ** 2
+        if self._residuals is not None:
+            squared = squared + _each(self._residuals, particles) ** 2
+        cost = np.sqrt(squared)
+        constraints = self.problem.formulation.constraints
+        if constraints is None:
+            return cost
+        assert self._constraints is not None
+        values = np.array([np.asarray(self._constraints(row)).ravel() for row in particles]).reshape(count, -1)
+        over = violation_of(constraints.lower, constraints.upper, values) / self.problem.tolerance
+        broken = np.sum(np.where(over > 1, over, 0.0), axis=1)
+        return np.where(broken > 0, _WORST * (1 + broken), np.minimum(cost, _WORST))
+
+    def _misfits(self, particles: Array) -> Array:
+        """Misfit of the measurement, (count,)."""
+        count, test, f = len(particles), self.problem.measurement, self.problem.formulation
+        padded = np.concatenate([particles, np.repeat(particles[-1:], _CHUNK - count, axis=0)])
+        wide = [np.asarray(part) for part in self._expand(padded.T)]
+        M, K, C, B, rigid = (_stack(part)[:count] for part in wide)
+        broken = ~(np.all(np.isfinite(M), axis=(1, 2)) & np.all(np.isfinite(K), axis=(1, 2)))
+        broken |= ~np.all(np.isfinite(C), axis=(1, 2))
+        n = M.shape[1]
+        M[broken], K[broken] = np.eye(n), np.eye(n)
+        C[broken] = 0.0
+        broken |= np.linalg.eigvalsh((M + M.swapaxes(1, 2)) / 2)[:, 0] <= 0
+        M[broken] = np.eye(n)
+        response = _by_modes if f.by_ratios else _by_states
+        a = response(M, K, C, B, test.freq)  # (count, n, d, n_freq)
+        F, runs = test.freq.size, test.n_runs
+        u = self._base.reshape(-1, runs, F)
+        a = np.einsum("pndf,drf->pnrf", a, u).reshape(count, n, runs * F)
+        predicted = [f.recovery @ a]
+        if len(self._targets) > 1:
+            predicted.append(B.swapaxes(1, 2) @ a + rigid @ self._base)
+        squared = np.zeros(count)
+        for (record, weight, scale), made in zip(self._targets, predicted, strict=True):
+            squared += np.sum(np.abs(weight * (made - record)) ** 2, axis=(1, 2)) / scale**2
+        squared[broken] = np.nan
+        return np.sqrt(squared)
+
+
+def _by_modes(M: Array, K: Array, C: Array, B: Array, freq: Array) -> ComplexArray:
+    """Relative acceleration for unit base motion, damping by ratios (count, n, 1)."""
+    L = np.linalg.cholesky((M + M.swapaxes(1, 2)) / 2)
+    half = np.linalg.solve(L, K)
+    H = np.linalg.solve(L, half.swapaxes(1, 2))
+    lam, psi = np.linalg.eigh((H + H.swapaxes(1, 2)) / 2)
+    phi = np.linalg.solve(L.swapaxes(1, 2), psi)
+    with np.errstate(invalid="ignore"):
+        omega = np.sqrt(lam)
+    g = np.array([gains(freq, w, zeta.ravel()) for w, zeta in zip(omega, C, strict=True)])
+    return np.einsum("pik,pkd,pkf->pidf", phi, phi.swapaxes(1, 2) @ B, g, optimize=True)
+
+
+def _by_states(M: Array, K: Array, C: Array, B: Array, freq: Array) -> ComplexArray:
+    """Relative acceleration for unit base motion, from the eigenvalues of the state space: ``a = -w² v``."""
+    count, n, d = B.shape
+    A = np.zeros((count, 2 * n, 2 * n))
+    A[:, :n, n:] = np.eye(n)
+    A[:, n:, :n], A[:, n:, n:] = -np.linalg.solve(M, K), -np.linalg.solve(M, C)
+    push = np.concatenate([np.zeros((count, n, d)), -np.linalg.solve(M, B)], axis=1)
+    w = 2 * np.pi * freq
+    lam, vectors = np.linalg.eig(A)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        try:
+            strength = np.linalg.solve(vectors, push.astype(complex))
+        except np.linalg.LinAlgError:  # a defective candidate among them: each by least squares
+            strength = np.linalg.pinv(vectors) @ push
+        poles = -(w**2) / (1j * w - lam[:, :, None])
+        return np.einsum("pik,pkd,pkf->pidf", vectors[:, :n], strength, poles, optimize=True)
+
+
+def _each(function: ca.Function, particles: Array) -> Array:
+    return np.array([float(function(row)) for row in particles])
+
+
+def _stack(wide: Array) -> Array:
+    """CasADi's side-by-side blocks (rows, chunk * columns) → (chunk, rows, columns)."""
+    return np.ascontiguousarray(wide.reshape(wide.shape[0], _CHUNK, -1).transpose(1, 0, 2))
+
+
+def _expanded(function: ca.Function) -> ca.Function:
+    """The same in scalar operations where all of it can be: several times faster for small matrices."""
+    try:
+        return function.expand()
+    except RuntimeError:  # a linear solver or an interpolant inside has no scalar form
+        return function
+
+
+def _as_function(variable: object) -> ca.Function:
+    s = ca.SX.sym("s", variable.size)  # type: ignore[attr-defined]
+    return ca.Function("sampling", [s], [ca.densify(variable.sampling(s))])  # type: ignore[attr-defined]
