@@ -78,9 +78,9 @@ test = sysid.Measurement.from_frf(freq, frf, rigid_body=G, force=force, sensors=
 test
 
 # %% [markdown]
-# Look at the records before anything is fitted. Far below the first resonance nothing amplifies, so every sensor must
-# follow the base as `G` says and the force must be the mass of the structure times the acceleration. A swapped axis,
-# a wrong sign or a wrong calibration shows here, for free.
+# Look at the records before anything is fitted. Far below the first resonance little amplifies, so within some
+# percent every sensor must follow the base as `G` says, and the force must be the mass of the structure times the
+# acceleration. A swapped axis, a wrong sign or a wrong calibration shows here, for free.
 
 # %%
 low = freq < 8
@@ -90,6 +90,7 @@ for name, row, measured in zip(names, G, frf[:, :, low].real.mean(axis=-1), stri
 weighed = np.diag(force[:, :, low].real.mean(axis=-1))
 print(f"force below 8 Hz: {weighed[0]:.1f} kg in x, {weighed[1]:.1f} kg in z; mass of the structure", end=" ")
 print(f"{truth.rigid_body_mass[0, 0]:.1f} kg")
+assert np.allclose(frf[:, :, low].real.mean(axis=-1), G, atol=0.1)
 
 # %%
 figure, panels = plt.subplots(1, 3, figsize=(11, 3.6), sharex=True, layout="constrained")
@@ -146,24 +147,23 @@ print(f"residual {result.residual:.4f}, the true structure leaves {floor:.4f}")
 # %% [markdown]
 # **The responses**, with the identified one dashed over the measured one and their difference below: the difference
 # should look like noise, without peaks at the modes. The band is the 95 % interval of the *identified curve*; in a
-# good test it is too narrow to be seen on a logarithmic axis, so the panel on the right shows its width. The noise of
-# a single line is 3 % of the base acceleration and hides the response where that is small; the curve, in which 1000
-# lines share 5 modes, is known far better.
+# good test it is too narrow to be seen on a logarithmic axis, so the panel on the right shows the standard deviation.
+# The noise of a single line is 3 % of the base acceleration and hides the response where that is small; the curve, in
+# which 1000 lines share 5 modes, is known far better.
 
 # %%
 spread = result.uncertainty.transmissibility(freq)  # standard deviation, (n_sensors, d, lines)
 i, j = names.index("arm mid"), "xz".index("x")
 size = np.abs(result.structure.transmissibility(freq)[i, j])
 noise = np.sqrt(np.mean(np.abs(test.relative - result.predict(test)) ** 2))
-percent = 100 * 1.96 / np.sqrt(2) / size  # half of a complex variance lies along the magnitude
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.6), layout="constrained")
 sysid.plot.transmissibility(result, left, sensor="arm mid", run="x", band=spread)
 left.set_ylim(2e-4, 60)
 left.legend(loc="lower right", ncols=4, fontsize=8)
-right.loglog(freq, percent * noise, color="#1f2430", label="one measured line")
-right.loglog(freq, percent * spread[i, j], color=colours[4], label="identified curve")
-right.set(xlabel="frequency [Hz]", ylabel="95 % interval, +- % of the response", title="how well each is known")
+right.loglog(freq, 100 * noise / size, color="#1f2430", label="one measured line")
+right.loglog(freq, 100 * spread[i, j] / size, color=colours[4], label="identified curve")
+right.set(xlabel="frequency [Hz]", ylabel="[% of the response]", title="standard deviation")
 right.legend()
 plt.show()
 assert 0.02 < noise < 0.04

@@ -10,8 +10,8 @@
 # 4. the difference between an *interval* (what the data leave open) and an *uncertainty* (what noise does);
 # 5. a mode that the base does not move.
 #
-# Everything is a structure of two degrees of freedom, so that it fits into a picture. Nothing here depends on sysid's
-# way of computing: it holds for every method that uses the same records.
+# Every example has two degrees of freedom, so that it fits into a picture. Nothing here depends on sysid's way of
+# computing: it holds for every method that uses the same records.
 
 # %%
 import matplotlib.pyplot as plt
@@ -195,13 +195,15 @@ for name, result in results.items():
     half = 1.96 * result.uncertainty.stiffness[1, 1] / 1e3
     word = "determined" if result.determined else "open"
     print(f"{result.residual:.4f}  {name:26} {low:7.2f} to {high:7.2f}   +- {half:5.2f}   {word}")
+    assert abs(result.residual - 0.01) < 0.001
+    assert not result.determined or abs(low - SPRINGS[1] / 1e3) < 1.5 * half
 
 # %%
 figure, (wide, close) = plt.subplots(1, 2, figsize=(10.5, 3.6), sharey=True, layout="constrained")
 end = 550.0
 for ax in (wide, close):
     ax.axvline(SPRINGS[1] / 1e3, color=red, linewidth=1, linestyle="--", label="true")
-for row, (name, result) in enumerate(results.items()):
+for row, result in enumerate(results.values()):
     low, high = result.stiffness_interval[:, 1, 1] / 1e3
     half = 1.96 * result.uncertainty.stiffness[1, 1] / 1e3
     if not result.determined:
