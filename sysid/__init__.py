@@ -3,10 +3,11 @@
 import casadi as _casadi
 
 from sysid import plot
+from sysid._written import Misfit
 from sysid.damping import ModalDamping, ProportionalDamping
 from sysid.errors import InputError, SolverError, SysidError
 from sysid.identification import History, Identification, Recipe
-from sysid.identify import Modal, Progress, Swarm, identify
+from sysid.identify import Continuation, Modal, Progress, Swarm, identify
 from sysid.mass import FullMass, KnownMass, LumpedMass
 from sysid.measurement import Measurement, Sensor, rigid_body, simulate
 from sysid.problem import Problem
@@ -24,8 +25,8 @@ if hasattr(_casadi.GlobalOptions, "setNumpyMode"):
     _casadi.GlobalOptions.setNumpyMode(-1)  # as it always was, without the warning
 
 __all__ = [
-    "ChainStiffness", "FullMass", "History", "Identification", "InputError", "KnownMass", "LumpedMass", "Measurement",
-    "Modal", "ModalDamping", "Problem", "Progress", "ProportionalDamping", "Recipe", "Sensor", "SolverError",
-    "SpectralStiffness", "Structure", "Swarm", "SwarmSettings", "SysidError", "Variable", "identify", "load",
-    "minimize_swarm", "plot", "resample", "rigid_body", "simulate",
+    "ChainStiffness", "Continuation", "FullMass", "History", "Identification", "InputError", "KnownMass", "LumpedMass",
+    "Measurement", "Misfit", "Modal", "ModalDamping", "Problem", "Progress", "ProportionalDamping", "Recipe", "Sensor",
+    "SolverError", "SpectralStiffness", "Structure", "Swarm", "SwarmSettings", "SysidError", "Variable", "identify",
+    "load", "minimize_swarm", "plot", "resample", "rigid_body", "simulate",
 ]  # fmt: skip

@@ -37,7 +37,7 @@ def check_matrices(formulation: Formulation, points: Array, names: dict[str, str
     """Refuse matrices that are those of a structure nowhere."""
     failures = {"mass": 0, "stiffness": 0}
     for x in points:
-        numbers = formulation.numbers(x)
+        numbers = formulation.matrices.numbers(x)
         for name in failures:
             if not _positive(getattr(numbers, name)):
                 failures[name] += 1
@@ -122,7 +122,10 @@ def unused(frame: FrameType | None, formulation: Formulation) -> list[Variable]:
     if frame is None:
         return []
     members = (*formulation.variables, *formulation.fixed)
-    return [v for v in _variables_in(frame.f_locals.values()) if not v.used and not any(v is m for m in members)]
+    there = list(_variables_in(frame.f_locals.values()))
+    if not any(v is m for v in there for m in members):
+        return []  # the problem was put together elsewhere
+    return [v for v in there if not v.used and not any(v is m for m in members)]
 
 
 def _variables_in(values: Any) -> Iterator[Variable]:

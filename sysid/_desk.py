@@ -97,6 +97,11 @@ class Desk:
         """Seconds that are left, at least one; None without a limit."""
         return None if self.max_time is None else max(self.max_time - self.seconds, 1.0)
 
+    @property
+    def time_for_more(self) -> bool:
+        """Whether half of the time is left."""
+        return self.max_time is None or self.seconds < self.max_time / 2
+
     def note(self, line: str) -> None:
         self.log.append(f"{self.seconds:8.2f} s  {line}")
 

@@ -9,17 +9,21 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid import local
+from sysid._continuation import descend, tests_of
 from sysid._desk import Desk, Stop
+from sysid._search import Outcome, as_unknowns
 from sysid.errors import InputError, SolverError
 from sysid.identification import History
 from sysid.layout import triangle, triangle_entries
 from sysid.mass import FullMass
 from sysid.problem import Problem
 from sysid.refinement import by_ipopt, closed_form
+from sysid.smoothing import Smoothed, levels_of
 from sysid.stiffness import SpectralStiffness
 from sysid.structure import Array, Structure
 from sysid.swarm import SwarmProgress, SwarmSettings, minimize_swarm
 from sysid.swarm_cost import SwarmCost
+from sysid.written_cost import WrittenCost
 
 _SETTINGS = SwarmSettings(inertia_b1=0.8, inertia_b2=0.5, acceleration_lower=0.5, acceleration_sum=3.0)
 _DOUBTFUL = 0.1  # relative residual above which a structured problem is searched again
@@ -61,36 +65,6 @@ class Swarm:
     local_phase: bool = True
     restarts: int = 4
     settings: SwarmSettings = _SETTINGS
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """Where a search ended.
-
-    Attributes
-    ----------
-    structure : Structure
-    x : (n_variables,) or None
-        The problem's unknowns that stand for the structure, where it has one degree of freedom a sensor.
-    strategy : str
-    success : bool
-        Of the last solver.
-    message : str
-    history : History
-    stopped : BaseException or None
-        What ended it early.
-    remarks : tuple of str
-        What the user should know of how it was done.
-    """
-
-    structure: Structure
-    x: Array | None
-    strategy: str
-    success: bool
-    message: str
-    history: History
-    stopped: BaseException | None = None
-    remarks: tuple[str, ...] = ()
 
 
 def by_swarm(
@@ -161,6 +135,7 @@ class _Search:
         self.problem, self.options, self.desk = problem, options, desk
         self.x: Array | None = None
         self.raw: Array = np.zeros(0)
+        self.steps: list[tuple[Smoothed, ...]] = []
         self.history = History()
         self.success, self.message = False, "ended before the local phase, as asked"
 
@@ -175,7 +150,7 @@ class _Search:
         """Whether the residual is at or below the goal; None where none is given."""
         if self.problem.goal is None or self.x is None:
             return None
-        return self.problem.measurement.residual(self.problem.structure(self.x)) <= self.problem.goal
+        return self.problem.residual_of(self.x) <= self.problem.goal
 
     @property
     def good_enough(self) -> bool:
@@ -201,8 +176,14 @@ class _Search:
         self, random: np.random.SeedSequence, start: ArrayLike | Structure | None, max_evaluations: int | None
     ) -> None:
         problem, options, desk = self.problem, self.options, self.desk
-        cost = SwarmCost(problem, refine=options.refine)
-        x0 = None if start is None else problem.to_sampling(_as_unknowns(problem, start))
+        cost: SwarmCost | WrittenCost
+        if problem.is_written:
+            # With wide peaks more of the swarm is on a slope that leads somewhere.
+            self.steps = levels_of(problem, poles)[1:] if (poles := tests_of(problem)) else []
+            cost = WrittenCost(problem, self.steps[0] if self.steps else None)
+        else:
+            cost = SwarmCost(problem, refine=options.refine)
+        x0 = None if start is None else problem.to_sampling(as_unknowns(problem, start))
         unknowns = ", ".join(f"{name} {count}" for name, count in problem.unknowns)
         if problem.poles is not None:
             found = ", ".join(f"{f:.4g}" for f in problem.poles.omega / (2 * np.pi))
@@ -243,10 +224,13 @@ class _Search:
         states = tuple((state.name.lower().replace("_", " "), int(n)) for state, n in result.state_counts.items())
         self.history = replace(self.history, states=states)
         desk.note(f"swarm ended after {result.nit} iterations at {result.fun:.4e}: {result.message}")
+        if problem.is_written:
+            desk.note(f"its best leaves {self.misfit:.4e} of the records themselves")
+            self.history = replace(self.history, start=np.nan, swarm=self.misfit)
         if result.n_nan:
             desk.note(f"{result.n_nan} of {result.nfev} candidates were no structure (not a number)")
 
-    def improver(self, cost: SwarmCost) -> Callable[[Array], Array]:
+    def improver(self, cost: SwarmCost | WrittenCost) -> Callable[[Array], Array]:
         """The exact-gradient refinement of the swarm's best, in the swarm's coordinates."""
 
         def improve(s: Array) -> Array:
@@ -280,12 +264,11 @@ class _Search:
         """Run the local phase; keep its answer where it is better."""
         assert self.x is not None
         before = self.misfit
-        answer = local.solve(
-            self.problem,
-            self.x,
-            max_time=self.desk.left,
-            monitor=lambda i, cost: self.desk.tell("local phase", i, 0, cost),
-        )
+        monitor = lambda i, cost: self.desk.tell("local phase", i, 0, cost)  # noqa: E731 - for both ways
+        if self.problem.is_written:
+            answer = descend(self.problem, self.x, self.steps, left=lambda: self.desk.left, monitor=monitor)
+        else:
+            answer = local.solve(self.problem, self.x, max_time=self.desk.left, monitor=monitor)
         after = self.misfit_of(answer.x)
         self.desk.note(f"local phase: {answer.message}, {answer.curve.size} iterates, residual {after:.4e}")
         self.success, self.message = answer.success, answer.message
@@ -298,17 +281,3 @@ class _Search:
         self.history = replace(self.history, local=min(after, before), local_curve=answer.curve)
         if answer.stopped is not None:
             raise answer.stopped
-
-
-def _as_unknowns(problem: Problem, start: ArrayLike | Structure) -> Array:
-    if isinstance(start, Structure):
-        layout = problem.layout
-        if (start.n, start.n_base, start.n_sensors) != (layout.n, layout.d, layout.n):
-            raise InputError("start: the structure has other degrees of freedom or base directions than the problem")
-        return problem.values(start)
-    x = np.asarray(start, dtype=float)
-    if x.shape != (problem.n_variables,) or not np.all(np.isfinite(x)):
-        raise InputError(
-            f"start has shape {x.shape}; ({problem.n_variables},) finite unknowns, or a Structure, is needed"
-        )
-    return x

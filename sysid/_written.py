@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from sysid.damping import DampingModel, ModalDamping
-from sysid.direct import Motion
+from sysid.direct import Motion, Response, absolute_response, relative_misfit, relative_response
 from sysid.errors import InputError
 from sysid.layout import Layout
 from sysid.mass import FullMass, KnownMass, LumpedMass
@@ -32,6 +33,57 @@ class Given(NamedTuple):
     rigid_body_dofs: Any
     healing: Mapping[Variable, Any]
     site: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Misfit:
+    """The misfit of a further test, for the `residuals` of a problem: of the structure as it was then.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        May have other sensors, lines and base motion than the problem's own.
+    mass, stiffness, damping : expression or array_like
+        (n, n), or (n + d, n + d) with the base's rows last, in the variables of the problem; damping (n, n).
+    recovery, rigid_body_dofs : array_like, optional
+        As in `Problem`.
+    """
+
+    measurement: Measurement
+    mass: Any = field(kw_only=True)
+    stiffness: Any = field(kw_only=True)
+    damping: Any = field(kw_only=True)
+    recovery: Any = field(default=None, kw_only=True)
+    rigid_body_dofs: Any = field(default=None, kw_only=True)
+
+    def blocks(self) -> Blocks:
+        """The blocks of its matrices."""
+        for name in ("mass", "stiffness", "damping"):
+            if isinstance(getattr(self, name), FullMass | LumpedMass | StiffnessModel | DampingModel):
+                raise InputError(f"Misfit: {name} is a model; write the matrix in the variables of the problem")
+        test = self.measurement
+        given = Given(
+            self.mass, self.stiffness, self.damping, (), (), None, self.recovery, self.rigid_body_dofs, {}
+        )  # fmt: skip
+        blocks = blocks_of(given, Layout(test.rigid_body, test.translational), test)
+        if blocks.by_ratios:
+            raise InputError("Misfit: damping must be a matrix (n, n)")
+        return blocks
+
+    @property
+    def response(self) -> Response:
+        """Absolute accelerations of the sensors as expressions, (n_sensors, runs * n_freq)."""
+        return absolute_response(self.measurement, self.blocks().motion)
+
+    @property
+    def force(self) -> Response:
+        """The base force as expressions, (d, runs * n_freq)."""
+        return relative_response(self.measurement, self.blocks().motion)[1]
+
+    @property
+    def expression(self) -> ca.MX:
+        """Relative residuals of accelerations and, where measured, of force, one below the other."""
+        return relative_misfit(self.measurement, self.blocks().motion, weighted=True)
 
 
 class Blocks(NamedTuple):

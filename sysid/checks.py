@@ -27,13 +27,14 @@ def doubts(problem: Problem, structure: Structure) -> tuple[str, ...]:
     test = problem.measurement
     records, poles = Records(test), _poles(structure)
     free = records.fit(*poles)
-    no_fit, rigid = tuple(_no_fit(problem, structure, records, free)), tuple(_rigid(test, records, free))
+    model = "the structure" if isinstance(problem.mass, FullMass) else "the stated mass model"
+    no_fit, rigid = tuple(_no_fit(test, structure, records, free, model)), tuple(_rigid(test, records, free))
     return (
         *_stated_mass(problem, structure),
         *_known_entries(problem, structure),
         *_lumped_total(problem, structure),
         *no_fit,
-        *_force(problem, structure),
+        *_force(test, structure, isinstance(problem.mass, LumpedMass)),
         *rigid,
         # Beside what those say, quadrature and likeness mean nothing.
         *(() if rigid else _damping(records, poles, free)),
@@ -41,14 +42,32 @@ def doubts(problem: Problem, structure: Structure) -> tuple[str, ...]:
     )
 
 
-def _no_fit(problem: Problem, structure: Structure, records: Records, free: ResidueFit) -> Iterator[str]:
+def written_doubts(problem: Problem, x: Array) -> tuple[str, ...]:
+    """The same for a problem in its own unknowns, as far as they apply to any model."""
+    if problem.formulation.misfit is not None:
+        return ()
+    found: list[str] = []
+    models = [(problem.measurement, problem.formulation.matrices), *problem.formulation.others]
+    for i, (test, matrices) in enumerate(models, start=1):
+        structure = matrices.structure(x, test)
+        records, poles = Records(test), _poles(structure)
+        velocity = not structure.modal_damping
+        if records.data.shape[0] <= 4 * poles[0].size * records.n_base:
+            continue
+        free = records.fit(*poles, velocity=velocity)
+        misses = tuple(_no_fit(test, structure, records, free, "the written model"))
+        rigid = tuple(_rigid(test, records, free))
+        told = (*misses, *_force(test, structure, False), *rigid, *(() if rigid or misses else _twins(test, structure)))
+        found += [told_one if len(models) == 1 else f"test {i}: {told_one}" for told_one in told]
+    return tuple(found)
+
+
+def _no_fit(test: Measurement, structure: Structure, records: Records, free: ResidueFit, model: str) -> Iterator[str]:
     """Whether the structure leaves clearly more of the accelerations than free residues at its own poles."""
-    test = problem.measurement
     left = replace(test, response=test.response - test.predict(structure))
     misfit = float(np.sqrt(Records(left).size / records.size))
     possible = max(float(np.sqrt(free.squared_error / records.size)), _ROUND_OFF)
     if misfit > _MISFIT * possible:
-        model = "the structure" if isinstance(problem.mass, FullMass) else "the stated mass model"
         yield (
             f"{model} misses {100 * misfit:.3g} % of the accelerations, its poles with free residues "
             f"{100 * possible:.3g} %: the model, a sign or axis in rigid_body, or a record is not what it is said to be"
@@ -121,12 +140,10 @@ def _lumped_total(problem: Problem, structure: Structure) -> Iterator[str]:
             )
 
 
-def _force(problem: Problem, structure: Structure) -> Iterator[str]:
+def _force(test: Measurement, structure: Structure, lumped: bool) -> Iterator[str]:
     """Whether the base force is that of the modes that the accelerations show."""
-    test = problem.measurement
     if test.force is None:
         return
-    lumped = isinstance(problem.mass, LumpedMass)
     fixture = ", and mass below the sensors (base ring, fixture), which a lumped mass has not" if lumped else ""
     # Both misfits in units of the stated noise: what is left at a noisy peak speaks against nothing.
     left = replace(test, force=test.force - test.predict_force(structure))

@@ -54,8 +54,11 @@ class Response(NamedTuple):
     imag: ca.MX
 
 
-def relative_response(test: Measurement, motion: Motion) -> tuple[Response, Response]:
+def relative_response(test: Measurement, motion: Motion, *, shift: float = 0.0) -> tuple[Response, Response]:
     """Accelerations of the degrees of freedom relative to the base under a test's base motion, and the base force.
+
+    With `shift`, 1/s, at the complex frequencies ``s = shift + i w`` in the place of ``i w``: as if all poles had so
+    much more decay.
 
     Returns
     -------
@@ -64,7 +67,7 @@ def relative_response(test: Measurement, motion: Motion) -> tuple[Response, Resp
     """
     n, d = motion.rigid_body_dofs.shape
     F = test.freq.size
-    per_line = _one_line(n, d).map(F)
+    per_line = _one_line(n, d, shift).map(F)
     flat = [
         ca.repmat(ca.densify(matrix), 1, F) for matrix in (motion.mass, motion.damping, motion.stiffness, motion.push)
     ]
@@ -94,9 +97,9 @@ def absolute_response(test: Measurement, motion: Motion) -> Response:
     return Response(R @ a.real + G @ u_re, R @ a.imag + G @ u_im)
 
 
-def relative_misfit(test: Measurement, motion: Motion, *, weighted: bool = False) -> ca.MX:
+def relative_misfit(test: Measurement, motion: Motion, *, weighted: bool = False, shift: float = 0.0) -> ca.MX:
     """Relative residuals, stacked, as `response.residual` has them: of accelerations, then of a measured force."""
-    a, f = relative_response(test, motion)
+    a, f = relative_response(test, motion, shift=shift)
     R = ca.DM(motion.recovery)
     weight, scale = weights_of(test.relative, test.response_std if weighted else None)
     a_re, a_im = parts_of(test.relative)
@@ -110,11 +113,12 @@ def relative_misfit(test: Measurement, motion: Motion, *, weighted: bool = False
     return ca.vertcat(*(ca.vec(ca.densify(piece)) for piece in pieces))
 
 
-def _one_line(n: int, d: int) -> ca.Function:
+def _one_line(n: int, d: int, shift: float) -> ca.Function:
     """Relative acceleration of one line for unit base motion, real over imaginary part, (2n, d)."""
     w = ca.MX.sym("w")
     M, C, K, B = ca.MX.sym("M", n, n), ca.MX.sym("C", n, n), ca.MX.sym("K", n, n), ca.MX.sym("B", n, d)
-    real, imag = K - w**2 * M, w * C
+    # s² M + s C + K, and -s² B on the right: where nothing moves at rest, s = 0, that is zero too.
+    real, imag = K + shift * C - (w**2 - shift**2) * M, w * C + 2 * shift * w * M
     dynamic = ca.blockcat([[real, -imag], [imag, real]])
-    # Where nothing moves at rest, w = 0, the right side is zero too.
-    return ca.Function("line", [w, M, C, K, B], [ca.solve(dynamic, ca.vertcat(w**2 * B, ca.MX.zeros(n, d)), _SOLVER)])
+    right = ca.vertcat((w**2 - shift**2) * B, -2 * shift * w * B)
+    return ca.Function("line", [w, M, C, K, B], [ca.solve(dynamic, right, _SOLVER)])

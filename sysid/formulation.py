@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from sysid._written import Given, as_matrix, at_point, blocks_of, check_finite, check_free, written_in
+from sysid._written import Blocks, Given, Misfit, as_matrix, at_point, blocks_of, check_finite, check_free, written_in
 from sysid.direct import Motion
 from sysid.errors import InputError
 from sysid.layout import Layout
@@ -47,6 +47,54 @@ class Numbers(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
+class Matrices:
+    """Matrices of the unknowns.
+
+    Attributes
+    ----------
+    function : casadi.Function
+        x to M_SS (n, n), M_S0 (n, d), M_00 (d, d), K_SS (n, n) and C (n, n), or ratios (n, 1) where `by_ratios`.
+    by_ratios : bool
+    rigid_body_dofs : (n, d)
+    recovery : (n_sensors, n)
+    """
+
+    function: ca.Function
+    by_ratios: bool
+    rigid_body_dofs: Array
+    recovery: Array
+
+    def numbers(self, x: Array) -> Numbers:
+        """The blocks at `x`."""
+        *blocks, damping = (np.asarray(ca.densify(part)) for part in self.function(x))
+        M, M_S0, M_00, K = blocks
+        C = damping.ravel() if self.by_ratios else (damping + damping.T) / 2
+        return Numbers((M + M.T) / 2, M_S0, (M_00 + M_00.T) / 2, (K + K.T) / 2, C)
+
+    def motion(self, x: ca.MX) -> Motion:
+        """The same as expressions of the symbol `x`; where damping is by ratios they stand in the place of C."""
+        M, M_S0, M_00, K, C = self.function(x)
+        return Motion(M, M_S0, M_00, K, C, self.rigid_body_dofs, self.recovery)
+
+    def structure(self, x: Array, test: Measurement) -> Structure:
+        """The structure that `x` stands for."""
+        M, M_S0, M_00, K, damping = self.numbers(x)
+        G = self.rigid_body_dofs
+        K_S0 = -K @ G
+        at_sensors = np.array_equal(self.recovery, np.eye(len(G)))
+        return Structure(
+            np.block([[M, M_S0], [M_S0.T, M_00]]),
+            np.block([[K, K_S0], [K_S0.T, -G.T @ K_S0]]),
+            damping if self.by_ratios else None,
+            damping_matrix=None if self.by_ratios else damping,
+            n_base=G.shape[1],
+            recovery=None if at_sensors else self.recovery,
+            rigid_body=None if at_sensors else test.rigid_body,
+            sensors=test.sensors,
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class Formulation:
     """Matrices, residuals and constraints as functions of the unknowns.
 
@@ -56,11 +104,9 @@ class Formulation:
         Those that are searched: x is their entries, one after the other.
     fixed : tuple of Variable
         Those held at their guess.
-    matrices : casadi.Function
-        x to M_SS (n, n), M_S0 (n, d), M_00 (d, d), K_SS (n, n) and C (n, n), or ratios (n, 1) where `by_ratios`.
-    by_ratios : bool
-    rigid_body_dofs : (n, d)
-    recovery : (n_sensors, n)
+    matrices : Matrices
+    others : tuple of (Measurement, Matrices)
+        Further tests, fitted beside the problem's own.
     residuals : casadi.Function or None
         x to a column: residuals beside the misfit of the measurement.
     misfit : casadi.Function or None
@@ -76,10 +122,8 @@ class Formulation:
 
     variables: tuple[Block | Variable, ...]
     fixed: tuple[Variable, ...]
-    matrices: ca.Function
-    by_ratios: bool
-    rigid_body_dofs: Array
-    recovery: Array
+    matrices: Matrices
+    others: tuple[tuple[Measurement, Matrices], ...]
     residuals: ca.Function | None
     misfit: ca.Function | None
     constraints: Constraints | None
@@ -117,35 +161,6 @@ class Formulation:
         """A name an entry of x."""
         return tuple(label for v in self.variables for label in labels_of(v))
 
-    def numbers(self, x: Array) -> Numbers:
-        """The matrices at `x`."""
-        *blocks, damping = (np.asarray(ca.densify(part)) for part in self.matrices(x))
-        M, M_S0, M_00, K = blocks
-        C = damping.ravel() if self.by_ratios else (damping + damping.T) / 2
-        return Numbers((M + M.T) / 2, M_S0, (M_00 + M_00.T) / 2, (K + K.T) / 2, C)
-
-    def motion(self, x: ca.MX) -> Motion:
-        """The same as expressions of the symbol `x`; where damping is by ratios they stand in the place of C."""
-        M, M_S0, M_00, K, C = self.matrices(x)
-        return Motion(M, M_S0, M_00, K, C, self.rigid_body_dofs, self.recovery)
-
-    def structure(self, x: Array, test: Measurement) -> Structure:
-        """The structure that `x` stands for."""
-        M, M_S0, M_00, K, damping = self.numbers(x)
-        G = self.rigid_body_dofs
-        K_S0 = -K @ G
-        at_sensors = np.array_equal(self.recovery, np.eye(len(G)))
-        return Structure(
-            np.block([[M, M_S0], [M_S0.T, M_00]]),
-            np.block([[K, K_S0], [K_S0.T, -G.T @ K_S0]]),
-            damping if self.by_ratios else None,
-            damping_matrix=None if self.by_ratios else damping,
-            n_base=G.shape[1],
-            recovery=None if at_sensors else self.recovery,
-            rigid_body=None if at_sensors else test.rigid_body,
-            sensors=test.sensors,
-        )
-
 
 def guess_of(variable: Block | Variable) -> Array:
     """Where a search may start."""
@@ -178,12 +193,21 @@ def formulate(given: Given, layout: Layout, test: Measurement) -> Formulation:
         Where a matrix, residual or constraint is not what it must be; named with the variables that it is written in.
     """
     blocks = blocks_of(given, layout, test)
-    motion = blocks.motion
-    residuals = [_column(f"residual {i}", r) for i, r in enumerate(given.residuals, start=1)]
+    others = [(other, other.blocks()) for other in given.residuals if isinstance(other, Misfit)]
+    residuals = [
+        _column(f"residual {i}", r) for i, r in enumerate(given.residuals, start=1) if not isinstance(r, Misfit)
+    ]
     misfit = None if given.misfit is None else _column("misfit", given.misfit)
     relations = [row for i, c in enumerate(given.constraints, start=1) for row in _relation(i, c)]
     healing = {variable: as_matrix("healing", expression) for variable, expression in given.healing.items()}
-    written = [*blocks.by_matrix, *residuals, *([] if misfit is None else [misfit]), *(g for g, _, _ in relations)]
+    tests = [part for _, other in others for part in other.by_matrix]
+    written = [
+        *blocks.by_matrix,
+        *tests,
+        *residuals,
+        *([] if misfit is None else [misfit]),
+        *(g for g, _, _ in relations),
+    ]
 
     models = {symbol.__hash__(): block for block, symbol in blocks.symbols}
     found: dict[int, Variable] = {}
@@ -206,6 +230,10 @@ def formulate(given: Given, layout: Layout, test: Measurement) -> Formulation:
     def function(name: str, expressions: Sequence[ca.MX]) -> ca.Function:
         return _function(name, symbols, fixed, expressions)
 
+    def matrices(part: Blocks) -> Matrices:
+        motion = part.motion
+        return Matrices(function("matrices", motion[:5]), part.by_ratios, motion.rigid_body_dofs, motion.recovery)
+
     constraints = None
     if relations:
         rows = [expression for expression, _, _ in relations]
@@ -216,17 +244,16 @@ def formulate(given: Given, layout: Layout, test: Measurement) -> Formulation:
             tuple(source for g, _, source in relations for _ in range(g.numel())),
         )
     healed = [healing.get(v, v.symbol) if isinstance(v, Variable) else None for v in searched]
-    groups = [*zip(MATRICES, blocks.by_matrix, strict=True), ("residuals", _stacked(residuals))]
+    groups = [*zip(MATRICES, blocks.by_matrix, strict=True)]
+    groups += [("further tests", _stacked(tests)), ("residuals", _stacked(residuals))]
     groups += [("misfit", _stacked([] if misfit is None else [misfit]))]
     groups += [("constraints", _stacked([g for g, _, _ in relations]))]
     members = [(name, tuple(v.name for v in searched if _uses(part, v, blocks.symbols))) for name, part in groups]
     return Formulation(
         variables=searched,
         fixed=fixed,
-        matrices=function("matrices", motion[:5]),
-        by_ratios=blocks.by_ratios,
-        rigid_body_dofs=motion.rigid_body_dofs,
-        recovery=motion.recovery,
+        matrices=matrices(blocks),
+        others=tuple((other.measurement, matrices(part)) for other, part in others),
         residuals=function("residuals", [ca.vertcat(*residuals)]) if residuals else None,
         misfit=None if misfit is None else function("misfit", [misfit]),
         constraints=constraints,

@@ -13,6 +13,7 @@ from sysid.errors import InputError
 from sysid.measurement import Measurement
 from sysid.problem import Problem
 from sysid.structure import Array, ComplexArray, Structure
+from sysid.variables import Variable, split
 
 if TYPE_CHECKING:
     from sysid.modal_masses import Intervals
@@ -136,8 +137,27 @@ class Identification:
 
     @property
     def residual(self) -> float:
-        """``‖predicted - measured‖ / ‖measured‖`` over relative accelerations of all runs, sensors and lines."""
+        """``‖predicted - measured‖ / ‖measured‖`` over relative accelerations of all runs, sensors and lines.
+
+        Of the problem's own misfit, where it has one.
+        """
+        if self.x is not None and self.problem.is_written:
+            return self.problem.residual_of(self.x)
         return self.measurement.residual(self.structure)
+
+    @cached_property
+    def values(self) -> dict[str, Array]:
+        """The problem's variables at the answer, by name and in their shapes, fixed ones too; empty where x is None."""
+        if self.x is None:
+            return {}
+        pieces = split(self.problem.variables, self.x)
+        found = {
+            v.name: v.shaped(p) if isinstance(v, Variable) else p
+            for v, p in zip(self.problem.variables, pieces, strict=True)
+        }
+        if self.problem.is_written:
+            found |= {v.name: v.shaped(v.guess) for v in self.problem.formulation.fixed}
+        return found
 
     @property
     def force_residual(self) -> float | None:
@@ -154,8 +174,11 @@ class Identification:
 
         They hold where the fit is one: for the members that the data leave open see `mass_interval`.
         """
-        from sysid.uncertainty import uncertainty
+        from sysid.uncertainty import uncertainty, written_uncertainty
 
+        if self.problem.is_written:
+            assert self.x is not None
+            return written_uncertainty(self.problem, self.x)
         return uncertainty(self.problem, self.structure)
 
     @property
@@ -181,12 +204,19 @@ class Identification:
         """Modes, counted from 0, whose modal mass neither the records nor the stated models fix."""
         from sysid.modal_masses import open_masses
 
+        if self.problem.is_written:
+            return ()
         return tuple(open_masses(self.problem, self.structure))
 
     @cached_property
     def _intervals(self) -> Intervals:
         from sysid.modal_masses import intervals
 
+        if self.problem.is_written:
+            from sysid.written_determination import written_intervals
+
+            assert self.x is not None
+            return written_intervals(self.problem, self.x)
         return intervals(self.problem, self.structure)
 
     @property

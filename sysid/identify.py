@@ -10,10 +10,12 @@ from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
 from sysid import local
+from sysid._continuation import Continuation, by_continuation
 from sysid._desk import DeferredInterrupt, Desk, Progress, Stop
-from sysid._swarm_search import Outcome, Swarm, by_swarm
+from sysid._search import Outcome
+from sysid._swarm_search import Swarm, by_swarm
 from sysid._watch import Watch
-from sysid.checks import doubts
+from sysid.checks import doubts, written_doubts
 from sysid.damping import ModalDamping
 from sysid.errors import InputError, SolverError
 from sysid.identification import History, Identification
@@ -24,17 +26,18 @@ from sysid.problem import Problem
 from sysid.refinement import SOLVED
 from sysid.stiffness import SpectralStiffness
 from sysid.structure import Structure
+from sysid.written_determination import written_determination
 
 _KNOWN = 0.1  # of the root of two diagonal entries; an entry with a larger standard deviation is not known
 _LARGE = 4000  # entries of the mode shapes, beyond which the covariance takes minutes and gigabytes
 _NO_FIT = 0.5  # relative residual above which nothing is explained
-STRATEGIES = ("auto", "swarm", "modal")
+STRATEGIES = ("auto", "swarm", "modal", "continuation")
 
 
 def identify(
     problem: Problem,
     *,
-    strategy: str | Swarm | Modal = "auto",
+    strategy: str | Swarm | Modal | Continuation = "auto",
     rng: int | np.random.Generator | None = None,
     start: ArrayLike | Structure | None = None,
     max_time: float | None = None,
@@ -47,16 +50,19 @@ def identify(
     Parameters
     ----------
     problem : Problem
-    strategy : str, Swarm or Modal
+    strategy : str, Swarm, Modal or Continuation
         "modal" takes poles and residues from the data and polishes them in modal coordinates: no swarm, no
-        frequencies needed, mostly within a second or two. "swarm" is the paper's hPSO-LS. A `Modal` or `Swarm` object
-        is that with other settings. "auto" takes modal for a full, lumped or known mass with spectral stiffness and
-        modal damping, else, or where the modal one turns out not to apply, the swarm; the result's remarks say which
-        and why.
+        frequencies needed, mostly within a second or two. "swarm" is the paper's hPSO-LS. "continuation" is for
+        structured stiffness and whatever is written in expressions: gradients from the guess and from further starts,
+        through responses whose peaks were widened. A `Modal`, `Swarm` or `Continuation` object is that with other
+        settings. "auto" takes modal for a full, lumped or known mass with spectral stiffness and modal damping, else
+        continuation where the stiffness has a form of its own, else the swarm, and the swarm too where the one that
+        was taken turns out not to apply or finds no good fit; the result's remarks say which and why.
     rng : int, numpy Generator or None
         The same seed gives the same bits. None draws one, which the result reports.
     start : array_like (n_variables,) or Structure, optional
-        A guess that joins the first swarm; "auto" then takes the swarm.
+        A guess that joins the first swarm, or takes the place of the variables' guesses; "auto" then takes no modal
+        strategy.
     max_time : float, optional
         s; the swarm takes at most two thirds of it.
     max_evaluations : int, optional
@@ -93,21 +99,34 @@ def identify(
                     raise InputError(f"strategy 'modal' does not apply: {error}; nor does the swarm: {other}") from None
                 return _finish(problem, end, why, seed, desk)
         desk.note(why)
+        if isinstance(options, Continuation):
+            end, misfit, good = by_continuation(problem, options, desk, random, start)
+            if strategy == "auto" and not good and end.stopped is None and desk.time_for_more:
+                why += f"; it left {misfit:.3g}, and a swarm followed"
+                desk.note(why)
+                swarm = by_swarm(problem, Swarm(), desk, random, start, max_evaluations)
+                if swarm.x is not None and problem.misfit_of(swarm.x) < misfit:
+                    end = swarm
+            return _finish(problem, end, why, seed, desk)
         return _finish(problem, by_swarm(problem, options, desk, random, start, max_evaluations), why, seed, desk)
 
 
 def _options(
-    strategy: str | Swarm | Modal, problem: Problem, start: ArrayLike | Structure | None
-) -> tuple[Swarm | Modal, str]:
+    strategy: str | Swarm | Modal | Continuation, problem: Problem, start: ArrayLike | Structure | None
+) -> tuple[Swarm | Modal | Continuation, str]:
     """Settings of the strategy that is taken, and why it is."""
-    if isinstance(strategy, Swarm | Modal):
+    if isinstance(strategy, Swarm | Modal | Continuation):
         return strategy, f"strategy {type(strategy).__name__.lower()!r}, as asked"
     if strategy not in STRATEGIES:
         raise InputError(f"strategy {strategy!r} is unknown; give one of {', '.join(map(repr, STRATEGIES))}")
     if strategy != "auto":
-        return (Modal() if strategy == "modal" else Swarm()), f"strategy {strategy!r}, as asked"
+        return {"modal": Modal, "swarm": Swarm, "continuation": Continuation}[
+            strategy
+        ](), f"strategy {strategy!r}, as asked"
+    if problem.is_written:
+        return Continuation(), "strategy 'continuation': the problem is written in unknowns of its own"
     if not isinstance(problem.stiffness, SpectralStiffness):
-        return Swarm(), "strategy 'swarm': the stiffness has a form of its own"
+        return Continuation(), "strategy 'continuation': the stiffness has a form of its own"
     if not isinstance(problem.damping, ModalDamping):
         return Swarm(), "strategy 'swarm': the damping has a form of its own"
     if start is not None:
@@ -117,7 +136,9 @@ def _options(
 
 def _by_modes(problem: Problem, options: Modal, desk: Desk) -> Outcome:
     """Modes from the data, and the structure that they make."""
-    if not (isinstance(problem.stiffness, SpectralStiffness) and isinstance(problem.damping, ModalDamping)):
+    if problem.is_written or not (
+        isinstance(problem.stiffness, SpectralStiffness) and isinstance(problem.damping, ModalDamping)
+    ):
         raise NotModalError("strategy 'modal' needs SpectralStiffness and ModalDamping; use 'swarm' for this problem")
     watch = Watch(lambda i, cost: desk.tell("local phase", i, 0, cost), desk.left)
     try:
@@ -191,7 +212,7 @@ def _seed(rng: int | np.random.Generator | None) -> tuple[int, np.random.SeedSeq
 def _finish(problem: Problem, end: Outcome, why: str, seed: int, desk: Desk) -> Identification:
     """Judge where the search ended, and say what it is worth."""
     structure, success, message = end.structure, end.success, end.message
-    residual = problem.measurement.residual(structure)
+    residual = problem.measurement.residual(structure) if end.x is None else problem.residual_of(end.x)
     if problem.goal is not None and residual > problem.goal:
         success = False
         message += f"; the residual {residual:.3g} is above the goal {problem.goal:.3g}"
@@ -202,9 +223,14 @@ def _finish(problem: Problem, end: Outcome, why: str, seed: int, desk: Desk) -> 
             "with exp(+iwt), the axes and signs of rigid_body right, the bounds wide enough?"
         )
     desk.note(f"done: residual {residual:.4e}, {message}")
-    known = determination(problem, structure)
-    # What was stopped on its way has misfits of another kind.
-    doubtful = doubts(problem, structure) if end.stopped is None else ()
+    if problem.is_written:
+        assert end.x is not None
+        known = written_determination(problem, end.x, end.rivals)
+        doubtful = written_doubts(problem, end.x) if end.stopped is None else ()
+    else:
+        known = determination(problem, structure)
+        # What was stopped on its way has misfits of another kind.
+        doubtful = doubts(problem, structure) if end.stopped is None else ()
     open_ = (*doubtful, *known.undetermined)
     if doubtful:
         message += "; " + "; ".join(doubtful)

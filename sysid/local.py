@@ -30,6 +30,7 @@ from sysid.modal_scales import stated_totals, to_stated_totals
 from sysid.problem import Problem, assemble
 from sysid.refinement import SOLVED
 from sysid.residues import linear_residues
+from sysid.smoothing import Smoothed
 from sysid.stiffness import SpectralStiffness
 from sysid.structure import Array, Structure
 
@@ -77,6 +78,7 @@ def solve(
     max_iterations: int = 500,
     max_time: float | None = None,
     monitor: Callable[[int, float], object] | None = None,
+    smoothed: tuple[Smoothed, ...] | None = None,
 ) -> LocalResult:
     """Minimise the residual from the unknowns `x`.
 
@@ -91,11 +93,13 @@ def solve(
     monitor : callable, optional
         Called with (iteration, residual) after each iteration; whatever it raises stops the solver
         and is handed back in `stopped`.
+    smoothed : tuple of Smoothed, optional
+        To be fitted in the place of the problem's tests, where it has unknowns of its own.
     """
     start, watch = problem.structure(x), Watch(monitor, max_time)
     if is_modal(problem):
         return _in_modal_coordinates(problem, start, watch, max_iterations)
-    end = fit_structured(problem, x, start, watch, max_iterations)
+    end = fit_structured(problem, x, start, watch, max_iterations, smoothed)
     return _result(end.x, end, watch)
 
 

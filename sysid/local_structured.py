@@ -22,6 +22,7 @@ from sysid.layout import lower_entries, triangle_entries
 from sysid.modal import FREQUENCY_WINDOW
 from sysid.problem import Problem
 from sysid.response import residual
+from sysid.smoothing import Smoothed
 from sysid.stiffness import SpectralStiffness
 from sysid.structure import Array, Structure
 from sysid.variables import split
@@ -40,10 +41,21 @@ class StructuredFit:
     bounds: str
 
 
-def fit_structured(problem: Problem, x: Array, start: Structure, watch: Watch, max_iterations: int) -> StructuredFit:
-    """Minimise the residuals of a problem over its own unknowns, from `x`, which stands for `start`."""
+def fit_structured(
+    problem: Problem,
+    x: Array,
+    start: Structure,
+    watch: Watch,
+    max_iterations: int,
+    smoothed: tuple[Smoothed, ...] | None = None,
+) -> StructuredFit:
+    """Minimise the residuals of a problem over its own unknowns, from `x`, which stands for `start`.
+
+    `smoothed` are to be fitted in the place of the problem's own test and its further ones.
+    """
     z, formulation = Coordinates(), problem.formulation
-    by_modes = formulation.by_ratios or isinstance(problem.damping, ProportionalDamping)
+    tests = smoothed or [Smoothed(test, 0.0) for test in (problem.measurement, *(t for t, _ in formulation.others))]
+    by_modes = formulation.matrices.by_ratios or isinstance(problem.damping, ProportionalDamping)
     modal = by_modes and formulation.misfit is None
     # The modes themselves stand for a spectral stiffness.
     held = modal and isinstance(problem.stiffness, SpectralStiffness)
@@ -68,16 +80,21 @@ def fit_structured(problem: Problem, x: Array, start: Structure, watch: Watch, m
         # In units of what the swarm lets pass, which is a small part of what the constraint makes over the box.
         unit = np.where(problem.tolerance > 0, problem.tolerance, 1.0) / 1e-2
         z.tie(broken / ca.DM(unit), constraints.lower / unit, constraints.upper / unit)
-    own = [] if formulation.residuals is None else [formulation.residuals(unknowns)]
     if modal:
-        miss, psi, omega = _in_modes(problem, unknowns, factors, start, z, held=held)
+        miss, psi, omega = _in_modes(problem, tests[0], unknowns, factors, start, z, held=held)
     else:
         psi = omega = ca.MX(0, 1)
         if formulation.misfit is not None:
             miss = formulation.misfit(unknowns)
         else:
-            miss = relative_misfit(problem.measurement, formulation.motion(unknowns), weighted=True)
-    miss = ca.vertcat(miss, *own)
+            miss = relative_misfit(
+                tests[0].test, formulation.matrices.motion(unknowns), weighted=True, shift=tests[0].shift
+            )
+    for other, (_, matrices) in zip(tests[1:], formulation.others, strict=True):
+        further = relative_misfit(other.test, matrices.motion(unknowns), weighted=True, shift=other.shift)
+        miss = ca.vertcat(miss, further)
+    if formulation.residuals is not None:
+        miss = ca.vertcat(miss, formulation.residuals(unknowns))
     derivatives = None if modal else {"hess_lag": _gauss_newton(z, miss)}
     best, status = z.minimize(ca.sumsqr(miss), watch, max_iterations, derivatives)
 
@@ -87,7 +104,7 @@ def fit_structured(problem: Problem, x: Array, start: Structure, watch: Watch, m
         w = values[2].ravel()
         order = np.argsort(w)
         # Psi = L' Phi with the mass as it ended, exactly orthogonal.
-        factor = np.linalg.cholesky(formulation.numbers(ended).mass)
+        factor = np.linalg.cholesky(formulation.matrices.numbers(ended).mass)
         phi = np.linalg.solve(np.linalg.cholesky(start.mass[: start.n, : start.n]).T, values[1])
         u, _, vt = np.linalg.svd(factor.T @ phi[:, order])
         ended[problem.parts.stiffness] = triangle_entries(np.linalg.cholesky((u @ vt * w[order] ** 2) @ (u @ vt).T))
@@ -98,13 +115,13 @@ def fit_structured(problem: Problem, x: Array, start: Structure, watch: Watch, m
 
 
 def _in_modes(
-    problem: Problem, unknowns: ca.MX, factors: ca.MX, start: Structure, z: Coordinates, *, held: bool
+    problem: Problem, test: Smoothed, unknowns: ca.MX, factors: ca.MX, start: Structure, z: Coordinates, *, held: bool
 ) -> tuple[ca.MX, ca.MX, ca.MX]:
     """Misfit in mode shapes and frequencies, tied to the matrices; ``Psi`` and w beside it.
 
     `factors` are those of a proportional damping.
     """
-    motion = problem.formulation.motion(unknowns)
+    motion = problem.formulation.matrices.motion(unknowns)
     n = start.n
     center = 2 * np.pi * start.natural_frequencies
     window = np.full(n, np.log(_OPEN_WINDOW))
@@ -126,7 +143,7 @@ def _in_modes(
     damping = problem.damping
     ratios = damping.ratios(factors, omega) if isinstance(damping, ProportionalDamping) else motion.damping
     miss = residual(
-        problem.measurement, shapes, phi.T @ motion.push, omega, ratios, motion.rigid_body_mass, weighted=True
+        test.test, shapes, phi.T @ motion.push, omega, ratios, motion.rigid_body_mass, weighted=True, shift=test.shift
     )
     return miss, psi, omega
 

@@ -67,7 +67,7 @@ class Problem:
         (n, n) is C on the motion relative to the base; (n,) is one damping ratio a mode, in ascending frequency.
     residuals : sequence of expressions
         Minimised in the least-squares sense beside the misfit of the measurement, whose norm is 1 where nothing is
-        explained: a second test (`sysid.misfit`), or what is known to some accuracy.
+        explained: a second test (`sysid.Misfit`), or what is known to some accuracy.
     constraints : sequence of relations
         Such as ``k[0] <= k[1]`` or ``ca.sum1(m) == 900``. IPOPT holds them exactly; in the swarm a candidate that
         breaks them less is better, whatever its residual, and any that keeps them is better than these.
@@ -171,8 +171,8 @@ class Problem:
         if self.is_written:
             self._check_written(user_frame())
             put("variables", self.formulation.variables)
-            M, M_S0, M_00, *_ = self.formulation.numbers(self.formulation.guess)
-            G = self.formulation.rigid_body_dofs
+            M, M_S0, M_00, *_ = self.formulation.matrices.numbers(self.formulation.guess)
+            G = self.formulation.matrices.rigid_body_dofs
             put("totals", np.diag(G.T @ M @ G + G.T @ M_S0 + M_S0.T @ G + M_00).copy())
             return
         put("variables", tuple(v for group in self._groups() for v in group))
@@ -292,7 +292,7 @@ class Problem:
         if values.shape != (self.n_variables,):
             raise InputError(f"x has shape {values.shape}; this problem has ({self.n_variables},) unknowns")
         if self.is_written:
-            return self.formulation.structure(values, self.measurement)
+            return self.formulation.matrices.structure(values, self.measurement)
         symbols = ca.SX.sym("x", self.n_variables)
         function = ca.Function("matrices", [symbols], list(self.matrices(symbols)))
         L, coupling, base, H, c = (np.asarray(m) for m in function(values))
@@ -319,6 +319,12 @@ class Problem:
             ]
         )
 
+    def residual_of(self, x: Array) -> float:
+        """Relative residual of the measurement at `x`, or, where the problem has one, of its own misfit."""
+        if self.is_written and self.formulation.misfit is not None:
+            return float(np.linalg.norm(self.formulation.misfit(x)))
+        return self.measurement.residual(self.structure(x))
+
     def misfit_of(self, x: Array) -> float:
         """Root of the sum of squares of all relative residuals: of accelerations, force, and what else was stated."""
         if self.is_written and self.formulation.misfit is not None:
@@ -326,9 +332,15 @@ class Problem:
         else:
             structure, test = self.structure(x), self.measurement
             own = float(np.hypot(test.residual(structure), test.force_residual(structure) or 0.0))
-        if not self.is_written or self.formulation.residuals is None:
+        if not self.is_written:
             return own
-        return float(np.hypot(own, np.linalg.norm(self.formulation.residuals(x))))
+        parts = [own]
+        for test, matrices in self.formulation.others:
+            structure = matrices.structure(x, test)
+            parts += [test.residual(structure), test.force_residual(structure) or 0.0]
+        if self.formulation.residuals is not None:
+            parts.append(float(np.linalg.norm(self.formulation.residuals(x))))
+        return float(np.linalg.norm(parts))
 
     def from_sampling(self, s: ca.SX) -> ca.SX:
         """Unknowns of the swarm's coordinates, which have the same bounds (eq. 18)."""

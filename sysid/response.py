@@ -21,14 +21,22 @@ def parts_of(record: ComplexArray) -> tuple[ca.DM, ca.DM]:
     return ca.sparsify(ca.DM(flat.real)), ca.sparsify(ca.DM(flat.imag))
 
 
-def modal_gains(omega: ca.MX, ratios: ca.MX, freq: Array) -> tuple[ca.MX, ca.MX]:
-    """Real and imaginary part of ``g_k = w² / (w_k² - w² + 2 i zeta_k w_k w)``, (m, n_freq) each (eq. 14)."""
+def modal_gains(omega: ca.MX, ratios: ca.MX, freq: Array, shift: float = 0.0) -> tuple[ca.MX, ca.MX]:
+    """Real and imaginary part of ``g_k = w² / (w_k² - w² + 2 i zeta_k w_k w)``, (m, n_freq) each (eq. 14).
+
+    With `shift`, 1/s, at ``s = shift + i w`` in the place of ``i w``.
+    """
     w = ca.DM(2 * np.pi * freq).T
     squared = ca.repmat(w**2, omega.numel(), 1)
     detuning = omega**2 @ ca.DM.ones(1, freq.size) - squared
     loss = (2 * ratios * omega) @ w
-    size = squared / (detuning**2 + loss**2)
-    return size * detuning, -size * loss
+    if not shift:
+        size = squared / (detuning**2 + loss**2)
+        return size * detuning, -size * loss
+    detuning = detuning + shift**2 + 2 * shift * (ratios * omega) @ ca.DM.ones(1, freq.size)
+    loss, turned = loss + 2 * shift * ca.repmat(w, omega.numel(), 1), 2 * shift * ca.repmat(w, omega.numel(), 1)
+    size, squared = 1 / (detuning**2 + loss**2), squared - shift**2
+    return size * (squared * detuning - turned * loss), -size * (squared * loss + turned * detuning)
 
 
 def residual(
@@ -40,6 +48,7 @@ def residual(
     rigid_body_mass: ca.MX,
     *,
     weighted: bool = False,
+    shift: float = 0.0,
 ) -> ca.MX:
     """Relative residuals, stacked: their sum of squares is the squared relative error of each record.
 
@@ -57,6 +66,8 @@ def residual(
     weighted : bool
         Channels and lines weigh by their stated noise, and accelerations and force by each other's where both are
         stated.
+    shift : float, 1/s
+        Of the complex frequencies from the imaginary axis, see `modal_gains`.
 
     Returns
     -------
@@ -65,7 +76,7 @@ def residual(
         same of the base force.
     """
     runs = test.base.shape[0]
-    g_re, g_im = modal_gains(omega, ratios, test.freq)
+    g_re, g_im = modal_gains(omega, ratios, test.freq, shift)
     if runs > 1:
         g_re, g_im = ca.repmat(g_re, 1, runs), ca.repmat(g_im, 1, runs)
     u_re, u_im = parts_of(test.base)
@@ -104,8 +115,11 @@ def weighed_mass(test: Measurement, omega: Array, ratios: Array) -> Array:
     return _real_least_squares(weight * design, weight * columns(test.force).T)[: test.n_base].T
 
 
-def gains(freq: Array, omega: Array, ratios: Array) -> ComplexArray:
-    """Numbers of ``g_k = w² / (w_k² - w² + 2 i zeta_k w_k w)`` at lines in Hz, (m, n_freq)."""
+def gains(freq: Array, omega: Array, ratios: Array, shift: float = 0.0) -> ComplexArray:
+    """Numbers of ``g_k = w² / (w_k² - w² + 2 i zeta_k w_k w)`` at lines in Hz, (m, n_freq); `shift` as above."""
+    if shift:
+        s = shift + 2j * np.pi * freq
+        return -(s**2) / (omega[:, None] ** 2 + s**2 + 2 * (ratios * omega)[:, None] * s)
     w = 2 * np.pi * freq
     return w**2 / (omega[:, None] ** 2 - w**2 + 2j * (ratios * omega)[:, None] * w)
 

@@ -6,7 +6,8 @@
     ├── x              the unknowns
     ├── structure      mass, stiffness, damping_ratios | damping_matrix, recovery, rigid_body, sensors
     ├── problem        goal; measurement, validation/0, validation/1, ..., reference
-    │   └── mass, stiffness, damping      the models: their kind and their fields
+    │   ├── mass, stiffness, damping      the models: their kind and their fields
+    │   └── formulation    in their place, for a problem in its own unknowns: variables and CasADi functions as text
     ├── history        residual after each phase, both curves, states, log
     └── recipe         module, data, rng
 """
@@ -24,6 +25,8 @@ from typing import Any
 
 import numpy as np
 
+from sysid._stored_formulation import read as read_formulation
+from sysid._stored_formulation import write as write_formulation
 from sysid.damping import ModalDamping, ProportionalDamping
 from sysid.errors import InputError
 from sysid.identification import History, Identification, Recipe
@@ -34,7 +37,7 @@ from sysid.stiffness import ChainStiffness, SpectralStiffness
 from sysid.structure import Structure
 
 CONTENT = "sysid identification"
-FORMAT = 1  # rises where an older sysid could not read the file
+FORMAT = 2  # rises where an older sysid could not read the file: 2 holds problems in their own unknowns
 FILE_NAME = "result.h5"
 
 _SUFFIXES = (".h5", ".hdf5")
@@ -180,7 +183,7 @@ def _write(file: Any, identification: Identification) -> None:
     from sysid import __version__
 
     it = identification
-    _put(file.attrs, content=CONTENT, format=FORMAT, sysid_version=__version__)
+    _put(file.attrs, content=CONTENT, format=FORMAT if it.problem.is_written else 1, sysid_version=__version__)
     _put(
         file.attrs, strategy=it.strategy, seed=it.seed, success=it.success, message=it.message,
         determined=it.determined, interrupted=it.interrupted,
@@ -195,7 +198,9 @@ def _write(file: Any, identification: Identification) -> None:
         _write_measurement(problem.create_group(f"validation/{i}"), test)
     if it.problem.reference is not None:
         _write_structure(problem.create_group("reference"), it.problem.reference)
-    for name in ("mass", "stiffness", "damping"):
+    if it.problem.is_written:
+        write_formulation(problem.create_group("formulation"), it.problem.formulation, _put, _write_measurement)
+    for name in () if it.problem.is_written else ("mass", "stiffness", "damping"):
         model = getattr(it.problem, name)
         group = problem.create_group(name)
         _put(group.attrs, kind=type(model).__name__)
@@ -219,9 +224,7 @@ def _read(file: Any) -> Identification:
     tests = group.get("validation", {})
     problem = Problem(
         _read_measurement(group["measurement"]),
-        mass=_read_model(group["mass"]),
-        stiffness=_read_model(group["stiffness"]),
-        damping=_read_model(group["damping"]),
+        **_read_models(group),
         reference=_read_structure(group["reference"]) if "reference" in group else None,
         validation=[_read_measurement(tests[str(i)]) for i in range(len(tests))],
         goal=_get(group.attrs, "goal"),
@@ -293,6 +296,12 @@ def _read_measurement(group: Any) -> Measurement:
         force_std=_get(group, "force_std"),
         base_axes=_get(group, "base_axes"),
     )
+
+
+def _read_models(group: Any) -> dict[str, Any]:
+    if "formulation" in group:
+        return read_formulation(group["formulation"], _get, _read_measurement)
+    return {name: _read_model(group[name]) for name in ("mass", "stiffness", "damping")}
 
 
 def _read_model(group: Any) -> Any:

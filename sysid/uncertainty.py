@@ -24,8 +24,9 @@ from sysid.mass import FullMass
 from sysid.modal_fit import Modes
 from sysid.modal_masses import open_masses
 from sysid.problem import Problem
-from sysid.structure import Array, Structure, check_frequencies
-from sysid.variables import Block
+from sysid.sensitivity import Slopes, response_slopes, sensitivity, slopes_of
+from sysid.structure import Array, ComplexArray, Structure, check_frequencies
+from sysid.variables import Block, Variable, split
 
 _MOVED = 1e-6  # of a quantity's size, by which an unseen move of order one must change it to count
 _SAME = 1e-6  # relative distance that is put between repeated frequencies
@@ -57,12 +58,14 @@ class Uncertainty:
     mass, stiffness, damping : (m, m)
         M_SS, K_SS and C at the structure's degrees of freedom.
     parameters : tuple of str
-        Frequencies, damping ratios, and the participations that are known.
+        Frequencies, damping ratios, and the participations that are known; the unknowns of a problem that has its own.
     covariance : (p, p)
         Of `parameters`.
     inflation : float
         Factor by which all standard deviations were raised because the misfit is larger than the stated noise
         explains; 1 otherwise, NaN where the lines are too few to tell a noise that is not stated.
+    variables : dict of str to ndarray
+        For each variable of a problem in its own unknowns, by name and in its shape.
 
     Notes
     -----
@@ -90,6 +93,8 @@ class Uncertainty:
     inflation: float
     _modes: Modes = field(repr=False)
     _moves: _Moves = field(repr=False)
+    variables: dict[str, Array] = field(default_factory=dict)
+    _direct: _Direct | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
         worst = 100 * np.max(self.natural_frequencies / self.structure.natural_frequencies)
@@ -143,6 +148,8 @@ class Uncertainty:
 
     def transmissibility(self, freq: ArrayLike) -> Array:
         """Standard deviation ``sqrt(E|e|²)`` of the transmissibility at lines in Hz, (n_sensors, d, n_freq)."""
+        if self._direct is not None:
+            return self._direct.transmissibility(check_frequencies(freq, increasing=False))
         (phi, gamma, _, _), moves = self._modes, self._moves
         g, slopes = gains_of(check_frequencies(freq, increasing=False), self._modes)
         size = float(np.max(np.abs(np.einsum("ik,kj,kf->ijf", phi, gamma, g))))
@@ -155,6 +162,8 @@ class Uncertainty:
 
     def base_force(self, freq: ArrayLike) -> Array:
         """Standard deviation ``sqrt(E|e|²)`` of the apparent mass at lines in Hz, kg, (d, d, n_freq)."""
+        if self._direct is not None:
+            return self._direct.base_force(check_frequencies(freq, increasing=False))
         gamma, moves = self._modes.gamma, self._moves
         g, slopes = gains_of(check_frequencies(freq, increasing=False), self._modes)
         weight = np.sqrt(np.diag(self.structure.rigid_body_mass)).tolist()
@@ -388,8 +397,95 @@ class _Moves(NamedTuple):
         return np.where(moved > _MOVED * size, np.nan, np.sqrt(np.maximum(variance, 0.0)))
 
 
-def _quantities(problem: Problem, structure: Structure, modes: Modes, moves: _Moves, inflation: float) -> Uncertainty:
-    """Everything that follows from the moves."""
+def written_uncertainty(problem: Problem, x: Array) -> Uncertainty:
+    """Standard deviations of everything that follows from the unknowns of a problem in its own unknowns.
+
+    Parameters
+    ----------
+    problem : Problem
+    x : (n_variables,)
+        Its fit.
+
+    Returns
+    -------
+    Uncertainty
+        First order in the noise; a variable on a bound is treated as if the bound were not there.
+    """
+    formulation, test = problem.formulation, problem.measurement
+    slopes = slopes_of(formulation.matrices, x, test)
+    known = sensitivity(problem, x, slopes)
+    structure = slopes.structure
+    inflation = 1.0
+    if formulation.misfit is None:
+        inflation = inflation_of(test, records_of(test, structure, x.size), x.size)
+    every = np.hstack([inflation * known.normals, known.unit[:, None] * known.unseen])
+    normals = known.rank
+    shapes = np.einsum("si,ikc->skc", structure.recovery, slopes.d_shapes)
+    pushes = np.einsum("ikc,id->kdc", slopes.d_shapes, slopes.push)
+    pushes = pushes + np.einsum("ik,idc->kdc", structure.normal_modes, slopes.d_push)
+    parts = (shapes, pushes, slopes.d_log_omega, slopes.d_log_ratios, slopes.d_rigid)
+    shapes, pushes, log_omega, log_ratios, rigid = (part @ every for part in parts)
+    moves = _Moves(shapes, pushes, log_omega, log_ratios, rigid, normals)
+    n = structure.n
+    matrices = []
+    for matrix, slope in (
+        (structure.mass[:n, :n], slopes.mass), (structure.stiffness[:n, :n], slopes.stiffness),
+        (structure.damping, slopes.damping),
+    ):  # fmt: skip
+        size = np.sqrt(np.abs(np.diag(matrix)))
+        matrices.append(moves.std(slope @ every, np.outer(size, size)))
+    std = moves.std(every, known.unit)
+    covariance = every[:, :normals] @ every[:, :normals].T
+    covariance[np.isnan(std)], covariance[:, np.isnan(std)] = np.nan, np.nan
+    named = {
+        v.name: v.shaped(part) if isinstance(v, Variable) else part
+        for v, part in zip(problem.variables, split(problem.variables, std), strict=True)
+    }
+    direct = None if structure.modal_damping else _Direct(slopes, moves, every)
+    return replace(
+        _quantities(problem, structure, _modes(structure), moves, inflation, tuple(matrices)),
+        parameters=formulation.labels, covariance=covariance, variables=named, _direct=direct,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Direct:
+    """Standard deviations of spectra where the damping is a matrix: by direct solves."""
+
+    slopes: Slopes
+    moves: _Moves
+    every: Array
+
+    def transmissibility(self, freq: Array) -> Array:
+        """As in `Uncertainty`."""
+        X, dX = response_slopes(self.slopes, freq)
+        R = self.slopes.structure.recovery
+        return self._std(np.einsum("si,fidc->sdfc", R, dX, optimize=True), float(np.abs(X).max()))
+
+    def base_force(self, freq: Array) -> Array:
+        """As in `Uncertainty`."""
+        s = self.slopes
+        X, dX = response_slopes(s, freq)
+        change = np.einsum("iec,fid->edfc", s.d_push, X, optimize=True) + s.d_rigid[:, :, None]
+        change = change + np.einsum("ie,fidc->edfc", s.push, dX, optimize=True)
+        return self._std(change, float(np.abs(s.structure.rigid_body_mass).max()))
+
+    def _std(self, change: ComplexArray, size: float) -> Array:
+        moved = change @ self.every
+        std = np.linalg.norm(moved[..., : self.moves.normals], axis=-1)
+        unseen = np.abs(moved[..., self.moves.normals :]).max(axis=-1, initial=0.0)
+        return np.where(unseen > _MOVED * size, np.nan, std)
+
+
+def _quantities(
+    problem: Problem,
+    structure: Structure,
+    modes: Modes,
+    moves: _Moves,
+    inflation: float,
+    matrices: tuple[Array, ...] | None = None,
+) -> Uncertainty:
+    """Everything that follows from the moves; `matrices` are those of M_SS, K_SS and C where they are known."""
     phi, gamma, omega, ratios = modes
     frequencies, n = omega / (2 * np.pi), structure.n
     d_frequencies, d_ratios = frequencies[:, None] * moves.log_omega, ratios[:, None] * moves.log_ratios
@@ -415,7 +511,9 @@ def _quantities(problem: Problem, structure: Structure, modes: Modes, moves: _Mo
         (omega**2, 2 * omega[:, None] ** 2 * moves.log_omega),
         (loss, loss[:, None] * (moves.log_omega + moves.log_ratios)),
     )
-    mass, stiffness, damping = (_matrix_std(structure, moves, diagonal, change) for diagonal, change in diagonals)
+    mass, stiffness, damping = matrices or (
+        _matrix_std(structure, moves, diagonal, change) for diagonal, change in diagonals
+    )
     if is_modal(problem) and problem.measurement.force is None and open_masses(problem, structure):
         mass, stiffness, damping = np.full((3, n, n), np.nan)  # zeros that a decoupled structure keeps included
 

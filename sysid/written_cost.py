@@ -6,8 +6,10 @@ import casadi as ca
 import numpy as np
 
 from sysid._declaration import violation_of
+from sysid.formulation import Matrices
 from sysid.problem import Problem
 from sysid.response import columns, gains, weights_of
+from sysid.smoothing import Smoothed
 from sysid.structure import Array, ComplexArray
 from sysid.variables import split
 
@@ -28,9 +30,10 @@ class WrittenCost:
         (Comput. Methods Appl. Mech. Eng. 186 (2000) 311-338): whatever keeps them comes before what does not.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, smoothed: tuple[Smoothed, ...] | None = None) -> None:
         self.problem = problem
         f = problem.formulation
+        own = [Smoothed(test, 0.0) for test in (problem.measurement, *(t for t, _ in f.others))]
         s = ca.MX.sym("s", f.size)
         pieces = [
             p if v.sampling is None else _as_function(v)(p)
@@ -40,21 +43,17 @@ class WrittenCost:
         if f.healing is not None:
             x = ca.fmin(ca.fmax(f.healing(x), ca.DM(f.lower)), ca.DM(f.upper))
         self._unknowns = ca.Function("unknowns", [s], [x])
-        motion = f.motion(x)
-        parts = [motion.mass, motion.stiffness, motion.damping, motion.push, motion.rigid_body_mass]
-        self._expand = _expanded(ca.Function("expand", [s], [ca.densify(part) for part in parts])).map(_CHUNK)
+        models = (f.matrices, *(matrices for _, matrices in f.others))
+        self._tests = [
+            _TestCost(test, matrices, s, x)
+            for test, matrices in zip(smoothed or own, models, strict=True)
+            if f.misfit is None or matrices is not f.matrices
+        ]
         self._own = None if f.misfit is None else ca.Function("misfit", [s], [ca.norm_2(f.misfit(x))])
         self._residuals = None if f.residuals is None else ca.Function("residuals", [s], [ca.norm_2(f.residuals(x))])
         self._constraints = (
             None if f.constraints is None else ca.Function("constraints", [s], [ca.densify(f.constraints.function(x))])
         )
-        test = problem.measurement
-        self._base = columns(test.base)
-        self._targets: list[tuple[ComplexArray, Array, float]] = []
-        for record, std in ((test.relative, test.response_std), (test.force, test.force_std)):
-            if record is not None:
-                weight, scale = weights_of(record, std)
-                self._targets.append((columns(record), np.asarray(weight), scale))
 
     def __call__(self, particles: Array) -> Array:
         """Cost of each row; NaN where a candidate is no structure."""
@@ -71,7 +70,9 @@ class WrittenCost:
 
     def _chunk(self, particles: Array) -> Array:
         count = len(particles)
-        squared = self._misfits(particles) ** 2 if self._own is None else _each(self._own, particles) ** 2
+        squared = np.zeros(count) if self._own is None else _each(self._own, particles) ** 2
+        for test in self._tests:
+            squared = squared + test.squared(particles)
         if self._residuals is not None:
             squared = squared + _each(self._residuals, particles) ** 2
         cost = np.sqrt(squared)
@@ -84,35 +85,49 @@ class WrittenCost:
         broken = np.sum(np.where(over > 1, over, 0.0), axis=1)
         return np.where(broken > 0, _WORST * (1 + broken), np.minimum(cost, _WORST))
 
-    def _misfits(self, particles: Array) -> Array:
-        """Misfit of the measurement, (count,)."""
-        count, test, f = len(particles), self.problem.measurement, self.problem.formulation
+
+class _TestCost:
+    """Squared relative residual of one test."""
+
+    def __init__(self, smoothed: Smoothed, matrices: Matrices, s: ca.MX, x: ca.MX) -> None:
+        self.by_ratios, self.recovery = matrices.by_ratios, matrices.recovery
+        self.test, self.shift = smoothed.test, smoothed.shift
+        motion = matrices.motion(x)
+        parts = [motion.mass, motion.stiffness, motion.damping, motion.push, motion.rigid_body_mass]
+        self._expand = _expanded(ca.Function("expand", [s], [ca.densify(part) for part in parts])).map(_CHUNK)
+        test = smoothed.test
+        self._base = columns(test.base)
+        self._targets: list[tuple[ComplexArray, Array, float]] = []
+        for record, std in ((test.relative, test.response_std), (test.force, test.force_std)):
+            if record is not None:
+                weight, scale = weights_of(record, std)
+                self._targets.append((columns(record), np.asarray(weight), scale))
+
+    def squared(self, particles: Array) -> Array:
+        """Of each candidate, (count,); NaN where it is no structure."""
+        count, freq, runs = len(particles), self.test.freq, self.test.n_runs
         padded = np.concatenate([particles, np.repeat(particles[-1:], _CHUNK - count, axis=0)])
-        wide = [np.asarray(part) for part in self._expand(padded.T)]
-        M, K, C, B, rigid = (_stack(part)[:count] for part in wide)
-        broken = ~(np.all(np.isfinite(M), axis=(1, 2)) & np.all(np.isfinite(K), axis=(1, 2)))
-        broken |= ~np.all(np.isfinite(C), axis=(1, 2))
+        M, K, C, B, rigid = (_stack(np.asarray(part))[:count] for part in self._expand(padded.T))
         n = M.shape[1]
-        M[broken], K[broken] = np.eye(n), np.eye(n)
-        C[broken] = 0.0
-        broken |= np.linalg.eigvalsh((M + M.swapaxes(1, 2)) / 2)[:, 0] <= 0
-        M[broken] = np.eye(n)
-        response = _by_modes if f.by_ratios else _by_states
-        a = response(M, K, C, B, test.freq)  # (count, n, d, n_freq)
-        F, runs = test.freq.size, test.n_runs
-        u = self._base.reshape(-1, runs, F)
-        a = np.einsum("pndf,drf->pnrf", a, u).reshape(count, n, runs * F)
-        predicted = [f.recovery @ a]
+        # A candidate that is no structure must not stop the eigensolver for the others.
+        broken = ~np.all([np.all(np.isfinite(part), axis=(1, 2)) for part in (M, K, C, B)], axis=0)
+        M[broken], K[broken], C[broken], B[broken] = np.eye(n), np.eye(n), 0.0, 0.0
+        light = np.linalg.eigvalsh((M + M.swapaxes(1, 2)) / 2)[:, 0] <= 0
+        M[light] = np.eye(n)
+        a = (_by_modes if self.by_ratios else _by_states)(M, K, C, B, freq, self.shift)  # (count, n, d, n_freq)
+        u = self._base.reshape(-1, runs, freq.size)
+        a = np.einsum("pndf,drf->pnrf", a, u).reshape(count, n, -1)
+        predicted = [self.recovery @ a]
         if len(self._targets) > 1:
             predicted.append(B.swapaxes(1, 2) @ a + rigid @ self._base)
         squared = np.zeros(count)
         for (record, weight, scale), made in zip(self._targets, predicted, strict=True):
             squared += np.sum(np.abs(weight * (made - record)) ** 2, axis=(1, 2)) / scale**2
-        squared[broken] = np.nan
-        return np.sqrt(squared)
+        squared[broken | light] = np.nan
+        return squared
 
 
-def _by_modes(M: Array, K: Array, C: Array, B: Array, freq: Array) -> ComplexArray:
+def _by_modes(M: Array, K: Array, C: Array, B: Array, freq: Array, shift: float) -> ComplexArray:
     """Relative acceleration for unit base motion, damping by ratios (count, n, 1)."""
     L = np.linalg.cholesky((M + M.swapaxes(1, 2)) / 2)
     half = np.linalg.solve(L, K)
@@ -121,25 +136,25 @@ def _by_modes(M: Array, K: Array, C: Array, B: Array, freq: Array) -> ComplexArr
     phi = np.linalg.solve(L.swapaxes(1, 2), psi)
     with np.errstate(invalid="ignore"):
         omega = np.sqrt(lam)
-    g = np.array([gains(freq, w, zeta.ravel()) for w, zeta in zip(omega, C, strict=True)])
+    g = np.array([gains(freq, w, zeta.ravel(), shift) for w, zeta in zip(omega, C, strict=True)])
     return np.einsum("pik,pkd,pkf->pidf", phi, phi.swapaxes(1, 2) @ B, g, optimize=True)
 
 
-def _by_states(M: Array, K: Array, C: Array, B: Array, freq: Array) -> ComplexArray:
-    """Relative acceleration for unit base motion, from the eigenvalues of the state space: ``a = -w² v``."""
+def _by_states(M: Array, K: Array, C: Array, B: Array, freq: Array, shift: float) -> ComplexArray:
+    """Relative acceleration for unit base motion, from the eigenvalues of the state space: ``a = s² v``."""
     count, n, d = B.shape
     A = np.zeros((count, 2 * n, 2 * n))
     A[:, :n, n:] = np.eye(n)
     A[:, n:, :n], A[:, n:, n:] = -np.linalg.solve(M, K), -np.linalg.solve(M, C)
     push = np.concatenate([np.zeros((count, n, d)), -np.linalg.solve(M, B)], axis=1)
-    w = 2 * np.pi * freq
+    s = shift + 2j * np.pi * freq
     lam, vectors = np.linalg.eig(A)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         try:
             strength = np.linalg.solve(vectors, push.astype(complex))
         except np.linalg.LinAlgError:  # a defective candidate among them: each by least squares
             strength = np.linalg.pinv(vectors) @ push
-        poles = -(w**2) / (1j * w - lam[:, :, None])
+        poles = s**2 / (s - lam[:, :, None])
         return np.einsum("pik,pkd,pkf->pidf", vectors[:, :n], strength, poles, optimize=True)
 
 

@@ -1,0 +1,157 @@
+"""Strategy "continuation": from wide peaks, step by step, to the records themselves, for structured problems."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.stats import qmc
+
+from sysid import local
+from sysid._desk import Desk, Stop
+from sysid._search import Outcome, as_unknowns
+from sysid.formulation import sampled
+from sysid.identification import History
+from sysid.local import LocalResult
+from sysid.problem import Problem
+from sysid.smoothing import PolesAndResidues, Smoothed, levels_of
+from sysid.structure import Array, Structure
+from sysid.variables import split
+
+_STEPS = 60  # iterations of a fit on the way
+_NEAR = 1.1  # times the misfit of free residues at the poles of the data: what a structure may leave
+_AS_GOOD = 1.02  # times the best misfit, up to which another solution explains the data as well
+_APART = 0.01  # of the search space, from which two solutions are two
+
+
+@dataclass(frozen=True)
+class Continuation:
+    """Strategy "continuation", with its settings.
+
+    The misfit of a lightly damped structure has minima as narrow as its peaks. So each search begins with the
+    responses at complex frequencies, where the peaks are wide, and takes smaller and smaller shifts to the records
+    themselves; IPOPT with exact derivatives does each step.
+
+    Parameters
+    ----------
+    starts : int
+        Where searches begin: at the guess, and at so many less one points spread over the search space. Several also
+        show whether another structure explains the data as well.
+    """
+
+    starts: int = 3
+
+
+def tests_of(problem: Problem) -> list[PolesAndResidues] | None:
+    """What stands for each test at complex frequencies; None where one shows no poles or the misfit is an own one."""
+    formulation = problem.formulation
+    if formulation.misfit is not None:
+        return None
+    found = [PolesAndResidues.of(test) for test in (problem.measurement, *(test for test, _ in formulation.others))]
+    known = [poles for poles in found if poles is not None]
+    return known if len(known) == len(found) else None
+
+
+def descend(
+    problem: Problem,
+    x: Array,
+    steps: list[tuple[Smoothed, ...]],
+    *,
+    left: Callable[[], float | None],
+    monitor: Callable[[int, float], object] | None = None,
+) -> LocalResult:
+    """Fit every step from where the one before ended, and at last the records."""
+    curve: list[float] = []
+
+    def watch(i: int, cost: float) -> None:
+        if monitor is not None:
+            monitor(len(curve) + i, cost)
+
+    for step in steps:
+        answer = local.solve(problem, x, max_iterations=_STEPS, max_time=left(), monitor=watch, smoothed=step)
+        curve += answer.curve.tolist()
+        if answer.stopped is not None:
+            return replace(answer, curve=np.array(curve))
+        if not np.all(np.isfinite(answer.x)):
+            break
+        x = answer.x
+    answer = local.solve(problem, x, max_time=left(), monitor=watch)
+    return replace(answer, curve=np.array(curve + answer.curve.tolist()))
+
+
+def by_continuation(
+    problem: Problem,
+    options: Continuation,
+    desk: Desk,
+    random: np.random.SeedSequence,
+    start: ArrayLike | Structure | None,
+) -> tuple[Outcome, float, bool]:
+    """Search from several starts; the best end, its misfit, and whether the data let a structure be hardly better."""
+    poles = tests_of(problem)
+    steps = [] if poles is None else levels_of(problem, poles)
+    floor = 0.0 if poles is None else float(np.linalg.norm([p.residual for p in poles]))
+    desk.note(
+        f"continuation over {problem.n_variables} unknowns in {len(steps)} steps"
+        + ("" if poles is None else f"; free residues at the poles of the data leave {floor:.3g}")
+    )
+    first = problem.formulation.guess if start is None else as_unknowns(problem, start)
+    ends: list[tuple[float, LocalResult]] = []
+    history = replace(History(), start=problem.misfit_of(first))
+    stopped: BaseException | None = None
+    for x in (first, *_spread(problem, options.starts - 1, random)):
+        try:
+            answer = descend(
+                problem, x, steps, left=lambda: desk.left, monitor=lambda i, cost: desk.tell("local phase", i, 0, cost)
+            )
+        except (Stop, KeyboardInterrupt) as stop:
+            stopped = stop
+            break
+        misfit = problem.misfit_of(answer.x)
+        desk.note(f"local phase: {answer.message}, {answer.curve.size} iterates, residual {misfit:.4e}")
+        ends.append((misfit, answer))
+        stopped = answer.stopped
+        if stopped is not None or not desk.time_for_more:
+            break
+    if stopped is not None and not isinstance(stopped, Stop | KeyboardInterrupt):
+        raise stopped
+    if not ends:
+        assert stopped is not None
+        raise stopped
+    misfit, best = min(ends, key=lambda end: end[0] if np.isfinite(end[0]) else np.inf)
+    structure = problem.structure(best.x)
+    history = replace(history, local=misfit, local_curve=best.curve)
+    if problem.goal is not None:
+        good = problem.residual_of(best.x) <= problem.goal
+    else:
+        good = misfit <= max(_NEAR * floor, local.EXACT) if poles is not None else best.success
+    success, message = best.success, best.message
+    if stopped is not None:
+        success, message = False, str(stopped) or "interrupted"
+    rivals = tuple(_rivals(problem, best.x, misfit, ends)) if success else ()
+    return Outcome(structure, best.x, "continuation", success, message, history, stopped, rivals=rivals), misfit, good
+
+
+def _spread(problem: Problem, count: int, random: np.random.SeedSequence) -> list[Array]:
+    """Points spread over the search space as the swarm's are."""
+    if count < 1:
+        return []
+    unit = qmc.LatinHypercube(problem.n_variables, rng=np.random.default_rng(random)).random(count)
+    rows = problem.lower + unit * (problem.upper - problem.lower)
+    return [
+        np.concatenate([sampled(v, s) for v, s in zip(problem.variables, split(problem.variables, row), strict=True)])
+        for row in rows
+    ]
+
+
+def _rivals(problem: Problem, x: Array, misfit: float, ends: list[tuple[float, LocalResult]]) -> list[Array]:
+    """Other ends that explain the data as well."""
+    width = np.where(problem.upper > problem.lower, problem.upper - problem.lower, 1.0)
+    size = np.minimum(width, np.maximum(np.abs(x), np.finfo(float).tiny))
+    found: list[Array] = []
+    for other, answer in ends:
+        good = np.isfinite(other) and other <= max(_AS_GOOD * misfit, local.EXACT)
+        if good and all(np.max(np.abs(answer.x - known) / size) > _APART for known in (x, *found)):
+            found.append(answer.x)
+    return found

@@ -1,0 +1,131 @@
+"""A problem in its own unknowns on disk: CasADi's functions as text, and the variables beside them.
+
+The text is CasADi's own serialisation, which holds expressions and numbers and no Python.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from sysid._written import Misfit
+from sysid.errors import InputError
+from sysid.formulation import Formulation, Matrices, guess_of
+from sysid.measurement import Measurement
+from sysid.variables import Block, Variable, split
+
+Put = Callable[..., None]
+Get = Callable[[Any, str], Any]
+
+
+def write(
+    group: Any, formulation: Formulation, put: Put, write_measurement: Callable[[Any, Measurement], None]
+) -> None:
+    """Store a formulation in a group; `put` stores values in groups."""
+    for i, variable in enumerate((*formulation.variables, *formulation.fixed)):
+        _write_variable(group.create_group(f"variables/{i}"), variable, put)
+    _write_matrices(group.create_group("matrices"), formulation.matrices, put)
+    for i, (test, matrices) in enumerate(formulation.others):
+        write_measurement(group.create_group(f"others/{i}/measurement"), test)
+        _write_matrices(group[f"others/{i}"], matrices, put)
+    for name in ("residuals", "misfit", "healing"):
+        function = getattr(formulation, name)
+        if function is not None:
+            put(group, **{name: _text(name, function)})
+    constraints = formulation.constraints
+    if constraints is not None:
+        put(
+            group.create_group("constraints"), function=_text("constraints", constraints.function),
+            equal=np.array(constraints.lower == constraints.upper),
+        )  # fmt: skip
+
+
+def read(group: Any, get: Get, read_measurement: Callable[[Any], Measurement]) -> dict[str, Any]:
+    """What a `Problem` is given to be the one that was stored."""
+    stored = group["variables"]
+    every = [_read_variable(stored[str(i)], get) for i in range(len(stored))]
+    searched = [v for v in every if not v.fixed]
+    x = ca.vertcat(*(ca.vec(v.symbol) for v in searched))
+    given = _matrices(group["matrices"], x, get)
+    others = group.get("others", {})
+    residuals: list[Any] = [
+        Misfit(read_measurement(others[str(i)]["measurement"]), **_matrices(others[str(i)], x, get))
+        for i in range(len(others))
+    ]
+    if "residuals" in group:
+        residuals.append(_function(group, "residuals", get)(x))
+    if "misfit" in group:
+        given["misfit"] = _function(group, "misfit", get)(x)
+    if "healing" in group:
+        healed = split(searched, _function(group, "healing", get)(x))
+        given["healing"] = {v: ca.reshape(part, *v.symbol.shape) for v, part in zip(searched, healed, strict=True)}
+    constraints = []
+    if "constraints" in group:
+        rows = _function(group["constraints"], "function", get)(x)
+        equal = np.atleast_1d(get(group["constraints"], "equal"))
+        constraints = [rows[i] == 0 if same else rows[i] <= 0 for i, same in enumerate(equal.tolist())]
+    return {**given, "residuals": residuals, "constraints": constraints}
+
+
+def _text(name: str, function: ca.Function) -> str:
+    try:
+        return str(function.serialize())
+    except (RuntimeError, NotImplementedError):
+        raise InputError(
+            f"{name}: a Python callback in an expression cannot be stored, nor sent to another machine; write it in "
+            "CasADi's own operations"
+        ) from None
+
+
+def _function(group: Any, name: str, get: Get) -> ca.Function:
+    return ca.Function.deserialize(get(group, name))
+
+
+def _write_matrices(group: Any, matrices: Matrices, put: Put) -> None:
+    put(
+        group, function=_text("matrices", matrices.function), rigid_body_dofs=matrices.rigid_body_dofs,
+        recovery=matrices.recovery,
+    )  # fmt: skip
+    put(group.attrs, by_ratios=matrices.by_ratios)
+
+
+def _matrices(group: Any, x: ca.MX, get: Get) -> dict[str, Any]:
+    M, M_S0, M_00, K, damping = _function(group, "function", get)(x)
+    recovery = get(group, "recovery")
+    at_sensors = np.array_equal(recovery, np.eye(len(recovery)))
+    if get(group.attrs, "by_ratios") and K.numel() == 1:
+        damping = 2 * damping * ca.sqrt(K * M)  # a single ratio would be read as a matrix
+    return {
+        "mass": ca.blockcat([[M, M_S0], [M_S0.T, M_00]]),
+        "stiffness": K,
+        "damping": damping,
+        "recovery": None if at_sensors else recovery,
+        "rigid_body_dofs": get(group, "rigid_body_dofs"),
+    }
+
+
+def _write_variable(group: Any, variable: Block | Variable, put: Put) -> None:
+    own = isinstance(variable, Variable)
+    shape = variable.shape if isinstance(variable, Variable) else (variable.size,)
+    put(
+        group, name=variable.name, unit=variable.unit, lower=variable.lower, upper=variable.upper,
+        guess=guess_of(variable), shape=np.array(shape, np.int64),
+    )  # fmt: skip
+    put(
+        group.attrs, log=own and variable.log, fixed=own and variable.fixed, guessed=own and variable.has_guess
+    )  # fmt: skip
+
+
+def _read_variable(group: Any, get: Get) -> Variable:
+    shape = tuple(np.atleast_1d(get(group, "shape")).astype(int).tolist())
+    lower, upper, guess = (
+        np.reshape(get(group, name), shape, order="F") for name in ("lower", "upper", "guess")
+    )  # fmt: skip
+    return Variable(
+        get(group, "name"), shape, lower=lower, upper=upper, unit=get(group, "unit") or "",
+        guess=guess if get(group.attrs, "guessed") or get(group.attrs, "fixed") else None,
+        log=bool(get(group.attrs, "log")), fixed=bool(get(group.attrs, "fixed")),
+    )  # fmt: skip

@@ -1,0 +1,98 @@
+r"""A test as it would look with more decay: wide peaks, in which a model far from the truth still finds its way.
+
+The misfit of a lightly damped structure has a minimum for every way in which peaks can be mistaken for others, and each
+is as wide as a peak. So a search begins with the response at complex frequencies :math:`s = \sigma + i\omega`,
+where all peaks are wider by :math:`\sigma`, and takes smaller and smaller shifts to the records themselves. What the
+records would be there follows from their poles and residues, whatever model is fitted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.errors import InputError
+from sysid.measurement import Measurement
+from sysid.poles import find_poles
+from sysid.problem import Problem
+from sysid.residues import Records
+from sysid.response import gains
+from sysid.structure import Array, ComplexArray
+
+SHIFTS = (0.5, 0.2, 0.08, 0.03, 0.01)  # of the geometric mean of the natural frequencies
+_LINES = 80
+_BEYOND = 0.3  # of the lowest and of the highest frequency, how far the lines reach
+
+
+@dataclass(frozen=True, eq=False)
+class PolesAndResidues:
+    """What stands for a test at any complex frequency.
+
+    Attributes
+    ----------
+    omega, ratios : (m,)
+    residues, quadrature : (m, n_sensors, d)
+        Of ``g_k`` and of ``s / w_k g_k``.
+    inputs : (d, r)
+        Orthonormal directions in which the base moves.
+    residual : float
+        Relative residual of accelerations that they leave.
+    """
+
+    omega: Array
+    ratios: Array
+    residues: Array
+    quadrature: Array
+    inputs: Array
+    residual: float
+
+    @classmethod
+    def of(cls, test: Measurement) -> PolesAndResidues | None:
+        """Those of a test; None where it shows none."""
+        try:
+            poles = find_poles(test)
+        except InputError:
+            return None
+        records = Records(test)
+        # Of any damping: residues in quadrature too, where the lines suffice for them.
+        many = records.data.shape[0] > 4 * poles.omega.size * records.n_base
+        fit = records.fit(poles.omega, poles.ratios, velocity=many)
+        m = poles.omega.size
+        both = fit.residues.reshape(m, 2 if many else 1, -1, fit.residues.shape[-1])
+        parts = [records.by_sensor(both[:, i]) for i in range(both.shape[1])]
+        inputs = np.eye(test.n_base) if records.unit else np.linalg.svd(records.moving, full_matrices=False)[0]
+        quadrature = parts[1] if many else np.zeros_like(parts[0])
+        return cls(
+            poles.omega, poles.ratios, parts[0], quadrature, inputs, float(np.sqrt(fit.squared_error / records.size))
+        )
+
+    def response(self, freq: Array, shift: float) -> ComplexArray:
+        """Relative accelerations for unit base motion at ``s = shift + 2 pi i freq``, (n_sensors, d, n_freq)."""
+        g = gains(freq, self.omega, self.ratios, shift)
+        turned = (shift + 2j * np.pi * freq) / self.omega[:, None] * g
+        return np.einsum("ksd,kf->sdf", self.residues, g) + np.einsum("ksd,kf->sdf", self.quadrature, turned)
+
+    def smoothed(self, test: Measurement, share: float) -> Smoothed:
+        """The test with a shift of this share of its mean frequency, one run for each independent base motion."""
+        shift = share * float(np.exp(np.log(self.omega).mean()))
+        ends = self.omega[[0, -1]] / (2 * np.pi)
+        freq = np.linspace(max((1 - _BEYOND) * ends[0], 1e-3 * ends[1]), (1 + _BEYOND) * ends[1], _LINES)
+        base = np.repeat(self.inputs.T[:, :, None], freq.size, axis=2).astype(complex)
+        relative = np.einsum("sdf,rdf->rsf", self.response(freq, shift), base)
+        absolute = relative + np.einsum("sd,rdf->rsf", test.rigid_body, base)
+        return Smoothed(Measurement(freq, base, absolute, rigid_body=test.rigid_body, base_axes=test.base_axes), shift)
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """Records at complex frequencies ``s = shift + i w``, in the form of a test at real ones."""
+
+    test: Measurement
+    shift: float
+
+
+def levels_of(problem: Problem, tests: list[PolesAndResidues]) -> list[tuple[Smoothed, ...]]:
+    """The problem's own test and its further ones, with smaller and smaller shifts."""
+    records = (problem.measurement, *(test for test, _ in problem.formulation.others))
+    return [tuple(poles.smoothed(test, share) for poles, test in zip(tests, records, strict=True)) for share in SHIFTS]
