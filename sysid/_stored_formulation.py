@@ -108,15 +108,13 @@ def _matrices(group: Any, x: ca.MX, get: Get) -> dict[str, Any]:
 
 
 def _write_variable(group: Any, variable: Block | Variable, put: Put) -> None:
-    own = isinstance(variable, Variable)
     shape = variable.shape if isinstance(variable, Variable) else (variable.size,)
     put(
         group, name=variable.name, unit=variable.unit, lower=variable.lower, upper=variable.upper,
         guess=guess_of(variable), shape=np.array(shape, np.int64),
     )  # fmt: skip
-    put(
-        group.attrs, log=own and variable.log, fixed=own and variable.fixed, guessed=own and variable.has_guess
-    )  # fmt: skip
+    if isinstance(variable, Variable):
+        put(group.attrs, log=variable.log, fixed=variable.fixed, guessed=variable.has_guess)
 
 
 def _read_variable(group: Any, get: Get) -> Variable:
