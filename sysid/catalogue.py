@@ -21,6 +21,7 @@ from types import ModuleType
 from sysid.errors import InputError
 from sysid.identification import Recipe
 from sysid.problem import Problem
+from sysid.variables import declared
 
 _SIGNATURE = "def problem(*, data=None, rng=0) -> sysid.Problem"
 
@@ -106,10 +107,15 @@ def build(recipe: Recipe) -> Problem:
         inspect.signature(function).bind(data=data, rng=recipe.rng)
     except TypeError as error:
         raise InputError(f"{path}: problem() does not take data and rng ({error}); write {_SIGNATURE}") from None
+    before = len(declared())
     with _telling_the_line(path):
         problem = function(data=data, rng=recipe.rng)
     if not isinstance(problem, Problem):
         raise InputError(f"{path}: problem() gives a {type(problem).__name__}, not a sysid.Problem")
+    idle = [variable for variable in declared()[before:] if not variable.used]
+    if idle:
+        told = ", ".join(f"{variable.name!r} ({variable.declared})" for variable in idle)
+        raise InputError(f"{path}: variable {told} enters no matrix, residual or constraint: use it, or take it out")
     return problem
 
 
