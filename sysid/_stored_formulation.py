@@ -93,7 +93,7 @@ def _write_matrices(group: Any, matrices: Matrices, put: Put) -> None:
 
 
 def _matrices(group: Any, x: ca.MX, get: Get) -> dict[str, Any]:
-    M, M_S0, M_00, K, damping = _function(group, "function", get)(x)
+    M, M_S0, M_00, K, damping = _function(group, "function", get)(x)[:5]
     recovery = get(group, "recovery")
     at_sensors = np.array_equal(recovery, np.eye(len(recovery)))
     if get(group.attrs, "by_ratios") and K.numel() == 1:

@@ -87,9 +87,10 @@ class Misfit:
 
 
 class Blocks(NamedTuple):
-    """The blocks as expressions, and the variables of the models among them with their symbols."""
+    """The blocks as expressions, L with ``M_SS = L L'``, and the variables of the models with their symbols."""
 
     motion: Motion
+    factor: ca.MX
     by_ratios: bool
     symbols: list[tuple[Block, ca.MX]]
     by_matrix: tuple[ca.MX, ca.MX, ca.MX]
@@ -196,7 +197,8 @@ def blocks_of(given: Given, layout: Layout, test: Measurement) -> Blocks:
             "the degrees of freedom, or signs and axes of the sensors, are not what the matrices have"
         )
     by_matrix = ca.veccat(M, coupling, base), ca.vec(K), ca.vec(C)
-    return Blocks(Motion(M, coupling, base, K, C, G, recovery), by_ratios, symbols, by_matrix)
+    L = cholesky(M) if factor is None else factor
+    return Blocks(Motion(M, coupling, base, K, C, G, recovery), L, by_ratios, symbols, by_matrix)
 
 
 def square(name: str, value: Any) -> ca.MX:

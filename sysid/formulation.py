@@ -53,7 +53,8 @@ class Matrices:
     Attributes
     ----------
     function : casadi.Function
-        x to M_SS (n, n), M_S0 (n, d), M_00 (d, d), K_SS (n, n) and C (n, n), or ratios (n, 1) where `by_ratios`.
+        x to M_SS (n, n), M_S0 (n, d), M_00 (d, d), K_SS (n, n), C (n, n), or ratios (n, 1) where `by_ratios`, and the
+        Cholesky factor L (n, n) of M_SS.
     by_ratios : bool
     rigid_body_dofs : (n, d)
     recovery : (n_sensors, n)
@@ -66,15 +67,21 @@ class Matrices:
 
     def numbers(self, x: Array) -> Numbers:
         """The blocks at `x`."""
-        *blocks, damping = (np.asarray(ca.densify(part)) for part in self.function(x))
-        M, M_S0, M_00, K = blocks
+        M, M_S0, M_00, K, damping = (np.asarray(ca.densify(part)) for part in self.function(x)[:5])
         C = damping.ravel() if self.by_ratios else (damping + damping.T) / 2
         return Numbers((M + M.T) / 2, M_S0, (M_00 + M_00.T) / 2, (K + K.T) / 2, C)
 
     def motion(self, x: ca.MX) -> Motion:
         """The same as expressions of the symbol `x`; where damping is by ratios they stand in the place of C."""
-        M, M_S0, M_00, K, C = self.function(x)
+        M, M_S0, M_00, K, C = self.function(x)[:5]
         return Motion(M, M_S0, M_00, K, C, self.rigid_body_dofs, self.recovery)
+
+    def factors(self, x: ca.MX) -> tuple[ca.MX, ca.MX]:
+        """L with ``M_SS = L L'`` and its inverse."""
+        factor = self.function(x)[5]
+        L = ca.SX.sym("L", ca.Sparsity.lower(factor.size1()))
+        inverse = ca.Function("inverse", [L], [ca.densify(ca.solve(L, ca.SX.eye(L.size1())))])
+        return factor, inverse(ca.tril(factor))
 
     def structure(self, x: Array, test: Measurement) -> Structure:
         """The structure that `x` stands for."""
@@ -232,7 +239,9 @@ def formulate(given: Given, layout: Layout, test: Measurement) -> Formulation:
 
     def matrices(part: Blocks) -> Matrices:
         motion = part.motion
-        return Matrices(function("matrices", motion[:5]), part.by_ratios, motion.rigid_body_dofs, motion.recovery)
+        return Matrices(
+            function("matrices", [*motion[:5], part.factor]), part.by_ratios, motion.rigid_body_dofs, motion.recovery
+        )
 
     constraints = None
     if relations:

@@ -216,7 +216,7 @@ def _finish(problem: Problem, end: Outcome, why: str, seed: int, desk: Desk) -> 
     if problem.goal is not None and residual > problem.goal:
         success = False
         message += f"; the residual {residual:.3g} is above the goal {problem.goal:.3g}"
-    elif success and problem.goal is None and residual > _NO_FIT:
+    elif problem.goal is None and residual > _NO_FIT and end.stopped is None:
         success = False
         message += (
             f"; the residual {residual:.3g} is no fit: are the frequencies in Hz, the responses absolute and complex "

@@ -2,9 +2,9 @@
 
 - Where C is an expression the response is a direct solve, and the unknowns are all there is: a least-squares problem
   with exact Jacobian, whose Hessian is taken as ``J'J`` (Gauss-Newton) plus that of the constraints.
-- Where damping is by ratios the response needs the modes. They are further unknowns: ``Phi = L_0^-T Psi`` with L_0 the
-  factor of the mass at the start, and ``Phi' M Phi = I``, ``Phi' K Phi = diag(w²)`` are polynomial equalities, so that
-  no eigenvector routine is left in the graph.
+- Where damping is by ratios the response needs the modes. They are further unknowns: ``Phi = L^-T Psi``, Psi is held
+  orthogonal and, but for a spectral stiffness, diagonalises ``H = L^-1 K L^-T``: polynomial equalities, so that no
+  eigenvector routine is left in the graph. A scale of the mass that no record sees then moves no mode.
 """
 
 from __future__ import annotations
@@ -103,10 +103,7 @@ def fit_structured(
     if held:
         w = values[2].ravel()
         order = np.argsort(w)
-        # Psi = L' Phi with the mass as it ended, exactly orthogonal.
-        factor = np.linalg.cholesky(formulation.matrices.numbers(ended).mass)
-        phi = np.linalg.solve(np.linalg.cholesky(start.mass[: start.n, : start.n]).T, values[1])
-        u, _, vt = np.linalg.svd(factor.T @ phi[:, order])
+        u, _, vt = np.linalg.svd(values[1][:, order])  # exactly orthogonal
         ended[problem.parts.stiffness] = triangle_entries(np.linalg.cholesky((u @ vt * w[order] ** 2) @ (u @ vt).T))
         ratios = ended[problem.parts.damping]
         ended[problem.parts.damping] = ratios[order] if ratios.size == order.size else ratios
@@ -130,10 +127,9 @@ def _in_modes(
         center[: targets.size], window[: targets.size] = targets, np.log1p(FREQUENCY_WINDOW)
     shift = np.clip(np.log(2 * np.pi * start.natural_frequencies / center), -window, window)
     omega = ca.DM(center) * ca.exp(z.add("frequency", shift, -window, window))
-    L = np.linalg.cholesky(start.mass[:n, :n])
-    inverse = ca.DM(np.linalg.inv(L))
-    psi = z.add("mode shape", L.T @ start.normal_modes)
-    z.tie(lower_entries(psi.T @ (inverse @ motion.mass @ inverse.T) @ psi - ca.MX.eye(n)))
+    _, inverse = problem.formulation.matrices.factors(unknowns)
+    psi = z.add("mode shape", np.linalg.cholesky(start.mass[:n, :n]).T @ start.normal_modes)
+    z.tie(lower_entries(psi.T @ psi - ca.MX.eye(n)))
     if not held:
         scaled = psi @ ca.diag(1 / ca.DM(center))
         H = inverse @ motion.stiffness @ inverse.T

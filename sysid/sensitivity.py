@@ -43,7 +43,7 @@ def slopes_of(matrices: Matrices, x: Array, test: Measurement) -> Slopes:
     """Derivatives of everything that `x` stands for."""
     structure = matrices.structure(x, test)
     symbol = ca.MX.sym("x", x.size)
-    jacobians = [ca.jacobian(ca.vec(ca.densify(part)), symbol) for part in matrices.function(symbol)]
+    jacobians = [ca.jacobian(ca.vec(ca.densify(part)), symbol) for part in matrices.function(symbol)[:5]]
     values = ca.Function("slopes", [symbol], jacobians)(x)
     n, d = matrices.rigid_body_dofs.shape
     shapes = (n, n), (n, d), (d, d), (n, n), (n, 1) if matrices.by_ratios else (n, n)

@@ -46,7 +46,7 @@ class TestStrategy:
 
     @pytest.mark.parametrize("strategy", ["magic", "", "Swarm"])
     def test_unknown(self, problem, strategy):
-        with pytest.raises(InputError, match=f"'{strategy}' is unknown; give one of 'auto', 'swarm', 'modal'$"):
+        with pytest.raises(InputError, match=f"'{strategy}' is unknown; give one of 'auto', 'swarm', 'modal', 'continuation'$"):
             identify(problem, strategy=strategy)
 
     def test_something_else(self, problem):
@@ -106,17 +106,17 @@ class TestAuto:
         assert result.residual < 1e-10
 
     @pytest.mark.parametrize(
-        ("stiffness", "damping", "reason"),
+        ("stiffness", "damping", "strategy", "reason"),
         [
-            ("chain", "modal", "stiffness has a form of its own"),
-            ("spectral", "proportional", "damping has a form of its own"),
+            ("chain", "modal", "continuation", "stiffness has a form of its own"),
+            ("spectral", "proportional", "swarm", "damping has a form of its own"),
         ],
     )
-    def test_swarm_where_a_model_has_a_form_of_its_own(self, random_case, stiffness, damping, reason):
+    def test_another_where_a_model_has_a_form_of_its_own(self, random_case, stiffness, damping, strategy, reason):
         _, problem = random_case(np.random.default_rng(1), "lumped", stiffness, damping, n=3, d=1)
         result = self.at_once(problem)
-        assert result.strategy == "swarm"
-        assert result.remarks == (f"strategy 'swarm': the {reason}",)
+        assert result.strategy == strategy
+        assert result.remarks == (f"strategy '{strategy}': the {reason}",)
         with pytest.raises(InputError, match="'modal' needs SpectralStiffness and ModalDamping"):
             identify(problem, strategy="modal")
 
