@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from sysid._unknowns import MANY, rows_of
 from sysid.identification import Identification
 from sysid.structure import Array
 
@@ -23,6 +24,7 @@ def summary(it: Identification) -> str:
     lines = [
         *_mode_table(it),
         "",
+        *_unknowns(it),
         f"{'success' if it.success else 'no success'}: {it.message}",
         f"relative residual {it.residual:.3e}{goal}{force}; seed {it.seed}, {it.history.wall_time:.1f} s",
         *it.remarks,
@@ -42,15 +44,20 @@ def verdict(it: Identification) -> str:
     """What the matrices are worth, in one sentence."""
     if it.determined:
         return "Determined: data and stated model leave one mass and one stiffness matrix"
-    if it.open_masses:
+    if it.is_one_of_many:
         return "Not determined: this is one of many models that explain the data"
     return "Not determined: something speaks against this model, or is not known well enough"
 
 
 def next_steps(it: Identification) -> list[str]:
     """What would close open modal masses, in sentences."""
-    if it.determined or not it.open_masses:
+    if it.determined or not it.is_one_of_many:
         return []
+    if it.problem.is_written:
+        return [
+            "to close it: state one of these unknowns (fixed=True with its value), a relation between them as a "
+            "constraint, or fit another record that sees them: a base force, a sensor, a test with a known mass added"
+        ]
     if it.measurement.force is not None:
         return ["to weigh these modes: more force at their frequencies, longer records, or another base direction"]
     return [
@@ -107,6 +114,17 @@ def _mode_table(it: Identification) -> list[str]:
     notes.append("mass: effective, in % of the rigid-body mass")
     notes += ["~ one of many values that explain the data"] if many.any() else []
     return [*lines, "; ".join(notes)]
+
+
+def _unknowns(it: Identification) -> list[str]:
+    """Table of the problem's own unknowns, where there are some and not too many for a terminal."""
+    rows = rows_of(it)
+    if not 0 < len(rows) <= MANY:
+        return []
+    told = [[row.label, f"{row.value:.6g}", half_width(row.std, row.value), row.unit] for row in rows]
+    at = [f"on its {row.on_bound} bound" if row.on_bound else f"{row.lower:.4g} to {row.upper:.4g}" for row in rows]
+    columns = [list(column) for column in zip(["unknown", "value", "+-", "unit"], *told, strict=True)]
+    return [*_aligned([*columns, ["search space", *at]]), ""]
 
 
 def _aligned(columns: list[list[str]]) -> list[str]:

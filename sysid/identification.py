@@ -208,6 +208,14 @@ class Identification:
             return ()
         return tuple(open_masses(self.problem, self.structure))
 
+    @property
+    def is_one_of_many(self) -> bool:
+        """Whether other matrices explain the same data within what was stated."""
+        if not self.problem.is_written:
+            return bool(self.open_masses)
+        ends = self._intervals
+        return not (np.all(np.isfinite(ends.mass)) and np.all(np.isfinite(ends.stiffness)))
+
     @cached_property
     def _intervals(self) -> Intervals:
         from sysid.modal_masses import intervals

@@ -11,10 +11,13 @@ from sysid import plot
 from sysid._html import Cell, beside, bullets, fold, matrix, number, page, paragraph, picture, table, text
 from sysid._panels import is_unit, run_names
 from sysid._summary import half_width, is_one_of_many, mass_percent_std, next_steps, verdict
+from sysid._unknowns import rows_of
+from sysid.damping import DampingModel
 from sysid.errors import InputError
 from sysid.identification import Identification
-from sysid.mass import FullMass
+from sysid.mass import FullMass, MassModel
 from sysid.measurement import Measurement
+from sysid.stiffness import StiffnessModel
 from sysid.storage import atomically, file_or_folder
 from sysid.structure import Array, ComplexArray, Structure
 
@@ -85,6 +88,7 @@ def render(identification: Identification) -> str:
         _title(it),
         _verdict(it),
         [
+            ("Unknowns", _unknowns(it)),
             ("Modes", _modes(it)),
             ("Rigid-body mass", _rigid_body_mass(it)),
             ("Measured against identified", _responses(it, it.measurement)),
@@ -140,6 +144,20 @@ def _verdict(it: Identification) -> str:
     lines += [paragraph(_sentence(step)) for step in steps]
     head += f'<div class="verdict {kind}">{"".join(lines)}</div>'
     return head + "".join(paragraph(_sentence(remark), "soft") for remark in it.remarks)
+
+
+def _unknowns(it: Identification) -> str:
+    rows = [
+        (
+            row.label, number(row.value, 6), half_width(row.std, row.value), row.unit, number(row.lower),
+            number(row.upper), f"on its {row.on_bound} bound" if row.on_bound else "",
+        )
+        for row in rows_of(it)
+    ]  # fmt: skip
+    if not rows:
+        return ""
+    head = ("unknown", "value", "±", "unit", "lower", "upper", "")
+    return table(head, rows, "The problem's own unknowns; ± is half of the 95 % interval that noise leaves.")
 
 
 def _modes(it: Identification) -> str:
@@ -454,6 +472,8 @@ def _sentence(words: str) -> str:
 
 
 def _model(model: object) -> str:
+    if not isinstance(model, MassModel | StiffnessModel | DampingModel):
+        return "numbers" if isinstance(model, np.ndarray) else "written in variables"
     kind = type(model).__name__
     if not isinstance(model, FullMass):
         return kind
