@@ -17,7 +17,7 @@ from sysid.mass import FullMass, KnownMass, LumpedMass
 from sysid.measurement import Measurement
 from sysid.stiffness import StiffnessModel
 from sysid.structure import Array, finite_array
-from sysid.variables import Block, Variable, expression_of, variable_of
+from sysid.variables import Block, Variable, call_site, expression_of, user_frame, variable_of
 
 
 class Given(NamedTuple):
@@ -32,7 +32,6 @@ class Given(NamedTuple):
     recovery: Any
     rigid_body_dofs: Any
     healing: Mapping[Variable, Any]
-    site: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +205,10 @@ def square(name: str, value: Any) -> ca.MX:
     matrix = as_matrix(name, value)
     if matrix.size1() != matrix.size2():
         raise InputError(f"{name} is {_size(matrix)}, and a square matrix is needed{written_in(matrix)}")
-    for place, numbers in (("at the guess", at_point(matrix, None)), ("away from the guess", at_point(matrix, 0.37))):
+    for place, numbers in (
+        ("at the guess", at_point(name, matrix, None)),
+        ("away from the guess", at_point(name, matrix, 0.37)),
+    ):
         if place == "at the guess":
             check_finite(name, numbers, matrix)
         size = np.sqrt(np.abs(np.diag(numbers)))
@@ -259,7 +261,7 @@ def rigid_body_dofs(given: Given, layout: Layout, stiffness: ca.MX, n: int) -> A
     elif given.recovery is None:
         G = layout.rigid_body
     elif stiffness.size1() > n:
-        K = at_point(stiffness, None)
+        K = at_point("stiffness", stiffness, None)
         G = -np.linalg.lstsq(K[:n, :n], K[:n, n:], rcond=None)[0]
     else:
         raise InputError(
@@ -267,7 +269,7 @@ def rigid_body_dofs(given: Given, layout: Layout, stiffness: ca.MX, n: int) -> A
             "degrees of freedom with a rigid base"
         )
     if stiffness.size1() > n:
-        K = at_point(stiffness, None)
+        K = at_point("stiffness", stiffness, None)
         left = np.abs(K[:n, :n] @ G + K[:n, n:]).max()
         if left > 1e-6 * np.abs(K).max():
             raise InputError(
@@ -277,23 +279,23 @@ def rigid_body_dofs(given: Given, layout: Layout, stiffness: ca.MX, n: int) -> A
     return G
 
 
-def at_point(expression: ca.MX, share: float | None) -> Array:
+def at_point(name: str, expression: ca.MX, share: float | None) -> Array:
     """Numbers of an expression with its variables at their guesses, or at this share of their search space."""
     symbols = ca.symvar(expression)
     found = [variable_of(symbol) for symbol in symbols]
-    check_free(symbols, found)
+    check_free(name, symbols, found)
     values = [v.guess if share is None else v.lower + share * (v.upper - v.lower) for v in found if v is not None]
     shaped = [ca.reshape(ca.DM(value), *symbol.shape) for value, symbol in zip(values, symbols, strict=True)]
     return np.asarray(ca.densify(ca.Function("at", symbols, [expression])(*shaped)))
 
 
-def check_free(symbols: Sequence[ca.MX], found: Sequence[Variable | None], at: str = "") -> None:
+def check_free(name: str, symbols: Sequence[ca.MX], found: Sequence[Variable | None]) -> None:
     """Refuse symbols that are no variables."""
     free = [symbol.name() for symbol, variable in zip(symbols, found, strict=True) if variable is None]
     if free:
         raise InputError(
-            f"{', '.join(map(repr, free))} in {at or 'an expression'} is a free CasADi symbol: declare it as a "
-            "sysid.Variable with bounds"
+            f"{', '.join(map(repr, free))} in {name} ({call_site(user_frame())}) is a free CasADi symbol: declare it as "
+            "a sysid.Variable with bounds"
         )
 
 

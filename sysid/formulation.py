@@ -221,7 +221,7 @@ def formulate(given: Given, layout: Layout, test: Measurement) -> Formulation:
     for expression in (*written, *healing.values()):
         symbols = [symbol for symbol in ca.symvar(expression) if symbol.__hash__() not in models]
         variables = [variable_of(symbol) for symbol in symbols]
-        check_free(symbols, variables, given.site)
+        check_free("healing", symbols, variables)
         found |= {symbol.__hash__(): v for symbol, v in zip(symbols, variables, strict=True) if v is not None}
     own = sorted(found.values(), key=lambda variable: variable.order)
     _check_names(own)
@@ -280,7 +280,7 @@ def _stacked(expressions: Sequence[ca.MX]) -> ca.MX:
 
 def _column(name: str, value: Any) -> ca.MX:
     column = ca.vec(ca.densify(as_matrix(name, value)))
-    check_finite(name, at_point(column, None).ravel(), column)
+    check_finite(name, at_point(name, column, None).ravel(), column)
     return column
 
 

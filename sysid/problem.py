@@ -196,7 +196,7 @@ class Problem:
         """Matrices, residuals and constraints as CasADi functions of the unknowns."""
         given = Given(
             self.mass, self.stiffness, self.damping, self.residuals, self.constraints, self.misfit, self.recovery,
-            self.rigid_body_dofs, self.healing, call_site(user_frame()),
+            self.rigid_body_dofs, self.healing,
         )  # fmt: skip
         return formulate(given, self.layout, self.measurement)
 
