@@ -294,8 +294,8 @@ def check_free(name: str, symbols: Sequence[ca.MX], found: Sequence[Variable | N
     free = [symbol.name() for symbol, variable in zip(symbols, found, strict=True) if variable is None]
     if free:
         raise InputError(
-            f"{', '.join(map(repr, free))} in {name} ({call_site(user_frame())}) is a free CasADi symbol: declare it as "
-            "a sysid.Variable with bounds"
+            f"{', '.join(map(repr, free))} in {name} ({call_site(user_frame())}) is a free CasADi symbol: declare it "
+            "as a sysid.Variable with bounds"
         )
 
 

@@ -332,8 +332,8 @@ def call_site(frame: FrameType | None) -> str:
 
 
 def _is_ours(frame: FrameType) -> bool:
-    """Whether a frame is the package's own; bundled problems live in its folder and are not."""
-    return str(frame.f_globals.get("__name__", "")).split(".")[0] == "sysid"
+    """Whether a frame is the package's own, or of what carries out its cached properties; bundled problems' are not."""
+    return str(frame.f_globals.get("__name__", "")).split(".")[0] in ("sysid", "functools")
 
 
 def _short(filename: str) -> str:
