@@ -23,7 +23,8 @@ from sysid.variables import split
 _STEPS = 60  # iterations of a fit on the way
 _NEAR = 1.1  # times the misfit of free residues at the poles of the data: what a structure may leave
 _AS_GOOD = 1.02  # times the best misfit, up to which another solution explains the data as well
-_APART = 0.01  # of the search space, from which two solutions are two
+_APART = 0.01  # of an unknown's size, from which two solutions are two ...
+_TOGETHER = 1e-3  # ... and up to which two ways are one
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,30 @@ def tests_of(problem: Problem) -> list[PolesAndResidues] | None:
     return known if len(known) == len(found) else None
 
 
+def smooth_fit(
+    problem: Problem,
+    x: Array,
+    steps: list[tuple[Smoothed, ...]],
+    *,
+    left: Callable[[], float | None],
+    monitor: Callable[[int, float], object] | None = None,
+) -> LocalResult | None:
+    """Fit every step from where the one before ended; None without steps."""
+    curve: list[float] = []
+    answer = None
+    for step in steps:
+        taken = len(curve)
+        watch = None if monitor is None else lambda i, cost, taken=taken: monitor(taken + i, cost)
+        new = local.solve(problem, x, max_iterations=_STEPS, max_time=left(), monitor=watch, smoothed=step)
+        curve += new.curve.tolist()
+        if not np.all(np.isfinite(new.x)):
+            break
+        answer, x = replace(new, curve=np.array(curve)), new.x
+        if new.stopped is not None:
+            break
+    return answer
+
+
 def descend(
     problem: Problem,
     x: Array,
@@ -62,23 +87,11 @@ def descend(
     left: Callable[[], float | None],
     monitor: Callable[[int, float], object] | None = None,
 ) -> LocalResult:
-    """Fit every step from where the one before ended, and at last the records."""
-    curve: list[float] = []
-
-    def watch(i: int, cost: float) -> None:
-        if monitor is not None:
-            monitor(len(curve) + i, cost)
-
-    for step in steps:
-        answer = local.solve(problem, x, max_iterations=_STEPS, max_time=left(), monitor=watch, smoothed=step)
-        curve += answer.curve.tolist()
-        if answer.stopped is not None:
-            return replace(answer, curve=np.array(curve))
-        if not np.all(np.isfinite(answer.x)):
-            break
-        x = answer.x
-    answer = local.solve(problem, x, max_time=left(), monitor=watch)
-    return replace(answer, curve=np.array(curve + answer.curve.tolist()))
+    """Fit every step, and at last the records."""
+    way = smooth_fit(problem, x, steps, left=left, monitor=monitor)
+    if way is not None and way.stopped is not None:
+        return way
+    return local.solve(problem, x if way is None else way.x, max_time=left(), monitor=monitor)
 
 
 def by_continuation(
@@ -98,12 +111,23 @@ def by_continuation(
     )
     first = problem.formulation.guess if start is None else as_unknowns(problem, start)
     ends: list[tuple[float, LocalResult]] = []
+    ways: list[Array] = []
     history = replace(History(), start=problem.misfit_of(first))
     stopped: BaseException | None = None
+    monitor = lambda i, cost: desk.tell("local phase", i, 0, cost)  # noqa: E731 - for both calls
     for x in (first, *_spread(problem, options.starts - 1, random)):
         try:
-            answer = descend(
-                problem, x, steps, left=lambda: desk.left, monitor=lambda i, cost: desk.tell("local phase", i, 0, cost)
+            way = smooth_fit(problem, x, steps, left=lambda: desk.left, monitor=monitor)
+            if way is not None and way.stopped is None:
+                if any(_apart(problem, way.x, other) < _TOGETHER for other in ways):
+                    desk.note("another start comes the same way")
+                    continue
+                ways.append(way.x)
+                x = way.x
+            answer = (
+                way
+                if way is not None and way.stopped is not None
+                else local.solve(problem, x, max_time=desk.left, monitor=monitor)
             )
         except (Stop, KeyboardInterrupt) as stop:
             stopped = stop
@@ -147,11 +171,15 @@ def _spread(problem: Problem, count: int, random: np.random.SeedSequence) -> lis
 
 def _rivals(problem: Problem, x: Array, misfit: float, ends: list[tuple[float, LocalResult]]) -> list[Array]:
     """Other ends that explain the data as well."""
-    width = np.where(problem.upper > problem.lower, problem.upper - problem.lower, 1.0)
-    size = np.minimum(width, np.maximum(np.abs(x), np.finfo(float).tiny))
     found: list[Array] = []
     for other, answer in ends:
         good = np.isfinite(other) and other <= max(_AS_GOOD * misfit, local.EXACT)
-        if good and all(np.max(np.abs(answer.x - known) / size) > _APART for known in (x, *found)):
+        if good and all(_apart(problem, answer.x, known) > _APART for known in (x, *found)):
             found.append(answer.x)
     return found
+
+
+def _apart(problem: Problem, x: Array, other: Array) -> float:
+    """Largest difference of two sets of unknowns, of their size or, where that is less, of the search space."""
+    width = np.where(problem.upper > problem.lower, problem.upper - problem.lower, 1.0)
+    return float(np.max(np.abs(x - other) / np.minimum(width, np.maximum(np.abs(other), np.finfo(float).tiny))))

@@ -6,6 +6,7 @@ accelerations by :math:`dX = Z^{-1} (\omega^2 dB - dZ\, X)`; modes follow by fir
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -13,14 +14,17 @@ import casadi as ca
 import numpy as np
 
 from sysid._information import records_of
-from sysid.formulation import Matrices
+from sysid.formulation import Matrices, labels_of
 from sysid.measurement import Measurement
 from sysid.problem import Problem
 from sysid.response import columns
 from sysid.structure import Array, ComplexArray, Structure
+from sysid.variables import Block, Variable, split
 
 _SAME = 1e-9  # relative distance of squared frequencies that count as one
 _NULL = 1e-9  # of the largest singular value of the Jacobian, in units of the unknowns: what no record sees
+_SMALL = 1e-6  # of a unit: what is not told of a direction
+_TERMS = 8  # of a direction, told
 _ACTIVE = 1e-6  # of its scale: how near its bound a constraint counts as active
 
 
@@ -235,21 +239,24 @@ def _left_by_constraints(problem: Problem, x: Array, unit: Array) -> Array:
     return Vt[int(np.count_nonzero(s > 1e-9)) :].T
 
 
-def directions_in_words(labels: tuple[str, ...], x: Array, unit: Array, directions: Array) -> list[str]:
-    """Null directions, (p, count) in units, in the user's names: "k[0] +1 %, m +2 %"."""
+def directions_in_words(variables: Sequence[Block | Variable], x: Array, unit: Array, directions: Array) -> list[str]:
+    """Directions, (p, count) in units, in the user's names: "k[0] +1 %, m +2 %"; a name alone is all of it."""
     sentences = []
     for v in _sparse(directions).T:
-        big = np.argsort(-np.abs(v))
-        big = big[np.abs(v[big]) > 1e-4][:8]
-        moved = v * unit
-        terms = [
-            f"{labels[j]} {100 * moved[j] / abs(x[j]):+.3g} %"
-            if abs(x[j]) > 1e-3 * unit[j]
-            else f"{labels[j]} {moved[j]:+.3g}"
-            for j in np.sort(big)
-        ]
-        rest = int(np.count_nonzero(np.abs(v) > 1e-4)) - big.size
-        sentences.append(", ".join(terms) + (f" and {rest} more" if rest else ""))
+        terms = []
+        pieces = (split(variables, part) for part in (v, v * unit, x, unit))
+        for variable, share, moved, value, large in zip(variables, *pieces, strict=True):
+            told = [
+                f"{100 * step / abs(at):+.3g} %" if abs(at) > 1e-3 * size else f"{step:+.3g}"
+                for step, at, size in zip(moved, value, large, strict=True)
+            ]
+            if len(set(told)) == 1 and abs(share[0]) > _SMALL:
+                terms.append(f"{variable.name} {told[0]}")
+                continue
+            names = labels_of(variable)
+            terms += [f"{names[j]} {told[j]}" for j in np.flatnonzero(np.abs(share) > _SMALL)]
+        rest = len(terms) - _TERMS
+        sentences.append(", ".join(terms[:_TERMS]) + (f" and {rest} more" if rest > 0 else ""))
     return sentences
 
 

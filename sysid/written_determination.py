@@ -23,7 +23,7 @@ def written_determination(problem: Problem, x: Array, rivals: tuple[Array, ...] 
     open_: list[str] = []
     if known.unseen.shape[1]:
         moved = _moves_matrices(slopes, known)
-        words = directions_in_words(labels, x, known.unit, known.unseen)
+        words = directions_in_words(problem.variables, x, known.unit, known.unseen)
         fixed = "" if moved else "; mass, stiffness and damping stay the same all the same"
         sentence = (
             f"the records see {known.rank} of {known.free.shape[1]} directions of the {count} unknowns; no record sees "
