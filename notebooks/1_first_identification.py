@@ -280,4 +280,4 @@ print("  true structure: ", *(f"{f:8.3f}" for f in on_plate(truth.to_craig_bampt
 #
 # - No force was measured, or the summary says "not determined": notebook 3.
 # - Time records in place of FRFs, several events, real noise: notebook 4.
-# - Another structure of the matrices, such as a chain of springs or known masses: the README's problem table.
+# - You know how the structure is built (springs between floors, known masses): notebook 2.
