@@ -75,11 +75,7 @@ def find_poles(test: Measurement) -> Poles:
 def _find(records: Records) -> Poles:
     count = max(records.n_sensors, _independent(records)) + _SPARE
     while True:
-        if 2 * np.count_nonzero(records.freq) < 4 * count + 2:
-            raise InputError(
-                f"{records.freq.size} lines are too few to look for {count} poles: state natural_frequencies or add "
-                "lines"
-            )
+        _check_lines(records, count)
         omega, ratios = _search(records, count)
         if omega.size <= count - _SPARE // 2:
             break
@@ -125,8 +121,31 @@ def _independent(records: Records) -> int:
     return int(np.count_nonzero(sizes > max(1.5 * np.median(sizes), 1e-9 * sizes[0])))
 
 
-def _search(records: Records, count: int) -> tuple[Array, Array]:
-    """Poles that earn their place, from `count` that are spread over the lines."""
+def poles_of_any_damping(records: Records) -> tuple[Array, Array]:
+    """Circular frequencies and damping ratios of poles with residues in quadrature beside the real ones.
+
+    They serve to continue records off the lines: none is tried beside or between them, and none is merged.
+
+    Raises
+    ------
+    InputError
+        Too few lines.
+    """
+    with threadpool_limits(limits=1):
+        count = max(records.n_sensors, _independent(records)) + _SPARE
+        _check_lines(records, count)
+        return _settled(records, *_relocated(records, count), velocity=True)
+
+
+def _check_lines(records: Records, count: int) -> None:
+    if 2 * np.count_nonzero(records.freq) < 4 * count + 2:
+        raise InputError(
+            f"{records.freq.size} lines are too few to look for {count} poles: state natural_frequencies or add lines"
+        )
+
+
+def _relocated(records: Records, count: int) -> tuple[Array, Array]:
+    """Poles that earn their place, from `count` that are spread over the lines, before they are polished."""
     lines = 2 * np.pi * records.freq[records.freq > 0]
     omega, ratios = np.geomspace(lines[0], lines[-1], count), np.full(count, _GUESS)
     channels = _principal(records, count)
@@ -137,7 +156,12 @@ def _search(records: Records, count: int) -> tuple[Array, Array]:
         if error < _EXACT**2 * records.size or error > 0.97 * before:
             break
     # A pole of a structure with other than classical damping needs its velocity too, or others would stand in for it.
-    first = _prune(records, omega, ratios, velocity=True)
+    return _prune(records, omega, ratios, velocity=True)
+
+
+def _search(records: Records, count: int) -> tuple[Array, Array]:
+    """Poles that stand out of the noise."""
+    first = _relocated(records, count)
     if first[0].size == 0:
         return first
     omega, ratios = _settled(records, *first)

@@ -14,14 +14,15 @@ import numpy as np
 
 from sysid.errors import InputError
 from sysid.measurement import Measurement
-from sysid.poles import find_poles
+from sysid.poles import poles_of_any_damping
 from sysid.problem import Problem
 from sysid.residues import Records
-from sysid.response import gains
+from sysid.response import columns, gains
 from sysid.structure import Array, ComplexArray
 
 SHIFTS = (0.5, 0.2, 0.08, 0.03, 0.01)  # of the geometric mean of the natural frequencies
 _LINES = 80
+_DEPENDENT = 1e-9  # of the largest singular value of the base records
 _BEYOND = 0.3  # of the lowest and of the highest frequency, how far the lines reach
 
 
@@ -50,22 +51,23 @@ class PolesAndResidues:
     @classmethod
     def of(cls, test: Measurement) -> PolesAndResidues | None:
         """Those of a test; None where it shows none."""
+        records = Records(test)
         try:
-            poles = find_poles(test)
+            omega, ratios = poles_of_any_damping(records)
         except InputError:
             return None
-        records = Records(test)
-        # Of any damping: residues in quadrature too, where the lines suffice for them.
-        many = records.data.shape[0] > 4 * poles.omega.size * records.n_base
-        fit = records.fit(poles.omega, poles.ratios, velocity=many)
-        m = poles.omega.size
-        both = fit.residues.reshape(m, 2 if many else 1, -1, fit.residues.shape[-1])
+        if omega.size == 0:
+            return None
+        order = np.argsort(omega)
+        omega, ratios = omega[order], ratios[order]
+        # Residues in quadrature too, where the lines suffice for them.
+        many = records.data.shape[0] > 4 * omega.size * records.n_base
+        fit = records.fit(omega, ratios, velocity=many)
+        both = fit.residues.reshape(omega.size, 2 if many else 1, -1, fit.residues.shape[-1])
         parts = [records.by_sensor(both[:, i]) for i in range(both.shape[1])]
-        inputs = np.eye(test.n_base) if records.unit else np.linalg.svd(records.moving, full_matrices=False)[0]
+        inputs = np.eye(test.n_base) if records.unit else _moved(test)
         quadrature = parts[1] if many else np.zeros_like(parts[0])
-        return cls(
-            poles.omega, poles.ratios, parts[0], quadrature, inputs, float(np.sqrt(fit.squared_error / records.size))
-        )
+        return cls(omega, ratios, parts[0], quadrature, inputs, float(np.sqrt(fit.squared_error / records.size)))
 
     def response(self, freq: Array, shift: float) -> ComplexArray:
         """Relative accelerations for unit base motion at ``s = shift + 2 pi i freq``, (n_sensors, d, n_freq)."""
@@ -82,6 +84,15 @@ class PolesAndResidues:
         relative = np.einsum("sdf,rdf->rsf", self.response(freq, shift), base)
         absolute = relative + np.einsum("sd,rdf->rsf", test.rigid_body, base)
         return Smoothed(Measurement(freq, base, absolute, rigid_body=test.rigid_body, base_axes=test.base_axes), shift)
+
+
+def _moved(test: Measurement) -> Array:
+    """Orthonormal directions in which the base moves, (d, r)."""
+    flat = columns(test.base)
+    size = np.linalg.norm(flat, axis=1, keepdims=True)
+    scaled = flat / np.where(size > 0, size, 1.0)
+    left, s, _ = np.linalg.svd(np.hstack([scaled.real, scaled.imag]), full_matrices=False)
+    return np.linalg.qr(size * left[:, s > _DEPENDENT * s[0]])[0]
 
 
 @dataclass(frozen=True, eq=False)
