@@ -1,4 +1,4 @@
-"""The command line: ``sysid list``, ``sysid run PROBLEM``, ``sysid report RESULT``.
+"""The command line: ``sysid list``, ``new NAME``, ``show PROBLEM``, ``run PROBLEM``, ``report RESULT``.
 
 Exit status: 0 success; 1 the search did not reach its goal; 2 a mistake in what was given, told in
 one line; 130 interrupted, with the best so far saved; 70 an error of sysid itself, told in one line
@@ -37,6 +37,8 @@ SUCCESS, NOT_REACHED, MISTAKE, BUG, INTERRUPTED = 0, 1, 2, 70, 130
 
 _PLAIN_EVERY = 5.0  # s between lines where the display is no terminal
 _LOG = "sysid-error.log"
+_PROBLEM = "a path to a module, else a module in ./problems, else a bundled problem, else a dotted module"
+_DATA = "file or folder of records, for problems that read some"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -107,6 +109,27 @@ def _list(options: argparse.Namespace, out: _Output) -> int:
     return SUCCESS
 
 
+def _new(options: argparse.Namespace, out: _Output) -> int:
+    from sysid import new
+
+    module, test = new.write(options.name)
+    out.write(
+        f"{module} and {test} are written. Try them, then change the five steps of {module} into your own:\n"
+        f"  sysid show {module}    what is unknown, and what the data determine\n"
+        f"  sysid run {module}     identify, and write results/{module.stem}/report.html\n"
+        f"  python -m pytest {test}\n"
+    )
+    return SUCCESS
+
+
+def _show(options: argparse.Namespace, out: _Output) -> int:
+    from sysid.show import show
+
+    recipe = Recipe(options.problem, options.data, options.seed)
+    out.write(f"{show(catalogue.build(recipe), recipe.module)}\n")
+    return SUCCESS
+
+
 def _run(options: argparse.Namespace, out: _Output) -> int:
     recipe = Recipe(options.problem, options.data)
     folder = Path("results") / catalogue.short_name(recipe.module) if options.out is None else Path(options.out)
@@ -171,16 +194,33 @@ def _parser() -> argparse.ArgumentParser:
     lister = command("list", help="list the problems that can be run by name")
     lister.set_defaults(command=_list)
 
+    new = command(
+        "new",
+        help="write a commented problem module and its test here",
+        description="Write NAME.py, a commented problem that runs at once, and test_NAME.py; never over a file.",
+    )
+    new.add_argument("name", metavar="NAME", help="a name that Python can import: letters, digits, underscores")
+    new.set_defaults(command=_new)
+
+    show = command(
+        "show",
+        help="tell the unknowns of a problem and what its data determine, without a search",
+        description="Tell the unknowns of a problem, their bounds and scaling, and what the data determine: rank and "
+        "unseen directions of the exact Jacobian at the reference, where it is known, or at a guess.",
+    )
+    show.add_argument("problem", metavar="PROBLEM", help=_PROBLEM)
+    show.add_argument(
+        "--seed", type=_seed, default=0, metavar="N", help="reaches problem() as rng: of simulated noise; 0 by default"
+    )
+    show.add_argument("--data", metavar="PATH", help=_DATA)
+    show.set_defaults(command=_show)
+
     run = command(
         "run",
         help="identify the structure of a problem",
         description="Identify the structure of a problem. Writes result.h5, summary.json and report.html.",
     )
-    run.add_argument(
-        "problem",
-        metavar="PROBLEM",
-        help="a path to a module, else a module in ./problems, else a bundled problem, else a dotted module",
-    )
+    run.add_argument("problem", metavar="PROBLEM", help=_PROBLEM)
     run.add_argument(
         "--seed",
         type=_seed,
@@ -194,10 +234,11 @@ def _parser() -> argparse.ArgumentParser:
         choices=STRATEGIES,
         default="auto",
         metavar="S",
-        help="modal: modes from the data, without a search; swarm: the particle swarm and its refinement; "
-        "auto, by default: modal where the models of the problem allow it, else swarm",
+        help="modal: modes from the data, without a search; continuation: gradients through widened peaks, for "
+        "structured models and variables of your own; swarm: the particle swarm and its refinement; auto, by default: "
+        "modal where the models of the problem allow it, continuation where they have a form of their own, else swarm",
     )
-    run.add_argument("--data", metavar="PATH", help="file or folder of records, for problems that read some")
+    run.add_argument("--data", metavar="PATH", help=_DATA)
     run.add_argument("--out", metavar="DIR", help="folder of the results, results/NAME by default")
     run.add_argument("--max-time", type=_seconds, metavar="S", help="end the search after about so many seconds")
     run.set_defaults(command=_run)
