@@ -12,6 +12,7 @@ from scipy.stats import qmc
 from sysid import local
 from sysid._desk import Desk, Stop
 from sysid._search import Outcome, as_unknowns
+from sysid.errors import InputError, SolverError
 from sysid.formulation import sampled
 from sysid.identification import History
 from sysid.local import LocalResult
@@ -143,8 +144,7 @@ def by_continuation(
     if not ends:
         assert stopped is not None
         raise stopped
-    misfit, best = min(ends, key=lambda end: end[0] if np.isfinite(end[0]) else np.inf)
-    structure = problem.structure(best.x)
+    misfit, best, structure = _best(problem, ends)
     history = replace(history, local=misfit, local_curve=best.curve)
     if problem.goal is not None:
         good = problem.residual_of(best.x) <= problem.goal
@@ -155,6 +155,20 @@ def by_continuation(
         success, message = False, str(stopped) or "interrupted"
     rivals = tuple(_rivals(problem, best.x, misfit, ends)) if success else ()
     return Outcome(structure, best.x, "continuation", success, message, history, stopped, rivals=rivals), misfit, good
+
+
+def _best(problem: Problem, ends: list[tuple[float, LocalResult]]) -> tuple[float, LocalResult, Structure]:
+    """The end with the least misfit that is a structure."""
+    wrong: InputError | None = None
+    for misfit, answer in sorted(ends, key=lambda end: end[0] if np.isfinite(end[0]) else np.inf):
+        try:
+            return misfit, answer, problem.structure(answer.x)
+        except InputError as error:
+            wrong = error
+    raise SolverError(
+        f"no search ended at a structure ({wrong}): write the matrices so that they are positive for all unknowns "
+        "within their bounds, by a Cholesky factor or by springs and dampers that are positive"
+    )
 
 
 def _spread(problem: Problem, count: int, random: np.random.SeedSequence) -> list[Array]:

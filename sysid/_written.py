@@ -286,7 +286,7 @@ def at_point(name: str, expression: ca.MX, share: float | None) -> Array:
     check_free(name, symbols, found)
     values = [v.guess if share is None else v.lower + share * (v.upper - v.lower) for v in found if v is not None]
     shaped = [ca.reshape(ca.DM(value), *symbol.shape) for value, symbol in zip(values, symbols, strict=True)]
-    return np.asarray(ca.densify(ca.Function("at", symbols, [expression])(*shaped)))
+    return np.asarray(ca.densify(ca.Function("at", symbols, [expression]).call(shaped)[0]))
 
 
 def check_free(name: str, symbols: Sequence[ca.MX], found: Sequence[Variable | None]) -> None:

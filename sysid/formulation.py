@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from sysid._written import Blocks, Given, Misfit, as_matrix, at_point, blocks_of, check_finite, check_free, written_in
-from sysid.direct import Motion
+from sysid.direct import Motion, relative_misfit
 from sysid.errors import InputError
 from sysid.layout import Layout
 from sysid.measurement import Measurement
@@ -167,6 +167,16 @@ class Formulation:
     def labels(self) -> tuple[str, ...]:
         """A name an entry of x."""
         return tuple(label for v in self.variables for label in labels_of(v))
+
+
+def relative_error(test: Measurement, matrices: Matrices, x: Array) -> float:
+    """Relative residual of accelerations and, where it was measured, of force; also where C is that of no structure."""
+    if matrices.by_ratios:
+        structure = matrices.structure(x, test)
+        return float(np.hypot(test.residual(structure), test.force_residual(structure) or 0.0))
+    symbol = ca.MX.sym("x", x.size)
+    function = ca.Function("error", [symbol], [ca.norm_2(relative_misfit(test, matrices.motion(symbol)))])
+    return float(function(x))
 
 
 def guess_of(variable: Block | Variable) -> Array:

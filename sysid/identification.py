@@ -277,6 +277,10 @@ class Identification:
             "natural_frequencies_std_hz": _known(None if u is None else u.natural_frequencies, n),
             "damping_ratios": self.structure.damping_ratios.tolist(),
             "damping_ratios_std": _known(None if u is None else u.damping_ratios, n),
+            "unknowns": {} if not self.problem.is_written else {k: v.tolist() for k, v in self.values.items()},
+            "unknowns_std": {}
+            if not self.problem.is_written or u is None
+            else {k: v.tolist() for k, v in u.variables.items()},
             "total_mass_kg": np.diag(self.structure.rigid_body_mass).tolist(),
             "determined": bool(self.determined),
             "closed_by": list(self.closed_by),

@@ -68,7 +68,8 @@ class LocalResult:
 
 def is_modal(problem: Problem) -> bool:
     """Whether mode shapes and participations are free, so that the coordinates are modal."""
-    return isinstance(problem.mass, FullMass) and isinstance(problem.stiffness, SpectralStiffness)
+    models = isinstance(problem.mass, FullMass) and isinstance(problem.stiffness, SpectralStiffness)
+    return models and not problem.is_written
 
 
 def solve(
@@ -96,10 +97,10 @@ def solve(
     smoothed : tuple of Smoothed, optional
         To be fitted in the place of the problem's tests, where it has unknowns of its own.
     """
-    start, watch = problem.structure(x), Watch(monitor, max_time)
+    watch = Watch(monitor, max_time)
     if is_modal(problem):
-        return _in_modal_coordinates(problem, start, watch, max_iterations)
-    end = fit_structured(problem, x, start, watch, max_iterations, smoothed)
+        return _in_modal_coordinates(problem, problem.structure(x), watch, max_iterations)
+    end = fit_structured(problem, x, watch, max_iterations, smoothed)
     return _result(end.x, end, watch)
 
 

@@ -25,7 +25,7 @@ from sysid.response import residual
 from sysid.smoothing import Smoothed
 from sysid.stiffness import SpectralStiffness
 from sysid.structure import Array, Structure
-from sysid.variables import split
+from sysid.variables import slices_of, split
 
 _OPEN_WINDOW = 20.0  # factor either way for a frequency that nobody gave
 _RANGE = 0.05  # of the search space: the least unit of an unknown
@@ -44,12 +44,11 @@ class StructuredFit:
 def fit_structured(
     problem: Problem,
     x: Array,
-    start: Structure,
     watch: Watch,
     max_iterations: int,
     smoothed: tuple[Smoothed, ...] | None = None,
 ) -> StructuredFit:
-    """Minimise the residuals of a problem over its own unknowns, from `x`, which stands for `start`.
+    """Minimise the residuals of a problem over its own unknowns, from `x`.
 
     `smoothed` are to be fitted in the place of the problem's own test and its further ones.
     """
@@ -81,7 +80,7 @@ def fit_structured(
         unit = np.where(problem.tolerance > 0, problem.tolerance, 1.0) / 1e-2
         z.tie(broken / ca.DM(unit), constraints.lower / unit, constraints.upper / unit)
     if modal:
-        miss, psi, omega = _in_modes(problem, tests[0], unknowns, factors, start, z, held=held)
+        miss, psi, omega = _in_modes(problem, tests[0], unknowns, factors, problem.structure(x), z, held=held)
     else:
         psi = omega = ca.MX(0, 1)
         if formulation.misfit is not None:
@@ -104,9 +103,12 @@ def fit_structured(
         w = values[2].ravel()
         order = np.argsort(w)
         u, _, vt = np.linalg.svd(values[1][:, order])  # exactly orthogonal
-        ended[problem.parts.stiffness] = triangle_entries(np.linalg.cholesky((u @ vt * w[order] ** 2) @ (u @ vt).T))
-        ratios = ended[problem.parts.damping]
-        ended[problem.parts.damping] = ratios[order] if ratios.size == order.size else ratios
+        at = {
+            variable.name: part for variable, part in zip(problem.variables, slices_of(problem.variables), strict=True)
+        }
+        ended[at["stiffness_factor"]] = triangle_entries(np.linalg.cholesky((u @ vt * w[order] ** 2) @ (u @ vt).T))
+        if "damping_ratio" in at:
+            ended[at["damping_ratio"]] = ended[at["damping_ratio"]][order]
     ended = np.clip(ended, problem.lower, problem.upper)
     return StructuredFit(ended, float(values[3].item()), status, z.on_bounds(best))
 

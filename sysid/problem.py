@@ -18,7 +18,7 @@ from sysid._declaration import check_constraints, check_matrices, points_of, unu
 from sysid._written import Given, is_expression
 from sysid.damping import DampingModel, ModalDamping
 from sysid.errors import InputError
-from sysid.formulation import Formulation, formulate
+from sysid.formulation import Formulation, formulate, relative_error
 from sysid.layout import Layout
 from sysid.mass import FullMass, KnownMass, LumpedMass, MassBlocks, MassModel
 from sysid.measurement import Measurement
@@ -327,20 +327,13 @@ class Problem:
 
     def misfit_of(self, x: Array) -> float:
         """Root of the sum of squares of all relative residuals: of accelerations, force, and what else was stated."""
-        if self.is_written and self.formulation.misfit is not None:
-            own = float(np.linalg.norm(self.formulation.misfit(x)))
-        else:
-            structure, test = self.structure(x), self.measurement
-            own = float(np.hypot(test.residual(structure), test.force_residual(structure) or 0.0))
         if not self.is_written:
-            return own
-        parts = [own]
-        for test, matrices in self.formulation.others:
-            structure = matrices.structure(x, test)
-            parts += [test.residual(structure), test.force_residual(structure) or 0.0]
-        if self.formulation.residuals is not None:
-            parts.append(float(np.linalg.norm(self.formulation.residuals(x))))
-        return float(np.linalg.norm(parts))
+            structure, test = self.structure(x), self.measurement
+            return float(np.hypot(test.residual(structure), test.force_residual(structure) or 0.0))
+        f = self.formulation
+        parts = [float(np.linalg.norm(column(x))) for column in (f.residuals, f.misfit) if column is not None]
+        tests = [*([(self.measurement, f.matrices)] if f.misfit is None else []), *f.others]
+        return float(np.linalg.norm(parts + [relative_error(test, matrices, x) for test, matrices in tests]))
 
     def from_sampling(self, s: ca.SX) -> ca.SX:
         """Unknowns of the swarm's coordinates, which have the same bounds (eq. 18)."""

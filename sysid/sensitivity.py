@@ -25,7 +25,7 @@ _SAME = 1e-9  # relative distance of squared frequencies that count as one
 _NULL = 1e-9  # of the largest singular value of the Jacobian, in units of the unknowns: what no record sees
 _SMALL = 1e-6  # of a unit: what is not told of a direction
 _TERMS = 8  # of a direction, told
-_ACTIVE = 1e-6  # of its scale: how near its bound a constraint counts as active
+_ACTIVE = 1e-6  # of its scale: how near its bound an inequality counts as active
 
 
 class Slopes(NamedTuple):
@@ -231,7 +231,7 @@ def _left_by_constraints(problem: Problem, x: Array, unit: Array) -> Array:
     value, slope = ca.Function("active", [symbol], [ca.densify(g), ca.densify(ca.jacobian(g, symbol))])(x)
     at, J = np.asarray(value).ravel(), np.asarray(slope) * unit
     size = np.maximum(np.linalg.norm(J, axis=1), np.finfo(float).tiny)
-    active = (np.abs(at - constraints.upper) < _ACTIVE * size) | (np.abs(at - constraints.lower) < _ACTIVE * size)
+    active = (constraints.lower == constraints.upper) | (np.abs(at - constraints.upper) < _ACTIVE * size)
     if not np.any(active):
         return np.eye(x.size)
     J = J[active] / size[active, None]

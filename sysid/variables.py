@@ -344,7 +344,12 @@ def _short(filename: str) -> str:
         return filename
 
 
+def slices_of(variables: Iterable[Block | Variable]) -> list[slice]:
+    """Where each variable stands in the vector of all unknowns."""
+    ends = np.cumsum([0, *(variable.size for variable in variables)]).tolist()
+    return [slice(a, b) for a, b in pairwise(ends)]
+
+
 def split(variables: Iterable[Block | Variable], x: ca.SX | Array) -> list:
     """Cut a vector of all unknowns into one piece a variable."""
-    ends = np.cumsum([0, *(variable.size for variable in variables)])
-    return [x[int(a) : int(b)] for a, b in pairwise(ends)]
+    return [x[part] for part in slices_of(variables)]

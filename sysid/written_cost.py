@@ -14,6 +14,7 @@ from sysid.structure import Array, ComplexArray
 from sysid.variables import split
 
 _CHUNK = 64  # candidates a compiled call: fixed, so that the bits do not depend on the swarm's size
+_ROUND_OFF = 1e-9  # of the largest entry
 _WORST = 1e6  # a residual that no candidate passes that keeps the constraints
 
 
@@ -114,6 +115,10 @@ class _TestCost:
         M[broken], K[broken], C[broken], B[broken] = np.eye(n), np.eye(n), 0.0, 0.0
         light = np.linalg.eigvalsh((M + M.swapaxes(1, 2)) / 2)[:, 0] <= 0
         M[light] = np.eye(n)
+        if not self.by_ratios:
+            # A damping that feeds energy in is no structure's either.
+            least = np.linalg.eigvalsh((C + C.swapaxes(1, 2)) / 2)[:, 0]
+            broken |= least < -_ROUND_OFF * np.abs(C).max(axis=(1, 2))
         a = (_by_modes if self.by_ratios else _by_states)(M, K, C, B, freq, self.shift)  # (count, n, d, n_freq)
         u = self._base.reshape(-1, runs, freq.size)
         a = np.einsum("pndf,drf->pnrf", a, u).reshape(count, n, -1)

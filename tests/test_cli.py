@@ -270,7 +270,7 @@ IN_THE_MODULE = {
     "no problem()": ("def problem(", "def another(", r"has no function problem\(\)"),
     "problem() without its arguments": ("(*, data=None, rng=0)", "()", "does not take data and rng"),
     "problem() that gives something else": ("return sysid.Problem(", "return dict(measurement=", "gives a dict, not a"),
-    "an array as stiffness": (f"sysid.SpectralStiffness({FREQUENCIES})", "np.eye(2)", "not a stiffness model"),
+    "a text as stiffness": (f"sysid.SpectralStiffness({FREQUENCIES})", "'soft'", "stiffness is a str"),
 }
 
 
