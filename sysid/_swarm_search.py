@@ -242,7 +242,7 @@ class _Search:
     def refine(self) -> None:
         """Refine the swarm's best from its own L_H through IPOPT, as the paper does, beside the closed form."""
         stiffness, n = self.problem.stiffness, self.problem.layout.n
-        if not (isinstance(stiffness, SpectralStiffness) and self.options.refine):
+        if self.problem.is_written or not (isinstance(stiffness, SpectralStiffness) and self.options.refine):
             return
         assert self.x is not None
         self.desk.tell("refinement", 0, 1, self.history.swarm)
