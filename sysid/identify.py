@@ -236,6 +236,9 @@ def _finish(problem: Problem, end: Outcome, why: str, seed: int, desk: Desk) -> 
         message += "; " + "; ".join(doubtful)
     if not success:
         open_ = ("the search did not end in a fit, so this is not yet any structure that explains the data", *open_)
+    remarks = (why, *end.remarks)
+    if problem.is_written and problem.formulation.misfit is not None:
+        remarks += ("the problem states a misfit of its own; pictures and scores compare with the records as they are",)
     return _as_certain(
         Identification(
             structure=structure,
@@ -249,7 +252,7 @@ def _finish(problem: Problem, end: Outcome, why: str, seed: int, desk: Desk) -> 
             determined=not open_,
             closed_by=() if open_ else known.closed_by,
             undetermined=open_,
-            remarks=(why, *end.remarks),
+            remarks=remarks,
             interrupted=isinstance(end.stopped, KeyboardInterrupt),
         )
     )

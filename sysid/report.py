@@ -122,7 +122,13 @@ def _verdict(it: Identification) -> str:
     )
     word = "Interrupted: the best until then" if it.interrupted else "Success" if it.success else "No success"
     lines = [f"<strong>{word}</strong>", paragraph(it.message)]
-    residual = f"Relative residual {it.residual:.3e}, over the relative accelerations of all runs, sensors and lines"
+    own = it.problem.is_written and it.problem.formulation.misfit is not None
+    of = (
+        "of the misfit that the problem states"
+        if own
+        else "over the relative accelerations of all runs, sensors and lines"
+    )
+    residual = f"Relative residual {it.residual:.3e}, {of}"
     if it.problem.goal is not None:
         residual += f" (goal {it.problem.goal:.3g})"
     lines.append(paragraph(residual + "."))
