@@ -13,6 +13,7 @@ from scipy.stats import qmc
 
 from sysid.errors import InputError
 from sysid.formulation import Formulation, sampled
+from sysid.measurement import Measurement
 from sysid.structure import Array
 from sysid.variables import Variable, split
 
@@ -33,8 +34,9 @@ def points_of(formulation: Formulation, count: int = _POINTS) -> Array:
     return np.array([formulation.guess, *points])
 
 
-def check_matrices(formulation: Formulation, points: Array, names: dict[str, str]) -> None:
+def check_matrices(formulation: Formulation, points: Array, test: Measurement, site: str) -> None:
     """Refuse matrices that are those of a structure nowhere."""
+    names = formulation.declarations
     failures = {"mass": 0, "stiffness": 0}
     for x in points:
         numbers = formulation.matrices.numbers(x)
@@ -47,6 +49,18 @@ def check_matrices(formulation: Formulation, points: Array, names: dict[str, str
                 f"{name} is not positive definite over the structure's degrees of freedom, neither at the guess nor at "
                 f"any of {len(points) - 1} points of the search space{names[name]}"
             )
+    wrong: InputError | None = None
+    for x in points:
+        try:
+            formulation.matrices.structure(x, test)
+        except InputError as error:
+            wrong = wrong or error
+        else:
+            return
+    raise InputError(
+        f"the matrices (problem at {site}) are those of a structure nowhere, neither at the guess ({wrong}) nor at any "
+        f"of {len(points) - 1} points of the search space{names['damping']}"
+    )
 
 
 def _positive(matrix: Array) -> bool:
@@ -71,7 +85,8 @@ def check_constraints(formulation: Formulation, points: Array, site: str) -> Arr
     assert constraints is not None
     scale = scale_of(formulation, points)
     values = np.array([np.asarray(constraints.function(x)).ravel() for x in points])
-    order = np.argsort(np.nansum((violation_of(constraints.lower, constraints.upper, values) / scale) ** 2, axis=1))
+    broken = violation_of(constraints.lower, constraints.upper, values) / scale
+    order = np.argsort(np.sum(np.where(np.isfinite(broken), broken, np.inf) ** 2, axis=1))
     best, at = np.full(scale.size, np.inf), np.inf
     for x in points[order[:_STARTS]]:
         left = _nearest(formulation, x, scale)

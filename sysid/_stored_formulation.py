@@ -51,7 +51,9 @@ def read(group: Any, get: Get, read_measurement: Callable[[Any], Measurement]) -
     x = ca.vertcat(*(ca.vec(v.symbol) for v in searched))
     given = _matrices(group["matrices"], x, get)
     others = group.get("others", {})
-    residuals: list[Any] = [
+    # Fixed ones are numbers in the functions; rows that are zero keep them among the problem's variables.
+    residuals: list[Any] = [v.symbol - ca.reshape(ca.DM(v.guess), *v.symbol.shape) for v in every if v.fixed]
+    residuals += [
         Misfit(read_measurement(others[str(i)]["measurement"]), **_matrices(others[str(i)], x, get))
         for i in range(len(others))
     ]
@@ -70,9 +72,23 @@ def read(group: Any, get: Get, read_measurement: Callable[[Any], Measurement]) -
     return {**given, "residuals": residuals, "constraints": constraints}
 
 
+def check_storable(formulation: Formulation) -> None:
+    """Refuse what could not be stored at the end: a Python callback inside an expression."""
+    functions = {"matrices": formulation.matrices.function, "residuals": formulation.residuals}
+    functions |= {"misfit": formulation.misfit, "healing": formulation.healing}
+    functions |= {f"matrices of test {i}": m.function for i, (_, m) in enumerate(formulation.others, start=2)}
+    if formulation.constraints is not None:
+        functions["constraints"] = formulation.constraints.function
+    for name, function in functions.items():
+        if function is not None:
+            _text(name, function)
+
+
 def _text(name: str, function: ca.Function) -> str:
     try:
-        return str(function.serialize())
+        text = str(function.serialize())
+        ca.Function.deserialize(text)  # a callback is written without a word, and then cannot be read
+        return text
     except (RuntimeError, NotImplementedError):
         raise InputError(
             f"{name}: a Python callback in an expression cannot be stored, nor sent to another machine; write it in "
@@ -96,29 +112,27 @@ def _matrices(group: Any, x: ca.MX, get: Get) -> dict[str, Any]:
     M, M_S0, M_00, K, damping = _function(group, "function", get)(x)[:5]
     recovery = get(group, "recovery")
     at_sensors = np.array_equal(recovery, np.eye(len(recovery)))
-    if get(group.attrs, "by_ratios") and K.numel() == 1:
-        damping = 2 * damping * ca.sqrt(K * M)  # a single ratio would be read as a matrix
     return {
         "mass": ca.blockcat([[M, M_S0], [M_S0.T, M_00]]),
         "stiffness": K,
-        "damping": damping,
+        "damping": [damping] if get(group.attrs, "by_ratios") and K.numel() == 1 else damping,
         "recovery": None if at_sensors else recovery,
         "rigid_body_dofs": get(group, "rigid_body_dofs"),
     }
 
 
 def _write_variable(group: Any, variable: Block | Variable, put: Put) -> None:
-    shape = variable.shape if isinstance(variable, Variable) else (variable.size,)
+    shape = variable.shape if isinstance(variable, Variable) else () if variable.size == 1 else (variable.size,)
     put(
         group, name=variable.name, unit=variable.unit, lower=variable.lower, upper=variable.upper,
-        guess=guess_of(variable), shape=np.array(shape, np.int64),
+        guess=guess_of(variable), shape=list(map(str, shape)),
     )  # fmt: skip
     if isinstance(variable, Variable):
         put(group.attrs, log=variable.log, fixed=variable.fixed, guessed=variable.has_guess)
 
 
 def _read_variable(group: Any, get: Get) -> Variable:
-    shape = tuple(np.atleast_1d(get(group, "shape")).astype(int).tolist())
+    shape = tuple(map(int, get(group, "shape") or ()))
     lower, upper, guess = (
         np.reshape(get(group, name), shape, order="F") for name in ("lower", "upper", "guess")
     )  # fmt: skip

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from sysid.damping import DampingModel, ModalDamping
+from sysid.damping import DampingModel, ModalDamping, ProportionalDamping
 from sysid.direct import Motion, Response, absolute_response, relative_misfit, relative_response
 from sysid.errors import InputError
 from sysid.layout import Layout
@@ -57,6 +57,8 @@ class Misfit:
 
     def blocks(self) -> Blocks:
         """The blocks of its matrices."""
+        if not isinstance(self.measurement, Measurement):
+            raise InputError(f"Misfit: measurement is a {type(self.measurement).__name__}, not a sysid.Measurement")
         for name in ("mass", "stiffness", "damping"):
             if isinstance(getattr(self, name), FullMass | LumpedMass | StiffnessModel | DampingModel):
                 raise InputError(f"Misfit: {name} is a model; write the matrix in the variables of the problem")
@@ -110,84 +112,66 @@ def as_matrix(name: str, value: Any) -> ca.MX:
     if isinstance(value, ca.MX):
         return value
     if isinstance(value, ca.SX):
-        if value.is_constant():
-            return ca.MX(ca.DM(value))
-        raise InputError(f"{name} is a CasADi SX with symbols of its own: write it in sysid.Variable (or MX)")
+        return ca.MX(ca.DM(_constant(name, value)))
     if isinstance(value, np.ndarray) and value.dtype == object:
         value = value.tolist()
     if isinstance(value, list | tuple) and is_expression(value):
         rows = [row if isinstance(row, list | tuple) else [row] for row in value]
+        entries = [[_entry(name, entry) for entry in row] for row in rows]
         try:
-            return ca.blockcat([[expression_of(entry) for entry in row] for row in rows])
-        except RuntimeError:
+            return ca.blockcat(entries)
+        except (RuntimeError, NotImplementedError):
+            sizes = ", ".join(str(len(row)) for row in rows)
             raise InputError(
-                f"{name}: its rows do not fit together; every row needs the same number of entries"
+                f"{name} ({call_site(user_frame())}): its rows do not fit together; they have {sizes} entries"
             ) from None
     if isinstance(value, ca.DM):
         return ca.MX(value)
     return ca.MX(ca.sparsify(ca.DM(np.atleast_1d(finite_array(name, value)))))
 
 
-def blocks_of(given: Given, layout: Layout, test: Measurement) -> Blocks:
-    """The blocks of the matrices as expressions."""
-    symbols: list[tuple[Block, ca.MX]] = []
-    d = layout.d
+def _entry(name: str, value: Any) -> Any:
+    """An entry of a matrix that is given by rows."""
+    value = expression_of(value)
+    if isinstance(value, ca.SX):
+        return ca.DM(_constant(name, value))
+    if isinstance(value, ca.MX | ca.DM | np.ndarray) or (np.isscalar(value) and not isinstance(value, str | bytes)):
+        return value
+    raise InputError(
+        f"{name} ({call_site(user_frame())}) holds a {type(value).__name__} in its rows: numbers and expressions are "
+        "needed"
+    )
 
-    def unknowns(blocks: Sequence[Block]) -> ca.MX:
+
+def _constant(name: str, value: ca.SX) -> ca.SX:
+    if not value.is_constant():
+        raise InputError(
+            f"{name} ({call_site(user_frame())}) is a CasADi SX with symbols of its own: write it in sysid.Variable "
+            "(or MX)"
+        )
+    return value
+
+
+class _Models:
+    """The unknowns of the models among the matrices, with their symbols."""
+
+    def __init__(self) -> None:
+        self.symbols: list[tuple[Block, ca.MX]] = []
+
+    def unknowns(self, blocks: Sequence[Block]) -> ca.MX:
+        """New symbols for blocks, one below the other."""
         new = [(block, ca.MX.sym(block.name, block.size)) for block in blocks]
-        symbols.extend(new)
+        self.symbols += new
         return ca.vertcat(ca.MX(0, 1), *(symbol for _, symbol in new))
 
-    factor: ca.MX | None = None
-    if isinstance(given.mass, FullMass | LumpedMass | KnownMass) and not (
-        isinstance(given.mass, KnownMass) and given.recovery is not None
-    ):
-        y = unknowns(given.mass.variables(layout))
-        sx = ca.SX.sym("y", y.numel())
-        factor, coupling, base = ca.Function("mass", [sx], [ca.densify(b) for b in given.mass.blocks(layout, sx)])(y)
-        M = factor @ factor.T
-    else:
-        whole = square("mass", given.mass.matrix if isinstance(given.mass, KnownMass) else given.mass)
-        n = dofs_of(given, layout, whole)
-        if whole.size1() not in (n, n + d):
-            raise InputError(f"mass is {_size(whole)}; ({n}, {n}) or, with the base, ({n + d}, {n + d}) is needed")
-        M, coupling, base = ca.MX(whole[:n, :n]), ca.MX(n, d), ca.MX(d, d)
-        if whole.size1() > n:
-            coupling, base = whole[:n, n:], whole[n:, n:]
+
+def blocks_of(given: Given, layout: Layout, test: Measurement) -> Blocks:
+    """The blocks of the matrices as expressions."""
+    models = _Models()
+    M, coupling, base, factor = _mass(given, layout, models)
+    K, G = _stiffness(given, layout, models, factor)
+    C, by_ratios = _damping(given, layout, models, M, K)
     n = M.size1()
-
-    if isinstance(given.stiffness, StiffnessModel):
-        if given.recovery is not None:
-            raise InputError("a stiffness model has one degree of freedom a sensor: with recovery write K yourself")
-        y = unknowns(given.stiffness.variables(layout))
-        L = cholesky(M) if factor is None else factor
-        sx, sl = ca.SX.sym("y", y.numel()), ca.SX.sym("L", ca.Sparsity.lower(n))
-        H = ca.densify(given.stiffness.mass_normalised(layout, sx, sl))
-        K = ca.Function("stiffness", [sx, sl], [sl @ H @ sl.T])(y, ca.tril(L))
-        G = layout.rigid_body
-    else:
-        whole = square("stiffness", given.stiffness)
-        if whole.size1() not in (n, n + d):
-            raise InputError(f"stiffness is {_size(whole)}; ({n}, {n}) or, with the base, ({n + d}, {n + d}) is needed")
-        K = whole[:n, :n]
-        G = rigid_body_dofs(given, layout, whole, n)
-
-    by_ratios = False
-    if isinstance(given.damping, ModalDamping):
-        y = unknowns(given.damping.variables(layout if n == layout.n else _sized(layout, n)))
-        C, by_ratios = y, True
-    elif isinstance(given.damping, DampingModel):
-        y = unknowns(given.damping.variables(layout))
-        C = y[0] * M + y[1] * K
-    else:
-        C = as_matrix("damping", given.damping)
-        if C.size2() == 1 and C.size1() == n > 1:
-            by_ratios = True
-        else:
-            C = square("damping", C)
-            if C.size1() not in (n, n + d):
-                raise InputError(f"damping is {_size(C)}; a matrix ({n}, {n}), or one ratio a mode ({n},), is needed")
-            C = C[:n, :n]
     recovery = np.eye(n) if given.recovery is None else finite_array("recovery", given.recovery)
     moved = np.abs(recovery @ G - test.rigid_body).max()
     if moved > 1e-6 * max(1.0, np.abs(test.rigid_body).max()):
@@ -196,8 +180,79 @@ def blocks_of(given: Given, layout: Layout, test: Measurement) -> Blocks:
             "the degrees of freedom, or signs and axes of the sensors, are not what the matrices have"
         )
     by_matrix = ca.veccat(M, coupling, base), ca.vec(K), ca.vec(C)
-    L = cholesky(M) if factor is None else factor
-    return Blocks(Motion(M, coupling, base, K, C, G, recovery), L, by_ratios, symbols, by_matrix)
+    return Blocks(Motion(M, coupling, base, K, C, G, recovery), factor, by_ratios, models.symbols, by_matrix)
+
+
+def _mass(given: Given, layout: Layout, models: _Models) -> tuple[ca.MX, ca.MX, ca.MX, ca.MX]:
+    """M_SS, M_S0, M_00 and the factor of the first."""
+    d, mass = layout.d, given.mass
+    if isinstance(mass, FullMass | LumpedMass) or (isinstance(mass, KnownMass) and given.recovery is None):
+        if given.recovery is not None:
+            raise InputError("a mass model has one degree of freedom a sensor: with recovery write M yourself")
+        y = models.unknowns(mass.variables(layout))
+        sx = ca.SX.sym("y", y.numel())
+        factor, coupling, base = ca.Function("mass", [sx], [ca.densify(b) for b in mass.blocks(layout, sx)])(y)
+        return factor @ factor.T, coupling, base, factor
+    whole = square("mass", mass.matrix if isinstance(mass, KnownMass) else mass)
+    n = dofs_of(given, layout)
+    _check_size("mass", whole, n, d)
+    M = ca.MX(whole[:n, :n])
+    if whole.size1() == n:
+        return M, ca.MX(n, d), ca.MX(d, d), cholesky(M)
+    return M, whole[:n, n:], whole[n:, n:], cholesky(M)
+
+
+def _stiffness(given: Given, layout: Layout, models: _Models, factor: ca.MX) -> tuple[ca.MX, Array]:
+    """K_SS, and the motion of the degrees of freedom with a rigid base."""
+    n = factor.size1()
+    if not isinstance(given.stiffness, StiffnessModel):
+        whole = square("stiffness", given.stiffness)
+        _check_size("stiffness", whole, n, layout.d)
+        return whole[:n, :n], rigid_body_dofs(given, layout, whole, n)
+    if given.recovery is not None:
+        raise InputError("a stiffness model has one degree of freedom a sensor: with recovery write K yourself")
+    y = models.unknowns(given.stiffness.variables(layout))
+    sx, L = ca.SX.sym("y", y.numel()), ca.SX.sym("L", ca.Sparsity.lower(n))
+    H = ca.densify(given.stiffness.mass_normalised(layout, sx, L))
+    return ca.Function("stiffness", [sx, L], [L @ H @ L.T])(y, ca.tril(factor)), layout.rigid_body
+
+
+def _damping(given: Given, layout: Layout, models: _Models, M: ca.MX, K: ca.MX) -> tuple[ca.MX, bool]:
+    """C, or ratios and True."""
+    n, damping = M.size1(), given.damping
+    if isinstance(damping, ModalDamping):
+        return models.unknowns(damping.variables(layout if n == layout.n else _sized(layout, n))), True
+    if isinstance(damping, ProportionalDamping):
+        y = models.unknowns(damping.variables(layout))
+        return y[0] * M + y[1] * K, False
+    C = as_matrix("damping", damping)
+    if C.size2() == 1 and C.size1() == n and (n > 1 or _is_list(damping)):
+        column = at_point("damping", C, None)
+        check_finite("damping ratio", column.ravel(), C)
+        if np.any(column < 0):
+            raise InputError(f"damping: the ratio {column.min():.3g} at the guess is negative{written_in(C)}")
+        return C, True
+    C = square("damping", damping)
+    _check_size("damping", C, n, layout.d)
+    return C[:n, :n], False
+
+
+def _is_list(damping: Any) -> bool:
+    """Whether damping was given in one dimension, as ratios are."""
+    if isinstance(damping, Variable):
+        return len(damping.shape) == 1
+    if isinstance(damping, list | tuple):
+        return not any(isinstance(entry, list | tuple) for entry in damping)
+    return isinstance(damping, np.ndarray) and damping.ndim == 1
+
+
+def _check_size(name: str, matrix: ca.MX, n: int, d: int) -> None:
+    if matrix.size1() not in (n, n + d):
+        ratios = ", or one ratio a mode" if name == "damping" else ""
+        raise InputError(
+            f"{name} ({call_site(user_frame())}) is {_size(matrix)}; ({n}, {n}) or, with the base, ({n + d}, {n + d}) "
+            f"is needed{ratios}{written_in(matrix)}"
+        )
 
 
 def square(name: str, value: Any) -> ca.MX:
@@ -242,7 +297,7 @@ def written_in(expression: ca.MX) -> str:
     return f"; it is written in {named}" + (f" and {len(found) - 6} more" if len(found) > 6 else "")
 
 
-def dofs_of(given: Given, layout: Layout, mass: ca.MX) -> int:
+def dofs_of(given: Given, layout: Layout) -> int:
     """Number of degrees of freedom."""
     if given.recovery is None:
         return layout.n
@@ -270,11 +325,11 @@ def rigid_body_dofs(given: Given, layout: Layout, stiffness: ca.MX, n: int) -> A
         )
     if stiffness.size1() > n:
         K = at_point("stiffness", stiffness, None)
-        left = np.abs(K[:n, :n] @ G + K[:n, n:]).max()
+        left = np.abs(K[:, :n] @ G + K[:, n:]).max()
         if left > 1e-6 * np.abs(K).max():
             raise InputError(
-                "stiffness strains when the base moves as a rigid body: K_S0 must be -K_SS G (a spring to the base "
-                "counts in both; are its last rows those of the base?)" + written_in(stiffness)
+                "stiffness strains when the base moves as a rigid body: K_S0 must be -K_SS G, and K_00 G' K_SS G (a "
+                "spring to the base counts in all; are its last rows those of the base?)" + written_in(stiffness)
             )
     return G
 

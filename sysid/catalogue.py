@@ -98,6 +98,7 @@ def build(recipe: Recipe) -> Problem:
     """
     if recipe.data is not None and not (recipe.data and _exists(Path(recipe.data))):
         raise InputError(f"data {recipe.data!r}: there is no such file or folder")
+    before = len(declared())
     module, path = _load(recipe.module)
     function = getattr(module, "problem", None)
     if not callable(function):
@@ -107,7 +108,6 @@ def build(recipe: Recipe) -> Problem:
         inspect.signature(function).bind(data=data, rng=recipe.rng)
     except TypeError as error:
         raise InputError(f"{path}: problem() does not take data and rng ({error}); write {_SIGNATURE}") from None
-    before = len(declared())
     with _telling_the_line(path):
         problem = function(data=data, rng=recipe.rng)
     if not isinstance(problem, Problem):

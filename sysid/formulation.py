@@ -21,8 +21,9 @@ from sysid.direct import Motion, relative_misfit
 from sysid.errors import InputError
 from sysid.layout import Layout
 from sysid.measurement import Measurement
+from sysid.response import residual
 from sysid.structure import Array, Structure
-from sysid.variables import Block, Variable, expression_of, variable_of
+from sysid.variables import Block, Variable, call_site, expression_of, user_frame, variable_of
 
 MATRICES = ("mass", "stiffness", "damping")
 
@@ -170,13 +171,19 @@ class Formulation:
 
 
 def relative_error(test: Measurement, matrices: Matrices, x: Array) -> float:
-    """Relative residual of accelerations and, where it was measured, of force; also where C is that of no structure."""
-    if matrices.by_ratios:
-        structure = matrices.structure(x, test)
-        return float(np.hypot(test.residual(structure), test.force_residual(structure) or 0.0))
+    """Relative residual of accelerations and, where it was measured, of force, weighed by their stated noise.
+
+    With a damping matrix also where that is no structure's.
+    """
     symbol = ca.MX.sym("x", x.size)
-    function = ca.Function("error", [symbol], [ca.norm_2(relative_misfit(test, matrices.motion(symbol)))])
-    return float(function(x))
+    motion = matrices.motion(symbol)
+    if not matrices.by_ratios:
+        return float(ca.Function("error", [symbol], [ca.norm_2(relative_misfit(test, motion, weighted=True))])(x))
+    s = matrices.structure(x, test)
+    modes = (s.mode_shapes, s.participation, 2 * np.pi * s.natural_frequencies[:, None], s.damping_ratios[:, None])
+    phi, gamma, omega, ratios = (ca.MX(ca.DM(part)) for part in modes)
+    rigid = ca.MX(ca.DM(s.rigid_body_mass))
+    return float(ca.evalf(ca.norm_2(residual(test, phi, gamma, omega, ratios, rigid, weighted=True))))
 
 
 def guess_of(variable: Block | Variable) -> Array:
@@ -234,11 +241,16 @@ def formulate(given: Given, layout: Layout, test: Measurement) -> Formulation:
         check_free("healing", symbols, variables)
         found |= {symbol.__hash__(): v for symbol, v in zip(symbols, variables, strict=True) if v is not None}
     own = sorted(found.values(), key=lambda variable: variable.order)
-    _check_names(own)
+    _check_names(own, [block for block, _ in blocks.symbols])
     free, fixed = [v for v in own if not v.fixed], tuple(v for v in own if v.fixed)
     for variable in healing:
         if not any(variable is v for v in free):
             raise InputError(f"healing: {variable!r} is no unknown of this problem")
+        if expression.shape != variable.symbol.shape:
+            raise InputError(
+                f"healing of {variable.name!r} ({variable.declared}) has the shape {expression.shape}; that of the "
+                f"variable is {variable.symbol.shape}"
+            )
     symbols = [symbol for _, symbol in blocks.symbols] + [v.symbol for v in free]
     searched: tuple[Block | Variable, ...] = (*(block for block, _ in blocks.symbols), *free)
     if not searched:
@@ -291,6 +303,8 @@ def _stacked(expressions: Sequence[ca.MX]) -> ca.MX:
 def _column(name: str, value: Any) -> ca.MX:
     column = ca.vec(ca.densify(as_matrix(name, value)))
     check_finite(name, at_point(name, column, None).ravel(), column)
+    if not ca.symvar(column):
+        raise InputError(f"{name} ({call_site(user_frame())}) holds no variable: there is nothing that it could move")
     return column
 
 
@@ -303,15 +317,20 @@ def _relation(number: int, value: Any) -> list[tuple[ca.MX, bool, str]]:
     if kind is None:
         what = type(value).__name__ if not isinstance(value, ca.MX) else f"the expression {str(value)[:60]}"
         raise InputError(
-            f"{name} is {what}: a constraint is a relation of variables, such as k[0] <= k[1] or sum(m) == 9"
+            f"{name} ({call_site(user_frame())}) is {what}: a constraint is a relation of variables, such as "
+            f"k[0] <= k[1] or ca.sum1(m) == 9{written_in(relation) if isinstance(relation, ca.MX) else ''}"
         )
     left, right = relation.dep(0), relation.dep(1)
     row = _column(name, left - right)
     return [(row, kinds[kind], name + written_in(relation).replace("; it is", ","))]
 
 
-def _check_names(variables: Sequence[Variable]) -> None:
+def _check_names(variables: Sequence[Variable], models: Sequence[Block]) -> None:
     for i, variable in enumerate(variables):
+        if any(block.name == variable.name for block in models):
+            raise InputError(
+                f"variable {variable.name!r} ({variable.declared}) has the name of a model's unknowns: call it otherwise"
+            )
         for other in variables[:i]:
             if other.name == variable.name:
                 raise InputError(

@@ -273,6 +273,7 @@ def _as_certain(it: Identification) -> Identification:
     pairs = ("M_SS", s.mass[:n, :n], u.mass), ("K_SS", s.stiffness[:n, :n], u.stiffness), ("C", s.damping, u.damping)
     for name, matrix, std in pairs:
         size = np.sqrt(np.diag(matrix))
+        size[size == 0] = max(size.max(), np.finfo(float).tiny)  # a degree of freedom without a damper
         relative = std / np.outer(size, size)
         if not np.all(relative <= _KNOWN):
             told = (

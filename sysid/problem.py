@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid._declaration import check_constraints, check_matrices, points_of, unused
+from sysid._stored_formulation import check_storable
 from sysid._written import Given, is_expression
 from sysid.damping import DampingModel, ModalDamping
 from sysid.errors import InputError
@@ -135,11 +136,17 @@ class Problem:
             if not (isinstance(given, kinds) or is_expression(given)):
                 least = 1 if name == "damping" else 2
                 put(name, _as_matrix(name, given, f"a {name} model of sysid, an expression or a matrix", least))
-        for name in ("residuals", "constraints"):
+        for name in ("residuals", "constraints", "validation"):
             given = getattr(self, name)
             if not isinstance(given, list | tuple):
                 raise InputError(f"Problem: {name} is a {type(given).__name__}; give a list of them: {name}=[...]")
             put(name, tuple(given))
+        if not isinstance(self.healing, Mapping) or not all(isinstance(v, Variable) for v in self.healing):
+            raise InputError(
+                "Problem: healing is a dictionary from variables to expressions: healing={m: 9 * m / ca.sum1(m)}"
+            )
+        if self.reference is not None and not isinstance(self.reference, Structure):
+            raise InputError(f"Problem: reference is a {type(self.reference).__name__}, not a sysid.Structure")
         if self.goal is not None and not finite_array("goal", self.goal) > 0:
             raise InputError(f"goal = {self.goal}: a positive relative residual is needed")
         test = self.measurement
@@ -162,7 +169,6 @@ class Problem:
         if test.force is not None and isinstance(self.mass, FullMass | LumpedMass) and self.mass.total_mass is None:
             layout = replace(layout, weighed=_weigh(test, self.stiffness))
         put("layout", layout)
-        put("validation", tuple(self.validation))
         for other in self.validation:
             if other.rigid_body.shape != test.rigid_body.shape:
                 raise InputError("a validation measurement has other sensors or base directions than the one fitted")
@@ -206,7 +212,8 @@ class Problem:
             raise InputError("known entries of a FullMass go with the modal strategy only: write them as constraints")
         formulation, site = self.formulation, call_site(frame)
         points = points_of(formulation)
-        check_matrices(formulation, points, formulation.declarations)
+        check_matrices(formulation, points, self.measurement, site)
+        check_storable(formulation)
         tolerance = check_constraints(formulation, points, site) if formulation.constraints else np.zeros(0)
         object.__setattr__(self, "tolerance", tolerance)
         for variable in (*formulation.variables, *formulation.fixed):

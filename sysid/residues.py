@@ -205,10 +205,12 @@ def linear_residues(test: Measurement, omega: Array, ratios: Array) -> tuple[Arr
     return records.by_sensor(fit.residues), float(np.sqrt(fit.squared_error / records.size))
 
 
-def force_residual_left(test: Measurement, omega: Array, ratios: Array) -> float:
+def force_residual_left(test: Measurement, omega: Array, ratios: Array, *, velocity: bool = False) -> float:
     """Relative residual of the base force with its own residues and rigid-body mass free at given poles."""
     records = Records(test, force=True)
-    g = np.concatenate([np.ones((1, test.freq.size)), gains(test.freq, omega, ratios)])
+    own = gains(test.freq, omega, ratios)
+    turned = [2j * np.pi * test.freq / omega[:, None] * own] if velocity else []
+    g = np.concatenate([np.ones((1, test.freq.size)), own, *turned])
     basis = records.basis(g)
     Q = np.linalg.qr(basis / np.maximum(np.linalg.norm(basis, axis=0), np.finfo(float).tiny))[0]
     return float(np.linalg.norm(records.data - Q @ (Q.T @ records.data)) / np.sqrt(records.size))

@@ -16,7 +16,7 @@ from sysid.errors import InputError
 from sysid.measurement import Measurement
 from sysid.poles import poles_of_any_damping
 from sysid.problem import Problem
-from sysid.residues import Records
+from sysid.residues import Records, force_residual_left
 from sysid.response import columns, gains
 from sysid.structure import Array, ComplexArray
 
@@ -38,7 +38,7 @@ class PolesAndResidues:
     inputs : (d, r)
         Orthonormal directions in which the base moves.
     residual : float
-        Relative residual of accelerations that they leave.
+        Relative residual of accelerations and, where it was measured, of force that they leave.
     """
 
     omega: Array
@@ -67,7 +67,10 @@ class PolesAndResidues:
         parts = [records.by_sensor(both[:, i]) for i in range(both.shape[1])]
         inputs = np.eye(test.n_base) if records.unit else _moved(test)
         quadrature = parts[1] if many else np.zeros_like(parts[0])
-        return cls(omega, ratios, parts[0], quadrature, inputs, float(np.sqrt(fit.squared_error / records.size)))
+        left = float(np.sqrt(fit.squared_error / records.size))
+        if test.force is not None:
+            left = float(np.hypot(left, force_residual_left(test, omega, ratios, velocity=many)))
+        return cls(omega, ratios, parts[0], quadrature, inputs, left)
 
     def response(self, freq: Array, shift: float) -> ComplexArray:
         """Relative accelerations for unit base motion at ``s = shift + 2 pi i freq``, (n_sensors, d, n_freq)."""

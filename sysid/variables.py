@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -118,8 +119,10 @@ class Variable:
         fixed: bool = False,
         unit: str = "",
     ) -> None:
-        self.name, self.log, self.fixed, self.unit = str(name), bool(log), bool(fixed), str(unit)
         self.declared = call_site(user_frame())
+        if not isinstance(name, str) or not name:
+            raise InputError(f"a Variable ({self.declared}) needs a name, and {name!r} is none")
+        self.name, self.log, self.fixed, self.unit = name, bool(log), bool(fixed), str(unit)
         self.used = False  # whether it entered a problem
         self.shape = self._check_shape(shape)
         lower, upper = self._flat("lower", lower), self._flat("upper", upper)
@@ -137,7 +140,7 @@ class Variable:
             self._refuse(f"log=True needs positive bounds, and lower is {lower.min():g}")
         if fixed and guess is None:
             self._refuse("fixed=True needs a guess, at which it is held")
-        middle = np.sqrt(lower * upper) if log else (lower + upper) / 2
+        middle = np.exp((np.log(lower) + np.log(upper)) / 2) if log else (lower + upper) / 2
         self.has_guess = guess is not None
         self.guess: Array = middle if guess is None else self._flat("guess", guess)
         if not np.all(np.isfinite(self.guess)):
@@ -151,9 +154,10 @@ class Variable:
         _declared[self.symbol.__hash__()] = self
 
     def _check_shape(self, shape: int | Sequence[int]) -> tuple[int, ...]:
+        given = (shape,) if isinstance(shape, int | np.integer) else shape
         try:
-            sizes = tuple(int(size) for size in np.atleast_1d(np.asarray(shape, dtype=int)).tolist())
-        except (TypeError, ValueError):
+            sizes = tuple(0 if isinstance(size, bool) else operator.index(size) for size in given)
+        except TypeError:
             sizes = (0,)
         if len(sizes) > 2 or any(size < 1 for size in sizes):
             self._refuse(f"its shape {shape!r} is not (), n or (n, m)")
@@ -162,6 +166,7 @@ class Variable:
     def _flat(self, what: str, value: ArrayLike) -> Array:
         """Entries column by column, as CasADi has them."""
         try:
+            value = np.asarray(value).reshape(self.shape) if isinstance(value, ca.DM) else value
             array = np.broadcast_to(np.asarray(value, dtype=float), self.shape)
         except (TypeError, ValueError):
             self._refuse(f"{what} = {value!r} is no number, nor numbers of its shape {self.shape}")
@@ -227,7 +232,12 @@ class Variable:
         return self.symbol.__array_ufunc__(ufunc, method, *map(expression_of, inputs), **options)
 
     def __getitem__(self, index: Any) -> ca.MX:
-        return self.symbol[index]
+        try:
+            return self.symbol[index]
+        except RuntimeError:
+            raise InputError(
+                f"variable {self.name!r} ({self.declared}) has no entry [{index}]: its shape is {self.shape}"
+            ) from None
 
     def __len__(self) -> int:
         if not self.shape:
@@ -236,6 +246,9 @@ class Variable:
 
     def __iter__(self) -> Any:
         return iter([self.symbol[i, :] if len(self.shape) == 2 else self.symbol[i] for i in range(len(self))])
+
+    def __pos__(self) -> ca.MX:
+        return self.symbol
 
     def __neg__(self) -> ca.MX:
         return -self.symbol

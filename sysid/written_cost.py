@@ -83,6 +83,7 @@ class WrittenCost:
         assert self._constraints is not None
         values = np.array([np.asarray(self._constraints(row)).ravel() for row in particles]).reshape(count, -1)
         over = violation_of(constraints.lower, constraints.upper, values) / self.problem.tolerance
+        over = np.where(np.isfinite(over), over, np.inf)
         broken = np.sum(np.where(over > 1, over, 0.0), axis=1)
         return np.where(broken > 0, _WORST * (1 + broken), np.minimum(cost, _WORST))
 
@@ -95,6 +96,7 @@ class _TestCost:
         self.test, self.shift = smoothed.test, smoothed.shift
         motion = matrices.motion(x)
         parts = [motion.mass, motion.stiffness, motion.damping, motion.push, motion.rigid_body_mass]
+        parts += [motion.coupling, motion.base]
         self._expand = _expanded(ca.Function("expand", [s], [ca.densify(part) for part in parts])).map(_CHUNK)
         test = smoothed.test
         self._base = columns(test.base)
@@ -102,23 +104,28 @@ class _TestCost:
         for record, std in ((test.relative, test.response_std), (test.force, test.force_std)):
             if record is not None:
                 weight, scale = weights_of(record, std)
+                if self._targets and test.response_std is not None and test.force_std is not None:
+                    scale = self._targets[0][2]  # as `response.residual` has it
                 self._targets.append((columns(record), np.asarray(weight), scale))
 
     def squared(self, particles: Array) -> Array:
         """Of each candidate, (count,); NaN where it is no structure."""
         count, freq, runs = len(particles), self.test.freq, self.test.n_runs
         padded = np.concatenate([particles, np.repeat(particles[-1:], _CHUNK - count, axis=0)])
-        M, K, C, B, rigid = (_stack(np.asarray(part))[:count] for part in self._expand(padded.T))
+        M, K, C, B, rigid, M_S0, M_00 = (_stack(np.asarray(part))[:count] for part in self._expand(padded.T))
         n = M.shape[1]
         # A candidate that is no structure must not stop the eigensolver for the others.
         broken = ~np.all([np.all(np.isfinite(part), axis=(1, 2)) for part in (M, K, C, B)], axis=0)
         M[broken], K[broken], C[broken], B[broken] = np.eye(n), np.eye(n), 0.0, 0.0
-        light = np.linalg.eigvalsh((M + M.swapaxes(1, 2)) / 2)[:, 0] <= 0
+        light = _least(M) <= 0
         M[light] = np.eye(n)
+        light |= _least(K) <= 0
+        remainder = M_00 - M_S0.swapaxes(1, 2) @ np.linalg.solve(M, M_S0)
+        light |= _least(remainder) < -_ROUND_OFF * np.abs(M).max(axis=(1, 2))
         if not self.by_ratios:
             # A damping that feeds energy in is no structure's either.
-            least = np.linalg.eigvalsh((C + C.swapaxes(1, 2)) / 2)[:, 0]
-            broken |= least < -_ROUND_OFF * np.abs(C).max(axis=(1, 2))
+            light |= _least(C) < -_ROUND_OFF * np.abs(C).max(axis=(1, 2))
+        K[light] = np.eye(n)
         a = (_by_modes if self.by_ratios else _by_states)(M, K, C, B, freq, self.shift)  # (count, n, d, n_freq)
         u = self._base.reshape(-1, runs, freq.size)
         a = np.einsum("pndf,drf->pnrf", a, u).reshape(count, n, -1)
@@ -130,6 +137,13 @@ class _TestCost:
             squared += np.sum(np.abs(weight * (made - record)) ** 2, axis=(1, 2)) / scale**2
         squared[broken | light] = np.nan
         return squared
+
+
+def _least(stack: Array) -> Array:
+    """Least eigenvalue of each symmetric matrix; minus infinity where it is no number."""
+    bad = ~np.all(np.isfinite(stack), axis=(1, 2))
+    clean = np.where(bad[:, None, None], 0.0, (stack + stack.swapaxes(1, 2)) / 2)
+    return np.where(bad, -np.inf, np.linalg.eigvalsh(clean)[:, 0])
 
 
 def _by_modes(M: Array, K: Array, C: Array, B: Array, freq: Array, shift: float) -> ComplexArray:
