@@ -43,17 +43,20 @@ def write(
         )  # fmt: skip
 
 
-def read(group: Any, get: Get, read_measurement: Callable[[Any], Measurement]) -> dict[str, Any]:
-    """What a `Problem` is given to be the one that was stored."""
+def read(
+    group: Any, get: Get, read_measurement: Callable[[Any], Measurement]
+) -> tuple[dict[str, Any], tuple[Variable, ...]]:
+    """What a `Problem` is given to be the one that was stored, and its fixed variables.
+
+    These are numbers in the stored functions, so that no expression holds them any more.
+    """
     stored = group["variables"]
     every = [_read_variable(stored[str(i)], get) for i in range(len(stored))]
     searched = [v for v in every if not v.fixed]
     x = ca.vertcat(*(ca.vec(v.symbol) for v in searched))
     given = _matrices(group["matrices"], x, get)
     others = group.get("others", {})
-    # Fixed ones are numbers in the functions; rows that are zero keep them among the problem's variables.
-    residuals: list[Any] = [v.symbol - ca.reshape(ca.DM(v.guess), *v.symbol.shape) for v in every if v.fixed]
-    residuals += [
+    residuals: list[Any] = [
         Misfit(read_measurement(others[str(i)]["measurement"]), **_matrices(others[str(i)], x, get))
         for i in range(len(others))
     ]
@@ -69,7 +72,7 @@ def read(group: Any, get: Get, read_measurement: Callable[[Any], Measurement]) -
         rows = _function(group["constraints"], "function", get)(x)
         equal = np.atleast_1d(get(group["constraints"], "equal"))
         constraints = [rows[i] == 0 if same else rows[i] <= 0 for i, same in enumerate(equal.tolist())]
-    return {**given, "residuals": residuals, "constraints": constraints}
+    return {**given, "residuals": residuals, "constraints": constraints}, tuple(v for v in every if v.fixed)
 
 
 def check_storable(formulation: Formulation) -> None:
@@ -122,7 +125,7 @@ def _matrices(group: Any, x: ca.MX, get: Get) -> dict[str, Any]:
 
 
 def _write_variable(group: Any, variable: Block | Variable, put: Put) -> None:
-    shape = variable.shape if isinstance(variable, Variable) else () if variable.size == 1 else (variable.size,)
+    shape = variable.shape if isinstance(variable, Variable) else (variable.size,)
     put(
         group, name=variable.name, unit=variable.unit, lower=variable.lower, upper=variable.upper,
         guess=guess_of(variable), shape=list(map(str, shape)),

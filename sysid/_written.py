@@ -250,7 +250,7 @@ def _check_size(name: str, matrix: ca.MX, n: int, d: int) -> None:
     if matrix.size1() not in (n, n + d):
         ratios = ", or one ratio a mode" if name == "damping" else ""
         raise InputError(
-            f"{name} ({call_site(user_frame())}) is {_size(matrix)}; ({n}, {n}) or, with the base, ({n + d}, {n + d}) "
+            f"{name} is {_size(matrix)} ({call_site(user_frame())}); ({n}, {n}) or, with the base, ({n + d}, {n + d}) "
             f"is needed{ratios}{written_in(matrix)}"
         )
 

@@ -317,7 +317,7 @@ def _relation(number: int, value: Any) -> list[tuple[ca.MX, bool, str]]:
     if kind is None:
         what = type(value).__name__ if not isinstance(value, ca.MX) else f"the expression {str(value)[:60]}"
         raise InputError(
-            f"{name} ({call_site(user_frame())}) is {what}: a constraint is a relation of variables, such as "
+            f"{name} is {what} ({call_site(user_frame())}): a constraint is a relation of variables, such as "
             f"k[0] <= k[1] or ca.sum1(m) == 9{written_in(relation) if isinstance(relation, ca.MX) else ''}"
         )
     left, right = relation.dep(0), relation.dep(1)
@@ -329,7 +329,7 @@ def _check_names(variables: Sequence[Variable], models: Sequence[Block]) -> None
     for i, variable in enumerate(variables):
         if any(block.name == variable.name for block in models):
             raise InputError(
-                f"variable {variable.name!r} ({variable.declared}) has the name of a model's unknowns: call it otherwise"
+                f"variable {variable.name!r} ({variable.declared}) has the name of a model's unknowns: rename it"
             )
         for other in variables[:i]:
             if other.name == variable.name:

@@ -141,6 +141,7 @@ class Variable:
         if fixed and guess is None:
             self._refuse("fixed=True needs a guess, at which it is held")
         middle = np.exp((np.log(lower) + np.log(upper)) / 2) if log else (lower + upper) / 2
+        middle = np.clip(middle, lower, upper)
         self.has_guess = guess is not None
         self.guess: Array = middle if guess is None else self._flat("guess", guess)
         if not np.all(np.isfinite(self.guess)):
@@ -183,7 +184,7 @@ class Variable:
     @property
     def labels(self) -> tuple[str, ...]:
         """A name an entry: ``k``, or ``k[0]``, or ``k[0,1]``, column by column."""
-        if not self.shape:
+        if self.size == 1:
             return (self.name,)
         at = np.unravel_index(np.arange(self.size), self.shape, order="F")
         return tuple(f"{self.name}[{','.join(map(str, index))}]" for index in zip(*at, strict=True))
