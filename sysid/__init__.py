@@ -3,7 +3,7 @@
 import casadi as _casadi
 
 from sysid import plot
-from sysid._written import Misfit
+from sysid._written import Known, Misfit
 from sysid.damping import ModalDamping, ProportionalDamping
 from sysid.errors import InputError, SolverError, SysidError
 from sysid.identification import History, Identification, Recipe
@@ -25,8 +25,8 @@ if hasattr(_casadi.GlobalOptions, "setNumpyMode"):
     _casadi.GlobalOptions.setNumpyMode(-1)  # as it always was, without the warning
 
 __all__ = [
-    "ChainStiffness", "Continuation", "FullMass", "History", "Identification", "InputError", "KnownMass", "LumpedMass",
-    "Measurement", "Misfit", "Modal", "ModalDamping", "Problem", "Progress", "ProportionalDamping", "Recipe", "Sensor",
-    "SolverError", "SpectralStiffness", "Structure", "Swarm", "SwarmSettings", "SysidError", "Variable", "identify",
-    "load", "minimize_swarm", "plot", "resample", "rigid_body", "simulate",
+    "ChainStiffness", "Continuation", "FullMass", "History", "Identification", "InputError", "Known", "KnownMass",
+    "LumpedMass", "Measurement", "Misfit", "Modal", "ModalDamping", "Problem", "Progress", "ProportionalDamping",
+    "Recipe", "Sensor", "SolverError", "SpectralStiffness", "Structure", "Swarm", "SwarmSettings", "SysidError",
+    "Variable", "identify", "load", "minimize_swarm", "plot", "resample", "rigid_body", "simulate",
 ]  # fmt: skip

@@ -17,10 +17,11 @@ from sysid.formulation import sampled
 from sysid.identification import History
 from sysid.local import LocalResult
 from sysid.problem import Problem
-from sysid.smoothing import PolesAndResidues, Smoothed, levels_of
+from sysid.smoothing import PolesAndResidues, Smoothed
 from sysid.structure import Array, Structure
 from sysid.variables import split
 
+SHIFTS = (0.5, 0.2, 0.08, 0.03, 0.01)  # of the geometric mean of the natural frequencies
 _STEPS = 60  # iterations of a fit on the way
 _NEAR = 1.1  # times the misfit of free residues at the poles of the data: what a structure may leave
 _AS_GOOD = 1.02  # times the best misfit, up to which another solution explains the data as well
@@ -54,6 +55,12 @@ def tests_of(problem: Problem) -> list[PolesAndResidues] | None:
     found = [PolesAndResidues.of(test) for test in (problem.measurement, *(test for test, _ in formulation.others))]
     known = [poles for poles in found if poles is not None]
     return known if len(known) == len(found) else None
+
+
+def levels_of(problem: Problem, tests: list[PolesAndResidues]) -> list[tuple[Smoothed, ...]]:
+    """The problem's own test and its further ones, with smaller and smaller shifts."""
+    records = (problem.measurement, *(test for test, _ in problem.formulation.others))
+    return [tuple(poles.smoothed(test, share) for poles, test in zip(tests, records, strict=True)) for share in SHIFTS]
 
 
 def smooth_fit(
@@ -115,10 +122,11 @@ def by_continuation(
     ways: list[Array] = []
     history = replace(History(), start=problem.misfit_of(first))
     stopped: BaseException | None = None
-    monitor = lambda i, cost: desk.tell("local phase", i, 0, cost)  # noqa: E731 - for both calls
+    on_way = lambda i, cost: desk.tell("continuation", i, 0, cost)  # noqa: E731
+    at_end = lambda i, cost: desk.tell("local phase", i, 0, cost)  # noqa: E731
     for x in (first, *_spread(problem, options.starts - 1, random)):
         try:
-            way = smooth_fit(problem, x, steps, left=lambda: desk.left, monitor=monitor)
+            way = smooth_fit(problem, x, steps, left=lambda: desk.left, monitor=on_way)
             if way is not None and way.stopped is None:
                 if any(_apart(problem, way.x, other) < _TOGETHER for other in ways):
                     desk.note("another start comes the same way")
@@ -128,13 +136,13 @@ def by_continuation(
             answer = (
                 way
                 if way is not None and way.stopped is not None
-                else local.solve(problem, x, max_time=desk.left, monitor=monitor)
+                else local.solve(problem, x, max_time=desk.left, monitor=at_end)
             )
         except (Stop, KeyboardInterrupt) as stop:
             stopped = stop
             break
         misfit = problem.misfit_of(answer.x)
-        desk.note(f"local phase: {answer.message}, {answer.curve.size} iterates, residual {misfit:.4e}")
+        desk.note(f"local phase: {answer.message}, {answer.curve.size} iterates, {misfit:.4e} of all that is fitted")
         ends.append((misfit, answer))
         stopped = answer.stopped
         if stopped is not None or not desk.time_for_more:
@@ -150,8 +158,7 @@ def by_continuation(
         good = problem.residual_of(best.x) <= problem.goal
     else:
         # What residuals of the user's own leave beside the tests has no floor of its own.
-        own = problem.formulation.residuals
-        reached = misfit if own is None else float(np.sqrt(max(misfit**2 - np.sum(np.square(own(best.x))), 0.0)))
+        reached = float(np.sqrt(max(misfit**2 - problem.own_squares(best.x), 0.0)))
         good = reached <= max(_NEAR * floor, local.EXACT) if poles is not None else best.success
     success, message = best.success, best.message
     if stopped is not None:

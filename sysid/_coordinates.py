@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import casadi as ca
 import numpy as np
 
@@ -17,6 +19,7 @@ class Coordinates:
     def __init__(self) -> None:
         self.pieces: list[ca.MX] = []
         self.names: list[str] = []
+        self.labels: list[str] = []
         self.start: list[Array] = []
         self.lower: list[Array] = []
         self.upper: list[Array] = []
@@ -29,12 +32,23 @@ class Coordinates:
         """All unknowns, (p, 1)."""
         return ca.vertcat(*self.pieces)
 
-    def add(self, name: str, start: Array, lower: Array | float = -np.inf, upper: Array | float = np.inf) -> ca.MX:
-        """Further unknowns of the shape of `start`."""
+    def add(
+        self,
+        name: str,
+        start: Array,
+        lower: Array | float = -np.inf,
+        upper: Array | float = np.inf,
+        labels: Sequence[str] | None = None,
+    ) -> ca.MX:
+        """Further unknowns of the shape of `start`.
+
+        In messages `labels` follow the name; without them the unknowns are numbered from 1.
+        """
         shape = start.shape if start.ndim == 2 else (start.size, 1)
         symbol = ca.MX.sym(name, *shape)
         self.pieces.append(ca.vec(symbol))
         self.names += [name] * start.size
+        self.labels += labels or [f" {i + 1}" for i in range(start.size)]
         self.start.append(start.ravel(order="F"))
         self.lower.append(np.broadcast_to(lower, start.shape).ravel(order="F"))
         self.upper.append(np.broadcast_to(upper, start.shape).ravel(order="F"))
@@ -98,13 +112,11 @@ class Coordinates:
         with np.errstate(invalid="ignore"):
             near = 1e-6 * np.where(np.isfinite(upper - lower), upper - lower, 1.0)
             low, high = np.isfinite(lower) & (at - lower < near), np.isfinite(upper) & (upper - at < near)
-        seen: dict[str, int] = {}
         ended: dict[str, list[str]] = {}
-        for name, is_low, is_high in zip(self.names, low & free, high & free, strict=True):
-            seen[name] = seen.get(name, 0) + 1
+        for name, label, is_low, is_high in zip(self.names, self.labels, low & free, high & free, strict=True):
             if is_low or is_high:
-                ended.setdefault(name, []).append(f"{seen[name]} ({'lower' if is_low else 'upper'})")
+                ended.setdefault(name, []).append(f"{label} ({'lower' if is_low else 'upper'})")
         return "; ".join(
-            f"{name} {', '.join(which[:4])}" + (f" and {len(which) - 4} more" if len(which) > 4 else "")
+            f"{name}{','.join(which[:4])}" + (f" and {len(which) - 4} more" if len(which) > 4 else "")
             for name, which in ended.items()
         )

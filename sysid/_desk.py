@@ -9,6 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+Phase = Literal["swarm", "refinement", "continuation", "local phase"]
+
 
 @dataclass(frozen=True, eq=False)
 class Progress:
@@ -17,23 +19,23 @@ class Progress:
     Attributes
     ----------
     phase : str
-        "swarm", "refinement" or "local phase".
+        "swarm", "refinement", "continuation" (of widened peaks) or "local phase".
     iteration, of : int
         The iteration, and the most there can be (0: not known).
     residual : float
-        Relative residual of the best candidate so far.
+        Of the best candidate so far: root of the squared relative residuals of all that this phase fits.
     seconds : float
         Since the start.
     """
 
-    phase: Literal["swarm", "refinement", "local phase"]
+    phase: Phase
     iteration: int
     of: int
     residual: float
     seconds: float
 
     def __str__(self) -> str:
-        return f"{self.phase:11s}  iteration {self.iteration:4d}  residual {self.residual:.3e}  {self.seconds:6.1f} s"
+        return f"{self.phase:12s}  iteration {self.iteration:4d}  residual {self.residual:.3e}  {self.seconds:6.1f} s"
 
 
 class DeferredInterrupt:
@@ -105,7 +107,7 @@ class Desk:
     def note(self, line: str) -> None:
         self.log.append(f"{self.seconds:8.2f} s  {line}")
 
-    def tell(self, phase: Literal["swarm", "refinement", "local phase"], iteration: int, of: int, cost: float) -> None:
+    def tell(self, phase: Phase, iteration: int, of: int, cost: float) -> None:
         self.interrupt.check()
         for listener in self.listeners:
             try:

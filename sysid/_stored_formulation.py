@@ -11,7 +11,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from sysid._written import Misfit
+from sysid._written import Known, Misfit
 from sysid.errors import InputError
 from sysid.formulation import Formulation, Matrices, guess_of
 from sysid.measurement import Measurement
@@ -31,7 +31,7 @@ def write(
     for i, (test, matrices) in enumerate(formulation.others):
         write_measurement(group.create_group(f"others/{i}/measurement"), test)
         _write_matrices(group[f"others/{i}"], matrices, put)
-    for name in ("residuals", "misfit", "healing"):
+    for name in ("residuals", "known", "misfit", "healing"):
         function = getattr(formulation, name)
         if function is not None:
             put(group, **{name: _text(name, function)})
@@ -62,6 +62,8 @@ def read(
     ]
     if "residuals" in group:
         residuals.append(_function(group, "residuals", get)(x))
+    if "known" in group:
+        residuals.append(Known(_function(group, "known", get)(x), 0.0, 1.0))
     if "misfit" in group:
         given["misfit"] = _function(group, "misfit", get)(x)
     if "healing" in group:
@@ -78,6 +80,7 @@ def read(
 def check_storable(formulation: Formulation) -> None:
     """Refuse what could not be stored at the end: a Python callback inside an expression."""
     functions = {"matrices": formulation.matrices.function, "residuals": formulation.residuals}
+    functions |= {"known": formulation.known}
     functions |= {"misfit": formulation.misfit, "healing": formulation.healing}
     functions |= {f"matrices of test {i}": m.function for i, (_, m) in enumerate(formulation.others, start=2)}
     if formulation.constraints is not None:

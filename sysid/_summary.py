@@ -20,16 +20,23 @@ def summary(it: Identification) -> str:
     """Table of the result, at most 120 columns wide."""
     s, axes, problem = it.structure, it.measurement.base_axes or (), it.problem
     goal = "" if problem.goal is None else f" (goal {problem.goal:.3g})"
+    which = " of the first test" if it.further_tests else ""
     force = "" if it.force_residual is None else f", of the base force {it.force_residual:.3e}"
     lines = [
         *_mode_table(it),
         "",
         *_unknowns(it),
         f"{'success' if it.success else 'no success'}: {it.message}",
-        f"relative residual {it.residual:.3e}{goal}{force}; seed {it.seed}, {it.history.wall_time:.1f} s",
+        f"relative residual{which} {it.residual:.3e}{goal}{force}; seed {it.seed}, {it.history.wall_time:.1f} s",
         *it.remarks,
         "rigid-body mass " + ", ".join(_rigid_masses(it, axes)),
     ]
+    for i, (test, structure) in enumerate(it.further_tests, start=1):
+        frequencies = ", ".join(f"{f:.5g}" for f in structure.natural_frequencies[:8])
+        lines.append(
+            f"further test {i} of {len(it.further_tests)}: relative residual {test.residual(structure):.3e}, natural "
+            f"frequencies {frequencies} Hz"
+        )
     for i, test in enumerate(problem.validation, start=1):
         lines.append(f"test {i} of {len(problem.validation)} never fitted: relative residual {test.residual(s):.3e}")
     lines.append(f"{verdict(it)}.")
@@ -123,7 +130,7 @@ def _unknowns(it: Identification) -> list[str]:
         return []
     told = [[row.label, f"{row.value:.6g}", half_width(row.std, row.value), row.unit] for row in rows]
     at = [f"on its {row.on_bound} bound" if row.on_bound else f"{row.lower:.4g} to {row.upper:.4g}" for row in rows]
-    columns = [list(column) for column in zip(["unknown", "value", "+-", "unit"], *told, strict=True)]
+    columns = [list(column) for column in zip(["unknown", "value", "+- (95 %)", "unit"], *told, strict=True)]
     return [*_aligned([*columns, ["search space", *at]]), ""]
 
 

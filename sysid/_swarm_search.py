@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid import local
-from sysid._continuation import descend, tests_of
+from sysid._continuation import descend, levels_of, tests_of
 from sysid._desk import Desk, Stop
 from sysid._search import Outcome, as_unknowns
 from sysid.errors import InputError, SolverError
@@ -18,7 +18,7 @@ from sysid.layout import triangle, triangle_entries
 from sysid.mass import FullMass
 from sysid.problem import Problem
 from sysid.refinement import by_ipopt, closed_form
-from sysid.smoothing import Smoothed, levels_of
+from sysid.smoothing import Smoothed
 from sysid.stiffness import SpectralStiffness
 from sysid.structure import Array, Structure
 from sysid.swarm import SwarmProgress, SwarmSettings, minimize_swarm

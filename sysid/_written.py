@@ -87,6 +87,46 @@ class Misfit:
         return relative_misfit(self.measurement, self.blocks().motion, weighted=True)
 
 
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Something known to some accuracy, for the `residuals` of a problem: it counts as one more measurement.
+
+    Parameters
+    ----------
+    expression : Variable or expression
+        What is known: a variable, or any column of numbers written in variables.
+    value : array_like
+        Its value, broadcast to it.
+    std : array_like
+        Standard deviation of the value, in the same unit.
+
+    Examples
+    --------
+    >>> import sysid
+    >>> m = sysid.Variable("floor", 2, lower=100.0, upper=900.0, unit="kg")
+    >>> weighed = sysid.Known(m, [410.0, 395.0], std=12.0)
+    """
+
+    expression: Any
+    value: Any
+    std: Any
+
+    def rows(self, name: str) -> tuple[ca.MX, Array, Array]:
+        """The expression as a column, its values and standard deviations, (rows,) each."""
+        column = ca.vec(ca.densify(as_matrix(name, self.expression)))
+        given = []
+        for what, numbers in (("value", self.value), ("std", self.std)):
+            array = finite_array(f"{name}: {what}", numbers).ravel(order="F")
+            if array.size not in (1, column.numel()):
+                raise InputError(f"{name}: {what} holds {array.size} numbers for {column.numel()}{written_in(column)}")
+            given.append(np.broadcast_to(array, (column.numel(),)))
+        if np.any(given[1] <= 0):
+            raise InputError(
+                f"{name}: std = {given[1].min():g}; standard deviations must be positive{written_in(column)}"
+            )
+        return column, given[0], given[1]
+
+
 class Blocks(NamedTuple):
     """The blocks as expressions, L with ``M_SS = L L'``, and the variables of the models with their symbols."""
 
@@ -251,7 +291,7 @@ def _check_size(name: str, matrix: ca.MX, n: int, d: int) -> None:
         ratios = ", or one ratio a mode" if name == "damping" else ""
         raise InputError(
             f"{name} is {_size(matrix)} ({call_site(user_frame())}); ({n}, {n}) or, with the base, ({n + d}, {n + d}) "
-            f"is needed{ratios}{written_in(matrix)}"
+            f"is needed{ratios}, or recovery= beside it, from degrees of freedom to {n} sensors{written_in(matrix)}"
         )
 
 

@@ -12,6 +12,7 @@ from sysid.measurement import Measurement
 from sysid.problem import Problem
 from sysid.residues import Records, ResidueFit, beyond_chance, force_residual_left
 from sysid.response import weighed_mass
+from sysid.smoothing import PolesAndResidues
 from sysid.structure import Array, Structure
 
 _ROUND_OFF = 1e-8  # of the records: what counts as noise where there is none
@@ -19,6 +20,7 @@ _SAME_POLE = 1e-6  # relative distance of poles that count as one
 _ALIKE = 3.0  # misfits by which two records must differ to be of two sensors
 _MISFIT = 1.5  # times what free residues leave, beyond which a record is not what the modes make of it
 _MIMICKED = 1e-2  # of a constant; less of it is left where a mode far below the lines answers like one
+_FAR = 4.0  # standard deviations from a stated value, beyond which something is wrong
 _GAIN = 0.03  # of the base's motion; smaller errors of a sensor's gain are usual
 
 
@@ -46,7 +48,7 @@ def written_doubts(problem: Problem, x: Array) -> tuple[str, ...]:
     """The same for a problem in its own unknowns, as far as they apply to any model."""
     if problem.formulation.misfit is not None:
         return ()
-    found: list[str] = []
+    found = list(_stated_values(problem, x))
     models = [(problem.measurement, problem.formulation.matrices), *problem.formulation.others]
     for i, (test, matrices) in enumerate(models, start=1):
         structure = matrices.structure(x, test)
@@ -56,10 +58,41 @@ def written_doubts(problem: Problem, x: Array) -> tuple[str, ...]:
             continue
         free = records.fit(*poles, velocity=velocity)
         misses = tuple(_no_fit(test, structure, records, free, "the written model"))
+        misses = misses or tuple(_other_poles(test, structure, records))
         rigid = tuple(_rigid(test, records, free))
         told = (*misses, *_force(test, structure, False), *rigid, *(() if rigid or misses else _twins(test, structure)))
         found += [told_one if len(models) == 1 else f"test {i}: {told_one}" for told_one in told]
     return tuple(found)
+
+
+def _stated_values(problem: Problem, x: Array) -> Iterator[str]:
+    """What was stated as known, where the fit is far from it."""
+    formulation = problem.formulation
+    if formulation.known is None:
+        return
+    off = np.asarray(formulation.known(x)).ravel()
+    for name, deviations in zip(formulation.known_names, off, strict=True):
+        if abs(deviations) > _FAR:
+            yield (
+                f"{name} ends {abs(deviations):.3g} of the stated standard deviations from the value that is stated as "
+                "known: that value, its deviation, or the model is wrong"
+            )
+
+
+def _other_poles(test: Measurement, structure: Structure, records: Records) -> Iterator[str]:
+    """Whether poles of the data's own leave clearly less than the structure does."""
+    poles = PolesAndResidues.of(test)
+    if poles is None:
+        return
+    left = replace(test, response=test.response - test.predict(structure))
+    misfit = float(np.sqrt(Records(left).size / records.size))
+    possible = max(poles.of_accelerations, _ROUND_OFF)
+    if misfit > _MISFIT * possible:
+        yield (
+            f"the written model misses {100 * misfit:.3g} % of the accelerations, the poles of the data with free "
+            f"residues {100 * possible:.3g} %: the form of its mass, stiffness or damping, recovery, or a bound is not "
+            "the structure's"
+        )
 
 
 def _no_fit(test: Measurement, structure: Structure, records: Records, free: ResidueFit, model: str) -> Iterator[str]:

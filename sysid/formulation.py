@@ -16,12 +16,24 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from sysid._written import Blocks, Given, Misfit, as_matrix, at_point, blocks_of, check_finite, check_free, written_in
+from sysid._written import (
+    Blocks,
+    Given,
+    Known,
+    Misfit,
+    as_matrix,
+    at_point,
+    blocks_of,
+    check_finite,
+    check_free,
+    written_in,
+)
 from sysid.direct import Motion, relative_misfit
 from sysid.errors import InputError
 from sysid.layout import Layout
 from sysid.measurement import Measurement
 from sysid.response import residual
+from sysid.smoothing import noise_level
 from sysid.structure import Array, Structure
 from sysid.variables import Block, Variable, call_site, expression_of, user_frame, variable_of
 
@@ -117,6 +129,12 @@ class Formulation:
         Further tests, fitted beside the problem's own.
     residuals : casadi.Function or None
         x to a column: residuals beside the misfit of the measurement.
+    known : casadi.Function or None
+        x to a column: what is known to some accuracy, less its value, in standard deviations.
+    known_names : tuple of str
+        What each of its rows is called.
+    level : float
+        Standard deviation of a real number of the measurement's relative residual: what one of them counts.
     misfit : casadi.Function or None
         x to a column: what stands in the place of the misfit of the measurement.
     constraints : Constraints or None
@@ -133,6 +151,9 @@ class Formulation:
     matrices: Matrices
     others: tuple[tuple[Measurement, Matrices], ...]
     residuals: ca.Function | None
+    known: ca.Function | None
+    known_names: tuple[str, ...]
+    level: float
     misfit: ca.Function | None
     constraints: Constraints | None
     healing: ca.Function | None
@@ -218,8 +239,10 @@ def formulate(given: Given, layout: Layout, test: Measurement) -> Formulation:
     """
     blocks = blocks_of(given, layout, test)
     others = [(other, other.blocks()) for other in given.residuals if isinstance(other, Misfit)]
+    stated = [k.rows(f"residual {i}") for i, k in enumerate(given.residuals, start=1) if isinstance(k, Known)]
+    known = [(column - ca.DM(value)) / ca.DM(std) for column, value, std in stated]
     residuals = [
-        _column(f"residual {i}", r) for i, r in enumerate(given.residuals, start=1) if not isinstance(r, Misfit)
+        _column(f"residual {i}", r) for i, r in enumerate(given.residuals, start=1) if not isinstance(r, Misfit | Known)
     ]
     misfit = None if given.misfit is None else _column("misfit", given.misfit)
     relations = [row for i, c in enumerate(given.constraints, start=1) for row in _relation(i, c)]
@@ -229,6 +252,7 @@ def formulate(given: Given, layout: Layout, test: Measurement) -> Formulation:
         *blocks.by_matrix,
         *tests,
         *residuals,
+        *known,
         *([] if misfit is None else [misfit]),
         *(g for g, _, _ in relations),
     ]
@@ -276,7 +300,7 @@ def formulate(given: Given, layout: Layout, test: Measurement) -> Formulation:
         )
     healed = [healing.get(v, v.symbol) if isinstance(v, Variable) else None for v in searched]
     groups = [*zip(MATRICES, blocks.by_matrix, strict=True)]
-    groups += [("further tests", _stacked(tests)), ("residuals", _stacked(residuals))]
+    groups += [("further tests", _stacked(tests)), ("residuals", _stacked(residuals + known))]
     groups += [("misfit", _stacked([] if misfit is None else [misfit]))]
     groups += [("constraints", _stacked([g for g, _, _ in relations]))]
     members = [(name, tuple(v.name for v in searched if _uses(part, v, blocks.symbols))) for name, part in groups]
@@ -286,6 +310,9 @@ def formulate(given: Given, layout: Layout, test: Measurement) -> Formulation:
         matrices=matrices(blocks),
         others=tuple((other.measurement, matrices(part)) for other, part in others),
         residuals=function("residuals", [ca.vertcat(*residuals)]) if residuals else None,
+        known=function("known", [ca.vertcat(*known)]) if known else None,
+        known_names=tuple(_name_of(column, i) for column, _, _ in stated for i in range(column.numel())),
+        level=noise_level(test) if known else 0.0,
         misfit=None if misfit is None else function("misfit", [misfit]),
         constraints=constraints,
         healing=function("healing", [ca.veccat(*(s if h is None else h for h, s in zip(healed, symbols, strict=True)))])
@@ -294,6 +321,14 @@ def formulate(given: Given, layout: Layout, test: Measurement) -> Formulation:
         members=tuple((name, names) for name, names in members if names),
         declarations={name: written_in(part) for name, part in zip(MATRICES, blocks.by_matrix, strict=True)},
     )
+
+
+def _name_of(column: ca.MX, row: int) -> str:
+    """What a row of something known is called: its variable's entry, or the variables that it is written in."""
+    names = [v for v in map(variable_of, ca.symvar(column[row])) if v is not None]
+    if len(names) == 1 and names[0].size == column.numel():
+        return names[0].labels[row]
+    return "a relation of " + ", ".join(v.name for v in names)
 
 
 def _stacked(expressions: Sequence[ca.MX]) -> ca.MX:

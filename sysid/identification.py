@@ -13,7 +13,7 @@ from sysid.errors import InputError
 from sysid.measurement import Measurement
 from sysid.problem import Problem
 from sysid.structure import Array, ComplexArray, Structure
-from sysid.variables import Variable, split
+from sysid.variables import by_name
 
 if TYPE_CHECKING:
     from sysid.modal_masses import Intervals
@@ -150,14 +150,17 @@ class Identification:
         """The problem's variables at the answer, by name and in their shapes, fixed ones too; empty where x is None."""
         if self.x is None:
             return {}
-        pieces = split(self.problem.variables, self.x)
-        found = {
-            v.name: v.shaped(p) if isinstance(v, Variable) else p
-            for v, p in zip(self.problem.variables, pieces, strict=True)
-        }
+        found = by_name(self.problem.variables, self.x)
         if self.problem.is_written:
             found |= {v.name: v.shaped(v.guess) for v in self.problem.formulation.fixed}
         return found
+
+    @property
+    def further_tests(self) -> tuple[tuple[Measurement, Structure], ...]:
+        """Tests that were fitted beside the problem's own (`sysid.Misfit`), and the structure as it was in each."""
+        if self.x is None or not self.problem.is_written:
+            return ()
+        return tuple((test, matrices.structure(self.x, test)) for test, matrices in self.problem.formulation.others)
 
     @property
     def force_residual(self) -> float | None:
@@ -174,7 +177,8 @@ class Identification:
 
         They hold where the fit is one: for the members that the data leave open see `mass_interval`.
         """
-        from sysid.uncertainty import uncertainty, written_uncertainty
+        from sysid.uncertainty import uncertainty
+        from sysid.written_uncertainty import written_uncertainty
 
         if self.problem.is_written:
             assert self.x is not None

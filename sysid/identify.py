@@ -213,6 +213,9 @@ def _finish(problem: Problem, end: Outcome, why: str, seed: int, desk: Desk) -> 
     """Judge where the search ended, and say what it is worth."""
     structure, success, message = end.structure, end.success, end.message
     residual = problem.measurement.residual(structure) if end.x is None else problem.residual_of(end.x)
+    if problem.is_written and end.x is not None:
+        others = [test.residual(m.structure(end.x, test)) for test, m in problem.formulation.others]
+        residual = max([residual, *others])
     if problem.goal is not None and residual > problem.goal:
         success = False
         message += f"; the residual {residual:.3g} is above the goal {problem.goal:.3g}"
@@ -226,7 +229,7 @@ def _finish(problem: Problem, end: Outcome, why: str, seed: int, desk: Desk) -> 
     if problem.is_written:
         assert end.x is not None
         known = written_determination(problem, end.x, end.rivals)
-        doubtful = written_doubts(problem, end.x) if end.stopped is None else ()
+        doubtful = written_doubts(problem, end.x) if end.stopped is None and success else ()
     else:
         known = determination(problem, structure)
         # What was stopped on its way has misfits of another kind.
@@ -237,6 +240,12 @@ def _finish(problem: Problem, end: Outcome, why: str, seed: int, desk: Desk) -> 
     if not success:
         open_ = ("the search did not end in a fit, so this is not yet any structure that explains the data", *open_)
     remarks = (why, *end.remarks)
+    if problem.is_written and end.x is not None:
+        near = 1e-6 * (problem.upper - problem.lower)
+        at = (end.x - problem.lower < near) | (problem.upper - end.x < near)
+        names = [label for label, on in zip(problem.formulation.labels, at, strict=True) if on]
+        if names:
+            remarks += (f"on a bound of the search space, beyond which the truth may lie: {', '.join(names)}",)
     if problem.is_written and problem.formulation.misfit is not None:
         remarks += ("the problem states a misfit of its own; pictures and scores compare with the records as they are",)
     return _as_certain(

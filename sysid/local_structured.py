@@ -18,6 +18,7 @@ from sysid._coordinates import Coordinates
 from sysid._watch import OBJECTIVE_SCALE, Watch
 from sysid.damping import ProportionalDamping
 from sysid.direct import relative_misfit
+from sysid.formulation import labels_of
 from sysid.layout import lower_entries, triangle_entries
 from sysid.modal import FREQUENCY_WINDOW
 from sysid.problem import Problem
@@ -25,7 +26,7 @@ from sysid.response import residual
 from sysid.smoothing import Smoothed
 from sysid.stiffness import SpectralStiffness
 from sysid.structure import Array, Structure
-from sysid.variables import slices_of, split
+from sysid.variables import Variable, slices_of, split
 
 _OPEN_WINDOW = 20.0  # factor either way for a frequency that nobody gave
 _RANGE = 0.05  # of the search space: the least unit of an unknown
@@ -68,8 +69,11 @@ def fit_structured(
         # Each unknown in units of its start, or of its range where that is larger.
         unit = np.maximum(np.abs(values), _RANGE * (variable.upper - variable.lower))
         unit = np.where(unit > 0, unit, 1.0) if variable.name != "rayleigh_factor" else variable.upper
-        name = variable.name.replace("_", " ")
-        pieces.append(z.add(name, values / unit, variable.lower / unit, variable.upper / unit) * ca.DM(unit))
+        own = isinstance(variable, Variable)
+        name = variable.name if own else variable.name.replace("_", " ")
+        labels = [label.removeprefix(variable.name) for label in labels_of(variable)] if own else None
+        ends = variable.lower / unit, variable.upper / unit
+        pieces.append(z.add(name, values / unit, *ends, labels) * ca.DM(unit))
         factors = pieces[-1] if variable.name == "rayleigh_factor" else factors
     unknowns = ca.vertcat(*pieces)
 
@@ -94,6 +98,8 @@ def fit_structured(
         miss = ca.vertcat(miss, further)
     if formulation.residuals is not None:
         miss = ca.vertcat(miss, formulation.residuals(unknowns))
+    if formulation.known is not None:
+        miss = ca.vertcat(miss, formulation.level * formulation.known(unknowns))
     derivatives = None if modal else {"hess_lag": _gauss_newton(z, miss)}
     best, status = z.minimize(ca.sumsqr(miss), watch, max_iterations, derivatives)
 

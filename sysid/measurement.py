@@ -108,8 +108,8 @@ class Measurement:
     response_std, force_std : array_like, optional
         Standard deviation of the complex noise, ``sqrt(E|e|²)``; broadcast to their records.
     base_axes : str or sequence of str, optional
-        Names of the base directions (see `sysid.rigid_body`); x y z rx ry rz in this order by
-        default. Needed where fewer than four directions hold a rotation.
+        Names of the base directions (see `sysid.rigid_body`); by default those that the sensors' axes tell, else
+        x y z rx ry rz in this order. Needed where fewer than four directions hold a rotation.
 
     Notes
     -----
@@ -163,12 +163,30 @@ class Measurement:
             return names
         if d > 6:
             raise InputError(f"base has {d} directions; a rigid base has at most six")
+        told = self._axes_of_sensors()
+        if told is not None:
+            return told
         if d <= 3 and np.any(np.linalg.norm(self.rigid_body, axis=1) > 1 + 1e-6):
             raise InputError(
                 "rigid_body has rows longer than 1, as only a rotation gives (a unit axis under translations has a row "
                 "of at most 1): state base_axes, such as ['x', 'ry']"
             )
         return BASE_AXES[:d]
+
+    def _axes_of_sensors(self) -> tuple[str, ...] | None:
+        """Translations that the sensors' axes make of the columns of G; None where they tell no names, or several."""
+        if not self.sensors or not all(isinstance(sensor, Sensor) for sensor in self.sensors):
+            return None
+        axes = np.array([axis_vector(sensor.axis, sensor.name) for sensor in self.sensors])
+        names: list[str] = []
+        for column in self.rigid_body.T:
+            alike = [
+                name for name, own in zip(BASE_AXES[:3], axes.T, strict=True) if np.allclose(own, column, atol=1e-6)
+            ]
+            if len(alike) != 1 or not np.any(column):
+                return None
+            names += alike
+        return tuple(names) if len(set(names)) == len(names) else None
 
     @property
     def translational(self) -> NDArray[np.bool_]:

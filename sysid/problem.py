@@ -68,7 +68,8 @@ class Problem:
         (n, n) is C on the motion relative to the base; (n,) is one damping ratio a mode, in ascending frequency.
     residuals : sequence of expressions
         Minimised in the least-squares sense beside the misfit of the measurement, whose norm is 1 where nothing is
-        explained: a second test (`sysid.Misfit`), or what is known to some accuracy.
+        explained: a second test (`sysid.Misfit`), or what
+        is known to some accuracy (`sysid.Known`). Other rows count as they are.
     constraints : sequence of relations
         Such as ``k[0] <= k[1]`` or ``ca.sum1(m) == 900``. IPOPT holds them exactly; in the swarm a candidate that
         breaks them less is better, whatever its residual, and any that keeps them is better than these.
@@ -338,9 +339,16 @@ class Problem:
             structure, test = self.structure(x), self.measurement
             return float(np.hypot(test.residual(structure), test.force_residual(structure) or 0.0))
         f = self.formulation
-        parts = [float(np.linalg.norm(column(x))) for column in (f.residuals, f.misfit) if column is not None]
+        parts = [float(np.sqrt(self.own_squares(x)))]
+        parts += [] if f.misfit is None else [float(np.linalg.norm(f.misfit(x)))]
         tests = [*([(self.measurement, f.matrices)] if f.misfit is None else []), *f.others]
         return float(np.linalg.norm(parts + [relative_error(test, matrices, x) for test, matrices in tests]))
+
+    def own_squares(self, x: Array) -> float:
+        """Sum of squares of the residuals that are stated beside the tests."""
+        f = self.formulation
+        own = 0.0 if f.residuals is None else float(np.sum(np.square(f.residuals(x))))
+        return own if f.known is None else own + float(np.sum(np.square(f.level * f.known(x))))
 
     def from_sampling(self, s: ca.SX) -> ca.SX:
         """Unknowns of the swarm's coordinates, which have the same bounds (eq. 18)."""

@@ -93,6 +93,7 @@ def render(identification: Identification) -> str:
             ("Rigid-body mass", _rigid_body_mass(it)),
             ("Measured against identified", _responses(it, it.measurement)),
             ("Base force", _base_force(it, it.measurement)),
+            ("Further tests", _further(it)),
             ("Validation", _validation(it)),
             ("Poles in the data", _poles(it)),
             ("Convergence", _convergence(it)),
@@ -258,6 +259,28 @@ def _base_force(it: Identification, test: Measurement) -> str:
     for r, name in enumerate(run_names(test)):
         alt = f"measured and identified base force, {name}"
         parts.append(picture(plot.base_forces(it, r, measurement=test, band=band), alt))
+    return "\n".join(parts)
+
+
+def _further(it: Identification) -> str:
+    parts = []
+    for i, (test, structure) in enumerate(it.further_tests, start=1):
+        parts.append(f"<h3>Test {i} of {len(it.further_tests)}, fitted beside the first one</h3>")
+        residual = f"Relative residual {number(test.residual(structure))}"
+        if test.force is not None:
+            residual += f", of the base force {number(test.force_residual(structure))}"
+        parts.append(paragraph(residual + "; the structure as it was then:"))
+        rows = zip(structure.natural_frequencies, 100 * structure.damping_ratios, strict=True)
+        cells = [(k, number(f, 6), number(ratio)) for k, (f, ratio) in enumerate(rows, start=1)]
+        parts.append(table(("mode", "frequency [Hz]", "damping [%]"), cells))
+        scored = zip(test.sensor_names, scores(structure, test).relative, strict=True)
+        parts.append(
+            table(
+                ("sensor", "score"),
+                [(name, number(score)) for name, score in scored],
+                "1 - ‖predicted - measured‖ / ‖measured‖ of the accelerations relative to the base.",
+            )
+        )
     return "\n".join(parts)
 
 

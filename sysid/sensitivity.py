@@ -182,8 +182,11 @@ class Sensitivity:
         return self.seen.shape[1]
 
 
-def sensitivity(problem: Problem, x: Array, slopes: Slopes | None = None) -> Sensitivity:
-    """Rank, null directions and noise of the unknowns at `x`, from the exact Jacobian."""
+def sensitivity(problem: Problem, x: Array, slopes: Slopes | None = None, *, known: bool = True) -> Sensitivity:
+    """Rank, null directions and noise of the unknowns at `x`, from the exact Jacobian.
+
+    With `known` false without what is stated as known to some accuracy.
+    """
     formulation, p = problem.formulation, x.size
     rows: list[Rows] = []
     if formulation.misfit is None:
@@ -195,6 +198,9 @@ def sensitivity(problem: Problem, x: Array, slopes: Slopes | None = None) -> Sen
     if formulation.residuals is not None:
         # One more number each, of the same relative noise as those measured.
         rows.append(_own_rows(formulation.residuals, x, float(np.sqrt(np.mean(rows[0].std ** 2)))))
+    if formulation.known is not None and known:
+        stated, level = _own_rows(formulation.known, x, 1.0), formulation.level
+        rows.append(Rows(level * stated.residuals, level * stated.jacobian, level * stated.std))
     # A part of the range where that is larger than the unknown itself.
     unit = np.maximum(np.abs(x), 0.05 * (problem.upper - problem.lower))
     free = _left_by_constraints(problem, x, unit)

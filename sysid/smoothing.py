@@ -15,13 +15,12 @@ import numpy as np
 from sysid.errors import InputError
 from sysid.measurement import Measurement
 from sysid.poles import poles_of_any_damping
-from sysid.problem import Problem
 from sysid.residues import Records, force_residual_left
-from sysid.response import columns, gains
+from sysid.response import columns, gains, weights_of
 from sysid.structure import Array, ComplexArray
 
-SHIFTS = (0.5, 0.2, 0.08, 0.03, 0.01)  # of the geometric mean of the natural frequencies
 _LINES = 80
+_LEAST = 1e-8  # a smaller level of noise would leave no weight to what is known beside the records
 _DEPENDENT = 1e-9  # of the largest singular value of the base records
 _BEYOND = 0.3  # of the lowest and of the highest frequency, how far the lines reach
 
@@ -37,8 +36,8 @@ class PolesAndResidues:
         Of ``g_k`` and of ``s / w_k g_k``.
     inputs : (d, r)
         Orthonormal directions in which the base moves.
-    residual : float
-        Relative residual of accelerations and, where it was measured, of force that they leave.
+    of_accelerations, residual : float
+        Relative residual of the accelerations that they leave; the same with that of the force, where it was measured.
     """
 
     omega: Array
@@ -46,6 +45,7 @@ class PolesAndResidues:
     residues: Array
     quadrature: Array
     inputs: Array
+    of_accelerations: float
     residual: float
 
     @classmethod
@@ -67,10 +67,10 @@ class PolesAndResidues:
         parts = [records.by_sensor(both[:, i]) for i in range(both.shape[1])]
         inputs = np.eye(test.n_base) if records.unit else _moved(test)
         quadrature = parts[1] if many else np.zeros_like(parts[0])
-        left = float(np.sqrt(fit.squared_error / records.size))
+        own = left = float(np.sqrt(fit.squared_error / records.size))
         if test.force is not None:
             left = float(np.hypot(left, force_residual_left(test, omega, ratios, velocity=many)))
-        return cls(omega, ratios, parts[0], quadrature, inputs, left)
+        return cls(omega, ratios, parts[0], quadrature, inputs, own, left)
 
     def response(self, freq: Array, shift: float) -> ComplexArray:
         """Relative accelerations for unit base motion at ``s = shift + 2 pi i freq``, (n_sensors, d, n_freq)."""
@@ -106,7 +106,15 @@ class Smoothed:
     shift: float
 
 
-def levels_of(problem: Problem, tests: list[PolesAndResidues]) -> list[tuple[Smoothed, ...]]:
-    """The problem's own test and its further ones, with smaller and smaller shifts."""
-    records = (problem.measurement, *(test for test, _ in problem.formulation.others))
-    return [tuple(poles.smoothed(test, share) for poles, test in zip(tests, records, strict=True)) for share in SHIFTS]
+def noise_level(test: Measurement) -> float:
+    """Standard deviation of each real number of a test's relative, weighted residual.
+
+    Of the stated noise where one is stated, else of what free residues at the poles of the data leave.
+    """
+    if test.response_std is not None:
+        weight, scale = weights_of(test.relative, test.response_std)
+        std = np.asarray(weight) * columns(test.response_std.astype(complex)).real
+        return max(float(np.sqrt(np.mean(std**2) / 2)) / scale, _LEAST)
+    poles = PolesAndResidues.of(test)
+    left = 0.0 if poles is None else poles.residual
+    return max(left / float(np.sqrt(2 * test.response.size)), _LEAST)

@@ -62,8 +62,9 @@ class Structure:
         Symmetric viscous damping on the relative motion, N s/m. Exactly one of `damping_ratios`
         and `damping_matrix` is given.
     rigid_body : array_like, shape (n_sensors, d), optional
-        Motion of the sensors for unit base motion. Follows from the stiffness unless `recovery`
-        is given; a stated one that disagrees is an error.
+        Motion of the sensors for unit base motion. Follows from the stiffness, through `recovery` where that is given;
+        a stated one that disagrees is an error where the degrees of freedom are the sensors, and else geometry that
+        modes left out would spoil.
     recovery : array_like, shape (n_sensors, n), optional
         Takes the degrees of freedom to the sensors; the identity by default.
     sensors : sequence, optional
@@ -341,9 +342,7 @@ class Structure:
         shape = (self.recovery.shape[0], self.n_base)
         if recovered:
             if given is None:
-                raise InputError(
-                    "a structure with a recovery matrix needs rigid_body (n_sensors, d): geometry tells it"
-                )
+                return self.recovery @ self.rigid_body_dofs
             return _matrix("rigid_body", given, shape)
         G = self.rigid_body_dofs
         if given is not None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import casadi as ca
 import numpy as np
@@ -24,17 +24,26 @@ from sysid.mass import FullMass
 from sysid.modal_fit import Modes
 from sysid.modal_masses import open_masses
 from sysid.problem import Problem
-from sysid.sensitivity import Slopes, response_slopes, sensitivity, slopes_of
-from sysid.structure import Array, ComplexArray, Structure, check_frequencies
-from sysid.variables import Block, Variable, split
+from sysid.structure import Array, Structure, check_frequencies
+from sysid.variables import Block
 
-_MOVED = 1e-6  # of a quantity's size, by which an unseen move of order one must change it to count
+MOVED = 1e-6  # of a quantity's size, by which an unseen move of order one must change it to count
 _SAME = 1e-6  # relative distance that is put between repeated frequencies
 _LEAST_RATIO = 1e-8  # a damping ratio of zero has no logarithm
 
 _POSITIVE = ("natural_frequencies", "damping_ratios")
 _MATRICES = ("mass", "stiffness", "damping")
 _QUANTITIES = (*_POSITIVE, "mode_shapes", "participation", "effective_masses", "rigid_body_mass", *_MATRICES)
+
+
+class Spectra(Protocol):
+    """What predicts spectra where modes do not."""
+
+    def transmissibility(self, freq: Array) -> Array:
+        """Standard deviations, (n_sensors, d, n_freq)."""
+
+    def base_force(self, freq: Array) -> Array:
+        """Standard deviations, (d, d, n_freq)."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -64,8 +73,9 @@ class Uncertainty:
     inflation : float
         Factor by which all standard deviations were raised because the misfit is larger than the stated noise
         explains; 1 otherwise, NaN where the lines are too few to tell a noise that is not stated.
-    variables : dict of str to ndarray
-        For each variable of a problem in its own unknowns, by name and in its shape.
+    values, variables : dict of str to ndarray
+        Values, and their standard deviations, of the variables of a problem in its own unknowns: by name, in their
+        shapes.
 
     Notes
     -----
@@ -92,9 +102,10 @@ class Uncertainty:
     covariance: Array
     inflation: float
     _modes: Modes = field(repr=False)
-    _moves: _Moves = field(repr=False)
+    _moves: Moves = field(repr=False)
+    values: dict[str, Array] = field(default_factory=dict)
     variables: dict[str, Array] = field(default_factory=dict)
-    _direct: _Direct | None = field(default=None, repr=False)
+    _direct: Spectra | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
         worst = 100 * np.max(self.natural_frequencies / self.structure.natural_frequencies)
@@ -107,7 +118,7 @@ class Uncertainty:
         Parameters
         ----------
         name : str
-            One of the quantities above, "natural_frequencies" for instance.
+            One of the quantities above, "natural_frequencies" for instance, or a variable of a problem of its own.
         level : float
             Between 0 and 1.
 
@@ -116,7 +127,7 @@ class Uncertainty:
         ndarray, shape (2, ...)
             Lower and upper ends, from a normal law: of the logarithm for frequencies, damping ratios and the diagonals
             of M_SS, K_SS and C, which stay positive; of the participation for diagonal effective masses,
-            which may be zero; of the value itself for all others.
+            which may be zero; of the value itself for all others. Bounds of variables are not counted.
 
         Raises
         ------
@@ -125,11 +136,15 @@ class Uncertainty:
         """
         from scipy.stats import norm
 
-        if name not in _QUANTITIES:
-            raise InputError(f"no uncertainty of {name!r}; give one of {', '.join(_QUANTITIES)}")
+        if name not in (*_QUANTITIES, *self.variables):
+            raise InputError(f"no uncertainty of {name!r}; give one of {', '.join((*_QUANTITIES, *self.variables))}")
         if not 0 < level < 1:
             raise InputError(f"level = {level}: a probability between 0 and 1 is needed")
         z = float(norm.ppf((1 + level) / 2))
+        if name in self.variables:
+            return np.stack(
+                [self.values[name] - z * self.variables[name], self.values[name] + z * self.variables[name]]
+            )
         n, value, std = self.structure.n, np.asarray(getattr(self.structure, name)), getattr(self, name)
         value = value[:n, :n] if name in _MATRICES else value
         ends = np.stack([value - z * std, value + z * std])
@@ -194,7 +209,7 @@ def uncertainty(problem: Problem, structure: Structure) -> Uncertainty:
     -------
     Uncertainty
     """
-    test, modes = problem.measurement, _modes(structure)
+    test, modes = problem.measurement, modes_of(structure)
     index = Index(structure.n_sensors, structure.n, structure.n_base)
     path = _free(problem, modes, index) if is_modal(problem) else _structured(problem, structure, modes, index)
     unknowns = path.unit.size - path.gauge.shape[1]
@@ -207,11 +222,11 @@ def uncertainty(problem: Problem, structure: Structure) -> Uncertainty:
     if _masses_known(problem, structure):
         normals, unseen = (_held(problem, modes, index, path, part) for part in (normals, unseen))
     inflation = inflation_of(test, records, unknowns)
-    moves = _Moves(*index.split(np.hstack([inflation * normals, unseen])), normals.shape[1])
-    return _quantities(problem, structure, modes, moves, inflation)
+    moves = Moves(*index.split(np.hstack([inflation * normals, unseen])), normals.shape[1])
+    return quantities(problem, structure, modes, moves, inflation)
 
 
-def _modes(structure: Structure) -> Modes:
+def modes_of(structure: Structure) -> Modes:
     """The modal model, repeated frequencies a little apart.
 
     At one frequency the shapes are open to a rotation that no record sees and K_SS does not feel; a small distance
@@ -373,7 +388,7 @@ def _structured(problem: Problem, structure: Structure, modes: Modes, index: Ind
     return Path(slope, unit, np.zeros((unit.size, 0)))
 
 
-class _Moves(NamedTuple):
+class Moves(NamedTuple):
     """Moves of the modal parameters in the last axis: `normals` of a standard normal each, then those unseen."""
 
     phi: Array
@@ -387,101 +402,21 @@ class _Moves(NamedTuple):
         """Standard deviations of quantities with this change, (..., moves); `size` (...) tells what is much."""
         std = np.linalg.norm(change[..., : self.normals], axis=-1)
         unseen = np.abs(change[..., self.normals :]).max(axis=-1, initial=0.0)
-        return np.where(unseen > _MOVED * np.asarray(size), np.nan, std)
+        return np.where(unseen > MOVED * np.asarray(size), np.nan, std)
 
     def std_of_lines(self, change: Array, factors: Sequence[NDArray[np.inexact[Any]]], size: float) -> Array:
         """Of a spectrum that changes by the sum of `change` (rows, moves) times `factors` (rows, n_freq)."""
         weight, seen, unseen = np.vstack(factors), change[:, : self.normals], change[:, self.normals :]
         variance = np.sum(weight.conj() * ((seen @ seen.T) @ weight), axis=0).real
         moved = np.abs(unseen.T @ weight).max(axis=0, initial=0.0)
-        return np.where(moved > _MOVED * size, np.nan, np.sqrt(np.maximum(variance, 0.0)))
+        return np.where(moved > MOVED * size, np.nan, np.sqrt(np.maximum(variance, 0.0)))
 
 
-def written_uncertainty(problem: Problem, x: Array) -> Uncertainty:
-    """Standard deviations of everything that follows from the unknowns of a problem in its own unknowns.
-
-    Parameters
-    ----------
-    problem : Problem
-    x : (n_variables,)
-        Its fit.
-
-    Returns
-    -------
-    Uncertainty
-        First order in the noise; a variable on a bound is treated as if the bound were not there.
-    """
-    formulation, test = problem.formulation, problem.measurement
-    slopes = slopes_of(formulation.matrices, x, test)
-    known = sensitivity(problem, x, slopes)
-    structure = slopes.structure
-    inflation = 1.0
-    if formulation.misfit is None:
-        inflation = inflation_of(test, records_of(test, structure, x.size), x.size)
-    every = np.hstack([inflation * known.normals, known.unit[:, None] * known.unseen])
-    normals = known.rank
-    shapes = np.einsum("si,ikc->skc", structure.recovery, slopes.d_shapes)
-    pushes = np.einsum("ikc,id->kdc", slopes.d_shapes, slopes.push)
-    pushes = pushes + np.einsum("ik,idc->kdc", structure.normal_modes, slopes.d_push)
-    parts = (shapes, pushes, slopes.d_log_omega, slopes.d_log_ratios, slopes.d_rigid)
-    shapes, pushes, log_omega, log_ratios, rigid = (part @ every for part in parts)
-    moves = _Moves(shapes, pushes, log_omega, log_ratios, rigid, normals)
-    n = structure.n
-    matrices = []
-    for matrix, slope in (
-        (structure.mass[:n, :n], slopes.mass), (structure.stiffness[:n, :n], slopes.stiffness),
-        (structure.damping, slopes.damping),
-    ):  # fmt: skip
-        size = np.sqrt(np.abs(np.diag(matrix)))
-        matrices.append(moves.std(slope @ every, np.outer(size, size)))
-    std = moves.std(every, known.unit)
-    covariance = every[:, :normals] @ every[:, :normals].T
-    covariance[np.isnan(std)], covariance[:, np.isnan(std)] = np.nan, np.nan
-    named = {
-        v.name: v.shaped(part) if isinstance(v, Variable) else part
-        for v, part in zip(problem.variables, split(problem.variables, std), strict=True)
-    }
-    direct = None if structure.modal_damping else _Direct(slopes, moves, every)
-    return replace(
-        _quantities(problem, structure, _modes(structure), moves, inflation, tuple(matrices)),
-        parameters=formulation.labels, covariance=covariance, variables=named, _direct=direct,
-    )  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class _Direct:
-    """Standard deviations of spectra where the damping is a matrix: by direct solves."""
-
-    slopes: Slopes
-    moves: _Moves
-    every: Array
-
-    def transmissibility(self, freq: Array) -> Array:
-        """As in `Uncertainty`."""
-        X, dX = response_slopes(self.slopes, freq)
-        R = self.slopes.structure.recovery
-        return self._std(np.einsum("si,fidc->sdfc", R, dX, optimize=True), float(np.abs(X).max()))
-
-    def base_force(self, freq: Array) -> Array:
-        """As in `Uncertainty`."""
-        s = self.slopes
-        X, dX = response_slopes(s, freq)
-        change = np.einsum("iec,fid->edfc", s.d_push, X, optimize=True) + s.d_rigid[:, :, None]
-        change = change + np.einsum("ie,fidc->edfc", s.push, dX, optimize=True)
-        return self._std(change, float(np.abs(s.structure.rigid_body_mass).max()))
-
-    def _std(self, change: ComplexArray, size: float) -> Array:
-        moved = change @ self.every
-        std = np.linalg.norm(moved[..., : self.moves.normals], axis=-1)
-        unseen = np.abs(moved[..., self.moves.normals :]).max(axis=-1, initial=0.0)
-        return np.where(unseen > _MOVED * size, np.nan, std)
-
-
-def _quantities(
+def quantities(
     problem: Problem,
     structure: Structure,
     modes: Modes,
-    moves: _Moves,
+    moves: Moves,
     inflation: float,
     matrices: tuple[Array, ...] | None = None,
 ) -> Uncertainty:
@@ -544,7 +479,7 @@ def _quantities(
     )
 
 
-def _matrix_std(structure: Structure, moves: _Moves, diagonal: Array, change: Array) -> Array:
+def _matrix_std(structure: Structure, moves: Moves, diagonal: Array, change: Array) -> Array:
     """Of ``T^-T diag(diagonal) T^-1``, T the modes at the degrees of freedom, where `diagonal` (m,) changes too."""
     T = structure.normal_modes
     dT = np.zeros((*T.shape, change.shape[1]))

@@ -364,6 +364,13 @@ def slices_of(variables: Iterable[Block | Variable]) -> list[slice]:
     return [slice(a, b) for a, b in pairwise(ends)]
 
 
+def by_name(variables: Iterable[Block | Variable], x: Array) -> dict[str, Array]:
+    """Numbers of all unknowns as one array a variable, in its shape."""
+    variables = tuple(variables)
+    pieces = zip(variables, split(variables, x), strict=True)
+    return {v.name: v.shaped(part) if isinstance(v, Variable) else part for v, part in pieces}
+
+
 def split(variables: Iterable[Block | Variable], x: ca.SX | Array) -> list:
     """Cut a vector of all unknowns into one piece a variable."""
     return [x[part] for part in slices_of(variables)]

@@ -51,7 +51,9 @@ class WrittenCost:
             if f.misfit is None or matrices is not f.matrices
         ]
         self._own = None if f.misfit is None else ca.Function("misfit", [s], [ca.norm_2(f.misfit(x))])
-        self._residuals = None if f.residuals is None else ca.Function("residuals", [s], [ca.norm_2(f.residuals(x))])
+        rows = [] if f.residuals is None else [f.residuals(x)]
+        rows += [] if f.known is None else [f.level * f.known(x)]
+        self._residuals = ca.Function("residuals", [s], [ca.norm_2(ca.vertcat(*rows))]) if rows else None
         self._constraints = (
             None if f.constraints is None else ca.Function("constraints", [s], [ca.densify(f.constraints.function(x))])
         )

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from sysid.local import EXACT
 from sysid.modal_masses import Determination, Intervals
 from sysid.problem import Problem
 from sysid.sensitivity import Sensitivity, Slopes, directions_in_words, sensitivity, slopes_of
 from sysid.structure import Array
 
+_LOOSE = 1e-2  # of an unknown, by which what is left of exact records may move it
 _MOVED = 1e-6  # of the root of two diagonals, by which an unseen step of order one must change an entry to count
 
 
@@ -31,12 +33,21 @@ def written_determination(problem: Problem, x: Array, rivals: tuple[Array, ...] 
         )
         if moved:
             open_.append(sentence)
+    misfit = problem.misfit_of(x)
+    if known.rank and misfit < EXACT and misfit > _LOOSE * known.singular_values[known.rank - 1]:
+        weakest = directions_in_words(problem.variables, x, known.unit, known.seen[:, -1:])[0]
+        open_.append(f"the search ended at {misfit:.2g} of the records, by which {weakest} is hardly held")
     for other in rivals:
-        far = np.argsort(-np.abs(other - x) / known.unit)[:4]
+        far = np.argsort(-np.abs(other - x) / known.unit)
+        far = far[np.abs(other - x)[far] > 1e-3 * known.unit[far]][:4]
         told = ", ".join(f"{labels[j]} = {other[j]:.4g} in place of {x[j]:.4g}" for j in np.sort(far))
         if _other_matrices(problem, slopes, other):
             open_.append(f"another structure explains the data as well: {told}")
     closed = f"the data and the written model fix all {count} unknowns"
+    if problem.formulation.known is not None:
+        alone = sensitivity(problem, x, slopes, known=False)
+        only = known.rank - alone.rank
+        closed += f", {only} of them by what is stated as known alone" if only else ""
     if known.free.shape[1] < count:
         closed += f", {count - known.free.shape[1]} of them by constraints"
     if known.unseen.shape[1]:

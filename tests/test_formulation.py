@@ -337,7 +337,6 @@ def test_motion_in_symbols_is_that_of_the_numbers():
     assert float(miss(at)) == pytest.approx(problem.misfit_of(at), rel=1e-9)
 
 
-@pytest.mark.xfail(strict=True, reason="with one degree of freedom a ratio is read as a damping matrix, N s/m")
 @pytest.mark.parametrize("given", ["numbers", "a variable"])
 def test_one_ratio_of_one_degree_of_freedom_is_a_ratio(given):
     truth = sysid.Structure(np.diag([2.0, 0]), 1e4 * np.array([[1, -1], [-1, 1.0]]), [0.02], n_base=1)

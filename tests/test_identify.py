@@ -46,7 +46,9 @@ class TestStrategy:
 
     @pytest.mark.parametrize("strategy", ["magic", "", "Swarm"])
     def test_unknown(self, problem, strategy):
-        with pytest.raises(InputError, match=f"'{strategy}' is unknown; give one of 'auto', 'swarm', 'modal', 'continuation'$"):
+        with pytest.raises(
+            InputError, match=f"'{strategy}' is unknown; give one of 'auto', 'swarm', 'modal', 'continuation'$"
+        ):
             identify(problem, strategy=strategy)
 
     def test_something_else(self, problem):

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid._continuation import Continuation, descend
+from sysid._continuation import SHIFTS, Continuation, descend, levels_of
 from sysid._continuation import tests_of as stand_ins
-from sysid.smoothing import SHIFTS, PolesAndResidues, levels_of
+from sysid.smoothing import PolesAndResidues
 
 FREQ = np.linspace(1.0, 70.0, 240)
 

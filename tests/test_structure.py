@@ -347,8 +347,10 @@ class TestConstructionChecks:
         G = Structure(**good).rigid_body
         self.refuse(good, "rigid_body differs", rigid_body=-G)
 
-    def test_recovery_without_geometry(self, good):
-        self.refuse(good, "needs rigid_body", recovery=np.ones((2, 3)))
+    def test_without_geometry_sensors_move_with_their_degrees_of_freedom(self, good):
+        recovery = np.array([[1.0, 0.0, 0.0], [0.5, 0.5, 0.0]])
+        structure = sysid.Structure(**{**good, "recovery": recovery})
+        np.testing.assert_allclose(structure.rigid_body, recovery @ structure.rigid_body_dofs)
 
     def test_number_of_sensors(self, good):
         self.refuse(good, "1 sensors are described", sensors=[sysid.Sensor("a", (0, 0, 0), "x")])
