@@ -123,6 +123,17 @@ print(f"largest error: {worst:.1f} standard deviations")
 assert worst < 4
 
 # %% [markdown]
+# A weighing has an accuracy. `Known` states a value with its standard deviation, and counts as one more measurement:
+# here the tank alone, 12.2 kg give or take 0.2 kg. All masses then are as uncertain as that weighing.
+
+# %%
+tank = sysid.Known(m[3], 12.2, std=0.2)
+result = sysid.identify(sysid.Problem(test, mass=M, stiffness=K, damping=C, residuals=[tank]), rng=0)
+mass, std = result.values["mass"], result.uncertainty.variables["mass"]
+print("masses, kg:", *(f"{value:.1f} ± {1.96 * s:.1f}" for value, s in zip(mass, std, strict=True)))
+print(*result.closed_by)
+
+# %% [markdown]
 # ## Closing it with a second test
 #
 # Nothing was weighed, but you can bolt 20 kg to the top floor and shake once more. A `Misfit` is a further test of the
@@ -166,10 +177,10 @@ sysid.plot.transmissibility(result, band=result.uncertainty.transmissibility(fre
 # |---|---|
 # | some quantity is known | a number in its place, or `fixed=True` with `guess=` |
 # | damping ratios, mode by mode | `damping=sysid.ModalDamping()`, or `(n,)` ratios of your own variables |
-# | fewer sensors than degrees of freedom | `recovery=` (n_sensors, n), with the base's rows in mass and stiffness |
+# | sensors on some floors only | `recovery=np.eye(4)[[0, 3]]`, in `Problem`, `Misfit` and `Structure` alike |
 # | the force at the base | `force=` of the measurement: it weighs the structure |
 # | magnitudes without phase | `misfit=`: any column of residuals in the place of the usual one |
-# | something known to some accuracy | `residuals=[weight * (k[0] / 4e5 - 1)]`, beside the relative misfit |
+# | something known to some accuracy | `residuals=[sysid.Known(m[3], 12.0, std=0.2)]` |
 # | an order, a limit, a total | `constraints=[k[0] >= k[1], ca.sum1(m) <= 340]` |
 # | a finite-element frame | `sysid.frame`, its sections' properties as variables |
 #
