@@ -41,7 +41,7 @@ def summary(it: Identification) -> str:
         lines.append(f"test {i} of {len(problem.validation)} never fitted: relative residual {test.residual(s):.3e}")
     lines.append(f"{verdict(it)}.")
     lines += [f"  - {sentence}" for sentence in it.closed_by + it.undetermined]
-    if not it.determined:
+    if not it.determined and not it.problem.is_written:
         lines += _ranges(it)
     lines += [f"  > {sentence}" for sentence in next_steps(it)]
     return "\n".join(_folded(line) for line in lines)

@@ -253,7 +253,9 @@ class Problem:
 
     @property
     def parts(self) -> Parts:
-        """Slices of x that belong to each matrix."""
+        """Slices of x that belong to each matrix, for a problem of models alone."""
+        if self.is_written:
+            raise InputError("unknowns of a problem in expressions belong to no one matrix: see formulation.members")
         ends = np.cumsum([0, *(count for _, count in self.unknowns)]).tolist()
         return Parts(*(slice(a, b) for a, b in pairwise(ends)))
 

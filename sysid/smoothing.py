@@ -34,6 +34,8 @@ class PolesAndResidues:
     omega, ratios : (m,)
     residues, quadrature : (m, n_sensors, d)
         Of ``g_k`` and of ``s / w_k g_k``.
+    force : (1 + 2m, d, d) or None
+        Of a measured base force: of the base's own acceleration, then of the same functions.
     inputs : (d, r)
         Orthonormal directions in which the base moves.
     of_accelerations, residual : float
@@ -44,6 +46,7 @@ class PolesAndResidues:
     ratios: Array
     residues: Array
     quadrature: Array
+    force: Array | None
     inputs: Array
     of_accelerations: float
     residual: float
@@ -70,7 +73,16 @@ class PolesAndResidues:
         own = left = float(np.sqrt(fit.squared_error / records.size))
         if test.force is not None:
             left = float(np.hypot(left, force_residual_left(test, omega, ratios, velocity=many)))
-        return cls(omega, ratios, parts[0], quadrature, inputs, own, left)
+        force = None if test.force is None else _force_residues(test, omega, ratios, many)
+        return cls(omega, ratios, parts[0], quadrature, force, inputs, own, left)
+
+    def base_force(self, freq: Array, shift: float) -> ComplexArray | None:
+        """Base force likewise, (d, d, n_freq); None where it was not measured."""
+        if self.force is None:
+            return None
+        g = gains(freq, self.omega, self.ratios, shift)
+        turned = (shift + 2j * np.pi * freq) / self.omega[:, None] * g
+        return np.einsum("kij,kf->ijf", self.force, np.concatenate([np.ones((1, freq.size)), g, turned]))
 
     def response(self, freq: Array, shift: float) -> ComplexArray:
         """Relative accelerations for unit base motion at ``s = shift + 2 pi i freq``, (n_sensors, d, n_freq)."""
@@ -86,7 +98,22 @@ class PolesAndResidues:
         base = np.repeat(self.inputs.T[:, :, None], freq.size, axis=2).astype(complex)
         relative = np.einsum("sdf,rdf->rsf", self.response(freq, shift), base)
         absolute = relative + np.einsum("sd,rdf->rsf", test.rigid_body, base)
-        return Smoothed(Measurement(freq, base, absolute, rigid_body=test.rigid_body, base_axes=test.base_axes), shift)
+        made = self.base_force(freq, shift)
+        force = None if made is None else np.einsum("edf,rdf->ref", made, base)
+        smooth = Measurement(freq, base, absolute, rigid_body=test.rigid_body, force=force, base_axes=test.base_axes)
+        return Smoothed(smooth, shift)
+
+
+def _force_residues(test: Measurement, omega: Array, ratios: Array, velocity: bool) -> Array:
+    """Free residues of the base force, (1 + 2m, d, d): of the base itself, of ``g_k`` and of ``s / w_k g_k``."""
+    records = Records(test, force=True)
+    g = gains(test.freq, omega, ratios)
+    turned = [2j * np.pi * test.freq / omega[:, None] * g] if velocity else []
+    basis = records.basis(np.concatenate([np.ones((1, test.freq.size)), g, *turned]))
+    size = np.maximum(np.linalg.norm(basis, axis=0), np.finfo(float).tiny)
+    beta = np.linalg.lstsq(basis / size, records.data, rcond=None)[0] / size[:, None]
+    known = records.by_sensor(beta.reshape(1 + (1 + velocity) * omega.size, -1, beta.shape[1]))
+    return np.concatenate([known, np.zeros((1 + 2 * omega.size - len(known), *known.shape[1:]))])
 
 
 def _moved(test: Measurement) -> Array:
