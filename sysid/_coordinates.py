@@ -61,11 +61,18 @@ class Coordinates:
         self._tie_upper.append(np.broadcast_to(upper, expression.numel()))
 
     def minimize(
-        self, objective: ca.MX, watch: Watch, max_iterations: int, derivatives: dict[str, ca.Function] | None = None
+        self,
+        objective: ca.MX,
+        watch: Watch,
+        max_iterations: int,
+        derivatives: dict[str, ca.Function] | None = None,
+        *,
+        acceptable: float = 1e2,
     ) -> tuple[Array, str]:
         """Run IPOPT on `objective`, which is 1 where nothing is explained; the unknowns at its end, and its status.
 
-        `derivatives` are functions in the place of CasADi's own, as `nlpsol` names them. Where the watch was stopped
+        `derivatives` are functions in the place of CasADi's own, as `nlpsol` names them; `acceptable` is the tolerance
+        that five iterates in a row must meet, in units of the tolerance. Where the watch was stopped
         the status is "stopped", and the unknowns are the last iterate's.
         """
         z = self.z
@@ -85,7 +92,7 @@ class Coordinates:
                 "show_eval_warnings": False,  # a step too long is IPOPT's to shorten
                 "iteration_callback": call,
                 "ipopt": {
-                    "print_level": 0, "sb": "yes", "tol": tolerance, "acceptable_tol": 100 * tolerance,
+                    "print_level": 0, "sb": "yes", "tol": tolerance, "acceptable_tol": acceptable * tolerance,
                     "acceptable_iter": 5, "constr_viol_tol": 1e-11, "mu_strategy": "adaptive", **limits,
                 },
                 **(derivatives or {}),

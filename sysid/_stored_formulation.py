@@ -35,6 +35,7 @@ def write(
         function = getattr(formulation, name)
         if function is not None:
             put(group, **{name: _text(name, function)})
+    put(group, known_names=list(formulation.known_names))
     constraints = formulation.constraints
     if constraints is not None:
         put(
@@ -43,12 +44,10 @@ def write(
         )  # fmt: skip
 
 
-def read(
-    group: Any, get: Get, read_measurement: Callable[[Any], Measurement]
-) -> tuple[dict[str, Any], tuple[Variable, ...]]:
-    """What a `Problem` is given to be the one that was stored, and its fixed variables.
+def read(group: Any, get: Get, read_measurement: Callable[[Any], Measurement]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What a `Problem` is given to be the one that was stored, and what the functions do not tell of its formulation.
 
-    These are numbers in the stored functions, so that no expression holds them any more.
+    Fixed variables are numbers in the stored functions, and names of what is known are gone.
     """
     stored = group["variables"]
     every = [_read_variable(stored[str(i)], get) for i in range(len(stored))]
@@ -74,7 +73,8 @@ def read(
         rows = _function(group["constraints"], "function", get)(x)
         equal = np.atleast_1d(get(group["constraints"], "equal"))
         constraints = [rows[i] == 0 if same else rows[i] <= 0 for i, same in enumerate(equal.tolist())]
-    return {**given, "residuals": residuals, "constraints": constraints}, tuple(v for v in every if v.fixed)
+    untold = {"fixed": tuple(v for v in every if v.fixed), "known_names": tuple(get(group, "known_names") or ())}
+    return {**given, "residuals": residuals, "constraints": constraints}, untold
 
 
 def check_storable(formulation: Formulation) -> None:

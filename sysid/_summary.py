@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from sysid._unknowns import MANY, rows_of
+from sysid._unknowns import MANY, rows_of, stated_values
 from sysid.identification import Identification
 from sysid.structure import Array
 
@@ -31,6 +31,7 @@ def summary(it: Identification) -> str:
         *it.remarks,
         "rigid-body mass " + ", ".join(_rigid_masses(it, axes)),
     ]
+    lines += stated_values(it)
     for i, (test, structure) in enumerate(it.further_tests, start=1):
         frequencies = ", ".join(f"{f:.5g}" for f in structure.natural_frequencies[:8])
         lines.append(

@@ -31,6 +31,18 @@ class Row(NamedTuple):
         return "lower" if self.value - self.lower < near else "upper" if self.upper - self.value < near else ""
 
 
+def stated_values(it: Identification) -> list[str]:
+    """How far each value that was stated as known is missed, in words."""
+    known = it.problem.formulation.known if it.problem.is_written else None
+    if known is None or it.x is None:
+        return []
+    off = np.asarray(known(it.x)).ravel()
+    return [
+        f"{name} ends {z:+.2g} standard deviations from the value stated as known"
+        for name, z in zip(it.problem.formulation.known_names, off, strict=True)
+    ]
+
+
 def rows_of(it: Identification) -> list[Row]:
     """A row a scalar unknown; none for a problem of models alone."""
     problem = it.problem

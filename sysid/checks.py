@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+from scipy.stats import chi2
 
 from sysid.mass import FullMass, KnownMass, LumpedMass
 from sysid.measurement import Measurement
@@ -20,6 +21,7 @@ _SAME_POLE = 1e-6  # relative distance of poles that count as one
 _ALIKE = 3.0  # misfits by which two records must differ to be of two sensors
 _MISFIT = 1.5  # times what free residues leave, beyond which a record is not what the modes make of it
 _MIMICKED = 1e-2  # of a constant; less of it is left where a mode far below the lines answers like one
+_CHANCE = 1e-4  # that errors as stated are so large together
 _FAR = 4.0  # standard deviations from a stated value, beyond which something is wrong
 _GAIN = 0.03  # of the base's motion; smaller errors of a sensor's gain are usual
 
@@ -71,6 +73,12 @@ def _stated_values(problem: Problem, x: Array) -> Iterator[str]:
     if formulation.known is None:
         return
     off = np.asarray(formulation.known(x)).ravel()
+    if np.sum(off**2) > chi2.isf(_CHANCE, off.size) and np.all(np.abs(off) <= _FAR):
+        told = ", ".join(f"{name} by {z:+.2g}" for name, z in zip(formulation.known_names, off, strict=True))
+        yield (
+            f"the values that are stated as known are missed together, in standard deviations: {told}; they, another "
+            "number, or the model is wrong"
+        )
     for name, deviations in zip(formulation.known_names, off, strict=True):
         if abs(deviations) > _FAR:
             yield (

@@ -429,6 +429,7 @@ class _Display:
             self._pending = True
             if changed or progress.seconds - self._printed >= _PLAIN_EVERY:
                 self._print(progress)
+        self._phases.pop(progress.phase, None)  # the phase at work is the last
         self._phases[progress.phase] = progress
 
     def _print(self, progress: Progress) -> None:

@@ -325,9 +325,12 @@ def formulate(given: Given, layout: Layout, test: Measurement) -> Formulation:
 
 def _name_of(column: ca.MX, row: int) -> str:
     """What a row of something known is called: its variable's entry, or the variables that it is written in."""
-    names = [v for v in map(variable_of, ca.symvar(column[row])) if v is not None]
-    if len(names) == 1 and names[0].size == column.numel():
-        return names[0].labels[row]
+    entry = column[row]
+    names = [v for v in map(variable_of, ca.symvar(entry)) if v is not None]
+    if len(names) == 1:
+        _, entries = ca.jacobian_sparsity(entry, names[0].symbol).get_triplet()
+        if len(entries) == 1:
+            return names[0].labels[entries[0]]
     return "a relation of " + ", ".join(v.name for v in names)
 
 

@@ -11,7 +11,7 @@ from sysid import plot
 from sysid._html import Cell, beside, bullets, fold, matrix, number, page, paragraph, picture, table, text
 from sysid._panels import is_unit, run_names
 from sysid._summary import half_width, is_one_of_many, mass_percent_std, next_steps, verdict
-from sysid._unknowns import rows_of
+from sysid._unknowns import rows_of, stated_values
 from sysid.damping import DampingModel
 from sysid.errors import InputError
 from sysid.identification import Identification
@@ -164,7 +164,8 @@ def _unknowns(it: Identification) -> str:
     if not rows:
         return ""
     head = ("unknown", "value", "±", "unit", "lower", "upper", "")
-    return table(head, rows, "The problem's own unknowns; ± is half of the 95 % interval that noise leaves.")
+    told = bullets(_sentence(s) for s in stated_values(it))
+    return table(head, rows, "The problem's own unknowns; ± is half of the 95 % interval that noise leaves.") + told
 
 
 def _modes(it: Identification) -> str:

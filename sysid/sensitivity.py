@@ -13,7 +13,7 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from sysid._information import records_of
+from sysid._information import inflation_of, records_of
 from sysid.formulation import Matrices, labels_of
 from sysid.measurement import Measurement
 from sysid.problem import Problem
@@ -119,7 +119,10 @@ class Rows:
 
 
 def rows_of_test(test: Measurement, s: Slopes, unknowns: int) -> list[Rows]:
-    """Rows of the accelerations and, where it was measured, of the force, as the local phase weighs them."""
+    """Rows of the accelerations and, where it was measured, of the force, as the local phase weighs them.
+
+    Noise that is larger than stated, or shared by neighbouring lines, is counted as it is.
+    """
     X, dX = response_slopes(s, test.freq)
     R, u = s.structure.recovery, test.base  # (runs, d, n_freq)
     d_a = np.einsum("si,fidc,rdf->srfc", R, dX, u, optimize=True)
@@ -134,15 +137,15 @@ def rows_of_test(test: Measurement, s: Slopes, unknowns: int) -> list[Rows]:
     both_stated = test.response_std is not None and test.force_std is not None
     rows: list[Rows] = []
     scale = 1.0
-    for i, (record, change, target) in enumerate(
-        zip(records_of(test, s.structure, unknowns), parts, measured, strict=True)
-    ):
+    records = records_of(test, s.structure, unknowns)
+    inflation = inflation_of(test, records, unknowns)
+    for i, (record, change, target) in enumerate(zip(records, parts, measured, strict=True)):
         weight = record.by_channel[:, None] * record.by_line
         if i == 0 or not both_stated:
             scale = float(np.linalg.norm(weight * target))
         weight = weight / scale
         flat = (weight[..., None] * change).reshape(-1, change.shape[-1])
-        left, std = (-weight * record.misfit).ravel(), (weight * record.std).ravel() / np.sqrt(2)
+        left, std = (-weight * record.misfit).ravel(), inflation * (weight * record.std).ravel() / np.sqrt(2)
         rows.append(Rows(_real(left), _real(flat), np.concatenate([std, std])))
     return rows
 

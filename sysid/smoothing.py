@@ -20,7 +20,7 @@ from sysid.response import columns, gains, weights_of
 from sysid.structure import Array, ComplexArray
 
 _LINES = 80
-_LEAST = 1e-8  # a smaller level of noise would leave no weight to what is known beside the records
+_LEAST = 1e-5  # a smaller level of noise would leave no weight to what is known beside the records
 _DEPENDENT = 1e-9  # of the largest singular value of the base records
 _BEYOND = 0.3  # of the lowest and of the highest frequency, how far the lines reach
 

@@ -35,7 +35,6 @@ from sysid.measurement import Measurement, Sensor
 from sysid.problem import Problem
 from sysid.stiffness import ChainStiffness, SpectralStiffness
 from sysid.structure import Structure
-from sysid.variables import Variable
 
 CONTENT = "sysid identification"
 FORMAT = 2  # rises where an older sysid could not read the file: 2 holds problems in their own unknowns
@@ -223,7 +222,7 @@ def _write(file: Any, identification: Identification) -> None:
 def _read(file: Any) -> Identification:
     group = file["problem"]
     tests = group.get("validation", {})
-    given, fixed = _read_models(group)
+    given, untold = _read_models(group)
     problem = Problem(
         _read_measurement(group["measurement"]),
         **given,
@@ -231,8 +230,8 @@ def _read(file: Any) -> Identification:
         validation=[_read_measurement(tests[str(i)]) for i in range(len(tests))],
         goal=_get(group.attrs, "goal"),
     )
-    if fixed:
-        vars(problem)["formulation"] = replace(problem.formulation, fixed=fixed)
+    if untold:
+        vars(problem)["formulation"] = replace(problem.formulation, **untold)
     stored = {field.name: _get(file["history"], field.name) for field in fields(History)}
     counts = file["history/state_counts"][()].tolist()
     stored["states"] = tuple(zip(stored["states"], counts, strict=True))
@@ -302,10 +301,10 @@ def _read_measurement(group: Any) -> Measurement:
     )
 
 
-def _read_models(group: Any) -> tuple[dict[str, Any], tuple[Variable, ...]]:
+def _read_models(group: Any) -> tuple[dict[str, Any], dict[str, Any]]:
     if "formulation" in group:
         return read_formulation(group["formulation"], _get, _read_measurement)
-    return {name: _read_model(group[name]) for name in ("mass", "stiffness", "damping")}, ()
+    return {name: _read_model(group[name]) for name in ("mass", "stiffness", "damping")}, {}
 
 
 def _read_model(group: Any) -> Any:

@@ -50,6 +50,7 @@ def written_determination(problem: Problem, x: Array, rivals: tuple[Array, ...] 
         closed += f", {only} of them by what is stated as known alone" if only else ""
     if known.free.shape[1] < count:
         closed += f", {count - known.free.shape[1]} of them by constraints"
+    closed += "; what is written as a number counts as exact"
     if known.unseen.shape[1]:
         closed = "the data and the written model fix mass, stiffness and damping"
     return Determination(not open_, () if open_ else (closed,), tuple(open_))

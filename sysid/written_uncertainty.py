@@ -35,7 +35,7 @@ def written_uncertainty(problem: Problem, x: Array) -> Uncertainty:
     inflation = 1.0
     if formulation.misfit is None:
         inflation = inflation_of(test, records_of(test, structure, x.size), x.size)
-    every = np.hstack([inflation * known.normals, known.unit[:, None] * known.unseen])
+    every = np.hstack([known.normals, known.unit[:, None] * known.unseen])
     normals = known.rank
     shapes = np.einsum("si,ikc->skc", structure.recovery, slopes.d_shapes)
     pushes = np.einsum("ikc,id->kdc", slopes.d_shapes, slopes.push)

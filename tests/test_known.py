@@ -1,0 +1,115 @@
+"""What is known to some accuracy counts as one more measurement, and is told where the fit is far from it."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import sysid
+
+STRETCH = np.array([[1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]])
+MASS, SPRINGS, DAMPERS = np.array([5.0, 4.0]), np.array([2000.0, 1500.0]), np.array([3.0, 2.0])
+FREQ = np.linspace(0.5, 6.0, 150)
+QUICK = sysid.Continuation(starts=1)
+
+
+def measured(seed, noise=0.01, mass=MASS):
+    K, C = (STRETCH.T @ np.diag(values) @ STRETCH for values in (SPRINGS, DAMPERS))
+    truth = sysid.Structure(np.diag([*mass, 0.0]), K, damping_matrix=C[:2, :2], n_base=1)
+    return sysid.simulate(truth, FREQ, noise=noise, rng=seed)
+
+
+def problem(test, known, *, further=(), **options):
+    m = sysid.Variable("mass", 2, lower=1.0, upper=20.0, unit="kg")
+    k = sysid.Variable("spring", 2, lower=100.0, upper=1e5, log=True, unit="N/m")
+    c = sysid.Variable("damper", 2, lower=0.1, upper=100.0, log=True, unit="N s/m")
+    K, C = STRETCH.T @ ca.diag(k) @ STRETCH, (STRETCH.T @ ca.diag(c) @ STRETCH)[:2, :2]
+    M = ca.diag(m)
+    tests = [sysid.Misfit(other, mass=M + np.diag(added), stiffness=K, damping=C) for other, added in further]
+    return sysid.Problem(test, mass=M, stiffness=K, damping=C, residuals=[*known(m, k), *tests], **options)
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.0])
+def test_alone_it_gives_the_open_scale_its_own_accuracy(noise):
+    """Accelerations know ratios to a thousandth; the weighing to 2 % then is the accuracy of every mass and spring."""
+    result = sysid.identify(
+        problem(measured(0, noise), lambda m, k: [sysid.Known(m[0], 5.2, std=0.1)]), rng=0, strategy=QUICK
+    )
+    assert result.determined
+    np.testing.assert_allclose(result.values["mass"][0], 5.2, rtol=1e-4)
+    np.testing.assert_allclose(result.values["mass"], MASS * 1.04, rtol=2e-3)
+    for name in ("mass", "spring"):
+        np.testing.assert_allclose(result.uncertainty.variables[name] / result.values[name], 0.1 / 5.2, rtol=0.02)
+    assert any("by what is stated as known alone" in sentence for sentence in result.closed_by)
+
+
+def test_two_of_them_are_weighed_by_their_deviations():
+    """Both tell the one open scale: the weighted mean, with the deviation that belongs to it."""
+    known = lambda m, k: [sysid.Known(m, [5.0 * 1.02, 4.0 * 0.99], std=[0.1, 0.04])]  # noqa: E731 - 2 and 1 %
+    result = sysid.identify(problem(measured(1), known), rng=0, strategy=QUICK)
+    # In units of the truth: x = 1.02 give or take 0.02, and 0.99 give or take 0.01.
+    weights = np.array([0.02, 0.01]) ** -2
+    mean = weights @ [1.02, 0.99] / weights.sum()
+    np.testing.assert_allclose(result.values["mass"] / MASS, mean, rtol=2e-3)
+    std = result.uncertainty.variables["mass"] / MASS
+    np.testing.assert_allclose(std, weights.sum() ** -0.5, rtol=0.03)
+
+
+def test_errors_are_as_large_as_their_deviations_say():
+    """Noise of records and weighings drawn together, which both matter: a loaded test gives the scale too."""
+    z = []
+    for seed in range(30):
+        random = np.random.default_rng(seed)
+        added = np.array([0.0, 0.4])
+        further = [(measured([seed, 1], mass=MASS + added), added)]
+        weighed = MASS + 0.02 * random.normal(size=2)
+        known = lambda m, k, weighed=weighed: [sysid.Known(m, weighed, std=0.02)]  # noqa: E731
+        result = sysid.identify(problem(measured([seed, 0]), known, further=further), rng=0, strategy=QUICK)
+        assert result.determined
+        for name, true in (("mass", MASS), ("spring", SPRINGS)):
+            z.append((result.values[name] - true) / result.uncertainty.variables[name])
+    # 120 numbers, of which those of one draw hang together.
+    assert 0.75 < np.sqrt(np.mean(np.square(z))) < 1.25
+
+
+def test_a_value_that_the_records_contradict_is_named():
+    added = np.array([0.0, 2.0])
+    further = [(measured(5, mass=MASS + added), added)]
+    known = lambda m, k: [sysid.Known(m[1], 4.4, std=0.01)]  # noqa: E731 - 40 deviations off
+    result = sysid.identify(problem(measured(4), known, further=further), rng=0, strategy=QUICK)
+    assert not result.determined
+    assert any("mass[1] ends" in sentence for sentence in result.undetermined)
+
+
+def test_values_that_are_missed_together_are_named_though_none_is_alone():
+    added = np.array([0.0, 2.0])
+    further = [(measured(5, mass=MASS + added), added)]
+
+    def known(m, k):
+        return [sysid.Known(m, MASS * 1.05, std=MASS * 0.016), sysid.Known(k, SPRINGS * 1.05, std=SPRINGS * 0.016)]
+
+    result = sysid.identify(problem(measured(4), known, further=further), rng=0, strategy=QUICK)
+    assert not result.determined
+    assert any("missed together" in sentence for sentence in result.undetermined)
+
+
+def test_names_come_back_from_a_file(tmp_path):
+    known = lambda m, k: [sysid.Known(m[1], 4.1, std=0.1), sysid.Known(k[0] / k[1], 1.3, std=0.5)]  # noqa: E731
+    result = sysid.identify(problem(measured(2), known), rng=0, strategy=QUICK)
+    again = sysid.load(result.save(tmp_path))
+    assert again.problem.formulation.known_names == ("mass[1]", "a relation of spring")
+    assert "mass[1] ends" in again.summary()
+    np.testing.assert_allclose(again.uncertainty.variables["mass"], result.uncertainty.variables["mass"], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "said"),
+    [
+        (4.0, 0.0, "must be positive"),
+        ([1.0, 2.0, 3.0], 0.1, "3 numbers for 2"),
+        (np.nan, 0.1, "NaN"),
+        ("heavy", 0.1, "value"),
+    ],
+)
+def test_mistakes(value, std, said):
+    with pytest.raises(sysid.InputError, match=said):
+        problem(measured(0), lambda m, k: [sysid.Known(m, value, std)])
