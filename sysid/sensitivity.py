@@ -215,7 +215,8 @@ def sensitivity(problem: Problem, x: Array, slopes: Slopes | None = None, *, kno
     V = np.linalg.svd(J, full_matrices=True)[2].T if rank < J.shape[1] and len(J) < J.shape[1] else Vt.T
     # x = unit V (1/s) U' e: each column of U carries the noise of its rows.
     mixed = (U[:, :rank].T * std**2) @ U[:, :rank]
-    lam, turn = np.linalg.eigh(mixed)
+    # Where the lines are too few to tell a noise that is not stated, no deviation is known.
+    lam, turn = np.linalg.eigh(mixed) if np.all(np.isfinite(mixed)) else (np.full(rank, np.nan), np.eye(rank))
     normals = unit[:, None] * (free @ (V[:, :rank] / s[:rank]) @ (turn * np.sqrt(np.maximum(lam, 0.0))))
     return Sensitivity(unit, free, s, free @ V[:, :rank], free @ V[:, rank:], normals)
 
