@@ -118,10 +118,11 @@ class Rows:
     std: Array
 
 
-def rows_of_test(test: Measurement, s: Slopes, unknowns: int) -> list[Rows]:
+def rows_of_test(test: Measurement, s: Slopes, unknowns: int, *, as_stated: bool = False) -> list[Rows]:
     """Rows of the accelerations and, where it was measured, of the force, as the local phase weighs them.
 
-    Noise that is larger than stated, or shared by neighbouring lines, is counted as it is.
+    Noise that is larger than stated, or shared by neighbouring lines, counts as the misfit shows it; with `as_stated`
+    it is not, as where a test is planned.
     """
     X, dX = response_slopes(s, test.freq)
     R, u = s.structure.recovery, test.base  # (runs, d, n_freq)
@@ -138,7 +139,7 @@ def rows_of_test(test: Measurement, s: Slopes, unknowns: int) -> list[Rows]:
     rows: list[Rows] = []
     scale = 1.0
     records = records_of(test, s.structure, unknowns)
-    inflation = inflation_of(test, records, unknowns)
+    inflation = 1.0 if as_stated else inflation_of(test, records, unknowns)
     for i, (record, change, target) in enumerate(zip(records, parts, measured, strict=True)):
         weight = record.by_channel[:, None] * record.by_line
         if i == 0 or not both_stated:
@@ -185,19 +186,22 @@ class Sensitivity:
         return self.seen.shape[1]
 
 
-def sensitivity(problem: Problem, x: Array, slopes: Slopes | None = None, *, known: bool = True) -> Sensitivity:
+def sensitivity(
+    problem: Problem, x: Array, slopes: Slopes | None = None, *, known: bool = True, as_stated: bool = False
+) -> Sensitivity:
     """Rank, null directions and noise of the unknowns at `x`, from the exact Jacobian.
 
-    With `known` false without what is stated as known to some accuracy.
+    With `known` false without what is stated as known to some accuracy; `as_stated` as in `rows_of_test`.
     """
     formulation, p = problem.formulation, x.size
     rows: list[Rows] = []
     if formulation.misfit is None:
-        rows += rows_of_test(problem.measurement, slopes or slopes_of(formulation.matrices, x, problem.measurement), p)
+        slopes = slopes or slopes_of(formulation.matrices, x, problem.measurement)
+        rows += rows_of_test(problem.measurement, slopes, p, as_stated=as_stated)
     else:
         rows.append(_own_rows(formulation.misfit, x, None))
     for test, matrices in formulation.others:
-        rows += rows_of_test(test, slopes_of(matrices, x, test), p)
+        rows += rows_of_test(test, slopes_of(matrices, x, test), p, as_stated=as_stated)
     if formulation.residuals is not None:
         # One more number each, of the same relative noise as those measured.
         rows.append(_own_rows(formulation.residuals, x, float(np.sqrt(np.mean(rows[0].std ** 2)))))
