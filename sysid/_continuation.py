@@ -7,19 +7,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import qmc
 
 from sysid import local
+from sysid._declaration import spread
 from sysid._desk import Desk, Stop
 from sysid._search import Outcome, as_unknowns
 from sysid.errors import InputError, SolverError
-from sysid.formulation import sampled
 from sysid.identification import History
 from sysid.local import LocalResult
 from sysid.problem import Problem
 from sysid.smoothing import PolesAndResidues, Smoothed
 from sysid.structure import Array, Structure
-from sysid.variables import split
 
 SHIFTS = (0.5, 0.2, 0.08, 0.03, 0.01)  # of the geometric mean of the natural frequencies
 _STEPS = 60  # iterations of a fit on the way
@@ -124,7 +122,7 @@ def by_continuation(
     stopped: BaseException | None = None
     on_way = lambda i, cost: desk.tell("continuation", i, 0, cost)  # noqa: E731
     at_end = lambda i, cost: desk.tell("local phase", i, 0, cost)  # noqa: E731
-    for x in (first, *_spread(problem, options.starts - 1, random)):
+    for x in (first, *spread(problem.formulation, max(options.starts - 1, 0), np.random.default_rng(random))):
         try:
             way = smooth_fit(problem, x, steps, left=lambda: desk.left, monitor=on_way)
             if way is not None and way.stopped is None:
@@ -179,18 +177,6 @@ def _best(problem: Problem, ends: list[tuple[float, LocalResult]]) -> tuple[floa
         f"no search ended at a structure ({wrong}): write the matrices so that they are positive for all unknowns "
         "within their bounds, by a Cholesky factor or by springs and dampers that are positive"
     )
-
-
-def _spread(problem: Problem, count: int, random: np.random.SeedSequence) -> list[Array]:
-    """Points spread over the search space as the swarm's are."""
-    if count < 1:
-        return []
-    unit = qmc.LatinHypercube(problem.n_variables, rng=np.random.default_rng(random)).random(count)
-    rows = problem.lower + unit * (problem.upper - problem.lower)
-    return [
-        np.concatenate([sampled(v, s) for v, s in zip(problem.variables, split(problem.variables, row), strict=True)])
-        for row in rows
-    ]
 
 
 def _rivals(problem: Problem, x: Array, misfit: float, ends: list[tuple[float, LocalResult]]) -> list[Array]:

@@ -23,15 +23,19 @@ _HELD = 1e-6  # of a constraint's scale: what counts as satisfied
 _LOOSE = 1e-2  # likewise for the swarm, which meets no equality exactly
 
 
-def points_of(formulation: Formulation, count: int = _POINTS) -> Array:
-    """The guess, and points spread over the search space as the swarm's are, (count, size)."""
-    unit = qmc.LatinHypercube(formulation.size, rng=np.random.default_rng(0)).random(count - 1)
-    points = []
-    for row in formulation.lower + unit * (formulation.upper - formulation.lower):
-        pieces = split(formulation.variables, row)
-        pieces = [sampled(v, s) for v, s in zip(formulation.variables, pieces, strict=True)]
-        points.append(np.concatenate(pieces))
-    return np.array([formulation.guess, *points])
+def points_of(formulation: Formulation) -> Array:
+    """The guess, and points spread over the search space, (count, size)."""
+    return np.array([formulation.guess, *spread(formulation, _POINTS - 1, np.random.default_rng(0))])
+
+
+def spread(formulation: Formulation, count: int, rng: np.random.Generator) -> list[Array]:
+    """Points spread over the search space as the swarm's are."""
+    unit = qmc.LatinHypercube(formulation.size, rng=rng).random(count)
+    rows = formulation.lower + unit * (formulation.upper - formulation.lower)
+    variables = formulation.variables
+    return [
+        np.concatenate([sampled(v, s) for v, s in zip(variables, split(variables, row), strict=True)]) for row in rows
+    ]
 
 
 def check_matrices(formulation: Formulation, points: Array, test: Measurement, site: str) -> None:

@@ -245,6 +245,24 @@ def run_index(test: Measurement, run: int | str) -> int:
     return index_of("run", run, names)
 
 
+def strongest(
+    test: Measurement, count: int, *, sensor: int | str | None = None, run: int | str | None = None
+) -> list[tuple[int, int]]:
+    """Pairs (sensor, run) with the largest relative accelerations, of different sensors, the runs in turn."""
+    energy = np.linalg.norm(test.relative, axis=-1)
+    sensors = range(test.n_sensors) if sensor is None else [sensor_index(test, sensor)]
+    runs = range(test.n_runs) if run is None else [run_index(test, run)]
+    free = list(sensors)
+    chosen: list[tuple[int, int]] = []
+    first = max(runs, key=lambda r: energy[r, free].max())
+    while free and len(chosen) < count:
+        r = runs[(runs.index(first) + len(chosen)) % len(runs)]
+        s = max(free, key=lambda s: energy[r, s])
+        free.remove(s)
+        chosen.append((s, r))
+    return chosen
+
+
 def with_force(test: Measurement) -> Measurement:
     if test.force is None:
         raise InputError("base_force: this measurement has no base force")

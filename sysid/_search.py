@@ -21,7 +21,8 @@ class Outcome:
     ----------
     structure : Structure
     x : (n_variables,) or None
-        The problem's unknowns that stand for the structure, where it has one degree of freedom a sensor.
+        The problem's unknowns that stand for the structure; None where the modal strategy chose other degrees of
+        freedom than the sensors.
     strategy : str
     success : bool
         Of the last solver.

@@ -143,7 +143,7 @@ class _Search:
     def misfit(self) -> float:
         """At the best so far."""
         assert self.x is not None
-        return self.misfit_of(self.x)
+        return self.problem.misfit_of(self.x)
 
     @property
     def meets_goal(self) -> bool | None:
@@ -159,10 +159,6 @@ class _Search:
             return self.meets_goal is True
         # Without a goal: modal coordinates notice their local minima themselves, structured ones cannot.
         return local.is_modal(self.problem) or self.misfit <= _DOUBTFUL
-
-    def misfit_of(self, x: Array) -> float:
-        """What all phases minimise."""
-        return self.problem.misfit_of(x)
 
     def run(
         self, random: np.random.SeedSequence, start: ArrayLike | Structure | None, max_evaluations: int | None
@@ -251,7 +247,7 @@ class _Search:
         chosen, solved = closed_form(factor, stiffness.targets), by_ipopt(factor, stiffness.targets)
         x = self.x.copy()
         x[part] = triangle_entries(solved.factor)
-        misfit, other = self.misfit, self.misfit_of(x)
+        misfit, other = self.misfit, self.problem.misfit_of(x)
         self.desk.note(
             f"refinement of eigenvalues 1 to {stiffness.targets.size} of {n}: {solved.message}, within "
             f"{solved.error:.1e} of the given ones, residual {other:.4e} (closed form {misfit:.4e})"
@@ -269,7 +265,7 @@ class _Search:
             answer = descend(self.problem, self.x, self.steps, left=lambda: self.desk.left, monitor=monitor)
         else:
             answer = local.solve(self.problem, self.x, max_time=self.desk.left, monitor=monitor)
-        after = self.misfit_of(answer.x)
+        after = self.problem.misfit_of(answer.x)
         self.desk.note(f"local phase: {answer.message}, {answer.curve.size} iterates, residual {after:.4e}")
         self.success, self.message = answer.success, answer.message
         if after < before:

@@ -17,7 +17,7 @@ from sysid.mass import FullMass, KnownMass, LumpedMass
 from sysid.measurement import Measurement
 from sysid.stiffness import StiffnessModel
 from sysid.structure import Array, finite_array
-from sysid.variables import Block, Variable, call_site, expression_of, user_frame, variable_of
+from sysid.variables import Block, Variable, expression_of, user_site, variable_of
 
 
 class Given(NamedTuple):
@@ -163,7 +163,7 @@ def as_matrix(name: str, value: Any) -> ca.MX:
         except (RuntimeError, NotImplementedError):
             sizes = ", ".join(str(len(row)) for row in rows)
             raise InputError(
-                f"{name} ({call_site(user_frame())}): its rows do not fit together; they have {sizes} entries"
+                f"{name} ({user_site()}): its rows do not fit together; they have {sizes} entries"
             ) from None
     if isinstance(value, ca.DM):
         return ca.MX(value)
@@ -178,16 +178,14 @@ def _entry(name: str, value: Any) -> Any:
     if isinstance(value, ca.MX | ca.DM | np.ndarray) or (np.isscalar(value) and not isinstance(value, str | bytes)):
         return value
     raise InputError(
-        f"{name} ({call_site(user_frame())}) holds a {type(value).__name__} in its rows: numbers and expressions are "
-        "needed"
+        f"{name} ({user_site()}) holds a {type(value).__name__} in its rows: numbers and expressions are needed"
     )
 
 
 def _constant(name: str, value: ca.SX) -> ca.SX:
     if not value.is_constant():
         raise InputError(
-            f"{name} ({call_site(user_frame())}) is a CasADi SX with symbols of its own: write it in sysid.Variable "
-            "(or MX)"
+            f"{name} ({user_site()}) is a CasADi SX with symbols of its own: write it in sysid.Variable (or MX)"
         )
     return value
 
@@ -290,7 +288,7 @@ def _check_size(name: str, matrix: ca.MX, n: int, d: int) -> None:
     if matrix.size1() not in (n, n + d):
         ratios = ", or one ratio a mode" if name == "damping" else ""
         raise InputError(
-            f"{name} is {_size(matrix)} ({call_site(user_frame())}); ({n}, {n}) or, with the base, ({n + d}, {n + d}) "
+            f"{name} is {_size(matrix)} ({user_site()}); ({n}, {n}) or, with the base, ({n + d}, {n + d}) "
             f"is needed{ratios}, or recovery= beside it, from degrees of freedom to {n} sensors{written_in(matrix)}"
         )
 
@@ -389,7 +387,7 @@ def check_free(name: str, symbols: Sequence[ca.MX], found: Sequence[Variable | N
     free = [symbol.name() for symbol, variable in zip(symbols, found, strict=True) if variable is None]
     if free:
         raise InputError(
-            f"{', '.join(map(repr, free))} in {name} ({call_site(user_frame())}) is a free CasADi symbol: declare it "
+            f"{', '.join(map(repr, free))} in {name} ({user_site()}) is a free CasADi symbol: declare it "
             "as a sysid.Variable with bounds"
         )
 

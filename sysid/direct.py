@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from sysid.measurement import Measurement
-from sysid.response import parts_of, weights_of
+from sysid.response import parts_of, weights_of_test
 from sysid.structure import Array
 
 _SOLVER = "lapacklu"  # of the wheels' plugins the fastest on small dense systems
@@ -101,13 +101,11 @@ def relative_misfit(test: Measurement, motion: Motion, *, weighted: bool = False
     """Relative residuals, stacked, as `response.residual` has them: of accelerations, then of a measured force."""
     a, f = relative_response(test, motion, shift=shift)
     R = ca.DM(motion.recovery)
-    weight, scale = weights_of(test.relative, test.response_std if weighted else None)
+    (weight, scale), *of_force = weights_of_test(test, weighted=weighted)
     a_re, a_im = parts_of(test.relative)
     pieces = [weight * (R @ a.real - a_re) / scale, weight * (R @ a.imag - a_im) / scale]
     if test.force is not None:
-        weight, force_scale = weights_of(test.force, test.force_std if weighted else None)
-        if not weighted or test.response_std is None or test.force_std is None:
-            scale = force_scale
+        ((weight, scale),) = of_force
         f_re, f_im = parts_of(test.force)
         pieces += [weight * (f.real - f_re) / scale, weight * (f.imag - f_im) / scale]
     return ca.vertcat(*(ca.vec(ca.densify(piece)) for piece in pieces))

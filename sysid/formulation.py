@@ -2,8 +2,8 @@
 
 ::
 
-    models, arrays, expressions --> Parts (MX)  --symbols--> variables, in the order of x
-                                                --Function-> matrices(x), residuals(x), constraints(x), healing(x)
+    models, arrays, expressions --> Blocks (MX)  --symbols--> variables, in the order of x
+                                                 --Function-> matrices(x), residuals(x), constraints(x), healing(x)
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from sysid.measurement import Measurement
 from sysid.response import residual
 from sysid.smoothing import noise_level
 from sysid.structure import Array, Structure
-from sysid.variables import Block, Variable, call_site, expression_of, user_frame, variable_of
+from sysid.variables import Block, Variable, expression_of, user_site, variable_of
 
 MATRICES = ("mass", "stiffness", "damping")
 
@@ -216,10 +216,13 @@ def guess_of(variable: Block | Variable) -> Array:
 
 def sampled(variable: Block | Variable, s: Array) -> Array:
     """Numbers of the variable that the swarm's coordinates `s`, (size,), stand for."""
-    if variable.sampling is None:
-        return s
-    symbol = ca.SX.sym("s", variable.size)
-    return np.asarray(ca.Function("sampling", [symbol], [ca.densify(variable.sampling(symbol))])(s)).ravel()
+    return s if variable.sampling is None else np.asarray(sampling_function(variable)(s)).ravel()
+
+
+def sampling_function(variable: Block | Variable) -> ca.Function:
+    """The variable of the swarm's coordinates, (size,) each."""
+    s = ca.SX.sym("s", variable.size)
+    return ca.Function("sampling", [s], [s if variable.sampling is None else ca.densify(variable.sampling(s))])
 
 
 def labels_of(variable: Block | Variable) -> tuple[str, ...]:
@@ -267,7 +270,7 @@ def formulate(given: Given, layout: Layout, test: Measurement) -> Formulation:
     own = sorted(found.values(), key=lambda variable: variable.order)
     _check_names(own, [block for block, _ in blocks.symbols])
     free, fixed = [v for v in own if not v.fixed], tuple(v for v in own if v.fixed)
-    for variable in healing:
+    for variable, expression in healing.items():
         if not any(variable is v for v in free):
             raise InputError(f"healing: {variable!r} is no unknown of this problem")
         if expression.shape != variable.symbol.shape:
@@ -342,7 +345,7 @@ def _column(name: str, value: Any) -> ca.MX:
     column = ca.vec(ca.densify(as_matrix(name, value)))
     check_finite(name, at_point(name, column, None).ravel(), column)
     if not ca.symvar(column):
-        raise InputError(f"{name} ({call_site(user_frame())}) holds no variable: there is nothing that it could move")
+        raise InputError(f"{name} ({user_site()}) holds no variable: there is nothing that it could move")
     return column
 
 
@@ -355,7 +358,7 @@ def _relation(number: int, value: Any) -> list[tuple[ca.MX, bool, str]]:
     if kind is None:
         what = type(value).__name__ if not isinstance(value, ca.MX) else f"the expression {str(value)[:60]}"
         raise InputError(
-            f"{name} is {what} ({call_site(user_frame())}): a constraint is a relation of variables, such as "
+            f"{name} is {what} ({user_site()}): a constraint is a relation of variables, such as "
             f"k[0] <= k[1] or ca.sum1(m) == 9{written_in(relation) if isinstance(relation, ca.MX) else ''}"
         )
     left, right = relation.dep(0), relation.dep(1)

@@ -44,14 +44,14 @@ class Recipe:
 class History:
     """What ran, phase by phase; residuals are relative, NaN where a phase did not run.
 
-    Where a base force was measured they count it too: the root of the sum of both squared relative residuals.
-    The modal strategy has the local phase only.
+    They count all that is fitted, base force and further tests too: the root of the sum of all squared relative
+    residuals. The modal strategy has the local phase only, continuation start and local phase.
 
     Attributes
     ----------
     start, swarm, refinement, local : float
-        Residual of the best candidate after each phase: the Latin hypercube (or the start that was
-        given), the swarm, the eigenvalue refinement, the local phase.
+        Residual of the best candidate after each phase: the Latin hypercube (or the start that was given; of
+        continuation the guess), the swarm, the eigenvalue refinement, the local phase.
     swarm_curve, local_curve : ndarray
         Best residual after each iteration of the swarm, and residual of each local iterate as IPOPT saw it, the
         records weighed by stated noise.
@@ -89,7 +89,8 @@ class Identification:
     structure : Structure
     problem : Problem
     x : (n_variables,) or None
-        The problem's unknowns that stand for the structure, where it has one degree of freedom a sensor.
+        The problem's unknowns that stand for the structure; None where the modal strategy chose other degrees of
+        freedom than the sensors.
     strategy : str
     seed : int or None
     success : bool

@@ -56,8 +56,9 @@ def identify(
         structured stiffness and whatever is written in expressions: gradients from the guess and from further starts,
         through responses whose peaks were widened. A `Modal`, `Swarm` or `Continuation` object is that with other
         settings. "auto" takes modal for a full, lumped or known mass with spectral stiffness and modal damping, else
-        continuation where the stiffness has a form of its own, else the swarm, and the swarm too where the one that
-        was taken turns out not to apply or finds no good fit; the result's remarks say which and why.
+        continuation where the stiffness has a form of its own or anything is written in expressions, else the swarm,
+        and the swarm too where the one that was taken turns out not to apply or finds no good fit; the result's
+        remarks say which and why.
     rng : int, numpy Generator or None
         The same seed gives the same bits. None draws one, which the result reports.
     start : array_like (n_variables,) or Structure, optional
@@ -78,7 +79,7 @@ def identify(
     Identification
         Also where Ctrl-C stopped the search, with `interrupted` set.
     """
-    options, why = _options(strategy, problem, start)
+    options, why = options_of(strategy, problem, start)
     seed, random = _seed(rng)
     if max_time is not None and not max_time > 0:
         raise InputError(f"max_time = {max_time}: a positive number of seconds is needed")
@@ -111,7 +112,7 @@ def identify(
         return _finish(problem, by_swarm(problem, options, desk, random, start, max_evaluations), why, seed, desk)
 
 
-def _options(
+def options_of(
     strategy: str | Swarm | Modal | Continuation, problem: Problem, start: ArrayLike | Structure | None
 ) -> tuple[Swarm | Modal | Continuation, str]:
     """Settings of the strategy that is taken, and why it is."""
@@ -120,9 +121,8 @@ def _options(
     if strategy not in STRATEGIES:
         raise InputError(f"strategy {strategy!r} is unknown; give one of {', '.join(map(repr, STRATEGIES))}")
     if strategy != "auto":
-        return {"modal": Modal, "swarm": Swarm, "continuation": Continuation}[
-            strategy
-        ](), f"strategy {strategy!r}, as asked"
+        kinds = {"modal": Modal, "swarm": Swarm, "continuation": Continuation}
+        return kinds[strategy](), f"strategy {strategy!r}, as asked"
     if problem.is_written:
         return Continuation(), "strategy 'continuation': the problem is written in unknowns of its own"
     if not isinstance(problem.stiffness, SpectralStiffness):

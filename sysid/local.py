@@ -21,10 +21,9 @@ import numpy as np
 from sysid._coordinates import Coordinates
 from sysid._watch import Watch
 from sysid.damping import ModalDamping
-from sysid.local_structured import StructuredFit, fit_structured
+from sysid.local_structured import StructuredFit, fit_structured, frequencies
 from sysid.mass import FullMass
 from sysid.measurement import Measurement
-from sysid.modal import FREQUENCY_WINDOW
 from sysid.modal_fit import ModalFit, Modes, fit_modes, rank_one
 from sysid.modal_scales import stated_totals, to_stated_totals
 from sysid.problem import Problem, assemble
@@ -34,7 +33,6 @@ from sysid.smoothing import Smoothed
 from sysid.stiffness import SpectralStiffness
 from sysid.structure import Array, Structure
 
-_OPEN_WINDOW = 20.0  # factor either way for a frequency that nobody gave
 _SUSPECT = 1.05  # a residual so many times that of free residues at the same poles is a local minimum
 _LEAST_SHAPE = 1e-6  # of the largest singular value of the shapes, below which M_SS would be no mass matrix
 EXACT = 1e-8  # a residual that needs no second look
@@ -111,7 +109,7 @@ def _in_modal_coordinates(problem: Problem, start: Structure, watch: Watch, max_
 
     def attempt(modes: Modes) -> ModalFit:
         return fit_modes(
-            test, modes, lambda z: _spectrum(problem, modes, z)[:2], unit=np.sqrt(problem.totals),
+            test, modes, lambda z: _spectrum(problem, modes, z), unit=np.sqrt(problem.totals),
             remainder=remainder, ties=stated_totals(problem), watch=watch, max_iterations=max_iterations,
         )  # fmt: skip
 
@@ -161,29 +159,18 @@ def _modes(structure: Structure) -> Modes:
     )
 
 
-def _spectrum(problem: Problem, start: Modes, z: Coordinates) -> tuple[ca.MX, ca.MX, Array]:
-    """Frequencies and damping ratios as expressions; circular frequencies that they are relative to."""
-    center, window = start.omega.copy(), np.full(start.omega.size, np.log(_OPEN_WINDOW))
-    if isinstance(problem.stiffness, SpectralStiffness):
-        targets = problem.stiffness.targets
-        center[: targets.size], window[: targets.size] = targets, np.log1p(FREQUENCY_WINDOW)
-    shift = z.add("frequency", np.clip(np.log(start.omega / center), -window, window), -window, window)
-    omega = ca.DM(center) * ca.exp(shift)
+def _spectrum(problem: Problem, start: Modes, z: Coordinates) -> tuple[ca.MX, ca.MX]:
+    """Circular frequencies and damping ratios as expressions."""
+    omega, _ = frequencies(problem, start.omega, z)
     damping = problem.damping
     (variable,) = damping.variables(problem.layout)
     if isinstance(damping, ModalDamping):
         guess = np.clip(start.ratios, variable.lower, variable.upper)
         low, high = np.log(variable.lower / guess), np.log(variable.upper / guess)
-        return omega, ca.DM(guess) * ca.exp(z.add("damping ratio", np.zeros(guess.size), low, high)), center
+        return omega, ca.DM(guess) * ca.exp(z.add("damping ratio", np.zeros(guess.size), low, high))
     guess = np.clip(damping.values(start.ratios, start.omega), variable.lower, variable.upper)
     y = z.add("rayleigh factor", guess / variable.upper, variable.lower / variable.upper, 1.0)
-    return omega, damping.ratios(y * ca.DM(variable.upper), omega), center
-
-
-def _damping_values(problem: Problem, ratios: Array, omega: Array) -> Array:
-    """The damping's unknowns, inside the bounds that IPOPT may leave by its tolerance."""
-    (variable,) = problem.damping.variables(problem.layout)
-    return np.clip(problem.damping.values(ratios, omega), variable.lower, variable.upper)
+    return omega, damping.ratios(y * ca.DM(variable.upper), omega)
 
 
 def _unknowns(problem: Problem, modes: Modes, rigid: Array, remainder: Array) -> Array:
@@ -203,7 +190,8 @@ def _unknowns(problem: Problem, modes: Modes, rigid: Array, remainder: Array) ->
     M_S0 = P.T @ pushes - M_SS @ G
     low = np.linalg.solve(np.linalg.cholesky(M_SS), M_S0)
     x = problem.values(assemble(M_SS, M_S0, low.T @ low + left, (P.T * w**2) @ P, zeta, G))
-    x[problem.parts.damping] = _damping_values(problem, zeta, w)
+    at = problem.parts.damping
+    x[at] = np.clip(x[at], problem.lower[at], problem.upper[at])  # IPOPT may leave bounds by its tolerance
     return x
 
 

@@ -26,10 +26,9 @@ from sysid.response import residual
 from sysid.smoothing import Smoothed
 from sysid.stiffness import SpectralStiffness
 from sysid.structure import Array, Structure
-from sysid.variables import Variable, slices_of, split
+from sysid.variables import Block, Variable, slices_of, split, steps_of
 
 _OPEN_WINDOW = 20.0  # factor either way for a frequency that nobody gave
-_RANGE = 0.05  # of the search space: the least unit of an unknown
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +54,7 @@ def fit_structured(
     """
     z, formulation = Coordinates(), problem.formulation
     tests = smoothed or [Smoothed(test, 0.0) for test in (problem.measurement, *(t for t, _ in formulation.others))]
-    by_modes = formulation.matrices.by_ratios or isinstance(problem.damping, ProportionalDamping)
-    modal = by_modes and formulation.misfit is None
+    modal = needs_modes(problem)
     # The modes themselves stand for a spectral stiffness.
     held = modal and isinstance(problem.stiffness, SpectralStiffness)
     pieces: list[ca.MX] = []
@@ -66,9 +64,7 @@ def fit_structured(
         if held and variable.name == "stiffness_factor":
             pieces.append(ca.MX(ca.DM(values)))
             continue
-        # Each unknown in units of its start, or of its range where that is larger.
-        unit = np.maximum(np.abs(values), _RANGE * (variable.upper - variable.lower))
-        unit = np.where(unit > 0, unit, 1.0) if variable.name != "rayleigh_factor" else variable.upper
+        unit = unit_of(variable, values)
         own = isinstance(variable, Variable)
         name = variable.name if own else variable.name.replace("_", " ")
         labels = [label.removeprefix(variable.name) for label in labels_of(variable)] if own else None
@@ -121,6 +117,30 @@ def fit_structured(
     return StructuredFit(ended, float(values[3].item()), status, z.on_bounds(best))
 
 
+def needs_modes(problem: Problem) -> bool:
+    """Whether modes are further unknowns: damping by ratios has no direct solve."""
+    by_ratios = problem.formulation.matrices.by_ratios or isinstance(problem.damping, ProportionalDamping)
+    return by_ratios and problem.formulation.misfit is None
+
+
+def unit_of(variable: Block | Variable, values: Array) -> Array:
+    """What IPOPT counts a variable in: its start, or a part of its range where that is larger."""
+    if variable.name == "rayleigh_factor":
+        return variable.upper
+    unit = steps_of([variable], values)
+    return np.where(unit > 0, unit, 1.0)
+
+
+def frequencies(problem: Problem, start: Array, z: Coordinates) -> tuple[ca.MX, Array]:
+    """Circular frequencies as new unknowns, held near those that were given, and what they are relative to, rad/s."""
+    center, window = start.copy(), np.full(start.size, np.log(_OPEN_WINDOW))
+    if isinstance(problem.stiffness, SpectralStiffness):
+        targets = problem.stiffness.targets
+        center[: targets.size], window[: targets.size] = targets, np.log1p(FREQUENCY_WINDOW)
+    shift = np.clip(np.log(start / center), -window, window)
+    return ca.DM(center) * ca.exp(z.add("frequency", shift, -window, window)), center
+
+
 def _in_modes(
     problem: Problem, test: Smoothed, unknowns: ca.MX, factors: ca.MX, start: Structure, z: Coordinates, *, held: bool
 ) -> tuple[ca.MX, ca.MX, ca.MX]:
@@ -130,13 +150,7 @@ def _in_modes(
     """
     motion = problem.formulation.matrices.motion(unknowns)
     n = start.n
-    center = 2 * np.pi * start.natural_frequencies
-    window = np.full(n, np.log(_OPEN_WINDOW))
-    if isinstance(problem.stiffness, SpectralStiffness):
-        targets = problem.stiffness.targets
-        center[: targets.size], window[: targets.size] = targets, np.log1p(FREQUENCY_WINDOW)
-    shift = np.clip(np.log(2 * np.pi * start.natural_frequencies / center), -window, window)
-    omega = ca.DM(center) * ca.exp(z.add("frequency", shift, -window, window))
+    omega, center = frequencies(problem, 2 * np.pi * start.natural_frequencies, z)
     _, inverse = problem.formulation.matrices.factors(unknowns)
     psi = z.add("mode shape", np.linalg.cholesky(start.mass[:n, :n]).T @ start.normal_modes)
     z.tie(lower_entries(psi.T @ psi - ca.MX.eye(n)))

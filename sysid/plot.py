@@ -40,6 +40,7 @@ from sysid._panels import (
     response_channel,
     run_index,
     sensor_index,
+    strongest,
     with_force,
 )  # fmt: skip
 from sysid.errors import InputError
@@ -457,24 +458,6 @@ def overview(identification: Identification, *, title: str | None = None) -> Fig
         title = f"{head}{test.n_sensors} sensors, {test.n_base} base directions, residual {identification.residual:.2e}"
     figure.suptitle(title, fontsize=13, color=INK, parse_math=False)
     return figure
-
-
-def strongest(
-    test: Measurement, count: int, *, sensor: int | str | None = None, run: int | str | None = None
-) -> list[tuple[int, int]]:
-    """Pairs (sensor, run) with the largest relative accelerations, of different sensors, the runs in turn."""
-    energy = np.linalg.norm(test.relative, axis=-1)
-    sensors = range(test.n_sensors) if sensor is None else [sensor_index(test, sensor)]
-    runs = range(test.n_runs) if run is None else [run_index(test, run)]
-    free = list(sensors)
-    chosen: list[tuple[int, int]] = []
-    first = max(runs, key=lambda r: energy[r, free].max())
-    while free and len(chosen) < count:
-        r = runs[(runs.index(first) + len(chosen)) % len(runs)]
-        s = max(free, key=lambda s: energy[r, s])
-        free.remove(s)
-        chosen.append((s, r))
-    return chosen
 
 
 def normalised(matrix: Array) -> Array:

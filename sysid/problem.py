@@ -1,4 +1,4 @@
-"""An identification problem: a measurement, a model of each matrix, and the search space that they span."""
+"""An identification problem: a measurement, its matrices as models, numbers or expressions, and the search space."""
 
 from __future__ import annotations
 
@@ -38,18 +38,18 @@ class Parts(NamedTuple):
     damping: slice
 
 
-class Matrices(NamedTuple):
-    """Everything that a vector of unknowns stands for, as numbers or expressions.
+class ModelMatrices(NamedTuple):
+    """Everything that the unknowns of models stand for, as expressions.
 
     ``factor`` is L, the Cholesky factor of M_SS (n, n); ``coupling`` M_S0 (n, d); ``base`` M_00 (d, d);
     ``mass_normalised`` H = L^-1 K_SS L^-T (n, n); ``damping`` the damping model's unknowns.
     """
 
-    factor: ca.SX | Array
-    coupling: ca.SX | Array
-    base: ca.SX | Array
-    mass_normalised: ca.SX | Array
-    damping: ca.SX | Array
+    factor: ca.SX
+    coupling: ca.SX
+    base: ca.SX
+    mass_normalised: ca.SX
+    damping: ca.SX
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -66,10 +66,10 @@ class Problem:
         A matrix is (n, n) or (n + d, n + d).
     damping : ModalDamping, ProportionalDamping, array_like or expression
         (n, n) is C on the motion relative to the base; (n,) is one damping ratio a mode, in ascending frequency.
-    residuals : sequence of expressions
+    residuals : sequence of Misfit, Known or expressions
         Minimised in the least-squares sense beside the misfit of the measurement, whose norm is 1 where nothing is
-        explained: a second test (`sysid.Misfit`), or what
-        is known to some accuracy (`sysid.Known`). Other rows count as they are.
+        explained: a further test (`sysid.Misfit`), or what is known to some accuracy (`sysid.Known`). The rows of an
+        expression count as they are.
     constraints : sequence of relations
         Such as ``k[0] <= k[1]`` or ``ca.sum1(m) == 900``. IPOPT holds them exactly; in the swarm a candidate that
         breaks them less is better, whatever its residual, and any that keeps them is better than these.
@@ -97,7 +97,8 @@ class Problem:
     lower, upper : (n_variables,)
         The search space, in the variables' own units.
     totals : (d,)
-        Total mass in each base direction: stated, else weighed by the base force, else 1 kg.
+        Total mass in each base direction: stated, else weighed by the base force, else 1 kg; of a problem written in
+        expressions what moves with the base at the guess.
     layout : Layout
         Geometry of the test, as the matrix models see it.
     tolerance : (rows,)
@@ -201,11 +202,15 @@ class Problem:
     @cached_property
     def formulation(self) -> Formulation:
         """Matrices, residuals and constraints as CasADi functions of the unknowns."""
+        return self.formulate(self.layout)
+
+    def formulate(self, layout: Layout) -> Formulation:
+        """The same with another layout."""
         given = Given(
             self.mass, self.stiffness, self.damping, self.residuals, self.constraints, self.misfit, self.recovery,
             self.rigid_body_dofs, self.healing,
         )  # fmt: skip
-        return formulate(given, self.layout, self.measurement)
+        return formulate(given, layout, self.measurement)
 
     def _check_written(self, frame: FrameType | None) -> None:
         """Refuse what cannot be searched, before anything runs."""
@@ -289,12 +294,12 @@ class Problem:
         """Rigid-body mass (d, d) where a full mass states all of it, else None."""
         return self.layout.rigid_total(self.mass.total_mass) if isinstance(self.mass, FullMass) else None
 
-    def matrices(self, x: ca.SX) -> Matrices:
-        """Expressions of the blocks that the unknowns `x` stand for."""
+    def matrices(self, x: ca.SX) -> ModelMatrices:
+        """Expressions of the blocks that the unknowns `x` stand for, in a problem of models alone."""
         y_mass, y_stiffness, y_damping = (x[part] for part in self.parts)
         blocks: MassBlocks = self.mass.blocks(self.layout, y_mass)
         H = self.stiffness.mass_normalised(self.layout, y_stiffness, blocks.factor)
-        return Matrices(*blocks, H, y_damping)
+        return ModelMatrices(*blocks, H, y_damping)
 
     def structure(self, x: ArrayLike) -> Structure:
         """The structure that the unknowns `x`, (n_variables,) in the variables' own units, stand for."""

@@ -82,19 +82,30 @@ def residual(
     u_re, u_im = parts_of(test.base)
     push_re, push_im = gamma @ u_re, gamma @ u_im
     q_re, q_im = g_re * push_re - g_im * push_im, g_re * push_im + g_im * push_re
-    weight, scale = weights_of(test.relative, test.response_std if weighted else None)
+    (weight, scale), *of_force = weights_of_test(test, weighted=weighted)
     a_re, a_im = parts_of(test.relative)
     pieces = [weight * (phi @ q_re - a_re) / scale, weight * (phi @ q_im - a_im) / scale]
     if test.force is not None:
-        weight, force_scale = weights_of(test.force, test.force_std if weighted else None)
-        if not weighted or test.response_std is None or test.force_std is None:
-            scale = force_scale
+        ((weight, scale),) = of_force
         f_re, f_im = parts_of(test.force)
         pieces += [
             weight * (gamma.T @ q_re + rigid_body_mass @ u_re - f_re) / scale,
             weight * (gamma.T @ q_im + rigid_body_mass @ u_im - f_im) / scale,
         ]
     return ca.vertcat(*(ca.vec(ca.densify(piece)) for piece in pieces))
+
+
+def weights_of_test(test: Measurement, *, weighted: bool) -> list[tuple[ca.DM, float]]:
+    """`weights_of` the relative accelerations and, where it was measured, the base force.
+
+    Where the noise of both is stated, both have the size of the accelerations, so that they weigh by their noise alone.
+    """
+    records = [(test.relative, test.response_std)]
+    records += [] if test.force is None else [(test.force, test.force_std)]
+    found = [weights_of(record, std if weighted else None) for record, std in records]
+    if weighted and test.response_std is not None and test.force_std is not None:
+        found = [(weight, found[0][1]) for weight, _ in found]
+    return found
 
 
 def weights_of(record: ComplexArray, std: Array | None) -> tuple[ca.DM, float]:

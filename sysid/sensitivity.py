@@ -19,7 +19,7 @@ from sysid.measurement import Measurement
 from sysid.problem import Problem
 from sysid.response import columns
 from sysid.structure import Array, ComplexArray, Structure
-from sysid.variables import Block, Variable, split
+from sysid.variables import Block, Variable, split, steps_of
 
 _SAME = 1e-9  # relative distance of squared frequencies that count as one
 _NULL = 1e-9  # of the largest singular value of the Jacobian, in units of the unknowns: what no record sees
@@ -42,19 +42,28 @@ class Slopes(NamedTuple):
     d_log_omega: Array
     d_log_ratios: Array
 
+    @property
+    def d_participation(self) -> Array:
+        """Of ``gamma = Phi' B``, (n, d, p)."""
+        moved = np.einsum("ikc,id->kdc", self.d_shapes, self.push)
+        return moved + np.einsum("ik,idc->kdc", self.structure.normal_modes, self.d_push)
 
-def slopes_of(matrices: Matrices, x: Array, test: Measurement) -> Slopes:
-    """Derivatives of everything that `x` stands for."""
+
+def slopes_of(matrices: Matrices, x: Array, test: Measurement, omega: Array | None = None) -> Slopes:
+    """Derivatives of everything that `x` stands for.
+
+    The shapes of modes of one frequency are not turned into each other, unless `omega` (n,), rad/s, sets them apart.
+    """
     structure = matrices.structure(x, test)
-    symbol = ca.MX.sym("x", x.size)
-    jacobians = [ca.jacobian(ca.vec(ca.densify(part)), symbol) for part in matrices.function(symbol)[:5]]
-    values = ca.Function("slopes", [symbol], jacobians)(x)
-    n, d = matrices.rigid_body_dofs.shape
-    shapes = (n, n), (n, d), (d, d), (n, n), (n, 1) if matrices.by_ratios else (n, n)
+    symbol, p = ca.MX.sym("x", x.size), x.size
+    function = ca.Function("matrices", [symbol], [ca.densify(part) for part in matrices.function(symbol)[:5]])
+    # One forward sweep an unknown: a Jacobian of all entries as a graph takes far longer to build.
+    sweeps = function.forward(1).map(p)
+    here = (ca.repmat(ca.DM(part), 1, p) for part in (x, *function(x)))
     dM, dM_S0, dM_00, dK, dC = (
-        np.asarray(ca.densify(value)).reshape(*shape, -1, order="F")
-        for value, shape in zip(values, shapes, strict=True)
+        np.asarray(wide).reshape(wide.shape[0], p, -1).swapaxes(1, 2) for wide in sweeps(*here, ca.DM.eye(p))
     )
+    n = len(matrices.rigid_body_dofs)
     dM, dM_00, dK = ((part + part.swapaxes(0, 1)) / 2 for part in (dM, dM_00, dK))
     G = matrices.rigid_body_dofs
     M, M_S0 = structure.mass[:n, :n], structure.mass[:n, n:]
@@ -62,7 +71,8 @@ def slopes_of(matrices: Matrices, x: Array, test: Measurement) -> Slopes:
     cross = np.einsum("ie,ifc->efc", G, dM_S0)
     d_rigid = np.einsum("ie,ijc,jf->efc", G, dM, G, optimize=True) + cross + cross.swapaxes(0, 1) + dM_00
 
-    phi, omega, ratios = structure.normal_modes, 2 * np.pi * structure.natural_frequencies, structure.damping_ratios
+    phi, ratios = structure.normal_modes, structure.damping_ratios
+    omega = 2 * np.pi * structure.natural_frequencies if omega is None else omega
     lam = omega**2
     by_mass = np.einsum("il,ijc,jk->lkc", phi, dM, phi, optimize=True)
     by_stiffness = np.einsum("il,ijc,jk->lkc", phi, dK, phi, optimize=True)
@@ -208,8 +218,7 @@ def sensitivity(
     if formulation.known is not None and known:
         stated, level = _own_rows(formulation.known, x, 1.0), formulation.level
         rows.append(Rows(level * stated.residuals, level * stated.jacobian, level * stated.std))
-    # A part of the range where that is larger than the unknown itself.
-    unit = np.maximum(np.abs(x), 0.05 * (problem.upper - problem.lower))
+    unit = steps_of(problem.variables, x)
     free = _left_by_constraints(problem, x, unit)
     J = np.concatenate([row.jacobian for row in rows]) * unit @ free
     std = np.concatenate([row.std for row in rows])

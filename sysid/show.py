@@ -15,11 +15,11 @@ import numpy as np
 
 from sysid._declaration import points_of, scale_of
 from sysid._written import Misfit
-from sysid.damping import ProportionalDamping
 from sysid.errors import InputError, SysidError
 from sysid.formulation import Formulation, guess_of, sampled
-from sysid.identify import Modal, _options, identify
+from sysid.identify import Modal, identify, options_of
 from sysid.local import is_modal
+from sysid.local_structured import needs_modes, unit_of
 from sysid.mass import FullMass
 from sysid.measurement import Measurement
 from sysid.modal_masses import determination
@@ -27,7 +27,7 @@ from sysid.problem import Problem
 from sysid.sensitivity import Sensitivity, Slopes, directions_in_words, sensitivity, slopes_of
 from sysid.stiffness import SpectralStiffness
 from sysid.structure import Array, ComplexArray, Structure
-from sysid.variables import Block, Variable
+from sysid.variables import Block, Variable, steps_of
 
 _WIDTH = 120
 _NOISE = 0.01  # of a record's rms, where no noise is stated
@@ -78,7 +78,7 @@ def _test(problem: Problem, name: str) -> Iterator[str]:
     known += [f"predicted and never fitted: {_count(len(problem.validation), 'test')}"] if problem.validation else []
     known += [f"goal {problem.goal:.3g}"] if problem.goal is not None else []
     yield "; ".join([f"degrees of freedom {n}, unknowns {problem.n_variables}", *known])
-    yield f"--strategy auto takes {_options('auto', problem, None)[1].removeprefix('strategy ')}"
+    yield f"--strategy auto takes {options_of('auto', problem, None)[1].removeprefix('strategy ')}"
 
 
 def _records(test: Measurement) -> str:
@@ -162,7 +162,7 @@ def _point(problem: Problem) -> _Point:
     sentences: tuple[str, ...] = ()
     if not problem.is_written:
         found = _at_reference(problem)
-        if found is None and isinstance(_options("auto", problem, None)[0], Modal):
+        if found is None and isinstance(options_of("auto", problem, None)[0], Modal):
             found, sentences = _at_modes(problem)
         if found is not None:
             return found
@@ -195,7 +195,7 @@ def _feasible(problem: Problem, x: Array, where: str) -> tuple[Array, str]:
     at = np.asarray(constraints.function(x)).ravel() / scale
     if np.all((at <= upper - np.where(room > 0, room, -_HELD)) & (at >= lower - _HELD)):
         return x, where
-    unit = np.maximum(np.abs(x), 0.05 * (problem.upper - problem.lower))
+    unit = steps_of(problem.variables, x)
     t = ca.MX.sym("t", x.size)
     broken = constraints.function(ca.DM(x) + ca.DM(unit) * t) / ca.DM(scale)
     solver = ca.nlpsol(
@@ -304,7 +304,6 @@ def _values(problem: Problem, point: _Point, moves: Array, noise: str) -> Iterat
     for v in formulation.variables:
         part = slice(at, at + v.size)
         at += v.size
-        unit = v.upper if v.name == "rayleigh_factor" else known.unit[part]
         relative = std[part] / np.where(np.abs(x[part]) > 1e-3 * known.unit[part], np.abs(x[part]), np.nan)
         if np.any(open_[part]):
             told = "open" if np.all(open_[part]) else f"open in {np.count_nonzero(open_[part])} of {v.size}"
@@ -312,7 +311,7 @@ def _values(problem: Problem, point: _Point, moves: Array, noise: str) -> Iterat
             told = f"{100 * relative.max():.3g} %"
         else:
             told = f"{std[part].max():.3g} {v.unit}".rstrip()
-        rows.append([v.name, _range(x[part]), "-" if modal else _range(unit), told])
+        rows.append([v.name, _range(x[part]), "-" if modal else _range(unit_of(v, x[part])), told])
     yield from _table(rows)
 
 
@@ -323,15 +322,9 @@ def _coordinates(problem: Problem) -> Iterator[str]:
             "IPOPT works in mode shapes, participations and the logarithms of frequencies and damping ratios, from "
             "which these unknowns follow; here each counts in units of its size, or 5 % of its range where that is more"
         )
-    elif _by_modes(problem):
+    elif needs_modes(problem):
         held = ", which stand for the stiffness factor" if isinstance(problem.stiffness, SpectralStiffness) else ""
         yield f"IPOPT has mode shapes and frequencies as further unknowns{held}, as damping is by ratios"
-
-
-def _by_modes(problem: Problem) -> bool:
-    """Whether the local phase needs modes, as `sysid.local_structured` has it."""
-    by_ratios = problem.formulation.matrices.by_ratios or isinstance(problem.damping, ProportionalDamping)
-    return by_ratios and problem.formulation.misfit is None
 
 
 def _unseen(problem: Problem, point: _Point) -> Iterator[str]:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from sysid.errors import InputError
 from sysid.layout import FACTOR_FLOOR, Layout, lower_triangle, triangle_entries
 from sysid.structure import Array, finite_array
-from sysid.variables import Block
+from sysid.variables import Block, log_sampling
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,12 +111,10 @@ class ChainStiffness:
             raise InputError(f"ChainStiffness: bounds are one number, or one a sensor ({layout.n}), in N/m") from None
         if not (np.all(np.isfinite(high)) and np.all(low > 0) and np.all(low < high)):
             raise InputError("ChainStiffness: bounds must be finite with 0 < lower < upper (N/m)")
-        span, width = np.log(high / low), high - low
+        sampling, unsampling = log_sampling(low, high)
         return (
             Block(
-                "spring", low, high, unit="N/m",
-                sampling=lambda s: low * ca.exp((s - low) / width * span),
-                unsampling=lambda k: low + width * np.log(k / low) / span,
+                "spring", low, high, unit="N/m", sampling=sampling, unsampling=unsampling,
             ),
         )  # fmt: skip
 

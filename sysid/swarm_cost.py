@@ -12,7 +12,7 @@ from sysid.response import residual
 from sysid.stiffness import SpectralStiffness
 from sysid.structure import Array
 
-_CHUNK = 64  # particles a compiled call: fixed, so that the bits do not depend on the swarm's size
+CHUNK = 64  # particles a compiled call: fixed, so that the bits do not depend on the swarm's size
 _THREADS = 2  # of CasADi's own; the bits do not depend on it
 
 
@@ -41,21 +41,21 @@ class SwarmCost:
         push = L @ (L.T @ G) + blocks.coupling
         rigid = G.T @ push + blocks.coupling.T @ G + blocks.base
         outputs = [ca.densify(block) for block in (L_inverse, push, blocks.mass_normalised, rigid, blocks.damping)]
-        self._expand = ca.Function("expand", [s], outputs).map(_CHUNK)
+        self._expand = ca.Function("expand", [s], outputs).map(CHUNK)
         self._unknowns = ca.Function("unknowns", [s], [x])
 
         shapes = {"phi": (n, n), "gamma": (n, d), "omega": (n, 1), "rigid": (d, d), "c": blocks.damping.shape}
         phi, gamma, omega, rigid_mx, c = (ca.MX.sym(name, *shape) for name, shape in shapes.items())
         miss = residual(problem.measurement, phi, gamma, omega, problem.damping.ratios(c, omega), rigid_mx)
         cost = ca.sqrt(ca.sumsqr(miss))
-        self._evaluate = ca.Function("cost", [phi, gamma, omega, rigid_mx, c], [cost]).map(_CHUNK, "thread", _THREADS)
+        self._evaluate = ca.Function("cost", [phi, gamma, omega, rigid_mx, c], [cost]).map(CHUNK, "thread", _THREADS)
         stiffness = problem.stiffness
         self._targets = stiffness.targets if refine and isinstance(stiffness, SpectralStiffness) else None
 
     def __call__(self, particles: Array) -> Array:
         """Relative residual of each row; NaN where a candidate is no structure."""
         return np.concatenate(
-            [self._chunk(particles[start : start + _CHUNK]) for start in range(0, len(particles), _CHUNK)]
+            [self._chunk(particles[start : start + CHUNK]) for start in range(0, len(particles), CHUNK)]
         )
 
     def unknowns(self, s: Array) -> Array:
@@ -72,10 +72,9 @@ class SwarmCost:
 
     def _chunk(self, particles: Array) -> Array:
         count = len(particles)
-        padded = np.concatenate([particles, np.repeat(particles[-1:], _CHUNK - count, axis=0)])
         n = self.problem.layout.n
-        flat = [np.asarray(block) for block in self._expand(padded.T)]
-        L_inverse, push, H = (_stack(block, n) for block in flat[:3])
+        flat = [np.asarray(block) for block in self._expand(padded(particles))]
+        L_inverse, push, H = (stacked(block) for block in flat[:3])
         # A candidate that is no structure must not stop the eigensolver for the others.
         broken = ~np.all(np.isfinite(H), axis=(1, 2))
         H[broken] = np.eye(n)
@@ -92,11 +91,16 @@ class SwarmCost:
         return out
 
 
-def _stack(wide: Array, rows: int) -> Array:
-    """CasADi's side-by-side blocks (rows, count * columns) → (count, rows, columns)."""
-    return np.ascontiguousarray(wide.reshape(rows, _CHUNK, -1).transpose(1, 0, 2))
+def padded(particles: Array) -> Array:
+    """Candidates side by side, as a compiled call takes them: the last one again and again fills the chunk."""
+    return np.concatenate([particles, np.repeat(particles[-1:], CHUNK - len(particles), axis=0)]).T
+
+
+def stacked(wide: Array) -> Array:
+    """CasADi's side-by-side blocks (rows, CHUNK * columns) → (CHUNK, rows, columns)."""
+    return np.ascontiguousarray(wide.reshape(wide.shape[0], CHUNK, -1).transpose(1, 0, 2))
 
 
 def _wide(stack: Array) -> Array:
-    """Inverse of `_stack`."""
+    """Inverse of `stacked`."""
     return stack.transpose(1, 0, 2).reshape(stack.shape[1], -1)

@@ -8,7 +8,7 @@ squares, and it is NaN where something unseen moves it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol
 
@@ -24,8 +24,9 @@ from sysid.mass import FullMass
 from sysid.modal_fit import Modes
 from sysid.modal_masses import open_masses
 from sysid.problem import Problem
+from sysid.sensitivity import slopes_of
 from sysid.structure import Array, Structure, check_frequencies
-from sysid.variables import Block
+from sysid.variables import steps_of
 
 MOVED = 1e-6  # of a quantity's size, by which an unseen move of order one must change it to count
 _SAME = 1e-6  # relative distance that is put between repeated frequencies
@@ -333,59 +334,22 @@ def _damping_slopes(problem: Problem, modes: Modes) -> tuple[Array, Array, Array
     answer = damping.ratios(y, w)
     slopes = ca.Function("slopes", [y, w], [ca.jacobian(answer, y), ca.jacobian(answer, w)])
     by_unknowns, by_omega = (ca.densify(part).full() / ratios[:, None] for part in slopes(at, omega))
-    return by_unknowns, by_omega * omega, _steps((variable,), at)
-
-
-def _steps(variables: Iterable[Block], x: Array) -> Array:
-    """A large step of each unknown: its own size, or a part of its range where that is larger."""
-    width = np.concatenate([variable.upper - variable.lower for variable in variables])
-    return np.maximum(np.abs(x), 0.05 * width)
+    return by_unknowns, by_omega * omega, steps_of((variable,), at)
 
 
 def _structured(problem: Problem, structure: Structure, modes: Modes, index: Index) -> Path:
-    """Mass or stiffness with unknowns of their own: first-order perturbation of ``H psi = w² psi``, Phi = L^-T Psi."""
-    layout, parts, n, G = problem.layout, problem.parts, problem.layout.n, problem.layout.rigid_body
+    """Mass or stiffness with unknowns of their own: modes move as the matrices do (`sysid.sensitivity`)."""
+    layout, x = problem.layout, problem.values(structure)
     if problem.unit_mass:
         # Nobody stated the totals, to which masses are normalised: they are unknowns that no record sees.
         layout = replace(layout, weighed=problem.totals)
-    x, mass_values = problem.values(structure), problem.mass.values(layout, structure.mass)
-    mass_variables, stiffness_variables = problem.mass.variables(layout), problem.stiffness.variables(layout)
-    symbols = ca.SX.sym("x", mass_values.size), ca.SX.sym("y", x[parts.stiffness].size)
-    blocks = problem.mass.blocks(layout, symbols[0])
-    H = problem.stiffness.mass_normalised(layout, symbols[1], blocks.factor)
-    pieces, both = [*blocks, H], ca.vertcat(*symbols)
-    jacobians = [ca.jacobian(ca.vec(ca.densify(piece)), both) for piece in pieces]
-    values = ca.Function("values", [both], [ca.densify(piece) for piece in (*pieces, *jacobians)])
-    at = np.concatenate([mass_values, x[parts.stiffness]])
-    L, M_S0, M_00, _, *changes = (np.asarray(value) for value in values(at))
-    shapes = (n, n), M_S0.shape, M_00.shape, (n, n)
-    dL, dM_S0, dM_00, dH = (
-        change.reshape(*shape, -1, order="F") for change, shape in zip(changes, shapes, strict=True)
-    )
-    omega, phi = modes.omega, structure.normal_modes
-    psi = L.T @ phi
-    dH = np.einsum("il,ijc,jk->lkc", psi, dH, psi, optimize=True)
-    gap = omega**2 - omega[:, None] ** 2 + np.eye(n)  # lam_k - lam_l; its diagonal is not used
-    turn = dH / gap[:, :, None] * (1 - np.eye(n))[:, :, None]
-    d_phi = np.einsum("il,lkc->ikc", phi, turn) - np.einsum(
-        "ij,ljc,lk->ikc", np.linalg.inv(L).T, dL, phi, optimize=True
-    )
-    dM = np.einsum("ijc,kj->ikc", dL, L)
-    dM = dM + dM.swapaxes(0, 1)
-    push, d_push = L @ (L.T @ G) + M_S0, np.einsum("ijc,je->iec", dM, G) + dM_S0
-    d_gamma = np.einsum("ikc,ie->kec", d_phi, push) + np.einsum("ik,iec->kec", phi, d_push)
-    cross = np.einsum("ie,ifc->efc", G, dM_S0)
-    d_rigid = np.einsum("ie,ijc,jf->efc", G, dM, G, optimize=True) + cross + cross.swapaxes(0, 1) + dM_00
-    d_log_omega = np.einsum("kkc->kc", dH) / (2 * omega[:, None] ** 2)
-    by_damping, by_log_omega, damping_steps = _damping_slopes(problem, modes)
-
-    slope = np.zeros((index.size, at.size + damping_steps.size))
-    rigid = np.stack([d_rigid[i, j] for i, j in index.pairs])
-    changes = [d_phi, d_gamma, d_log_omega, by_log_omega @ d_log_omega, rigid]
-    slope[:, : at.size] = np.concatenate([change.reshape(-1, at.size) for change in changes])
-    slope[index.log_ratios, at.size :] = by_damping
-    unit = np.concatenate([_steps((*mass_variables, *stiffness_variables), at), damping_steps])
-    return Path(slope, unit, np.zeros((unit.size, 0)))
+        x = np.concatenate([problem.mass.values(layout, structure.mass), x[problem.parts.stiffness.start :]])
+    formulation = problem.formulate(layout)
+    s = slopes_of(formulation.matrices, x, problem.measurement, modes.omega)
+    rigid = np.stack([s.d_rigid[i, j] for i, j in index.pairs])
+    changes = (s.d_shapes, s.d_participation, s.d_log_omega, s.d_log_ratios, rigid)
+    slope = np.concatenate([change.reshape(-1, x.size) for change in changes])
+    return Path(slope, steps_of(formulation.variables, x), np.zeros((x.size, 0)))
 
 
 class Moves(NamedTuple):

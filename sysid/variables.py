@@ -18,6 +18,8 @@ from numpy.typing import ArrayLike
 from sysid.errors import InputError
 from sysid.structure import Array
 
+_PART = 0.05  # of its range: the least step of an unknown
+
 
 @dataclass(frozen=True, eq=False)
 class Block:
@@ -119,7 +121,7 @@ class Variable:
         fixed: bool = False,
         unit: str = "",
     ) -> None:
-        self.declared = call_site(user_frame())
+        self.declared = user_site()
         if not isinstance(name, str) or not name:
             raise InputError(f"a Variable ({self.declared}) needs a name, and {name!r} is none")
         self.name, self.log, self.fixed, self.unit = name, bool(log), bool(fixed), str(unit)
@@ -194,20 +196,14 @@ class Variable:
         """As in `Block`."""
         if not self.log:
             return None
-        low, width, span = self.lower, np.maximum(self.upper - self.lower, np.finfo(float).tiny), self._span
-        return lambda s: low * ca.exp((s - low) / width * span)
+        return log_sampling(self.lower, self.upper)[0]
 
     @property
     def unsampling(self) -> Callable[[Array], Array] | None:
         """As in `Block`."""
         if not self.log:
             return None
-        low, width, span = self.lower, self.upper - self.lower, np.where(self._span > 0, self._span, 1.0)
-        return lambda x: low + width * np.log(x / low) / span
-
-    @property
-    def _span(self) -> Array:
-        return np.log(self.upper / self.lower)
+        return log_sampling(self.lower, self.upper)[1]
 
     def shaped(self, flat: Array) -> Array:
         """Numbers of the variable's entries, column by column, as an array of its shape."""
@@ -345,6 +341,11 @@ def call_site(frame: FrameType | None) -> str:
     return "?" if frame is None else f"{_short(frame.f_code.co_filename)}, line {frame.f_lineno}"
 
 
+def user_site() -> str:
+    """Where the user's code called into the package, for messages."""
+    return call_site(user_frame())
+
+
 def _is_ours(frame: FrameType) -> bool:
     """Whether a frame is the package's own, or of what carries out its cached properties; bundled problems' are not."""
     return str(frame.f_globals.get("__name__", "")).split(".")[0] in ("sysid", "functools")
@@ -356,6 +357,19 @@ def _short(filename: str) -> str:
         return str(Path(filename).relative_to(Path.cwd()))
     except (ValueError, OSError):
         return filename
+
+
+def log_sampling(lower: Array, upper: Array) -> tuple[Callable[[ca.SX], ca.SX], Callable[[Array], Array]]:
+    """`sampling` and `unsampling` of a `Block` that is searched on a logarithmic scale; bounds may be equal."""
+    width, span = upper - lower, np.log(upper / lower)
+    wide, long = np.where(width > 0, width, 1.0), np.where(span > 0, span, 1.0)
+    return lambda s: lower * ca.exp((s - lower) / wide * span), lambda x: lower + width * np.log(x / lower) / long
+
+
+def steps_of(variables: Iterable[Block | Variable], x: Array) -> Array:
+    """A large step of each unknown: its own size, or a part of its range where that is larger, (size of x,)."""
+    width = np.concatenate([np.zeros(0), *(v.upper - v.lower for v in variables)])
+    return np.maximum(np.abs(x), _PART * width)
 
 
 def slices_of(variables: Iterable[Block | Variable]) -> list[slice]:

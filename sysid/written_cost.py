@@ -6,14 +6,14 @@ import casadi as ca
 import numpy as np
 
 from sysid._declaration import violation_of
-from sysid.formulation import Matrices
+from sysid.formulation import Matrices, sampling_function
 from sysid.problem import Problem
-from sysid.response import columns, gains, weights_of
+from sysid.response import columns, gains, weights_of_test
 from sysid.smoothing import Smoothed
 from sysid.structure import Array, ComplexArray
+from sysid.swarm_cost import CHUNK, padded, stacked
 from sysid.variables import split
 
-_CHUNK = 64  # candidates a compiled call: fixed, so that the bits do not depend on the swarm's size
 _ROUND_OFF = 1e-9  # of the largest entry
 _WORST = 1e6  # a residual that no candidate passes that keeps the constraints
 
@@ -36,11 +36,7 @@ class WrittenCost:
         f = problem.formulation
         own = [Smoothed(test, 0.0) for test in (problem.measurement, *(t for t, _ in f.others))]
         s = ca.MX.sym("s", f.size)
-        pieces = [
-            p if v.sampling is None else _as_function(v)(p)
-            for v, p in zip(f.variables, split(f.variables, s), strict=True)
-        ]
-        x = ca.vertcat(*pieces)
+        x = ca.vertcat(*(sampling_function(v)(p) for v, p in zip(f.variables, split(f.variables, s), strict=True)))
         if f.healing is not None:
             x = ca.fmin(ca.fmax(f.healing(x), ca.DM(f.lower)), ca.DM(f.upper))
         self._unknowns = ca.Function("unknowns", [s], [x])
@@ -60,8 +56,8 @@ class WrittenCost:
 
     def __call__(self, particles: Array) -> Array:
         """Cost of each row; NaN where a candidate is no structure."""
-        chunks = range(0, len(particles), _CHUNK)
-        return np.concatenate([self._chunk(particles[start : start + _CHUNK]) for start in chunks])
+        chunks = range(0, len(particles), CHUNK)
+        return np.concatenate([self._chunk(particles[start : start + CHUNK]) for start in chunks])
 
     def unknowns(self, s: Array) -> Array:
         """The unknowns x that the swarm coordinates `s` stand for, healed."""
@@ -99,22 +95,19 @@ class _TestCost:
         motion = matrices.motion(x)
         parts = [motion.mass, motion.stiffness, motion.damping, motion.push, motion.rigid_body_mass]
         parts += [motion.coupling, motion.base]
-        self._expand = _expanded(ca.Function("expand", [s], [ca.densify(part) for part in parts])).map(_CHUNK)
+        self._expand = _expanded(ca.Function("expand", [s], [ca.densify(part) for part in parts])).map(CHUNK)
         test = smoothed.test
         self._base = columns(test.base)
-        self._targets: list[tuple[ComplexArray, Array, float]] = []
-        for record, std in ((test.relative, test.response_std), (test.force, test.force_std)):
-            if record is not None:
-                weight, scale = weights_of(record, std)
-                if self._targets and test.response_std is not None and test.force_std is not None:
-                    scale = self._targets[0][2]  # as `response.residual` has it
-                self._targets.append((columns(record), np.asarray(weight), scale))
+        records = [test.relative] if test.force is None else [test.relative, test.force]
+        self._targets = [
+            (columns(record), np.asarray(weight), scale)
+            for record, (weight, scale) in zip(records, weights_of_test(test, weighted=True), strict=True)
+        ]
 
     def squared(self, particles: Array) -> Array:
         """Of each candidate, (count,); NaN where it is no structure."""
         count, freq, runs = len(particles), self.test.freq, self.test.n_runs
-        padded = np.concatenate([particles, np.repeat(particles[-1:], _CHUNK - count, axis=0)])
-        M, K, C, B, rigid, M_S0, M_00 = (_stack(np.asarray(part))[:count] for part in self._expand(padded.T))
+        M, K, C, B, rigid, M_S0, M_00 = (stacked(np.asarray(part))[:count] for part in self._expand(padded(particles)))
         n = M.shape[1]
         # A candidate that is no structure must not stop the eigensolver for the others.
         broken = ~np.all([np.all(np.isfinite(part), axis=(1, 2)) for part in (M, K, C, B)], axis=0)
@@ -183,19 +176,9 @@ def _each(function: ca.Function, particles: Array) -> Array:
     return np.array([float(function(row)) for row in particles])
 
 
-def _stack(wide: Array) -> Array:
-    """CasADi's side-by-side blocks (rows, chunk * columns) → (chunk, rows, columns)."""
-    return np.ascontiguousarray(wide.reshape(wide.shape[0], _CHUNK, -1).transpose(1, 0, 2))
-
-
 def _expanded(function: ca.Function) -> ca.Function:
     """The same in scalar operations where all of it can be: several times faster for small matrices."""
     try:
         return function.expand()
     except RuntimeError:  # a linear solver or an interpolant inside has no scalar form
         return function
-
-
-def _as_function(variable: object) -> ca.Function:
-    s = ca.SX.sym("s", variable.size)  # type: ignore[attr-defined]
-    return ca.Function("sampling", [s], [ca.densify(variable.sampling(s))])  # type: ignore[attr-defined]

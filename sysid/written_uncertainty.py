@@ -38,9 +38,7 @@ def written_uncertainty(problem: Problem, x: Array) -> Uncertainty:
     every = np.hstack([known.normals, known.unit[:, None] * known.unseen])
     normals = known.rank
     shapes = np.einsum("si,ikc->skc", structure.recovery, slopes.d_shapes)
-    pushes = np.einsum("ikc,id->kdc", slopes.d_shapes, slopes.push)
-    pushes = pushes + np.einsum("ik,idc->kdc", structure.normal_modes, slopes.d_push)
-    parts = (shapes, pushes, slopes.d_log_omega, slopes.d_log_ratios, slopes.d_rigid)
+    parts = (shapes, slopes.d_participation, slopes.d_log_omega, slopes.d_log_ratios, slopes.d_rigid)
     shapes, pushes, log_omega, log_ratios, rigid = (part @ every for part in parts)
     moves = Moves(shapes, pushes, log_omega, log_ratios, rigid, normals)
     n = structure.n

@@ -282,6 +282,16 @@ def test_healing_changes_its_own_variable_only():
     np.testing.assert_allclose(healed, np.concatenate([[0.75, 1.5, 3.75], SPRINGS / 2]))
 
 
+def test_variables_of_different_shapes_are_healed_side_by_side():
+    a, b = m(), sysid.Variable("b", lower=1e-5, upper=1e-3, unit="s")
+    problem = sysid.Problem(
+        TEST, mass=ca.diag(a), stiffness=chain(SPRINGS), damping=b * chain(SPRINGS),
+        healing={a: 6 * a / ca.sum1(a), b: ca.fmin(b, 1e-4)},
+    )  # fmt: skip
+    healed = np.asarray(problem.formulation.healing([1.0, 2.0, 5.0, 5e-4])).ravel()
+    np.testing.assert_allclose(healed, [0.75, 1.5, 3.75, 1e-4])
+
+
 def test_two_tests_with_different_sensors_lines_and_masses():
     added = np.array([0.0, 0.0, 0.7])
     later = sysid.Structure(

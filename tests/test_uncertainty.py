@@ -8,7 +8,7 @@ import scipy.linalg
 import scipy.stats
 
 import sysid
-from sysid import FullMass, InputError, LumpedMass, Measurement, Problem, SpectralStiffness, Structure
+from sysid import FullMass, InputError, Measurement, Problem, SpectralStiffness, Structure
 from sysid.uncertainty import uncertainty
 
 FREQ = np.linspace(2, 66, 90)
@@ -350,105 +350,6 @@ class TestWhatTheDataDoNotShow:
         for name in ("mass", "stiffness"):
             np.testing.assert_allclose(getattr(close, name), expected[name], rtol=1e-4)
             np.testing.assert_allclose(getattr(one, name), expected[name], rtol=2e-2)
-
-
-def by_unknowns(problem, truth, unknowns, build, names):
-    """Standard deviations by a finite-difference Fisher matrix in any unknowns, `build` taking them to a structure."""
-    test = problem.measurement
-
-    def records(structure):
-        parts = [(test.predict(structure) / test.response_std).ravel()]
-        if test.force is not None:
-            parts.append((test.predict_force(structure) / test.force_std).ravel())
-        stacked = np.concatenate(parts)
-        return np.concatenate([stacked.real, stacked.imag]) * np.sqrt(2)
-
-    def cut(structure, name):
-        value = getattr(structure, name)
-        return value[: truth.n, : truth.n] if name in ("mass", "stiffness", "damping") else value
-
-    J, Q = [], {name: [] for name in names}
-    for p, value in enumerate(unknowns):
-        step = np.zeros(unknowns.size)
-        step[p] = 1e-6 * max(abs(value), 0.1 * np.abs(unknowns).min())
-        low, high = build(unknowns - step), build(unknowns + step)
-        J.append((records(high) - records(low)) / (2 * step[p]))
-        for name in names:
-            Q[name].append((cut(high, name) - cut(low, name)) / (2 * step[p]))
-    J = np.array(J).T
-    scale = np.maximum(np.linalg.norm(J, axis=0), 1e-30)
-    inverse = np.linalg.pinv(J / scale, rcond=1e-7) / scale[:, None]
-    covariance = inverse @ inverse.T
-    return {name: np.sqrt(np.einsum("p...,pq,q...->...", Q[name], covariance, Q[name])) for name in names}
-
-
-class TestStructuredModels:
-    NAMES = ("natural_frequencies", "damping_ratios", "mass", "stiffness", "damping", "participation")
-
-    def lumped_unknowns(self, problem, truth, *, total):
-        """m_i (all but the last, where the total ties it), entries of K_SS, damping ratios."""
-        n, G = truth.n, truth.rigid_body
-        low = np.tril_indices(n)
-        m = np.diag(truth.mass)[:n]
-        fixed = 1 if total else 0
-
-        def build(x):
-            masses, entries, ratios = np.split(x, [n - fixed, n - fixed + low[0].size])
-            masses = np.append(masses, m.sum() - masses.sum()) if total else masses
-            K = np.zeros((n, n))
-            K[low] = entries
-            K = K + np.tril(K, -1).T
-            full = np.block([[K, -K @ G], [-(K @ G).T, G.T @ K @ G]])
-            return Structure(np.diag([*masses, *np.zeros(G.shape[1])]), full, ratios, n_base=G.shape[1])
-
-        at = np.concatenate([m[: n - fixed], truth.stiffness[:n, :n][low], truth.damping_ratios])
-        return by_unknowns(problem, truth, at, build, self.NAMES)
-
-    @pytest.mark.parametrize("force", [False, True])
-    def test_lumped_mass_in_its_own_unknowns(self, random_case, force):
-        truth, problem = random_case(
-            np.random.default_rng(14), "lumped", n=4, d=1, force=force, total=not force, noise=0.01
-        )
-        expected = self.lumped_unknowns(problem, truth, total=not force)
-        u = uncertainty(problem, truth)
-        check(u, expected, self.NAMES, rtol=1e-5)
-        assert np.all(np.isfinite(u.mass)) and np.all(u.mass[np.tril_indices(4, -1)] < 1e-9 * u.mass[0, 0])
-
-    @pytest.mark.parametrize("stiffness", ["spectral", "chain"])
-    def test_without_any_mass_the_scale_is_open(self, random_case, stiffness):
-        """Frequencies and what no common scale changes stay known."""
-        truth, problem = random_case(np.random.default_rng(15), "lumped", stiffness, n=4, d=1, total=False, noise=0.01)
-        u = uncertainty(problem, truth)
-        assert np.all(np.isnan(np.diag(u.mass))) and np.all(np.isnan(np.diag(u.stiffness)))
-        assert np.all(np.isnan(np.diag(u.damping))) and np.all(np.isnan(u.participation))
-        assert np.all(np.isnan(u.mode_shapes)) and np.all(np.isnan(u.rigid_body_mass))
-        assert np.all(np.isfinite(u.natural_frequencies)) and np.all(np.isfinite(u.transmissibility(FREQ)))
-        if stiffness == "spectral":
-            total = np.diag(truth.mass)[:4].sum()
-            with_total = dataclasses.replace(problem, mass=LumpedMass(total))
-            expected = self.lumped_unknowns(with_total, truth, total=True)
-            check(u, expected, ("natural_frequencies", "damping_ratios"), rtol=1e-5)
-
-    @pytest.mark.parametrize(
-        ("mass", "stiffness", "damping", "force", "total"),
-        [
-            ("lumped", "chain", "proportional", False, True),
-            ("lumped", "spectral", "proportional", True, False),
-            ("known", "spectral", "modal", False, True),
-            ("trace", "chain", "modal", True, True),
-            ("rigid_body", "chain", "proportional", True, False),
-        ],
-    )
-    def test_in_the_unknowns_of_the_problem(self, random_case, mass, stiffness, damping, force, total):
-        truth, problem = random_case(
-            np.random.default_rng(16), mass, stiffness, damping, n=3, d=2, force=force, total=total, noise=0.01
-        )
-        expected = by_unknowns(problem, truth, problem.values(truth), problem.structure, self.NAMES)
-        u = uncertainty(problem, truth)
-        names = [name for name in self.NAMES if mass != "known" or name != "mass"]
-        check(u, expected, names, rtol=1e-4)
-        if mass == "known":
-            assert np.all(u.mass < 1e-10 * np.diag(truth.mass).max())
 
 
 def noisy(structure, clean, rng):
