@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.stats import chi2
 
 from sysid import local
 from sysid._declaration import spread
@@ -20,9 +22,10 @@ from sysid.smoothing import PolesAndResidues, Smoothed
 from sysid.structure import Array, Structure
 
 SHIFTS = (0.5, 0.2, 0.08, 0.03, 0.01)  # of the geometric mean of the natural frequencies
+_DRAWN = 20  # points looked at for each that is a structure
 _STEPS = 60  # iterations of a fit on the way
 _NEAR = 1.1  # times the misfit of free residues at the poles of the data: what a structure may leave
-_AS_GOOD = 1.02  # times the best misfit, up to which another solution explains the data as well
+_CHANCE = 1e-3  # that noise alone makes the misfit of one of two answers so much larger
 _APART = 0.01  # of an unknown's size, from which two solutions are two ...
 _TOGETHER = 1e-3  # ... and up to which two ways are one
 
@@ -75,7 +78,10 @@ def smooth_fit(
     for step in steps:
         taken = len(curve)
         watch = None if monitor is None else lambda i, cost, taken=taken: monitor(taken + i, cost)
-        new = local.solve(problem, x, max_iterations=_STEPS, max_time=left(), monitor=watch, smoothed=step)
+        try:
+            new = local.solve(problem, x, max_iterations=_STEPS, max_time=left(), monitor=watch, smoothed=step)
+        except InputError:  # modes are needed, and this is no structure
+            break
         curve += new.curve.tolist()
         if not np.all(np.isfinite(new.x)):
             break
@@ -110,7 +116,13 @@ def by_continuation(
     """Search from several starts; the best end, its misfit, and whether the data let a structure be hardly better."""
     poles = tests_of(problem)
     steps = [] if poles is None else levels_of(problem, poles)
-    floor = 0.0 if poles is None else float(np.linalg.norm([p.residual for p in poles]))
+    floor = (
+        0.0
+        if poles is None
+        else float(
+            np.linalg.norm([s * p.residual for s, p in zip((1.0, *problem.formulation.shares), poles, strict=True)])
+        )
+    )
     desk.note(
         f"continuation over {problem.n_variables} unknowns in {len(steps)} steps"
         + ("" if poles is None else f"; free residues at the poles of the data leave {floor:.3g}")
@@ -118,11 +130,12 @@ def by_continuation(
     first = problem.formulation.guess if start is None else as_unknowns(problem, start)
     ends: list[tuple[float, LocalResult]] = []
     ways: list[Array] = []
-    history = replace(History(), start=problem.misfit_of(first))
+    history = replace(History(), start=_misfit_at(problem, first))
     stopped: BaseException | None = None
+    wrong: InputError | None = None
     on_way = lambda i, cost: desk.tell("continuation", i, 0, cost)  # noqa: E731
     at_end = lambda i, cost: desk.tell("local phase", i, 0, cost)  # noqa: E731
-    for x in (first, *spread(problem.formulation, max(options.starts - 1, 0), np.random.default_rng(random))):
+    for x in (first, *_starts(problem, options.starts - 1, random)):
         try:
             way = smooth_fit(problem, x, steps, left=lambda: desk.left, monitor=on_way)
             if way is not None and way.stopped is None:
@@ -136,10 +149,14 @@ def by_continuation(
                 if way is not None and way.stopped is not None
                 else local.solve(problem, x, max_time=desk.left, monitor=at_end)
             )
+        except InputError as error:
+            wrong = error
+            desk.note(f"a start is passed over: {error}")
+            continue
         except (Stop, KeyboardInterrupt) as stop:
             stopped = stop
             break
-        misfit = problem.misfit_of(answer.x)
+        misfit = _misfit_at(problem, answer.x)
         desk.note(f"local phase: {answer.message}, {answer.curve.size} iterates, {misfit:.4e} of all that is fitted")
         ends.append((misfit, answer))
         stopped = answer.stopped
@@ -148,8 +165,7 @@ def by_continuation(
     if stopped is not None and not isinstance(stopped, Stop | KeyboardInterrupt):
         raise stopped
     if not ends:
-        assert stopped is not None
-        raise stopped
+        raise stopped or SolverError(f"no search began at a structure ({wrong}): state guesses that make one")
     misfit, best, structure = _best(problem, ends)
     history = replace(history, local=misfit, local_curve=best.curve)
     if problem.goal is not None:
@@ -168,7 +184,11 @@ def by_continuation(
 def _best(problem: Problem, ends: list[tuple[float, LocalResult]]) -> tuple[float, LocalResult, Structure]:
     """The end with the least misfit that is a structure."""
     wrong: InputError | None = None
-    for misfit, answer in sorted(ends, key=lambda end: end[0] if np.isfinite(end[0]) else np.inf):
+
+    def order(end: tuple[float, LocalResult]) -> tuple[bool, float]:
+        return not problem.keeps_constraints(end[1].x), end[0] if np.isfinite(end[0]) else np.inf
+
+    for misfit, answer in sorted(ends, key=order):
         try:
             return misfit, answer, problem.structure(answer.x)
         except InputError as error:
@@ -179,11 +199,38 @@ def _best(problem: Problem, ends: list[tuple[float, LocalResult]]) -> tuple[floa
     )
 
 
+def _starts(problem: Problem, count: int, random: np.random.SeedSequence) -> list[Array]:
+    """Points spread over the search space as the swarm's are, of those that stand for a structure."""
+    if count < 1:
+        return []
+    points = spread(problem.formulation, _DRAWN * count, np.random.default_rng(random))
+    return list(islice((x for x in points if _is_structure(problem, x)), count))
+
+
+def _is_structure(problem: Problem, x: Array) -> bool:
+    try:
+        problem.structure(x)
+    except InputError:
+        return False
+    return True
+
+
+def _misfit_at(problem: Problem, x: Array) -> float:
+    """NaN where modes are needed and `x` is no structure."""
+    try:
+        return problem.misfit_of(x)
+    except InputError:
+        return float("nan")
+
+
 def _rivals(problem: Problem, x: Array, misfit: float, ends: list[tuple[float, LocalResult]]) -> list[Array]:
     """Other ends that explain the data as well."""
+    tests = (problem.measurement, *(test for test, _ in problem.formulation.others))
+    numbers = 2 * sum(test.response.size + (0 if test.force is None else test.force.size) for test in tests)
+    as_good = misfit * np.sqrt(1 + chi2.isf(_CHANCE, x.size) / max(numbers - x.size, 1))
     found: list[Array] = []
     for other, answer in ends:
-        good = np.isfinite(other) and other <= max(_AS_GOOD * misfit, local.EXACT)
+        good = np.isfinite(other) and other <= max(as_good, local.EXACT)
         if good and all(_apart(problem, answer.x, known) > _APART for known in (x, *found)):
             found.append(answer.x)
     return found

@@ -19,8 +19,8 @@ from sysid.variables import Variable, split
 
 _POINTS = 128  # of the search space, looked at
 _STARTS = 8  # of the search for a point that satisfies the constraints
-_HELD = 1e-6  # of a constraint's scale: what counts as satisfied
-_LOOSE = 1e-2  # likewise for the swarm, which meets no equality exactly
+HELD = 1e-6  # of a constraint's scale: what counts as satisfied
+LOOSE = 1e-2  # likewise for the swarm, which meets no equality exactly
 
 
 def points_of(formulation: Formulation) -> Array:
@@ -96,9 +96,9 @@ def check_constraints(formulation: Formulation, points: Array, site: str) -> Arr
         left = _nearest(formulation, x, scale)
         if left.max(initial=0.0) < at:
             best, at = left, left.max(initial=0.0)
-        if at <= _HELD:
-            return scale * np.where(constraints.lower == constraints.upper, _LOOSE, _HELD)
-    worst = dict.fromkeys(source for source, miss in zip(constraints.sources, best, strict=True) if miss > _HELD)
+        if at <= HELD:
+            return scale * np.where(constraints.lower == constraints.upper, LOOSE, HELD)
+    worst = dict.fromkeys(source for source, miss in zip(constraints.sources, best, strict=True) if miss > HELD)
     raise InputError(
         f"no point within the bounds satisfies {' and '.join(worst)} (problem at {site}): widen the bounds of these "
         "variables, or correct the relation"

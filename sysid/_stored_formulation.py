@@ -5,6 +5,7 @@ The text is CasADi's own serialisation, which holds expressions and numbers and 
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from typing import Any
 
@@ -36,6 +37,8 @@ def write(
         if function is not None:
             put(group, **{name: _text(name, function)})
     put(group, known_names=list(formulation.known_names))
+    # JSON, as names may hold any character.
+    put(group, members=json.dumps(formulation.members), declarations=json.dumps(formulation.declarations))
     constraints = formulation.constraints
     if constraints is not None:
         put(
@@ -73,7 +76,12 @@ def read(group: Any, get: Get, read_measurement: Callable[[Any], Measurement]) -
         rows = _function(group["constraints"], "function", get)(x)
         equal = np.atleast_1d(get(group["constraints"], "equal"))
         constraints = [rows[i] == 0 if same else rows[i] <= 0 for i, same in enumerate(equal.tolist())]
-    untold = {"fixed": tuple(v for v in every if v.fixed), "known_names": tuple(get(group, "known_names") or ())}
+    untold = {
+        "fixed": tuple(v for v in every if v.fixed),
+        "known_names": tuple(get(group, "known_names") or ()),
+        "members": tuple((name, tuple(names)) for name, names in json.loads(get(group, "members"))),
+        "declarations": json.loads(get(group, "declarations")),
+    }
     return {**given, "residuals": residuals, "constraints": constraints}, untold
 
 

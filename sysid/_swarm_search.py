@@ -98,7 +98,7 @@ def by_swarm(
         except (Stop, KeyboardInterrupt) as stop:
             stopped, search.success, search.message = stop, False, str(stop) or "interrupted"
         evaluations += search.history.evaluations
-        if search.x is not None and (best is None or search.misfit < best.misfit):
+        if search.x is not None and (best is None or problem.rank_of(search.x) < problem.rank_of(best.found)):
             best = search
         if best is None:
             if isinstance(stopped, KeyboardInterrupt):
@@ -138,6 +138,12 @@ class _Search:
         self.steps: list[tuple[Smoothed, ...]] = []
         self.history = History()
         self.success, self.message = False, "ended before the local phase, as asked"
+
+    @property
+    def found(self) -> Array:
+        """The best unknowns so far."""
+        assert self.x is not None
+        return self.x
 
     @property
     def misfit(self) -> float:
@@ -268,7 +274,7 @@ class _Search:
         after = self.problem.misfit_of(answer.x)
         self.desk.note(f"local phase: {answer.message}, {answer.curve.size} iterates, residual {after:.4e}")
         self.success, self.message = answer.success, answer.message
-        if after < before:
+        if self.problem.rank_of(answer.x) < self.problem.rank_of(self.x):
             self.x = answer.x
         else:
             # A start that meets the goal needs no improvement; any other was not made by a solver that succeeded.

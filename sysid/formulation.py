@@ -133,6 +133,8 @@ class Formulation:
         x to a column: what is known to some accuracy, less its value, in standard deviations.
     known_names : tuple of str
         What each of its rows is called.
+    shares : tuple of float
+        What the misfit of each further test is multiplied by, so that all tests count by their noise.
     level : float
         Standard deviation of a real number of the measurement's relative residual: what one of them counts.
     misfit : casadi.Function or None
@@ -153,6 +155,7 @@ class Formulation:
     residuals: ca.Function | None
     known: ca.Function | None
     known_names: tuple[str, ...]
+    shares: tuple[float, ...]
     level: float
     misfit: ca.Function | None
     constraints: Constraints | None
@@ -194,13 +197,16 @@ class Formulation:
 def relative_error(test: Measurement, matrices: Matrices, x: Array) -> float:
     """Relative residual of accelerations and, where it was measured, of force, weighed by their stated noise.
 
-    With a damping matrix also where that is no structure's.
+    With a damping matrix also where that is no structure's; NaN where modes are needed and there are none.
     """
     symbol = ca.MX.sym("x", x.size)
     motion = matrices.motion(symbol)
     if not matrices.by_ratios:
         return float(ca.Function("error", [symbol], [ca.norm_2(relative_misfit(test, motion, weighted=True))])(x))
-    s = matrices.structure(x, test)
+    try:
+        s = matrices.structure(x, test)
+    except InputError:  # modes of what is no structure
+        return float("nan")
     modes = (s.mode_shapes, s.participation, 2 * np.pi * s.natural_frequencies[:, None], s.damping_ratios[:, None])
     phi, gamma, omega, ratios = (ca.MX(ca.DM(part)) for part in modes)
     rigid = ca.MX(ca.DM(s.rigid_body_mass))
@@ -292,6 +298,9 @@ def formulate(given: Given, layout: Layout, test: Measurement) -> Formulation:
             function("matrices", [*motion[:5], part.factor]), part.by_ratios, motion.rigid_body_dofs, motion.recovery
         )
 
+    if known and misfit is not None:
+        raise InputError("Known beside a misfit of your own: put it into that misfit, in the units of its rows")
+    level = noise_level(test) if known or others else 0.0
     constraints = None
     if relations:
         rows = [expression for expression, _, _ in relations]
@@ -315,7 +324,8 @@ def formulate(given: Given, layout: Layout, test: Measurement) -> Formulation:
         residuals=function("residuals", [ca.vertcat(*residuals)]) if residuals else None,
         known=function("known", [ca.vertcat(*known)]) if known else None,
         known_names=tuple(_name_of(column, i) for column, _, _ in stated for i in range(column.numel())),
-        level=noise_level(test) if known else 0.0,
+        shares=tuple(1.0 if misfit is not None else level / noise_level(other.measurement) for other, _ in others),
+        level=level if known else 0.0,
         misfit=None if misfit is None else function("misfit", [misfit]),
         constraints=constraints,
         healing=function("healing", [ca.veccat(*(s if h is None else h for h, s in zip(healed, symbols, strict=True)))])

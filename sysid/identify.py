@@ -105,11 +105,32 @@ def identify(
             if strategy == "auto" and not good and end.stopped is None and desk.time_for_more:
                 why += f"; it left {misfit:.3g}, and a swarm followed"
                 desk.note(why)
-                swarm = by_swarm(problem, Swarm(), desk, random, start, max_evaluations)
-                if swarm.x is not None and problem.misfit_of(swarm.x) < misfit:
-                    end = swarm
+                end = _followed(problem, end, desk, random, start, max_evaluations)
             return _finish(problem, end, why, seed, desk)
         return _finish(problem, by_swarm(problem, options, desk, random, start, max_evaluations), why, seed, desk)
+
+
+def _followed(
+    problem: Problem, end: Outcome, desk: Desk, random: np.random.SeedSequence, start: ArrayLike | Structure | None,
+    max_evaluations: int | None,
+) -> Outcome:  # fmt: skip
+    """The better of what a continuation found and what a swarm after it does; the first is never lost."""
+    stopped: BaseException | None
+    try:
+        swarm = by_swarm(problem, Swarm(), desk, random, start, max_evaluations)
+    except (InputError, SolverError) as error:
+        desk.note(f"the swarm found nothing: {error}")
+        return end
+    except KeyboardInterrupt as interrupt:
+        stopped = interrupt
+    else:
+        assert swarm.x is not None and end.x is not None
+        if problem.rank_of(swarm.x) < problem.rank_of(end.x):
+            return swarm
+        stopped = swarm.stopped
+    if stopped is None:
+        return end
+    return replace(end, success=False, message=str(stopped) or "interrupted", stopped=stopped)
 
 
 def options_of(
@@ -216,6 +237,9 @@ def _finish(problem: Problem, end: Outcome, why: str, seed: int, desk: Desk) -> 
     if problem.is_written and end.x is not None:
         others = [test.residual(m.structure(end.x, test)) for test, m in problem.formulation.others]
         residual = max([residual, *others])
+    if end.x is not None and success and not problem.keeps_constraints(end.x):
+        success = False
+        message += "; a constraint does not hold"
     if problem.goal is not None and residual > problem.goal:
         success = False
         message += f"; the residual {residual:.3g} is above the goal {problem.goal:.3g}"
@@ -272,7 +296,12 @@ def _as_certain(it: Identification) -> Identification:
 
     Null directions of exact records are closed by their noise, and show as large standard deviations only.
     """
-    if not it.determined or max(it.residual, it.force_residual or 0.0) < local.EXACT:
+    exact = max(it.residual, it.force_residual or 0.0) < local.EXACT
+    if it.problem.is_written:
+        assert it.x is not None
+        # A further test may be noisy, and what is stated as known always is.
+        exact = exact and it.problem.formulation.known is None and it.problem.misfit_of(it.x) < local.EXACT
+    if not it.determined or exact:
         return it
     if it.structure.mode_shapes.size > _LARGE:
         told = "whether noise leaves each entry known was not judged, as that takes minutes: see uncertainty"

@@ -15,8 +15,9 @@ import casadi as ca
 import numpy as np
 
 from sysid._coordinates import Coordinates
+from sysid._declaration import HELD, LOOSE
 from sysid._watch import OBJECTIVE_SCALE, Watch
-from sysid.damping import ProportionalDamping
+from sysid.damping import ModalDamping, ProportionalDamping
 from sysid.direct import relative_misfit
 from sysid.formulation import labels_of
 from sysid.layout import lower_entries, triangle_entries
@@ -76,8 +77,8 @@ def fit_structured(
     constraints = formulation.constraints
     if constraints is not None:
         broken = constraints.function(unknowns)
-        # In units of what the swarm lets pass, which is a small part of what the constraint makes over the box.
-        unit = np.where(problem.tolerance > 0, problem.tolerance, 1.0) / 1e-2
+        # In units of what the constraint makes over the search space.
+        unit = problem.tolerance / np.where(constraints.lower == constraints.upper, LOOSE, HELD)
         z.tie(broken / ca.DM(unit), constraints.lower / unit, constraints.upper / unit)
     if modal:
         miss, psi, omega = _in_modes(problem, tests[0], unknowns, factors, problem.structure(x), z, held=held)
@@ -89,8 +90,8 @@ def fit_structured(
             miss = relative_misfit(
                 tests[0].test, formulation.matrices.motion(unknowns), weighted=True, shift=tests[0].shift
             )
-    for other, (_, matrices) in zip(tests[1:], formulation.others, strict=True):
-        further = relative_misfit(other.test, matrices.motion(unknowns), weighted=True, shift=other.shift)
+    for other, (_, matrices), share in zip(tests[1:], formulation.others, formulation.shares, strict=True):
+        further = share * relative_misfit(other.test, matrices.motion(unknowns), weighted=True, shift=other.shift)
         miss = ca.vertcat(miss, further)
     if formulation.residuals is not None:
         miss = ca.vertcat(miss, formulation.residuals(unknowns))
@@ -103,6 +104,10 @@ def fit_structured(
 
     values = [np.asarray(v) for v in ca.Function("end", [z.z], [unknowns, psi, omega, ca.norm_2(miss)])(best)]
     ended = values[0].ravel()
+    if not held and isinstance(problem.damping, ModalDamping) and modal:
+        names = [variable.name for variable in problem.variables]
+        part = slices_of(problem.variables)[names.index("damping_ratio")]
+        ended[part] = ended[part][np.argsort(values[2].ravel())]
     if held:
         w = values[2].ravel()
         order = np.argsort(w)

@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid._declaration import check_constraints, check_matrices, points_of, unused
+from sysid._declaration import HELD, LOOSE, check_constraints, check_matrices, points_of, unused, violation_of
 from sysid._stored_formulation import check_storable
 from sysid._written import Given, is_expression
 from sysid.damping import DampingModel, ModalDamping
@@ -69,7 +69,7 @@ class Problem:
     residuals : sequence of Misfit, Known or expressions
         Minimised in the least-squares sense beside the misfit of the measurement, whose norm is 1 where nothing is
         explained: a further test (`sysid.Misfit`), or what is known to some accuracy (`sysid.Known`). The rows of an
-        expression count as they are.
+        expression count like one number of the test each, as exact as its noise.
     constraints : sequence of relations
         Such as ``k[0] <= k[1]`` or ``ca.sum1(m) == 900``. IPOPT holds them exactly; in the swarm a candidate that
         breaks them less is better, whatever its residual, and any that keeps them is better than these.
@@ -348,8 +348,23 @@ class Problem:
         f = self.formulation
         parts = [float(np.sqrt(self.own_squares(x)))]
         parts += [] if f.misfit is None else [float(np.linalg.norm(f.misfit(x)))]
-        tests = [*([(self.measurement, f.matrices)] if f.misfit is None else []), *f.others]
-        return float(np.linalg.norm(parts + [relative_error(test, matrices, x) for test, matrices in tests]))
+        parts += [] if f.misfit is not None else [relative_error(self.measurement, f.matrices, x)]
+        parts += [s * relative_error(test, m, x) for s, (test, m) in zip(f.shares, f.others, strict=True)]
+        return float(np.linalg.norm(parts))
+
+    def keeps_constraints(self, x: Array) -> bool:
+        """Whether constraints hold, to round-off beside what they make over the search space."""
+        constraints = self.formulation.constraints if self.is_written else None
+        if constraints is None:
+            return True
+        over = violation_of(constraints.lower, constraints.upper, np.asarray(constraints.function(x)).ravel())
+        equal = constraints.lower == constraints.upper
+        return bool(np.all(over <= self.tolerance * np.where(equal, HELD / LOOSE, 1.0)))
+
+    def rank_of(self, x: Array) -> tuple[bool, float]:
+        """By which answers are compared: constraints first, then the misfit."""
+        misfit = self.misfit_of(x)
+        return not self.keeps_constraints(x), misfit if np.isfinite(misfit) else np.inf
 
     def own_squares(self, x: Array) -> float:
         """Sum of squares of the residuals that are stated beside the tests."""

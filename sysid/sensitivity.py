@@ -128,7 +128,9 @@ class Rows:
     std: Array
 
 
-def rows_of_test(test: Measurement, s: Slopes, unknowns: int, *, as_stated: bool = False) -> list[Rows]:
+def rows_of_test(
+    test: Measurement, s: Slopes, unknowns: int, *, share: float = 1.0, as_stated: bool = False
+) -> list[Rows]:
     """Rows of the accelerations and, where it was measured, of the force, as the local phase weighs them.
 
     Noise that is larger than stated, or shared by neighbouring lines, counts as the misfit shows it; with `as_stated`
@@ -154,7 +156,7 @@ def rows_of_test(test: Measurement, s: Slopes, unknowns: int, *, as_stated: bool
         weight = record.by_channel[:, None] * record.by_line
         if i == 0 or not both_stated:
             scale = float(np.linalg.norm(weight * target))
-        weight = weight / scale
+        weight = share * weight / scale
         flat = (weight[..., None] * change).reshape(-1, change.shape[-1])
         left, std = (-weight * record.misfit).ravel(), inflation * (weight * record.std).ravel() / np.sqrt(2)
         rows.append(Rows(_real(left), _real(flat), np.concatenate([std, std])))
@@ -210,8 +212,8 @@ def sensitivity(
         rows += rows_of_test(problem.measurement, slopes, p, as_stated=as_stated)
     else:
         rows.append(_own_rows(formulation.misfit, x, None))
-    for test, matrices in formulation.others:
-        rows += rows_of_test(test, slopes_of(matrices, x, test), p, as_stated=as_stated)
+    for share, (test, matrices) in zip(formulation.shares, formulation.others, strict=True):
+        rows += rows_of_test(test, slopes_of(matrices, x, test), p, share=share, as_stated=as_stated)
     if formulation.residuals is not None:
         # One more number each, of the same relative noise as those measured.
         rows.append(_own_rows(formulation.residuals, x, float(np.sqrt(np.mean(rows[0].std ** 2)))))
@@ -219,8 +221,9 @@ def sensitivity(
         stated, level = _own_rows(formulation.known, x, 1.0), formulation.level
         rows.append(Rows(level * stated.residuals, level * stated.jacobian, level * stated.std))
     unit = steps_of(problem.variables, x)
-    free = _left_by_constraints(problem, x, unit)
-    J = np.concatenate([row.jacobian for row in rows]) * unit @ free
+    J = np.concatenate([row.jacobian for row in rows]) * unit
+    free = _left_by_constraints(problem, x, unit, J)
+    J = J @ free
     std = np.concatenate([row.std for row in rows])
     U, s, Vt = np.linalg.svd(J, full_matrices=False)
     s = np.concatenate([s, np.zeros(J.shape[1] - s.size)])
@@ -244,8 +247,11 @@ def _own_rows(function: ca.Function, x: Array, std: float | None) -> Rows:
     return Rows(left, np.asarray(slope), np.full(left.size, std))
 
 
-def _left_by_constraints(problem: Problem, x: Array, unit: Array) -> Array:
-    """Orthonormal directions, in units of x, along which active constraints stay as they are."""
+def _left_by_constraints(problem: Problem, x: Array, unit: Array, records: Array) -> Array:
+    """Orthonormal directions, in units of x, along which equalities and what presses on an inequality stay as they are.
+
+    An inequality that happens to be at its bound, and that a direction leaves which no record sees, holds nothing.
+    """
     constraints = problem.formulation.constraints
     if constraints is None:
         return np.eye(x.size)
@@ -254,12 +260,21 @@ def _left_by_constraints(problem: Problem, x: Array, unit: Array) -> Array:
     value, slope = ca.Function("active", [symbol], [ca.densify(g), ca.densify(ca.jacobian(g, symbol))])(x)
     at, J = np.asarray(value).ravel(), np.asarray(slope) * unit
     size = np.maximum(np.linalg.norm(J, axis=1), np.finfo(float).tiny)
-    active = (constraints.lower == constraints.upper) | (np.abs(at - constraints.upper) < _ACTIVE * size)
-    if not np.any(active):
-        return np.eye(x.size)
-    J = J[active] / size[active, None]
-    _, s, Vt = np.linalg.svd(J)
-    return Vt[int(np.count_nonzero(s > 1e-9)) :].T
+    rows = J / size[:, None]
+    equal = constraints.lower == constraints.upper
+    free = _null_space(rows[equal])
+    unseen = free @ _null_space(records @ free, _NULL)
+    at_bound = ~equal & (np.abs(at - constraints.upper) < _ACTIVE * size)
+    pressed = at_bound & (np.abs(rows @ unseen).max(axis=1, initial=0.0) < _SMALL)
+    return _null_space(rows[equal | pressed])
+
+
+def _null_space(rows: Array, least: float = 1e-9) -> Array:
+    """Orthonormal basis of what rows (count, p) do not see, (p, free); `least` of the largest singular value."""
+    if not len(rows):
+        return np.eye(rows.shape[1])
+    _, s, Vt = np.linalg.svd(rows, full_matrices=len(rows) < rows.shape[1])
+    return Vt[int(np.count_nonzero(s > least * max(s[0], np.finfo(float).tiny))) :].T
 
 
 def directions_in_words(variables: Sequence[Block | Variable], x: Array, unit: Array, directions: Array) -> list[str]:

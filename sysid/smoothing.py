@@ -72,7 +72,7 @@ class PolesAndResidues:
         quadrature = parts[1] if many else np.zeros_like(parts[0])
         own = left = float(np.sqrt(fit.squared_error / records.size))
         if test.force is not None:
-            left = float(np.hypot(left, force_residual_left(test, omega, ratios, velocity=many)))
+            left = float(np.hypot(left, force_share(test) * force_residual_left(test, omega, ratios, velocity=many)))
         force = None if test.force is None else _force_residues(test, omega, ratios, many)
         return cls(omega, ratios, parts[0], quadrature, force, inputs, own, left)
 
@@ -125,6 +125,14 @@ def _moved(test: Measurement) -> Array:
     return np.linalg.qr(size * left[:, s > _DEPENDENT * s[0]])[0]
 
 
+def force_share(test: Measurement) -> float:
+    """Size of a weighted force record in the misfit, that of the accelerations being 1."""
+    if test.response_std is None or test.force_std is None:
+        return 1.0
+    assert test.force is not None
+    return weights_of(test.force, test.force_std)[1] / weights_of(test.relative, test.response_std)[1]
+
+
 @dataclass(frozen=True, eq=False)
 class Smoothed:
     """Records at complex frequencies ``s = shift + i w``, in the form of a test at real ones."""
@@ -143,5 +151,9 @@ def noise_level(test: Measurement) -> float:
         std = np.asarray(weight) * columns(test.response_std.astype(complex)).real
         return max(float(np.sqrt(np.mean(std**2) / 2)) / scale, _LEAST)
     poles = PolesAndResidues.of(test)
-    left = 0.0 if poles is None else poles.residual
-    return max(left / float(np.sqrt(2 * test.response.size)), _LEAST)
+    if poles is None:
+        return _LEAST
+    # The free residues and the poles have taken their share of the noise.
+    free = 2 * poles.omega.size * (1 + poles.inputs.shape[1] * test.n_sensors)
+    measured = 2 * test.response.size
+    return max(poles.of_accelerations / float(np.sqrt(max(measured - free, 0.25 * measured))), _LEAST)

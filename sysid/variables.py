@@ -367,9 +367,12 @@ def log_sampling(lower: Array, upper: Array) -> tuple[Callable[[ca.SX], ca.SX], 
 
 
 def steps_of(variables: Iterable[Block | Variable], x: Array) -> Array:
-    """A large step of each unknown: its own size, or a part of its range where that is larger, (size of x,)."""
-    width = np.concatenate([np.zeros(0), *(v.upper - v.lower for v in variables)])
-    return np.maximum(np.abs(x), _PART * width)
+    """A large step of each unknown, (size of x,): its own size, or a part of its range where that is larger.
+
+    Where a range spans decades (log) it tells nothing about the unknown.
+    """
+    width = [np.zeros(v.size) if isinstance(v, Variable) and v.log else v.upper - v.lower for v in variables]
+    return np.maximum(np.abs(x), _PART * np.concatenate([np.zeros(0), *width]))
 
 
 def slices_of(variables: Iterable[Block | Variable]) -> list[slice]:

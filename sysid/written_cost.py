@@ -42,8 +42,8 @@ class WrittenCost:
         self._unknowns = ca.Function("unknowns", [s], [x])
         models = (f.matrices, *(matrices for _, matrices in f.others))
         self._tests = [
-            _TestCost(test, matrices, s, x)
-            for test, matrices in zip(smoothed or own, models, strict=True)
+            (share, _TestCost(test, matrices, s, x))
+            for share, test, matrices in zip((1.0, *f.shares), smoothed or own, models, strict=True)
             if f.misfit is None or matrices is not f.matrices
         ]
         self._own = None if f.misfit is None else ca.Function("misfit", [s], [ca.norm_2(f.misfit(x))])
@@ -70,8 +70,8 @@ class WrittenCost:
     def _chunk(self, particles: Array) -> Array:
         count = len(particles)
         squared = np.zeros(count) if self._own is None else _each(self._own, particles) ** 2
-        for test in self._tests:
-            squared = squared + test.squared(particles)
+        for share, test in self._tests:
+            squared = squared + share**2 * test.squared(particles)
         if self._residuals is not None:
             squared = squared + _each(self._residuals, particles) ** 2
         cost = np.sqrt(squared)

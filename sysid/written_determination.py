@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sysid.errors import InputError
 from sysid.local import EXACT
 from sysid.modal_masses import Determination, Intervals
 from sysid.problem import Problem
@@ -50,7 +51,7 @@ def written_determination(problem: Problem, x: Array, rivals: tuple[Array, ...] 
         closed += f", {only} of them by what is stated as known alone" if only else ""
     if known.free.shape[1] < count:
         closed += f", {count - known.free.shape[1]} of them by constraints"
-    closed += "; what is written as a number counts as exact"
+    closed += " about this answer; what is written as a number counts as exact"
     if known.unseen.shape[1]:
         closed = "the data and the written model fix mass, stiffness and damping"
     return Determination(not open_, () if open_ else (closed,), tuple(open_))
@@ -91,8 +92,14 @@ def _moves_matrices(slopes: Slopes, known: Sensitivity) -> bool:
 
 def _other_matrices(problem: Problem, slopes: Slopes, other: Array) -> bool:
     """Whether other unknowns stand for other matrices, and not for the same in another way."""
-    mine, its = slopes.structure, problem.structure(other)
-    for a, b in ((mine.mass, its.mass), (mine.stiffness, its.stiffness), (mine.damping, its.damping)):
+    mine = slopes.structure
+    try:
+        its = problem.structure(other)
+    except InputError:  # of no structure
+        return False
+    n = mine.n
+    pairs = (mine.mass[:n, :n], its.mass[:n, :n]), (mine.stiffness[:n, :n], its.stiffness[:n, :n])
+    for a, b in (*pairs, (mine.damping, its.damping)):
         size = np.sqrt(np.abs(np.diag(a))) + np.finfo(float).tiny
         if np.any(np.abs(a - b) > 1e-3 * np.outer(size, size)):
             return True

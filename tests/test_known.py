@@ -113,3 +113,17 @@ def test_names_come_back_from_a_file(tmp_path):
 def test_mistakes(value, std, said):
     with pytest.raises(sysid.InputError, match=said):
         problem(measured(0), lambda m, k: [sysid.Known(m, value, std)])
+
+
+@pytest.mark.parametrize("noises", [(0.05, 0.001), (0.001, 0.05)])
+def test_tests_count_by_their_noise(noises):
+    """Beside a test fifty times better the noisy one hardly matters, whichever comes first."""
+    added = np.array([0.0, 2.0])
+    stds = []
+    for first, second in (noises, (min(noises), min(noises))):
+        further = [(measured(5, second, mass=MASS + added), added)]
+        given = problem(measured(4, first), lambda m, k: [m[0] - MASS[0]], further=further)
+        result = sysid.identify(given, rng=0, strategy=QUICK)
+        assert result.determined
+        stds.append(result.uncertainty.variables["damper"] / DAMPERS)
+    assert np.all(stds[0] < 2.0 * stds[1])

@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import norm
 
 import sysid
-from sysid import plot, report
+from sysid import _report_matrices, plot, report
 
 FREQ = np.linspace(1.0, 40.0, 30)
 HOSTILE = "</td><script>alert('x')</script> & \"$\\foo$\""
@@ -133,9 +133,10 @@ def plain(truth):
 @pytest.fixture
 def no_pictures(monkeypatch):
     """Leave the pictures out, which take most of the time."""
-    monkeypatch.setattr(
-        report, "picture", lambda figure, alt, caption="", *, label="", **_: f"<p>{label} {caption}</p>"
-    )
+    for room in (report, _report_matrices):
+        monkeypatch.setattr(
+            room, "picture", lambda figure, alt, caption="", *, label="", **_: f"<p>{label} {caption}</p>"
+        )
 
 
 def test_the_report_has_every_part_in_order(complete, page):
