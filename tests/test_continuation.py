@@ -1,0 +1,84 @@
+"""Searches from several starts through widened peaks: what they find, and what they must not lose."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import sysid
+
+STRETCH = np.array([[1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]])
+MASS, SPRINGS, DAMPERS = np.array([5.0, 4.0]), np.array([2e4, 1.5e4]), np.array([9.0, 6.0])
+FREQ = np.linspace(2.0, 20.0, 150)
+
+
+def measured(**options):
+    K, C = (STRETCH.T @ np.diag(values) @ STRETCH for values in (SPRINGS, DAMPERS))
+    truth = sysid.Structure(np.diag([*MASS, 0.0]), K, damping_matrix=C[:2, :2], n_base=1)
+    return sysid.simulate(truth, FREQ, rng=0, **options)
+
+
+def springs_and_dampers(lower=1e3, upper=1e6):
+    k = sysid.Variable("spring", 2, lower=lower, upper=upper, log=True, unit="N/m")
+    c = sysid.Variable("damper", 2, lower=0.1, upper=500.0, log=True, unit="N s/m")
+    return k, c, STRETCH.T @ ca.diag(k) @ STRETCH, (STRETCH.T @ ca.diag(c) @ STRETCH)[:2, :2]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_starts_that_are_no_structure_are_passed_over(seed):
+    """Half of this search space is indefinite, and modes are needed: damping by ratios."""
+    K = np.diag([3.5e4, 1.5e4]) - 1.5e4 * (np.ones((2, 2)) - np.eye(2))
+    full = np.block([[K, -K.sum(axis=1, keepdims=True)], [-K.sum(axis=0, keepdims=True), K.sum().reshape(1, 1)]])
+    truth = sysid.Structure(np.diag([*MASS, 0.0]), full, [0.02, 0.01], n_base=1)
+    a, d = (sysid.Variable(name, lower=5e3, upper=1e5) for name in "ad")
+    b, zeta = sysid.Variable("b", lower=-1e5, upper=1e5, guess=-1e4), sysid.Variable("zeta", 2, lower=1e-3, upper=0.1)
+    problem = sysid.Problem(sysid.simulate(truth, FREQ), mass=np.diag(MASS), stiffness=[[a, b], [b, d]], damping=zeta)
+    result = sysid.identify(problem, rng=seed)
+    assert result.success
+    np.testing.assert_allclose(result.structure.stiffness[:2, :2], K, rtol=1e-6)
+
+
+def test_no_answer_breaks_a_constraint_to_fit_better():
+    """The force weighs 9 kg, and 9.05 are stated: the misfit would rather have the former."""
+    m = sysid.Variable("mass", 2, lower=1.0, upper=20.0, unit="kg")
+    _, _, K, C = springs_and_dampers()
+    total = [ca.sum1(m) == 9.05]
+    problem = sysid.Problem(measured(force=True), mass=ca.diag(m), stiffness=K, damping=C, constraints=total)
+    for strategy in ("auto", sysid.Swarm(max_iterations=30, restarts=0)):
+        result = sysid.identify(problem, strategy=strategy, rng=0)
+        np.testing.assert_allclose(result.values["mass"].sum(), 9.05, rtol=1e-7)
+        assert not result.determined  # the force says otherwise
+
+
+@pytest.mark.parametrize("decades", [4, 9])
+def test_a_range_of_many_decades_is_no_scale(decades):
+    _, _, K, C = springs_and_dampers(lower=1e2, upper=10.0 ** (2 + decades))
+    result = sysid.identify(sysid.Problem(measured(), mass=np.diag(MASS), stiffness=K, damping=C), rng=0)
+    assert result.determined
+    np.testing.assert_allclose(result.values["spring"], SPRINGS, rtol=1e-8)
+
+
+def test_the_same_seed_gives_the_same_bits():
+    def once():
+        _, _, K, C = springs_and_dampers()
+        return sysid.identify(sysid.Problem(measured(noise=0.01), mass=np.diag(MASS), stiffness=K, damping=C), rng=3)
+
+    first, second = once(), once()
+    np.testing.assert_array_equal(first.x, second.x)
+    np.testing.assert_array_equal(first.history.local_curve, second.history.local_curve)
+
+
+@pytest.mark.parametrize("after", [0, 5, 40])
+def test_a_callback_that_stops_it_leaves_the_best_so_far(after):
+    seen = []
+
+    def stop(progress):
+        seen.append(progress)
+        if len(seen) > after:
+            raise StopIteration
+
+    _, _, K, C = springs_and_dampers()
+    problem = sysid.Problem(measured(noise=0.01), mass=np.diag(MASS), stiffness=K, damping=C)
+    result = sysid.identify(problem, rng=0, callback=stop)
+    assert not result.success
+    assert not result.determined
+    assert np.all(np.isfinite(result.x))
