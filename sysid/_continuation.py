@@ -8,7 +8,6 @@ from itertools import islice
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import chi2
 
 from sysid import local
 from sysid._declaration import spread
@@ -225,6 +224,8 @@ def _misfit_at(problem: Problem, x: Array) -> float:
 
 def _rivals(problem: Problem, x: Array, misfit: float, ends: list[tuple[float, LocalResult]]) -> list[Array]:
     """Other ends that explain the data as well."""
+    from scipy.stats import chi2
+
     tests = (problem.measurement, *(test for test, _ in problem.formulation.others))
     numbers = 2 * sum(test.response.size + (0 if test.force is None else test.force.size) for test in tests)
     as_good = misfit * np.sqrt(1 + chi2.isf(_CHANCE, x.size) / max(numbers - x.size, 1))

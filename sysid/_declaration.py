@@ -9,7 +9,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import scipy.linalg
-from scipy.stats import qmc
 
 from sysid.errors import InputError
 from sysid.formulation import Formulation, sampled
@@ -30,6 +29,8 @@ def points_of(formulation: Formulation) -> Array:
 
 def spread(formulation: Formulation, count: int, rng: np.random.Generator) -> list[Array]:
     """Points spread over the search space as the swarm's are."""
+    from scipy.stats import qmc
+
     unit = qmc.LatinHypercube(formulation.size, rng=rng).random(count)
     rows = formulation.lower + unit * (formulation.upper - formulation.lower)
     variables = formulation.variables

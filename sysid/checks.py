@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
 
 from sysid.mass import FullMass, KnownMass, LumpedMass
 from sysid.measurement import Measurement
@@ -72,6 +71,8 @@ def _stated_values(problem: Problem, x: Array) -> Iterator[str]:
     formulation = problem.formulation
     if formulation.known is None:
         return
+    from scipy.stats import chi2
+
     off = np.asarray(formulation.known(x)).ravel()
     if np.sum(off**2) > chi2.isf(_CHANCE, off.size) and np.all(np.abs(off) <= _FAR):
         told = ", ".join(f"{name} by {z:+.2g}" for name, z in zip(formulation.known_names, off, strict=True))

@@ -233,7 +233,9 @@ def _seed(rng: int | np.random.Generator | None) -> tuple[int, np.random.SeedSeq
 def _finish(problem: Problem, end: Outcome, why: str, seed: int, desk: Desk) -> Identification:
     """Judge where the search ended, and say what it is worth."""
     structure, success, message = end.structure, end.success, end.message
-    residual = problem.measurement.residual(structure) if end.x is None else problem.residual_of(end.x)
+    residual = problem.measurement.residual(structure)
+    if problem.is_written and end.x is not None:
+        residual = problem.residual_of(end.x)
     if problem.is_written and end.x is not None:
         others = [test.residual(m.structure(end.x, test)) for test, m in problem.formulation.others]
         residual = max([residual, *others])
