@@ -16,9 +16,7 @@ def lines(reduced: bool, data: Path, only: str) -> Iterator[Line]:
     draws = range(3 if reduced else 20)
     groups = {
         "six": lambda: six_springs(draws, judged=not reduced),
-        "five": lambda: five_storeys(
-            range(3 if reduced else 60), judged=not reduced
-        ),  # quick, and errors hang together
+        "five": lambda: five_storeys(range(3 if reduced else 60), judged=not reduced),  # errors hang together
         "newcomers": newcomers,
         "mistakes": mistakes,
     }

@@ -30,7 +30,7 @@ def _errors(module, names: tuple[str, ...], true: np.ndarray, noise: float, draw
 
 
 def six_springs(draws: range, *, judged: bool) -> Iterator[Line]:
-    """Errors of springs and dampers at four levels of noise; a few draws alone do not judge their ratio to the bound."""
+    """Errors of springs and dampers at four levels of noise; a few draws do not judge their ratio to the bound."""
     module = load_module("six_springs")
     true = np.concatenate([module.SPRINGS, module.DAMPERS])
     truth = module.building()
