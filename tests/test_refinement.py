@@ -1,5 +1,8 @@
 """Eigenvalue refinement: both ways reach the target; the closed form is the nearest and stays in the box."""
 
+import sys
+
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -104,6 +107,60 @@ def test_a_target_that_is_met_already_changes_nothing(seed):
     own = np.sort(np.linalg.svd(L, compute_uv=False))
     answer = closed_form(L, own).factor
     np.testing.assert_allclose(answer @ answer.T, L @ L.T, atol=1e-9 * own[-1] ** 2)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_ipopt_starts_from_the_candidates_own_factor(seed):
+    """Not from a fresh diagonal, half of its norm away: a candidate that has the target already hardly moves."""
+    rng = np.random.default_rng(seed)
+    L = factor_in_the_box(rng, 5, 100.0)
+    answer = by_ipopt(L, np.sort(np.linalg.svd(L, compute_uv=False))).factor
+    assert np.linalg.norm(answer @ answer.T - L @ L.T) < 0.05 * np.linalg.norm(L @ L.T)
+
+
+class _Altered:
+    """A solver that gives another status, or its start for an answer."""
+
+    def __init__(self, solver, status, stays):
+        self.solver, self.status, self.stays = solver, status, stays
+
+    def __call__(self, **arguments):
+        solution = self.solver(**arguments)
+        return solution | {"x": arguments["x0"]} if self.stays else solution
+
+    def stats(self):
+        return self.solver.stats() | {"return_status": self.status}
+
+
+def forget_solvers():
+    """Empty the caches of the module that holds `by_ipopt`."""
+    for kept in vars(sys.modules[by_ipopt.__module__]).values():
+        if hasattr(kept, "cache_clear"):
+            kept.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("status", "stays", "success"),
+    [
+        ("Solve_Succeeded", False, True),
+        ("Solved_To_Acceptable_Level", False, True),
+        ("Restoration_Failed", False, False),
+        ("Maximum_Iterations_Exceeded", False, False),
+        ("Solve_Succeeded", True, False),
+    ],
+)
+def test_success_is_what_ipopt_says_and_the_spectrum_shows(monkeypatch, status, stays, success):
+    solver = ca.nlpsol
+    L = np.array([[10.0, 0.0], [3.0, 20.0]])
+    lowest = np.linalg.svd(L, compute_uv=False).min()
+    with monkeypatch.context() as patched:
+        patched.setattr(ca, "nlpsol", lambda *arguments: _Altered(solver(*arguments), status, stays))
+        forget_solvers()
+        answer = by_ipopt(L, np.array([1.1 * lowest]))
+    forget_solvers()
+    assert answer.success == success
+    assert status in answer.message
+    assert answer.error == pytest.approx(1 - 1 / 1.21 if stays else 0.0, abs=1e-8)
 
 
 @pytest.mark.parametrize("way", [closed_form, by_ipopt])

@@ -39,11 +39,11 @@ def modal(structure):
     return np.concatenate([p.ravel(order="F") for p in pieces]), shapes
 
 
-def expression(test, shapes):
+def expression(test, shapes, **options):
     z = ca.MX.sym("z", sum(a * b for a, b in shapes))
     ends = np.cumsum([0, *(a * b for a, b in shapes)]).tolist()
     parts = [ca.reshape(z[a:b], *shape) for a, b, shape in zip(ends[:-1], ends[1:], shapes, strict=True)]
-    return z, residual(test, *parts)
+    return z, residual(test, *parts, **options)
 
 
 @pytest.mark.parametrize("force", [False, True])
@@ -84,6 +84,35 @@ def test_it_vanishes_at_the_truth(random_structure, seed):
     values, shapes = modal(s)
     z, miss = expression(measurement(s, test.freq, test.base, a, f), shapes)
     assert np.linalg.norm(np.asarray(ca.Function("miss", [z], [miss])(values))) < 1e-13
+
+
+@pytest.mark.parametrize("shift", [0.3, 20.0, 150.0])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_at_complex_frequencies_it_vanishes_at_direct_solves_there(random_structure, seed, shift):
+    """(s² M + s C + K) a = -s² B u with s = shift + i w; f = B' a + M_rb u."""
+    rng = np.random.default_rng(seed)
+    structure = random_structure(rng, n=4, d=2)
+    test, n = random_test(rng, structure), structure.n
+    M, K, C = structure.mass[:n, :n], structure.stiffness[:n, :n], structure.damping
+    B = M @ structure.rigid_body + structure.mass[:n, n:]
+    s = shift + 2j * np.pi * test.freq
+    Z = s[:, None, None] ** 2 * M + s[:, None, None] * C + K
+    u = np.moveaxis(test.base, -1, 0)  # (lines, runs, d)
+    a = np.linalg.solve(Z, -(s[:, None, None] ** 2) * (B @ u.swapaxes(1, 2)))
+    f = B.T @ a + structure.rigid_body_mass @ u.swapaxes(1, 2)
+    a, f = (np.moveaxis(record, (0, 1, 2), (2, 1, 0)) for record in (a, f))
+    values, shapes = modal(structure)
+    z, miss = expression(measurement(structure, test.freq, test.base, a, f), shapes, shift=shift)
+    assert np.linalg.norm(np.asarray(ca.Function("miss", [z], [miss])(values))) < 1e-12
+
+
+def test_a_modal_gain_at_a_complex_frequency_by_hand():
+    """One mass, w = 2, zeta = 1/4, at s = 1 + i: s² = 2i, s² + s + 4 = 5 + 3i, a = -2i / (5 + 3i) = -(6 + 10i) / 34."""
+    record = np.array([[[1 - (6 + 10j) / 34]]])
+    test = Measurement([1 / (2 * np.pi)], np.ones((1, 1, 1)), record, rigid_body=[[1.0]])
+    one = ca.MX(1.0)
+    miss = residual(test, one, one, ca.MX(2.0), ca.MX(0.25), one, shift=1.0)
+    assert float(ca.evalf(ca.norm_2(miss))) < 1e-14
 
 
 def numpy_cost(test, shapes):
