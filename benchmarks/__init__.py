@@ -1,1 +1,4 @@
-"""Measured claims: what each capability must reach, and what it does reach."""
+"""Measured figures, each beside the bound that it must keep.
+
+``python -m benchmarks`` lists them, ``python -m benchmarks NAME...`` runs some. `registry` says how one is added.
+"""

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import textwrap
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
+
+HEADER = ("what was measured", "figure", "bound", "met")
+WIDTHS = (62, 32, 18, 7)  # characters
 
 
 @dataclass(frozen=True)
@@ -15,7 +20,7 @@ class Line:
     text : str
         What was measured.
     figure : str
-        What came.
+        The figure, as it is printed.
     bound : str
         What is asked for; empty where the figure is only printed.
     met : bool or None
@@ -29,9 +34,7 @@ class Line:
 
     def __str__(self) -> str:
         verdict = {True: "met", False: "NOT MET", None: "-"}[self.met]
-        return f"{verdict:8s} {self.text}\n         figure: {self.figure}" + (
-            f"    bound: {self.bound}" if self.bound else ""
-        )
+        return row((self.text, self.figure, self.bound, verdict), WIDTHS)
 
 
 def below(text: str, value: float, bound: float) -> Line:
@@ -42,6 +45,20 @@ def below(text: str, value: float, bound: float) -> Line:
 def above(text: str, value: float, bound: float) -> Line:
     """A figure that must reach its bound."""
     return Line(text, f"{value:.4g}", f">= {bound:g}", bool(value >= bound))
+
+
+def row(cells: Sequence[str], widths: Sequence[int]) -> str:
+    """One row of a table with columns of fixed widths; a long cell is wrapped."""
+    columns = [textwrap.wrap(cell, width) for cell, width in zip(cells, widths, strict=True)]
+    return "\n".join(
+        "  ".join(part.ljust(width) for part, width in zip(parts, widths, strict=True)).rstrip()
+        for parts in zip_longest(*columns, fillvalue="")
+    )
+
+
+def rule(widths: Sequence[int]) -> str:
+    """The line between a table's header and its rows."""
+    return "  ".join("-" * width for width in widths)
 
 
 def show(lines: Iterable[Line]) -> int:

@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 import sysid
 from benchmarks.bad_input import CASES, outcome
 from benchmarks.line import Line, above, below
-from benchmarks.modules import ROOT, load_module
+from benchmarks.problem_modules import ROOT, load_module
 from benchmarks.shake_amplitude import unseen_scores_with_amplitude
 from sysid.swarm import SwarmSettings
 from sysid.swarm_cost import SwarmCost

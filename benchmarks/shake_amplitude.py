@@ -38,7 +38,7 @@ import numpy as np
 from scipy import signal
 
 import sysid
-from benchmarks.modules import load_module
+from benchmarks.problem_modules import load_module
 from sysid.files import xsens_dot
 
 FITTED, UNSEEN = "sine_1p5", "sine_2p0"

@@ -8,7 +8,7 @@ import numpy as np
 
 import sysid
 from benchmarks.line import Line
-from benchmarks.modules import load_module
+from benchmarks.problem_modules import load_module
 from benchmarks.parameter_bound import parameter_bound
 
 # Noise: mean |error| of springs and dampers that the source gives, in % (Chen, Chen and Liu 2014, ant colony; its

@@ -1,4 +1,4 @@
-"""Lines of capability 3: tests that cannot tell what is asked of them, and whether the result says so.
+"""Tests that cannot tell what is asked of them, and whether the result says so.
 
 What counts is an `InputError` with a sentence that names the cause, or a result with ``determined`` False and such a
 sentence in ``undetermined``. A sound test must draw no such sentence.
@@ -14,8 +14,8 @@ import numpy as np
 
 import sysid
 from benchmarks.line import Line
-from benchmarks.modules import load_module
-from benchmarks.random_structures import lines, random_structure
+from benchmarks.modal.random_structures import frequency_lines, random_structure
+from benchmarks.problem_modules import load_module
 
 NOISE = 0.01
 
@@ -36,8 +36,8 @@ class Case:
     cause: str
 
 
-def negative() -> Iterator[Line]:
-    """One line a case."""
+def lines(reduced: bool) -> Iterator[Line]:
+    """One line a case; both forms are the same."""
     for name, case in CASES.items():
         said, flagged, figure = outcome(case)
         figure = figure + "".join(f"; {sentence!r}" for sentence in said)
@@ -70,7 +70,7 @@ def _names(said: tuple[str, ...], cause: str) -> bool:
 def _test(n: int = 6, d: int = 3, *, count: int | None = None) -> sysid.Measurement:
     """A sound test of a random structure, with base force and noise."""
     truth = random_structure(1, n=n, d=d)
-    return sysid.simulate(truth, lines(truth, count), noise=NOISE, force=True, rng=1)
+    return sysid.simulate(truth, frequency_lines(truth, count), noise=NOISE, force=True, rng=1)
 
 
 def _sound() -> sysid.Problem:
@@ -95,7 +95,7 @@ def _still_mode() -> sysid.Structure:
 
 def _invisible(*, stated: bool) -> sysid.Problem:
     truth = _still_mode()
-    test = sysid.simulate(truth, lines(truth), noise=NOISE, force=True, rng=1)
+    test = sysid.simulate(truth, frequency_lines(truth), noise=NOISE, force=True, rng=1)
     given = truth.natural_frequencies if stated else None
     return sysid.Problem(test, mass=sysid.FullMass(), stiffness=sysid.SpectralStiffness(given))
 
@@ -123,7 +123,7 @@ def _wrong_force(factor: float, *, stated: bool) -> sysid.Problem:
 def _few_lines(*, stated: bool) -> sysid.Problem:
     """Eight sensors, one direction, four lines: 64 numbers for 80 unknowns of the modal model."""
     truth = random_structure(1, n=8, d=1)
-    test = sysid.simulate(truth, lines(truth, 4), force=True)
+    test = sysid.simulate(truth, frequency_lines(truth, 4), force=True)
     given = truth.natural_frequencies if stated else None
     return sysid.Problem(test, mass=sysid.FullMass(), stiffness=sysid.SpectralStiffness(given))
 
@@ -131,7 +131,7 @@ def _few_lines(*, stated: bool) -> sysid.Problem:
 def _twins() -> sysid.Problem:
     """The last sensor records what the first does, with noise of its own."""
     truth = random_structure(1, n=6, d=3)
-    freq = lines(truth)
+    freq = frequency_lines(truth)
     clean, noisy = (sysid.simulate(truth, freq, noise=level, force=True, rng=1) for level in (0.0, NOISE))
     response, G = noisy.response.copy(), noisy.rigid_body.copy()
     response[:, -1] = clean.response[:, 0] + (noisy.response[:, -1] - clean.response[:, -1])

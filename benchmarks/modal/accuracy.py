@@ -1,4 +1,4 @@
-"""Lines of capability 3: errors against the Cramér-Rao bound, and whether 95 % intervals hold the truth."""
+"""Errors of noisy tests against the Cramér-Rao bound, and whether 95 % intervals hold the truth."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from functools import cache
 import numpy as np
 
 import sysid
-from benchmarks.attempt import identified, named
-from benchmarks.cramer_rao import CramerRao, cramer_rao
 from benchmarks.line import Line, below
-from benchmarks.random_structures import lines, random_structure
-from benchmarks.spread import spread
+from benchmarks.modal.cramer_rao import CramerRao, cramer_rao
+from benchmarks.modal.identification import error_text, identify_records
+from benchmarks.modal.random_structures import frequency_lines, random_structure
+from benchmarks.modal.spread import spread
 
 NOISE, LEVEL = 0.01, 0.95
 RATIO, POOLED, EACH = 1.2, (0.93, 0.97), (0.90, 0.99)
@@ -52,24 +52,33 @@ class Draw:
     said: str = ""
 
 
-def bound(structures: range, draws: int, printed: bool) -> Iterator[Line]:
+def lines(reduced: bool) -> Iterator[Line]:
     """RMS errors and coverage over noise draws of some structures; only printed where they are few."""
-    tasks = [(seed, number) for seed in structures for number in range(draws)]
-    answers = spread(draw, tasks)
+    structures, draws = (range(9, 10), 6) if reduced else (range(10), 200)
+    answers = spread(draw, [(seed, number) for seed in structures for number in range(draws)])
     what = f"1 % noise, base force, {len(structures)} structures x {draws} draws: "
     complete = [a for a in answers if a.held]
+    yield _left_out(what, answers, structures)
+    if not complete:
+        yield Line(what + "nothing to compare", "no complete draw", "", False)
+        return
+    yield from _errors(what, complete, structures, printed=reduced)
+    yield from _coverages(what, complete, printed=reduced)
+
+
+def _left_out(what: str, answers: list[Draw], structures: range) -> Line:
     missing = []
     for seed in structures:
         reasons = [a.said or f"{a.found} modes" for a in answers if a.structure == seed and not a.held]
         if reasons:
             missing.append(f"structure {seed}, n = {random_structure(seed).n}: {_tally(reasons)}")
-    yield Line(
+    return Line(
         what + f"draws without a result of all n modes, left out of what follows ({'; '.join(missing) or 'none'})",
-        f"{len(answers) - len(complete)} of {len(answers)}",
+        f"{sum(not a.held for a in answers)} of {len(answers)}",
     )
-    if not complete:
-        yield Line(what + "nothing to compare", "no complete draw", "", False)
-        return
+
+
+def _errors(what: str, complete: list[Draw], structures: range, *, printed: bool) -> Iterator[Line]:
     for name, label in (("mass", "M_SS"), ("stiffness", "K_SS")):
         ratios = {}
         for seed in structures:
@@ -82,11 +91,13 @@ def bound(structures: range, draws: int, printed: bool) -> Iterator[Line]:
         ) + ")"  # fmt: skip
         worst = max(ratios.values())
         yield Line(text, f"{worst:.3f}") if printed else below(text, float(worst), RATIO)
-    shares = {label: _share(complete, [name]) for name, label in KINDS.items()}
+
+
+def _coverages(what: str, complete: list[Draw], *, printed: bool) -> Iterator[Line]:
     text = what + "share of 95 % intervals that hold the truth, "
     yield _coverage(text + "pooled", _share(complete, [*KINDS]), POOLED, printed)
-    for label, share in shares.items():
-        yield _coverage(text + label, share, EACH, printed)
+    for name, label in KINDS.items():
+        yield _coverage(text + label, _share(complete, [name]), EACH, printed)
     products = _share(complete, ["effective_mass_products"])
     yield Line(what + "the same for the products of two participations (off the diagonals)", f"{products:.4f}")
     lowest = {
@@ -125,7 +136,7 @@ def _relative_bound(seed: int, name: str) -> float:
 def _setting(seed: int) -> tuple[sysid.Structure, np.ndarray, CramerRao]:
     """Structure, lines, and the bound in its test; the noise's standard deviation is the same in every draw."""
     truth = random_structure(seed)
-    freq = lines(truth)
+    freq = frequency_lines(truth)
     return truth, freq, cramer_rao(truth, sysid.simulate(truth, freq, noise=NOISE, force=True, rng=0))
 
 
@@ -134,14 +145,15 @@ def draw(task: tuple[int, int]) -> Draw:
     try:
         return _draw(*task)
     except Exception as error:  # a crash is an answer too, and must not end the others
-        return Draw(task[0], said=named(error))
+        return Draw(task[0], said=error_text(error))
 
 
 def _draw(seed: int, number: int) -> Draw:
     truth = random_structure(seed)
     n, d = truth.n, truth.n_base
-    test = sysid.simulate(truth, lines(truth), noise=NOISE, force=True, rng=np.random.default_rng((seed, number)))
-    result = identified(test)
+    rng = np.random.default_rng((seed, number))
+    test = sysid.simulate(truth, frequency_lines(truth), noise=NOISE, force=True, rng=rng)
+    result = identify_records(test)
     found = result.structure
     if found.n != n:
         return Draw(seed, found.n)

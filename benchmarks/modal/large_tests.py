@@ -1,6 +1,6 @@
-"""Lines of capability 3 on large tests: time and memory, each in a process of its own.
+"""Time and memory that large noise-free tests take, each in a process of its own.
 
-``python -m benchmarks.large N D LINES`` runs one and prints its figures as JSON.
+``python -m benchmarks.modal.large_tests N D LINES`` runs one and prints its figures as JSON.
 """
 
 from __future__ import annotations
@@ -16,19 +16,18 @@ from collections.abc import Iterator
 import numpy as np
 
 import sysid
-from benchmarks.attempt import identified
-from benchmarks.exact import distance
 from benchmarks.line import Line, below
-from benchmarks.modules import ROOT
-from benchmarks.random_structures import lines, random_structure
+from benchmarks.modal.identification import identify_records, matrix_distance
+from benchmarks.modal.random_structures import frequency_lines, random_structure
+from benchmarks.problem_modules import ROOT
 
 SIZES = ((50, 3, 1000, 10.0), (100, 3, 2000, 90.0))  # n, d, lines, s
 MEMORY = 4.0  # GiB
 PATIENCE = 5.0  # times the bound on the seconds, after which a run is ended
 
 
-def large(reduced: bool) -> Iterator[Line]:
-    """Noise-free tests with base force."""
+def lines(reduced: bool) -> Iterator[Line]:
+    """Noise-free tests with base force; the reduced form takes the smaller one."""
     for n, d, count, seconds in SIZES[: 1 if reduced else None]:
         what = f"no noise, base force, n = {n}, d = {d}, {count} lines: "
         figures = _in_own_process(n, d, count, PATIENCE * seconds)
@@ -45,7 +44,7 @@ def large(reduced: bool) -> Iterator[Line]:
 
 
 def _in_own_process(n: int, d: int, count: int, patience: float) -> dict:
-    command = [sys.executable, "-m", "benchmarks.large", str(n), str(d), str(count)]
+    command = [sys.executable, "-m", "benchmarks.modal.large_tests", str(n), str(d), str(count)]
     paths = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
     environment = {**os.environ, "PYTHONPATH": paths}
     try:
@@ -64,10 +63,10 @@ def main() -> None:
     """Run one, and print its figures."""
     n, d, count = (int(a) for a in sys.argv[1:])
     truth = random_structure(0, n=n, d=d)
-    test = sysid.simulate(truth, lines(truth, count), force=True)
+    test = sysid.simulate(truth, frequency_lines(truth, count), force=True)
     begun = time.perf_counter()
     try:
-        result = identified(test)
+        result = identify_records(test)
     except sysid.SysidError as error:
         print(json.dumps({"said": str(error)}))
         return
@@ -80,7 +79,7 @@ def main() -> None:
         "memory": peak,
         "residual": result.residual,
         "force_residual": result.force_residual,
-        "matrices": distance(found, truth) if found.n == n else np.inf,
+        "matrices": matrix_distance(found, truth) if found.n == n else np.inf,
         "found": found.n,
     }
     print(json.dumps(figures))

@@ -1,4 +1,4 @@
-"""Lines of capability 3 on the three-storey building of Majcher (2025), accelerations only."""
+"""Matrices of the three-storey building of Majcher (2025), and their extremes, from accelerations only."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 import sysid
-from benchmarks.attempt import identified, named
 from benchmarks.line import Line, below
-from benchmarks.modules import load_module
+from benchmarks.modal.identification import error_text, identify_records
+from benchmarks.problem_modules import load_module
 
 BOUND = 1e-6
 NEARLY = 3e-7  # share of the total on the modes that an extreme leaves without mass: it is reached in the limit only
 
 
-def building() -> Iterator[Line]:
-    """Lumped mass with and without its total; full mass with and without one."""
+def lines(reduced: bool) -> Iterator[Line]:
+    """Lumped mass with and without its total; full mass with and without one. Both forms are the same."""
     module = load_module("shear_building")
     truth, masses, springs = module.building(), module.MASSES, module.SPRINGS
     test = sysid.simulate(truth, np.linspace(0.2, 6.0, 300))
@@ -63,9 +63,9 @@ def building() -> Iterator[Line]:
 
 def _identify(test: sysid.Measurement, mass: object) -> tuple[sysid.Identification | None, str]:
     try:
-        return identified(test, mass), ""
+        return identify_records(test, mass), ""
     except Exception as error:  # a crash is an answer too, and must not end the others
-        return None, named(error)
+        return None, error_text(error)
 
 
 def _masses_and_springs(structure: sysid.Structure) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Random structures on a moving base, as the lines of capability 3 ask for them."""
+"""Random structures on a moving base, with full mass matrices and close pairs of modes."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def random_structure(seed: int, *, n: int | None = None, d: int | None = None) -
             return structure
 
 
-def lines(structure: sysid.Structure, count: int | None = None) -> np.ndarray:
+def frequency_lines(structure: sysid.Structure, count: int | None = None) -> np.ndarray:
     """Lines of a test, Hz: 60 a mode unless `count` is given, from below the first to above the last mode."""
     f = structure.natural_frequencies
     return np.geomspace(0.7 * f[0], 1.3 * f[-1], count or 60 * structure.n)

@@ -1,19 +1,19 @@
-"""Lines of capability 3 with noise: which modes are found, and whether what is wrong says so."""
+"""Modes found in noisy tests, and whether a result says so where it is wrong."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 import sysid
-from benchmarks.attempt import identified, named
 from benchmarks.line import Line, above, below
-from benchmarks.random_structures import lines, random_structure
-from benchmarks.spread import spread
+from benchmarks.modal.identification import error_text, identify_records
+from benchmarks.modal.random_structures import frequency_lines, random_structure
+from benchmarks.modal.spread import spread
 
 COUNTS = 10.0  # a mode counts where its part of the records is so many times the noise
 NEAR = 0.5  # of half the half-power bandwidth
@@ -60,8 +60,9 @@ class Run:
         return not self.said and self.missed == 0 and self.spurious == 0
 
 
-def noise(seeds: range, levels: Sequence[float]) -> Iterator[Line]:
+def lines(reduced: bool) -> Iterator[Line]:
     """Noisy tests of random structures; no frequency and no number of modes is given."""
+    seeds, levels = (range(4), (0.01,)) if reduced else (range(100), (0.001, 0.01, 0.03))
     tasks = [(seed, level, force) for level in levels for force in (False, True) for seed in seeds]
     runs = dict(zip(tasks, spread(run, tasks), strict=True))
     for level in levels:
@@ -112,11 +113,11 @@ def run(task: tuple[int, float, bool]) -> Run:
     """Identify one noisy test: seed, noise, whether the base force is recorded."""
     seed, level, force = task
     truth = random_structure(seed)
-    test = sysid.simulate(truth, lines(truth), noise=level, force=force, rng=seed)
+    test = sysid.simulate(truth, frequency_lines(truth), noise=level, force=force, rng=seed)
     counts = strength(truth, test) >= COUNTS
     answer = {"name": f"seed {seed}", "true": truth.n, "counting": int(np.count_nonzero(counts))}
     try:
-        result = identified(test)
+        result = identify_records(test)
         partner = partners(result, truth, counts)
         return Run(
             **answer,
@@ -127,7 +128,7 @@ def run(task: tuple[int, float, bool]) -> Run:
             nonsense=nonsense(result, truth),
         )
     except Exception as error:  # a crash is an answer too, and must not end the others
-        return Run(**answer, missed=answer["counting"], said=named(error))
+        return Run(**answer, missed=answer["counting"], said=error_text(error))
 
 
 def _doubted(result: sysid.Identification, k: int) -> bool:

@@ -1,0 +1,52 @@
+"""Seconds that an identification of a noise-free test takes, `Problem` and `identify` together."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+import sysid
+from benchmarks.line import Line, below
+from benchmarks.modal.identification import identify_records
+from benchmarks.modal.random_structures import frequency_lines, random_structure
+
+SECONDS = {10: 0.3, 20: 2.0}  # bounds on the medians, by the number of modes
+
+
+def lines(reduced: bool) -> Iterator[Line]:
+    """Wall-clock medians over random structures, nothing else running here; by kinds of tests.
+
+    Of each structure the least of so many repeats counts: where others share the machine it says most about the code.
+    """
+    count, repeats = (3, 3) if reduced else (10, 1)
+    directions: dict[str, int | None] = {"d = 3": 3} if reduced else {"d = 3": 3, "d = 1 to 3": None}
+    for n, bound in SECONDS.items():
+        medians = {}
+        for label, d in directions.items():
+            for force in (False, True):
+                tests = [_test(seed, n, d, force=force) for seed in range(count)]
+                with threadpool_limits(limits=1):
+                    _seconds(tests[0])  # what is imported at the first call is not counted
+                    least = [min(_seconds(test) for _ in range(repeats)) for test in tests]
+                medians[f"{label}, {'with' if force else 'no'} force"] = float(np.median(least))
+        shown = "; ".join(f"{label} {value:.2f}" for label, value in medians.items())
+        what = f"largest median over {count} structures, least of {repeats}, s"
+        text = f"no noise, n = {n}, {60 * n} lines: {what} ({shown})"
+        yield below(text, max(medians.values()), bound)
+
+
+def _seconds(test: sysid.Measurement) -> float:
+    begun = time.perf_counter()
+    try:
+        identify_records(test)
+    except Exception:
+        return np.inf  # no answer is not a fast answer
+    return time.perf_counter() - begun
+
+
+def _test(seed: int, n: int, d: int | None, *, force: bool) -> sysid.Measurement:
+    structure = random_structure(seed, n=n, d=d)
+    return sysid.simulate(structure, frequency_lines(structure), force=force)
