@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 
@@ -59,12 +59,3 @@ def row(cells: Sequence[str], widths: Sequence[int]) -> str:
 def rule(widths: Sequence[int]) -> str:
     """The line between a table's header and its rows."""
     return "  ".join("-" * width for width in widths)
-
-
-def show(lines: Iterable[Line]) -> int:
-    """Print lines as they come; how many are not met."""
-    unmet = 0
-    for line in lines:
-        print(line, flush=True)
-        unmet += line.met is False
-    return unmet

@@ -53,7 +53,7 @@ class Swarm:
     settings : SwarmSettings
         Constants of the swarm itself. The paper leaves b1 and b2 of its eq. 11 to the user; with the
         usual 0.3 and 0.2 and c1 + c2 up to 4 (``SwarmSettings()``) the swarm of this problem contracts
-        too early. These keep it moving: see the swarm lines of ``benchmarks/lines_2.py`` for both.
+        too early. These keep it moving: ``python -m benchmarks swarm_alone`` measures both.
     """
 
     max_iterations: int = 150

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+
+from benchmarks.command_line import sysid_run
+from benchmarks.line import Line
 
 _MODULE = """
 import numpy as np
@@ -69,14 +72,18 @@ CASES = {
 }
 
 
-def outcome(case: Case, folder: Path) -> tuple[str, str, bool]:
+def lines(reduced: bool) -> Iterator[Line]:
+    """One line a mistake: status 2, one line on stderr, and nothing written. Both forms are the same."""
+    for name, case in CASES.items():
+        with tempfile.TemporaryDirectory() as folder:
+            yield Line(f"bad input: {name}", *_outcome(case, Path(folder)))
+
+
+def _outcome(case: Case, folder: Path) -> tuple[str, str, bool]:
     """Run one mistake in an empty folder: figure, bound, met."""
     (folder / "mistake.py").write_text(case.module.replace("{change}", case.change), encoding="utf-8")
     arguments = [str(folder / "mistake.py") if a == "MODULE" else a for a in case.arguments]
-    run = subprocess.run(
-        [sys.executable, "-m", "sysid", "run", *arguments, "--out", str(folder / "out")],
-        cwd=folder, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    run = sysid_run(arguments, folder)
     said = run.stderr.strip().splitlines()
     written = sorted(p.name for p in folder.iterdir() if p.name not in ("mistake.py", "__pycache__"))
     met = run.returncode == 2 and len(said) == 1 and "Traceback" not in run.stderr and not written

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from benchmarks.command_line import sysid_run
 from benchmarks.line import Line
 
 _MODULE = '''"""A chain of two floors."""
@@ -50,16 +49,13 @@ CASES = {
 }
 
 
-def mistakes() -> Iterator[Line]:
-    """One line a mistake: status 2, one message, with name, file and line."""
+def lines(reduced: bool) -> Iterator[Line]:
+    """One line a mistake: status 2, one message, with name, file and line. Both forms are the same."""
     for name, (change, words) in CASES.items():
         with tempfile.TemporaryDirectory() as place:
             folder = Path(place)
             (folder / "variant.py").write_text(_MODULE.replace("{change}", change), encoding="utf-8")
-            run = subprocess.run(
-                [sys.executable, "-m", "sysid", "run", "variant.py", "--out", "out"],
-                cwd=folder, capture_output=True, text=True, check=False,
-            )  # fmt: skip
+            run = sysid_run(["variant.py"], folder)
             said = run.stderr.strip().splitlines()
             named = all(word in run.stderr for word in (*words, "variant.py, line "))
             alone = not (folder / "out").exists() and len(said) == 1 and run.returncode == 2

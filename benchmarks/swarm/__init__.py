@@ -1,0 +1,1 @@
+"""The published algorithm: from a base-shake test to a structural model, measured records and users' mistakes too."""

@@ -1,0 +1,57 @@
+"""Measured records of a shake table: fitted on one event, predicting another."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+import sysid
+from benchmarks.line import Line, below
+from benchmarks.problem_modules import ROOT, load_module
+from benchmarks.swarm.shake_amplitude import unseen_scores_with_amplitude
+
+DATA = ROOT.parent / "shared" / "data" / "mini_shake_table" / "flexible_3_storey"
+
+
+def lines(reduced: bool) -> Iterator[Line]:
+    """mini_shake_table: fitted on one event, predicting the other. Both forms are the same.
+
+    The variable SYSID_DATA names the folder of both events; by default it is looked for beside the checkout.
+    """
+    data = Path(os.environ.get("SYSID_DATA") or DATA)
+    if not data.is_dir():
+        yield Line("mini_shake_table", "records absent: not run (set SYSID_DATA to their folder)")
+        return
+    problem = load_module("mini_shake_table").problem(data=str(data))
+    result = sysid.identify(problem, strategy="swarm", rng=0)
+    given = np.array([3.75, 11.2, 16.6])
+    frequencies = result.structure.natural_frequencies
+    yield below(
+        f"mini_shake_table: largest relative distance of {frequencies.round(3).tolist()} Hz from 3.75, 11.2, 16.6",
+        float(np.max(np.abs(frequencies / given - 1))),
+        0.02,
+    )
+    fitted, unseen = problem.measurement, problem.validation[0]
+    yield _scores("fitted event, relative X", _score(result.predict(fitted), fitted.relative), (0.79, 0.82, 0.75))
+    yield _scores("unseen event, relative X", _score(result.predict(unseen), unseen.relative), (0.38, 0.33, 0.29))
+    stretch, how = unseen_scores_with_amplitude(result, data)
+    yield _scores(f"stretch, unseen event ({how})", stretch, (0.50, 0.50, 0.50))
+    for name, test in (("fitted", fitted), ("unseen", unseen)):
+        rigid = test.response - test.relative
+        yield _scores(f"{name} event, absolute X", _score(rigid + result.predict(test), test.response))
+        yield _scores(f"{name} event, absolute X, floors move with the table", _score(rigid, test.response))
+
+
+def _score(predicted: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    return 1 - np.linalg.norm(predicted - measured, axis=(0, 2)) / np.linalg.norm(measured, axis=(0, 2))
+
+
+def _scores(text: str, scores: np.ndarray, bounds: tuple[float, ...] = ()) -> Line:
+    figure = " / ".join(f"{s:.3f}" for s in scores)
+    if not bounds:
+        return Line("mini_shake_table: " + text, figure)
+    met = all(s >= b for s, b in zip(scores, bounds, strict=True))
+    return Line("mini_shake_table: " + text, figure, ">= " + " / ".join(f"{b:g}" for b in bounds), met)

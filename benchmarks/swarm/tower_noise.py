@@ -1,0 +1,28 @@
+"""The tower with noise: how near to the noise floor a run of the swarm strategy ends."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import sysid
+from benchmarks.line import Line, below
+from benchmarks.problem_modules import load_module
+
+
+def lines(reduced: bool) -> Iterator[Line]:
+    """cantilever_tower with 1 % noise, a new draw each seed."""
+    seeds = range(1 if reduced else 5)
+    module = load_module("cantilever_tower")
+    ratios = []
+    for seed in seeds:
+        problem = module.problem(noise=0.01, rng=seed)
+        result = sysid.identify(problem, strategy="swarm", rng=seed)
+        ratios.append(result.residual / problem.measurement.residual(problem.reference))
+    worst = max(abs(ratio - 1) for ratio in ratios)
+    yield below(
+        f"cantilever_tower, 1 % noise, {len(seeds)} draws: |residual / noise floor - 1| (ratios "
+        + ", ".join(f"{ratio:.4f}" for ratio in ratios)
+        + ")",
+        worst,
+        0.05,
+    )

@@ -1,0 +1,33 @@
+"""Variants by people who had read the README and one notebook: run as they were first written."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from benchmarks.command_line import sysid_run
+from benchmarks.line import Line
+from benchmarks.problem_modules import ROOT
+
+FOLDER = ROOT / "tests" / "newcomers"
+
+
+def lines(reduced: bool) -> Iterator[Line]:
+    """One line a variant: it runs from the command line and ends in success. Both forms are the same."""
+    modules = sorted(FOLDER.glob("*.py"))
+    if not modules:
+        yield Line("variants of newcomers", "no module in tests/newcomers", "some", False)
+    for path in modules:
+        with tempfile.TemporaryDirectory() as place:
+            run = sysid_run([str(path)], Path(place))
+            summary = Path(place) / "out" / "summary.json"
+            told = json.loads(summary.read_text(encoding="utf-8")) if summary.is_file() else {}
+        yield Line(
+            f"variant of a newcomer: {path.stem}",
+            f"status {run.returncode}, residual {told.get('residual')}, determined {told.get('determined')}"
+            + (f"; {run.stderr.strip().splitlines()[-1][:120]}" if run.returncode else ""),
+            "status 0",
+            run.returncode == 0,
+        )
