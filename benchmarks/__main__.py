@@ -11,7 +11,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from benchmarks.line import HEADER, WIDTHS, Line, row, rule
 from benchmarks.registry import BENCHMARKS, Benchmark, names, select
 
-LISTED = (("group", 8), ("name", 19), ("what it measures", 72), ("full", 7), ("reduced", 7))
+LIST_HEADER = ("group", "name", "what it measures", "full", "reduced")
+LIST_WIDTHS = (8, 19, 72, 7, 7)  # characters
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -22,8 +23,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     unknown = [name for name in options.names if name not in names()]
     if unknown:
-        told = f"no benchmark or group is called {', '.join(map(repr, unknown))}: `{parser.prog}` lists them"
-        print(f"{parser.prog}: {told}", file=sys.stderr)
+        message = f"no benchmark or group is called {', '.join(map(repr, unknown))}: `{parser.prog}` lists them"
+        print(f"{parser.prog}: {message}", file=sys.stderr)
         return 2
     if not options.names:
         print(listing())
@@ -33,9 +34,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def listing() -> str:
     """A table of all benchmarks."""
-    header, widths = zip(*LISTED, strict=True)
     cells = [(b.group, b.name, b.what, b.full, b.reduced) for b in BENCHMARKS]
-    return "\n".join([row(header, widths), rule(widths), *(row(c, widths) for c in cells)])
+    return "\n".join([row(LIST_HEADER, LIST_WIDTHS), rule(LIST_WIDTHS), *(row(c, LIST_WIDTHS) for c in cells)])
 
 
 def run(benchmarks: Iterable[Benchmark], reduced: bool) -> list[str]:
@@ -50,7 +50,7 @@ def run(benchmarks: Iterable[Benchmark], reduced: bool) -> list[str]:
             if line.met is False:
                 unmet.append(f"{benchmark.name}: {line.text}: {line.figure}, bound {line.bound}")
         print(f"{benchmark.name}: {time.perf_counter() - own:.1f} s", flush=True)
-    print(f"\n{count} lines, {len(unmet)} not met, {time.perf_counter() - begun:.0f} s")
+    print(f"\nlines: {count}; not met: {len(unmet)}; {time.perf_counter() - begun:.0f} s in all")
     for text in unmet:
         print(f"NOT MET  {text}")
     return unmet

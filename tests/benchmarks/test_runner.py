@@ -61,5 +61,5 @@ def test_lines_that_are_not_met_and_crashes_count(package, monkeypatch, capsys):
     monkeypatch.setattr(registry.Benchmark, "lines", lines)
     assert runner.main(["tower"]) == 1
     printed = capsys.readouterr()
-    assert "3 lines, 2 not met" in printed.out
+    assert "lines: 3; not met: 2" in printed.out
     assert "RuntimeError: broken" in printed.err
