@@ -3,20 +3,21 @@
 import casadi as _casadi
 
 from sysid import plot
-from sysid._written import Known, Misfit
-from sysid.damping import ModalDamping, ProportionalDamping
 from sysid.errors import InputError, SolverError, SysidError
-from sysid.identification import History, Identification, Recipe
 from sysid.identify import Continuation, Modal, Progress, Swarm, identify
-from sysid.mass import FullMass, KnownMass, LumpedMass
-from sysid.measurement import Measurement, Sensor, rigid_body, simulate
-from sysid.problem import Problem
-from sysid.spectra import resample
-from sysid.stiffness import ChainStiffness, SpectralStiffness
-from sysid.storage import load
-from sysid.structure import Structure
+from sysid.measurement.measurement import Measurement, Sensor, rigid_body, simulate
+from sysid.measurement.spectra import resample
+from sysid.models.damping import ModalDamping, ProportionalDamping
+from sysid.models.mass import FullMass, KnownMass, LumpedMass
+from sysid.models.stiffness import ChainStiffness, SpectralStiffness
+from sysid.models.unknowns import Variable
+from sysid.problem.blocks import Known, Misfit
+from sysid.problem.problem import Problem
+from sysid.results.identification import Identification, Recipe
+from sysid.results.storage import load
+from sysid.search.strategy import History
+from sysid.structure.structure import Structure
 from sysid.swarm import SwarmSettings, minimize_swarm
-from sysid.variables import Variable
 
 __version__ = "0.1.0"
 

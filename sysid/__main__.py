@@ -2,7 +2,7 @@
 
 import sys
 
-from sysid.cli import main
+from sysid.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -19,9 +19,9 @@ from pathlib import Path
 from types import ModuleType
 
 from sysid.errors import InputError
-from sysid.identification import Recipe
-from sysid.problem import Problem
-from sysid.variables import declared
+from sysid.models.unknowns import declared
+from sysid.problem.problem import Problem
+from sysid.results.identification import Recipe
 
 _SIGNATURE = "def problem(*, data=None, rng=0) -> sysid.Problem"
 

@@ -9,24 +9,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
-from sysid import local
-from sysid._continuation import Continuation, by_continuation
-from sysid._desk import DeferredInterrupt, Desk, Progress, Stop
-from sysid._search import Outcome
-from sysid._swarm_search import Swarm, by_swarm
-from sysid._watch import Watch
-from sysid.checks import doubts, written_doubts
-from sysid.damping import ModalDamping
+from sysid.assessment.checks import doubts, written_doubts
+from sysid.assessment.determination import written_determination
+from sysid.assessment.modal_mass_cone import determination
 from sysid.errors import InputError, SolverError
-from sysid.identification import History, Identification
-from sysid.mass import FullMass
-from sysid.modal import Modal, NotModalError, held_by_model, modal_structure
-from sysid.modal_masses import determination
-from sysid.problem import Problem
-from sysid.refinement import SOLVED
-from sysid.stiffness import SpectralStiffness
-from sysid.structure import Structure
-from sysid.written_determination import written_determination
+from sysid.models.damping import ModalDamping
+from sysid.models.mass import FullMass
+from sysid.models.spectrum import SOLVED
+from sysid.models.stiffness import SpectralStiffness
+from sysid.nlp import EXACT, Watch
+from sysid.problem.problem import Problem
+from sysid.results.identification import Identification
+from sysid.search import local
+from sysid.search.continuation import Continuation, by_continuation
+from sysid.search.modal import Modal, NotModalError, held_by_model, modal_structure
+from sysid.search.session import DeferredInterrupt, Desk, Progress, Stop
+from sysid.search.strategy import History, Outcome
+from sysid.search.swarm import Swarm, by_swarm
+from sysid.structure.structure import Structure
 
 _KNOWN = 0.1  # of the root of two diagonal entries; an entry with a larger standard deviation is not known
 _LARGE = 4000  # entries of the mode shapes, beyond which the covariance takes minutes and gigabytes
@@ -177,7 +177,7 @@ def _by_modes(problem: Problem, options: Modal, desk: Desk) -> Outcome:
         + f" Hz (free residues fit within {poles.residual:.2e})"
     )
     success, message, stopped = (
-        end.status in SOLVED or end.residual <= local.EXACT,
+        end.status in SOLVED or end.residual <= EXACT,
         f"IPOPT: {end.status}",
         watch.stopped,
     )
@@ -298,11 +298,11 @@ def _as_certain(it: Identification) -> Identification:
 
     Null directions of exact records are closed by their noise, and show as large standard deviations only.
     """
-    exact = max(it.residual, it.force_residual or 0.0) < local.EXACT
+    exact = max(it.residual, it.force_residual or 0.0) < EXACT
     if it.problem.is_written:
         assert it.x is not None
         # A further test may be noisy, and what is stated as known always is.
-        exact = exact and it.problem.formulation.known is None and it.problem.misfit_of(it.x) < local.EXACT
+        exact = exact and it.problem.formulation.known is None and it.problem.misfit_of(it.x) < EXACT
     if not it.determined or exact:
         return it
     if it.structure.mode_shapes.size > _LARGE:

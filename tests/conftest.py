@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.layout import Layout
+from sysid.models.geometry import Layout
 
 
 def _geometry(rng, n, d):

@@ -7,7 +7,7 @@ import pytest
 
 import sysid
 from sysid import catalogue
-from sysid.identification import Recipe
+from sysid.results.identification import Recipe
 
 CHAIN = '''"""Two masses in a row."""
 

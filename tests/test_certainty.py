@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import block_diag
 
 from sysid import FullMass, InputError, LumpedMass, Measurement, Problem, Structure, identify, simulate
-from sysid.residues import line_correlation
+from sysid.modal_analysis.residues import line_correlation
 
 FREQ = np.linspace(2.0, 30.0, 500)
 

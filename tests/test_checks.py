@@ -5,7 +5,7 @@ import pytest
 
 import sysid
 from sysid import FullMass, KnownMass, LumpedMass, Measurement, Problem, Structure, simulate
-from sysid.checks import doubts
+from sysid.assessment.checks import doubts
 
 
 def lines(truth, count=240):

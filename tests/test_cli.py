@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid import cli
+from sysid.cli import main as cli
 
 FREQUENCIES = "truth.natural_frequencies"
 MODULE = Path(__file__).with_name("pair_problem.py").read_text()

@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 
 import sysid
-import sysid._swarm_search
-from sysid import cli, report
+import sysid.search.swarm
+from sysid.cli import main as cli
+from sysid.report import report
 
 MODULE = Path(__file__).with_name("pair_problem.py").read_text()
 
@@ -146,7 +147,8 @@ def test_ctrl_c_while_saving_says_that_files_are_missing(here, capsys, monkeypat
 
 ENDLESS = """
 import sysid
-from sysid import cli, identify
+from sysid import identify
+from sysid.cli import main as cli
 
 endless = sysid.Swarm(10**6, stall_iterations=10**6)
 sysid.identify = lambda *a, strategy, **k: identify(*a, **k, strategy=endless)
@@ -206,7 +208,7 @@ def test_a_second_ctrl_c_acts_at_once_and_what_it_breaks_is_no_error_of_ours(her
         except KeyboardInterrupt as error:
             raise SystemError("returned a result with an exception set") from error
 
-    monkeypatch.setattr(sysid._swarm_search.SwarmCost, "__call__", expand)
+    monkeypatch.setattr(sysid.search.swarm.SwarmCost, "__call__", expand)
     try:
         assert cli.main(["run", "pair.py", "--strategy", "swarm"]) == 130
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

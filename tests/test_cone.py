@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog, minimize
 
-from sysid.cone import Cone, forms, null_space, unknowns
+from sysid.assessment.cone import Cone, forms, null_space, unknowns
 
 
 def random_functions(rng, q, n):

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from sysid import InputError, ModalDamping, ProportionalDamping
-from sysid.damping import physical_damping
-from sysid.layout import Layout
+from sysid.models.damping import physical_damping
+from sysid.models.geometry import Layout
 
 SEEDS = range(5)
 LAYOUT = Layout(np.ones((4, 1)), np.ones(1, bool))

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid import catalogue, cli
-from sysid.identification import Recipe
-from sysid.written_cost import WrittenCost
+from sysid import catalogue
+from sysid.cli import main as cli
+from sysid.results.identification import Recipe
+from sysid.search.direct_objective import WrittenCost
 
 FREQ = np.linspace(1.0, 30.0, 25)
 MASSES, SPRINGS = np.array([3.0, 2.0, 1.0]), np.array([2e4, 1.5e4, 1e4])

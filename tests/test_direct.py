@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.direct import Motion, absolute_response, relative_misfit, relative_response
+from sysid.problem.direct_response import Motion, absolute_response, relative_misfit, relative_response
 
 FREQ = np.linspace(1.0, 70.0, 23)
 

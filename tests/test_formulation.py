@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.direct import relative_misfit
+from sysid.problem.direct_response import relative_misfit
 
 FREQ = np.linspace(1.0, 30.0, 25)
 ONE = np.ones((3, 1))

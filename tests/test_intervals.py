@@ -6,8 +6,8 @@ from scipy.optimize import linprog
 
 import sysid
 from sysid import FullMass, KnownMass, LumpedMass, Measurement, SpectralStiffness, Structure
-from sysid.modal_masses import _cone, _known, determination, intervals
-from sysid.problem import Problem
+from sysid.assessment.modal_mass_cone import _cone, _known, determination, intervals
+from sysid.problem.problem import Problem
 
 FREQ = np.linspace(1, 70, 60)
 

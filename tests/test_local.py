@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid import FullMass, SpectralStiffness, local
-from sysid.refinement import SOLVED
-from sysid.swarm_cost import SwarmCost
+from sysid import FullMass, SpectralStiffness
+from sysid.models.spectrum import SOLVED
+from sysid.search import local
+from sysid.search.swarm_objective import SwarmCost
 
 MASSES, DAMPINGS = ("trace", "rigid_body", "lumped", "known"), ("modal", "proportional")
 

@@ -6,8 +6,8 @@ import pytest
 import scipy.integrate
 
 from sysid import FullMass, InputError, KnownMass, LumpedMass
-from sysid.layout import FACTOR_FLOOR, Layout
-from sysid.mass import gather_rows, sampling_exponent, spread_rows
+from sysid.models.geometry import FACTOR_FLOOR, Layout
+from sysid.models.mass import gather_rows, sampling_exponent, spread_rows
 
 SEEDS = range(4)
 HEALINGS = ("trace", "rigid_body")

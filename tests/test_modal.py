@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.damping import ProportionalDamping
+from sysid.models.damping import ProportionalDamping
 
 
 def structure(seed, n, d):

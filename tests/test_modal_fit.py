@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from sysid import Measurement, Structure
-from sysid._coordinates import Coordinates
-from sysid._watch import OBJECTIVE_SCALE, Watch
-from sysid.layout import lower_triangle, triangle_entries
-from sysid.measurement import unit_runs
-from sysid.modal_fit import Modes, _derivatives, _Error, fit_modes, rank_one
-from sysid.refinement import SOLVED
+from sysid.measurement.measurement import unit_runs
+from sysid.modal_analysis.modal_fit import Modes, _derivatives, _Error, fit_modes, rank_one
+from sysid.models.spectrum import SOLVED
+from sysid.nlp import OBJECTIVE_SCALE, Coordinates, Watch
+from sysid.structure.triangular import lower_triangle, triangle_entries
 
 
 def modes_of(structure):

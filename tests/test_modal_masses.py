@@ -7,7 +7,7 @@ import pytest
 
 import sysid
 from sysid import FullMass, KnownMass, LumpedMass, Measurement, Problem, SpectralStiffness, Structure
-from sysid.modal_masses import determination
+from sysid.assessment.modal_mass_cone import determination
 
 FREQ = np.linspace(1, 70, 60)
 

@@ -6,8 +6,8 @@ import pytest
 
 import sysid
 from sysid import FullMass, InputError, KnownMass, LumpedMass, Measurement, Problem, Structure, simulate
-from sysid.modal_fit import Modes
-from sysid.modal_scales import nearest_lumped, of_known_mass, stated_totals, to_stated_totals, weigh
+from sysid.modal_analysis.modal_fit import Modes
+from sysid.search.modal_scaling import nearest_lumped, of_known_mass, stated_totals, to_stated_totals, weigh
 
 
 def lines(truth, count=200):

@@ -8,7 +8,8 @@ import sys
 import pytest
 
 import sysid
-from sysid import cli, new
+from sysid.cli import main as cli
+from sysid.cli import new
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sysid import FullMass, Problem, identify, simulate
-from sysid.poles import find_poles
+from sysid.modal_analysis.vector_fitting import find_poles
 
 
 @pytest.fixture

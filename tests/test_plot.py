@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 
 import sysid
 from sysid import plot
-from sysid._canvas import to_png
-from sysid._panels import draw, key, response_channel
-from sysid.stabilisation import LEVELS, cmif, stabilisation
+from sysid.modal_analysis.stabilisation import LEVELS, cmif, stabilisation
+from sysid.plot.canvas import to_png
+from sysid.plot.panels import draw, key, response_channel
 
 FREQ = np.linspace(1.0, 40.0, 60)
 

@@ -5,7 +5,7 @@ import pytest
 
 import sysid
 from sysid import InputError, Measurement, Problem, simulate
-from sysid.poles import find_poles, poles_near
+from sysid.modal_analysis.vector_fitting import find_poles, poles_near
 
 
 def structure(rng, n, d, *, near=0.0):

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid import FullMass, InputError, KnownMass, Measurement, Problem, SpectralStiffness, swarm_cost
-from sysid.refinement import closed_form
-from sysid.swarm_cost import SwarmCost
+from sysid import FullMass, InputError, KnownMass, Measurement, Problem, SpectralStiffness
+from sysid.models.spectrum import closed_form
+from sysid.search import swarm_objective as swarm_cost
+from sysid.search.swarm_objective import SwarmCost
 
 SEEDS = range(3)
 MASSES = ("trace", "rigid_body", "lumped", "known")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sysid import InputError
-from sysid.refinement import by_ipopt, closed_form, replace_spectrum
+from sysid.models.spectrum import by_ipopt, closed_form, replace_spectrum
 
 SIZES = range(3, 13)
 PER_SIZE = 10  # 100 candidates over n = 3 to 12

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from sysid import Measurement
-from sysid.measurement import unit_runs
-from sysid.residues import Records, force_residual_left, independent, linear_residues
+from sysid.measurement.measurement import unit_runs
+from sysid.modal_analysis.residues import Records, force_residual_left, independent, linear_residues
 
 POLES = 2 * np.pi * np.array([5.0, 9.0, 9.4]), np.array([0.01, 0.02, 0.015])
 M = 3

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from sysid import Measurement
-from sysid.residues import linear_residues
-from sysid.response import residual, weighed_mass
+from sysid.modal_analysis.residues import linear_residues
+from sysid.modal_analysis.response import residual, weighed_mass
 
 SEEDS = range(4)
 

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid import local
-from sysid.sensitivity import directions_in_words, response_slopes, rows_of_test, sensitivity, slopes_of
-from sysid.written_determination import written_determination, written_intervals
-from sysid.written_uncertainty import written_uncertainty
+from sysid.assessment.determination import written_determination, written_intervals
+from sysid.assessment.sensitivity import directions_in_words, response_slopes, rows_of_test, sensitivity, slopes_of
+from sysid.assessment.written_uncertainty import written_uncertainty
+from sysid.search import local
 
 FREQ = np.linspace(1.0, 30.0, 40)
 MASSES, SPRINGS, DAMPERS = np.array([3.0, 2.0, 1.0]), np.array([2e4, 1.5e4, 1e4]), np.array([8.0, 5.0, 3.0])

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid import catalogue, cli, local
-from sysid.identification import Recipe
-from sysid.show import _point, show
+from sysid import catalogue
+from sysid.cli import main as cli
+from sysid.cli.show import _point, show
+from sysid.results.identification import Recipe
+from sysid.search import local
 
 MASSES, SPRINGS, DAMPERS = np.array([4.0, 3.0, 2.0]), np.array([9e3, 7e3, 5e3]), np.array([30.0, 25.0, 20.0])
 STRETCH = np.array([[1.0, 0.0, 0.0, -1.0], [-1.0, 1.0, 0.0, 0.0], [0.0, -1.0, 1.0, 0.0]])
@@ -139,7 +141,7 @@ def test_expected_errors_are_the_bound_from_finite_differences(stated):
 def test_units_are_those_that_the_local_phase_counts_in(monkeypatch):
     problem = chain(mass=MASSES, k=[9e3, 7e3, 1.2e3], c=[30.0, 25.0, 1.0])
     x, units = problem.formulation.guess, {}
-    from sysid._coordinates import Coordinates
+    from sysid.nlp import Coordinates
 
     original = Coordinates.add
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid._continuation import SHIFTS, Continuation, descend, levels_of
-from sysid._continuation import tests_of as stand_ins
-from sysid.smoothing import PolesAndResidues
+from sysid.modal_analysis.complex_frequency import PolesAndResidues
+from sysid.search.continuation import SHIFTS, Continuation, descend, levels_of
+from sysid.search.continuation import tests_of as stand_ins
 
 FREQ = np.linspace(1.0, 70.0, 240)
 

@@ -6,7 +6,8 @@ import scipy.integrate
 import scipy.signal
 
 import sysid
-from sysid import InputError, Measurement, resample, spectra
+from sysid import InputError, Measurement, resample
+from sysid.measurement import spectra
 
 RATE = 100.0
 

@@ -5,7 +5,7 @@ import pytest
 
 import sysid
 from sysid import InputError, Measurement, simulate
-from sysid.stabilisation import LEVELS, cmif, relative_frf, stabilisation
+from sysid.modal_analysis.stabilisation import LEVELS, cmif, relative_frf, stabilisation
 
 
 def lines(truth, count=60):

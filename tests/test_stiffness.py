@@ -6,7 +6,7 @@ import pytest
 import scipy.linalg
 
 from sysid import ChainStiffness, InputError, SpectralStiffness
-from sysid.layout import FACTOR_FLOOR, Layout
+from sysid.models.geometry import FACTOR_FLOOR, Layout
 
 SEEDS = range(5)
 

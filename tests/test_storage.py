@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid import storage
-from sysid.variables import Block
+from sysid.models.unknowns import Block
+from sysid.results import storage
 
 
 def building(damping_matrix: bool = False, sensors: bool = True) -> sysid.Structure:

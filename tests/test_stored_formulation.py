@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid._continuation import Continuation
-from sysid.written_cost import WrittenCost
+from sysid.search.continuation import Continuation
+from sysid.search.direct_objective import WrittenCost
 
 FREQ = np.linspace(1.0, 30.0, 40)
 ONE = np.ones((2, 1))

@@ -9,7 +9,7 @@ import scipy.stats
 
 import sysid
 from sysid import FullMass, InputError, Measurement, Problem, SpectralStiffness, Structure
-from sysid.uncertainty import uncertainty
+from sysid.assessment.uncertainty import uncertainty
 
 FREQ = np.linspace(2, 66, 90)
 NAMES = (

@@ -7,7 +7,7 @@ import pytest
 
 import sysid
 from sysid import LumpedMass, SpectralStiffness, Structure
-from sysid.uncertainty import uncertainty
+from sysid.assessment.uncertainty import uncertainty
 
 
 def check(u, expected, names, rtol):

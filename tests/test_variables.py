@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.variables import Block, split, variable_of
+from sysid.models.unknowns import Block, split, variable_of
 
 V = np.array([1.0, 2.0, 3.0])
 A = np.arange(1.0, 10.0).reshape(3, 3)

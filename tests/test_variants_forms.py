@@ -10,8 +10,8 @@ import pytest
 
 import sysid
 from sysid import catalogue
-from sysid.sensitivity import sensitivity
-from sysid.written_determination import written_determination
+from sysid.assessment.determination import written_determination
+from sysid.assessment.sensitivity import sensitivity
 
 # Those that are determined, with the options of `problem`, and a seed for their noise.
 DETERMINED = [

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sysid.weights import separable
+from sysid.measurement.noise import separable
 
 SHAPE = (2, 3, 7)
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.written_cost import WrittenCost
+from sysid.search.direct_objective import WrittenCost
 
 FREQ = np.linspace(1.0, 30.0, 31)
 

@@ -11,8 +11,8 @@ import numpy as np
 import scipy.linalg
 
 import sysid
-from sysid.axes import BASE_AXES, rigid_motion
 from sysid.frame import Beam, Frame, PointMass, Section
+from sysid.structure.axes import BASE_AXES, rigid_motion
 
 MODES = 20
 BAND = (8.0, 200.0)  # Hz

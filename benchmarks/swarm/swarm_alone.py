@@ -10,8 +10,8 @@ from threadpoolctl import threadpool_limits
 import sysid
 from benchmarks.line import Line, below
 from benchmarks.problem_modules import load_module
+from sysid.search.swarm_objective import SwarmCost
 from sysid.swarm import SwarmSettings
-from sysid.swarm_cost import SwarmCost
 
 SEEDS = range(5)
 

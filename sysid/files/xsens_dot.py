@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from sysid.errors import InputError
-from sysid.structure import Array
+from sysid.structure.structure import Array
 
 _TIME = "SampleTimeFine"
 _ACCELERATION = ("Acc_X", "Acc_Y", "Acc_Z")

@@ -1,0 +1,1 @@
+"""What the answer is worth: determination, uncertainty, checks."""

@@ -1,0 +1,258 @@
+"""Checks of a fit against its records: signs that the model is not the structure's, whatever its residual."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.complex_frequency import PolesAndResidues
+from sysid.modal_analysis.residues import Records, ResidueFit, beyond_chance, force_residual_left
+from sysid.modal_analysis.response import weighed_mass
+from sysid.models.mass import FullMass, KnownMass, LumpedMass
+from sysid.problem.problem import Problem
+from sysid.structure.structure import Array, Structure
+
+_ROUND_OFF = 1e-8  # of the records: what counts as noise where there is none
+_SAME_POLE = 1e-6  # relative distance of poles that count as one
+_ALIKE = 3.0  # misfits by which two records must differ to be of two sensors
+_MISFIT = 1.5  # times what free residues leave, beyond which a record is not what the modes make of it
+_MIMICKED = 1e-2  # of a constant; less of it is left where a mode far below the lines answers like one
+_CHANCE = 1e-4  # that errors as stated are so large together
+_FAR = 4.0  # standard deviations from a stated value, beyond which something is wrong
+_GAIN = 0.03  # of the base's motion; smaller errors of a sensor's gain are usual
+
+
+def doubts(problem: Problem, structure: Structure) -> tuple[str, ...]:
+    """What speaks against the identified structure, in sentences; nothing counts as determined beside one."""
+    test = problem.measurement
+    records, poles = Records(test), _poles(structure)
+    free = records.fit(*poles)
+    model = "the structure" if isinstance(problem.mass, FullMass) else "the stated mass model"
+    no_fit, rigid = tuple(_no_fit(test, structure, records, free, model)), tuple(_rigid(test, records, free))
+    return (
+        *_stated_mass(problem, structure),
+        *_known_entries(problem, structure),
+        *_lumped_total(problem, structure),
+        *no_fit,
+        *_force(test, structure, isinstance(problem.mass, LumpedMass)),
+        *rigid,
+        # Beside what those say, quadrature and likeness mean nothing.
+        *(() if rigid else _damping(records, poles, free)),
+        *(() if rigid or no_fit else _twins(test, structure)),
+    )
+
+
+def written_doubts(problem: Problem, x: Array) -> tuple[str, ...]:
+    """The same for a problem in its own unknowns, as far as they apply to any model."""
+    if problem.formulation.misfit is not None:
+        return ()
+    found = list(_stated_values(problem, x))
+    models = [(problem.measurement, problem.formulation.matrices), *problem.formulation.others]
+    for i, (test, matrices) in enumerate(models, start=1):
+        structure = matrices.structure(x, test)
+        records, poles = Records(test), _poles(structure)
+        velocity = not structure.modal_damping
+        if records.data.shape[0] <= 4 * poles[0].size * records.n_base:
+            continue
+        free = records.fit(*poles, velocity=velocity)
+        misses = tuple(_no_fit(test, structure, records, free, "the written model"))
+        misses = misses or tuple(_other_poles(test, structure, records))
+        rigid = tuple(_rigid(test, records, free))
+        told = (*misses, *_force(test, structure, False), *rigid, *(() if rigid or misses else _twins(test, structure)))
+        found += [told_one if len(models) == 1 else f"test {i}: {told_one}" for told_one in told]
+    return tuple(found)
+
+
+def _stated_values(problem: Problem, x: Array) -> Iterator[str]:
+    """What was stated as known, where the fit is far from it."""
+    formulation = problem.formulation
+    if formulation.known is None:
+        return
+    from scipy.stats import chi2
+
+    off = np.asarray(formulation.known(x)).ravel()
+    if np.sum(off**2) > chi2.isf(_CHANCE, off.size) and np.all(np.abs(off) <= _FAR):
+        told = ", ".join(f"{name} by {z:+.2g}" for name, z in zip(formulation.known_names, off, strict=True))
+        yield (
+            f"the values that are stated as known are missed together, in standard deviations: {told}; they, another "
+            "number, or the model is wrong"
+        )
+    for name, deviations in zip(formulation.known_names, off, strict=True):
+        if abs(deviations) > _FAR:
+            yield (
+                f"{name} ends {abs(deviations):.3g} of the stated standard deviations from the value that is stated as "
+                "known: that value, its deviation, or the model is wrong"
+            )
+
+
+def _other_poles(test: Measurement, structure: Structure, records: Records) -> Iterator[str]:
+    """Whether poles of the data's own leave clearly less than the structure does."""
+    poles = PolesAndResidues.of(test)
+    if poles is None:
+        return
+    left = replace(test, response=test.response - test.predict(structure))
+    misfit = float(np.sqrt(Records(left).size / records.size))
+    possible = max(poles.of_accelerations, _ROUND_OFF)
+    if misfit > _MISFIT * possible:
+        yield (
+            f"the written model misses {100 * misfit:.3g} % of the accelerations, the poles of the data with free "
+            f"residues {100 * possible:.3g} %: the form of its mass, stiffness or damping, recovery, or a bound is not "
+            "the structure's"
+        )
+
+
+def _no_fit(test: Measurement, structure: Structure, records: Records, free: ResidueFit, model: str) -> Iterator[str]:
+    """Whether the structure leaves clearly more of the accelerations than free residues at its own poles."""
+    left = replace(test, response=test.response - test.predict(structure))
+    misfit = float(np.sqrt(Records(left).size / records.size))
+    possible = max(float(np.sqrt(free.squared_error / records.size)), _ROUND_OFF)
+    if misfit > _MISFIT * possible:
+        yield (
+            f"{model} misses {100 * misfit:.3g} % of the accelerations, its poles with free residues "
+            f"{100 * possible:.3g} %: the model, a sign or axis in rigid_body, or a record is not what it is said to be"
+        )
+
+
+def _poles(structure: Structure) -> tuple[Array, Array]:
+    """Distinct poles, rad/s and ratios."""
+    omega = 2 * np.pi * structure.natural_frequencies
+    poles = omega * (1 + 1j * structure.damping_ratios)
+    first = np.concatenate([[True], np.abs(np.diff(poles)) > _SAME_POLE * omega[1:]])
+    return omega[first], structure.damping_ratios[first]
+
+
+def _stated_mass(problem: Problem, structure: Structure) -> Iterator[str]:
+    """What the base force weighs, where a stated mass says otherwise."""
+    test = problem.measurement
+    if test.force is None or (not isinstance(problem.mass, KnownMass) and problem.mass.total_mass is None):
+        return
+    poles = _poles(structure)
+    weighed, stated = np.diag(weighed_mass(test, *poles)), np.diag(structure.rigid_body_mass)
+    off = np.abs(weighed / stated - 1)
+    if np.any(off >= max(0.01, 3 * force_residual_left(test, *poles) / np.sqrt(test.freq.size))):
+        given, told = (", ".join(f"{m:.4g}" for m in masses) for masses in (stated, weighed))
+        yield (
+            f"the stated mass makes {given} kg in the base directions, but the base force weighs {told} kg: one of "
+            "them, or the unit of the force, is wrong"
+        )
+
+
+def _known_entries(problem: Problem, structure: Structure) -> Iterator[str]:
+    """Whether the identified mass has the entries that were stated, and leaves the base what is left of the total."""
+    n, known, mass = problem.layout.n, problem.known_mass, problem.mass
+    stated = np.isfinite(known)
+    if not np.any(stated):
+        return
+    assert isinstance(mass, FullMass)
+    if not structure.at_sensors:
+        yield "the known entries of the mass are not used: the degrees of freedom are not the sensors alone"
+        return
+    size = np.sqrt(np.diag(structure.mass))
+    scale = np.outer(size[:n], np.where(size > 0, size, size.max()))
+    off = np.where(stated, np.abs(structure.mass[:n] - known) / scale, 0.0)
+    if off.max() > max(_ROUND_OFF, _ALIKE * problem.measurement.residual(structure)):
+        i, j = np.unravel_index(np.argmax(off), off.shape)
+        name = problem.measurement.sensor_names[i]
+        yield (
+            f"the known entries of the mass cannot all be met: row {name}, column {j + 1} is "
+            f"{structure.mass[i, j]:.4g} in place of {known[i, j]:.4g}"
+        )
+    if mass.total_mass is not None:
+        makes = mass.total(problem.layout, structure.mass)
+        if np.any(makes > problem.totals * (1 + 1e-6)):
+            given, told = (", ".join(f"{m:.4g}" for m in masses) for masses in (problem.totals, makes))
+            yield f"the known entries of the mass make {told} kg or more, and {given} kg are stated in all"
+
+
+def _lumped_total(problem: Problem, structure: Structure) -> Iterator[str]:
+    """Whether the total of a lumped mass, a sum over the sensors of a direction, is what moves in that direction."""
+    mass, layout = problem.mass, problem.layout
+    if not isinstance(mass, LumpedMass) or mass.total_mass is None:
+        return
+    own, groups = np.diag(structure.mass)[: layout.n], layout.directions[: layout.n]
+    moves = np.einsum("j,ji->i", own, layout.rigid_body**2)
+    for i in np.flatnonzero(layout.translational):
+        if np.any(groups == i) and abs(moves[i] / problem.totals[i] - 1) > 1e-6:
+            yield (
+                f"{problem.totals[i]:.4g} kg are stated over the sensors of base direction {i + 1}, but their masses "
+                f"make {moves[i]:.4g} kg in it: a lumped mass needs sensors along the base directions, not skew ones"
+            )
+
+
+def _force(test: Measurement, structure: Structure, lumped: bool) -> Iterator[str]:
+    """Whether the base force is that of the modes that the accelerations show."""
+    if test.force is None:
+        return
+    fixture = ", and mass below the sensors (base ring, fixture), which a lumped mass has not" if lumped else ""
+    # Both misfits in units of the stated noise: what is left at a noisy peak speaks against nothing.
+    left = replace(test, force=test.force - test.predict_force(structure))
+    misfit = float(np.sqrt(Records(left, force=True).size / Records(test, force=True).size))
+    possible = max(force_residual_left(test, *_poles(structure)), _ROUND_OFF)
+    if misfit > max(_MISFIT * possible, 1e-6):
+        yield (
+            f"the base force misses what the modes of the accelerations make of it by {100 * misfit:.3g} % "
+            f"(free residues leave {100 * possible:.3g} %): check its sign, unit, axes and point of reference{fixture}"
+        )
+
+
+def _rigid(test: Measurement, records: Records, free: ResidueFit) -> Iterator[str]:
+    """Whether sensors move in a constant proportion to the base beside their modes: G is not what it is said to be."""
+    ones = records.basis(np.ones((1, test.freq.size), dtype=complex))
+    extra = ones - free.Q @ (free.Q.T @ ones)
+    if np.linalg.norm(extra) < _MIMICKED * np.linalg.norm(ones):
+        return
+    Q, R = np.linalg.qr(extra)
+    along = Q.T @ free.left
+    left = free.left - Q @ along
+    gained = np.sum(along**2, axis=0)
+    if records.unit:
+        gained = gained.reshape(test.n_base, test.n_sensors).sum(axis=0)
+    noise = records.noise(left, free.residues.size + along.size, least=_ROUND_OFF)
+    moved = records.by_sensor(np.linalg.solve(R, along)[None])[0]
+    reach = np.abs(test.rigid_body).max(axis=0)
+    moved /= np.where(reach > 0, reach, np.inf)
+    clear = gained > noise * beyond_chance(test.n_base)
+    wrong = np.flatnonzero(clear & (np.abs(moved).max(axis=1) > _GAIN))
+    if wrong.size:
+        worst = wrong[np.argsort(-np.abs(moved[wrong]).max(axis=1))][:3]
+        told = []
+        for i in worst:
+            j = int(np.argmax(np.abs(moved[i])))
+            told.append(f"{test.sensor_names[i]} by {moved[i, j]:.2g} times base direction {j + 1}")
+        yield (
+            f"{wrong.size} of {test.n_sensors} sensors move with the base beside their modes and what rigid_body says "
+            f"({', '.join(told)}): their sign, gain or axis is wrong, or their accelerations are not absolute"
+        )
+
+
+def _damping(records: Records, poles: tuple[Array, Array], free: ResidueFit) -> Iterator[str]:
+    """Whether residues in quadrature, which normal modes have not, stand out: on the basis {g, i w g}."""
+    if records.data.shape[0] <= 4 * poles[0].size * records.n_base:
+        return
+    both = records.fit(*poles, velocity=True)
+    extra = poles[0].size * records.n_base * records.n_sensors
+    noise = records.noise(both.left, 2 * extra, least=_ROUND_OFF)
+    gained = free.squared_error - both.squared_error
+    if gained > noise * beyond_chance(extra):
+        yield (
+            f"residues in quadrature explain {100 * np.sqrt(gained / records.size):.2g} % of the response: the damping "
+            "is not classical, or a mode is missing; modal damping ratios are then an approximation"
+        )
+
+
+def _twins(test: Measurement, structure: Structure) -> Iterator[str]:
+    """Sensors that record one motion."""
+    relative = np.moveaxis(test.relative, 0, 1).reshape(test.n_sensors, -1)
+    misfit = np.linalg.norm(np.moveaxis(test.predict(structure), 0, 1).reshape(test.n_sensors, -1) - relative, axis=1)
+    size, names = np.linalg.norm(relative, axis=1), test.sensor_names
+    for i in range(test.n_sensors):
+        for j in range(i):
+            bound = _ALIKE * np.hypot(misfit[i], misfit[j]) + 1e-9 * max(size[i], size[j])
+            apart = min(np.linalg.norm(relative[i] - relative[j]), np.linalg.norm(relative[i] + relative[j]))
+            if size[i] > bound and apart <= bound:
+                yield (
+                    f"sensors {names[j]} and {names[i]} record one motion and are one degree of freedom: leave one out"
+                )

@@ -1,0 +1,213 @@
+r"""Fisher information of a base-shake test about the modal parameters, and moves that make up its inverse.
+
+The parameters are ``theta = (Phi, Gamma, log w, log zeta, M_rb)``, Phi the shapes at the sensors. The records are
+
+.. math:: a = \sum_k \phi_k g_k \gamma_k u_0, \qquad f_0 = \Big(\sum_k \gamma_k' g_k \gamma_k + M_{rb}\Big) u_0,
+
+so that every column of their Jacobian is a few numbers times a few spectra (`spectra_of`): the information is put
+together from the Gram matrix of these, and the Jacobian itself is never formed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+
+from sysid.measurement.measurement import Measurement
+from sysid.measurement.noise import separable
+from sysid.modal_analysis.modal_fit import Modes
+from sysid.modal_analysis.residues import line_correlation
+from sysid.modal_analysis.response import columns, gain_slopes, gains
+from sysid.structure.structure import Array, ComplexArray, Structure
+
+_EXACT = 1e-14  # of a record's rms: what counts as noise where there is none
+_UNSEEN = 1e-10  # of the strongest parameter's part in the records: below it there is round-off only
+_SUSPECT = 1.2  # reduced chi-squared above which the stated noise does not explain the misfit ...
+_DEVIATIONS = 4.0  # ... nor chance, in standard deviations of the chi-squared law
+
+
+class Index:
+    """Where the modal parameters stand in theta."""
+
+    def __init__(self, s: int, m: int, d: int) -> None:
+        self.shapes = ((s, m), (m, d), (m,), (m,))
+        ends = np.cumsum([np.prod(shape) for shape in self.shapes]).tolist()
+        self.phi, self.gamma, self.log_omega, self.log_ratios = map(slice, [0, *ends], ends)
+        self.pairs = [(i, j) for i in range(d) for j in range(i, d)]  # of M_rb, which is symmetric
+        self.size = ends[-1] + len(self.pairs)
+        self.rigid = np.arange(ends[-1], self.size)
+
+    def split(self, theta: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """Phi, Gamma, log w, log zeta and M_rb of columns of theta, (..., columns)."""
+        d = self.shapes[1][1]
+        rigid = np.empty((d, d, theta.shape[1]))
+        for (i, j), row in zip(self.pairs, theta[self.rigid], strict=True):
+            rigid[i, j] = rigid[j, i] = row
+        phi, gamma = theta[self.phi].reshape(*self.shapes[0], -1), theta[self.gamma].reshape(*self.shapes[1], -1)
+        return phi, gamma, theta[self.log_omega], theta[self.log_ratios], rigid
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """Noise and misfit of the responses or of the force, (channels, runs * n_freq), and the weights of the fit."""
+
+    std: Array
+    misfit: ComplexArray
+    by_channel: Array
+    by_line: Array
+
+    @property
+    def shared(self) -> bool:
+        """Whether the weights of the fit are those of the noise."""
+        return bool(np.all(np.abs(self.by_channel[:, None] * self.by_line * self.std - 1) < 1e-9))
+
+    def grams(self, spectra: ComplexArray) -> Iterator[Array]:
+        """``Re V' W V`` of each channel, W the squared weights: one Gram matrix but for a factor."""
+        gram = _gram(spectra * self.by_line)
+        return (weight**2 * gram for weight in self.by_channel)
+
+    def sandwich_grams(self, spectra: ComplexArray) -> Iterator[Array]:
+        """``Re V' W S W V`` of each channel, S the variances of the noise."""
+        return (_gram(spectra * row) for row in (self.by_channel[:, None] * self.by_line) ** 2 * self.std)
+
+
+def records_of(test: Measurement, structure: Structure, unknowns: int) -> list[Record]:
+    """Responses and, where measured, force; each bears its share of the unknowns."""
+    parts = [(test.response, test.response_std, test.relative - test.predict(structure))]
+    if test.force is not None:
+        parts.append((test.force, test.force_std, test.force - test.predict_force(structure)))
+    left = max(1 - unknowns / _measured(test), 0.5)
+    records = []
+    for record, stated, misfit in parts:
+        noise = np.sqrt(np.mean(np.abs(misfit) ** 2) / left) if stated is None else stated
+        least = _EXACT * np.sqrt(np.mean(np.abs(record) ** 2))
+        std = np.broadcast_to(np.maximum(noise, least), record.shape)
+        by_channel, by_line = separable(std, record.shape)
+        records.append(Record(columns(std).real, columns(misfit), by_channel, by_line.ravel()))
+    return records
+
+
+def _measured(test: Measurement) -> int:
+    """How many real numbers were measured."""
+    return 2 * test.response.size + (0 if test.force is None else 2 * test.force.size)
+
+
+def inflation_of(test: Measurement, records: list[Record], unknowns: int) -> float:
+    """Factor by which errors exceed what the stated noise explains; NaN where nothing tells the noise.
+
+    By the misfit's size, and by what neighbouring lines share of it, as lines of averaged spectra do.
+    """
+    freedom = _measured(test) - unknowns
+    if freedom <= 0:
+        stated = test.response_std is not None and (test.force is None or test.force_std is not None)
+        return 1.0 if stated else np.nan
+    reduced = 2 * sum(np.sum(np.abs(record.misfit / record.std) ** 2) for record in records) / freedom
+    beyond = reduced if reduced > max(_SUSPECT, 1 + _DEVIATIONS * np.sqrt(2 / freedom)) else 1.0
+    shared = line_correlation(
+        np.concatenate([(r.misfit / r.std).reshape(-1, test.n_runs, test.freq.size) for r in records])
+    )
+    return float(np.sqrt(beyond * shared))
+
+
+def gains_of(freq: Array, modes: Modes) -> tuple[ComplexArray, ComplexArray]:
+    """Modal gains (m, n_freq), and their slopes by log w, then by log zeta (2m, n_freq)."""
+    return gains(freq, modes.omega, modes.ratios), gain_slopes(freq, modes.omega, modes.ratios)
+
+
+def spectra_of(test: Measurement, modes: Modes) -> ComplexArray:
+    """What all columns of the Jacobian are made of, (m + m d + 2m + d, runs * n_freq).
+
+    ``q_k = g_k gamma_k u``; ``g_k u_j``; the slopes of q_k by log w_k, then by log zeta_k; ``u_j``.
+    """
+    g, slopes = (np.tile(part, test.n_runs) for part in gains_of(test.freq, modes))
+    u = columns(test.base)
+    push = modes.gamma @ u
+    return np.concatenate([g * push, (g[:, None] * u).reshape(-1, u.shape[1]), slopes * np.tile(push, (2, 1)), u])
+
+
+def _gram(vectors: ComplexArray) -> Array:
+    stacked = np.hstack([vectors.real, vectors.imag])
+    return stacked @ stacked.T
+
+
+def information(modes: Modes, index: Index, grams: list[Iterator[Array]]) -> Array:
+    """``Re J' W J`` over theta, from the Gram matrix of the spectra of each sensor and each direction of the force."""
+    phi, gamma = modes.phi, modes.gamma
+    m, d = gamma.shape
+    A = np.zeros((index.size, index.size))
+    common = np.arange(index.gamma.start, index.log_ratios.stop)
+    for i, gram in enumerate(grams[0]):
+        at = np.concatenate([np.arange(i * m, (i + 1) * m), common])
+        factor = np.concatenate([np.ones(m), np.repeat(phi[i], d), phi[i], phi[i]])
+        A[np.ix_(at, at)] += np.outer(factor, factor) * gram[: at.size, : at.size]
+    at = np.concatenate([common, index.rigid])
+    for i, gram in enumerate(grams[1] if len(grams) > 1 else ()):
+        mix = np.zeros((len(gram), at.size))
+        factor = np.concatenate([np.repeat(gamma[:, i], d), gamma[:, i], gamma[:, i]])
+        mix[m : m + factor.size, : factor.size] = np.diag(factor)
+        mix[np.arange(m), np.arange(m) * d + i] += 1.0  # gamma_ki is also the share of q_k in direction i
+        for column, (a, b) in enumerate(index.pairs, start=factor.size):
+            if i in (a, b):
+                mix[m + factor.size + (b if i == a else a), column] = 1.0
+        A[np.ix_(at, at)] += mix.T @ gram @ mix
+    return A
+
+
+class Path(NamedTuple):
+    """How theta moves with a problem's unknowns.
+
+    ``slope`` (size of theta, unknowns); ``unit`` (unknowns,), a large step of each; ``gauge`` (unknowns, count),
+    directions that are known to change no record, one of a mode's own each.
+    """
+
+    slope: Array
+    unit: Array
+    gauge: Array
+
+
+def spread(A: Array, B: Array | None, path: Path) -> tuple[Array, Array]:
+    """Moves of theta, in columns: what one standard normal each makes, and what no record sees.
+
+    The first are a factor of the covariance: ``A^-1 / 2``, or ``A^-1 B A^-1 / 2`` where the weights are not those of
+    the noise (half, as half of a complex error's variance is in its real part). The second are steps of order one.
+    """
+    slope, unit, gauge = scipy.sparse.csr_array(path.slope), path.unit, path.gauge  # mostly an identity
+    A = slope.T @ A @ slope
+    size = np.sqrt(np.maximum(np.diag(A), 0.0))
+    seen = size * unit > _UNSEEN * np.max(size * unit)
+    # The gauge of a mode whose shape is not seen is no direction beside that shape.
+    gauge = gauge[:, np.linalg.norm(gauge[~seen] / unit[~seen, None], axis=0) < 0.5]
+    fixed = gauge[seen] * size[seen, None]
+    fixed = fixed / np.linalg.norm(fixed, axis=0)
+    size = size[seen]
+    factor, lost = _inverse_factor(A[np.ix_(seen, seen)] / np.outer(size, size) + fixed @ fixed.T)
+    factor = factor - fixed @ (fixed.T @ factor)
+    if B is not None:
+        B = slope.T @ B @ slope
+        variances, turn = np.linalg.eigh(factor.T @ (B[np.ix_(seen, seen)] / np.outer(size, size)) @ factor)
+        factor = (factor @ turn) * np.sqrt(np.maximum(variances, 0.0))
+    normals = np.zeros((unit.size, factor.shape[1]))
+    normals[seen] = factor / size[:, None] / np.sqrt(2)
+    blind = np.zeros((unit.size, lost.shape[1]))
+    blind[seen] = lost / size[:, None]
+    unseen = np.hstack([blind, np.eye(unit.size)[:, ~seen], gauge])
+    unseen = unseen / np.linalg.norm(unseen / unit[:, None], axis=0)
+    return slope @ normals, slope @ unseen
+
+
+def _inverse_factor(matrix: Array) -> tuple[Array, Array]:
+    """F with ``F F'`` the inverse of a semidefinite matrix on its range, and an orthonormal basis of the rest."""
+    least = len(matrix) * np.finfo(float).eps
+    triangle, singular = scipy.linalg.lapack.dpotrf(matrix, lower=1)
+    # Where it is regular this takes a tenth of the time of eigenvalues.
+    if not singular and scipy.linalg.lapack.dpocon(triangle, np.linalg.norm(matrix, 1), uplo="L")[0] > least:
+        inverse = scipy.linalg.solve_triangular(triangle, np.eye(len(matrix)), lower=True, check_finite=False)
+        return inverse.T, np.zeros((len(matrix), 0))
+    lam, vectors = np.linalg.eigh(matrix)
+    known = lam > least * lam[-1]
+    return vectors[:, known] / np.sqrt(lam[known]), vectors[:, ~known]

@@ -1,0 +1,461 @@
+"""What the data determine: the modal-mass cone.
+
+Base and response accelerations fix frequencies, damping ratios and rank-one residues, and nothing
+else. All models that explain them are ``M_SS = P' T P``, ``K_SS = P' W T W P``, ``M_S0 = P' T (Gamma - P G)``,
+with ``T = diag(t)``, one modal mass t_k > 0 a mode (P the inverse of the mode shapes, W the circular frequencies),
+and a positive definite block of T for modes at one pole. What a measured force or a stated model adds is linear in T:
+its rank tells what stays open (`determination`), and how far that may go is a convex problem (`intervals`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from sysid.assessment.cone import Cone, Pairs, forms, null_space, unknowns
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.response import columns, gains
+from sysid.models.geometry import Layout
+from sysid.models.mass import FullMass, KnownMass, LumpedMass
+from sysid.models.stiffness import ChainStiffness
+from sysid.problem.problem import Problem
+from sysid.structure.structure import Array, ComplexArray, Structure
+
+_SAME_POLE = 1e-6  # relative distance of poles that count as one even without a misfit
+_UNRESOLVED = 20.0  # misfits, in parts of the half-power half-width, by which resolved poles differ
+_CLEAR = 3.0  # misfits above which a mode's share of the responses is seen
+_AS_STATED = 1.2  # times the stated noise, to which a misfit may be noise alone
+_RESOLVED = 10.0  # standard deviations of a mode's amplitude at which it is known, to a tenth
+_GAIN = 0.02  # of the base's motion; a smaller error of a sensor's gain is not told from a mode below the lines
+_QUIET = 1e-9  # of a channel's own size: noise below it is round-off
+_INVISIBLE = 1e-6  # of the strongest mode's participation
+_NOTHING = 5e-7  # of an entry's range: ends below it are zero
+_ROUND_OFF = 1e-13
+_AT_ONCE = 100  # entries whose ends are sought together: enough for speed, few enough for memory
+
+
+@dataclass(frozen=True)
+class Determination:
+    """Whether data and stated model fix every entry of M_SS, K_SS and C.
+
+    Attributes
+    ----------
+    determined : bool
+    closed_by : tuple of str
+        What closes the cone, in sentences.
+    undetermined : tuple of str
+        What is left open, in sentences; empty where determined.
+    """
+
+    determined: bool
+    closed_by: tuple[str, ...]
+    undetermined: tuple[str, ...]
+
+
+def determination(problem: Problem, structure: Structure) -> Determination:
+    """Which modal masses of `structure` the measurement and the stated models of `problem` fix.
+
+    What counts as seen is judged against the misfit that the structure leaves: a mode whose share of
+    the records is not clearly above it, poles that it cannot tell apart, and base directions that
+    differ by less than it are not taken as known.
+    """
+    test = problem.measurement
+    misfit = test.residual(structure)
+    closed, open_ = [], list(_unseen(problem, structure, misfit))
+    known = _known(problem, structure, misfit)
+    free, common = _open_modes(known)
+    responses = _responses(test, structure)
+    for cluster in known.clusters:
+        if len(cluster) > 1:
+            names = " and ".join(_mode(structure, k) for k in cluster)
+            seen = _seen(test, structure, cluster, structure.mode_shapes, responses).shape[1]
+            if seen < len(cluster):
+                open_.append(f"{names} are too close to be told apart, and the data show {seen or 'none'} of them only")
+            elif not set(cluster).isdisjoint(free):
+                open_.append(f"{names} are too close to be told apart: only the sum of their residues is known")
+    if known.sentence:
+        closed.append(known.sentence)
+    if test.force is not None:
+        closed.append("the measured base force weighs each mode that the base moves")
+    if free:
+        if common:
+            what = "one common scale of mass, stiffness and damping is open"
+        elif len(free) == structure.n:
+            what = "all modal masses are open"
+        else:
+            masses = [f"the modal mass of {_mode(structure, k)}" for k in free]
+            listed = masses if len(masses) == 1 else [", ".join(masses[:-1]), masses[-1]]
+            what = " and ".join(listed) + (" is open" if len(masses) == 1 else " are open")
+        bounded = ", within what is stated" if len(known.equations) else ""
+        open_.append(f"{what}: other mass and stiffness matrices answer identically{bounded}")
+        if problem.unit_mass:
+            open_.append("no number with a unit of mass is given: masses are normalised to 1 kg in each base direction")
+    if not structure.at_sensors:
+        how_far = "completely" if test.force is not None and not free else "up to the modal masses"
+        alike = ", which do not all move independently" if structure.n == structure.n_sensors else ""
+        open_.append(
+            f"{structure.n} modes stand out for {structure.n_sensors} sensors{alike}: the mass and stiffness matrices "
+            "hold for the stated degrees of freedom only; the Craig-Bampton form (to_craig_bampton(), modal and base "
+            f"coordinates) is what the data determine, {how_far}"
+        )
+    return Determination(not open_, () if free else tuple(closed), tuple(open_))
+
+
+def open_masses(problem: Problem, structure: Structure) -> list[int]:
+    """Modes, counted from 0, whose modal mass neither the records nor the stated models fix."""
+    return _open_modes(_known(problem, structure, problem.measurement.residual(structure)))[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Intervals:
+    """Extremes of the entries of M_SS and K_SS over all models that explain the data and what was stated.
+
+    Attributes
+    ----------
+    mass, stiffness : (2, n, n)
+        kg and N/m (kg m, kg m² and N, N m where a rotation is involved): lower ends, then upper ends.
+        Infinite where there is none.
+    """
+
+    mass: Array
+    stiffness: Array
+
+
+def intervals(problem: Problem, structure: Structure) -> Intervals:
+    """How far each entry of M_SS and K_SS may go over the modal-mass cone.
+
+    Parameters
+    ----------
+    problem : Problem
+    structure : Structure
+        A member of the cone, and one that the models of `problem` can hold: what is known is taken to be equal to what
+        it has, so that misfit closes nothing. Its poles, residues and mode shapes are kept, also the shape of a mode
+        that the base does not move, of which the data tell nothing.
+
+    Returns
+    -------
+    Intervals
+        Each end is attained by a member, or approached by members where a modal mass of zero attains it.
+    """
+    n = structure.n
+    known = _known(problem, structure, problem.measurement.residual(structure))
+    matrices = structure.mass[:n, :n], structure.stiffness[:n, :n]
+    if not _open_modes(known)[0]:
+        return Intervals(*(np.stack([matrix, matrix]) for matrix in matrices))
+    cone = _cone(problem, structure, known)
+    P = np.linalg.inv(structure.normal_modes)
+    omega = 2 * np.pi * structure.natural_frequencies[:, None]
+    return Intervals(*(_entries(cone, rows, own) for rows, own in zip((P, P * omega), matrices, strict=True)))
+
+
+def _entries(cone: Cone, rows: Array, own: Array) -> Array:
+    """Ends of the entries of ``rows' T rows``, (2, n, n); `own` is its value for T = I."""
+    size = np.linalg.norm(rows, axis=0)
+    unit = (rows / size).T
+    ends = np.empty((2, *own.shape))
+    upper = np.array(np.triu_indices(len(own)))
+    for i, j in np.array_split(upper, -(-upper.shape[1] // _AT_ONCE), axis=1):
+        functions = unit[i][:, :, None] * unit[j][:, None, :]
+        functions = (functions + np.swapaxes(functions, 1, 2)) / 2
+        values, _ = cone.largest(np.concatenate([-functions, functions]))
+        values = values.reshape(2, -1)
+        largest = np.where(np.isfinite(values), np.abs(values), 1.0).max(axis=0)
+        values = np.where(np.abs(values) < _NOTHING * largest + _ROUND_OFF, 0.0, values) * size[i] * size[j]
+        ends[0, i, j] = ends[0, j, i] = np.minimum(-values[0], own[i, j])
+        ends[1, i, j] = ends[1, j, i] = np.maximum(values[1], own[i, j])
+    return ends
+
+
+class _Known(NamedTuple):
+    """What holds linear functions of T equal to what they are for T = I.
+
+    Attributes
+    ----------
+    clusters : list of list of int
+        Modes that the misfit cannot tell apart.
+    weighed : list of (n, w)
+        Directions W of a cluster that the base force weighs: ``W' T W`` is known.
+    equations : (e, m)
+        Rows of linear equations in the unknowns, scaled to order one, that the stated models add.
+    signs : (p, m) or None
+        Masses or springs that the models leave, as functions of the unknowns.
+    sentence : str
+        Which models those are.
+    """
+
+    clusters: list[list[int]]
+    weighed: list[Array]
+    equations: Array
+    signs: Array | None
+    sentence: str
+
+
+def _known(problem: Problem, structure: Structure, misfit: float) -> _Known:
+    clusters = _clusters(structure, misfit)
+    weighed = _weighed(problem.measurement, structure, clusters)
+    return _Known(clusters, weighed, *_model_equations(problem, structure, unknowns(clusters)))
+
+
+def _open_modes(known: _Known) -> tuple[list[int], bool]:
+    """Modes whose modal mass is open, and whether only one scale that is common to all modes is."""
+    pairs = unknowns(known.clusters)
+    rows = [forms(W, W, pairs).reshape(-1, len(pairs)) for W in known.weighed]
+    null = null_space(np.vstack([known.equations, *rows]))
+    taking_part = np.abs(null).max(axis=0, initial=0.0) > 1e-6
+    free = sorted({k for pair, part in zip(pairs, taking_part, strict=True) if part for k in pair})
+    own = np.array([float(k == m) for k, m in pairs])  # T = I, which a common scale multiplies
+    common = len(null) == 1 and abs(null[0] @ own) > (1 - 1e-6) * np.linalg.norm(null[0]) * np.linalg.norm(own)
+    return free, bool(common) and sum(map(len, known.clusters)) > 1
+
+
+def _cone(problem: Problem, structure: Structure, known: _Known) -> Cone:
+    """The modal-mass cone, with the bounds that a total mass or a rigid-body mass puts on it."""
+    mass, n = problem.mass, structure.n
+    visible = sum((W @ (W.T @ structure.participation) for W in _moved(structure, known.clusters)), np.zeros((n, 1)))
+    traces, matrices = [], []
+    if problem.measurement.force is not None:
+        matrices.append(_below(visible, structure.rigid_body_mass))
+    if isinstance(mass, FullMass) and mass.total_mass is not None:
+        if problem.rigid_total is not None:
+            matrices.append(_below(visible, problem.rigid_total))
+        elif mass.healing == "rigid_body":
+            traces += [
+                _at_most(column[:, None], total) for column, total in zip(visible.T, problem.totals, strict=True)
+            ]
+        elif structure.at_sensors:
+            traces += [
+                _at_most(W, total)
+                for W, total in zip(_by_direction(problem.layout, structure), problem.totals, strict=True)
+            ]
+    return Cone(known.clusters, known.weighed, traces, matrices, known.equations, known.signs)
+
+
+def _by_direction(layout: Layout, structure: Structure) -> list[Array]:
+    """Weights of each direction's part of trace M, its sensors' and, of M_00, what M cannot do without."""
+    P = np.linalg.inv(structure.normal_modes)
+    delta = structure.participation - P @ structure.rigid_body_dofs
+    groups = layout.directions[: layout.n]
+    return [np.hstack([P[:, groups == i], delta[:, [i]]]) for i in range(layout.d)]
+
+
+def _at_most(weights: Array, total: float) -> Array:
+    """Weights W for ``trace(W' T W) <= 1``; what the structure itself has is never too much."""
+    return weights / np.sqrt(max(total, float(np.sum(weights**2))) or 1.0)
+
+
+def _below(weights: Array, bound: Array) -> Array:
+    """Weights W for ``W' T W <= I``, of ``weights' T weights <= bound``; what the structure has is never too much."""
+    own = weights.T @ weights
+    size = np.sqrt(np.maximum(np.diag(own), np.diag(bound)))
+    size[size == 0] = 1.0
+    lam, V = np.linalg.eigh((bound - own) / np.outer(size, size))
+    lam, V = np.linalg.eigh(own / np.outer(size, size) + (V * np.maximum(lam, 0.0)) @ V.T)
+    some = lam > 1e-12 * lam[-1]
+    return weights / size @ V[:, some] / np.sqrt(lam[some])
+
+
+def _moved(structure: Structure, clusters: list[list[int]]) -> list[Array]:
+    """For each cluster the directions that the base moves, orthonormal, (n, w)."""
+    size = np.sqrt(np.diag(structure.rigid_body_mass))
+    gamma = structure.participation / np.where(size > 0, size, 1.0)  # kg and kg m² can be compared
+    strongest = np.linalg.norm(gamma, axis=1).max()
+    moved: list[Array] = []
+    for cluster in clusters:
+        U, s, _ = np.linalg.svd(gamma[cluster], full_matrices=False)
+        W = np.zeros((structure.n, np.count_nonzero(s > _INVISIBLE * strongest)))
+        W[cluster] = U[:, : W.shape[1]]
+        moved.append(W)
+    return moved
+
+
+def _weighed(test: Measurement, structure: Structure, clusters: list[list[int]]) -> list[Array]:
+    """The same for what stands out of the misfit of the base force."""
+    record = _forces(test, structure)
+    if record is None:
+        return []
+    weighed = [_seen(test, structure, cluster, structure.participation.T, record) for cluster in clusters]
+    return [W for W in weighed if W.shape[1]]
+
+
+class _Record(NamedTuple):
+    """A record beside what a structure leaves of it, all channels in units of their noise.
+
+    Attributes
+    ----------
+    weight : (channels,)
+    size : float
+        Norm of the weighted record.
+    misfit : float
+        Relative.
+    level : float
+        Part of the record that a mode must exceed to be known.
+    """
+
+    weight: Array
+    size: float
+    misfit: float
+    level: float
+
+
+def _like_rigid(problem: Problem, structure: Structure, k: int) -> str:
+    """What else a mode below the lines may be: far above it, it moves sensors by a constant times the base's motion."""
+    test, G = problem.measurement, problem.measurement.rigid_body
+    moved = -np.outer(structure.mode_shapes[:, k], structure.participation[k])
+    reach = np.abs(G).max(axis=0)
+    wrong = np.abs(moved) / np.where(reach > 0, reach, np.inf)
+    i, j = np.unravel_index(np.argmax(wrong), wrong.shape)
+    if wrong[i, j] < _GAIN:
+        return ""
+    return (
+        f"; or sign, gain or axis of {test.sensor_names[i]} are wrong, which in all these lines moves by "
+        f"{moved[i, j]:.2g} times base direction {j + 1} beside what its row of rigid_body says"
+    )
+
+
+def _record(record: ComplexArray, predicted: ComplexArray, std: Array | None, times: float) -> _Record:
+    """Weigh a record; `times` the misfit is what may look like a mode where its origin is unknown.
+
+    Where the misfit is no more than the stated noise, all lines together tell an amplitude, and `_RESOLVED` of
+    its standard deviations will do.
+    """
+    rms = lambda x: np.sqrt(np.mean(np.abs(x) ** 2, axis=(0, 2)))  # noqa: E731
+    noise = rms(record - predicted) if std is None else rms(std)
+    own = rms(record)
+    weight = 1 / np.maximum(noise, _QUIET * np.where(own > 0, own, own.max()))
+    by_channel = weight[:, None]
+    size = float(np.linalg.norm(record * by_channel))
+    misfit = float(np.linalg.norm((record - predicted) * by_channel)) / size
+    level = times * misfit
+    if std is not None and misfit <= _AS_STATED * np.linalg.norm(std * by_channel) / size:
+        level = float(_RESOLVED * misfit / np.sqrt(2 * record.size))
+    return _Record(weight, size, misfit, level)
+
+
+def _responses(test: Measurement, structure: Structure) -> _Record:
+    return _record(test.relative, test.predict(structure), test.response_std, _CLEAR)
+
+
+def _forces(test: Measurement, structure: Structure) -> _Record | None:
+    if test.force is None:
+        return None
+    return _record(test.force, test.predict_force(structure), test.force_std, 1.0)
+
+
+def _shares(test: Measurement, structure: Structure, k: int, rows: Array, push: Array, record: _Record) -> Array:
+    """Relative size of what motions `rows` (channels, w) at mode k's pole make of a record, pushed by `push` (w, d)."""
+    g = gains(test.freq, 2 * np.pi * structure.natural_frequencies[[k]], structure.damping_ratios[[k]])
+    moved = np.linalg.norm(np.einsum("wd,rdf->wrf", push, test.base) * g, axis=(1, 2))
+    return moved * np.linalg.norm(record.weight[:, None] * rows, axis=0) / record.size
+
+
+def _seen(test: Measurement, structure: Structure, cluster: list[int], rows: Array, record: _Record) -> Array:
+    """Directions of a cluster that stand out of a record in which the modes move `rows` (channels, n), (n, w)."""
+    (W,) = _moved(structure, [cluster])
+    shares = _shares(test, structure, cluster[0], rows @ W, W.T @ structure.participation, record)
+    return W[:, shares >= record.level]
+
+
+def _unseen(problem: Problem, structure: Structure, misfit: float) -> Iterator[str]:
+    """What the records do not show, in sentences."""
+    test = problem.measurement
+    base = columns(test.base)
+    sizes = np.linalg.norm(base, axis=1, keepdims=True)
+    spread = np.linalg.svd(base / np.where(sizes > 0, sizes, 1.0), compute_uv=False)
+    rank = int(np.count_nonzero(spread > max(1e-9, min(misfit, 0.5)) * spread[0]))
+    if rank < test.n_base:
+        yield f"the base moves in only {rank} of {test.n_base} independent directions: responses to the others are open"
+    if 2 * test.response.size < problem.n_variables:
+        yield f"{2 * test.response.size} measured numbers cannot fix {problem.n_variables} unknowns"
+    responses, forces = _responses(test, structure), _forces(test, structure)
+    level = responses.level
+    for k in range(structure.n):
+        f, push = structure.natural_frequencies[k], structure.participation[[k]]
+        (share,) = _shares(test, structure, k, structure.mode_shapes[:, [k]], push, responses)
+        if share < _INVISIBLE:
+            yield f"{_mode(structure, k)} is not moved by the base: nothing in these data tells its mass"
+        elif share < level:
+            yield (
+                f"{_mode(structure, k)} makes {100 * share:.2g} % of the response, which does not stand out of the "
+                f"misfit of {100 * responses.misfit:.2g} %: its mass is not known"
+            )
+        elif not test.freq[0] <= f <= test.freq[-1]:
+            yield (
+                f"{_mode(structure, k)} lies outside the lines ({test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz) and "
+                "answers for all modes there"
+            ) + (_like_rigid(problem, structure, k) if f < test.freq[0] else "")
+        elif forces and _shares(test, structure, k, push.T, push, forces)[0] < forces.level:
+            yield f"{_mode(structure, k)} does not stand out of the misfit of the base force: its mass is not weighed"
+
+
+def _clusters(structure: Structure, misfit: float) -> list[list[int]]:
+    """Modes that the misfit cannot tell apart: of them only the sum of the residues is seen."""
+    poles = structure.natural_frequencies * (1 + 1j * structure.damping_ratios)
+    clusters = [[0]]
+    for k in range(1, structure.n):
+        apart = abs(poles[k] - poles[clusters[-1][-1]])
+        width = structure.damping_ratios[k] * structure.natural_frequencies[k]
+        if apart < max(_SAME_POLE * abs(poles[k]), min(_UNRESOLVED * misfit, 1.0) * width):
+            clusters[-1].append(k)
+        else:
+            clusters.append([k])
+    return clusters
+
+
+def _model_equations(problem: Problem, structure: Structure, pairs: Pairs) -> tuple[Array, Array | None, str]:
+    """What the stated models add: `_Known.equations`, `signs` and `sentence`."""
+    n, G = structure.n, structure.rigid_body_dofs
+    nothing = np.zeros((0, len(pairs)))
+    if not structure.at_sensors:
+        return nothing, None, ""
+    P = np.linalg.inv(structure.normal_modes)
+    delta = structure.participation - P @ G
+    size = np.linalg.norm(P, axis=0)
+    mass_entries = forms(P / size, P / size, pairs)
+    coupling = forms(P / size, delta / (np.linalg.norm(delta) + size.max()), pairs)
+    rows: list[Array] = []
+    signs = None
+    sentences = []
+    layout, mass = problem.layout, problem.mass
+    if isinstance(problem.stiffness, ChainStiffness):
+        omega = 2 * np.pi * structure.natural_frequencies[:, None]
+        stiff = np.sqrt(np.diag(structure.stiffness)[:n])
+        scaled = forms(P * omega / stiff, P * omega / stiff, pairs)
+        rows.append(scaled[np.abs(structure.stiffness[:n, :n]) <= 1e-9 * np.outer(stiff, stiff)])
+        # A floor that no spring ties to the base is at rest in a rigid motion.
+        at_base = forms(P * omega / stiff, P @ G * omega / np.linalg.norm(P @ G * omega, axis=0), pairs)
+        rigid = structure.stiffness[:n, :n] @ G
+        rows.append(at_base[np.abs(rigid) <= 1e-9 * stiff[:, None] * stiff.max()])
+        stiffness = np.moveaxis(scaled * np.outer(stiff, stiff)[:, :, None], -1, 0)
+        signs = np.array([problem.stiffness.values(layout, np.eye(n), K) for K in stiffness]).T
+        sentences.append("the stiffness is stated to be a chain")
+    if isinstance(mass, LumpedMass):
+        rows += [mass_entries[np.tril_indices(n, -1)], coupling.reshape(-1, len(pairs))]
+        if mass.total_mass is None:
+            sentences.append("the mass is stated to be lumped on the sensors")
+        else:
+            sentences.append("the mass is stated to be lumped on the sensors, with its total given")
+            for i in range(layout.d):
+                own = P[:, layout.directions[:n] == i]
+                if own.size:
+                    rows.append(np.einsum("iiu->u", forms(own, own, pairs))[None] / np.sum(own**2))
+    elif isinstance(mass, FullMass):
+        known = np.isfinite(problem.known_mass)
+        rows += [mass_entries[known[:, :n]], coupling[known[:, n:]]]
+        if np.any(known):
+            count = np.count_nonzero(np.triu(known[:, :n])) + np.count_nonzero(known[:, n:])
+            sentences.append(f"{count} {'entry' if count == 1 else 'entries'} of the mass matrix stated to be known")
+            # Modes that share a block have no such rows: their intervals do without the equations.
+            signs = np.eye(len(pairs)) if len(pairs) == n else None
+    elif isinstance(mass, KnownMass):
+        rows += [mass_entries.reshape(-1, len(pairs)), coupling.reshape(-1, len(pairs))]
+        sentences.append("the mass matrix is known")
+    if isinstance(mass, LumpedMass | KnownMass):
+        signs = np.einsum("iiu->iu", mass_entries)
+    return np.vstack([nothing, *rows]), signs, "; ".join(reversed(sentences))
+
+
+def _mode(structure: Structure, k: int) -> str:
+    return f"mode {k + 1} ({structure.natural_frequencies[k]:.4g} Hz)"

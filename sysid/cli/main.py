@@ -1,0 +1,460 @@
+"""The command line: ``sysid list``, ``new NAME``, ``show PROBLEM``, ``run PROBLEM``, ``report RESULT``.
+
+Exit status: 0 success; 1 the search did not reach its goal; 2 a mistake in what was given, told in
+one line; 130 interrupted, with the best so far saved; 70 an error of sysid itself, told in one line
+with the traceback in a log file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import functools
+import json
+import math
+import os
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any, NoReturn, cast
+
+import sysid
+from sysid import catalogue
+from sysid.errors import InputError, SolverError
+from sysid.identify import STRATEGIES, Progress
+from sysid.results.identification import Identification, Recipe
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+SUCCESS, NOT_REACHED, MISTAKE, BUG, INTERRUPTED = 0, 1, 2, 70, 130
+
+_PLAIN_EVERY = 5.0  # s between lines where the display is no terminal
+_LOG = "sysid-error.log"
+_PROBLEM = "a path to a module, else a module in ./problems, else a bundled problem, else a dotted module"
+_DATA = "file or folder of records, for problems that read some"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Arguments; those of the process by default.
+
+    Returns
+    -------
+    int
+        Exit status.
+    """
+    out = _Output(sys.stdout)
+    # Whatever argparse, a problem module or CasADi prints passes through it too.
+    with contextlib.redirect_stdout(cast(IO[str], out)):
+        status = _run_command(argv, out)
+    out.flush()
+    if out.failed is not None:
+        # What is left in the interpreter's own buffer would fail once more at exit.
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(out.failed, BrokenPipeError):  # a reader that has seen enough is no mistake
+            _complain(f"standard output cannot be written: {out.failed.strerror}")
+            status = status or MISTAKE
+    return status
+
+
+def _run_command(argv: Sequence[str] | None, out: _Output) -> int:
+    """Parse and run; every exception becomes one line and a status."""
+    try:
+        options = _parser().parse_args(argv)
+        with _collected_warnings() as remarks:
+            status = int(options.command(options, out))
+        for remark in remarks:
+            _complain(f"warning: {remark}")
+        return status
+    except SystemExit as end:  # argparse, after --help or --version
+        return int(end.code or 0)
+    except InputError as error:
+        _complain(error)
+        return MISTAKE
+    except SolverError as error:
+        _complain(error)
+        return NOT_REACHED
+    except KeyboardInterrupt:
+        _complain("interrupted; nothing was saved")
+        return INTERRUPTED
+    except Exception as error:
+        log = _write_log()
+        _complain(f"an error of sysid itself ({type(error).__name__}: {error}); {log}")
+        return BUG
+
+
+# -- the commands -------------------------------------------------------------------------------
+
+
+def _list(options: argparse.Namespace, out: _Output) -> int:
+    entries = catalogue.entries()
+    width = max((len(entry.name) for entry in entries), default=0)
+    for entry in entries:
+        own = "" if entry.bundled else f"  ({entry.path})"
+        out.write(f"{entry.name:{width}}  {entry.description}{own}\n")
+    if not entries:
+        out.write("no problems found; a path to a module does as well: sysid run PATH\n")
+    return SUCCESS
+
+
+def _new(options: argparse.Namespace, out: _Output) -> int:
+    from sysid.cli import new
+
+    module, test = new.write(options.name)
+    out.write(
+        f"{module} and {test} are written. Try them, then change the five steps of {module} into your own:\n"
+        f"  sysid show {module}    what is unknown, and what the data determine\n"
+        f"  sysid run {module}     identify, and write results/{module.stem}/report.html\n"
+        f"  python -m pytest {test}\n"
+    )
+    return SUCCESS
+
+
+def _show(options: argparse.Namespace, out: _Output) -> int:
+    from sysid.cli.show import show
+
+    recipe = Recipe(options.problem, options.data, options.seed)
+    out.write(f"{show(catalogue.build(recipe), recipe.module)}\n")
+    return SUCCESS
+
+
+def _run(options: argparse.Namespace, out: _Output) -> int:
+    recipe = Recipe(options.problem, options.data)
+    folder = Path("results") / catalogue.short_name(recipe.module) if options.out is None else Path(options.out)
+    problem = catalogue.build(recipe)
+    _check_folder(folder)
+    test = problem.measurement
+    out.write(
+        f"{recipe.module}: {test.n_sensors} sensors, base moving along {' '.join(test.base_axes or ())}, "
+        f"{test.freq.size} lines from {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz, "
+        f"{problem.n_variables} unknowns, seed {options.seed}\n"
+    )
+    with _Display(out) as display:
+        result = sysid.identify(
+            problem, strategy=options.strategy, rng=options.seed, max_time=options.max_time, progress=display
+        )
+    result = replace(result, recipe=recipe)
+    out.write(f"\n{result.summary()}\n\n")
+    out.flush()
+    try:
+        _save(result, folder, out)
+    except KeyboardInterrupt:
+        _complain(f"interrupted while saving; not every file is in {folder}")
+        return INTERRUPTED
+    if result.interrupted:
+        _complain(f"interrupted; the best so far is in {folder}")
+        return INTERRUPTED
+    return SUCCESS if result.success else NOT_REACHED
+
+
+def _report(options: argparse.Namespace, out: _Output) -> int:
+    from sysid.report import report
+
+    source = Path(options.result)
+    result = sysid.load(source)
+    folder = source if source.is_dir() else source.parent
+    out.write(f"{report.write(result, folder / report.FILE_NAME)}\n")
+    return SUCCESS
+
+
+# -- arguments ----------------------------------------------------------------------------------
+
+
+class _Parser(argparse.ArgumentParser):
+    """Mistakes become an InputError, so that they are one line like all others."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"{message} (see '{self.prog} --help')")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="sysid",
+        description="Mass, stiffness and damping matrices of a structure from shaker-table tests.",
+        epilog="Exit status: 0 success, 1 the search did not reach its goal, 2 a mistake in what was given, "
+        "130 interrupted (the best so far is saved), 70 an error of sysid itself.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=f"sysid {sysid.__version__}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    command = functools.partial(commands.add_parser, allow_abbrev=False)
+
+    lister = command("list", help="list the problems that can be run by name")
+    lister.set_defaults(command=_list)
+
+    new = command(
+        "new",
+        help="write a commented problem module and its test here",
+        description="Write NAME.py, a commented problem that runs at once, and test_NAME.py; never over a file.",
+    )
+    new.add_argument("name", metavar="NAME", help="a name that Python can import: letters, digits, underscores")
+    new.set_defaults(command=_new)
+
+    show = command(
+        "show",
+        help="tell the unknowns of a problem and what its data determine, without a search",
+        description="Tell the unknowns of a problem, their bounds and scaling, and what the data determine: rank and "
+        "unseen directions of the exact Jacobian at the reference, where it is known, or at a guess.",
+    )
+    show.add_argument("problem", metavar="PROBLEM", help=_PROBLEM)
+    show.add_argument(
+        "--seed", type=_seed, default=0, metavar="N", help="reaches problem() as rng: of simulated noise; 0 by default"
+    )
+    show.add_argument("--data", metavar="PATH", help=_DATA)
+    show.set_defaults(command=_show)
+
+    run = command(
+        "run",
+        help="identify the structure of a problem",
+        description="Identify the structure of a problem. Writes result.h5, summary.json and report.html.",
+    )
+    run.add_argument("problem", metavar="PROBLEM", help=_PROBLEM)
+    run.add_argument(
+        "--seed",
+        type=_seed,
+        default=0,
+        metavar="N",
+        help="of the search, 0 by default: the same seed gives the same result. The simulated noise of a problem is "
+        "part of the problem and does not change with it",
+    )
+    run.add_argument(
+        "--strategy",
+        choices=STRATEGIES,
+        default="auto",
+        metavar="S",
+        help="modal: modes from the data, without a search; continuation: gradients through widened peaks, for "
+        "structured models and variables of your own; swarm: the particle swarm and its refinement; auto, by default: "
+        "modal where the models of the problem allow it, continuation where they have a form of their own, else swarm",
+    )
+    run.add_argument("--data", metavar="PATH", help=_DATA)
+    run.add_argument("--out", metavar="DIR", help="folder of the results, results/NAME by default")
+    run.add_argument("--max-time", type=_seconds, metavar="S", help="end the search after about so many seconds")
+    run.set_defaults(command=_run)
+
+    report = command("report", help="write report.html again, beside a result")
+    report.add_argument("result", metavar="RESULT", help="a result.h5, or the folder that holds it")
+    report.set_defaults(command=_report)
+    return parser
+
+
+def _seed(text: str) -> int:
+    try:
+        seed = int(text)
+    except ValueError:
+        seed = -1
+    if seed < 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a nonnegative integer")
+    return seed
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not 0 < seconds < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number of seconds")
+    return seconds
+
+
+# -- files --------------------------------------------------------------------------------------
+
+
+def _check_folder(folder: Path) -> None:
+    """Refuse a folder of results that cannot be written, before the search and without making it."""
+    try:
+        place = folder
+        while not place.exists() and place != place.parent:
+            place = place.parent
+        if not place.is_dir():
+            raise InputError(f"folder of results {folder}: {place} is not a folder")
+    except OSError as error:
+        raise InputError(f"folder of results {folder}: {error.strerror or error}") from None
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise InputError(f"folder of results {folder}: {place} cannot be written")
+
+
+def _save(result: Identification, folder: Path, out: _Output) -> None:
+    """Write the three files, each whole or not at all; a folder made for nothing is taken away again."""
+    from sysid.results.storage import FILE_NAME, atomically
+
+    missing = [place for place in (folder, *folder.parents) if not place.exists()]
+    try:
+        out.write(f"result   {result.save(folder / FILE_NAME)}\n")
+        summary = folder / "summary.json"
+        with atomically(summary) as temporary:
+            temporary.write_text(_summary(result), encoding="utf-8")
+        out.write(f"summary  {summary}\n")
+        from sysid.report import report
+
+        out.write(f"report   {report.write(result, folder / report.FILE_NAME)}\n")
+    except BaseException:
+        with contextlib.suppress(OSError):
+            for place in missing:
+                place.rmdir()  # only where it is empty
+        raise
+
+
+def _summary(result: Identification) -> str:
+    """``summary.json``: strict JSON, null for what is not a number."""
+    return json.dumps(_finite(result.to_dict()), indent=2, allow_nan=False) + "\n"
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _write_log() -> str:
+    """Write the traceback of the exception at hand; what to tell about it."""
+    text = f"sysid {sysid.__version__}, Python {sys.version}\n{sys.argv}\n\n{traceback.format_exc()}"
+    for folder in (Path(), Path(tempfile.gettempdir())):
+        log = folder / _LOG
+        with contextlib.suppress(OSError):
+            log.write_text(text, encoding="utf-8", errors="backslashreplace")
+            return f"the traceback is in {log.absolute()}"
+    return "no log file could be written"
+
+
+# -- what the user sees -------------------------------------------------------------------------
+
+
+class _Output:
+    """A text stream that takes any character and never raises.
+
+    A closed pipe or a full disk must not end a search whose result goes elsewhere; `failed` keeps
+    the first such error.
+    """
+
+    def __init__(self, stream: IO[str]) -> None:
+        self._stream = stream
+        self.encoding = getattr(stream, "encoding", None) or "utf-8"
+        self.failed: OSError | None = None
+
+    def write(self, text: str) -> int:
+        if self.failed is None:
+            try:
+                self._stream.write(text.encode(self.encoding, "replace").decode(self.encoding))
+            except OSError as error:
+                self.failed = error
+        return len(text)
+
+    def flush(self) -> None:
+        if self.failed is None:
+            try:
+                self._stream.flush()
+            except OSError as error:
+                self.failed = error
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def _complain(message: object) -> None:
+    """One line on standard error, whatever the message holds."""
+    with contextlib.suppress(OSError):
+        print("sysid:", " ".join(str(message).split()), file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def _collected_warnings() -> Iterator[list[str]]:
+    """Keep warnings for the end: they would tear the live display, or stand beside the one line of a mistake."""
+    lines: list[str] = []
+    with warnings.catch_warnings():
+        # An assignment, and not record=True: warnings that are errors stay so.
+        warnings.showwarning = lambda message, category, filename, lineno, file=None, line=None: lines.append(
+            f"{filename}:{lineno}: {category.__name__}: {message}"
+        )
+        yield lines
+
+
+def _console(out: _Output) -> Console:
+    """Console without markup; no control codes unless it is a terminal, whatever the environment asks."""
+    from rich.console import Console
+
+    terminal = out.isatty()
+    return Console(
+        file=cast(IO[str], out), force_terminal=terminal, force_jupyter=False, width=None if terminal else 100,
+        markup=False, emoji=False, highlight=False,
+    )  # fmt: skip
+
+
+class _Display:
+    """Live progress: a table that updates in a terminal, elsewhere a line at times."""
+
+    def __init__(self, out: _Output) -> None:
+        from rich.live import Live
+
+        self._out = out
+        self._phases: dict[str, Progress] = {}
+        self._begun = time.perf_counter()
+        self._printed, self._pending = -math.inf, False
+        console = _console(out)
+        live = console.is_terminal and not console.is_dumb_terminal
+        self._live = Live(get_renderable=self._table, console=console, refresh_per_second=8) if live else None
+
+    def __enter__(self) -> _Display:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        if self._live is not None:
+            self._live.stop()
+        elif self._pending:
+            self._print(next(reversed(self._phases.values())))
+
+    def __call__(self, progress: Progress) -> None:
+        """Take the news."""
+        if self._live is None:
+            last = next(reversed(self._phases.values()), None)
+            changed = last is None or last.phase != progress.phase
+            if changed and last is not None and self._pending:
+                self._print(last)
+            self._pending = True
+            if changed or progress.seconds - self._printed >= _PLAIN_EVERY:
+                self._print(progress)
+        self._phases.pop(progress.phase, None)  # the phase at work is the last
+        self._phases[progress.phase] = progress
+
+    def _print(self, progress: Progress) -> None:
+        self._printed, self._pending = progress.seconds, False
+        self._out.write(f"{progress}\n")
+        self._out.flush()
+
+    def _table(self) -> Table:
+        from rich import box
+        from rich.table import Table
+
+        table = Table(box=box.SIMPLE, pad_edge=False)
+        table.add_column("phase", min_width=12)
+        for name, width in (("iteration", 10), ("residual", 10), ("time", 8)):
+            table.add_column(name, justify="right", min_width=width, no_wrap=True)
+        rows = list(self._phases.values())
+        for p in rows:
+            # The clock of the phase at work runs on between its news.
+            seconds = p.seconds if p is not rows[-1] or not self._running else time.perf_counter() - self._begun
+            count = f"{p.iteration} / {p.of}" if p.of else f"{p.iteration}"
+            table.add_row(p.phase, count, f"{p.residual:.3e}", f"{seconds:.1f} s")
+        if not rows:
+            table.add_row("preparation", "", "", f"{time.perf_counter() - self._begun:.1f} s")
+        return table
+
+    @property
+    def _running(self) -> bool:
+        return self._live is not None and self._live.is_started

@@ -1,0 +1,1 @@
+"""Records and spectra of a base-shake test, and their noise."""

@@ -1,0 +1,483 @@
+"""A base-shake test: spectra of the base and of the sensors, from FRFs, time records or a simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sysid.errors import InputError
+from sysid.measurement import spectra
+from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
+from sysid.structure.structure import Array, ComplexArray, Structure, check_frequencies
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """One accelerometer axis.
+
+    Parameters
+    ----------
+    name : str
+        As it should stand in tables and pictures.
+    position : tuple of float, shape (3,)
+        m.
+    axis : str or tuple of float, shape (3,)
+        "x", "-y", ..., or a direction vector.
+    """
+
+    name: str
+    position: tuple[float, float, float]
+    axis: str | tuple[float, float, float]
+
+
+def rigid_body(
+    positions: ArrayLike,
+    axes: Sequence[str | Sequence[float]],
+    *,
+    base_axes: str | Sequence[str] = "xyz",
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
+) -> Array:
+    """Motion of each sensor for unit rigid motion of the base (method of eq. 4 of Cerini et al. 2024).
+
+    A sensor along the unit vector e at r from `origin` has the row ``[e', (r x e)']``.
+
+    Parameters
+    ----------
+    positions : array_like, shape (n_sensors, 3)
+        m.
+    axes : sequence of n_sensors strings ("x", "-y", ...) or direction vectors
+    base_axes : str or sequence of str
+        Of x y z rx ry rz; a string such as "xy" is short for its letters, "x rz" names two.
+    origin : sequence of float, shape (3,)
+        The base point, m. Rotations of the base are in rad/s² about it.
+
+    Returns
+    -------
+    ndarray, shape (n_sensors, d)
+
+    Examples
+    --------
+    >>> rigid_body([[0, 0, 2.0]], ["x"], base_axes=["x", "ry"])
+    array([[1., 2.]])
+    """
+    points = np.atleast_2d(_checked("positions", positions, float))
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) != len(axes):
+        raise InputError(f"positions {points.shape} and {len(axes)} axes disagree; both have one row of three a sensor")
+    columns = base_columns(base_axes)
+    motion = rigid_motion(points, origin).reshape(len(points), 6, 6)
+    rows = [axis_vector(axis, f"sensor {i}") @ motion[i, :3] for i, axis in enumerate(axes)]
+    return np.array(rows)[:, columns]
+
+
+def base_axis_names(base_axes: str | Sequence[str]) -> tuple[str, ...]:
+    """Spell out base axes: "xyz" → ("x", "y", "z"); "x rz" → ("x", "rz")."""
+    return tuple(BASE_AXES[column] for column in base_columns(base_axes))
+
+
+def axis_vector(axis: str | Sequence[float], label: str = "a sensor") -> Array:
+    """Unit vector of "x", "-y", ... or of a direction vector."""
+    row = sensor_row(axis, label)
+    if np.any(row[3:]):
+        raise InputError(
+            f"the axis of {label} is the rotation {axis!r}; an accelerometer measures x, y or z, or a vector"
+        )
+    return row[:3]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Measurement:
+    """Spectra of a base-shake test.
+
+    Parameters
+    ----------
+    freq : array_like, shape (n_freq,)
+        Hz, strictly increasing.
+    base : array_like, complex, shape (runs, d, n_freq)
+        Base acceleration, m/s² (rad/s² for a rotation). One run may be given without its axis.
+    response : array_like, complex, shape (runs, n_sensors, n_freq)
+        *Absolute* acceleration of the sensors, m/s².
+    rigid_body : array_like, shape (n_sensors, d)
+        Motion of the sensors for unit base motion (`sysid.rigid_body`).
+    force : array_like, complex, shape (runs, d, n_freq), optional
+        Force of the base on the structure, N (N m): it tends to ``+M_rb u0''`` at low frequency.
+    sensors : sequence of Sensor, optional
+    response_std, force_std : array_like, optional
+        Standard deviation of the complex noise, ``sqrt(E|e|²)``; broadcast to their records.
+    base_axes : str or sequence of str, optional
+        Names of the base directions (see `sysid.rigid_body`); by default those that the sensors' axes tell, else
+        x y z rx ry rz in this order. Needed where fewer than four directions hold a rotation.
+
+    Notes
+    -----
+    Spectra follow ``exp(+i w t)``. Their common scale (per Hz, one-sided or not) does not matter
+    as long as base, response and force share it.
+    """
+
+    freq: Array
+    base: ComplexArray
+    response: ComplexArray
+    rigid_body: Array = field(kw_only=True)
+    force: ComplexArray | None = field(default=None, kw_only=True)
+    sensors: tuple[Sensor, ...] | None = field(default=None, kw_only=True)
+    response_std: Array | None = field(default=None, kw_only=True)
+    force_std: Array | None = field(default=None, kw_only=True)
+    base_axes: tuple[str, ...] | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 - a frozen class fills itself
+        put("freq", check_frequencies(self.freq))
+        put("base", _records("base", self.base, self.freq.size))
+        put("response", _records("response", self.response, self.freq.size))
+        put("rigid_body", np.atleast_2d(_checked("rigid_body", self.rigid_body, float)))
+        (runs, d, _), (response_runs, sensors, _) = self.base.shape, self.response.shape
+        if runs != response_runs:
+            raise InputError(f"base has {runs} runs but response has {response_runs}")
+        if self.rigid_body.shape != (sensors, d):
+            raise InputError(
+                f"rigid_body is {self.rigid_body.shape}, but response has {sensors} sensors and base {d} directions: "
+                f"({sensors}, {d}) is needed"
+            )
+        if not np.any(self.base):
+            raise InputError("base is zero everywhere: there is no excitation to identify from")
+        if self.force is not None:
+            put("force", _records("force", self.force, self.freq.size))
+            if self.force.shape != self.base.shape:
+                raise InputError(f"force is {self.force.shape} but base is {self.base.shape}; they have the same axes")
+        if self.sensors is not None:
+            put("sensors", tuple(self.sensors))
+            if len(self.sensors) != sensors:
+                raise InputError(f"{len(self.sensors)} sensors are described but response has {sensors}")
+        put("base_axes", self._check_base_axes(d))
+        put("response_std", _std("response_std", self.response_std, self.response))
+        put("force_std", _std("force_std", self.force_std, self.force))
+
+    def _check_base_axes(self, d: int) -> tuple[str, ...]:
+        if self.base_axes is not None:
+            names = base_axis_names(self.base_axes)
+            if len(names) != d:
+                raise InputError(f"base_axes names {len(names)} directions but base has {d}")
+            return names
+        if d > 6:
+            raise InputError(f"base has {d} directions; a rigid base has at most six")
+        told = self._axes_of_sensors()
+        if told is not None:
+            return told
+        if d <= 3 and np.any(np.linalg.norm(self.rigid_body, axis=1) > 1 + 1e-6):
+            raise InputError(
+                "rigid_body has rows longer than 1, as only a rotation gives (a unit axis under translations has a row "
+                "of at most 1): state base_axes, such as ['x', 'ry']"
+            )
+        return BASE_AXES[:d]
+
+    def _axes_of_sensors(self) -> tuple[str, ...] | None:
+        """Translations that the sensors' axes make of the columns of G; None where they tell no names, or several."""
+        if not self.sensors or not all(isinstance(sensor, Sensor) for sensor in self.sensors):
+            return None
+        axes = np.array([axis_vector(sensor.axis, sensor.name) for sensor in self.sensors])
+        names: list[str] = []
+        for column in self.rigid_body.T:
+            alike = [
+                name for name, own in zip(BASE_AXES[:3], axes.T, strict=True) if np.allclose(own, column, atol=1e-6)
+            ]
+            if len(alike) != 1 or not np.any(column):
+                return None
+            names += alike
+        return tuple(names) if len(set(names)) == len(names) else None
+
+    @property
+    def translational(self) -> NDArray[np.bool_]:
+        """Which base directions are translations, (d,)."""
+        assert self.base_axes is not None
+        return np.array([name in BASE_AXES[:3] for name in self.base_axes])
+
+    def __repr__(self) -> str:
+        axes = " ".join(self.base_axes or ())
+        force = ", force" if self.force is not None else ""
+        return (
+            f"<Measurement: {self.n_sensors} sensors, base {axes}, {self.n_runs} runs, {self.freq.size} lines from "
+            f"{self.freq[0]:.4g} to {self.freq[-1]:.4g} Hz{force}>"
+        )
+
+    @property
+    def n_runs(self) -> int:
+        """Number of runs."""
+        return int(self.base.shape[0])
+
+    @property
+    def n_base(self) -> int:
+        """Number d of base directions."""
+        return int(self.base.shape[1])
+
+    @property
+    def n_sensors(self) -> int:
+        """Number of sensor axes."""
+        return int(self.response.shape[1])
+
+    @property
+    def relative(self) -> ComplexArray:
+        """Acceleration relative to the moving base, ``response - G base``, (runs, n_sensors, n_freq)."""
+        return self.response - np.einsum("sd,rdf->rsf", self.rigid_body, self.base)
+
+    @property
+    def sensor_names(self) -> tuple[str, ...]:
+        """Names for tables; numbered where the sensors are not described."""
+        if self.sensors is None:
+            return tuple(f"sensor {i + 1}" for i in range(self.n_sensors))
+        return tuple(sensor.name for sensor in self.sensors)
+
+    def predict(self, structure: Structure) -> ComplexArray:
+        """Relative accelerations of a structure under this test's base motion, (runs, n_sensors, n_freq)."""
+        if structure.rigid_body.shape != self.rigid_body.shape:
+            raise InputError(
+                f"the structure has {structure.rigid_body.shape[0]} sensors and {structure.n_base} base directions, "
+                f"the measurement {self.n_sensors} and {self.n_base}"
+            )
+        return np.einsum("sdf,rdf->rsf", structure.relative_acceleration(self.freq), self.base)
+
+    def predict_force(self, structure: Structure) -> ComplexArray:
+        """Base force of a structure under this test's base motion, (runs, d, n_freq)."""
+        return np.einsum("edf,rdf->ref", structure.base_force(self.freq), self.base)
+
+    def residual(self, structure: Structure) -> float:
+        """``‖predicted - measured‖ / ‖measured‖`` over relative accelerations of all runs, sensors and lines."""
+        measured = self.relative
+        return float(np.linalg.norm(self.predict(structure) - measured) / np.linalg.norm(measured))
+
+    def force_residual(self, structure: Structure) -> float | None:
+        """The same over the base force; None where none was measured."""
+        if self.force is None:
+            return None
+        return float(np.linalg.norm(self.predict_force(structure) - self.force) / np.linalg.norm(self.force))
+
+    def in_band(self, low: float, high: float) -> Measurement:
+        """The lines from `low` to `high` Hz, both included."""
+        keep = (self.freq >= low) & (self.freq <= high)
+        if not np.any(keep):
+            raise InputError(
+                f"no line between {low:g} and {high:g} Hz; the record has {self.freq[0]:g} to {self.freq[-1]:g} Hz"
+            )
+        return self.at(keep)
+
+    def at(self, keep: NDArray[np.bool_]) -> Measurement:
+        """The lines where `keep`, (n_freq,), is true."""
+        cut = lambda record: None if record is None else record[..., keep]  # noqa: E731
+        return Measurement(
+            self.freq[keep], self.base[..., keep], self.response[..., keep], rigid_body=self.rigid_body,
+            force=cut(self.force), sensors=self.sensors,
+            response_std=cut(self.response_std), force_std=cut(self.force_std), base_axes=self.base_axes,
+        )  # fmt: skip
+
+    @classmethod
+    def from_frf(
+        cls,
+        freq: ArrayLike,
+        frf: ArrayLike,
+        *,
+        rigid_body: ArrayLike,
+        force: ArrayLike | None = None,
+        sensors: Sequence[Sensor] | None = None,
+        response_std: ArrayLike | None = None,
+        force_std: ArrayLike | None = None,
+        base_axes: str | Sequence[str] | None = None,
+    ) -> Measurement:
+        """From frequency response functions: d unit runs, one a base direction.
+
+        Parameters
+        ----------
+        freq : array_like, shape (n_freq,)
+            Hz.
+        frf : array_like, complex, shape (n_sensors, d, n_freq)
+            Transmissibility: absolute acceleration per unit base acceleration. With one base
+            direction (n_sensors, n_freq) will do.
+        rigid_body : array_like, shape (n_sensors, d)
+        force : array_like, complex, shape (d, d, n_freq), optional
+            Apparent mass, kg: [force direction, base direction] per unit base acceleration.
+        sensors : sequence of Sensor, optional
+        response_std : array_like, optional
+            Standard deviation of `frf`, broadcast to (n_sensors, d, n_freq).
+        force_std : array_like, optional
+            Standard deviation of `force`, broadcast to (d, d, n_freq).
+        base_axes : str or sequence of str, optional
+        """
+        lines = check_frequencies(freq)
+        one_direction = np.ndim(frf) == 2  # (n_sensors, n_freq)
+        H = _records("frf", np.expand_dims(np.asarray(frf), 1) if one_direction else frf, lines.size)
+        d = H.shape[1]
+
+        def by_run(name: str, value: ArrayLike | None, like: ComplexArray | None) -> Any:
+            """Base direction first: it becomes the run."""
+            if value is None:
+                return None
+            if like is None:
+                raise InputError(f"{name} is given without its record")
+            try:
+                return np.moveaxis(np.broadcast_to(np.asarray(value), like.shape), 1, 0)
+            except ValueError:
+                raise InputError(f"{name} {np.shape(value)} does not broadcast to its record {like.shape}") from None
+
+        F = None if force is None else _records("force", force, lines.size)
+        if F is not None and F.shape[:2] != (d, d):
+            raise InputError(f"force is {F.shape}; with {d} base directions it is ({d}, {d}, {lines.size})")
+        return cls(
+            lines, unit_runs(d, lines.size), by_run("frf", H, H), rigid_body=np.asarray(rigid_body),
+            force=by_run("force", F, F),
+            sensors=None if sensors is None else tuple(sensors),
+            response_std=by_run("response_std", response_std, H), force_std=by_run("force_std", force_std, F),
+            base_axes=None if base_axes is None else base_axis_names(base_axes),
+        )  # fmt: skip
+
+    @classmethod
+    def from_time(
+        cls,
+        runs: Sequence[tuple[ArrayLike, ArrayLike, ArrayLike | None]],
+        sample_rate: float,
+        *,
+        rigid_body: ArrayLike,
+        estimator: Literal["spectra", "h1", "h2"] = "spectra",
+        segment: int | None = None,
+        band: tuple[float, float] | None = None,
+        sensors: Sequence[Sensor] | None = None,
+        base_axes: str | Sequence[str] | None = None,
+    ) -> Measurement:
+        """From time records on one clock (`sysid.resample` brings unequal clocks together).
+
+        Parameters
+        ----------
+        runs : sequence of (base, response, force or None)
+            Records (d, n_samples), (n_sensors, n_samples) and (d, n_samples); responses absolute.
+        sample_rate : float
+            Hz.
+        rigid_body : array_like, shape (n_sensors, d)
+        estimator : {"spectra", "h1", "h2"}
+            "spectra" is the Fourier transform of each whole record (all runs equally long), right
+            for transients that start and end at rest. "h1" (noise on the responses) and "h2" (noise
+            on the base) average over segments and runs by Welch's method and give d unit runs;
+            "h1" solves for several base directions at once and gives standard deviations from the coherence.
+        segment : int, optional
+            Samples a segment of "h1" and "h2"; a quarter of the shortest record by default. Its lines must be
+            several times closer than the narrowest resonance is wide (rate / segment well below 2 zeta f), else
+            leakage flattens the peak, and damping and masses come out wrong.
+        band : (low, high), optional
+            Hz, both ends included; all lines but zero by default.
+        sensors : sequence of Sensor, optional
+        base_axes : str or sequence of str, optional
+        """
+        G = np.atleast_2d(np.asarray(rigid_body, dtype=float))
+        records = spectra.check_runs(runs, sample_rate, G.shape)
+        described = None if sensors is None else tuple(sensors)
+        axes = None if base_axes is None else base_axis_names(base_axes)
+        if estimator == "spectra":
+            freq, base, response, force = spectra.whole_record(records, sample_rate)
+            test = cls(freq, base, response, rigid_body=G, force=force, sensors=described, base_axes=axes)
+        elif estimator in ("h1", "h2"):
+            estimate = spectra.averaged(records, sample_rate, kind=estimator, segment=segment)
+            test = cls.from_frf(
+                estimate.freq, estimate.frf, rigid_body=G, force=estimate.force, sensors=described,
+                response_std=estimate.frf_std, force_std=estimate.force_std, base_axes=axes,
+            )  # fmt: skip
+        else:
+            raise InputError(f"estimator {estimator!r} is unknown; give 'spectra', 'h1' or 'h2'")
+        return test if band is None else test.in_band(*band)
+
+
+def simulate(
+    structure: Structure,
+    freq: ArrayLike,
+    *,
+    noise: float = 0.0,
+    force: bool = False,
+    rng: int | np.random.Generator | None = None,
+    base_axes: str | Sequence[str] | None = None,
+) -> Measurement:
+    """The virtual test: d runs of unit base motion, noise on the responses (and force) only.
+
+    Parameters
+    ----------
+    structure : Structure
+    freq : array_like, shape (n_freq,)
+        Hz.
+    noise : float
+        Circular complex noise with ``E|e|² = noise² mean|record|²``, the mean taken over all runs,
+        channels and lines; responses and force apart.
+    force : bool
+        Record the base force too.
+    rng : int, numpy Generator or None
+    base_axes : str or sequence of str, optional
+        Names of the base directions, as in `Measurement`.
+
+    Returns
+    -------
+    Measurement
+        Its standard deviations are set where `noise` is not zero. The *noise floor* of a draw is
+        ``measurement.residual(structure)``.
+    """
+    if not (np.isfinite(noise) and noise >= 0):
+        raise InputError(f"noise = {noise}: a finite fraction >= 0 is needed")
+    lines = check_frequencies(freq)
+    random = np.random.default_rng(rng)
+    response = np.moveaxis(structure.transmissibility(lines), 1, 0)
+    base_force = np.moveaxis(structure.base_force(lines), 1, 0) if force else None
+    response, response_std = _with_noise(response, noise, random)
+    force_std = None
+    if base_force is not None:
+        base_force, force_std = _with_noise(base_force, noise, random)
+    return Measurement(
+        lines, unit_runs(structure.n_base, lines.size), response, rigid_body=structure.rigid_body,
+        force=base_force, sensors=structure.sensors, response_std=response_std, force_std=force_std,
+        base_axes=None if base_axes is None else base_axis_names(base_axes),
+    )  # fmt: skip
+
+
+def unit_runs(d: int, n_freq: int) -> ComplexArray:
+    """Base spectra of d runs, each of unit acceleration in its own direction, (d, d, n_freq)."""
+    return np.repeat(np.eye(d, dtype=complex)[:, :, None], n_freq, axis=2)
+
+
+def _with_noise(record: ComplexArray, noise: float, random: np.random.Generator) -> tuple[ComplexArray, Array | None]:
+    if noise == 0:
+        return record, None
+    std = noise * np.sqrt(np.mean(np.abs(record) ** 2))
+    error = random.standard_normal(record.shape) + 1j * random.standard_normal(record.shape)
+    return record + error * std / np.sqrt(2), np.array(std)
+
+
+def _checked(name: str, value: ArrayLike, kind: type) -> NDArray[Any]:
+    if kind is float and np.iscomplexobj(value):
+        raise InputError(f"{name} is complex; real numbers are needed")
+    try:
+        array: NDArray[Any] = np.array(value, dtype=kind)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} is not an array of numbers") from None
+    bad = ~np.isfinite(array)
+    if np.any(bad):
+        first = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise InputError(f"{name} holds {int(bad.sum())} NaN or infinite samples, the first at index {first}")
+    return array
+
+
+def _records(name: str, value: ArrayLike, n_freq: int) -> ComplexArray:
+    array = _checked(name, value, complex)
+    if array.ndim == 2:
+        array = array[None]
+    if array.ndim != 3 or array.shape[-1] != n_freq:
+        raise InputError(f"{name} has shape {array.shape}; (runs, channels, {n_freq}) is needed, frequency last")
+    return array
+
+
+def _std(name: str, value: ArrayLike | None, record: ComplexArray | None) -> Array | None:
+    if value is None:
+        return None
+    array = _checked(name, value, float)
+    if record is None:
+        raise InputError(f"{name} is given without its record")
+    try:
+        full = np.broadcast_to(array, record.shape).copy()
+    except ValueError:
+        raise InputError(f"{name} {array.shape} does not broadcast to its record {record.shape}") from None
+    if np.any(full < 0):
+        raise InputError(f"{name} holds negative entries")
+    return full

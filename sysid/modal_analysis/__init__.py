@@ -1,0 +1,1 @@
+"""What records show without mass and stiffness: poles, residues, modes."""

@@ -1,0 +1,157 @@
+"""The frequency-domain residual as CasADi expressions, bilinear in mode shapes and participations."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from sysid.measurement.measurement import Measurement
+from sysid.measurement.noise import separable
+from sysid.structure.structure import Array, ComplexArray
+
+
+def columns(record: ComplexArray) -> ComplexArray:
+    """All runs side by side: (runs, channels, n_freq) → (channels, runs * n_freq)."""
+    return np.moveaxis(record, 0, 1).reshape(record.shape[1], -1)
+
+
+def parts_of(record: ComplexArray) -> tuple[ca.DM, ca.DM]:
+    """Real and imaginary part; zeros are structural, so that real unit runs cost no imaginary arithmetic."""
+    flat = columns(record)
+    return ca.sparsify(ca.DM(flat.real)), ca.sparsify(ca.DM(flat.imag))
+
+
+def modal_gains(omega: ca.MX, ratios: ca.MX, freq: Array, shift: float = 0.0) -> tuple[ca.MX, ca.MX]:
+    """Real and imaginary part of ``g_k = w² / (w_k² - w² + 2 i zeta_k w_k w)``, (m, n_freq) each (eq. 14).
+
+    With `shift`, 1/s, at ``s = shift + i w`` in the place of ``i w``.
+    """
+    w = ca.DM(2 * np.pi * freq).T
+    squared = ca.repmat(w**2, omega.numel(), 1)
+    detuning = omega**2 @ ca.DM.ones(1, freq.size) - squared
+    loss = (2 * ratios * omega) @ w
+    if not shift:
+        size = squared / (detuning**2 + loss**2)
+        return size * detuning, -size * loss
+    detuning = detuning + shift**2 + 2 * shift * (ratios * omega) @ ca.DM.ones(1, freq.size)
+    loss, turned = loss + 2 * shift * ca.repmat(w, omega.numel(), 1), 2 * shift * ca.repmat(w, omega.numel(), 1)
+    size, squared = 1 / (detuning**2 + loss**2), squared - shift**2
+    return size * (squared * detuning - turned * loss), -size * (squared * loss + turned * detuning)
+
+
+def residual(
+    test: Measurement,
+    phi: ca.MX,
+    gamma: ca.MX,
+    omega: ca.MX,
+    ratios: ca.MX,
+    rigid_body_mass: ca.MX,
+    *,
+    weighted: bool = False,
+    shift: float = 0.0,
+) -> ca.MX:
+    """Relative residuals, stacked: their sum of squares is the squared relative error of each record.
+
+    Parameters
+    ----------
+    test : Measurement
+    phi : (n, m)
+        Mode shapes at the sensors.
+    gamma : (m, d)
+        Participations.
+    omega, ratios : (m, 1)
+        Circular frequencies, rad/s, and damping ratios.
+    rigid_body_mass : (d, d), kg
+        Read only where the test has a force.
+    weighted : bool
+        Channels and lines weigh by their stated noise, and accelerations and force by each other's where both are
+        stated.
+    shift : float, 1/s
+        Of the complex frequencies from the imaginary axis, see `modal_gains`.
+
+    Returns
+    -------
+    MX, a column
+        ``(A_estimated - A_target) / ‖A_target‖`` (eq. 15), real then imaginary parts, then the
+        same of the base force.
+    """
+    runs = test.base.shape[0]
+    g_re, g_im = modal_gains(omega, ratios, test.freq, shift)
+    if runs > 1:
+        g_re, g_im = ca.repmat(g_re, 1, runs), ca.repmat(g_im, 1, runs)
+    u_re, u_im = parts_of(test.base)
+    push_re, push_im = gamma @ u_re, gamma @ u_im
+    q_re, q_im = g_re * push_re - g_im * push_im, g_re * push_im + g_im * push_re
+    (weight, scale), *of_force = weights_of_test(test, weighted=weighted)
+    a_re, a_im = parts_of(test.relative)
+    pieces = [weight * (phi @ q_re - a_re) / scale, weight * (phi @ q_im - a_im) / scale]
+    if test.force is not None:
+        ((weight, scale),) = of_force
+        f_re, f_im = parts_of(test.force)
+        pieces += [
+            weight * (gamma.T @ q_re + rigid_body_mass @ u_re - f_re) / scale,
+            weight * (gamma.T @ q_im + rigid_body_mass @ u_im - f_im) / scale,
+        ]
+    return ca.vertcat(*(ca.vec(ca.densify(piece)) for piece in pieces))
+
+
+def weights_of_test(test: Measurement, *, weighted: bool) -> list[tuple[ca.DM, float]]:
+    """`weights_of` the relative accelerations and, where it was measured, the base force.
+
+    Where the noise of both is stated, both have the size of the accelerations, so that they weigh by their noise alone.
+    """
+    records = [(test.relative, test.response_std)]
+    records += [] if test.force is None else [(test.force, test.force_std)]
+    found = [weights_of(record, std if weighted else None) for record, std in records]
+    if weighted and test.response_std is not None and test.force_std is not None:
+        found = [(weight, found[0][1]) for weight, _ in found]
+    return found
+
+
+def weights_of(record: ComplexArray, std: Array | None) -> tuple[ca.DM, float]:
+    """Weights of a record's channels and lines as `columns` has them, and the size of the weighted record."""
+    channel, line = separable(std, record.shape)
+    weight = channel[:, None] * line.ravel()
+    return ca.DM(weight), float(np.linalg.norm(weight * columns(record)))
+
+
+def weighed_mass(test: Measurement, omega: Array, ratios: Array) -> Array:
+    """Rigid-body mass (d, d) that the base force tells, its modal part free at the given poles; kg.
+
+    Lines weigh by what is stated of the force's noise.
+    """
+    assert test.force is not None
+    weight = separable(test.force_std, test.force.shape)[1].ravel()[:, None]
+    design = np.hstack([columns(test.base).T, _modal_basis(test, omega, ratios)])
+    return _real_least_squares(weight * design, weight * columns(test.force).T)[: test.n_base].T
+
+
+def gains(freq: Array, omega: Array, ratios: Array, shift: float = 0.0) -> ComplexArray:
+    """Numbers of ``g_k = w² / (w_k² - w² + 2 i zeta_k w_k w)`` at lines in Hz, (m, n_freq); `shift` as above."""
+    if shift:
+        s = shift + 2j * np.pi * freq
+        return -(s**2) / (omega[:, None] ** 2 + s**2 + 2 * (ratios * omega)[:, None] * s)
+    w = 2 * np.pi * freq
+    return w**2 / (omega[:, None] ** 2 - w**2 + 2j * (ratios * omega)[:, None] * w)
+
+
+def gain_slopes(freq: Array, omega: Array, ratios: Array) -> ComplexArray:
+    """Derivatives of `gains` by log w_k, then by log zeta_k, (2m, n_freq)."""
+    w = 2 * np.pi * freq
+    g = gains(freq, omega, ratios)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        over = np.where(w > 0, g / w**2, 0.0)  # one over the denominator; at rest nothing moves
+    loss = 2j * (ratios * omega)[:, None] * w
+    return np.concatenate([-g * over * (2 * omega[:, None] ** 2 + loss), -g * over * loss])
+
+
+def _modal_basis(test: Measurement, omega: Array, ratios: Array) -> ComplexArray:
+    """Response of each mode to each base direction, (runs * n_freq, m * d)."""
+    g = gains(test.freq, omega, ratios)
+    u = columns(test.base)
+    return (np.tile(g, test.n_runs)[:, None] * u[None]).reshape(-1, u.shape[1]).T
+
+
+def _real_least_squares(design: ComplexArray, records: ComplexArray) -> Array:
+    stacked = np.vstack([design.real, design.imag])
+    return np.linalg.lstsq(stacked, np.vstack([records.real, records.imag]), rcond=None)[0]

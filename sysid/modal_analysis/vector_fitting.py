@@ -1,0 +1,385 @@
+"""Poles from the data: number, frequency and damping of the modes, over all sensors and directions at once.
+
+Relaxed vector fitting of the relative accelerations with common poles (Gustavsen and Semlyen 1999; Gustavsen
+2006), in the basis ``g_k = w² / (w_k² - w² + 2 i zeta_k w_k w)`` so that errors weigh as accelerations, from more
+poles than there can be modes. Those that do not earn their place are removed one by one (the rise of the squared error
+without a pole against the noise), what stays is polished by variable projection over (log w, log zeta) with real
+residues, further poles are tried beside and between them, and close ones that one can stand for are merged.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from sysid.errors import InputError
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.residues import ROUND_OFF, Records, ResidueFit, beyond_chance, independent, stacked
+from sysid.modal_analysis.response import gain_slopes, gains
+from sysid.structure.structure import Array, ComplexArray
+
+_SPARE = 6  # poles beyond those expected: without spare ones noise moves true poles
+_RELOCATIONS = 6
+_STEPS = 100
+_SETTLED = 1e-6  # fall of the squared error, relative, at which poles are polished: far below what noise moves it by
+_EXACT = 1e-13  # relative residual that no further step betters
+_FAR = 100.0  # times the error that may be, from which moving other poles too does not save a pole less
+_GUESS = 0.01  # damping ratio to begin with
+_RAZOR = 0.02  # of the distance of lines; half the width of a peak that answers for one bad line, not for a mode
+_DAMPED = 0.5  # a pole with more damping than this is no mode of a structure
+_EDGE = 10.0  # times their ends, how far outside the lines a mode may lie: it answers for all that are there
+_BESIDE = 0.1  # how far outside the lines a mode alone may lie, as a fraction of their ends
+
+
+@dataclass(frozen=True, eq=False)
+class Poles:
+    """Modes that stand out of the data.
+
+    Attributes
+    ----------
+    omega, ratios : (p,)
+        Circular frequencies, rad/s, ascending, and damping ratios.
+    residual : float
+        Relative residual of the modal model with these poles and free real residues.
+    """
+
+    omega: Array
+    ratios: Array
+    residual: float
+
+
+def find_poles(test: Measurement) -> Poles:
+    """Find the modes that stand out of the noise.
+
+    Parameters
+    ----------
+    test : Measurement
+        Its lines must hold the modes; lines closer than the half-power bandwidth.
+
+    Raises
+    ------
+    InputError
+        Too few lines for so many poles, or no mode at all.
+
+    References
+    ----------
+    B. Gustavsen, A. Semlyen, IEEE Trans. Power Delivery 14 (1999) 1052-1061; B. Gustavsen, ibid. 21 (2006)
+    1587-1592. G. H. Golub, V. Pereyra, SIAM J. Numer. Anal. 10 (1973) 413-432, with Kaufman's Jacobian (1975).
+    """
+    with threadpool_limits(limits=1):  # the same bits whatever the machine does beside
+        return _find(Records(test))
+
+
+def _find(records: Records) -> Poles:
+    count = max(records.n_sensors, _independent(records)) + _SPARE
+    while True:
+        _check_lines(records, count)
+        omega, ratios = _search(records, count)
+        if omega.size <= count - _SPARE // 2:
+            break
+        count += max(count // 2, _SPARE)  # too few were spare
+    lines = 2 * np.pi * records.freq
+    if not np.any((omega > (1 - _BESIDE) * lines[0]) & (omega < (1 + _BESIDE) * lines[-1])):
+        raise InputError(
+            "no mode stands out of the noise between these lines: state natural_frequencies or widen them, unless base "
+            "and sensors are in different units (g and m/s²) or the spectra follow exp(-iwt) (take the conjugate)"
+        )
+    return _in_order(records, omega, ratios)
+
+
+def poles_near(test: Measurement, omega: Array, window: float) -> Poles:
+    """Poles for frequencies that somebody states, rad/s: polished from there, each held within `window` (relative).
+
+    Raises
+    ------
+    InputError
+        Where a stated frequency is none of the data's.
+    """
+    records = Records(test)
+    distinct = np.unique(omega)
+    found, ratios = _polish(records, distinct, np.full(distinct.size, _GUESS))
+    off = np.abs(np.log(found / distinct))
+    fit = records.fit(found, ratios)
+    # By its place, or by what the fit would lose without it.
+    lacking = (off > np.log1p(window)) | (fit.gain < _least_gain(fit) * _noise(records, fit, found.size))
+    if np.any(lacking):
+        stated, ends = (
+            ", ".join(f"{value:.5g}" for value in values[lacking] / (2 * np.pi)) for values in (distinct, found)
+        )
+        raise InputError(
+            f"of the stated natural frequencies {stated} Hz does not stand out of the data (a fit from there ends at "
+            f"{ends} Hz): the base may not move this mode"
+        )
+    return _in_order(records, found, ratios)
+
+
+def _independent(records: Records) -> int:
+    """Number of independent functions of frequency in the channels, where it stands out of the noise."""
+    sizes = np.linalg.svd(records.data, compute_uv=False)
+    return int(np.count_nonzero(sizes > max(1.5 * np.median(sizes), 1e-9 * sizes[0])))
+
+
+def poles_of_any_damping(records: Records) -> tuple[Array, Array]:
+    """Circular frequencies and damping ratios of poles with residues in quadrature beside the real ones.
+
+    They serve to continue records off the lines: none is tried beside or between them, and none is merged.
+
+    Raises
+    ------
+    InputError
+        Too few lines.
+    """
+    with threadpool_limits(limits=1):
+        count = max(records.n_sensors, _independent(records)) + _SPARE
+        _check_lines(records, count)
+        return _settled(records, *_relocated(records, count), velocity=True)
+
+
+def _check_lines(records: Records, count: int) -> None:
+    if 2 * np.count_nonzero(records.freq) < 4 * count + 2:
+        raise InputError(
+            f"{records.freq.size} lines are too few to look for {count} poles: state natural_frequencies or add lines"
+        )
+
+
+def _relocated(records: Records, count: int) -> tuple[Array, Array]:
+    """Poles that earn their place, from `count` that are spread over the lines, before they are polished."""
+    lines = 2 * np.pi * records.freq[records.freq > 0]
+    omega, ratios = np.geomspace(lines[0], lines[-1], count), np.full(count, _GUESS)
+    channels = _principal(records, count)
+    error = np.inf
+    for _ in range(_RELOCATIONS):
+        omega, ratios = _relocate(records, channels, omega, ratios)
+        before, error = error, records.fit(omega, ratios).squared_error
+        if error < _EXACT**2 * records.size or error > 0.97 * before:
+            break
+    # A pole of a structure with other than classical damping needs its velocity too, or others would stand in for it.
+    return _prune(records, omega, ratios, velocity=True)
+
+
+def _search(records: Records, count: int) -> tuple[Array, Array]:
+    """Poles that stand out of the noise."""
+    first = _relocated(records, count)
+    if first[0].size == 0:
+        return first
+    omega, ratios = _settled(records, *first)
+    for _ in range(count):
+        more = _with_another(records, omega, ratios) if omega.size else None
+        if more is None:
+            break
+        omega, ratios = more
+    omega, ratios = _merged(records, omega, ratios)
+    if omega.size and _explains(records, (omega, ratios), True) < _explains(records, (omega, ratios), False):
+        with_velocity = _settled(records, *first, velocity=True)
+        if _explains(records, with_velocity, True) < _explains(records, (omega, ratios), False):
+            return with_velocity
+    return omega, ratios
+
+
+def _explains(records: Records, poles: tuple[Array, Array], velocity: bool) -> float:
+    """How badly poles explain the records for the unknowns they take: Schwarz's criterion."""
+    if poles[0].size == 0:
+        return np.inf
+    fit = records.fit(*poles, velocity=velocity)
+    unknowns = poles[0].size * (fit.whitened[0].size + 2)
+    error = max(fit.squared_error / records.size, ROUND_OFF**2)
+    return float(records.data.size * np.log(error) + unknowns * np.log(records.data.size))
+
+
+def _merged(records: Records, omega: Array, ratios: Array) -> tuple[Array, Array]:
+    """Poles without those that a neighbour, once it may move, stands in for: close poles trade their residues."""
+    order = np.argsort(omega)
+    omega, ratios = omega[order], ratios[order]
+    k = 0
+    while k < omega.size:
+        close = np.flatnonzero(np.abs(np.log(omega / omega[k])) < ratios[k] / 2)
+        if close.size > 1:
+            fit = records.fit(omega, ratios)
+            allowed = _least_gain(fit) * _noise(records, fit, omega.size)
+            if fit.rise_with_one_less(close) > _FAR * allowed:
+                k += 1
+                continue
+            fewer = _polish(records, np.delete(omega, k), np.delete(ratios, k))
+            rise = records.fit(*fewer).squared_error - fit.squared_error
+            if rise <= allowed:
+                omega, ratios = fewer
+                continue
+        k += 1
+    return omega, ratios
+
+
+def _settled(records: Records, omega: Array, ratios: Array, *, velocity: bool = False) -> tuple[Array, Array]:
+    """Poles polished, and pruned until all that stay earn their place."""
+    while omega.size:
+        size = omega.size
+        omega, ratios = _polish(records, omega, ratios, velocity=velocity)
+        omega, ratios = _prune(records, omega, ratios, velocity=velocity)
+        if omega.size == size:
+            break
+    return omega, ratios
+
+
+def _with_another(records: Records, omega: Array, ratios: Array) -> tuple[Array, Array] | None:
+    """The poles and one more, settled; None where what they leave calls for none.
+
+    Candidates lie beside each pole, for two modes that share it, and between the poles. Damping that is not classical
+    calls for no pole: one more must answer what the velocities of the poles cannot, or more than they all can.
+    """
+    shift = np.concatenate([1 + ratios, 1 - ratios, 1 + 3 * ratios, 1 - 3 * ratios])
+    between = np.geomspace(omega.min(), omega.max(), 4 * omega.size)
+    at = np.concatenate([np.tile(omega, 4) * shift, between])
+    loss = np.concatenate([np.tile(ratios, 4), np.full(between.size, np.median(ratios))])
+    plain = records.basis(gains(records.freq, at, loss))
+    size = np.linalg.norm(plain, axis=0)
+    own, with_velocity = records.fit(omega, ratios), records.fit(omega, ratios, velocity=True)
+    least = _least_gain(own)
+    for fit, to_beat in ((with_velocity, np.inf), (own, with_velocity.squared_error)):
+        trial = plain - fit.Q @ (fit.Q.T @ plain)
+        left = np.linalg.norm(trial, axis=0)
+        trial = trial / np.where(left > 1e-6 * size, left, np.inf)
+        gain = np.sum((trial.T @ fit.left) ** 2, axis=1).reshape(at.size, -1).sum(axis=1)
+        best = int(np.argmax(gain))
+        if gain[best] <= least * _noise(records, fit, omega.size):
+            continue
+        more = _settled(records, np.append(omega, at[best]), np.append(ratios, loss[best]))
+        if more[0].size > omega.size and records.fit(*more).squared_error < to_beat:
+            return more
+    return None
+
+
+def _in_order(records: Records, omega: Array, ratios: Array) -> Poles:
+    order = np.argsort(omega)
+    left = float(np.sqrt(records.fit(omega, ratios).squared_error / records.size))
+    return Poles(omega[order], ratios[order], left)
+
+
+def _least_gain(fit: ResidueFit) -> float:
+    """What a pole must lower the squared error by to earn its place, in units of the noise's variance."""
+    return beyond_chance(fit.whitened[0].size + 2)  # real parameters that come with a pole
+
+
+def _noise(records: Records, fit: ResidueFit, m: int) -> float:
+    """Variance of a record's real number about the fit of m poles."""
+    return records.noise(fit.left, m * (fit.whitened[0].size + 2))
+
+
+def _principal(records: Records, count: int) -> list[tuple[ComplexArray, Array]]:
+    """Base and principal channels of each block: at most as many as there are poles, whatever the channels."""
+    out = []
+    for base, channels in records.blocks:
+        moving = independent(base[None]).T @ base  # a run moves the base in fewer directions than all together
+        left, sizes, _ = np.linalg.svd(stacked(channels), full_matrices=False)
+        keep = np.flatnonzero(sizes > 1e-14 * sizes[0])[:count]
+        principal = left[:, keep] * sizes[keep]
+        n = base.shape[1]
+        out.append((moving, principal[:n].T + 1j * principal[n:].T))
+    return out
+
+
+def _relocate(
+    records: Records, blocks: list[tuple[ComplexArray, Array]], omega: Array, ratios: Array
+) -> tuple[Array, Array]:
+    """One step of relaxed vector fitting: the zeros of sigma in ``sigma a = sum of (r_1 + r_2 i w) g``."""
+    w, m = 2 * np.pi * records.freq, omega.size
+    g = gains(records.freq, omega, ratios)
+    numerators = np.concatenate([g, 1j * w / omega[:, None] * g])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        partial = np.where(w > 0, (omega[:, None] / w) ** 2 * g, 1.0)  # w_k² over the same denominator
+    sigma = np.concatenate([np.ones((1, w.size)), partial, 1j * w / omega[:, None] * partial])
+    rows = []
+    for base, channels in blocks:
+        basis = stacked((numerators[:, None] * base).reshape(-1, w.size))
+        Q = np.linalg.qr(basis / np.maximum(np.linalg.norm(basis, axis=0), np.finfo(float).tiny))[0]
+        for record in channels:
+            product = stacked(record * sigma)
+            product = product - Q @ (Q.T @ product)
+            rows.append(np.linalg.qr(product, mode="r"))
+    # Relaxation: the sum of Re sigma over the lines is fixed instead of its constant term.
+    weight = np.sqrt(records.size) / w.size
+    system = np.vstack([*rows, weight * sigma.real.sum(axis=1)])
+    wanted = np.zeros(len(system))
+    wanted[-1] = weight * w.size
+    scale = np.maximum(np.linalg.norm(system, axis=0), np.finfo(float).tiny)
+    c = np.linalg.lstsq(system / scale, wanted, rcond=1e-14)[0] / scale
+    constant = c[0] if abs(c[0]) > 1e-8 else np.copysign(1e-8, c[0])
+    # sigma's poles as second-order blocks; its zeros are the eigenvalues after feedback.
+    A, b, out = np.zeros((2 * m, 2 * m)), np.zeros(2 * m), np.zeros(2 * m)
+    i = 2 * np.arange(m)
+    A[i, i + 1], A[i + 1, i], A[i + 1, i + 1] = omega, -omega, -2 * ratios * omega
+    b[i + 1], out[i], out[i + 1] = omega, c[1 : m + 1], c[m + 1 :]
+    return _as_modes(np.linalg.eigvals(A - np.outer(b, out) / constant))
+
+
+def _as_modes(eigenvalues: ComplexArray) -> tuple[Array, Array]:
+    """Frequency and damping of each conjugate pair; unstable ones mirrored, real ones paired off as overdamped."""
+    real = np.abs(eigenvalues.imag) <= 1e-9 * np.abs(eigenvalues)
+    pairs = eigenvalues[~real & (eigenvalues.imag > 0)]
+    sizes = np.sort(np.abs(eigenvalues[real]))
+    sizes = sizes[: 2 * (sizes.size // 2)]
+    omega = np.concatenate([np.abs(pairs), np.sqrt(sizes[::2] * sizes[1::2])])
+    ratios = np.concatenate([np.abs(pairs.real) / np.abs(pairs), np.full(sizes.size // 2, 0.9)])
+    keep = omega > 0
+    order = np.argsort(omega[keep])
+    return omega[keep][order], np.clip(ratios[keep][order], 1e-5, 0.99)
+
+
+def _prune(records: Records, omega: Array, ratios: Array, *, velocity: bool = False) -> tuple[Array, Array]:
+    """Remove poles, the least useful first, until each that stays lowers the error by far more than noise would."""
+    lines = 2 * np.pi * records.freq[records.freq > 0]
+    inside = (omega > lines[0] / _EDGE) & (omega < _EDGE * lines[-1]) & (ratios < _DAMPED)
+    inside &= ratios * omega > _RAZOR * np.interp(omega, lines, np.gradient(lines))
+    while omega.size:
+        fit = records.fit(omega, ratios, velocity=velocity)
+        # What is no mode goes first, whatever it explains.
+        worth = np.where(inside, fit.gain / _noise(records, fit, omega.size), -1.0)
+        least = int(np.argmin(worth))
+        if worth[least] > _least_gain(fit):
+            break
+        omega, ratios, inside = (np.delete(values, least) for values in (omega, ratios, inside))
+    return omega, ratios
+
+
+def _polish(records: Records, omega: Array, ratios: Array, *, velocity: bool = False) -> tuple[Array, Array]:
+    """Variable projection: Levenberg-Marquardt steps over (log w, log zeta), the residues eliminated."""
+    m = omega.size
+    p = np.log(np.concatenate([omega, ratios]))
+    damping = 1e-3
+    error, H, slope = _projected(records, p, velocity)
+    for _ in range(_STEPS):
+        if error < _EXACT**2 * records.size:
+            break
+        step = np.linalg.solve(H + damping * np.diag(np.diag(H)), slope)
+        trial = p + np.clip(step, -0.5, 0.5)
+        trial[m:] = np.clip(trial[m:], np.log(1e-6), np.log(0.99))
+        lower, *model = _projected(records, trial, velocity)
+        if lower < error:
+            done = error - lower < _SETTLED * error
+            p, error, (H, slope), damping = trial, lower, model, max(damping / 10, 1e-12)
+            if done:
+                break
+        else:
+            damping *= 10
+            if damping > 1e6:
+                break
+    return np.exp(p[:m]), np.exp(p[m:])
+
+
+def _projected(records: Records, p: Array, velocity: bool) -> tuple[float, Array, Array]:
+    """Squared error, Gauss-Newton matrix (2m, 2m) and descent direction of the projected problem at log poles `p`."""
+    m = p.size // 2
+    omega, ratios = np.exp(p[:m]), np.exp(p[m:])
+    fit = records.fit(omega, ratios, velocity=velocity)
+    by_pole = gain_slopes(records.freq, omega, ratios)[:, None]
+    if velocity:
+        turn = 2j * np.pi * records.freq / np.tile(omega, 2)[:, None]
+        moved = np.concatenate([gains(records.freq, omega, ratios), np.zeros((m, records.freq.size))])
+        by_pole = np.concatenate([by_pole, (turn * (by_pole[:, 0] - moved))[:, None]], axis=1)
+    slopes = records.basis(by_pole.reshape(-1, records.freq.size))
+    slopes = slopes - fit.Q @ (fit.Q.T @ slopes)
+    residues = np.concatenate([fit.residues, fit.residues]).reshape(slopes.shape[1], -1)
+    d = slopes.shape[1] // (2 * m)
+    H = ((slopes.T @ slopes) * (residues @ residues.T)).reshape(2 * m, d, 2 * m, d).sum(axis=(1, 3))
+    slope = np.sum((slopes.T @ fit.left) * residues, axis=1).reshape(2 * m, d).sum(axis=1)
+    return fit.squared_error, H, slope

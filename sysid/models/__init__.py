@@ -1,0 +1,1 @@
+"""The unknowns, and each matrix as variables and expressions."""

@@ -1,0 +1,322 @@
+"""Mass matrices as CasADi expressions: full with healing (Cerini et al. 2024, section 3.2.3), lumped, known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sysid.errors import InputError
+from sysid.models.geometry import FACTOR_FLOOR, Layout
+from sysid.models.unknowns import Block
+from sysid.structure.structure import Array, finite_array
+from sysid.structure.triangular import lower_triangle, triangle_entries
+
+_ROW_EXPECTATION = 1.0  # the paper's c
+_NEWTON_STEPS = 20  # for the coupled scales of the rigid-body healing; quadratic from a good start
+
+
+class MassBlocks(NamedTuple):
+    """CasADi expressions: Cholesky factor of M_SS (n, n), M_S0 (n, d), M_00 (d, d)."""
+
+    factor: ca.SX
+    coupling: ca.SX
+    base: ca.SX
+
+
+def sampling_exponent(k: int, c: float = _ROW_EXPECTATION) -> float:
+    """Exponent alpha of eq. 18 for a row of k entries (eq. 20, with its misprinted 2 mended to 4).
+
+    It is the root of eq. 19, ``∫_{-1}^{1} y² dx = c / k``: every row of the Cholesky factor then has the
+    same expected squared norm.
+
+    >>> round(sampling_exponent(1), 4)
+    1.7808
+    """
+    return (3 * c + np.sqrt(c**2 + 16 * c * k)) / (4 * (2 * k - c))
+
+
+def spread_rows(x: ca.SX | Array, exponents: Array) -> ca.SX | Array:
+    """Eq. 18: ``y = sgn(x) (1 - (1 - |x|)^alpha)``, from the swarm's uniform coordinates to factor entries."""
+    if isinstance(x, np.ndarray):
+        return np.sign(x) * (1 - (1 - np.minimum(np.abs(x), 1.0)) ** exponents)
+    size = ca.fmin(ca.fabs(x), 1.0)  # a round-off beyond 1 would be a power of a negative number
+    return ca.sign(x) * (1 - (1 - size) ** exponents)
+
+
+def gather_rows(y: Array, exponents: Array) -> Array:
+    """Inverse of `spread_rows` on numbers."""
+    return np.sign(y) * (1 - (1 - np.minimum(np.abs(y), 1.0)) ** (1 / exponents))
+
+
+@dataclass(frozen=True, eq=False)
+class FullMass:
+    """A full mass matrix over sensors and base, through its Cholesky factor.
+
+    Parameters
+    ----------
+    total_mass : float, array_like (d,) or (d, d), optional
+        kg a base direction (kg m² where it is a rotation); a matrix is the whole rigid-body mass, from a mass
+        properties report. All that moves with the base counts, base mass too. Without it, and without a measured
+        base force or a known mass, masses are normalised to 1 kg a direction, and the result says so.
+    healing : {"trace", "rigid_body"}
+        What the total is: "trace", the sum of diag M over the direction's sensors and its base row
+        (eq. 21-22 of the paper: right for lumped masses on orthogonal axes); "rigid_body", the
+        physical ``M_rb[i, i]``; the only one for a matrix.
+    known : array_like (n, n) or (n, n + d), optional
+        Entries of ``M_SS``, or of ``[M_SS, M_S0]``, that are known, NaN where they are not: weighed parts, zeros
+        between what cannot be coupled. The modal strategy holds them, or checks them where a base force was
+        measured, and the result says what they close; the swarm cannot. More entries than the data
+        leave open are met in the least-squares sense. They need one mode a sensor.
+
+    References
+    ----------
+    Cerini, Yotov, Aglietti, Mech. Syst. Signal Process. 209 (2024) 111084, eq. 17-25.
+    """
+
+    total_mass: ArrayLike | None = None
+    healing: Literal["trace", "rigid_body"] = "trace"
+    known: ArrayLike | None = None
+
+    def __post_init__(self) -> None:
+        if self.healing not in ("trace", "rigid_body"):
+            raise InputError(f"healing {self.healing!r} is unknown; give 'trace' or 'rigid_body'")
+        if self.total_mass is not None and np.ndim(self.total_mass) == 2 and self.healing != "rigid_body":
+            raise InputError("a matrix of total mass is the rigid-body mass: state healing='rigid_body' with it")
+
+    @property
+    def healable(self) -> bool:
+        """Whether scaling the rows of a factor meets all that is stated."""
+        return self.known is None and (self.total_mass is None or np.ndim(self.total_mass) < 2)
+
+    def known_entries(self, layout: Layout) -> Array:
+        """What is known of ``[M_SS, M_S0]``, (n, n + d); NaN where nothing is."""
+        n, d = layout.n, layout.d
+        entries = np.full((n, n + d), np.nan)
+        if self.known is None:
+            return entries
+        try:
+            given = np.asarray(self.known, dtype=float)
+        except (TypeError, ValueError):
+            raise InputError("FullMass: known must hold numbers, NaN where an entry is not known") from None
+        if given.shape not in ((n, n), (n, n + d)):
+            raise InputError(f"FullMass: known is {given.shape}; ({n}, {n}) or ({n}, {n + d}) is needed")
+        entries[:, : given.shape[1]] = given
+        across = np.where(np.isnan(entries[:, :n]), entries[:, :n].T, entries[:, :n])
+        if np.any(np.isinf(entries)) or np.nanmax(np.abs(across - across.T), initial=0.0) > 1e-9 * np.nanmax(
+            np.abs(across), initial=0.0
+        ):
+            raise InputError("FullMass: known is infinite somewhere, or not symmetric over the sensors")
+        if np.nanmin(np.diag(across), initial=np.inf) <= 0:
+            raise InputError("FullMass: known masses must be positive")
+        entries[:, :n] = across
+        return entries
+
+    def variables(self, layout: Layout) -> tuple[Block, ...]:
+        """Entries of the factor's lower triangle, row by row, in [-1, 1] (eq. 35)."""
+        size = layout.n + layout.d
+        rows, columns = np.tril_indices(size)
+        exponents = np.array([sampling_exponent(k) for k in range(1, size + 1)])[rows]
+        lower = np.where(rows == columns, FACTOR_FLOOR, -1.0)
+        return (
+            *layout.total_variables(self.total_mass),
+            Block(
+                "mass_factor",
+                lower,
+                np.ones(rows.size),
+                sampling=lambda x: ca.fmax(spread_rows(x, exponents), lower),
+                unsampling=lambda y: gather_rows(y, exponents),
+            ),
+        )
+
+    def totals(self, layout: Layout) -> Array:
+        """Total mass in each base direction, (d,)."""
+        return layout.totals(self.total_mass)
+
+    def blocks(self, layout: Layout, y: ca.SX) -> MassBlocks:
+        """Healed mass blocks of the factor entries `y`; positive definite for every `y` in the box."""
+        n = layout.n
+        totals, entries = layout.split_totals(self.total_mass, y)
+        healed = heal(lower_triangle(entries, n + layout.d), layout, totals, self.healing)
+        L, low, base = healed[:n, :n], healed[n:, :n], healed[n:, n:]
+        return MassBlocks(L, L @ low.T, low @ low.T + base @ base.T)
+
+    def values(self, layout: Layout, mass: Array) -> Array:
+        """Factor entries that `blocks` takes back to `mass`, (n + d, n + d), which has the stated totals."""
+        n = layout.n
+        L = np.linalg.cholesky(mass[:n, :n])
+        low = np.linalg.solve(L, mass[:n, n:]).T
+        remainder = mass[n:, n:] - low @ low.T
+        lam, vectors = np.linalg.eigh((remainder + remainder.T) / 2)
+        # A semidefinite remainder has a triangular factor too: by QR of any square root.
+        root = (vectors * np.sqrt(np.maximum(lam, 0.0))).T
+        base = np.linalg.qr(root)[1].T
+        base = base * np.where(np.diag(base) < 0, -1.0, 1.0)
+        factor = np.block([[L, np.zeros((n, layout.d))], [low, base]])
+        entries = triangle_entries(factor)
+        # Half the box: near its edge the sampling transform loses what it is given to round-off.
+        entries = entries / (2 * np.abs(entries).max())
+        if not layout.total_variables(self.total_mass):
+            return entries
+        return np.concatenate([self.total(layout, mass), entries])
+
+    def total(self, layout: Layout, mass: Array) -> Array:
+        """What this healing calls the total of `mass`, (d,)."""
+        if self.healing == "rigid_body":
+            return rigid_body_masses(layout, mass)
+        return np.array([mass.diagonal()[layout.directions == i].sum() for i in range(layout.d)])
+
+
+@dataclass(frozen=True, eq=False)
+class LumpedMass:
+    """A diagonal mass matrix on the sensors, without coupling to the base and without base mass.
+
+    Parameters
+    ----------
+    total_mass : float or array_like (d,), optional
+        kg summed over the sensors of a direction; normalised to 1 kg, and said so, where None.
+    """
+
+    total_mass: ArrayLike | None = None
+
+    def variables(self, layout: Layout) -> tuple[Block, ...]:
+        """Shares of the masses, scaled afterwards to their direction's total."""
+        share = Block("mass_share", np.full(layout.n, FACTOR_FLOOR), np.ones(layout.n))
+        return (*layout.total_variables(self.total_mass), share)
+
+    def totals(self, layout: Layout) -> Array:
+        """Total mass in each base direction, (d,)."""
+        return layout.totals(self.total_mass)
+
+    def blocks(self, layout: Layout, y: ca.SX) -> MassBlocks:
+        """Diagonal blocks; the base rows are zero."""
+        groups = layout.directions[: layout.n]
+        totals, share = layout.split_totals(self.total_mass, y)
+        scales = {
+            i: totals[i] / ca.sum1(share[np.flatnonzero(groups == i).tolist()]) for i in set(groups.tolist()) - {-1}
+        }
+        free = sum(scales.values()) / max(len(scales), 1) if scales else 1.0
+        masses = [share[j] * scales.get(g, free) for j, g in enumerate(groups.tolist())]
+        return MassBlocks(ca.diag(ca.sqrt(ca.vertcat(*masses))), ca.SX(layout.n, layout.d), ca.SX(layout.d, layout.d))
+
+    def values(self, layout: Layout, mass: Array) -> Array:
+        """Shares that `blocks` takes back to `mass`."""
+        m, groups = np.diag(mass)[: layout.n], layout.directions[: layout.n]
+        if not layout.total_variables(self.total_mass):
+            return m / m.max()
+        totals = [m[groups == i].sum() or layout.totals(None)[i] for i in range(layout.d)]
+        return np.concatenate([totals, m / m.max()])
+
+
+@dataclass(frozen=True, eq=False)
+class KnownMass:
+    """A mass matrix that is known, kg: (n + d, n + d), or (n, n) with no mass on the base rows."""
+
+    matrix: ArrayLike
+
+    def variables(self, layout: Layout) -> tuple[Block, ...]:
+        """No unknowns."""
+        return ()
+
+    def totals(self, layout: Layout) -> Array:
+        """Rigid-body mass in each base direction, (d,)."""
+        return rigid_body_masses(layout, self.full(layout))
+
+    def blocks(self, layout: Layout, y: ca.SX) -> MassBlocks:
+        """Constant blocks."""
+        full = self.full(layout)
+        n = layout.n
+        try:
+            L = np.linalg.cholesky(full[:n, :n])
+        except np.linalg.LinAlgError:
+            raise InputError("the known mass matrix is not positive definite over the sensors") from None
+        return MassBlocks(ca.SX(ca.sparsify(ca.DM(L))), ca.SX(full[:n, n:]), ca.SX(full[n:, n:]))
+
+    def values(self, layout: Layout, mass: Array) -> Array:
+        """Nothing to tell."""
+        return np.zeros(0)
+
+    def full(self, layout: Layout) -> Array:
+        """The matrix over sensors and base, (n + d, n + d)."""
+        matrix = finite_array("the known mass matrix", self.matrix)
+        n, size = layout.n, layout.n + layout.d
+        if matrix.shape == (n, n):
+            matrix = np.pad(matrix, (0, layout.d))
+        if matrix.shape != (size, size):
+            raise InputError(f"the known mass matrix is {matrix.shape}; ({n}, {n}) or ({size}, {size}) is needed")
+        if np.abs(matrix - matrix.T).max() > 1e-9 * np.abs(matrix).max():
+            raise InputError("the known mass matrix is not symmetric")
+        scale = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
+        if np.any(np.diag(matrix)[:n] <= 0) or np.linalg.eigvalsh(matrix / np.outer(scale, scale))[0] < -1e-8:
+            raise InputError(
+                "the known mass matrix is not positive semidefinite (M_00 >= M_S0' M_SS^-1 M_S0), "
+                "or a sensor has no mass"
+            )
+        return matrix
+
+
+MassModel = FullMass | LumpedMass | KnownMass
+
+
+def rigid_body_masses(layout: Layout, mass: Array) -> Array:
+    """Diagonal of ``[G; I]' M [G; I]``, (d,)."""
+    rigid = np.vstack([layout.rigid_body, np.eye(layout.d)])
+    return np.einsum("ni,nm,mi->i", rigid, mass, rigid)
+
+
+def heal(factor: ca.SX, layout: Layout, totals: ca.SX | Array, kind: str) -> ca.SX:
+    """Scale the factor's rows, one scale a base direction, so that M has the stated totals (eq. 21-22).
+
+    Rows of no direction take the mean of the scales: their mass has no total to obey.
+    """
+    d, groups = layout.d, layout.directions
+    members = [np.flatnonzero(groups == i).tolist() for i in range(d)]
+    if kind == "trace":
+        scales = [ca.sqrt(totals[i] / ca.sumsqr(factor[rows, :])) for i, rows in enumerate(members)]
+    else:
+        scales = _rigid_body_scales(factor, layout, totals, members)
+    free = sum(scales) / d
+    by_row = ca.vertcat(*(scales[g] if g >= 0 else free for g in groups.tolist()))
+    return ca.diag(by_row) @ factor
+
+
+def _rigid_body_scales(factor: ca.SX, layout: Layout, totals: ca.SX | Array, members: list[list[int]]) -> list:
+    """Scales s with ``r_i' D(s) M D(s) r_i = totals[i]`` for every direction i, r_i column i of [G; I].
+
+    Where no sensor's row of G has two entries the equations are uncoupled and closed. Otherwise
+    they are d quadratics, solved by Newton's method inside the expression; where that has not
+    converged, mostly because no positive scales exist, they are NaN, and the candidate is passed over.
+    """
+    d, groups = layout.d, layout.directions
+    rigid = np.vstack([layout.rigid_body, np.eye(d)])
+    free = np.flatnonzero(groups < 0).tolist()
+    # Total i is |sum_a s_a row_a|² with row_a = (part of r_i in group a)' L; Gram matrices hold all.
+    grams = []
+    for i in range(d):
+        parts = []
+        for rows in members:
+            part = ca.SX(rigid[rows, i]).T @ factor[rows, :]
+            if free:
+                part = part + ca.SX(rigid[free, i]).T @ factor[free, :] / d
+            parts.append(part)
+        stacked = ca.vertcat(*parts)
+        grams.append(stacked @ stacked.T / totals[i])
+    own = ca.vertcat(*(1 / ca.sqrt(gram[i, i]) for i, gram in enumerate(grams)))
+    if not any(np.any(rigid[groups != i, i]) for i in range(d)):
+        return ca.vertsplit(own)
+    z, q = ca.SX.sym("z", d), ca.SX.sym("q", d, d * d)
+    # In logarithms scales stay positive and the equations are nearly linear; long steps are cut.
+    s = ca.exp(z)
+    miss = ca.vertcat(*(ca.log(s.T @ gram @ s) for gram in ca.horzsplit(q, d)))
+    change = ca.solve(ca.jacobian(miss, z), miss)
+    step = ca.Function("newton", [z, q], [z - change / ca.fmax(1, ca.norm_inf(change))])
+    error = ca.Function("miss", [z, q], [ca.norm_inf(miss)])
+    # One scale for all is where a mass with the right totals starts, and stays.
+    uniform = ca.sqrt(d / sum(ca.sum1(ca.sum2(gram)) for gram in grams))
+    given, log_scale = ca.horzcat(*grams), ca.repmat(ca.log(uniform), d, 1)
+    for _ in range(_NEWTON_STEPS):
+        log_scale = step(log_scale, given)
+    return ca.vertsplit(ca.if_else(error(log_scale, given) < 1e-10, ca.exp(log_scale), np.nan))

@@ -1,0 +1,393 @@
+"""The unknowns of an identification problem: named, shaped, bounded, scaled."""
+
+from __future__ import annotations
+
+import operator
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sysid.errors import InputError
+from sysid.structure.structure import Array
+
+_PART = 0.05  # of its range: the least step of an unknown
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """A block of scalar unknowns, as the matrix models and the search space have it.
+
+    Parameters
+    ----------
+    name : str
+    lower, upper : ndarray, shape (size,)
+        The search space; equal where an entry is known.
+    unit : str
+    sampling : callable, optional
+        CasADi expression of the swarm's coordinates (size,) to the block's, both in
+        [lower, upper]: where the swarm had better search another distribution than the uniform
+        one (eq. 18 of the paper). Gradient methods never see it.
+    unsampling : callable, optional
+        Its inverse on numbers, shape (size,) to (size,).
+    """
+
+    name: str
+    lower: Array
+    upper: Array
+    unit: str = ""
+    sampling: Callable[[ca.SX], ca.SX] | None = None
+    unsampling: Callable[[Array], Array] | None = None
+
+    def __post_init__(self) -> None:
+        lower, upper = np.atleast_1d(np.asarray(self.lower, float)), np.atleast_1d(np.asarray(self.upper, float))
+        if lower.shape != upper.shape or lower.ndim != 1:
+            raise InputError(f"variable {self.name}: bounds {lower.shape} and {upper.shape} disagree")
+        if not (np.all(np.isfinite(lower)) and np.all(np.isfinite(upper)) and np.all(lower <= upper)):
+            raise InputError(f"variable {self.name}: bounds must be finite with lower <= upper")
+        object.__setattr__(self, "lower", lower)
+        object.__setattr__(self, "upper", upper)
+
+    @property
+    def size(self) -> int:
+        """Number of scalar unknowns."""
+        return int(self.lower.size)
+
+
+class Variable:
+    """A named unknown, or an array of them, of which matrices, residuals and constraints are written.
+
+    Slices, operators, NumPy's ufuncs and CasADi's functions accept it: it stands for a CasADi MX symbol.
+
+    Parameters
+    ----------
+    name : str
+        As tables, messages and results call it; each name once in a problem.
+    shape : int or tuple of int
+        () for a scalar, n or (n,) for a column, (n, m) for a matrix.
+    lower, upper : float or array_like
+        The search space, broadcast to the shape; finite.
+    guess : float or array_like, optional
+        Where a search may start; the middle of the search space where none is given.
+    log : bool
+        The swarm searches it on a logarithmic scale (lower > 0): for what is known to an order of magnitude. IPOPT
+        works in the variable itself, in units of its start.
+    fixed : bool
+        Held at `guess`, and no unknown: the way to try a variant with this quantity known.
+    unit : str
+        For tables.
+
+    Attributes
+    ----------
+    declared : str
+        File and line of its declaration.
+
+    Raises
+    ------
+    InputError
+        Where bounds are reversed, infinite or of another shape, or the guess is outside them.
+
+    Examples
+    --------
+    >>> import casadi as ca
+    >>> import sysid
+    >>> k = sysid.Variable("storey stiffness", 3, lower=1e5, upper=1e7, log=True, unit="N/m")
+    >>> K = ca.diag(k) + ca.diag(ca.vertcat(k[1:], 0))
+    >>> K.shape
+    (3, 3)
+    """
+
+    # NumPy leaves mixed arithmetic to the methods below.
+    __array_priority__ = 2000.0
+    # Comparison makes a constraint, so a variable is equal to itself only.
+    __hash__ = object.__hash__
+
+    def __init__(
+        self,
+        name: str,
+        shape: int | Sequence[int] = (),
+        *,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        guess: ArrayLike | None = None,
+        log: bool = False,
+        fixed: bool = False,
+        unit: str = "",
+    ) -> None:
+        self.declared = user_site()
+        if not isinstance(name, str) or not name:
+            raise InputError(f"a Variable ({self.declared}) needs a name, and {name!r} is none")
+        self.name, self.log, self.fixed, self.unit = name, bool(log), bool(fixed), str(unit)
+        self.used = False  # whether it entered a problem
+        self.shape = self._check_shape(shape)
+        lower, upper = self._flat("lower", lower), self._flat("upper", upper)
+        self.lower, self.upper = lower, upper
+        if not (np.all(np.isfinite(lower)) and np.all(np.isfinite(upper))):
+            self._refuse(
+                "its bounds are not all finite; the search space must be bounded (state the widest you believe)"
+            )
+        if np.any(lower > upper):
+            at = int(np.argmax(lower > upper))
+            self._refuse(f"its bounds are reversed: lower {lower[at]:g} is above upper {upper[at]:g}")
+        if not fixed and np.all(lower == upper):
+            self._refuse(f"its bounds are equal ({lower[0]:g}): state fixed=True with a guess for what is known")
+        if log and np.any(lower <= 0):
+            self._refuse(f"log=True needs positive bounds, and lower is {lower.min():g}")
+        if fixed and guess is None:
+            self._refuse("fixed=True needs a guess, at which it is held")
+        middle = np.exp((np.log(lower) + np.log(upper)) / 2) if log else (lower + upper) / 2
+        middle = np.clip(middle, lower, upper)
+        self.has_guess = guess is not None
+        self.guess: Array = middle if guess is None else self._flat("guess", guess)
+        if not np.all(np.isfinite(self.guess)):
+            self._refuse("its guess is not finite")
+        if np.any((self.guess < lower) | (self.guess > upper)):
+            at = int(np.argmax((self.guess < lower) | (self.guess > upper)))
+            self._refuse(f"its guess {self.guess[at]:g} is outside the bounds {lower[at]:g} to {upper[at]:g}")
+        rows_columns = (*self.shape, 1, 1)[:2]
+        self.symbol = ca.MX.sym(self.name, *rows_columns)
+        self.order = len(_declared)
+        _declared[self.symbol.__hash__()] = self
+
+    def _check_shape(self, shape: int | Sequence[int]) -> tuple[int, ...]:
+        given = (shape,) if isinstance(shape, int | np.integer) else shape
+        try:
+            sizes = tuple(0 if isinstance(size, bool) else operator.index(size) for size in given)
+        except TypeError:
+            sizes = (0,)
+        if len(sizes) > 2 or any(size < 1 for size in sizes):
+            self._refuse(f"its shape {shape!r} is not (), n or (n, m)")
+        return sizes
+
+    def _flat(self, what: str, value: ArrayLike) -> Array:
+        """Entries column by column, as CasADi has them."""
+        try:
+            value = np.asarray(value).reshape(self.shape) if isinstance(value, ca.DM) else value
+            array = np.broadcast_to(np.asarray(value, dtype=float), self.shape)
+        except (TypeError, ValueError):
+            self._refuse(f"{what} = {value!r} is no number, nor numbers of its shape {self.shape}")
+        return array.ravel(order="F").copy()
+
+    def _refuse(self, what: str) -> None:
+        raise InputError(f"variable {self.name!r} ({self.declared}): {what}")
+
+    @property
+    def size(self) -> int:
+        """Number of scalar unknowns."""
+        return int(self.lower.size)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """A name an entry: ``k``, or ``k[0]``, or ``k[0,1]``, column by column."""
+        if self.size == 1:
+            return (self.name,)
+        at = np.unravel_index(np.arange(self.size), self.shape, order="F")
+        return tuple(f"{self.name}[{','.join(map(str, index))}]" for index in zip(*at, strict=True))
+
+    @property
+    def sampling(self) -> Callable[[ca.SX], ca.SX] | None:
+        """As in `Block`."""
+        if not self.log:
+            return None
+        return log_sampling(self.lower, self.upper)[0]
+
+    @property
+    def unsampling(self) -> Callable[[Array], Array] | None:
+        """As in `Block`."""
+        if not self.log:
+            return None
+        return log_sampling(self.lower, self.upper)[1]
+
+    def shaped(self, flat: Array) -> Array:
+        """Numbers of the variable's entries, column by column, as an array of its shape."""
+        return np.reshape(flat, self.shape, order="F")
+
+    def __repr__(self) -> str:
+        unit = f" {self.unit}" if self.unit else ""
+        shape = "" if not self.shape else f", shape {self.shape}"
+        return f"<Variable {self.name}: {self.lower.min():g} to {self.upper.max():g}{unit}{shape}>"
+
+    # -- what makes it an expression --------------------------------------------------------------
+
+    def __MX__(self) -> ca.MX:  # noqa: N802 - CasADi looks for this name
+        return self.symbol
+
+    def __getattr__(self, name: str) -> Any:
+        # What Variable does not have itself, such as `.T`, is the symbol's.
+        if name.startswith("_") or name == "symbol":
+            raise AttributeError(name)
+        return getattr(self.symbol, name)
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
+        return self.symbol.__array_ufunc__(ufunc, method, *map(expression_of, inputs), **options)
+
+    def __getitem__(self, index: Any) -> ca.MX:
+        try:
+            return self.symbol[index]
+        except RuntimeError:
+            raise InputError(
+                f"variable {self.name!r} ({self.declared}) has no entry [{index}]: its shape is {self.shape}"
+            ) from None
+
+    def __len__(self) -> int:
+        if not self.shape:
+            raise TypeError(f"variable {self.name!r} is a scalar and has no length")
+        return self.shape[0]
+
+    def __iter__(self) -> Any:
+        return iter([self.symbol[i, :] if len(self.shape) == 2 else self.symbol[i] for i in range(len(self))])
+
+    def __pos__(self) -> ca.MX:
+        return self.symbol
+
+    def __neg__(self) -> ca.MX:
+        return -self.symbol
+
+    def __abs__(self) -> ca.MX:
+        return ca.fabs(self.symbol)
+
+    def __add__(self, other: Any) -> ca.MX:
+        return self.symbol + expression_of(other)
+
+    def __radd__(self, other: Any) -> ca.MX:
+        return expression_of(other) + self.symbol
+
+    def __sub__(self, other: Any) -> ca.MX:
+        return self.symbol - expression_of(other)
+
+    def __rsub__(self, other: Any) -> ca.MX:
+        return expression_of(other) - self.symbol
+
+    def __mul__(self, other: Any) -> ca.MX:
+        return self.symbol * expression_of(other)
+
+    def __rmul__(self, other: Any) -> ca.MX:
+        return expression_of(other) * self.symbol
+
+    def __truediv__(self, other: Any) -> ca.MX:
+        return self.symbol / expression_of(other)
+
+    def __rtruediv__(self, other: Any) -> ca.MX:
+        return expression_of(other) / self.symbol
+
+    def __pow__(self, other: Any) -> ca.MX:
+        return self.symbol ** expression_of(other)
+
+    def __rpow__(self, other: Any) -> ca.MX:
+        return expression_of(other) ** self.symbol
+
+    def __matmul__(self, other: Any) -> ca.MX:
+        return self.symbol @ expression_of(other)
+
+    def __rmatmul__(self, other: Any) -> ca.MX:
+        return expression_of(other) @ self.symbol
+
+    def __le__(self, other: Any) -> ca.MX:
+        return self.symbol <= expression_of(other)
+
+    def __ge__(self, other: Any) -> ca.MX:
+        return self.symbol >= expression_of(other)
+
+    def __lt__(self, other: Any) -> ca.MX:
+        return self.symbol < expression_of(other)
+
+    def __gt__(self, other: Any) -> ca.MX:
+        return self.symbol > expression_of(other)
+
+    def __eq__(self, other: object) -> Any:
+        return self.symbol == expression_of(other)
+
+    def __ne__(self, other: object) -> Any:
+        return self.symbol != expression_of(other)
+
+
+# The one global of the package: a CasADi symbol knows no Python object, so this is how an expression's symbols lead
+# back to the variables that they stand for. A variable is a few hundred bytes.
+_declared: dict[int, Variable] = {}
+
+
+def variable_of(symbol: ca.MX) -> Variable | None:
+    """The variable that a symbol stands for; None for any other symbol."""
+    return _declared.get(symbol.__hash__())
+
+
+def declared() -> tuple[Variable, ...]:
+    """All variables of this process, in the order of their declaration."""
+    return tuple(_declared.values())
+
+
+def expression_of(value: Any) -> Any:
+    """The CasADi symbol of a variable; anything else as it is."""
+    return value.symbol if isinstance(value, Variable) else value
+
+
+def user_frame() -> FrameType | None:
+    """The frame of the user's code that called into the package."""
+    frame: FrameType | None = sys._getframe(1)
+    while frame is not None and _is_ours(frame):
+        frame = frame.f_back
+    return frame
+
+
+def call_site(frame: FrameType | None) -> str:
+    """Where a frame is, for messages: "file, line n"."""
+    return "?" if frame is None else f"{_short(frame.f_code.co_filename)}, line {frame.f_lineno}"
+
+
+def user_site() -> str:
+    """Where the user's code called into the package, for messages."""
+    return call_site(user_frame())
+
+
+def _is_ours(frame: FrameType) -> bool:
+    """Whether a frame is the package's own, or of what carries out its cached properties; bundled problems' are not."""
+    return str(frame.f_globals.get("__name__", "")).split(".")[0] in ("sysid", "functools")
+
+
+def _short(filename: str) -> str:
+    """A path as the user would write it: from here where that is shorter."""
+    try:
+        return str(Path(filename).relative_to(Path.cwd()))
+    except (ValueError, OSError):
+        return filename
+
+
+def log_sampling(lower: Array, upper: Array) -> tuple[Callable[[ca.SX], ca.SX], Callable[[Array], Array]]:
+    """`sampling` and `unsampling` of a `Block` that is searched on a logarithmic scale; bounds may be equal."""
+    width, span = upper - lower, np.log(upper / lower)
+    wide, long = np.where(width > 0, width, 1.0), np.where(span > 0, span, 1.0)
+    return lambda s: lower * ca.exp((s - lower) / wide * span), lambda x: lower + width * np.log(x / lower) / long
+
+
+def steps_of(variables: Iterable[Block | Variable], x: Array) -> Array:
+    """A large step of each unknown, (size of x,): its own size, or a part of its range where that is larger.
+
+    Where a range spans decades (log) it tells nothing about the unknown.
+    """
+    width = [np.zeros(v.size) if isinstance(v, Variable) and v.log else v.upper - v.lower for v in variables]
+    return np.maximum(np.abs(x), _PART * np.concatenate([np.zeros(0), *width]))
+
+
+def slices_of(variables: Iterable[Block | Variable]) -> list[slice]:
+    """Where each variable stands in the vector of all unknowns."""
+    ends = np.cumsum([0, *(variable.size for variable in variables)]).tolist()
+    return [slice(a, b) for a, b in pairwise(ends)]
+
+
+def by_name(variables: Iterable[Block | Variable], x: Array) -> dict[str, Array]:
+    """Numbers of all unknowns as one array a variable, in its shape."""
+    variables = tuple(variables)
+    pieces = zip(variables, split(variables, x), strict=True)
+    return {v.name: v.shaped(part) if isinstance(v, Variable) else part for v, part in pieces}
+
+
+def split(variables: Iterable[Block | Variable], x: ca.SX | Array) -> list:
+    """Cut a vector of all unknowns into one piece a variable."""
+    return [x[part] for part in slices_of(variables)]

@@ -1,0 +1,203 @@
+"""A nonlinear program: unknowns, equalities and bounds collected piece by piece, one run of IPOPT, its monitor."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating[Any]]
+
+OBJECTIVE_SCALE = 1e3  # lifts a residual of 1e-8 above IPOPT's tolerance
+EXACT = 1e-8  # a relative residual that needs no second look
+_TOLERANCE = 1e-9  # of IPOPT
+
+
+class Coordinates:
+    """Unknowns z of the nonlinear programme, and the equalities and inequalities that tie them."""
+
+    def __init__(self) -> None:
+        self.pieces: list[ca.MX] = []
+        self.names: list[str] = []
+        self.labels: list[str] = []
+        self.start: list[Array] = []
+        self.lower: list[Array] = []
+        self.upper: list[Array] = []
+        self.ties: list[ca.MX] = []
+        self._tie_lower: list[Array] = []
+        self._tie_upper: list[Array] = []
+
+    @property
+    def z(self) -> ca.MX:
+        """All unknowns, (p, 1)."""
+        return ca.vertcat(*self.pieces)
+
+    def add(
+        self,
+        name: str,
+        start: Array,
+        lower: Array | float = -np.inf,
+        upper: Array | float = np.inf,
+        labels: Sequence[str] | None = None,
+    ) -> ca.MX:
+        """Further unknowns of the shape of `start`.
+
+        In messages `labels` follow the name; without them the unknowns are numbered from 1.
+        """
+        shape = start.shape if start.ndim == 2 else (start.size, 1)
+        symbol = ca.MX.sym(name, *shape)
+        self.pieces.append(ca.vec(symbol))
+        self.names += [name] * start.size
+        self.labels += labels or [f" {i + 1}" for i in range(start.size)]
+        self.start.append(start.ravel(order="F"))
+        self.lower.append(np.broadcast_to(lower, start.shape).ravel(order="F"))
+        self.upper.append(np.broadcast_to(upper, start.shape).ravel(order="F"))
+        return symbol
+
+    def tie(self, expression: ca.MX, lower: Array | float = 0.0, upper: Array | float = 0.0) -> None:
+        """Hold an expression, a column, between bounds; at zero by default."""
+        self.ties.append(expression)
+        self._tie_lower.append(np.broadcast_to(lower, expression.numel()))
+        self._tie_upper.append(np.broadcast_to(upper, expression.numel()))
+
+    def minimize(
+        self,
+        objective: ca.MX,
+        watch: Watch,
+        max_iterations: int,
+        derivatives: dict[str, ca.Function] | None = None,
+        *,
+        acceptable: float = 1e2,
+    ) -> tuple[Array, str]:
+        """Run IPOPT on `objective`, which is 1 where nothing is explained; the unknowns at its end, and its status.
+
+        `derivatives` are functions in the place of CasADi's own, as `nlpsol` names them; `acceptable` is the tolerance
+        that five iterates in a row must meet, in units of the tolerance. Where the watch was stopped
+        the status is "stopped", and the unknowns are the last iterate's.
+        """
+        z = self.z
+        ties = ca.vertcat(*self.ties) if self.ties else ca.MX(0, 1)
+        nlp = {"x": z, "f": OBJECTIVE_SCALE * objective, "g": ties}
+        lower, upper = np.concatenate(self.lower), np.concatenate(self.upper)
+        tie_lower, tie_upper = (np.concatenate([np.zeros(0), *part]) for part in (self._tie_lower, self._tie_upper))
+        start = np.clip(np.concatenate(self.start), lower, upper)
+        call = watch.callback(start, ties.numel())
+
+        def run(at: Array, tolerance: float) -> tuple[str, Array]:
+            limits: dict[str, float] = {"max_iter": max_iterations}
+            if np.isfinite(watch.left):
+                limits["max_wall_time"] = max(watch.left, 0.1)
+            options = {
+                "print_time": False,
+                "show_eval_warnings": False,  # a step too long is IPOPT's to shorten
+                "iteration_callback": call,
+                "ipopt": {
+                    "print_level": 0, "sb": "yes", "tol": tolerance, "acceptable_tol": acceptable * tolerance,
+                    "acceptable_iter": 5, "constr_viol_tol": 1e-11, "mu_strategy": "adaptive", **limits,
+                },
+                **(derivatives or {}),
+            }  # fmt: skip
+            solver = ca.nlpsol("local", "ipopt", nlp, options)
+            answer = solver(x0=at, lbx=lower, ubx=upper, lbg=tie_lower, ubg=tie_upper)
+            return solver.stats()["return_status"], np.asarray(answer["x"]).ravel()
+
+        try:
+            status, best = run(start, _TOLERANCE)
+            if status == "Search_Direction_Becomes_Too_Small" and watch.stopped is None:
+                # Noise can leave the gradient's round-off above the tolerance: the same point is judged by a wider one.
+                status, best = run(best, 1e3 * _TOLERANCE)
+        except KeyboardInterrupt as interrupt:
+            watch.stopped = interrupt
+        if watch.stopped is not None:
+            return watch.z, "stopped"
+        return best, status
+
+    def on_bounds(self, at: Array) -> str:
+        """Which unknowns press against a finite bound at a solution, in words."""
+        lower, upper = np.concatenate(self.lower), np.concatenate(self.upper)
+        free = upper > lower  # what is held fixed rests on no bound
+        with np.errstate(invalid="ignore"):
+            near = 1e-6 * np.where(np.isfinite(upper - lower), upper - lower, 1.0)
+            low, high = np.isfinite(lower) & (at - lower < near), np.isfinite(upper) & (upper - at < near)
+        ended: dict[str, list[str]] = {}
+        for name, label, is_low, is_high in zip(self.names, self.labels, low & free, high & free, strict=True):
+            if is_low or is_high:
+                ended.setdefault(name, []).append(f"{label} ({'lower' if is_low else 'upper'})")
+        return "; ".join(
+            f"{name}{','.join(which[:4])}" + (f" and {len(which) - 4} more" if len(which) > 4 else "")
+            for name, which in ended.items()
+        )
+
+
+class Watch:
+    """What happens between the iterations of all attempts: the curve, the monitor, and its wish to stop."""
+
+    def __init__(self, monitor: Callable[[int, float], object] | None, max_time: float | None) -> None:
+        self.monitor = monitor
+        self.deadline = np.inf if max_time is None else time.perf_counter() + max_time
+        self.curve: list[float] = []
+        self.stopped: BaseException | None = None
+        self.z: Array = np.zeros(0)
+
+    @property
+    def left(self) -> float:
+        """Seconds until the deadline."""
+        return self.deadline - time.perf_counter()
+
+    @property
+    def taken(self) -> int:
+        """Iterates so far."""
+        return len(self.curve)
+
+    def callback(self, start: Array, n_ties: int) -> ca.Callback:
+        self.z = start
+        return _IterationCallback(self, start.size, n_ties)
+
+    def take(self, z: Array, objective: float) -> bool:
+        """Take an iterate; whether to stop."""
+        try:
+            self.z = z
+            self.curve.append(float(np.sqrt(max(objective, 0.0) / OBJECTIVE_SCALE)))
+            if self.monitor is not None:
+                self.monitor(len(self.curve) - 1, self.curve[-1])
+        except BaseException as error:  # must not unwind through IPOPT; the caller raises it again
+            self.stopped = error
+        return self.stopped is not None
+
+
+class _IterationCallback(ca.Callback):
+    """CasADi's shape of an iteration callback."""
+
+    def __init__(self, watch: Watch, n: int, n_ties: int) -> None:
+        ca.Callback.__init__(self)
+        self.watch = watch
+        self.sizes = {"x": n, "f": 1, "g": n_ties, "lam_x": n, "lam_g": n_ties, "lam_p": 0}
+        self.construct("iteration", {})
+
+    def get_n_in(self) -> int:
+        """Count the outputs of an nlpsol."""
+        return int(ca.nlpsol_n_out())
+
+    def get_n_out(self) -> int:
+        """Give one flag."""
+        return 1
+
+    def get_name_in(self, i: int) -> str:
+        """Name an nlpsol output."""
+        return str(ca.nlpsol_out(i))
+
+    def get_name_out(self, i: int) -> str:
+        """Name the flag."""
+        return "stop"
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Shapes of the nlpsol outputs."""
+        return ca.Sparsity.dense(self.sizes[ca.nlpsol_out(i)], 1)
+
+    def eval(self, arg: list) -> list:
+        """Hand the iterate on; a nonzero answer stops IPOPT."""
+        return [int(self.watch.take(np.asarray(arg[0]).ravel(), float(arg[1])))]

@@ -1,0 +1,478 @@
+"""The pictures of `sysid.plot`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sysid.errors import InputError
+from sysid.measurement.measurement import Measurement, axis_vector
+from sysid.plot.canvas import (
+    COLOURS,
+    FAINT,
+    INK,
+    colour_bar,
+    count_cells,
+    count_modes,
+    dress,
+    new_axes,
+    new_figure,
+    plain_log,
+)  # fmt: skip
+from sysid.plot.modal_panels import draw_cmif, draw_stabilisation
+from sysid.plot.panels import (
+    band_of,
+    draw,
+    force_channel,
+    index_of,
+    key,
+    panels,
+    place,
+    positive,
+    response_channel,
+    run_index,
+    sensor_index,
+    strongest,
+    with_force,
+)  # fmt: skip
+from sysid.results.identification import Identification
+from sysid.structure.structure import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_MAX_NUMBERS = 12  # modes up to which a MAC's cells carry their numbers
+_MAX_SHAPES = 6
+
+
+def transmissibility(
+    identification: Identification,
+    ax: Axes | Sequence[Axes] | None = None,
+    *,
+    sensor: int | str | None = None,
+    run: int | str | None = None,
+    measurement: Measurement | None = None,
+    band: ArrayLike | None = None,
+) -> Any:
+    """Measured against identified absolute response of one sensor, magnitude and phase.
+
+    For unit runs (FRFs, simulated tests) this is the absolute transmissibility from one base
+    direction. For other runs, in which the whole base moves as it did, it is the spectrum of the
+    sensor's absolute acceleration, and the phase is against the base direction that moved most.
+
+    Parameters
+    ----------
+    identification : Identification
+    ax : Axes or two Axes, optional
+        Magnitude alone, or magnitude and phase; a new figure with both where None.
+    sensor : int or str, optional
+        Index or name; with `run`, the channel with the largest relative acceleration by default.
+    run : int or str, optional
+        Index; of unit runs also the base direction's name, such as "x".
+    measurement : Measurement, optional
+        Another test of the same sensors to predict, such as a validation; the one fitted by default.
+    band : array_like, shape (n_sensors, d, n_freq), optional
+        Standard deviation of the transmissibility at the test's lines, such as `Uncertainty.transmissibility` gives:
+        the 95 % interval of the magnitude is shaded where it is wide enough to be seen.
+
+    Returns
+    -------
+    Figure, Axes or the sequence given
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sysid
+    >>> result = sysid.load("results/cantilever_tower")  # doctest: +SKIP
+    >>> band = result.uncertainty.transmissibility(result.measurement.freq)  # doctest: +SKIP
+    >>> sysid.plot.transmissibility(result, sensor="x5", run="x", band=band)  # doctest: +SKIP
+    """
+    test = identification.measurement if measurement is None else measurement
+    chosen = strongest(test, 1, sensor=sensor, run=run)[0]
+    return place(ax, response_channel(identification, test, *chosen, band=band_of(test, band, test.n_sensors)))
+
+
+def responses(
+    identification: Identification,
+    sensor: int | str,
+    *,
+    measurement: Measurement | None = None,
+    band: ArrayLike | None = None,
+) -> Figure:
+    """All runs of one sensor side by side; see `transmissibility`."""
+    test = identification.measurement if measurement is None else measurement
+    s, std = sensor_index(test, sensor), band_of(test, band, test.n_sensors)
+    return panels([response_channel(identification, test, s, r, band=std) for r in range(test.n_runs)], alone=10.0)
+
+
+def base_force(
+    identification: Identification,
+    ax: Axes | Sequence[Axes] | None = None,
+    *,
+    direction: int | str = 0,
+    run: int | str | None = None,
+    measurement: Measurement | None = None,
+    band: ArrayLike | None = None,
+) -> Any:
+    """Measured against identified force of the base on the structure, magnitude and phase.
+
+    Per unit base acceleration (apparent mass, kg) for unit runs, else the force's spectrum.
+
+    Parameters
+    ----------
+    identification : Identification
+    ax : Axes or two Axes, optional
+    direction : int or str
+        Of the force: index or name of a base direction.
+    run : int or str, optional
+        Index or, of unit runs, name; by default the run in which the base moves most in `direction`.
+    measurement : Measurement, optional
+    band : array_like, shape (d, d, n_freq), optional
+        Standard deviation of the apparent mass at the test's lines, kg, such as `Uncertainty.base_force` gives.
+
+    Returns
+    -------
+    Figure, Axes or the sequence given
+    """
+    test = with_force(identification.measurement if measurement is None else measurement)
+    i = index_of("base direction", direction, test.base_axes or ())
+    r = int(np.argmax(np.linalg.norm(test.base[:, i], axis=-1))) if run is None else run_index(test, run)
+    return place(ax, force_channel(identification, test, i, r, band=band_of(test, band, test.n_base)))
+
+
+def base_forces(
+    identification: Identification,
+    run: int | str,
+    *,
+    measurement: Measurement | None = None,
+    band: ArrayLike | None = None,
+) -> Figure:
+    """All directions of the base force of one run side by side; see `base_force`."""
+    test = with_force(identification.measurement if measurement is None else measurement)
+    r, std = run_index(test, run), band_of(test, band, test.n_base)
+    return panels([force_channel(identification, test, i, r, band=std) for i in range(test.n_base)], alone=10.0)
+
+
+def convergence(identification: Identification, ax: Axes | None = None) -> Any:
+    """Residual through the phases that ran: the swarm's best, the refinement, each iterate of the local phase.
+
+    With a measured force both curves count it too; what is marked after the refinement does not.
+
+    Parameters
+    ----------
+    identification : Identification
+    ax : Axes, optional
+
+    Returns
+    -------
+    Figure or Axes
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    figure, ax = new_axes(ax, 6.0, 3.6)
+    history = identification.history
+    swarm, local = positive(history.swarm_curve), positive(history.local_curve)
+    end = max(swarm.size - 1, 0)
+    if swarm.size:
+        ax.plot(np.arange(swarm.size), swarm, color=COLOURS[0], linewidth=1.6, label="swarm (best so far)")
+    if local.size:
+        # Without a swarm the iterates are few, and may be a single one.
+        marker = None if swarm.size else "o"
+        iterate = end + np.arange(local.size)
+        ax.plot(iterate, local, color=COLOURS[5], linewidth=1.6, marker=marker, markersize=3.5, label="local phase")
+    if swarm.size and local.size:
+        ax.axvline(end, color=FAINT, linewidth=0.8, linestyle=":")
+    if history.refinement > 0:
+        ax.plot([end], [history.refinement], "D", color=INK, markersize=5, label="after refinement", zorder=4)
+    goal = identification.problem.goal
+    if goal is not None:
+        ax.axhline(goal, color=FAINT, linewidth=0.8, linestyle="--", label=f"goal {goal:.3g}")
+    values = np.concatenate([swarm, local, [history.refinement, goal or np.nan]])
+    if np.any(values > 0):
+        low, high = np.nanmin(values[values > 0]), np.nanmax(values)
+        ax.set_yscale("log")
+        # A curve that hardly falls is shown as flat as it is.
+        ax.set_ylim(min(low / (high / low) ** 0.08, 0.6 * low), max(high * (high / low) ** 0.08, 1.6 * high))
+        if high < 30 * low:
+            plain_log(ax.yaxis)
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(frameon=False, fontsize="small")
+    else:
+        ax.text(0.5, 0.5, "no search is recorded", transform=ax.transAxes, ha="center", color=FAINT)
+    both = " (with the force)" if identification.measurement.force is not None else ""
+    if not swarm.size:
+        ax.set_xlim(-0.5, max(local.size, 2) - 0.5)
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    told = "iteration, swarm then local phase" if swarm.size else "iteration"
+    dress(ax, "Convergence", told, f"relative residual{both} [–]")
+    return ax if figure is None else figure
+
+
+def mac(identification: Identification, ax: Axes | None = None) -> Any:
+    """Modal assurance criterion against the reference where one is known, else the AutoMAC.
+
+    Parameters
+    ----------
+    identification : Identification
+    ax : Axes, optional
+
+    Returns
+    -------
+    Figure or Axes
+    """
+    values = identification.mac
+    known = identification.problem.reference is not None
+    side = min(2.6 + 0.3 * max(values.shape), 7.0)
+    figure, ax = new_axes(ax, side + 0.6, side)
+    image = ax.imshow(values, cmap="Blues", vmin=0, vmax=1, origin="lower")
+    count_cells(ax, values.shape)
+    if max(values.shape) <= _MAX_NUMBERS:
+        size = 8 if max(values.shape) <= 6 else 6
+        for (i, j), value in np.ndenumerate(values):
+            if value >= 0.005:
+                colour = "white" if value > 0.55 else INK
+                ax.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=size, color=colour)
+    colour_bar(image, ax, "MAC [–]")
+    other = "mode of the reference" if known else "mode"
+    dress(ax, "MAC against the reference" if known else "AutoMAC", other, "identified mode", grid=False)
+    return ax if figure is None else figure
+
+
+def effective_masses(identification: Identification, ax: Axes | None = None) -> Any:
+    """Effective mass of each mode (bars) and their running sum (lines), % of the rigid-body mass.
+
+    Parameters
+    ----------
+    identification : Identification
+    ax : Axes, optional
+
+    Returns
+    -------
+    Figure or Axes
+    """
+    structure = identification.structure
+    names = identification.measurement.base_axes or ()
+    share = structure.effective_mass_percent
+    modes = np.arange(1, structure.n + 1)
+    figure, ax = new_axes(ax, min(5.0 + 0.18 * structure.n, 9.0), 3.6)
+    width = 0.8 / structure.n_base
+    for i, name in enumerate(names):
+        colour = COLOURS[i % len(COLOURS)]
+        total = np.cumsum(share[:, i])
+        at = modes + (i - (structure.n_base - 1) / 2) * width
+        ax.bar(at, share[:, i], width, color=colour, alpha=0.85, label=f"base {name}")
+        ax.plot(modes, total, color=colour, linewidth=1.2, marker="o", markersize=3)
+        reference = identification.problem.reference
+        if reference is not None and reference.n == structure.n:
+            last = i == structure.n_base - 1
+            size = max(80 / (structure.n * structure.n_base), 4)
+            label = "reference" if last else None
+            ax.plot(at, reference.effective_mass_percent[:, i], "_", color=INK, markersize=size, label=label)
+    ax.axhline(100, color=FAINT, linewidth=0.8, linestyle=":")
+    ax.set_ylim(0, max(105.0, 1.05 * float(np.cumsum(share, axis=0).max())))
+    count_modes(ax, structure.n)
+    ax.legend(frameon=False, fontsize="small", loc="center right")
+    dress(ax, "Effective masses and their sum", "mode", "% of rigid-body mass")
+    return ax if figure is None else figure
+
+
+def matrices(identification: Identification, ax: Sequence[Axes] | None = None) -> Any:
+    """Heat maps of M_SS, K_SS and C, each entry over the root of its two diagonal entries.
+
+    Parameters
+    ----------
+    identification : Identification
+    ax : three Axes, optional
+
+    Returns
+    -------
+    Figure, or the axes given
+    """
+    figure = None
+    if ax is None:
+        figure = new_figure(10.0, 3.6)
+        ax = figure.subplots(1, 3)
+    structure = identification.structure
+    n = structure.n
+    blocks = {"$M_{SS}$": structure.mass[:n, :n], "$K_{SS}$": structure.stiffness[:n, :n], "$C$": structure.damping}
+    for one, (name, matrix) in zip(ax, blocks.items(), strict=True):
+        image = one.imshow(normalised(matrix), cmap="RdBu_r", vmin=-1, vmax=1)
+        count_cells(one, matrix.shape)
+        dress(one, name, "degree of freedom", "degree of freedom" if one is ax[0] else "", grid=False, math=True)
+    colour_bar(image, list(ax), r"$a_{ij} / \sqrt{a_{ii} a_{jj}}$ [–]")
+    return ax if figure is None else figure
+
+
+def mode_shapes(identification: Identification, modes: Sequence[int] | None = None) -> Figure:
+    """Mode shapes in space, one panel a mode: sticks join neighbouring sensors, grey at rest.
+
+    Parameters
+    ----------
+    identification : Identification
+    modes : sequence of int, optional
+        From 1; the first six by default.
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    InputError
+        Where the sensors have no positions, or all the same.
+    """
+    points, motion, sticks = _geometry(identification)
+    structure = identification.structure
+    chosen = range(1, min(structure.n, _MAX_SHAPES) + 1) if modes is None else modes
+    if any(not 1 <= k <= structure.n for k in chosen):
+        raise InputError(f"modes {list(chosen)}: this structure has modes 1 to {structure.n}")
+    columns = min(len(chosen), 6)
+    rows = -(-len(chosen) // columns)
+    figure = new_figure(max(1.9 * columns, 3.0), 2.7 * rows)
+    extent = np.ptp(points, axis=0)
+    box = np.maximum(extent, 0.35 * extent.max())
+    centre = (points.max(axis=0) + points.min(axis=0)) / 2
+    for at, k in enumerate(chosen):
+        ax: Any = figure.add_subplot(rows, columns, at + 1, projection="3d")
+        shape = motion @ structure.mode_shapes[:, k - 1]
+        moved = points + 0.18 * extent.max() * shape / np.abs(shape).max()
+        for where, style in (
+            (points, {"color": "#c3cad2", "linewidth": 1.0}),
+            (moved, {"color": COLOURS[0], "linewidth": 1.6, "marker": "o", "markersize": 2.5}),
+        ):
+            for i, j in sticks:
+                ax.plot(*where[[i, j]].T, **style)
+        for name, middle, size in zip("xyz", centre, box, strict=True):
+            getattr(ax, f"set_{name}lim")(middle - 0.7 * size, middle + 0.7 * size)
+            getattr(ax, f"set_{name}label")(f"{name} [m]", fontsize=7, labelpad=-6, color=INK)
+            axis = getattr(ax, f"{name}axis")
+            axis.set_pane_color((1, 1, 1, 0))
+            axis.set_tick_params(labelsize=6, pad=-3, labelcolor=FAINT)
+            axis.get_major_locator().set_params(nbins=3)
+            if size < 0.5 * box.max():
+                getattr(ax, f"set_{name}ticks")([])  # no room for numbers
+        ax.grid(False)
+        ax.set_box_aspect(box.tolist(), zoom=1.05)  # a list: an array would be scaled in place
+        ax.view_init(elev=20, azim=-50)
+        ax.set_title(f"mode {k}: {structure.natural_frequencies[k - 1]:.4g} Hz", fontsize=9, color=INK)
+    return figure
+
+
+def stabilisation(subject: Identification | Measurement, ax: Axes | None = None) -> Any:
+    """Stabilisation diagram: poles of models of rising order (pLSCF), a second opinion beside the modes found.
+
+    A mode is a column of poles that stay where they are; behind them stands the largest singular value of the FRFs of
+    relative acceleration. Dashed lines are the modes of the result or, for a measurement alone, those that vector
+    fitting finds. Where no FRF follows from the runs, the spectra and the modes are shown without poles, and why.
+
+    Parameters
+    ----------
+    subject : Identification or Measurement
+    ax : Axes, optional
+
+    Returns
+    -------
+    Figure or Axes
+
+    See Also
+    --------
+    sysid.stabilisation.stabilisation : The same as numbers.
+    """
+    figure, ax = new_axes(ax, 6.4, 4.2)
+    draw_stabilisation(ax, subject)
+    return ax if figure is None else figure
+
+
+def cmif(subject: Identification | Measurement, ax: Axes | None = None) -> Any:
+    """Complex mode indicator function: singular values of the FRFs of relative acceleration over frequency.
+
+    Two that peak at one line are two modes there. Dashed lines as in `stabilisation`. Where no FRF follows from the
+    runs, the singular values are those of the runs' own spectra, and the picture says so.
+
+    Parameters
+    ----------
+    subject : Identification or Measurement
+    ax : Axes, optional
+
+    Returns
+    -------
+    Figure or Axes
+
+    See Also
+    --------
+    sysid.stabilisation.cmif : The same as numbers.
+    """
+    figure, ax = new_axes(ax, 6.4, 3.8)
+    draw_cmif(ax, subject)
+    return ax if figure is None else figure
+
+
+def overview(identification: Identification, *, title: str | None = None) -> Figure:
+    """One figure that tells the result: three responses, convergence or poles, MAC, effective masses.
+
+    Parameters
+    ----------
+    identification : Identification
+    title : str, optional
+
+    Returns
+    -------
+    Figure
+        12 in wide: 1200 pixels at 100 dpi.
+    """
+    test = identification.measurement
+    figure = new_figure(12.0, 7.4)
+    top, bottom = np.ravel(np.asarray(figure.subfigures(2, 1, height_ratios=[1.08, 1]), dtype=object))
+    chosen = strongest(test, min(3, test.n_sensors))
+    above = top.subplots(2, len(chosen), height_ratios=[2.3, 1], sharex="col", squeeze=False)
+    for column, (sensor, run) in enumerate(chosen):
+        channel = response_channel(identification, test, sensor, run)
+        draw(above[:, column], channel)
+        if column:
+            for ax in above[:, column]:
+                ax.set_ylabel("")
+    above[0, 0].legend(handles=key(above[0, 0]), frameon=False, fontsize="small")
+    below = bottom.subplots(1, 3, width_ratios=[1.15, 1, 1.25])
+    if identification.history.swarm_curve.size:
+        convergence(identification, below[0])
+    else:
+        stabilisation(identification, below[0])
+    mac(identification, below[1])
+    effective_masses(identification, below[2])
+    if title is None:
+        from pathlib import PurePath
+
+        recipe = identification.recipe
+        head = f"{PurePath(recipe.module).stem}: " if recipe else ""
+        title = f"{head}{test.n_sensors} sensors, {test.n_base} base directions, residual {identification.residual:.2e}"
+    figure.suptitle(title, fontsize=13, color=INK, parse_math=False)
+    return figure
+
+
+def normalised(matrix: Array) -> Array:
+    """Each entry over the root of its two diagonal entries; zero where one of these is."""
+    root = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    outer = np.outer(root, root)
+    return np.divide(matrix, outer, out=np.zeros_like(outer), where=outer > 0)
+
+
+def _geometry(identification: Identification) -> tuple[Array, Array, list[tuple[int, int]]]:
+    """Points (p, 3); each sensor's share in their motion (p, 3, n_sensors); pairs of points that a stick joins."""
+    from scipy.sparse.csgraph import minimum_spanning_tree
+    from scipy.spatial.distance import pdist, squareform
+
+    sensors = identification.measurement.sensors
+    if sensors is None:
+        raise InputError("mode_shapes: the sensors are not described; give the measurement sysid.Sensor objects")
+    points, owner = np.unique(np.array([s.position for s in sensors], float).round(9), axis=0, return_inverse=True)
+    if len(points) < 2:
+        raise InputError("mode_shapes: all sensors are described at one place; positions are needed")
+    motion = np.zeros((len(points), 3, len(sensors)))
+    for s, (sensor, p) in enumerate(zip(sensors, np.ravel(owner), strict=True)):
+        motion[p, :, s] = axis_vector(sensor.axis)
+    tree = minimum_spanning_tree(squareform(pdist(points))).tocoo()
+    return points, motion, list(zip(tree.row.tolist(), tree.col.tolist(), strict=True))

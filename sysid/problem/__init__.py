@@ -1,0 +1,1 @@
+"""The least-squares problem: unknowns, matrices, terms, constraints."""

@@ -1,0 +1,185 @@
+"""A static page from pieces: text, tables, pictures; nothing that runs, nothing from elsewhere."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from sysid.plot.canvas import to_png
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from sysid.structure.structure import Array
+
+ROUND_OFF = 1e-12
+_WIDE = 11  # columns beyond which a table is printed smaller
+
+STYLE = """
+:root { --ink: #1f2430; --soft: #5a6472; --line: #dde2e7; --good: #0a7d5a; --warn: #b36b00; --bad: #b3261e; }
+* { box-sizing: border-box; }
+body { margin: 0 auto; padding: 2rem 1.5rem 4rem; max-width: 1120px; color: var(--ink); background: #fff;
+  font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", "DejaVu Sans", sans-serif; }
+h1 { font-size: 1.7rem; margin: 0 0 .2rem; overflow-wrap: anywhere; }
+h2 { font-size: 1.25rem; margin: 2.6rem 0 .6rem; padding-bottom: .25rem; border-bottom: 1px solid var(--line); }
+h3 { font-size: 1rem; margin: 1.4rem 0 .4rem; }
+p { margin: .5rem 0; max-width: 72ch; } ul { margin: .3rem 0; padding-left: 1.3rem; max-width: 72ch; }
+.pair { display: flex; flex-wrap: wrap; gap: 0 1.5rem; align-items: flex-start; }
+.pair figure { flex: 1 1 420px; min-width: 0; }
+.mark { border: 1px solid #c6ccd3; border-radius: 3px; padding: 0 .4em; margin-right: .5em; color: var(--soft);
+  background: #f1f3f5; font-size: .8rem; white-space: nowrap; }
+td small { display: block; color: var(--soft); font-size: .82em; line-height: 1.25; }
+details { border-bottom: 1px solid var(--line); } summary { cursor: pointer; padding: .35rem 0; }
+.soft, figcaption { color: var(--soft); font-size: .9rem; }
+.verdict { border: 1px solid var(--line); border-left: 6px solid var(--soft); border-radius: 4px; padding: .7rem 1rem;
+  margin: 1rem 0; overflow-wrap: anywhere; }
+.verdict strong { font-size: 1.1rem; }
+.good { border-left-color: var(--good); } .warn { border-left-color: var(--warn); }
+.bad { border-left-color: var(--bad); }
+.scroll { overflow-x: auto; margin: .6rem 0 1rem; break-inside: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .88rem; }
+th, td { padding: .2rem .65rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
+thead th { border-bottom: 1.5px solid var(--soft); vertical-align: bottom; font-weight: 600;
+  white-space: normal; max-width: 9em; }
+.words td, .words th { text-align: left; }
+th:first-child, td:first-child { text-align: left; font-weight: 500; }
+figure { margin: .8rem 0 1.2rem; break-inside: avoid; } img { max-width: 100%; height: auto; display: block; }
+pre { background: #f5f7f9; padding: .8rem 1rem; overflow-x: auto; font-size: .82rem; line-height: 1.45; }
+nav { margin: .8rem 0; font-size: .9rem; } nav a { color: #0b5c96; margin-right: 1rem; white-space: nowrap; }
+@media print { body { max-width: none; padding: 0; font-size: 10pt; } nav { display: none; }
+  details::details-content { content-visibility: visible; block-size: auto; }
+  .scroll { overflow: visible; } table { font-size: 7.5pt; } .wide { font-size: 5.5pt; }
+  th, td { padding: .1rem .3rem; }
+  h2 { break-after: avoid; } pre { white-space: pre-wrap; } }
+"""
+
+
+class Cell(NamedTuple):
+    """A cell of a table, with smaller lines below its value."""
+
+    value: object
+    below: tuple[str, ...] = ()
+
+
+def text(value: object) -> str:
+    """Escape anything for use inside an element or a quoted attribute."""
+    return html.escape(str(value), quote=True)
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """Write a number with so many significant digits; a dash for what is not there."""
+    if value is None or not np.isfinite(value):
+        return "–"
+    return f"{value + 0.0:.{digits}g}"  # a zero has no sign
+
+
+def paragraph(value: object, kind: str = "") -> str:
+    """Set a paragraph of plain text."""
+    return f"<p{_class(kind)}>{text(value)}</p>"
+
+
+def bullets(sentences: Iterable[object]) -> str:
+    """Set a list of plain sentences; nothing where there are none."""
+    items = "".join(f"<li>{text(s)}</li>" for s in sentences)
+    return f"<ul>{items}</ul>" if items else ""
+
+
+def mark(words: str) -> str:
+    """Set a grey label; nothing where there are no words."""
+    return f'<span class="mark">{text(words)}</span>' if words else ""
+
+
+def fold(heading: object, content: str, *, opened: bool = False) -> str:
+    """Set content that its heading unfolds."""
+    return f"<details{' open' if opened else ''}><summary>{text(heading)}</summary>\n{content}\n</details>"
+
+
+def beside(*parts: str) -> str:
+    """Set figures beside each other where there is room."""
+    return f'<div class="pair">{"".join(parts)}</div>'
+
+
+def table(
+    head: Sequence[object],
+    rows: Iterable[Sequence[object]],
+    caption: object = "",
+    *,
+    words: bool = False,
+    label: str = "",
+) -> str:
+    """Set a table in a box that scrolls: numbers to the right, or words to the left.
+
+    Cells are plain, or a `Cell`; `label` is a grey mark before the caption.
+    """
+    above = _caption(caption, label)
+    kind = _class("words" if words else "wide" if len(head) > _WIDE else "")
+    names = "".join(f'<th scope="col">{text(cell)}</th>' for cell in head)
+    body = "".join("<tr>" + "".join(f"<td>{_cell(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    top = f"<thead><tr>{names}</tr></thead>" if any(head) else ""
+    return f'<figure class="scroll">{above}<table{kind}>{top}<tbody>{body}</tbody></table></figure>'
+
+
+def matrix(
+    values: Array,
+    rows: Sequence[object],
+    columns: Sequence[object],
+    caption: object,
+    *,
+    below: Sequence[Sequence[tuple[str, ...]]] | None = None,
+    label: str = "",
+) -> str:
+    """Set a matrix with named rows and columns, four significant digits; what is round-off beside the largest is 0.
+
+    `below` holds smaller lines for each entry.
+    """
+    values = np.where(np.abs(values) > ROUND_OFF * np.abs(values).max(), values, 0.0)
+    lines: list[list[object]] = []
+    for i, (name, line) in enumerate(zip(rows, values.tolist(), strict=True)):
+        under = [()] * len(line) if below is None else below[i]
+        lines.append([name, *(Cell(number(v), lower) for v, lower in zip(line, under, strict=True))])
+    return table(["", *columns], lines, caption, label=label)
+
+
+def picture(
+    figure: Figure, alt: object, caption: object = "", *, dpi: float = 130, colours: int | None = 128, label: str = ""
+) -> str:
+    """Embed a figure as PNG; shown at 92 pixels an inch, so that it is sharp on paper and on dense screens."""
+    width = round(92 * float(figure.get_size_inches()[0]))
+    data = base64.b64encode(to_png(figure, dpi=dpi, colours=colours)).decode("ascii")
+    below = _caption(caption, label)
+    return f'<figure><img width="{width}" alt="{text(alt)}" src="data:image/png;base64,{data}">{below}</figure>'
+
+
+def page(title: object, head: str, sections: Iterable[tuple[str, str]]) -> str:
+    """Join the sections, (heading, content), to a page with links to each; empty ones are left out."""
+    kept = [(name, content) for name, content in sections if content]
+    links = " ".join(f'<a href="#s{i}">{text(name)}</a>' for i, (name, _) in enumerate(kept))
+    body = "\n".join(
+        f'<section><h2 id="s{i}">{text(name)}</h2>\n{content}\n</section>' for i, (name, content) in enumerate(kept)
+    )
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta http-equiv="Content-Security-Policy" '
+        "content=\"default-src 'none'; img-src data:; style-src 'unsafe-inline'\">\n"
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{text(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
+        f"<h1>{text(title)}</h1>\n{head}\n<nav>{links}</nav>\n{body}\n</body>\n</html>\n"
+    )
+
+
+def _cell(cell: object) -> str:
+    if not isinstance(cell, Cell):
+        return text(cell)
+    return text(cell.value) + "".join(f"<small>{text(line)}</small>" for line in cell.below)
+
+
+def _caption(words: object, label: str) -> str:
+    return f"<figcaption>{mark(label)}{text(words)}</figcaption>" if words or label else ""
+
+
+def _class(kind: str) -> str:
+    return f' class="{kind}"' if kind else ""

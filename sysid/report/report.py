@@ -1,0 +1,416 @@
+"""The report: one self-contained static page that tells an identification, from the verdict to the log."""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePath
+from typing import NamedTuple
+
+import numpy as np
+
+from sysid import plot
+from sysid.errors import InputError
+from sysid.measurement.measurement import Measurement
+from sysid.models.damping import DampingModel
+from sysid.models.mass import FullMass, MassModel
+from sysid.models.stiffness import StiffnessModel
+from sysid.plot.panels import is_unit, run_names
+from sysid.report.html import Cell, beside, bullets, fold, matrix, number, page, paragraph, picture, table, text
+from sysid.report.matrices import CHOSEN, ONE_OF_MANY, SAME, half_widths, matrices, stated
+from sysid.results.identification import Identification
+from sysid.results.storage import atomically, file_or_folder
+from sysid.results.summary import half_width, is_one_of_many, mass_percent_std, next_steps, verdict
+from sysid.results.unknowns_table import rows_of, stated_values
+from sysid.structure.structure import Array, ComplexArray, Structure
+
+FILE_NAME = "report.html"
+_SUFFIXES = (".html", ".htm")
+_MANY_PANELS = 40  # beyond which the pictures are drawn with fewer pixels
+
+
+class Scores(NamedTuple):
+    """``1 - ‖predicted - measured‖ / ‖measured‖`` of each sensor over all runs and lines, (n_sensors,).
+
+    NaN where nothing was measured. ``relative`` and ``absolute`` are the model's, on the accelerations
+    relative to the base and as recorded; ``rigid`` is what "the sensors move with the base" scores
+    on those recorded (on the relative ones it scores 0).
+    """
+
+    relative: Array
+    absolute: Array
+    rigid: Array
+
+
+def scores(structure: Structure, test: Measurement) -> Scores:
+    """How well `structure` predicts a test, sensor by sensor; 1 is perfect."""
+    with_base = np.einsum("sd,rdf->rsf", test.rigid_body, test.base)
+    predicted = test.predict(structure)
+    return Scores(
+        _score(predicted, test.relative),
+        _score(predicted + with_base, test.response),
+        _score(with_base, test.response),
+    )
+
+
+def write(identification: Identification, path: str | Path) -> Path:
+    """Write the report, whole or not at all.
+
+    Parameters
+    ----------
+    identification : Identification
+    path : str or Path
+        The file (``.html``), or the folder in which it becomes ``report.html``; folders are made.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    InputError
+        Where the file cannot be written.
+    """
+    target = file_or_folder(path, FILE_NAME, _SUFFIXES)
+    content = render(identification).encode("utf-8", "replace")
+    with atomically(target) as temporary:
+        temporary.write_bytes(content)
+    return target
+
+
+def render(identification: Identification) -> str:
+    """Make the page, as a string."""
+    it = identification
+    return page(
+        _title(it),
+        _verdict(it),
+        [
+            ("Unknowns", _unknowns(it)),
+            ("Modes", _modes(it)),
+            ("Rigid-body mass", _rigid_body_mass(it)),
+            ("Measured against identified", _responses(it, it.measurement)),
+            ("Base force", _base_force(it, it.measurement)),
+            ("Further tests", _further(it)),
+            ("Validation", _validation(it)),
+            ("Poles in the data", _poles(it)),
+            ("Convergence", _convergence(it)),
+            ("Modal assurance criterion", _mac(it)),
+            ("Effective masses", _effective_masses(it)),
+            ("Mode shapes", _mode_shapes(it)),
+            ("Matrices", matrices(it)),
+            ("What ran", _what_ran(it)),
+        ],
+    )
+
+
+def _title(it: Identification) -> str:
+    name = PurePath(it.recipe.module).stem if it.recipe else ""
+    return f"Identification of {name}" if name else "Identification"
+
+
+def _verdict(it: Identification) -> str:
+    test, n, d = it.measurement, it.structure.n, it.structure.n_base
+    sensors = "" if n == test.n_sensors else f" seen by {test.n_sensors} sensors"
+    runs = f"{test.n_runs} run{'s' if test.n_runs > 1 else ''}"
+    head = paragraph(
+        f"{n} degrees of freedom{sensors}, {d} base direction{'s' if d > 1 else ''} "
+        f"({', '.join(test.base_axes or ())}), {runs}, "
+        f"{test.freq.size} lines from {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz",
+        "soft",
+    )
+    word = "Interrupted: the best until then" if it.interrupted else "Success" if it.success else "No success"
+    lines = [f"<strong>{word}</strong>", paragraph(it.message)]
+    own = it.problem.is_written and it.problem.formulation.misfit is not None
+    of = (
+        "of the misfit that the problem states"
+        if own
+        else "over the relative accelerations of all runs, sensors and lines"
+    )
+    residual = f"Relative residual {it.residual:.3e}, {of}"
+    if it.problem.goal is not None:
+        residual += f" (goal {it.problem.goal:.3g})"
+    lines.append(paragraph(residual + "."))
+    if it.force_residual is not None:
+        lines.append(paragraph(f"Of the base force: {it.force_residual:.3e}."))
+    head += f'<div class="verdict {"good" if it.success else "bad"}">{"".join(lines)}</div>'
+    kind, steps = "good" if it.determined else "warn", next_steps(it)
+    lines = [f"<strong>{text(verdict(it))}</strong>"]
+    if it.closed_by:
+        lines.append(paragraph("What fixes it:"))
+    if steps:
+        lines.append(
+            paragraph(
+                "Frequencies, damping ratios and the responses to base motion hold for all of them; the mass, "
+                "stiffness and damping matrices below are one choice. What is open:"
+            )
+        )
+    lines.append(bullets(_sentence(s) for s in it.closed_by + it.undetermined))
+    lines += [paragraph(_sentence(step)) for step in steps]
+    head += f'<div class="verdict {kind}">{"".join(lines)}</div>'
+    return head + "".join(paragraph(_sentence(remark), "soft") for remark in it.remarks)
+
+
+def _unknowns(it: Identification) -> str:
+    rows = [
+        (
+            row.label, number(row.value, 6), half_width(row.std, row.value), row.unit, number(row.lower),
+            number(row.upper), f"on its {row.on_bound} bound" if row.on_bound else "",
+        )
+        for row in rows_of(it)
+    ]  # fmt: skip
+    if not rows:
+        return ""
+    head = ("unknown", "value", "±", "unit", "lower", "upper", "")
+    told = bullets(_sentence(s) for s in stated_values(it))
+    return table(head, rows, "The problem's own unknowns; ± is half of the 95 % interval that noise leaves.") + told
+
+
+def _modes(it: Identification) -> str:
+    structure, reference, u = it.structure, it.problem.reference, it.quick_uncertainty
+    axes = it.measurement.base_axes or ()
+    share, share_std, many = structure.effective_mass_percent, mass_percent_std(it), is_one_of_many(it)
+    frequencies, ratios = structure.natural_frequencies, structure.damping_ratios
+    head = ["mode", "frequency [Hz]", "±", "damping [%]", "±", *(f"effective mass {a} [%]" for a in axes)]
+    if u is None:
+        del head[4], head[2]
+    known = reference if reference is not None and reference.n == structure.n else None
+    if known is not None:
+        head += ["reference [Hz]", "difference [%]", "reference damping [%]", "difference [%]"]
+    rows = []
+    for k, (f, zeta) in enumerate(zip(frequencies, ratios, strict=True)):
+        row: list[object] = [k + 1, number(f, 6), number(100 * zeta)]
+        if u is not None:
+            row.insert(2, half_width(u.natural_frequencies[k], f))
+            row.append(half_width(100 * u.damping_ratios[k], 100 * zeta))
+        for value, std, one_of_many in zip(share[k], share_std[k], many[k], strict=True):
+            width = half_width(std, 100.0)
+            below = (f"± {width}",) if width not in ("open", "0") else ()
+            row.append(Cell(f"{'~' if one_of_many else ''}{value:.2f}", below))
+        if known is not None:
+            f0, zeta0 = known.natural_frequencies[k], known.damping_ratios[k]
+            row += [number(f0, 6), _difference(f, f0), number(100 * zeta0), _difference(zeta, zeta0)]
+        rows.append(row)
+    sums = (f"{'~' if many[:, i].any() else ''}{total:.2f}" for i, total in enumerate(share.sum(axis=0)))
+    rows.append(["sum", *[""] * (2 if u is None else 4), *sums, *[""] * (4 if known is not None else 0)])
+    notes = ["Effective mass in % of the rigid-body mass of its base direction."]
+    if u is not None:
+        notes.append("±: half of the 95 % interval that the noise of the records makes; 0 where it is round-off.")
+        if it.measurement.response_std is None:
+            notes.append("No noise is stated, so the misfit is taken for it.")
+    if many.any():
+        notes.append("~: one of many values that explain the data.")
+    return table(head, rows, " ".join(notes))
+
+
+def _rigid_body_mass(it: Identification) -> str:
+    axes, turns = it.measurement.base_axes or (), ~it.measurement.translational
+    rigid, reference = it.structure.rigid_body_mass, it.problem.reference
+    parts = []
+    if it.problem.unit_mass:
+        parts.append(
+            paragraph(
+                "No mass is stated and no base force was measured: the masses are normalised to 1 kg in each base "
+                "direction. All mass, stiffness and damping entries carry this scale, which the data do not tell."
+            )
+        )
+    unit = "kg" if not turns.any() else "kg; kg m where one axis is a rotation, kg m² where both are"
+    u = it.quick_uncertainty
+    below = None if u is None or it.problem.unit_mass else half_widths(rigid, u.rigid_body_mass, stated(it))
+    parts.append(matrix(rigid, axes, axes, f"Total mass M_rb = [G; I]' M [G; I], {unit}.", below=below))
+    if reference is not None:
+        parts.append(matrix(reference.rigid_body_mass, axes, axes, f"Of the reference, {unit}."))
+    return "".join(parts)
+
+
+def _responses(it: Identification, test: Measurement) -> str:
+    if is_unit(test):
+        words = (
+            "Absolute acceleration of each sensor per unit base acceleration (transmissibility), magnitude and phase. "
+            "The difference of the two is drawn faint."
+        )
+    else:
+        words = (
+            "Spectra of each sensor's absolute acceleration in each run, as the base moved: not transmissibilities. "
+            "The phase is told against the base direction that moved most. The difference of the two is drawn faint."
+        )
+    u = it.quick_uncertainty
+    band = None if u is None else u.transmissibility(test.freq)
+    if band is not None:
+        words += " The shade around the identified curve, where it is wide enough to be seen, is its 95 % interval."
+    dpi = 130 if test.n_sensors * test.n_runs <= _MANY_PANELS else 92
+    parts = [paragraph(words, "soft")]
+    for s, (name, score) in enumerate(zip(test.sensor_names, scores(it.structure, test).relative, strict=True)):
+        alt = f"{name}: measured and identified response, {', '.join(run_names(test))}"
+        drawn = picture(plot.responses(it, s, measurement=test, band=band), alt, dpi=dpi)
+        heading = f"{name}: relative residual {number(1 - score, 3)}" if np.isfinite(score) else name
+        parts.append(fold(heading, drawn, opened=s == 0))
+    return "\n".join(parts)
+
+
+def _base_force(it: Identification, test: Measurement) -> str:
+    if test.force is None:
+        return ""
+    residual = number(test.force_residual(it.structure))
+    parts = [paragraph(f"Force of the base on the structure. Relative residual over all of it: {residual}.", "soft")]
+    u = it.quick_uncertainty
+    band = None if u is None else u.base_force(test.freq)
+    for r, name in enumerate(run_names(test)):
+        alt = f"measured and identified base force, {name}"
+        parts.append(picture(plot.base_forces(it, r, measurement=test, band=band), alt))
+    return "\n".join(parts)
+
+
+def _further(it: Identification) -> str:
+    parts = []
+    for i, (test, structure) in enumerate(it.further_tests, start=1):
+        parts.append(f"<h3>Test {i} of {len(it.further_tests)}, fitted beside the first one</h3>")
+        residual = f"Relative residual {number(test.residual(structure))}"
+        if test.force is not None:
+            residual += f", of the base force {number(test.force_residual(structure))}"
+        parts.append(paragraph(residual + "; the structure as it was then:"))
+        rows = zip(structure.natural_frequencies, 100 * structure.damping_ratios, strict=True)
+        cells = [(k, number(f, 6), number(ratio)) for k, (f, ratio) in enumerate(rows, start=1)]
+        parts.append(table(("mode", "frequency [Hz]", "damping [%]"), cells))
+        scored = zip(test.sensor_names, scores(structure, test).relative, strict=True)
+        parts.append(
+            table(
+                ("sensor", "score"),
+                [(name, number(score)) for name, score in scored],
+                "1 - ‖predicted - measured‖ / ‖measured‖ of the accelerations relative to the base.",
+            )
+        )
+    return "\n".join(parts)
+
+
+def _validation(it: Identification) -> str:
+    parts = []
+    for i, test in enumerate(it.problem.validation):
+        parts.append(f"<h3>Test {i + 1} of {len(it.problem.validation)}: predicted, never fitted</h3>")
+        residual = f"Relative residual {number(test.residual(it.structure))}"
+        if test.force is not None:
+            residual += f", of the base force {number(test.force_residual(it.structure))}"
+        parts += [paragraph(residual + "."), _score_table(it, test), _responses(it, test), _base_force(it, test)]
+    if parts:
+        parts.append("<h3>The test that was fitted, for comparison</h3>" + _score_table(it, it.measurement))
+    return "\n".join(parts)
+
+
+def _score_table(it: Identification, test: Measurement) -> str:
+    rows = zip(test.sensor_names, *scores(it.structure, test), strict=True)
+    return table(
+        ["sensor", "relative acceleration", "absolute acceleration", "“moves with the base”, absolute"],
+        ([name, *(f"{v:.3f}" if np.isfinite(v) else "–" for v in values)] for name, *values in rows),
+        "Score: 1 − ‖predicted − measured‖ / ‖measured‖ over all runs and lines; 1 is perfect.",
+    )
+
+
+def _poles(it: Identification) -> str:
+    words = (
+        "What the records show without the model. Left: poles of models of rising order, over the largest singular "
+        "value of the FRFs; a mode is a column of poles that stay where they are. Right: all singular values; two that "
+        "peak at one line are two modes there."
+    )
+    return paragraph(words, "soft") + beside(
+        picture(plot.stabilisation(it), "stabilisation diagram"),
+        picture(plot.cmif(it), "complex mode indicator function"),
+    )
+
+
+def _convergence(it: Identification) -> str:
+    history = it.history
+    steps = max(history.local_curve.size - 1, 0)
+    refined = "eigenvalues replaced by those given"
+    if np.isfinite(history.refinement_error):
+        refined += f", within {history.refinement_error:.1e} (relative, ω²)"
+    rows = [
+        ("start", history.start, "best of the first candidates, or the start given"),
+        ("swarm", history.swarm, f"{history.evaluations} candidates in {history.swarm_curve.size} iterations"),
+        ("refinement", history.refinement, refined),
+        ("local phase", history.local, f"{steps} iteration{'' if steps == 1 else 's'}, exact derivatives"),
+    ]
+    ran = [[phase, number(residual), words] for phase, residual, words in rows if np.isfinite(residual)]
+    parts = [picture(plot.convergence(it), f"residual through {', '.join(phase for phase, *_ in ran) or 'no search'}")]
+    if ran:
+        parts.append(table(["after", "relative residual", ""], ran, words=True))
+    if history.states:
+        parts.append(table(["state of the swarm", "iterations"], history.states))
+    return "".join(parts)
+
+
+def _mac(it: Identification) -> str:
+    known = it.problem.reference is not None
+    words = (
+        "Identified mode shapes against those of the reference at the sensors: 1 on the diagonal where they agree."
+        if known
+        else "Mode shapes against each other (no reference is known): off-diagonal entries near 1 tell modes that "
+        "these sensors cannot tell apart."
+    )
+    return paragraph(words, "soft") + picture(plot.mac(it), "modal assurance criterion", colours=None)
+
+
+def _effective_masses(it: Identification) -> str:
+    words = "Bars: each mode; lines: their running sum. What is missing to 100 % moves with the base."
+    drawn = plot.effective_masses(it)
+    many = bool(is_one_of_many(it).any())
+    label, caption = (ONE_OF_MANY, CHOSEN) if many else ("", "")
+    alt = "effective masses by mode and base direction"
+    return paragraph(words, "soft") + picture(drawn, alt, caption, label=label)
+
+
+def _mode_shapes(it: Identification) -> str:
+    try:
+        figure = plot.mode_shapes(it)
+    except InputError:  # no positions: no picture
+        return ""
+    return picture(figure, "mode shapes", "Sticks join neighbouring sensors; grey: at rest.")
+
+
+def _what_ran(it: Identification) -> str:
+    from sysid import __version__
+
+    problem, recipe = it.problem, it.recipe
+    facts: list[list[object]] = [
+        ["strategy", it.strategy],
+        ["seed", "–" if it.seed is None else it.seed],
+        ["wall time", f"{it.history.wall_time:.1f} s"],
+        ["mass model", _model(problem.mass)],
+        ["stiffness model", _model(problem.stiffness)],
+        ["damping model", _model(problem.damping)],
+        ["sysid", __version__],
+    ]
+    if recipe is not None:
+        facts[:0] = [["problem", recipe.module], ["data", recipe.data or "its own"], ["problem's rng", recipe.rng]]
+    counts = [*problem.unknowns, ("together", problem.n_variables)]
+    log = f"<h3>Log</h3><pre>{text(chr(10).join(it.history.log))}</pre>" if it.history.log else ""
+    return (
+        table(["", ""], facts, words=True)
+        + table(["matrix", "unknowns"], counts, "Unknowns of the search, matrix by matrix.")
+        + log
+    )
+
+
+def _score(predicted: ComplexArray, measured: ComplexArray) -> Array:
+    size = np.linalg.norm(measured, axis=(0, 2))
+    miss = np.linalg.norm(predicted - measured, axis=(0, 2))
+    return 1 - np.divide(miss, size, out=np.full_like(miss, np.nan), where=size > 0)
+
+
+def _difference(value: float, reference: float) -> str:
+    if not reference:
+        return "–"
+    share = value / reference - 1
+    return f"{100 * share:+.2g}" if abs(share) > SAME else "0"
+
+
+def _sentence(words: str) -> str:
+    """Begin with a capital, end with a stop."""
+    return words[:1].upper() + words[1:] + ("" if words.endswith((".", "!")) else ".")
+
+
+def _model(model: object) -> str:
+    if not isinstance(model, MassModel | StiffnessModel | DampingModel):
+        return "numbers" if isinstance(model, np.ndarray) else "written in variables"
+    kind = type(model).__name__
+    if not isinstance(model, FullMass):
+        return kind
+    known = "" if model.known is None else ", known entries"
+    return f"{kind} ({model.healing} healing{known})"

@@ -1,0 +1,179 @@
+"""An identification in words and figures: the summary for a terminal, and what it shares with the report."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from sysid.results.unknowns_table import MANY, rows_of, stated_values
+from sysid.results.identification import Identification
+from sysid.structure.structure import Array
+
+DEVIATES = 1.96  # standard deviations on either side of 95 % of a normal law
+_ROUND_OFF = 1e-10  # of a value: what is no noise of an instrument
+_WIDTH = 120
+
+
+def summary(it: Identification) -> str:
+    """Table of the result, at most 120 columns wide."""
+    s, axes, problem = it.structure, it.measurement.base_axes or (), it.problem
+    goal = "" if problem.goal is None else f" (goal {problem.goal:.3g})"
+    which = " of the first test" if it.further_tests else ""
+    force = "" if it.force_residual is None else f", of the base force {it.force_residual:.3e}"
+    lines = [
+        *_mode_table(it),
+        "",
+        *_unknowns(it),
+        f"{'success' if it.success else 'no success'}: {it.message}",
+        f"relative residual{which} {it.residual:.3e}{goal}{force}; seed {it.seed}, {it.history.wall_time:.1f} s",
+        *it.remarks,
+        "rigid-body mass " + ", ".join(_rigid_masses(it, axes)),
+    ]
+    lines += stated_values(it)
+    for i, (test, structure) in enumerate(it.further_tests, start=1):
+        frequencies = ", ".join(f"{f:.5g}" for f in structure.natural_frequencies[:8])
+        lines.append(
+            f"further test {i} of {len(it.further_tests)}: relative residual {test.residual(structure):.3e}, natural "
+            f"frequencies {frequencies} Hz"
+        )
+    for i, test in enumerate(problem.validation, start=1):
+        lines.append(f"test {i} of {len(problem.validation)} never fitted: relative residual {test.residual(s):.3e}")
+    lines.append(f"{verdict(it)}.")
+    lines += [f"  - {sentence}" for sentence in it.closed_by + it.undetermined]
+    if not it.determined and not it.problem.is_written:
+        lines += _ranges(it)
+    lines += [f"  > {sentence}" for sentence in next_steps(it)]
+    return "\n".join(_folded(line) for line in lines)
+
+
+def verdict(it: Identification) -> str:
+    """What the matrices are worth, in one sentence."""
+    if it.determined:
+        return "Determined: data and stated model leave one mass and one stiffness matrix"
+    if it.is_one_of_many:
+        return "Not determined: this is one of many models that explain the data"
+    return "Not determined: something speaks against this model, or is not known well enough"
+
+
+def next_steps(it: Identification) -> list[str]:
+    """What would close open modal masses, in sentences."""
+    if it.determined or not it.is_one_of_many:
+        return []
+    if it.problem.is_written:
+        return [
+            "to close it: state one of these unknowns (fixed=True with its value), a relation between them as a "
+            "constraint, or fit another record that sees them: a base force, a sensor, a test with a known mass added"
+        ]
+    if it.measurement.force is not None:
+        return ["to weigh these modes: more force at their frequencies, longer records, or another base direction"]
+    return [
+        "to close it: measure the force between table and structure; or state what is known of the mass, where it is "
+        "true: LumpedMass, or FullMass(known=...); a total mass alone only bounds it"
+    ]
+
+
+def half_width(std: float, value: float) -> str:
+    """Half of the 95 % interval about `value`; "open" where it is not known, 0 where it is round-off."""
+    if not np.isfinite(std):
+        return "open"
+    return f"{DEVIATES * std:.2g}" if std > _ROUND_OFF * abs(value) else "0"
+
+
+def mass_percent_std(it: Identification) -> Array:
+    """Standard deviations of `Structure.effective_mass_percent`, (n, d); NaN where open or not computed."""
+    u, rigid = it.quick_uncertainty, np.diag(it.structure.rigid_body_mass)
+    if u is None:
+        return np.full((it.structure.n, it.structure.n_base), np.nan)
+    return 100 * np.einsum("kii->ki", u.effective_masses) / np.where(rigid > 0, rigid, np.inf)
+
+
+def is_one_of_many(it: Identification) -> Array:
+    """Which effective masses are one choice among many, (n, d) of bool."""
+    if it.determined:
+        return np.zeros((it.structure.n, it.structure.n_base), dtype=bool)
+    return np.isnan(mass_percent_std(it))
+
+
+def _mode_table(it: Identification) -> list[str]:
+    """Frequencies, damping and effective masses, with half-widths where they are known and there is room."""
+    s, u, axes = it.structure, it.quick_uncertainty, it.measurement.base_axes or ()
+    std, many = mass_percent_std(it), is_one_of_many(it)
+    k = range(s.n)
+    columns = [["mode", *(f"{i + 1}" for i in k), "sum"]]
+    columns.append(["frequency, Hz", *(f"{f:.5g}" for f in s.natural_frequencies), ""])
+    columns.append(["damping, %", *(f"{100 * zeta:.4g}" for zeta in s.damping_ratios), ""])
+    if u is not None:
+        widths = [half_width(u.natural_frequencies[i], s.natural_frequencies[i]) for i in k]
+        columns.insert(2, ["+-", *widths, ""])
+        columns.append(["+-", *(half_width(100 * u.damping_ratios[i], 100 * s.damping_ratios[i]) for i in k), ""])
+    shares = s.effective_mass_percent
+    masses, mass_widths = [], []
+    for j, axis in enumerate(axes):
+        cells = [f"{'~' if many[i, j] else ''}{shares[i, j]:.1f}" for i in k]
+        masses.append([f"mass {axis}, %", *cells, f"{'~' if many[:, j].any() else ''}{shares[:, j].sum():.1f}"])
+        mass_widths.append(["+-", *(half_width(value, 100.0) for value in std[:, j]), ""])
+    both = [column for pair in zip(masses, mass_widths, strict=True) for column in pair]
+    lines = _aligned(columns + both)
+    if not np.any(np.isfinite(std)) or len(lines[0]) > _WIDTH:
+        lines = _aligned(columns + masses)
+    notes = [] if u is None else ["+- half of the 95 % interval"]
+    notes.append("mass: effective, in % of the rigid-body mass")
+    notes += ["~ one of many values that explain the data"] if many.any() else []
+    return [*lines, "; ".join(notes)]
+
+
+def _unknowns(it: Identification) -> list[str]:
+    """Table of the problem's own unknowns, where there are some and not too many for a terminal."""
+    rows = rows_of(it)
+    if not 0 < len(rows) <= MANY:
+        return []
+    told = [[row.label, f"{row.value:.6g}", half_width(row.std, row.value), row.unit] for row in rows]
+    at = [f"on its {row.on_bound} bound" if row.on_bound else f"{row.lower:.4g} to {row.upper:.4g}" for row in rows]
+    columns = [list(column) for column in zip(["unknown", "value", "+- (95 %)", "unit"], *told, strict=True)]
+    return [*_aligned([*columns, ["search space", *at]]), ""]
+
+
+def _aligned(columns: list[list[str]]) -> list[str]:
+    """Lines of a table, every column as wide as its longest cell."""
+    widths = [max(map(len, column)) for column in columns]
+    return [
+        "  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in zip(*columns, strict=True)
+    ]
+
+
+def _rigid_masses(it: Identification, axes: Sequence[str]) -> Iterator[str]:
+    """Rigid-body mass by base direction, with its half-width where noise moves it."""
+    u = it.quick_uncertainty
+    for i, axis in enumerate(axes):
+        mass = it.structure.rigid_body_mass[i, i]
+        width = "open" if u is None else half_width(u.rigid_body_mass[i, i], mass)
+        told = "" if width in ("open", "0") else f" +- {width}"
+        yield f"{axis} {mass:.6g}{told} {'kg m²' if axis[0] == 'r' else 'kg'}"
+
+
+def _ranges(it: Identification) -> Iterator[str]:
+    """How far the diagonals may go, in one line, where that is known quickly and something may move."""
+    ends = it.quick_intervals
+    if ends is None:
+        return
+    n, words = it.structure.n, []
+    pairs = ("M_SS", it.structure.mass, ends.mass), ("K_SS", it.structure.stiffness, ends.stiffness)
+    for name, matrix, (lower, upper) in pairs:
+        own = np.diag(matrix)[:n]
+        low, high = abs(float(np.min(np.diag(lower) / own))), float(np.max(np.diag(upper) / own))
+        if high - low > 1e-6:
+            top = f"{high:.3g} times" if np.isfinite(high) else "any number of times"
+            words.append(f"{low:.3g} to {top} those of this {name}")
+    if words:
+        yield f"  - over all these models the diagonal entries are {', '.join(words)}"
+
+
+def _folded(line: str) -> str:
+    """Fold a long line at the width of a terminal, the rest indented."""
+    if len(line) <= _WIDTH:
+        return line
+    indent = "    " if line.startswith("  - ") else "  "
+    return textwrap.fill(line, _WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)

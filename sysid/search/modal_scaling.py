@@ -1,0 +1,200 @@
+"""The scale of each mode, its modal mass, by whatever is known: each a small linear problem.
+
+Accelerations leave all modal masses open (the modal-mass cone, see `modal_masses`). A measured base force, a known
+mass matrix, enough known entries of one, or a lumped one with its total fix them; otherwise the member nearest to a
+lumped mass is taken.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import scipy.linalg
+
+from sysid.errors import InputError
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.modal_fit import Modes, Ties
+from sysid.modal_analysis.response import columns, gains
+from sysid.models.mass import FullMass
+from sysid.problem.problem import Problem
+from sysid.structure.structure import Array
+from sysid.structure.triangular import lower_entries
+
+_HELD = 1e5  # weight of known entries beside what is only likely
+_SPARE = 1e-3  # least share of a total mass that is left to the base
+_SHARE = 1e-3  # of the largest share of a mode in a total; a smaller one would make its modal mass beyond measure
+_LEAST = 0.5  # of an equal share of the mass, that each mode keeps where nothing tells modal masses
+
+
+def weigh(test: Measurement, modes: Modes) -> tuple[Array, Array]:
+    """Modal masses t (m,) > 0 and rigid-body mass (d, d): the base force is linear in both.
+
+    Raises
+    ------
+    InputError
+        Where the force wants negative masses: a wrong sign.
+    """
+    from scipy.optimize import lsq_linear
+
+    d, m = test.n_base, modes.omega.size
+    assert test.force is not None
+    base, force = columns(test.base), columns(test.force)
+    g = np.tile(gains(test.freq, modes.omega, modes.ratios), test.n_runs)
+    pairs = [(i, j) for i in range(d) for j in range(i, d)]
+    pushes = (modes.gamma @ base) * g
+    parts = [np.outer(modes.gamma[k], pushes[k]) for k in range(m)]
+    for i, j in pairs:
+        unit = np.zeros((d, d))
+        unit[i, j] = unit[j, i] = 1.0
+        parts.append(unit @ base)
+    # Moments and forces count in units of their own records.
+    size = np.linalg.norm(force, axis=1, keepdims=True)
+    size[size == 0] = 1.0
+    design = np.array([(part / size).ravel() for part in parts]).T
+    wanted = (force / size).ravel()
+    scale = np.linalg.norm(design, axis=0)
+    scale[scale == 0] = 1.0
+    stacked = np.vstack([design.real, design.imag]) / scale
+    target = np.concatenate([wanted.real, wanted.imag])
+    lower = np.concatenate([np.zeros(m), np.full(len(pairs), -np.inf)])
+    # The triangular factor stands for all lines.
+    Q, R = np.linalg.qr(stacked)
+    plain = Q.T @ target
+    free = np.linalg.lstsq(R, plain, rcond=None)[0]
+    strength = np.abs(free[:m])
+    if np.sum(free[:m] * strength) < -0.5 * np.sum(strength**2):
+        raise InputError(
+            "the base force answers to the modes with negative masses: check its sign (it is the base's on the "
+            "structure, in phase with the base acceleration at low frequency)"
+        )
+    answer = (free if np.all(free[:m] > 0) else lsq_linear(R, plain, (lower, np.inf), tol=1e-14).x) / scale
+    rigid = np.zeros((d, d))
+    for (i, j), mass in zip(pairs, answer[m:], strict=True):
+        rigid[i, j] = rigid[j, i] = mass
+    t = answer[:m]
+    return np.maximum(t, 1e-9 * t.max()), rigid
+
+
+def stated_totals(problem: Problem) -> Ties | None:
+    """Equalities that hold the stated total mass where the base force would set another."""
+    layout, mass, totals = problem.layout, problem.mass, problem.totals
+    if problem.measurement.force is None or not isinstance(mass, FullMass) or mass.total_mass is None:
+        return None
+
+    def ties(phi: ca.MX, gamma: ca.MX, rigid: ca.MX) -> list[ca.MX]:
+        if problem.rigid_total is not None:
+            size = np.sqrt(totals)
+            off = (rigid - ca.DM(problem.rigid_total)) / ca.DM(np.outer(size, size))
+            return [lower_entries(off)]
+        if mass.healing == "rigid_body" or phi.size1() != phi.size2():
+            return [ca.diag(rigid) / totals - 1]
+        P = ca.inv(phi)
+        delta = gamma - P @ ca.DM(layout.rigid_body)
+        rows = ca.diag(P.T @ P)
+        base = ca.diag(rigid - gamma.T @ gamma + delta.T @ delta)
+        groups = layout.directions[: layout.n]
+        own = [ca.sum1(rows[np.flatnonzero(groups == i).tolist()]) for i in range(layout.d)]
+        return [(own[i] + base[i]) / totals[i] - 1 for i in range(layout.d)]
+
+    return ties
+
+
+def to_stated_totals(
+    problem: Problem, P: Array, gamma: Array, G: Array, groups: Array, remainder: Array, *, scaled: bool = False
+) -> tuple[float, Array]:
+    """Common modal-mass factor t and base remainder (d, d) with which a full mass has the stated totals.
+
+    Scaling all modal masses by one t changes no response; the remainder is invisible in accelerations. It keeps its
+    correlations, and takes what mass the modes leave.
+
+    Parameters
+    ----------
+    P : (m, m)
+        Inverse of the mode shapes at the degrees of freedom.
+    gamma, G : (m, d)
+        Participations, and rigid motion of the degrees of freedom.
+    groups : (m,)
+        Base direction of each degree of freedom, -1 for none.
+    scaled : bool
+        Whether known masses set the modal masses already, so that t is one; a total that is not stated, or
+        less than they make, is then what they make.
+    """
+    spare = 0.0 if problem.measurement.force is not None else _SPARE  # a force tells what the base has
+    if problem.rigid_total is not None:
+        size = np.sqrt(problem.totals)
+        own, total = ((part / np.outer(size, size)) for part in (gamma.T @ gamma, problem.rigid_total))
+        t = 1.0 if scaled else min(1.0, (1 - spare) / float(scipy.linalg.eigvalsh(own, total)[-1]))
+        lam, vectors = np.linalg.eigh(total - t * own)
+        return t, (vectors * np.maximum(lam, 0.0)) @ vectors.T * np.outer(size, size)
+    if isinstance(problem.mass, FullMass) and problem.mass.healing == "rigid_body":
+        used = np.sum(gamma**2, axis=0)
+    else:
+        rows = np.sum(P**2, axis=0)
+        own = [rows[groups == i].sum() for i in range(G.shape[1])]
+        used = np.array(own) + np.sum((gamma - P @ G) ** 2, axis=0)
+    totals = problem.totals
+    if scaled:
+        stated = isinstance(problem.mass, FullMass) and problem.mass.total_mass is not None
+        totals = np.maximum(totals if stated else 0.0, (1 + spare) * used)
+    t = 1.0 if scaled else min(1.0, float(np.min((1 - spare) * totals / used)))
+    share = np.sqrt(np.maximum(totals - t * used, 0.0) / np.maximum(np.diag(remainder), np.finfo(float).tiny))
+    return t, remainder * np.outer(share, share)
+
+
+def nearest_lumped(
+    problem: Problem, P: Array, gamma: Array, G: Array, groups: Array, known: Array | None = None
+) -> Array:
+    """Modal masses (m,) whose mass matrix is nearest to a lumped, uncoupled one with the stated totals.
+
+    Parameters
+    ----------
+    P, gamma, G, groups :
+        As in `to_stated_totals`.
+    known : (m, m + d), optional
+        Entries of [M_SS, M_S0] to be met, NaN where there is none; where they fix all modal masses nothing else counts.
+    """
+    from scipy.optimize import lsq_linear
+
+    m = len(P)
+    delta = gamma - P @ G
+    off = np.einsum("ki,kj->ijk", P, P)[np.tril_indices(m, -1)]
+    coupling = np.einsum("ki,kj->ijk", P, delta).reshape(-1, m)
+    entries, values = _entries(P, delta, np.full((m, m + G.shape[1]), np.nan) if known is None else known)
+    scaled = np.flatnonzero(values)
+    if scaled.size and np.linalg.matrix_rank(entries / np.linalg.norm(entries, axis=1, keepdims=True), 1e-9) == m:
+        unit = np.linalg.norm(entries, axis=0)
+        weights = 1 / np.where(values == 0, np.abs(values).max(), np.abs(values))[:, None]
+        t = lsq_linear(entries * weights / unit, values * weights[:, 0], (0.0, np.inf), tol=1e-14).x
+        return np.maximum(t, 1e-9 * t.max()) / unit
+    # Known masses set the scale, or else the totals do.
+    totals = [(entries[i], values[i]) for i in scaled if values[i] > 0 and np.all(entries[i] >= 0)] or [
+        (np.sum(P[:, groups == i] ** 2, axis=1), problem.totals[i]) for i in range(G.shape[1])
+    ]
+    told = [(row, total) for row, total in totals if np.any(row > 0)] or [(np.sum(P**2, axis=1), 1.0)]
+    weight = max(total for _, total in told)
+    held = _HELD * weight / np.where(values == 0, weight, np.abs(values))
+    rows = np.vstack([off, coupling, *(row[None] * weight / total for row, total in told), entries * held[:, None]])
+    wanted = np.concatenate([np.zeros(len(off) + len(coupling)), np.full(len(told), weight), values * held])
+    size = np.maximum(np.linalg.norm(rows, axis=0), np.finfo(float).tiny)
+    # No modal mass vanishes, or M_SS would be singular: each keeps a share of what it could be by itself.
+    share = np.max([row / total for row, total in told], axis=0)
+    least = _LEAST / m * size / np.maximum(share, _SHARE * share.max())
+    return np.maximum(lsq_linear(rows / size, wanted, (least, np.inf), tol=1e-14).x, least) / size
+
+
+def _entries(P: Array, delta: Array, known: Array) -> tuple[Array, Array]:
+    """Rows (e, m) of modal masses that make the known entries (e,) of [M_SS, M_S0]."""
+    i, j = np.nonzero(np.isfinite(known))
+    once = j >= i
+    i, j = i[once], j[once]
+    return (P[:, i] * np.hstack([P, delta])[:, j]).T, known[i, j]
+
+
+def of_known_mass(mass: Array, P: Array, gamma: Array, G: Array) -> Array:
+    """Modal masses (n,) with which the modes have a known mass matrix (n + d, n + d)."""
+    from scipy.optimize import nnls
+
+    n = len(P)
+    rows = np.concatenate([P, gamma - P @ G], axis=1)[:, None, :] * P[:, :, None]
+    t = nnls(rows.reshape(n, -1).T, mass[:n].ravel())[0]
+    return np.maximum(t, np.finfo(float).eps * t.max())

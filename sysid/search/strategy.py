@@ -1,0 +1,101 @@
+"""What the strategies share: where a search ended, and what a start stands for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sysid.errors import InputError
+from sysid.problem.problem import Problem
+from sysid.structure.structure import Array, Structure
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """What ran, phase by phase; residuals are relative, NaN where a phase did not run.
+
+    They count all that is fitted, base force and further tests too: the root of the sum of all squared relative
+    residuals. The modal strategy has the local phase only, continuation start and local phase.
+
+    Attributes
+    ----------
+    start, swarm, refinement, local : float
+        Residual of the best candidate after each phase: the Latin hypercube (or the start that was given; of
+        continuation the guess), the swarm, the eigenvalue refinement, the local phase.
+    swarm_curve, local_curve : ndarray
+        Best residual after each iteration of the swarm, and residual of each local iterate as IPOPT saw it, the
+        records weighed by stated noise.
+    refinement_error : float
+        Largest relative difference of a refined eigenvalue (w²) from the one that was given.
+    states : tuple of (str, int)
+        How often the swarm was in each evolutionary state.
+    evaluations : int
+        Candidates that the swarm evaluated.
+    wall_time : float
+        s.
+    log : tuple of str
+        What ran, one line a step.
+    """
+
+    start: float = np.nan
+    swarm: float = np.nan
+    refinement: float = np.nan
+    local: float = np.nan
+    swarm_curve: Array = field(default_factory=lambda: np.zeros(0))
+    local_curve: Array = field(default_factory=lambda: np.zeros(0))
+    refinement_error: float = np.nan
+    states: tuple[tuple[str, int], ...] = ()
+    evaluations: int = 0
+    wall_time: float = 0.0
+    log: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Where a search ended.
+
+    Attributes
+    ----------
+    structure : Structure
+    x : (n_variables,) or None
+        The problem's unknowns that stand for the structure; None where the modal strategy chose other degrees of
+        freedom than the sensors.
+    strategy : str
+    success : bool
+        Of the last solver.
+    message : str
+    history : History
+    stopped : BaseException or None
+        What ended it early.
+    remarks : tuple of str
+        What the user should know of how it was done.
+    rivals : tuple of (n_variables,)
+        Other unknowns that explain the data as well.
+    """
+
+    structure: Structure
+    x: Array | None
+    strategy: str
+    success: bool
+    message: str
+    history: History
+    stopped: BaseException | None = None
+    remarks: tuple[str, ...] = ()
+    rivals: tuple[Array, ...] = ()
+
+
+def as_unknowns(problem: Problem, start: ArrayLike | Structure) -> Array:
+    """Unknowns of a start that the user gave."""
+    if isinstance(start, Structure):
+        layout = problem.layout
+        if (start.n, start.n_base, start.n_sensors) != (layout.n, layout.d, layout.n):
+            raise InputError("start: the structure has other degrees of freedom or base directions than the problem")
+        return problem.values(start)
+    x = np.asarray(start, dtype=float)
+    if x.shape != (problem.n_variables,) or not np.all(np.isfinite(x)):
+        raise InputError(
+            f"start has shape {x.shape}; ({problem.n_variables},) finite unknowns, or a Structure, is needed"
+        )
+    return x

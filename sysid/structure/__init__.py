@@ -1,0 +1,1 @@
+"""Structures as numbers: matrices, modes, responses, frames of beams."""
