@@ -1,0 +1,1 @@
+"""The answer: the result of an identification, its summary, its file."""
