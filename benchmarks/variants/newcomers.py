@@ -11,14 +11,14 @@ from benchmarks.command_line import sysid_run
 from benchmarks.line import Line
 from benchmarks.problem_modules import ROOT
 
-FOLDER = ROOT / "tests" / "newcomers"
+FOLDER = ROOT / "tests" / "modules_from_readme"
 
 
 def lines(reduced: bool) -> Iterator[Line]:
     """One line a variant: it runs from the command line and ends in success. Both forms are the same."""
     modules = sorted(FOLDER.glob("*.py"))
     if not modules:
-        yield Line("variants of newcomers", "no module in tests/newcomers", "some", False)
+        yield Line("variants of newcomers", "no module in tests/modules_from_readme", "some", False)
     for path in modules:
         with tempfile.TemporaryDirectory() as place:
             run = sysid_run([str(path)], Path(place))

@@ -16,7 +16,9 @@ from sysid import catalogue
 
 FILE = Path(__file__).with_name("reference.json")
 ROOT = FILE.parents[2]
-MODULES = {path.stem: path for folder in ("problems", "tests/newcomers") for path in (ROOT / folder).glob("[!_]*.py")}
+MODULES = {
+    path.stem: path for folder in ("problems", "tests/modules_from_readme") for path in (ROOT / folder).glob("[!_]*.py")
+}
 RECORDS = os.environ.get("SYSID_DATA") or ROOT.parent / "shared" / "data" / "mini_shake_table" / "flexible_3_storey"
 DATA = {"mini_shake_table": str(RECORDS)}
 # Processor time in s of those that only SYSID_FULL=1 runs; what they are written in, others have too.

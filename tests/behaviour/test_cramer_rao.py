@@ -8,7 +8,7 @@ import pytest
 
 import sysid
 
-PATH = Path(__file__).resolve().parents[1] / "benchmarks" / "modal" / "cramer_rao.py"
+PATH = Path(__file__).resolve().parents[2] / "benchmarks" / "modal" / "cramer_rao.py"
 
 
 @pytest.fixture(scope="module")

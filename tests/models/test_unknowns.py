@@ -225,7 +225,7 @@ def test_a_declaration_that_cannot_be_is_refused_with_name_file_and_line(mistake
         sysid.Variable("stiff one", **given)
     line = inspect.currentframe().f_lineno - 1
     assert str(caught.value).startswith("variable 'stiff one' (")
-    assert re.search(rf"test_variables\.py, line {line}\)", str(caught.value))
+    assert re.search(rf"test_unknowns\.py, line {line}\)", str(caught.value))
 
 
 def test_a_column_of_casadi_numbers_is_a_bound():
@@ -257,7 +257,7 @@ def test_variables_are_declared_where_the_author_wrote_them_also_through_functio
     variable = make("k")
     source, first = inspect.getsourcelines(inspect.currentframe())
     place = first + next(i for i, line in enumerate(source) if "# the place" in line)
-    assert variable.declared.endswith(f"test_variables.py, line {place}")
+    assert variable.declared.endswith(f"test_unknowns.py, line {place}")
 
 
 def test_blocks_refuse_bounds_that_disagree():

@@ -122,7 +122,7 @@ UNITS = ("ground", "floor_1", "floor_2", "floor_3")
 def event(request):
     """The records of a real shake-table test, where they are at hand."""
     given = os.environ.get("SYSID_DATA")
-    shared = Path(__file__).resolve().parents[2] / "shared" / "data" / "mini_shake_table" / "flexible_3_storey"
+    shared = Path(__file__).resolve().parents[3] / "shared" / "data" / "mini_shake_table" / "flexible_3_storey"
     folder = (Path(given) if given else shared) / request.param
     if not folder.is_dir():
         pytest.skip("the records of the shake-table test are not here: set SYSID_DATA to the folder of both events")
