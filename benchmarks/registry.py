@@ -70,6 +70,7 @@ BENCHMARKS = (
     Benchmark("variants.five_storeys", "errors of storey stiffnesses at 5 % noise", "FULL", "RED"),
     Benchmark("variants.newcomers", "whether variants run as their first users wrote them", "FULL", "RED"),
     Benchmark("variants.module_mistakes", "how mistakes in a problem module are reported", "FULL", "RED"),
+    Benchmark("house", "imports one way, tests of types, branches, sizes of functions and files", "2 s", "2 s"),
 )
 
 
