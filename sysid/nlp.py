@@ -154,6 +154,7 @@ class Watch:
         return len(self.curve)
 
     def callback(self, start: Array, n_ties: int) -> ca.Callback:
+        """IPOPT's iteration callback, which records each iterate; `start` stands until the first comes."""
         self.z = start
         return _IterationCallback(self, start.size, n_ties)
 

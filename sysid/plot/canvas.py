@@ -56,6 +56,7 @@ def _figure_class() -> type[Figure]:
 
 
 def new_figure(width: float, height: float, layout: Literal["constrained"] | None = "constrained") -> Figure:
+    """An empty figure, width and height in inches."""
     return _figure_class()(figsize=(width, height), layout=layout)
 
 
@@ -68,7 +69,7 @@ def new_axes(ax: Axes | None, width: float, height: float) -> tuple[Figure | Non
 
 
 def dress(ax: Axes, title: str, x: str, y: str, *, grid: bool = True, math: bool = False) -> None:
-    """Give axes their words and the house's look."""
+    """Set title, labels and the common style of axes."""
     if title:
         ax.set_title(title, fontsize=10, color=INK, parse_math=math, y=1.0)  # a stated y is not searched for: faster
     ax.set_xlabel(x, fontsize=9, color=INK)
@@ -99,6 +100,7 @@ def count_cells(ax: Axes, shape: tuple[int, ...]) -> None:
 
 
 def count_modes(ax: Axes, n: int) -> None:
+    """Count modes 1 to n along the x axis, not all where they are many."""
     ax.set_xlim(0.4, n + 0.6)
     ax.set_xticks(np.arange(1, n + 1, max(1, -(-n // 12))))
 

@@ -123,6 +123,7 @@ def _channel(
 
 
 def place(ax: Axes | Sequence[Axes] | None, channel: Channel) -> Any:
+    """Draw a channel into axes for magnitude and phase, which are given back; without them into a new figure."""
     if ax is None:
         return panels([channel])
     draw(np.ravel(np.asarray(ax, dtype=object)), channel)
@@ -227,6 +228,7 @@ def positive(values: Array) -> Array:
 
 
 def index_of(what: str, value: int | str, names: Sequence[str]) -> int:
+    """Index of a name or of a number, which may count from the end; `what` it is, for the message of an InputError."""
     if isinstance(value, str):
         if value not in names:
             raise InputError(f"{what} {value!r} is unknown; there are {', '.join(names)}")
@@ -237,10 +239,12 @@ def index_of(what: str, value: int | str, names: Sequence[str]) -> int:
 
 
 def sensor_index(test: Measurement, sensor: int | str) -> int:
+    """Index of a sensor by name or number."""
     return index_of("sensor", sensor, test.sensor_names)
 
 
 def run_index(test: Measurement, run: int | str) -> int:
+    """Index of a run by name or number; runs of unit base motion are called as the base axes."""
     names = (test.base_axes or ()) if is_unit(test) else run_names(test)
     return index_of("run", run, names)
 
@@ -264,6 +268,7 @@ def strongest(
 
 
 def with_force(test: Measurement) -> Measurement:
+    """The measurement itself; an InputError where it has no base force."""
     if test.force is None:
         raise InputError("base_force: this measurement has no base force")
     return test

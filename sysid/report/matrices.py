@@ -18,6 +18,7 @@ Lines = list[list[tuple[str, ...]]]  # below each entry of a matrix
 
 
 def matrices(it: Identification) -> str:
+    """HTML of heat maps and tables of M_SS, K_SS, C and the base's blocks of M."""
     structure, test = it.structure, it.measurement
     n, axes = structure.n, test.base_axes or ()
     names = it.degrees_of_freedom

@@ -11,10 +11,10 @@ import numpy as np
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
+from sysid.models.unknowns import by_name
 from sysid.problem.problem import Problem
 from sysid.search.strategy import History
 from sysid.structure.structure import Array, ComplexArray, Structure
-from sysid.models.unknowns import by_name
 
 if TYPE_CHECKING:
     from sysid.assessment.modal_mass_cone import Intervals

@@ -25,16 +25,16 @@ from typing import Any
 
 import numpy as np
 
+from sysid.errors import InputError
+from sysid.measurement.measurement import Measurement, Sensor
+from sysid.models.damping import ModalDamping, ProportionalDamping
+from sysid.models.mass import FullMass, KnownMass, LumpedMass
+from sysid.models.stiffness import ChainStiffness, SpectralStiffness
+from sysid.problem.problem import Problem
 from sysid.problem.stored import read as read_formulation
 from sysid.problem.stored import write as write_formulation
-from sysid.models.damping import ModalDamping, ProportionalDamping
-from sysid.errors import InputError
 from sysid.results.identification import Identification, Recipe
 from sysid.search.strategy import History
-from sysid.models.mass import FullMass, KnownMass, LumpedMass
-from sysid.measurement.measurement import Measurement, Sensor
-from sysid.problem.problem import Problem
-from sysid.models.stiffness import ChainStiffness, SpectralStiffness
 from sysid.structure.structure import Structure
 
 CONTENT = "sysid identification"

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from sysid.results.unknowns_table import MANY, rows_of, stated_values
 from sysid.results.identification import Identification
+from sysid.results.unknowns_table import MANY, rows_of, stated_values
 from sysid.structure.structure import Array
 
 DEVIATES = 1.96  # standard deviations on either side of 95 % of a normal law

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sysid.models.unknowns import split
 from sysid.problem.formulation import labels_of
 from sysid.results.identification import Identification
-from sysid.models.unknowns import split
 
 _ON_BOUND = 1e-6  # of the range
 MANY = 60  # rows beyond which a terminal shows none

@@ -1,4 +1,4 @@
-"""What surrounds a search: its news, its clock and log, and how it is stopped."""
+"""Progress reporting, time limit and interruption of a search."""
 
 from __future__ import annotations
 
@@ -72,6 +72,7 @@ class DeferredInterrupt:
         self.asked = True
 
     def check(self) -> None:
+        """Raise the KeyboardInterrupt that was held back."""
         if self.asked:
             raise KeyboardInterrupt
 
@@ -92,6 +93,7 @@ class Desk:
 
     @property
     def seconds(self) -> float:
+        """Seconds since the search began."""
         return time.perf_counter() - self.begun
 
     @property
@@ -105,9 +107,11 @@ class Desk:
         return self.max_time is None or self.seconds < self.max_time / 2
 
     def note(self, line: str) -> None:
+        """Add a line to the log, with the time."""
         self.log.append(f"{self.seconds:8.2f} s  {line}")
 
     def tell(self, phase: Phase, iteration: int, of: int, cost: float) -> None:
+        """Report an iteration to the listeners; raise `Stop` or KeyboardInterrupt where the search is to end."""
         self.interrupt.check()
         for listener in self.listeners:
             try:
