@@ -12,7 +12,7 @@ import sysid
 from sysid import plot
 from sysid.modal_analysis.stabilisation import LEVELS, cmif, stabilisation
 from sysid.plot.canvas import to_png
-from sysid.plot.panels import draw, key, response_channel
+from sysid.plot.panels import draw, key, response_channel, strongest
 
 FREQ = np.linspace(1.0, 40.0, 60)
 
@@ -130,7 +130,7 @@ def test_the_default_channel_is_the_strongest(unit):
     run, sensor = np.unravel_index(np.argmax(energy), energy.shape)
     title = plot.transmissibility(unit).axes[0].get_title()
     assert title == f"{unit.measurement.sensor_names[sensor]}, base {'xy'[run]}"
-    chosen = plot.strongest(unit.measurement, 3)
+    chosen = strongest(unit.measurement, 3)
     assert sorted(s for s, _ in chosen) == [0, 1, 2]
 
 
