@@ -161,3 +161,28 @@ class TestTwins:
         # Two feet of the frame, which move with the base.
         response[0, [0, 3]] = test.rigid_body[[0, 3]] * test.base[0] + noise
         assert not [s for s in said(changed(test, response=response), structure) if "record one motion" in s]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize("stated", [20.0, 30.0])
+def test_a_model_whose_poles_are_not_those_of_the_data_is_told(stated, noise):
+    """One mass on an unknown spring, its damper of 20 N s/m stated rightly, or as 30: free residues at the model's
+    own poles then miss as much as the model does.
+    """
+    freq, rng = np.linspace(2.0, 20.0, 100), np.random.default_rng(0)
+    w = 2 * np.pi * freq
+    a = 5 * w**2 / (2e4 - 5 * w**2 + 20j * w)
+    a += noise * np.sqrt(np.mean(np.abs(a) ** 2) / 2) * (rng.normal(size=w.size) + 1j * rng.normal(size=w.size))
+    k = sysid.Variable("spring", lower=5e3, upper=8e4, guess=1.9e4)
+    test = Measurement(freq, np.ones((1, w.size)), (1 + a)[None, None], rigid_body=[[1.0]])
+    problem = Problem(
+        test, mass=np.diag([5.0, 0.0]), stiffness=k * np.array([[1.0, -1.0], [-1.0, 1.0]]), damping=[[stated]]
+    )
+    result = sysid.identify(problem, strategy=sysid.Continuation(starts=1), rng=0)
+    assert result.success
+    if stated == 20.0:
+        assert result.determined
+    else:
+        (doubt,) = result.undetermined
+        assert "poles of the data" in doubt
+        assert not result.determined

@@ -82,3 +82,34 @@ def test_a_callback_that_stops_it_leaves_the_best_so_far(after):
     assert not result.success
     assert not result.determined
     assert np.all(np.isfinite(result.x))
+
+
+@pytest.mark.parametrize("sensors", [1, 2])
+def test_a_second_structure_that_explains_the_data_exactly_is_told(sensors):
+    """The base drives coordinate 1 alone, so that its motion holds the square of the coupling to coordinate 2.
+
+    From the motion of coordinate 1 that coupling is 8000 N/m or -8000 N/m; the motion of coordinate 2 tells the sign.
+    """
+    M, C, G = np.diag([5.0, 4.0]), np.diag([12.0, 9.0]), np.array([[1.0], [0.0]])
+    w, coupling = 2 * np.pi * FREQ[::3, None, None], 8e3
+    K = np.array([[3e4, coupling], [coupling, 2e4]])
+    absolute = np.linalg.solve(-(w**2) * M + 1j * w * C + K, w**2 * (M @ G) + 0j)[..., 0].T + G
+    test = sysid.Measurement(
+        FREQ[::3], np.ones((1, len(w))), absolute[None, :sensors], rigid_body=G[:sensors], base_axes="x"
+    )
+    k = sysid.Variable("coupling", lower=-2e4, upper=2e4, guess=3e3, unit="N/m")
+    problem = sysid.Problem(
+        test, mass=M, stiffness=ca.blockcat([[3e4, k], [k, 2e4]]), damping=C,
+        recovery=np.eye(2)[:sensors], rigid_body_dofs=G,
+    )  # fmt: skip
+    result = sysid.identify(problem, strategy=sysid.Continuation(starts=5), rng=0)
+    assert result.success
+    found = result.values["coupling"].item()
+    if sensors == 2:
+        assert found == pytest.approx(coupling, rel=1e-8)
+        assert result.determined
+        return
+    assert abs(found) == pytest.approx(coupling, rel=1e-8)
+    assert not result.determined
+    (told,) = (sentence for sentence in result.undetermined if "another structure explains" in sentence)
+    assert f"coupling = {-found:.4g} in place of {found:.4g}" in told
