@@ -40,7 +40,7 @@ class Mutant:
     code, replacement : str
         What stands in the package, and what takes its place, on one line.
     tests : str
-        Names of the test files that are to notice it, without ``.py``, the quickest first.
+        Names of the test files that are to notice it, without ``.py``, or ``FILE::TEST``; the quickest first.
     """
 
     identifier: str
@@ -77,307 +77,185 @@ class Result:
 
 # Each of these was once missed by all tests, or noticed by the luck of one seed.
 MISSED = (
-    Mutant(
-        "A07", "refinement by IPOPT starts from a fresh diagonal",
+    Mutant("A07", "refinement by IPOPT starts from a fresh diagonal",
         "lam, psi = np.linalg.eigh(factor @ factor.T) unit = _units(",
         'factor = np.diag(np.pad(targets, (0, len(factor) - targets.size), mode="edge") * 0.9); lam, psi = '
         'np.linalg.eigh(factor @ factor.T); unit = _units(',
-        "test_refinement",
-    ),
-    Mutant(
-        "A08", "status of the refinement by IPOPT ignored",
+        "test_refinement::test_ipopt_starts_from_the_candidates_own_factor"),
+    Mutant("A08", "status of the refinement by IPOPT ignored",
         "return answer if answer.error < _REACHED else replace(answer, success=False)",
-        "return replace(answer, success=True)", "test_refinement",
-    ),
-    Mutant(
-        "B02", "c1 and c2 exchanged in the velocity", "self.cognitive * towards_own + self.social * towards_best",
-        "self.social * towards_own + self.cognitive * towards_best", "test_moves",
-    ),
-    Mutant(
-        "B05", "one random number a particle, not one a component",
+        "return replace(answer, success=True)",
+        "test_refinement::test_success_is_what_ipopt_says_and_the_spectrum_shows"),
+    Mutant("B02", "c1 and c2 exchanged in the velocity", "self.cognitive * towards_own + self.social * towards_best",
+        "self.social * towards_own + self.cognitive * towards_best", "test_moves"),
+    Mutant("B05", "one random number a particle, not one a component",
         "towards_best = self._rng.random(self._positions.shape)",
-        "towards_best = self._rng.random((self._positions.shape[0], 1)) * np.ones(self._positions.shape)", "test_moves",
-    ),
-    Mutant(
-        "B10", "accelerations never adapted", "self.cognitive, self.social = adaptation.next_accelerations(",
-        "_ = adaptation.next_accelerations(", "test_moves",
-    ),
-    Mutant(
-        "C05", "inflation of a problem in expressions times 1.5",
+        "towards_best = self._rng.random((self._positions.shape[0], 1)) * np.ones(self._positions.shape)",
+        "test_moves"),
+    Mutant("B10", "accelerations never adapted", "self.cognitive, self.social = adaptation.next_accelerations(",
+        "_ = adaptation.next_accelerations(", "test_moves"),
+    Mutant("C05", "inflation of a problem in expressions times 1.5",
         "inflation = inflation_of(test, records_of(test, structure, x.size), x.size)",
-        "inflation = 1.5 * inflation_of(test, records_of(test, structure, x.size), x.size)", "test_stated_noise",
-    ),
-    Mutant(
-        "C12", "poles of the data that fit better than the model's never told",
-        "possible = max(poles.of_accelerations, _ROUND_OFF)", "possible = np.inf", "test_checks",
-    ),
-    Mutant(
-        "D03", "stated noise ignored in a fit by direct solves", "weighted=True, shift=tests[0].shift",
-        "weighted=False, shift=tests[0].shift", "test_stated_noise",
-    ),
-    Mutant(
-        "F01", "gain at a complex frequency with a wrong sign", "detuning + shift**2 + 2", "detuning - shift**2 + 2",
-        "test_response",
-    ),
-    Mutant(
-        "F04", "other structures that explain the data never told", "if good and all(_apart(",
-        "if False and all(_apart(", "test_continuation",
-    ),
-    Mutant(
-        "F05", "refinement by IPOPT never taken", "if solved.success and other < misfit:", "if False:",
-        "test_swarm_strategy",
-    ),
-    Mutant(
-        "F09", "default of the largest velocity 4", "SwarmSettings(inertia_b1=0.8",
-        "SwarmSettings(max_velocity=4.0, inertia_b1=0.8", "test_swarm_strategy",
-    ),
-    Mutant(
-        "F10", "default of 2 particles", "n_particles: int | None = None stall_iterations",
-        "n_particles: int | None = 2; stall_iterations", "test_swarm_strategy",
-    ),
-    Mutant(
-        "F11", "default of 1 iteration", "max_iterations: int = 150", "max_iterations: int = 1", "test_swarm_strategy",
-    ),
-    Mutant(
-        "G01", "r and s one and the same draw", "towards_best = self._rng.random(self._positions.shape)",
+        "inflation = 1.5 * inflation_of(test, records_of(test, structure, x.size), x.size)", "test_stated_noise"),
+    Mutant("C12", "poles of the data that fit better than the model's never told",
+        "possible = max(poles.of_accelerations, _ROUND_OFF)", "possible = np.inf",
+        "test_checks::test_a_model_whose_poles_are_not_those_of_the_data_is_told"),
+    Mutant("D03", "stated noise ignored in a fit by direct solves", "weighted=True, shift=tests[0].shift",
+        "weighted=False, shift=tests[0].shift", "test_stated_noise"),
+    Mutant("F01", "gain at a complex frequency with a wrong sign", "detuning + shift**2 + 2", "detuning - shift**2 + 2",
+        "test_response"),
+    Mutant("F04", "other structures that explain the data never told", "if good and all(_apart(",
+        "if False and all(_apart(",
+        "test_continuation::test_a_second_structure_that_explains_the_data_exactly_is_told"),
+    Mutant("F05", "refinement by IPOPT never taken", "if solved.success and other < misfit:", "if False:",
+        "test_swarm_strategy"),
+    Mutant("F09", "default of the largest velocity 4", "SwarmSettings(inertia_b1=0.8",
+        "SwarmSettings(max_velocity=4.0, inertia_b1=0.8", "test_swarm_strategy"),
+    Mutant("F10", "default of 2 particles", "n_particles: int | None = None stall_iterations",
+        "n_particles: int | None = 2; stall_iterations", "test_swarm_strategy"),
+    Mutant("F11", "default of 1 iteration", "max_iterations: int = 150", "max_iterations: int = 1",
+        "test_swarm_strategy"),
+    Mutant("G01", "r and s one and the same draw", "towards_best = self._rng.random(self._positions.shape)",
         "towards_best = np.divide(towards_own, self._own - self._positions, "
         "out=self._rng.random(self._positions.shape), where=self._own != self._positions)",
-        "test_moves",
-    ),
-    Mutant(
-        "G02", "inertia without its random number", "inertia_weight(kappa, rng.random(), settings",
-        "inertia_weight(kappa, 0.5 + 0 * rng.random(), settings", "test_moves",
-    ),
-    Mutant(
-        "G03", "step of the accelerations always at its upper end",
+        "test_moves"),
+    Mutant("G02", "inertia without its random number", "inertia_weight(kappa, rng.random(), settings",
+        "inertia_weight(kappa, 0.5 + 0 * rng.random(), settings", "test_moves"),
+    Mutant("G03", "step of the accelerations always at its upper end",
         "rng.uniform(settings.acceleration_step_lower, settings.acceleration_step_upper)",
         "max(settings.acceleration_step_upper, rng.uniform(settings.acceleration_step_lower, "
         "settings.acceleration_step_upper))",
-        "test_moves",
-    ),
-    Mutant(
-        "G04", "state decided without the one before", "adaptation.next_state(factor, self.state)",
-        "adaptation.next_state(factor, EvolutionaryState.EXPLORATION)", "test_moves",
-    ),
-    Mutant(
-        "H02", "elitist learning in every state",
+        "test_moves"),
+    Mutant("G04", "state decided without the one before", "adaptation.next_state(factor, self.state)",
+        "adaptation.next_state(factor, EvolutionaryState.EXPLORATION)", "test_moves"),
+    Mutant("H02", "elitist learning in every state",
         "if self.state is EvolutionaryState.CONVERGENCE and self.box.n_free > 0:", "if self.box.n_free > 0:",
-        "test_moves",
-    ),
-    Mutant(
-        "H03", "deviations of a problem in expressions never inflated",
+        "test_moves"),
+    Mutant("H03", "deviations of a problem in expressions never inflated",
         "inflation = 1.0 if as_stated else inflation_of(test, records, unknowns)", "inflation = 1.0",
-        "test_stated_noise",
-    ),
+        "test_stated_noise"),
 )  # fmt: skip
 
 NOTICED = (
-    Mutant(
-        "A01", "exponent of the mass distribution as misprinted in eq. 20", "(4 * (2 * k - c))", "(2 * (2 * k - c))",
-        "test_mass",
-    ),
-    Mutant(
-        "A02", "healing by the trace without its square root", "ca.sqrt(totals[i] / ca.sumsqr(factor[rows, :]))",
-        "(totals[i] / ca.sumsqr(factor[rows, :]))", "test_mass",
-    ),
-    Mutant(
-        "A03", "healing by the trace without the base row", "[np.flatnonzero(groups == i).tolist() for i in range(d)]",
-        "[np.flatnonzero(groups[: layout.n] == i).tolist() for i in range(d)]", "test_mass",
-    ),
-    Mutant(
-        "A04", "damping matrix by ratios without its factor 2", "ca.diag(2 * ratios * omega)",
-        "ca.diag(ratios * omega)", "test_damping",
-    ),
-    Mutant(
-        "A05", "ratio of stiffness-proportional damping without 1/2", "y[1] * omega / 2", "y[1] * omega",
-        "test_damping",
-    ),
-    Mutant(
-        "A06", "closed form of the refinement with transposed eigenvectors",
+    Mutant("A01", "exponent of the mass distribution as misprinted in eq. 20", "(4 * (2 * k - c))", "(2 * (2 * k - c))",
+        "test_mass"),
+    Mutant("A02", "healing by the trace without its square root", "ca.sqrt(totals[i] / ca.sumsqr(factor[rows, :]))",
+        "(totals[i] / ca.sumsqr(factor[rows, :]))", "test_mass"),
+    Mutant("A03", "healing by the trace without the base row",
+        "[np.flatnonzero(groups == i).tolist() for i in range(d)]",
+        "[np.flatnonzero(groups[: layout.n] == i).tolist() for i in range(d)]", "test_mass"),
+    Mutant("A04", "damping matrix by ratios without its factor 2", "ca.diag(2 * ratios * omega)",
+        "ca.diag(ratios * omega)", "test_damping"),
+    Mutant("A05", "ratio of stiffness-proportional damping without 1/2", "y[1] * omega / 2", "y[1] * omega",
+        "test_damping"),
+    Mutant("A06", "closed form of the refinement with transposed eigenvectors",
         "replace_spectrum(lam, targets))[:, None] * psi.T", "replace_spectrum(lam, targets))[:, None] * psi",
-        "test_refinement",
-    ),
-    Mutant(
-        "A09", "bound of the stiffness factor at half the highest frequency", "return float(targets[-1])",
-        "return float(targets[-1]) / 2", "test_stiffness",
-    ),
-    Mutant(
-        "A10", "cost of the swarm without the measured spectrum", "lam = replace_spectrum(lam, self._targets)", "pass",
-        "test_problem",
-    ),
-    Mutant(
-        "A11", "cost of the swarm without coupling to the base", "push = L @ (L.T @ G) + blocks.coupling",
-        "push = L @ (L.T @ G)", "test_problem",
-    ),
-    Mutant(
-        "A12", "imaginary part of the modal gain with the wrong sign", "return size * detuning, -size * loss",
-        "return size * detuning, size * loss", "test_response",
-    ),
-    Mutant(
-        "A13", "modal gain with zeta in place of 2 zeta", "g = omega**2 / (lam**2 - omega**2 + 2j * self",
-        "g = omega**2 / (lam**2 - omega**2 + 1j * self", "test_structure",
-    ),
-    Mutant(
-        "A14", "participations without coupling to the base", "B = self.mass[:n, :n] @ G + self.mass[:n, n:]",
-        "B = self.mass[:n, :n] @ G", "test_structure",
-    ),
-    Mutant(
-        "B01", "largest velocity not applied",
+        "test_refinement::test_the_closed_form_is_the_nearest_matrix_of_that_spectrum"),
+    Mutant("A09", "bound of the stiffness factor at half the highest frequency", "return float(targets[-1])",
+        "return float(targets[-1]) / 2", "test_stiffness"),
+    Mutant("A10", "cost of the swarm without the measured spectrum", "lam = replace_spectrum(lam, self._targets)",
+        "pass", "test_problem"),
+    Mutant("A11", "cost of the swarm without coupling to the base", "push = L @ (L.T @ G) + blocks.coupling",
+        "push = L @ (L.T @ G)", "test_problem"),
+    Mutant("A12", "imaginary part of the modal gain with the wrong sign", "return size * detuning, -size * loss",
+        "return size * detuning, size * loss", "test_response"),
+    Mutant("A13", "modal gain with zeta in place of 2 zeta", "g = omega**2 / (lam**2 - omega**2 + 2j * self",
+        "g = omega**2 / (lam**2 - omega**2 + 1j * self", "test_structure"),
+    Mutant("A14", "participations without coupling to the base", "B = self.mass[:n, :n] @ G + self.mass[:n, n:]",
+        "B = self.mass[:n, :n] @ G", "test_structure"),
+    Mutant("B01", "largest velocity not applied",
         "np.clip(velocities, -self._settings.max_velocity, self._settings.max_velocity, out=velocities)", "pass",
-        "test_particles",
-    ),
-    Mutant(
-        "B03", "velocity forgotten", "velocities = self.inertia * self._velocities +",
-        "velocities = 0.0 * self._velocities +", "test_moves",
-    ),
-    Mutant(
-        "B04", "cognitive term dropped", "+ self.cognitive * towards_own + self.social",
-        "+ 0.0 * towards_own + self.social", "test_moves",
-    ),
-    Mutant(
-        "B06", "evolutionary factor of the worst particle", "evolutionary_factor(distances, self._leader)",
-        "evolutionary_factor(distances, int(np.argmax(self._costs)))", "test_moves",
-    ),
-    Mutant(
-        "B07", "directions of exploration and exploitation exchanged", "_S1: (1.0, -1.0), _S2: (0.5, -0.5),",
-        "_S1: (0.5, -0.5), _S2: (1.0, -1.0),", "test_adaptation",
-    ),
-    Mutant(
-        "B08", "candidate of elitist learning never accepted", "if cost < self.best_cost:", "if cost < -np.inf:",
-        "test_particles",
-    ),
-    Mutant(
-        "B09", "focusing distance to the mean position",
+        "test_particles"),
+    Mutant("B03", "velocity forgotten", "velocities = self.inertia * self._velocities +",
+        "velocities = 0.0 * self._velocities +", "test_moves"),
+    Mutant("B04", "cognitive term dropped", "+ self.cognitive * towards_own + self.social",
+        "+ 0.0 * towards_own + self.social", "test_moves"),
+    Mutant("B06", "evolutionary factor of the worst particle", "evolutionary_factor(distances, self._leader)",
+        "evolutionary_factor(distances, int(np.argmax(self._costs)))", "test_moves"),
+    Mutant("B07", "directions of exploration and exploitation exchanged", "_S1: (1.0, -1.0), _S2: (0.5, -0.5),",
+        "_S1: (0.5, -0.5), _S2: (1.0, -1.0),", "test_adaptation"),
+    Mutant("B08", "candidate of elitist learning never accepted", "if cost < self.best_cost:", "if cost < -np.inf:",
+        "test_particles"),
+    Mutant("B09", "focusing distance to the mean position",
         "focusing_change_rate(self._positions, self._own[self._leader])",
-        "focusing_change_rate(self._positions, self._positions.mean(axis=0))", "test_particles",
-    ),
-    Mutant(
-        "B11", "elitist learning never narrows", "self.nit / self.horizon, settings", "0.0, settings", "test_particles",
-    ),
-    Mutant(
-        "B12", "stall never seen", "return before - now <= tolerance * abs(before)", "return False", "test_minimize",
-    ),
-    Mutant(
-        "C01", "deviations times 1.5", "np.hstack([inflation * normals, unseen])",
-        "np.hstack([1.5 * inflation * normals, unseen])", "test_uncertainty",
-    ),
-    Mutant(
-        "C02", "intervals 1.2 times too wide", "z = float(norm.ppf((1 + level) / 2))",
-        "z = 1.2 * float(norm.ppf((1 + level) / 2))", "test_uncertainty",
-    ),
+        "focusing_change_rate(self._positions, self._positions.mean(axis=0))", "test_particles"),
+    Mutant("B11", "elitist learning never narrows", "self.nit / self.horizon, settings", "0.0, settings",
+        "test_particles"),
+    Mutant("B12", "stall never seen", "return before - now <= tolerance * abs(before)", "return False",
+        "test_minimize"),
+    Mutant("C01", "deviations times 1.5", "np.hstack([inflation * normals, unseen])",
+        "np.hstack([1.5 * inflation * normals, unseen])", "test_uncertainty"),
+    Mutant("C02", "intervals 1.2 times too wide", "z = float(norm.ppf((1 + level) / 2))",
+        "z = 1.2 * float(norm.ppf((1 + level) / 2))", "test_uncertainty"),
     Mutant("C03", "level of intervals one-sided", "norm.ppf((1 + level) / 2)", "norm.ppf(level)", "test_uncertainty"),
-    Mutant("C04", "no inflation", "return float(np.sqrt(beyond * shared))", "return 1.0", "test_uncertainty"),
+    Mutant("C04", "no inflation", "return float(np.sqrt(beyond * shared))", "return 1.0",
+        "test_uncertainty::TestNoiseLevel"),
     Mutant("C06", "everything determined", "determined=not open_,", "determined=True,", "test_honesty"),
-    Mutant(
-        "C07", "matrices that noise leaves open called determined", "if not it.determined or exact:", "if True:",
-        "test_certainty",
-    ),
-    Mutant(
-        "C08", "upper ends of the masses 1 % too high", "np.maximum(values[1], own[i, j])",
-        "np.maximum(values[1], own[i, j]) * 1.01", "test_modal_masses",
-    ),
+    Mutant("C07", "matrices that noise leaves open called determined", "if not it.determined or exact:", "if True:",
+        "test_certainty"),
+    Mutant("C08", "upper ends of the masses 1 % too high", "np.maximum(values[1], own[i, j])",
+        "np.maximum(values[1], own[i, j]) * 1.01", "test_intervals"),
     Mutant("C09", "twin sensors never told", "if size[i] > bound and apart <= bound:", "if False:", "test_checks"),
-    Mutant(
-        "C10", "a stated mass that the force contradicts never told", "max(0.01, 3 * force_residual_left",
-        "max(np.inf, 3 * force_residual_left", "test_checks",
-    ),
-    Mutant("C11", "sensors that move with the base never told", "if wrong.size:", "if False:", "test_checks"),
-    Mutant(
-        "C13", "stated values that are missed together never told",
-        "if np.sum(off**2) > chi2.isf(_CHANCE, off.size) and", "if False and", "test_known",
-    ),
-    Mutant(
-        "D01", "status of the local phase ignored", "success = end.status in SOLVED or end.residual <= EXACT",
-        "success = True", "test_honesty test_local",
-    ),
-    Mutant(
-        "D02", "a local minimum of the residues never left",
-        "if ended.of_accelerations <= _SUSPECT * min(possible for _, _, possible in fits):", "if True:", "test_local",
-    ),
-    Mutant(
-        "D04", "weight of a further test ignored", "further = share * relative_misfit(",
-        "further = 1.0 * relative_misfit(", "test_known",
-    ),
-    Mutant(
-        "D05", "half the Gauss-Newton Hessian", "2 * OBJECTIVE_SCALE * factor * (J.T @ J)",
-        "OBJECTIVE_SCALE * factor * (J.T @ J)", "test_variants_forms",
-    ),
-    Mutant(
-        "D06", "modal Hessian by frequencies wrong",
+    Mutant("C10", "a stated mass that the force contradicts never told", "max(0.01, 3 * force_residual_left",
+        "max(np.inf, 3 * force_residual_left", "test_checks"),
+    Mutant("C11", "sensors that move with the base never told", "if wrong.size:", "if False:",
+        "test_certainty::test_a_sensor_of_wrong_sign_gain_or_axis_is_named"),
+    Mutant("C13", "stated values that are missed together never told",
+        "if np.sum(off**2) > chi2.isf(_CHANCE, off.size) and", "if False and",
+        "test_known::test_values_that_are_missed_together_are_named_though_none_is_alone"),
+    Mutant("D01", "status of the local phase ignored", "success = end.status in SOLVED or end.residual <= EXACT",
+        "success = True", "test_local::TestControl"),
+    Mutant("D02", "a local minimum of the residues never left",
+        "if ended.of_accelerations <= _SUSPECT * min(possible for _, _, possible in fits):", "if True:", "test_local"),
+    Mutant("D04", "weight of a further test ignored", "further = share * relative_misfit(",
+        "further = 1.0 * relative_misfit(", "test_known::test_tests_count_by_their_noise"),
+    Mutant("D05", "half the Gauss-Newton Hessian", "2 * OBJECTIVE_SCALE * factor * (J.T @ J)",
+        "OBJECTIVE_SCALE * factor * (J.T @ J)", "test_variants_forms"),
+    Mutant("D06", "modal Hessian by frequencies wrong",
         "(by_ratio[0] - 2 * stiff * turned[0], by_ratio[1] - 2 * stiff * turned[1])",
-        "(by_ratio[0] - stiff * turned[0], by_ratio[1] - stiff * turned[1])", "test_modal_fit",
-    ),
-    Mutant(
-        "D07", "modal Hessian twice too large", "ca.diagcat(2 * inner * alike", "ca.diagcat(4 * inner * alike",
-        "test_modal_fit",
-    ),
+        "(by_ratio[0] - stiff * turned[0], by_ratio[1] - stiff * turned[1])", "test_modal_fit"),
+    Mutant("D07", "modal Hessian twice too large", "ca.diagcat(2 * inner * alike", "ca.diagcat(4 * inner * alike",
+        "test_modal_fit"),
     Mutant("E01", "stored problem without its goal", 'goal=_get(group.attrs, "goal"),', "goal=None,", "test_storage"),
-    Mutant(
-        "E02", "stored test without the deviation of its force", 'force_std=_get(group, "force_std"),',
-        "force_std=None,", "test_storage",
-    ),
-    Mutant(
-        "E03", "stored result without its remarks", 'remarks=_get(file, "remarks") or (),', "remarks=(),",
-        "test_storage",
-    ),
+    Mutant("E02", "stored test without the deviation of its force", 'force_std=_get(group, "force_std"),',
+        "force_std=None,", "test_storage"),
+    Mutant("E03", "stored result without its remarks", 'remarks=_get(file, "remarks") or (),', "remarks=(),",
+        "test_storage"),
     Mutant("E04", "stored structure without its recovery", 'recovery=group["recovery"][()],', "", "test_storage"),
-    Mutant(
-        "E05", "plot with the prediction of another sensor",
+    Mutant("E05", "plot with the prediction of another sensor",
         "test.predict(identification.structure)[run, sensor] + test",
-        "test.predict(identification.structure)[run, 0] + test", "test_plot",
-    ),
-    Mutant(
-        "E06", "plot with the record of another sensor", "_channel(test, test.response[run, sensor], predicted,",
-        "_channel(test, test.response[run, -1], predicted,", "test_plot",
-    ),
-    Mutant(
-        "E07", "residual of absolute accelerations",
+        "test.predict(identification.structure)[run, 0] + test", "test_plot"),
+    Mutant("E06", "plot with the record of another sensor", "_channel(test, test.response[run, sensor], predicted,",
+        "_channel(test, test.response[run, -1], predicted,", "test_plot"),
+    Mutant("E07", "residual of absolute accelerations",
         'self.response - np.einsum("sd,rdf->rsf", self.rigid_body, self.base)',
-        'self.response - 0 * np.einsum("sd,rdf->rsf", self.rigid_body, self.base)', "test_measurement",
-    ),
-    Mutant(
-        "E08", "residual of the force relative to the prediction",
+        'self.response - 0 * np.einsum("sd,rdf->rsf", self.rigid_body, self.base)', "test_measurement"),
+    Mutant("E08", "residual of the force relative to the prediction",
         "np.linalg.norm(self.predict_force(structure) - self.force) / np.linalg.norm(self.force)",
         "np.linalg.norm(self.predict_force(structure) - self.force) / np.linalg.norm(self.predict_force(structure))",
-        "test_measurement",
-    ),
-    Mutant(
-        "E09", "plotted band for unit base motion", "np.sum(band * np.abs(test.base[run]), axis=0)",
-        "np.sum(band, axis=0)", "test_plot",
-    ),
-    Mutant(
-        "F02", "candidates that break constraints not penalised",
+        "test_measurement"),
+    Mutant("E09", "plotted band for unit base motion", "np.sum(band * np.abs(test.base[run]), axis=0)",
+        "np.sum(band, axis=0)", "test_plot"),
+    Mutant("F02", "candidates that break constraints not penalised",
         "np.where(broken > 0, _WORST * (1 + broken), np.minimum(cost, _WORST))", "np.minimum(cost, _WORST)",
-        "test_written_cost",
-    ),
-    Mutant(
-        "F03", "success above the goal", "residual > problem.goal: success = False message +=",
-        "residual > problem.goal: message +=", "test_identify",
-    ),
+        "test_written_cost"),
+    Mutant("F03", "success above the goal", "residual > problem.goal: success = False message +=",
+        "residual > problem.goal: message +=", "test_identify"),
     Mutant("F06", "refinement by IPOPT left out", "self.refine()", "pass", "test_swarm_strategy test_identify"),
-    Mutant(
-        "F07", "the first best of the swarm kept", "self.raw, self.x = cost.unknowns(state.x), cost.refined(state.x)",
-        "if self.x is None: self.raw, self.x = cost.unknowns(state.x), cost.refined(state.x)", "test_identify",
-    ),
-    Mutant(
-        "F08", "gradient steps of the swarm left out", "improve_every=options.gradient_every,", "improve_every=0,",
-        "test_identify",
-    ),
-    Mutant(
-        "G05", "social pull towards the first particle's best",
+    Mutant("F07", "the first best of the swarm kept",
+        "self.raw, self.x = cost.unknowns(state.x), cost.refined(state.x)",
+        "if self.x is None: self.raw, self.x = cost.unknowns(state.x), cost.refined(state.x)", "test_identify"),
+    Mutant("F08", "gradient steps of the swarm left out", "improve_every=options.gradient_every,", "improve_every=0,",
+        "test_identify"),
+    Mutant("G05", "social pull towards the first particle's best",
         "towards_best *= self._own[self._leader] - self._positions", "towards_best *= self._own[0] - self._positions",
-        "test_moves",
-    ),
-    Mutant(
-        "H01", "deviations of a problem in expressions times 1.5",
+        "test_moves"),
+    Mutant("H01", "deviations of a problem in expressions times 1.5",
         "inflation * (weight * record.std).ravel() / np.sqrt(2)",
-        "1.5 * inflation * (weight * record.std).ravel() / np.sqrt(2)", "test_stated_noise",
-    ),
-    Mutant(
-        "H04", "inertia never adapted",
+        "1.5 * inflation * (weight * record.std).ravel() / np.sqrt(2)", "test_stated_noise"),
+    Mutant("H04", "inertia never adapted",
         "self.inertia = adaptation.inertia_weight(kappa, rng.random(), settings.inertia_b1, settings.inertia_b2)",
-        "self.inertia = 0.3 + 0 * rng.random()", "test_moves",
-    ),
+        "self.inertia = 0.3 + 0 * rng.random()", "test_moves"),
 )  # fmt: skip
 MUTANTS = MISSED + NOTICED
 
@@ -425,15 +303,15 @@ def examine(mutant: Mutant) -> Result:
     """Make a change in a copy of the package, and see whether its tests notice it."""
     begun = time.perf_counter()
     places = [(path, match) for path in sorted(PACKAGE.rglob("*.py")) for match in occurrences(mutant.code, path)]
-    files = [path for name in mutant.tests.split() for path in sorted(TESTS.rglob(f"{name}.py"))]
+    tests = [test for name in mutant.tests.split() for test in _tests_of(name)]
     if len(places) != 1:
         verdict, detail = "not found", f"its code occurs {len(places)} times"
-    elif len(files) < len(mutant.tests.split()):
-        verdict, detail = "not found", f"not all of {mutant.tests} are below {TESTS.name}/"
+    elif len(tests) < len(mutant.tests.split()):
+        verdict, detail = "not found", f"not all files of {mutant.tests} are below {TESTS.name}/"
     else:
         ((path, match),) = places
         text = match.string[: match.start()] + mutant.replacement + match.string[match.end() :]
-        verdict, detail = _judged(path.relative_to(PACKAGE), text, files)
+        verdict, detail = _judged(path.relative_to(PACKAGE), text, tests)
     return Result(mutant, verdict, detail, time.perf_counter() - begun)
 
 
@@ -444,7 +322,13 @@ def occurrences(code: str, path: Path) -> list[re.Match[str]]:
     return list(re.finditer(start + pattern + end, path.read_text(encoding="utf-8")))
 
 
-def _judged(path: Path, text: str, files: list[Path]) -> tuple[str, str]:
+def _tests_of(name: str) -> list[str]:
+    """Full names of the test files, or of what they hold, that are called so."""
+    file, *inside = name.split("::")
+    return ["::".join([str(path), *inside]) for path in sorted(TESTS.rglob(f"{file}.py"))]
+
+
+def _judged(path: Path, text: str, tests: list[str]) -> tuple[str, str]:
     """Verdict and detail of a package in which the file `path` has this text."""
     try:
         ast.parse(text)
@@ -456,13 +340,13 @@ def _judged(path: Path, text: str, files: list[Path]) -> tuple[str, str]:
         shutil.copytree(PACKAGE, changed / PACKAGE.name)
         (changed / PACKAGE.name / path).write_text(text, encoding="utf-8")
         try:
-            status = _pytest(changed, cache, "-x", *map(str, files))
+            status = _pytest(changed, cache, "-x", *tests)
             if status == 0:
                 return "survived", str(path)
             if status != 1:
                 return "no verdict", f"{path}: pytest ended with status {status}"
             # The failed test alone, without the change.
-            status = _pytest(ROOT, cache, "--last-failed", "--last-failed-no-failures=none", *map(str, files))
+            status = _pytest(ROOT, cache, "--last-failed", "--last-failed-no-failures=none", *tests)
         except subprocess.TimeoutExpired:
             return "no verdict", f"{path}: the tests took more than {SECONDS:.0f} s"
     if status != 0:
