@@ -17,6 +17,12 @@ EXACT = 1e-8  # a relative residual that needs no second look
 _TOLERANCE = 1e-9  # of IPOPT
 
 
+def quiet_options(max_iterations: int) -> dict[str, Any]:
+    """Options of a small run of IPOPT that prints nothing."""
+    ipopt = {"print_level": 0, "sb": "yes", "max_iter": max_iterations}
+    return {"print_time": False, "show_eval_warnings": False, "ipopt": ipopt}
+
+
 class Coordinates:
     """Unknowns z of the nonlinear programme, and the equalities and inequalities that tie them."""
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from sysid.errors import InputError
-from sysid.models.geometry import Layout
-from sysid.models.unknowns import Block
-from sysid.structure.structure import Array
+from sysid.models.expressions import as_matrix, at_point, check_finite, check_size, is_column, square, written_in
+from sysid.models.geometry import Geometry
+from sysid.models.model import MassBlocks, Stated, StiffnessBlocks
+from sysid.models.unknowns import Unknown
+from sysid.structure.structure import Array, Structure
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,19 +23,27 @@ class ModalDamping:
     lower: float = 0.005
     upper: float = 0.05
 
-    def variables(self, layout: Layout) -> tuple[Block, ...]:
+    def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """Damping ratios, in ascending order of frequency."""
         if not 0 < self.lower < self.upper < 1:
             raise InputError(f"ModalDamping: 0 < lower < upper < 1 is needed, not {self.lower} and {self.upper}")
-        return (Block("damping_ratio", np.full(layout.n, self.lower), np.full(layout.n, self.upper)),)
+        return (Unknown("damping_ratio", np.full(geometry.n, self.lower), np.full(geometry.n, self.upper)),)
 
-    def ratios(self, y: ca.SX, omega: ca.SX) -> ca.SX:
-        """Damping ratios (n,) at the circular frequencies `omega`."""
+    def blocks(self, geometry: Geometry, y: ca.SX, mass: MassBlocks, stiffness: StiffnessBlocks) -> None:
+        """No matrix: ratios only."""
+        return None
+
+    def ratios(self, geometry: Geometry, y: ca.SX, omega: ca.SX) -> ca.SX:
+        """Damping ratios (n,), in ascending order of frequency."""
         return y
 
-    def values(self, ratios: Array, omega: Array) -> Array:
-        """Unknowns that give these ratios."""
-        return ratios
+    def values(self, geometry: Geometry, structure: Structure) -> Array:
+        """Damping ratios of a structure."""
+        return structure.damping_ratios
+
+    def stated(self, geometry: Geometry) -> Stated:
+        """Any ratios."""
+        return Stated(free=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,24 +59,79 @@ class ProportionalDamping:
     alpha: tuple[float, float]
     beta: tuple[float, float]
 
-    def variables(self, layout: Layout) -> tuple[Block, ...]:
+    def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """The two factors; alpha in 1/s, beta in s."""
         for name, (low, high) in (("alpha", self.alpha), ("beta", self.beta)):
             if not 0 <= low < high < np.inf:
                 raise InputError(f"ProportionalDamping: {name} needs 0 <= lower < upper, not ({low}, {high})")
         lower, upper = np.array([self.alpha, self.beta], dtype=float).T
-        return (Block("rayleigh_factor", lower, upper, unit="1/s, s"),)
+        return (Unknown("rayleigh_factor", lower, upper, unit="1/s, s"),)
 
-    def ratios(self, y: ca.SX, omega: ca.SX) -> ca.SX:
+    def blocks(self, geometry: Geometry, y: ca.SX, mass: MassBlocks, stiffness: StiffnessBlocks) -> ca.SX:
+        """C (n, n)."""
+        return y[0] * mass.factor @ mass.factor.T + y[1] * stiffness.stiffness
+
+    def ratios(self, geometry: Geometry, y: ca.SX, omega: ca.SX) -> ca.SX:
         """Damping ratios (n,) at the circular frequencies `omega`."""
         return y[0] / (2 * omega) + y[1] * omega / 2
 
-    def values(self, ratios: Array, omega: Array) -> Array:
-        """Least-squares alpha and beta for these ratios."""
-        return np.linalg.lstsq(np.column_stack([1 / (2 * omega), omega / 2]), ratios, rcond=None)[0]
+    def values(self, geometry: Geometry, structure: Structure) -> Array:
+        """Least-squares alpha and beta for a structure's ratios."""
+        omega = 2 * np.pi * structure.natural_frequencies
+        columns = np.column_stack([1 / (2 * omega), omega / 2])
+        return np.linalg.lstsq(columns, structure.damping_ratios, rcond=None)[0]
+
+    def stated(self, geometry: Geometry) -> Stated:
+        """Nothing that the modes would tell."""
+        return Stated()
 
 
-DampingModel = ModalDamping | ProportionalDamping
+@dataclass(frozen=True, eq=False)
+class WrittenDamping:
+    """Damping written in variables or numbers.
+
+    Parameters
+    ----------
+    matrix : expression or array_like
+        C (n, n) on the motion relative to the base, base rows are cut off; or one ratio a mode, (n,).
+    """
+
+    matrix: Any
+
+    def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
+        """None of its own: its variables are the problem's."""
+        return ()
+
+    def blocks(self, geometry: Geometry, y: ca.MX, mass: MassBlocks, stiffness: StiffnessBlocks) -> ca.MX | None:
+        """C (n, n), or None where ratios are written."""
+        if self._by_ratios(geometry):
+            return None
+        C = square("damping", self.matrix)
+        check_size("damping", C, geometry.n, geometry.d)
+        return C[: geometry.n, : geometry.n]
+
+    def ratios(self, geometry: Geometry, y: ca.MX, omega: ca.MX) -> ca.MX | None:
+        """The ratios (n,); None where C is written."""
+        if not self._by_ratios(geometry):
+            return None
+        column = as_matrix("damping", self.matrix)
+        numbers = at_point("damping", column, None)
+        check_finite("damping ratio", numbers.ravel(), column)
+        if np.any(numbers < 0):
+            raise InputError(f"damping: the ratio {numbers.min():.3g} at the guess is negative{written_in(column)}")
+        return column
+
+    def _by_ratios(self, geometry: Geometry) -> bool:
+        given, n = as_matrix("damping", self.matrix), geometry.n
+        return given.shape == (n, 1) and (n > 1 or is_column(self.matrix))
+
+    def values(self, geometry: Geometry, structure: Structure) -> Array:
+        """Refused: an expression has no inverse."""
+        raise InputError("a damping written in expressions has no inverse: give the unknowns, not a Structure")
+
+    def stated(self, geometry: Geometry) -> Stated:
+        """Nothing that is read off an expression."""
+        return Stated()
 
 
 def physical_damping(mass: ca.SX, mode_shapes: ca.SX, omega: ca.SX, ratios: ca.SX) -> ca.SX:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sysid.errors import InputError
-from sysid.models.unknowns import Block
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.vector_fitting import Poles, find_poles
+from sysid.models.unknowns import Unknown
 from sysid.structure.structure import Array, finite_array
 
 # A Cholesky diagonal of zero makes the mode shapes infinite; one of 1e-3 already spans a
@@ -17,28 +20,66 @@ from sysid.structure.structure import Array, finite_array
 FACTOR_FLOOR = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class Layout:
-    """What the matrix models must know of a test.
+class Geometry:
+    """The geometry of a test's degrees of freedom, and what its records tell before any model is fitted.
+
+    Poles and weights are found when they are first asked for, once.
 
     Parameters
     ----------
-    rigid_body : ndarray, shape (n, d)
-        G, motion of the sensors for unit base motion.
-    translational : ndarray of bool, shape (d,)
-        Which base directions are translations.
-    weighed : ndarray, shape (d,), optional
-        Rigid-body mass a direction that a measured base force suggests. A total that is not
+    test : Measurement
+    rigid_body : ndarray, shape (n, d), optional
+        G, motion of the degrees of freedom for unit base motion; those of the sensors where it is not given.
+    recovery : ndarray, shape (n_sensors, n), optional
+        From degrees of freedom to sensors, where they are not one and the same.
+    weighed : ndarray, shape (d,) or callable, optional
+        Rigid-body mass a direction, or what finds it, that a measured base force suggests. A total that is not
         stated is then an unknown, searched around it.
     """
 
-    rigid_body: Array
-    translational: NDArray[np.bool_]
-    weighed: Array | None = None
+    def __init__(
+        self,
+        test: Measurement,
+        rigid_body: Array | None = None,
+        recovery: Array | None = None,
+        weighed: Array | Callable[[], Array] | None = None,
+    ) -> None:
+        self.test = test
+        self.rigid_body = test.rigid_body if rigid_body is None else rigid_body
+        self.recovery = np.eye(len(self.rigid_body)) if recovery is None else recovery
+        self.translational = test.translational
+        self._weighed = weighed
+
+    @cached_property
+    def poles(self) -> Poles:
+        """Poles that stand out of the records."""
+        return find_poles(self.test)
+
+    @cached_property
+    def weighed(self) -> Array | None:
+        """Rigid-body mass a direction that the base force suggests, (d,); None where nothing is weighed."""
+        return self._weighed() if callable(self._weighed) else self._weighed
+
+    def unsearched(self) -> Geometry:
+        """The same with made-up poles and weights, to check what is declared before anything is searched."""
+        copy = Geometry(self.test, self.rigid_body, self.recovery, None if self._weighed is None else np.ones(self.d))
+        omega = 2 * np.pi * np.linspace(self.test.freq[0] or self.test.freq[-1] / 2, self.test.freq[-1], self.n)
+        copy.__dict__["poles"] = Poles(omega, np.full(self.n, 0.01), 0.0)
+        return copy
+
+    @property
+    def weighs(self) -> bool:
+        """Whether a total that is not stated is an unknown."""
+        return self._weighed is not None
+
+    @property
+    def at_sensors(self) -> bool:
+        """Whether the degrees of freedom are the sensors."""
+        return np.array_equal(self.recovery, np.eye(len(self.rigid_body)))
 
     @property
     def n(self) -> int:
-        """Number of sensors."""
+        """Number of degrees of freedom."""
         return int(self.rigid_body.shape[0])
 
     @property
@@ -59,17 +100,17 @@ class Layout:
         groups = np.where(strength.max(axis=1) > 0, np.argmax(ties, axis=1), -1)
         return np.concatenate([groups, np.arange(self.d)])
 
-    def total_variables(self, total_mass: ArrayLike | None) -> tuple[Block, ...]:
+    def total_unknowns(self, total_mass: ArrayLike | None) -> tuple[Unknown, ...]:
         """The totals as unknowns, where they are not stated and the base force tells them."""
         if total_mass is not None or self.weighed is None:
             return ()
         # Skew sensors may all belong to one direction, which then carries what the force weighs in all.
         upper = np.where(self.translational, self.weighed[self.translational].sum(), self.weighed)
-        return (Block("total_mass", self.weighed / 4, upper * 4, unit="kg"),)
+        return (Unknown("total_mass", self.weighed / 4, upper * 4, unit="kg"),)
 
     def split_totals(self, total_mass: ArrayLike | None, y: ca.SX) -> tuple[ca.SX | Array, ca.SX]:
         """Totals, stated or the first of the unknowns `y`, and the unknowns left."""
-        if self.total_variables(total_mass):
+        if total_mass is None and self.weighs:
             return y[: self.d], y[self.d :]
         return self.totals(total_mass), y
 

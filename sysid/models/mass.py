@@ -3,28 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError
-from sysid.models.geometry import FACTOR_FLOOR, Layout
-from sysid.models.unknowns import Block
-from sysid.structure.structure import Array, finite_array
+from sysid.models.expressions import check_size, cholesky, square
+from sysid.models.geometry import FACTOR_FLOOR, Geometry
+from sysid.models.model import MassBlocks, Stated, Totals, constant
+from sysid.models.unknowns import Unknown
+from sysid.structure.structure import Array, Structure, finite_array
 from sysid.structure.triangular import lower_triangle, triangle_entries
 
 _ROW_EXPECTATION = 1.0  # the paper's c
 _NEWTON_STEPS = 20  # for the coupled scales of the rigid-body healing; quadratic from a good start
-
-
-class MassBlocks(NamedTuple):
-    """CasADi expressions: Cholesky factor of M_SS (n, n), M_S0 (n, d), M_00 (d, d)."""
-
-    factor: ca.SX
-    coupling: ca.SX
-    base: ca.SX
 
 
 def sampling_exponent(k: int, c: float = _ROW_EXPECTATION) -> float:
@@ -87,14 +81,9 @@ class FullMass:
         if self.total_mass is not None and np.ndim(self.total_mass) == 2 and self.healing != "rigid_body":
             raise InputError("a matrix of total mass is the rigid-body mass: state healing='rigid_body' with it")
 
-    @property
-    def healable(self) -> bool:
-        """Whether scaling the rows of a factor meets all that is stated."""
-        return self.known is None and (self.total_mass is None or np.ndim(self.total_mass) < 2)
-
-    def known_entries(self, layout: Layout) -> Array:
+    def known_entries(self, geometry: Geometry) -> Array:
         """What is known of ``[M_SS, M_S0]``, (n, n + d); NaN where nothing is."""
-        n, d = layout.n, layout.d
+        n, d = geometry.n, geometry.d
         entries = np.full((n, n + d), np.nan)
         if self.known is None:
             return entries
@@ -115,38 +104,35 @@ class FullMass:
         entries[:, :n] = across
         return entries
 
-    def variables(self, layout: Layout) -> tuple[Block, ...]:
+    def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """Entries of the factor's lower triangle, row by row, in [-1, 1] (eq. 35)."""
-        size = layout.n + layout.d
+        size = geometry.n + geometry.d
         rows, columns = np.tril_indices(size)
         exponents = np.array([sampling_exponent(k) for k in range(1, size + 1)])[rows]
         lower = np.where(rows == columns, FACTOR_FLOOR, -1.0)
         return (
-            *layout.total_variables(self.total_mass),
-            Block(
+            *geometry.total_unknowns(self.total_mass),
+            Unknown(
                 "mass_factor",
                 lower,
                 np.ones(rows.size),
                 sampling=lambda x: ca.fmax(spread_rows(x, exponents), lower),
                 unsampling=lambda y: gather_rows(y, exponents),
+                scale="by row",
             ),
         )
 
-    def totals(self, layout: Layout) -> Array:
-        """Total mass in each base direction, (d,)."""
-        return layout.totals(self.total_mass)
-
-    def blocks(self, layout: Layout, y: ca.SX) -> MassBlocks:
+    def blocks(self, geometry: Geometry, y: ca.SX) -> MassBlocks:
         """Healed mass blocks of the factor entries `y`; positive definite for every `y` in the box."""
-        n = layout.n
-        totals, entries = layout.split_totals(self.total_mass, y)
-        healed = heal(lower_triangle(entries, n + layout.d), layout, totals, self.healing)
+        n = geometry.n
+        totals, entries = geometry.split_totals(self.total_mass, y)
+        healed = heal(lower_triangle(entries, n + geometry.d), geometry, totals, self.healing)
         L, low, base = healed[:n, :n], healed[n:, :n], healed[n:, n:]
         return MassBlocks(L, L @ low.T, low @ low.T + base @ base.T)
 
-    def values(self, layout: Layout, mass: Array) -> Array:
-        """Factor entries that `blocks` takes back to `mass`, (n + d, n + d), which has the stated totals."""
-        n = layout.n
+    def values(self, geometry: Geometry, structure: Structure) -> Array:
+        """Factor entries that `blocks` takes back to the structure's mass, which has the stated totals."""
+        n, mass = geometry.n, structure.mass
         L = np.linalg.cholesky(mass[:n, :n])
         low = np.linalg.solve(L, mass[:n, n:]).T
         remainder = mass[n:, n:] - low @ low.T
@@ -155,19 +141,29 @@ class FullMass:
         root = (vectors * np.sqrt(np.maximum(lam, 0.0))).T
         base = np.linalg.qr(root)[1].T
         base = base * np.where(np.diag(base) < 0, -1.0, 1.0)
-        factor = np.block([[L, np.zeros((n, layout.d))], [low, base]])
+        factor = np.block([[L, np.zeros((n, geometry.d))], [low, base]])
         entries = triangle_entries(factor)
         # Half the box: near its edge the sampling transform loses what it is given to round-off.
         entries = entries / (2 * np.abs(entries).max())
-        if not layout.total_variables(self.total_mass):
+        if self.total_mass is not None or not geometry.weighs:
             return entries
-        return np.concatenate([self.total(layout, mass), entries])
+        return np.concatenate([total_of(geometry, mass, self.healing), entries])
 
-    def total(self, layout: Layout, mass: Array) -> Array:
-        """What this healing calls the total of `mass`, (d,)."""
-        if self.healing == "rigid_body":
-            return rigid_body_masses(layout, mass)
-        return np.array([mass.diagonal()[layout.directions == i].sum() for i in range(layout.d)])
+    def stated(self, geometry: Geometry) -> Stated:
+        """Known entries, and totals of its kind."""
+        known = self.known_entries(geometry)
+        if not np.any(np.isfinite(known)):
+            return Stated(free=True, totals=self._stated_totals(geometry))
+        count = np.count_nonzero(np.triu(np.isfinite(known[:, : geometry.n])))
+        count += np.count_nonzero(np.isfinite(known[:, geometry.n :]))
+        sentence = f"{count} {'entry' if count == 1 else 'entries'} of the mass matrix stated to be known"
+        return Stated(free=True, entries=known, totals=self._stated_totals(geometry), sentence=sentence)
+
+    def _stated_totals(self, geometry: Geometry) -> Totals | None:
+        if self.total_mass is None:
+            return None
+        whole = geometry.rigid_total(self.total_mass)
+        return Totals(geometry.totals(self.total_mass) if whole is None else whole, self.healing)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,33 +178,40 @@ class LumpedMass:
 
     total_mass: ArrayLike | None = None
 
-    def variables(self, layout: Layout) -> tuple[Block, ...]:
+    def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """Shares of the masses, scaled afterwards to their direction's total."""
-        share = Block("mass_share", np.full(layout.n, FACTOR_FLOOR), np.ones(layout.n))
-        return (*layout.total_variables(self.total_mass), share)
+        share = Unknown("mass_share", np.full(geometry.n, FACTOR_FLOOR), np.ones(geometry.n))
+        return (*geometry.total_unknowns(self.total_mass), share)
 
-    def totals(self, layout: Layout) -> Array:
-        """Total mass in each base direction, (d,)."""
-        return layout.totals(self.total_mass)
-
-    def blocks(self, layout: Layout, y: ca.SX) -> MassBlocks:
+    def blocks(self, geometry: Geometry, y: ca.SX) -> MassBlocks:
         """Diagonal blocks; the base rows are zero."""
-        groups = layout.directions[: layout.n]
-        totals, share = layout.split_totals(self.total_mass, y)
+        groups = geometry.directions[: geometry.n]
+        totals, share = geometry.split_totals(self.total_mass, y)
         scales = {
             i: totals[i] / ca.sum1(share[np.flatnonzero(groups == i).tolist()]) for i in set(groups.tolist()) - {-1}
         }
         free = sum(scales.values()) / max(len(scales), 1) if scales else 1.0
         masses = [share[j] * scales.get(g, free) for j, g in enumerate(groups.tolist())]
-        return MassBlocks(ca.diag(ca.sqrt(ca.vertcat(*masses))), ca.SX(layout.n, layout.d), ca.SX(layout.d, layout.d))
+        return MassBlocks(
+            ca.diag(ca.sqrt(ca.vertcat(*masses))), ca.SX(geometry.n, geometry.d), ca.SX(geometry.d, geometry.d)
+        )
 
-    def values(self, layout: Layout, mass: Array) -> Array:
-        """Shares that `blocks` takes back to `mass`."""
-        m, groups = np.diag(mass)[: layout.n], layout.directions[: layout.n]
-        if not layout.total_variables(self.total_mass):
+    def values(self, geometry: Geometry, structure: Structure) -> Array:
+        """Shares that `blocks` takes back to the structure's mass."""
+        m, groups = np.diag(structure.mass)[: geometry.n], geometry.directions[: geometry.n]
+        if self.total_mass is not None or not geometry.weighs:
             return m / m.max()
-        totals = [m[groups == i].sum() or layout.totals(None)[i] for i in range(layout.d)]
+        totals = [m[groups == i].sum() or geometry.totals(None)[i] for i in range(geometry.d)]
         return np.concatenate([totals, m / m.max()])
+
+    def stated(self, geometry: Geometry) -> Stated:
+        """Zeros off the diagonal, and the total over the sensors."""
+        entries = np.where(np.eye(geometry.n, geometry.n + geometry.d) > 0, np.nan, 0.0)
+        sentence = "the mass is stated to be lumped on the sensors"
+        if self.total_mass is None:
+            return Stated(entries=entries, sentence=sentence)
+        totals = Totals(geometry.totals(self.total_mass), "sensors")
+        return Stated(entries=entries, totals=totals, sentence=f"{sentence}, with its total given")
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,34 +220,34 @@ class KnownMass:
 
     matrix: ArrayLike
 
-    def variables(self, layout: Layout) -> tuple[Block, ...]:
+    def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """No unknowns."""
         return ()
 
-    def totals(self, layout: Layout) -> Array:
-        """Rigid-body mass in each base direction, (d,)."""
-        return rigid_body_masses(layout, self.full(layout))
-
-    def blocks(self, layout: Layout, y: ca.SX) -> MassBlocks:
+    def blocks(self, geometry: Geometry, y: ca.SX) -> MassBlocks:
         """Constant blocks."""
-        full = self.full(layout)
-        n = layout.n
+        full = self.full(geometry)
+        n = geometry.n
         try:
             L = np.linalg.cholesky(full[:n, :n])
         except np.linalg.LinAlgError:
             raise InputError("the known mass matrix is not positive definite over the sensors") from None
-        return MassBlocks(ca.SX(ca.sparsify(ca.DM(L))), ca.SX(full[:n, n:]), ca.SX(full[n:, n:]))
+        return MassBlocks(*map(constant, (L, full[:n, n:], full[n:, n:])))
 
-    def values(self, layout: Layout, mass: Array) -> Array:
+    def values(self, geometry: Geometry, structure: Structure) -> Array:
         """Nothing to tell."""
         return np.zeros(0)
 
-    def full(self, layout: Layout) -> Array:
+    def stated(self, geometry: Geometry) -> Stated:
+        """All entries."""
+        return Stated(entries=self.full(geometry)[: geometry.n], sentence="the mass matrix is known")
+
+    def full(self, geometry: Geometry) -> Array:
         """The matrix over sensors and base, (n + d, n + d)."""
         matrix = finite_array("the known mass matrix", self.matrix)
-        n, size = layout.n, layout.n + layout.d
+        n, size = geometry.n, geometry.n + geometry.d
         if matrix.shape == (n, n):
-            matrix = np.pad(matrix, (0, layout.d))
+            matrix = np.pad(matrix, (0, geometry.d))
         if matrix.shape != (size, size):
             raise InputError(f"the known mass matrix is {matrix.shape}; ({n}, {n}) or ({size}, {size}) is needed")
         if np.abs(matrix - matrix.T).max() > 1e-9 * np.abs(matrix).max():
@@ -258,40 +261,78 @@ class KnownMass:
         return matrix
 
 
-MassModel = FullMass | LumpedMass | KnownMass
+@dataclass(frozen=True, eq=False)
+class WrittenMass:
+    """A mass matrix written in variables.
+
+    Parameters
+    ----------
+    expression : expression
+        (n, n), or with the base's rows last (n + d, n + d).
+    """
+
+    expression: Any
+
+    def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
+        """None of its own: its variables are the problem's."""
+        return ()
+
+    def blocks(self, geometry: Geometry, y: ca.MX) -> MassBlocks:
+        """The blocks of the expression; no coupling and no base mass where it has no base rows."""
+        n, d = geometry.n, geometry.d
+        whole = square("mass", self.expression)
+        check_size("mass", whole, n, d)
+        if whole.size1() == n:
+            return MassBlocks(cholesky(whole), ca.MX(n, d), ca.MX(d, d))
+        return MassBlocks(cholesky(whole[:n, :n]), whole[:n, n:], whole[n:, n:])
+
+    def values(self, geometry: Geometry, structure: Structure) -> Array:
+        """Refused: an expression has no inverse."""
+        raise InputError("a mass written in expressions has no inverse: give the unknowns, not a Structure")
+
+    def stated(self, geometry: Geometry) -> Stated:
+        """Nothing that is read off an expression."""
+        return Stated()
 
 
-def rigid_body_masses(layout: Layout, mass: Array) -> Array:
+def total_of(geometry: Geometry, mass: Array, kind: str) -> Array:
+    """What a kind of healing calls the total of `mass` (n + d, n + d), (d,)."""
+    if kind == "rigid_body":
+        return rigid_body_masses(geometry, mass)
+    return np.array([mass.diagonal()[geometry.directions == i].sum() for i in range(geometry.d)])
+
+
+def rigid_body_masses(geometry: Geometry, mass: Array) -> Array:
     """Diagonal of ``[G; I]' M [G; I]``, (d,)."""
-    rigid = np.vstack([layout.rigid_body, np.eye(layout.d)])
+    rigid = np.vstack([geometry.rigid_body, np.eye(geometry.d)])
     return np.einsum("ni,nm,mi->i", rigid, mass, rigid)
 
 
-def heal(factor: ca.SX, layout: Layout, totals: ca.SX | Array, kind: str) -> ca.SX:
+def heal(factor: ca.SX, geometry: Geometry, totals: ca.SX | Array, kind: str) -> ca.SX:
     """Scale the factor's rows, one scale a base direction, so that M has the stated totals (eq. 21-22).
 
     Rows of no direction take the mean of the scales: their mass has no total to obey.
     """
-    d, groups = layout.d, layout.directions
+    d, groups = geometry.d, geometry.directions
     members = [np.flatnonzero(groups == i).tolist() for i in range(d)]
     if kind == "trace":
         scales = [ca.sqrt(totals[i] / ca.sumsqr(factor[rows, :])) for i, rows in enumerate(members)]
     else:
-        scales = _rigid_body_scales(factor, layout, totals, members)
+        scales = _rigid_body_scales(factor, geometry, totals, members)
     free = sum(scales) / d
     by_row = ca.vertcat(*(scales[g] if g >= 0 else free for g in groups.tolist()))
     return ca.diag(by_row) @ factor
 
 
-def _rigid_body_scales(factor: ca.SX, layout: Layout, totals: ca.SX | Array, members: list[list[int]]) -> list:
+def _rigid_body_scales(factor: ca.SX, geometry: Geometry, totals: ca.SX | Array, members: list[list[int]]) -> list:
     """Scales s with ``r_i' D(s) M D(s) r_i = totals[i]`` for every direction i, r_i column i of [G; I].
 
     Where no sensor's row of G has two entries the equations are uncoupled and closed. Otherwise
     they are d quadratics, solved by Newton's method inside the expression; where that has not
     converged, mostly because no positive scales exist, they are NaN, and the candidate is passed over.
     """
-    d, groups = layout.d, layout.directions
-    rigid = np.vstack([layout.rigid_body, np.eye(d)])
+    d, groups = geometry.d, geometry.directions
+    rigid = np.vstack([geometry.rigid_body, np.eye(d)])
     free = np.flatnonzero(groups < 0).tolist()
     # Total i is |sum_a s_a row_a|² with row_a = (part of r_i in group a)' L; Gram matrices hold all.
     grams = []

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError
-from sysid.models.geometry import FACTOR_FLOOR, Layout
-from sysid.models.unknowns import Block, log_sampling
-from sysid.structure.structure import Array, finite_array
+from sysid.models.expressions import at_point, check_size, square, written_in
+from sysid.models.geometry import FACTOR_FLOOR, Geometry
+from sysid.models.model import MassBlocks, Stated, StiffnessBlocks
+from sysid.models.unknowns import Unknown, log_sampling
+from sysid.structure.structure import Array, Structure, finite_array
 from sysid.structure.triangular import lower_triangle, triangle_entries
 
 
@@ -39,30 +42,34 @@ class SpectralStiffness:
     natural_frequencies: ArrayLike | None = None
     max_frequency: float | None = None
 
-    @property
-    def targets(self) -> Array:
-        """Measured circular frequencies, rad/s, ascending."""
+    def targets(self, geometry: Geometry) -> Array:
+        """Circular frequencies that are stated, else those that stand out of the data, rad/s, ascending, at most n."""
         if self.natural_frequencies is None:
-            raise InputError("no natural_frequencies (Hz): state them, or let a Problem find them in its data")
+            return geometry.poles.omega[: geometry.n]
         given = np.atleast_1d(finite_array("natural_frequencies", self.natural_frequencies))
         if given.ndim != 1 or given.size == 0 or np.any(given <= 0):
             raise InputError("natural_frequencies must be a list of positive numbers in Hz")
         if np.any(np.diff(given) < 0):
             raise InputError("natural_frequencies must be in ascending order")
+        if given.size > geometry.n:
+            raise InputError(
+                f"{given.size} natural frequencies are given for {geometry.n} sensors; at most {geometry.n} fit"
+            )
         return 2 * np.pi * given
 
-    def limit(self, n: int) -> float:
+    def limit(self, geometry: Geometry) -> float:
         """Bound on the frequencies of an n-degree-of-freedom model, rad/s (w_lim of eq. 37)."""
-        targets = self.targets
-        if targets.size > n:
-            raise InputError(f"{targets.size} natural frequencies are given or found for {n} sensors; at most {n} fit")
+        targets, n = self.targets(geometry), geometry.n
         if self.max_frequency is None:
-            if targets.size < n:
-                raise InputError(
-                    f"{targets.size} natural frequencies are given or found for {n} sensors: "
-                    "state max_frequency (Hz), at or above the highest frequency of the whole model"
-                )
-            return float(targets[-1])
+            if targets.size == n:
+                return float(targets[-1])
+            if self.natural_frequencies is None:
+                # With fewer modes in the data than sensors nothing tells the model's other frequencies.
+                return float(max(2 * np.pi * geometry.test.freq[-1], targets[-1]))
+            raise InputError(
+                f"{targets.size} natural frequencies are given for {n} sensors: "
+                "state max_frequency (Hz), at or above the highest frequency of the whole model"
+            )
         limit = 2 * np.pi * float(self.max_frequency)
         if not np.isfinite(limit) or limit < targets[-1]:
             raise InputError(
@@ -71,21 +78,30 @@ class SpectralStiffness:
             )
         return limit
 
-    def variables(self, layout: Layout) -> tuple[Block, ...]:
+    def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """Entries of L_H, row by row, rad/s (eq. 37)."""
-        rows, columns = np.tril_indices(layout.n)
-        limit = self.limit(layout.n)
+        rows, columns = np.tril_indices(geometry.n)
+        limit = self.limit(geometry)
         lower = np.where(rows == columns, FACTOR_FLOOR * limit, -limit)
-        return (Block("stiffness_factor", lower, np.full(rows.size, limit), unit="rad/s"),)
+        return (Unknown("stiffness_factor", lower, np.full(rows.size, limit), unit="rad/s"),)
 
-    def mass_normalised(self, layout: Layout, y: ca.SX, factor: ca.SX) -> ca.SX:
-        """``H`` (n, n), rad²/s², whatever the mass is."""
-        L = lower_triangle(y, layout.n)
-        return L @ L.T
+    def blocks(self, geometry: Geometry, y: ca.SX, mass: MassBlocks) -> StiffnessBlocks:
+        """``K_SS = L H L'`` and ``H = L_H L_H'``, rad²/s², whatever the mass is."""
+        L_H, L = lower_triangle(y, geometry.n), mass.factor
+        H = L_H @ L_H.T
+        return StiffnessBlocks(L @ H @ L.T, H)
 
-    def values(self, layout: Layout, H: Array, stiffness: Array) -> Array:
-        """Entries of L_H for a given positive definite `H`."""
-        return triangle_entries(np.linalg.cholesky(H))
+    def values(self, geometry: Geometry, structure: Structure) -> Array:
+        """Entries of L_H."""
+        n = geometry.n
+        L = np.linalg.cholesky(structure.mass[:n, :n])
+        half = np.linalg.solve(L, structure.stiffness[:n, :n])
+        H = np.linalg.solve(L, half.T)
+        return triangle_entries(np.linalg.cholesky((H + H.T) / 2))
+
+    def stated(self, geometry: Geometry) -> Stated:
+        """The spectrum, stated or found."""
+        return Stated(free=True, spectrum=self.targets(geometry))
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,47 +120,95 @@ class ChainStiffness:
     lower: ArrayLike
     upper: ArrayLike
 
-    def variables(self, layout: Layout) -> tuple[Block, ...]:
+    def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """One spring a sensor, N/m."""
         try:
-            low, high = (np.broadcast_to(np.asarray(v, dtype=float), (layout.n,)) for v in (self.lower, self.upper))
+            low, high = (np.broadcast_to(np.asarray(v, dtype=float), (geometry.n,)) for v in (self.lower, self.upper))
         except (TypeError, ValueError):
-            raise InputError(f"ChainStiffness: bounds are one number, or one a sensor ({layout.n}), in N/m") from None
+            raise InputError(f"ChainStiffness: bounds are one number, or one a sensor ({geometry.n}), in N/m") from None
         if not (np.all(np.isfinite(high)) and np.all(low > 0) and np.all(low < high)):
             raise InputError("ChainStiffness: bounds must be finite with 0 < lower < upper (N/m)")
         sampling, unsampling = log_sampling(low, high)
         return (
-            Block(
-                "spring", low, high, unit="N/m", sampling=sampling, unsampling=unsampling,
+            Unknown(
+                "spring", low, high, unit="N/m", sampling=sampling, unsampling=unsampling, scale="log",
             ),
         )  # fmt: skip
 
-    def mass_normalised(self, layout: Layout, y: ca.SX, factor: ca.SX) -> ca.SX:
-        """``H = L^-1 K_SS L^-T`` (n, n), with L the Cholesky factor of M_SS."""
-        K = _chain_pattern(layout)
-        K_SS = sum((y[i] * ca.SX(ca.sparsify(ca.DM(K[i]))) for i in range(layout.n)), ca.SX(layout.n, layout.n))
-        half = ca.solve(factor, K_SS)
-        return ca.solve(factor, half.T)
+    def blocks(self, geometry: Geometry, y: ca.SX, mass: MassBlocks) -> ca.SX:
+        """K_SS (n, n)."""
+        K, n = _chain_pattern(geometry), geometry.n
+        return sum((y[i] * ca.SX(ca.sparsify(ca.DM(K[i]))) for i in range(n)), ca.SX(n, n))
 
-    def values(self, layout: Layout, H: Array, stiffness: Array) -> Array:
+    def values(self, geometry: Geometry, structure: Structure) -> Array:
         """Spring stiffnesses of a chain's stiffness matrix."""
-        n, arms = layout.n, _arms(layout)
-        K = stiffness[:n, :n] * np.outer(arms, arms)
-        # A spring is minus the coupling to the sensor below, or what the row adds up to at the base.
-        return np.array([K[i].sum() if below < 0 else -K[i, below] for i, below in enumerate(_previous(layout))])
+        n = geometry.n
+        return np.einsum("sij,ij->s", _spring_weights(geometry), structure.stiffness[:n, :n])
+
+    def stated(self, geometry: Geometry) -> Stated:
+        """Zeros where no spring couples; springs that do not push."""
+        pattern = np.abs(_chain_pattern(geometry)).sum(axis=0)
+        to_base = np.abs(_pattern_to_base(geometry))
+        entries = np.where(np.hstack([pattern, to_base]) > 0, np.nan, 0.0)
+        return Stated(
+            entries=entries, positive=_spring_weights(geometry), sentence="the stiffness is stated to be a chain"
+        )
 
 
-StiffnessModel = SpectralStiffness | ChainStiffness
+@dataclass(frozen=True, eq=False)
+class WrittenStiffness:
+    """A stiffness matrix written in variables or numbers.
+
+    Parameters
+    ----------
+    matrix : expression or array_like
+        (n, n), or with the base's rows last (n + d, n + d).
+    """
+
+    matrix: Any
+
+    def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
+        """None of its own: its variables are the problem's."""
+        return ()
+
+    def blocks(self, geometry: Geometry, y: ca.MX, mass: MassBlocks) -> ca.MX:
+        """K_SS (n, n)."""
+        n = geometry.n
+        whole = square("stiffness", self.matrix)
+        check_size("stiffness", whole, n, geometry.d)
+        if whole.size1() > n:
+            check_rigid(whole, geometry.rigid_body)
+        return whole[:n, :n]
+
+    def values(self, geometry: Geometry, structure: Structure) -> Array:
+        """Refused: an expression has no inverse."""
+        raise InputError("a stiffness written in expressions has no inverse: give the unknowns, not a Structure")
+
+    def stated(self, geometry: Geometry) -> Stated:
+        """Nothing that is read off an expression."""
+        return Stated()
 
 
-def _arms(layout: Layout) -> Array:
+def check_rigid(stiffness: ca.MX, rigid_body: Array) -> None:
+    """Refuse a stiffness with base columns that strains when the base moves as a rigid body."""
+    n = len(rigid_body)
+    K = at_point("stiffness", stiffness, None)
+    left = np.abs(K[:, :n] @ rigid_body + K[:, n:]).max()
+    if left > 1e-6 * np.abs(K).max():
+        raise InputError(
+            "stiffness strains when the base moves as a rigid body: K_S0 must be -K_SS G, and K_00 G' K_SS G (a "
+            "spring to the base counts in all; are its last rows those of the base?)" + written_in(stiffness)
+        )
+
+
+def _arms(geometry: Geometry) -> Array:
     """Motion of each sensor for unit motion of its floor along the chain, (n,): 1, or -1 where it points back."""
-    groups = layout.directions[: layout.n]
+    groups = geometry.directions[: geometry.n]
     if np.any(groups < 0):
         at = int(np.argmax(groups < 0))
         raise InputError(f"ChainStiffness: sensor {at + 1} is moved by no base direction; a chain cannot hold it")
-    arms = layout.rigid_body[np.arange(layout.n), groups]
-    rest = np.linalg.norm(layout.rigid_body, axis=1) - np.abs(arms)
+    arms = geometry.rigid_body[np.arange(geometry.n), groups]
+    rest = np.linalg.norm(geometry.rigid_body, axis=1) - np.abs(arms)
     if np.any(np.abs(np.abs(arms) - 1) > 1e-6) or np.any(rest > 1e-6):
         raise InputError(
             "ChainStiffness: each sensor must point along one base direction (entries 1 or -1 in rigid_body)"
@@ -152,19 +216,37 @@ def _arms(layout: Layout) -> Array:
     return arms
 
 
-def _previous(layout: Layout) -> list[int]:
+def _previous(geometry: Geometry) -> list[int]:
     """The sensor below each one in its chain; -1 for the base."""
-    groups = layout.directions[: layout.n].tolist()
-    return [max((j for j in range(i) if groups[j] == groups[i]), default=-1) for i in range(layout.n)]
+    groups = geometry.directions[: geometry.n].tolist()
+    return [max((j for j in range(i) if groups[j] == groups[i]), default=-1) for i in range(geometry.n)]
 
 
-def _chain_pattern(layout: Layout) -> Array:
+def _chain_pattern(geometry: Geometry) -> Array:
     """Stiffness of each unit spring, (n, n, n)."""
-    patterns, arms = np.zeros((layout.n,) * 3), _arms(layout)
-    for i, below in enumerate(_previous(layout)):
-        elongation = np.zeros(layout.n)
+    patterns, arms = np.zeros((geometry.n,) * 3), _arms(geometry)
+    for i, below in enumerate(_previous(geometry)):
+        elongation = np.zeros(geometry.n)
         elongation[i] = arms[i]
         if below >= 0:
             elongation[below] = -arms[below]
         patterns[i] = np.outer(elongation, elongation)
     return patterns
+
+
+def _spring_weights(geometry: Geometry) -> Array:
+    """Weights W with ``spring_i = sum(W_i * K_SS)``, (n, n, n)."""
+    weights, arms = np.zeros((geometry.n,) * 3), _arms(geometry)
+    for i, below in enumerate(_previous(geometry)):
+        # A spring is minus the coupling to the sensor below, or what the row adds up to at the base.
+        if below < 0:
+            weights[i, i] = arms[i] * arms
+        else:
+            weights[i, i, below] = -arms[i] * arms[below]
+    return weights
+
+
+def _pattern_to_base(geometry: Geometry) -> Array:
+    """Which sensors a chain's springs tie to the base, (n, d)."""
+    first = np.array([below < 0 for below in _previous(geometry)])
+    return np.where(first[:, None], geometry.rigid_body, 0.0)

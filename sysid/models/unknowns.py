@@ -5,7 +5,6 @@ from __future__ import annotations
 import operator
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from types import FrameType
@@ -21,47 +20,98 @@ from sysid.structure.structure import Array
 _PART = 0.05  # of its range: the least step of an unknown
 
 
-@dataclass(frozen=True, eq=False)
-class Block:
-    """A block of scalar unknowns, as the matrix models and the search space have it.
+class Unknown:
+    """A column of scalar unknowns of one name, as the matrix models state them.
 
     Parameters
     ----------
     name : str
-    lower, upper : ndarray, shape (size,)
+        As tables and results call it, with underscores for spaces.
+    lower, upper : array_like, shape (size,)
         The search space; equal where an entry is known.
     unit : str
+        For tables.
     sampling : callable, optional
-        CasADi expression of the swarm's coordinates (size,) to the block's, both in
+        CasADi expression of the swarm's coordinates (size,) to the unknowns, both in
         [lower, upper]: where the swarm had better search another distribution than the uniform
         one (eq. 18 of the paper). Gradient methods never see it.
     unsampling : callable, optional
         Its inverse on numbers, shape (size,) to (size,).
+    scale : str
+        How the swarm spreads its candidates over the bounds, in a word: "linear", "log", "by row".
+
+    Attributes
+    ----------
+    guess : (size,)
+        Where a search may start: the middle of the swarm's search space.
+    has_guess, fixed : bool
+        Whether the guess was stated, and whether the unknown is held at it; both only a `Variable`'s.
+
+    Raises
+    ------
+    InputError
+        Where bounds are reversed, infinite, or of two shapes.
     """
 
-    name: str
-    lower: Array
-    upper: Array
-    unit: str = ""
-    sampling: Callable[[ca.SX], ca.SX] | None = None
-    unsampling: Callable[[Array], Array] | None = None
+    has_guess = False
+    fixed = False
 
-    def __post_init__(self) -> None:
-        lower, upper = np.atleast_1d(np.asarray(self.lower, float)), np.atleast_1d(np.asarray(self.upper, float))
-        if lower.shape != upper.shape or lower.ndim != 1:
-            raise InputError(f"variable {self.name}: bounds {lower.shape} and {upper.shape} disagree")
-        if not (np.all(np.isfinite(lower)) and np.all(np.isfinite(upper)) and np.all(lower <= upper)):
-            raise InputError(f"variable {self.name}: bounds must be finite with lower <= upper")
-        object.__setattr__(self, "lower", lower)
-        object.__setattr__(self, "upper", upper)
+    def __init__(
+        self,
+        name: str,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        *,
+        unit: str = "",
+        sampling: Callable[[ca.SX], ca.SX] | None = None,
+        unsampling: Callable[[Array], Array] | None = None,
+        scale: str = "linear",
+    ) -> None:
+        self.name, self.unit, self.scale = name, unit, scale
+        self.lower, self.upper = (np.atleast_1d(np.asarray(bound, float)) for bound in (lower, upper))
+        if self.lower.shape != self.upper.shape or self.lower.ndim != 1:
+            raise InputError(f"variable {name}: bounds {self.lower.shape} and {self.upper.shape} disagree")
+        if not (np.all(np.isfinite(self.lower + self.upper)) and np.all(self.lower <= self.upper)):
+            raise InputError(f"variable {name}: bounds must be finite with lower <= upper")
+        self.shape: tuple[int, ...] = (self.lower.size,)
+        self._sampling, self._unsampling = sampling, unsampling
+        middle = (self.lower + self.upper) / 2
+        self.guess: Array = middle if sampling is None else np.asarray(self.sampled()(middle)).ravel()
 
     @property
     def size(self) -> int:
         """Number of scalar unknowns."""
         return int(self.lower.size)
 
+    @property
+    def title(self) -> str:
+        """The name as messages and tables write it."""
+        return self.name.replace("_", " ")
 
-class Variable:
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """A name an entry, counted from 1: ``spring 1``."""
+        return (self.title,) if self.size == 1 else tuple(f"{self.title} {i + 1}" for i in range(self.size))
+
+    def sampling(self, s: ca.SX) -> ca.SX:
+        """The unknowns that the swarm's coordinates `s` stand for, (size,) each."""
+        return s if self._sampling is None else self._sampling(s)
+
+    def unsampling(self, x: Array) -> Array:
+        """The inverse of `sampling`, on numbers."""
+        return x if self._unsampling is None else self._unsampling(x)
+
+    def sampled(self) -> ca.Function:
+        """`sampling` as a function of numbers."""
+        s = ca.SX.sym("s", self.size)
+        return ca.Function("sampling", [s], [ca.densify(self.sampling(s))])
+
+    def shaped(self, flat: Array) -> Array:
+        """Numbers of its entries, column by column, as an array of its shape."""
+        return np.reshape(flat, self.shape, order="F")
+
+
+class Variable(Unknown):
     """A named unknown, or an array of them, of which matrices, residuals and constraints are written.
 
     Slices, operators, NumPy's ufuncs and CasADi's functions accept it: it stands for a CasADi MX symbol.
@@ -125,7 +175,7 @@ class Variable:
         if not isinstance(name, str) or not name:
             raise InputError(f"a Variable ({self.declared}) needs a name, and {name!r} is none")
         self.name, self.log, self.fixed, self.unit = name, bool(log), bool(fixed), str(unit)
-        self.used = False  # whether it entered a problem
+        self.scale = "log" if log else "linear"
         self.shape = self._check_shape(shape)
         lower, upper = self._flat("lower", lower), self._flat("upper", upper)
         self.lower, self.upper = lower, upper
@@ -142,10 +192,10 @@ class Variable:
             self._refuse(f"log=True needs positive bounds, and lower is {lower.min():g}")
         if fixed and guess is None:
             self._refuse("fixed=True needs a guess, at which it is held")
+        self._sampling, self._unsampling = log_sampling(lower, upper) if log else (None, None)
         middle = np.exp((np.log(lower) + np.log(upper)) / 2) if log else (lower + upper) / 2
-        middle = np.clip(middle, lower, upper)
         self.has_guess = guess is not None
-        self.guess: Array = middle if guess is None else self._flat("guess", guess)
+        self.guess = np.clip(middle, lower, upper) if guess is None else self._flat("guess", guess)
         if not np.all(np.isfinite(self.guess)):
             self._refuse("its guess is not finite")
         if np.any((self.guess < lower) | (self.guess > upper)):
@@ -179,9 +229,9 @@ class Variable:
         raise InputError(f"variable {self.name!r} ({self.declared}): {what}")
 
     @property
-    def size(self) -> int:
-        """Number of scalar unknowns."""
-        return int(self.lower.size)
+    def title(self) -> str:
+        """The name as it was given."""
+        return self.name
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -190,24 +240,6 @@ class Variable:
             return (self.name,)
         at = np.unravel_index(np.arange(self.size), self.shape, order="F")
         return tuple(f"{self.name}[{','.join(map(str, index))}]" for index in zip(*at, strict=True))
-
-    @property
-    def sampling(self) -> Callable[[ca.SX], ca.SX] | None:
-        """As in `Block`."""
-        if not self.log:
-            return None
-        return log_sampling(self.lower, self.upper)[0]
-
-    @property
-    def unsampling(self) -> Callable[[Array], Array] | None:
-        """As in `Block`."""
-        if not self.log:
-            return None
-        return log_sampling(self.lower, self.upper)[1]
-
-    def shaped(self, flat: Array) -> Array:
-        """Numbers of the variable's entries, column by column, as an array of its shape."""
-        return np.reshape(flat, self.shape, order="F")
 
     def __repr__(self) -> str:
         unit = f" {self.unit}" if self.unit else ""
@@ -328,22 +360,12 @@ def expression_of(value: Any) -> Any:
     return value.symbol if isinstance(value, Variable) else value
 
 
-def user_frame() -> FrameType | None:
-    """The frame of the user's code that called into the package."""
+def user_site() -> str:
+    """Where the user's code called into the package, for messages: "file, line n"."""
     frame: FrameType | None = sys._getframe(1)
     while frame is not None and _is_ours(frame):
         frame = frame.f_back
-    return frame
-
-
-def call_site(frame: FrameType | None) -> str:
-    """Where a frame is, for messages: "file, line n"."""
     return "?" if frame is None else f"{_short(frame.f_code.co_filename)}, line {frame.f_lineno}"
-
-
-def user_site() -> str:
-    """Where the user's code called into the package, for messages."""
-    return call_site(user_frame())
 
 
 def _is_ours(frame: FrameType) -> bool:
@@ -360,34 +382,43 @@ def _short(filename: str) -> str:
 
 
 def log_sampling(lower: Array, upper: Array) -> tuple[Callable[[ca.SX], ca.SX], Callable[[Array], Array]]:
-    """`sampling` and `unsampling` of a `Block` that is searched on a logarithmic scale; bounds may be equal."""
+    """`sampling` and `unsampling` of an `Unknown` that is searched on a logarithmic scale; bounds may be equal."""
     width, span = upper - lower, np.log(upper / lower)
     wide, long = np.where(width > 0, width, 1.0), np.where(span > 0, span, 1.0)
     return lambda s: lower * ca.exp((s - lower) / wide * span), lambda x: lower + width * np.log(x / lower) / long
 
 
-def steps_of(variables: Iterable[Block | Variable], x: Array) -> Array:
+def scales_of(unknowns: Iterable[Unknown], x: Array) -> Array:
     """A large step of each unknown, (size of x,): its own size, or a part of its range where that is larger.
 
-    Where a range spans decades (log) it tells nothing about the unknown.
+    Where a range spans decades it tells nothing about the unknown.
     """
-    width = [np.zeros(v.size) if isinstance(v, Variable) and v.log else v.upper - v.lower for v in variables]
+    width = [np.zeros(v.size) if v.scale == "log" else v.upper - v.lower for v in unknowns]
     return np.maximum(np.abs(x), _PART * np.concatenate([np.zeros(0), *width]))
 
 
-def slices_of(variables: Iterable[Block | Variable]) -> list[slice]:
-    """Where each variable stands in the vector of all unknowns."""
-    ends = np.cumsum([0, *(variable.size for variable in variables)]).tolist()
+def lower_of(unknowns: Iterable[Unknown]) -> Array:
+    """Lower bounds of all unknowns, one after the other."""
+    return np.concatenate([np.zeros(0), *(v.lower for v in unknowns)])
+
+
+def upper_of(unknowns: Iterable[Unknown]) -> Array:
+    """Upper bounds of all unknowns, one after the other."""
+    return np.concatenate([np.zeros(0), *(v.upper for v in unknowns)])
+
+
+def slices_of(unknowns: Iterable[Unknown]) -> list[slice]:
+    """Where each unknown stands in the vector of all."""
+    ends = np.cumsum([0, *(unknown.size for unknown in unknowns)]).tolist()
     return [slice(a, b) for a, b in pairwise(ends)]
 
 
-def by_name(variables: Iterable[Block | Variable], x: Array) -> dict[str, Array]:
-    """Numbers of all unknowns as one array a variable, in its shape."""
-    variables = tuple(variables)
-    pieces = zip(variables, split(variables, x), strict=True)
-    return {v.name: v.shaped(part) if isinstance(v, Variable) else part for v, part in pieces}
+def by_name(unknowns: Iterable[Unknown], x: Array) -> dict[str, Array]:
+    """Numbers of all unknowns as one array a name, in its shape."""
+    unknowns = tuple(unknowns)
+    return {v.name: v.shaped(part) for v, part in zip(unknowns, split(unknowns, x), strict=True)}
 
 
-def split(variables: Iterable[Block | Variable], x: ca.SX | Array) -> list:
-    """Cut a vector of all unknowns into one piece a variable."""
-    return [x[part] for part in slices_of(variables)]
+def split(unknowns: Iterable[Unknown], x: ca.SX | Array) -> list:
+    """Cut a vector of all unknowns into one piece a name."""
+    return [x[part] for part in slices_of(unknowns)]

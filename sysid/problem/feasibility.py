@@ -1,10 +1,6 @@
-"""Whether a problem in its own unknowns can be searched at all: asked before anything runs."""
+"""Whether a problem can be searched at all: asked before anything runs."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator
-from types import FrameType
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -12,8 +8,9 @@ import scipy.linalg
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
-from sysid.models.unknowns import Variable, split
-from sysid.problem.formulation import Formulation, sampled
+from sysid.nlp import quiet_options
+from sysid.problem.formulation import Formulation
+from sysid.problem.terms import ExpressionTerm
 from sysid.structure.structure import Array
 
 _POINTS = 128  # of the search space, looked at
@@ -24,32 +21,25 @@ LOOSE = 1e-2  # likewise for the swarm, which meets no equality exactly
 
 def points_of(formulation: Formulation) -> Array:
     """The guess, and points spread over the search space, (count, size)."""
-    return np.array([formulation.guess, *spread(formulation, _POINTS - 1, np.random.default_rng(0))])
+    return np.array([formulation.guess, *latin_hypercube(formulation, _POINTS - 1, np.random.default_rng(0))])
 
 
-def spread(formulation: Formulation, count: int, rng: np.random.Generator) -> list[Array]:
+def latin_hypercube(formulation: Formulation, count: int, rng: np.random.Generator) -> list[Array]:
     """Points spread over the search space as the swarm's are."""
     from scipy.stats import qmc
 
     unit = qmc.LatinHypercube(formulation.size, rng=rng).random(count)
     rows = formulation.lower + unit * (formulation.upper - formulation.lower)
-    variables = formulation.variables
-    return [
-        np.concatenate([sampled(v, s) for v, s in zip(variables, split(variables, row), strict=True)]) for row in rows
-    ]
+    s = ca.MX.sym("s", formulation.size)
+    sampling = ca.Function("sampling", [s], [formulation.from_sampling(s)])
+    return [np.asarray(sampling(row)).ravel() for row in rows]
 
 
 def check_matrices(formulation: Formulation, points: Array, test: Measurement, site: str) -> None:
     """Refuse matrices that are those of a structure nowhere."""
     names = formulation.declarations
-    failures = {"mass": 0, "stiffness": 0}
-    for x in points:
-        numbers = formulation.matrices.numbers(x)
-        for name in failures:
-            if not _positive(getattr(numbers, name)):
-                failures[name] += 1
-    for name, count in failures.items():
-        if count == len(points):
+    for name in ("mass", "stiffness"):
+        if not any(_positive(getattr(formulation.matrices.numbers(x), name)) for x in points):
             raise InputError(
                 f"{name} is not positive definite over the structure's degrees of freedom, neither at the guess nor at "
                 f"any of {len(points) - 1} points of the search space{names[name]}"
@@ -77,20 +67,19 @@ def _positive(matrix: Array) -> bool:
 
 def scale_of(formulation: Formulation, points: Array) -> Array:
     """How much each constraint varies over the search space, (rows,)."""
-    assert formulation.constraints is not None
-    values = np.array([np.asarray(formulation.constraints.function(x)).ravel() for x in points])
+    values = np.array([formulation.constraints.at(x) for x in points])
     with np.errstate(invalid="ignore"):
-        spread = np.nanmax(np.abs(np.where(np.isfinite(values), values, np.nan)), axis=0)
+        spread = np.nanmax(np.abs(np.where(np.isfinite(values), values, np.nan)), axis=0, initial=0.0)
     return np.where(spread > 0, spread, 1.0)
 
 
-def check_constraints(formulation: Formulation, points: Array, site: str) -> Array:
-    """Refuse constraints that no point satisfies; else the violation of each that the swarm lets pass, (rows,)."""
+def check_constraints(formulation: Formulation, points: Array, site: str) -> None:
+    """Refuse constraints that no point satisfies."""
     constraints = formulation.constraints
-    assert constraints is not None
+    if not constraints.lower.size:
+        return
     scale = scale_of(formulation, points)
-    values = np.array([np.asarray(constraints.function(x)).ravel() for x in points])
-    broken = violation_of(constraints.lower, constraints.upper, values) / scale
+    broken = np.array([constraints.violation(x) for x in points]) / scale
     order = np.argsort(np.sum(np.where(np.isfinite(broken), broken, np.inf) ** 2, axis=1))
     best, at = np.full(scale.size, np.inf), np.inf
     for x in points[order[:_STARTS]]:
@@ -98,7 +87,7 @@ def check_constraints(formulation: Formulation, points: Array, site: str) -> Arr
         if left.max(initial=0.0) < at:
             best, at = left, left.max(initial=0.0)
         if at <= HELD:
-            return scale * np.where(constraints.lower == constraints.upper, LOOSE, HELD)
+            return
     worst = dict.fromkeys(source for source, miss in zip(constraints.sources, best, strict=True) if miss > HELD)
     raise InputError(
         f"no point within the bounds satisfies {' and '.join(worst)} (problem at {site}): widen the bounds of these "
@@ -106,53 +95,52 @@ def check_constraints(formulation: Formulation, points: Array, site: str) -> Arr
     )
 
 
-def violation_of(lower: Array, upper: Array, values: Array) -> Array:
-    """By how much values leave their bounds, of the values' shape."""
-    return np.maximum(np.maximum(lower - values, values - upper), 0.0)
-
-
 def _nearest(formulation: Formulation, start: Array, scale: Array) -> Array:
     """Least violation that IPOPT finds from a point, relative to the scale, (rows,)."""
-    constraints = formulation.constraints
-    assert constraints is not None
-    lower, upper = formulation.lower, formulation.upper
+    constraints, lower, upper = formulation.constraints, formulation.lower, formulation.upper
     width = np.where(upper > lower, upper - lower, 1.0)
     t = ca.MX.sym("t", formulation.size)
     slack = ca.MX.sym("slack", scale.size)
     g = constraints.function(ca.DM(lower) + ca.DM(width) * t) / ca.DM(scale)
     solver = ca.nlpsol(
-        "feasible", "ipopt", {"x": ca.vertcat(t, slack), "f": ca.sumsqr(slack), "g": g - slack},
-        {"print_time": False, "show_eval_warnings": False, "ipopt": {"print_level": 0, "sb": "yes", "max_iter": 200}},
-    )  # fmt: skip
-    lbg, ubg = constraints.lower / scale, constraints.upper / scale
+        "feasible", "ipopt", {"x": ca.vertcat(t, slack), "f": ca.sumsqr(slack), "g": g - slack}, quiet_options(200)
+    )
     begun = (start - lower) / width
     answer = solver(
-        x0=np.concatenate([begun, np.zeros(scale.size)]), lbg=lbg, ubg=ubg,
+        x0=np.concatenate([begun, np.zeros(scale.size)]), lbg=constraints.lower / scale, ubg=constraints.upper / scale,
         lbx=np.concatenate([np.zeros(begun.size), np.full(scale.size, -np.inf)]),
         ubx=np.concatenate([np.where(upper > lower, 1.0, 0.0), np.full(scale.size, np.inf)]),
     )  # fmt: skip
     # Whatever the status, what counts is the violation at the point that came, put inside the box.
     found = np.clip(np.asarray(answer["x"]).ravel()[: begun.size], 0.0, 1.0)
-    values = np.asarray(constraints.function(lower + width * found)).ravel() / scale
-    return np.where(np.isfinite(values), violation_of(lbg, ubg, values), np.inf)
+    broken = constraints.violation(lower + width * found) / scale
+    return np.where(np.isfinite(broken), broken, np.inf)
 
 
-def unused(frame: FrameType | None, formulation: Formulation) -> list[Variable]:
-    """Variables among the locals of the author's code that enter no problem."""
-    if frame is None:
-        return []
-    members = (*formulation.variables, *formulation.fixed)
-    there = list(_variables_in(frame.f_locals.values()))
-    if not any(v is m for v in there for m in members):
-        return []  # the problem was put together elsewhere
-    return [v for v in there if not v.used and not any(v is m for m in members)]
+def check_storable(formulation: Formulation) -> None:
+    """Refuse what could not be stored at the end: a Python callback inside an expression."""
+    functions = {"matrices": formulation.matrices.function, "ratios": formulation.matrices.ratio_function}
+    functions |= {"constraints": formulation.constraints.function, "healing": formulation.healing}
+    functions |= {term.name: term.function for term in formulation.beside if isinstance(term, ExpressionTerm)}
+    functions |= {f"matrices of {term.name}": term.matrices.function for term in formulation.further_tests}
+    for name, function in functions.items():
+        text_of(name, function)
 
 
-def _variables_in(values: Any) -> Iterator[Variable]:
-    for value in list(values):
-        if isinstance(value, Variable):
-            yield value
-        elif isinstance(value, list | tuple):
-            yield from (v for v in value if isinstance(v, Variable))
-        elif isinstance(value, dict):
-            yield from (v for v in value.values() if isinstance(v, Variable))
+def text_of(name: str, function: ca.Function) -> str:
+    """A CasADi function as text.
+
+    Raises
+    ------
+    InputError
+        Where it holds a Python callback.
+    """
+    try:
+        text = str(function.serialize())
+        ca.Function.deserialize(text)  # a callback is written without a word, and then cannot be read
+        return text
+    except (RuntimeError, NotImplementedError):
+        raise InputError(
+            f"{name}: a Python callback in an expression cannot be stored, nor sent to another machine; write it in "
+            "CasADi's own operations"
+        ) from None

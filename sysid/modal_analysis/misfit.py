@@ -1,0 +1,87 @@
+"""Noise and misfit of the records of a test: what a structure leaves of them, beside what is stated of their noise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.measurement.measurement import Measurement
+from sysid.measurement.noise import separable
+from sysid.modal_analysis.residues import line_correlation
+from sysid.modal_analysis.response import columns
+from sysid.structure.structure import Array, ComplexArray, Structure
+
+_DEVIATIONS = 4.0  # ... nor chance, in standard deviations of the chi-squared law
+_EXACT = 1e-14  # of a record's rms: what counts as noise where there is none
+_SUSPECT = 1.2  # reduced chi-squared above which the stated noise does not explain the misfit ...
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """Noise and misfit of the responses or of the force, (channels, runs * n_freq), and the weights of the fit."""
+
+    std: Array
+    misfit: ComplexArray
+    by_channel: Array
+    by_line: Array
+
+    @property
+    def shared(self) -> bool:
+        """Whether the weights of the fit are those of the noise."""
+        return bool(np.all(np.abs(self.by_channel[:, None] * self.by_line * self.std - 1) < 1e-9))
+
+    def grams(self, spectra: ComplexArray) -> Iterator[Array]:
+        """``Re V' W V`` of each channel, W the squared weights: one Gram matrix but for a factor."""
+        gram = _gram(spectra * self.by_line)
+        return (weight**2 * gram for weight in self.by_channel)
+
+    def sandwich_grams(self, spectra: ComplexArray) -> Iterator[Array]:
+        """``Re V' W S W V`` of each channel, S the variances of the noise."""
+        return (_gram(spectra * row) for row in (self.by_channel[:, None] * self.by_line) ** 2 * self.std)
+
+
+def records_of(test: Measurement, structure: Structure, unknowns: int) -> list[Record]:
+    """Responses and, where measured, force; each bears its share of the unknowns."""
+    parts = [(test.response, test.response_std, test.relative - test.predict(structure))]
+    if test.force is not None:
+        parts.append((test.force, test.force_std, test.force - test.predict_force(structure)))
+    left = max(1 - unknowns / _measured(test), 0.5)
+    records = []
+    for record, stated, misfit in parts:
+        noise = np.sqrt(np.mean(np.abs(misfit) ** 2) / left) if stated is None else stated
+        least = _EXACT * np.sqrt(np.mean(np.abs(record) ** 2))
+        std = np.broadcast_to(np.maximum(noise, least), record.shape)
+        by_channel, by_line = separable(std, record.shape)
+        records.append(Record(columns(std).real, columns(misfit), by_channel, by_line.ravel()))
+    return records
+
+
+def _measured(test: Measurement) -> int:
+    """How many real numbers were measured."""
+    return 2 * test.response.size + (0 if test.force is None else 2 * test.force.size)
+
+
+def inflation_of(test: Measurement, records: list[Record], unknowns: int) -> float:
+    """Factor by which errors exceed what the stated noise explains; NaN where nothing tells the noise.
+
+    By the misfit's size, and by what neighbouring lines share of it, as lines of averaged spectra do.
+    """
+    freedom = _measured(test) - unknowns
+    if freedom <= 0:
+        stated = test.response_std is not None and (test.force is None or test.force_std is not None)
+        return 1.0 if stated else np.nan
+    reduced = 2 * sum(np.sum(np.abs(record.misfit / record.std) ** 2) for record in records) / freedom
+    beyond = reduced if reduced > max(_SUSPECT, 1 + _DEVIATIONS * np.sqrt(2 / freedom)) else 1.0
+    shared = line_correlation(
+        np.concatenate([(r.misfit / r.std).reshape(-1, test.n_runs, test.freq.size) for r in records])
+    )
+    return float(np.sqrt(beyond * shared))
+
+
+def _gram(vectors: ComplexArray) -> Array:
+    stacked = np.hstack([vectors.real, vectors.imag])
+    return stacked @ stacked.T
+
+

@@ -1,0 +1,158 @@
+"""Matrices written in variables: what a user gives brought to CasADi expressions, and checked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from sysid.errors import InputError
+from sysid.models.unknowns import Variable, expression_of, user_site, variable_of
+from sysid.structure.structure import Array, finite_array
+
+
+def is_expression(value: Any) -> bool:
+    """Whether a matrix is written in variables, rather than a model or numbers."""
+    if isinstance(value, Variable | ca.MX | ca.SX):
+        return True
+    if isinstance(value, list | tuple):
+        return any(is_expression(entry) for entry in value)
+    return isinstance(value, np.ndarray) and value.dtype == object
+
+
+def as_matrix(name: str, value: Any) -> ca.MX:
+    """An expression, numbers or rows of both, as an expression."""
+    value = expression_of(value)
+    if isinstance(value, ca.MX):
+        return value
+    if isinstance(value, ca.SX):
+        return ca.MX(ca.DM(_constant(name, value)))
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        value = value.tolist()
+    if isinstance(value, list | tuple) and is_expression(value):
+        rows = [row if isinstance(row, list | tuple) else [row] for row in value]
+        entries = [[_entry(name, entry) for entry in row] for row in rows]
+        try:
+            return ca.blockcat(entries)
+        except (RuntimeError, NotImplementedError):
+            sizes = ", ".join(str(len(row)) for row in rows)
+            raise InputError(
+                f"{name} ({user_site()}): its rows do not fit together; they have {sizes} entries"
+            ) from None
+    if isinstance(value, ca.DM):
+        return ca.MX(value)
+    return ca.MX(ca.sparsify(ca.DM(np.atleast_1d(finite_array(name, value)))))
+
+
+def _entry(name: str, value: Any) -> Any:
+    """An entry of a matrix that is given by rows."""
+    value = expression_of(value)
+    if isinstance(value, ca.SX):
+        return ca.DM(_constant(name, value))
+    if isinstance(value, ca.MX | ca.DM | np.ndarray) or (np.isscalar(value) and not isinstance(value, str | bytes)):
+        return value
+    raise InputError(
+        f"{name} ({user_site()}) holds a {type(value).__name__} in its rows: numbers and expressions are needed"
+    )
+
+
+def _constant(name: str, value: ca.SX) -> ca.SX:
+    if not value.is_constant():
+        raise InputError(
+            f"{name} ({user_site()}) is a CasADi SX with symbols of its own: write it in sysid.Variable (or MX)"
+        )
+    return value
+
+
+def square(name: str, value: Any) -> ca.MX:
+    """A matrix of the user's as an expression; refused where it is not square, finite and symmetric."""
+    matrix = as_matrix(name, value)
+    if matrix.size1() != matrix.size2():
+        raise InputError(f"{name} is {size_of(matrix)}, and a square matrix is needed{written_in(matrix)}")
+    for place, numbers in (
+        ("at the guess", at_point(name, matrix, None)),
+        ("away from the guess", at_point(name, matrix, 0.37)),
+    ):
+        if place == "at the guess":
+            check_finite(name, numbers, matrix)
+        size = np.sqrt(np.abs(np.diag(numbers)))
+        off = np.abs(numbers - numbers.T)
+        if np.any(off > 1e-9 * (np.outer(size, size) + np.abs(numbers).max())):
+            i, j = np.unravel_index(int(np.argmax(off)), off.shape)
+            pair = ca.veccat(matrix[int(i), int(j)], matrix[int(j), int(i)])
+            raise InputError(
+                f"{name} is not symmetric: {place} [{i}, {j}] is {numbers[i, j]:.6g} and [{j}, {i}] is "
+                f"{numbers[j, i]:.6g}{written_in(pair) or written_in(matrix)}"
+            )
+    return matrix
+
+
+def check_finite(name: str, numbers: Array, expression: ca.MX) -> None:
+    """Refuse what is no number at the guess."""
+    bad = np.argwhere(~np.isfinite(numbers))
+    if bad.size:
+        at = tuple(int(i) for i in bad[0])
+        entry = expression[at[0], at[1]] if len(at) == 2 else expression[at[0]]
+        where = f"[{', '.join(map(str, at))}] " if numbers.size > 1 else ""
+        raise InputError(f"{name} {where}is {numbers[tuple(bad[0])]:g} at the guess{written_in(entry)}")
+
+
+def written_in(expression: ca.MX) -> str:
+    """The variables of an expression with their declarations, for the end of a message."""
+    found = [v for v in map(variable_of, ca.symvar(expression)) if v is not None]
+    if not found:
+        return ""
+    named = ", ".join(f"{v.name!r} ({v.declared})" for v in found[:6])
+    return f"; it is written in {named}" + (f" and {len(found) - 6} more" if len(found) > 6 else "")
+
+
+def at_point(name: str, expression: ca.MX, share: float | None) -> Array:
+    """Numbers of an expression with its variables at their guesses, or at this share of their search space."""
+    symbols = ca.symvar(expression)
+    found = [variable_of(symbol) for symbol in symbols]
+    check_free(name, symbols, found)
+    values = [v.guess if share is None else v.lower + share * (v.upper - v.lower) for v in found if v is not None]
+    shaped = [ca.reshape(ca.DM(value), *symbol.shape) for value, symbol in zip(values, symbols, strict=True)]
+    return np.asarray(ca.densify(ca.Function("at", symbols, [expression]).call(shaped)[0]))
+
+
+def check_free(name: str, symbols: Sequence[ca.MX], found: Sequence[Variable | None]) -> None:
+    """Refuse symbols that are no variables."""
+    free = [symbol.name() for symbol, variable in zip(symbols, found, strict=True) if variable is None]
+    if free:
+        raise InputError(
+            f"{', '.join(map(repr, free))} in {name} ({user_site()}) is a free CasADi symbol: declare it "
+            "as a sysid.Variable with bounds"
+        )
+
+
+def cholesky(M: ca.MX) -> ca.MX:
+    """Lower-triangular factor of an expression."""
+    A = ca.SX.sym("A", M.size1(), M.size1())
+    return ca.Function("cholesky", [A], [ca.densify(ca.chol(A).T)])(M)
+
+
+def is_column(damping: Any) -> bool:
+    """Whether a matrix was given in one dimension, as damping ratios are."""
+    if isinstance(damping, Variable):
+        return len(damping.shape) == 1
+    if isinstance(damping, list | tuple):
+        return not any(isinstance(entry, list | tuple) for entry in damping)
+    return isinstance(damping, np.ndarray) and damping.ndim == 1
+
+
+def check_size(name: str, matrix: ca.MX, n: int, d: int) -> None:
+    """Refuse a matrix that is neither (n, n) nor (n + d, n + d)."""
+    if matrix.size1() not in (n, n + d):
+        ratios = ", or one ratio a mode" if name == "damping" else ""
+        raise InputError(
+            f"{name} is {size_of(matrix)} ({user_site()}); ({n}, {n}) or, with the base, ({n + d}, {n + d}) "
+            f"is needed{ratios}, or recovery= beside it, from degrees of freedom to {n} sensors{written_in(matrix)}"
+        )
+
+
+def size_of(matrix: ca.MX) -> str:
+    """The size of a matrix in words."""
+    return f"{matrix.size1()} x {matrix.size2()}"

@@ -1,0 +1,132 @@
+"""The one contract of a matrix model, and what a model states of its matrix.
+
+A matrix model makes one matrix of unknowns. Those of this package stand beside this file; any other class with the
+methods of `MatrixModel` can be given to a `Problem` as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
+
+import casadi as ca
+import numpy as np
+
+from sysid.models.geometry import Geometry
+from sysid.models.unknowns import Unknown
+from sysid.structure.structure import Array, Structure
+
+
+@dataclass(frozen=True, eq=False)
+class Totals:
+    """Stated total masses.
+
+    Attributes
+    ----------
+    values : (d,) or (d, d)
+        kg a base direction (kg m² for rotations), or the whole rigid-body mass.
+    kind : {"trace", "rigid_body", "sensors"}
+        What is summed: the diagonal over the direction's sensors and its base row; ``M_rb``; or the diagonal over the
+        sensors alone.
+    """
+
+    values: Array
+    kind: Literal["trace", "rigid_body", "sensors"]
+
+
+@dataclass(frozen=True, eq=False)
+class Stated:
+    """What a model states about its matrix: strategies, determination and checks read this, and never the model's type.
+
+    Attributes
+    ----------
+    free : bool
+        Every positive definite matrix that has the stated entries and totals is in the model.
+    entries : (n, n + d) or None
+        Entries of ``[M_SS, M_S0]`` or ``[K_SS, K_S0]`` that have one value in the whole model, NaN where they vary.
+        A model that is not free has nothing beyond its entries, totals and `positive`; where it has, None.
+    totals : Totals or None
+        Of a mass.
+    spectrum : (k,) or None
+        Of a stiffness: natural frequencies that are stated or were found, rad/s, ascending.
+    positive : (p, n, n) or None
+        Weights W of sums ``sum(W * matrix)`` that are never negative, such as the springs of a chain.
+    sentence : str
+        "the mass is stated to be lumped on the sensors"; empty where nothing is stated.
+    """
+
+    free: bool = False
+    entries: Array | None = None
+    totals: Totals | None = None
+    spectrum: Array | None = None
+    positive: Array | None = None
+    sentence: str = ""
+
+
+class MassBlocks(NamedTuple):
+    """Expressions: Cholesky factor of M_SS (n, n), M_S0 (n, d), M_00 (d, d)."""
+
+    factor: Any
+    coupling: Any
+    base: Any
+
+
+class StiffnessBlocks(NamedTuple):
+    """Expressions: K_SS (n, n), and ``H = L^-1 K_SS L^-T`` (n, n), L the Cholesky factor of M_SS."""
+
+    stiffness: Any
+    mass_normalised: Any
+
+
+@runtime_checkable
+class MatrixModel(Protocol):
+    """Mass, stiffness or damping as variables and expressions.
+
+    Symbols are CasADi SX in a model with unknowns, and MX (as those of `sysid.Variable` s) in one without.
+    """
+
+    def unknowns(self, geometry: Geometry) -> Sequence[Unknown]:
+        """What is searched; none where the matrix is written in variables or numbers."""
+
+    def blocks(self, geometry: Geometry, y: Any, *before: Any) -> Any:
+        """The matrix of the unknowns `y`, all in one column, as expressions.
+
+        A mass gives `MassBlocks`; a stiffness, after the mass's blocks, `StiffnessBlocks`, or K_SS alone; a damping,
+        after both, C (n, n), or None where it has no matrix but ratios only.
+        """
+
+    def values(self, geometry: Geometry, structure: Structure) -> Array:
+        """The unknowns that stand for a structure's matrix: the inverse of `blocks`.
+
+        Raises
+        ------
+        InputError
+            Where there is none.
+        """
+
+    def stated(self, geometry: Geometry) -> Stated:
+        """What is stated of the matrix."""
+
+
+class DampingRatios(Protocol):
+    """What a damping model has besides where the damping of each mode is a function of its frequency alone."""
+
+    def ratios(self, geometry: Geometry, y: Any, omega: Any) -> Any:
+        """One damping ratio a mode, (n,), at the circular frequencies `omega` (n,), in ascending order; None if C."""
+
+
+def stiffness_blocks(given: Any, factor: Any) -> StiffnessBlocks:
+    """Both blocks of a stiffness, where its model gives K_SS alone."""
+    if isinstance(given, StiffnessBlocks):
+        return given
+    n = factor.shape[0]
+    L, K = ca.SX.sym("L", ca.Sparsity.lower(n)), ca.SX.sym("K", n, n)
+    half = ca.solve(L, K)
+    mass_normalised = ca.Function("mass_normalised", [L, K], [ca.densify(ca.solve(L, half.T))])
+    return StiffnessBlocks(given, mass_normalised(ca.tril(factor), given))
+
+
+def constant(matrix: Array) -> ca.DM:
+    """Numbers as a CasADi matrix, zeros left out."""
+    return ca.sparsify(ca.DM(np.atleast_2d(matrix)))

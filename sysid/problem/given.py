@@ -1,0 +1,98 @@
+"""What a user gives as mass, stiffness and damping, brought to matrix models, and the geometry that they have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from sysid.errors import InputError
+from sysid.measurement.measurement import Measurement
+from sysid.models.damping import WrittenDamping
+from sysid.models.expressions import at_point, is_expression, square
+from sysid.models.geometry import Geometry
+from sysid.models.mass import KnownMass, WrittenMass
+from sysid.models.model import MatrixModel
+from sysid.models.stiffness import WrittenStiffness
+from sysid.structure.structure import Array, finite_array
+
+
+def as_models(mass: Any, stiffness: Any, damping: Any) -> tuple[MatrixModel, MatrixModel, MatrixModel]:
+    """Models as they are, numbers and expressions as models.
+
+    Raises
+    ------
+    InputError
+        Where something is none of these.
+    """
+    if not isinstance(mass, MatrixModel):
+        mass = WrittenMass(mass) if is_expression(mass) else KnownMass(_numbers("mass", mass))
+    if not isinstance(stiffness, MatrixModel):
+        stiffness = WrittenStiffness(stiffness if is_expression(stiffness) else _numbers("stiffness", stiffness))
+    if not isinstance(damping, MatrixModel):
+        damping = WrittenDamping(damping if is_expression(damping) else _numbers("damping", damping, least=1))
+    return mass, stiffness, damping
+
+
+def _numbers(name: str, value: object, least: int = 2) -> Array:
+    try:
+        matrix = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        matrix = np.zeros(())
+    if not least <= matrix.ndim <= 2:
+        wanted = "a model such as FullMass(kg) or a matrix"
+        if name != "mass":
+            wanted = f"a {name} model of sysid, an expression or a matrix"
+        raise InputError(f"Problem: {name} is a {type(value).__name__}; give {wanted}")
+    return matrix
+
+
+def geometry_of(
+    test: Measurement,
+    stiffness: MatrixModel,
+    recovery: Any = None,
+    rigid_body_dofs: Any = None,
+    weighed: Callable[[], Array] | None = None,
+) -> Geometry:
+    """Geometry of the degrees of freedom of a problem or of a further test.
+
+    Raises
+    ------
+    InputError
+        Where recovery, rigid_body_dofs and the sensors do not fit together.
+    """
+    if recovery is None and rigid_body_dofs is None:
+        return Geometry(test, weighed=weighed)
+    R = np.eye(test.n_sensors) if recovery is None else finite_array("recovery", recovery)
+    if R.ndim != 2 or len(R) != test.n_sensors:
+        raise InputError(f"recovery is {R.shape}; ({test.n_sensors}, n) takes n degrees of freedom to the sensors")
+    G = _rigid_body_dofs(test, stiffness, R, recovery is not None, rigid_body_dofs)
+    moved = np.abs(R @ G - test.rigid_body).max()
+    if moved > 1e-6 * max(1.0, np.abs(test.rigid_body).max()):
+        raise InputError(
+            f"recovery @ rigid_body_dofs differs from the measurement's rigid_body by up to {moved:.3g}: the order of "
+            "the degrees of freedom, or signs and axes of the sensors, are not what the matrices have"
+        )
+    return Geometry(test, G, None if recovery is None else R, weighed)
+
+
+def _rigid_body_dofs(test: Measurement, stiffness: MatrixModel, R: Array, other: bool, stated: Any) -> Array:
+    """G of the degrees of freedom, (n, d): stated, or what a stiffness with its base columns has."""
+    n, d = R.shape[1], test.n_base
+    if stated is not None:
+        G = finite_array("rigid_body_dofs", stated)
+        if G.shape != (n, d):
+            raise InputError(f"rigid_body_dofs is {G.shape}; ({n}, {d}) is needed")
+        return G
+    if not other:
+        return test.rigid_body
+    whole = square("stiffness", stiffness.matrix) if isinstance(stiffness, WrittenStiffness) else ca.MX(n, n)
+    if whole.size1() <= n:
+        raise InputError(
+            "with recovery, and a stiffness without its base columns, state rigid_body_dofs (n, d): the motion of the "
+            "degrees of freedom with a rigid base"
+        )
+    K = at_point("stiffness", whole, None)
+    return -np.linalg.lstsq(K[:n, :n], K[:n, n:], rcond=None)[0]

@@ -1,0 +1,213 @@
+"""Mass, stiffness and damping as functions of the vector x of all unknowns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from sysid.measurement.measurement import Measurement
+from sysid.models.geometry import Geometry
+from sysid.models.model import MassBlocks, MatrixModel, StiffnessBlocks, stiffness_blocks
+from sysid.models.unknowns import Unknown
+from sysid.problem.direct_response import Motion
+from sysid.structure.structure import Array, Structure
+
+
+class Numbers(NamedTuple):
+    """The blocks of the matrices at one x; `damping` is C (n, n), or empty where damping is by ratios."""
+
+    mass: Array
+    coupling: Array
+    base: Array
+    stiffness: Array
+    damping: Array
+    mass_normalised: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Matrices:
+    """Matrices of the unknowns.
+
+    Attributes
+    ----------
+    function : casadi.Function
+        x to M_SS (n, n), M_S0 (n, d), M_00 (d, d), K_SS (n, n), C (n, n) or nothing, the Cholesky factor L (n, n) of
+        M_SS, and ``H = L^-1 K_SS L^-T`` (n, n).
+    ratio_function : casadi.Function
+        x and circular frequencies (n,) to damping ratios (n,), or to nothing where C tells them.
+    rigid_body : (n, d)
+        Motion of the degrees of freedom for unit base motion.
+    recovery : (n_sensors, n)
+    semidefinite : bool
+        M is positive semidefinite for every x, as its model makes it so.
+    """
+
+    function: ca.Function
+    ratio_function: ca.Function
+    rigid_body: Array
+    recovery: Array
+    semidefinite: bool = False
+
+    @property
+    def by_ratios(self) -> bool:
+        """Whether the damping of each mode is a function of its frequency, so that the response needs the modes."""
+        return bool(self.ratio_function.numel_out(0))
+
+    @property
+    def at_sensors(self) -> bool:
+        """Whether the degrees of freedom are the sensors."""
+        return np.array_equal(self.recovery, np.eye(len(self.rigid_body)))
+
+    def numbers(self, x: Array) -> Numbers:
+        """The blocks at `x`."""
+        M, M_S0, M_00, K, C, _, H = (np.asarray(ca.densify(part)) for part in self.function(x))
+        symmetric = lambda A: (A + A.T) / 2  # noqa: E731
+        return Numbers(symmetric(M), M_S0, symmetric(M_00), symmetric(K), symmetric(C) if C.size else C, symmetric(H))
+
+    def motion(self, x: ca.MX) -> Motion:
+        """The same as expressions of the symbol `x`."""
+        mass, coupling, base, stiffness, damping, *_ = self.function(x)
+        return Motion(mass, coupling, base, stiffness, damping, self.rigid_body, self.recovery)
+
+    def factors(self, x: ca.MX) -> tuple[ca.MX, ca.MX]:
+        """L with ``M_SS = L L'`` and its inverse."""
+        factor = self.function(x)[5]
+        L = ca.SX.sym("L", ca.Sparsity.lower(factor.size1()))
+        inverse = ca.Function("inverse", [L], [ca.densify(ca.solve(L, ca.SX.eye(L.size1())))])
+        return factor, inverse(ca.tril(factor))
+
+    def structure(self, x: Array, test: Measurement) -> Structure:
+        """The structure that `x` stands for, with the sensors of a test.
+
+        Raises
+        ------
+        InputError
+            Where it stands for none.
+        """
+        M, M_S0, M_00, K, C, H = self.numbers(x)
+        G, ratios = self.rigid_body, None
+        if self.by_ratios:
+            with np.errstate(invalid="ignore"):
+                omega = np.sqrt(np.linalg.eigvalsh(H)) if np.all(np.isfinite(H)) else np.full(len(H), np.nan)
+            ratios = np.asarray(self.ratio_function(x, omega)).ravel()
+        return assemble(
+            M, M_S0, M_00, K, G, ratios=ratios, damping=None if self.by_ratios else C,
+            recovery=None if self.at_sensors else self.recovery, test=test,
+        )  # fmt: skip
+
+
+def assemble(
+    M_SS: Array, M_S0: Array, M_00: Array, K_SS: Array, G: Array, *, test: Measurement,
+    ratios: Array | None = None, damping: Array | None = None, recovery: Array | None = None,
+) -> Structure:  # fmt: skip
+    """Structure from its blocks; the base rows of K follow from ``K_S0 = -K_SS G``."""
+    K_S0 = -K_SS @ G
+    return Structure(
+        np.block([[M_SS, M_S0], [M_S0.T, M_00]]),
+        np.block([[K_SS, K_S0], [K_S0.T, -G.T @ K_S0]]),
+        ratios,
+        damping_matrix=damping,
+        n_base=G.shape[1],
+        recovery=recovery,
+        rigid_body=None if recovery is None else test.rigid_body,
+        sensors=test.sensors,
+    )
+
+
+class Blocks(NamedTuple):
+    """The matrices as expressions, and the unknowns of each model with their symbols.
+
+    `damping` and `ratios` are empty where there is none; `omega` is the symbol of the circular frequencies in `ratios`.
+    """
+
+    mass: MassBlocks
+    stiffness: StiffnessBlocks
+    damping: ca.MX
+    ratios: ca.MX
+    omega: ca.MX
+    symbols: tuple[tuple[tuple[Unknown, ca.MX], ...], ...]
+
+    @property
+    def by_matrix(self) -> tuple[ca.MX, ca.MX, ca.MX]:
+        """All entries of mass, stiffness and damping, a column each."""
+        mass, factor = self.mass, self.mass.factor
+        return (
+            ca.veccat(factor, mass.coupling, mass.base), ca.vec(self.stiffness.stiffness),
+            ca.veccat(self.damping, self.ratios),
+        )  # fmt: skip
+
+    def motion(self, geometry: Geometry) -> Motion:
+        """What direct solves of the response need."""
+        mass, coupling, base, stiffness, damping, *_ = self.outputs
+        return Motion(mass, coupling, base, stiffness, damping, geometry.rigid_body, geometry.recovery)
+
+    @property
+    def outputs(self) -> list[ca.MX]:
+        """What `Matrices.function` gives."""
+        L, coupling, base = self.mass
+        return [L @ L.T, coupling, base, self.stiffness.stiffness, self.damping, L, self.stiffness.mass_normalised]
+
+
+def blocks_of(mass: MatrixModel, stiffness: MatrixModel, damping: MatrixModel, geometry: Geometry) -> Blocks:
+    """The matrices of three models as expressions of new symbols, and of the variables that they are written in."""
+    n, empty = geometry.n, ca.MX(0, 0)
+    symbols = tuple(
+        tuple((unknown, ca.MX.sym(unknown.name, unknown.size)) for unknown in model.unknowns(geometry))
+        for model in (mass, stiffness, damping)
+    )
+    y_mass, y_stiffness, y_damping = (ca.vertcat(ca.MX(0, 1), *(s for _, s in group)) for group in symbols)
+
+    made = MassBlocks(*_evaluated(lambda y: mass.blocks(geometry, y), y_mass, ()))
+    of_mass = MassBlocks(ca.tril(made.factor), made.coupling, made.base)
+    K = StiffnessBlocks(
+        *_evaluated(
+            lambda y, *m: stiffness_blocks(stiffness.blocks(geometry, y, MassBlocks(*m)), m[0]), y_stiffness, of_mass
+        )
+    )
+    (C,) = _evaluated(
+        lambda y, *b: (damping.blocks(geometry, y, MassBlocks(*b[:3]), StiffnessBlocks(*b[3:])),), y_damping,
+        (*of_mass, *K),
+    )  # fmt: skip
+    omega = ca.MX.sym("omega", n)
+    of_modes = getattr(damping, "ratios", None)  # a model of a matrix alone need not have it
+    (ratios,) = _evaluated(lambda y, w: (of_modes and of_modes(geometry, y, w),), y_damping, (omega,))
+    return Blocks(made, K, empty if C is None else C, empty if ratios is None else ratios, omega, symbols)
+
+
+def _evaluated(expressions: Any, y: ca.MX, before: tuple[ca.MX, ...]) -> list[ca.MX | None]:
+    """What a model makes of its unknowns and of the blocks before it.
+
+    A model with unknowns sees scalar symbols, whose operations run fastest.
+    """
+    if not y.numel():
+        return [None if part is None else ca.MX(part) for part in expressions(y, *before)]
+    symbols = [ca.SX.sym("y", y.numel()), *(ca.SX.sym(f"b{i}", part.sparsity()) for i, part in enumerate(before))]
+    made = expressions(*symbols)
+    there = [i for i, part in enumerate(made) if part is not None]
+    function = ca.Function("model", symbols, [ca.densify(ca.SX(made[i])) for i in there])
+    values = dict(zip(there, function.call([y, *before]), strict=True))
+    return [values.get(i) for i in range(len(made))]
+
+
+def written_in_symbols(models: Sequence[MatrixModel], geometry: Geometry) -> list[ca.MX]:
+    """The symbols of variables that mass, stiffness and damping are written in; a model with unknowns has none."""
+    n, d = geometry.n, geometry.d
+    mass = MassBlocks(*(ca.MX.sym("mass", *shape) for shape in ((n, n), (n, d), (d, d))))
+    stiffness = StiffnessBlocks(ca.MX.sym("stiffness", n, n), ca.MX.sym("stiffness", n, n))
+    omega, y = ca.MX.sym("omega", n), ca.MX(0, 1)
+    given = {symbol.__hash__() for symbol in (*mass, *stiffness, omega)}
+    found: list[ca.MX] = []
+    for model, before in zip(models, ((), (mass,), (mass, stiffness)), strict=True):
+        if model.unknowns(geometry):
+            continue
+        made = [model.blocks(geometry, y, *before)]
+        if len(before) == 2 and hasattr(model, "ratios"):
+            made.append(model.ratios(geometry, y, omega))
+        parts = [part for block in made for part in (block if isinstance(block, tuple) else (block,))]
+        symbols = [symbol for part in parts if isinstance(part, ca.MX) for symbol in ca.symvar(part)]
+        found += [symbol for symbol in symbols if symbol.__hash__() not in given]
+    return found

@@ -1,0 +1,385 @@
+"""The terms of the least-squares problem: what is fitted, and how each term weighs.
+
+The objective is the sum of squares of all rows of all terms. A term of a new kind is one class with the methods of
+`Term`, and what a user gives for it, among the `residuals` of a problem, one with those of `TermSource`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import casadi as ca
+import numpy as np
+
+from sysid.errors import InputError
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.complex_frequency import noise_level
+from sysid.modal_analysis.response import residual
+from sysid.models.expressions import as_matrix, at_point, check_finite, written_in
+from sysid.models.geometry import Geometry
+from sysid.models.model import MatrixModel
+from sysid.models.unknowns import user_site, variable_of
+from sysid.problem.batch_objective import TestObjective
+from sysid.problem.direct_response import Response, absolute_response, relative_misfit, relative_response
+from sysid.problem.given import as_models, geometry_of
+from sysid.problem.matrices import Blocks, Matrices, blocks_of
+from sysid.problem.slopes import Rows, Slopes, rows_of_test, slopes_of, stacked_rows
+from sysid.structure.structure import Array, finite_array
+
+_FAR = 4.0  # standard deviations from a stated value, beyond which something is wrong
+
+
+class ModeSymbols(NamedTuple):
+    """Modes as unknowns of their own: mass-normalised shapes (n, n) at the degrees of freedom, and w (n,), rad/s."""
+
+    shapes: ca.MX
+    omega: ca.MX
+
+
+class Term(Protocol):
+    """Something that is fitted."""
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+
+    def rows(self, x: ca.MX, modes: ModeSymbols | None = None) -> ca.MX:
+        """Weighted residuals, a column; `modes` are those of the problem's own matrices where they are unknowns too."""
+
+    def error(self, x: Array) -> float:
+        """Root of the sum of squares of the rows at x; NaN where x is no structure."""
+
+    def squared(self, particles: Array) -> Array:
+        """Sum of squares of the rows for many x at once, (count, size) to (count,); NaN where x is no structure."""
+
+    def linearised(self, x: Array, noise: float) -> Rows:
+        """Rows, Jacobian and standard deviations at x; `noise` is that of the first term's rows."""
+
+    def doubts(self, x: Array) -> Sequence[str]:
+        """What speaks against the fit at x, in sentences."""
+
+
+@dataclass(frozen=True, eq=False)
+class TestTerm:
+    """The records of a test, each weighed by its noise.
+
+    The weight of a record's channel and line is the inverse of its stated standard deviation, as a product of one
+    factor a channel and one a line of each run (`sysid.measurement.noise`): a diagonal weight matrix a line.
+
+    Attributes
+    ----------
+    test : Measurement
+    matrices : Matrices
+        Of the structure as it was in this test.
+    weight : float
+        Of the whole test, so that all tests count by their noise.
+    shift : float, 1/s
+        Of the complex frequencies s = shift + i w that the records are given at.
+    name : str
+    """
+
+    __test__ = False  # pytest takes names in Test for its own
+
+    test: Measurement
+    matrices: Matrices
+    weight: float = 1.0
+    shift: float = 0.0
+    name: str = "the test"
+
+    def rows(self, x: ca.MX, modes: ModeSymbols | None = None) -> ca.MX:
+        """Relative residuals of accelerations and, where measured, of the force."""
+        motion = self.matrices.motion(x)
+        if modes is None:
+            return self.weight * relative_misfit(self.test, motion, weighted=True, shift=self.shift)
+        phi, omega = modes
+        ratios = self.matrices.ratio_function(x, omega)
+        shapes = ca.DM(motion.recovery) @ phi
+        miss = residual(
+            self.test, shapes, phi.T @ motion.push, omega, ratios, motion.rigid_body_mass, weighted=True,
+            shift=self.shift,
+        )  # fmt: skip
+        return self.weight * miss
+
+    @cached_property
+    def batch(self) -> TestObjective:
+        """The compiled objective of many candidates."""
+        return TestObjective(self.test, self.matrices, self.shift)
+
+    def squared(self, particles: Array, spectrum: Array | None = None) -> Array:
+        """As in `Term`; where a `spectrum`, rad/s, is given it takes the place of each candidate's own."""
+        return self.weight**2 * self.batch.squared(particles, spectrum)
+
+    def error(self, x: Array) -> float:
+        """Root of the sum of squares of the rows at `x`; NaN where modes are needed and `x` is no structure."""
+        if self.matrices.by_ratios:
+            try:
+                s = self.matrices.structure(x, self.test)
+            except InputError:
+                return float("nan")
+            modes = (s.mode_shapes, s.participation, 2 * np.pi * s.natural_frequencies, s.damping_ratios)
+            phi, gamma, omega, ratios, rigid = (ca.MX(ca.DM(part)) for part in (*modes, s.rigid_body_mass))
+            rows = residual(self.test, phi, gamma, omega, ratios, rigid, weighted=True, shift=self.shift)
+            return self.weight * float(ca.evalf(ca.norm_2(rows)))
+        symbol = ca.MX.sym("x", x.size)
+        return float(ca.Function("error", [symbol], [ca.norm_2(self.rows(symbol))])(x))
+
+    def relative(self, x: Array) -> tuple[float, float]:
+        """Norms of ``predicted - measured`` and of ``measured``: relative accelerations, unweighted."""
+        size = float(np.linalg.norm(self.test.relative))
+        return self.test.residual(self.matrices.structure(x, self.test)) * size, size
+
+    def linearised(
+        self, x: Array, noise: float = np.nan, slopes: Slopes | None = None, *, as_stated: bool = False
+    ) -> Rows:
+        """As in `Term`; noise that is larger than stated counts as the misfit shows it, unless `as_stated`."""
+        slopes = slopes or slopes_of(self.matrices, x, self.test)
+        return stacked_rows(rows_of_test(self.test, slopes, x.size, share=self.weight, as_stated=as_stated))
+
+    def doubts(self, x: Array) -> Sequence[str]:
+        """None of its own: records are checked in `sysid.assessment.checks`."""
+        return ()
+
+
+@dataclass(frozen=True, eq=False)
+class ExpressionTerm:
+    """A column of expressions.
+
+    Attributes
+    ----------
+    name : str
+    function : casadi.Function
+        x to the column.
+    weight : float
+    std : float or None
+        Standard deviation of each row before it is weighed; None where it is not stated.
+    like_records : bool
+        A row that states none is as exact as a number of the records; else what the column leaves is its noise.
+    labels : tuple of str
+        What each row is called where rows are values known to some accuracy, less these, in standard deviations.
+    """
+
+    name: str
+    function: ca.Function
+    weight: float = 1.0
+    std: float | None = None
+    like_records: bool = True
+    labels: tuple[str, ...] = ()
+
+    def rows(self, x: ca.MX, modes: ModeSymbols | None = None) -> ca.MX:
+        """The weighted column."""
+        return self.weight * self.function(x)
+
+    def numbers(self, x: Array) -> Array:
+        """The column at `x`, not weighed."""
+        return np.asarray(self.function(x)).ravel()
+
+    def error(self, x: Array) -> float:
+        """Root of the sum of squares of the rows at `x`."""
+        return self.weight * float(np.linalg.norm(self.numbers(x)))
+
+    def squared(self, particles: Array) -> Array:
+        """As in `Term`."""
+        return np.array([self.error(x) ** 2 for x in particles])
+
+    def linearised(self, x: Array, noise: float) -> Rows:
+        """As in `Term`."""
+        symbol = ca.MX.sym("x", x.size)
+        column = self.function(symbol)
+        function = ca.Function("rows", [symbol], [ca.densify(column), ca.densify(ca.jacobian(column, symbol))])
+        left, slope = (np.asarray(part) for part in function(x))
+        left = left.ravel()
+        std = self.std
+        if std is None and self.like_records:
+            std = noise / self.weight
+        elif std is None:
+            std = max(float(np.linalg.norm(left)) / np.sqrt(max(left.size - x.size, 1)), 1e-15)
+        return Rows(self.weight * left, self.weight * slope, np.full(left.size, self.weight * std))
+
+    def doubts(self, x: Array) -> Sequence[str]:
+        """Values known to some accuracy from which the fit is far."""
+        return [
+            f"{name} ends {abs(off):.3g} of the stated standard deviations from the value that is stated as known: "
+            "that value, its deviation, or the model is wrong"
+            for name, off in zip(self.labels, self.numbers(x) if self.labels else (), strict=True)
+            if abs(off) > _FAR
+        ]
+
+
+class Builder(NamedTuple):
+    """What makes terms of what a user gives.
+
+    ``function(name, expressions)`` is a CasADi function of x; ``matrices(blocks, geometry)`` are matrices of x;
+    ``own()`` are the problem's; ``noise()`` is the standard deviation of a number of the measurement's relative
+    residual; ``replaced`` tells whether a misfit stands in the place of the measurement's.
+    """
+
+    function: Callable[[str, Sequence[ca.MX]], ca.Function]
+    matrices: Callable[[Blocks, Geometry], Matrices]
+    own: Callable[[], Matrices]
+    noise: Callable[[], float]
+    replaced: bool
+
+
+@runtime_checkable
+class TermSource(Protocol):
+    """What a user gives among the `residuals` of a problem."""
+
+    def expressions(self, name: str) -> Sequence[ca.MX]:
+        """What it is written in; empty where it is about the problem's own matrices. `name` is for messages."""
+
+    def term(self, name: str, build: Builder) -> Term:
+        """Its term."""
+
+
+@dataclass(frozen=True, eq=False)
+class FurtherTest:
+    """A further test, for the `residuals` of a problem: of the structure as it was then.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        May have other sensors, lines and base motion than the problem's own.
+    mass, stiffness, damping : expression or array_like
+        (n, n), or (n + d, n + d) with the base's rows last, in the variables of the problem; damping (n, n).
+    recovery, rigid_body_dofs : array_like, optional
+        As in `Problem`.
+    """
+
+    measurement: Measurement
+    mass: Any = field(kw_only=True)
+    stiffness: Any = field(kw_only=True)
+    damping: Any = field(kw_only=True)
+    recovery: Any = field(default=None, kw_only=True)
+    rigid_body_dofs: Any = field(default=None, kw_only=True)
+
+    @cached_property
+    def blocks(self) -> tuple[Blocks, Geometry]:
+        """The blocks of its matrices, and their geometry."""
+        if not isinstance(self.measurement, Measurement):
+            raise InputError(
+                f"FurtherTest: measurement is a {type(self.measurement).__name__}, not a sysid.Measurement"
+            )
+        for name in ("mass", "stiffness", "damping"):
+            if isinstance(getattr(self, name), MatrixModel):
+                raise InputError(f"FurtherTest: {name} is a model; write the matrix in the variables of the problem")
+        models = as_models(self.mass, self.stiffness, self.damping)
+        geometry = geometry_of(self.measurement, models[1], self.recovery, self.rigid_body_dofs)
+        blocks = blocks_of(*models, geometry)
+        if blocks.ratios.numel():
+            raise InputError("FurtherTest: damping must be a matrix (n, n)")
+        return blocks, geometry
+
+    kind = "further tests"
+
+    def expressions(self, name: str) -> Sequence[ca.MX]:
+        """Its matrices."""
+        return self.blocks[0].by_matrix
+
+    def term(self, name: str, build: Builder) -> TestTerm:
+        """Its records, weighed by their noise beside that of the problem's own."""
+        weight = 1.0 if build.replaced else build.noise() / noise_level(self.measurement)
+        return TestTerm(self.measurement, build.matrices(*self.blocks), weight, name=name)
+
+    @property
+    def response(self) -> Response:
+        """Absolute accelerations of the sensors as expressions, (n_sensors, runs * n_freq)."""
+        return absolute_response(self.measurement, self.blocks[0].motion(self.blocks[1]))
+
+    @property
+    def force(self) -> Response:
+        """The base force as expressions, (d, runs * n_freq)."""
+        return relative_response(self.measurement, self.blocks[0].motion(self.blocks[1]))[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Something known to some accuracy, for the `residuals` of a problem: it counts as one more measurement.
+
+    Parameters
+    ----------
+    expression : Variable or expression
+        What is known: a variable, or any column of numbers written in variables.
+    value : array_like
+        Its value, broadcast to it.
+    std : array_like
+        Standard deviation of the value, in the same unit.
+
+    Examples
+    --------
+    >>> import sysid
+    >>> m = sysid.Variable("floor", 2, lower=100.0, upper=900.0, unit="kg")
+    >>> weighed = sysid.Prior(m, [410.0, 395.0], std=12.0)
+    """
+
+    expression: Any
+    value: Any
+    std: Any
+
+    def column(self, name: str) -> tuple[ca.MX, Array, Array]:
+        """The expression as a column, its values and standard deviations, (rows,) each."""
+        column = ca.vec(ca.densify(as_matrix(name, self.expression)))
+        given = []
+        for what, numbers in (("value", self.value), ("std", self.std)):
+            array = finite_array(f"{name}: {what}", numbers).ravel(order="F")
+            if array.size not in (1, column.numel()):
+                raise InputError(f"{name}: {what} holds {array.size} numbers for {column.numel()}{written_in(column)}")
+            given.append(np.broadcast_to(array, (column.numel(),)))
+        if np.any(given[1] <= 0):
+            raise InputError(
+                f"{name}: std = {given[1].min():g}; standard deviations must be positive{written_in(column)}"
+            )
+        return column, given[0], given[1]
+
+    def expressions(self, name: str) -> Sequence[ca.MX]:
+        """What is known, less its value, in standard deviations."""
+        column, value, std = self.column(name)
+        return [(column - ca.DM(value)) / ca.DM(std)]
+
+    def term(self, name: str, build: Builder) -> ExpressionTerm:
+        """Rows in units of the noise of the records."""
+        if build.replaced:
+            raise InputError("Prior beside a misfit of your own: put it into that misfit, in the units of its rows")
+        column = self.column(name)[0]
+        labels = tuple(_label(column, i) for i in range(column.numel()))
+        function = build.function("prior", self.expressions(name))
+        return ExpressionTerm(name, function, weight=build.noise(), std=1.0, labels=labels)
+
+
+@dataclass(frozen=True, eq=False)
+class Residual:
+    """A column of relative residuals written by the user: each row counts like one number of the test."""
+
+    expression: Any
+    is_misfit: bool = False
+
+    def expressions(self, name: str) -> Sequence[ca.MX]:
+        """The column."""
+        return [column_of(name, self.expression)]
+
+    def term(self, name: str, build: Builder) -> ExpressionTerm:
+        """The column as it is."""
+        function = build.function("residuals", self.expressions(name))
+        return ExpressionTerm(name, function, like_records=not self.is_misfit)
+
+
+def column_of(name: str, value: Any) -> ca.MX:
+    """A column of expressions, refused where it is not finite at the guess or holds no variable."""
+    column = ca.vec(ca.densify(as_matrix(name, value)))
+    check_finite(name, at_point(name, column, None).ravel(), column)
+    if not ca.symvar(column):
+        raise InputError(f"{name} ({user_site()}) holds no variable: there is nothing that it could move")
+    return column
+
+
+def _label(column: ca.MX, row: int) -> str:
+    """What a row of something known is called: its variable's entry, or the variables that it is written in."""
+    entry = column[row]
+    names = [v for v in map(variable_of, ca.symvar(entry)) if v is not None]
+    if len(names) == 1:
+        _, entries = ca.jacobian_sparsity(entry, names[0].symbol).get_triplet()
+        if len(entries) == 1:
+            return names[0].labels[entries[0]]
+    return "a relation of " + ", ".join(v.name for v in names)
