@@ -23,8 +23,8 @@ def quiet_options(max_iterations: int) -> dict[str, Any]:
     return {"print_time": False, "show_eval_warnings": False, "ipopt": ipopt}
 
 
-class Coordinates:
-    """Unknowns z of the nonlinear programme, and the equalities and inequalities that tie them."""
+class NonlinearProgram:
+    """Unknowns z, and the equalities and inequalities between them."""
 
     def __init__(self) -> None:
         self.pieces: list[ca.MX] = []
@@ -33,16 +33,16 @@ class Coordinates:
         self.start: list[Array] = []
         self.lower: list[Array] = []
         self.upper: list[Array] = []
-        self.ties: list[ca.MX] = []
-        self._tie_lower: list[Array] = []
-        self._tie_upper: list[Array] = []
+        self.constraints: list[ca.MX] = []
+        self._lower: list[Array] = []
+        self._upper: list[Array] = []
 
     @property
     def z(self) -> ca.MX:
         """All unknowns, (p, 1)."""
         return ca.vertcat(*self.pieces)
 
-    def add(
+    def variable(
         self,
         name: str,
         start: Array,
@@ -64,16 +64,16 @@ class Coordinates:
         self.upper.append(np.broadcast_to(upper, start.shape).ravel(order="F"))
         return symbol
 
-    def tie(self, expression: ca.MX, lower: Array | float = 0.0, upper: Array | float = 0.0) -> None:
+    def constrain(self, expression: ca.MX, lower: Array | float = 0.0, upper: Array | float = 0.0) -> None:
         """Hold an expression, a column, between bounds; at zero by default."""
-        self.ties.append(expression)
-        self._tie_lower.append(np.broadcast_to(lower, expression.numel()))
-        self._tie_upper.append(np.broadcast_to(upper, expression.numel()))
+        self.constraints.append(expression)
+        self._lower.append(np.broadcast_to(lower, expression.numel()))
+        self._upper.append(np.broadcast_to(upper, expression.numel()))
 
     def minimize(
         self,
         objective: ca.MX,
-        watch: Watch,
+        monitor: IterationMonitor,
         max_iterations: int,
         derivatives: dict[str, ca.Function] | None = None,
         *,
@@ -82,21 +82,21 @@ class Coordinates:
         """Run IPOPT on `objective`, which is 1 where nothing is explained; the unknowns at its end, and its status.
 
         `derivatives` are functions in the place of CasADi's own, as `nlpsol` names them; `acceptable` is the tolerance
-        that five iterates in a row must meet, in units of the tolerance. Where the watch was stopped
+        that five iterates in a row must meet, in units of the tolerance. Where the monitor was stopped
         the status is "stopped", and the unknowns are the last iterate's.
         """
         z = self.z
-        ties = ca.vertcat(*self.ties) if self.ties else ca.MX(0, 1)
-        nlp = {"x": z, "f": OBJECTIVE_SCALE * objective, "g": ties}
+        constraints = ca.vertcat(ca.MX(0, 1), *self.constraints)
+        nlp = {"x": z, "f": OBJECTIVE_SCALE * objective, "g": constraints}
         lower, upper = np.concatenate(self.lower), np.concatenate(self.upper)
-        tie_lower, tie_upper = (np.concatenate([np.zeros(0), *part]) for part in (self._tie_lower, self._tie_upper))
+        bounds_below, bounds_above = (np.concatenate([np.zeros(0), *part]) for part in (self._lower, self._upper))
         start = np.clip(np.concatenate(self.start), lower, upper)
-        call = watch.callback(start, ties.numel())
+        call = monitor.callback(start, constraints.numel())
 
         def run(at: Array, tolerance: float) -> tuple[str, Array]:
             limits: dict[str, float] = {"max_iter": max_iterations}
-            if np.isfinite(watch.left):
-                limits["max_wall_time"] = max(watch.left, 0.1)
+            if np.isfinite(monitor.left):
+                limits["max_wall_time"] = max(monitor.left, 0.1)
             options = {
                 "print_time": False,
                 "show_eval_warnings": False,  # a step too long is IPOPT's to shorten
@@ -108,18 +108,18 @@ class Coordinates:
                 **(derivatives or {}),
             }  # fmt: skip
             solver = ca.nlpsol("local", "ipopt", nlp, options)
-            answer = solver(x0=at, lbx=lower, ubx=upper, lbg=tie_lower, ubg=tie_upper)
+            answer = solver(x0=at, lbx=lower, ubx=upper, lbg=bounds_below, ubg=bounds_above)
             return solver.stats()["return_status"], np.asarray(answer["x"]).ravel()
 
         try:
             status, best = run(start, _TOLERANCE)
-            if status == "Search_Direction_Becomes_Too_Small" and watch.stopped is None:
+            if status == "Search_Direction_Becomes_Too_Small" and monitor.stopped is None:
                 # Noise can leave the gradient's round-off above the tolerance: the same point is judged by a wider one.
                 status, best = run(best, 1e3 * _TOLERANCE)
         except KeyboardInterrupt as interrupt:
-            watch.stopped = interrupt
-        if watch.stopped is not None:
-            return watch.z, "stopped"
+            monitor.stopped = interrupt
+        if monitor.stopped is not None:
+            return monitor.z, "stopped"
         return best, status
 
     def on_bounds(self, at: Array) -> str:
@@ -139,11 +139,19 @@ class Coordinates:
         )
 
 
-class Watch:
-    """What happens between the iterations of all attempts: the curve, the monitor, and its wish to stop."""
+class IterationMonitor:
+    """What happens between the iterations of all runs of IPOPT: the curve, the listener, and its wish to stop.
 
-    def __init__(self, monitor: Callable[[int, float], object] | None, max_time: float | None) -> None:
-        self.monitor = monitor
+    Parameters
+    ----------
+    listener : callable or None
+        Called with (iteration, objective) after each iteration; whatever it raises stops the solver.
+    max_time : float or None
+        s, for all runs.
+    """
+
+    def __init__(self, listener: Callable[[int, float], object] | None, max_time: float | None) -> None:
+        self.listener = listener
         self.deadline = np.inf if max_time is None else time.perf_counter() + max_time
         self.curve: list[float] = []
         self.stopped: BaseException | None = None
@@ -159,18 +167,18 @@ class Watch:
         """Iterates so far."""
         return len(self.curve)
 
-    def callback(self, start: Array, n_ties: int) -> ca.Callback:
-        """IPOPT's iteration callback, which records each iterate; `start` stands until the first comes."""
+    def callback(self, start: Array, n_constraints: int) -> ca.Callback:
+        """What `nlpsol` calls after each iteration."""
         self.z = start
-        return _IterationCallback(self, start.size, n_ties)
+        return _IterationCallback(self, start.size, n_constraints)
 
-    def take(self, z: Array, objective: float) -> bool:
-        """Take an iterate; whether to stop."""
+    def record(self, z: Array, objective: float) -> bool:
+        """Record an iterate; whether to stop."""
         try:
             self.z = z
             self.curve.append(float(np.sqrt(max(objective, 0.0) / OBJECTIVE_SCALE)))
-            if self.monitor is not None:
-                self.monitor(len(self.curve) - 1, self.curve[-1])
+            if self.listener is not None:
+                self.listener(len(self.curve) - 1, self.curve[-1])
         except BaseException as error:  # must not unwind through IPOPT; the caller raises it again
             self.stopped = error
         return self.stopped is not None
@@ -179,10 +187,10 @@ class Watch:
 class _IterationCallback(ca.Callback):
     """CasADi's shape of an iteration callback."""
 
-    def __init__(self, watch: Watch, n: int, n_ties: int) -> None:
+    def __init__(self, monitor: IterationMonitor, n: int, n_constraints: int) -> None:
         ca.Callback.__init__(self)
-        self.watch = watch
-        self.sizes = {"x": n, "f": 1, "g": n_ties, "lam_x": n, "lam_g": n_ties, "lam_p": 0}
+        self.monitor = monitor
+        self.sizes = {"x": n, "f": 1, "g": n_constraints, "lam_x": n, "lam_g": n_constraints, "lam_p": 0}
         self.construct("iteration", {})
 
     def get_n_in(self) -> int:
@@ -207,4 +215,4 @@ class _IterationCallback(ca.Callback):
 
     def eval(self, arg: list) -> list:
         """Hand the iterate on; a nonzero answer stops IPOPT."""
-        return [int(self.watch.take(np.asarray(arg[0]).ravel(), float(arg[1])))]
+        return [int(self.monitor.record(np.asarray(arg[0]).ravel(), float(arg[1])))]

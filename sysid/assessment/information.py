@@ -18,11 +18,9 @@ import scipy.linalg
 import scipy.sparse
 
 from sysid.measurement.measurement import Measurement
-from sysid.measurement.noise import separable
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.modal_analysis.residues import line_correlation
 from sysid.modal_analysis.response import columns, gain_slopes, gains
-from sysid.structure.structure import Array, ComplexArray, Structure
+from sysid.structure.structure import Array, ComplexArray
 
 _UNSEEN = 1e-10  # of the strongest parameter's part in the records: below it there is round-off only
 

@@ -8,18 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from sysid.assessment.information import inflation_of, records_of
-from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.response import columns
 from sysid.models.unknowns import Block, Variable, split, steps_of
-from sysid.problem.formulation import Matrices, labels_of
+from sysid.problem.formulation import labels_of
 from sysid.problem.problem import Problem
-from sysid.structure.structure import Array, ComplexArray, Structure
+from sysid.structure.structure import Array
 
 _NULL = 1e-9  # of the largest singular value of the Jacobian, in units of the unknowns: what no record sees
 _SMALL = 1e-6  # of a unit: what is not told of a direction

@@ -83,5 +83,3 @@ def inflation_of(test: Measurement, records: list[Record], unknowns: int) -> flo
 def _gram(vectors: ComplexArray) -> Array:
     stacked = np.hstack([vectors.real, vectors.imag])
     return stacked @ stacked.T
-
-

@@ -21,7 +21,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.measurement.noise import separable
 from sysid.modal_analysis.residues import force_residual_left, linear_residues
 from sysid.modal_analysis.response import columns
-from sysid.nlp import OBJECTIVE_SCALE, Coordinates, Watch
+from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.triangular import lower_triangle, triangle_entries
 
@@ -72,7 +72,7 @@ class ModalFit:
     bounds: str
 
 
-Spectrum = Callable[[Coordinates], tuple[ca.MX, ca.MX]]
+Spectrum = Callable[[NonlinearProgram], tuple[ca.MX, ca.MX]]
 Ties = Callable[[ca.MX, ca.MX, ca.MX], list[ca.MX]]
 
 
@@ -84,7 +84,7 @@ def fit_modes(
     unit: Array,
     remainder: Array,
     ties: Ties | None = None,
-    watch: Watch,
+    monitor: IterationMonitor,
     max_iterations: int = 500,
 ) -> ModalFit:
     """Minimise the weighted squared error of accelerations and, where it was measured, base force.
@@ -95,7 +95,7 @@ def fit_modes(
     first : Modes
         Where to start; shapes are not read.
     spectrum : callable
-        Adds its unknowns to the coordinates, and gives circular frequencies and damping ratios, (m, 1) each.
+        Adds its unknowns to the program, and gives circular frequencies and damping ratios, (m, 1) each.
     unit : (d,), kg^½ (times m for a rotation)
         Makes participations of order one.
     remainder : (d, d)
@@ -107,26 +107,26 @@ def fit_modes(
     ----------
     G. H. Golub, V. Pereyra, SIAM J. Numer. Anal. 10 (1973) 413-432; L. Kaufman, BIT 15 (1975) 49-57.
     """
-    z = Coordinates()
+    z = NonlinearProgram()
     m, d = first.gamma.shape
     weighed = test.force is not None
     gauge, held = _gauge(first, unit, weighed)
     low, high = np.full((m, d), -np.inf), np.full((m, d), np.inf)
     low[held], high[held] = gauge[held], gauge[held]
-    gamma = z.add("participation", gauge, low, high) @ ca.diag(ca.DM(unit))
+    gamma = z.variable("participation", gauge, low, high) @ ca.diag(ca.DM(unit))
     omega, ratios = spectrum(z)
     rigid = gamma.T @ gamma
     if weighed:
         lam, vectors = np.linalg.eigh(remainder / np.outer(unit, unit))
         # A factor of zero has no slope.
         root = np.linalg.cholesky((vectors * np.maximum(lam, _LEAST_MASS * max(1.0, lam[-1]))) @ vectors.T)
-        factor = ca.diag(ca.DM(unit)) @ lower_triangle(z.add("base mass", triangle_entries(root)), d)
+        factor = ca.diag(ca.DM(unit)) @ lower_triangle(z.variable("base mass", triangle_entries(root)), d)
         rigid = rigid + factor @ factor.T
     error = _Error(test, gamma, omega, ratios, rigid, first)
     if ties is not None:
         for tie in ties(error.phi, gamma, rigid):
-            z.tie(tie)
-    best, status = z.minimize(error.value, watch, max_iterations, _derivatives(z, error, gamma, omega, ratios, rigid))
+            z.constrain(tie)
+    best, status = z.minimize(error.value, monitor, max_iterations, _derivatives(z, error, gamma, omega, ratios, rigid))
     end = ca.Function("end", [z.z], [error.phi, gamma, omega, ratios, rigid, error.value, ca.norm_fro(error.left)])
     values = [np.asarray(v) for v in end(best)]
     if not all(np.all(np.isfinite(v)) for v in values):
@@ -301,7 +301,7 @@ def _force_weight(test: Measurement, first: Modes, size: float, force_size: floa
 
 
 def _derivatives(
-    z: Coordinates, error: _Error, gamma: ca.MX, omega: ca.MX, ratios: ca.MX, rigid: ca.MX
+    z: NonlinearProgram, error: _Error, gamma: ca.MX, omega: ca.MX, ratios: ca.MX, rigid: ca.MX
 ) -> dict[str, ca.Function]:
     """Gradient and Gauss-Newton Hessian by the unknowns, in IPOPT's scale of the objective."""
     unknowns = z.z
@@ -315,7 +315,7 @@ def _derivatives(
         ca.hessian(ca.dot(slope, rigid - gamma.T @ gamma), unknowns)[0], slope, ca.reshape(gradient[-d * d :], d, d)
     )
     p, factor, multipliers = ca.MX.sym("p", 0), ca.MX.sym("factor"), ca.MX.sym("multipliers", sum(
-        tie.numel() for tie in z.ties
+        tie.numel() for tie in z.constraints
     ))  # fmt: skip
     return {
         "grad_f": ca.Function(

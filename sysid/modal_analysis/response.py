@@ -7,7 +7,7 @@ import numpy as np
 
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.noise import separable
-from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.structure import Array, ComplexArray, Structure
 
 
 def columns(record: ComplexArray) -> ComplexArray:
@@ -93,6 +93,19 @@ def residual(
             weight * (gamma.T @ q_im + rigid_body_mass @ u_im - f_im) / scale,
         ]
     return ca.vertcat(*(ca.vec(ca.densify(piece)) for piece in pieces))
+
+
+def weighted_error(test: Measurement, structure: Structure) -> float:
+    """Norm of `residual` of a structure, its records weighed by stated noise."""
+    made = [(test.relative, test.predict(structure))]
+    if test.force is not None:
+        made.append((test.force, test.predict_force(structure)))
+    weights = weights_of_test(test, weighted=True)
+    rows = [
+        np.linalg.norm(np.asarray(weight) * columns(predicted - record)) / scale
+        for (record, predicted), (weight, scale) in zip(made, weights, strict=True)
+    ]
+    return float(np.linalg.norm(rows))
 
 
 def weights_of_test(test: Measurement, *, weighted: bool) -> list[tuple[ca.DM, float]]:

@@ -49,11 +49,12 @@ class Geometry:
         self.recovery = np.eye(len(self.rigid_body)) if recovery is None else recovery
         self.translational = test.translational
         self._weighed = weighed
+        self.monitor: Callable[[int, float], object] | None = None  # of a search for poles
 
     @cached_property
     def poles(self) -> Poles:
         """Poles that stand out of the records."""
-        return find_poles(self.test)
+        return find_poles(self.test, monitor=self.monitor)
 
     @cached_property
     def weighed(self) -> Array | None:

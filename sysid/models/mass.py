@@ -149,6 +149,10 @@ class FullMass:
             return entries
         return np.concatenate([total_of(geometry, mass, self.healing), entries])
 
+    def total(self, geometry: Geometry, mass: Array) -> Array:
+        """What this healing calls the total of `mass`, (n + d, n + d): (d,)."""
+        return total_of(geometry, mass, self.healing)
+
     def stated(self, geometry: Geometry) -> Stated:
         """Known entries, and totals of its kind."""
         known = self.known_entries(geometry)

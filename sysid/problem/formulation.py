@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -105,6 +105,7 @@ class Formulation:
         self.sources += [(f"residual {i}", as_source(given)) for i, given in enumerate(residuals, start=1)]
         self.fits_records = misfit is None
         self._constraints, self._healing = constraints, healing or {}
+        self.monitor: Callable[[int, float], object] | None = None  # of a search for poles
 
     def check(self) -> None:
         """Refuse what is declared wrong.
@@ -246,7 +247,7 @@ class Formulation:
     @cached_property
     def noise(self) -> float:
         """Standard deviation of a real number of the measurement's relative, weighted residual."""
-        return noise_level(self.measurement)
+        return noise_level(self.measurement, monitor=self.monitor)
 
     @property
     def further_tests(self) -> tuple[TestTerm, ...]:
@@ -283,7 +284,7 @@ class Formulation:
 
     @cached_property
     def healing(self) -> ca.Function:
-        """x to x: what the swarm's candidates pass through; the identity where nothing is healed."""
+        """X to x: what the swarm's candidates pass through; the identity where nothing is healed."""
         columns = [self.healed.get(u, s) if isinstance(u, Variable) else s for u, s in self._symbols]
         return self._function("healing", [ca.veccat(*columns)])
 

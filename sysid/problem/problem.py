@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -175,6 +175,23 @@ class Problem:
         return Formulation(
             self.measurement, self.models, geometry, self.residuals, self.constraints, self.misfit, self.healing
         )
+
+    def prepare(self, monitor: Callable[[int, float], object] | None = None) -> None:
+        """Find what the records tell before any fit, once: poles, weights, levels of noise.
+
+        Parameters
+        ----------
+        monitor : callable, optional
+            Called with (iteration, relative residual) while poles are looked for; what it raises passes through.
+        """
+        geometry, formulation = self.geometry, self.formulation
+        geometry.monitor = formulation.monitor = monitor
+        try:
+            _ = formulation.unknowns
+            if not formulation.free_modes:
+                _ = formulation.terms
+        finally:
+            geometry.monitor = formulation.monitor = None
 
     def check(self) -> None:
         """Refuse what cannot be searched, before any search.

@@ -1,22 +1,24 @@
-"""Strategy "continuation": from wide peaks, step by step, to the records themselves, for structured problems."""
+"""Strategy "continuation": from wide peaks, step by step, to the records themselves."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, SolverError
-from sysid.modal_analysis.complex_frequency import PolesAndResidues, Smoothed
+from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.nlp import EXACT
-from sysid.problem.feasibility import spread
+from sysid.problem.feasibility import latin_hypercube
 from sysid.problem.problem import Problem
+from sysid.problem.terms import TestTerm
 from sysid.search import local
 from sysid.search.local import LocalResult
-from sysid.search.session import Desk, Stop
+from sysid.search.session import Session, Stop
 from sysid.search.strategy import History, Outcome, as_unknowns
 from sysid.structure.structure import Array, Structure
 
@@ -45,40 +47,72 @@ class Continuation:
     """
 
     starts: int = 3
+    name: ClassVar[str] = "continuation"
 
-
-def tests_of(problem: Problem) -> list[PolesAndResidues] | None:
-    """What stands for each test at complex frequencies; None where one shows no poles or the misfit is an own one."""
-    formulation = problem.formulation
-    if formulation.misfit is not None:
+    def refusal(self, problem: Problem, start: ArrayLike | Structure | None) -> str | None:
+        """Why "auto" does not take it: poles and residues make the matrices, or entries of a free mass are stated."""
+        formulation = problem.formulation
+        if formulation.mass.free and (formulation.mass.entries is not None or problem.rigid_total is not None):
+            return "it cannot hold known entries of a free mass or a whole rigid-body mass"
+        described = formulation.mass.free or formulation.mass.entries is not None
+        if formulation.test_alone and formulation.geometry.at_sensors and formulation.stiffness.free and described:
+            return "neither mass nor stiffness has a form of its own"
         return None
-    found = [PolesAndResidues.of(test) for test in (problem.measurement, *(test for test, _ in formulation.others))]
+
+    def run(self, problem: Problem, session: Session, start: ArrayLike | Structure | None) -> Outcome:
+        """Search from several starts: the best end."""
+        return _Run(problem, session).outcome(self.starts, start)
+
+
+def smoothed_tests(problem: Problem, monitor: Callable[[int, float], object] | None = None) -> _Smoother | None:
+    """What stands for each fitted test at complex frequencies; None where one shows no poles, or none is fitted."""
+    if not problem.formulation.fits_records:
+        return None
+    terms = problem.formulation.tests
+    found = [PolesAndResidues.of(term.test, monitor=monitor) for term in terms]
     known = [poles for poles in found if poles is not None]
-    return known if len(known) == len(found) else None
+    return _Smoother(terms, known) if len(known) == len(terms) else None
 
 
-def levels_of(problem: Problem, tests: list[PolesAndResidues]) -> list[tuple[Smoothed, ...]]:
-    """The problem's own test and its further ones, with smaller and smaller shifts."""
-    records = (problem.measurement, *(test for test, _ in problem.formulation.others))
-    return [tuple(poles.smoothed(test, share) for poles, test in zip(tests, records, strict=True)) for share in SHIFTS]
+@dataclass(frozen=True, eq=False)
+class _Smoother:
+    """The fitted tests, and the poles and residues that stand for their records."""
+
+    terms: Sequence[TestTerm]
+    poles: Sequence[PolesAndResidues]
+
+    @property
+    def steps(self) -> list[tuple[TestTerm, ...]]:
+        """The tests with smaller and smaller shifts."""
+        return [tuple(self._at(term, poles, share) for term, poles in self._pairs) for share in SHIFTS]
+
+    @property
+    def floor(self) -> float:
+        """Objective that free residues at the poles of the data leave."""
+        return float(np.linalg.norm([term.weight * poles.residual for term, poles in self._pairs]))
+
+    @property
+    def _pairs(self) -> list[tuple[TestTerm, PolesAndResidues]]:
+        return list(zip(self.terms, self.poles, strict=True))
+
+    @staticmethod
+    def _at(term: TestTerm, poles: PolesAndResidues, share: float) -> TestTerm:
+        wide = poles.smoothed(term.test, share)
+        return replace(term, test=wide.test, shift=wide.shift)
 
 
 def smooth_fit(
-    problem: Problem,
-    x: Array,
-    steps: list[tuple[Smoothed, ...]],
-    *,
-    left: Callable[[], float | None],
-    monitor: Callable[[int, float], object] | None = None,
-) -> LocalResult | None:
+    problem: Problem, x: Array, steps: list[tuple[TestTerm, ...]], session: Session,
+    monitor: Callable[[int, float], object],
+) -> LocalResult | None:  # fmt: skip
     """Fit every step from where the one before ended; None without steps."""
     curve: list[float] = []
     answer = None
     for step in steps:
         taken = len(curve)
-        watch = None if monitor is None else lambda i, cost, taken=taken: monitor(taken + i, cost)
+        listener = lambda i, objective, taken=taken: monitor(taken + i, objective)  # noqa: E731
         try:
-            new = local.solve(problem, x, max_iterations=_STEPS, max_time=left(), monitor=watch, smoothed=step)
+            new = local.solve(problem, x, max_iterations=_STEPS, max_time=session.left, monitor=listener, smoothed=step)
         except InputError:  # modes are needed, and this is no structure
             break
         curve += new.curve.tolist()
@@ -90,106 +124,108 @@ def smooth_fit(
     return answer
 
 
-def descend(
-    problem: Problem,
-    x: Array,
-    steps: list[tuple[Smoothed, ...]],
-    *,
-    left: Callable[[], float | None],
-    monitor: Callable[[int, float], object] | None = None,
-) -> LocalResult:
+def descend(problem: Problem, x: Array, steps: list[tuple[TestTerm, ...]], session: Session) -> LocalResult:
     """Fit every step, and at last the records."""
-    way = smooth_fit(problem, x, steps, left=left, monitor=monitor)
+    monitor = session.reporter("local phase")
+    way = smooth_fit(problem, x, steps, session, monitor)
     if way is not None and way.stopped is not None:
         return way
-    return local.solve(problem, x if way is None else way.x, max_time=left(), monitor=monitor)
+    return local.solve(problem, x if way is None else way.x, max_time=session.left, monitor=monitor)
 
 
-def by_continuation(
-    problem: Problem,
-    options: Continuation,
-    desk: Desk,
-    random: np.random.SeedSequence,
-    start: ArrayLike | Structure | None,
-) -> tuple[Outcome, float, bool]:
-    """Search from several starts; the best end, its misfit, and whether the data let a structure be hardly better."""
-    poles = tests_of(problem)
-    steps = [] if poles is None else levels_of(problem, poles)
-    floor = (
-        0.0
-        if poles is None
-        else float(
-            np.linalg.norm([s * p.residual for s, p in zip((1.0, *problem.formulation.shares), poles, strict=True)])
+class _Run:
+    """Searches from several starts: where they ended so far."""
+
+    def __init__(self, problem: Problem, session: Session) -> None:
+        self.problem, self.session = problem, session
+        self.smoother = smoothed_tests(problem, session.preparing)
+        self.steps = [] if self.smoother is None else self.smoother.steps
+        self.ends: list[tuple[float, LocalResult]] = []
+        self.ways: list[Array] = []
+        self.stopped: BaseException | None = None
+        self.wrong: InputError | None = None
+
+    def outcome(self, starts: int, start: ArrayLike | Structure | None) -> Outcome:
+        """Search, and take the best end."""
+        problem, session = self.problem, self.session
+        floor = (
+            "" if self.smoother is None else f"; free residues at the poles of the data leave {self.smoother.floor:.3g}"
         )
-    )
-    desk.note(
-        f"continuation over {problem.n_variables} unknowns in {len(steps)} steps"
-        + ("" if poles is None else f"; free residues at the poles of the data leave {floor:.3g}")
-    )
-    first = problem.formulation.guess if start is None else as_unknowns(problem, start)
-    ends: list[tuple[float, LocalResult]] = []
-    ways: list[Array] = []
-    history = replace(History(), start=_misfit_at(problem, first))
-    stopped: BaseException | None = None
-    wrong: InputError | None = None
-    on_way = lambda i, cost: desk.tell("continuation", i, 0, cost)  # noqa: E731
-    at_end = lambda i, cost: desk.tell("local phase", i, 0, cost)  # noqa: E731
-    for x in (first, *_starts(problem, options.starts - 1, random)):
+        session.log(f"continuation over {problem.n_variables} unknowns in {len(self.steps)} steps{floor}")
+        first = problem.formulation.guess if start is None else as_unknowns(problem, start)
+        for x in (first, *_starts(problem, starts - 1, session.random)):
+            self._from(x)
+            if self.stopped is not None or (self.ends and not session.time_for_more):
+                break
+        if self.stopped is not None and not isinstance(self.stopped, Stop | KeyboardInterrupt):
+            raise self.stopped
+        if not self.ends:
+            raise self.stopped or SolverError(
+                f"no search began at a structure ({self.wrong}): state guesses that make one"
+            )
+        objective, best, structure = _best(problem, self.ends)
+        success, message = best.success, best.message
+        if self.stopped is not None:
+            success, message = False, str(self.stopped) or "interrupted"
+        return Outcome(
+            structure, best.x, Continuation.name, success, message,
+            History(start=_objective_at(problem, first), local=objective, local_curve=best.curve), self.stopped,
+            alternatives=tuple(_alternatives(problem, best.x, objective, self.ends)) if success else (),
+            good=self._good(objective, best),
+        )  # fmt: skip
+
+    def _from(self, x: Array) -> None:
+        """One search."""
+        problem, session = self.problem, self.session
         try:
-            way = smooth_fit(problem, x, steps, left=lambda: desk.left, monitor=on_way)
+            way = smooth_fit(problem, x, self.steps, session, session.reporter("continuation"))
             if way is not None and way.stopped is None:
-                if any(_apart(problem, way.x, other) < _TOGETHER for other in ways):
-                    desk.note("another start comes the same way")
-                    continue
-                ways.append(way.x)
+                if any(_apart(problem, way.x, other) < _TOGETHER for other in self.ways):
+                    session.log("another start comes the same way")
+                    return
+                self.ways.append(way.x)
                 x = way.x
+            stopped = way is not None and way.stopped is not None
             answer = (
                 way
-                if way is not None and way.stopped is not None
-                else local.solve(problem, x, max_time=desk.left, monitor=at_end)
+                if stopped
+                else local.solve(problem, x, max_time=session.left, monitor=session.reporter("local phase"))
             )
         except InputError as error:
-            wrong = error
-            desk.note(f"a start is passed over: {error}")
-            continue
+            self.wrong = error
+            session.log(f"a start is passed over: {error}")
+            return
         except (Stop, KeyboardInterrupt) as stop:
-            stopped = stop
-            break
-        misfit = _misfit_at(problem, answer.x)
-        desk.note(f"local phase: {answer.message}, {answer.curve.size} iterates, {misfit:.4e} of all that is fitted")
-        ends.append((misfit, answer))
-        stopped = answer.stopped
-        if stopped is not None or not desk.time_for_more:
-            break
-    if stopped is not None and not isinstance(stopped, Stop | KeyboardInterrupt):
-        raise stopped
-    if not ends:
-        raise stopped or SolverError(f"no search began at a structure ({wrong}): state guesses that make one")
-    misfit, best, structure = _best(problem, ends)
-    history = replace(history, local=misfit, local_curve=best.curve)
-    if problem.goal is not None:
-        good = problem.residual_of(best.x) <= problem.goal
-    else:
+            self.stopped = stop
+            return
+        assert answer is not None
+        objective = _objective_at(problem, answer.x)
+        session.log(f"local phase: {answer.message}, {answer.curve.size} iterates, objective {objective:.4e}")
+        self.ends.append((objective, answer))
+        self.stopped = answer.stopped
+
+    def _good(self, objective: float, best: LocalResult) -> bool:
+        """Whether the data let a structure be hardly better."""
+        problem = self.problem
+        if problem.goal is not None:
+            return problem.residual(best.x) <= problem.goal
+        if self.smoother is None:
+            return best.success
         # What residuals of the user's own leave beside the tests has no floor of its own.
-        reached = float(np.sqrt(max(misfit**2 - problem.own_squares(best.x), 0.0)))
-        good = reached <= max(_NEAR * floor, EXACT) if poles is not None else best.success
-    success, message = best.success, best.message
-    if stopped is not None:
-        success, message = False, str(stopped) or "interrupted"
-    rivals = tuple(_rivals(problem, best.x, misfit, ends)) if success else ()
-    return Outcome(structure, best.x, "continuation", success, message, history, stopped, rivals=rivals), misfit, good
+        own = sum(term.error(best.x) ** 2 for term in problem.formulation.beside if not isinstance(term, TestTerm))
+        return float(np.sqrt(max(objective**2 - own, 0.0))) <= max(_NEAR * self.smoother.floor, EXACT)
 
 
 def _best(problem: Problem, ends: list[tuple[float, LocalResult]]) -> tuple[float, LocalResult, Structure]:
-    """The end with the least misfit that is a structure."""
+    """The end with the least objective that is a structure."""
     wrong: InputError | None = None
 
     def order(end: tuple[float, LocalResult]) -> tuple[bool, float]:
         return not problem.keeps_constraints(end[1].x), end[0] if np.isfinite(end[0]) else np.inf
 
-    for misfit, answer in sorted(ends, key=order):
+    for objective, answer in sorted(ends, key=order):
         try:
-            return misfit, answer, problem.structure(answer.x)
+            return objective, answer, problem.structure(answer.x)
         except InputError as error:
             wrong = error
     raise SolverError(
@@ -202,7 +238,7 @@ def _starts(problem: Problem, count: int, random: np.random.SeedSequence) -> lis
     """Points spread over the search space as the swarm's are, of those that stand for a structure."""
     if count < 1:
         return []
-    points = spread(problem.formulation, _DRAWN * count, np.random.default_rng(random))
+    points = latin_hypercube(problem.formulation, _DRAWN * count, np.random.default_rng(random))
     return list(islice((x for x in points if _is_structure(problem, x)), count))
 
 
@@ -214,21 +250,21 @@ def _is_structure(problem: Problem, x: Array) -> bool:
     return True
 
 
-def _misfit_at(problem: Problem, x: Array) -> float:
+def _objective_at(problem: Problem, x: Array) -> float:
     """NaN where modes are needed and `x` is no structure."""
     try:
-        return problem.misfit_of(x)
+        return problem.objective(x)
     except InputError:
         return float("nan")
 
 
-def _rivals(problem: Problem, x: Array, misfit: float, ends: list[tuple[float, LocalResult]]) -> list[Array]:
+def _alternatives(problem: Problem, x: Array, objective: float, ends: list[tuple[float, LocalResult]]) -> list[Array]:
     """Other ends that explain the data as well."""
     from scipy.stats import chi2
 
-    tests = (problem.measurement, *(test for test, _ in problem.formulation.others))
+    tests = [term.test for term in problem.formulation.tests]
     numbers = 2 * sum(test.response.size + (0 if test.force is None else test.force.size) for test in tests)
-    as_good = misfit * np.sqrt(1 + chi2.isf(_CHANCE, x.size) / max(numbers - x.size, 1))
+    as_good = objective * np.sqrt(1 + chi2.isf(_CHANCE, x.size) / max(numbers - x.size, 1))
     found: list[Array] = []
     for other, answer in ends:
         good = np.isfinite(other) and other <= max(as_good, EXACT)

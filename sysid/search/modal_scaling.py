@@ -15,7 +15,6 @@ from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Modes, Ties
 from sysid.modal_analysis.response import columns, gains
-from sysid.models.mass import FullMass
 from sysid.problem.problem import Problem
 from sysid.structure.structure import Array
 from sysid.structure.triangular import lower_entries
@@ -76,25 +75,26 @@ def weigh(test: Measurement, modes: Modes) -> tuple[Array, Array]:
 
 
 def stated_totals(problem: Problem) -> Ties | None:
-    """Equalities that hold the stated total mass where the base force would set another."""
-    layout, mass, totals = problem.layout, problem.mass, problem.totals
-    if problem.measurement.force is None or not isinstance(mass, FullMass) or mass.total_mass is None:
+    """Equalities that hold the stated total mass of a free mass where the base force would set another."""
+    geometry, mass, totals = problem.geometry, problem.formulation.mass, problem.totals
+    if problem.measurement.force is None or not mass.free or mass.totals is None:
         return None
+    stated = mass.totals
 
     def ties(phi: ca.MX, gamma: ca.MX, rigid: ca.MX) -> list[ca.MX]:
-        if problem.rigid_total is not None:
+        if stated.values.ndim == 2:
             size = np.sqrt(totals)
-            off = (rigid - ca.DM(problem.rigid_total)) / ca.DM(np.outer(size, size))
+            off = (rigid - ca.DM(stated.values)) / ca.DM(np.outer(size, size))
             return [lower_entries(off)]
-        if mass.healing == "rigid_body" or phi.size1() != phi.size2():
+        if stated.kind == "rigid_body" or phi.size1() != phi.size2():
             return [ca.diag(rigid) / totals - 1]
         P = ca.inv(phi)
-        delta = gamma - P @ ca.DM(layout.rigid_body)
+        delta = gamma - P @ ca.DM(geometry.rigid_body)
         rows = ca.diag(P.T @ P)
         base = ca.diag(rigid - gamma.T @ gamma + delta.T @ delta)
-        groups = layout.directions[: layout.n]
-        own = [ca.sum1(rows[np.flatnonzero(groups == i).tolist()]) for i in range(layout.d)]
-        return [(own[i] + base[i]) / totals[i] - 1 for i in range(layout.d)]
+        groups = geometry.directions[: geometry.n]
+        own = [ca.sum1(rows[np.flatnonzero(groups == i).tolist()]) for i in range(geometry.d)]
+        return [(own[i] + base[i]) / totals[i] - 1 for i in range(geometry.d)]
 
     return ties
 
@@ -126,7 +126,8 @@ def to_stated_totals(
         t = 1.0 if scaled else min(1.0, (1 - spare) / float(scipy.linalg.eigvalsh(own, total)[-1]))
         lam, vectors = np.linalg.eigh(total - t * own)
         return t, (vectors * np.maximum(lam, 0.0)) @ vectors.T * np.outer(size, size)
-    if isinstance(problem.mass, FullMass) and problem.mass.healing == "rigid_body":
+    stated = problem.formulation.mass.totals
+    if stated is not None and stated.kind == "rigid_body":
         used = np.sum(gamma**2, axis=0)
     else:
         rows = np.sum(P**2, axis=0)
@@ -134,8 +135,7 @@ def to_stated_totals(
         used = np.array(own) + np.sum((gamma - P @ G) ** 2, axis=0)
     totals = problem.totals
     if scaled:
-        stated = isinstance(problem.mass, FullMass) and problem.mass.total_mass is not None
-        totals = np.maximum(totals if stated else 0.0, (1 + spare) * used)
+        totals = np.maximum(0.0 if stated is None else totals, (1 + spare) * used)
     t = 1.0 if scaled else min(1.0, float(np.min((1 - spare) * totals / used)))
     share = np.sqrt(np.maximum(totals - t * used, 0.0) / np.maximum(np.diag(remainder), np.finfo(float).tiny))
     return t, remainder * np.outer(share, share)

@@ -9,7 +9,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-Phase = Literal["swarm", "refinement", "continuation", "local phase"]
+import numpy as np
+
+Phase = Literal["poles", "swarm", "refinement", "continuation", "local phase"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,11 +21,12 @@ class Progress:
     Attributes
     ----------
     phase : str
-        "swarm", "refinement", "continuation" (of widened peaks) or "local phase".
+        "poles" (of the records), "swarm", "refinement", "continuation" (of widened peaks) or "local phase".
     iteration, of : int
         The iteration, and the most there can be (0: not known).
-    residual : float
-        Of the best candidate so far: root of the squared relative residuals of all that this phase fits.
+    objective : float
+        Of the best candidate so far: root of the sum of squares of all that this phase fits, each record relative and
+        weighed by its noise.
     seconds : float
         Since the start.
     """
@@ -31,11 +34,11 @@ class Progress:
     phase: Phase
     iteration: int
     of: int
-    residual: float
+    objective: float
     seconds: float
 
     def __str__(self) -> str:
-        return f"{self.phase:12s}  iteration {self.iteration:4d}  residual {self.residual:.3e}  {self.seconds:6.1f} s"
+        return f"{self.phase:12s}  iteration {self.iteration:4d}  objective {self.objective:.3e}  {self.seconds:6.1f} s"
 
 
 class DeferredInterrupt:
@@ -78,22 +81,41 @@ class DeferredInterrupt:
 
 
 class Stop(Exception):  # noqa: N818 - not an error
-    """The callback asked to stop."""
+    """The callback asked to stop, or the time is over."""
 
 
-class Desk:
-    """The clock, the log, and the listeners of an identification."""
+class Session:
+    """The clock, the log, the listeners and the random source of an identification.
+
+    Parameters
+    ----------
+    listeners : list of callable
+        Called with a `Progress` at each iteration.
+    interrupt : DeferredInterrupt
+    max_time : float or None
+        s.
+    random : SeedSequence
+    max_evaluations : int or None
+        Candidates that a swarm may evaluate.
+    """
 
     def __init__(
-        self, listeners: list[Callable[[Progress], object]], interrupt: DeferredInterrupt, max_time: float | None
+        self,
+        listeners: list[Callable[[Progress], object]],
+        interrupt: DeferredInterrupt,
+        max_time: float | None = None,
+        random: np.random.SeedSequence | None = None,
+        max_evaluations: int | None = None,
     ) -> None:
         self.listeners, self.interrupt, self.max_time = listeners, interrupt, max_time
+        self.random = random or np.random.SeedSequence(0)
+        self.max_evaluations = max_evaluations
         self.begun = time.perf_counter()
-        self.log: list[str] = []
+        self.lines: list[str] = []
 
     @property
     def seconds(self) -> float:
-        """Seconds since the search began."""
+        """Seconds since the start."""
         return time.perf_counter() - self.begun
 
     @property
@@ -106,15 +128,31 @@ class Desk:
         """Whether half of the time is left."""
         return self.max_time is None or self.seconds < self.max_time / 2
 
-    def note(self, line: str) -> None:
-        """Add a line to the log, with the time."""
-        self.log.append(f"{self.seconds:8.2f} s  {line}")
+    def log(self, line: str) -> None:
+        """Add a line to the log."""
+        self.lines.append(f"{self.seconds:8.2f} s  {line}")
 
-    def tell(self, phase: Phase, iteration: int, of: int, cost: float) -> None:
-        """Report an iteration to the listeners; raise `Stop` or KeyboardInterrupt where the search is to end."""
+    def report(self, phase: Phase, iteration: int, of: int, objective: float) -> None:
+        """Tell the listeners of an iteration.
+
+        Raises
+        ------
+        Stop, KeyboardInterrupt
+            Where a listener or the user wants to stop.
+        """
         self.interrupt.check()
         for listener in self.listeners:
             try:
-                listener(Progress(phase, iteration, of, cost, self.seconds))
+                listener(Progress(phase, iteration, of, objective, self.seconds))
             except StopIteration:
                 raise Stop("the callback stopped the search") from None
+
+    def reporter(self, phase: Phase) -> Callable[[int, float], None]:
+        """`report` for a phase whose iterations are not counted beforehand."""
+        return lambda iteration, objective: self.report(phase, iteration, 0, objective)
+
+    def preparing(self, iteration: int, objective: float) -> None:
+        """`report` while poles are looked for, before there is anything to keep: the time limit ends it too."""
+        self.report("poles", iteration, 0, objective)
+        if self.max_time is not None and self.seconds > self.max_time:
+            raise Stop(f"the time of {self.max_time:g} s was over before the poles of the records were found")

@@ -1,32 +1,34 @@
-"""What the strategies share: where a search ended, and what a start stands for."""
+"""What the strategies have in common: their contract, where a search ended, and what a start stands for."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError
 from sysid.problem.problem import Problem
+from sysid.search.session import Session
 from sysid.structure.structure import Array, Structure
 
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """What ran, phase by phase; residuals are relative, NaN where a phase did not run.
+    """What ran, phase by phase; NaN where a phase did not run.
 
-    They count all that is fitted, base force and further tests too: the root of the sum of all squared relative
-    residuals. The modal strategy has the local phase only, continuation start and local phase.
+    The objective counts all that is fitted, base force and further tests too: the root of the sum of all squared
+    rows, each record relative and weighed by its noise. The modal strategy has the local phase only, continuation
+    start and local phase.
 
     Attributes
     ----------
     start, swarm, refinement, local : float
-        Residual of the best candidate after each phase: the Latin hypercube (or the start that was given; of
+        Objective of the best candidate after each phase: the Latin hypercube (or the start that was given; of
         continuation the guess), the swarm, the eigenvalue refinement, the local phase.
     swarm_curve, local_curve : ndarray
-        Best residual after each iteration of the swarm, and residual of each local iterate as IPOPT saw it, the
-        records weighed by stated noise.
+        Best objective after each iteration of the swarm, and objective of each local iterate.
     refinement_error : float
         Largest relative difference of a refined eigenvalue (w²) from the one that was given.
     states : tuple of (str, int)
@@ -71,8 +73,10 @@ class Outcome:
         What ended it early.
     remarks : tuple of str
         What the user should know of how it was done.
-    rivals : tuple of (n_variables,)
+    alternatives : tuple of (n_variables,)
         Other unknowns that explain the data as well.
+    good : bool
+        The fit is as good as the data let it be, as far as the strategy can tell: no other needs to follow.
     """
 
     structure: Structure
@@ -83,14 +87,41 @@ class Outcome:
     history: History
     stopped: BaseException | None = None
     remarks: tuple[str, ...] = ()
-    rivals: tuple[Array, ...] = ()
+    alternatives: tuple[Array, ...] = ()
+    good: bool = True
+
+
+class Strategy(Protocol):
+    """A way to look for the best unknowns; its fields are its settings."""
+
+    @property
+    def name(self) -> str:
+        """As ``strategy=`` and results call it."""
+
+    def refusal(self, problem: Problem, start: ArrayLike | Structure | None) -> str | None:
+        """Why "auto" does not take it for a problem; None where it does."""
+
+    def run(self, problem: Problem, session: Session, start: ArrayLike | Structure | None) -> Outcome:
+        """Search.
+
+        Raises
+        ------
+        DoesNotApplyError
+            Where the strategy cannot be used for the problem.
+        InputError, SolverError
+            Where data or models are wrong, or nothing came out.
+        """
+
+
+class DoesNotApplyError(InputError):
+    """A strategy does not apply to a problem; another may."""
 
 
 def as_unknowns(problem: Problem, start: ArrayLike | Structure) -> Array:
     """Unknowns of a start that the user gave."""
     if isinstance(start, Structure):
-        layout = problem.layout
-        if (start.n, start.n_base, start.n_sensors) != (layout.n, layout.d, layout.n):
+        geometry = problem.geometry
+        if (start.n, start.n_base, start.n_sensors) != (geometry.n, geometry.d, problem.measurement.n_sensors):
             raise InputError("start: the structure has other degrees of freedom or base directions than the problem")
         return problem.values(start)
     x = np.asarray(start, dtype=float)

@@ -4,28 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, SolverError
-from sysid.modal_analysis.complex_frequency import Smoothed
-from sysid.models.mass import FullMass
-from sysid.models.spectrum import by_ipopt, closed_form
-from sysid.models.stiffness import SpectralStiffness
+from sysid.errors import SolverError
+from sysid.models.spectrum import Refinement, by_ipopt, closed_form
+from sysid.problem.matrices import assemble
 from sysid.problem.problem import Problem
+from sysid.problem.terms import TestTerm
 from sysid.search import local
-from sysid.search.continuation import descend, levels_of, tests_of
-from sysid.search.direct_objective import WrittenCost
-from sysid.search.session import Desk, Stop
-from sysid.search.strategy import History, Outcome, as_unknowns
-from sysid.search.swarm_objective import SwarmCost
+from sysid.search.continuation import descend, smoothed_tests
+from sysid.search.session import Session, Stop
+from sysid.search.strategy import DoesNotApplyError, History, Outcome, as_unknowns
+from sysid.search.swarm_objective import SwarmObjective
 from sysid.structure.structure import Array, Structure
-from sysid.structure.triangular import triangle, triangle_entries
 from sysid.swarm import SwarmProgress, SwarmSettings, minimize_swarm
 
 _SETTINGS = SwarmSettings(inertia_b1=0.8, inertia_b2=0.5, acceleration_lower=0.5, acceleration_sum=3.0)
-_DOUBTFUL = 0.1  # relative residual above which a structured problem is searched again
+_DOUBTFUL = 0.1  # objective above which a problem without free modes is searched again
 
 
 @dataclass(frozen=True)
@@ -47,8 +45,8 @@ class Swarm:
     local_phase : bool
         Whether the local phase follows. Without it no solver vouches for the result, and `success` is False.
     restarts : int
-        How many further swarms may follow where the goal is missed, or, without a goal and with a structured
-        mass or stiffness, the residual is above 0.1.
+        How many further swarms may follow where the goal is missed, or, without a goal and where modes are not free,
+        the objective is above 0.1.
     settings : SwarmSettings
         Constants of the swarm itself. The paper leaves b1 and b2 of its eq. 11 to the user; with the
         usual 0.3 and 0.2 and c1 + c2 up to 4 (``SwarmSettings()``) the swarm of this problem contracts
@@ -64,77 +62,72 @@ class Swarm:
     local_phase: bool = True
     restarts: int = 4
     settings: SwarmSettings = _SETTINGS
+    name: ClassVar[str] = "swarm"
 
-
-def by_swarm(
-    problem: Problem,
-    options: Swarm,
-    desk: Desk,
-    random: np.random.SeedSequence,
-    start: ArrayLike | Structure | None,
-    max_evaluations: int | None,
-) -> Outcome:
-    """Search, and again from another swarm while the goal is missed; the best.
-
-    Raises
-    ------
-    InputError
-        Where more modes were found in the data than sensors, or known entries or a whole rigid-body mass are stated.
-    """
-    if isinstance(problem.mass, FullMass) and not problem.mass.healable:
-        raise InputError(
-            "the swarm cannot hold known entries of the mass or a whole rigid-body mass: state their diagonals as "
-            "total_mass only, or take strategy 'modal'"
-        )
-    _check_modes(problem)
-    best: _Search | None = None
-    evaluations = 0
-    for child in random.spawn(1 + options.restarts):
-        search = _Search(problem, options, desk)
-        stopped: BaseException | None = None
-        try:
-            search.run(child, start, None if max_evaluations is None else max_evaluations - evaluations)
-        except (Stop, KeyboardInterrupt) as stop:
-            stopped, search.success, search.message = stop, False, str(stop) or "interrupted"
-        evaluations += search.history.evaluations
-        if search.x is not None and (best is None or problem.rank_of(search.x) < problem.rank_of(best.found)):
-            best = search
-        if best is None:
-            if isinstance(stopped, KeyboardInterrupt):
-                raise stopped
-            raise SolverError("the search ended before it had a single candidate; give it more time")
-        late = desk.max_time is not None and desk.seconds > desk.max_time / 2
-        spent = max_evaluations is not None and 2 * evaluations > max_evaluations
-        if stopped or late or spent or not options.local_phase or best.good_enough:
-            break
-        desk.note(f"{best.misfit:.4g} is no good fit: another swarm")
-    assert best is not None
-    if stopped is not None:
-        best.success, best.message = False, str(stopped) or "interrupted"
-    best.history = replace(best.history, evaluations=evaluations)
-    assert best.x is not None
-    return Outcome(problem.structure(best.x), best.x, "swarm", best.success, best.message, best.history, stopped)
-
-
-def _check_modes(problem: Problem) -> None:
-    """The swarm's models have one mode a sensor."""
-    n, poles = problem.layout.n, problem.poles
-    if poles is not None and poles.omega.size > n:
+    def refusal(self, problem: Problem, start: ArrayLike | Structure | None) -> str | None:
+        """Why it cannot search a problem: what healing cannot meet, or more modes than degrees of freedom."""
+        mass = problem.formulation.mass
+        if mass.free and (mass.entries is not None or problem.rigid_total is not None):
+            return (
+                "the swarm cannot hold known entries of the mass or a whole rigid-body mass: state their diagonals as "
+                "total_mass only, or take strategy 'modal'"
+            )
+        n, poles = problem.geometry.n, problem.poles
+        if poles is None or poles.omega.size <= n:
+            return None
         found = ", ".join(f"{w / (2 * np.pi):.4g}" for w in poles.omega)
-        raise InputError(
+        return (
             f"{poles.omega.size} modes stand out of the data ({found} Hz) for {n} sensors, but the swarm's models have "
             "one a sensor: narrow the band, or use strategy 'modal'"
         )
+
+    def run(self, problem: Problem, session: Session, start: ArrayLike | Structure | None) -> Outcome:
+        """Search, and again from another swarm while there is no good fit; the best.
+
+        Raises
+        ------
+        DoesNotApplyError
+            Where there are more modes in the data than sensors, or known entries or a whole rigid-body mass are stated.
+        """
+        refusal = self.refusal(problem, start)
+        if refusal:
+            raise DoesNotApplyError(refusal)
+        best: _Search | None = None
+        evaluations, most = 0, session.max_evaluations
+        for child in session.random.spawn(1 + self.restarts):
+            search = _Search(problem, self, session)
+            stopped: BaseException | None = None
+            try:
+                search.run(child, start, None if most is None else most - evaluations)
+            except (Stop, KeyboardInterrupt) as stop:
+                stopped, search.success, search.message = stop, False, str(stop) or "interrupted"
+            evaluations += search.history.evaluations
+            if search.x is not None and (best is None or problem.rank_of(search.x) < problem.rank_of(best.found)):
+                best = search
+            if best is None:
+                if isinstance(stopped, KeyboardInterrupt):
+                    raise stopped
+                raise SolverError("the search ended before it had a single candidate; give it more time")
+            late = session.max_time is not None and session.seconds > session.max_time / 2
+            spent = most is not None and 2 * evaluations > most
+            if stopped or late or spent or not self.local_phase or best.good_enough:
+                break
+            session.log(f"{best.objective:.4g} is no good fit: another swarm")
+        assert best is not None
+        if stopped is not None:
+            best.success, best.message = False, str(stopped) or "interrupted"
+        history = replace(best.history, evaluations=evaluations)
+        return Outcome(problem.structure(best.found), best.found, "swarm", best.success, best.message, history, stopped)
 
 
 class _Search:
     """One swarm, its refinement and its local phase: the best so far and its history."""
 
-    def __init__(self, problem: Problem, options: Swarm, desk: Desk) -> None:
-        self.problem, self.options, self.desk = problem, options, desk
+    def __init__(self, problem: Problem, options: Swarm, session: Session) -> None:
+        self.problem, self.options, self.session = problem, options, session
         self.x: Array | None = None
         self.raw: Array = np.zeros(0)
-        self.steps: list[tuple[Smoothed, ...]] = []
+        self.steps: list[tuple[TestTerm, ...]] = []
         self.history = History()
         self.success, self.message = False, "ended before the local phase, as asked"
 
@@ -145,135 +138,160 @@ class _Search:
         return self.x
 
     @property
-    def misfit(self) -> float:
+    def objective(self) -> float:
         """At the best so far."""
-        assert self.x is not None
-        return self.problem.misfit_of(self.x)
+        return self.problem.objective(self.found)
 
     @property
     def meets_goal(self) -> bool | None:
         """Whether the residual is at or below the goal; None where none is given."""
         if self.problem.goal is None or self.x is None:
             return None
-        return self.problem.residual_of(self.x) <= self.problem.goal
+        return self.problem.residual(self.x) <= self.problem.goal
 
     @property
     def good_enough(self) -> bool:
         """Whether another swarm is not worth its time."""
         if self.problem.goal is not None:
             return self.meets_goal is True
-        # Without a goal: modal coordinates notice their local minima themselves, structured ones cannot.
-        return self.problem.free_modes or self.misfit <= _DOUBTFUL
+        # Without a goal: modal coordinates notice their local minima themselves, others cannot.
+        return self.problem.free_modes or self.objective <= _DOUBTFUL
+
+    @property
+    def spectrum(self) -> Array | None:
+        """The measured spectrum, where each candidate is given it."""
+        formulation = self.problem.formulation
+        return formulation.stiffness.spectrum if self.options.refine and formulation.refinable else None
 
     def run(
         self, random: np.random.SeedSequence, start: ArrayLike | Structure | None, max_evaluations: int | None
     ) -> None:
+        """All phases."""
         self.swarm(random, start, max_evaluations)
-        self.refine()
+        if self.spectrum is not None:
+            self.refine(self.spectrum)
         if self.options.local_phase:
             self.local()
 
     def swarm(
         self, random: np.random.SeedSequence, start: ArrayLike | Structure | None, max_evaluations: int | None
     ) -> None:
-        problem, options, desk = self.problem, self.options, self.desk
-        cost: SwarmCost | WrittenCost
-        if problem.is_written:
+        """The swarm itself."""
+        problem, options, session = self.problem, self.options, self.session
+        if not problem.formulation.refinable and (smoother := smoothed_tests(problem, session.preparing)):
             # With wide peaks more of the swarm is on a slope that leads somewhere.
-            self.steps = levels_of(problem, poles)[1:] if (poles := tests_of(problem)) else []
-            cost = WrittenCost(problem, self.steps[0] if self.steps else None)
-        else:
-            cost = SwarmCost(problem, refine=options.refine)
-        x0 = None if start is None else problem.to_sampling(as_unknowns(problem, start))
-        unknowns = ", ".join(f"{name} {count}" for name, count in problem.unknowns)
-        if problem.poles is not None:
-            found = ", ".join(f"{f:.4g}" for f in problem.poles.omega / (2 * np.pi))
-            desk.note(
-                f"natural frequencies found in the data: {found} Hz (modal fit within {problem.poles.residual:.2e})"
-            )
-        desk.note(f"swarm over {problem.n_variables} unknowns ({unknowns})")
+            self.steps = smoother.steps[1:]
+        objective = SwarmObjective(problem, self.steps[0] if self.steps else (), self.spectrum)
+        self._log_start()
         curve: list[float] = []
 
-        def watch(state: SwarmProgress) -> None:
+        def listen(state: SwarmProgress) -> None:
             if np.isfinite(state.fun):
-                self.raw, self.x = cost.unknowns(state.x), cost.refined(state.x)
+                self.raw = objective.unknowns(state.x)
+                self.x = self.refined(self.raw)
             curve.append(state.fun)
             self.history = replace(
                 self.history, start=curve[0], swarm=curve[-1], swarm_curve=np.array(curve), evaluations=state.nfev
             )
-            desk.tell("swarm", state.nit, options.max_iterations, state.fun)
+            session.report("swarm", state.nit, options.max_iterations, state.fun)
 
         result = minimize_swarm(
-            cost,
+            objective,
             np.column_stack([problem.lower, problem.upper]),
             rng=np.random.default_rng(random),
             n_particles=options.n_particles,
             max_iterations=options.max_iterations,
             max_evaluations=max_evaluations,
-            max_time=None if desk.left is None else desk.left * 2 / 3,
-            target=problem.goal,
+            max_time=None if session.left is None else session.left * 2 / 3,
+            target=self._target(),
             stall_iterations=options.stall_iterations,
             stall_tolerance=options.stall_tolerance,
-            callback=watch,
-            improve=self.improver(cost) if options.gradient_every else None,
+            callback=listen,
+            improve=self._improver(objective) if options.gradient_every else None,
             improve_every=options.gradient_every,
-            x0=x0,
+            x0=None if start is None else problem.formulation.to_sampling(as_unknowns(problem, start)),
             settings=options.settings,
         )
         if self.x is None:
             raise SolverError(f"the swarm found no candidate that is a structure: {result.message}")
         states = tuple((state.name.lower().replace("_", " "), int(n)) for state, n in result.state_counts.items())
         self.history = replace(self.history, states=states)
-        desk.note(f"swarm ended after {result.nit} iterations at {result.fun:.4e}: {result.message}")
-        if problem.is_written:
-            desk.note(f"its best leaves {self.misfit:.4e} of the records themselves")
-            self.history = replace(self.history, start=np.nan, swarm=self.misfit)
+        session.log(f"swarm ended after {result.nit} iterations at {result.fun:.4e}: {result.message}")
+        if self.steps:
+            session.log(f"its best leaves {self.objective:.4e} of the records themselves")
+            self.history = replace(self.history, start=np.nan, swarm=self.objective)
         if result.n_nan:
-            desk.note(f"{result.n_nan} of {result.nfev} candidates were no structure (not a number)")
+            session.log(f"{result.n_nan} of {result.nfev} candidates were no structure (not a number)")
 
-    def improver(self, cost: SwarmCost | WrittenCost) -> Callable[[Array], Array]:
+    def _target(self) -> float | None:
+        """The objective at which the swarm may end: the goal, where objective and residual are one."""
+        test, formulation = self.problem.measurement, self.problem.formulation
+        alike = test.response_std is None and test.force is None and len(formulation.terms) == 1 and not self.steps
+        return self.problem.goal if alike else None
+
+    def _log_start(self) -> None:
+        problem = self.problem
+        unknowns = ", ".join(f"{name} {count}" for name, count in problem.unknowns)
+        if problem.poles is not None:
+            found = ", ".join(f"{f:.4g}" for f in problem.poles.omega / (2 * np.pi))
+            self.session.log(
+                f"natural frequencies found in the data: {found} Hz (modal fit within {problem.poles.residual:.2e})"
+            )
+        self.session.log(f"swarm over {problem.n_variables} unknowns ({unknowns})")
+
+    def _improver(self, objective: SwarmObjective) -> Callable[[Array], Array]:
         """The exact-gradient refinement of the swarm's best, in the swarm's coordinates."""
 
         def improve(s: Array) -> Array:
-            better = local.solve(self.problem, cost.refined(s), max_iterations=30)
-            return self.problem.to_sampling(better.x)
+            better = local.solve(self.problem, self.refined(objective.unknowns(s)), max_iterations=30)
+            return self.problem.formulation.to_sampling(better.x)
 
         return improve
 
-    def refine(self) -> None:
+    def refined(self, x: Array) -> Array:
+        """The unknowns of the structure that `x` was given its objective for: its spectrum replaced."""
+        return x if self.spectrum is None else self._with_factor(x, closed_form(self._factor(x), self.spectrum))
+
+    def refine(self, spectrum: Array) -> None:
         """Refine the swarm's best from its own L_H through IPOPT, as the paper does, beside the closed form."""
-        stiffness, n = self.problem.stiffness, self.problem.layout.n
-        if self.problem.is_written or not (isinstance(stiffness, SpectralStiffness) and self.options.refine):
-            return
-        assert self.x is not None
-        self.desk.tell("refinement", 0, 1, self.history.swarm)
-        part = self.problem.parts.stiffness
-        factor = triangle(self.raw[part], n)
-        chosen, solved = closed_form(factor, stiffness.targets), by_ipopt(factor, stiffness.targets)
-        x = self.x.copy()
-        x[part] = triangle_entries(solved.factor)
-        misfit, other = self.misfit, self.problem.misfit_of(x)
-        self.desk.note(
-            f"refinement of eigenvalues 1 to {stiffness.targets.size} of {n}: {solved.message}, within "
-            f"{solved.error:.1e} of the given ones, residual {other:.4e} (closed form {misfit:.4e})"
+        self.session.report("refinement", 0, 1, self.history.swarm)
+        factor, n = self._factor(self.raw), self.problem.geometry.n
+        chosen, solved = closed_form(factor, spectrum), by_ipopt(factor, spectrum)
+        x = self._with_factor(self.raw, solved)
+        objective, other = self.objective, self.problem.objective(x)
+        self.session.log(
+            f"refinement of eigenvalues 1 to {spectrum.size} of {n}: {solved.message}, within "
+            f"{solved.error:.1e} of the given ones, objective {other:.4e} (closed form {objective:.4e})"
         )
-        if solved.success and other < misfit:
-            self.x, chosen, misfit = x, solved, other
-        self.history = replace(self.history, refinement=misfit, refinement_error=chosen.error)
+        if solved.success and other < objective:
+            self.x, chosen, objective = x, solved, other
+        self.history = replace(self.history, refinement=objective, refinement_error=chosen.error)
+
+    def _factor(self, x: Array) -> Array:
+        """L_H at `x`, rad/s."""
+        return np.linalg.cholesky(self.problem.formulation.matrices.numbers(x).mass_normalised)
+
+    def _with_factor(self, x: Array, refined: Refinement) -> Array:
+        """Unknowns with this L_H in the place of their own."""
+        formulation = self.problem.formulation
+        M_SS, M_S0, M_00, *_ = formulation.matrices.numbers(x)
+        root = np.linalg.cholesky(M_SS) @ refined.factor
+        structure = assemble(
+            M_SS, M_S0, M_00, root @ root.T, formulation.matrices.rigid_body, ratios=np.full(len(root), 0.01),
+            test=self.problem.measurement,
+        )  # fmt: skip
+        x = x.copy()
+        x[formulation.parts.stiffness] = formulation.models[1].values(formulation.geometry, structure)
+        return x
 
     def local(self) -> None:
         """Run the local phase; keep its answer where it is better."""
-        assert self.x is not None
-        before = self.misfit
-        monitor = lambda i, cost: self.desk.tell("local phase", i, 0, cost)  # noqa: E731 - for both ways
-        if self.problem.is_written:
-            answer = descend(self.problem, self.x, self.steps, left=lambda: self.desk.left, monitor=monitor)
-        else:
-            answer = local.solve(self.problem, self.x, max_time=self.desk.left, monitor=monitor)
-        after = self.problem.misfit_of(answer.x)
-        self.desk.note(f"local phase: {answer.message}, {answer.curve.size} iterates, residual {after:.4e}")
+        before = self.objective
+        answer = descend(self.problem, self.found, self.steps, self.session)
+        after = self.problem.objective(answer.x)
+        self.session.log(f"local phase: {answer.message}, {answer.curve.size} iterates, objective {after:.4e}")
         self.success, self.message = answer.success, answer.message
-        if self.problem.rank_of(answer.x) < self.problem.rank_of(self.x):
+        if self.problem.rank_of(answer.x) < self.problem.rank_of(self.found):
             self.x = answer.x
         else:
             # A start that meets the goal needs no improvement; any other was not made by a solver that succeeded.

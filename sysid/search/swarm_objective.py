@@ -1,106 +1,68 @@
-"""The swarm's cost: the residual of a whole swarm at once, on compiled CasADi functions."""
+"""The objective of a whole swarm at once, on compiled CasADi functions."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import casadi as ca
 import numpy as np
 
-from sysid.modal_analysis.response import residual
-from sysid.models.spectrum import closed_form, replace_spectrum
-from sysid.models.stiffness import SpectralStiffness
+from sysid.problem.batch_objective import CHUNK, in_chunks, padded
 from sysid.problem.problem import Problem
+from sysid.problem.terms import TestTerm
+from sysid.search.matrix_coordinates import terms_with
 from sysid.structure.structure import Array
-from sysid.structure.triangular import triangle, triangle_entries
 
-CHUNK = 64  # particles a compiled call: fixed, so that the bits do not depend on the swarm's size
-_THREADS = 2  # of CasADi's own; the bits do not depend on it
+_WORST = 1e6  # an objective that no candidate passes that keeps the constraints
 
 
-class SwarmCost:
-    """Relative residual of a whole swarm at once: (n_particles, n_variables) → (n_particles,).
+class SwarmObjective:
+    """What a swarm minimises: (n_particles, n_variables) → (n_particles,), the problem's objective.
 
-    Two compiled CasADi functions with LAPACK's batched eigensolver between them, which also does
-    the eigenvalue refinement in closed form.
+    Constraints count by the feasibility rules of Deb (Comput. Methods Appl. Mech. Eng. 186 (2000) 311-338): whatever
+    keeps them comes before what does not.
 
     Parameters
     ----------
     problem : Problem
-    refine : bool
-        Replace the spectrum of each candidate by the measured one, where the stiffness has one.
+        Its healing is applied.
+    smoothed : sequence of TestTerm
+        In the place of the problem's tests, in their order.
+    spectrum : ndarray, optional
+        Circular frequencies, rad/s, that take the place of each candidate's own lowest ones (eigenvalue refinement in
+        closed form).
     """
 
-    def __init__(self, problem: Problem, *, refine: bool = True) -> None:
-        self.problem = problem
-        layout, D = problem.layout, problem.n_variables
-        n, d = layout.n, layout.d
-        s = ca.SX.sym("s", D)
-        x = problem.from_sampling(s)
-        blocks = problem.matrices(x)
-        L, G = blocks.factor, ca.SX(layout.rigid_body)
-        L_inverse = ca.densify(ca.solve(L, ca.SX.eye(n)))
-        push = L @ (L.T @ G) + blocks.coupling
-        rigid = G.T @ push + blocks.coupling.T @ G + blocks.base
-        outputs = [ca.densify(block) for block in (L_inverse, push, blocks.mass_normalised, rigid, blocks.damping)]
-        self._expand = ca.Function("expand", [s], outputs).map(CHUNK)
-        self._unknowns = ca.Function("unknowns", [s], [x])
-
-        shapes = {"phi": (n, n), "gamma": (n, d), "omega": (n, 1), "rigid": (d, d), "c": blocks.damping.shape}
-        phi, gamma, omega, rigid_mx, c = (ca.MX.sym(name, *shape) for name, shape in shapes.items())
-        miss = residual(problem.measurement, phi, gamma, omega, problem.damping.ratios(c, omega), rigid_mx)
-        cost = ca.sqrt(ca.sumsqr(miss))
-        self._evaluate = ca.Function("cost", [phi, gamma, omega, rigid_mx, c], [cost]).map(CHUNK, "thread", _THREADS)
-        stiffness = problem.stiffness
-        self._targets = stiffness.targets if refine and isinstance(stiffness, SpectralStiffness) else None
+    def __init__(self, problem: Problem, smoothed: Sequence[TestTerm] = (), spectrum: Array | None = None) -> None:
+        self.problem, self.spectrum = problem, spectrum
+        self.terms = terms_with(problem.formulation, smoothed)
+        formulation = problem.formulation
+        s = ca.MX.sym("s", formulation.size)
+        x = formulation.from_sampling(s)
+        if formulation.healed:
+            x = ca.fmin(ca.fmax(formulation.healing(x), ca.DM(formulation.lower)), ca.DM(formulation.upper))
+        self._unknowns = ca.Function("unknowns", [s], [ca.densify(x)])
+        self._all_unknowns = self._unknowns.map(CHUNK)
 
     def __call__(self, particles: Array) -> Array:
-        """Relative residual of each row; NaN where a candidate is no structure."""
-        return np.concatenate(
-            [self._chunk(particles[start : start + CHUNK]) for start in range(0, len(particles), CHUNK)]
-        )
+        """Objective of each row; NaN where a candidate is no structure."""
+        x = in_chunks(self._chunk, particles)
+        squared = np.zeros(len(x))
+        for i, term in enumerate(self.terms):
+            own = i == 0 and self.spectrum is not None and isinstance(term, TestTerm)
+            squared = squared + (term.squared(x, self.spectrum) if own else term.squared(x))
+        objective = np.sqrt(squared)
+        constraints = self.problem.formulation.constraints
+        if not constraints.lower.size:
+            return objective
+        over = np.array([constraints.violation(row) for row in x]) / self.problem.tolerance
+        over = np.where(np.isfinite(over), over, np.inf)
+        broken = np.sum(np.where(over > 1, over, 0.0), axis=1)
+        return np.where(broken > 0, _WORST * (1 + broken), np.minimum(objective, _WORST))
 
     def unknowns(self, s: Array) -> Array:
-        """The unknowns x that the swarm coordinates `s` stand for."""
+        """The unknowns x that the swarm coordinates `s` stand for, healed."""
         return np.asarray(self._unknowns(s)).ravel()
 
-    def refined(self, s: Array) -> Array:
-        """The unknowns of the structure that `s` was given its cost for: its spectrum replaced."""
-        x = self.unknowns(s)
-        if self._targets is not None:
-            n, part = self.problem.layout.n, self.problem.parts.stiffness
-            x[part] = triangle_entries(closed_form(triangle(x[part], n), self._targets).factor)
-        return x
-
     def _chunk(self, particles: Array) -> Array:
-        count = len(particles)
-        n = self.problem.layout.n
-        flat = [np.asarray(block) for block in self._expand(padded(particles))]
-        L_inverse, push, H = (stacked(block) for block in flat[:3])
-        # A candidate that is no structure must not stop the eigensolver for the others.
-        broken = ~np.all(np.isfinite(H), axis=(1, 2))
-        H[broken] = np.eye(n)
-        lam, psi = np.linalg.eigh((H + H.transpose(0, 2, 1)) / 2)
-        if self._targets is not None:
-            lam = replace_spectrum(lam, self._targets)
-        with np.errstate(invalid="ignore"):
-            omega = np.sqrt(lam)
-        phi = L_inverse.transpose(0, 2, 1) @ psi
-        gamma = phi.transpose(0, 2, 1) @ push
-        cost = self._evaluate(_wide(phi), _wide(gamma), omega.T, flat[3], flat[4])
-        out = np.array(cost).ravel()[:count]
-        out[broken[:count]] = np.nan
-        return out
-
-
-def padded(particles: Array) -> Array:
-    """Candidates side by side, as a compiled call takes them: the last one again and again fills the chunk."""
-    return np.concatenate([particles, np.repeat(particles[-1:], CHUNK - len(particles), axis=0)]).T
-
-
-def stacked(wide: Array) -> Array:
-    """CasADi's side-by-side blocks (rows, CHUNK * columns) → (CHUNK, rows, columns)."""
-    return np.ascontiguousarray(wide.reshape(wide.shape[0], CHUNK, -1).transpose(1, 0, 2))
-
-
-def _wide(stack: Array) -> Array:
-    """Inverse of `stacked`."""
-    return stack.transpose(1, 0, 2).reshape(stack.shape[1], -1)
+        return np.asarray(self._all_unknowns(padded(particles))).T[: len(particles)]

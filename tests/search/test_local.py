@@ -11,30 +11,37 @@ import sysid
 from sysid import FullMass, SpectralStiffness
 from sysid.models.spectrum import SOLVED
 from sysid.search import local
-from sysid.search.swarm_objective import SwarmCost
+from sysid.search.session import DeferredInterrupt, Session
+from sysid.search.swarm import Swarm, _Search
+from sysid.search.swarm_objective import SwarmObjective
 
 MASSES, DAMPINGS = ("trace", "rigid_body", "lumped", "known"), ("modal", "proportional")
 
 
+def refined(problem, x):
+    """The unknowns with the measured spectrum."""
+    return _Search(problem, Swarm(), Session([], DeferredInterrupt())).refined(x)
+
+
 def random_start(rng, problem):
     """A random candidate of the swarm with the measured spectrum."""
-    cost = SwarmCost(problem)
+    objective = SwarmObjective(problem)
     for row in rng.uniform(problem.lower, problem.upper, (50, problem.n_variables)):
-        if np.isfinite(cost(row[None])[0]):
-            return cost.refined(row)
+        if np.isfinite(objective(row[None])[0]):
+            return refined(problem, objective.unknowns(row))
     raise AssertionError("no random candidate is a structure")
 
 
 def near(rng, problem, truth, by):
     """The truth, every unknown off by up to a fraction, with the measured spectrum."""
     x = problem.values(truth) * rng.uniform(1 - by, 1 + by, problem.n_variables)
-    return SwarmCost(problem).refined(problem.to_sampling(x))
+    return refined(problem, np.clip(x, problem.lower, problem.upper))
 
 
 def total_error(problem, structure):
     mass = problem.mass
     if isinstance(mass, FullMass):
-        got = mass.total(problem.layout, structure.mass)
+        got = mass.total(problem.geometry, structure.mass)
     else:
         got = np.diag(structure.rigid_body_mass)
     return np.max(np.abs(got / problem.totals - 1))
@@ -131,7 +138,7 @@ def test_records_that_want_negative_damping_end_on_the_bound_and_say_so(random_c
     problem = dataclasses.replace(problem, measurement=mirrored, reference=None)
     answer = local.solve(problem, near(rng, problem, truth, 0.01), max_iterations=60)
     assert "rayleigh factor" in answer.message
-    assert np.all(answer.x[problem.parts.damping] >= 0)
+    assert np.all(answer.x[problem.formulation.parts.damping] >= 0)
     assert np.all(problem.structure(answer.x).damping_ratios >= 0)
 
 
@@ -156,7 +163,7 @@ def test_a_stated_total_is_kept_where_the_force_says_otherwise(random_case, heal
     problem = dataclasses.replace(problem, mass=FullMass(stated, healing=healing))
     answer = local.solve(problem, random_start(rng, problem))
     structure = problem.structure(answer.x)
-    np.testing.assert_allclose(problem.mass.total(problem.layout, structure.mass), stated, rtol=1e-9)
+    np.testing.assert_allclose(problem.mass.total(problem.geometry, structure.mass), stated, rtol=1e-9)
     assert problem.measurement.force_residual(structure) > 1e-4  # the two cannot both be right
     assert truth.n == 4
 

@@ -51,7 +51,7 @@ def test_accelerations_alone_are_matched_with_the_stated_total_and_called_open(s
     assert result.success
     assert result.residual < 1e-10
     assert not result.determined
-    np.testing.assert_allclose(problem.mass.total(problem.layout, result.structure.mass), 40.0, rtol=1e-9)
+    np.testing.assert_allclose(problem.mass.total(problem.geometry, result.structure.mass), 40.0, rtol=1e-9)
     n = truth.n
     invariant = np.linalg.solve(truth.mass[:n, :n], truth.stiffness[:n, :n])
     found = np.linalg.solve(result.structure.mass[:n, :n], result.structure.stiffness[:n, :n])

@@ -132,7 +132,7 @@ def test_any_structure_has_a_nearest_lumped_one_with_all_its_modes(random_struct
         truth = random_structure(np.random.default_rng(seed), n=5, d=2)
         given = sysid.SpectralStiffness(truth.natural_frequencies)
         problem = Problem(simulate(truth, lines(truth)), mass=FullMass(10.0), stiffness=given)
-        t = nearest_lumped(problem, *known_pieces(truth), problem.layout.directions[:5])
+        t = nearest_lumped(problem, *known_pieces(truth), problem.geometry.directions[:5])
         assert np.all(t > 0)
         P = known_pieces(truth)[0]
         assert np.linalg.eigvalsh((P.T * t) @ P)[0] > 0
@@ -149,12 +149,12 @@ def test_totals_are_met_by_one_factor_and_the_base(random_structure, seed, total
     problem = Problem(simulate(truth, lines(truth)), mass=FullMass(total, healing=healing), stiffness=given)
     P, gamma, G = known_pieces(truth)
     remainder = np.array([[2.0, 0.9], [0.9, 1.0]])
-    t, left = to_stated_totals(problem, P, gamma, G, problem.layout.directions[:5], remainder)
+    t, left = to_stated_totals(problem, P, gamma, G, problem.geometry.directions[:5], remainder)
     assert 0 < t <= 1
     M_SS, coupling = t * P.T @ P, t * (P.T @ gamma - P.T @ P @ G)
     delta = np.sqrt(t) * (gamma - P @ G)
     mass = np.block([[M_SS, coupling], [coupling.T, delta.T @ delta + left]])
-    np.testing.assert_allclose(problem.mass.total(problem.layout, mass), np.broadcast_to(total, 2), rtol=1e-9)
+    np.testing.assert_allclose(problem.mass.total(problem.geometry, mass), np.broadcast_to(total, 2), rtol=1e-9)
     assert np.linalg.eigvalsh(left)[0] > 0
     assert left[0, 1] / np.sqrt(left[0, 0] * left[1, 1]) == pytest.approx(0.9 / np.sqrt(2))
 
@@ -169,7 +169,7 @@ class TestStatedTotals:
     def test_the_ties_vanish_where_the_model_has_its_totals_and_nowhere_else(self, random_structure, healing):
         truth = random_structure(np.random.default_rng(2), n=4, d=2)
         model = FullMass([1.0, 1.0], healing=healing)
-        totals = model.total(self.problem(truth, model).layout, truth.mass)
+        totals = model.total(self.problem(truth, model).geometry, truth.mass)
         problem = self.problem(truth, FullMass(totals, healing=healing))
         pieces = truth.mode_shapes, truth.participation, truth.rigid_body_mass
         ties = stated_totals(problem)

@@ -1,0 +1,148 @@
+"""The local phase in the unknowns themselves.
+
+- Where C is an expression the response is a direct solve, and the unknowns are all there is: a least-squares problem
+  with exact Jacobian, whose Hessian is taken as ``J'J`` (Gauss-Newton) plus that of the constraints.
+- Where damping is by ratios the response needs the modes. They are further unknowns: ``Phi = L^-T Psi``, Psi is held
+  orthogonal and, but for a free stiffness, diagonalises ``H = L^-1 K L^-T``: polynomial equalities, so that no
+  eigenvector routine is left in the graph. A scale of the mass that no record sees then moves no mode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import casadi as ca
+import numpy as np
+
+from sysid.models.unknowns import Unknown, scales_of, split
+from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram
+from sysid.problem.feasibility import HELD, LOOSE
+from sysid.problem.formulation import Formulation
+from sysid.problem.matrices import assemble
+from sysid.problem.problem import Problem
+from sysid.problem.terms import ModeSymbols, Term, TestTerm
+from sysid.search.modal_coordinates import End, frequencies
+from sysid.structure.structure import Array, Structure
+from sysid.structure.triangular import lower_entries
+
+
+def fit_in_matrices(
+    problem: Problem, x: Array, monitor: IterationMonitor, max_iterations: int, smoothed: Sequence[TestTerm] = ()
+) -> End:
+    """Minimise the objective of a problem over its own unknowns, from `x`.
+
+    `smoothed` are fitted in the place of the tests, in their order.
+    """
+    formulation, z = problem.formulation, NonlinearProgram()
+    modal = needs_modes(formulation)
+    # The modes themselves stand for a free stiffness.
+    held = formulation.parts.stiffness if modal and formulation.stiffness.free else slice(0, 0)
+    x = np.clip(x, formulation.lower, formulation.upper)
+    unknowns = add_unknowns(z, formulation.unknowns, x, held)
+    _add_constraints(problem, unknowns, z)
+    modes = _add_modes(problem, unknowns, problem.structure(x), z) if modal else None
+    rows = ca.vertcat(*(term.rows(unknowns, modes) for term in terms_with(formulation, smoothed)))
+    derivatives = None if modal else {"hess_lag": _gauss_newton(z, rows)}
+    # Beside noise the objective's round-off stops the line search first: the gradient is then small, not at tolerance.
+    best, status = z.minimize(ca.sumsqr(rows), monitor, max_iterations, derivatives, acceptable=1e2 if modal else 1e3)
+    symbols = (modes.shapes, modes.omega) if modes else (ca.MX(0, 1), ca.MX(0, 1))
+    end = ca.Function("end", [z.z], [unknowns, *symbols, ca.norm_2(rows)])
+    ended, shapes, omega, objective = (np.asarray(value) for value in end(best))
+    ended = ended.ravel()
+    if modes is not None:
+        ended = _in_order(problem, ended, shapes, omega.ravel())
+    ended = np.clip(ended, formulation.lower, formulation.upper)
+    return End(ended, float(objective.item()), status, z.on_bounds(best))
+
+
+def terms_with(formulation: Formulation, smoothed: Sequence[TestTerm]) -> list[Term]:
+    """All terms, with other records in the place of the tests', in their order; none given: as they are."""
+    if not smoothed:
+        return list(formulation.terms)
+    others = iter(smoothed)
+    return [next(others) if isinstance(term, TestTerm) else term for term in formulation.terms]
+
+
+def needs_modes(formulation: Formulation) -> bool:
+    """Whether modes are further unknowns: damping by ratios has no direct solve."""
+    return formulation.fits_records and formulation.matrices.by_ratios
+
+
+def add_unknowns(z: NonlinearProgram, unknowns: Sequence[Unknown], x: Array, held: slice = slice(0, 0)) -> ca.MX:
+    """The unknowns as expressions of new ones in units of their scale, those in `held` as numbers."""
+    pieces, at = [], 0
+    for unknown, values in zip(unknowns, split(unknowns, x), strict=True):
+        if held.start <= at < held.stop:
+            pieces.append(ca.MX(ca.DM(values)))
+        else:
+            unit = scale_of_unknown(unknown, values)
+            labels = [label.removeprefix(unknown.title) for label in unknown.labels]
+            scaled = z.variable(unknown.title, values / unit, unknown.lower / unit, unknown.upper / unit, labels)
+            pieces.append(scaled * ca.DM(unit))
+        at += unknown.size
+    return ca.vertcat(*pieces)
+
+
+def scale_of_unknown(unknown: Unknown, values: Array) -> Array:
+    """What IPOPT counts an unknown in: its start, or a part of its range where that is larger."""
+    unit = scales_of([unknown], values)
+    return np.where(unit > 0, unit, 1.0)
+
+
+def _add_constraints(problem: Problem, unknowns: ca.MX, z: NonlinearProgram) -> None:
+    """The problem's constraints, in units of what each makes over the search space."""
+    constraints = problem.formulation.constraints
+    unit = problem.tolerance / np.where(constraints.equal, LOOSE, HELD)
+    if unit.size:
+        z.constrain(constraints.function(unknowns) / ca.DM(unit), constraints.lower / unit, constraints.upper / unit)
+
+
+def _add_modes(problem: Problem, unknowns: ca.MX, start: Structure, z: NonlinearProgram) -> ModeSymbols:
+    """Mode shapes and frequencies as new unknowns, bound to the matrices."""
+    formulation = problem.formulation
+    n = start.n
+    omega, center = frequencies(problem, 2 * np.pi * start.natural_frequencies, z)
+    _, inverse = formulation.matrices.factors(unknowns)
+    psi = z.variable("mode shape", np.linalg.cholesky(start.mass[:n, :n]).T @ start.normal_modes)
+    z.constrain(lower_entries(psi.T @ psi - ca.MX.eye(n)))
+    if not formulation.stiffness.free:
+        scaled = psi @ ca.diag(1 / ca.DM(center))
+        H = inverse @ formulation.matrices.motion(unknowns).stiffness @ inverse.T
+        z.constrain(lower_entries(scaled.T @ H @ scaled - ca.diag((omega / ca.DM(center)) ** 2)))
+    return ModeSymbols(inverse.T @ psi, omega)
+
+
+def _in_order(problem: Problem, x: Array, shapes: Array, omega: Array) -> Array:
+    """Unknowns with modes in ascending order, and a free stiffness that has these modes."""
+    formulation, order = problem.formulation, np.argsort(omega)
+    if formulation.damping.free:
+        at = formulation.parts.damping
+        x[at] = x[at][order]
+    if not formulation.stiffness.free:
+        return x
+    M_SS, M_S0, M_00, *_ = formulation.matrices.numbers(x)
+    L = np.linalg.cholesky(M_SS)
+    u, _, vt = np.linalg.svd(L.T @ shapes[:, order])
+    root = L @ (u @ vt) * omega[order]  # Psi exactly orthogonal
+    structure = assemble(
+        M_SS, M_S0, M_00, root @ root.T, formulation.matrices.rigid_body, ratios=np.full(omega.size, 0.01),
+        test=problem.measurement,
+    )  # fmt: skip
+    at = formulation.parts.stiffness
+    x[at] = formulation.models[1].values(formulation.geometry, structure)
+    return x
+
+
+def _gauss_newton(z: NonlinearProgram, miss: ca.MX) -> ca.Function:
+    """Hessian of the Lagrangian with ``2 J'J`` for that of the objective (Gauss-Newton), as nlpsol's `hess_lag`."""
+    at = z.z
+    J = ca.densify(ca.jacobian(miss, at))
+    rows = ca.vertcat(ca.MX(0, 1), *z.constraints)
+    p, factor, multipliers = ca.MX.sym("p", 0), ca.MX.sym("factor"), ca.MX.sym("multipliers", rows.numel())
+    hessian = 2 * OBJECTIVE_SCALE * factor * (J.T @ J)
+    if rows.numel():
+        hessian = hessian + ca.hessian(ca.dot(multipliers, rows), at)[0]
+    return ca.Function(
+        "hessian", [at, p, factor, multipliers], [ca.triu(hessian)],
+        ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"],
+    )  # fmt: skip

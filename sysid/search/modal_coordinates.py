@@ -1,0 +1,145 @@
+"""The local phase where mode shapes and participations are free.
+
+The response is bilinear in mode shapes and participations, so these are the unknowns, with ``log w`` and
+``log zeta``; no inverse, no eigenvector routine and no infinite slope is left in the graph. Every regular Phi gives a
+positive definite ``M_SS = (Phi Phi')^-1`` and ``K_SS = M_SS Phi diag(w²) Phi' M_SS``, and participations give the
+coupling. A local minimum shows: with frequencies and damping as they ended, the best residues are a linear
+least-squares problem, and where that fits clearly better, the search starts again from there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.modal_fit import ModalFit, Modes, fit_modes, rank_one
+from sysid.modal_analysis.residues import linear_residues
+from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram
+from sysid.problem.matrices import assemble
+from sysid.problem.problem import Problem
+from sysid.search.modal_scaling import stated_totals, to_stated_totals
+from sysid.structure.structure import Array, Structure
+
+FREQUENCY_WINDOW = 0.05  # relative; what a frequency read off a peak may be wrong by
+_OPEN_WINDOW = 20.0  # factor either way for a frequency that nobody gave
+_SUSPECT = 1.05  # a residual so many times that of free residues at the same poles is a local minimum
+_LEAST_SHAPE = 1e-6  # of the largest singular value of the shapes, below which M_SS would be no mass matrix
+
+
+class End(NamedTuple):
+    """Where IPOPT ended: unknowns (n_variables,), objective, status, and bounds in words."""
+
+    x: Array
+    objective: float
+    status: str
+    bounds: str
+    remark: str = ""
+
+
+def fit_in_modes(problem: Problem, x: Array, monitor: IterationMonitor, max_iterations: int) -> End:
+    """Minimise the objective of a problem with free modes, from the structure of `x`."""
+    start = problem.structure(x)
+    first, test = modes_of(start), problem.measurement
+    remainder = start.rigid_body_mass - start.participation.T @ start.participation
+
+    def attempt(modes: Modes) -> ModalFit:
+        return fit_modes(
+            test, modes, lambda z: _spectrum(problem, start, modes, z), unit=np.sqrt(problem.totals),
+            remainder=remainder, ties=stated_totals(problem), monitor=monitor, max_iterations=max_iterations,
+        )  # fmt: skip
+
+    best, tried = attempt(first), 1
+    for again in _linear_starts(test, best, first):
+        if monitor.stopped is not None or best.residual <= EXACT or monitor.left < 1.0:
+            break
+        answer = attempt(again)
+        tried += 1
+        if answer.residual < best.residual:
+            best = answer
+    remark = f"best of {tried} starts, as the first ended in a local minimum" if tried > 1 else ""
+    modes = best.modes
+    if test.force is None:
+        # Accelerations leave the scale of each mode open: shapes keep the size that they had.
+        size = np.linalg.norm(first.phi, axis=0) / np.maximum(np.linalg.norm(modes.phi, axis=0), np.finfo(float).tiny)
+        modes = modes._replace(phi=modes.phi * size, gamma=modes.gamma / size[:, None])
+    return End(_unknowns(problem, modes, best.rigid, remainder, x), best.residual, best.status, best.bounds, remark)
+
+
+def _linear_starts(test: Measurement, ended: ModalFit, first: Modes) -> Iterator[Modes]:
+    """New starts where free residues fit clearly better than what was reached: at its poles, then at the first ones."""
+    fits = [(poles, *linear_residues(test, poles.omega, poles.ratios)) for poles in (ended.modes, first)]
+    if ended.of_accelerations <= _SUSPECT * min(possible for _, _, possible in fits):
+        return
+    for poles, residues, _ in fits:
+        yield rank_one(residues, poles.omega, poles.ratios, np.linalg.norm(poles.phi, axis=0))
+
+
+def _modes(structure: Structure) -> Modes:
+    return Modes(
+        structure.mode_shapes,
+        structure.participation,
+        2 * np.pi * structure.natural_frequencies,
+        structure.damping_ratios,
+    )
+
+
+def modes_of(structure: Structure) -> Modes:
+    """The modes of a structure, rad/s."""
+    omega = 2 * np.pi * structure.natural_frequencies
+    return Modes(structure.mode_shapes, structure.participation, omega, structure.damping_ratios)
+
+
+def frequencies(problem: Problem, start: Array, z: NonlinearProgram) -> tuple[ca.MX, Array]:
+    """Circular frequencies as new unknowns, held near those that were given, and what they are relative to, rad/s."""
+    center, window = start.copy(), np.full(start.size, np.log(_OPEN_WINDOW))
+    spectrum = problem.formulation.stiffness.spectrum
+    if spectrum is not None:
+        center[: spectrum.size], window[: spectrum.size] = spectrum, np.log1p(FREQUENCY_WINDOW)
+    shift = np.clip(np.log(start / center), -window, window)
+    return ca.DM(center) * ca.exp(z.variable("frequency", shift, -window, window)), center
+
+
+def _spectrum(problem: Problem, structure: Structure, start: Modes, z: NonlinearProgram) -> tuple[ca.MX, ca.MX]:
+    """Circular frequencies and damping ratios as expressions."""
+    formulation = problem.formulation
+    omega, _ = frequencies(problem, start.omega, z)
+    damping, (unknown,) = formulation.models[2], formulation.of_models[2]
+    if formulation.damping.free:
+        guess = np.clip(start.ratios, unknown.lower, unknown.upper)
+        low, high = np.log(unknown.lower / guess), np.log(unknown.upper / guess)
+        return omega, ca.DM(guess) * ca.exp(z.variable(unknown.title, np.zeros(guess.size), low, high))
+    guess = np.clip(damping.values(formulation.geometry, structure), unknown.lower, unknown.upper)
+    y = z.variable(unknown.title, guess / unknown.upper, unknown.lower / unknown.upper, 1.0)
+    return omega, damping.ratios(formulation.geometry, y * ca.DM(unknown.upper), omega)
+
+
+def _unknowns(problem: Problem, modes: Modes, rigid: Array, remainder: Array, x: Array) -> Array:
+    """The problem's unknowns of a fit in modal coordinates; the damping inside its search space."""
+    order = np.argsort(modes.omega)
+    gamma, w, zeta = modes.gamma[order], modes.omega[order], np.maximum(modes.ratios[order], 0.0)
+    P, geometry = _regular_inverse(modes.phi[:, order]), problem.geometry
+    if problem.measurement.force is None:
+        t, left = to_stated_totals(problem, P, gamma, geometry.rigid_body, geometry.directions[: len(P)], remainder)
+        P, gamma = P * np.sqrt(t), gamma * np.sqrt(t)
+    else:
+        left = rigid - gamma.T @ gamma
+    G = geometry.rigid_body
+    M_SS = P.T @ P
+    M_S0 = P.T @ gamma - M_SS @ G
+    low = np.linalg.solve(np.linalg.cholesky(M_SS), M_S0)
+    M_00, K_SS = low.T @ low + left, (P.T * w**2) @ P
+    found = problem.values(assemble(M_SS, M_S0, M_00, K_SS, G, ratios=zeta, test=problem.measurement))
+    at = problem.formulation.parts.damping
+    found[at] = np.clip(found[at], problem.lower[at], problem.upper[at])  # IPOPT may leave bounds by its tolerance
+    found[at.stop :] = x[at.stop :]
+    return found
+
+
+def _regular_inverse(phi: Array) -> Array:
+    """Inverse of the shapes; where a bad fit has made some alike or next to nothing, of near ones that are not."""
+    u, s, vt = np.linalg.svd(phi)
+    return (vt.T / np.maximum(s, _LEAST_SHAPE * s[0])) @ u.T
