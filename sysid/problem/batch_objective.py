@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import casadi as ca
 import numpy as np
 
@@ -36,34 +38,30 @@ class TestObjective:
     def __init__(self, test: Measurement, matrices: Matrices, shift: float) -> None:
         self.test, self.matrices, self.shift = test, matrices, shift
         x = ca.MX.sym("x", matrices.function.numel_in(0))
-        motion, L = matrices.motion(x), matrices.function(x)[5]
+        M, M_S0, M_00, K, C, L, H = matrices.function(x)
+        G = ca.DM(matrices.rigid_body)
         if matrices.by_ratios:
-            G = ca.DM(motion.rigid_body_dofs)
-            push = L @ (L.T @ G) + motion.coupling
-            rigid = G.T @ push + motion.coupling.T @ G + motion.base
-            parts = [matrices.factors(x)[1], push, matrices.function(x)[6], rigid, motion.coupling, motion.base]
-            self._evaluate = self._by_modes()
+            push = L @ (L.T @ G) + M_S0
+            parts = [matrices.inverse(L), push, H, G.T @ push + M_S0.T @ G + M_00]
+            parts += [] if matrices.semidefinite else [M_S0, M_00]
+            self._evaluate = Batch(self._error_of_modes(), _THREADS)
         else:
-            parts = [motion.mass, motion.stiffness, motion.damping, motion.push, motion.rigid_body_mass]
-            parts += [motion.coupling, motion.base]
-        self._expand = _expanded(ca.Function("expand", [x], [ca.densify(part) for part in parts])).map(CHUNK)
+            push = M @ G + M_S0
+            parts = [M, K, C, push, G.T @ push + M_S0.T @ G + M_00, M_S0, M_00]
+        self._expand = Batch(expanded(ca.Function("expand", [x], [ca.densify(part) for part in parts])))
 
     def squared(self, particles: Array, spectrum: Array | None = None) -> Array:
         """Of each candidate, (count,); NaN where it is no structure.
 
         Where damping is by ratios, a `spectrum`, rad/s, takes the place of each candidate's own lowest frequencies.
         """
-        return in_chunks(lambda chunk: self._chunk(chunk, spectrum), particles)
-
-    def _chunk(self, particles: Array, spectrum: Array | None) -> Array:
-        flat = [np.asarray(part) for part in self._expand(padded(particles))]
         if self.matrices.by_ratios:
-            return self._modal(particles, flat, spectrum)
-        return self._direct(len(particles), [stacked(part)[: len(particles)] for part in flat])
+            return in_chunks(lambda chunk: self._modal(chunk, spectrum), particles)
+        return in_chunks(lambda chunk: self._direct(len(chunk), self._expand(chunk)), particles)
 
     # -- damping by ratios: modes ------------------------------------------------------------------
 
-    def _by_modes(self) -> ca.Function:
+    def _error_of_modes(self) -> ca.Function:
         """Squared residual of modes, rigid-body mass, and x for the ratios."""
         n, d = self.matrices.rigid_body.shape
         shapes = {"phi": (n, n), "gamma": (n, d), "omega": (n, 1), "rigid": (d, d)}
@@ -72,26 +70,25 @@ class TestObjective:
         ratios = self.matrices.ratio_function(x, omega)
         at_sensors = phi if self.matrices.at_sensors else ca.DM(self.matrices.recovery) @ phi
         miss = residual(self.test, at_sensors, gamma, omega, ratios, rigid, weighted=True, shift=self.shift)
-        return ca.Function("squared", [phi, gamma, omega, rigid, x], [ca.sumsqr(miss)]).map(CHUNK, "thread", _THREADS)
+        return ca.Function("squared", [phi, gamma, omega, rigid, x], [ca.sumsqr(miss)])
 
-    def _modal(self, particles: Array, flat: list[Array], spectrum: Array | None) -> Array:
-        L_inverse, push, H = (stacked(block) for block in flat[:3])
+    def _modal(self, particles: Array, spectrum: Array | None) -> Array:
+        L_inverse, push, H, rigid, *base = self._expand(particles)
         # A candidate that is no structure must not stop the eigensolver for the others.
         broken = ~np.all(np.isfinite(H), axis=(1, 2))
         H[broken] = np.eye(H.shape[1])
         lam, psi = np.linalg.eigh((H + H.transpose(0, 2, 1)) / 2)
         if spectrum is not None:
             lam = replace_spectrum(lam, spectrum)
-        if not self.matrices.semidefinite:
-            broken |= _base_is_light(L_inverse, stacked(flat[4]), stacked(flat[5]))
+        if base:
+            broken |= _base_is_light(L_inverse, *base)
         with np.errstate(invalid="ignore"):
             omega = np.sqrt(lam)
         phi = L_inverse.transpose(0, 2, 1) @ psi
         gamma = phi.transpose(0, 2, 1) @ push
-        squared = self._evaluate(_wide(phi), _wide(gamma), omega.T, flat[3], padded(particles))
-        out = np.array(squared).ravel()[: len(particles)]
-        out[broken[: len(particles)]] = np.nan
-        return out
+        squared = self._evaluate(phi, gamma, omega, rigid, particles)[0].ravel()
+        squared[broken] = np.nan
+        return squared
 
     # -- a damping matrix: state space -------------------------------------------------------------
 
@@ -121,25 +118,41 @@ class TestObjective:
         return squared
 
 
-def in_chunks(function: object, particles: Array) -> Array:
+class Batch:
+    """A CasADi function of one candidate, over a chunk of candidates at once and without conversions.
+
+    Parameters
+    ----------
+    function : casadi.Function
+        Dense; of the arrays of one candidate.
+    threads : int
+        CasADi's own; 0 for none.
+    """
+
+    def __init__(self, function: ca.Function, threads: int = 0) -> None:
+        mapped = function.map(CHUNK, "thread", threads) if threads else function.map(CHUNK)
+        # CasADi stands columns side by side: (rows, CHUNK * columns) is (CHUNK, columns, rows) here.
+        self._given = [np.zeros((CHUNK, *function.size_in(i)[::-1])) for i in range(function.n_in())]
+        self._made = [np.zeros((CHUNK, *function.size_out(i)[::-1])) for i in range(function.n_out())]
+        self._buffer, self._run = mapped.buffer()
+        for i, array in enumerate(self._given):
+            self._buffer.set_arg(i, memoryview(array))
+        for i, array in enumerate(self._made):
+            self._buffer.set_res(i, memoryview(array))
+
+    def __call__(self, *arrays: Array) -> list[Array]:
+        """Outputs (count, rows, columns) of inputs (count, rows) or (count, rows, columns), count up to CHUNK."""
+        count = len(arrays[0])
+        for place, array in zip(self._given, arrays, strict=True):
+            place[:count] = array.reshape(count, *place.shape[:0:-1]).swapaxes(1, 2)
+            place[count:] = place[count - 1]  # the last one again and again fills the chunk
+        self._run()
+        return [np.array(made[:count].swapaxes(1, 2), order="C") for made in self._made]
+
+
+def in_chunks(function: Callable[[Array], Array], particles: Array) -> Array:
     """A function of a chunk of candidates over all of them."""
-    assert callable(function)
     return np.concatenate([function(particles[at : at + CHUNK]) for at in range(0, len(particles), CHUNK)])
-
-
-def padded(particles: Array) -> Array:
-    """Candidates side by side, as a compiled call takes them: the last one again and again fills the chunk."""
-    return np.concatenate([particles, np.repeat(particles[-1:], CHUNK - len(particles), axis=0)]).T
-
-
-def stacked(wide: Array) -> Array:
-    """CasADi's side-by-side blocks (rows, CHUNK * columns) → (CHUNK, rows, columns)."""
-    return np.ascontiguousarray(wide.reshape(wide.shape[0], CHUNK, -1).transpose(1, 0, 2))
-
-
-def _wide(stack: Array) -> Array:
-    """Inverse of `stacked`."""
-    return stack.transpose(1, 0, 2).reshape(stack.shape[1], -1)
 
 
 def _base_is_light(L_inverse: Array, coupling: Array, base: Array) -> Array:
@@ -156,7 +169,7 @@ def _least(stack: Array) -> Array:
     return np.where(bad, -np.inf, np.linalg.eigvalsh(clean)[:, 0])
 
 
-def _expanded(function: ca.Function) -> ca.Function:
+def expanded(function: ca.Function) -> ca.Function:
     """The same in scalar operations where all of it can be: several times faster for small matrices."""
     try:
         return function.expand()

@@ -73,12 +73,16 @@ class Matrices:
         mass, coupling, base, stiffness, damping, *_ = self.function(x)
         return Motion(mass, coupling, base, stiffness, damping, self.rigid_body, self.recovery)
 
+    def inverse(self, factor: ca.MX) -> ca.MX:
+        """Inverse of the Cholesky factor, an expression."""
+        L = ca.SX.sym("L", ca.Sparsity.lower(factor.size1()))
+        inverse = ca.Function("inverse", [L], [ca.densify(ca.solve(L, ca.SX.eye(L.size1())))])
+        return inverse(ca.tril(factor))
+
     def factors(self, x: ca.MX) -> tuple[ca.MX, ca.MX]:
         """L with ``M_SS = L L'`` and its inverse."""
         factor = self.function(x)[5]
-        L = ca.SX.sym("L", ca.Sparsity.lower(factor.size1()))
-        inverse = ca.Function("inverse", [L], [ca.densify(ca.solve(L, ca.SX.eye(L.size1())))])
-        return factor, inverse(ca.tril(factor))
+        return factor, self.inverse(factor)
 
     def structure(self, x: Array, test: Measurement) -> Structure:
         """The structure that `x` stands for, with the sensors of a test.

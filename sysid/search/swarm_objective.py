@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
-from sysid.problem.batch_objective import CHUNK, in_chunks, padded
+from sysid.problem.batch_objective import Batch, expanded, in_chunks
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.search.matrix_coordinates import terms_with
@@ -41,12 +41,12 @@ class SwarmObjective:
         x = formulation.from_sampling(s)
         if formulation.healed:
             x = ca.fmin(ca.fmax(formulation.healing(x), ca.DM(formulation.lower)), ca.DM(formulation.upper))
-        self._unknowns = ca.Function("unknowns", [s], [ca.densify(x)])
-        self._all_unknowns = self._unknowns.map(CHUNK)
+        self._unknowns = expanded(ca.Function("unknowns", [s], [ca.densify(x)]))
+        self._all_unknowns = Batch(self._unknowns)
 
     def __call__(self, particles: Array) -> Array:
         """Objective of each row; NaN where a candidate is no structure."""
-        x = in_chunks(self._chunk, particles)
+        x = in_chunks(lambda chunk: self._all_unknowns(chunk)[0][:, :, 0], particles)
         squared = np.zeros(len(x))
         for i, term in enumerate(self.terms):
             own = i == 0 and self.spectrum is not None and isinstance(term, TestTerm)
@@ -63,6 +63,3 @@ class SwarmObjective:
     def unknowns(self, s: Array) -> Array:
         """The unknowns x that the swarm coordinates `s` stand for, healed."""
         return np.asarray(self._unknowns(s)).ravel()
-
-    def _chunk(self, particles: Array) -> Array:
-        return np.asarray(self._all_unknowns(padded(particles))).T[: len(particles)]
