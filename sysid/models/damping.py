@@ -9,7 +9,16 @@ import casadi as ca
 import numpy as np
 
 from sysid.errors import InputError
-from sysid.models.expressions import as_matrix, at_point, check_finite, check_size, is_column, square, written_in
+from sysid.models.expressions import (
+    as_matrix,
+    at_point,
+    check_finite,
+    check_size,
+    is_column,
+    square,
+    values_of_written,
+    written_in,
+)
 from sysid.models.geometry import Geometry
 from sysid.models.model import MassBlocks, Stated, StiffnessBlocks
 from sysid.models.unknowns import Unknown
@@ -69,7 +78,7 @@ class ProportionalDamping:
 
     def blocks(self, geometry: Geometry, y: ca.SX, mass: MassBlocks, stiffness: StiffnessBlocks) -> ca.SX:
         """C (n, n)."""
-        return y[0] * mass.factor @ mass.factor.T + y[1] * stiffness.stiffness
+        return y[0] * mass.mass + y[1] * stiffness.stiffness
 
     def ratios(self, geometry: Geometry, y: ca.SX, omega: ca.SX) -> ca.SX:
         """Damping ratios (n,) at the circular frequencies `omega`."""
@@ -126,8 +135,8 @@ class WrittenDamping:
         return given.shape == (n, 1) and (n > 1 or is_column(self.matrix))
 
     def values(self, geometry: Geometry, structure: Structure) -> Array:
-        """Refused: an expression has no inverse."""
-        raise InputError("a damping written in expressions has no inverse: give the unknowns, not a Structure")
+        """None of its own; refused where it is written in variables."""
+        return values_of_written("damping", self.matrix)
 
     def stated(self, geometry: Geometry) -> Stated:
         """Nothing that is read off an expression."""

@@ -128,7 +128,21 @@ def check_free(name: str, symbols: Sequence[ca.MX], found: Sequence[Variable | N
         )
 
 
-def cholesky(M: ca.MX) -> ca.MX:
+def values_of_written(name: str, value: Any) -> Array:
+    """The unknowns of a written matrix's own: none.
+
+    Raises
+    ------
+    InputError
+        Where it is written in variables that are searched: an expression has no inverse.
+    """
+    found = map(variable_of, ca.symvar(as_matrix(name, value)))
+    if any(v is not None and not v.fixed for v in found):
+        raise InputError(f"a {name} written in expressions has no inverse: give the unknowns, not a Structure")
+    return np.zeros(0)
+
+
+def cholesky(M: ca.SX | ca.MX) -> ca.SX | ca.MX:
     """Lower-triangular factor of an expression."""
     A = ca.SX.sym("A", M.size1(), M.size1())
     return ca.Function("cholesky", [A], [ca.densify(ca.chol(A).T)])(M)

@@ -64,8 +64,8 @@ class Geometry:
     def unsearched(self) -> Geometry:
         """The same with made-up poles and weights, to check what is declared before anything is searched."""
         copy = Geometry(self.test, self.rigid_body, self.recovery, None if self._weighed is None else np.ones(self.d))
-        omega = 2 * np.pi * np.linspace(self.test.freq[0] or self.test.freq[-1] / 2, self.test.freq[-1], self.n)
-        copy.__dict__["poles"] = Poles(omega, np.full(self.n, 0.01), 0.0)
+        low = 1e-6 * self.test.freq[-1]  # within any limit that is stated
+        copy.__dict__["poles"] = Poles(np.full(self.n, low), np.full(self.n, 0.01), 0.0)
         return copy
 
     @property
@@ -103,8 +103,16 @@ class Geometry:
 
     def total_unknowns(self, total_mass: ArrayLike | None) -> tuple[Unknown, ...]:
         """The totals as unknowns, where they are not stated and the base force tells them."""
-        if total_mass is not None or self.weighed is None:
+        if total_mass is not None or not self.weighs:
             return ()
+        moved = np.any(self.test.base, axis=(0, 2))
+        if not np.all(moved):
+            raise InputError(
+                f"the base moves in only {np.count_nonzero(moved)} of {self.d} independent directions: the base force "
+                "weighs nothing in the others; add runs that move them, describe the test by the directions that move, "
+                "or state total_mass"
+            )
+        assert self.weighed is not None
         # Skew sensors may all belong to one direction, which then carries what the force weighs in all.
         upper = np.where(self.translational, self.weighed[self.translational].sum(), self.weighed)
         return (Unknown("total_mass", self.weighed / 4, upper * 4, unit="kg"),)

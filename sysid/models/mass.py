@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError
-from sysid.models.expressions import check_size, cholesky, square
+from sysid.models.expressions import check_size, square, values_of_written
 from sysid.models.geometry import FACTOR_FLOOR, Geometry
 from sysid.models.model import MassBlocks, Stated, Totals, constant
 from sysid.models.unknowns import Unknown
@@ -281,18 +281,15 @@ class WrittenMass:
         """None of its own: its variables are the problem's."""
         return ()
 
-    def blocks(self, geometry: Geometry, y: ca.MX) -> MassBlocks:
-        """The blocks of the expression; no coupling and no base mass where it has no base rows."""
-        n, d = geometry.n, geometry.d
+    def blocks(self, geometry: Geometry, y: ca.MX) -> ca.MX:
+        """The expression; no coupling and no base mass where it has no base rows."""
         whole = square("mass", self.expression)
-        check_size("mass", whole, n, d)
-        if whole.size1() == n:
-            return MassBlocks(cholesky(whole), ca.MX(n, d), ca.MX(d, d))
-        return MassBlocks(cholesky(whole[:n, :n]), whole[:n, n:], whole[n:, n:])
+        check_size("mass", whole, geometry.n, geometry.d)
+        return whole
 
     def values(self, geometry: Geometry, structure: Structure) -> Array:
-        """Refused: an expression has no inverse."""
-        raise InputError("a mass written in expressions has no inverse: give the unknowns, not a Structure")
+        """None of its own; refused where it is written in variables."""
+        return values_of_written("mass", self.expression)
 
     def stated(self, geometry: Geometry) -> Stated:
         """Nothing that is read off an expression."""

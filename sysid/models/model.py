@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 import casadi as ca
 import numpy as np
 
+from sysid.models.expressions import cholesky
 from sysid.models.geometry import Geometry
 from sysid.models.unknowns import Unknown
 from sysid.structure.structure import Array, Structure
@@ -65,11 +66,15 @@ class Stated:
 
 
 class MassBlocks(NamedTuple):
-    """Expressions: Cholesky factor of M_SS (n, n), M_S0 (n, d), M_00 (d, d)."""
+    """Expressions: Cholesky factor L of M_SS (n, n), M_S0 (n, d), M_00 (d, d), and M_SS (n, n).
+
+    Without M_SS, which then is ``L L'``, the whole mass is positive semidefinite for every value of the unknowns.
+    """
 
     factor: Any
     coupling: Any
     base: Any
+    mass: Any = None
 
 
 class StiffnessBlocks(NamedTuple):
@@ -92,8 +97,9 @@ class MatrixModel(Protocol):
     def blocks(self, geometry: Geometry, y: Any, *before: Any) -> Any:
         """The matrix of the unknowns `y`, all in one column, as expressions.
 
-        A mass gives `MassBlocks`; a stiffness, after the mass's blocks, `StiffnessBlocks`, or K_SS alone; a damping,
-        after both, C (n, n), or None where it has no matrix but ratios only.
+        A mass gives `MassBlocks`, or the matrix alone, (n, n) or with the base's rows last (n + d, n + d); a
+        stiffness, after the mass's blocks, `StiffnessBlocks`, or K_SS alone; a damping, after both, C (n, n), or None
+        where it has no matrix but ratios only.
         """
 
     def values(self, geometry: Geometry, structure: Structure) -> Array:
@@ -114,6 +120,16 @@ class DampingRatios(Protocol):
 
     def ratios(self, geometry: Geometry, y: Any, omega: Any) -> Any:
         """One damping ratio a mode, (n,), at the circular frequencies `omega` (n,), in ascending order; None if C."""
+
+
+def mass_blocks(given: Any, geometry: Geometry) -> MassBlocks:
+    """All blocks of a mass, where its model gives the matrix alone."""
+    if isinstance(given, MassBlocks):
+        return given
+    n, d = geometry.n, geometry.d
+    own, whole = given[:n, :n], given.shape[0] > n
+    coupling, base = (given[:n, n:], given[n:, n:]) if whole else (type(given)(n, d), type(given)(d, d))
+    return MassBlocks(cholesky(own), coupling, base, own)
 
 
 def stiffness_blocks(given: Any, factor: Any) -> StiffnessBlocks:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError
-from sysid.models.expressions import at_point, check_size, square, written_in
+from sysid.models.expressions import at_point, check_size, square, values_of_written, written_in
 from sysid.models.geometry import FACTOR_FLOOR, Geometry
 from sysid.models.model import MassBlocks, Stated, StiffnessBlocks
 from sysid.models.unknowns import Unknown, log_sampling
@@ -70,8 +70,10 @@ class SpectralStiffness:
                 f"{targets.size} natural frequencies are given for {n} sensors: "
                 "state max_frequency (Hz), at or above the highest frequency of the whole model"
             )
+        if not finite_array("max_frequency", self.max_frequency) > 0:
+            raise InputError(f"max_frequency = {self.max_frequency:g} Hz: a positive number is needed")
         limit = 2 * np.pi * float(self.max_frequency)
-        if not np.isfinite(limit) or limit < targets[-1]:
+        if limit < targets[-1]:
             raise InputError(
                 f"max_frequency = {self.max_frequency:g} Hz is below the given natural frequency "
                 f"{targets[-1] / (2 * np.pi):g} Hz: the truth would lie outside the search space"
@@ -181,8 +183,8 @@ class WrittenStiffness:
         return whole[:n, :n]
 
     def values(self, geometry: Geometry, structure: Structure) -> Array:
-        """Refused: an expression has no inverse."""
-        raise InputError("a stiffness written in expressions has no inverse: give the unknowns, not a Structure")
+        """None of its own; refused where it is written in variables."""
+        return values_of_written("stiffness", self.matrix)
 
     def stated(self, geometry: Geometry) -> Stated:
         """Nothing that is read off an expression."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import operator
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from types import FrameType
@@ -75,8 +76,12 @@ class Unknown:
             raise InputError(f"variable {name}: bounds must be finite with lower <= upper")
         self.shape: tuple[int, ...] = (self.lower.size,)
         self._sampling, self._unsampling = sampling, unsampling
+
+    @cached_property
+    def guess(self) -> Array:
+        """The middle of the swarm's search space."""
         middle = (self.lower + self.upper) / 2
-        self.guess: Array = middle if sampling is None else np.asarray(self.sampled()(middle)).ravel()
+        return middle if self._sampling is None else np.asarray(self.sampled()(middle)).ravel()
 
     @property
     def size(self) -> int:

@@ -70,7 +70,9 @@ class TestObjective:
         ratios = self.matrices.ratio_function(x, omega)
         at_sensors = phi if self.matrices.at_sensors else ca.DM(self.matrices.recovery) @ phi
         miss = residual(self.test, at_sensors, gamma, omega, ratios, rigid, weighted=True, shift=self.shift)
-        return ca.Function("squared", [phi, gamma, omega, rigid, x], [ca.sumsqr(miss)])
+        # Negative ratios are no structure's.
+        squared = ca.if_else(ca.mmin(ratios) < 0, np.nan, ca.sumsqr(miss))
+        return ca.Function("squared", [phi, gamma, omega, rigid, x], [squared])
 
     def _modal(self, particles: Array, spectrum: Array | None) -> Array:
         L_inverse, push, H, rigid, *base = self._expand(particles)

@@ -119,8 +119,9 @@ def _nearest(formulation: Formulation, start: Array, scale: Array) -> Array:
 
 def check_storable(formulation: Formulation) -> None:
     """Refuse what could not be stored at the end: a Python callback inside an expression."""
-    functions = {"matrices": formulation.matrices.function, "ratios": formulation.matrices.ratio_function}
-    functions |= {"constraints": formulation.constraints.function, "healing": formulation.healing}
+    functions = {"constraints": formulation.constraints.function, "healing": formulation.healing}
+    if not formulation.free_modes:  # nothing is written in their matrices
+        functions |= {"matrices": formulation.matrices.function, "ratios": formulation.matrices.ratio_function}
     functions |= {term.name: term.function for term in formulation.beside if isinstance(term, ExpressionTerm)}
     functions |= {f"matrices of {term.name}": term.matrices.function for term in formulation.further_tests}
     for name, function in functions.items():

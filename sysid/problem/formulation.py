@@ -32,8 +32,8 @@ from sysid.models.unknowns import (
     user_site,
     variable_of,
 )  # fmt: skip
-from sysid.problem.matrices import Blocks, Matrices, blocks_of, written_in_symbols
-from sysid.problem.terms import Builder, ExpressionTerm, Residual, Term, TermSource, TestTerm, column_of
+from sysid.problem.matrices import Blocks, Matrices, blocks_of, symbols_in
+from sysid.problem.terms import Builder, ExpressionTerm, Prior, Residual, Term, TermSource, TestTerm, column_of
 from sysid.structure.structure import Array, Structure
 
 MATRICES = ("mass", "stiffness", "damping")
@@ -116,10 +116,19 @@ class Formulation:
             Where a matrix, residual or constraint is not what it must be; named with the variables that it is written
             in.
         """
-        _check_names(self.variables, [unknown for group in self.of_models for unknown in group])
+        _check_names([*(unknown for group in self.of_models for unknown in group), *self.variables])
         _check_healing(self.healed, self.unknowns)
         if not self.unknowns:
             raise InputError("this problem has no unknowns: nothing is to be identified")
+        if not self.fits_records and any(isinstance(source, Prior) for _, source in self.sources):
+            raise InputError("Prior beside a misfit of your own: put it into that misfit, in the units of its rows")
+        stated = self.mass
+        whole = stated.totals is not None and stated.totals.values.ndim == 2
+        if stated.free and (stated.entries is not None or whole) and not self.free_modes:
+            raise InputError(
+                "known entries of a FullMass, and a total_mass that is a matrix, go with the modal strategy only, and "
+                "that with SpectralStiffness and damping ratios alone: write them as constraints"
+            )
 
     # -- what is searched --------------------------------------------------------------------------
 
@@ -131,7 +140,7 @@ class Formulation:
     @cached_property
     def variables(self) -> tuple[Variable, ...]:
         """The variables that anything is written in, in the order of their declaration."""
-        expressions = [*self._in_matrices, *(e for group in self._in_sources for e in group)]
+        expressions = [*(s for group in self._in_matrices for s in group), *(e for g in self._in_sources for e in g)]
         return _variables([*expressions, *(row.expression for row in self._relations), *self.healed.values()])
 
     @cached_property
@@ -192,6 +201,14 @@ class Formulation:
         """What is stated of the damping."""
         return self.models[2].stated(self.geometry)
 
+    @cached_property
+    def by_ratios(self) -> bool:
+        """Whether the damping of each mode is a function of its frequency."""
+        symbol = ca.SX if self.of_models[2] else ca.MX
+        y, omega = symbol.sym("y", sum(v.size for v in self.of_models[2])), symbol.sym("omega", self.geometry.n)
+        ratios = getattr(self.models[2], "ratios", None)
+        return ratios is not None and ratios(self.geometry, y, omega) is not None
+
     @property
     def test_alone(self) -> bool:
         """Whether nothing but the problem's own records tells about the matrices."""
@@ -200,26 +217,26 @@ class Formulation:
     @property
     def free_modes(self) -> bool:
         """Whether mode shapes and participations are free, so that modal coordinates can take the unknowns' place."""
-        free_ratios = hasattr(self.models[2], "ratios") and bool(self.of_models[2])
+        free_ratios = self.by_ratios and bool(self.of_models[2])
         free = self.mass.free and self.stiffness.free and free_ratios
         return free and self.geometry.at_sensors and self.test_alone and not self.healed
 
     @property
     def refinable(self) -> bool:
         """Whether the spectrum of each candidate can be replaced by the measured one."""
-        return self.stiffness.free and self.stiffness.spectrum is not None and self.test_alone and not self.healed
+        stated = self.stiffness.free and self.stiffness.spectrum is not None
+        return stated and self.by_ratios and self.test_alone and not self.healed
 
     # -- matrices, terms, constraints --------------------------------------------------------------
 
     @cached_property
     def _blocks(self) -> Blocks:
-        return blocks_of(*self.models, self.geometry)
+        return blocks_of(self.models, self.geometry, self._of_models)
 
     @cached_property
     def matrices(self) -> Matrices:
         """The problem's matrices of x."""
-        stated = self.mass
-        return self._matrices(self._blocks, self.geometry, semidefinite=stated.free or stated.entries is not None)
+        return self._matrices(self._blocks, self.geometry)
 
     @cached_property
     def own_test(self) -> TestTerm:
@@ -284,28 +301,28 @@ class Formulation:
 
     @cached_property
     def healing(self) -> ca.Function:
-        """X to x: what the swarm's candidates pass through; the identity where nothing is healed."""
+        """What x of the swarm's candidates passes through; the identity where nothing is healed."""
         columns = [self.healed.get(u, s) if isinstance(u, Variable) else s for u, s in self._symbols]
         return self._function("healing", [ca.veccat(*columns)])
 
     @cached_property
     def members(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
         """Which unknowns enter each matrix, and residuals, misfit and constraints where there are any."""
-        of: dict[str, list[ca.MX]] = {name: [part] for name, part in zip(MATRICES, self._blocks.by_matrix, strict=True)}
+        groups = zip(self._of_models, self._in_matrices, strict=True)
+        of = {name: [*own, *written] for name, (own, written) in zip(MATRICES, groups, strict=True)}
         for (name, source), expressions in zip(self.sources, self._in_sources, strict=True):
             kind = "misfit" if name == "misfit" else getattr(source, "kind", "residuals")
             of.setdefault(kind, []).extend(expressions)
         of["constraints"] = [row.expression for row in self._relations]
-        found = [
-            (kind, tuple(u.name for u, s in self._symbols if _contain(part, {s.__hash__()})))
-            for kind, part in of.items()
-        ]
+        inside = [(kind, {s.__hash__() for e in part for s in ca.symvar(e)}) for kind, part in of.items()]
+        found = [(kind, tuple(u.name for u, s in self._symbols if s.__hash__() in there)) for kind, there in inside]
         return tuple((kind, names) for kind, names in found if names)
 
     @property
     def declarations(self) -> dict[str, str]:
         """For each matrix the variables that it is written in, for messages."""
-        return {name: written_in(part) for name, part in zip(MATRICES, self._blocks.by_matrix, strict=True)}
+        groups = zip(MATRICES, self._in_matrices, strict=True)
+        return {name: written_in(ca.veccat(ca.MX(0, 1), *symbols)) for name, symbols in groups}
 
     # -- at one point ------------------------------------------------------------------------------
 
@@ -349,9 +366,9 @@ class Formulation:
     # -- how it is put together --------------------------------------------------------------------
 
     @cached_property
-    def _in_matrices(self) -> list[ca.MX]:
+    def _in_matrices(self) -> list[list[ca.MX]]:
         """Symbols of the variables that mass, stiffness and damping are written in; models have their unknowns."""
-        return written_in_symbols(self.models, self.geometry)
+        return symbols_in(self.models, self.of_models, self.geometry)
 
     @cached_property
     def _in_sources(self) -> list[tuple[ca.MX, ...]]:
@@ -362,18 +379,25 @@ class Formulation:
         return [row for i, c in enumerate(self._constraints, start=1) for row in _relation(i, c)]
 
     @cached_property
+    def _of_models(self) -> list[list[ca.MX]]:
+        """Symbols of the models' unknowns."""
+        return [[ca.MX.sym(unknown.name, unknown.size) for unknown in group] for group in self.of_models]
+
+    @property
     def _symbols(self) -> list[tuple[Unknown, ca.MX]]:
-        of_models = [pair for group in self._blocks.symbols for pair in group]
-        return [*of_models, *((v, v.symbol) for v in self.variables if not v.fixed)]
+        """The unknowns with their symbols."""
+        symbols = [symbol for group in self._of_models for symbol in group]
+        symbols += [v.symbol for v in self.variables if not v.fixed]
+        return list(zip(self.unknowns, symbols, strict=True))
 
     def _touches(self, expressions: Sequence[ca.MX]) -> bool:
-        return _contain(expressions, {symbol.__hash__() for symbol in self._in_matrices})
+        return _contain(expressions, {symbol.__hash__() for group in self._in_matrices for symbol in group})
 
-    def _matrices(self, blocks: Blocks, geometry: Geometry, *, semidefinite: bool = False) -> Matrices:
+    def _matrices(self, blocks: Blocks, geometry: Geometry) -> Matrices:
         ratios = blocks.ratios if blocks.ratios.numel() else ca.MX(0, 1)
         by_frequency = self._function("ratios", [ratios], blocks.omega)
         function = self._function("matrices", blocks.outputs)
-        return Matrices(function, by_frequency, geometry.rigid_body, geometry.recovery, semidefinite)
+        return Matrices(function, by_frequency, geometry.rigid_body, geometry.recovery, blocks.mass.mass is None)
 
     def _function(self, name: str, expressions: Sequence[ca.MX], *further: ca.MX) -> ca.Function:
         """Expressions of the unknowns as a function of the vector x; fixed variables are numbers in it."""
@@ -413,18 +437,21 @@ def _variables(expressions: Sequence[ca.MX]) -> tuple[Variable, ...]:
     return tuple(sorted(found.values(), key=lambda variable: variable.order))
 
 
-def _check_names(variables: Sequence[Variable], of_models: Sequence[Unknown]) -> None:
-    for i, variable in enumerate(variables):
-        if any(unknown.name == variable.name for unknown in of_models):
+def _check_names(unknowns: Sequence[Unknown]) -> None:
+    for i, unknown in enumerate(unknowns):
+        same = next((other for other in unknowns[:i] if other.name == unknown.name), None)
+        if same is None:
+            continue
+        if not isinstance(unknown, Variable):
+            raise InputError(f"two matrix models have unknowns called {unknown.name!r}: rename those of one")
+        if not isinstance(same, Variable):
             raise InputError(
-                f"variable {variable.name!r} ({variable.declared}) has the name of a model's unknowns: rename it"
+                f"variable {unknown.name!r} ({unknown.declared}) has the name of a model's unknowns: rename it"
             )
-        for other in variables[:i]:
-            if other.name == variable.name:
-                raise InputError(
-                    f"two variables are called {variable.name!r} ({other.declared}; {variable.declared}): tables and "
-                    "results need a name each"
-                )
+        raise InputError(
+            f"two variables are called {unknown.name!r} ({same.declared}; {unknown.declared}): tables and results "
+            "need a name each"
+        )
 
 
 def _check_healing(healed: Mapping[Variable, ca.MX], free: Sequence[Unknown]) -> None:

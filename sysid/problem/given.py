@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.models.damping import WrittenDamping
-from sysid.models.expressions import at_point, is_expression, square
+from sysid.models.expressions import at_point, check_size, is_expression, square
 from sysid.models.geometry import Geometry
 from sysid.models.mass import KnownMass, WrittenMass
 from sysid.models.model import MatrixModel
@@ -27,13 +28,24 @@ def as_models(mass: Any, stiffness: Any, damping: Any) -> tuple[MatrixModel, Mat
     InputError
         Where something is none of these.
     """
-    if not isinstance(mass, MatrixModel):
+    if not _is_model(mass, 0):
         mass = WrittenMass(mass) if is_expression(mass) else KnownMass(_numbers("mass", mass))
-    if not isinstance(stiffness, MatrixModel):
+    if not _is_model(stiffness, 1):
         stiffness = WrittenStiffness(stiffness if is_expression(stiffness) else _numbers("stiffness", stiffness))
-    if not isinstance(damping, MatrixModel):
+    if not _is_model(damping, 2):
         damping = WrittenDamping(damping if is_expression(damping) else _numbers("damping", damping, least=1))
     return mass, stiffness, damping
+
+
+def _is_model(value: object, before: int) -> bool:
+    """Whether a value has the methods of a matrix model whose blocks follow those of so many others."""
+    if isinstance(value, type) or not isinstance(value, MatrixModel):
+        return False
+    try:
+        inspect.signature(value.blocks).bind("geometry", "y", *range(before))
+    except TypeError:
+        return False
+    return True
 
 
 def _numbers(name: str, value: object, least: int = 2) -> Array:
@@ -94,5 +106,6 @@ def _rigid_body_dofs(test: Measurement, stiffness: MatrixModel, R: Array, other:
             "with recovery, and a stiffness without its base columns, state rigid_body_dofs (n, d): the motion of the "
             "degrees of freedom with a rigid base"
         )
+    check_size("stiffness", whole, n, d)
     K = at_point("stiffness", whole, None)
     return -np.linalg.lstsq(K[:n, :n], K[:n, n:], rcond=None)[0]

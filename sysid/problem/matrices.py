@@ -11,7 +11,7 @@ import numpy as np
 
 from sysid.measurement.measurement import Measurement
 from sysid.models.geometry import Geometry
-from sysid.models.model import MassBlocks, MatrixModel, StiffnessBlocks, stiffness_blocks
+from sysid.models.model import MassBlocks, MatrixModel, StiffnessBlocks, mass_blocks, stiffness_blocks
 from sysid.models.unknowns import Unknown
 from sysid.problem.direct_response import Motion
 from sysid.structure.structure import Array, Structure
@@ -123,7 +123,7 @@ def assemble(
 
 
 class Blocks(NamedTuple):
-    """The matrices as expressions, and the unknowns of each model with their symbols.
+    """The matrices as expressions.
 
     `damping` and `ratios` are empty where there is none; `omega` is the symbol of the circular frequencies in `ratios`.
     """
@@ -133,14 +133,13 @@ class Blocks(NamedTuple):
     damping: ca.MX
     ratios: ca.MX
     omega: ca.MX
-    symbols: tuple[tuple[tuple[Unknown, ca.MX], ...], ...]
 
     @property
     def by_matrix(self) -> tuple[ca.MX, ca.MX, ca.MX]:
         """All entries of mass, stiffness and damping, a column each."""
-        mass, factor = self.mass, self.mass.factor
+        mass = self.mass
         return (
-            ca.veccat(factor, mass.coupling, mass.base), ca.vec(self.stiffness.stiffness),
+            ca.veccat(mass.factor, mass.coupling, mass.base), ca.vec(self.stiffness.stiffness),
             ca.veccat(self.damping, self.ratios),
         )  # fmt: skip
 
@@ -152,34 +151,37 @@ class Blocks(NamedTuple):
     @property
     def outputs(self) -> list[ca.MX]:
         """What `Matrices.function` gives."""
-        L, coupling, base = self.mass
-        return [L @ L.T, coupling, base, self.stiffness.stiffness, self.damping, L, self.stiffness.mass_normalised]
+        (L, coupling, base, M), (K, H) = self.mass, self.stiffness
+        return [L @ L.T if M is None else M, coupling, base, K, self.damping, L, H]
 
 
-def blocks_of(mass: MatrixModel, stiffness: MatrixModel, damping: MatrixModel, geometry: Geometry) -> Blocks:
-    """The matrices of three models as expressions of new symbols, and of the variables that they are written in."""
+def blocks_of(
+    models: Sequence[MatrixModel], geometry: Geometry, symbols: Sequence[Sequence[ca.MX]] = ((), (), ())
+) -> Blocks:
+    """The matrices of mass, stiffness and damping as expressions.
+
+    They are written in the `symbols` of each model's unknowns, and in the variables of models without.
+    """
+    mass, stiffness, damping = models
     n, empty = geometry.n, ca.MX(0, 0)
-    symbols = tuple(
-        tuple((unknown, ca.MX.sym(unknown.name, unknown.size)) for unknown in model.unknowns(geometry))
-        for model in (mass, stiffness, damping)
-    )
-    y_mass, y_stiffness, y_damping = (ca.vertcat(ca.MX(0, 1), *(s for _, s in group)) for group in symbols)
+    y_mass, y_stiffness, y_damping = (ca.vertcat(ca.MX(0, 1), *group) for group in symbols)
 
-    made = MassBlocks(*_evaluated(lambda y: mass.blocks(geometry, y), y_mass, ()))
-    of_mass = MassBlocks(ca.tril(made.factor), made.coupling, made.base)
+    made = MassBlocks(*_evaluated(lambda y: mass_blocks(mass.blocks(geometry, y), geometry), y_mass, ()))
+    L = made.factor
+    of_mass = made._replace(factor=ca.tril(L), mass=L @ L.T if made.mass is None else made.mass)
     K = StiffnessBlocks(
         *_evaluated(
             lambda y, *m: stiffness_blocks(stiffness.blocks(geometry, y, MassBlocks(*m)), m[0]), y_stiffness, of_mass
         )
     )
     (C,) = _evaluated(
-        lambda y, *b: (damping.blocks(geometry, y, MassBlocks(*b[:3]), StiffnessBlocks(*b[3:])),), y_damping,
+        lambda y, *b: (damping.blocks(geometry, y, MassBlocks(*b[:4]), StiffnessBlocks(*b[4:])),), y_damping,
         (*of_mass, *K),
     )  # fmt: skip
     omega = ca.MX.sym("omega", n)
     of_modes = getattr(damping, "ratios", None)  # a model of a matrix alone need not have it
     (ratios,) = _evaluated(lambda y, w: (of_modes and of_modes(geometry, y, w),), y_damping, (omega,))
-    return Blocks(made, K, empty if C is None else C, empty if ratios is None else ratios, omega, symbols)
+    return Blocks(made, K, empty if C is None else C, empty if ratios is None else ratios, omega)
 
 
 def _evaluated(expressions: Any, y: ca.MX, before: tuple[ca.MX, ...]) -> list[ca.MX | None]:
@@ -197,21 +199,21 @@ def _evaluated(expressions: Any, y: ca.MX, before: tuple[ca.MX, ...]) -> list[ca
     return [values.get(i) for i in range(len(made))]
 
 
-def written_in_symbols(models: Sequence[MatrixModel], geometry: Geometry) -> list[ca.MX]:
+def symbols_in(
+    models: Sequence[MatrixModel], of_models: Sequence[Sequence[Unknown]], geometry: Geometry
+) -> list[list[ca.MX]]:
     """The symbols of variables that mass, stiffness and damping are written in; a model with unknowns has none."""
     n, d = geometry.n, geometry.d
-    mass = MassBlocks(*(ca.MX.sym("mass", *shape) for shape in ((n, n), (n, d), (d, d))))
+    mass = MassBlocks(*(ca.MX.sym("mass", *shape) for shape in ((n, n), (n, d), (d, d), (n, n))))
     stiffness = StiffnessBlocks(ca.MX.sym("stiffness", n, n), ca.MX.sym("stiffness", n, n))
     omega, y = ca.MX.sym("omega", n), ca.MX(0, 1)
     given = {symbol.__hash__() for symbol in (*mass, *stiffness, omega)}
-    found: list[ca.MX] = []
-    for model, before in zip(models, ((), (mass,), (mass, stiffness)), strict=True):
-        if model.unknowns(geometry):
-            continue
-        made = [model.blocks(geometry, y, *before)]
-        if len(before) == 2 and hasattr(model, "ratios"):
+    found: list[list[ca.MX]] = []
+    for model, unknowns, before in zip(models, of_models, ((), (mass,), (mass, stiffness)), strict=True):
+        made = [] if unknowns else [model.blocks(geometry, y, *before)]
+        if made and len(before) == 2 and hasattr(model, "ratios"):
             made.append(model.ratios(geometry, y, omega))
         parts = [part for block in made for part in (block if isinstance(block, tuple) else (block,))]
         symbols = [symbol for part in parts if isinstance(part, ca.MX) for symbol in ca.symvar(part)]
-        found += [symbol for symbol in symbols if symbol.__hash__() not in given]
+        found.append([symbol for symbol in symbols if symbol.__hash__() not in given])
     return found

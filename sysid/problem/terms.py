@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import casadi as ca
 import numpy as np
@@ -20,7 +20,6 @@ from sysid.modal_analysis.complex_frequency import noise_level
 from sysid.modal_analysis.response import residual
 from sysid.models.expressions import as_matrix, at_point, check_finite, written_in
 from sysid.models.geometry import Geometry
-from sysid.models.model import MatrixModel
 from sysid.models.unknowns import user_site, variable_of
 from sysid.problem.batch_objective import TestObjective
 from sysid.problem.direct_response import Response, absolute_response, relative_misfit, relative_response
@@ -114,17 +113,22 @@ class TestTerm:
 
     def error(self, x: Array) -> float:
         """Root of the sum of squares of the rows at `x`; NaN where modes are needed and `x` is no structure."""
-        if self.matrices.by_ratios:
-            try:
-                s = self.matrices.structure(x, self.test)
-            except InputError:
-                return float("nan")
-            modes = (s.mode_shapes, s.participation, 2 * np.pi * s.natural_frequencies, s.damping_ratios)
-            phi, gamma, omega, ratios, rigid = (ca.MX(ca.DM(part)) for part in (*modes, s.rigid_body_mass))
-            rows = residual(self.test, phi, gamma, omega, ratios, rigid, weighted=True, shift=self.shift)
-            return self.weight * float(ca.evalf(ca.norm_2(rows)))
-        symbol = ca.MX.sym("x", x.size)
-        return float(ca.Function("error", [symbol], [ca.norm_2(self.rows(symbol))])(x))
+        if not self.matrices.by_ratios:
+            return float(self._norm(x))
+        try:
+            s = self.matrices.structure(x, self.test)
+        except InputError:
+            return float("nan")
+        return float(self._norm(x, s.normal_modes, 2 * np.pi * s.natural_frequencies))
+
+    @cached_property
+    def _norm(self) -> ca.Function:
+        """Norm of the rows at x, and at the modes where damping is by ratios."""
+        x, n = ca.MX.sym("x", self.matrices.function.numel_in(0)), len(self.matrices.rigid_body)
+        if not self.matrices.by_ratios:
+            return ca.Function("norm", [x], [ca.norm_2(self.rows(x))])
+        modes = ModeSymbols(ca.MX.sym("shapes", n, n), ca.MX.sym("omega", n))
+        return ca.Function("norm", [x, *modes], [ca.norm_2(self.rows(x, modes))])
 
     def relative(self, x: Array) -> tuple[float, float]:
         """Norms of ``predicted - measured`` and of ``measured``: relative accelerations, unweighted."""
@@ -182,7 +186,8 @@ class ExpressionTerm:
 
     def squared(self, particles: Array) -> Array:
         """As in `Term`."""
-        return np.array([self.error(x) ** 2 for x in particles])
+        rows = np.asarray(ca.densify(self.function(particles.T)))  # a column each
+        return np.sum((self.weight * rows) ** 2, axis=0)
 
     def linearised(self, x: Array, noise: float) -> Rows:
         """As in `Term`."""
@@ -255,6 +260,8 @@ class FurtherTest:
     recovery: Any = field(default=None, kw_only=True)
     rigid_body_dofs: Any = field(default=None, kw_only=True)
 
+    kind: ClassVar[str] = "further tests"  # what its unknowns are listed under
+
     @cached_property
     def blocks(self) -> tuple[Blocks, Geometry]:
         """The blocks of its matrices, and their geometry."""
@@ -262,17 +269,15 @@ class FurtherTest:
             raise InputError(
                 f"FurtherTest: measurement is a {type(self.measurement).__name__}, not a sysid.Measurement"
             )
-        for name in ("mass", "stiffness", "damping"):
-            if isinstance(getattr(self, name), MatrixModel):
-                raise InputError(f"FurtherTest: {name} is a model; write the matrix in the variables of the problem")
         models = as_models(self.mass, self.stiffness, self.damping)
         geometry = geometry_of(self.measurement, models[1], self.recovery, self.rigid_body_dofs)
-        blocks = blocks_of(*models, geometry)
+        for name, model in zip(("mass", "stiffness", "damping"), models, strict=True):
+            if model.unknowns(geometry.unsearched()):
+                raise InputError(f"FurtherTest: {name} is a model; write the matrix in the variables of the problem")
+        blocks = blocks_of(models, geometry)
         if blocks.ratios.numel():
             raise InputError("FurtherTest: damping must be a matrix (n, n)")
         return blocks, geometry
-
-    kind = "further tests"
 
     def expressions(self, name: str) -> Sequence[ca.MX]:
         """Its matrices."""
@@ -292,6 +297,11 @@ class FurtherTest:
     def force(self) -> Response:
         """The base force as expressions, (d, runs * n_freq)."""
         return relative_response(self.measurement, self.blocks[0].motion(self.blocks[1]))[1]
+
+    @property
+    def expression(self) -> ca.MX:
+        """Relative residuals of accelerations and, where measured, of force, one below the other."""
+        return relative_misfit(self.measurement, self.blocks[0].motion(self.blocks[1]), weighted=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,8 +350,6 @@ class Prior:
 
     def term(self, name: str, build: Builder) -> ExpressionTerm:
         """Rows in units of the noise of the records."""
-        if build.replaced:
-            raise InputError("Prior beside a misfit of your own: put it into that misfit, in the units of its rows")
         column = self.column(name)[0]
         labels = tuple(_label(column, i) for i in range(column.numel()))
         function = build.function("prior", self.expressions(name))
