@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.models.geometry import Layout
+from sysid.models.geometry import Geometry
 
 
 def _geometry(rng, n, d):
@@ -93,8 +93,10 @@ def _case(rng, mass="trace", stiffness="spectral", damping="modal", *, n=4, d=2,
     elif mass == "known":
         model = sysid.KnownMass(M)
     else:
-        layout = Layout(G, np.ones(d, bool))
-        stated = sysid.FullMass(healing=mass).total(layout, M)
+        rigid = np.vstack([G, np.eye(d)])
+        strongest = np.argmax(np.abs(rigid), axis=1)
+        traces = [np.diag(M)[strongest == i].sum() for i in range(d)]
+        stated = {"trace": traces, "rigid_body": np.diag(rigid.T @ M @ rigid)}[mass]
         model = sysid.FullMass(stated if total else None, healing=mass)
     frequencies = truth.natural_frequencies
     stiff = {
@@ -105,6 +107,16 @@ def _case(rng, mass="trace", stiffness="spectral", damping="modal", *, n=4, d=2,
         "modal": sysid.ModalDamping(0.005, 0.05), "proportional": sysid.ProportionalDamping((0.0, 5.0), (0.0, 1e-3))
     }[damping]  # fmt: skip
     return truth, sysid.Problem(test, mass=model, stiffness=stiff, damping=damp, reference=truth)
+
+
+def _geometry_of(G, translational=None, weighed=None):
+    """What models see of a test whose sensors move by `G` (n_sensors, d) with the base; all directions translate."""
+    G = np.asarray(G, dtype=float)
+    sensors, d = G.shape
+    moves, turns = iter(["x", "y", "z"]), iter(["rx", "ry", "rz"])
+    axes = [next(moves if moved else turns) for moved in (np.ones(d) if translational is None else translational)]
+    test = sysid.Measurement([1.0, 2.0], np.ones((1, d, 2)), np.ones((1, sensors, 2)), rigid_body=G, base_axes=axes)
+    return Geometry(test, weighed=weighed)
 
 
 @pytest.fixture
@@ -130,3 +142,8 @@ def random_blocks():
 @pytest.fixture
 def random_structure():
     return _structure
+
+
+@pytest.fixture
+def geometry_of():
+    return _geometry_of

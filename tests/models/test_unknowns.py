@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.models.unknowns import Block, split, variable_of
+from sysid.models.unknowns import Unknown, by_name, log_sampling, scales_of, slices_of, split, variable_of
 
 V = np.array([1.0, 2.0, 3.0])
 A = np.arange(1.0, 10.0).reshape(3, 3)
@@ -162,8 +162,10 @@ def test_sampling_is_logarithmic_between_the_bounds_and_unsampling_its_inverse()
         x = np.asarray(sample(low + share * (high - low))).ravel()
         np.testing.assert_allclose(x, low ** (1 - share) * high**share, rtol=1e-12)
         np.testing.assert_allclose(variable.unsampling(x), low + share * (high - low), rtol=1e-9)
-    assert sysid.Variable("k", lower=1, upper=2).sampling is None
-    assert sysid.Variable("k", lower=1, upper=2).unsampling is None
+    plain, s = sysid.Variable("k", 3, lower=1, upper=2), ca.SX.sym("s", 3)
+    assert plain.sampling(s) is s
+    assert plain.unsampling(V) is V
+    np.testing.assert_array_equal(np.asarray(plain.sampled()(V)).ravel(), V)
 
 
 def test_a_symbol_leads_back_to_its_variable_and_to_no_other(names):
@@ -260,8 +262,43 @@ def test_variables_are_declared_where_the_author_wrote_them_also_through_functio
     assert variable.declared.endswith(f"test_unknowns.py, line {place}")
 
 
-def test_blocks_refuse_bounds_that_disagree():
+def test_unknowns_refuse_bounds_that_disagree():
     with pytest.raises(sysid.InputError, match="disagree"):
-        Block("x", np.zeros(2), np.ones(3))
+        Unknown("x", np.zeros(2), np.ones(3))
     with pytest.raises(sysid.InputError, match="finite with lower <= upper"):
-        Block("x", np.ones(2), np.zeros(2))
+        Unknown("x", np.ones(2), np.zeros(2))
+    with pytest.raises(sysid.InputError, match="finite with lower <= upper"):
+        Unknown("x", np.ones(2), [2.0, np.inf])
+
+
+def test_unknowns_of_models_are_counted_from_one_and_written_with_spaces():
+    unknown = Unknown("mass_share", np.zeros(3), np.ones(3))
+    assert unknown.title == "mass share"
+    assert unknown.labels == ("mass share 1", "mass share 2", "mass share 3")
+    assert Unknown("total_mass", 1.0, 2.0).labels == ("total mass",)
+    assert (unknown.size, unknown.shape, unknown.fixed, unknown.has_guess) == (3, (3,), False, False)
+    np.testing.assert_array_equal(unknown.shaped(V), V)
+
+
+def test_a_guess_of_a_model_is_the_middle_as_the_swarm_sees_it():
+    low, high = np.array([1.0, 4.0, 9.0]), np.array([4.0, 9.0, 9.0])
+    sampling, unsampling = log_sampling(low, high)
+    np.testing.assert_allclose(Unknown("k", low, high).guess, [2.5, 6.5, 9])
+    logarithmic = Unknown("k", low, high, sampling=sampling, unsampling=unsampling, scale="log")
+    np.testing.assert_allclose(logarithmic.guess, [2, 6, 9], rtol=1e-14)
+    np.testing.assert_allclose(logarithmic.unsampling(np.array([2.0, 6, 9])), [2.5, 6.5, 9], rtol=1e-14)
+
+
+def test_a_large_step_is_a_twentieth_of_the_range_or_the_size_itself():
+    x = np.array([0.0, 3.0, -0.5, 7.0])
+    unknowns = Unknown("a", np.zeros(2), [20.0, 20]), Unknown("b", [-1.0, 1], [1.0, 1e6], scale="log")
+    # A twentieth of 20; the size 3 above it; and over decades the size alone.
+    np.testing.assert_allclose(scales_of(unknowns, x), [1, 3, 0.5, 7])
+
+
+def test_one_vector_and_an_array_a_name(names):
+    assert slices_of(names.values()) == [slice(0, 3), slice(3, 4), slice(4, 13)]
+    parts = by_name(names.values(), np.arange(13.0))
+    np.testing.assert_array_equal(parts["k"], [0, 1, 2])
+    assert parts["s"].shape == ()
+    np.testing.assert_array_equal(parts["S"], [[4, 7, 10], [5, 8, 11], [6, 9, 12]])
