@@ -45,7 +45,10 @@ FLOOR_OF = {room: number for number, rooms in enumerate(FLOORS) for room in room
 
 MODEL_NAME = re.compile(r"[A-Z]\w*(Mass|Stiffness|Damping|Models?)|Written[A-Z]?\w*")
 NO_MODELS = {"PointMass"}  # a part of a frame
-UNKNOWNS_OF_MODELS = {"mass_factor", "mass_share", "stiffness_factor", "damping_ratio", "rayleigh_factor"}
+UNKNOWNS_OF_MODELS = {
+    "mass_factor", "mass_share", "stiffness_factor", "damping_ratio", "rayleigh_factor", "rayleigh_alpha",
+    "rayleigh_beta",
+}  # fmt: skip
 SHARED_FIELDS = {"mass", "stiffness", "damping", "constraints", "healing"}  # a problem has them too
 FORMULATIONS = {"formulation", "f"}  # what a formulation is called where it is used
 

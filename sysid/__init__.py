@@ -4,30 +4,35 @@ import casadi as _casadi
 
 from sysid import plot
 from sysid.errors import InputError, SolverError, SysidError
-from sysid.identify import Continuation, Modal, Progress, Swarm, identify
+from sysid.identify import identify
 from sysid.measurement.measurement import Measurement, Sensor, rigid_body, simulate
 from sysid.measurement.spectra import resample
 from sysid.models.damping import ModalDamping, ProportionalDamping
 from sysid.models.mass import FullMass, KnownMass, LumpedMass
+from sysid.models.model import MassBlocks, MatrixModel, Stated, StiffnessBlocks, Totals
 from sysid.models.stiffness import ChainStiffness, SpectralStiffness
-from sysid.models.unknowns import Variable
-from sysid.problem.blocks import Known, Misfit
+from sysid.models.unknowns import Unknown, Variable
 from sysid.problem.problem import Problem
+from sysid.problem.terms import FurtherTest, Prior
 from sysid.results.identification import Identification, Recipe
 from sysid.results.storage import load
+from sysid.results.version import __version__
+from sysid.search.continuation import Continuation
+from sysid.search.modal import Modal
+from sysid.search.session import Progress
 from sysid.search.strategy import History
+from sysid.search.swarm import Swarm
 from sysid.structure.structure import Structure
 from sysid.swarm import SwarmSettings, minimize_swarm
-
-__version__ = "0.1.0"
 
 # CasADi 3.8 warns once about its coming NumPy conventions unless one is chosen.
 if hasattr(_casadi.GlobalOptions, "setNumpyMode"):
     _casadi.GlobalOptions.setNumpyMode(-1)  # as it always was, without the warning
 
 __all__ = [
-    "ChainStiffness", "Continuation", "FullMass", "History", "Identification", "InputError", "Known", "KnownMass",
-    "LumpedMass", "Measurement", "Misfit", "Modal", "ModalDamping", "Problem", "Progress", "ProportionalDamping",
-    "Recipe", "Sensor", "SolverError", "SpectralStiffness", "Structure", "Swarm", "SwarmSettings", "SysidError",
-    "Variable", "identify", "load", "minimize_swarm", "plot", "resample", "rigid_body", "simulate",
+    "ChainStiffness", "Continuation", "FullMass", "FurtherTest", "History", "Identification", "InputError",
+    "KnownMass", "LumpedMass", "MassBlocks", "MatrixModel", "Measurement", "Modal", "ModalDamping", "Prior", "Problem",
+    "Progress", "ProportionalDamping", "Recipe", "Sensor", "SolverError", "SpectralStiffness", "Stated",
+    "StiffnessBlocks", "Structure", "Swarm", "SwarmSettings", "SysidError", "Totals", "Unknown", "Variable",
+    "__version__", "identify", "load", "minimize_swarm", "plot", "resample", "rigid_body", "simulate",
 ]  # fmt: skip

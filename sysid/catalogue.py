@@ -93,8 +93,8 @@ def build(recipe: Recipe) -> Problem:
     Raises
     ------
     InputError
-        Whatever is wrong with the module, its data or what it gives; an InputError from inside the
-        module passes as it is, any other exception is told with its line of the module.
+        Whatever is wrong with the module, its data or what it gives, a problem that cannot be searched too; an
+        InputError from inside the module passes as it is, any other exception is told with its line of the module.
     """
     if recipe.data is not None and not (recipe.data and _exists(Path(recipe.data))):
         raise InputError(f"data {recipe.data!r}: there is no such file or folder")
@@ -112,10 +112,12 @@ def build(recipe: Recipe) -> Problem:
         problem = function(data=data, rng=recipe.rng)
     if not isinstance(problem, Problem):
         raise InputError(f"{path}: problem() gives a {type(problem).__name__}, not a sysid.Problem")
-    idle = [variable for variable in declared()[before:] if not variable.used]
+    used = set(problem.formulation.variables)
+    idle = [variable for variable in declared()[before:] if variable not in used]
     if idle:
         told = ", ".join(f"{variable.name!r} ({variable.declared})" for variable in idle)
         raise InputError(f"{path}: variable {told} enters no matrix, residual or constraint: use it, or take it out")
+    problem.check()
     return problem
 
 

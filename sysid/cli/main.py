@@ -18,20 +18,24 @@ import tempfile
 import time
 import traceback
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, NoReturn, cast
 
-import sysid
 from sysid import catalogue
 from sysid.errors import InputError, SolverError
-from sysid.identify import STRATEGIES, Progress
+from sysid.identify import STRATEGIES, identify
 from sysid.results.identification import Identification, Recipe
+from sysid.results.storage import load
+from sysid.results.version import __version__
+from sysid.search.session import Progress
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
+
+    from sysid.problem.problem import Problem
 
 SUCCESS, NOT_REACHED, MISTAKE, BUG, INTERRUPTED = 0, 1, 2, 70, 130
 
@@ -139,10 +143,10 @@ def _run(options: argparse.Namespace, out: _Output) -> int:
     out.write(
         f"{recipe.module}: {test.n_sensors} sensors, base moving along {' '.join(test.base_axes or ())}, "
         f"{test.freq.size} lines from {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz, "
-        f"{problem.n_variables} unknowns, seed {options.seed}\n"
+        f"{_count_unknowns(problem)} unknowns, seed {options.seed}\n"
     )
     with _Display(out) as display:
-        result = sysid.identify(
+        result = identify(
             problem, strategy=options.strategy, rng=options.seed, max_time=options.max_time, progress=display
         )
     result = replace(result, recipe=recipe)
@@ -159,11 +163,16 @@ def _run(options: argparse.Namespace, out: _Output) -> int:
     return SUCCESS if result.success else NOT_REACHED
 
 
+def _count_unknowns(problem: Problem) -> int:
+    """Number of unknowns; poles, which may take long, are left to the search and its progress and time limit."""
+    return problem.formulate(problem.geometry.unsearched()).size
+
+
 def _report(options: argparse.Namespace, out: _Output) -> int:
     from sysid.report import report
 
     source = Path(options.result)
-    result = sysid.load(source)
+    result = load(source)
     folder = source if source.is_dir() else source.parent
     out.write(f"{report.write(result, folder / report.FILE_NAME)}\n")
     return SUCCESS
@@ -187,7 +196,7 @@ def _parser() -> argparse.ArgumentParser:
         "130 interrupted (the best so far is saved), 70 an error of sysid itself.",
         allow_abbrev=False,
     )
-    parser.add_argument("--version", action="version", version=f"sysid {sysid.__version__}")
+    parser.add_argument("--version", action="version", version=f"sysid {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     command = functools.partial(commands.add_parser, allow_abbrev=False)
 
@@ -215,6 +224,15 @@ def _parser() -> argparse.ArgumentParser:
     show.add_argument("--data", metavar="PATH", help=_DATA)
     show.set_defaults(command=_show)
 
+    _add_run(command)
+
+    report = command("report", help="write report.html again, beside a result")
+    report.add_argument("result", metavar="RESULT", help="a result.h5, or the folder that holds it")
+    report.set_defaults(command=_report)
+    return parser
+
+
+def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
     run = command(
         "run",
         help="identify the structure of a problem",
@@ -242,11 +260,6 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--out", metavar="DIR", help="folder of the results, results/NAME by default")
     run.add_argument("--max-time", type=_seconds, metavar="S", help="end the search after about so many seconds")
     run.set_defaults(command=_run)
-
-    report = command("report", help="write report.html again, beside a result")
-    report.add_argument("result", metavar="RESULT", help="a result.h5, or the folder that holds it")
-    report.set_defaults(command=_report)
-    return parser
 
 
 def _seed(text: str) -> int:
@@ -322,7 +335,7 @@ def _finite(value: Any) -> Any:
 
 def _write_log() -> str:
     """Write the traceback of the exception at hand; what to tell about it."""
-    text = f"sysid {sysid.__version__}, Python {sys.version}\n{sys.argv}\n\n{traceback.format_exc()}"
+    text = f"sysid {__version__}, Python {sys.version}\n{sys.argv}\n\n{traceback.format_exc()}"
     for folder in (Path(), Path(tempfile.gettempdir())):
         log = folder / _LOG
         with contextlib.suppress(OSError):
@@ -443,14 +456,14 @@ class _Display:
 
         table = Table(box=box.SIMPLE, pad_edge=False)
         table.add_column("phase", min_width=12)
-        for name, width in (("iteration", 10), ("residual", 10), ("time", 8)):
+        for name, width in (("iteration", 10), ("objective", 10), ("time", 8)):
             table.add_column(name, justify="right", min_width=width, no_wrap=True)
         rows = list(self._phases.values())
         for p in rows:
             # The clock of the phase at work runs on between its news.
             seconds = p.seconds if p is not rows[-1] or not self._running else time.perf_counter() - self._begun
             count = f"{p.iteration} / {p.of}" if p.of else f"{p.iteration}"
-            table.add_row(p.phase, count, f"{p.residual:.3e}", f"{seconds:.1f} s")
+            table.add_row(p.phase, count, f"{p.objective:.3e}", f"{seconds:.1f} s")
         if not rows:
             table.add_row("preparation", "", "", f"{time.perf_counter() - self._begun:.1f} s")
         return table

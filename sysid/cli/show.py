@@ -1,7 +1,7 @@
 """``sysid show``: a problem in words and tables before anything is searched: its unknowns, and what the data determine.
 
 Rank and null directions are those of the exact Jacobian of all that is fitted, each unknown counted in the unit that
-IPOPT counts it in (`sysid.sensitivity`).
+IPOPT counts it in (`sysid.assessment.sensitivity`).
 """
 
 from __future__ import annotations
@@ -13,19 +13,18 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from sysid.assessment.modal_mass_cone import determination
-from sysid.assessment.sensitivity import Sensitivity, Slopes, directions_in_words, sensitivity, slopes_of
+from sysid.assessment.determination import determine
+from sysid.assessment.sensitivity import Sensitivity, directions_in_words, sensitivity
 from sysid.errors import InputError, SysidError
-from sysid.identify import Modal, identify, options_of
+from sysid.identify import choose, identify
 from sysid.measurement.measurement import Measurement
-from sysid.models.mass import FullMass
-from sysid.models.stiffness import SpectralStiffness
-from sysid.models.unknowns import Block, Variable, steps_of
-from sysid.problem.blocks import Misfit
-from sysid.problem.feasibility import points_of, scale_of
-from sysid.problem.formulation import Formulation, guess_of, sampled
+from sysid.models.unknowns import Unknown, scales_of, slices_of
+from sysid.nlp import quiet_options
+from sysid.problem.feasibility import HELD, LOOSE, points_of
+from sysid.problem.formulation import MATRICES
 from sysid.problem.problem import Problem
-from sysid.search.local_structured import needs_modes, unit_of
+from sysid.problem.slopes import Slopes, slopes_of
+from sysid.problem.terms import FurtherTest
 from sysid.structure.structure import Array, ComplexArray, Structure
 
 _WIDTH = 120
@@ -58,8 +57,9 @@ def show(problem: Problem, name: str) -> str:
     Raises
     ------
     InputError
-        Where no point of the search space makes a structure, or the Jacobian there is not finite.
+        Where the problem cannot be searched, or the Jacobian is finite at no point that was looked at.
     """
+    problem.check()
     point = _point(problem)
     blocks = (_test(problem, name), _variables(problem), _unknowns(problem), _at(problem, point))
     return "\n\n".join("\n".join(_folded(line) for line in block) for block in blocks)
@@ -70,14 +70,13 @@ def show(problem: Problem, name: str) -> str:
 
 def _test(problem: Problem, name: str) -> Iterator[str]:
     yield f"{name}: {_records(problem.measurement)}"
-    for i, (test, _) in enumerate(problem.formulation.others, start=1):
-        yield f"further test {i}: {_records(test)}"
-    n = len(problem.formulation.matrices.rigid_body_dofs)
+    for i, term in enumerate(problem.formulation.further_tests, start=1):
+        yield f"further test {i}: {_records(term.test)}"
     known = ["the reference is known"] if problem.reference is not None else []
     known += [f"predicted and never fitted: {_count(len(problem.validation), 'test')}"] if problem.validation else []
     known += [f"goal {problem.goal:.3g}"] if problem.goal is not None else []
-    yield "; ".join([f"degrees of freedom {n}, unknowns {problem.n_variables}", *known])
-    yield f"--strategy auto takes {options_of('auto', problem, None)[1].removeprefix('strategy ')}"
+    yield "; ".join([f"degrees of freedom {problem.geometry.n}, unknowns {problem.n_variables}", *known])
+    yield f"--strategy auto takes {choose('auto', problem, None)[1].removeprefix('strategy ')}"
 
 
 def _records(test: Measurement) -> str:
@@ -93,52 +92,34 @@ def _records(test: Measurement) -> str:
 
 
 def _variables(problem: Problem) -> Iterator[str]:
+    """A line a variable; the models' own come with the model's name, those of the user with their declaration."""
     rows = [["variable", "shape", "unit", "lower", "upper", "guess", "scale", "declared"]]
-    formulation = problem.formulation
-    for v in (*formulation.variables, *formulation.fixed):
-        if isinstance(v, Variable):
-            shape, told = " x ".join(map(str, v.shape)) or "scalar", v.has_guess
-            scale, declared = "fixed" if v.fixed else _scale(v), v.declared
-        else:
-            shape, told, scale, declared = str(v.size), False, _scale(v), _model(problem, v)
-        guess = _range(guess_of(v)) + ("" if told else " (middle)")
-        rows.append([v.name, shape, v.unit or "-", _range(v.lower), _range(v.upper), guess, scale, declared])
+    for model, group in zip(problem.models, problem.formulation.of_models, strict=True):
+        rows += [_variable(unknown, type(model).__name__) for unknown in group]
+    rows += [_variable(variable, variable.declared) for variable in problem.formulation.variables]
     yield from _table(rows)
 
 
-def _scale(variable: Block | Variable) -> str:
-    """How the swarm spreads its candidates over the bounds."""
-    if variable.sampling is None:
-        return "linear"
-    middle, product = sampled(variable, (variable.lower + variable.upper) / 2), variable.lower * variable.upper
-    return "log" if np.all(product > 0) and np.allclose(middle, np.sqrt(np.abs(product))) else "by row"
-
-
-def _model(problem: Problem, block: Block) -> str:
-    """The matrix model that a block of unknowns belongs to: of the first matrix that has it."""
-    models = {"mass": problem.mass, "stiffness": problem.stiffness, "damping": problem.damping}
-    matrix = next(name for name, members in problem.formulation.members if block.name in members)
-    return type(models[matrix]).__name__
+def _variable(v: Unknown, declared: str) -> list[str]:
+    shape = " x ".join(map(str, v.shape)) or "scalar"
+    guess = _range(v.guess) + ("" if v.has_guess else " (middle)")
+    scale = "fixed" if v.fixed else v.scale
+    return [v.name, shape, v.unit or "-", _range(v.lower), _range(v.upper), guess, scale, declared]
 
 
 def _unknowns(problem: Problem) -> Iterator[str]:
     """Variables by matrix; a model counts its own, a written matrix all that enter it."""
     formulation = problem.formulation
-    sizes, counts = {v.name: v.size for v in formulation.variables}, dict(problem.unknowns)
+    sizes, counts = {v.name: v.size for v in formulation.unknowns}, dict(problem.unknowns)
+    own = {name: tuple(v.name for v in group) for name, group in zip(MATRICES, formulation.of_models, strict=True)}
+    labels = {"constraints": _count(formulation.constraints.lower.size, "constraint")}
     rows = [["enters", "unknowns", "variables"]]
-    starts = np.cumsum([0, *(v.size for v in formulation.variables)])
     for name, members in formulation.members:
-        if not problem.is_written:
-            at = getattr(problem.parts, name)
-            members = tuple(
-                v.name for v, i in zip(formulation.variables, starts, strict=False) if at.start <= i < at.stop
-            )
-        label = name
-        if name == "constraints" and formulation.constraints is not None:
-            label = _count(formulation.constraints.lower.size, "constraint")
-        rows.append([label, str(counts[name]), ", ".join(f"{v} ({sizes[v]})" for v in members)])
+        entering = own.get(name) or members
+        told = ", ".join(f"{v} ({sizes[v]})" for v in entering)
+        rows.append([labels.get(name, name), str(counts[name]), told])
     yield from _table(rows)
-    if formulation.healing is not None:
+    if formulation.healed:
         yield "healing: the swarm's candidates are brought to what it states before they are judged"
 
 
@@ -157,21 +138,20 @@ class _Point:
 
 
 def _point(problem: Problem) -> _Point:
-    """The point at which the data are judged."""
-    sentences: tuple[str, ...] = ()
-    if not problem.is_written:
-        found = _at_reference(problem)
-        if found is None and isinstance(options_of("auto", problem, None)[0], Modal):
-            found, sentences = _at_modes(problem)
-        if found is not None:
-            return found
-    formulation = problem.formulation
-    guess, *others = points_of(formulation)[:_TRIED]
-    # A spectral stiffness has all its frequencies equal in the middle of its search space.
-    spectral = isinstance(problem.stiffness, SpectralStiffness)
-    why = "as the guess has all frequencies equal" if spectral else "as the guess makes no structure with derivatives"
-    for i, x in list(enumerate((guess, *others)))[spectral:]:
-        where = "the guess" if i == 0 else f"a point of the search space, {why}"
+    """The point at which the data are judged: the reference, what the modal strategy finds, or a guess."""
+    found, sentences = _at_reference(problem), ()
+    if found is None and choose("auto", problem, None)[0].name == "modal":
+        found, sentences = _at_modes(problem)
+    return found or _at_guess(problem, sentences)
+
+
+def _at_guess(problem: Problem, sentences: tuple[str, ...]) -> _Point:
+    """The guess, else the first of some points of the search space at which there are derivatives."""
+    # A free stiffness has all its frequencies equal in the middle of its search space.
+    free = problem.formulation.stiffness.free
+    why = "as the guess has all frequencies equal" if free else "as the guess makes no structure with derivatives"
+    names = ["the guess", *[f"a point of the search space, {why}"] * (_TRIED - 1)]
+    for x, where in list(zip(points_of(problem.formulation), names, strict=False))[free:]:
         try:
             return _judged(problem, *_feasible(problem, x, where), sentences)
         except (InputError, np.linalg.LinAlgError):
@@ -184,23 +164,18 @@ def _point(problem: Problem) -> _Point:
 
 def _feasible(problem: Problem, x: Array, where: str) -> tuple[Array, str]:
     """The point next to `x` that keeps the constraints, clear of inequalities where it can be, and where that is."""
-    formulation = problem.formulation
-    constraints = formulation.constraints
-    if constraints is None:
-        return x, where
-    scale = scale_of(formulation, points_of(formulation))
+    constraints = problem.formulation.constraints
+    # What each makes over the search space.
+    scale = problem.tolerance / np.where(constraints.equal, LOOSE, HELD)
     lower, upper = constraints.lower / scale, constraints.upper / scale
-    room = np.where(lower < upper, _ROOM, 0.0)
-    at = np.asarray(constraints.function(x)).ravel() / scale
-    if np.all((at <= upper - np.where(room > 0, room, -_HELD)) & (at >= lower - _HELD)):
+    room = np.where(constraints.equal, 0.0, _ROOM)
+    at = constraints.at(x) / scale
+    if np.all((at <= upper - np.where(constraints.equal, -_HELD, _ROOM)) & (at >= lower - _HELD)):
         return x, where
-    unit = steps_of(problem.variables, x)
+    unit = scales_of(problem.variables, x)
     t = ca.MX.sym("t", x.size)
     broken = constraints.function(ca.DM(x) + ca.DM(unit) * t) / ca.DM(scale)
-    solver = ca.nlpsol(
-        "feasible", "ipopt", {"x": t, "f": ca.sumsqr(t), "g": broken},
-        {"print_time": False, "show_eval_warnings": False, "ipopt": {"print_level": 0, "sb": "yes", "max_iter": 200}},
-    )  # fmt: skip
+    solver = ca.nlpsol("feasible", "ipopt", {"x": t, "f": ca.sumsqr(t), "g": broken}, quiet_options(200))
     for margin in (room, 0.0):
         answer = solver(
             x0=0.0, lbx=(problem.lower - x) / unit, ubx=(problem.upper - x) / unit, lbg=lower, ubg=upper - margin
@@ -222,17 +197,17 @@ def _judged(problem: Problem, x: Array, where: str, sentences: tuple[str, ...] =
 def _at_reference(problem: Problem) -> _Point | None:
     """The reference, where there is one that the models can hold or come near."""
     truth = problem.reference
-    if truth is None or not truth.at_sensors:
+    if truth is None or not (truth.at_sensors and problem.geometry.at_sensors):
         return None
     try:
-        x = problem.values(truth)
-        sentences = _sentences(problem, truth)
-        point = _judged(problem, x, "the reference", sentences)
+        x, where = _feasible(problem, problem.values(truth), "the reference")
+        point = _judged(problem, x, where)
+        said = determine(problem, truth, x)
     except (InputError, np.linalg.LinAlgError):
         return None
     if _differ(truth, point.slopes.structure):
-        return replace(point, where="what the models can hold of the reference, which is not all of it")
-    return point
+        where = "what the models can hold of the reference, which is not all of it"
+    return replace(point, where=where, sentences=(*said.closed_by, *said.undetermined))
 
 
 def _differ(a: Structure, b: Structure) -> bool:
@@ -255,22 +230,17 @@ def _at_modes(problem: Problem) -> tuple[_Point | None, tuple[str, ...]]:
     return _judged(problem, found.x, "what the modal strategy finds in the data", sentences), sentences
 
 
-def _sentences(problem: Problem, structure: Structure) -> tuple[str, ...]:
-    said = determination(problem, structure)
-    return (*said.closed_by, *said.undetermined)
-
-
 # -- what the data determine --------------------------------------------------------------------
 
 
 def _at(problem: Problem, point: _Point) -> Iterator[str]:
     """Values, units and expected errors; rank; what is not seen, and what is seen least."""
-    formulation, known, x = problem.formulation, point.known, point.x
+    known, count = point.known, point.x.size
     noise = "the stated noise" if _all_stated(problem) else f"{100 * _NOISE:g} % noise"
     moves = _moves(problem, point)
-    free, count = known.free.shape[1], x.size
-    inverse = problem.is_written and problem.reference is not None
-    yield f"At {point.where}" + (" (a written problem cannot be inverted to its reference):" if inverse else ":")
+    free = known.free.shape[1]
+    missed = problem.reference is not None and "guess" in point.where
+    yield f"At {point.where}" + (" (the models cannot be inverted to the reference):" if missed else ":")
     yield from _values(problem, point, moves, noise)
     yield from _coordinates(problem)
     s = known.singular_values[: known.rank]
@@ -286,50 +256,47 @@ def _at(problem: Problem, point: _Point) -> Iterator[str]:
     if known.unseen.shape[1]:
         yield from _unseen(problem, point)
     if moves.shape[1]:
-        yield _seen_least(formulation, point, moves, noise)
-    if isinstance(problem.mass, FullMass) and not problem.mass.healable:
+        yield _seen_least(problem, point, moves, noise)
+    if problem.formulation.mass.free and (np.any(np.isfinite(problem.known_mass)) or problem.rigid_total is not None):
         yield "  - what is stated of the mass beyond totals is held by the modal strategy, and not counted above"
     yield from (f"  - {sentence}" for sentence in point.sentences)
 
 
 def _values(problem: Problem, point: _Point, moves: Array, noise: str) -> Iterator[str]:
     """A line a variable: the largest error of its entries stands for all."""
-    formulation, known, x = problem.formulation, point.known, point.x
+    known, x = point.known, point.x
     std = np.linalg.norm(moves, axis=1)
     open_ = np.linalg.norm(known.unseen, axis=1) > _TOUCHED
+    relative = std / np.where(np.abs(x) > 1e-3 * known.unit, np.abs(x), np.nan)
     rows = [["variable", "value", "unit of IPOPT", f"standard deviation at {noise}"]]
-    modal = problem.free_modes
-    at = 0
-    for v in formulation.variables:
-        part = slice(at, at + v.size)
-        at += v.size
-        relative = std[part] / np.where(np.abs(x[part]) > 1e-3 * known.unit[part], np.abs(x[part]), np.nan)
+    for v, part in zip(problem.variables, slices_of(problem.variables), strict=True):
         if np.any(open_[part]):
             told = "open" if np.all(open_[part]) else f"open in {np.count_nonzero(open_[part])} of {v.size}"
-        elif np.all(np.isfinite(relative)):
-            told = f"{100 * relative.max():.3g} %"
+        elif np.all(np.isfinite(relative[part])):
+            told = f"{100 * relative[part].max():.3g} %"
         else:
             told = f"{std[part].max():.3g} {v.unit}".rstrip()
-        rows.append([v.name, _range(x[part]), "-" if modal else _range(unit_of(v, x[part])), told])
+        rows.append([v.name, _range(x[part]), "-" if problem.free_modes else _range(known.unit[part]), told])
     yield from _table(rows)
 
 
 def _coordinates(problem: Problem) -> Iterator[str]:
     """What IPOPT has in the place of these unknowns, or beside them."""
+    formulation = problem.formulation
     if problem.free_modes:
         yield (
             "IPOPT works in mode shapes, participations and the logarithms of frequencies and damping ratios, from "
             "which these unknowns follow; here each counts in units of its size, or 5 % of its range where that is more"
         )
-    elif needs_modes(problem):
-        held = ", which stand for the stiffness factor" if isinstance(problem.stiffness, SpectralStiffness) else ""
+    elif formulation.fits_records and formulation.matrices.by_ratios:
+        held = ", which stand for the stiffness factor" if formulation.stiffness.free else ""
         yield f"IPOPT has mode shapes and frequencies as further unknowns{held}, as damping is by ratios"
 
 
 def _unseen(problem: Problem, point: _Point) -> Iterator[str]:
     """The null directions: what they change, and the shortest in words."""
     known, x = point.known, point.x
-    words = sorted(directions_in_words(problem.formulation.variables, x, known.unit, known.unseen), key=len)
+    words = sorted(directions_in_words(problem.variables, x, known.unit, known.unseen), key=len)
     own, base = _moved_matrices(point)
     left = len(words) - own - base
     kinds = [f"mass, stiffness or damping change along {own}"] if own else []
@@ -370,7 +337,7 @@ def _moved_matrices(point: _Point) -> tuple[int, int]:
 
 def _generic(problem: Problem, point: _Point) -> tuple[str, int]:
     """Rank at another point of the search space, where this one is a guess; nothing where it is not."""
-    if not (problem.is_written and point.where.startswith("the guess")):
+    if not point.where.startswith("the guess"):
         return "", 0
     for x in points_of(problem.formulation)[1:_TRIED]:
         where = "another point of the search space"
@@ -381,36 +348,37 @@ def _generic(problem: Problem, point: _Point) -> tuple[str, int]:
     return "", 0
 
 
-def _seen_least(formulation: Formulation, point: _Point, moves: Array, noise: str) -> str:
+def _seen_least(problem: Problem, point: _Point, moves: Array, noise: str) -> str:
     """The direction of the largest variance, in units."""
     known = point.known
     U, s, _ = np.linalg.svd(moves / known.unit[:, None], full_matrices=False)
-    words = directions_in_words(formulation.variables, point.x, known.unit, U[:, :1])[0]
+    words = directions_in_words(problem.variables, point.x, known.unit, U[:, :1])[0]
     size = 100 * s[0] * np.abs(U[:, 0]).max()  # words have the largest entry at 1 % of its unit
     return f"  - seen least: {words}; its standard deviation at {noise} is {size:.3g} times that"
 
 
 def _moves(problem: Problem, point: _Point) -> Array:
     """Moves of x that one standard normal of noise each makes, (p, rank); of 1 % noise where none is stated."""
-    test, formulation, known = problem.measurement, problem.formulation, point.known
-    if formulation.misfit is not None:
+    formulation, known = problem.formulation, point.known
+    if not formulation.fits_records:
         # What stands in the place of the misfit is relative: its norm is 1 where nothing is explained.
-        rows = formulation.misfit.size1_out(0)
+        rows = formulation.terms[0].linearised(point.x, np.nan).residuals.size
         s = known.singular_values[: known.rank]
         return known.unit[:, None] * known.seen / s * (_NOISE / np.sqrt(rows))
     if _all_stated(problem):
         return known.normals
     residuals = [
-        replace(r, measurement=_with_noise(r.measurement)) if isinstance(r, Misfit) else r for r in problem.residuals
+        replace(r, measurement=_with_noise(r.measurement)) if isinstance(r, FurtherTest) else r
+        for r in problem.residuals
     ]
-    noisy = replace(problem, measurement=_with_noise(test), residuals=residuals)
+    noisy = replace(problem, measurement=_with_noise(problem.measurement), residuals=residuals)
     return sensitivity(noisy, point.x, point.slopes, as_stated=True).normals
 
 
 def _all_stated(problem: Problem) -> bool:
     """Whether every record that is fitted states its noise."""
-    tests = [problem.measurement, *(test for test, _ in problem.formulation.others)]
-    return problem.formulation.misfit is None and all(map(_noise_is_stated, tests))
+    formulation = problem.formulation
+    return formulation.fits_records and all(_noise_is_stated(term.test) for term in formulation.tests)
 
 
 def _noise_is_stated(test: Measurement) -> bool:

@@ -69,12 +69,11 @@ class ProportionalDamping:
     beta: tuple[float, float]
 
     def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
-        """The two factors; alpha in 1/s, beta in s."""
+        """The two factors."""
         for name, (low, high) in (("alpha", self.alpha), ("beta", self.beta)):
             if not 0 <= low < high < np.inf:
                 raise InputError(f"ProportionalDamping: {name} needs 0 <= lower < upper, not ({low}, {high})")
-        lower, upper = np.array([self.alpha, self.beta], dtype=float).T
-        return (Unknown("rayleigh_factor", lower, upper, unit="1/s, s"),)
+        return Unknown("rayleigh_alpha", *self.alpha, unit="1/s"), Unknown("rayleigh_beta", *self.beta, unit="s")
 
     def blocks(self, geometry: Geometry, y: ca.SX, mass: MassBlocks, stiffness: StiffnessBlocks) -> ca.SX:
         """C (n, n)."""

@@ -184,7 +184,7 @@ class LumpedMass:
 
     def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """Shares of the masses, scaled afterwards to their direction's total."""
-        share = Unknown("mass_share", np.full(geometry.n, FACTOR_FLOOR), np.ones(geometry.n))
+        share = Unknown("mass_share", np.full(geometry.n, FACTOR_FLOOR), np.ones(geometry.n), relative=True)
         return (*geometry.total_unknowns(self.total_mass), share)
 
     def blocks(self, geometry: Geometry, y: ca.SX) -> MassBlocks:

@@ -40,6 +40,8 @@ class Unknown:
         Its inverse on numbers, shape (size,) to (size,).
     scale : str
         How the swarm spreads its candidates over the bounds, in a word: "linear", "log", "by row".
+    relative : bool
+        Only the ratios of its entries mean something, so that tables of results leave it out.
 
     Attributes
     ----------
@@ -56,6 +58,7 @@ class Unknown:
 
     has_guess = False
     fixed = False
+    relative = False
 
     def __init__(
         self,
@@ -67,8 +70,9 @@ class Unknown:
         sampling: Callable[[ca.SX], ca.SX] | None = None,
         unsampling: Callable[[Array], Array] | None = None,
         scale: str = "linear",
+        relative: bool = False,
     ) -> None:
-        self.name, self.unit, self.scale = name, unit, scale
+        self.name, self.unit, self.scale, self.relative = name, unit, scale, relative
         self.lower, self.upper = (np.atleast_1d(np.asarray(bound, float)) for bound in (lower, upper))
         if self.lower.shape != self.upper.shape or self.lower.ndim != 1:
             raise InputError(f"variable {name}: bounds {self.lower.shape} and {self.upper.shape} disagree")

@@ -1,4 +1,4 @@
-"""Figures, axes and their look: what all pictures share."""
+"""Figures, axes and the style that all pictures share."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def new_figure(width: float, height: float, layout: Literal["constrained"] | Non
 
 
 def new_axes(ax: Axes | None, width: float, height: float) -> tuple[Figure | None, Any]:
-    """Give the figure, where it had to be made, and the axes."""
+    """The figure, where it had to be made, and the axes."""
     if ax is not None:
         return None, ax
     figure = new_figure(width, height)

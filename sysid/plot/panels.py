@@ -53,7 +53,7 @@ def is_unit(test: Measurement) -> bool:
 
 
 def run_names(test: Measurement) -> tuple[str, ...]:
-    """Give what a run is called in a title: "base x" for unit runs, else "run 1"."""
+    """What each run is called in a title: "base x" for unit runs, else "run 1"."""
     if is_unit(test):
         return tuple(f"base {name}" for name in test.base_axes or ())
     return tuple(f"run {r + 1}" for r in range(test.n_runs))
@@ -157,7 +157,7 @@ def panels(channels: Sequence[Channel], *, alone: float = 6.4) -> Figure:
 
 
 def key(magnitude: Axes) -> list[Any]:
-    """Give the entries of a legend in the order in which they are told."""
+    """The entries of a legend, in their order."""
     handles, labels = magnitude.get_legend_handles_labels()
     entries = dict(zip(labels, handles, strict=True))
     told = (style["label"] for style in (MEASURED, IDENTIFIED, _BAND, RESIDUAL))

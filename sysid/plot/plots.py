@@ -158,9 +158,10 @@ def base_forces(
 
 
 def convergence(identification: Identification, ax: Axes | None = None) -> Any:
-    """Residual through the phases that ran: the swarm's best, the refinement, each iterate of the local phase.
+    """Objective through the phases that ran: the swarm's best, the refinement, each iterate of the local phase.
 
-    With a measured force both curves count it too; what is marked after the refinement does not.
+    It is the root of the sum of squares of all that is fitted, so it may differ from the residual, which is of
+    accelerations alone and unweighted.
 
     Parameters
     ----------
@@ -171,29 +172,14 @@ def convergence(identification: Identification, ax: Axes | None = None) -> Any:
     -------
     Figure or Axes
     """
-    from matplotlib.ticker import MaxNLocator
-
     figure, ax = new_axes(ax, 6.0, 3.6)
     history = identification.history
     swarm, local = positive(history.swarm_curve), positive(history.local_curve)
-    end = max(swarm.size - 1, 0)
-    if swarm.size:
-        ax.plot(np.arange(swarm.size), swarm, color=COLOURS[0], linewidth=1.6, label="swarm (best so far)")
-    if local.size:
-        # Without a swarm the iterates are few, and may be a single one.
-        marker = None if swarm.size else "o"
-        iterate = end + np.arange(local.size)
-        ax.plot(iterate, local, color=COLOURS[5], linewidth=1.6, marker=marker, markersize=3.5, label="local phase")
-    if swarm.size and local.size:
-        ax.axvline(end, color=FAINT, linewidth=0.8, linestyle=":")
-    if history.refinement > 0:
-        ax.plot([end], [history.refinement], "D", color=INK, markersize=5, label="after refinement", zorder=4)
-    goal = identification.problem.goal
-    if goal is not None:
-        ax.axhline(goal, color=FAINT, linewidth=0.8, linestyle="--", label=f"goal {goal:.3g}")
-    values = np.concatenate([swarm, local, [history.refinement, goal or np.nan]])
-    if np.any(values > 0):
-        low, high = np.nanmin(values[values > 0]), np.nanmax(values)
+    _draw_curves(ax, swarm, local, history.refinement)
+    values = np.concatenate([swarm, local, [history.refinement]])
+    values = values[values > 0]
+    if values.size:
+        low, high = values.min(), values.max()
         ax.set_yscale("log")
         # A curve that hardly falls is shown as flat as it is.
         ax.set_ylim(min(low / (high / low) ** 0.08, 0.6 * low), max(high * (high / low) ** 0.08, 1.6 * high))
@@ -203,13 +189,30 @@ def convergence(identification: Identification, ax: Axes | None = None) -> Any:
         ax.legend(frameon=False, fontsize="small")
     else:
         ax.text(0.5, 0.5, "no search is recorded", transform=ax.transAxes, ha="center", color=FAINT)
-    both = " (with the force)" if identification.measurement.force is not None else ""
-    if not swarm.size:
+    told = "iteration, swarm then local phase" if swarm.size else "iteration"
+    dress(ax, "Convergence", told, "objective [–]")
+    return ax if figure is None else figure
+
+
+def _draw_curves(ax: Axes, swarm: Array, local: Array, refinement: float) -> None:
+    """Best of the swarm, what the refinement made of it, and after them the iterates of the local phase."""
+    from matplotlib.ticker import MaxNLocator
+
+    end = max(swarm.size - 1, 0)
+    if swarm.size:
+        ax.plot(np.arange(swarm.size), swarm, color=COLOURS[0], linewidth=1.6, label="swarm (best so far)")
+    else:
         ax.set_xlim(-0.5, max(local.size, 2) - 0.5)
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    told = "iteration, swarm then local phase" if swarm.size else "iteration"
-    dress(ax, "Convergence", told, f"relative residual{both} [–]")
-    return ax if figure is None else figure
+    if local.size:
+        # Without a swarm the iterates are few, and may be a single one.
+        marker = None if swarm.size else "o"
+        iterate = end + np.arange(local.size)
+        ax.plot(iterate, local, color=COLOURS[5], linewidth=1.6, marker=marker, markersize=3.5, label="local phase")
+    if swarm.size and local.size:
+        ax.axvline(end, color=FAINT, linewidth=0.8, linestyle=":")
+    if refinement > 0:
+        ax.plot([end], [refinement], "D", color=INK, markersize=5, label="after refinement", zorder=4)
 
 
 def mac(identification: Identification, ax: Axes | None = None) -> Any:
@@ -346,20 +349,25 @@ def mode_shapes(identification: Identification, modes: Sequence[int] | None = No
         ):
             for i, j in sticks:
                 ax.plot(*where[[i, j]].T, **style)
-        for name, middle, size in zip("xyz", centre, box, strict=True):
-            getattr(ax, f"set_{name}lim")(middle - 0.7 * size, middle + 0.7 * size)
-            getattr(ax, f"set_{name}label")(f"{name} [m]", fontsize=7, labelpad=-6, color=INK)
-            axis = getattr(ax, f"{name}axis")
-            axis.set_pane_color((1, 1, 1, 0))
-            axis.set_tick_params(labelsize=6, pad=-3, labelcolor=FAINT)
-            axis.get_major_locator().set_params(nbins=3)
-            if size < 0.5 * box.max():
-                getattr(ax, f"set_{name}ticks")([])  # no room for numbers
-        ax.grid(False)
-        ax.set_box_aspect(box.tolist(), zoom=1.05)  # a list: an array would be scaled in place
-        ax.view_init(elev=20, azim=-50)
+        _set_box(ax, centre, box)
         ax.set_title(f"mode {k}: {structure.natural_frequencies[k - 1]:.4g} Hz", fontsize=9, color=INK)
     return figure
+
+
+def _set_box(ax: Any, centre: Array, box: Array) -> None:
+    """Limits, labels and view of a picture in space, `box` (3,) wide about `centre` (3,), m."""
+    for name, middle, size in zip("xyz", centre, box, strict=True):
+        getattr(ax, f"set_{name}lim")(middle - 0.7 * size, middle + 0.7 * size)
+        getattr(ax, f"set_{name}label")(f"{name} [m]", fontsize=7, labelpad=-6, color=INK)
+        axis = getattr(ax, f"{name}axis")
+        axis.set_pane_color((1, 1, 1, 0))
+        axis.set_tick_params(labelsize=6, pad=-3, labelcolor=FAINT)
+        axis.get_major_locator().set_params(nbins=3)
+        if size < 0.5 * box.max():
+            getattr(ax, f"set_{name}ticks")([])  # no room for numbers
+    ax.grid(False)
+    ax.set_box_aspect(box.tolist(), zoom=1.05)  # a list: an array would be scaled in place
+    ax.view_init(elev=20, azim=-50)
 
 
 def stabilisation(subject: Identification | Measurement, ax: Axes | None = None) -> Any:
@@ -380,7 +388,7 @@ def stabilisation(subject: Identification | Measurement, ax: Axes | None = None)
 
     See Also
     --------
-    sysid.stabilisation.stabilisation : The same as numbers.
+    sysid.modal_analysis.stabilisation.stabilisation : The same as numbers.
     """
     figure, ax = new_axes(ax, 6.4, 4.2)
     draw_stabilisation(ax, subject)
@@ -404,7 +412,7 @@ def cmif(subject: Identification | Measurement, ax: Axes | None = None) -> Any:
 
     See Also
     --------
-    sysid.stabilisation.cmif : The same as numbers.
+    sysid.modal_analysis.stabilisation.cmif : The same as numbers.
     """
     figure, ax = new_axes(ax, 6.4, 3.8)
     draw_cmif(ax, subject)

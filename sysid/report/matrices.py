@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from sysid import plot
-from sysid.models.mass import FullMass
 from sysid.report.html import matrix, number, paragraph, picture
 from sysid.results.identification import Identification
 from sysid.results.summary import half_width
@@ -91,10 +90,10 @@ def half_widths(values: Array, std: Array, stated: Array | None = None) -> Lines
 
 def stated(it: Identification) -> Array:
     """Which entries of the rigid-body mass were stated, (d, d) of bool."""
-    mass, d = it.problem.mass, it.structure.n_base
-    if not isinstance(mass, FullMass) or mass.total_mass is None or mass.healing != "rigid_body":
+    totals, d = it.problem.formulation.mass.totals, it.structure.n_base
+    if totals is None or totals.kind != "rigid_body":
         return np.zeros((d, d), dtype=bool)
-    return np.ones((d, d), dtype=bool) if np.ndim(mass.total_mass) == 2 else np.eye(d, dtype=bool)
+    return np.ones((d, d), dtype=bool) if totals.values.ndim == 2 else np.eye(d, dtype=bool)
 
 
 def _ranges(ends: Array, otherwise: Lines | None) -> Lines:

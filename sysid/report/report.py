@@ -10,16 +10,23 @@ import numpy as np
 from sysid import plot
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
-from sysid.models.damping import DampingModel
-from sysid.models.mass import FullMass, MassModel
-from sysid.models.stiffness import StiffnessModel
 from sysid.plot.panels import is_unit, run_names
+from sysid.problem.formulation import MATRICES
+from sysid.problem.problem import Problem
 from sysid.report.html import Cell, beside, bullets, fold, matrix, number, page, paragraph, picture, table, text
 from sysid.report.matrices import CHOSEN, ONE_OF_MANY, SAME, half_widths, matrices, stated
 from sysid.results.identification import Identification
 from sysid.results.storage import atomically, file_or_folder
-from sysid.results.summary import half_width, is_one_of_many, mass_percent_std, next_steps, verdict
+from sysid.results.summary import (
+    half_width,
+    is_one_of_many,
+    mass_percent_std,
+    next_steps,
+    residual_in_words,
+    verdict,
+)  # fmt: skip
 from sysid.results.unknowns_table import rows_of, stated_values
+from sysid.results.version import __version__
 from sysid.structure.structure import Array, ComplexArray, Structure
 
 FILE_NAME = "report.html"
@@ -119,16 +126,11 @@ def _verdict(it: Identification) -> str:
     )
     word = "Interrupted: the best until then" if it.interrupted else "Success" if it.success else "No success"
     lines = [f"<strong>{word}</strong>", paragraph(it.message)]
-    own = it.problem.is_written and it.problem.formulation.misfit is not None
-    of = (
-        "of the misfit that the problem states"
-        if own
-        else "over the relative accelerations of all runs, sensors and lines"
-    )
-    residual = f"Relative residual {it.residual:.3e}, {of}"
-    if it.problem.goal is not None:
-        residual += f" (goal {it.problem.goal:.3g})"
-    lines.append(paragraph(residual + "."))
+    of = "over the relative accelerations of all runs, sensors and lines, unweighted"
+    if not it.residuals:
+        of = "of the misfit that the problem states"
+    lines.append(paragraph(f"Relative residual {residual_in_words(it)}, {of}."))
+    lines.append(paragraph(f"Objective {it.objective:.3e}: all that is fitted, each record weighted by its noise."))
     if it.force_residual is not None:
         lines.append(paragraph(f"Of the base force: {it.force_residual:.3e}."))
     head += f'<div class="verdict {"good" if it.success else "bad"}">{"".join(lines)}</div>'
@@ -161,7 +163,7 @@ def _unknowns(it: Identification) -> str:
         return ""
     head = ("unknown", "value", "±", "unit", "lower", "upper", "")
     told = bullets(_sentence(s) for s in stated_values(it))
-    return table(head, rows, "The problem's own unknowns; ± is half of the 95 % interval that noise leaves.") + told
+    return table(head, rows, "± is half of the 95 % interval that noise leaves; open: the data do not tell.") + told
 
 
 def _modes(it: Identification) -> str:
@@ -327,10 +329,10 @@ def _convergence(it: Identification) -> str:
         ("refinement", history.refinement, refined),
         ("local phase", history.local, f"{steps} iteration{'' if steps == 1 else 's'}, exact derivatives"),
     ]
-    ran = [[phase, number(residual), words] for phase, residual, words in rows if np.isfinite(residual)]
-    parts = [picture(plot.convergence(it), f"residual through {', '.join(phase for phase, *_ in ran) or 'no search'}")]
+    ran = [[phase, number(objective), words] for phase, objective, words in rows if np.isfinite(objective)]
+    parts = [picture(plot.convergence(it), f"objective through {', '.join(phase for phase, *_ in ran) or 'no search'}")]
     if ran:
-        parts.append(table(["after", "relative residual", ""], ran, words=True))
+        parts.append(table(["after", "objective", ""], ran, words=True))
     if history.states:
         parts.append(table(["state of the swarm", "iterations"], history.states))
     return "".join(parts)
@@ -365,16 +367,12 @@ def _mode_shapes(it: Identification) -> str:
 
 
 def _what_ran(it: Identification) -> str:
-    from sysid import __version__
-
     problem, recipe = it.problem, it.recipe
     facts: list[list[object]] = [
         ["strategy", it.strategy],
         ["seed", "–" if it.seed is None else it.seed],
         ["wall time", f"{it.history.wall_time:.1f} s"],
-        ["mass model", _model(problem.mass)],
-        ["stiffness model", _model(problem.stiffness)],
-        ["damping model", _model(problem.damping)],
+        *_models(problem),
         ["sysid", __version__],
     ]
     if recipe is not None:
@@ -406,11 +404,13 @@ def _sentence(words: str) -> str:
     return words[:1].upper() + words[1:] + ("" if words.endswith((".", "!")) else ".")
 
 
-def _model(model: object) -> str:
-    if not isinstance(model, MassModel | StiffnessModel | DampingModel):
-        return "numbers" if isinstance(model, np.ndarray) else "written in variables"
-    kind = type(model).__name__
-    if not isinstance(model, FullMass):
-        return kind
-    known = "" if model.known is None else ", known entries"
-    return f"{kind} ({model.healing} healing{known})"
+def _models(problem: Problem) -> list[list[object]]:
+    """A row a matrix: its model, and what that states; or that it is written in variables or numbers."""
+    formulation, counts = problem.formulation, dict(problem.unknowns)
+    stated = (formulation.mass, formulation.stiffness, formulation.damping)
+    rows: list[list[object]] = []
+    for name, model, group, known in zip(MATRICES, problem.models, formulation.of_models, stated, strict=True):
+        kind = type(model).__name__ if group else "written in variables" if counts[name] else "numbers"
+        total = "" if known.totals is None else f"{known.totals.kind.replace('_', '-')} total"
+        rows.append([f"{name} model", "; ".join(filter(None, (kind, total, known.sentence)))])
+    return rows

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from sysid.results.identification import Identification
+from sysid.results.answer import Answer
 from sysid.results.unknowns_table import MANY, rows_of, stated_values
 from sysid.structure.structure import Array
 
@@ -16,39 +16,47 @@ _ROUND_OFF = 1e-10  # of a value: what is no noise of an instrument
 _WIDTH = 120
 
 
-def summary(it: Identification) -> str:
+def summary(it: Answer) -> str:
     """Table of the result, at most 120 columns wide."""
     s, axes, problem = it.structure, it.measurement.base_axes or (), it.problem
-    goal = "" if problem.goal is None else f" (goal {problem.goal:.3g})"
-    which = " of the first test" if it.further_tests else ""
     force = "" if it.force_residual is None else f", of the base force {it.force_residual:.3e}"
     lines = [
         *_mode_table(it),
         "",
         *_unknowns(it),
         f"{'success' if it.success else 'no success'}: {it.message}",
-        f"relative residual{which} {it.residual:.3e}{goal}{force}; seed {it.seed}, {it.history.wall_time:.1f} s",
+        f"relative residual {residual_in_words(it)}{force}; seed {it.seed}, {it.history.wall_time:.1f} s",
         *it.remarks,
         "rigid-body mass " + ", ".join(_rigid_masses(it, axes)),
     ]
     lines += stated_values(it)
-    for i, (test, structure) in enumerate(it.further_tests, start=1):
+    further = it.further_tests
+    for i, (test, structure) in enumerate(further, start=1):
         frequencies = ", ".join(f"{f:.5g}" for f in structure.natural_frequencies[:8])
         lines.append(
-            f"further test {i} of {len(it.further_tests)}: relative residual {test.residual(structure):.3e}, natural "
+            f"further test {i} of {len(further)}: relative residual {test.residual(structure):.3e}, natural "
             f"frequencies {frequencies} Hz"
         )
     for i, test in enumerate(problem.validation, start=1):
         lines.append(f"test {i} of {len(problem.validation)} never fitted: relative residual {test.residual(s):.3e}")
     lines.append(f"{verdict(it)}.")
     lines += [f"  - {sentence}" for sentence in it.closed_by + it.undetermined]
-    if not it.determined and not it.problem.is_written:
+    if not it.determined and it.open_masses:
         lines += _ranges(it)
     lines += [f"  > {sentence}" for sentence in next_steps(it)]
     return "\n".join(_folded(line) for line in lines)
 
 
-def verdict(it: Identification) -> str:
+def residual_in_words(it: Answer) -> str:
+    """The residual of all that is fitted, the goal beside it, and each test's own where there are more."""
+    goal = "" if it.problem.goal is None else f" (goal {it.problem.goal:.3g})"
+    if len(it.residuals) < 2:
+        return f"{it.residual:.3e}{goal}"
+    own = ", ".join(f"{value:.3e}" for value in it.residuals)
+    return f"{it.residual:.3e}{goal} over {len(it.residuals)} tests (one by one {own})"
+
+
+def verdict(it: Answer) -> str:
     """What the matrices are worth, in one sentence."""
     if it.determined:
         return "Determined: data and stated model leave one mass and one stiffness matrix"
@@ -57,11 +65,11 @@ def verdict(it: Identification) -> str:
     return "Not determined: something speaks against this model, or is not known well enough"
 
 
-def next_steps(it: Identification) -> list[str]:
-    """What would close open modal masses, in sentences."""
+def next_steps(it: Answer) -> list[str]:
+    """What would close what is open, in sentences."""
     if it.determined or not it.is_one_of_many:
         return []
-    if it.problem.is_written:
+    if not it.open_masses:
         return [
             "to close it: state one of these unknowns (fixed=True with its value), a relation between them as a "
             "constraint, or fit another record that sees them: a base force, a sensor, a test with a known mass added"
@@ -81,7 +89,7 @@ def half_width(std: float, value: float) -> str:
     return f"{DEVIATES * std:.2g}" if std > _ROUND_OFF * abs(value) else "0"
 
 
-def mass_percent_std(it: Identification) -> Array:
+def mass_percent_std(it: Answer) -> Array:
     """Standard deviations of `Structure.effective_mass_percent`, (n, d); NaN where open or not computed."""
     u, rigid = it.quick_uncertainty, np.diag(it.structure.rigid_body_mass)
     if u is None:
@@ -89,14 +97,14 @@ def mass_percent_std(it: Identification) -> Array:
     return 100 * np.einsum("kii->ki", u.effective_masses) / np.where(rigid > 0, rigid, np.inf)
 
 
-def is_one_of_many(it: Identification) -> Array:
+def is_one_of_many(it: Answer) -> Array:
     """Which effective masses are one choice among many, (n, d) of bool."""
     if it.determined:
         return np.zeros((it.structure.n, it.structure.n_base), dtype=bool)
     return np.isnan(mass_percent_std(it))
 
 
-def _mode_table(it: Identification) -> list[str]:
+def _mode_table(it: Answer) -> list[str]:
     """Frequencies, damping and effective masses, with half-widths where they are known and there is room."""
     s, u, axes = it.structure, it.quick_uncertainty, it.measurement.base_axes or ()
     std, many = mass_percent_std(it), is_one_of_many(it)
@@ -124,8 +132,8 @@ def _mode_table(it: Identification) -> list[str]:
     return [*lines, "; ".join(notes)]
 
 
-def _unknowns(it: Identification) -> list[str]:
-    """Table of the problem's own unknowns, where there are some and not too many for a terminal."""
+def _unknowns(it: Answer) -> list[str]:
+    """Table of the unknowns that mean something by themselves, where there are some and not too many."""
     rows = rows_of(it)
     if not 0 < len(rows) <= MANY:
         return []
@@ -144,7 +152,7 @@ def _aligned(columns: list[list[str]]) -> list[str]:
     ]
 
 
-def _rigid_masses(it: Identification, axes: Sequence[str]) -> Iterator[str]:
+def _rigid_masses(it: Answer, axes: Sequence[str]) -> Iterator[str]:
     """Rigid-body mass by base direction, with its half-width where noise moves it."""
     u = it.quick_uncertainty
     for i, axis in enumerate(axes):
@@ -154,7 +162,7 @@ def _rigid_masses(it: Identification, axes: Sequence[str]) -> Iterator[str]:
         yield f"{axis} {mass:.6g}{told} {'kg m²' if axis[0] == 'r' else 'kg'}"
 
 
-def _ranges(it: Identification) -> Iterator[str]:
+def _ranges(it: Answer) -> Iterator[str]:
     """How far the diagonals may go, in one line, where that is known quickly and something may move."""
     ends = it.quick_intervals
     if ends is None:

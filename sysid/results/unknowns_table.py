@@ -1,4 +1,4 @@
-"""The unknowns of a problem that has its own, for the faces: value, 95 % interval, search space."""
+"""The unknowns of a problem, for summary and report: value, 95 % interval, search space."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.models.unknowns import split
-from sysid.problem.formulation import labels_of
-from sysid.results.identification import Identification
+from sysid.results.answer import Answer, reported_unknowns
 
 _ON_BOUND = 1e-6  # of the range
 MANY = 60  # rows beyond which a terminal shows none
@@ -31,31 +29,32 @@ class Row(NamedTuple):
         return "lower" if self.value - self.lower < near else "upper" if self.upper - self.value < near else ""
 
 
-def stated_values(it: Identification) -> list[str]:
+def stated_values(it: Answer) -> list[str]:
     """How far each value that was stated as known is missed, in words."""
-    known = it.problem.formulation.known if it.problem.is_written else None
-    if known is None or it.x is None:
+    if it.x is None:
         return []
-    off = np.asarray(known(it.x)).ravel()
     return [
         f"{name} ends {z:+.2g} standard deviations from the value stated as known"
-        for name, z in zip(it.problem.formulation.known_names, off, strict=True)
+        for prior in it.problem.formulation.priors
+        for name, z in zip(prior.labels, prior.numbers(it.x), strict=True)
     ]
 
 
-def rows_of(it: Identification) -> list[Row]:
-    """A row a scalar unknown; none for a problem of models alone."""
-    problem = it.problem
-    if not problem.is_written or it.x is None:
+def rows_of(it: Answer) -> list[Row]:
+    """A row a scalar unknown that was searched and means something by itself: see `reported_unknowns`."""
+    if it.x is None:
         return []
     u = it.quick_uncertainty
+    known = {} if u is None else u.variables
     rows: list[Row] = []
-    for variable, values in zip(problem.variables, split(problem.variables, it.x), strict=True):
-        std = np.full(variable.size, np.nan) if u is None else np.ravel(u.variables[variable.name], order="F")
+    for unknown in reported_unknowns(it.problem):
+        if unknown.fixed:
+            continue
+        values = np.ravel(it.values[unknown.name], order="F")
+        std = np.ravel(known.get(unknown.name, np.full(unknown.shape, np.nan)), order="F")
+        columns = zip(unknown.labels, values, std, unknown.lower, unknown.upper, strict=True)
         rows += [
-            Row(label, float(value), float(s), variable.unit, float(low), float(high))
-            for label, value, s, low, high in zip(
-                labels_of(variable), values, std, variable.lower, variable.upper, strict=True
-            )
+            Row(label, float(value), float(s), unknown.unit, float(low), float(high))
+            for label, value, s, low, high in columns
         ]
     return rows

@@ -1,0 +1,236 @@
+"""Where an identification ended: a structure, and all that follows from it, its problem and its search."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sysid.errors import InputError
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.misfit import weighted_misfit
+from sysid.models.unknowns import Unknown, by_name
+from sysid.problem.problem import Problem
+from sysid.search.strategy import History
+from sysid.structure.structure import Array, ComplexArray, Structure
+
+if TYPE_CHECKING:
+    from sysid.assessment.determination import Intervals
+    from sysid.assessment.uncertainty import Uncertainty
+
+_QUICK_SHAPES = 1000  # entries of the mode shapes up to which uncertainty takes a second or less
+_QUICK_DOFS = 20  # degrees of freedom up to which intervals take a few seconds or less
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Answer:
+    """A structure identified from a base-shake test, and how far it can be trusted.
+
+    Attributes
+    ----------
+    structure : Structure
+    problem : Problem
+    x : (n_variables,) or None
+        The problem's unknowns that stand for the structure; None where the modal strategy chose other degrees of
+        freedom than the sensors.
+    strategy : str
+    seed : int or None
+    success : bool
+        The last solver's status is good, and the residual meets the goal; where none is given it must
+        at least be below one half.
+    message : str
+    history : History
+    determined : bool
+        Every entry of M_SS, K_SS and C is fixed by the data and the stated model, nothing speaks against the fit, and
+        noise leaves each entry known to a tenth of the root of its two diagonal entries (standard deviation).
+    closed_by, undetermined : tuple of str
+        What fixes it, empty where anything is open; and what is open, in sentences.
+    remarks : tuple of str
+        How it was done, and why so, in sentences.
+    interrupted : bool
+        The search was stopped by Ctrl-C, and this is the best until then.
+    """
+
+    structure: Structure
+    problem: Problem
+    x: Array | None
+    strategy: str
+    seed: int | None
+    success: bool
+    message: str
+    history: History
+    determined: bool
+    closed_by: tuple[str, ...]
+    undetermined: tuple[str, ...]
+    remarks: tuple[str, ...] = ()
+    interrupted: bool = False
+
+    @property
+    def measurement(self) -> Measurement:
+        """The test that was fitted."""
+        return self.problem.measurement
+
+    @property
+    def _in_modes(self) -> bool:
+        """Whether the records are all that is fitted and the structure tells all of it: no expression is asked for.
+
+        With free modes a graph of the matrices has some n³ operations, which a hundred sensors cannot wait for.
+        """
+        return self.x is None or (self.problem.free_modes and not self.problem.formulation.sources)
+
+    @cached_property
+    def residual(self) -> float:
+        """``‖predicted - measured‖ / ‖measured‖`` over all tests that are fitted, unweighted.
+
+        Of the accelerations relative to the base, over all runs, sensors and lines. Where the problem states a misfit
+        of its own and no test is fitted beside it, the norm of that misfit.
+        """
+        return self.measurement.residual(self.structure) if self._in_modes else self.problem.residual(self._unknowns)
+
+    @cached_property
+    def residuals(self) -> tuple[float, ...]:
+        """`residual` of each test that is fitted: the problem's own first, then further ones."""
+        if self._in_modes:
+            return (self.residual,)
+        return self.problem.formulation.residuals(self._unknowns)
+
+    @cached_property
+    def objective(self) -> float:
+        """What was minimised, at the answer: the root of the sum of squares of all that is fitted.
+
+        Accelerations and force, each relative to its size and weighted by its stated noise, further tests and whatever
+        else the problem states among its residuals.
+        """
+        if self._in_modes:
+            return weighted_misfit(self.measurement, self.structure)
+        return self.problem.objective(self._unknowns)
+
+    @cached_property
+    def values(self) -> dict[str, Array]:
+        """The problem's unknowns at the answer, by name and in their shapes, fixed ones too; empty where x is None."""
+        if self.x is None:
+            return {}
+        fixed = {v.name: v.shaped(v.guess) for v in self.problem.formulation.fixed}
+        return by_name(self.problem.variables, self.x) | fixed
+
+    @property
+    def _unknowns(self) -> Array:
+        assert self.x is not None
+        return self.x
+
+    @property
+    def further_tests(self) -> tuple[tuple[Measurement, Structure], ...]:
+        """Tests that were fitted beside the problem's own (`sysid.FurtherTest`), each with the structure as it was."""
+        if self._in_modes:
+            return ()
+        terms = self.problem.formulation.further_tests
+        return tuple((term.test, term.matrices.structure(self._unknowns, term.test)) for term in terms)
+
+    @property
+    def force_residual(self) -> float | None:
+        """``‖predicted - measured‖ / ‖measured‖`` over the base force; None where none was measured."""
+        return self.measurement.force_residual(self.structure)
+
+    def predict(self, measurement: Measurement) -> ComplexArray:
+        """Relative accelerations under another test's base motion, (runs, n_sensors, n_freq)."""
+        return measurement.predict(self.structure)
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty:
+        """Standard deviations and intervals that the measured noise makes; computed when first asked for.
+
+        They hold where the fit is one: for the members that the data leave open see `mass_interval`.
+        """
+        from sysid.assessment.uncertainty import uncertainty
+
+        return uncertainty(self.problem, self.structure, self.x)
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of ``uncertainty.parameters``, (p, p)."""
+        return self.uncertainty.covariance
+
+    @property
+    def mass_interval(self) -> Array:
+        """Least and largest M_SS, entry by entry, over all models that explain the data and keep to what was stated.
+
+        (2, n, n), kg; infinite where unbounded, equal where determined. Noise is not in it: see `uncertainty`.
+        """
+        return self._intervals.mass
+
+    @property
+    def stiffness_interval(self) -> Array:
+        """The same of K_SS, (2, n, n), N/m."""
+        return self._intervals.stiffness
+
+    @cached_property
+    def open_masses(self) -> tuple[int, ...]:
+        """Modes, counted from 0, whose modal mass neither the records nor the stated models fix.
+
+        None of a problem that is written in unknowns of its own: what is open there are directions of these.
+        """
+        from sysid.assessment.determination import open_masses
+
+        return tuple(open_masses(self.problem, self.structure))
+
+    @property
+    def is_one_of_many(self) -> bool:
+        """Whether other matrices explain the same data within what was stated."""
+        if self.open_masses:
+            return True
+        ends = self._intervals
+        return not (np.all(np.isfinite(ends.mass)) and np.all(np.isfinite(ends.stiffness)))
+
+    @cached_property
+    def _intervals(self) -> Intervals:
+        from sysid.assessment.determination import intervals
+
+        return intervals(self.problem, self.structure, self.x)
+
+    @property
+    def mac(self) -> Array:
+        """Modal assurance criterion against the reference where one is known, else against itself."""
+        other = self.problem.reference or self.structure
+        return modal_assurance(self.structure.mode_shapes, other.mode_shapes)
+
+    @property
+    def degrees_of_freedom(self) -> tuple[str, ...]:
+        """What the rows of M_SS, K_SS and C stand for: a sensor's name, or "coordinate of mode 7"."""
+        names, structure = self.measurement.sensor_names, self.structure
+        return tuple(
+            names[sensor] if sensor >= 0 else f"coordinate of mode {mode + 1}" if mode >= 0 else f"coordinate {j + 1}"
+            for j, (sensor, mode) in enumerate(zip(structure.dof_sensors, structure.dof_modes, strict=True))
+        )
+
+    @property
+    def quick_uncertainty(self) -> Uncertainty | None:
+        """`uncertainty` where it is known already or takes no longer than about a second; else None."""
+        known = "uncertainty" in self.__dict__
+        return self.uncertainty if known or self.structure.mode_shapes.size <= _QUICK_SHAPES else None
+
+    @property
+    def quick_intervals(self) -> Intervals | None:
+        """Both intervals where they are known already or take no longer than a few seconds; else None."""
+        known = "_intervals" in self.__dict__
+        return self._intervals if known or self.structure.n <= _QUICK_DOFS else None
+
+
+def modal_assurance(phi: Array, other: Array) -> Array:
+    """``|phi_i' phi_j|² / (phi_i' phi_i · phi_j' phi_j)``, (modes, other modes)."""
+    if phi.shape[0] != other.shape[0]:
+        raise InputError(f"mode shapes at {phi.shape[0]} and {other.shape[0]} sensors cannot be compared")
+    return (phi.T @ other) ** 2 / np.outer(np.sum(phi**2, axis=0), np.sum(other**2, axis=0))
+
+
+def reported_unknowns(problem: Problem, *, damping_ratios: bool = False) -> tuple[Unknown, ...]:
+    """Unknowns that mean something by themselves: those of models with a form of their own, and variables, fixed too.
+
+    The entries of a free matrix's factor are none, nor are shares of which only the ratios count. Free damping ratios
+    stand in the table of modes, and are among them only where asked for.
+    """
+    formulation = problem.formulation
+    stated = (formulation.mass.free, formulation.stiffness.free, formulation.damping.free and not damping_ratios)
+    of_models = (v for group, free in zip(formulation.of_models, stated, strict=True) for v in group if not free)
+    return (*(v for v in of_models if not v.relative), *formulation.variables)
