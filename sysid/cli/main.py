@@ -249,7 +249,7 @@ def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
     )
     run.add_argument(
         "--strategy",
-        choices=STRATEGIES,
+        choices=("auto", *(kind.name for kind in STRATEGIES)),
         default="auto",
         metavar="S",
         help="modal: modes from the data, without a search; continuation: gradients through widened peaks, for "

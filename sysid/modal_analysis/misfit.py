@@ -10,7 +10,7 @@ import numpy as np
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.noise import separable
 from sysid.modal_analysis.residues import line_correlation
-from sysid.modal_analysis.response import columns, weights_of_test
+from sysid.modal_analysis.response import columns
 from sysid.structure.structure import Array, ComplexArray, Structure
 
 _DEVIATIONS = 4.0  # ... nor chance, in standard deviations of the chi-squared law
@@ -40,21 +40,6 @@ class Record:
     def sandwich_grams(self, spectra: ComplexArray) -> Iterator[Array]:
         """``Re V' W S W V`` of each channel, S the variances of the noise."""
         return (_gram(spectra * row) for row in (self.by_channel[:, None] * self.by_line) ** 2 * self.std)
-
-
-def weighted_misfit(test: Measurement, structure: Structure) -> float:
-    """Norm of the relative residuals of accelerations and, where it was measured, force; stated noise weighs them.
-
-    Their sum of squares is what a fit of the test minimises: `sysid.modal_analysis.response.residual` with numbers.
-    """
-    left = [test.predict(structure) - test.relative]
-    left += [] if test.force is None else [test.predict_force(structure) - test.force]
-    weights = weights_of_test(test, weighted=True)
-    sizes = [
-        np.linalg.norm(np.asarray(weight) * columns(part)) / size
-        for part, (weight, size) in zip(left, weights, strict=True)
-    ]
-    return float(np.linalg.norm(sizes))
 
 
 def records_of(test: Measurement, structure: Structure, unknowns: int) -> list[Record]:

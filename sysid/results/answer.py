@@ -10,7 +10,7 @@ import numpy as np
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.misfit import weighted_misfit
+from sysid.modal_analysis.response import weighted_error
 from sysid.models.unknowns import Unknown, by_name
 from sysid.problem.problem import Problem
 from sysid.search.strategy import History
@@ -104,7 +104,7 @@ class Answer:
         else the problem states among its residuals.
         """
         if self._in_modes:
-            return weighted_misfit(self.measurement, self.structure)
+            return weighted_error(self.measurement, self.structure)
         return self.problem.objective(self._unknowns)
 
     @cached_property
@@ -169,7 +169,7 @@ class Answer:
     def open_masses(self) -> tuple[int, ...]:
         """Modes, counted from 0, whose modal mass neither the records nor the stated models fix.
 
-        None of a problem that is written in unknowns of its own: what is open there are directions of these.
+        None of a problem in unknowns of its own: what is open there are directions of these.
         """
         from sysid.assessment.determination import open_masses
 
@@ -178,8 +178,10 @@ class Answer:
     @property
     def is_one_of_many(self) -> bool:
         """Whether other matrices explain the same data within what was stated."""
-        if self.open_masses:
-            return True
+        from sysid.assessment.modal_mass_cone import speaks
+
+        if speaks(self.problem.formulation):
+            return bool(self.open_masses)
         ends = self._intervals
         return not (np.all(np.isfinite(ends.mass)) and np.all(np.isfinite(ends.stiffness)))
 
