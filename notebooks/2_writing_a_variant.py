@@ -123,11 +123,11 @@ print(f"largest error: {worst:.1f} standard deviations")
 assert worst < 4
 
 # %% [markdown]
-# A weighing has an accuracy. `Known` states a value with its standard deviation, and counts as one more measurement:
+# A weighing has an accuracy. `Prior` states a value with its standard deviation, and counts as one more measurement:
 # here the tank alone, 12.2 kg give or take 0.2 kg. All masses then are as uncertain as that weighing.
 
 # %%
-tank = sysid.Known(m[3], 12.2, std=0.2)
+tank = sysid.Prior(m[3], 12.2, std=0.2)
 result = sysid.identify(sysid.Problem(test, mass=M, stiffness=K, damping=C, residuals=[tank]), rng=0)
 mass, std = result.values["mass"], result.uncertainty.variables["mass"]
 print("masses, kg:", *(f"{value:.1f} ± {1.96 * s:.1f}" for value, s in zip(mass, std, strict=True)))
@@ -136,7 +136,7 @@ print(*result.closed_by)
 # %% [markdown]
 # ## Closing it with a second test
 #
-# Nothing was weighed, but you can bolt 20 kg to the top floor and shake once more. A `Misfit` is a further test of the
+# Nothing was weighed, but you can bolt 20 kg to the top floor and shake once more. A `FurtherTest` is a test of the
 # structure *as it was then*: the same variables, and the known mass added. Both tests are fitted together.
 
 # %%
@@ -144,7 +144,7 @@ added = np.diag([0.0, 0.0, 20.0, 0.0, 0.0])  # kg
 heavier = structure(true["mass"] + np.diag(added)[:4], true["spring"], true["damper"])
 second = sysid.simulate(heavier, freq, noise=0.01, rng=2)
 both = sysid.Problem(
-    test, mass=M, stiffness=K, damping=C, residuals=[sysid.Misfit(second, mass=M + added, stiffness=K, damping=C)]
+    test, mass=M, stiffness=K, damping=C, residuals=[sysid.FurtherTest(second, mass=M + added, stiffness=K, damping=C)]
 )
 result = sysid.identify(both, rng=0)
 print(result.summary())
@@ -177,12 +177,13 @@ sysid.plot.transmissibility(result, band=result.uncertainty.transmissibility(fre
 # |---|---|
 # | some quantity is known | a number in its place, or `fixed=True` with `guess=` |
 # | damping ratios, mode by mode | `damping=sysid.ModalDamping()`, or `(n,)` ratios of your own variables |
-# | sensors on some floors only | `recovery=np.eye(4)[[0, 3]]`, in `Problem`, `Misfit` and `Structure` alike |
+# | sensors on some floors only | `recovery=np.eye(4)[[0, 3]]`, in `Problem`, `FurtherTest` and `Structure` alike |
 # | the force at the base | `force=` of the measurement: it weighs the structure |
 # | magnitudes without phase | `misfit=`: any column of residuals in the place of the usual one |
-# | something known to some accuracy | `residuals=[sysid.Known(m[3], 12.0, std=0.2)]` |
+# | something known to some accuracy | `residuals=[sysid.Prior(m[3], 12.0, std=0.2)]` |
 # | an order, a limit, a total | `constraints=[k[0] >= k[1], ca.sum1(m) <= 340]` |
 # | a finite-element frame | `sysid.frame`, its sections' properties as variables |
+# | a form that you need again | a class with four methods: "A matrix model of your own" in the README |
 #
 # ## Where a search fails
 #

@@ -41,7 +41,7 @@ def problem(*, data=None, rng=0, noise=0.0, added=8.0):
         mass=M,
         stiffness=K,
         damping=C,
-        residuals=[sysid.Misfit(loaded, mass=M + added * ROOF, stiffness=K, damping=C)],
+        residuals=[sysid.FurtherTest(loaded, mass=M + added * ROOF, stiffness=K, damping=C)],
         reference=truth,
         goal=1e-6 if noise == 0 else 1.05 * bare.residual(truth),  # or 5 % above the noise floor
     )

@@ -37,7 +37,7 @@ def problem(*, data=None, rng=0, noise=0.0):
     c = sysid.Variable("damper", 3, lower=100.0, upper=20000.0, log=True, unit="N s/m")
     M = ca.diag(ca.vertcat(*FLOORS, roof, 0.0))
     K, C = STRETCH.T @ ca.diag(k) @ STRETCH, STRETCH.T @ ca.diag(c) @ STRETCH
-    a = sysid.Misfit(test, mass=M, stiffness=K, damping=C).response
+    a = sysid.FurtherTest(test, mass=M, stiffness=K, damping=C).response
     magnitude, floor = np.sqrt(a.real**2 + a.imag**2), np.abs(truth.transmissibility(test.freq)[:, 0]) - measured
     return sysid.Problem(
         replace(test, response=measured[None], response_std=None),  # no phase is left in it

@@ -61,6 +61,6 @@ def problem(*, data=None, rng=0):
         damping=alpha[0] * MASS + beta[0] * K1,
         recovery=RECOVERY,
         residuals=[
-            sysid.Misfit(after, mass=MASS, stiffness=K2, damping=alpha[1] * MASS + beta[1] * K2, recovery=RECOVERY)
+            sysid.FurtherTest(after, mass=MASS, stiffness=K2, damping=alpha[1] * MASS + beta[1] * K2, recovery=RECOVERY)
         ],
     )

@@ -65,5 +65,5 @@ def problem(*, data=None, rng=0):
     return sysid.Problem(
         test, mass=M, stiffness=K, damping=C, recovery=RECOVERY, reference=truth,
         constraints=[k[i] >= k[i + 1] for i in range(3)],
-        residuals=[sysid.Known(m[i], weighed[i], std=0.02 * weighed[i]) for i in range(4)],
+        residuals=[sysid.Prior(m[i], weighed[i], std=0.02 * weighed[i]) for i in range(4)],
     )  # fmt: skip

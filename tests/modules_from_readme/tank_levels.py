@@ -65,7 +65,7 @@ def problem(*, data=None, rng=0):
     )
     (M, K, C), *filled = (matrices(*unknowns, level * WATER) for level in LEVELS)
     residuals = [
-        sysid.Misfit(test, mass=m, stiffness=k, damping=c, recovery=recovery)
+        sysid.FurtherTest(test, mass=m, stiffness=k, damping=c, recovery=recovery)
         for test, recovery, (m, k, c) in zip(tests[1:], recoveries[1:], filled, strict=True)
     ]
     return sysid.Problem(
