@@ -11,7 +11,9 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.residues import Records, ResidueFit, beyond_chance, force_residual_left
 from sysid.modal_analysis.response import weighed_mass
-from sysid.models.mass import FullMass, KnownMass, LumpedMass
+from sysid.models.mass import total_of
+from sysid.models.model import Stated
+from sysid.problem.formulation import Formulation
 from sysid.problem.problem import Problem
 from sysid.structure.structure import Array, Structure
 
@@ -19,76 +21,95 @@ _ROUND_OFF = 1e-8  # of the records: what counts as noise where there is none
 _SAME_POLE = 1e-6  # relative distance of poles that count as one
 _ALIKE = 3.0  # misfits by which two records must differ to be of two sensors
 _MISFIT = 1.5  # times what free residues leave, beyond which a record is not what the modes make of it
+_LINES = 2  # times the free residues: fewer numbers than these tell nothing beside noise
 _MIMICKED = 1e-2  # of a constant; less of it is left where a mode far below the lines answers like one
 _CHANCE = 1e-4  # that errors as stated are so large together
-_FAR = 4.0  # standard deviations from a stated value, beyond which something is wrong
+_FAR = 4.0  # standard deviations from a stated value, beyond which it is told by itself
 _GAIN = 0.03  # of the base's motion; smaller errors of a sensor's gain are usual
 
 
-def doubts(problem: Problem, structure: Structure) -> tuple[str, ...]:
-    """What speaks against the identified structure, in sentences; nothing counts as determined beside one."""
-    test = problem.measurement
-    records, poles = Records(test), _poles(structure)
-    free = records.fit(*poles)
-    model = "the structure" if isinstance(problem.mass, FullMass) else "the stated mass model"
-    no_fit, rigid = tuple(_no_fit(test, structure, records, free, model)), tuple(_rigid(test, records, free))
-    return (
-        *_stated_mass(problem, structure),
-        *_known_entries(problem, structure),
-        *_lumped_total(problem, structure),
-        *no_fit,
-        *_force(test, structure, isinstance(problem.mass, LumpedMass)),
-        *rigid,
-        # Beside what those say, quadrature and likeness mean nothing.
-        *(() if rigid else _damping(records, poles, free)),
-        *(() if rigid or no_fit else _twins(test, structure)),
-    )
+def doubts(problem: Problem, structure: Structure, x: Array | None) -> tuple[str, ...]:
+    """What speaks against an answer, in sentences; nothing counts as determined beside one.
 
+    Parameters
+    ----------
+    problem : Problem
+    structure : Structure
+        The answer, with the sensors of the problem's own test.
+    x : (n_variables,) or None
+        The unknowns that stand for it; None where it has other degrees of freedom than the sensors.
 
-def written_doubts(problem: Problem, x: Array) -> tuple[str, ...]:
-    """The same for a problem in its own unknowns, as far as they apply to any model."""
-    if problem.formulation.misfit is not None:
-        return ()
-    found = list(_stated_values(problem, x))
-    models = [(problem.measurement, problem.formulation.matrices), *problem.formulation.others]
-    for i, (test, matrices) in enumerate(models, start=1):
-        structure = matrices.structure(x, test)
-        records, poles = Records(test), _poles(structure)
-        velocity = not structure.modal_damping
-        if records.data.shape[0] <= 4 * poles[0].size * records.n_base:
-            continue
-        free = records.fit(*poles, velocity=velocity)
-        misses = tuple(_no_fit(test, structure, records, free, "the written model"))
-        misses = misses or tuple(_other_poles(test, structure, records))
-        rigid = tuple(_rigid(test, records, free))
-        told = (*misses, *_force(test, structure, False), *rigid, *(() if rigid or misses else _twins(test, structure)))
-        found += [told_one if len(models) == 1 else f"test {i}: {told_one}" for told_one in told]
+    Returns
+    -------
+    tuple of str
+    """
+    formulation = problem.formulation
+    found = [] if x is None else [*_priors(formulation, x), *(d for term in formulation.beside for d in term.doubts(x))]
+    tests = [(problem.measurement, structure)] if formulation.fits_records else []
+    if formulation.fits_records:
+        found += [*_stated_mass(problem, structure), *_known_entries(problem, structure)]
+        found += _lumped_total(problem, structure)
+    if x is not None:
+        tests += [(term.test, term.matrices.structure(x, term.test)) for term in formulation.further_tests]
+    for i, (test, its) in enumerate(tests, start=1):
+        told = _of_records(formulation, test, its)
+        found += told if len(tests) == 1 else [f"test {i}: {sentence}" for sentence in told]
     return tuple(found)
 
 
-def _stated_values(problem: Problem, x: Array) -> Iterator[str]:
-    """What was stated as known, where the fit is far from it."""
-    formulation = problem.formulation
-    if formulation.known is None:
+def _of_records(formulation: Formulation, test: Measurement, structure: Structure) -> list[str]:
+    """What the records of one test say against a structure."""
+    records, poles = Records(test), _poles(structure)
+    velocity = not structure.modal_damping
+    if records.data.shape[0] <= _LINES * poles[0].size * records.n_base * (2 if velocity else 1):
+        return []
+    free = records.fit(*poles, velocity=velocity)
+    model = _called(formulation.mass)
+    misses = list(_no_fit(test, structure, records, free, model))
+    if not (misses or formulation.free_modes):
+        misses += _other_poles(test, structure, records, model)
+    rigid = list(_rigid(test, records, free))
+    found = [*misses, *_force(test, structure, _is_lumped(formulation)), *rigid]
+    # Beside what those say, quadrature and likeness mean nothing.
+    if structure.modal_damping and not rigid:
+        found += _damping(records, poles, free)
+    if not (misses or rigid):
+        found += _twins(test, structure)
+    return found
+
+
+def _called(mass: Stated) -> str:
+    """What sentences call the model."""
+    if mass.free:
+        return "the structure"
+    return "the written model" if mass.entries is None else "the stated mass model"
+
+
+def _is_lumped(formulation: Formulation) -> bool:
+    """Whether masses are open, and none of them is below the sensors."""
+    mass, n = formulation.mass, formulation.geometry.n
+    if mass.free or mass.entries is None:
+        return False
+    return bool(np.any(np.isnan(mass.entries)) and np.all(mass.entries[:, n:] == 0))
+
+
+def _priors(formulation: Formulation, x: Array) -> Iterator[str]:
+    """Values that are stated as known, where errors as stated do not miss them all so far."""
+    names = [name for term in formulation.priors for name in term.labels]
+    if not names:
         return
     from scipy.stats import chi2
 
-    off = np.asarray(formulation.known(x)).ravel()
+    off = np.concatenate([term.numbers(x) for term in formulation.priors])
     if np.sum(off**2) > chi2.isf(_CHANCE, off.size) and np.all(np.abs(off) <= _FAR):
-        told = ", ".join(f"{name} by {z:+.2g}" for name, z in zip(formulation.known_names, off, strict=True))
+        told = ", ".join(f"{name} by {z:+.2g}" for name, z in zip(names, off, strict=True))
         yield (
             f"the values that are stated as known are missed together, in standard deviations: {told}; they, another "
             "number, or the model is wrong"
         )
-    for name, deviations in zip(formulation.known_names, off, strict=True):
-        if abs(deviations) > _FAR:
-            yield (
-                f"{name} ends {abs(deviations):.3g} of the stated standard deviations from the value that is stated as "
-                "known: that value, its deviation, or the model is wrong"
-            )
 
 
-def _other_poles(test: Measurement, structure: Structure, records: Records) -> Iterator[str]:
+def _other_poles(test: Measurement, structure: Structure, records: Records, model: str) -> Iterator[str]:
     """Whether poles of the data's own leave clearly less than the structure does."""
     poles = PolesAndResidues.of(test)
     if poles is None:
@@ -98,7 +119,7 @@ def _other_poles(test: Measurement, structure: Structure, records: Records) -> I
     possible = max(poles.of_accelerations, _ROUND_OFF)
     if misfit > _MISFIT * possible:
         yield (
-            f"the written model misses {100 * misfit:.3g} % of the accelerations, the poles of the data with free "
+            f"{model} misses {100 * misfit:.3g} % of the accelerations, the poles of the data with free "
             f"residues {100 * possible:.3g} %: the form of its mass, stiffness or damping, recovery, or a bound is not "
             "the structure's"
         )
@@ -126,14 +147,15 @@ def _poles(structure: Structure) -> tuple[Array, Array]:
 
 def _stated_mass(problem: Problem, structure: Structure) -> Iterator[str]:
     """What the base force weighs, where a stated mass says otherwise."""
-    test = problem.measurement
-    if test.force is None or (not isinstance(problem.mass, KnownMass) and problem.mass.total_mass is None):
+    test, stated = problem.measurement, problem.formulation.mass
+    whole = stated.totals is not None or np.all(np.isfinite(problem.known_mass))
+    if test.force is None or not whole or not structure.modal_damping:
         return
     poles = _poles(structure)
-    weighed, stated = np.diag(weighed_mass(test, *poles)), np.diag(structure.rigid_body_mass)
-    off = np.abs(weighed / stated - 1)
+    weighed, own = np.diag(weighed_mass(test, *poles)), np.diag(structure.rigid_body_mass)
+    off = np.abs(weighed / own - 1)
     if np.any(off >= max(0.01, 3 * force_residual_left(test, *poles) / np.sqrt(test.freq.size))):
-        given, told = (", ".join(f"{m:.4g}" for m in masses) for masses in (stated, weighed))
+        given, told = (", ".join(f"{m:.4g}" for m in masses) for masses in (own, weighed))
         yield (
             f"the stated mass makes {given} kg in the base directions, but the base force weighs {told} kg: one of "
             "them, or the unit of the force, is wrong"
@@ -142,11 +164,10 @@ def _stated_mass(problem: Problem, structure: Structure) -> Iterator[str]:
 
 def _known_entries(problem: Problem, structure: Structure) -> Iterator[str]:
     """Whether the identified mass has the entries that were stated, and leaves the base what is left of the total."""
-    n, known, mass = problem.layout.n, problem.known_mass, problem.mass
-    stated = np.isfinite(known)
-    if not np.any(stated):
+    geometry, mass = problem.geometry, problem.formulation.mass
+    if not mass.free or mass.entries is None:
         return
-    assert isinstance(mass, FullMass)
+    n, known, stated = geometry.n, mass.entries, np.isfinite(mass.entries)
     if not structure.at_sensors:
         yield "the known entries of the mass are not used: the degrees of freedom are not the sensors alone"
         return
@@ -160,8 +181,8 @@ def _known_entries(problem: Problem, structure: Structure) -> Iterator[str]:
             f"the known entries of the mass cannot all be met: row {name}, column {j + 1} is "
             f"{structure.mass[i, j]:.4g} in place of {known[i, j]:.4g}"
         )
-    if mass.total_mass is not None:
-        makes = mass.total(problem.layout, structure.mass)
+    if mass.totals is not None:
+        makes = total_of(geometry, structure.mass, mass.totals.kind)
         if np.any(makes > problem.totals * (1 + 1e-6)):
             given, told = (", ".join(f"{m:.4g}" for m in masses) for masses in (problem.totals, makes))
             yield f"the known entries of the mass make {told} kg or more, and {given} kg are stated in all"
@@ -169,15 +190,15 @@ def _known_entries(problem: Problem, structure: Structure) -> Iterator[str]:
 
 def _lumped_total(problem: Problem, structure: Structure) -> Iterator[str]:
     """Whether the total of a lumped mass, a sum over the sensors of a direction, is what moves in that direction."""
-    mass, layout = problem.mass, problem.layout
-    if not isinstance(mass, LumpedMass) or mass.total_mass is None:
+    totals, geometry = problem.formulation.mass.totals, problem.geometry
+    if totals is None or totals.kind != "sensors":
         return
-    own, groups = np.diag(structure.mass)[: layout.n], layout.directions[: layout.n]
-    moves = np.einsum("j,ji->i", own, layout.rigid_body**2)
-    for i in np.flatnonzero(layout.translational):
-        if np.any(groups == i) and abs(moves[i] / problem.totals[i] - 1) > 1e-6:
+    own, groups = np.diag(structure.mass)[: geometry.n], geometry.directions[: geometry.n]
+    moves = np.einsum("j,ji->i", own, geometry.rigid_body**2)
+    for i in np.flatnonzero(geometry.translational):
+        if np.any(groups == i) and abs(moves[i] / totals.values[i] - 1) > 1e-6:
             yield (
-                f"{problem.totals[i]:.4g} kg are stated over the sensors of base direction {i + 1}, but their masses "
+                f"{totals.values[i]:.4g} kg are stated over the sensors of base direction {i + 1}, but their masses "
                 f"make {moves[i]:.4g} kg in it: a lumped mass needs sensors along the base directions, not skew ones"
             )
 

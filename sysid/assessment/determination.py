@@ -1,98 +1,239 @@
-"""What the data determine of a problem in its own unknowns: rank and null directions of the exact Jacobian."""
+"""What data and stated models determine of an answer, and how far the rest may go.
+
+The modal-mass cone speaks where it holds all models that explain the data: exact, and of all of them at once. Elsewhere
+the rank of the exact Jacobian does: of small changes of the answer, to first order.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
-from sysid.assessment.modal_mass_cone import Determination, Intervals
-from sysid.assessment.sensitivity import Sensitivity, Slopes, directions_in_words, sensitivity, slopes_of
+from sysid.assessment import modal_mass_cone
+from sysid.assessment.sensitivity import (
+    Sensitivity,
+    directions_in_words,
+    meaningful,
+    of_outside,
+    outside_variables,
+    sensitivity,
+)  # fmt: skip
 from sysid.errors import InputError
+from sysid.models.unknowns import scales_of, split
 from sysid.nlp import EXACT
+from sysid.problem.formulation import Formulation
 from sysid.problem.problem import Problem
-from sysid.structure.structure import Array
+from sysid.problem.slopes import Slopes, slopes_of
+from sysid.structure.structure import Array, Structure
 
 _LOOSE = 1e-2  # of an unknown, by which what is left of exact records may move it
 _MOVED = 1e-6  # of the root of two diagonals, by which an unseen step of order one must change an entry to count
+_OTHER = 1e-3  # of an unknown, or of the root of two diagonals: what differs by less is the same
+_TOLD = 4  # unknowns of another answer, told
+_SAME_MATRICES = "mass, stiffness and damping stay the same all the same"
+BY_CONE = "judged by the modal-mass cone, which holds all models that explain the data"
+BY_RANK = "judged by the rank of the Jacobian, to first order about this answer"
 
 
-def written_determination(problem: Problem, x: Array, rivals: tuple[Array, ...] = ()) -> Determination:
-    """Whether records, constraints and the form of the matrices fix every entry of M_SS, K_SS and C at `x`.
+@dataclass(frozen=True)
+class Determination:
+    """Whether data and stated model fix every entry of M_SS, K_SS and C.
 
-    `rivals` are other unknowns found to explain the data as well.
+    Attributes
+    ----------
+    determined : bool
+    closed_by : tuple of str
+        What fixes them, in sentences.
+    undetermined : tuple of str
+        What is left open, in sentences; empty where determined.
+    judged_by : str
+        `BY_CONE` or `BY_RANK`.
     """
+
+    determined: bool
+    closed_by: tuple[str, ...]
+    undetermined: tuple[str, ...]
+    judged_by: str
+
+
+@dataclass(frozen=True, eq=False)
+class Intervals:
+    """Extremes of the entries of M_SS and K_SS over all models that explain the data and what was stated.
+
+    Attributes
+    ----------
+    mass, stiffness : (2, n, n)
+        kg and N/m (kg m, kg m² and N, N m where a rotation is involved): lower ends, then upper ends.
+        Infinite where there is none.
+    """
+
+    mass: Array
+    stiffness: Array
+
+
+def determine(problem: Problem, structure: Structure, x: Array | None, rivals: Sequence[Array] = ()) -> Determination:
+    """Whether records, constraints and stated models fix every entry of M_SS, K_SS and C.
+
+    Parameters
+    ----------
+    problem : Problem
+    structure : Structure
+        The answer.
+    x : (n_variables,) or None
+        The unknowns that stand for it; None where it has other degrees of freedom than the sensors.
+    rivals : sequence of (n_variables,)
+        Other unknowns found to explain the data as well.
+
+    Returns
+    -------
+    Determination
+
+    Raises
+    ------
+    InputError
+        Where the rank of the Jacobian is asked for, and no x is given.
+    """
+    if modal_mass_cone.speaks(problem.formulation):
+        closed, open_ = modal_mass_cone.verdict(problem, structure)
+        # Where the cone is open, other answers are members of it.
+        others = () if x is None or open_ else tuple(_others(problem, structure, x, rivals))
+        beside = () if x is None else tuple(_open_outside(problem.formulation, x))
+        open_ = (*open_, *beside) if open_ else others
+        return Determination(not open_, () if open_ else (*closed, *beside), open_, BY_CONE)
+    x = _needed(x)
+    closed, open_ = _by_rank(problem, structure, x)
+    open_ = (*open_, *_others(problem, structure, x, rivals))
+    return Determination(not open_, () if open_ else closed, open_, BY_RANK)
+
+
+def intervals(problem: Problem, structure: Structure, x: Array | None) -> Intervals:
+    """Extremes of M_SS and K_SS over what the data leave open, entry by entry; parameters as in `determine`.
+
+    To first order where the cone does not speak: no end is followed along a null direction until a bound stops it, so
+    that it is infinite for an entry that something unseen moves.
+    """
+    if modal_mass_cone.speaks(problem.formulation):
+        return Intervals(*modal_mass_cone.ends(problem, structure))
+    x = _needed(x)
     slopes = slopes_of(problem.formulation.matrices, x, problem.measurement)
     known = sensitivity(problem, x, slopes)
-    count, labels = x.size, problem.formulation.labels
-    open_: list[str] = []
-    if known.unseen.shape[1]:
-        moved = _moves_matrices(slopes, known)
-        words = directions_in_words(problem.variables, x, known.unit, known.unseen)
-        fixed = "" if moved else "; mass, stiffness and damping stay the same all the same"
-        sentence = (
-            f"the records see {known.rank} of {known.free.shape[1]} directions of the {count} unknowns; no record sees "
-            f"a change of {'; nor of '.join(words)}{fixed}"
-        )
-        if moved:
-            open_.append(sentence)
-    misfit = problem.misfit_of(x)
-    if known.rank and misfit < EXACT and misfit > _LOOSE * known.singular_values[known.rank - 1]:
-        weakest = directions_in_words(problem.variables, x, known.unit, known.seen[:, -1:])[0]
-        open_.append(f"the search ended at {misfit:.2g} of the records, by which {weakest} is hardly held")
-    for other in rivals:
-        far = np.argsort(-np.abs(other - x) / known.unit)
-        far = far[np.abs(other - x)[far] > 1e-3 * known.unit[far]][:4]
-        told = ", ".join(f"{labels[j]} = {other[j]:.4g} in place of {x[j]:.4g}" for j in np.sort(far))
-        if _other_matrices(problem, slopes, other):
-            open_.append(f"another structure explains the data as well: {told}")
-    closed = f"the data and the written model fix all {count} unknowns"
-    if problem.formulation.known is not None:
-        alone = sensitivity(problem, x, slopes, known=False)
-        only = known.rank - alone.rank
-        closed += f", {only} of them by what is stated as known alone" if only else ""
-    if known.free.shape[1] < count:
-        closed += f", {count - known.free.shape[1]} of them by constraints"
-    closed += " about this answer; what is written as a number counts as exact"
-    if known.unseen.shape[1]:
-        closed = "the data and the written model fix mass, stiffness and damping"
-    return Determination(not open_, () if open_ else (closed,), tuple(open_))
-
-
-def written_intervals(problem: Problem, x: Array) -> Intervals:
-    """Extremes of M_SS and K_SS over what the data leave open: infinite for an entry that something unseen moves.
-
-    To first order: no end is followed along a null direction until a bound stops it.
-    """
-    slopes = slopes_of(problem.formulation.matrices, x, problem.measurement)
-    known = sensitivity(problem, x, slopes)
-    n = slopes.structure.n
     ends = []
-    for matrix, slope in ((slopes.structure.mass, slopes.mass), (slopes.structure.stiffness, slopes.stiffness)):
-        value = matrix[:n, :n]
+    for value, slope in _pairs(structure, slopes)[:2]:
         open_ = _open_entries(value, slope, known)
         low, high = value.copy(), value.copy()
         low[open_], high[open_] = -np.inf, np.inf
-        diagonal = open_ & np.eye(n, dtype=bool)
-        low[diagonal] = 0.0
+        low[open_ & np.eye(len(value), dtype=bool)] = 0.0
         ends.append(np.stack([low, high]))
     return Intervals(*ends)
 
 
+def open_masses(problem: Problem, structure: Structure) -> list[int]:
+    """Modes, counted from 0, whose modal mass neither records nor stated models fix; none where no cone tells."""
+    return modal_mass_cone.open_modes(problem, structure) if modal_mass_cone.speaks(problem.formulation) else []
+
+
+def _needed(x: Array | None) -> Array:
+    if x is None:
+        raise InputError(
+            "the rank of the Jacobian is taken at the unknowns of the problem: give x beside the structure"
+        )
+    return x
+
+
+# -- by the rank of the Jacobian -----------------------------------------------------------------
+
+
+def _by_rank(problem: Problem, structure: Structure, x: Array) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """What fixes the matrices, and what is left open, in sentences."""
+    formulation = problem.formulation
+    slopes = slopes_of(formulation.matrices, x, problem.measurement)
+    known = sensitivity(problem, x, slopes)
+    open_: list[str] = []
+    if any(np.any(_open_entries(*pair, known)) for pair in _pairs(structure, slopes)):
+        open_.append(_unseen(formulation, x, known))
+    misfit = problem.objective(x)
+    if known.rank and misfit < EXACT and misfit > _LOOSE * known.singular_values[known.rank - 1]:
+        (weakest,) = _in_words(formulation, x, known, known.seen[:, -1:])
+        open_.append(f"the search ended at {misfit:.2g} of the records, by which {weakest} is hardly held")
+    if known.unseen.shape[1]:
+        closed = "the data and the written model fix mass, stiffness and damping"
+        return (closed, f"{_unseen(formulation, x, known)}; {_SAME_MATRICES}"), tuple(open_)
+    only = known.rank - sensitivity(problem, x, slopes, priors=False).rank if formulation.priors else 0
+    by_constraints = x.size - known.free.shape[1]
+    closed = f"the data and the written model fix all {x.size} unknowns"
+    closed += f", {only} of them by what is stated as known alone" if only else ""
+    closed += f", {by_constraints} of them by constraints" if by_constraints else ""
+    return (f"{closed} about this answer; what is written as a number counts as exact",), tuple(open_)
+
+
+def _unseen(formulation: Formulation, x: Array, known: Sensitivity) -> str:
+    """What no record sees, in a sentence."""
+    words = "; nor of ".join(_in_words(formulation, x, known, known.unseen))
+    return (
+        f"the records see {known.rank} of {known.free.shape[1]} directions of the {known.unit.size} unknowns; no "
+        f"record sees a change of {words}"
+    )
+
+
+def _in_words(formulation: Formulation, x: Array, known: Sensitivity, directions: Array) -> list[str]:
+    """Directions in the user's names; of those that move factors of a free matrix only how many there are."""
+    factors = directions[~meaningful(formulation)]
+    lam, turn = np.linalg.eigh(factors.T @ factors)
+    named, others = directions @ turn[:, lam < _MOVED**2], directions @ turn[:, lam >= _MOVED**2]
+    words = directions_in_words(formulation.unknowns, x, known.unit, named)
+    if not others.shape[1]:
+        return words
+    moved = split(formulation.unknowns, np.abs(others).max(axis=1) > _MOVED)
+    titles = [unknown.title for unknown, part in zip(formulation.unknowns, moved, strict=True) if np.any(part)]
+    return [*words, f"{', '.join(titles)} together, in {others.shape[1]} ways"]
+
+
+def _pairs(structure: Structure, slopes: Slopes) -> list[tuple[Array, Array]]:
+    """M_SS, K_SS and C, and their slopes."""
+    n = structure.n
+    return [
+        (structure.mass[:n, :n], slopes.mass), (structure.stiffness[:n, :n], slopes.stiffness),
+        (structure.damping, slopes.damping),
+    ]  # fmt: skip
+
+
 def _open_entries(matrix: Array, slope: Array, known: Sensitivity) -> Array:
+    """Which entries (n, n) of a matrix something unseen moves."""
     size = np.sqrt(np.abs(np.diag(matrix)))
     moved = np.abs(slope @ (known.unit[:, None] * known.unseen)).max(axis=-1, initial=0.0)
     return moved > _MOVED * np.outer(size, size)
 
 
-def _moves_matrices(slopes: Slopes, known: Sensitivity) -> bool:
-    s = slopes.structure
-    n = s.n
-    pairs = (s.mass[:n, :n], slopes.mass), (s.stiffness[:n, :n], slopes.stiffness), (s.damping, slopes.damping)
-    return any(bool(np.any(_open_entries(matrix, slope, known))) for matrix, slope in pairs)
+# -- of what else was found, and of variables beside ---------------------------------------------
 
 
-def _other_matrices(problem: Problem, slopes: Slopes, other: Array) -> bool:
+def _open_outside(formulation: Formulation, x: Array) -> Iterator[str]:
+    """Variables that enter no matrix and that no term sees, in a sentence."""
+    outside = formulation.outside
+    if not np.any(outside):
+        return
+    known = of_outside(formulation, x)
+    if known.unseen.shape[1]:
+        words = directions_in_words(outside_variables(formulation), x[outside], known.unit, known.unseen)
+        yield f"no term sees a change of {'; nor of '.join(words)}; {_SAME_MATRICES}"
+
+
+def _others(problem: Problem, structure: Structure, x: Array, rivals: Sequence[Array]) -> Iterator[str]:
+    """Other answers whose matrices are others."""
+    formulation = problem.formulation
+    unit, named, labels = scales_of(formulation.unknowns, x), meaningful(formulation), formulation.labels
+    for other in rivals:
+        off = np.where(named, np.abs(other - x) / unit, 0.0)
+        far = [j for j in np.argsort(-off, kind="stable")[:_TOLD] if off[j] > _OTHER]
+        told = ", ".join(f"{labels[j]} = {other[j]:.4g} in place of {x[j]:.4g}" for j in sorted(far))
+        if _other_matrices(problem, structure, other):
+            yield f"another structure explains the data as well{': ' if told else ''}{told}"
+
+
+def _other_matrices(problem: Problem, mine: Structure, other: Array) -> bool:
     """Whether other unknowns stand for other matrices, and not for the same in another way."""
-    mine = slopes.structure
     try:
         its = problem.structure(other)
     except InputError:  # of no structure
@@ -101,6 +242,6 @@ def _other_matrices(problem: Problem, slopes: Slopes, other: Array) -> bool:
     pairs = (mine.mass[:n, :n], its.mass[:n, :n]), (mine.stiffness[:n, :n], its.stiffness[:n, :n])
     for a, b in (*pairs, (mine.damping, its.damping)):
         size = np.sqrt(np.abs(np.diag(a))) + np.finfo(float).tiny
-        if np.any(np.abs(a - b) > 1e-3 * np.outer(size, size)):
+        if np.any(np.abs(a - b) > _OTHER * np.outer(size, size)):
             return True
     return False

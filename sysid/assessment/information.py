@@ -85,7 +85,7 @@ def information(modes: Modes, index: Index, grams: list[Iterator[Array]]) -> Arr
     return A
 
 
-class Path(NamedTuple):
+class Parametrisation(NamedTuple):
     """How theta moves with a problem's unknowns.
 
     ``slope`` (size of theta, unknowns); ``unit`` (unknowns,), a large step of each; ``gauge`` (unknowns, count),
@@ -97,7 +97,7 @@ class Path(NamedTuple):
     gauge: Array
 
 
-def spread(A: Array, B: Array | None, path: Path) -> tuple[Array, Array]:
+def spread(A: Array, B: Array | None, path: Parametrisation) -> tuple[Array, Array]:
     """Moves of theta, in columns: what one standard normal each makes, and what no record sees.
 
     The first are a factor of the covariance: ``A^-1 / 2``, or ``A^-1 B A^-1 / 2`` where the weights are not those of

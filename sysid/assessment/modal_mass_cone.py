@@ -4,13 +4,13 @@ Base and response accelerations fix frequencies, damping ratios and rank-one res
 else. All models that explain them are ``M_SS = P' T P``, ``K_SS = P' W T W P``, ``M_S0 = P' T (Gamma - P G)``,
 with ``T = diag(t)``, one modal mass t_k > 0 a mode (P the inverse of the mode shapes, W the circular frequencies),
 and a positive definite block of T for modes at one pole. What a measured force or a stated model adds is linear in T:
-its rank tells what stays open (`determination`), and how far that may go is a convex problem (`intervals`).
+its rank tells what stays open (`verdict`), and how far that may go is a convex problem (`ends`). Both hold for all
+models at once.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -18,9 +18,9 @@ import numpy as np
 from sysid.assessment.cone import Cone, Pairs, forms, null_space, unknowns
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.response import columns, gains
-from sysid.models.geometry import Layout
-from sysid.models.mass import FullMass, KnownMass, LumpedMass
-from sysid.models.stiffness import ChainStiffness
+from sysid.models.geometry import Geometry
+from sysid.models.model import Stated
+from sysid.problem.formulation import Formulation
 from sysid.problem.problem import Problem
 from sysid.structure.structure import Array, ComplexArray, Structure
 
@@ -37,26 +37,17 @@ _ROUND_OFF = 1e-13
 _AT_ONCE = 100  # entries whose ends are sought together: enough for speed, few enough for memory
 
 
-@dataclass(frozen=True)
-class Determination:
-    """Whether data and stated model fix every entry of M_SS, K_SS and C.
+def speaks(formulation: Formulation) -> bool:
+    """Whether the cone holds all models that explain the data, and what is stated of them.
 
-    Attributes
-    ----------
-    determined : bool
-    closed_by : tuple of str
-        What closes the cone, in sentences.
-    undetermined : tuple of str
-        What is left open, in sentences; empty where determined.
+    So it is where the records stand alone, damping is by ratios, and `Stated` tells all of mass and stiffness.
     """
-
-    determined: bool
-    closed_by: tuple[str, ...]
-    undetermined: tuple[str, ...]
+    told = all(stated.free or stated.entries is not None for stated in (formulation.mass, formulation.stiffness))
+    return told and formulation.by_ratios and formulation.geometry.at_sensors and formulation.test_alone
 
 
-def determination(problem: Problem, structure: Structure) -> Determination:
-    """Which modal masses of `structure` the measurement and the stated models of `problem` fix.
+def verdict(problem: Problem, structure: Structure) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """What closes the modal masses of `structure`, and what is left open, in sentences.
 
     What counts as seen is judged against the misfit that the structure leaves: a mode whose share of
     the records is not clearly above it, poles that it cannot tell apart, and base directions that
@@ -101,30 +92,15 @@ def determination(problem: Problem, structure: Structure) -> Determination:
             "hold for the stated degrees of freedom only; the Craig-Bampton form (to_craig_bampton(), modal and base "
             f"coordinates) is what the data determine, {how_far}"
         )
-    return Determination(not open_, () if free else tuple(closed), tuple(open_))
+    return () if free else tuple(closed), tuple(open_)
 
 
-def open_masses(problem: Problem, structure: Structure) -> list[int]:
+def open_modes(problem: Problem, structure: Structure) -> list[int]:
     """Modes, counted from 0, whose modal mass neither the records nor the stated models fix."""
     return _open_modes(_known(problem, structure, problem.measurement.residual(structure)))[0]
 
 
-@dataclass(frozen=True, eq=False)
-class Intervals:
-    """Extremes of the entries of M_SS and K_SS over all models that explain the data and what was stated.
-
-    Attributes
-    ----------
-    mass, stiffness : (2, n, n)
-        kg and N/m (kg m, kg m² and N, N m where a rotation is involved): lower ends, then upper ends.
-        Infinite where there is none.
-    """
-
-    mass: Array
-    stiffness: Array
-
-
-def intervals(problem: Problem, structure: Structure) -> Intervals:
+def ends(problem: Problem, structure: Structure) -> tuple[Array, Array]:
     """How far each entry of M_SS and K_SS may go over the modal-mass cone.
 
     Parameters
@@ -137,18 +113,20 @@ def intervals(problem: Problem, structure: Structure) -> Intervals:
 
     Returns
     -------
-    Intervals
-        Each end is attained by a member, or approached by members where a modal mass of zero attains it.
+    mass, stiffness : (2, n, n)
+        Lower ends, then upper ends; each is attained by a member, or approached by members where a modal mass of zero
+        attains it.
     """
     n = structure.n
     known = _known(problem, structure, problem.measurement.residual(structure))
     matrices = structure.mass[:n, :n], structure.stiffness[:n, :n]
     if not _open_modes(known)[0]:
-        return Intervals(*(np.stack([matrix, matrix]) for matrix in matrices))
+        mass, stiffness = (np.stack([matrix, matrix]) for matrix in matrices)
+        return mass, stiffness
     cone = _cone(problem, structure, known)
     P = np.linalg.inv(structure.normal_modes)
     omega = 2 * np.pi * structure.natural_frequencies[:, None]
-    return Intervals(*(_entries(cone, rows, own) for rows, own in zip((P, P * omega), matrices, strict=True)))
+    return _entries(cone, P, matrices[0]), _entries(cone, P * omega, matrices[1])
 
 
 def _entries(cone: Cone, rows: Array, own: Array) -> Array:
@@ -213,32 +191,27 @@ def _open_modes(known: _Known) -> tuple[list[int], bool]:
 
 def _cone(problem: Problem, structure: Structure, known: _Known) -> Cone:
     """The modal-mass cone, with the bounds that a total mass or a rigid-body mass puts on it."""
-    mass, n = problem.mass, structure.n
+    totals, n = problem.formulation.mass.totals, structure.n
     visible = sum((W @ (W.T @ structure.participation) for W in _moved(structure, known.clusters)), np.zeros((n, 1)))
     traces, matrices = [], []
     if problem.measurement.force is not None:
         matrices.append(_below(visible, structure.rigid_body_mass))
-    if isinstance(mass, FullMass) and mass.total_mass is not None:
-        if problem.rigid_total is not None:
-            matrices.append(_below(visible, problem.rigid_total))
-        elif mass.healing == "rigid_body":
-            traces += [
-                _at_most(column[:, None], total) for column, total in zip(visible.T, problem.totals, strict=True)
-            ]
-        elif structure.at_sensors:
-            traces += [
-                _at_most(W, total)
-                for W, total in zip(_by_direction(problem.layout, structure), problem.totals, strict=True)
-            ]
+    if totals is not None and totals.values.ndim == 2:
+        matrices.append(_below(visible, totals.values))
+    elif totals is not None and totals.kind == "rigid_body":
+        traces += [_at_most(column[:, None], total) for column, total in zip(visible.T, totals.values, strict=True)]
+    elif totals is not None and totals.kind == "trace" and structure.at_sensors:
+        weights = _by_direction(problem.geometry, structure)
+        traces += [_at_most(W, total) for W, total in zip(weights, totals.values, strict=True)]
     return Cone(known.clusters, known.weighed, traces, matrices, known.equations, known.signs)
 
 
-def _by_direction(layout: Layout, structure: Structure) -> list[Array]:
+def _by_direction(geometry: Geometry, structure: Structure) -> list[Array]:
     """Weights of each direction's part of trace M, its sensors' and, of M_00, what M cannot do without."""
     P = np.linalg.inv(structure.normal_modes)
     delta = structure.participation - P @ structure.rigid_body_dofs
-    groups = layout.directions[: layout.n]
-    return [np.hstack([P[:, groups == i], delta[:, [i]]]) for i in range(layout.d)]
+    groups = geometry.directions[: geometry.n]
+    return [np.hstack([P[:, groups == i], delta[:, [i]]]) for i in range(geometry.d)]
 
 
 def _at_most(weights: Array, total: float) -> Array:
@@ -367,8 +340,9 @@ def _unseen(problem: Problem, structure: Structure, misfit: float) -> Iterator[s
     rank = int(np.count_nonzero(spread > max(1e-9, min(misfit, 0.5)) * spread[0]))
     if rank < test.n_base:
         yield f"the base moves in only {rank} of {test.n_base} independent directions: responses to the others are open"
-    if 2 * test.response.size < problem.n_variables:
-        yield f"{2 * test.response.size} measured numbers cannot fix {problem.n_variables} unknowns"
+    count = int(np.count_nonzero(~problem.formulation.outside))
+    if 2 * test.response.size < count:
+        yield f"{2 * test.response.size} measured numbers cannot fix {count} unknowns"
     responses, forces = _responses(test, structure), _forces(test, structure)
     level = responses.level
     for k in range(structure.n):
@@ -406,55 +380,56 @@ def _clusters(structure: Structure, misfit: float) -> list[list[int]]:
 
 def _model_equations(problem: Problem, structure: Structure, pairs: Pairs) -> tuple[Array, Array | None, str]:
     """What the stated models add: `_Known.equations`, `signs` and `sentence`."""
-    n, G = structure.n, structure.rigid_body_dofs
     nothing = np.zeros((0, len(pairs)))
     if not structure.at_sensors:
         return nothing, None, ""
-    P = np.linalg.inv(structure.normal_modes)
-    delta = structure.participation - P @ G
+    mass, stiffness = problem.formulation.mass, problem.formulation.stiffness
+    of_mass, masses = _of_mass(problem.geometry, mass, structure, pairs)
+    of_stiffness, springs = _of_stiffness(stiffness, structure, pairs)
+    rows = np.vstack([nothing, *of_mass, *of_stiffness])
+    # Modes that share a block have no such rows: their intervals do without the equations.
+    modal = np.eye(len(pairs)) if len(rows) and len(pairs) == structure.n else None
+    signs = next((signs for signs in (masses, springs) if signs is not None), modal)
+    return rows, signs, "; ".join(stated.sentence for stated in (mass, stiffness) if stated.sentence)
+
+
+def _of_mass(
+    geometry: Geometry, stated: Stated, structure: Structure, pairs: Pairs
+) -> tuple[list[Array], Array | None]:
+    """Equations that a stated mass adds, and the masses that it leaves."""
+    if stated.entries is None:
+        return [], None
+    n, P = structure.n, np.linalg.inv(structure.normal_modes)
+    delta = structure.participation - P @ structure.rigid_body_dofs
     size = np.linalg.norm(P, axis=0)
-    mass_entries = forms(P / size, P / size, pairs)
+    entries = forms(P / size, P / size, pairs)
     coupling = forms(P / size, delta / (np.linalg.norm(delta) + size.max()), pairs)
-    rows: list[Array] = []
-    signs = None
-    sentences = []
-    layout, mass = problem.layout, problem.mass
-    if isinstance(problem.stiffness, ChainStiffness):
-        omega = 2 * np.pi * structure.natural_frequencies[:, None]
-        stiff = np.sqrt(np.diag(structure.stiffness)[:n])
-        scaled = forms(P * omega / stiff, P * omega / stiff, pairs)
-        rows.append(scaled[np.abs(structure.stiffness[:n, :n]) <= 1e-9 * np.outer(stiff, stiff)])
-        # A floor that no spring ties to the base is at rest in a rigid motion.
-        at_base = forms(P * omega / stiff, P @ G * omega / np.linalg.norm(P @ G * omega, axis=0), pairs)
-        rigid = structure.stiffness[:n, :n] @ G
-        rows.append(at_base[np.abs(rigid) <= 1e-9 * stiff[:, None] * stiff.max()])
-        stiffness = np.moveaxis(scaled * np.outer(stiff, stiff)[:, :, None], -1, 0)
-        signs = np.array([problem.stiffness.values(layout, np.eye(n), K) for K in stiffness]).T
-        sentences.append("the stiffness is stated to be a chain")
-    if isinstance(mass, LumpedMass):
-        rows += [mass_entries[np.tril_indices(n, -1)], coupling.reshape(-1, len(pairs))]
-        if mass.total_mass is None:
-            sentences.append("the mass is stated to be lumped on the sensors")
-        else:
-            sentences.append("the mass is stated to be lumped on the sensors, with its total given")
-            for i in range(layout.d):
-                own = P[:, layout.directions[:n] == i]
-                if own.size:
-                    rows.append(np.einsum("iiu->u", forms(own, own, pairs))[None] / np.sum(own**2))
-    elif isinstance(mass, FullMass):
-        known = np.isfinite(problem.known_mass)
-        rows += [mass_entries[known[:, :n]], coupling[known[:, n:]]]
-        if np.any(known):
-            count = np.count_nonzero(np.triu(known[:, :n])) + np.count_nonzero(known[:, n:])
-            sentences.append(f"{count} {'entry' if count == 1 else 'entries'} of the mass matrix stated to be known")
-            # Modes that share a block have no such rows: their intervals do without the equations.
-            signs = np.eye(len(pairs)) if len(pairs) == n else None
-    elif isinstance(mass, KnownMass):
-        rows += [mass_entries.reshape(-1, len(pairs)), coupling.reshape(-1, len(pairs))]
-        sentences.append("the mass matrix is known")
-    if isinstance(mass, LumpedMass | KnownMass):
-        signs = np.einsum("iiu->iu", mass_entries)
-    return np.vstack([nothing, *rows]), signs, "; ".join(reversed(sentences))
+    known = np.isfinite(stated.entries)
+    rows = [entries[known[:, :n]], coupling[known[:, n:]]]
+    if stated.totals is not None and stated.totals.kind == "sensors":
+        for i in range(geometry.d):
+            own = P[:, geometry.directions[:n] == i]
+            if own.size:
+                rows.append(np.einsum("iiu->u", forms(own, own, pairs))[None] / np.sum(own**2))
+    diagonal = np.all(known[:, :n] | np.eye(n, dtype=bool))
+    return rows, None if stated.free or not diagonal else np.einsum("iiu->iu", entries)
+
+
+def _of_stiffness(stated: Stated, structure: Structure, pairs: Pairs) -> tuple[list[Array], Array | None]:
+    """Equations that a stated stiffness adds, and the springs that it leaves."""
+    if stated.entries is None:
+        return [], None
+    n, P = structure.n, np.linalg.inv(structure.normal_modes)
+    P = P * (2 * np.pi * structure.natural_frequencies[:, None])
+    size = np.sqrt(np.diag(structure.stiffness)[:n])
+    entries, rigid = forms(P / size, P / size, pairs), P @ structure.rigid_body_dofs
+    # K_S0 = -K_SS G: a floor that no spring ties to the base is at rest in a rigid motion.
+    to_base = forms(P / size, rigid / np.linalg.norm(rigid, axis=0), pairs)
+    known = np.isfinite(stated.entries)
+    rows = [entries[known[:, :n]], to_base[known[:, n:]]]
+    if stated.positive is None:
+        return rows, None
+    return rows, np.einsum("pij,iju->pu", stated.positive, entries * np.outer(size, size)[:, :, None])
 
 
 def _mode(structure: Structure, k: int) -> str:

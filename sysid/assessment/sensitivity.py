@@ -1,7 +1,6 @@
-r"""What each unknown does to matrices, modes and records: exact first derivatives, and what the data make of them.
+"""What all that is fitted sees of the unknowns about an answer: rank, null directions and noise, by the exact Jacobian.
 
-With :math:`Z = -\omega^2 M + i\omega C + K` and :math:`X = Z^{-1} \omega^2 B` (unit base motion), an unknown moves the
-accelerations by :math:`dX = Z^{-1} (\omega^2 dB - dZ\, X)`; modes follow by first-order perturbation.
+To first order: what is said of a direction holds for small steps along it.
 """
 
 from __future__ import annotations
@@ -11,10 +10,12 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
-from sysid.models.unknowns import Block, Variable, split, steps_of
-from sysid.problem.formulation import labels_of
+from sysid.models.unknowns import Unknown, scales_of, split
+from sysid.problem.formulation import Formulation
 from sysid.problem.problem import Problem
+from sysid.problem.slopes import Rows, Slopes, stacked_rows
 from sysid.structure.structure import Array
 
 _NULL = 1e-9  # of the largest singular value of the Jacobian, in units of the unknowns: what no record sees
@@ -25,7 +26,7 @@ _ACTIVE = 1e-6  # of its scale: how near its bound an inequality counts as activ
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """What the data say about the unknowns about a point.
+    """What the data say about p unknowns about a point.
 
     Attributes
     ----------
@@ -53,34 +54,78 @@ class Sensitivity:
         """Number of directions that the records see."""
         return self.seen.shape[1]
 
+    @property
+    def steps(self) -> Array:
+        """The normals, then what no record sees in steps of order one, (p, q)."""
+        return np.hstack([self.normals, self.unit[:, None] * self.unseen])
+
 
 def sensitivity(
-    problem: Problem, x: Array, slopes: Slopes | None = None, *, known: bool = True, as_stated: bool = False
+    problem: Problem, x: Array, slopes: Slopes | None = None, *, priors: bool = True, as_stated: bool = False
 ) -> Sensitivity:
-    """Rank, null directions and noise of the unknowns at `x`, from the exact Jacobian.
+    """Rank, null directions and noise of all unknowns at `x`.
 
-    With `known` false without what is stated as known to some accuracy; `as_stated` as in `rows_of_test`.
+    Parameters
+    ----------
+    problem : Problem
+    x : (n_variables,)
+    slopes : Slopes, optional
+        Those of the problem's own matrices at x, where they are known.
+    priors : bool
+        With what is stated as known to some accuracy, or without it.
+    as_stated : bool
+        As in `Term.linearised`.
+
+    Returns
+    -------
+    Sensitivity
     """
-    formulation, p = problem.formulation, x.size
+    return of_formulation(problem.formulation, x, slopes, priors=priors, as_stated=as_stated)
+
+
+def of_formulation(
+    formulation: Formulation, x: Array, slopes: Slopes | None = None, *, priors: bool = True, as_stated: bool = False
+) -> Sensitivity:
+    """The same of a formulation."""
     rows: list[Rows] = []
-    if formulation.misfit is None:
-        slopes = slopes or slopes_of(formulation.matrices, x, problem.measurement)
-        rows += rows_of_test(problem.measurement, slopes, p, as_stated=as_stated)
-    else:
-        rows.append(_own_rows(formulation.misfit, x, None))
-    for share, (test, matrices) in zip(formulation.shares, formulation.others, strict=True):
-        rows += rows_of_test(test, slopes_of(matrices, x, test), p, share=share, as_stated=as_stated)
-    if formulation.residuals is not None:
-        # One more number each, of the same relative noise as those measured.
-        rows.append(_own_rows(formulation.residuals, x, float(np.sqrt(np.mean(rows[0].std ** 2)))))
-    if formulation.known is not None and known:
-        stated, level = _own_rows(formulation.known, x, 1.0), formulation.level
-        rows.append(Rows(level * stated.residuals, level * stated.jacobian, level * stated.std))
-    unit = steps_of(problem.variables, x)
-    J = np.concatenate([row.jacobian for row in rows]) * unit
-    free = _left_by_constraints(problem, x, unit, J)
+    if formulation.fits_records:
+        rows.append(formulation.own_test.linearised(x, slopes=slopes, as_stated=as_stated))
+    left_out = () if priors else formulation.priors
+    for term in formulation.beside:
+        if term not in left_out:
+            noise = float(np.sqrt(np.mean(rows[0].std ** 2))) if rows else np.nan
+            rows.append(term.linearised(x, noise, as_stated=as_stated))
+    return _judged(formulation, x, rows, np.full(x.size, True))
+
+
+def of_outside(formulation: Formulation, x: Array) -> Sensitivity:
+    """The same of the variables that enter no matrix (`Formulation.outside`), by the terms beside the records alone."""
+    rows = [term.linearised(x, formulation.noise) for term in formulation.beside]
+    return _judged(formulation, x, rows, formulation.outside)
+
+
+def meaningful(formulation: Formulation) -> NDArray[np.bool_]:
+    """Which entries of x mean something by themselves, (size,): all but those of the factors of a free matrix."""
+    mask = np.full(formulation.size, True)
+    mask[formulation.parts.mass] = not formulation.mass.free
+    mask[formulation.parts.stiffness] = not formulation.stiffness.free
+    return mask
+
+
+def outside_variables(formulation: Formulation) -> tuple[Unknown, ...]:
+    """The variables that enter no matrix."""
+    unknowns = formulation.unknowns
+    return tuple(u for u, part in zip(unknowns, split(unknowns, formulation.outside), strict=True) if np.all(part))
+
+
+def _judged(formulation: Formulation, x: Array, rows: list[Rows], part: NDArray[np.bool_]) -> Sensitivity:
+    """Of the unknowns in `part`, the others held."""
+    unit = scales_of(formulation.unknowns, x)[part]
+    none = Rows(np.zeros(0), np.zeros((0, x.size)), np.zeros(0))
+    all_rows = stacked_rows([none, *rows])
+    J, std = all_rows.jacobian[:, part] * unit, all_rows.std
+    free = _left_by_constraints(formulation, x, unit, J, part)
     J = J @ free
-    std = np.concatenate([row.std for row in rows])
     U, s, Vt = np.linalg.svd(J, full_matrices=False)
     s = np.concatenate([s, np.zeros(J.shape[1] - s.size)])
     rank = int(np.count_nonzero(s > _NULL * max(s[0], np.finfo(float).tiny))) if s.size else 0
@@ -93,34 +138,25 @@ def sensitivity(
     return Sensitivity(unit, free, s, free @ V[:, :rank], free @ V[:, rank:], normals)
 
 
-def _own_rows(function: ca.Function, x: Array, std: float | None) -> Rows:
-    symbol = ca.MX.sym("x", x.size)
-    column = function(symbol)
-    value, slope = ca.Function("rows", [symbol], [ca.densify(column), ca.densify(ca.jacobian(column, symbol))])(x)
-    left = np.asarray(value).ravel()
-    if std is None:
-        std = max(float(np.linalg.norm(left)) / np.sqrt(max(left.size - x.size, 1)), 1e-15)
-    return Rows(left, np.asarray(slope), np.full(left.size, std))
-
-
-def _left_by_constraints(problem: Problem, x: Array, unit: Array, records: Array) -> Array:
+def _left_by_constraints(
+    formulation: Formulation, x: Array, unit: Array, records: Array, part: NDArray[np.bool_]
+) -> Array:
     """Orthonormal directions, in units of x, along which equalities and what presses on an inequality stay as they are.
 
     An inequality that happens to be at its bound, and that a direction leaves which no record sees, holds nothing.
     """
-    constraints = problem.formulation.constraints
-    if constraints is None:
-        return np.eye(x.size)
+    constraints = formulation.constraints
     symbol = ca.MX.sym("x", x.size)
     g = constraints.function(symbol)
     value, slope = ca.Function("active", [symbol], [ca.densify(g), ca.densify(ca.jacobian(g, symbol))])(x)
-    at, J = np.asarray(value).ravel(), np.asarray(slope) * unit
+    at, J = np.asarray(value).ravel(), np.asarray(slope)[:, part] * unit
     size = np.maximum(np.linalg.norm(J, axis=1), np.finfo(float).tiny)
-    rows = J / size[:, None]
-    equal = constraints.lower == constraints.upper
+    rows, equal = J / size[:, None], constraints.equal
     free = _null_space(rows[equal])
+    if np.all(equal):
+        return free
     unseen = free @ _null_space(records @ free, _NULL)
-    at_bound = ~equal & (np.abs(at - constraints.upper) < _ACTIVE * size)
+    at_bound = np.logical_not(equal) & (np.abs(at - constraints.upper) < _ACTIVE * size)
     pressed = at_bound & (np.abs(rows @ unseen).max(axis=1, initial=0.0) < _SMALL)
     return _null_space(rows[equal | pressed])
 
@@ -133,22 +169,21 @@ def _null_space(rows: Array, least: float = 1e-9) -> Array:
     return Vt[int(np.count_nonzero(s > least * max(s[0], np.finfo(float).tiny))) :].T
 
 
-def directions_in_words(variables: Sequence[Block | Variable], x: Array, unit: Array, directions: Array) -> list[str]:
+def directions_in_words(unknowns: Sequence[Unknown], x: Array, unit: Array, directions: Array) -> list[str]:
     """Directions, (p, count) in units, in the user's names: "k[0] +1 %, m +2 %"; a name alone is all of it."""
     sentences = []
     for v in _sparse(directions).T:
         terms = []
-        pieces = (split(variables, part) for part in (v, v * unit, x, unit))
-        for variable, share, moved, value, large in zip(variables, *pieces, strict=True):
+        pieces = (split(unknowns, part) for part in (v, v * unit, x, unit))
+        for unknown, share, moved, value, large in zip(unknowns, *pieces, strict=True):
             told = [
                 f"{100 * step / abs(at):+.3g} %" if abs(at) > 1e-3 * size else f"{step:+.3g}"
                 for step, at, size in zip(moved, value, large, strict=True)
             ]
             if len(set(told)) == 1 and abs(share[0]) > _SMALL:
-                terms.append(f"{variable.name} {told[0]}")
+                terms.append(f"{unknown.title} {told[0]}")
                 continue
-            names = labels_of(variable)
-            terms += [f"{names[j]} {told[j]}" for j in np.flatnonzero(np.abs(share) > _SMALL)]
+            terms += [f"{unknown.labels[j]} {told[j]}" for j in np.flatnonzero(np.abs(share) > _SMALL)]
         rest = len(terms) - _TERMS
         sentences.append(", ".join(terms[:_TERMS]) + (f" and {rest} more" if rest > 0 else ""))
     return sentences

@@ -8,51 +8,40 @@ squares, and it is NaN where something unseen moves it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Protocol
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.assessment.information import (
-    Index,
-    Path,
-    gains_of,
-    inflation_of,
-    information,
-    records_of,
-    spectra_of,
-    spread,
-)
-from sysid.assessment.modal_mass_cone import open_masses
-from sysid.assessment.sensitivity import slopes_of
+from sysid.assessment.information import Index, information, spectra_of, spread
+from sysid.assessment.modal_mass_cone import open_modes
+from sysid.assessment.parametrisation import held_by_entries, parametrisation
+from sysid.assessment.perturbations import (
+    MOVED,
+    DirectSpectra,
+    ModalSpectra,
+    Perturbations,
+    Spectra,
+    matrices_of_modes,
+    std_of,
+)  # fmt: skip
+from sysid.assessment.sensitivity import Sensitivity, meaningful, of_formulation, of_outside, outside_variables
 from sysid.errors import InputError
+from sysid.modal_analysis.misfit import inflation_of, records_of
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.models.damping import ModalDamping
-from sysid.models.mass import FullMass
-from sysid.models.unknowns import steps_of
+from sysid.models.unknowns import by_name, split
+from sysid.problem.formulation import Formulation
 from sysid.problem.problem import Problem
+from sysid.problem.slopes import Slopes, slopes_of
 from sysid.structure.structure import Array, Structure, check_frequencies
 
-MOVED = 1e-6  # of a quantity's size, by which an unseen move of order one must change it to count
 _SAME = 1e-6  # relative distance that is put between repeated frequencies
 _LEAST_RATIO = 1e-8  # a damping ratio of zero has no logarithm
 
 _POSITIVE = ("natural_frequencies", "damping_ratios")
 _MATRICES = ("mass", "stiffness", "damping")
 _QUANTITIES = (*_POSITIVE, "mode_shapes", "participation", "effective_masses", "rigid_body_mass", *_MATRICES)
-
-
-class Spectra(Protocol):
-    """What predicts spectra where modes do not."""
-
-    def transmissibility(self, freq: Array) -> Array:
-        """Standard deviations, (n_sensors, d, n_freq)."""
-
-    def base_force(self, freq: Array) -> Array:
-        """Standard deviations, (d, d, n_freq)."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -76,15 +65,16 @@ class Uncertainty:
     mass, stiffness, damping : (m, m)
         M_SS, K_SS and C at the structure's degrees of freedom.
     parameters : tuple of str
-        Frequencies, damping ratios, and the participations that are known; the unknowns of a problem that has its own.
+        Frequencies, damping ratios, and the participations that are known; where all unknowns of the problem mean
+        something by themselves, these.
     covariance : (p, p)
         Of `parameters`.
     inflation : float
         Factor by which all standard deviations were raised because the misfit is larger than the stated noise
         explains; 1 otherwise, NaN where the lines are too few to tell a noise that is not stated.
     values, variables : dict of str to ndarray
-        Values, and their standard deviations, of the variables of a problem in its own unknowns: by name, in their
-        shapes.
+        Values, and their standard deviations, of the unknowns that mean something by themselves: variables, springs,
+        damping ratios; not the entries of factors of a matrix, nor shares of a total. By name, in their shapes.
 
     Notes
     -----
@@ -110,11 +100,9 @@ class Uncertainty:
     parameters: tuple[str, ...]
     covariance: Array
     inflation: float
-    _modes: Modes = field(repr=False)
-    _moves: Moves = field(repr=False)
+    _spectra: Spectra = field(repr=False)
     values: dict[str, Array] = field(default_factory=dict)
     variables: dict[str, Array] = field(default_factory=dict)
-    _direct: Spectra | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
         worst = 100 * np.max(self.natural_frequencies / self.structure.natural_frequencies)
@@ -127,7 +115,7 @@ class Uncertainty:
         Parameters
         ----------
         name : str
-            One of the quantities above, "natural_frequencies" for instance, or a variable of a problem of its own.
+            One of the quantities above, "natural_frequencies" for instance, or one of `variables`.
         level : float
             Between 0 and 1.
 
@@ -172,37 +160,14 @@ class Uncertainty:
 
     def transmissibility(self, freq: ArrayLike) -> Array:
         """Standard deviation ``sqrt(E|e|²)`` of the transmissibility at lines in Hz, (n_sensors, d, n_freq)."""
-        if self._direct is not None:
-            return self._direct.transmissibility(check_frequencies(freq, increasing=False))
-        (phi, gamma, _, _), moves = self._modes, self._moves
-        g, slopes = gains_of(check_frequencies(freq, increasing=False), self._modes)
-        size = float(np.max(np.abs(np.einsum("ik,kj,kf->ijf", phi, gamma, g))))
-        std = np.empty((len(phi), gamma.shape[1], g.shape[1]))
-        for i, j in np.ndindex(*std.shape[:2]):
-            residue = np.tile(phi[i] * gamma[:, j], 2)[:, None]
-            change = np.vstack([moves.phi[i], moves.gamma[:, j], moves.log_omega, moves.log_ratios])
-            std[i, j] = moves.std_of_lines(change, [gamma[:, [j]] * g, phi[i, :, None] * g, residue * slopes], size)
-        return std
+        return self._spectra.transmissibility(check_frequencies(freq, increasing=False))
 
     def base_force(self, freq: ArrayLike) -> Array:
         """Standard deviation ``sqrt(E|e|²)`` of the apparent mass at lines in Hz, kg, (d, d, n_freq)."""
-        if self._direct is not None:
-            return self._direct.base_force(check_frequencies(freq, increasing=False))
-        gamma, moves = self._modes.gamma, self._moves
-        g, slopes = gains_of(check_frequencies(freq, increasing=False), self._modes)
-        weight = np.sqrt(np.diag(self.structure.rigid_body_mass)).tolist()
-        std = np.empty((len(weight), len(weight), g.shape[1]))
-        for i, j in np.ndindex(*std.shape[:2]):
-            residue = np.tile(gamma[:, i] * gamma[:, j], 2)[:, None]
-            change = np.vstack(
-                [moves.gamma[:, i], moves.gamma[:, j], moves.log_omega, moves.log_ratios, moves.rigid[i, [j]]]
-            )
-            factors = [gamma[:, [j]] * g, gamma[:, [i]] * g, residue * slopes, np.ones((1, g.shape[1]))]
-            std[i, j] = moves.std_of_lines(change, factors, weight[i] * weight[j])
-        return std
+        return self._spectra.base_force(check_frequencies(freq, increasing=False))
 
 
-def uncertainty(problem: Problem, structure: Structure) -> Uncertainty:
+def uncertainty(problem: Problem, structure: Structure, x: Array | None) -> Uncertainty:
     """Standard deviations of everything that was identified.
 
     Parameters
@@ -211,28 +176,125 @@ def uncertainty(problem: Problem, structure: Structure) -> Uncertainty:
         The standard deviations that its measurement states are the noise; where none are stated, the misfit that
         `structure` leaves is.
     structure : Structure
-        The fit of `problem`. Its mode shapes and participations are free for a full mass with spectral
-        stiffness; otherwise it moves as the problem's unknowns let it.
+        The fit of `problem`.
+    x : (n_variables,) or None
+        The unknowns that stand for it; those that the models have for it where they are not given.
 
     Returns
     -------
     Uncertainty
+        First order in the noise; an unknown on a bound is treated as if the bound were not there. Where modes are
+        free the structure moves as its modal parameters do, elsewhere as the problem's unknowns let it.
+
+    Raises
+    ------
+    InputError
+        Where x is needed and not given, and a matrix is written in expressions.
     """
+    if problem.free_modes:
+        return _by_modes(problem, structure, x)
+    return _by_unknowns(problem, structure, problem.values(structure) if x is None else x)
+
+
+def _by_modes(problem: Problem, structure: Structure, x: Array | None) -> Uncertainty:
+    """Where the modal parameters are free: by their information."""
     test, modes = problem.measurement, modes_of(structure)
     index = Index(structure.n_sensors, structure.n, structure.n_base)
-    path = _free(problem, modes, index) if problem.free_modes else _structured(problem, structure, modes, index)
+    path = parametrisation(problem, structure, modes, index)
     unknowns = path.unit.size - path.gauge.shape[1]
     records, spectra = records_of(test, structure, unknowns), spectra_of(test, modes)
     A = information(modes, index, [record.grams(spectra) for record in records])
     B = None
     if not all(record.shared for record in records):
         B = information(modes, index, [record.sandwich_grams(spectra) for record in records])
-    normals, unseen = spread(A, B, path)
-    if _masses_known(problem, structure):
-        normals, unseen = (_held(problem, modes, index, path, part) for part in (normals, unseen))
+    steps = spread(A, B, path)
+    normals, unseen = (held_by_entries(problem, structure, modes, index, path, part) for part in steps)
     inflation = inflation_of(test, records, unknowns)
-    moves = Moves(*index.split(np.hstack([inflation * normals, unseen])), normals.shape[1])
-    return quantities(problem, structure, modes, moves, inflation)
+    moves = Perturbations(normals.shape[1], *index.split(np.hstack([inflation * normals, unseen])))
+    matrices = matrices_of_modes(structure, modes, moves)
+    if test.force is None and open_modes(problem, structure):
+        open_ = np.full((structure.n, structure.n), np.nan)
+        matrices = open_, open_, open_  # zeros that a decoupled structure keeps included
+    found = _quantities(problem, structure, modes, moves, inflation, matrices)
+    if x is None or not np.any(problem.formulation.outside):
+        return found
+    variables, at = outside_variables(problem.formulation), x[problem.formulation.outside]
+    known = of_outside(problem.formulation, x)
+    std = std_of(known.steps, known.rank, known.unit)
+    return replace(found, values=by_name(variables, at), variables=by_name(variables, std))
+
+
+def _by_unknowns(problem: Problem, structure: Structure, x: Array) -> Uncertainty:
+    """By the Jacobian of all that is fitted, in the problem's unknowns."""
+    test, modes = problem.measurement, modes_of(structure)
+    formulation, at = _with_totals(problem, structure, x)
+    slopes = slopes_of(formulation.matrices, at, test, modes.omega)
+    known = of_formulation(formulation, at, slopes)
+    steps, normals = known.steps, known.rank
+    inflation = inflation_of(test, records_of(test, structure, at.size), at.size) if formulation.fits_records else 1.0
+    shapes = np.einsum("si,ikc->skc", structure.recovery, slopes.d_shapes)
+    parts = (shapes, slopes.d_participation, slopes.d_log_omega, slopes.d_log_ratios, slopes.d_rigid)
+    moves = Perturbations(normals, *(part @ steps for part in parts))
+    n = structure.n
+    matrices = []
+    for matrix, slope in (
+        (structure.mass[:n, :n], slopes.mass), (structure.stiffness[:n, :n], slopes.stiffness),
+        (structure.damping, slopes.damping),
+    ):  # fmt: skip
+        size = np.sqrt(np.abs(np.diag(matrix)))
+        matrices.append(std_of(slope @ steps, normals, np.outer(size, size)))
+    found = _quantities(problem, structure, modes, moves, inflation, matrices)
+    if not structure.modal_damping:
+        found = replace(found, _spectra=DirectSpectra(slopes, steps, normals))
+    return _with_unknowns(found, problem, formulation, at, known, slopes)
+
+
+def _with_totals(problem: Problem, structure: Structure, x: Array) -> tuple[Formulation, Array]:
+    """The formulation and its unknowns; with the totals among them where nobody stated these, so that none is known."""
+    formulation = problem.formulation
+    if not problem.unit_mass:
+        return formulation, x
+    geometry = problem.geometry.weighing(problem.totals)
+    of_mass = formulation.models[0].values(geometry, structure)
+    return problem.formulate(geometry), np.concatenate([of_mass, x[formulation.parts.mass.stop :]])
+
+
+def _with_unknowns(
+    found: Uncertainty, problem: Problem, formulation: Formulation, x: Array, known: Sensitivity, slopes: Slopes
+) -> Uncertainty:
+    """The same with the unknowns that mean something by themselves; with their covariance where all do."""
+    steps, of_models = known.steps, slice(0, formulation.parts.damping.stop)
+    told = meaningful(formulation)
+    told[of_models] &= ~_arbitrary(known, slopes)[of_models]
+    std = std_of(steps, known.rank, known.unit)
+    names = {unknown.name for unknown in problem.formulation.unknowns}
+    values, variables = {}, {}
+    for unknown, part, value, deviation in zip(
+        formulation.unknowns, *(split(formulation.unknowns, of_all) for of_all in (told, x, std)), strict=True
+    ):
+        if np.all(part) and unknown.name in names:
+            values[unknown.name], variables[unknown.name] = unknown.shaped(value), unknown.shaped(deviation)
+    found = replace(found, values=values, variables=variables)
+    if len(values) < len(formulation.unknowns):
+        return found
+    covariance = steps[:, : known.rank] @ steps[:, : known.rank].T
+    covariance[np.isnan(std)], covariance[:, np.isnan(std)] = np.nan, np.nan
+    return replace(found, parameters=formulation.labels, covariance=covariance)
+
+
+def _arbitrary(known: Sensitivity, slopes: Slopes) -> NDArray[np.bool_]:
+    """Unknowns that can move together with no matrix moving, (p,), such as shares that a total scales."""
+    s, steps = slopes.structure, known.unit[:, None] * known.unseen
+    changes = []
+    for matrix, slope in (
+        (s.mass, slopes.mass), (s.stiffness, slopes.stiffness), (s.damping, slopes.damping),
+        (slopes.push, slopes.d_push), (s.rigid_body_mass, slopes.d_rigid),
+    ):  # fmt: skip
+        size = max(np.abs(matrix).max(), np.abs(slope * known.unit).max(), np.finfo(float).tiny)
+        changes.append(slope.reshape(-1, len(steps)) @ steps / size)
+    moved = np.concatenate(changes)
+    lam, turn = np.linalg.eigh(moved.T @ moved)
+    return np.linalg.norm(known.unseen @ turn[:, lam < MOVED**2], axis=1) > MOVED
 
 
 def modes_of(structure: Structure) -> Modes:
@@ -248,151 +310,11 @@ def modes_of(structure: Structure) -> Modes:
     return Modes(structure.mode_shapes, structure.participation, omega, ratios)
 
 
-def _free(problem: Problem, modes: Modes, index: Index) -> Path:
-    """A full mass with spectral stiffness: theta itself, less what the damping model and stated totals tie."""
-    test, (phi, gamma, _, _) = problem.measurement, modes
-    m, d = gamma.shape
-    slope, unit, keep = np.eye(index.size), np.ones(index.size), np.ones(index.size, bool)
-    strength = np.linalg.norm(phi, axis=0)
-    unit[index.phi] = np.tile(strength, len(phi))
-    # Only the product of shape and participation has a size of its own.
-    unit[index.gamma] = np.repeat(np.max(strength * np.linalg.norm(gamma, axis=1)) / strength, d)
-    weight = np.sqrt(problem.totals)
-    unit[index.rigid] = [weight[i] * weight[j] for i, j in index.pairs]
-    if not isinstance(problem.damping, ModalDamping):
-        at = index.log_ratios
-        by_unknowns, by_log_omega, unknowns = _damping_slopes(problem, modes)
-        slope[at, at], slope[at, index.log_omega] = 0.0, by_log_omega
-        slope[at, at.start : at.start + unknowns.size] = by_unknowns
-        unit[at.start : at.start + unknowns.size], keep[at.start + unknowns.size : at.stop] = unknowns, False
-    gauge = np.zeros((index.size, 0))
-    if test.force is None:
-        gauge = np.zeros((index.size, m))
-        modes_of = np.eye(m)
-        gauge[index.phi] = -(phi[:, :, None] * modes_of).reshape(-1, m)
-        gauge[index.gamma] = (gamma[:, :, None] * modes_of[:, None]).reshape(-1, m)
-    elif isinstance(problem.mass, FullMass) and problem.mass.total_mass is not None:
-        for entry, row in _tied_masses(problem, modes, index):
-            slope[entry], keep[entry] = row, False
-    return Path(slope[:, keep], unit[keep], gauge[keep])
-
-
-def _tied_masses(problem: Problem, modes: Modes, index: Index) -> Iterator[tuple[int, Array]]:
-    """Entries of M_rb that a stated total mass ties, and how they follow theta, (size of theta,)."""
-    mass, layout, (phi, gamma, _, _) = problem.mass, problem.layout, modes
-    assert isinstance(mass, FullMass)
-    every = np.asarray(mass.total_mass).ndim == 2  # the whole matrix is stated
-    for at, (i, j) in zip(index.rigid.tolist(), index.pairs, strict=True):
-        row = np.zeros(index.size)
-        if i != j and not every:
-            continue
-        # With other degrees of freedom than the sensors the fit ties M_rb itself.
-        if mass.healing == "trace" and phi.shape[0] == phi.shape[1]:
-            # M_rb,ii = total - sum of the sensors' M_jj - (delta' delta)_ii + (Gamma' Gamma)_ii, delta = Gamma - P G
-            P, own = np.linalg.inv(phi), layout.directions[: layout.n] == i
-            drawn = P @ layout.rigid_body[:, i]
-            delta = gamma[:, i] - drawn
-            by_phi = 2 * (P.T @ P)[:, own] @ P[:, own].T - 2 * np.outer(P.T @ delta, drawn)
-            row[index.phi] = by_phi.ravel()
-            row[index.gamma].reshape(gamma.shape)[:, i] = 2 * (gamma[:, i] - delta)
-        yield at, row
-
-
-def _masses_known(problem: Problem, structure: Structure) -> bool:
-    """Whether known entries of a full mass, not a force, set the scale of the modes."""
-    stated = problem.free_modes and problem.measurement.force is None and np.any(np.isfinite(problem.known_mass))
-    return bool(stated and structure.at_sensors)
-
-
-def _held(problem: Problem, modes: Modes, index: Index, path: Path, moves: Array) -> Array:
-    """Moves of theta (size of theta, moves) with the scale of each mode moved so that known entries of the mass stay.
-
-    With P the inverse of Phi the entries are those of ``M_SS = P' P`` and ``M_S0 = P' (Gamma - P G)``.
-    """
-    phi, gamma, _, _ = modes
-    n, G, known = len(phi), problem.layout.rigid_body, problem.known_mass
-    P = np.linalg.inv(phi)
-    M, push = P.T @ P, P.T @ gamma
-    size = np.sqrt(np.diag(M))
-    rows = []
-    for i, j in np.argwhere(np.isfinite(known)):
-        row = np.zeros(index.size)
-        if j < n:
-            by_phi = -(np.outer(M[i], P[:, j]) + np.outer(M[j], P[:, i]))
-        else:
-            # M_S0 = P' Gamma - M G
-            by_phi = (
-                -np.outer(push[:, j - n], P[:, i])
-                + np.outer(M[i], P @ G[:, j - n])
-                + np.outer(M @ G[:, j - n], P[:, i])
-            )
-            row[index.gamma].reshape(gamma.shape)[:, j - n] = P[:, i]
-        row[index.phi] = by_phi.ravel()
-        rows.append(row / (size[i] * (size[j] if j < n else size.max())))
-    C, gauge = np.array(rows), path.slope @ path.gauge
-    return moves - gauge @ (np.linalg.pinv(C @ gauge, rcond=1e-9) @ (C @ moves))
-
-
-def _damping_slopes(problem: Problem, modes: Modes) -> tuple[Array, Array, Array]:
-    """Slopes of log zeta by the damping's unknowns (m, unknowns) and by log w (m, m), and large steps of the first."""
-    damping, omega, ratios = problem.damping, modes.omega, modes.ratios
-    (variable,) = damping.variables(problem.layout)
-    at = damping.values(ratios, omega)
-    y, w = ca.SX.sym("y", variable.size), ca.SX.sym("w", omega.size)
-    answer = damping.ratios(y, w)
-    slopes = ca.Function("slopes", [y, w], [ca.jacobian(answer, y), ca.jacobian(answer, w)])
-    by_unknowns, by_omega = (ca.densify(part).full() / ratios[:, None] for part in slopes(at, omega))
-    return by_unknowns, by_omega * omega, steps_of((variable,), at)
-
-
-def _structured(problem: Problem, structure: Structure, modes: Modes, index: Index) -> Path:
-    """Mass or stiffness with unknowns of their own: modes move as the matrices do (`sysid.sensitivity`)."""
-    layout, x = problem.layout, problem.values(structure)
-    if problem.unit_mass:
-        # Nobody stated the totals, to which masses are normalised: they are unknowns that no record sees.
-        layout = replace(layout, weighed=problem.totals)
-        x = np.concatenate([problem.mass.values(layout, structure.mass), x[problem.parts.stiffness.start :]])
-    formulation = problem.formulate(layout)
-    s = slopes_of(formulation.matrices, x, problem.measurement, modes.omega)
-    rigid = np.stack([s.d_rigid[i, j] for i, j in index.pairs])
-    changes = (s.d_shapes, s.d_participation, s.d_log_omega, s.d_log_ratios, rigid)
-    slope = np.concatenate([change.reshape(-1, x.size) for change in changes])
-    return Path(slope, steps_of(formulation.variables, x), np.zeros((x.size, 0)))
-
-
-class Moves(NamedTuple):
-    """Moves of the modal parameters in the last axis: `normals` of a standard normal each, then those unseen."""
-
-    phi: Array
-    gamma: Array
-    log_omega: Array
-    log_ratios: Array
-    rigid: Array
-    normals: int
-
-    def std(self, change: Array, size: ArrayLike) -> Array:
-        """Standard deviations of quantities with this change, (..., moves); `size` (...) tells what is much."""
-        std = np.linalg.norm(change[..., : self.normals], axis=-1)
-        unseen = np.abs(change[..., self.normals :]).max(axis=-1, initial=0.0)
-        return np.where(unseen > MOVED * np.asarray(size), np.nan, std)
-
-    def std_of_lines(self, change: Array, factors: Sequence[NDArray[np.inexact[Any]]], size: float) -> Array:
-        """Of a spectrum that changes by the sum of `change` (rows, moves) times `factors` (rows, n_freq)."""
-        weight, seen, unseen = np.vstack(factors), change[:, : self.normals], change[:, self.normals :]
-        variance = np.sum(weight.conj() * ((seen @ seen.T) @ weight), axis=0).real
-        moved = np.abs(unseen.T @ weight).max(axis=0, initial=0.0)
-        return np.where(moved > MOVED * size, np.nan, np.sqrt(np.maximum(variance, 0.0)))
-
-
-def quantities(
-    problem: Problem,
-    structure: Structure,
-    modes: Modes,
-    moves: Moves,
-    inflation: float,
-    matrices: tuple[Array, ...] | None = None,
-) -> Uncertainty:
-    """Everything that follows from the moves; `matrices` are those of M_SS, K_SS and C where they are known."""
+def _quantities(
+    problem: Problem, structure: Structure, modes: Modes, moves: Perturbations, inflation: float,
+    matrices: Sequence[Array],
+) -> Uncertainty:  # fmt: skip
+    """Everything that follows from the perturbations; `matrices` are the deviations of M_SS, K_SS and C."""
     phi, gamma, omega, ratios = modes
     frequencies, n = omega / (2 * np.pi), structure.n
     d_frequencies, d_ratios = frequencies[:, None] * moves.log_omega, ratios[:, None] * moves.log_ratios
@@ -412,18 +334,6 @@ def quantities(
     effective = np.sqrt(moves.std(first, size) ** 2 + each[:, :, None] * each[:, None] + together**2)
     effective[hidden] = np.nan
 
-    loss, none = 2 * ratios * omega, np.zeros_like(d_ratios)
-    diagonals = (
-        (np.ones(n), none),
-        (omega**2, 2 * omega[:, None] ** 2 * moves.log_omega),
-        (loss, loss[:, None] * (moves.log_omega + moves.log_ratios)),
-    )
-    mass, stiffness, damping = matrices or (
-        _matrix_std(structure, moves, diagonal, change) for diagonal, change in diagonals
-    )
-    if problem.free_modes and problem.measurement.force is None and open_masses(problem, structure):
-        mass, stiffness, damping = np.full((3, n, n), np.nan)  # zeros that a decoupled structure keeps included
-
     known = np.isfinite(push_std)
     changes = np.concatenate([d_frequencies, d_ratios, moves.gamma[known]])[:, : moves.normals]
     covariance = changes @ changes.T
@@ -440,29 +350,11 @@ def quantities(
         participation=push_std,
         effective_masses=effective,
         rigid_body_mass=moves.std(moves.rigid, size),
-        mass=mass,
-        stiffness=stiffness,
-        damping=damping,
+        mass=matrices[0],
+        stiffness=matrices[1],
+        damping=matrices[2],
         parameters=tuple(names),
         covariance=covariance,
         inflation=inflation,
-        _modes=modes,
-        _moves=moves,
+        _spectra=ModalSpectra(modes, moves, structure.rigid_body_mass),
     )
-
-
-def _matrix_std(structure: Structure, moves: Moves, diagonal: Array, change: Array) -> Array:
-    """Of ``T^-T diag(diagonal) T^-1``, T the modes at the degrees of freedom, where `diagonal` (m,) changes too."""
-    T = structure.normal_modes
-    dT = np.zeros((*T.shape, change.shape[1]))
-    for j, (sensor, mode) in enumerate(zip(structure.dof_sensors, structure.dof_modes, strict=True)):
-        if sensor >= 0:
-            dT[j] = moves.phi[sensor]
-        elif mode < 0:
-            return np.full(T.shape, np.nan)
-    P = np.linalg.inv(T)
-    X = (P.T * diagonal) @ P
-    half = np.einsum("ia,abc,bj->ijc", X, dT, P, optimize=True)
-    own = np.einsum("ki,kc,kj->ijc", P, change, P, optimize=True)
-    size = np.sqrt(np.diag(X))
-    return moves.std(own - half - half.swapaxes(0, 1), np.outer(size, size))

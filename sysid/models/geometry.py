@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from functools import cached_property
 
 import casadi as ca
@@ -63,10 +64,17 @@ class Geometry:
 
     def unsearched(self) -> Geometry:
         """The same with made-up poles and weights, to check what is declared before anything is searched."""
-        copy = Geometry(self.test, self.rigid_body, self.recovery, None if self._weighed is None else np.ones(self.d))
+        other = Geometry(self.test, self.rigid_body, self.recovery, None if self._weighed is None else np.ones(self.d))
         low = 1e-6 * self.test.freq[-1]  # within any limit that is stated
-        copy.__dict__["poles"] = Poles(np.full(self.n, low), np.full(self.n, 0.01), 0.0)
-        return copy
+        other.__dict__["poles"] = Poles(np.full(self.n, low), np.full(self.n, 0.01), 0.0)
+        return other
+
+    def weighing(self, totals: Array) -> Geometry:
+        """The same with totals, where none are stated, as unknowns that are searched around these (d,)."""
+        other = copy(self)
+        other.__dict__.pop("weighed", None)
+        other._weighed = totals
+        return other
 
     @property
     def weighs(self) -> bool:
@@ -106,7 +114,7 @@ class Geometry:
         if total_mass is not None or not self.weighs:
             return ()
         moved = np.any(self.test.base, axis=(0, 2))
-        if not np.all(moved):
+        if self.test.force is not None and not np.all(moved):
             raise InputError(
                 f"the base moves in only {np.count_nonzero(moved)} of {self.d} independent directions: the base force "
                 "weighs nothing in the others; add runs that move them, describe the test by the directions that move, "

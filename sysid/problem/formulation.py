@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
@@ -158,6 +159,13 @@ class Formulation:
         """Where the unknowns of each model stand in x."""
         ends = np.cumsum([0, *(sum(unknown.size for unknown in group) for group in self.of_models)]).tolist()
         return Parts(*(slice(a, b) for a, b in pairwise(ends)))
+
+    @cached_property
+    def outside(self) -> NDArray[np.bool_]:
+        """Which entries of x enter no matrix of the problem, (size,): some variables of residuals and constraints."""
+        entering = {symbol.__hash__() for symbol in self._in_matrices}
+        apart = [[isinstance(u, Variable) and u.symbol.__hash__() not in entering] * u.size for u in self.unknowns]
+        return np.array([entry for entries in apart for entry in entries], dtype=bool)
 
     @property
     def size(self) -> int:

@@ -45,7 +45,7 @@ class Slopes(NamedTuple):
 def slopes_of(matrices: Matrices, x: Array, test: Measurement, omega: Array | None = None) -> Slopes:
     """Derivatives of everything that `x` stands for.
 
-    The shapes of modes of one frequency are not turned into each other, unless `omega` (n,), rad/s, sets them apart.
+    The shapes of modes of one frequency are not turned within their plane, unless `omega` (n,), rad/s, sets them apart.
     """
     structure = matrices.structure(x, test)
     symbol, p = ca.MX.sym("x", x.size), x.size
@@ -76,9 +76,9 @@ def slopes_of(matrices: Matrices, x: Array, test: Measurement, omega: Array | No
     moved = by_stiffness - lam[:, None] * by_mass  # column k of phi_l' (dK - lam_k dM) phi_k
     gap = lam[None] - lam[:, None]
     apart = np.abs(gap) > _SAME * lam.max()
-    turn = np.where(apart[:, :, None], moved / np.where(apart, gap, 1.0)[:, :, None], 0.0)
+    # Modes of one frequency, and each mode itself, stay normalised to unit mass.
+    turn = np.where(apart[:, :, None], moved / np.where(apart, gap, 1.0)[:, :, None], -by_mass / 2)
     k = np.arange(n)
-    turn[k, k] = -by_mass[k, k] / 2
     d_shapes = np.einsum("il,lkc->ikc", phi, turn)
     d_log_omega = moved[k, k] / (2 * lam[:, None])
     if matrices.by_ratios:

@@ -54,8 +54,11 @@ class Term(Protocol):
     def squared(self, particles: Array) -> Array:
         """Sum of squares of the rows for many x at once, (count, size) to (count,); NaN where x is no structure."""
 
-    def linearised(self, x: Array, noise: float) -> Rows:
-        """Rows, Jacobian and standard deviations at x; `noise` is that of the first term's rows."""
+    def linearised(self, x: Array, noise: float, *, as_stated: bool = False) -> Rows:
+        """Rows, Jacobian and standard deviations at x; `noise` is that of the first term's rows.
+
+        Noise of records that is larger than stated counts as the misfit shows it, unless `as_stated`.
+        """
 
     def doubts(self, x: Array) -> Sequence[str]:
         """What speaks against the fit at x, in sentences."""
@@ -138,7 +141,7 @@ class TestTerm:
     def linearised(
         self, x: Array, noise: float = np.nan, slopes: Slopes | None = None, *, as_stated: bool = False
     ) -> Rows:
-        """As in `Term`; noise that is larger than stated counts as the misfit shows it, unless `as_stated`."""
+        """As in `Term`; `slopes` are those at x where they are known."""
         slopes = slopes or slopes_of(self.matrices, x, self.test)
         return stacked_rows(rows_of_test(self.test, slopes, x.size, share=self.weight, as_stated=as_stated))
 
@@ -189,7 +192,7 @@ class ExpressionTerm:
         rows = np.asarray(ca.densify(self.function(particles.T)))  # a column each
         return np.sum((self.weight * rows) ** 2, axis=0)
 
-    def linearised(self, x: Array, noise: float) -> Rows:
+    def linearised(self, x: Array, noise: float, *, as_stated: bool = False) -> Rows:
         """As in `Term`."""
         symbol = ca.MX.sym("x", x.size)
         column = self.function(symbol)

@@ -1,0 +1,154 @@
+"""Standard deviations of what follows from modal parameters or matrices, by the chain rule.
+
+What noise does is kept as columns, each the move that one independent standard normal makes; moves that no record sees
+stand beside them. The variance of a quantity is a sum of squares; it is NaN where something unseen moves it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sysid.assessment.information import gains_of
+from sysid.modal_analysis.modal_fit import Modes
+from sysid.problem.slopes import Slopes, response_slopes
+from sysid.structure.structure import Array, Structure
+
+MOVED = 1e-6  # of a quantity's size, by which an unseen move of order one must change it to count
+
+
+def std_of(change: NDArray[np.inexact[Any]], normals: int, size: ArrayLike) -> Array:
+    """Standard deviations of quantities with this change, (..., moves), `normals` of them of a standard normal each.
+
+    `size` (...) tells what is much.
+    """
+    std = np.linalg.norm(change[..., :normals], axis=-1)
+    unseen = np.abs(change[..., normals:]).max(axis=-1, initial=0.0)
+    return np.where(unseen > MOVED * np.asarray(size), np.nan, std)
+
+
+class Perturbations(NamedTuple):
+    """Moves of the modal parameters in the last axis: `normals` of a standard normal each, then those unseen."""
+
+    normals: int
+    phi: Array
+    gamma: Array
+    log_omega: Array
+    log_ratios: Array
+    rigid: Array
+
+    def std(self, change: Array, size: ArrayLike) -> Array:
+        """As `std_of`."""
+        return std_of(change, self.normals, size)
+
+    def std_of_lines(self, change: Array, factors: Sequence[NDArray[np.inexact[Any]]], size: float) -> Array:
+        """Of a spectrum that changes by the sum of `change` (rows, moves) times `factors` (rows, n_freq)."""
+        weight, seen, unseen = np.vstack(factors), change[:, : self.normals], change[:, self.normals :]
+        variance = np.sum(weight.conj() * ((seen @ seen.T) @ weight), axis=0).real
+        moved = np.abs(unseen.T @ weight).max(axis=0, initial=0.0)
+        return np.where(moved > MOVED * size, np.nan, np.sqrt(np.maximum(variance, 0.0)))
+
+
+class Spectra(Protocol):
+    """What tells standard deviations of predicted spectra."""
+
+    def transmissibility(self, freq: Array) -> Array:
+        """Standard deviations, (n_sensors, d, n_freq)."""
+
+    def base_force(self, freq: Array) -> Array:
+        """Standard deviations, kg, (d, d, n_freq)."""
+
+
+@dataclass(frozen=True, eq=False)
+class ModalSpectra:
+    """Where the damping is by ratios: by modes."""
+
+    modes: Modes
+    moves: Perturbations
+    rigid_body_mass: Array
+
+    def transmissibility(self, freq: Array) -> Array:
+        """As in `Spectra`."""
+        (phi, gamma, _, _), moves = self.modes, self.moves
+        g, slopes = gains_of(freq, self.modes)
+        size = float(np.max(np.abs(np.einsum("ik,kj,kf->ijf", phi, gamma, g))))
+        std = np.empty((len(phi), gamma.shape[1], g.shape[1]))
+        for i, j in np.ndindex(*std.shape[:2]):
+            residue = np.tile(phi[i] * gamma[:, j], 2)[:, None]
+            change = np.vstack([moves.phi[i], moves.gamma[:, j], moves.log_omega, moves.log_ratios])
+            std[i, j] = moves.std_of_lines(change, [gamma[:, [j]] * g, phi[i, :, None] * g, residue * slopes], size)
+        return std
+
+    def base_force(self, freq: Array) -> Array:
+        """As in `Spectra`."""
+        gamma, moves = self.modes.gamma, self.moves
+        g, slopes = gains_of(freq, self.modes)
+        weight = np.sqrt(np.diag(self.rigid_body_mass)).tolist()
+        std = np.empty((len(weight), len(weight), g.shape[1]))
+        for i, j in np.ndindex(*std.shape[:2]):
+            residue = np.tile(gamma[:, i] * gamma[:, j], 2)[:, None]
+            change = np.vstack(
+                [moves.gamma[:, i], moves.gamma[:, j], moves.log_omega, moves.log_ratios, moves.rigid[i, [j]]]
+            )
+            factors = [gamma[:, [j]] * g, gamma[:, [i]] * g, residue * slopes, np.ones((1, g.shape[1]))]
+            std[i, j] = moves.std_of_lines(change, factors, weight[i] * weight[j])
+        return std
+
+
+@dataclass(frozen=True, eq=False)
+class DirectSpectra:
+    """Where the damping is a matrix: by direct solves; `steps` (p, moves) of x, `normals` of a standard normal each."""
+
+    slopes: Slopes
+    steps: Array
+    normals: int
+
+    def transmissibility(self, freq: Array) -> Array:
+        """As in `Spectra`."""
+        X, dX = response_slopes(self.slopes, freq)
+        R = self.slopes.structure.recovery
+        change = np.einsum("si,fidc->sdfc", R, dX, optimize=True)
+        return std_of(change @ self.steps, self.normals, float(np.abs(X).max()))
+
+    def base_force(self, freq: Array) -> Array:
+        """As in `Spectra`."""
+        s = self.slopes
+        X, dX = response_slopes(s, freq)
+        change = np.einsum("iec,fid->edfc", s.d_push, X, optimize=True) + s.d_rigid[:, :, None]
+        change = change + np.einsum("ie,fidc->edfc", s.push, dX, optimize=True)
+        return std_of(change @ self.steps, self.normals, float(np.abs(s.structure.rigid_body_mass).max()))
+
+
+def matrices_of_modes(structure: Structure, modes: Modes, moves: Perturbations) -> tuple[Array, Array, Array]:
+    """Of M_SS, K_SS and C, (n, n) each, at the degrees of freedom; NaN where one of these is no sensor's nor a mode's.
+
+    Degrees of freedom at a sensor move with its row of the mode shapes, modal coordinates stand still.
+    """
+    _, _, omega, ratios = modes
+    squared, loss = omega**2, 2 * ratios * omega
+    return (
+        _matrix_std(structure, moves, np.ones_like(omega), np.zeros_like(moves.log_omega)),
+        _matrix_std(structure, moves, squared, 2 * squared[:, None] * moves.log_omega),
+        _matrix_std(structure, moves, loss, loss[:, None] * (moves.log_omega + moves.log_ratios)),
+    )
+
+
+def _matrix_std(structure: Structure, moves: Perturbations, diagonal: Array, change: Array) -> Array:
+    """Of ``T^-T diag(diagonal) T^-1``, T the modes at the degrees of freedom, where `diagonal` (m,) changes too."""
+    T = structure.normal_modes
+    dT = np.zeros((*T.shape, change.shape[1]))
+    for j, (sensor, mode) in enumerate(zip(structure.dof_sensors, structure.dof_modes, strict=True)):
+        if sensor >= 0:
+            dT[j] = moves.phi[sensor]
+        elif mode < 0:
+            return np.full(T.shape, np.nan)
+    P = np.linalg.inv(T)
+    X = (P.T * diagonal) @ P
+    half = np.einsum("ia,abc,bj->ijc", X, dT, P, optimize=True)
+    own = np.einsum("ki,kc,kj->ijc", P, change, P, optimize=True)
+    size = np.sqrt(np.diag(X))
+    return moves.std(own - half - half.swapaxes(0, 1), np.outer(size, size))
