@@ -1,0 +1,221 @@
+"""A tree of dictionaries, lists, arrays and texts as the bytes of an HDF5 file that carries its own SHA-256.
+
+::
+
+    byte 0      text: format of the content, length and SHA-256 of the file
+    byte 512    HDF5: a group for each dictionary or list, attributes for numbers and short texts, datasets for the rest
+
+What may stand in a tree: dict (its keys are names), list, numpy array of numbers, str, tuple of str, bool, int, float
+and None. It comes back as it was, but for the order of a dictionary's keys and for NUL characters at the end of a
+text. No class of the package is known here.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import re
+from typing import Any
+
+import numpy as np
+
+from sysid.errors import InputError
+
+Tree = dict[str, Any]
+
+_BLOCK = 512  # HDF5 allows 512, 1024, 2048, ... bytes of somebody else's before its own
+_MAGIC = b"sysid file, format "
+_HEADER = re.compile(
+    re.escape(_MAGIC) + rb"(\d+), (\d+) bytes: 512 of text, then HDF5\n"
+    rb"SHA-256 of the file, with zeros in the place of these 64 digits:\n([0-9a-f]{64})\n\0*"
+)
+_LENGTH = "[]"  # the attribute by which a list is told from a dictionary
+_LONGEST_ATTRIBUTE = 4096  # bytes of a text; HDF5 itself allows 64 kB
+_NUMBERS = "buifc"  # kinds of arrays
+_DEEPEST = 50  # groups in groups; in a damaged file a group may hold itself
+
+
+def to_bytes(tree: Tree, number: int) -> bytes:
+    """The file of a tree.
+
+    Parameters
+    ----------
+    tree : dict
+    number : int
+        Of the format, for whoever reads the tree.
+
+    Returns
+    -------
+    bytes
+        The same for the same tree, whatever the order of its keys.
+
+    Raises
+    ------
+    InputError
+        Where something else stands in the tree than listed above; says where.
+    """
+    import h5py
+
+    check(tree)
+    image = io.BytesIO()
+    # Groups as HDF5 has them since 1.8 take a fraction of the room of those before.
+    with h5py.File(image, "w", userblock_size=_BLOCK, libver=("v108", "v108")) as file:
+        _write(file, tree)
+    data = image.getbuffer()
+    data[:_BLOCK] = _header(number, len(data), b"0" * 64)
+    data[:_BLOCK] = _header(number, len(data), hashlib.sha256(data).hexdigest().encode())
+    return bytes(data)
+
+
+def is_tree(image: bytes) -> bool:
+    """Whether a file begins as `to_bytes` begins it."""
+    return image.startswith(_MAGIC)
+
+
+def from_bytes(image: bytes) -> tuple[Tree, int]:
+    """The tree and the number of its format; nothing is read before length and SHA-256 are found to be right.
+
+    Raises
+    ------
+    InputError
+        Where the bytes are not those that were written.
+    """
+    import h5py
+
+    header = _HEADER.fullmatch(image[:_BLOCK])
+    if header is None:
+        raise _damaged(f"its first {_BLOCK} bytes are not those that were written")
+    number, length = int(header[1]), int(header[2])
+    if len(image) != length:
+        raise _damaged(f"it has {len(image)} bytes, and {length} were written")
+    digest = hashlib.sha256(_header(number, length, b"0" * 64))
+    digest.update(memoryview(image)[_BLOCK:])
+    if digest.hexdigest().encode() != header[3]:
+        raise _damaged("its bytes have another SHA-256 than those that were written")
+    with h5py.File(io.BytesIO(image), "r") as file:
+        return read_group(file, length), number
+
+
+def read_group(group: Any, size: int, depth: int = 0) -> Any:
+    """Everything in a group, as a dictionary or a list.
+
+    Parameters
+    ----------
+    group : h5py.Group
+    size : int
+        Of its file, bytes.
+    depth : int
+        Groups around it.
+
+    Raises
+    ------
+    InputError
+        Where there is more in it than the file can hold. Other damage makes h5py raise what it likes.
+    """
+    import h5py
+
+    if depth > _DEEPEST:
+        raise _damaged("its groups stand in one another")
+    tree = {name: _value(value) for name, value in group.attrs.items()}
+    for name, item in group.items():
+        if isinstance(item, h5py.Dataset):
+            if item.nbytes > size:
+                raise _damaged(f"{item.name} claims {item.nbytes} bytes")
+            tree[name] = _value(item[()], array=True)
+        else:
+            tree[name] = read_group(item, size, depth + 1)
+    if _LENGTH in tree:
+        return [tree[str(i)] for i in range(tree[_LENGTH])]
+    return tree
+
+
+def check(value: Any, at: str = "") -> None:
+    """Refuse what cannot stand in a tree.
+
+    Raises
+    ------
+    InputError
+        Says where it stands and what may stand there.
+    """
+    if isinstance(value, dict):
+        for name, part in value.items():
+            if not isinstance(name, str) or not name or name in (".", _LENGTH) or "/" in name or "\0" in name:
+                raise InputError(f"{at or 'tree'}: {name!r} is no name: a text without '/' is needed")
+            check(part, f"{at}/{name}")
+    elif isinstance(value, list):
+        for i, part in enumerate(value):
+            check(part, f"{at}/{i}")
+    elif isinstance(value, int | np.integer) and not -(2**63) <= value < 2**63:
+        raise InputError(f"{at}: {value} has more than 64 bits and cannot be stored as a number")
+    elif not (
+        value is None
+        or isinstance(value, str | bool | int | float | np.bool_ | np.integer | np.floating)
+        or (isinstance(value, np.ndarray) and value.dtype.kind in _NUMBERS)
+        or (isinstance(value, tuple) and all(isinstance(text, str) for text in value))
+    ):
+        raise InputError(
+            f"{at}: a {type(value).__name__} cannot be stored; dictionaries, lists, arrays of numbers, texts, tuples "
+            "of texts, numbers, bool and None can"
+        )
+
+
+def _damaged(how: str) -> InputError:
+    return InputError(f"it is damaged: {how}; take another copy of it, or run the problem again")
+
+
+def _header(number: int, length: int, digest: bytes) -> bytes:
+    text = (
+        f"{_MAGIC.decode()}{number}, {length} bytes: {_BLOCK} of text, then HDF5\n"
+        f"SHA-256 of the file, with zeros in the place of these 64 digits:\n"
+    )
+    return (text.encode() + digest + b"\n").ljust(_BLOCK, b"\0")
+
+
+def _write(group: Any, tree: Tree) -> None:
+    for name in sorted(tree):
+        value = tree[name]
+        if isinstance(value, dict):
+            _write(group.create_group(name), value)
+        elif isinstance(value, list):
+            listed = group.create_group(name)
+            listed.attrs[_LENGTH] = len(value)
+            _write(listed, {str(i): part for i, part in enumerate(value)})
+        elif isinstance(value, np.ndarray):
+            group[name] = value
+        elif isinstance(value, tuple):
+            group[name] = _texts(value)
+        elif isinstance(value, str):
+            text = _texts((value,))[0]
+            (group.attrs if text.nbytes <= _LONGEST_ATTRIBUTE else group)[name] = text
+        else:
+            group.attrs[name] = _scalar(value)
+
+
+def _scalar(value: Any) -> Any:
+    import h5py
+
+    if value is None:
+        return h5py.Empty("f8")
+    if isinstance(value, bool | np.bool_):
+        return np.bool_(value)
+    return np.int64(value) if isinstance(value, int | np.integer) else np.float64(value)
+
+
+def _texts(values: tuple[str, ...]) -> Any:
+    """Texts of one length: those of free length are stored as objects, which fewer programs read."""
+    import h5py
+
+    encoded = [value.encode("utf-8", "surrogatepass") for value in values]
+    return np.array(encoded, dtype=h5py.string_dtype("utf-8", max([1, *map(len, encoded)])))
+
+
+def _value(value: Any, array: bool = False) -> Any:
+    import h5py
+
+    if isinstance(value, h5py.Empty):
+        return None
+    numbers = np.asarray(value)
+    if numbers.dtype.kind == "S":
+        texts = tuple(text.decode("utf-8", "surrogatepass") for text in numbers.ravel().tolist())
+        return texts if numbers.ndim else texts[0]
+    return numbers if array else numbers.item()
