@@ -12,26 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from sysid.errors import InputError
 from sysid.measurement import spectra
 from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
+from sysid.structure.sensor import Sensor, sensors_from_tree, sensors_to_tree
 from sysid.structure.structure import Array, ComplexArray, Structure, check_frequencies
-
-
-@dataclass(frozen=True)
-class Sensor:
-    """One accelerometer axis.
-
-    Parameters
-    ----------
-    name : str
-        As it should stand in tables and pictures.
-    position : tuple of float, shape (3,)
-        m.
-    axis : str or tuple of float, shape (3,)
-        "x", "-y", ..., or a direction vector.
-    """
-
-    name: str
-    position: tuple[float, float, float]
-    axis: str | tuple[float, float, float]
 
 
 def rigid_body(
@@ -187,6 +169,19 @@ class Measurement:
                 return None
             names += alike
         return tuple(names) if len(set(names)) == len(names) else None
+
+    def to_tree(self) -> dict[str, Any]:
+        """Give records, geometry and sensors as dictionaries, arrays and texts; `from_tree` takes them back."""
+        return {
+            "freq": self.freq, "base": self.base, "response": self.response, "rigid_body": self.rigid_body,
+            "force": self.force, "sensors": sensors_to_tree(self.sensors), "response_std": self.response_std,
+            "force_std": self.force_std, "base_axes": self.base_axes,
+        }  # fmt: skip
+
+    @classmethod
+    def from_tree(cls, tree: dict[str, Any]) -> Measurement:
+        """Give the measurement of a tree that `to_tree` made."""
+        return cls(**{**tree, "sensors": sensors_from_tree(tree["sensors"])})
 
     @property
     def translational(self) -> NDArray[np.bool_]:

@@ -19,6 +19,7 @@ from sysid.models.expressions import (
     values_of_written,
     written_in,
 )
+from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import Geometry
 from sysid.models.model import MassBlocks, Stated, StiffnessBlocks
 from sysid.models.unknowns import Unknown
@@ -26,7 +27,7 @@ from sysid.structure.structure import Array, Structure
 
 
 @dataclass(frozen=True, eq=False)
-class ModalDamping:
+class ModalDamping(FieldTree):
     """One damping ratio a mode; the bounds are the swarm's search space (eq. 38 of Cerini et al. 2024)."""
 
     lower: float = 0.005
@@ -56,7 +57,7 @@ class ModalDamping:
 
 
 @dataclass(frozen=True, eq=False)
-class ProportionalDamping:
+class ProportionalDamping(FieldTree):
     """Rayleigh damping ``C = alpha M_SS + beta K_SS``: ``zeta_k = alpha / (2 w_k) + beta w_k / 2``.
 
     Parameters
@@ -67,6 +68,11 @@ class ProportionalDamping:
 
     alpha: tuple[float, float]
     beta: tuple[float, float]
+
+    @classmethod
+    def from_tree(cls, tree: dict[str, Any]) -> ProportionalDamping:
+        """Give the model of a tree that `to_tree` made; its fields are pairs."""
+        return cls(*(tuple(tree[name].tolist()) for name in ("alpha", "beta")))
 
     def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """The two factors."""

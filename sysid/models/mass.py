@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from sysid.errors import InputError
 from sysid.models.expressions import check_size, square, values_of_written
+from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import FACTOR_FLOOR, Geometry
 from sysid.models.model import MassBlocks, Stated, Totals, constant
 from sysid.models.unknowns import Unknown
@@ -47,7 +48,7 @@ def gather_rows(y: Array, exponents: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class FullMass:
+class FullMass(FieldTree):
     """A full mass matrix over sensors and base, through its Cholesky factor.
 
     Parameters
@@ -171,7 +172,7 @@ class FullMass:
 
 
 @dataclass(frozen=True, eq=False)
-class LumpedMass:
+class LumpedMass(FieldTree):
     """A diagonal mass matrix on the sensors, without coupling to the base and without base mass.
 
     Parameters
@@ -219,7 +220,7 @@ class LumpedMass:
 
 
 @dataclass(frozen=True, eq=False)
-class KnownMass:
+class KnownMass(FieldTree):
     """A mass matrix that is known, kg: (n + d, n + d), or (n, n) with no mass on the base rows."""
 
     matrix: ArrayLike

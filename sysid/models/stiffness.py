@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from sysid.errors import InputError
 from sysid.models.expressions import at_point, check_size, square, values_of_written, written_in
+from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import FACTOR_FLOOR, Geometry
 from sysid.models.model import MassBlocks, Stated, StiffnessBlocks
 from sysid.models.unknowns import Unknown, log_sampling
@@ -19,7 +20,7 @@ from sysid.structure.triangular import lower_triangle, triangle_entries
 
 
 @dataclass(frozen=True, eq=False)
-class SpectralStiffness:
+class SpectralStiffness(FieldTree):
     """A full stiffness matrix through ``H = L^-1 K_SS L^-T = L_H L_H'``, L the Cholesky factor of M_SS.
 
     The spectrum of H is the structure's squared frequencies, so it can be searched without
@@ -107,7 +108,7 @@ class SpectralStiffness:
 
 
 @dataclass(frozen=True, eq=False)
-class ChainStiffness:
+class ChainStiffness(FieldTree):
     """Springs in series from the base to the last sensor, one chain a base direction.
 
     The sensors of a direction stand in the order of the chain, the one nearest the base first, each

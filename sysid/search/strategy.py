@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -52,6 +52,18 @@ class History:
     evaluations: int = 0
     wall_time: float = 0.0
     log: tuple[str, ...] = ()
+
+    def to_tree(self) -> dict[str, Any]:
+        """Give all of it as numbers, arrays and texts; `from_tree` takes them back."""
+        names, counts = tuple(name for name, _ in self.states), [count for _, count in self.states]
+        return {**vars(self), "states": names, "state_counts": np.array(counts, dtype=np.int64)}
+
+    @classmethod
+    def from_tree(cls, tree: dict[str, Any]) -> History:
+        """Give the history of a tree that `to_tree` made."""
+        given = dict(tree)
+        counts = given.pop("state_counts").tolist()
+        return cls(**{**given, "states": tuple(zip(tree["states"], counts, strict=True))})
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError
+from sysid.structure.sensor import sensors_from_tree, sensors_to_tree
 
 if TYPE_CHECKING:
     from scipy.signal import StateSpace
@@ -162,6 +163,22 @@ class Structure:
         self.effective_masses: Array = np.einsum("ki,kj->kij", self.participation, self.participation)
         self.rigid_body_mass: Array = rigid.T @ self.mass @ rigid
         self._coupling = B
+
+    def to_tree(self) -> dict[str, Any]:
+        """Give what the structure was made of as a dictionary of numbers and arrays; `from_tree` takes it back."""
+        return {
+            "mass": self.mass, "stiffness": self.stiffness,
+            # Which of the two was given; the other follows from it.
+            "damping_ratios": self.damping_ratios if self.modal_damping else None,
+            "damping_matrix": None if self.modal_damping else self.damping,
+            "n_base": self.n_base, "recovery": self.recovery, "rigid_body": self.rigid_body,
+            "sensors": sensors_to_tree(self.sensors),
+        }  # fmt: skip
+
+    @classmethod
+    def from_tree(cls, tree: dict[str, Any]) -> Structure:
+        """Give the structure of a tree that `to_tree` made; exact to the bit."""
+        return cls(**{**tree, "sensors": sensors_from_tree(tree["sensors"])})
 
     @property
     def n_sensors(self) -> int:
