@@ -14,8 +14,7 @@ from sysid.models.stiffness import ChainStiffness, SpectralStiffness
 from sysid.models.unknowns import Unknown, Variable
 from sysid.problem.problem import Problem
 from sysid.problem.terms import FurtherTest, Prior
-from sysid.results.identification import Identification, Recipe
-from sysid.results.storage import load
+from sysid.results.identification import Identification, Recipe, load
 from sysid.results.version import __version__
 from sysid.search.continuation import Continuation
 from sysid.search.modal import Modal

@@ -106,11 +106,11 @@ class WrittenDamping:
 
     Parameters
     ----------
-    matrix : expression or array_like
+    written : expression or array_like
         C (n, n) on the motion relative to the base, base rows are cut off; or one ratio a mode, (n,).
     """
 
-    matrix: Any
+    written: Any
 
     def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """None of its own: its variables are the problem's."""
@@ -120,7 +120,7 @@ class WrittenDamping:
         """C (n, n), or None where ratios are written."""
         if self._by_ratios(geometry):
             return None
-        C = square("damping", self.matrix)
+        C = square("damping", self.written)
         check_size("damping", C, geometry.n, geometry.d)
         return C[: geometry.n, : geometry.n]
 
@@ -128,7 +128,7 @@ class WrittenDamping:
         """The ratios (n,); None where C is written."""
         if not self._by_ratios(geometry):
             return None
-        column = as_matrix("damping", self.matrix)
+        column = as_matrix("damping", self.written)
         numbers = at_point("damping", column, None)
         check_finite("damping ratio", numbers.ravel(), column)
         if np.any(numbers < 0):
@@ -136,12 +136,12 @@ class WrittenDamping:
         return column
 
     def _by_ratios(self, geometry: Geometry) -> bool:
-        given, n = as_matrix("damping", self.matrix), geometry.n
-        return given.shape == (n, 1) and (n > 1 or is_column(self.matrix))
+        given, n = as_matrix("damping", self.written), geometry.n
+        return given.shape == (n, 1) and (n > 1 or is_column(self.written))
 
     def values(self, geometry: Geometry, structure: Structure) -> Array:
         """None of its own; refused where it is written in variables."""
-        return values_of_written("damping", self.matrix)
+        return values_of_written("damping", self.written)
 
     def stated(self, geometry: Geometry) -> Stated:
         """Nothing that is read off an expression."""

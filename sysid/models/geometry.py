@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
+from dataclasses import asdict
 from functools import cached_property
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -56,6 +58,17 @@ class Geometry:
     def poles(self) -> Poles:
         """Poles that stand out of the records."""
         return find_poles(self.test, monitor=self.monitor)
+
+    @property
+    def found(self) -> dict[str, Any] | None:
+        """The poles where they were found already, for storing; None where they were not."""
+        poles: Poles | None = self.__dict__.get("poles")
+        return None if poles is None else asdict(poles)
+
+    @found.setter
+    def found(self, tree: dict[str, Any] | None) -> None:
+        if tree is not None:
+            self.__dict__["poles"] = Poles(**tree)
 
     @cached_property
     def weighed(self) -> Array | None:

@@ -272,11 +272,11 @@ class WrittenMass:
 
     Parameters
     ----------
-    expression : expression
+    written : expression
         (n, n), or with the base's rows last (n + d, n + d).
     """
 
-    expression: Any
+    written: Any
 
     def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """None of its own: its variables are the problem's."""
@@ -284,13 +284,13 @@ class WrittenMass:
 
     def blocks(self, geometry: Geometry, y: ca.MX) -> ca.MX:
         """The expression; no coupling and no base mass where it has no base rows."""
-        whole = square("mass", self.expression)
+        whole = square("mass", self.written)
         check_size("mass", whole, geometry.n, geometry.d)
         return whole
 
     def values(self, geometry: Geometry, structure: Structure) -> Array:
         """None of its own; refused where it is written in variables."""
-        return values_of_written("mass", self.expression)
+        return values_of_written("mass", self.written)
 
     def stated(self, geometry: Geometry) -> Stated:
         """Nothing that is read off an expression."""

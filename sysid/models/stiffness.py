@@ -164,11 +164,11 @@ class WrittenStiffness:
 
     Parameters
     ----------
-    matrix : expression or array_like
+    written : expression or array_like
         (n, n), or with the base's rows last (n + d, n + d).
     """
 
-    matrix: Any
+    written: Any
 
     def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """None of its own: its variables are the problem's."""
@@ -177,7 +177,7 @@ class WrittenStiffness:
     def blocks(self, geometry: Geometry, y: ca.MX, mass: MassBlocks) -> ca.MX:
         """K_SS (n, n)."""
         n = geometry.n
-        whole = square("stiffness", self.matrix)
+        whole = square("stiffness", self.written)
         check_size("stiffness", whole, n, geometry.d)
         if whole.size1() > n:
             check_rigid(whole, geometry.rigid_body)
@@ -185,7 +185,7 @@ class WrittenStiffness:
 
     def values(self, geometry: Geometry, structure: Structure) -> Array:
         """None of its own; refused where it is written in variables."""
-        return values_of_written("stiffness", self.matrix)
+        return values_of_written("stiffness", self.written)
 
     def stated(self, geometry: Geometry) -> Stated:
         """Nothing that is read off an expression."""

@@ -10,7 +10,6 @@ from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.nlp import quiet_options
 from sysid.problem.formulation import Formulation
-from sysid.problem.terms import ExpressionTerm
 from sysid.structure.structure import Array
 
 _POINTS = 128  # of the search space, looked at
@@ -115,33 +114,3 @@ def _nearest(formulation: Formulation, start: Array, scale: Array) -> Array:
     found = np.clip(np.asarray(answer["x"]).ravel()[: begun.size], 0.0, 1.0)
     broken = constraints.violation(lower + width * found) / scale
     return np.where(np.isfinite(broken), broken, np.inf)
-
-
-def check_storable(formulation: Formulation) -> None:
-    """Refuse what could not be stored at the end: a Python callback inside an expression."""
-    functions = {"constraints": formulation.constraints.function, "healing": formulation.healing}
-    if not formulation.free_modes:  # nothing is written in their matrices
-        functions |= {"matrices": formulation.matrices.function, "ratios": formulation.matrices.ratio_function}
-    functions |= {term.name: term.function for term in formulation.beside if isinstance(term, ExpressionTerm)}
-    functions |= {f"matrices of {term.name}": term.matrices.function for term in formulation.further_tests}
-    for name, function in functions.items():
-        text_of(name, function)
-
-
-def text_of(name: str, function: ca.Function) -> str:
-    """A CasADi function as text.
-
-    Raises
-    ------
-    InputError
-        Where it holds a Python callback.
-    """
-    try:
-        text = str(function.serialize())
-        ca.Function.deserialize(text)  # a callback is written without a word, and then cannot be read
-        return text
-    except (RuntimeError, NotImplementedError):
-        raise InputError(
-            f"{name}: a Python callback in an expression cannot be stored, nor sent to another machine; write it in "
-            "CasADi's own operations"
-        ) from None

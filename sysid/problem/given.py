@@ -100,7 +100,7 @@ def _rigid_body_dofs(test: Measurement, stiffness: MatrixModel, R: Array, other:
         return G
     if not other:
         return test.rigid_body
-    whole = square("stiffness", stiffness.matrix) if isinstance(stiffness, WrittenStiffness) else ca.MX(n, n)
+    whole = square("stiffness", stiffness.written) if isinstance(stiffness, WrittenStiffness) else ca.MX(n, n)
     if whole.size1() <= n:
         raise InputError(
             "with recovery, and a stiffness without its base columns, state rigid_body_dofs (n, d): the motion of the "

@@ -19,12 +19,12 @@ from sysid.models.geometry import Geometry
 from sysid.models.model import MatrixModel
 from sysid.models.stiffness import SpectralStiffness
 from sysid.models.unknowns import Unknown, Variable, user_site
+from sysid.problem import stored
 from sysid.problem.feasibility import (
     HELD,
     LOOSE,
     check_constraints,
     check_matrices,
-    check_storable,
     points_of,
     scale_of,
 )  # fmt: skip
@@ -154,6 +154,38 @@ class Problem:
             model.stated(declared.geometry)
         declared.check()
 
+    def to_tree(self) -> dict[str, Any]:
+        """Give all that the problem was given as dictionaries, lists, arrays and texts; `from_tree` takes it back."""
+        return {
+            "measurement": self.measurement.to_tree(),
+            "given": stored.to_tree(vars(self)),
+            "poles": self.geometry.found,
+            "reference": None if self.reference is None else self.reference.to_tree(),
+            "validation": [test.to_tree() for test in self.validation],
+            "goal": self.goal,
+        }
+
+    @classmethod
+    def from_tree(cls, tree: dict[str, Any]) -> Problem:
+        """Make the problem of a tree that `to_tree` made: the same models, expressions, bounds and guesses.
+
+        Models and matrices, expressions and their variables go through the constructor, as when they are written.
+
+        Raises
+        ------
+        InputError
+            Where a model's class is not to be found, or this CasADi cannot read the expressions.
+        """
+        problem = cls(
+            Measurement.from_tree(tree["measurement"]),
+            **stored.from_tree(tree["given"]),
+            reference=None if tree["reference"] is None else Structure.from_tree(tree["reference"]),
+            validation=[Measurement.from_tree(test) for test in tree["validation"]],
+            goal=tree["goal"],
+        )
+        problem.geometry.found = tree.get("poles")
+        return problem
+
     @cached_property
     def geometry(self) -> Geometry:
         """The geometry of the degrees of freedom."""
@@ -208,7 +240,7 @@ class Problem:
         points = points_of(formulation)
         if not formulation.free_modes:  # with them every point makes a structure
             check_matrices(formulation, points, self.measurement, self.site)
-        check_storable(formulation)
+        stored.check_storable(vars(self))
         check_constraints(formulation, points, self.site)
 
     @cached_property

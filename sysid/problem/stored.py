@@ -1,157 +1,226 @@
-"""A problem in its own unknowns on disk: CasADi's functions as text, and the variables beside them.
+"""What a problem is given beside its measurement, as a tree: models by their fields, numbers, and expressions.
 
-The text is CasADi's own serialisation, which holds expressions and numbers and no Python.
+All expressions are the outputs of one CasADi function of the variables; its text is CasADi's own serialisation, which
+holds expressions and numbers and no Python.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from sysid.errors import InputError
+from sysid.files.tree import check
 from sysid.measurement.measurement import Measurement
-from sysid.models.unknowns import Block, Variable, split
-from sysid.problem.blocks import Known, Misfit
-from sysid.problem.formulation import Formulation, Matrices, guess_of
+from sysid.models.expressions import as_matrix, is_expression
+from sysid.models.registry import is_storable, model_from_tree, model_to_tree
+from sysid.models.unknowns import Variable, variable_of
+from sysid.problem.terms import FurtherTest, Prior
 
-Put = Callable[..., None]
-Get = Callable[[Any, str], Any]
+_MATRICES = ("mass", "stiffness", "damping")
+_ARRAYS = ("recovery", "rigid_body_dofs")
 
-
-def write(
-    group: Any, formulation: Formulation, put: Put, write_measurement: Callable[[Any, Measurement], None]
-) -> None:
-    """Store a formulation in a group; `put` stores values in groups."""
-    for i, variable in enumerate((*formulation.variables, *formulation.fixed)):
-        _write_variable(group.create_group(f"variables/{i}"), variable, put)
-    _write_matrices(group.create_group("matrices"), formulation.matrices, put)
-    for i, (test, matrices) in enumerate(formulation.others):
-        write_measurement(group.create_group(f"others/{i}/measurement"), test)
-        _write_matrices(group[f"others/{i}"], matrices, put)
-    for name in ("residuals", "known", "misfit", "healing"):
-        function = getattr(formulation, name)
-        if function is not None:
-            put(group, **{name: _text(name, function)})
-    put(group, known_names=list(formulation.known_names))
-    # JSON, as names may hold any character.
-    put(group, members=json.dumps(formulation.members), declarations=json.dumps(formulation.declarations))
-    constraints = formulation.constraints
-    if constraints is not None:
-        put(
-            group.create_group("constraints"), function=_text("constraints", constraints.function),
-            equal=np.array(constraints.lower == constraints.upper),
-        )  # fmt: skip
+Tree = dict[str, Any]
 
 
-def read(group: Any, get: Get, read_measurement: Callable[[Any], Measurement]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What a `Problem` is given to be the one that was stored, and what the functions do not tell of its formulation.
+def to_tree(given: Mapping[str, Any]) -> Tree:
+    """Tree of the models, numbers and expressions that a `Problem` was given.
 
-    Fixed variables are numbers in the stored functions, and names of what is known are gone.
+    Parameters
+    ----------
+    given : mapping
+        By the names of the parameters of `Problem`; mass, stiffness and damping are needed, and only what stands
+        beside measurement, reference, validation and goal is stored.
+
+    Raises
+    ------
+    InputError
+        Where a Python callback stands in an expression, or a model cannot be stored.
     """
-    stored = group["variables"]
-    every = [_read_variable(stored[str(i)], get) for i in range(len(stored))]
-    searched = [v for v in every if not v.fixed]
-    x = ca.vertcat(*(ca.vec(v.symbol) for v in searched))
-    given = _matrices(group["matrices"], x, get)
-    others = group.get("others", {})
-    residuals: list[Any] = [
-        Misfit(read_measurement(others[str(i)]["measurement"]), **_matrices(others[str(i)], x, get))
-        for i in range(len(others))
-    ]
-    if "residuals" in group:
-        residuals.append(_function(group, "residuals", get)(x))
-    if "known" in group:
-        residuals.append(Known(_function(group, "known", get)(x), 0.0, 1.0))
-    if "misfit" in group:
-        given["misfit"] = _function(group, "misfit", get)(x)
-    if "healing" in group:
-        healed = split(searched, _function(group, "healing", get)(x))
-        given["healing"] = {v: ca.reshape(part, *v.symbol.shape) for v, part in zip(searched, healed, strict=True)}
-    constraints = []
-    if "constraints" in group:
-        rows = _function(group["constraints"], "function", get)(x)
-        equal = np.atleast_1d(get(group["constraints"], "equal"))
-        constraints = [rows[i] == 0 if same else rows[i] <= 0 for i, same in enumerate(equal.tolist())]
-    untold = {
-        "fixed": tuple(v for v in every if v.fixed),
-        "known_names": tuple(get(group, "known_names") or ()),
-        "members": tuple((name, tuple(names)) for name, names in json.loads(get(group, "members"))),
-        "declarations": json.loads(get(group, "declarations")),
+    outputs = _Outputs()
+    misfit = given.get("misfit")
+    tree = {
+        **_matrices_to_tree(given, outputs),
+        "residuals": [_residual_to_tree(i, r, outputs) for i, r in enumerate(given.get("residuals", ()), start=1)],
+        "constraints": np.array(
+            [outputs.add(f"constraint {i}", c) for i, c in enumerate(given.get("constraints", ()), start=1)], np.int64
+        ),
+        "misfit": None if misfit is None else outputs.add("misfit", misfit),
+        "healing": [
+            {"variable": variable.name, "expression": outputs.add("healing", expression)}
+            for variable, expression in given.get("healing", {}).items()
+        ],
     }
-    return {**given, "residuals": residuals, "constraints": constraints}, untold
+    return {**tree, **outputs.to_tree()}
 
 
-def check_storable(formulation: Formulation) -> None:
-    """Refuse what could not be stored at the end: a Python callback inside an expression."""
-    functions = {"matrices": formulation.matrices.function, "residuals": formulation.residuals}
-    functions |= {"known": formulation.known}
-    functions |= {"misfit": formulation.misfit, "healing": formulation.healing}
-    functions |= {f"matrices of test {i}": m.function for i, (_, m) in enumerate(formulation.others, start=2)}
-    if formulation.constraints is not None:
-        functions["constraints"] = formulation.constraints.function
-    for name, function in functions.items():
-        if function is not None:
-            _text(name, function)
+def from_tree(tree: Tree) -> dict[str, Any]:
+    """What `Problem` takes beside measurement, reference, validation and goal, of a tree that `to_tree` made.
+
+    Raises
+    ------
+    InputError
+        Where a class of the user's own is missing, or this CasADi cannot read the expressions.
+    """
+    variables = {part["name"]: _variable_from_tree(part) for part in tree["variables"]}
+    outputs = _outputs_from_tree(tree, list(variables.values()))
+    return {
+        **_matrices_from_tree(tree, outputs),
+        "residuals": [_residual_from_tree(part, outputs) for part in tree["residuals"]],
+        "constraints": [outputs[i] for i in tree["constraints"].tolist()],
+        "misfit": None if tree["misfit"] is None else outputs[tree["misfit"]],
+        "healing": {variables[part["variable"]]: outputs[part["expression"]] for part in tree["healing"]},
+    }
 
 
-def _text(name: str, function: ca.Function) -> str:
+def check_storable(given: Mapping[str, Any]) -> None:
+    """Refuse before a search what could not be stored at its end.
+
+    Raises
+    ------
+    InputError
+        As `to_tree`, or where a model of the user's own gives a tree that holds something else than a tree can.
+    """
+    check(to_tree(given))
+
+
+class _Outputs:
+    """Expressions of a problem, numbered."""
+
+    def __init__(self) -> None:
+        self.expressions: list[tuple[str, ca.MX]] = []
+
+    def add(self, name: str, expression: Any) -> int:
+        """Number of an expression; the name is for messages."""
+        self.expressions.append((name, as_matrix(name, expression)))
+        return len(self.expressions) - 1
+
+    def to_tree(self) -> Tree:
+        """The variables of all expressions, and the function that gives the expressions."""
+        found = {variable_of(s) for _, expression in self.expressions for s in ca.symvar(expression)}
+        variables = sorted((v for v in found if v is not None), key=lambda variable: variable.order)
+        if not self.expressions:
+            return {"variables": [], "expressions": None, "casadi_version": ca.__version__}
+        symbols = [variable.symbol for variable in variables]
+        text = _text(symbols, [expression for _, expression in self.expressions])
+        if text is None:
+            names = [name for name, expression in self.expressions if _text(symbols, [expression]) is None]
+            raise InputError(
+                f"{', '.join(names)}: a Python callback in an expression cannot be stored, nor sent to another "
+                "machine; write it in CasADi's own operations"
+            )
+        return {
+            "variables": [_variable_to_tree(variable) for variable in variables],
+            "expressions": text,
+            "casadi_version": ca.__version__,
+        }
+
+
+def _text(symbols: Sequence[ca.MX], expressions: Sequence[ca.MX]) -> str | None:
+    """CasADi's text of a function; None where it holds what CasADi could not read again."""
+    function = ca.Function("expressions", symbols, expressions)
     try:
         text = str(function.serialize())
         ca.Function.deserialize(text)  # a callback is written without a word, and then cannot be read
-        return text
     except (RuntimeError, NotImplementedError):
+        return None
+    return text
+
+
+def _outputs_from_tree(tree: Tree, variables: Sequence[Variable]) -> list[ca.MX]:
+    if tree["expressions"] is None:
+        return []
+    try:
+        function = ca.Function.deserialize(tree["expressions"])
+    except RuntimeError as error:
         raise InputError(
-            f"{name}: a Python callback in an expression cannot be stored, nor sent to another machine; write it in "
-            "CasADi's own operations"
-        ) from None
+            f"its expressions were written by CasADi {tree['casadi_version']}, and CasADi {ca.__version__} cannot read "
+            f"them ({str(error).strip().splitlines()[-1]})"
+        ) from error
+    # Inlined: each expression is written in its own variables only, as it was.
+    return list(function.call([variable.symbol for variable in variables], True, False))
 
 
-def _function(group: Any, name: str, get: Get) -> ca.Function:
-    return ca.Function.deserialize(get(group, name))
-
-
-def _write_matrices(group: Any, matrices: Matrices, put: Put) -> None:
-    put(
-        group, function=_text("matrices", matrices.function), rigid_body_dofs=matrices.rigid_body_dofs,
-        recovery=matrices.recovery,
-    )  # fmt: skip
-    put(group.attrs, by_ratios=matrices.by_ratios)
-
-
-def _matrices(group: Any, x: ca.MX, get: Get) -> dict[str, Any]:
-    M, M_S0, M_00, K, damping = _function(group, "function", get)(x)[:5]
-    recovery = get(group, "recovery")
-    at_sensors = np.array_equal(recovery, np.eye(len(recovery)))
-    return {
-        "mass": ca.blockcat([[M, M_S0], [M_S0.T, M_00]]),
-        "stiffness": K,
-        "damping": [damping] if get(group.attrs, "by_ratios") and K.numel() == 1 else damping,
-        "recovery": None if at_sensors else recovery,
-        "rigid_body_dofs": get(group, "rigid_body_dofs"),
+def _matrices_to_tree(given: Mapping[str, Any], outputs: _Outputs) -> Tree:
+    """Mass, stiffness, damping and what takes their degrees of freedom to the sensors."""
+    arrays = {name: given.get(name) for name in _ARRAYS}
+    return {name: _matrix_to_tree(name, given[name], outputs) for name in _MATRICES} | {
+        name: None if value is None else np.array(value, dtype=float) for name, value in arrays.items()
     }
 
 
-def _write_variable(group: Any, variable: Block | Variable, put: Put) -> None:
-    shape = variable.shape if isinstance(variable, Variable) else (variable.size,)
-    put(
-        group, name=variable.name, unit=variable.unit, lower=variable.lower, upper=variable.upper,
-        guess=guess_of(variable), shape=list(map(str, shape)),
-    )  # fmt: skip
-    if isinstance(variable, Variable):
-        put(group.attrs, log=variable.log, fixed=variable.fixed, guessed=variable.has_guess)
+def _matrices_from_tree(tree: Tree, outputs: Sequence[ca.MX]) -> Tree:
+    return {name: _matrix_from_tree(tree[name], outputs) for name in _MATRICES} | {n: tree[n] for n in _ARRAYS}
 
 
-def _read_variable(group: Any, get: Get) -> Variable:
-    shape = tuple(map(int, get(group, "shape") or ()))
+def _matrix_to_tree(name: str, value: Any, outputs: _Outputs) -> Any:
+    """A model as a dictionary, numbers as an array, an expression as its number among the outputs."""
+    value = getattr(value, "written", value)
+    if is_expression(value):
+        # A single ratio in one dimension is no 1 x 1 matrix.
+        return {"expression": outputs.add(name, value), "dimensions": _dimensions(value)}
+    return model_to_tree(value) if is_storable(value) else np.array(value, dtype=float)
+
+
+def _matrix_from_tree(tree: Any, outputs: Sequence[ca.MX]) -> Any:
+    if not isinstance(tree, dict):
+        return tree
+    if "expression" not in tree:
+        return model_from_tree(tree)
+    expression = outputs[tree["expression"]]
+    return [expression] if tree["dimensions"] == 1 else expression
+
+
+def _dimensions(value: Any) -> int:
+    """Whether an expression was given in one dimension or in two."""
+    if isinstance(value, Variable):
+        return 1 if len(value.shape) == 1 else 2
+    if isinstance(value, list | tuple):
+        return 2 if any(isinstance(entry, list | tuple) for entry in value) else 1
+    return int(value.ndim) if isinstance(value, np.ndarray) else 2
+
+
+def _residual_to_tree(number: int, value: Any, outputs: _Outputs) -> Tree:
+    name = f"residual {number}"
+    if isinstance(value, FurtherTest):
+        return {"kind": "test", "measurement": value.measurement.to_tree(), **_matrices_to_tree(vars(value), outputs)}
+    if isinstance(value, Prior):
+        numbers = {part: np.array(getattr(value, part), dtype=float) for part in ("value", "std")}
+        return {"kind": "prior", "expression": outputs.add(name, value.expression), **numbers}
+    if is_storable(value):
+        return {"kind": "own", "source": model_to_tree(value)}
+    return {"kind": "rows", "expression": outputs.add(name, value)}
+
+
+def _residual_from_tree(tree: Tree, outputs: Sequence[ca.MX]) -> Any:
+    if tree["kind"] == "test":
+        return FurtherTest(Measurement.from_tree(tree["measurement"]), **_matrices_from_tree(tree, outputs))
+    if tree["kind"] == "prior":
+        return Prior(outputs[tree["expression"]], tree["value"], tree["std"])
+    return model_from_tree(tree["source"]) if tree["kind"] == "own" else outputs[tree["expression"]]
+
+
+def _variable_to_tree(variable: Variable) -> Tree:
+    names = ("name", "unit", "lower", "upper", "log", "fixed", "declared")
+    return {
+        **{name: getattr(variable, name) for name in names},
+        "shape": np.array(variable.shape, dtype=np.int64),
+        "guess": variable.guess if variable.has_guess else None,
+    }
+
+
+def _variable_from_tree(tree: Tree) -> Variable:
+    shape = tuple(tree["shape"].tolist())
     lower, upper, guess = (
-        np.reshape(get(group, name), shape, order="F") for name in ("lower", "upper", "guess")
+        None if tree[name] is None else np.reshape(tree[name], shape, order="F") for name in ("lower", "upper", "guess")
+    )
+    assert lower is not None and upper is not None
+    variable = Variable(
+        tree["name"], shape, lower=lower, upper=upper, guess=guess, log=tree["log"], fixed=tree["fixed"],
+        unit=tree["unit"],
     )  # fmt: skip
-    return Variable(
-        get(group, "name"), shape, lower=lower, upper=upper, unit=get(group, "unit") or "",
-        guess=guess if get(group.attrs, "guessed") or get(group.attrs, "fixed") else None,
-        log=bool(get(group.attrs, "log")), fixed=bool(get(group.attrs, "fixed")),
-    )  # fmt: skip
+    variable.declared = tree["declared"]  # messages name the author's line
+    return variable

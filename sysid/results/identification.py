@@ -8,10 +8,18 @@ from typing import Any
 
 import numpy as np
 
+from sysid.problem.problem import Problem
+from sysid.results import storage
 from sysid.results.answer import Answer, reported_unknowns
 from sysid.results.summary import summary
 from sysid.results.version import __version__
-from sysid.structure.structure import Array
+from sysid.search.strategy import History
+from sysid.structure.structure import Array, Structure
+
+# Fields that are texts, numbers or arrays themselves.
+_PLAIN = (
+    "x", "strategy", "success", "message", "determined", "closed_by", "undetermined", "remarks", "interrupted",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -29,6 +37,15 @@ class Recipe:
     module: str
     data: str | None = None
     rng: int = 0
+
+    def to_tree(self) -> dict[str, Any]:
+        """Give the fields by their names; `from_tree` takes them back."""
+        return {"module": self.module, "data": self.data, "rng": str(self.rng)}  # a number of any size
+
+    @classmethod
+    def from_tree(cls, tree: dict[str, Any]) -> Recipe:
+        """Give the recipe of a tree that `to_tree` made."""
+        return cls(tree["module"], tree["data"], int(tree["rng"]))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -84,11 +101,69 @@ class Identification(Answer):
             "version": __version__,
         }
 
-    def save(self, path: str | Path) -> Path:
-        """Write everything to an HDF5 file (no pickle inside); `sysid.load` reads it back."""
-        from sysid.results.storage import save  # storage builds Identifications, so it cannot be above this room
+    def to_tree(self) -> dict[str, Any]:
+        """Give everything as dictionaries, lists, arrays, numbers and texts; `from_tree` takes it back."""
+        return {
+            **{name: getattr(self, name) for name in _PLAIN},
+            "structure": self.structure.to_tree(),
+            "problem": self.problem.to_tree(),
+            "seed": None if self.seed is None else str(self.seed),  # a number of any size
+            "history": self.history.to_tree(),
+            "recipe": None if self.recipe is None else self.recipe.to_tree(),
+        }
 
-        return save(self, path)
+    @classmethod
+    def from_tree(cls, tree: dict[str, Any]) -> Identification:
+        """Give the identification of a tree that `to_tree` made, exact to the bit."""
+        return cls(
+            **{name: tree[name] for name in _PLAIN},
+            structure=Structure.from_tree(tree["structure"]),
+            problem=Problem.from_tree(tree["problem"]),
+            seed=None if tree["seed"] is None else int(tree["seed"]),
+            history=History.from_tree(tree["history"]),
+            recipe=None if tree["recipe"] is None else Recipe.from_tree(tree["recipe"]),
+        )
+
+    def save(self, path: str | Path) -> Path:
+        """Write everything to an HDF5 file, whole or not at all (no pickle inside); `sysid.load` reads it back.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file (``.h5``, ``.hdf5``), or the folder in which it becomes ``result.h5``; folders are made.
+
+        Returns
+        -------
+        Path
+            The file.
+
+        Raises
+        ------
+        InputError
+            Where it cannot be written, or what the user described by objects of another program cannot be stored.
+        """
+        return storage.write(self.to_tree(), path)
+
+
+def load(path: str | Path) -> Identification:
+    """Read an identification that `Identification.save` wrote, exact to the bit.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file, or the folder that holds its ``result.h5``.
+
+    Returns
+    -------
+    Identification
+
+    Raises
+    ------
+    InputError
+        Where there is no such file, or it is not a result of sysid, or damaged, or one of a later format, or a
+        matrix model of the user's own is not to be found; names the file.
+    """
+    return storage.read(path, Identification.from_tree)
 
 
 def _plain(values: Array) -> Any:

@@ -31,7 +31,7 @@ def unknown(name, values, **options):
 
 
 def everything():
-    """A fixed and a logarithmic variable, constraints, residuals, a further test, healing."""
+    """A fixed and a logarithmic variable, constraints, residuals, what is known, a further test, healing."""
     m, k, c = unknown("m", MASSES, unit="kg"), unknown("k", SPRINGS, log=True, unit="N/m"), unknown("c", DAMPERS)
     added = sysid.Variable("added", lower=0, upper=2, guess=0.7, fixed=True)
     test = sysid.simulate(structure(), FREQ, noise=0.01, rng=0)
@@ -39,7 +39,10 @@ def everything():
     later = ca.diag(ca.vertcat(m[0], m[1] + added))
     return sysid.Problem(
         test, mass=ca.diag(m), stiffness=chain(k), damping=chain(c),
-        residuals=[0.1 * (k[0] / k[1] - 4 / 3), sysid.Misfit(second, mass=later, stiffness=chain(k), damping=chain(c))],
+        residuals=[
+            0.1 * (k[0] / k[1] - 4 / 3), sysid.Misfit(second, mass=later, stiffness=chain(k), damping=chain(c)),
+            sysid.Known(ca.vertcat(m[1], c[0], k[0] + k[1]), [2.0, 8.0, 3.5e4], [0.5, 2.0, 1e4]),
+        ],
         constraints=[m[1] <= m[0], ca.sum1(m) == 5.0], healing={m: 5 * m / ca.sum1(m)}, goal=0.05,
     )  # fmt: skip
 
@@ -191,11 +194,45 @@ def test_saved_again_it_is_the_same_again(pair, tmp_path):
 
 def test_the_swarm_sees_the_same_cost(pair):
     before, after = (side.problem for side in pair[:2])
-    logarithmic = [isinstance(v, sysid.Variable) or v.sampling is None for v in before.variables]
-    if not all(logarithmic):
-        pytest.xfail("the sampling of a model's unknowns is not stored, so the swarm's coordinates are others")
     rows = np.random.default_rng(0).uniform(before.lower, before.upper, (20, before.n_variables))
     np.testing.assert_allclose(WrittenCost(after)(rows), WrittenCost(before)(rows), rtol=1e-9)
+
+
+def test_the_swarms_coordinates_are_the_same(pair):
+    before, after = (side.problem for side in pair[:2])
+    for x in np.random.default_rng(1).uniform(before.lower, before.upper, (5, before.n_variables)):
+        np.testing.assert_array_equal(after.to_sampling(x), before.to_sampling(x))
+
+
+@pytest.mark.parametrize("kind", [single, models, chained], ids=lambda kind: kind.__name__)
+def test_models_beside_expressions_come_back_as_models(kind):
+    before = kind()
+    after = sysid.Problem.from_tree(before.to_tree())
+    for name in ("mass", "stiffness", "damping"):
+        old, new = getattr(before, name), getattr(after, name)
+        if isinstance(old, sysid.KnownMass | sysid.LumpedMass | sysid.ChainStiffness | sysid.ProportionalDamping):
+            assert type(new) is type(old)
+            for field, value in vars(old).items():
+                np.testing.assert_array_equal(getattr(new, field), value)
+    assert isinstance(before.stiffness, sysid.ChainStiffness) == (kind is chained)
+
+
+def test_names_and_lines_of_the_author_are_kept(pair):
+    """For tables and messages, which tell the line of a variable's declaration, and not that of the loading."""
+    before, after = (side.problem.formulation for side in pair[:2])
+    assert after.labels == before.labels
+    assert after.members == before.members
+    assert after.known_names == before.known_names
+    assert after.declarations == before.declarations
+    assert [v.declared for v in after.fixed] == [v.declared for v in before.fixed]
+
+
+def test_what_this_casadi_cannot_read_is_said_with_its_version():
+    tree = single().to_tree()
+    given = tree["given"]
+    given |= {"expressions": given["expressions"][:600], "casadi_version": "9.9"}
+    with pytest.raises(sysid.InputError, match="its expressions were written by CasADi 9.9, and CasADi .* cannot read"):
+        sysid.Problem.from_tree(tree)
 
 
 def test_the_file_holds_text_and_numbers_and_no_pickle(pair):
@@ -214,7 +251,7 @@ def test_the_file_holds_text_and_numbers_and_no_pickle(pair):
 
     with h5py.File(pair[2], "r") as file:
         file.visititems(look)
-        assert int(file.attrs["format"]) == 2
+        assert int(file.attrs["format"]) == 3
     assert found
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import sysid
+from sysid.files.tree import from_bytes, to_bytes
 from sysid.models.unknowns import Block
 from sysid.results import storage
 
@@ -150,10 +151,10 @@ def test_round_trip_keeps_a_recovery_to_more_sensors(tmp_path):
 
 def test_a_path_is_a_file_or_a_folder(tmp_path):
     original = identification()
-    assert storage.save(original, tmp_path / "deep" / "run.v2") == tmp_path / "deep" / "run.v2" / "result.h5"
-    assert storage.save(original, str(tmp_path / "x.hdf5")) == tmp_path / "x.hdf5"
+    assert original.save(tmp_path / "deep" / "run.v2") == tmp_path / "deep" / "run.v2" / "result.h5"
+    assert original.save(str(tmp_path / "x.hdf5")) == tmp_path / "x.hdf5"
     for path in (tmp_path / "deep" / "run.v2", str(tmp_path / "deep" / "run.v2" / "result.h5"), tmp_path / "x.hdf5"):
-        assert storage.load(path).seed == original.seed
+        assert sysid.load(path).seed == original.seed
 
 
 def test_a_path_to_write_is_a_file_by_its_ending_or_else_a_folder(tmp_path):
@@ -206,10 +207,13 @@ def test_a_failure_while_writing_leaves_the_old_file_and_nothing_else(tmp_path, 
     path = identification().save(tmp_path)
     before = path.read_bytes()
 
-    def fail(*_: object) -> None:
+    write = Path.write_bytes
+
+    def fail(self: Path, data: bytes) -> None:
+        write(self, data[: len(data) // 2])
         raise failure("now")
 
-    monkeypatch.setattr(storage, "_write_measurement", fail)
+    monkeypatch.setattr(Path, "write_bytes", fail)
     with pytest.raises(failure):
         identification(seed=1).save(tmp_path)
     assert path.read_bytes() == before
@@ -223,48 +227,55 @@ def test_what_cannot_be_stored_leaves_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def change(path: Path, edit: object) -> Path:
-    with h5py.File(path, "r+") as file:
-        edit(file)
-    return path
-
-
 def test_each_wrong_file_gets_its_own_sentence(tmp_path):
-    good = identification().save(tmp_path / "good.h5")
+    good = identification().save(tmp_path / "good.h5").read_bytes()
 
     with pytest.raises(sysid.InputError, match="no result at"):
         sysid.load(tmp_path / "nowhere.h5")
     with pytest.raises(sysid.InputError, match=r"no result at .*result\.h5"):
         sysid.load(tmp_path)
-    text = tmp_path / "text.h5"
-    text.write_text("not this")
-    with pytest.raises(sysid.InputError, match="not an HDF5 file"):
-        sysid.load(text)
-    with h5py.File(tmp_path / "other.h5", "w") as file:
+    for name, content, sentence in (
+        ("text.h5", b"not this", "it is not a result of sysid"),
+        ("empty.h5", b"", "it is not a result of sysid"),
+        ("cut.h5", good[:9000], f"it has 9000 bytes, and {len(good)} were written"),
+        ("longer.h5", good + b"\0", f"it has {len(good) + 1} bytes, and {len(good)} were written"),
+        ("other.h5", good[:-1] + bytes([good[-1] ^ 1]), "its bytes have another SHA-256"),
+        ("later.h5", to_bytes({"sysid_version": "9.1"}, 4), r"format 4 \(sysid 9.1\), .* a later sysid is needed"),
+        ("records.h5", to_bytes({"content": "sysid test"}, 3), "it holds a sysid test, not a sysid identification"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(sysid.InputError, match=f"{name} cannot be read: .*{sentence}"):
+            sysid.load(tmp_path / name)
+    with h5py.File(tmp_path / "else.h5", "w") as file:
         file["data"] = [1, 2]
-    with pytest.raises(sysid.InputError, match="not a result of sysid"):
-        sysid.load(tmp_path / "other.h5")
-    cut = tmp_path / "cut.h5"
-    cut.write_bytes(good.read_bytes()[:20000])
-    with pytest.raises(sysid.InputError, match="cannot be read"):
-        sysid.load(cut)
-    with pytest.raises(sysid.InputError, match="a later sysid is needed"):
-        sysid.load(change(good, lambda file: file.attrs.modify("format", storage.FORMAT + 1)))
+    with pytest.raises(sysid.InputError, match=r"else\.h5 .*: it is an HDF5 file, but not a result of sysid"):
+        sysid.load(tmp_path / "else.h5")
 
 
 @pytest.mark.parametrize(
-    "edit",
+    ("edit", "sentence"),
     [
-        lambda file: file.pop("structure/mass"),
-        lambda file: file.pop("problem"),
-        lambda file: file["problem/mass"].attrs.modify("kind", "os.system"),
-        lambda file: file["problem/measurement/freq"].write_direct(np.zeros(40)),
-        lambda file: file["history"].pop("states"),
+        (lambda tree: tree["structure"].pop("mass"), "KeyError: 'mass'|missing 1 required"),
+        (lambda tree: tree.pop("problem"), "KeyError: 'problem'"),
+        (lambda tree: tree["problem"]["given"]["mass"].update(kind="os:system"), "the class system of the module 'os'"),
+        (lambda tree: tree["problem"]["measurement"]["freq"].fill(0.0), "freq must rise strictly"),
+        (lambda tree: tree["history"].pop("states"), "KeyError: 'states'"),
     ],
 )
-def test_a_damaged_file_is_called_damaged(tmp_path, edit):
-    path = change(identification().save(tmp_path), edit)
-    with pytest.raises(sysid.InputError, match="is damaged"):
+def test_what_is_sound_but_makes_no_result_is_refused_with_its_name(tmp_path, edit, sentence):
+    """Such as a program of somebody else's may write."""
+    tree, number = from_bytes(identification().save(tmp_path).read_bytes())
+    edit(tree)
+    (tmp_path / "edited.h5").write_bytes(to_bytes(tree, number))
+    with pytest.raises(sysid.InputError, match=rf"edited\.h5 cannot be read: .*({sentence})"):
+        sysid.load(tmp_path / "edited.h5")
+
+
+def test_a_file_that_was_edited_by_hand_is_refused(tmp_path):
+    path = identification().save(tmp_path)
+    with h5py.File(path, "r+") as file:
+        file["problem/measurement/response"][...] *= 2
+    with pytest.raises(sysid.InputError, match=r"result\.h5 cannot be read: it is damaged"):
         sysid.load(path)
 
 

@@ -1,0 +1,114 @@
+"""Matrix models as trees: those of the package by their names, others by their module."""
+
+import sys
+
+import numpy as np
+import pytest
+
+import sysid
+from sysid.files.tree import check, from_bytes, to_bytes
+from sysid.models.registry import model_from_tree, model_to_tree
+from sysid.problem import stored
+
+MODELS = (
+    sysid.FullMass([30.0, 31.0], healing="rigid_body"),
+    sysid.LumpedMass(12.5),
+    sysid.LumpedMass(),
+    sysid.KnownMass(np.diag([1.0, 2.0])),
+    sysid.SpectralStiffness([10.0, 20.0], 90.0),
+    sysid.ChainStiffness(1e3, [1e5, 2e5]),
+    sysid.ModalDamping(0.001, 0.1),
+    sysid.ProportionalDamping((0.0, 0.5), (0.0, 1e-3)),
+)
+OWN = """
+import numpy as np
+
+class Tank:
+    class Half:
+        def __init__(self, levels):
+            self.levels = levels
+
+        def to_tree(self):
+            return {"levels": np.array(self.levels)}
+
+        @classmethod
+        def from_tree(cls, tree):
+            return cls(tree["levels"].tolist())
+
+nothing = 3
+"""
+
+
+@pytest.fixture
+def tanks(tmp_path, monkeypatch):
+    """A module of the user's own."""
+    (tmp_path / "tanks_of_mine.py").write_text(OWN)
+    monkeypatch.syspath_prepend(tmp_path)
+    import tanks_of_mine
+
+    yield tanks_of_mine
+    sys.modules.pop("tanks_of_mine", None)
+
+
+@pytest.mark.parametrize("model", MODELS, ids=lambda model: type(model).__name__)
+def test_models_of_the_package_come_back_field_by_field(model):
+    tree = model_to_tree(model)
+    check(tree)
+    assert tree["kind"] == type(model).__name__
+    back = model_from_tree(tree)
+    assert type(back) is type(model)
+    for name, value in vars(model).items():
+        if isinstance(value, tuple | str | float) or value is None:
+            assert getattr(back, name) == value
+        else:
+            np.testing.assert_array_equal(getattr(back, name), value)
+
+
+def test_a_model_of_the_users_own_is_found_by_its_module(tanks):
+    tree, _ = from_bytes(to_bytes(model_to_tree(tanks.Tank.Half([0.3, 0.7])), 3))
+    assert tree["kind"] == "tanks_of_mine:Tank.Half"
+    back = model_from_tree(tree)
+    assert type(back) is tanks.Tank.Half and back.levels == [0.3, 0.7]
+
+
+def test_a_problem_stores_it_beside_expressions(tanks):
+    given = {"mass": tanks.Tank.Half([0.5]), "stiffness": sysid.ChainStiffness(1.0, 2.0), "damping": np.eye(2)}
+    back = stored.from_tree(from_bytes(to_bytes(stored.to_tree(given), 3))[0])
+    assert back["mass"].levels == [0.5]
+    assert (back["stiffness"].lower, back["stiffness"].upper) == (1.0, 2.0)
+    np.testing.assert_array_equal(back["damping"], np.eye(2))
+
+
+@pytest.mark.parametrize("lost", ["nowhere_at_all:Tank", "tanks_of_mine:Cask", "tanks_of_mine:nothing", "os:system"])
+def test_a_class_that_is_missing_is_named_with_its_module(tanks, lost):
+    module, name = lost.split(":")
+    with pytest.raises(sysid.InputError, match=f"the class {name} of the module '{module}' is needed"):
+        model_from_tree({"kind": lost, "fields": {}})
+
+
+def test_a_module_that_fails_is_named_with_its_error(tmp_path, monkeypatch):
+    (tmp_path / "broken_tanks.py").write_text("1 / 0")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(sysid.InputError, match="'broken_tanks' is needed.*ZeroDivisionError"):
+        model_from_tree({"kind": "broken_tanks:Tank", "fields": {}})
+
+
+def test_a_model_of_a_later_sysid_is_named():
+    with pytest.raises(sysid.InputError, match="model 'Foam' is unknown to this sysid"):
+        model_from_tree({"kind": "Foam", "fields": {}})
+
+
+def test_what_could_not_be_found_again_is_refused():
+    class Inside(sysid.LumpedMass):
+        pass
+
+    with pytest.raises(sysid.InputError, match="Inside cannot be stored: its class stands inside a function"):
+        model_to_tree(Inside(3.0))
+    with pytest.raises(sysid.InputError, match=r"object cannot be stored: its class needs a method to_tree"):
+        model_to_tree(object())
+
+
+def test_a_tree_of_the_users_own_that_holds_something_else_is_refused_early(tanks, monkeypatch):
+    monkeypatch.setattr(tanks.Tank.Half, "to_tree", lambda self: {"when": object()})
+    with pytest.raises(sysid.InputError, match="/mass/fields/when: a object cannot be stored"):
+        stored.check_storable({"mass": tanks.Tank.Half([]), "stiffness": np.eye(1), "damping": np.eye(1)})
