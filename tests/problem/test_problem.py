@@ -1,4 +1,4 @@
-"""Problem and SwarmCost: unknowns and back, costs against Structure, bits that do not depend on the batch."""
+"""Unknowns and back, many candidates at once against Structure, bits that do not depend on the batch, and mistakes."""
 
 import dataclasses
 import itertools
@@ -10,8 +10,8 @@ import pytest
 import sysid
 from sysid import FullMass, InputError, KnownMass, Measurement, Problem, SpectralStiffness
 from sysid.models.spectrum import closed_form
-from sysid.search import swarm_objective as swarm_cost
-from sysid.search.swarm_objective import SwarmCost
+from sysid.problem import batch_objective
+from sysid.structure.triangular import triangle, triangle_entries
 
 SEEDS = range(3)
 MASSES = ("trace", "rigid_body", "lumped", "known")
@@ -21,6 +21,25 @@ combinations = pytest.mark.parametrize(("mass", "stiffness", "damping"), COMBINA
 
 def particles(rng, problem, count):
     return rng.uniform(problem.lower, problem.upper, (count, problem.n_variables))
+
+
+def sampled(problem, rows):
+    """What the swarm's coordinates stand for, (count, n_variables)."""
+    s = ca.MX.sym("s", problem.n_variables)
+    function = ca.Function("sampling", [s], [problem.formulation.from_sampling(s)])
+    return np.array([np.asarray(function(row)).ravel() for row in rows])
+
+
+def batch(problem, rows, spectrum=None):
+    """Root of the squared relative residual of each candidate, all at once."""
+    return np.sqrt(problem.formulation.own_test.squared(sampled(problem, rows), spectrum))
+
+
+def refined(problem, x):
+    """The unknowns whose spectrum is the stated one: the nearest factor of H with it."""
+    x, part, n = x.copy(), problem.formulation.parts.stiffness, problem.geometry.n
+    x[part] = triangle_entries(closed_form(triangle(x[part], n), problem.formulation.stiffness.spectrum).factor)
+    return x
 
 
 def same(a, b, rtol):
@@ -48,55 +67,57 @@ def test_the_structure_of_the_values_of_a_structure_is_that_structure(random_cas
 @combinations
 @pytest.mark.parametrize("force", [False, True])
 @pytest.mark.parametrize("refine", [False, True])
-def test_the_swarms_cost_is_the_residual_of_the_structure(random_case, mass, stiffness, damping, force, refine):
+def test_a_batch_has_the_residual_of_each_structure(random_case, mass, stiffness, damping, force, refine):
     """With a force, the root of the sum of both squared relative residuals."""
     rng = np.random.default_rng(1)
     _, problem = random_case(rng, mass, stiffness, damping, n=4, force=force)
-    cost = SwarmCost(problem, refine=refine)
+    refine = refine and problem.formulation.refinable
     rows = particles(rng, problem, 12)
-    costs = cost(rows)
+    found = batch(problem, rows, problem.formulation.stiffness.spectrum if refine else None)
     checked = 0
-    for s, value in zip(rows, costs, strict=True):
+    for x, value in zip(sampled(problem, rows), found, strict=True):
         if not np.isfinite(value):
             continue  # a rigid-body healing without an answer
-        structure = problem.structure(cost.refined(s) if refine else cost.unknowns(s))
+        x = refined(problem, x) if refine else x
+        structure = problem.structure(x)
         expected = np.hypot(problem.measurement.residual(structure), problem.measurement.force_residual(structure) or 0)
         # Both go through the inverse of L: a candidate close to a singular mass loses digits with its condition.
-        assert value == pytest.approx(expected, rel=1e-9 + 1e-12 * np.linalg.cond(structure.mass[:4, :4]))
+        tolerance = 1e-9 + 1e-12 * np.linalg.cond(structure.mass[:4, :4])
+        assert value == pytest.approx(expected, rel=tolerance)
+        assert problem.objective(x) == pytest.approx(expected, rel=tolerance)
+        assert problem.residual(x) == pytest.approx(problem.measurement.residual(structure), rel=tolerance)
         checked += 1
     assert checked >= 8
+    assert problem.formulation.refinable == (stiffness == "spectral")
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_with_refinement_it_is_the_cost_of_the_closed_form(random_case, seed):
+def test_with_refinement_it_is_the_residual_of_the_closed_form(random_case, seed):
     rng = np.random.default_rng(seed)
     truth, problem = random_case(rng, n=5)
-    cost, n = SwarmCost(problem), 5
+    spectrum = 2 * np.pi * truth.natural_frequencies
     for s in particles(rng, problem, 5):
-        x = cost.unknowns(s)
-        factor = np.zeros((n, n))
-        factor[np.tril_indices(n)] = x[problem.parts.stiffness]
-        x[problem.parts.stiffness] = closed_form(factor, problem.stiffness.targets).factor[np.tril_indices(n)]
-        structure = problem.structure(x)
+        (x,) = sampled(problem, s[None])
+        structure = problem.structure(refined(problem, x))
         np.testing.assert_allclose(structure.natural_frequencies, truth.natural_frequencies, rtol=1e-8)
-        assert cost(s[None])[0] == pytest.approx(problem.measurement.residual(structure), rel=1e-8)
-        np.testing.assert_allclose(cost.refined(s), x, rtol=1e-12)
+        found = batch(problem, s[None], spectrum)[0]
+        assert found == pytest.approx(problem.measurement.residual(structure), rel=1e-8)
 
 
 @pytest.mark.parametrize(("mass", "stiffness"), [("rigid_body", "spectral"), ("lumped", "chain")])
 def test_bits_do_not_depend_on_the_batch_or_the_threads(random_case, monkeypatch, mass, stiffness):
     rng = np.random.default_rng(0)
     _, problem = random_case(rng, mass, stiffness, n=4, force=True)
-    rows = particles(rng, problem, 200)
-    whole = SwarmCost(problem)(rows)
+    rows = sampled(problem, particles(rng, problem, 200))
+    whole = problem.formulation.own_test.squared(rows)
     for threads in (1, 3):
-        monkeypatch.setattr(swarm_cost, "_THREADS", threads)
-        cost = SwarmCost(problem)
-        np.testing.assert_array_equal(cost(rows), whole)
+        monkeypatch.setattr(batch_objective, "_THREADS", threads)
+        term = problem.formulate(problem.geometry).own_test
+        np.testing.assert_array_equal(term.squared(rows), whole)
     for count in (1, 63, 64, 65, 127, 129, 200):
-        np.testing.assert_array_equal(cost(rows[:count]), whole[:count])
+        np.testing.assert_array_equal(term.squared(rows[:count]), whole[:count])
     order = rng.permutation(200)
-    np.testing.assert_array_equal(cost(rows[order]), whole[order])
+    np.testing.assert_array_equal(term.squared(rows[order]), whole[order])
 
 
 def test_candidates_that_are_no_structure_are_not_a_number_and_harm_no_other():
@@ -108,30 +129,30 @@ def test_candidates_that_are_no_structure_are_not_a_number_and_harm_no_other():
         Measurement(np.arange(1, 7), np.ones((2, 2, 6)) * np.eye(2)[:, :, None], response, rigid_body=G),
         mass=FullMass([40.0, 60.0], healing="rigid_body"), stiffness=SpectralStiffness([2.0, 3.0, 4.0, 5.0]),
     )  # fmt: skip
-    cost, rows = SwarmCost(problem), particles(rng, problem, 130)
-    values = cost(rows)
+    rows, spectrum = particles(rng, problem, 130), 2 * np.pi * np.array([2.0, 3, 4, 5])
+    values = batch(problem, rows, spectrum)
     good = np.isfinite(values)
     assert 10 < good.sum() < 130
-    np.testing.assert_array_equal(cost(rows[good]), values[good])
-    for s in rows[good][:10]:
-        totals = np.diag(problem.structure(cost.refined(s)).rigid_body_mass)
+    np.testing.assert_array_equal(batch(problem, rows[good], spectrum), values[good])
+    for x in sampled(problem, rows[good][:10]):
+        totals = np.diag(problem.structure(refined(problem, x)).rigid_body_mass)
         np.testing.assert_allclose(totals, [40, 60], rtol=1e-9)
+    bad = sampled(problem, rows[~good])[0]
+    assert np.isnan(problem.objective(bad))
 
 
 @combinations
 def test_sampling_and_unsampling_are_inverse(random_case, mass, stiffness, damping):
     rng = np.random.default_rng(2)
     _, problem = random_case(rng, mass, stiffness, damping, n=4)
-    s = ca.SX.sym("s", problem.n_variables)
-    forward = ca.Function("f", [s], [problem.from_sampling(s)])
     span = problem.upper - problem.lower
     for _ in range(10):
         x = rng.uniform(problem.lower + 0.05 * span, problem.upper - 0.05 * span)
-        sampled = problem.to_sampling(x)
-        assert np.all((sampled >= problem.lower) & (sampled <= problem.upper))
-        np.testing.assert_allclose(np.asarray(forward(sampled)).ravel(), x, atol=1e-9 * span.max(), rtol=1e-9)
-    far = problem.to_sampling(problem.upper + span)
-    np.testing.assert_array_equal(far, problem.to_sampling(problem.upper))
+        s = problem.formulation.to_sampling(x)
+        assert np.all((s >= problem.lower) & (s <= problem.upper))
+        np.testing.assert_allclose(sampled(problem, s[None])[0], x, atol=1e-9 * span.max(), rtol=1e-9)
+    far = problem.formulation.to_sampling(problem.upper + span)
+    np.testing.assert_array_equal(far, problem.formulation.to_sampling(problem.upper))
 
 
 class TestUnknowns:
@@ -147,7 +168,8 @@ class TestUnknowns:
         assert full == n * (n + 1) // 2 + n * d + d * (d + 1) // 2
         assert problem.unknowns == (("mass", full), ("stiffness", spectral), ("damping", n))
         assert problem.n_variables == full + spectral + n
-        assert problem.parts.stiffness == slice(full, full + spectral)
+        ends = [0, full, full + spectral, full + spectral + n]
+        assert problem.formulation.parts == tuple(slice(a, b) for a, b in itertools.pairwise(ends))
         lumped = Problem(test, mass=sysid.LumpedMass(1.0), stiffness=stiffness)
         assert lumped.unknowns == (("mass", n), ("stiffness", spectral), ("damping", n))
         known = Problem(test, mass=np.eye(n), stiffness=stiffness, damping=sysid.ProportionalDamping((0, 1), (0, 1e-3)))
@@ -171,14 +193,16 @@ class TestUnknowns:
         _, problem = random_case(np.random.default_rng(0))
         assert problem.lower.shape == problem.upper.shape == (problem.n_variables,)
         assert np.all(problem.lower < problem.upper)
-        np.testing.assert_array_equal(problem.lower[problem.parts.damping], 0.005)
+        np.testing.assert_array_equal(problem.lower[problem.formulation.parts.damping], 0.005)
 
 
 @pytest.mark.parametrize("mass", MASSES)
 def test_totals(random_case, mass):
     truth, problem = random_case(np.random.default_rng(0), mass)
     rigid = np.diag(truth.rigid_body_mass)
-    expected = FullMass().total(problem.layout, truth.mass) if mass == "trace" else rigid
+    strongest = np.argmax(np.abs(np.vstack([truth.rigid_body, np.eye(2)])), axis=1)
+    traces = [np.diag(truth.mass)[strongest == i].sum() for i in range(2)]
+    expected = traces if mass == "trace" else rigid
     np.testing.assert_allclose(problem.totals, expected, rtol=1e-10)
 
 
@@ -203,7 +227,9 @@ class TestMistakes:
             ("stiffness is a str", {"stiffness": "soft"}),
             ("stiffness is a ModalDamping", {"stiffness": sysid.ModalDamping()}),
             ("damping is a float", {"damping": 0.02}),
-            ("too few to look for", {"stiffness": SpectralStiffness()}),
+            ("mass is a ModalDamping", {"mass": sysid.ModalDamping()}),
+            ("damping is a FullMass", {"damping": FullMass(10.0)}),
+            ("damping is a SpectralStiffness", {"damping": SpectralStiffness([1.0, 2.0, 3.0])}),
             ("below the given natural frequency", {"stiffness": SpectralStiffness([1.0, 2, 3], max_frequency=2.0)}),
             ("4 natural frequencies", {"stiffness": SpectralStiffness([1.0, 2, 3, 4])}),
             ("goal", {"goal": 0.0}),
@@ -220,7 +246,7 @@ class TestMistakes:
         with pytest.raises(InputError, match="not positive semidefinite .* or a sensor has no mass"):
             Problem(**(good | {"mass": np.diag([1.0, -1.0, 1.0])}))
         with pytest.raises(InputError, match="not positive definite over the sensors"):
-            SwarmCost(Problem(**(good | {"mass": np.ones((3, 3))})))
+            Problem(**(good | {"mass": np.ones((3, 3))}))
 
     def test_a_known_mass_whose_base_rows_are_not_semidefinite(self, good):
         M = np.eye(5)
@@ -230,7 +256,7 @@ class TestMistakes:
 
     def test_a_chain_through_a_sensor_that_nothing_moves(self, good):
         with pytest.raises(InputError, match="moved by no base direction"):
-            SwarmCost(Problem(**(good | {"stiffness": sysid.ChainStiffness(1.0, 10.0)})))
+            Problem(**(good | {"stiffness": sysid.ChainStiffness(1.0, 10.0)}))
 
     def test_validation_and_reference_of_other_sensors(self, good, random_structure):
         other = Measurement([1.0], np.ones((1, 1, 1)), np.ones((1, 3, 1)), rigid_body=np.ones((3, 1)))
@@ -251,5 +277,11 @@ class TestMistakes:
         f = truth.natural_frequencies
         test = sysid.simulate(truth, np.linspace(0.1 * f[0], 1.2 * f[-1], 80), force=True)
         wrong = dataclasses.replace(test, force=-test.force)
+        problem = Problem(wrong, mass=FullMass(), stiffness=problem.stiffness)
         with pytest.raises(InputError, match="check its sign"):
-            Problem(wrong, mass=FullMass(), stiffness=problem.stiffness)
+            problem.check()
+
+    def test_too_few_lines_to_find_poles(self, good):
+        problem = Problem(**(good | {"stiffness": SpectralStiffness()}))
+        with pytest.raises(InputError, match="too few to look for"):
+            problem.check()
