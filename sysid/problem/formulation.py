@@ -163,9 +163,8 @@ class Formulation:
     @cached_property
     def outside(self) -> NDArray[np.bool_]:
         """Which entries of x enter no matrix of the problem, (size,): some variables of residuals and constraints."""
-        entering = {symbol.__hash__() for symbol in self._in_matrices}
-        apart = [[isinstance(u, Variable) and u.symbol.__hash__() not in entering] * u.size for u in self.unknowns]
-        return np.array([entry for entries in apart for entry in entries], dtype=bool)
+        apart = [isinstance(u, Variable) and not self._touches([u.symbol]) for u in self.unknowns]
+        return np.repeat(apart, [u.size for u in self.unknowns])
 
     @property
     def size(self) -> int:

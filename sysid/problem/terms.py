@@ -92,10 +92,11 @@ class TestTerm:
     name: str = "the test"
 
     def rows(self, x: ca.MX, modes: ModeSymbols | None = None) -> ca.MX:
-        """Relative residuals of accelerations and, where measured, of the force."""
+        """Relative residuals of accelerations and, where measured, of the force; modes are read with ratios only."""
         motion = self.matrices.motion(x)
-        if modes is None:
+        if not self.matrices.by_ratios:
             return self.weight * relative_misfit(self.test, motion, weighted=True, shift=self.shift)
+        assert modes is not None
         phi, omega = modes
         ratios = self.matrices.ratio_function(x, omega)
         shapes = ca.DM(motion.recovery) @ phi

@@ -24,7 +24,7 @@ def problem(test, known, *, further=(), **options):
     c = sysid.Variable("damper", 2, lower=0.1, upper=100.0, log=True, unit="N s/m")
     K, C = STRETCH.T @ ca.diag(k) @ STRETCH, (STRETCH.T @ ca.diag(c) @ STRETCH)[:2, :2]
     M = ca.diag(m)
-    tests = [sysid.Misfit(other, mass=M + np.diag(added), stiffness=K, damping=C) for other, added in further]
+    tests = [sysid.FurtherTest(other, mass=M + np.diag(added), stiffness=K, damping=C) for other, added in further]
     return sysid.Problem(test, mass=M, stiffness=K, damping=C, residuals=[*known(m, k), *tests], **options)
 
 
@@ -32,7 +32,7 @@ def problem(test, known, *, further=(), **options):
 def test_alone_it_gives_the_open_scale_its_own_accuracy(noise):
     """Accelerations know ratios to a thousandth; the weighing to 2 % then is the accuracy of every mass and spring."""
     result = sysid.identify(
-        problem(measured(0, noise), lambda m, k: [sysid.Known(m[0], 5.2, std=0.1)]), rng=0, strategy=QUICK
+        problem(measured(0, noise), lambda m, k: [sysid.Prior(m[0], 5.2, std=0.1)]), rng=0, strategy=QUICK
     )
     assert result.determined
     np.testing.assert_allclose(result.values["mass"][0], 5.2, rtol=1e-4)
@@ -44,7 +44,7 @@ def test_alone_it_gives_the_open_scale_its_own_accuracy(noise):
 
 def test_two_of_them_are_weighed_by_their_deviations():
     """Both tell the one open scale: the weighted mean, with the deviation that belongs to it."""
-    known = lambda m, k: [sysid.Known(m, [5.0 * 1.02, 4.0 * 0.99], std=[0.1, 0.04])]  # noqa: E731 - 2 and 1 %
+    known = lambda m, k: [sysid.Prior(m, [5.0 * 1.02, 4.0 * 0.99], std=[0.1, 0.04])]  # noqa: E731 - 2 and 1 %
     result = sysid.identify(problem(measured(1), known), rng=0, strategy=QUICK)
     # In units of the truth: x = 1.02 give or take 0.02, and 0.99 give or take 0.01.
     weights = np.array([0.02, 0.01]) ** -2
@@ -62,7 +62,7 @@ def test_errors_are_as_large_as_their_deviations_say():
         added = np.array([0.0, 0.4])
         further = [(measured([seed, 1], mass=MASS + added), added)]
         weighed = MASS + 0.02 * random.normal(size=2)
-        known = lambda m, k, weighed=weighed: [sysid.Known(m, weighed, std=0.02)]  # noqa: E731
+        known = lambda m, k, weighed=weighed: [sysid.Prior(m, weighed, std=0.02)]  # noqa: E731
         result = sysid.identify(problem(measured([seed, 0]), known, further=further), rng=0, strategy=QUICK)
         assert result.determined
         for name, true in (("mass", MASS), ("spring", SPRINGS)):
@@ -74,7 +74,7 @@ def test_errors_are_as_large_as_their_deviations_say():
 def test_a_value_that_the_records_contradict_is_named():
     added = np.array([0.0, 2.0])
     further = [(measured(5, mass=MASS + added), added)]
-    known = lambda m, k: [sysid.Known(m[1], 4.4, std=0.01)]  # noqa: E731 - 40 deviations off
+    known = lambda m, k: [sysid.Prior(m[1], 4.4, std=0.01)]  # noqa: E731 - 40 deviations off
     result = sysid.identify(problem(measured(4), known, further=further), rng=0, strategy=QUICK)
     assert not result.determined
     assert any("mass[1] ends" in sentence for sentence in result.undetermined)
@@ -85,7 +85,7 @@ def test_values_that_are_missed_together_are_named_though_none_is_alone():
     further = [(measured(5, mass=MASS + added), added)]
 
     def known(m, k):
-        return [sysid.Known(m, MASS * 1.05, std=MASS * 0.016), sysid.Known(k, SPRINGS * 1.05, std=SPRINGS * 0.016)]
+        return [sysid.Prior(m, MASS * 1.05, std=MASS * 0.016), sysid.Prior(k, SPRINGS * 1.05, std=SPRINGS * 0.016)]
 
     result = sysid.identify(problem(measured(4), known, further=further), rng=0, strategy=QUICK)
     assert not result.determined
@@ -93,10 +93,11 @@ def test_values_that_are_missed_together_are_named_though_none_is_alone():
 
 
 def test_names_come_back_from_a_file(tmp_path):
-    known = lambda m, k: [sysid.Known(m[1], 4.1, std=0.1), sysid.Known(k[0] / k[1], 1.3, std=0.5)]  # noqa: E731
+    known = lambda m, k: [sysid.Prior(m[1], 4.1, std=0.1), sysid.Prior(k[0] / k[1], 1.3, std=0.5)]  # noqa: E731
     result = sysid.identify(problem(measured(2), known), rng=0, strategy=QUICK)
     again = sysid.load(result.save(tmp_path))
-    assert again.problem.formulation.known_names == ("mass[1]", "a relation of spring")
+    labels = [label for prior in again.problem.formulation.priors for label in prior.labels]
+    assert labels == ["mass[1]", "a relation of spring"]
     assert "mass[1] ends" in again.summary()
     np.testing.assert_allclose(again.uncertainty.variables["mass"], result.uncertainty.variables["mass"], rtol=1e-9)
 
@@ -112,13 +113,13 @@ def test_names_come_back_from_a_file(tmp_path):
 )
 def test_mistakes(value, std, said):
     with pytest.raises(sysid.InputError, match=said):
-        problem(measured(0), lambda m, k: [sysid.Known(m, value, std)])
+        problem(measured(0), lambda m, k: [sysid.Prior(m, value, std)])
 
 
 @pytest.mark.parametrize("noises", [(0.05, 0.001), (0.001, 0.05)])
 def test_tests_count_by_their_noise(noises):
     """Beside a test fifty times better the noisy one hardly matters, whichever comes first."""
-    known = lambda m, k: [sysid.Known(m[0], MASS[0], std=1e-5)]  # noqa: E731
+    known = lambda m, k: [sysid.Prior(m[0], MASS[0], std=1e-5)]  # noqa: E731
     tests = [measured(seed, noise) for seed, noise in zip((4, 5), noises, strict=True)]
     better = tests[int(np.argmin(noises))]
     both = sysid.identify(problem(tests[0], known, further=[(tests[1], np.zeros(2))]), rng=0, strategy=QUICK)
