@@ -227,11 +227,11 @@ def _by_modes(problem: Problem, structure: Structure, x: Array | None) -> Uncert
 def _by_unknowns(problem: Problem, structure: Structure, x: Array) -> Uncertainty:
     """By the Jacobian of all that is fitted, in the problem's unknowns."""
     test, modes = problem.measurement, modes_of(structure)
-    formulation, at = _with_totals(problem, structure, x)
-    slopes = slopes_of(formulation.matrices, at, test, modes.omega)
-    known = of_formulation(formulation, at, slopes)
+    formulation, x = _with_totals(problem, structure, x)
+    slopes = slopes_of(formulation.matrices, x, test, modes.omega)
+    known = of_formulation(formulation, x, slopes)
     steps, normals = known.steps, known.rank
-    inflation = inflation_of(test, records_of(test, structure, at.size), at.size) if formulation.fits_records else 1.0
+    inflation = inflation_of(test, records_of(test, structure, x.size), x.size) if formulation.fits_records else 1.0
     shapes = np.einsum("si,ikc->skc", structure.recovery, slopes.d_shapes)
     parts = (shapes, slopes.d_participation, slopes.d_log_omega, slopes.d_log_ratios, slopes.d_rigid)
     moves = Perturbations(normals, *(part @ steps for part in parts))
@@ -246,7 +246,7 @@ def _by_unknowns(problem: Problem, structure: Structure, x: Array) -> Uncertaint
     found = _quantities(problem, structure, modes, moves, inflation, matrices)
     if not structure.modal_damping:
         found = replace(found, _spectra=DirectSpectra(slopes, steps, normals))
-    return _with_unknowns(found, problem, formulation, at, known, slopes)
+    return _with_unknowns(found, problem, formulation, x, known, slopes)
 
 
 def _with_totals(problem: Problem, structure: Structure, x: Array) -> tuple[Formulation, Array]:
