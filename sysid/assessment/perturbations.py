@@ -18,7 +18,7 @@ from sysid.modal_analysis.modal_fit import Modes
 from sysid.problem.slopes import Slopes, response_slopes
 from sysid.structure.structure import Array, Structure
 
-MOVED = 1e-6  # of a quantity's size, by which an unseen move of order one must change it to count
+_MOVED = 1e-6  # of a quantity's size, by which an unseen move of order one must change it to count
 
 
 def std_of(change: NDArray[np.inexact[Any]], normals: int, size: ArrayLike) -> Array:
@@ -28,7 +28,7 @@ def std_of(change: NDArray[np.inexact[Any]], normals: int, size: ArrayLike) -> A
     """
     std = np.linalg.norm(change[..., :normals], axis=-1)
     unseen = np.abs(change[..., normals:]).max(axis=-1, initial=0.0)
-    return np.where(unseen > MOVED * np.asarray(size), np.nan, std)
+    return np.where(unseen > _MOVED * np.asarray(size), np.nan, std)
 
 
 class Perturbations(NamedTuple):
@@ -50,7 +50,7 @@ class Perturbations(NamedTuple):
         weight, seen, unseen = np.vstack(factors), change[:, : self.normals], change[:, self.normals :]
         variance = np.sum(weight.conj() * ((seen @ seen.T) @ weight), axis=0).real
         moved = np.abs(unseen.T @ weight).max(axis=0, initial=0.0)
-        return np.where(moved > MOVED * size, np.nan, np.sqrt(np.maximum(variance, 0.0)))
+        return np.where(moved > _MOVED * size, np.nan, np.sqrt(np.maximum(variance, 0.0)))
 
 
 class Spectra(Protocol):

@@ -105,10 +105,10 @@ def of_outside(formulation: Formulation, x: Array) -> Sensitivity:
 
 
 def meaningful(formulation: Formulation) -> NDArray[np.bool_]:
-    """Which entries of x mean something by themselves, (size,): all but those of the factors of a free matrix."""
-    mask = np.full(formulation.size, True)
-    mask[formulation.parts.mass] = not formulation.mass.free
-    mask[formulation.parts.stiffness] = not formulation.stiffness.free
+    """Which entries of x mean something by themselves, (size,): no factors of a free matrix, no shares of a total."""
+    mask = np.concatenate([np.full(unknown.size, not unknown.relative) for unknown in formulation.unknowns])
+    mask[formulation.parts.mass] &= not formulation.mass.free
+    mask[formulation.parts.stiffness] &= not formulation.stiffness.free
     return mask
 
 

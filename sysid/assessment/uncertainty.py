@@ -12,13 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sysid.assessment.information import Index, information, spectra_of, spread
 from sysid.assessment.modal_mass_cone import open_modes
 from sysid.assessment.parametrisation import held_by_entries, parametrisation
 from sysid.assessment.perturbations import (
-    MOVED,
     DirectSpectra,
     ModalSpectra,
     Perturbations,
@@ -33,7 +32,7 @@ from sysid.modal_analysis.modal_fit import Modes
 from sysid.models.unknowns import by_name, split
 from sysid.problem.formulation import Formulation
 from sysid.problem.problem import Problem
-from sysid.problem.slopes import Slopes, slopes_of
+from sysid.problem.slopes import slopes_of
 from sysid.structure.structure import Array, Structure, check_frequencies
 
 _SAME = 1e-6  # relative distance that is put between repeated frequencies
@@ -246,7 +245,7 @@ def _by_unknowns(problem: Problem, structure: Structure, x: Array) -> Uncertaint
     found = _quantities(problem, structure, modes, moves, inflation, matrices)
     if not structure.modal_damping:
         found = replace(found, _spectra=DirectSpectra(slopes, steps, normals))
-    return _with_unknowns(found, problem, formulation, x, known, slopes)
+    return _with_unknowns(found, problem, formulation, x, known)
 
 
 def _with_totals(problem: Problem, structure: Structure, x: Array) -> tuple[Formulation, Array]:
@@ -260,41 +259,25 @@ def _with_totals(problem: Problem, structure: Structure, x: Array) -> tuple[Form
 
 
 def _with_unknowns(
-    found: Uncertainty, problem: Problem, formulation: Formulation, x: Array, known: Sensitivity, slopes: Slopes
+    found: Uncertainty, problem: Problem, formulation: Formulation, x: Array, known: Sensitivity
 ) -> Uncertainty:
     """The same with the unknowns that mean something by themselves; with their covariance where all do."""
-    steps, of_models = known.steps, slice(0, formulation.parts.damping.stop)
-    told = meaningful(formulation)
-    told[of_models] &= ~_arbitrary(known, slopes)[of_models]
+    steps, unknowns, names = known.steps, formulation.unknowns, {unknown.name for unknown in problem.variables}
     std = std_of(steps, known.rank, known.unit)
-    names = {unknown.name for unknown in problem.formulation.unknowns}
-    values, variables = {}, {}
-    for unknown, part, value, deviation in zip(
-        formulation.unknowns, *(split(formulation.unknowns, of_all) for of_all in (told, x, std)), strict=True
-    ):
-        if np.all(part) and unknown.name in names:
-            values[unknown.name], variables[unknown.name] = unknown.shaped(value), unknown.shaped(deviation)
+    told = [
+        bool(np.all(part)) and unknown.name in names
+        for unknown, part in zip(unknowns, split(unknowns, meaningful(formulation)), strict=True)
+    ]
+    values, variables = (
+        {name: part for (name, part), one in zip(by_name(unknowns, of_all).items(), told, strict=True) if one}
+        for of_all in (x, std)
+    )
     found = replace(found, values=values, variables=variables)
-    if len(values) < len(formulation.unknowns):
+    if not all(told):
         return found
     covariance = steps[:, : known.rank] @ steps[:, : known.rank].T
     covariance[np.isnan(std)], covariance[:, np.isnan(std)] = np.nan, np.nan
     return replace(found, parameters=formulation.labels, covariance=covariance)
-
-
-def _arbitrary(known: Sensitivity, slopes: Slopes) -> NDArray[np.bool_]:
-    """Unknowns that can move together with no matrix moving, (p,), such as shares that a total scales."""
-    s, steps = slopes.structure, known.unit[:, None] * known.unseen
-    changes = []
-    for matrix, slope in (
-        (s.mass, slopes.mass), (s.stiffness, slopes.stiffness), (s.damping, slopes.damping),
-        (slopes.push, slopes.d_push), (s.rigid_body_mass, slopes.d_rigid),
-    ):  # fmt: skip
-        size = max(np.abs(matrix).max(), np.abs(slope * known.unit).max(), np.finfo(float).tiny)
-        changes.append(slope.reshape(-1, len(steps)) @ steps / size)
-    moved = np.concatenate(changes)
-    lam, turn = np.linalg.eigh(moved.T @ moved)
-    return np.linalg.norm(known.unseen @ turn[:, lam < MOVED**2], axis=1) > MOVED
 
 
 def modes_of(structure: Structure) -> Modes:
