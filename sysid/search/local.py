@@ -12,8 +12,9 @@ from sysid.models.spectrum import SOLVED
 from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
-from sysid.search.matrix_coordinates import add_unknowns, fit_in_matrices
+from sysid.search.matrix_coordinates import fit_in_matrices
 from sysid.search.modal_coordinates import End, fit_in_modes
+from sysid.search.scaled_unknowns import add_unknowns
 from sysid.structure.structure import Array
 
 

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
-from sysid.models.unknowns import Unknown, scales_of, split
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram
 from sysid.problem.feasibility import HELD, LOOSE
 from sysid.problem.formulation import Formulation
@@ -22,6 +21,7 @@ from sysid.problem.matrices import assemble
 from sysid.problem.problem import Problem
 from sysid.problem.terms import ModeSymbols, Term, TestTerm
 from sysid.search.modal_coordinates import End, frequencies
+from sysid.search.scaled_unknowns import add_unknowns
 from sysid.structure.structure import Array, Structure
 from sysid.structure.triangular import lower_entries
 
@@ -66,27 +66,6 @@ def terms_with(formulation: Formulation, smoothed: Sequence[TestTerm]) -> list[T
 def needs_modes(formulation: Formulation) -> bool:
     """Whether modes are further unknowns: damping by ratios has no direct solve."""
     return formulation.fits_records and formulation.matrices.by_ratios
-
-
-def add_unknowns(z: NonlinearProgram, unknowns: Sequence[Unknown], x: Array, held: slice = slice(0, 0)) -> ca.MX:
-    """The unknowns as expressions of new ones in units of their scale, those in `held` as numbers."""
-    pieces, at = [], 0
-    for unknown, values in zip(unknowns, split(unknowns, x), strict=True):
-        if held.start <= at < held.stop:
-            pieces.append(ca.MX(ca.DM(values)))
-        else:
-            unit = scale_of_unknown(unknown, values)
-            labels = [label.removeprefix(unknown.title) for label in unknown.labels]
-            scaled = z.variable(unknown.title, values / unit, unknown.lower / unit, unknown.upper / unit, labels)
-            pieces.append(scaled * ca.DM(unit))
-        at += unknown.size
-    return ca.vertcat(*pieces)
-
-
-def scale_of_unknown(unknown: Unknown, values: Array) -> Array:
-    """What IPOPT counts an unknown in: its start, or a part of its range where that is larger."""
-    unit = scales_of([unknown], values)
-    return np.where(unit > 0, unit, 1.0)
 
 
 def _add_constraints(problem: Problem, unknowns: ca.MX, z: NonlinearProgram) -> None:

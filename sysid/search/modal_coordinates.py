@@ -18,10 +18,12 @@ import numpy as np
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, fit_modes, rank_one
 from sysid.modal_analysis.residues import linear_residues
+from sysid.models.unknowns import lower_of, upper_of
 from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram
 from sysid.problem.matrices import assemble
 from sysid.problem.problem import Problem
 from sysid.search.modal_scaling import stated_totals, to_stated_totals
+from sysid.search.scaled_unknowns import add_unknowns
 from sysid.structure.structure import Array, Structure
 
 FREQUENCY_WINDOW = 0.05  # relative; what a frequency read off a peak may be wrong by
@@ -107,14 +109,14 @@ def _spectrum(problem: Problem, structure: Structure, start: Modes, z: Nonlinear
     """Circular frequencies and damping ratios as expressions."""
     formulation = problem.formulation
     omega, _ = frequencies(problem, start.omega, z)
-    damping, (unknown,) = formulation.models[2], formulation.of_models[2]
+    damping, unknowns = formulation.models[2], formulation.of_models[2]
+    lower, upper = lower_of(unknowns), upper_of(unknowns)
     if formulation.damping.free:
-        guess = np.clip(start.ratios, unknown.lower, unknown.upper)
-        low, high = np.log(unknown.lower / guess), np.log(unknown.upper / guess)
-        return omega, ca.DM(guess) * ca.exp(z.variable(unknown.title, np.zeros(guess.size), low, high))
-    guess = np.clip(damping.values(formulation.geometry, structure), unknown.lower, unknown.upper)
-    y = z.variable(unknown.title, guess / unknown.upper, unknown.lower / unknown.upper, 1.0)
-    return omega, damping.ratios(formulation.geometry, y * ca.DM(unknown.upper), omega)
+        guess = np.clip(start.ratios, lower, upper)
+        low, high = np.log(lower / guess), np.log(upper / guess)
+        return omega, ca.DM(guess) * ca.exp(z.variable(unknowns[0].title, np.zeros(guess.size), low, high))
+    guess = np.clip(damping.values(formulation.geometry, structure), lower, upper)
+    return omega, damping.ratios(formulation.geometry, add_unknowns(z, unknowns, guess), omega)
 
 
 def _unknowns(problem: Problem, modes: Modes, rigid: Array, remainder: Array, x: Array) -> Array:

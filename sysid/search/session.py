@@ -112,6 +112,7 @@ class Session:
         self.max_evaluations = max_evaluations
         self.begun = time.perf_counter()
         self.lines: list[str] = []
+        self.stop_asked: Stop | None = None  # by a callback, before there was anything to keep
 
     @property
     def seconds(self) -> float:
@@ -141,6 +142,8 @@ class Session:
             Where a listener or the user wants to stop.
         """
         self.interrupt.check()
+        if self.stop_asked is not None and phase != "poles":
+            raise self.stop_asked
         for listener in self.listeners:
             try:
                 listener(Progress(phase, iteration, of, objective, self.seconds))
@@ -152,7 +155,13 @@ class Session:
         return lambda iteration, objective: self.report(phase, iteration, 0, objective)
 
     def preparing(self, iteration: int, objective: float) -> None:
-        """`report` while poles are looked for, before there is anything to keep: the time limit ends it too."""
-        self.report("poles", iteration, 0, objective)
+        """`report` while poles are looked for, before there is anything to keep: the time limit ends it too.
+
+        A callback that wants to stop does so when the search itself first reports.
+        """
+        try:
+            self.report("poles", iteration, 0, objective)
+        except Stop as stop:
+            self.stop_asked = stop
         if self.max_time is not None and self.seconds > self.max_time:
             raise Stop(f"the time of {self.max_time:g} s was over before the poles of the records were found")

@@ -6,8 +6,8 @@ import pytest
 
 import sysid
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
-from sysid.search.continuation import SHIFTS, Continuation, descend, levels_of
-from sysid.search.continuation import tests_of as stand_ins
+from sysid.search.continuation import SHIFTS, Continuation, descend, smoothed_tests
+from sysid.search.session import DeferredInterrupt, Session
 
 FREQ = np.linspace(1.0, 70.0, 240)
 
@@ -88,12 +88,13 @@ def storeys():
 
 def test_continuation_finds_the_truth_of_four_storeys_from_twenty_random_starts():
     problem = storeys()
-    steps = levels_of(problem, stand_ins(problem))
+    steps = smoothed_tests(problem).steps
     assert [step[0].shift for step in steps] == sorted((step[0].shift for step in steps), reverse=True)
     rng = np.random.default_rng(0)
     truth = np.concatenate([SPRINGS, 1.5e-4 * SPRINGS])
+    session = Session([], DeferredInterrupt())
     starts = problem.lower * (problem.upper / problem.lower) ** rng.random((20, 8))
-    ends = np.array([descend(problem, x, steps, left=lambda: None).x for x in starts])
+    ends = np.array([descend(problem, x, steps, session).x for x in starts])
     np.testing.assert_allclose(ends, np.broadcast_to(truth, ends.shape), rtol=1e-6)
 
 

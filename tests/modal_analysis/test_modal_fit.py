@@ -10,7 +10,7 @@ from sysid import Measurement, Structure
 from sysid.measurement.measurement import unit_runs
 from sysid.modal_analysis.modal_fit import Modes, _derivatives, _Error, fit_modes, rank_one
 from sysid.models.spectrum import SOLVED
-from sysid.nlp import OBJECTIVE_SCALE, Coordinates, Watch
+from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram
 from sysid.structure.triangular import lower_triangle, triangle_entries
 
 
@@ -44,7 +44,7 @@ def relative_spectrum(omega, ratios):
     """Poles as logarithms about given ones."""
 
     def spectrum(z):
-        shift, loss = (z.add(name, np.zeros(len(omega))) for name in ("frequency", "damping ratio"))
+        shift, loss = (z.variable(name, np.zeros(len(omega))) for name in ("frequency", "damping ratio"))
         return ca.DM(omega) * ca.exp(shift), ca.DM(ratios) * ca.exp(loss)
 
     return spectrum
@@ -52,13 +52,13 @@ def relative_spectrum(omega, ratios):
 
 def graph(test, structure):
     """The error about `structure`, its unknowns free of any gauge, and its derivatives as IPOPT gets them."""
-    first, d, z = modes_of(structure), structure.n_base, Coordinates()
-    gamma = z.add("participation", first.gamma)
+    first, d, z = modes_of(structure), structure.n_base, NonlinearProgram()
+    gamma = z.variable("participation", first.gamma)
     omega, ratios = relative_spectrum(first.omega, first.ratios)(z)
     rigid = gamma.T @ gamma
     if test.force is not None:
         root = np.linalg.cholesky(structure.rigid_body_mass - first.gamma.T @ first.gamma)
-        factor = lower_triangle(z.add("base mass", triangle_entries(root)), d)
+        factor = lower_triangle(z.variable("base mass", triangle_entries(root)), d)
         rigid = rigid + factor @ factor.T
     error = _Error(test, gamma, omega, ratios, rigid, first)
     functions = _derivatives(z, error, gamma, omega, ratios, rigid)
@@ -169,12 +169,12 @@ def test_a_force_whose_deviation_is_not_stated_weighs_by_the_noise_that_it_has(r
     np.testing.assert_allclose(weight, motion / pull, rtol=0.05)
 
 
-def fitted(test, first, spectrum=None, *, watch=None):
+def fitted(test, first, spectrum=None, *, monitor=None):
     """The fit from `first`, in participations of order one, its base mass from anywhere."""
     unit = np.full(test.n_base, np.linalg.norm(first.gamma) / np.sqrt(first.gamma.size))
     spectrum = relative_spectrum(first.omega, first.ratios) if spectrum is None else spectrum
-    watch = Watch(None, None) if watch is None else watch
-    return fit_modes(test, first, spectrum, unit=unit, remainder=np.diag(unit**2), watch=watch)
+    monitor = IterationMonitor(None, None) if monitor is None else monitor
+    return fit_modes(test, first, spectrum, unit=unit, remainder=np.diag(unit**2), monitor=monitor)
 
 
 def residues(modes):
@@ -195,13 +195,13 @@ class TestFit:
         rng = np.random.default_rng(d)
         structure = random_structure(rng, n=4, d=d)
         truth, test = modes_of(structure), trial(rng, structure, force=force, general=general, lines=200)
-        watch = Watch(None, None)
-        end = fitted(test, near(rng, truth, 0.2), watch=watch)
+        monitor = IterationMonitor(None, None)
+        end = fitted(test, near(rng, truth, 0.2), monitor=monitor)
         assert end.status in SOLVED
         assert end.residual < 1e-9
         assert end.of_accelerations < 1e-10
-        assert len(watch.curve) < 15
-        assert watch.curve[-1] < max(1e-12, 1e4 * watch.curve[-2] ** 2)
+        assert len(monitor.curve) < 15
+        assert monitor.curve[-1] < max(1e-12, 1e4 * monitor.curve[-2] ** 2)
         assert end.bounds == ""
         np.testing.assert_allclose(end.modes.omega, truth.omega, rtol=1e-11)
         np.testing.assert_allclose(end.modes.ratios, truth.ratios, rtol=1e-9)
@@ -255,10 +255,10 @@ def test_a_base_without_mass_is_no_trouble_to_a_noisy_force(random_orthogonal, s
     full = np.block([[K, -K @ G], [-(K @ G).T, G.T @ K @ G]])
     structure = Structure(np.diag([*np.ones(4), *np.zeros(d)]), (full + full.T) / 2, np.full(4, 0.01), n_base=d)
     test = trial(rng, structure, force=True, noise=0.005, lines=200)
-    watch = Watch(None, None)
-    end = fitted(test, near(rng, modes_of(structure), 0.05), watch=watch)
+    monitor = IterationMonitor(None, None)
+    end = fitted(test, near(rng, modes_of(structure), 0.05), monitor=monitor)
     assert end.status in SOLVED
-    assert len(watch.curve) < 40
+    assert len(monitor.curve) < 40
     remainder = np.linalg.eigvalsh(end.rigid - end.modes.gamma.T @ end.modes.gamma)
     assert remainder[0] > -1e-12
     assert remainder[-1] < 0.02
