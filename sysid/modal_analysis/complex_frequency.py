@@ -12,11 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.residues import Records, force_residual_left
 from sysid.modal_analysis.response import columns, gains, weights_of
-from sysid.modal_analysis.vector_fitting import poles_of_any_damping
+from sysid.modal_analysis.vector_fitting import Monitor, poles_of_any_damping
 from sysid.structure.structure import Array, ComplexArray
 
 _LINES = 80
@@ -52,13 +51,10 @@ class PolesAndResidues:
     residual: float
 
     @classmethod
-    def of(cls, test: Measurement) -> PolesAndResidues | None:
-        """Those of a test; None where it shows none."""
+    def of(cls, test: Measurement, *, monitor: Monitor | None = None) -> PolesAndResidues | None:
+        """Those of a test; None where it shows none. The monitor is called as `find_poles` does."""
         records = Records(test)
-        try:
-            omega, ratios = poles_of_any_damping(records)
-        except InputError:
-            return None
+        omega, ratios = poles_of_any_damping(records, monitor=monitor)
         if omega.size == 0:
             return None
         order = np.argsort(omega)
@@ -141,16 +137,22 @@ class Smoothed:
     shift: float
 
 
-def noise_level(test: Measurement) -> float:
+def noise_level(test: Measurement, *, monitor: Monitor | None = None) -> float:
     """Standard deviation of each real number of a test's relative, weighted residual.
 
     Of the stated noise where one is stated, else of what free residues at the poles of the data leave.
+
+    Parameters
+    ----------
+    test : Measurement
+    monitor : callable, optional
+        Called as `find_poles` does while the poles are looked for.
     """
     if test.response_std is not None:
         weight, scale = weights_of(test.relative, test.response_std)
         std = np.asarray(weight) * columns(test.response_std.astype(complex)).real
         return max(float(np.sqrt(np.mean(std**2) / 2)) / scale, _LEAST)
-    poles = PolesAndResidues.of(test)
+    poles = PolesAndResidues.of(test, monitor=monitor)
     if poles is None:
         return _LEAST
     # The free residues and the poles have taken their share of the noise.

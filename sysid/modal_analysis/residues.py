@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.linalg
@@ -15,6 +17,7 @@ from sysid.structure.structure import Array, ComplexArray
 
 _DEVIATIONS = 12.0  # of the chi-squared law, by which a squared error must fall to mean something
 ROUND_OFF = 1e-11  # of the records: what counts as noise where there is none
+_LARGE = 1e-6  # of the squared records: a squared error so large follows to ten digits as the difference of two squares
 _NEIGHBOURS = 3  # lines on either side that may share their noise
 _CHANCE = 5.0  # standard deviations of the correlation of white noise
 _DEPENDENT = 1e-9  # of the largest singular value of the base records
@@ -29,25 +32,54 @@ class ResidueFit:
     Q : (rows, columns)
         Orthonormal basis of what the poles can answer.
     residues : (m, inputs, channels)
-    left : (rows, channels)
-        What they leave.
-    whitened : (m, inputs, channels)
-        Residues in units of what white noise of unit variance would scatter them by: the sum of squares of pole
-        k is what the squared error would rise by without it.
     spread : (m, inputs, columns)
         Residues that one unit of each column of Q makes: scatter of the residues is ``spread @ spread'``.
+    data : (rows, channels)
+        The records.
+    answered : (columns, channels)
+        ``Q' data``.
+    size : float
+        Sum of squares of the records.
     """
 
     Q: Array
     residues: Array
-    left: Array
-    whitened: Array
     spread: Array
+    data: Array
+    answered: Array
+    size: float
 
-    @property
+    @cached_property
+    def left(self) -> Array:
+        """What the poles leave of the records, (rows, channels)."""
+        return self.data - self.Q @ self.answered
+
+    @cached_property
+    def whitened(self) -> Array:
+        """Residues in units of what white noise of unit variance would scatter them by, (m, inputs, channels).
+
+        The sum of squares of pole k is what the squared error would rise by without it.
+        """
+        factor = np.linalg.cholesky(np.einsum("kir,kjr->kij", self.spread, self.spread))
+        return np.linalg.solve(factor, self.residues)
+
+    @cached_property
     def squared_error(self) -> float:
         """Sum of squares of what is left."""
-        return float(np.sum(self.left**2))
+        return self._difference if self._is_large else float(np.vdot(self.left, self.left))
+
+    def products(self, columns: Array) -> Array:
+        """Products of columns (rows, k) that are orthogonal to Q with what is left, (k, channels)."""
+        return columns.T @ (self.data if self._is_large else self.left)
+
+    @cached_property
+    def _difference(self) -> float:
+        return self.size - float(np.vdot(self.answered, self.answered))
+
+    @property
+    def _is_large(self) -> bool:
+        """Whether round-off in differences of squares does not matter to what is left, which need not be formed."""
+        return self._difference > _LARGE * self.size
 
     @property
     def gain(self) -> Array:
@@ -103,39 +135,60 @@ class Records:
         block = np.tile(gains, len(self.blocks))[:, None] * self.base[None]
         return stacked(block.reshape(-1, self.base.shape[1]))
 
-    def fit(self, omega: Array, ratios: Array, *, velocity: bool = False) -> ResidueFit:
-        """Best real residues of ``g``; with `velocity` those of ``i w / w_k g`` too, as further inputs."""
+    @cached_property
+    def singular(self) -> tuple[Array, Array]:
+        """Singular values (k,) of all records as a matrix of rows by channels, and its right vectors (k, channels)."""
+        return _singular(self.data)
+
+    def principal(self, count: int) -> list[tuple[ComplexArray, ComplexArray]]:
+        """Base (inputs, n_freq) and at most so many principal channels (c, n_freq) of each block."""
+        out = []
+        for base, channels in self.blocks:
+            moving = independent(base[None]).T @ base  # a run moves the base in fewer directions than all together
+            sizes, right = self.singular if len(self.blocks) == 1 else _singular(stacked(channels))
+            keep = np.flatnonzero(sizes > 1e-14 * sizes[0])[:count]
+            out.append((moving, right[keep] @ channels))
+        return out
+
+    def functions(self, omega: Array, ratios: Array, *, velocity: bool = False) -> Array:
+        """Columns of ``g`` for each input; with `velocity` those of ``i w / w_k g`` too, as further inputs."""
         g = gains(self.freq, omega, ratios)
         if velocity:
             g = np.stack([g, 2j * np.pi * self.freq / omega[:, None] * g], axis=1).reshape(-1, self.freq.size)
-        X = self.basis(g)
-        scale = np.linalg.norm(X, axis=0)
-        scale[scale == 0] = 1.0
-        Q, R = np.linalg.qr(X / scale)
-        y = Q.T @ self.data
-        inverse = scipy.linalg.solve_triangular(R, np.eye(R.shape[0]), check_finite=False)
-        m = omega.size
-        inverse /= scale[:, None]
-        beta = (inverse @ y).reshape(m, -1, self.data.shape[1])
-        spread = inverse.reshape(m, beta.shape[1], -1)
-        factor = np.linalg.cholesky(np.einsum("kir,kjr->kij", spread, spread))
-        whitened = np.linalg.solve(factor, beta)
-        return ResidueFit(Q, beta, self.data - Q @ y, whitened, spread)
+        return self.basis(g)
+
+    def fit(self, omega: Array, ratios: Array, *, velocity: bool = False) -> ResidueFit:
+        """Best real residues of `functions`."""
+        return _least_squares(self.functions(omega, ratios, velocity=velocity), self.data, omega.size, self.size)
 
     def noise(self, left: Array, unknowns: int, *, least: float = ROUND_OFF) -> float:
         """Variance of a real number of the records about a fit of so many unknowns, as smooth functions feel it."""
+        return self.variance(self.line_correlation(left) * float(np.sum(left**2)), unknowns, least=least)
+
+    def variance(self, squared_error: float, unknowns: int, *, least: float = ROUND_OFF) -> float:
+        """Share of one real number of the records in a squared error that a fit of so many unknowns leaves."""
         freedom = max(self.data.size - unknowns, 1)
-        variance = self.line_correlation(left) * float(np.sum(left**2)) / freedom
-        return max(variance, least**2 * self.size / self.data.size)
+        return max(squared_error / freedom, least**2 * self.size / self.data.size)
 
     def line_correlation(self, left: Array) -> float:
         """Factor by which noise weighs more on smooth functions as neighbouring lines share it; one for white noise.
 
         Windows of averaged spectra smear each error over some lines: of H1 with Hann's it is 1.9.
         """
-        rows = len(left) // 2
-        error = (left[:rows] + 1j * left[rows:]).reshape(-1, self.freq.size, left.shape[1])
-        return line_correlation(np.moveaxis(error, 1, 2))
+        shared = (float(np.sum(left * self.neighbours(left, lag))) for lag in range(1, _NEIGHBOURS + 1))
+        return self.correlation_factor(float(np.sum(left**2)), shared)
+
+    def correlation_factor(self, power: float, shared: Iterable[float]) -> float:
+        """`line_correlation` from the sum of squares of an error, and of its products with neighbours at each lag."""
+        return 1.0 if self.freq.size <= 2 * _NEIGHBOURS else _correlation_factor(power, shared, self.data.size // 2)
+
+    def neighbours(self, rows: Array, lag: int) -> Array:
+        """Mean of what stands `lag` lines before and after, within each run, (rows, columns); zero beyond the ends."""
+        own = rows.reshape(-1, self.freq.size, rows.shape[1])
+        out = np.zeros_like(own)
+        out[:, lag:] += own[:, :-lag] / 2
+        out[:, :-lag] += own[:, lag:] / 2
+        return out.reshape(rows.shape)
 
     def by_sensor(self, residues: Array) -> Array:
         """Residues (m, inputs, channels) of `fit` in the test's own units, (m, n_sensors, d).
@@ -148,6 +201,80 @@ class Records:
         return np.einsum("mic,di->mcd", residues / self.channel, self.moving)
 
 
+class SubsetFits:
+    """Fits of the records on subsets of given poles, all from one QR factorisation of the functions of these poles.
+
+    With ``X = Q R`` for all poles, a subset's fit of the records is that of ``Q' data`` on columns of R: its rows are
+    as many as columns of X, not as lines. What Q leaves is the same for all subsets.
+
+    Parameters
+    ----------
+    records : Records
+    omega, ratios : (m,)
+        All poles.
+    velocity : bool
+        As in `Records.functions`.
+
+    Attributes
+    ----------
+    size : int
+        Number of all poles.
+    per_pole : int
+        Real parameters that come with a pole: residues, frequency and damping ratio.
+    """
+
+    def __init__(self, records: Records, omega: Array, ratios: Array, *, velocity: bool = False) -> None:
+        X = records.functions(omega, ratios, velocity=velocity)
+        scale = np.linalg.norm(X, axis=0)
+        scale[scale == 0] = 1.0
+        Q, R = np.linalg.qr(X / scale)
+        self.records, self.size = records, omega.size
+        self.per_pole = X.shape[1] // omega.size * records.data.shape[1] + 2
+        self._columns = R.reshape(len(R), omega.size, -1)  # by pole; no gain depends on their scale
+        self._answered = Q.T @ records.data
+        left = records.data - Q @ self._answered
+        self._size = float(np.vdot(self._answered, self._answered))
+        self._outside = float(np.sum(left**2))
+        # Products of an error `left + Q z` with its neighbours: constant, linear and quadratic in z, for each lag.
+        lags = range(1, _NEIGHBOURS + 1)
+        shifted = [records.neighbours(Q, lag).T for lag in lags]
+        self._constant = [float(np.sum(left * records.neighbours(left, lag))) for lag in lags]
+        self._linear = [2 * lagged @ left for lagged in shifted]
+        self._quadratic = [lagged @ Q for lagged in shifted]
+
+    def worth(self, kept: NDArray[np.intp]) -> tuple[Array, float]:
+        """What the squared error of the poles `kept` would rise by without each, over the noise, (len(kept),).
+
+        Returns
+        -------
+        worth : (len(kept),)
+            In units of the variance of the noise about the fit on these poles.
+        squared_error : float
+            Of this fit.
+        """
+        X = self._columns[:, kept].reshape(len(self._columns), -1)
+        fit = _least_squares(X, self._answered, kept.size, self._size)
+        z = fit.left
+        squares = z @ z.T
+        squared_error = self._outside + float(np.trace(squares))
+        terms = zip(self._constant, self._linear, self._quadratic, strict=True)
+        shared = (c + float(np.sum(linear * z)) + float(np.sum(quadratic * squares)) for c, linear, quadratic in terms)
+        factor = self.records.correlation_factor(squared_error, shared)
+        return fit.gain / self.records.variance(factor * squared_error, kept.size * self.per_pole), squared_error
+
+
+def _least_squares(X: Array, data: Array, m: int, size: float) -> ResidueFit:
+    """Fit of data (rows, channels), whose sum of squares is `size`, on columns X (rows, m * inputs)."""
+    scale = np.linalg.norm(X, axis=0)
+    scale[scale == 0] = 1.0
+    Q, R = np.linalg.qr(X / scale)
+    y = Q.T @ data
+    inverse = scipy.linalg.solve_triangular(R, np.eye(R.shape[0]), check_finite=False)
+    inverse /= scale[:, None]
+    beta = (inverse @ y).reshape(m, -1, data.shape[1])
+    return ResidueFit(Q, beta, inverse.reshape(m, beta.shape[1], -1), data, y, size)
+
+
 def beyond_chance(freedom: float) -> float:
     """Squared size, in units of the noise's variance, that so many numbers of noise alone do not reach."""
     return float(freedom + _DEVIATIONS * np.sqrt(2 * freedom))
@@ -155,15 +282,22 @@ def beyond_chance(freedom: float) -> float:
 
 def line_correlation(error: ComplexArray) -> float:
     """Sum of the correlations of errors (..., n_freq) with those of their neighbours, where these are no chance."""
-    power = float(np.sum(np.abs(error) ** 2))
-    if power == 0 or error.shape[-1] <= 2 * _NEIGHBOURS:
+    if error.shape[-1] <= 2 * _NEIGHBOURS:
         return 1.0
+    lags = range(1, _NEIGHBOURS + 1)
+    shared = (float(np.sum(error[..., lag:] * error[..., :-lag].conj()).real) for lag in lags)
+    return _correlation_factor(float(np.sum(np.abs(error) ** 2)), shared, error.size)
+
+
+def _correlation_factor(power: float, shared: Iterable[float], size: int) -> float:
+    """One, and twice the correlation of `size` complex errors at each lag up to the first that may be chance."""
     factor = 1.0
-    for lag in range(1, _NEIGHBOURS + 1):
-        shared = float(np.sum(error[..., lag:] * error[..., :-lag].conj()).real) / power
-        if shared < _CHANCE / np.sqrt(2 * error.size):
+    if power == 0:
+        return factor
+    for products in shared:
+        if products / power < _CHANCE / np.sqrt(2 * size):
             break
-        factor += 2 * shared
+        factor += 2 * products / power
     return factor
 
 
@@ -178,6 +312,12 @@ def independent(base: ComplexArray) -> Array:
     size[size == 0] = 1.0
     left, s, _ = np.linalg.svd((flat / size).T, full_matrices=False)
     return left[:, s > _DEPENDENT * s[0]] / size[:, None]
+
+
+def _singular(matrix: Array) -> tuple[Array, Array]:
+    """Singular values and right singular vectors, as rows; the left ones, which are long, are not formed."""
+    small = np.linalg.qr(matrix, mode="r") if matrix.shape[0] > matrix.shape[1] else matrix
+    return np.linalg.svd(small, full_matrices=False)[1:]
 
 
 def stacked(record: ComplexArray) -> Array:

@@ -9,6 +9,7 @@ residues, further poles are tried beside and between them, and close ones that o
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,11 +17,13 @@ from threadpoolctl import threadpool_limits
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.residues import ROUND_OFF, Records, ResidueFit, beyond_chance, independent, stacked
+from sysid.modal_analysis.relocation import relocate
+from sysid.modal_analysis.residues import ROUND_OFF, Records, ResidueFit, SubsetFits, beyond_chance
 from sysid.modal_analysis.response import gain_slopes, gains
-from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.structure import Array
 
 _SPARE = 6  # poles beyond those expected: without spare ones noise moves true poles
+_MANY = 100  # sensors: more of them are not taken to show a mode each unless the channels do
 _RELOCATIONS = 6
 _STEPS = 100
 _SETTLED = 1e-6  # fall of the squared error, relative, at which poles are polished: far below what noise moves it by
@@ -50,13 +53,38 @@ class Poles:
     residual: float
 
 
-def find_poles(test: Measurement) -> Poles:
+Monitor = Callable[[int, float], object]
+
+
+class _Progress:
+    """Count of iterations and the relative residual so far, which a monitor is told."""
+
+    def __init__(self, monitor: Monitor | None, records: Records) -> None:
+        self.monitor, self.size = monitor, records.size
+        self.iterations, self.residual = 0, 1.0
+
+    def step(self, squared_error: float) -> None:
+        """One iteration more, and what it leaves."""
+        self.iterations += 1
+        self.residual = float(np.sqrt(squared_error / self.size)) if self.size else 0.0
+        self.tell()
+
+    def tell(self) -> None:
+        """Within an iteration that takes long: what the monitor raises stops the search."""
+        if self.monitor is not None:
+            self.monitor(self.iterations, self.residual)
+
+
+def find_poles(test: Measurement, *, monitor: Monitor | None = None) -> Poles:
     """Find the modes that stand out of the noise.
 
     Parameters
     ----------
     test : Measurement
         Its lines must hold the modes; lines closer than the half-power bandwidth.
+    monitor : callable, optional
+        ``monitor(iterations, residual)`` is called in every iteration, with the relative residual so far, and within
+        those that take long; what it raises ends the search and passes through.
 
     Raises
     ------
@@ -69,14 +97,17 @@ def find_poles(test: Measurement) -> Poles:
     1587-1592. G. H. Golub, V. Pereyra, SIAM J. Numer. Anal. 10 (1973) 413-432, with Kaufman's Jacobian (1975).
     """
     with threadpool_limits(limits=1):  # the same bits whatever the machine does beside
-        return _find(Records(test))
+        records = Records(test)
+        return _find(records, _Progress(monitor, records))
 
 
-def _find(records: Records) -> Poles:
-    count = max(records.n_sensors, _independent(records)) + _SPARE
+def _find(records: Records, progress: _Progress) -> Poles:
+    count = _count(records, progress)
     while True:
-        _check_lines(records, count)
-        omega, ratios = _search(records, count)
+        if not _lines_suffice(records, count):
+            n = records.freq.size
+            raise InputError(f"{n} lines are too few to look for {count} poles: state natural_frequencies or add lines")
+        omega, ratios = _search(records, count, progress)
         if omega.size <= count - _SPARE // 2:
             break
         count += max(count // 2, _SPARE)  # too few were spare
@@ -89,8 +120,17 @@ def _find(records: Records) -> Poles:
     return _in_order(records, omega, ratios)
 
 
-def poles_near(test: Measurement, omega: Array, window: float) -> Poles:
+def poles_near(test: Measurement, omega: Array, window: float, *, monitor: Monitor | None = None) -> Poles:
     """Poles for frequencies that somebody states, rad/s: polished from there, each held within `window` (relative).
+
+    Parameters
+    ----------
+    test : Measurement
+    omega : (p,)
+        Stated circular frequencies, rad/s.
+    window : float
+    monitor : callable, optional
+        As in `find_poles`.
 
     Raises
     ------
@@ -99,7 +139,7 @@ def poles_near(test: Measurement, omega: Array, window: float) -> Poles:
     """
     records = Records(test)
     distinct = np.unique(omega)
-    found, ratios = _polish(records, distinct, np.full(distinct.size, _GUESS))
+    found, ratios = _polish(records, distinct, np.full(distinct.size, _GUESS), _Progress(monitor, records))
     off = np.abs(np.log(found / distinct))
     fit = records.fit(found, ratios)
     # By its place, or by what the fit would lose without it.
@@ -115,64 +155,78 @@ def poles_near(test: Measurement, omega: Array, window: float) -> Poles:
     return _in_order(records, found, ratios)
 
 
+def _count(records: Records, progress: _Progress) -> int:
+    """How many poles to begin with."""
+    progress.tell()
+    independent = _independent(records)
+    progress.tell()
+    return max(min(records.n_sensors, max(2 * independent, _MANY)), independent) + _SPARE
+
+
 def _independent(records: Records) -> int:
     """Number of independent functions of frequency in the channels, where it stands out of the noise."""
-    sizes = np.linalg.svd(records.data, compute_uv=False)
+    sizes, _ = records.singular
     return int(np.count_nonzero(sizes > max(1.5 * np.median(sizes), 1e-9 * sizes[0])))
 
 
-def poles_of_any_damping(records: Records) -> tuple[Array, Array]:
+def poles_of_any_damping(records: Records, *, monitor: Monitor | None = None) -> tuple[Array, Array]:
     """Circular frequencies and damping ratios of poles with residues in quadrature beside the real ones.
 
-    They serve to continue records off the lines: none is tried beside or between them, and none is merged.
+    They serve to continue records off the lines: none is tried beside or between them, and none is merged. None at all
+    where the lines are too few to look for so many.
 
-    Raises
-    ------
-    InputError
-        Too few lines.
+    Parameters
+    ----------
+    records : Records
+    monitor : callable, optional
+        As in `find_poles`.
     """
+    progress = _Progress(monitor, records)
     with threadpool_limits(limits=1):
-        count = max(records.n_sensors, _independent(records)) + _SPARE
-        _check_lines(records, count)
-        return _settled(records, *_relocated(records, count), velocity=True)
+        count = _count(records, progress)
+        while _lines_suffice(records, count):
+            omega, ratios = _settled(records, *_relocated(records, count, progress), progress, velocity=True)
+            if omega.size <= count - _SPARE // 2 or count >= records.n_sensors + _SPARE:
+                return omega, ratios
+            count += max(count // 2, _SPARE)
+    return np.empty(0), np.empty(0)
 
 
-def _check_lines(records: Records, count: int) -> None:
-    if 2 * np.count_nonzero(records.freq) < 4 * count + 2:
-        raise InputError(
-            f"{records.freq.size} lines are too few to look for {count} poles: state natural_frequencies or add lines"
-        )
+def _lines_suffice(records: Records, count: int) -> bool:
+    return 2 * int(np.count_nonzero(records.freq)) >= 4 * count + 2
 
 
-def _relocated(records: Records, count: int) -> tuple[Array, Array]:
+def _relocated(records: Records, count: int, progress: _Progress) -> tuple[Array, Array]:
     """Poles that earn their place, from `count` that are spread over the lines, before they are polished."""
     lines = 2 * np.pi * records.freq[records.freq > 0]
     omega, ratios = np.geomspace(lines[0], lines[-1], count), np.full(count, _GUESS)
-    channels = _principal(records, count)
+    progress.tell()
+    channels = records.principal(count)
     error = np.inf
     for _ in range(_RELOCATIONS):
-        omega, ratios = _relocate(records, channels, omega, ratios)
+        omega, ratios = relocate(records, channels, omega, ratios, progress.tell)
         before, error = error, records.fit(omega, ratios).squared_error
+        progress.step(error)
         if error < _EXACT**2 * records.size or error > 0.97 * before:
             break
     # A pole of a structure with other than classical damping needs its velocity too, or others would stand in for it.
-    return _prune(records, omega, ratios, velocity=True)
+    return _prune(records, omega, ratios, progress, velocity=True)
 
 
-def _search(records: Records, count: int) -> tuple[Array, Array]:
+def _search(records: Records, count: int, progress: _Progress) -> tuple[Array, Array]:
     """Poles that stand out of the noise."""
-    first = _relocated(records, count)
+    first = _relocated(records, count, progress)
     if first[0].size == 0:
         return first
-    omega, ratios = _settled(records, *first)
+    omega, ratios = _settled(records, *first, progress)
     for _ in range(count):
-        more = _with_another(records, omega, ratios) if omega.size else None
+        more = _with_another(records, omega, ratios, progress) if omega.size else None
         if more is None:
             break
         omega, ratios = more
-    omega, ratios = _merged(records, omega, ratios)
+    omega, ratios = _merged(records, omega, ratios, progress)
     if omega.size and _explains(records, (omega, ratios), True) < _explains(records, (omega, ratios), False):
-        with_velocity = _settled(records, *first, velocity=True)
+        with_velocity = _settled(records, *first, progress, velocity=True)
         if _explains(records, with_velocity, True) < _explains(records, (omega, ratios), False):
             return with_velocity
     return omega, ratios
@@ -188,12 +242,13 @@ def _explains(records: Records, poles: tuple[Array, Array], velocity: bool) -> f
     return float(records.data.size * np.log(error) + unknowns * np.log(records.data.size))
 
 
-def _merged(records: Records, omega: Array, ratios: Array) -> tuple[Array, Array]:
+def _merged(records: Records, omega: Array, ratios: Array, progress: _Progress) -> tuple[Array, Array]:
     """Poles without those that a neighbour, once it may move, stands in for: close poles trade their residues."""
     order = np.argsort(omega)
     omega, ratios = omega[order], ratios[order]
     k = 0
     while k < omega.size:
+        progress.tell()
         close = np.flatnonzero(np.abs(np.log(omega / omega[k])) < ratios[k] / 2)
         if close.size > 1:
             fit = records.fit(omega, ratios)
@@ -201,7 +256,7 @@ def _merged(records: Records, omega: Array, ratios: Array) -> tuple[Array, Array
             if fit.rise_with_one_less(close) > _FAR * allowed:
                 k += 1
                 continue
-            fewer = _polish(records, np.delete(omega, k), np.delete(ratios, k))
+            fewer = _polish(records, np.delete(omega, k), np.delete(ratios, k), progress)
             rise = records.fit(*fewer).squared_error - fit.squared_error
             if rise <= allowed:
                 omega, ratios = fewer
@@ -210,18 +265,20 @@ def _merged(records: Records, omega: Array, ratios: Array) -> tuple[Array, Array
     return omega, ratios
 
 
-def _settled(records: Records, omega: Array, ratios: Array, *, velocity: bool = False) -> tuple[Array, Array]:
+def _settled(
+    records: Records, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False
+) -> tuple[Array, Array]:
     """Poles polished, and pruned until all that stay earn their place."""
     while omega.size:
         size = omega.size
-        omega, ratios = _polish(records, omega, ratios, velocity=velocity)
-        omega, ratios = _prune(records, omega, ratios, velocity=velocity)
+        omega, ratios = _polish(records, omega, ratios, progress, velocity=velocity)
+        omega, ratios = _prune(records, omega, ratios, progress, velocity=velocity)
         if omega.size == size:
             break
     return omega, ratios
 
 
-def _with_another(records: Records, omega: Array, ratios: Array) -> tuple[Array, Array] | None:
+def _with_another(records: Records, omega: Array, ratios: Array, progress: _Progress) -> tuple[Array, Array] | None:
     """The poles and one more, settled; None where what they leave calls for none.
 
     Candidates lie beside each pole, for two modes that share it, and between the poles. Damping that is not classical
@@ -236,14 +293,15 @@ def _with_another(records: Records, omega: Array, ratios: Array) -> tuple[Array,
     own, with_velocity = records.fit(omega, ratios), records.fit(omega, ratios, velocity=True)
     least = _least_gain(own)
     for fit, to_beat in ((with_velocity, np.inf), (own, with_velocity.squared_error)):
+        progress.tell()
         trial = plain - fit.Q @ (fit.Q.T @ plain)
         left = np.linalg.norm(trial, axis=0)
         trial = trial / np.where(left > 1e-6 * size, left, np.inf)
-        gain = np.sum((trial.T @ fit.left) ** 2, axis=1).reshape(at.size, -1).sum(axis=1)
+        gain = np.sum(fit.products(trial) ** 2, axis=1).reshape(at.size, -1).sum(axis=1)
         best = int(np.argmax(gain))
         if gain[best] <= least * _noise(records, fit, omega.size):
             continue
-        more = _settled(records, np.append(omega, at[best]), np.append(ratios, loss[best]))
+        more = _settled(records, np.append(omega, at[best]), np.append(ratios, loss[best]), progress)
         if more[0].size > omega.size and records.fit(*more).squared_error < to_beat:
             return more
     return None
@@ -265,89 +323,38 @@ def _noise(records: Records, fit: ResidueFit, m: int) -> float:
     return records.noise(fit.left, m * (fit.whitened[0].size + 2))
 
 
-def _principal(records: Records, count: int) -> list[tuple[ComplexArray, Array]]:
-    """Base and principal channels of each block: at most as many as there are poles, whatever the channels."""
-    out = []
-    for base, channels in records.blocks:
-        moving = independent(base[None]).T @ base  # a run moves the base in fewer directions than all together
-        left, sizes, _ = np.linalg.svd(stacked(channels), full_matrices=False)
-        keep = np.flatnonzero(sizes > 1e-14 * sizes[0])[:count]
-        principal = left[:, keep] * sizes[keep]
-        n = base.shape[1]
-        out.append((moving, principal[:n].T + 1j * principal[n:].T))
-    return out
-
-
-def _relocate(
-    records: Records, blocks: list[tuple[ComplexArray, Array]], omega: Array, ratios: Array
+def _prune(
+    records: Records, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False
 ) -> tuple[Array, Array]:
-    """One step of relaxed vector fitting: the zeros of sigma in ``sigma a = sum of (r_1 + r_2 i w) g``."""
-    w, m = 2 * np.pi * records.freq, omega.size
-    g = gains(records.freq, omega, ratios)
-    numerators = np.concatenate([g, 1j * w / omega[:, None] * g])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        partial = np.where(w > 0, (omega[:, None] / w) ** 2 * g, 1.0)  # w_k² over the same denominator
-    sigma = np.concatenate([np.ones((1, w.size)), partial, 1j * w / omega[:, None] * partial])
-    rows = []
-    for base, channels in blocks:
-        basis = stacked((numerators[:, None] * base).reshape(-1, w.size))
-        Q = np.linalg.qr(basis / np.maximum(np.linalg.norm(basis, axis=0), np.finfo(float).tiny))[0]
-        for record in channels:
-            product = stacked(record * sigma)
-            product = product - Q @ (Q.T @ product)
-            rows.append(np.linalg.qr(product, mode="r"))
-    # Relaxation: the sum of Re sigma over the lines is fixed instead of its constant term.
-    weight = np.sqrt(records.size) / w.size
-    system = np.vstack([*rows, weight * sigma.real.sum(axis=1)])
-    wanted = np.zeros(len(system))
-    wanted[-1] = weight * w.size
-    scale = np.maximum(np.linalg.norm(system, axis=0), np.finfo(float).tiny)
-    c = np.linalg.lstsq(system / scale, wanted, rcond=1e-14)[0] / scale
-    constant = c[0] if abs(c[0]) > 1e-8 else np.copysign(1e-8, c[0])
-    # sigma's poles as second-order blocks; its zeros are the eigenvalues after feedback.
-    A, b, out = np.zeros((2 * m, 2 * m)), np.zeros(2 * m), np.zeros(2 * m)
-    i = 2 * np.arange(m)
-    A[i, i + 1], A[i + 1, i], A[i + 1, i + 1] = omega, -omega, -2 * ratios * omega
-    b[i + 1], out[i], out[i + 1] = omega, c[1 : m + 1], c[m + 1 :]
-    return _as_modes(np.linalg.eigvals(A - np.outer(b, out) / constant))
-
-
-def _as_modes(eigenvalues: ComplexArray) -> tuple[Array, Array]:
-    """Frequency and damping of each conjugate pair; unstable ones mirrored, real ones paired off as overdamped."""
-    real = np.abs(eigenvalues.imag) <= 1e-9 * np.abs(eigenvalues)
-    pairs = eigenvalues[~real & (eigenvalues.imag > 0)]
-    sizes = np.sort(np.abs(eigenvalues[real]))
-    sizes = sizes[: 2 * (sizes.size // 2)]
-    omega = np.concatenate([np.abs(pairs), np.sqrt(sizes[::2] * sizes[1::2])])
-    ratios = np.concatenate([np.abs(pairs.real) / np.abs(pairs), np.full(sizes.size // 2, 0.9)])
-    keep = omega > 0
-    order = np.argsort(omega[keep])
-    return omega[keep][order], np.clip(ratios[keep][order], 1e-5, 0.99)
-
-
-def _prune(records: Records, omega: Array, ratios: Array, *, velocity: bool = False) -> tuple[Array, Array]:
     """Remove poles, the least useful first, until each that stays lowers the error by far more than noise would."""
     lines = 2 * np.pi * records.freq[records.freq > 0]
     inside = (omega > lines[0] / _EDGE) & (omega < _EDGE * lines[-1]) & (ratios < _DAMPED)
     inside &= ratios * omega > _RAZOR * np.interp(omega, lines, np.gradient(lines))
-    while omega.size:
-        fit = records.fit(omega, ratios, velocity=velocity)
-        # What is no mode goes first, whatever it explains.
-        worth = np.where(inside, fit.gain / _noise(records, fit, omega.size), -1.0)
+    kept = np.flatnonzero(inside)  # what is no mode goes first, whatever it explains
+    subsets = None
+    while kept.size:
+        if subsets is None or 2 * kept.size < subsets.size:
+            omega, ratios, kept = omega[kept], ratios[kept], np.arange(kept.size)
+            subsets = SubsetFits(records, omega, ratios, velocity=velocity)
+        worth, squared_error = subsets.worth(kept)
+        progress.step(squared_error)
         least = int(np.argmin(worth))
-        if worth[least] > _least_gain(fit):
+        if worth[least] > beyond_chance(subsets.per_pole):
             break
-        omega, ratios, inside = (np.delete(values, least) for values in (omega, ratios, inside))
-    return omega, ratios
+        kept = np.delete(kept, least)
+    return omega[kept], ratios[kept]
 
 
-def _polish(records: Records, omega: Array, ratios: Array, *, velocity: bool = False) -> tuple[Array, Array]:
+def _polish(
+    records: Records, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False
+) -> tuple[Array, Array]:
     """Variable projection: Levenberg-Marquardt steps over (log w, log zeta), the residues eliminated."""
     m = omega.size
     p = np.log(np.concatenate([omega, ratios]))
     damping = 1e-3
     error, H, slope = _projected(records, p, velocity)
     for _ in range(_STEPS):
+        progress.step(error)
         if error < _EXACT**2 * records.size:
             break
         step = np.linalg.solve(H + damping * np.diag(np.diag(H)), slope)
@@ -381,5 +388,5 @@ def _projected(records: Records, p: Array, velocity: bool) -> tuple[float, Array
     residues = np.concatenate([fit.residues, fit.residues]).reshape(slopes.shape[1], -1)
     d = slopes.shape[1] // (2 * m)
     H = ((slopes.T @ slopes) * (residues @ residues.T)).reshape(2 * m, d, 2 * m, d).sum(axis=(1, 3))
-    slope = np.sum((slopes.T @ fit.left) * residues, axis=1).reshape(2 * m, d).sum(axis=1)
+    slope = np.sum(fit.products(slopes) * residues, axis=1).reshape(2 * m, d).sum(axis=1)
     return fit.squared_error, H, slope

@@ -5,6 +5,9 @@ import pytest
 
 import sysid
 from sysid import InputError, Measurement, Problem, simulate
+from sysid.modal_analysis.complex_frequency import PolesAndResidues, noise_level
+from sysid.modal_analysis.relocation import relocate
+from sysid.modal_analysis.residues import Records, SubsetFits
 from sysid.modal_analysis.vector_fitting import find_poles, poles_near
 
 
@@ -171,3 +174,129 @@ class TestPolesNear:
         omega = 2 * np.pi * truth.natural_frequencies
         found = poles_near(simulate(truth, lines(truth)), omega[[0, 1, 1, 2]], 0.05)
         np.testing.assert_allclose(found.omega, omega, rtol=1e-10)
+
+
+def broadband(truth, freq, runs, noise, rng):
+    """Runs that move the base in all directions at once, their responses with noise that lines share."""
+    shape = (runs, truth.n_base, freq.size)
+    base = rng.normal(size=shape) + 1j * rng.normal(size=shape)
+    relative = np.einsum("sdf,rdf->rsf", truth.transmissibility(freq), base)
+    white = rng.normal(size=relative.shape) + 1j * rng.normal(size=relative.shape)
+    smeared = white + np.roll(white, 1, axis=-1)
+    return Measurement(freq, base, relative + noise * np.abs(relative).mean() * smeared, rigid_body=truth.rigid_body)
+
+
+def left_by(records, omega, ratios, velocity):
+    """What least squares leave of all channels on these poles."""
+    X = records.functions(omega, ratios, velocity=velocity)
+    return records.data - X @ np.linalg.lstsq(X, records.data, rcond=None)[0]
+
+
+@pytest.mark.parametrize("velocity", [False, True])
+def test_fits_on_subsets_are_least_squares_on_these_poles_alone(velocity):
+    rng = np.random.default_rng(7)
+    truth = structure(rng, 4, 2)
+    records = Records(broadband(truth, lines(truth, 30), 3, 0.05, rng))
+    omega = np.sort(2 * np.pi * np.concatenate([truth.natural_frequencies, 1.2 * truth.natural_frequencies]))
+    ratios = rng.uniform(0.005, 0.05, omega.size)
+    fits = SubsetFits(records, omega, ratios, velocity=velocity)
+    inputs = 2 * (1 + velocity)
+    assert fits.per_pole == inputs * truth.n_sensors + 2
+    for kept in (np.arange(8), np.array([0, 3, 4, 6])):
+        worth, squared_error = fits.worth(kept)
+        left = left_by(records, omega[kept], ratios[kept], velocity)
+        without = [np.delete(kept, k) for k in range(kept.size)]
+        rise = [np.sum(left_by(records, omega[k], ratios[k], velocity) ** 2) - np.sum(left**2) for k in without]
+        assert squared_error == pytest.approx(np.sum(left**2), rel=1e-10)
+        np.testing.assert_allclose(worth, np.array(rise) / records.noise(left, kept.size * fits.per_pole), rtol=1e-7)
+
+
+@pytest.mark.parametrize("runs", [1, 3])
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_a_step_of_vector_fitting_ends_at_the_zeros_of_the_function_that_all_unknowns_together_give(noise, runs):
+    """Residues of all channels and the coefficients of sigma in one system of equations."""
+    rng = np.random.default_rng(8)
+    truth = structure(rng, 3, 1)
+    records = Records(broadband(truth, lines(truth, 20), runs, noise, rng))
+    blocks = records.principal(9)
+    omega, ratios = 2 * np.pi * truth.natural_frequencies * [0.98, 1.03, 0.99], np.full(3, 0.02)
+
+    def functions(s):
+        over = 1 / (omega[:, None] ** 2 + s**2 + 2 * (ratios * omega)[:, None] * s)
+        return np.concatenate([over, s * over])
+
+    s = 2j * np.pi * records.freq
+    sigma = np.concatenate([np.ones((1, s.size)), functions(s)])
+    rows = []
+    channels = sum(len(channels) for _, channels in blocks)
+    at = 0
+    for base, records_of_run in blocks:
+        for record in records_of_run:
+            answer = np.zeros((s.size, channels, 6), complex)
+            answer[:, at] = (-(s**2) * functions(s) * base[0]).T
+            rows.append(np.hstack([(record * sigma).T, -answer.reshape(s.size, -1)]))
+            at += 1
+    system = np.vstack([part(block) for block in rows for part in (np.real, np.imag)])
+    fixed = np.concatenate([sigma.real.sum(axis=1), np.zeros(system.shape[1] - 7)]) * np.sqrt(records.size) / s.size
+    system = np.vstack([system, fixed])
+    scale = np.linalg.norm(system, axis=0)
+    wanted = np.append(np.zeros(len(system) - 1), np.sqrt(records.size))
+    c = (np.linalg.lstsq(system / scale, wanted, rcond=None)[0] / scale)[:7]
+
+    found, loss = relocate(records, blocks, omega, ratios, lambda: None)
+    zeros = found * (-loss + 1j * np.sqrt(1 - loss**2))
+    terms = c * np.concatenate([np.ones((1, 3)), functions(zeros)]).T
+    assert np.all(np.abs(terms.sum(axis=1)) < 1e-7 * np.abs(terms).sum(axis=1))
+
+
+class TestMonitor:
+    @pytest.fixture
+    def measured(self):
+        """Without stated noise: its level follows from the poles."""
+        truth = structure(np.random.default_rng(2), 4, 2)
+        test = simulate(truth, lines(truth, 30), noise=0.01, rng=0)
+        return Measurement(test.freq, test.base, test.response, rigid_body=test.rigid_body)
+
+    @staticmethod
+    def searches(test):
+        stated = find_poles(test).omega
+        return [
+            lambda monitor: find_poles(test, monitor=monitor),
+            lambda monitor: poles_near(test, 1.01 * stated, 0.05, monitor=monitor),
+            lambda monitor: PolesAndResidues.of(test, monitor=monitor),
+            lambda monitor: noise_level(test, monitor=monitor),
+        ]
+
+    def test_is_told_the_number_of_iterations_and_the_residual_down_to_the_noise(self, measured):
+        for search in self.searches(measured):
+            told = []
+            search(lambda *news, told=told: told.append(news))
+            iterations, residuals = np.array(told).T
+            assert set(np.diff(iterations)) <= {0, 1}
+            assert iterations[-1] >= 3
+            assert np.all((residuals > 0) & (residuals <= 1 + 1e-12))
+            assert residuals[-1] == pytest.approx(0.01, rel=0.1)
+
+    def test_what_it_raises_passes_through(self, measured):
+        class StopError(InputError):
+            pass
+
+        for search in self.searches(measured):
+            for calls in (1, 3):
+                count = iter(range(1, 100))
+
+                def stop(*_, count=count, calls=calls):
+                    if next(count) == calls:
+                        raise StopError("enough")
+
+                with pytest.raises(StopError):
+                    search(stop)
+                assert next(count) == calls + 1
+
+    def test_is_told_between_the_channels_of_a_step_and_between_all_removals(self, measured):
+        """At least once for each of the 8 principal channels, and once for each pole removed of ten."""
+        told = []
+        poles = find_poles(measured, monitor=lambda *news: told.append(news))
+        first = [i for i, _ in told].index(1)
+        assert first >= 8
+        assert told[-1][0] >= 10 - poles.omega.size
