@@ -45,7 +45,7 @@ class Determination:
     ----------
     determined : bool
     closed_by : tuple of str
-        What fixes them, in sentences.
+        What fixes them, or the modal masses where these alone are fixed, in sentences.
     undetermined : tuple of str
         What is left open, in sentences; empty where determined.
     judged_by : str
@@ -101,7 +101,7 @@ def determine(problem: Problem, structure: Structure, x: Array | None, rivals: S
         others = () if x is None or open_ else tuple(_others(problem, structure, x, rivals))
         beside = () if x is None else tuple(_open_outside(problem.formulation, x))
         open_ = (*open_, *beside) if open_ else others
-        return Determination(not open_, () if open_ else (*closed, *beside), open_, BY_CONE)
+        return Determination(not open_, closed if open_ else (*closed, *beside), open_, BY_CONE)
     x = _needed(x)
     closed, open_ = _by_rank(problem, structure, x)
     open_ = (*open_, *_others(problem, structure, x, rivals))

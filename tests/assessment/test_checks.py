@@ -34,7 +34,7 @@ def changed(test, **changes):
 
 def said(test, structure, mass=None):
     given = sysid.SpectralStiffness(structure.natural_frequencies, max_frequency=2 * structure.natural_frequencies[-1])
-    return doubts(Problem(test, mass=FullMass() if mass is None else mass, stiffness=given), structure)
+    return doubts(Problem(test, mass=FullMass() if mass is None else mass, stiffness=given), structure, None)
 
 
 def modal_twin(truth):

@@ -6,7 +6,8 @@ from scipy.optimize import linprog
 
 import sysid
 from sysid import FullMass, KnownMass, LumpedMass, Measurement, SpectralStiffness, Structure
-from sysid.assessment.modal_mass_cone import _cone, _known, determination, intervals
+from sysid.assessment.determination import determine, intervals
+from sysid.assessment.modal_mass_cone import _cone, _known
 from sysid.problem.problem import Problem
 
 FREQ = np.linspace(1, 70, 60)
@@ -41,7 +42,7 @@ def answers_of(structure, T):
 
 def check_ends(problem, structure, *, freq=FREQ):
     """Truth inside, and every finite end the entry of a member that answers as the structure does; the intervals."""
-    found = intervals(problem, structure)
+    found = intervals(problem, structure, None)
     n = structure.n
     own, unit = (structure.mass[:n, :n], structure.stiffness[:n, :n]), answers_of(structure, np.eye(n))
     w = 2 * np.pi * freq[:, None, None]
@@ -92,15 +93,15 @@ def diagonal(n, limits):
 
 def weights(problem, structure):
     """Share of each unit of modal mass in each direction's stated total, (d, n): method.md, section 2, written out."""
-    P, layout = np.linalg.inv(structure.mode_shapes), problem.layout
-    push, totals = structure.participation, np.broadcast_to(problem.mass.total_mass, layout.d)
+    P, geometry = np.linalg.inv(structure.mode_shapes), problem.geometry
+    push, totals = structure.participation, np.broadcast_to(problem.mass.total_mass, geometry.d)
     delta = push - P @ structure.rigid_body
     rows = []
-    for i in range(layout.d):
+    for i in range(geometry.d):
         if problem.mass.healing == "rigid_body":
             share = push[:, i] ** 2
         else:
-            mine = [j for j in range(layout.n) if layout.directions[j] == i]
+            mine = [j for j in range(geometry.n) if geometry.directions[j] == i]
             share = np.sum(P[:, mine] ** 2, axis=1) + delta[:, i] ** 2
         rows.append(share / max(totals[i], share.sum()))
     return np.array(rows)
@@ -132,7 +133,7 @@ class TestIntervals:
         lines = np.linspace(0.2, 6, 60)
         test = sysid.simulate(truth, lines)
         problem = problem_of(truth, FullMass(m.sum(), healing=healing), test=test)
-        assert not determination(problem, truth).determined
+        assert not determine(problem, truth, None).determined
         found = check_ends(problem, truth, freq=lines)
         assert np.all(np.isfinite(found.mass)) and np.all(np.isfinite(found.stiffness))
         P, w = np.linalg.inv(truth.mode_shapes), 2 * np.pi * truth.natural_frequencies
@@ -149,7 +150,7 @@ class TestIntervals:
     def test_random_structures_with_totals(self, random_structure, n, d, healing):
         rng = np.random.default_rng(n)
         truth = random_structure(rng, n=n, d=d)
-        totals = FullMass(healing=healing).total(problem_of(truth, FullMass()).layout, truth.mass)
+        totals = FullMass(healing=healing).total(problem_of(truth, FullMass()).geometry, truth.mass)
         for share in (1.0, 0.8):  # a stated total below what the structure has is not held against it
             problem = problem_of(truth, FullMass(share * totals, healing=healing))
             found = check_ends(problem, truth)
@@ -183,7 +184,7 @@ class TestIntervals:
 
         check_samples(truth, found, rng, draw=draw)
         # The whole matrix says more than its diagonal.
-        wide = intervals(problem_of(truth, FullMass(np.diag(truth.rigid_body_mass), healing="rigid_body")), truth)
+        wide = intervals(problem_of(truth, FullMass(np.diag(truth.rigid_body_mass), healing="rigid_body")), truth, None)
         assert np.all(wide.mass[1] >= found.mass[1] * (1 - 1e-7)) and np.any(wide.mass[1] > 1.01 * found.mass[1])
 
     def test_without_a_unit_of_mass_ends_are_zero_or_infinite(self, random_structure):
@@ -207,8 +208,8 @@ class TestIntervals:
             (full, problem_of(full, KnownMass(full.mass))),
             (lumped, problem_of(lumped, LumpedMass([np.diag(lumped.mass)[:4][i::2].sum() for i in range(2)]))),
         ):
-            found = intervals(problem, truth)
-            assert determination(problem, truth).determined
+            found = intervals(problem, truth, None)
+            assert determine(problem, truth, None).determined
             assert np.array_equal(found.mass, [truth.mass[:4, :4]] * 2)
             assert np.array_equal(found.stiffness, [truth.stiffness[:4, :4]] * 2)
 
@@ -238,7 +239,7 @@ class TestIntervals:
         assert np.all(np.isfinite(totals.mass)) and totals.mass[1, 0, 1] > 0.1
         for word in ("force", "model"):
             mass, force = (FullMass(), True) if word == "force" else (LumpedMass(3.0), False)
-            closed = intervals(problem_of(truth, mass, force=force), truth)
+            closed = intervals(problem_of(truth, mass, force=force), truth, None)
             assert np.array_equal(closed.mass, [truth.mass[:4, :4]] * 2)
 
     @pytest.mark.parametrize("seed", range(2))
@@ -273,7 +274,7 @@ class TestIntervals:
         truth = Structure(np.diag([1.0, 1.0, 0.5]), K, [0.01, 0.02], n_base=1)
         problem = problem_of(truth, FullMass(total), force=True)
         assert any(
-            "the modal mass of mode 2 (20.13 Hz) is open" in s for s in determination(problem, truth).undetermined
+            "the modal mass of mode 2 (20.13 Hz) is open" in s for s in determine(problem, truth, None).undetermined
         )
         found = check_ends(problem, truth)
         # M = [[1 + t, 1 - t], [1 - t, 1 + t]] / 2 with t >= 0, and 1 + t <= total.
@@ -296,7 +297,7 @@ class TestIntervals:
         clean, noisy = (sysid.simulate(weak, FREQ, force=True, noise=noise, rng=0) for noise in (0.0, 0.05))
         test = Measurement(FREQ, clean.base, clean.response, rigid_body=weak.rigid_body, force=noisy.force)
         problem = problem_of(weak, FullMass(), test=test)
-        verdict = determination(problem, weak)
+        verdict = determine(problem, weak, None)
         assert any(s.startswith("the modal mass of mode 2") for s in verdict.undetermined)
         found = check_ends(problem, weak)
         rest = weak.rigid_body_mass - weak.effective_masses[[0, 2]].sum(axis=0)
@@ -310,10 +311,10 @@ class TestIntervals:
         rng = np.random.default_rng(0)
         M, K, _ = random_blocks(rng, 4, 2, frequencies=[10.0, 10.0, 25.0, 40.0])
         truth = Structure(M, K, [0.02, 0.02, 0.01, 0.01], n_base=2)
-        totals = FullMass().total(problem_of(truth, FullMass()).layout, truth.mass)
+        totals = FullMass().total(problem_of(truth, FullMass()).geometry, truth.mass)
         problem = problem_of(truth, FullMass(totals))
         found = check_ends(problem, truth)
-        P, groups = np.linalg.inv(truth.mode_shapes), problem.layout.directions[:4]
+        P, groups = np.linalg.inv(truth.mode_shapes), problem.geometry.directions[:4]
         delta = truth.participation - P @ truth.rigid_body
 
         def draw(rng):
@@ -328,7 +329,7 @@ class TestIntervals:
         check_samples(truth, found, rng, draw=draw)
         # Modes that are told apart by their damping have a smaller cone.
         apart = Structure(M, K, [0.02, 0.04, 0.01, 0.01], n_base=2)
-        fewer = intervals(problem_of(apart, FullMass(totals)), apart)
+        fewer = intervals(problem_of(apart, FullMass(totals)), apart, None)
         assert np.all(fewer.mass[1] <= found.mass[1] * (1 + 1e-7)) and np.any(fewer.mass[1] < 0.99 * found.mass[1])
 
     def test_modes_at_one_pole_with_a_force_in_one_direction(self, random_blocks):
@@ -372,14 +373,14 @@ class TestIntervals:
         truth = Structure(M, K, [0.01, 0.02, 0.015], n_base=2, recovery=R, rigid_body=R @ G)
         stiffness = SpectralStiffness(truth.natural_frequencies, max_frequency=100.0)
         weighed = problem_of(truth, FullMass(), force=True, stiffness=stiffness)
-        verdict = determination(weighed, truth)
+        verdict = determine(weighed, truth, None)
         assert not verdict.determined and verdict.closed_by
         (sentence,) = verdict.undetermined
         assert "3 modes stand out for 4 sensors" in sentence and sentence.endswith("determine, completely")
-        assert np.array_equal(intervals(weighed, truth).mass, [truth.mass[:3, :3]] * 2)
+        assert np.array_equal(intervals(weighed, truth, None).mass, [truth.mass[:3, :3]] * 2)
         stated = problem_of(truth, FullMass(9.0), stiffness=stiffness)
-        assert np.any(np.isinf(intervals(stated, truth).mass))
-        sentences = determination(stated, truth).undetermined
+        assert np.any(np.isinf(intervals(stated, truth, None).mass))
+        sentences = determine(stated, truth, None).undetermined
         assert any(s.endswith("up to the modal masses") for s in sentences)
         # What the physical total of each direction bounds is no matter of sensors.
         physical = problem_of(

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.assessment.determination import written_determination, written_intervals
-from sysid.assessment.sensitivity import directions_in_words, response_slopes, rows_of_test, sensitivity, slopes_of
-from sysid.assessment.written_uncertainty import written_uncertainty
+from sysid.assessment.determination import determine, intervals
+from sysid.assessment.sensitivity import directions_in_words, sensitivity
+from sysid.assessment.uncertainty import uncertainty
+from sysid.problem.slopes import response_slopes, rows_of_test, slopes_of
 from sysid.search import local
 
 FREQ = np.linspace(1.0, 30.0, 40)
@@ -132,7 +133,7 @@ def test_rows_of_a_test_are_weighted_residuals_and_their_central_differences(by_
         close(rows.residuals, residual(x), 1e-10)
         close(rows.jacobian, differences(residual, x), 5e-7)
     np.testing.assert_allclose(
-        np.hypot(np.linalg.norm(accelerations.residuals), np.linalg.norm(forces.residuals)), problem.misfit_of(x)
+        np.hypot(np.linalg.norm(accelerations.residuals), np.linalg.norm(forces.residuals)), problem.objective(x)
     )
 
 
@@ -157,13 +158,13 @@ def test_a_chain_without_a_weight_leaves_its_common_scale_open():
     np.testing.assert_allclose(direction / direction[0], 1.0, rtol=1e-6)
     (words,) = directions_in_words(problem.variables, TRUTH, known.unit, known.unseen)
     assert words in ("m +1 %, k +1 %, c +1 %", "m -1 %, k -1 %, c -1 %")
-    decided = written_determination(problem, TRUTH)
+    decided = determine(problem, problem.structure(TRUTH), TRUTH)
     assert not decided.determined
     assert "8 of 9 directions" in decided.undetermined[0]
-    uncertain = written_uncertainty(problem, TRUTH)
+    uncertain = uncertainty(problem, problem.structure(TRUTH), TRUTH)
     assert all(np.all(np.isnan(std)) for std in uncertain.variables.values())
     assert np.all(np.isfinite(uncertain.natural_frequencies))
-    ends = written_intervals(problem, TRUTH)
+    ends = intervals(problem, problem.structure(TRUTH), TRUTH)
     assert np.all(np.isinf(np.diagonal(ends.mass[1])))
     assert not np.any(np.diagonal(ends.mass[0]))
 
@@ -184,7 +185,7 @@ def test_one_number_with_a_unit_of_mass_closes_the_scale(build):
     assert known.rank == 9 - constrained
     assert known.unseen.shape[1] == 0
     assert known.free.shape == (9, 9 - constrained)
-    assert written_determination(problem, TRUTH).determined
+    assert determine(problem, problem.structure(TRUTH), TRUTH).determined
 
 
 def test_the_base_force_closes_the_scale():
@@ -198,9 +199,9 @@ def test_an_inequality_closes_nothing_that_the_records_leave(limit):
     known = sensitivity(problem, TRUTH)
     assert known.rank == 8
     assert known.free.shape == (9, 9)
-    assert not written_determination(problem, TRUTH).determined
+    assert not determine(problem, problem.structure(TRUTH), TRUTH).determined
     assert problem.keeps_constraints(TRUTH / 2)
-    assert problem.misfit_of(TRUTH / 2) < 1e-10
+    assert problem.objective(TRUTH / 2) < 1e-10
 
 
 def test_normals_stay_on_active_constraints():
@@ -222,9 +223,9 @@ def test_two_unknowns_of_which_only_the_sum_counts_are_one_null_direction():
     moved = known.unit * known.unseen[:, 0]
     np.testing.assert_allclose(moved[0], -moved[1], rtol=1e-6)
     # Nobody needs a and b: their sum, and so the matrices, are fixed.
-    decided = written_determination(problem, x)
+    decided = determine(problem, problem.structure(x), x)
     assert decided.determined
-    uncertain = written_uncertainty(problem, x)
+    uncertain = uncertainty(problem, problem.structure(x), x)
     assert np.isnan(uncertain.variables["a"])
     assert np.all(np.isfinite(uncertain.stiffness))
 
@@ -237,10 +238,10 @@ def test_a_further_test_adds_what_it_sees():
     second = sysid.simulate(chain_structure(MASSES + np.diag(added)), FREQ)
     problem = sysid.Problem(
         sysid.simulate(chain_structure(), FREQ), mass=ca.diag(m), stiffness=chain(k), damping=chain(c),
-        residuals=[sysid.Misfit(second, mass=ca.diag(m) + added, stiffness=chain(k), damping=chain(c))],
+        residuals=[sysid.FurtherTest(second, mass=ca.diag(m) + added, stiffness=chain(k), damping=chain(c))],
     )  # fmt: skip
     assert sensitivity(problem, TRUTH).rank == 9
-    assert written_determination(problem, TRUTH).determined
+    assert determine(problem, problem.structure(TRUTH), TRUTH).determined
 
 
 def test_an_own_misfit_has_its_own_jacobian():
@@ -321,7 +322,8 @@ def test_standard_deviations_are_those_of_draws(kind):
     x = np.concatenate([MASSES_2, SPRINGS_2, DAMPERS_2 if by_force else [0.02, 0.04]])
     answers, structures = drawn(problem_of, truth, x, force=by_force)
     problem = problem_of(sysid.simulate(truth, FREQ, noise=0.01, force=by_force, rng=1000))
-    uncertain = written_uncertainty(problem, local.solve(problem, x).x)
+    x = local.solve(problem, x).x
+    uncertain = uncertainty(problem, problem.structure(x), x)
     same(
         np.concatenate([np.ravel(uncertain.variables[name]) for name in ("m", "k", "c" if by_force else "z")]), answers
     )
@@ -358,6 +360,6 @@ def test_twice_the_noise_is_twice_the_deviation():
             )
         )  # fmt: skip
 
-    once, twice = (written_uncertainty(stated(f), x) for f in (1.0, 2.0))
+    once, twice = (uncertainty(p, p.structure(x), x) for p in map(stated, (1.0, 2.0)))
     for name in "mkc":
         np.testing.assert_allclose(twice.variables[name], 2 * once.variables[name], rtol=1e-9)

@@ -75,7 +75,7 @@ class TestStructuredModels:
             np.random.default_rng(14), "lumped", n=4, d=1, force=force, total=not force, noise=0.01
         )
         expected = self.lumped_unknowns(problem, truth, total=not force)
-        u = uncertainty(problem, truth)
+        u = uncertainty(problem, truth, problem.values(truth))
         check(u, expected, self.NAMES, rtol=1e-5)
         assert np.all(np.isfinite(u.mass)) and np.all(u.mass[np.tril_indices(4, -1)] < 1e-9 * u.mass[0, 0])
 
@@ -83,7 +83,7 @@ class TestStructuredModels:
     def test_without_any_mass_the_scale_is_open(self, random_case, stiffness):
         """Frequencies and what no common scale changes stay known."""
         truth, problem = random_case(np.random.default_rng(15), "lumped", stiffness, n=4, d=1, total=False, noise=0.01)
-        u = uncertainty(problem, truth)
+        u = uncertainty(problem, truth, problem.values(truth))
         assert np.all(np.isnan(np.diag(u.mass))) and np.all(np.isnan(np.diag(u.stiffness)))
         assert np.all(np.isnan(np.diag(u.damping))) and np.all(np.isnan(u.participation))
         assert np.all(np.isnan(u.mode_shapes)) and np.all(np.isnan(u.rigid_body_mass))
@@ -110,7 +110,7 @@ class TestStructuredModels:
             np.random.default_rng(16), mass, stiffness, damping, n=3, d=2, force=force, total=total, noise=0.01
         )
         expected = by_unknowns(problem, truth, problem.values(truth), problem.structure, self.NAMES)
-        u = uncertainty(problem, truth)
+        u = uncertainty(problem, truth, problem.values(truth))
         names = [name for name in self.NAMES if mass != "known" or name != "mass"]
         check(u, expected, names, rtol=1e-4)
         if mass == "known":
@@ -127,7 +127,8 @@ def test_repeated_frequencies_of_a_structured_model_are_the_limit_of_close_ones(
         test = sysid.simulate(truth, np.linspace(0.5, 8.0, 200), noise=0.01, rng=1)
         given = sysid.KnownMass(M) if mass == "known" else LumpedMass(9.0)
         stiffness = SpectralStiffness(truth.natural_frequencies)
-        return uncertainty(sysid.Problem(test, mass=given, stiffness=stiffness), truth)
+        problem = sysid.Problem(test, mass=given, stiffness=stiffness)
+        return uncertainty(problem, truth, problem.values(truth))
 
     one, close = stds(0.0), stds(2e-5)
     for name in ("natural_frequencies", "damping_ratios", "stiffness", "damping"):
