@@ -1,5 +1,8 @@
 """Each doubt about a fit is said where it must be, and only there."""
 
+import dataclasses
+
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -186,3 +189,69 @@ def test_a_model_whose_poles_are_not_those_of_the_data_is_told(stated, noise):
         (doubt,) = result.undetermined
         assert "poles of the data" in doubt
         assert not result.determined
+
+
+class TestOneListForEveryProblem:
+    """The same checks for a problem in variables, of further tests, and of priors."""
+
+    def chain(self, truth, test, **options):
+        k = sysid.Variable("k", 3, lower=1e2, upper=1e6, guess=5000.0)
+        T = np.array([[1.0, 0, 0, -1.0], [-1.0, 1.0, 0, 0], [0, -1.0, 1.0, 0]])
+        return Problem(test, mass=truth.mass, stiffness=T.T @ ca.diag(k) @ T, damping=[0.01] * 3, **options), k
+
+    def test_a_known_mass_with_a_written_stiffness_is_weighed_too(self):
+        truth = modal_twin(building())
+        test = simulate(truth, lines(truth), force=True)
+        x = np.full(3, 5000.0)
+        problem, _ = self.chain(truth, test)
+        assert doubts(problem, problem.structure(x), x) == ()
+        heavy, _ = self.chain(truth, changed(test, force=test.force / 2))
+        told = doubts(heavy, heavy.structure(x), x)
+        assert any("the stated mass makes 13 kg" in s and "weighs 6.5 kg" in s for s in told)
+
+    def test_each_test_is_checked_under_its_number(self):
+        truth = modal_twin(building())
+        M, C = truth.mass, truth.damping
+        test = simulate(Structure(M, truth.stiffness, n_base=1, damping_matrix=C), lines(truth))
+        flipped = test.response.copy()
+        flipped[:, 1] *= -1
+        for response in (test.response, flipped):
+            k = sysid.Variable("k", lower=0.5, upper=2.0, guess=1.0)
+            second = sysid.FurtherTest(
+                changed(test, response=response), mass=M, stiffness=k * truth.stiffness, damping=C
+            )
+            problem = Problem(test, mass=M, stiffness=k * truth.stiffness, damping=C, residuals=[second])
+            told = doubts(problem, problem.structure(np.ones(1)), np.ones(1))
+            if response is flipped:
+                assert told and all(sentence.startswith("test 2: ") for sentence in told)
+                assert any("sensor 2 by" in sentence for sentence in told)
+            else:
+                assert told == ()
+
+    def test_priors_are_checked_one_by_one_and_together(self):
+        truth = modal_twin(building())
+        test = simulate(truth, lines(truth))
+        x = np.full(3, 5000.0)
+
+        def told(*off):
+            problem, k = self.chain(truth, test)
+            priors = [sysid.Prior(k[i], 5000.0 - 100.0 * z, 100.0) for i, z in enumerate(off)]
+            problem = dataclasses.replace(problem, residuals=priors)
+            return doubts(problem, problem.structure(x), x)
+
+        assert told(1.0, -1.0, 2.0) == ()
+        (alone,) = told(4.5, 0.0, 0.0)
+        assert alone.startswith("k[0] ends 4.5 of the stated standard deviations")
+        # The chi-squared law of 3: a sum of squares of 21.1 is exceeded by chance in one of 10 000.
+        assert told(2.6, 2.6, 2.6) == ()
+        (together,) = told(2.7, -2.7, 2.7)
+        assert "missed together" in together and "k[1] by -2.7" in together
+
+    def test_of_a_misfit_of_the_users_own_the_records_are_not_checked(self):
+        truth = modal_twin(building())
+        test = simulate(truth, lines(truth))
+        problem, k = self.chain(truth, changed(test, response=-test.response))
+        x = np.full(3, 5000.0)
+        assert doubts(problem, problem.structure(x), x)
+        own = dataclasses.replace(problem, misfit=k - 5000.0)
+        assert doubts(own, own.structure(x), x) == ()

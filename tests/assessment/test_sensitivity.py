@@ -363,3 +363,15 @@ def test_twice_the_noise_is_twice_the_deviation():
     once, twice = (uncertainty(p, p.structure(x), x) for p in map(stated, (1.0, 2.0)))
     for name in "mkc":
         np.testing.assert_allclose(twice.variables[name], 2 * once.variables[name], rtol=1e-9)
+
+
+def test_damping_by_ratios_follows_the_mass_where_frequencies_repeat():
+    """K = w² M at every p: both modes stay at w with one ratio, so C = 2 zeta w M, whatever their shapes are."""
+    w, zeta, shape = 2 * np.pi * 9.0, 0.02, np.array([[1.0, 0.4], [0.4, -0.5]])
+    p = sysid.Variable("p", lower=-1, upper=1, guess=0.3)
+    M, G = ca.DM(np.diag([3.0, 2.0])) + p * ca.DM(shape), np.array([[1.0], [1.0]])
+    unit = sysid.Measurement(FREQ, np.ones((1, 40)), np.ones((1, 2, 40)) * (1 + 1j * FREQ), rigid_body=G)
+    problem = sysid.Problem(unit, mass=M, stiffness=w**2 * M, damping=np.array([zeta, zeta]))
+    slopes = slopes_of(problem.formulation.matrices, np.array([0.3]), unit)
+    np.testing.assert_allclose(slopes.damping[..., 0], 2 * zeta * w * shape, rtol=1e-9)
+    np.testing.assert_allclose(slopes.d_log_omega, 0, atol=1e-12)
