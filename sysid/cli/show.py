@@ -21,7 +21,6 @@ from sysid.measurement.measurement import Measurement
 from sysid.models.unknowns import Unknown, scales_of, slices_of
 from sysid.nlp import quiet_options
 from sysid.problem.feasibility import HELD, LOOSE, points_of
-from sysid.problem.formulation import MATRICES
 from sysid.problem.problem import Problem
 from sysid.problem.slopes import Slopes, slopes_of
 from sysid.problem.terms import FurtherTest
@@ -111,13 +110,10 @@ def _unknowns(problem: Problem) -> Iterator[str]:
     """Variables by matrix; a model counts its own, a written matrix all that enter it."""
     formulation = problem.formulation
     sizes, counts = {v.name: v.size for v in formulation.unknowns}, dict(problem.unknowns)
-    own = {name: tuple(v.name for v in group) for name, group in zip(MATRICES, formulation.of_models, strict=True)}
     labels = {"constraints": _count(formulation.constraints.lower.size, "constraint")}
     rows = [["enters", "unknowns", "variables"]]
     for name, members in formulation.members:
-        entering = own.get(name) or members
-        told = ", ".join(f"{v} ({sizes[v]})" for v in entering)
-        rows.append([labels.get(name, name), str(counts[name]), told])
+        rows.append([labels.get(name, name), str(counts[name]), ", ".join(f"{v} ({sizes[v]})" for v in members)])
     yield from _table(rows)
     if formulation.healed:
         yield "healing: the swarm's candidates are brought to what it states before they are judged"
@@ -288,7 +284,7 @@ def _coordinates(problem: Problem) -> Iterator[str]:
             "IPOPT works in mode shapes, participations and the logarithms of frequencies and damping ratios, from "
             "which these unknowns follow; here each counts in units of its size, or 5 % of its range where that is more"
         )
-    elif formulation.fits_records and formulation.matrices.by_ratios:
+    elif formulation.fits_records and formulation.by_ratios:
         held = ", which stand for the stiffness factor" if formulation.stiffness.free else ""
         yield f"IPOPT has mode shapes and frequencies as further unknowns{held}, as damping is by ratios"
 

@@ -53,7 +53,7 @@ def residual_in_words(it: Answer) -> str:
     if len(it.residuals) < 2:
         return f"{it.residual:.3e}{goal}"
     own = ", ".join(f"{value:.3e}" for value in it.residuals)
-    return f"{it.residual:.3e}{goal} over {len(it.residuals)} tests (one by one {own})"
+    return f"{it.residual:.3e}{goal} over {len(it.residuals)} tests (test by test {own})"
 
 
 def verdict(it: Answer) -> str:
