@@ -9,23 +9,23 @@ import pytest
 
 import sysid
 from sysid.files.tree import from_bytes, to_bytes
-from sysid.models.unknowns import Block
+from sysid.models.unknowns import Unknown
 from sysid.results import storage
 
 
-def building(damping_matrix: bool = False, sensors: bool = True) -> sysid.Structure:
+def building(damping_matrix: bool = False, sensors: bool = True, skew: bool = True) -> sysid.Structure:
     """Three masses, two base directions, a random coupling."""
     random = np.random.default_rng(5)
     n, d = 3, 2
     root = random.standard_normal((n + d, n + d))
     mass = root @ root.T + 5 * np.eye(n + d)
-    G = np.array([[1.0, 0.0], [0.6, 0.8], [0.0, 1.0]])
+    G = np.array([[1.0, 0.0], [0.6, 0.8] if skew else [1.0, 0.0], [0.0, 1.0]])
     spring = random.standard_normal((n, n))
     K = 4e4 * (spring @ spring.T + np.eye(n))
     stiffness = np.block([[K, -K @ G], [-G.T @ K, G.T @ K @ G]])
     described = (
         sysid.Sensor("top, +x", (0.0, 0.0, 3.0), "x"),
-        sysid.Sensor("Stütze 2 – schräg", (0.1, 0.2, 2.0), (0.6, 0.8, 0.0)),
+        sysid.Sensor("Stütze 2 – schräg", (0.1, 0.2, 2.0), (0.6, 0.8, 0.0) if skew else (1.0, 0.0, 0.0)),
         sysid.Sensor("tip", (0.0, 0.0, 1.0), "-y"),
     )
     return sysid.Structure(
@@ -63,13 +63,13 @@ def identification(
     mass: str = "full", stiffness: str = "spectral", damping: str = "modal", **changes: object
 ) -> sysid.Identification:
     """Make a result that no search has produced, with everything that one can have."""
-    truth = building()
+    truth = building(skew=stiffness != "chain")  # whose sensors point along the base directions
     freq = np.linspace(2.0, 60.0, 40)
     test = sysid.simulate(truth, freq, noise=0.02, force=True, rng=1, base_axes="yx")
     other = sysid.simulate(truth, freq[::2], noise=0.02, rng=2, base_axes="yx")
     problem = sysid.Problem(
         test, mass=MASSES[mass], stiffness=STIFFNESSES[stiffness], damping=DAMPINGS[damping],
-        reference=building(damping_matrix=True, sensors=False), validation=[other, test], goal=0.05,
+        reference=building(damping_matrix=True, sensors=False, skew=stiffness != "chain"), validation=[other, test], goal=0.05,
     )  # fmt: skip
     history = sysid.History(
         start=0.9, swarm=0.1 + 0.2, refinement=float("nan"), local=1e-300,
@@ -101,13 +101,14 @@ def assert_same(a: object, b: object, at: str = "result") -> None:
                 assert mine == other, f"{at}.{field.name}"
             else:  # a list becomes an array
                 assert_same(np.asarray(mine, float), np.asarray(other, float), f"{at}.{field.name}")
-    elif isinstance(a, Block):
+    elif isinstance(a, Unknown):
         assert_same(a.lower, b.lower, at)
         assert_same(a.upper, b.upper, at)
     elif dataclasses.is_dataclass(a):
         assert type(a) is type(b), at
         for field in dataclasses.fields(a):
-            assert_same(getattr(a, field.name), getattr(b, field.name), f"{at}.{field.name}")
+            if field.name != "site":  # where a problem was put together
+                assert_same(getattr(a, field.name), getattr(b, field.name), f"{at}.{field.name}")
     elif isinstance(a, tuple):
         assert isinstance(b, tuple) and len(a) == len(b), at
         for i, (mine, other) in enumerate(zip(a, b, strict=True)):
@@ -122,6 +123,10 @@ def assert_same(a: object, b: object, at: str = "result") -> None:
 @pytest.mark.parametrize("stiffness", STIFFNESSES)
 @pytest.mark.parametrize("damping", DAMPINGS)
 def test_round_trip_is_exact_for_every_model(tmp_path, mass, stiffness, damping):
+    if "known entries" in mass and stiffness == "chain":
+        with pytest.raises(sysid.InputError, match="modal strategy only"):
+            identification(mass, stiffness, damping)
+        return
     original = identification(mass, stiffness, damping)
     assert_same(original, sysid.load(original.save(tmp_path / "a.h5")))
 
