@@ -202,7 +202,7 @@ NOTICED = (
         "test_certainty::test_a_sensor_of_wrong_sign_gain_or_axis_is_named"),
     Mutant("C13", "stated values that are missed together never told",
         "if np.sum(off**2) > chi2.isf(_CHANCE, off.size) and", "if False and",
-        "test_known::test_values_that_are_missed_together_are_named_though_none_is_alone"),
+        "test_checks::TestOneListForEveryProblem::test_priors_are_checked_one_by_one_and_together"),
     Mutant("D01", "status of the local phase ignored", "success = end.status in SOLVED or end.residual <= EXACT",
         "success = True", "test_local::TestControl"),
     Mutant("D02", "a local minimum of the residues never left",
