@@ -75,17 +75,17 @@ def test_bundled_problems_are_inside_an_installed_package_and_beside_a_checkout(
 
 def test_a_path_an_own_problem_a_dotted_module_and_the_order_among_them(here, monkeypatch):
     (here / "chain.py").write_text(CHAIN)
-    assert catalogue.build(Recipe("chain.py")).layout.n == 2
-    assert catalogue.build(Recipe("./chain.py")).layout.n == 2
+    assert catalogue.build(Recipe("chain.py")).geometry.n == 2
+    assert catalogue.build(Recipe("./chain.py")).geometry.n == 2
     assert "unknown" in refused("chain")
 
     (here / "problems").mkdir()
     (here / "problems" / "chain.py").write_text(CHAIN)
-    assert catalogue.build(Recipe("chain")).layout.n == 2
+    assert catalogue.build(Recipe("chain")).geometry.n == 2
     # The user's own problem hides a bundled one of its name.
     hidden = next(entry.name for entry in catalogue.entries() if entry.bundled)
     (here / "problems" / f"{hidden}.py").write_text(CHAIN)
-    assert catalogue.build(Recipe(hidden)).layout.n == 2
+    assert catalogue.build(Recipe(hidden)).geometry.n == 2
     assert [entry.bundled for entry in catalogue.entries() if entry.name == hidden] == [False]
 
     package = here / "lab_of_chains"
@@ -94,7 +94,7 @@ def test_a_path_an_own_problem_a_dotted_module_and_the_order_among_them(here, mo
     (package / "second.py").write_text("from lab_of_chains.first import problem\n")
     (package / "first.py").write_text(CHAIN)
     monkeypatch.syspath_prepend(str(here))
-    assert catalogue.build(Recipe("lab_of_chains.second")).layout.n == 2
+    assert catalogue.build(Recipe("lab_of_chains.second")).geometry.n == 2
     assert "unknown" in refused("lab_of_chains.third")
     assert "unknown" in refused("no_such_lab.first")
     (package / "lame.py").write_text("\nimport no_such_module_at_all\n")
@@ -134,7 +134,7 @@ def test_loading_leaves_nothing_behind_and_reads_the_file_anew(here):
 def test_a_module_may_define_dataclasses_under_postponed_annotations(here):
     head = "from __future__ import annotations\nimport dataclasses\n@dataclasses.dataclass\nclass A:\n    x: int = 0\n"
     (here / "chain.py").write_text(head + CHAIN)
-    assert catalogue.build(Recipe("chain.py")).layout.n == 2
+    assert catalogue.build(Recipe("chain.py")).geometry.n == 2
 
 
 def test_a_module_does_not_inherit_this_packages_future_imports(here):

@@ -26,8 +26,7 @@ from typing import IO, TYPE_CHECKING, Any, NoReturn, cast
 from sysid import catalogue
 from sysid.errors import InputError, SolverError
 from sysid.identify import STRATEGIES, identify
-from sysid.results.identification import Identification, Recipe
-from sysid.results.storage import load
+from sysid.results.identification import Identification, Recipe, load
 from sysid.results.version import __version__
 from sysid.search.session import Progress
 

@@ -25,6 +25,7 @@ from typing import TypeVar
 from sysid.errors import InputError
 from sysid.files.tree import Tree, from_bytes, is_tree, to_bytes
 from sysid.results.old_formats import CONTENT, SIGNATURE, tree_of
+from sysid.results.version import __version__
 
 FORMAT = 3  # rises where an older sysid could not read the file: since 3 it is a tree with a SHA-256
 FILE_NAME = "result.h5"
@@ -53,8 +54,6 @@ def write(tree: Tree, path: str | Path) -> Path:
     InputError
         Where the file cannot be written, or something stands in the tree that cannot be stored.
     """
-    from sysid import __version__
-
     target = file_or_folder(path, FILE_NAME, _SUFFIXES)
     # Built in memory: on a full disk HDF5 loses the error when it closes, or takes the process down.
     image = to_bytes({"content": CONTENT, "format": FORMAT, "sysid_version": __version__, **tree}, FORMAT)

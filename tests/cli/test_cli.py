@@ -22,7 +22,7 @@ MODULE = Path(__file__).with_name("pair_problem.py").read_text()
 KEYS = {
     "problem", "strategy", "seed", "success", "message", "residual", "natural_frequencies_hz", "damping_ratios",
     "total_mass_kg", "determined", "evaluations", "wall_time_s", "version", "natural_frequencies_std_hz",
-    "damping_ratios_std", "remarks",
+    "damping_ratios_std", "remarks", "objective", "residuals", "unknowns", "unknowns_std", "unknown_units",
 }  # fmt: skip
 
 
@@ -151,13 +151,13 @@ def test_plain_output_has_no_control_codes_whatever_the_environment_asks(here):
     assert b"\r" not in done.stdout.replace(os.linesep.encode(), b"\n")
     text = done.stdout.decode("ascii")
     for phase in ("swarm", "refinement", "local phase"):
-        assert re.search(rf"^{phase} +iteration +\d+ +residual +\S+ +[\d.]+ s$", text, re.M)
+        assert re.search(rf"^{phase} +iteration +\d+ +objective +\S+ +[\d.]+ s$", text, re.M)
 
 
 def test_the_modal_strategy_tells_its_only_phase(here, capsys):
     assert cli.main(["run", "pair.py", "--strategy", "modal"]) == 0
     out = capsys.readouterr().out
-    assert re.search(r"^local phase +iteration +\d+ +residual +\S+ +[\d.]+ s$", out, re.M)
+    assert re.search(r"^local phase +iteration +\d+ +objective +\S+ +[\d.]+ s$", out, re.M)
     assert not re.search(r"^(swarm|refinement) ", out, re.M)
     assert "strategy 'modal', as asked" in out
     assert "nan" not in out
@@ -187,7 +187,7 @@ def test_a_terminal_sees_a_table_that_updates(here):
     assert running.wait(60) == 0
     text = shown.decode()
     assert "\x1b[" in text
-    for word in ("phase", "iteration", "residual", "swarm", "local phase", "report.html"):
+    for word in ("phase", "iteration", "objective", "swarm", "local phase", "report.html"):
         assert word in text
 
 
@@ -295,7 +295,7 @@ ON_THE_LINE = {
     "an option cut short": (["run", "pair.py", "--se", "1"], "--se"),
     "unknown option": (["list", "--all"], "--all"),
     "unknown problem": (["run", "cantilever_towr"], "did you mean 'cantilever_tower'.*shear_building"),
-    "unknown strategy": (["run", "pair.py", "--strategy", "simplex"], "'simplex'.*swarm.*modal"),
+    "unknown strategy": (["run", "pair.py", "--strategy", "simplex"], "'simplex'.*auto.*modal.*continuation.*swarm"),
     "missing module": (["run", "nowhere.py"], "nowhere.py cannot be read: No such file"),
     "missing module of a folder": (["run", "some/where"], "No such file"),
     "missing data": (["run", "pair.py", "--data", "nowhere"], "'nowhere': there is no such file or folder"),

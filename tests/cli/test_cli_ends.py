@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 import sysid
-import sysid.search.swarm
 from sysid.cli import main as cli
 from sysid.report import report
+from sysid.search.swarm_objective import SwarmObjective
 
 MODULE = Path(__file__).with_name("pair_problem.py").read_text()
 
@@ -56,7 +56,7 @@ def test_a_search_without_a_candidate_ends_with_one_and_writes_nothing(here, cap
     def identify(*arguments, **options):
         raise sysid.SolverError("no candidate\nat all")
 
-    monkeypatch.setattr(sysid, "identify", identify)
+    monkeypatch.setattr(cli, "identify", identify)
     assert cli.main(["run", "pair.py"]) == 1
     assert complaint(capsys) == "sysid: no candidate at all\n"
     assert files(here) == {"pair.py"}
@@ -66,7 +66,7 @@ def test_an_error_of_ours_is_one_line_and_its_traceback_is_in_the_log(here, caps
     def identify(*arguments, **options):
         raise RuntimeError("two\nlines")
 
-    monkeypatch.setattr(sysid, "identify", identify)
+    monkeypatch.setattr(cli, "identify", identify)
     assert cli.main(["run", "pair.py"]) == 70
     error = complaint(capsys)
     assert "RuntimeError: two lines" in error
@@ -86,7 +86,7 @@ def test_the_log_goes_to_the_temporary_folder_where_the_current_one_cannot_be_wr
 
     elsewhere = tmp_path_factory.mktemp("temporary")
     (here / "sysid-error.log").mkdir()
-    monkeypatch.setattr(sysid, "identify", identify)
+    monkeypatch.setattr(cli, "identify", identify)
     monkeypatch.setattr("tempfile.gettempdir", lambda: str(elsewhere))
     assert cli.main(["run", "pair.py"]) == 70
     assert str(elsewhere / "sysid-error.log") in complaint(capsys)
@@ -117,7 +117,7 @@ def test_an_interrupted_search_saves_the_best_so_far_and_ends_with_130(here, cap
 
         return original(*arguments, **(options | {"callback": interrupt}))
 
-    monkeypatch.setattr(sysid, "identify", identify)
+    monkeypatch.setattr(cli, "identify", identify)
     assert cli.main(["run", "pair.py", "--strategy", "swarm"]) == 130
     assert "the best so far is in results/pair" in complaint(capsys)
     assert sysid.load(here / "results/pair").interrupted
@@ -129,7 +129,7 @@ def test_ctrl_c_before_any_candidate_writes_nothing(here, capsys, monkeypatch):
     def identify(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(sysid, "identify", identify)
+    monkeypatch.setattr(cli, "identify", identify)
     assert cli.main(["run", "pair.py"]) == 130
     assert complaint(capsys) == "sysid: interrupted; nothing was saved\n"
     assert files(here) == {"pair.py"}
@@ -151,7 +151,7 @@ from sysid import identify
 from sysid.cli import main as cli
 
 endless = sysid.Swarm(10**6, stall_iterations=10**6)
-sysid.identify = lambda *a, strategy, **k: identify(*a, **k, strategy=endless)
+cli.identify = lambda *a, strategy, **k: identify(*a, **k, strategy=endless)
 raise SystemExit(cli.main(["run", "free.py"]))
 """
 
@@ -201,14 +201,14 @@ def test_a_second_ctrl_c_acts_at_once_and_what_it_breaks_is_no_error_of_ours(her
     """As CasADi does it, the interrupt comes out as another exception."""
     original = signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    def expand(self, s):
+    def judge(self, particles):
         signal.raise_signal(signal.SIGINT)  # the first waits for the next news
         try:
             signal.raise_signal(signal.SIGINT)
         except KeyboardInterrupt as error:
             raise SystemError("returned a result with an exception set") from error
 
-    monkeypatch.setattr(sysid.search.swarm.SwarmCost, "__call__", expand)
+    monkeypatch.setattr(SwarmObjective, "__call__", judge)
     try:
         assert cli.main(["run", "pair.py", "--strategy", "swarm"]) == 130
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -227,7 +227,7 @@ def test_a_run_that_was_told_to_ignore_ctrl_c_ignores_it(here, monkeypatch):
         signal.raise_signal(signal.SIGINT)
         return original(*arguments, **options)
 
-    monkeypatch.setattr(sysid, "identify", identify)
+    monkeypatch.setattr(cli, "identify", identify)
     try:
         assert cli.main(["run", "pair.py"]) == 0
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN

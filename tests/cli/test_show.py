@@ -11,6 +11,7 @@ import sysid
 from sysid import catalogue
 from sysid.cli import main as cli
 from sysid.cli.show import _point, show
+from sysid.nlp import NonlinearProgram
 from sysid.results.identification import Recipe
 from sysid.search import local
 
@@ -141,16 +142,14 @@ def test_expected_errors_are_the_bound_from_finite_differences(stated):
 def test_units_are_those_that_the_local_phase_counts_in(monkeypatch):
     problem = chain(mass=MASSES, k=[9e3, 7e3, 1.2e3], c=[30.0, 25.0, 1.0])
     x, units = problem.formulation.guess, {}
-    from sysid.nlp import Coordinates
+    original = NonlinearProgram.variable
 
-    original = Coordinates.add
-
-    def add(self, name, start, *bounds):
+    def variable(self, name, start, *bounds):
         at = {v.name: v.guess for v in problem.variables}[name]
         units.setdefault(name, at / start)
         return original(self, name, start, *bounds)
 
-    monkeypatch.setattr(Coordinates, "add", add)
+    monkeypatch.setattr(NonlinearProgram, "variable", variable)
     local.solve(problem, x, max_iterations=1)
     text = show(problem, "chain")
     for name, unit in units.items():
@@ -178,7 +177,7 @@ def test_models_are_told_by_name_and_an_unstated_guess_by_its_place(random_case)
     text = show(problem, "lumped")
     for block, scale, model in (
         ("mass_share", "linear", "LumpedMass"), ("spring", "log", "ChainStiffness"),
-        ("rayleigh_factor", "linear", "ProportionalDamping"),
+        ("rayleigh_alpha", "linear", "ProportionalDamping"), ("rayleigh_beta", "linear", "ProportionalDamping"),
     ):  # fmt: skip
         assert re.search(rf"^  {block} .*\(middle\) +{scale} +{model}$", text, re.M)
     assert re.search(r"^  mass +3 +mass_share \(3\)$", text, re.M)
@@ -243,7 +242,7 @@ def test_the_command_prints_it_and_a_mistake_is_one_line(tmp_path, monkeypatch, 
     out, error = capsys.readouterr()
     assert error == ""
     assert told(out) == (7, 8)
-    assert re.search(r"^      mass_share [+-]1 %$", out, re.M)  # a share of all is a share of none
+    assert re.search(r"^      mass share [+-]1 %$", out, re.M)  # a share of all is a share of none
     for arguments, message in (
         (["nowhere.py"], "cannot be read"), (["shear_building", "--data", "no"], "no such file"),
         (["shear_building", "--seed", "x"], "not a nonnegative integer"), ([], "PROBLEM"),

@@ -385,8 +385,8 @@ def test_convergence_tells_only_what_ran(modal, complete, plain, no_pictures):
 
 def test_a_large_structure_is_told_without_what_takes_long(modal, monkeypatch, no_pictures):
     it = modal(force=False)
-    monkeypatch.setattr("sysid.results.identification._QUICK_SHAPES", 0)
-    monkeypatch.setattr("sysid.results.identification._QUICK_DOFS", 0)
+    monkeypatch.setattr("sysid.results.answer._QUICK_SHAPES", 0)
+    monkeypatch.setattr("sysid.results.answer._QUICK_DOFS", 0)
     page = Page(report.render(it))
     assert not {"uncertainty", "_intervals"} & set(vars(it))
     assert page.tables[0][0][1:3] == ["frequency [Hz]", "damping [%]"] and "±" not in page.text

@@ -110,8 +110,8 @@ def test_degrees_of_freedom_are_sensors_or_modal_coordinates(modal, truth):
 
 def test_what_takes_long_is_asked_for_only_where_it_is_known(modal, monkeypatch):
     it = modal(force=False)
-    monkeypatch.setattr("sysid.results.identification._QUICK_SHAPES", 0)
-    monkeypatch.setattr("sysid.results.identification._QUICK_DOFS", 0)
+    monkeypatch.setattr("sysid.results.answer._QUICK_SHAPES", 0)
+    monkeypatch.setattr("sysid.results.answer._QUICK_DOFS", 0)
     assert it.quick_uncertainty is None and it.quick_intervals is None
     assert "+-" not in it.summary() and "diagonal entries" not in it.summary()
     assert it.to_dict()["natural_frequencies_std_hz"] == [None] * 3
