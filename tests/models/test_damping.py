@@ -85,8 +85,8 @@ def test_search_spaces(geometry_of):
     geometry = geometry_of(np.ones((4, 1)))
     (unknown,) = ModalDamping().unknowns(geometry)
     np.testing.assert_array_equal([unknown.lower, unknown.upper], [[0.005] * 4, [0.05] * 4])  # eq. 38
-    (unknown,) = ProportionalDamping((0.1, 2), (1e-5, 1e-3)).unknowns(geometry)
-    np.testing.assert_array_equal([unknown.lower, unknown.upper], [[0.1, 1e-5], [2, 1e-3]])
+    alpha, beta = ProportionalDamping((0.1, 2), (1e-5, 1e-3)).unknowns(geometry)
+    assert [(v.lower.item(), v.upper.item(), v.unit) for v in (alpha, beta)] == [(0.1, 2, "1/s"), (1e-5, 1e-3, "s")]
 
 
 def test_what_is_stated(geometry_of):

@@ -175,7 +175,7 @@ def test_models_and_expressions_mix():
     proportional = sysid.Problem(
         TEST, mass=sysid.LumpedMass(6.0), stiffness=chain(k()), damping=sysid.ProportionalDamping((0, 1), (0, 1e-3))
     )
-    assert [v.name for v in proportional.variables] == ["mass_share", "rayleigh_factor", "k"]
+    assert [v.name for v in proportional.variables] == ["mass_share", "rayleigh_alpha", "rayleigh_beta", "k"]
     x = np.concatenate([MASSES / 3, [0.4, 2e-4], SPRINGS])
     expected = sysid.Structure(
         TRUTH.mass, TRUTH.stiffness, n_base=1, damping_matrix=0.4 * np.diag(MASSES) + 2e-4 * chain(SPRINGS)
