@@ -135,7 +135,8 @@ class _Point:
 
 def _point(problem: Problem) -> _Point:
     """The point at which the data are judged: the reference, what the modal strategy finds, or a guess."""
-    found, sentences = _at_reference(problem), ()
+    sentences: tuple[str, ...] = ()
+    found = _at_reference(problem)
     if found is None and choose("auto", problem, None)[0].name == "modal":
         found, sentences = _at_modes(problem)
     return found or _at_guess(problem, sentences)

@@ -140,15 +140,7 @@ def averaged(runs: Sequence[Run], sample_rate: float, *, kind: str, segment: int
 
     freq = np.fft.rfftfreq(length, 1 / sample_rate)[1:]
     S_xx = np.moveaxis(cross("base", "base"), -1, 0).swapaxes(1, 2)  # [line, a, b] = E[x_a conj(x_b)]
-    size = np.sqrt(np.einsum("fii->fi", S_xx).real)
-    if np.any(size == 0):
-        raise InputError("a base direction does not move at some line; narrow the band or leave that direction out")
-    condition = np.linalg.cond(S_xx / (size[:, :, None] * size[:, None, :]))
-    if np.median(condition) > 1e8:
-        raise InputError(
-            "the base directions do not move independently over these runs (one fixed direction of motion?); "
-            "their responses cannot be told apart: add runs, or state fewer base directions"
-        )
+    _check_independent(S_xx)
     S_yx = np.moveaxis(cross("base", "outputs"), -1, 0).swapaxes(1, 2)  # [line, output, input] = E[y conj(x)]
     S_yy = np.moveaxis(_auto(runs, counts, sample_rate, window, length - step), -1, 0)
     inverse = np.linalg.inv(S_xx)
@@ -172,6 +164,19 @@ def averaged(runs: Sequence[Run], sample_rate: float, *, kind: str, segment: int
         force_std=frf_std[n:] if forced else None,
         coherence=coherence[:, :n].T,
     )
+
+
+def _check_independent(S_xx: ComplexArray) -> None:
+    """Refuse base spectra (n_freq, d, d) of directions that do not move, or not by themselves."""
+    size = np.sqrt(np.einsum("fii->fi", S_xx).real)
+    if np.any(size == 0):
+        raise InputError("a base direction does not move at some line; narrow the band or leave that direction out")
+    condition = np.linalg.cond(S_xx / (size[:, :, None] * size[:, None, :]))
+    if np.median(condition) > 1e8:
+        raise InputError(
+            "the base directions do not move independently over these runs (one fixed direction of motion?); "
+            "their responses cannot be told apart: add runs, or state fewer base directions"
+        )
 
 
 def resample(

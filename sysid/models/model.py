@@ -88,7 +88,9 @@ class StiffnessBlocks(NamedTuple):
 class MatrixModel(Protocol):
     """Mass, stiffness or damping as variables and expressions.
 
-    Symbols are CasADi SX in a model with unknowns, and MX (as those of `sysid.Variable` s) in one without.
+    Symbols are CasADi SX in a model with unknowns, and MX (as those of `sysid.Variable` s) in one without. A damping
+    whose ratios are a function of the frequency has one method more, ``ratios(geometry, y, omega)``: one ratio a mode,
+    (n,), at the circular frequencies `omega` (n,), in ascending order; None where C tells them.
     """
 
     def unknowns(self, geometry: Geometry) -> Sequence[Unknown]:
@@ -113,23 +115,6 @@ class MatrixModel(Protocol):
 
     def stated(self, geometry: Geometry) -> Stated:
         """What is stated of the matrix."""
-
-
-class DampingRatios(Protocol):
-    """What a damping model has besides where the damping of each mode is a function of its frequency alone."""
-
-    def ratios(self, geometry: Geometry, y: Any, omega: Any) -> Any:
-        """One damping ratio a mode, (n,), at the circular frequencies `omega` (n,), in ascending order; None if C."""
-
-
-def mass_blocks(given: Any, geometry: Geometry) -> MassBlocks:
-    """All blocks of a mass, where its model gives the matrix alone."""
-    if isinstance(given, MassBlocks):
-        return given
-    n, d = geometry.n, geometry.d
-    own, whole = given[:n, :n], given.shape[0] > n
-    coupling, base = (given[:n, n:], given[n:, n:]) if whole else (type(given)(n, d), type(given)(d, d))
-    return MassBlocks(cholesky(own), coupling, base, own)
 
 
 def stiffness_blocks(given: Any, factor: Any) -> StiffnessBlocks:

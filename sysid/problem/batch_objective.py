@@ -138,9 +138,9 @@ class Batch:
         self._made = [np.zeros((CHUNK, *function.size_out(i)[::-1])) for i in range(function.n_out())]
         self._buffer, self._run = mapped.buffer()
         for i, array in enumerate(self._given):
-            self._buffer.set_arg(i, memoryview(array))
+            self._buffer.set_arg(i, array.data)
         for i, array in enumerate(self._made):
-            self._buffer.set_res(i, memoryview(array))
+            self._buffer.set_res(i, array.data)
 
     def __call__(self, *arrays: Array) -> list[Array]:
         """Outputs (count, rows, columns) of inputs (count, rows) or (count, rows, columns), count up to CHUNK."""

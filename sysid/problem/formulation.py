@@ -213,8 +213,12 @@ class Formulation:
         """Whether the damping of each mode is a function of its frequency."""
         symbol = ca.SX if self.of_models[2] else ca.MX
         y, omega = symbol.sym("y", sum(v.size for v in self.of_models[2])), symbol.sym("omega", self.geometry.n)
-        ratios = getattr(self.models[2], "ratios", None)
-        return ratios is not None and ratios(self.geometry, y, omega) is not None
+        return self.ratios(y, omega) is not None
+
+    def ratios(self, y: Any, omega: Any) -> Any:
+        """Damping ratios of the damping model's unknowns `y` at circular frequencies; None where it has a matrix."""
+        of_modes = getattr(self.models[2], "ratios", None)  # a model of a matrix alone need not have it
+        return None if of_modes is None else of_modes(self.geometry, y, omega)
 
     @property
     def test_alone(self) -> bool:

@@ -168,4 +168,4 @@ def load(path: str | Path) -> Identification:
 
 def _plain(values: Array) -> Any:
     """Numbers as lists of Python's, None for what is not finite."""
-    return np.where(np.isfinite(values), values, None).tolist()
+    return np.where(np.isfinite(values), values.astype(object), np.array(None)).tolist()

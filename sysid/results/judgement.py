@@ -90,7 +90,8 @@ def residual_of(problem: Problem, end: Outcome) -> float:
 
 def _remarks(problem: Problem, end: Outcome) -> tuple[str, ...]:
     """What the user should know of the unknowns and of the misfit."""
-    formulation, remarks = problem.formulation, ()
+    formulation = problem.formulation
+    remarks: tuple[str, ...] = ()
     if end.x is not None and formulation.variables:
         near = _ON_BOUND * (problem.upper - problem.lower)
         at = (end.x - problem.lower < near) | (problem.upper - end.x < near)

@@ -174,9 +174,7 @@ def _variable(old: Tree) -> Variable:
     fixed = old.get("fixed", False)
     if not (old.get("guessed", False) or fixed):
         del shaped["guess"]
-    variable = Variable(old["name"], shape, **shaped, unit=old["unit"], log=old.get("log", False), fixed=fixed)
-    variable.used = True  # for the tree only
-    return variable
+    return Variable(old["name"], shape, **shaped, unit=old["unit"], log=old.get("log", False), fixed=fixed)
 
 
 def _zero(variable: Variable) -> ca.MX:

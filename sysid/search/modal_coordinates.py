@@ -116,7 +116,7 @@ def _spectrum(problem: Problem, structure: Structure, start: Modes, z: Nonlinear
         low, high = np.log(lower / guess), np.log(upper / guess)
         return omega, ca.DM(guess) * ca.exp(z.variable(unknowns[0].title, np.zeros(guess.size), low, high))
     guess = np.clip(damping.values(formulation.geometry, structure), lower, upper)
-    return omega, damping.ratios(formulation.geometry, add_unknowns(z, unknowns, guess), omega)
+    return omega, formulation.ratios(add_unknowns(z, unknowns, guess), omega)
 
 
 def _unknowns(problem: Problem, modes: Modes, rigid: Array, remainder: Array, x: Array) -> Array:

@@ -49,8 +49,10 @@ class SwarmObjective:
         x = in_chunks(lambda chunk: self._all_unknowns(chunk)[0][:, :, 0], particles)
         squared = np.zeros(len(x))
         for i, term in enumerate(self.terms):
-            own = i == 0 and self.spectrum is not None and isinstance(term, TestTerm)
-            squared = squared + (term.squared(x, self.spectrum) if own else term.squared(x))
+            if i == 0 and isinstance(term, TestTerm):
+                squared = squared + term.squared(x, self.spectrum)
+            else:
+                squared = squared + term.squared(x)
         objective = np.sqrt(squared)
         constraints = self.problem.formulation.constraints
         if not constraints.lower.size:

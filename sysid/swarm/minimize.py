@@ -160,7 +160,26 @@ def minimize_swarm(
                 "raise it or lower n_particles."
             )
         swarm.horizon = min(max_iterations, max_evaluations // swarm.n_particles)
+    reason, n_improved = _run(swarm, fun, rules, improve if improve_every else None, improve_every, callback)
+    found = math.isfinite(swarm.best_cost)
+    reached = target is None or swarm.best_cost <= target
+    return OptimizeResult(
+        x=swarm.best_x, fun=swarm.best_cost, nfev=swarm.nfev, nit=swarm.nit,
+        success=found and reached and reason is not StopReason.CALLBACK,
+        message=rules.message(reason, swarm), reason=reason, history=np.array(swarm.history), n_nan=swarm.n_nan,
+        n_improved=n_improved, state_counts=dict(swarm.state_counts),
+    )  # fmt: skip
 
+
+def _run(
+    swarm: ParticleSwarm,
+    fun: Callable[[FloatArray], ArrayLike],
+    rules: StopRules,
+    improve: Callable[[FloatArray], ArrayLike] | None,
+    improve_every: int,
+    callback: Callable[[SwarmProgress], object] | None,
+) -> tuple[StopReason, int]:
+    """Iterate until a stop rule or the callback ends it; why it ended, and how often `improve` gave a better point."""
     started = time.perf_counter()
     n_improved = 0
     refined: FloatArray | None = None
@@ -168,16 +187,13 @@ def minimize_swarm(
     while reason is None:
         rows = swarm.ask()
         if not rules.room_for(len(rows), swarm.nfev):
-            reason = StopReason.MAX_EVALUATIONS
-            break
+            return StopReason.MAX_EVALUATIONS, n_improved
         swarm.tell(checked_costs(fun(rows), len(rows), "that fun returned"))
-
-        due = improve_every > 0 and swarm.nit % improve_every == 0 and math.isfinite(swarm.best_cost)
-        seen = refined is not None and np.array_equal(refined, swarm.best_x)
-        if improve is not None and due and not seen and rules.room_for(1, swarm.nfev):
-            n_improved += _refine(swarm, fun, improve)
-            refined = swarm.best_x
-
+        if improve is not None and swarm.nit % improve_every == 0 and math.isfinite(swarm.best_cost):
+            seen = refined is not None and np.array_equal(refined, swarm.best_x)
+            if not seen and rules.room_for(1, swarm.nfev):
+                n_improved += _refine(swarm, fun, improve)
+                refined = swarm.best_x
         reason = rules.reason(swarm, time.perf_counter() - started)
         if callback is not None:
             try:
@@ -185,22 +201,7 @@ def minimize_swarm(
             except StopIteration:
                 # A search that had ended anyway was not cut short.
                 reason = reason or StopReason.CALLBACK
-
-    found = math.isfinite(swarm.best_cost)
-    reached = target is None or swarm.best_cost <= target
-    return OptimizeResult(
-        x=swarm.best_x,
-        fun=swarm.best_cost,
-        nfev=swarm.nfev,
-        nit=swarm.nit,
-        success=found and reached and reason is not StopReason.CALLBACK,
-        message=rules.message(reason, swarm),
-        reason=reason,
-        history=np.array(swarm.history),
-        n_nan=swarm.n_nan,
-        n_improved=n_improved,
-        state_counts=dict(swarm.state_counts),
-    )
+    return reason, n_improved
 
 
 def _refine(
