@@ -117,6 +117,16 @@ class MatrixModel(Protocol):
         """What is stated of the matrix."""
 
 
+def mass_blocks(given: Any, geometry: Geometry) -> MassBlocks:
+    """All blocks of a mass, where its model gives the matrix alone."""
+    if isinstance(given, MassBlocks):
+        return given
+    n, d = geometry.n, geometry.d
+    own, whole = given[:n, :n], given.shape[0] > n
+    coupling, base = (given[:n, n:], given[n:, n:]) if whole else (type(given)(n, d), type(given)(d, d))
+    return MassBlocks(cholesky(own), coupling, base, own)
+
+
 def stiffness_blocks(given: Any, factor: Any) -> StiffnessBlocks:
     """Both blocks of a stiffness, where its model gives K_SS alone."""
     if isinstance(given, StiffnessBlocks):

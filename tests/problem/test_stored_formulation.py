@@ -3,10 +3,10 @@
 import casadi as ca
 import numpy as np
 import pytest
+from sysid.search.direct_objective import WrittenCost
 
 import sysid
 from sysid.search.continuation import Continuation
-from sysid.search.direct_objective import WrittenCost
 
 FREQ = np.linspace(1.0, 30.0, 40)
 ONE = np.ones((2, 1))

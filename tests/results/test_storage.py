@@ -69,7 +69,8 @@ def identification(
     other = sysid.simulate(truth, freq[::2], noise=0.02, rng=2, base_axes="yx")
     problem = sysid.Problem(
         test, mass=MASSES[mass], stiffness=STIFFNESSES[stiffness], damping=DAMPINGS[damping],
-        reference=building(damping_matrix=True, sensors=False, skew=stiffness != "chain"), validation=[other, test], goal=0.05,
+        reference=building(damping_matrix=True, sensors=False, skew=stiffness != "chain"),
+        validation=[other, test], goal=0.05,
     )  # fmt: skip
     history = sysid.History(
         start=0.9, swarm=0.1 + 0.2, refinement=float("nan"), local=1e-300,
