@@ -182,6 +182,38 @@ def test_an_input_error_from_inside_passes_as_it_is(here):
     assert refused("bad.py") == "no records on Sundays"
 
 
+WRITTEN = """import casadi as ca
+import numpy as np
+import sysid
+
+def problem(*, data=None, rng=0):
+    stretch = np.array([[1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]])
+    truth = sysid.Structure(np.diag([2.0, 1.0, 0.0]), stretch.T @ np.diag([3e4, 2e4]) @ stretch, [0.01, 0.02], n_base=1)
+    k = sysid.Variable("spring", 2, lower=1e3, upper=1e5, log=True)
+    m = sysid.Variable("mass", 2, lower=0.1, upper=9.0, guess=[2.0, 1.0], fixed=True)
+    f = sysid.Variable("factor", lower=0.0, upper=2.0)
+    return sysid.Problem(
+        sysid.simulate(truth, np.linspace(1.0, 40.0, 30)), mass=ca.diag(m), stiffness=stretch.T @ ca.diag(k) @ stretch,
+        constraints=[CONSTRAINT],
+    )
+"""
+
+
+def test_a_variable_that_enters_nothing_is_refused_with_its_line(here):
+    module = here / "written.py"
+    module.write_text(WRITTEN.replace("CONSTRAINT", "k[1] <= k[0]"))
+    message = refused("written.py")
+    assert "written.py: variable 'factor' (written.py, line 10) enters no matrix, residual or constraint" in message
+    assert "'mass'" not in message  # fixed, and used
+    module.write_text(WRITTEN.replace("CONSTRAINT", "k[1] <= f * k[0]"))
+    assert [v.name for v in catalogue.build(Recipe("written.py")).variables] == ["spring", "factor"]
+
+
+def test_what_cannot_be_searched_is_refused_when_it_is_built(here):
+    (here / "written.py").write_text(WRITTEN.replace("CONSTRAINT", "f * k[0] >= 3e5"))
+    assert "no point within the bounds satisfies constraint 1" in refused("written.py")
+
+
 def test_ctrl_c_inside_a_module_is_no_mistake_of_the_module(here):
     (here / "slow.py").write_text("raise KeyboardInterrupt\n")
     with pytest.raises(KeyboardInterrupt):

@@ -168,4 +168,6 @@ def load(path: str | Path) -> Identification:
 
 def _plain(values: Array) -> Any:
     """Numbers as lists of Python's, None for what is not finite."""
-    return np.where(np.isfinite(values), values.astype(object), np.array(None)).tolist()
+    plain = values.astype(object)
+    plain[~np.isfinite(values)] = None
+    return plain.tolist()

@@ -228,6 +228,43 @@ def test_a_guess_without_derivatives_is_passed_over():
     assert "At a point of the search space, as the guess makes no structure with derivatives:" in text
 
 
+def test_a_term_beside_the_records_leaves_the_point_at_the_reference(random_case):
+    truth, problem = random_case(np.random.default_rng(1), "rigid_body", n=3, d=1)
+    offset = sysid.Variable("offset", lower=0.0, upper=1.0, guess=0.3)
+    alone, beside = (
+        sysid.Problem(
+            problem.measurement, mass=problem.mass, stiffness=problem.stiffness, reference=truth, residuals=residuals
+        )
+        for residuals in ([], [sysid.Prior(offset, 0.3, std=0.1)])
+    )
+    rank, count = told(show(alone, "alone"))
+    text = show(beside, "beside")
+    assert "At the reference:" in text
+    assert told(text) == (rank + 1, count + 1)  # the prior sees one more
+    line = next(line for line in text.splitlines() if line.startswith("  offset  0.3 "))
+    assert line.endswith("33.3 %")
+
+
+def test_springs_of_a_model_stand_at_the_reference_and_written_ones_at_their_guess():
+    truth = sysid.Structure(np.diag([*MASSES, 0.0]), STRETCH.T @ np.diag(SPRINGS) @ STRETCH, [0.01] * 3, n_base=1)
+    k = sysid.Variable("k", 3, lower=1e3, upper=1e5, log=True)
+    for stiffness, where in (
+        (sysid.ChainStiffness(1e3, 1e5), "At the reference:"),
+        (STRETCH.T @ ca.diag(k) @ STRETCH, "At the guess (the models cannot be inverted to the reference):"),
+    ):
+        problem = sysid.Problem(
+            sysid.simulate(truth, FREQ), mass=np.diag([*MASSES, 0.0]), stiffness=stiffness, reference=truth
+        )
+        text = show(problem, "chain")
+        assert where in text
+        assert ("5000 to 9000" in text) is isinstance(stiffness, sysid.ChainStiffness)
+
+
+def test_a_problem_that_cannot_be_searched_is_refused():
+    with pytest.raises(sysid.InputError, match="no point within the bounds satisfies constraint 1"):
+        show(chain(constraints=lambda m, k: [m[0] >= 2 * k[0]]), "chain")
+
+
 def test_a_reference_that_the_models_cannot_hold_is_not_passed_off_as_the_point(random_case):
     truth, problem = random_case(np.random.default_rng(5), "rigid_body", n=3, d=1)
     lumped = sysid.Problem(problem.measurement, mass=sysid.LumpedMass(), reference=truth)
