@@ -13,7 +13,7 @@ class FieldTree:
 
     def to_tree(self) -> dict[str, Any]:
         """Give the fields as numbers, arrays and texts; `from_tree` takes them back."""
-        return {field.name: _stored(getattr(self, field.name)) for field in fields(self)}  # type: ignore[arg-type]
+        return {field.name: plain(getattr(self, field.name)) for field in fields(self)}  # type: ignore[arg-type]
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Self:
@@ -21,7 +21,14 @@ class FieldTree:
         return cls(**tree)
 
 
-def _stored(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """A number, an array of numbers, a text or None as a tree holds it.
+
+    Raises
+    ------
+    TypeError, ValueError
+        Where it is none of these.
+    """
     if value is None or isinstance(value, str):
         return value
     numbers = np.asarray(value, dtype=float)

@@ -7,6 +7,7 @@ from typing import Any
 
 from sysid.errors import InputError
 from sysid.models.damping import ModalDamping, ProportionalDamping
+from sysid.models.field_tree import plain
 from sysid.models.mass import FullMass, KnownMass, LumpedMass
 from sysid.models.stiffness import ChainStiffness, SpectralStiffness
 
@@ -19,31 +20,47 @@ _OWN: dict[str, Any] = {
 
 
 def is_storable(model: Any) -> bool:
-    """Whether something is a model that can be stored: its class has `to_tree` and `from_tree`."""
-    return all(callable(getattr(type(model), name, None)) for name in ("to_tree", "from_tree"))
+    """Whether something is a model: its class has `to_tree` and `from_tree`, or the methods of a matrix model."""
+    return _has_tree(type(model)) or _is_model(type(model))
+
+
+def _has_tree(kind: type) -> bool:
+    return all(callable(getattr(kind, name, None)) for name in ("to_tree", "from_tree"))
+
+
+def _is_model(kind: type) -> bool:
+    return all(callable(getattr(kind, name, None)) for name in ("unknowns", "blocks", "values", "stated"))
 
 
 def model_to_tree(model: Any) -> dict[str, Any]:
-    """Tree of a matrix model of the package, or of any other class with `to_tree` and `from_tree`.
+    """Tree of a matrix model: what `to_tree` of its class gives, else its attributes.
 
     Raises
     ------
     InputError
-        Where the class could not be found again.
+        Where the class could not be found again, or an attribute is no number, array of numbers, text or None.
     """
     kind = type(model)
-    if not is_storable(model):
-        raise InputError(
-            f"a {kind.__name__} cannot be stored: its class needs a method to_tree(), which gives a dictionary of "
-            "arrays, numbers and texts, and a class method from_tree(tree), which takes it back"
-        )
     if "<locals>" in kind.__qualname__:
         raise InputError(
             f"a {kind.__name__} cannot be stored: its class stands inside a function ({kind.__qualname__}), where no "
             "other program finds it; move the class to the top of its module"
         )
     name = kind.__name__ if _OWN.get(kind.__name__) is kind else f"{kind.__module__}:{kind.__qualname__}"
-    return {"kind": name, "fields": model.to_tree()}
+    return {"kind": name, "fields": model.to_tree() if _has_tree(kind) else _attributes(model)}
+
+
+def _attributes(model: Any) -> dict[str, Any]:
+    """Attributes of a model whose class tells no tree of its own."""
+    try:
+        if _is_model(type(model)):
+            return {name: plain(value) for name, value in vars(model).items()}
+    except (TypeError, ValueError):
+        pass
+    raise InputError(
+        f"a {type(model).__name__} cannot be stored: its class needs a method to_tree(), which gives a dictionary of "
+        "arrays, numbers and texts, and a class method from_tree(tree), which takes it back"
+    )
 
 
 def model_from_tree(tree: dict[str, Any]) -> Any:
@@ -57,7 +74,12 @@ def model_from_tree(tree: dict[str, Any]) -> Any:
     module, colon, name = tree["kind"].rpartition(":")
     if not colon and name not in _OWN:
         raise InputError(f"model {name!r} is unknown to this sysid: a later one is needed")
-    return (_imported(module, name) if colon else _OWN[name]).from_tree(tree["fields"])
+    kind = _imported(module, name) if colon else _OWN[name]
+    if _has_tree(kind):
+        return kind.from_tree(tree["fields"])
+    model = object.__new__(kind)
+    vars(model).update(tree["fields"])
+    return model
 
 
 def _imported(module: str, name: str) -> Any:
@@ -66,9 +88,9 @@ def _imported(module: str, name: str) -> Any:
         kind: Any = importlib.import_module(module)
         for part in name.split("."):
             kind = getattr(kind, part)
-        if isinstance(kind, type) and callable(getattr(kind, "from_tree", None)):
+        if isinstance(kind, type) and (_has_tree(kind) or _is_model(kind)):
             return kind
-        problem = "it is no class with from_tree"
+        problem = "it is no class of a matrix model"
     except Exception as error:  # a module of the user's may fail in any way
         problem = f"{type(error).__name__}: {error}"
     raise InputError(

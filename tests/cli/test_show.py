@@ -241,8 +241,7 @@ def test_a_term_beside_the_records_leaves_the_point_at_the_reference(random_case
     text = show(beside, "beside")
     assert "At the reference:" in text
     assert told(text) == (rank + 1, count + 1)  # the prior sees one more
-    line = next(line for line in text.splitlines() if line.startswith("  offset  0.3 "))
-    assert line.endswith("33.3 %")
+    assert re.search(r"^  offset +0\.3 .* 33\.3 %$", text, re.M)
 
 
 def test_springs_of_a_model_stand_at_the_reference_and_written_ones_at_their_guess():

@@ -35,6 +35,15 @@ class Tank:
         def from_tree(cls, tree):
             return cls(tree["levels"].tolist())
 
+class Ring:
+    def __init__(self, sectors, stiffness=None):
+        self.sectors, self.stiffness = sectors, stiffness
+
+    def unknowns(self, geometry):
+        return []
+
+    blocks = values = stated = unknowns
+
 nothing = 3
 """
 
@@ -69,6 +78,15 @@ def test_a_model_of_the_users_own_is_found_by_its_module(tanks):
     assert tree["kind"] == "tanks_of_mine:Tank.Half"
     back = model_from_tree(tree)
     assert type(back) is tanks.Tank.Half and back.levels == [0.3, 0.7]
+
+
+def test_a_model_without_a_tree_of_its_own_is_stored_by_its_attributes(tanks):
+    given = tanks.Ring(12, stiffness=[2e4, 3e3])
+    back = model_from_tree(from_bytes(to_bytes(model_to_tree(given), 3))[0])
+    assert type(back) is tanks.Ring and back.sectors == 12
+    np.testing.assert_array_equal(back.stiffness, [2e4, 3e3])
+    with pytest.raises(sysid.InputError, match=r"Ring cannot be stored: its class needs a method to_tree"):
+        model_to_tree(tanks.Ring(object()))
 
 
 def test_a_problem_stores_it_beside_expressions(tanks):
