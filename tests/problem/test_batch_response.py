@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sysid.problem.batch_response import by_lines, by_modes, by_states
+from sysid.problem.batch_response import by_lines, by_states
 
 FREQ = np.linspace(0.0, 12.0, 25)
 
@@ -36,14 +36,6 @@ def test_states_and_lines_solve_the_equations_of_motion(shift):
         v = response(M, K, C, B, FREQ[1:], shift) / s**2
         force = np.stack([(M * x**2 + C * x + K) @ v[..., i] for i, x in enumerate(s)], axis=-1)
         np.testing.assert_allclose(force, -B[..., None] * np.ones(s.size), rtol=1e-9, atol=1e-10)
-
-
-@pytest.mark.parametrize("shift", [0.0, 3.0])
-def test_modes_of_oscillators_with_ratios(shift):
-    omega, ratios, masses = np.array([10.0, 25.0, 60.0]), np.array([0.02, 0.3, 0.05]), np.array([1.0, 2.0, 0.5])
-    M, K, _, B = (part[None] for part in matrices(omega, ratios, masses))
-    found = by_modes(M, K, ratios[None, :, None], B, FREQ, shift)
-    np.testing.assert_allclose(found[0], oscillators(omega, ratios, FREQ, shift), rtol=1e-12)
 
 
 @pytest.mark.parametrize("shift", [0.0, 3.0])
