@@ -16,9 +16,10 @@ from sysid.assessment.sensitivity import (
     Sensitivity,
     directions_in_words,
     meaningful,
+    of_formulation,
     of_outside,
     outside_variables,
-    sensitivity,
+    with_totals,
 )  # fmt: skip
 from sysid.errors import InputError
 from sysid.models.unknowns import scales_of, split
@@ -117,8 +118,9 @@ def intervals(problem: Problem, structure: Structure, x: Array | None) -> Interv
     if modal_mass_cone.speaks(problem.formulation):
         return Intervals(*modal_mass_cone.ends(problem, structure))
     x = _needed(x)
-    slopes = slopes_of(problem.formulation.matrices, x, problem.measurement)
-    known = sensitivity(problem, x, slopes)
+    formulation, x = with_totals(problem, structure, x)
+    slopes = slopes_of(formulation.matrices, x, problem.measurement)
+    known = of_formulation(formulation, x, slopes)
     ends = []
     for value, slope in _pairs(structure, slopes)[:2]:
         open_ = _open_entries(value, slope, known)
@@ -147,47 +149,58 @@ def _needed(x: Array | None) -> Array:
 
 def _by_rank(problem: Problem, structure: Structure, x: Array) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What fixes the matrices, and what is left open, in sentences."""
-    formulation = problem.formulation
+    formulation, x = with_totals(problem, structure, x)
     slopes = slopes_of(formulation.matrices, x, problem.measurement)
-    known = sensitivity(problem, x, slopes)
+    known = of_formulation(formulation, x, slopes)
+    count, rank = known.free.shape[1], known.rank
+    named, factors = _by_name(formulation, known.unseen)
+    words = directions_in_words(formulation.unknowns, x, known.unit, named)
+    seen = f"the records see {rank} of {count} directions of the {x.size} unknowns; no record sees a change of"
     open_: list[str] = []
     if any(np.any(_open_entries(*pair, known)) for pair in _pairs(structure, slopes)):
-        open_.append(_unseen(formulation, x, known))
-    misfit = problem.objective(x)
-    if known.rank and misfit < EXACT and misfit > _LOOSE * known.singular_values[known.rank - 1]:
-        (weakest,) = _in_words(formulation, x, known, known.seen[:, -1:])
+        factors = _moving(_pairs(structure, slopes), known.unit, factors)
+        open_.append(f"{seen} {'; nor of '.join([*words, *_factors_in_words(formulation, factors)])}")
+        open_ += [modal_mass_cone.UNIT_MASS] if problem.unit_mass else []
+    misfit = formulation.objective(x)
+    if rank and misfit < EXACT and misfit > _LOOSE * known.singular_values[rank - 1]:
+        (weakest,) = directions_in_words(formulation.unknowns, x, known.unit, known.seen[:, -1:])
         open_.append(f"the search ended at {misfit:.2g} of the records, by which {weakest} is hardly held")
     if known.unseen.shape[1]:
-        closed = "the data and the written model fix mass, stiffness and damping"
-        return (closed, f"{_unseen(formulation, x, known)}; {_SAME_MATRICES}"), tuple(open_)
-    only = known.rank - sensitivity(problem, x, slopes, priors=False).rank if formulation.priors else 0
-    by_constraints = x.size - known.free.shape[1]
-    closed = f"the data and the written model fix all {x.size} unknowns"
-    closed += f", {only} of them by what is stated as known alone" if only else ""
-    closed += f", {by_constraints} of them by constraints" if by_constraints else ""
-    return (f"{closed} about this answer; what is written as a number counts as exact",), tuple(open_)
+        closed = ["the data and the written model fix mass, stiffness and damping"]
+        closed += [f"{seen} {'; nor of '.join(words)}; {_SAME_MATRICES}"] if words else []
+        return tuple(closed), tuple(open_)
+    only = rank - of_formulation(formulation, x, slopes, priors=False).rank if formulation.priors else 0
+    closed = [f"the data and the written model fix all {x.size} unknowns"]
+    closed += [f"{only} of them by what is stated as known alone"] if only else []
+    closed += [f"{x.size - count} of them by constraints"] if count < x.size else []
+    return (f"{', '.join(closed)} about this answer; what is written as a number counts as exact",), tuple(open_)
 
 
-def _unseen(formulation: Formulation, x: Array, known: Sensitivity) -> str:
-    """What no record sees, in a sentence."""
-    words = "; nor of ".join(_in_words(formulation, x, known, known.unseen))
-    return (
-        f"the records see {known.rank} of {known.free.shape[1]} directions of the {known.unit.size} unknowns; no "
-        f"record sees a change of {words}"
-    )
+def _by_name(formulation: Formulation, directions: Array) -> tuple[Array, Array]:
+    """The same space (size, count) by directions of unknowns that mean something by themselves, and the others."""
+    without = directions[~meaningful(formulation)]
+    lam, turn = np.linalg.eigh(without.T @ without)
+    return directions @ turn[:, lam < _MOVED**2], directions @ turn[:, lam >= _MOVED**2]
 
 
-def _in_words(formulation: Formulation, x: Array, known: Sensitivity, directions: Array) -> list[str]:
-    """Directions in the user's names; of those that move factors of a free matrix only how many there are."""
-    factors = directions[~meaningful(formulation)]
-    lam, turn = np.linalg.eigh(factors.T @ factors)
-    named, others = directions @ turn[:, lam < _MOVED**2], directions @ turn[:, lam >= _MOVED**2]
-    words = directions_in_words(formulation.unknowns, x, known.unit, named)
-    if not others.shape[1]:
-        return words
-    moved = split(formulation.unknowns, np.abs(others).max(axis=1) > _MOVED)
-    titles = [unknown.title for unknown, part in zip(formulation.unknowns, moved, strict=True) if np.any(part)]
-    return [*words, f"{', '.join(titles)} together, in {others.shape[1]} ways"]
+def _moving(pairs: list[tuple[Array, Array]], unit: Array, directions: Array) -> Array:
+    """The part of a space (size, count) that moves matrices: what scales all shares of a total moves none."""
+    steps = unit[:, None] * directions
+    moved = [
+        slope.reshape(-1, len(unit)) @ steps / max(np.abs(matrix).max(), np.finfo(float).tiny)
+        for matrix, slope in pairs
+    ]
+    lam, turn = np.linalg.eigh(sum(change.T @ change for change in moved))
+    return directions @ turn[:, lam >= _MOVED**2]
+
+
+def _factors_in_words(formulation: Formulation, directions: Array) -> Iterator[str]:
+    """Directions that move entries of factors or shares, which nobody gave: what takes part, and how many there are."""
+    count = directions.shape[1]
+    if count:
+        moved = split(formulation.unknowns, np.abs(directions).max(axis=1) > _MOVED)
+        titles = [unknown.title for unknown, part in zip(formulation.unknowns, moved, strict=True) if np.any(part)]
+        yield f"{', '.join(titles)} together, in {count} {'way' if count == 1 else 'ways'}"
 
 
 def _pairs(structure: Structure, slopes: Slopes) -> list[tuple[Array, Array]]:

@@ -24,6 +24,7 @@ from sysid.problem.formulation import Formulation
 from sysid.problem.problem import Problem
 from sysid.structure.structure import Array, ComplexArray, Structure
 
+UNIT_MASS = "no number with a unit of mass is given: masses are normalised to 1 kg in each base direction"
 _SAME_POLE = 1e-6  # relative distance of poles that count as one even without a misfit
 _UNRESOLVED = 20.0  # misfits, in parts of the half-power half-width, by which resolved poles differ
 _CLEAR = 3.0  # misfits above which a mode's share of the responses is seen
@@ -83,7 +84,7 @@ def verdict(problem: Problem, structure: Structure) -> tuple[tuple[str, ...], tu
         bounded = ", within what is stated" if len(known.equations) else ""
         open_.append(f"{what}: other mass and stiffness matrices answer identically{bounded}")
         if problem.unit_mass:
-            open_.append("no number with a unit of mass is given: masses are normalised to 1 kg in each base direction")
+            open_.append(UNIT_MASS)
     if not structure.at_sensors:
         how_far = "completely" if test.force is not None and not free else "up to the modal masses"
         alike = ", which do not all move independently" if structure.n == structure.n_sensors else ""

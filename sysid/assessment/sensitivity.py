@@ -16,7 +16,7 @@ from sysid.models.unknowns import Unknown, scales_of, split
 from sysid.problem.formulation import Formulation
 from sysid.problem.problem import Problem
 from sysid.problem.slopes import Rows, Slopes, stacked_rows
-from sysid.structure.structure import Array
+from sysid.structure.structure import Array, Structure
 
 _NULL = 1e-9  # of the largest singular value of the Jacobian, in units of the unknowns: what no record sees
 _SMALL = 1e-6  # of a unit: what is not told of a direction
@@ -102,6 +102,19 @@ def of_outside(formulation: Formulation, x: Array) -> Sensitivity:
     """The same of the variables that enter no matrix (`Formulation.outside`), by the terms beside the records alone."""
     rows = [term.linearised(x, formulation.noise) for term in formulation.beside]
     return _judged(formulation, x, rows, formulation.outside)
+
+
+def with_totals(problem: Problem, structure: Structure, x: Array) -> tuple[Formulation, Array]:
+    """The formulation and its unknowns; with total masses among them where nobody stated these, so that none is known.
+
+    Without them a mass that is normalised to 1 kg would count as weighed.
+    """
+    formulation = problem.formulation
+    if not problem.unit_mass:
+        return formulation, x
+    geometry = problem.geometry.weighing(problem.totals)
+    of_mass = formulation.models[0].values(geometry, structure)
+    return problem.formulate(geometry), np.concatenate([of_mass, x[formulation.parts.mass.stop :]])
 
 
 def meaningful(formulation: Formulation) -> NDArray[np.bool_]:

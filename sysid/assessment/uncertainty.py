@@ -25,7 +25,14 @@ from sysid.assessment.perturbations import (
     matrices_of_modes,
     std_of,
 )  # fmt: skip
-from sysid.assessment.sensitivity import Sensitivity, meaningful, of_formulation, of_outside, outside_variables
+from sysid.assessment.sensitivity import (
+    Sensitivity,
+    meaningful,
+    of_formulation,
+    of_outside,
+    outside_variables,
+    with_totals,
+)  # fmt: skip
 from sysid.errors import InputError
 from sysid.modal_analysis.misfit import inflation_of, records_of
 from sysid.modal_analysis.modal_fit import Modes
@@ -226,7 +233,7 @@ def _by_modes(problem: Problem, structure: Structure, x: Array | None) -> Uncert
 def _by_unknowns(problem: Problem, structure: Structure, x: Array) -> Uncertainty:
     """By the Jacobian of all that is fitted, in the problem's unknowns."""
     test, modes = problem.measurement, modes_of(structure)
-    formulation, x = _with_totals(problem, structure, x)
+    formulation, x = with_totals(problem, structure, x)
     slopes = slopes_of(formulation.matrices, x, test, modes.omega)
     known = of_formulation(formulation, x, slopes)
     steps, normals = known.steps, known.rank
@@ -246,16 +253,6 @@ def _by_unknowns(problem: Problem, structure: Structure, x: Array) -> Uncertaint
     if not structure.modal_damping:
         found = replace(found, _spectra=DirectSpectra(slopes, steps, normals))
     return _with_unknowns(found, problem, formulation, x, known)
-
-
-def _with_totals(problem: Problem, structure: Structure, x: Array) -> tuple[Formulation, Array]:
-    """The formulation and its unknowns; with the totals among them where nobody stated these, so that none is known."""
-    formulation = problem.formulation
-    if not problem.unit_mass:
-        return formulation, x
-    geometry = problem.geometry.weighing(problem.totals)
-    of_mass = formulation.models[0].values(geometry, structure)
-    return problem.formulate(geometry), np.concatenate([of_mass, x[formulation.parts.mass.stop :]])
 
 
 def _with_unknowns(

@@ -236,3 +236,33 @@ class TestUnknownsOfModels:
         )  # fmt: skip
         x = other.values(truth)
         assert determine(other, truth, x) == determine(by_models(truth, 6.0), truth, x)
+
+
+class TestMassesThatNobodyWeighed:
+    """Masses are normalised to 1 kg where nobody states any; that is no knowledge."""
+
+    def chain(self, truth, total=None):
+        k = Variable("k", 3, lower=10.0, upper=1e6, guess=SPRINGS / 6.0)
+        test = sysid.simulate(truth, FREQ, noise=0.01, rng=1)
+        return Problem(test, mass=LumpedMass(total), stiffness=T.T @ ca.diag(k) @ T)
+
+    def test_a_written_stiffness_beside_them_is_open_by_their_scale(self, truth):
+        problem = self.chain(truth)
+        x = np.concatenate([MASSES / 3.0, truth.damping_ratios, SPRINGS / 6.0])
+        told = determine(problem, problem.structure(x), x)
+        assert told.judged_by == BY_RANK and not told.determined
+        direction, unit = told.undetermined
+        assert direction.endswith("no record sees a change of total mass +1 %, k +1 %")
+        assert "normalised to 1 kg" in unit
+        ends = intervals(problem, problem.structure(x), x)
+        assert np.all(np.isinf(np.diagonal(ends.mass[1]))) and np.all(np.isinf(np.diagonal(ends.stiffness[1])))
+        assert np.all(np.isnan(uncertainty(problem, problem.structure(x), x).variables["k"]))
+
+    def test_their_total_closes_it(self, truth):
+        problem = self.chain(truth, 6.0)
+        x = np.concatenate([MASSES / 3.0, truth.damping_ratios, SPRINGS])
+        told = determine(problem, problem.structure(x), x)
+        assert told.determined
+        assert told.closed_by == ("the data and the written model fix mass, stiffness and damping",)
+        assert np.all(np.isfinite(intervals(problem, problem.structure(x), x).stiffness))
+        assert np.all(np.isfinite(uncertainty(problem, problem.structure(x), x).variables["k"]))
