@@ -31,6 +31,7 @@ from sysid.structure.structure import Array, ComplexArray, Structure
 
 FILE_NAME = "report.html"
 _SUFFIXES = (".html", ".htm")
+_TOTALS = {"trace": "total of the diagonal", "rigid_body": "rigid-body total", "sensors": "total on the sensors"}
 _MANY_PANELS = 40  # beyond which the pictures are drawn with fewer pixels
 
 
@@ -411,6 +412,6 @@ def _models(problem: Problem) -> list[list[object]]:
     rows: list[list[object]] = []
     for name, model, group, known in zip(MATRICES, problem.models, formulation.of_models, stated, strict=True):
         kind = type(model).__name__ if group else "written in variables" if counts[name] else "numbers"
-        total = "" if known.totals is None else f"{known.totals.kind.replace('_', '-')} total"
+        total = "" if known.totals is None else _TOTALS[known.totals.kind]
         rows.append([f"{name} model", "; ".join(filter(None, (kind, total, known.sentence)))])
     return rows

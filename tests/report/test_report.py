@@ -5,6 +5,7 @@ import dataclasses
 import re
 from html.parser import HTMLParser
 
+import casadi as ca
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -415,3 +416,63 @@ def test_a_page_of_36_panels_stays_below_3_megabytes(random_structure, tmp_path)
         truth, problem, problem.values(truth), "swarm", 0, True, "", sysid.History(), False, (), (), ()
     )
     assert report.write(it, tmp_path).stat().st_size < 3e6
+
+
+@pytest.fixture
+def written(truth):
+    """Lumped mass, known stiffness and dampers written in variables, with a further test: where a search could end."""
+    c = sysid.Variable("damper", 3, lower=1.0, upper=500.0, unit="N s/m")
+    test = sysid.simulate(truth, FREQ, noise=0.01, rng=1)
+    C = np.eye(3) @ ca.diag(c)
+    further = sysid.FurtherTest(
+        dataclasses.replace(test, response=0.9 * test.response), mass=truth.mass, stiffness=truth.stiffness, damping=C
+    )
+    problem = sysid.Problem(
+        test, mass=sysid.LumpedMass([3.0, 4.0]), stiffness=truth.stiffness, damping=C, residuals=[further]
+    )
+    x = np.array([0.3, 0.6, 0.9, 20.0, 500.0, 40.0])
+    return sysid.Identification(
+        problem.structure(x), problem, x, "continuation", 0, True, "", sysid.History(), False, (), (), ()
+    )
+
+
+def test_unknowns_stand_with_units_and_mark_the_bound_that_they_rest_on(written, no_pictures):
+    page = Page(report.render(written))
+    assert page.headings[0] == "Unknowns"
+    rows = page.tables[0][1:]
+    assert [row[:2] + row[3:] for row in rows] == [
+        ["damper[0]", "20", "N s/m", "1", "500", ""],
+        ["damper[1]", "500", "N s/m", "1", "500", "on its upper bound"],
+        ["damper[2]", "40", "N s/m", "1", "500", ""],
+    ]
+    std = written.uncertainty.variables["damper"]
+    assert [row[2] for row in rows] == [half(value) for value in std]
+
+
+def test_residual_and_objective_of_all_tests_stand_on_top(written, no_pictures):
+    page = Page(report.render(written))
+    top = page.text[: page.text.index("Unknowns of the search")]
+    own, second = written.residuals
+    assert f"Relative residual {written.residual:.3e} over 2 tests (test by test {own:.3e}, {second:.3e})" in top
+    assert f"Objective {written.objective:.3e}" in top
+    assert f"Relative residual {second:.4g}; the structure as it was then" in page.text
+
+
+def test_what_each_matrix_was_stated_to_be_is_told(written, complete, no_pictures):
+    rows = [dict(Page(report._what_ran(it)).tables[0]) for it in (complete, written)]
+    assert [row["mass model"].split("; ") for row in rows] == [
+        ["FullMass", "total of the diagonal"],
+        ["LumpedMass", "total on the sensors", "the mass is stated to be lumped on the sensors, with its total given"],
+    ]
+    assert [row["stiffness model"] for row in rows] == ["SpectralStiffness", "numbers"]
+    assert [row["damping model"] for row in rows] == ["ModalDamping", "written in variables"]
+
+
+def test_a_misfit_of_the_users_is_named_as_what_was_fitted(written, no_pictures):
+    c = sysid.Variable("damper", 3, lower=1.0, upper=500.0)
+    problem = sysid.Problem(
+        written.measurement, mass=written.problem.mass, stiffness=written.problem.stiffness, damping=ca.diag(c),
+        misfit=c / 100 - 1,
+    )  # fmt: skip
+    own = dataclasses.replace(written, problem=problem)
+    assert "of the misfit that the problem states" in Page(report.render(own)).text
