@@ -103,17 +103,17 @@ def _variable(v: Unknown, declared: str) -> list[str]:
     shape = " x ".join(map(str, v.shape)) or "scalar"
     guess = _range(v.guess) + ("" if v.has_guess else " (middle)")
     scale = "fixed" if v.fixed else v.scale
-    return [v.name, shape, v.unit or "-", _range(v.lower), _range(v.upper), guess, scale, declared]
+    return [v.title, shape, v.unit or "-", _range(v.lower), _range(v.upper), guess, scale, declared]
 
 
 def _unknowns(problem: Problem) -> Iterator[str]:
     """Variables by matrix; a model counts its own, a written matrix all that enter it."""
     formulation = problem.formulation
-    sizes, counts = {v.name: v.size for v in formulation.unknowns}, dict(problem.unknowns)
+    told, counts = {v.name: f"{v.title} ({v.size})" for v in formulation.unknowns}, dict(problem.unknowns)
     labels = {"constraints": _count(formulation.constraints.lower.size, "constraint")}
     rows = [["enters", "unknowns", "variables"]]
     for name, members in formulation.members:
-        rows.append([labels.get(name, name), str(counts[name]), ", ".join(f"{v} ({sizes[v]})" for v in members)])
+        rows.append([labels.get(name, name), str(counts[name]), ", ".join(told[v] for v in members)])
     yield from _table(rows)
     if formulation.healed:
         yield "healing: the swarm's candidates are brought to what it states before they are judged"
@@ -273,7 +273,7 @@ def _values(problem: Problem, point: _Point, moves: Array, noise: str) -> Iterat
             told = f"{100 * relative[part].max():.3g} %"
         else:
             told = f"{std[part].max():.3g} {v.unit}".rstrip()
-        rows.append([v.name, _range(x[part]), "-" if problem.free_modes else _range(known.unit[part]), told])
+        rows.append([v.title, _range(x[part]), "-" if problem.free_modes else _range(known.unit[part]), told])
     yield from _table(rows)
 
 

@@ -176,11 +176,11 @@ def test_models_are_told_by_name_and_an_unstated_guess_by_its_place(random_case)
     problem = random_case(np.random.default_rng(3), "lumped", "chain", "proportional", n=3, d=1)[1]
     text = show(problem, "lumped")
     for block, scale, model in (
-        ("mass_share", "linear", "LumpedMass"), ("spring", "log", "ChainStiffness"),
-        ("rayleigh_alpha", "linear", "ProportionalDamping"), ("rayleigh_beta", "linear", "ProportionalDamping"),
+        ("mass share", "linear", "LumpedMass"), ("spring", "log", "ChainStiffness"),
+        ("rayleigh alpha", "linear", "ProportionalDamping"), ("rayleigh beta", "linear", "ProportionalDamping"),
     ):  # fmt: skip
         assert re.search(rf"^  {block} .*\(middle\) +{scale} +{model}$", text, re.M)
-    assert re.search(r"^  mass +3 +mass_share \(3\)$", text, re.M)
+    assert re.search(r"^  mass +3 +mass share \(3\)$", text, re.M)
 
 
 def test_constraints_take_directions_away_at_a_point_that_keeps_them():
