@@ -24,6 +24,7 @@ from sysid.problem.feasibility import HELD, LOOSE, points_of
 from sysid.problem.problem import Problem
 from sysid.problem.slopes import Slopes, slopes_of
 from sysid.problem.terms import FurtherTest
+from sysid.results.summary import counted
 from sysid.structure.structure import Array, ComplexArray, Structure
 
 _WIDTH = 120
@@ -72,7 +73,7 @@ def _test(problem: Problem, name: str) -> Iterator[str]:
     for i, term in enumerate(problem.formulation.further_tests, start=1):
         yield f"further test {i}: {_records(term.test)}"
     known = ["the reference is known"] if problem.reference is not None else []
-    known += [f"predicted and never fitted: {_count(len(problem.validation), 'test')}"] if problem.validation else []
+    known += [f"predicted and never fitted: {counted(len(problem.validation), 'test')}"] if problem.validation else []
     known += [f"goal {problem.goal:.3g}"] if problem.goal is not None else []
     yield "; ".join([f"degrees of freedom {problem.geometry.n}, unknowns {problem.n_variables}", *known])
     yield f"--strategy auto takes {choose('auto', problem, None)[1].removeprefix('strategy ')}"
@@ -83,9 +84,9 @@ def _records(test: Measurement) -> str:
     sensors = ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
     force = "no base force" if test.force is None else "with base force"
     noise = "noise stated" if _noise_is_stated(test) else "no noise stated"
-    runs, axes = _count(test.n_runs, "run"), " ".join(test.base_axes or ())
+    runs, axes = counted(test.n_runs, "run"), " ".join(test.base_axes or ())
     return (
-        f"{_count(len(names), 'sensor')} ({sensors}), base moving along {axes}, {runs}, {test.freq.size} lines from "
+        f"{counted(len(names), 'sensor')} ({sensors}), base moving along {axes}, {runs}, {test.freq.size} lines from "
         f"{test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz, {force}, {noise}"
     )
 
@@ -110,7 +111,7 @@ def _unknowns(problem: Problem) -> Iterator[str]:
     """Variables by matrix; a model counts its own, a written matrix all that enter it."""
     formulation = problem.formulation
     told, counts = {v.name: f"{v.title} ({v.size})" for v in formulation.unknowns}, dict(problem.unknowns)
-    labels = {"constraints": _count(formulation.constraints.lower.size, "constraint")}
+    labels = {"constraints": counted(formulation.constraints.lower.size, "constraint")}
     rows = [["enters", "unknowns", "variables"]]
     for name, members in formulation.members:
         rows.append([labels.get(name, name), str(counts[name]), ", ".join(told[v] for v in members)])
@@ -299,7 +300,7 @@ def _unseen(problem: Problem, point: _Point) -> Iterator[str]:
     kinds = [f"mass, stiffness or damping change along {own}"] if own else []
     kinds += [f"only mass and coupling of the base along {base}"] if base else []
     kinds += [f"no matrix (the same structure, written otherwise) along {left}"] if left else []
-    yield f"  - no record sees {_count(len(words), 'direction')}; of these {', '.join(kinds)}"
+    yield f"  - no record sees {counted(len(words), 'direction')}; of these {', '.join(kinds)}"
     more = f" (the {_SHORTEST} shortest of {len(words)})" if len(words) > _SHORTEST else ""
     yield f"  - unseen{more}:"
     yield from (f"      {word}" for word in words[:_SHORTEST])
@@ -393,10 +394,6 @@ def _with_noise(test: Measurement) -> Measurement:
 
 
 # -- lines --------------------------------------------------------------------------------------
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}" + ("" if number == 1 else "s")
 
 
 def _range(values: Array) -> str:

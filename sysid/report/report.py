@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path, PurePath
 from typing import NamedTuple
 
@@ -18,11 +19,14 @@ from sysid.report.matrices import CHOSEN, ONE_OF_MANY, SAME, half_widths, matric
 from sysid.results.identification import Identification
 from sysid.results.storage import atomically, file_or_folder
 from sysid.results.summary import (
+    counted,
     half_width,
     is_one_of_many,
+    known_half_width,
     mass_percent_std,
     next_steps,
     residual_in_words,
+    tilde,
     verdict,
 )  # fmt: skip
 from sysid.results.unknowns_table import rows_of, stated_values
@@ -117,11 +121,10 @@ def _title(it: Identification) -> str:
 
 def _verdict(it: Identification) -> str:
     test, n, d = it.measurement, it.structure.n, it.structure.n_base
-    sensors = "" if n == test.n_sensors else f" seen by {test.n_sensors} sensors"
-    runs = f"{test.n_runs} run{'s' if test.n_runs > 1 else ''}"
+    sensors = f" seen by {test.n_sensors} sensors" * (n != test.n_sensors)
     head = paragraph(
-        f"{n} degrees of freedom{sensors}, {d} base direction{'s' if d > 1 else ''} "
-        f"({', '.join(test.base_axes or ())}), {runs}, "
+        f"{n} degrees of freedom{sensors}, {counted(d, 'base direction')} "
+        f"({', '.join(test.base_axes or ())}), {counted(test.n_runs, 'run')}, "
         f"{test.freq.size} lines from {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz",
         "soft",
     )
@@ -169,39 +172,46 @@ def _unknowns(it: Identification) -> str:
 
 def _modes(it: Identification) -> str:
     structure, reference, u = it.structure, it.problem.reference, it.quick_uncertainty
-    axes = it.measurement.base_axes or ()
-    share, share_std, many = structure.effective_mass_percent, mass_percent_std(it), is_one_of_many(it)
+    many = is_one_of_many(it)
     frequencies, ratios = structure.natural_frequencies, structure.damping_ratios
-    head = ["mode", "frequency [Hz]", "±", "damping [%]", "±", *(f"effective mass {a} [%]" for a in axes)]
-    if u is None:
-        del head[4], head[2]
-    known = reference if reference is not None and reference.n == structure.n else None
-    if known is not None:
-        head += ["reference [Hz]", "difference [%]", "reference damping [%]", "difference [%]"]
-    rows = []
-    for k, (f, zeta) in enumerate(zip(frequencies, ratios, strict=True)):
-        row: list[object] = [k + 1, number(f, 6), number(100 * zeta)]
-        if u is not None:
-            row.insert(2, half_width(u.natural_frequencies[k], f))
-            row.append(half_width(100 * u.damping_ratios[k], 100 * zeta))
-        for value, std, one_of_many in zip(share[k], share_std[k], many[k], strict=True):
-            width = half_width(std, 100.0)
-            below = (f"± {width}",) if width not in ("open", "0") else ()
-            row.append(Cell(f"{'~' if one_of_many else ''}{value:.2f}", below))
-        if known is not None:
-            f0, zeta0 = known.natural_frequencies[k], known.damping_ratios[k]
-            row += [number(f0, 6), _difference(f, f0), number(100 * zeta0), _difference(zeta, zeta0)]
-        rows.append(row)
-    sums = (f"{'~' if many[:, i].any() else ''}{total:.2f}" for i, total in enumerate(share.sum(axis=0)))
-    rows.append(["sum", *[""] * (2 if u is None else 4), *sums, *[""] * (4 if known is not None else 0)])
+    columns: list[list[object]] = [
+        ["mode", *range(1, structure.n + 1), "sum"],
+        ["frequency [Hz]", *(number(f, 6) for f in frequencies), ""],
+        ["damping [%]", *(number(100 * zeta) for zeta in ratios), ""],
+    ]
     notes = ["Effective mass in % of the rigid-body mass of its base direction."]
     if u is not None:
+        columns.insert(2, _widths(u.natural_frequencies, frequencies))
+        columns.append(_widths(100 * u.damping_ratios, 100 * ratios))
         notes.append("±: half of the 95 % interval that the noise of the records makes; 0 where it is round-off.")
         if it.measurement.response_std is None:
             notes.append("No noise is stated, so the misfit is taken for it.")
+    columns += _effective_mass_columns(it, many)
+    if reference is not None and reference.n == structure.n:
+        for name, ours, theirs, digits in (
+            ("reference [Hz]", frequencies, reference.natural_frequencies, 6),
+            ("reference damping [%]", 100 * ratios, 100 * reference.damping_ratios, 4),
+        ):
+            columns.append([name, *(number(value, digits) for value in theirs), ""])
+            columns.append(["difference [%]", *map(_difference, ours, theirs), ""])
     if many.any():
         notes.append("~: one of many values that explain the data.")
+    head, *rows = zip(*columns, strict=True)
     return table(head, rows, " ".join(notes))
+
+
+def _widths(std: Array, values: Array) -> list[object]:
+    """A column of half-widths."""
+    return ["±", *map(half_width, std, values), ""]
+
+
+def _effective_mass_columns(it: Identification, many: Array) -> Iterator[list[object]]:
+    """Effective masses of all modes and their sum, a column a base direction."""
+    share, std = it.structure.effective_mass_percent, mass_percent_std(it)
+    for i, axis in enumerate(it.measurement.base_axes or ()):
+        below = [tuple(filter(None, (known_half_width(value, 100.0, "±"),))) for value in std[:, i]]
+        cells = [Cell(f"{tilde(one)}{v:.2f}", b) for v, one, b in zip(share[:, i], many[:, i], below, strict=True)]
+        yield [f"effective mass {axis} [%]", *cells, f"{tilde(many[:, i])}{share[:, i].sum():.2f}"]
 
 
 def _rigid_body_mass(it: Identification) -> str:
@@ -266,10 +276,7 @@ def _further(it: Identification) -> str:
     parts = []
     for i, (test, structure) in enumerate(it.further_tests, start=1):
         parts.append(f"<h3>Test {i} of {len(it.further_tests)}, fitted beside the first one</h3>")
-        residual = f"Relative residual {number(test.residual(structure))}"
-        if test.force is not None:
-            residual += f", of the base force {number(test.force_residual(structure))}"
-        parts.append(paragraph(residual + "; the structure as it was then:"))
+        parts.append(paragraph(f"{_residual(test, structure)}; the structure as it was then:"))
         rows = zip(structure.natural_frequencies, 100 * structure.damping_ratios, strict=True)
         cells = [(k, number(f, 6), number(ratio)) for k, (f, ratio) in enumerate(rows, start=1)]
         parts.append(table(("mode", "frequency [Hz]", "damping [%]"), cells))
@@ -284,14 +291,21 @@ def _further(it: Identification) -> str:
     return "\n".join(parts)
 
 
+def _residual(test: Measurement, structure: Structure) -> str:
+    force = "" if test.force is None else f", of the base force {number(test.force_residual(structure))}"
+    return f"Relative residual {number(test.residual(structure))}{force}"
+
+
 def _validation(it: Identification) -> str:
     parts = []
     for i, test in enumerate(it.problem.validation):
         parts.append(f"<h3>Test {i + 1} of {len(it.problem.validation)}: predicted, never fitted</h3>")
-        residual = f"Relative residual {number(test.residual(it.structure))}"
-        if test.force is not None:
-            residual += f", of the base force {number(test.force_residual(it.structure))}"
-        parts += [paragraph(residual + "."), _score_table(it, test), _responses(it, test), _base_force(it, test)]
+        parts += [
+            paragraph(f"{_residual(test, it.structure)}."),
+            _score_table(it, test),
+            _responses(it, test),
+            _base_force(it, test),
+        ]
     if parts:
         parts.append("<h3>The test that was fitted, for comparison</h3>" + _score_table(it, it.measurement))
     return "\n".join(parts)
@@ -328,7 +342,7 @@ def _convergence(it: Identification) -> str:
         ("start", history.start, "best of the first candidates, or the start given"),
         ("swarm", history.swarm, f"{history.evaluations} candidates in {history.swarm_curve.size} iterations"),
         ("refinement", history.refinement, refined),
-        ("local phase", history.local, f"{steps} iteration{'' if steps == 1 else 's'}, exact derivatives"),
+        ("local phase", history.local, f"{counted(steps, 'iteration')}, exact derivatives"),
     ]
     ran = [[phase, number(objective), words] for phase, objective, words in rows if np.isfinite(objective)]
     parts = [picture(plot.convergence(it), f"objective through {', '.join(phase for phase, *_ in ran) or 'no search'}")]

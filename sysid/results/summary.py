@@ -6,6 +6,7 @@ import textwrap
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sysid.results.answer import Answer
 from sysid.results.unknowns_table import MANY, rows_of, stated_values
@@ -89,6 +90,22 @@ def half_width(std: float, value: float) -> str:
     return f"{DEVIATES * std:.2g}" if std > _ROUND_OFF * abs(value) else "0"
 
 
+def known_half_width(std: float, value: float, sign: str) -> str:
+    """`half_width` after a sign; empty where it is not known or round-off."""
+    width = half_width(std, value)
+    return "" if width in ("open", "0") else f"{sign} {width}"
+
+
+def tilde(many: ArrayLike) -> str:
+    """The mark of a value that is one of many."""
+    return "~" if np.any(many) else ""
+
+
+def counted(number: int, what: str) -> str:
+    """A number of things: "1 run", "2 runs"."""
+    return f"{number} {what}" + "s" * (number != 1)
+
+
 def mass_percent_std(it: Answer) -> Array:
     """Standard deviations of `Structure.effective_mass_percent`, (n, d); NaN where open or not computed."""
     u, rigid = it.quick_uncertainty, np.diag(it.structure.rigid_body_mass)
@@ -119,8 +136,8 @@ def _mode_table(it: Answer) -> list[str]:
     shares = s.effective_mass_percent
     masses, mass_widths = [], []
     for j, axis in enumerate(axes):
-        cells = [f"{'~' if many[i, j] else ''}{shares[i, j]:.1f}" for i in k]
-        masses.append([f"mass {axis}, %", *cells, f"{'~' if many[:, j].any() else ''}{shares[:, j].sum():.1f}"])
+        cells = [f"{tilde(many[i, j])}{shares[i, j]:.1f}" for i in k]
+        masses.append([f"mass {axis}, %", *cells, f"{tilde(many[:, j])}{shares[:, j].sum():.1f}"])
         mass_widths.append(["+-", *(half_width(value, 100.0) for value in std[:, j]), ""])
     both = [column for pair in zip(masses, mass_widths, strict=True) for column in pair]
     lines = _aligned(columns + both)
@@ -157,9 +174,8 @@ def _rigid_masses(it: Answer, axes: Sequence[str]) -> Iterator[str]:
     u = it.quick_uncertainty
     for i, axis in enumerate(axes):
         mass = it.structure.rigid_body_mass[i, i]
-        width = "open" if u is None else half_width(u.rigid_body_mass[i, i], mass)
-        told = "" if width in ("open", "0") else f" +- {width}"
-        yield f"{axis} {mass:.6g}{told} {'kg m²' if axis[0] == 'r' else 'kg'}"
+        told = "" if u is None else known_half_width(u.rigid_body_mass[i, i], mass, " +-")
+        yield f"{axis} {mass:.6g}{told} kg{' m²' * (axis[0] == 'r')}"
 
 
 def _ranges(it: Answer) -> Iterator[str]:
