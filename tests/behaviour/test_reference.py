@@ -45,7 +45,7 @@ def facts(name):
         "determined": it.determined,
         "residual": it.residual,
         "residuals": [it.measurement.residual(s), *(test.residual(other) for test, other in it.further_tests)],
-        "objective": own if it.x is None else it.problem.misfit_of(it.x),
+        "objective": it.objective,
         "unweighted": own,  # accelerations and force of the first test, whatever noise is stated
         "undetermined": it.undetermined,
         "closed_by": it.closed_by,
@@ -136,8 +136,12 @@ def test_the_answer_is_that_of_the_table(name, reference):
     new, old = facts(name), reference[name]
     for what in ("strategy", "success", "determined"):
         assert new[what] == old[what], what
-    for what in ("residual", "residuals", "objective"):
-        np.testing.assert_allclose(new[what], old[what], rtol=1e-9, atol=1e-9, err_msg=what)
+    # The residual was the first test's, and is that of all fitted tests together; each test's own is in `residuals`.
+    same = ("residual", "residuals", "objective") if len(old["residuals"]) == 1 else ("residuals", "objective")
+    for what in same:
+        # An exact fit may come nearer to round-off than it did: base_force left 3e-9, and leaves 3e-12.
+        exact = 1e-8 if np.max(old[what]) < 1e-8 else 1e-9
+        np.testing.assert_allclose(new[what], old[what], rtol=1e-9, atol=exact, err_msg=what)
     if not old["determined"]:
         assert_same_invariants(new, old)
         return
