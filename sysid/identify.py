@@ -89,13 +89,15 @@ def prepare(problem: Problem, session: Session) -> None:
 
 def choose(strategy: str | Strategy, problem: Problem, start: ArrayLike | Structure | None) -> tuple[Strategy, str]:
     """The strategy that is taken, and why it is."""
+    names = ", ".join(repr(name) for name in ("auto", *(kind.name for kind in STRATEGIES)))
+    if not isinstance(strategy, str | Modal | Continuation | Swarm):
+        raise InputError(f"strategy is a {type(strategy).__name__}; give one of {names}, or one with its settings")
     if not isinstance(strategy, str):
         return strategy, f"strategy {strategy.name!r}, as asked"
     if strategy != "auto":
         for kind in STRATEGIES:
             if kind.name == strategy:
                 return kind(), f"strategy {strategy!r}, as asked"
-        names = ", ".join(repr(name) for name in ("auto", *(kind.name for kind in STRATEGIES)))
         raise InputError(f"strategy {strategy!r} is unknown; give one of {names}")
     refusals: list[str] = []
     for kind in STRATEGIES:
