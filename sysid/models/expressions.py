@@ -144,7 +144,7 @@ def values_of_written(name: str, value: Any) -> Array:
 
 def cholesky(M: ca.SX | ca.MX) -> ca.SX | ca.MX:
     """Lower-triangular factor of an expression."""
-    A = ca.SX.sym("A", M.size1(), M.size1())
+    A = ca.SX.sym("A", *M.shape)
     return ca.Function("cholesky", [A], [ca.densify(ca.chol(A).T)])(M)
 
 

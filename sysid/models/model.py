@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 import casadi as ca
 import numpy as np
 
+from sysid.errors import InputError
 from sysid.models.expressions import cholesky
 from sysid.models.geometry import Geometry
 from sysid.models.unknowns import Unknown
@@ -118,12 +119,21 @@ class MatrixModel(Protocol):
 
 
 def mass_blocks(given: Any, geometry: Geometry) -> MassBlocks:
-    """All blocks of a mass, where its model gives the matrix alone."""
-    if isinstance(given, MassBlocks):
-        return given
+    """All blocks of a mass, where its model gives the matrix alone.
+
+    Raises
+    ------
+    InputError
+        Where a block has another shape, here and below.
+    """
     n, d = geometry.n, geometry.d
-    own, whole = given[:n, :n], given.shape[0] > n
-    coupling, base = (given[:n, n:], given[n:, n:]) if whole else (type(given)(n, d), type(given)(d, d))
+    if isinstance(given, MassBlocks):
+        for part, shape in zip(given[:3], ((n, n), (n, d), (d, d)), strict=True):
+            check_shape("mass", part, shape)
+        return given
+    check_shape("mass", given, (n, n), (n + d, n + d))
+    own = given[:n, :n]
+    coupling, base = (given[:n, n:], given[n:, n:]) if given.shape[0] > n else (ca.DM(n, d), ca.DM(d, d))
     return MassBlocks(cholesky(own), coupling, base, own)
 
 
@@ -132,10 +142,18 @@ def stiffness_blocks(given: Any, factor: Any) -> StiffnessBlocks:
     if isinstance(given, StiffnessBlocks):
         return given
     n = factor.shape[0]
+    check_shape("stiffness", given, (n, n))
     L, K = ca.SX.sym("L", ca.Sparsity.lower(n)), ca.SX.sym("K", n, n)
     half = ca.solve(L, K)
     mass_normalised = ca.Function("mass_normalised", [L, K], [ca.densify(ca.solve(L, half.T))])
     return StiffnessBlocks(given, mass_normalised(ca.tril(factor), given))
+
+
+def check_shape(name: str, given: Any, *shapes: tuple[int, int]) -> None:
+    """Refuse what a matrix model gives in another shape."""
+    if tuple(given.shape) not in shapes:
+        needed = " or ".join(map(str, shapes))
+        raise InputError(f"the {name} model gives a matrix of the shape {tuple(given.shape)}; {needed} is needed")
 
 
 def constant(matrix: Array) -> ca.DM:

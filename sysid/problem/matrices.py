@@ -11,7 +11,14 @@ import numpy as np
 
 from sysid.measurement.measurement import Measurement
 from sysid.models.geometry import Geometry
-from sysid.models.model import MassBlocks, MatrixModel, StiffnessBlocks, mass_blocks, stiffness_blocks
+from sysid.models.model import (
+    MassBlocks,
+    MatrixModel,
+    StiffnessBlocks,
+    check_shape,
+    mass_blocks,
+    stiffness_blocks,
+)
 from sysid.models.unknowns import Unknown
 from sysid.problem.direct_response import Motion
 from sysid.structure.structure import Array, Structure
@@ -181,6 +188,9 @@ def blocks_of(
     omega = ca.MX.sym("omega", n)
     of_modes = getattr(damping, "ratios", None)  # a model of a matrix alone need not have it
     (ratios,) = _evaluated(lambda y, w: (of_modes and of_modes(geometry, y, w),), y_damping, (omega,))
+    for part, shape in ((C, (n, n)), (ratios, (n, 1))):
+        if part is not None:
+            check_shape("damping", part, shape)
     return Blocks(made, K, empty if C is None else C, empty if ratios is None else ratios, omega)
 
 

@@ -109,3 +109,63 @@ def test_they_come_back_from_a_tree(geometry_of, model):
     assert type(back) is type(model)
     for made, expected in zip(back.unknowns(geometry), model.unknowns(geometry), strict=True):
         np.testing.assert_array_equal([made.lower, made.upper], [expected.lower, expected.upper])
+
+
+class _Given:
+    """A model of numbers, or of expressions of one unknown."""
+
+    def __init__(self, blocks, count=1):
+        self._blocks, self._count = blocks, count
+
+    def unknowns(self, geometry):
+        return (sysid.Unknown("scale", np.full(self._count, 0.5), np.full(self._count, 2.0)),) if self._count else ()
+
+    def blocks(self, geometry, y, *before):
+        return self._blocks(y)
+
+    def values(self, geometry, structure):
+        return np.ones(self._count)
+
+    def stated(self, geometry):
+        return sysid.Stated()
+
+
+def problem_of(**given):
+    test = sysid.simulate(structure(np.diag([1.0, 2, 3, 0]), ring(3)), np.linspace(5, 80, 40))
+    return sysid.Problem(test, **{"mass": np.diag([1.0, 2, 3]), "stiffness": ring(3), "damping": [0.01] * 3, **given})
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_a_model_may_give_numpy_s_arrays(count):
+    """Of unknowns, or with none."""
+    scaled = lambda A: lambda y: A * y[0] if count else A  # noqa: E731
+    k = sysid.Variable("k", lower=0.5, upper=2.0)
+    options = {} if count else {"stiffness": k * ring(3)}
+    for mass in (np.diag([1.0, 2, 3]), np.diag([1.0, 2, 3, 0.5])):
+        problem = problem_of(mass=_Given(scaled(mass), count), **options)
+        numbers = problem.formulation.matrices.numbers(np.ones(problem.n_variables))
+        np.testing.assert_allclose(numbers.mass, np.diag([1.0, 2, 3]))
+        np.testing.assert_allclose(numbers.base, [[mass[3, 3] if len(mass) > 3 else 0]])
+    problem = problem_of(stiffness=_Given(scaled(ring(3)), count), mass=k * np.diag([1.0, 2, 3]))
+    np.testing.assert_allclose(problem.formulation.matrices.numbers(np.ones(problem.n_variables)).stiffness, ring(3))
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"mass": _Given(lambda y: y[0] * np.eye(2))}, r"the mass model .* \(2, 2\); \(3, 3\) or \(4, 4\) is needed"),
+        (
+            {"mass": _Given(lambda y: sysid.MassBlocks(y[0] * np.eye(3), np.zeros((3, 2)), np.zeros((1, 1))))},
+            r"the mass model .* \(3, 2\); \(3, 1\) is needed",
+        ),
+        (
+            {"stiffness": _Given(lambda y: y[0] * np.ones((3, 4)))},
+            r"the stiffness model .* \(3, 4\); \(3, 3\) is needed",
+        ),
+        ({"damping": _Given(lambda y: y[0] * np.eye(4))}, r"the damping model .* \(4, 4\); \(3, 3\) is needed"),
+    ],
+)
+def test_a_model_that_gives_another_shape_is_refused_before_a_search(given, words):
+    problem = problem_of(**given)
+    with pytest.raises(sysid.InputError, match=words):
+        problem.check()
