@@ -285,3 +285,25 @@ class TestMistakes:
         problem = Problem(**(good | {"stiffness": SpectralStiffness()}))
         with pytest.raises(InputError, match="too few to look for"):
             problem.check()
+
+
+class TestValues:
+    """The unknowns of a structure where not every matrix is a model."""
+
+    def test_numbers_have_none_and_variables_that_enter_no_matrix_are_at_their_guess(self, random_structure):
+        truth = random_structure(np.random.default_rng(0), n=3, d=1)
+        test = sysid.simulate(truth, np.linspace(3, 70, 30))
+        u = sysid.Variable("u", 2, lower=0.0, upper=2.0, guess=[0.5, 1.5])
+        problem = Problem(test, mass=truth.mass, stiffness=truth.stiffness, residuals=[sysid.Prior(u, 1.0, 0.1)])
+        x = problem.values(truth)
+        np.testing.assert_allclose(x, [*truth.damping_ratios, 0.5, 1.5], rtol=1e-12)
+        same(problem.structure(x), truth, 1e-9)
+
+    @pytest.mark.parametrize("matrix", ["mass", "stiffness", "damping"])
+    def test_an_expression_has_no_inverse(self, random_structure, matrix):
+        truth = random_structure(np.random.default_rng(0), n=3, d=1)
+        scale = sysid.Variable("scale", lower=0.5, upper=2.0)
+        given = {"mass": truth.mass, "stiffness": truth.stiffness, "damping": truth.damping}
+        problem = Problem(sysid.simulate(truth, [5.0, 9.0]), **given | {matrix: scale * given[matrix]})
+        with pytest.raises(InputError, match=f"a {matrix} written in expressions has no inverse"):
+            problem.values(truth)

@@ -279,3 +279,25 @@ class TestExpressions:
         for term in problem.formulation.beside:
             np.testing.assert_allclose(term.squared(x), [term.error(row) ** 2 for row in x], rtol=1e-12)
             assert term.squared(x[:1]).shape == (1,)
+
+
+@pytest.mark.parametrize("damping", ["matrix", "ratios"])
+def test_noise_that_is_larger_than_stated_counts_as_large_as_it_is(damping):
+    """Three times as large: so the misfit of the truth says, to the few per cent that so many numbers tell it."""
+    lines = np.linspace(1.0, 12.0, 300)
+    x = np.array([3.0, 2.0, 1.0, *SPRINGS, 5.0, 3.0, 2.0])
+    truth = structure_of(x, np.zeros(3), damping)
+    noisy = sysid.simulate(truth, lines, noise=0.03, force=True, rng=0)
+    m, k, c = variable("m", x[:3]), variable("k", x[3:6]), variable("c", x[6:])
+    own = {"matrix": ca.diag(c) + 0.1 * c[0], "ratios": [0.01, 0.02, 0.03]}[damping]
+
+    def factor(stated):
+        test = replace(noisy, response_std=noisy.response_std * stated, force_std=noisy.force_std * stated)
+        problem = sysid.Problem(test, mass=ca.diag(m), stiffness=chain(k), damping=own)
+        term, at = problem.formulation.own_test, problem.formulation.guess
+        return term.linearised(at).std / term.linearised(at, as_stated=True).std
+
+    np.testing.assert_allclose(factor(1 / 3), 3.0, rtol=0.1)
+    np.testing.assert_allclose(factor(1.0), 1.0, rtol=0.1)
+    # Smaller than stated it counts as stated.
+    np.testing.assert_allclose(factor(3.0), 1.0, rtol=0.1)
