@@ -306,7 +306,7 @@ class Problem:
         stated, geometry = self.formulation.mass, self.geometry
         if stated.totals is not None:
             return np.diag(stated.totals.values) if stated.totals.values.ndim == 2 else stated.totals.values
-        if stated.free or (stated.entries is not None and np.any(np.isnan(stated.entries))):
+        if self._leaves_total:
             return geometry.totals(None)
         M, M_S0, M_00, *_ = self.formulation.matrices.numbers(self.formulation.guess)
         G = geometry.rigid_body
@@ -315,10 +315,13 @@ class Problem:
     @property
     def unit_mass(self) -> bool:
         """Whether no number with a unit of mass is given, so that masses are normalised to 1 kg a direction."""
-        stated = self.formulation.mass
-        scalable = stated.free or (stated.entries is not None and np.any(np.isnan(stated.entries)))
-        told = stated.totals is not None or np.nansum(np.abs(self.known_mass)) > 0
-        return bool(scalable) and not told and self.measurement.force is None
+        told = self.measurement.force is not None or np.nansum(np.abs(self.known_mass)) > 0
+        return self._leaves_total and not told
+
+    @property
+    def _leaves_total(self) -> bool:
+        """Whether the mass model could state a total, and does not: any other mass has the size that it is given."""
+        return getattr(self.mass, "total_mass", np.nan) is None
 
     @property
     def known_mass(self) -> Array:

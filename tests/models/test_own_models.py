@@ -169,3 +169,29 @@ def test_a_model_that_gives_another_shape_is_refused_before_a_search(given, word
     problem = problem_of(**given)
     with pytest.raises(sysid.InputError, match=words):
         problem.check()
+
+
+class Diagonal:
+    """Unknown masses in kg on the sensors, and zeros beside them."""
+
+    def unknowns(self, geometry):
+        return (sysid.Unknown("mass", np.full(geometry.n, 1.0), np.full(geometry.n, 5.0), unit="kg"),)
+
+    def blocks(self, geometry, y):
+        return ca.diag(y)
+
+    def values(self, geometry, structure):
+        return np.diag(structure.mass)[: geometry.n]
+
+    def stated(self, geometry):
+        entries = np.where(np.eye(geometry.n, geometry.n + geometry.d) > 0, np.nan, 0.0)
+        return sysid.Stated(entries=entries, sentence="the mass is stated to be diagonal")
+
+
+def test_masses_in_kilograms_are_not_normalised_to_one():
+    """A model without a total of its own has the size of its unknowns, here that of the guess."""
+    problem = problem_of(mass=Diagonal())
+    assert not problem.unit_mass
+    np.testing.assert_allclose(problem.totals, [9.0])
+    assert problem_of(mass=sysid.LumpedMass()).unit_mass
+    np.testing.assert_allclose(problem_of(mass=sysid.LumpedMass()).totals, [1.0])
