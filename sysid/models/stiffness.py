@@ -140,8 +140,8 @@ class ChainStiffness(FieldTree):
 
     def blocks(self, geometry: Geometry, y: ca.SX, mass: MassBlocks) -> ca.SX:
         """K_SS (n, n)."""
-        K, n = _chain_pattern(geometry), geometry.n
-        return sum((y[i] * ca.SX(ca.sparsify(ca.DM(K[i]))) for i in range(n)), ca.SX(n, n))
+        strain = ca.sparsify(ca.DM(_elongations(geometry)))
+        return strain.T @ ca.diag(y) @ strain
 
     def values(self, geometry: Geometry, structure: Structure) -> Array:
         """Spring stiffnesses of a chain's stiffness matrix."""
@@ -150,7 +150,8 @@ class ChainStiffness(FieldTree):
 
     def stated(self, geometry: Geometry) -> Stated:
         """Zeros where no spring couples; springs that do not push."""
-        pattern = np.abs(_chain_pattern(geometry)).sum(axis=0)
+        strain = np.abs(_elongations(geometry))
+        pattern = strain.T @ strain
         to_base = np.abs(_pattern_to_base(geometry))
         entries = np.where(np.hstack([pattern, to_base]) > 0, np.nan, 0.0)
         return Stated(
@@ -225,16 +226,14 @@ def _previous(geometry: Geometry) -> list[int]:
     return [max((j for j in range(i) if groups[j] == groups[i]), default=-1) for i in range(geometry.n)]
 
 
-def _chain_pattern(geometry: Geometry) -> Array:
-    """Stiffness of each unit spring, (n, n, n)."""
-    patterns, arms = np.zeros((geometry.n,) * 3), _arms(geometry)
+def _elongations(geometry: Geometry) -> Array:
+    """Elongation of each spring for unit motion of each sensor, (n, n)."""
+    arms = _arms(geometry)
+    strain = np.diag(arms)
     for i, below in enumerate(_previous(geometry)):
-        elongation = np.zeros(geometry.n)
-        elongation[i] = arms[i]
         if below >= 0:
-            elongation[below] = -arms[below]
-        patterns[i] = np.outer(elongation, elongation)
-    return patterns
+            strain[i, below] = -arms[below]
+    return strain
 
 
 def _spring_weights(geometry: Geometry) -> Array:
