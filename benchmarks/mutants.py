@@ -209,7 +209,7 @@ NOTICED = (
     Mutant("D02", "a local minimum of the residues never left",
         "if ended.of_accelerations <= _SUSPECT * min(possible for _, _, possible in fits):", "if True:", "test_local"),
     Mutant("D04", "weight of a further test ignored",
-        "weight = 1.0 if build.replaced else build.noise() / noise_level(self.measurement)",
+        "weight = 1.0 if build.replaced else build.noise() / build.noise_of(self.measurement)",
         "weight = 1.0", "test_priors::test_tests_count_by_their_noise"),
     Mutant("D05", "half the Gauss-Newton Hessian", "2 * OBJECTIVE_SCALE * factor * (J.T @ J)",
         "OBJECTIVE_SCALE * factor * (J.T @ J)", "test_variants_forms"),

@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 import sysid
 from benchmarks.line import Line, below
 from benchmarks.problem_modules import load_module
-from sysid.search.swarm_objective import SwarmCost
+from sysid.search.swarm_objective import SwarmObjective
 from sysid.swarm import SwarmSettings
 
 SEEDS = range(5)
@@ -23,7 +23,7 @@ def lines(reduced: bool) -> Iterator[Line]:
         if reduced and elements == 5:
             continue
         problem = module.problem(elements=elements)
-        cost = SwarmCost(problem)
+        cost = SwarmObjective(problem, spectrum=problem.formulation.stiffness.spectrum)
         box = np.column_stack([problem.lower, problem.upper])
         what = f"swarm alone, n = {2 * elements}, D = {problem.n_variables}, 400 iterations"
         costs = _swarm_costs(cost, box, sysid.Swarm().settings)
@@ -35,7 +35,7 @@ def lines(reduced: bool) -> Iterator[Line]:
             )
 
 
-def _swarm_costs(cost: SwarmCost, box: np.ndarray, settings: SwarmSettings) -> list[float]:
+def _swarm_costs(cost: SwarmObjective, box: np.ndarray, settings: SwarmSettings) -> list[float]:
     with threadpool_limits(limits=1):
         return [
             sysid.minimize_swarm(cost, box, rng=seed, max_iterations=400, stall_iterations=None, settings=settings).fun

@@ -210,15 +210,20 @@ class _Error:
         m, d = gamma.shape
         pull = self.shapes.T @ self.left
         gradient = ca.vertcat(*(-2 * ca.sum2(pull * v) for v in motion.vectors), ca.MX(d * d, 1))
-        onto = ca.vertcat(*(v @ motion.q.T for v in motion.vectors)) / ca.repmat(self.scale.T, m * (d + 2), 1)
-        inner = _gram(motion.vectors) - onto @ ca.solve(self.normal, onto.T)
+        modes = motion.q.T
+        onto = ca.vertcat(*(v @ modes for v in motion.vectors)) / ca.repmat(self.scale.T, m * (d + 2), 1)
+        # Records that weigh their lines alike have their products in common.
+        both = _gram([*motion.vectors, motion.base]) if self.force_motion is motion else None
+        inner = _gram(motion.vectors) if both is None else both[: m * (d + 2), : m * (d + 2)]
+        inner = inner - onto @ ca.solve(self.normal, onto.T)
         alike = ca.repmat(self.shapes.T @ self.shapes, d + 2, d + 2)
         hessian = ca.diagcat(2 * inner * alike, ca.MX(d * d, d * d))
         if self.force_motion is None:
             return gradient, hessian
         motion = self.force_motion
         full = [*motion.vectors, motion.base]
-        gram, onto = _gram(full), ca.horzcat(*(self.force_left @ v.T for v in full))
+        gram = _gram(full) if both is None else both
+        onto = ca.horzcat(*(self.force_left @ v.T for v in full))
         for j in range(d):
             blocks = [[ca.MX(m, m)] * (d + 2) for _ in range(d + 2)]
             for i in range(d + 2):
@@ -266,7 +271,8 @@ class _Motion:
 
 def _gram(blocks: list[ca.MX]) -> ca.MX:
     """Inner products of all rows of the blocks."""
-    inner = {(i, j): blocks[i] @ blocks[j].T for i in range(len(blocks)) for j in range(i + 1)}
+    turned = [block.T for block in blocks]
+    inner = {(i, j): blocks[i] @ turned[j] for i in range(len(blocks)) for j in range(i + 1)}
     return ca.vertcat(
         *(
             ca.horzcat(*(inner[i, j] if j <= i else inner[j, i].T for j in range(len(blocks))))

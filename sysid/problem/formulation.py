@@ -258,8 +258,9 @@ class Formulation:
     def beside(self) -> tuple[Term, ...]:
         """The terms beside the problem's own records, or in their place."""
         build = Builder(
-            self._function, self._matrices, lambda: self.matrices, lambda: self.noise, not self.fits_records
-        )
+            self._function, self._matrices, lambda: self.matrices, lambda: self.noise,
+            lambda test: noise_level(test, monitor=self.monitor), not self.fits_records,
+        )  # fmt: skip
         return tuple(source.term(name, build) for name, source in self.sources)
 
     @property

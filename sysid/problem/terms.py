@@ -16,7 +16,6 @@ import numpy as np
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.complex_frequency import noise_level
 from sysid.modal_analysis.response import residual
 from sysid.models.expressions import as_matrix, at_point, check_finite, written_in
 from sysid.models.geometry import Geometry
@@ -222,13 +221,15 @@ class Builder(NamedTuple):
 
     ``function(name, expressions)`` is a CasADi function of x; ``matrices(blocks, geometry)`` are matrices of x;
     ``own()`` are the problem's; ``noise()`` is the standard deviation of a number of the measurement's relative
-    residual; ``replaced`` tells whether a misfit stands in the place of the measurement's.
+    residual, ``noise_of(test)`` of a further test's; ``replaced`` tells whether a misfit stands in the place of the
+    measurement's.
     """
 
     function: Callable[[str, Sequence[ca.MX]], ca.Function]
     matrices: Callable[[Blocks, Geometry], Matrices]
     own: Callable[[], Matrices]
     noise: Callable[[], float]
+    noise_of: Callable[[Measurement], float]
     replaced: bool
 
 
@@ -289,7 +290,7 @@ class FurtherTest:
 
     def term(self, name: str, build: Builder) -> TestTerm:
         """Its records, weighed by their noise beside that of the problem's own."""
-        weight = 1.0 if build.replaced else build.noise() / noise_level(self.measurement)
+        weight = 1.0 if build.replaced else build.noise() / build.noise_of(self.measurement)
         return TestTerm(self.measurement, build.matrices(*self.blocks), weight, name=name)
 
     @property
