@@ -1,4 +1,4 @@
-"""Write the table of reference: what every bundled problem and every newcomer's problem gives.
+"""Write the table of reference: what every bundled problem and every module written from the README gives.
 
     python tests/behaviour/make_reference.py [NAME ...]
 
