@@ -1,4 +1,4 @@
-"""Variants by people who had read the README and one notebook: run as they were first written."""
+"""Problem modules that were written from the README and one notebook alone: run as they are."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every bundled problem and every module written from the README ends as it did in the table of reference (reference.json).
+"""Every bundled problem and every module written from the README ends as in the table of reference (reference.json).
 
 The table holds what strategy "auto" with seed 0 gave before the package was reorganised; `make_reference.py` writes it.
 SYSID_FULL=1 runs the problems that are left out for their time too; mini_shake_table needs its records (SYSID_DATA).
