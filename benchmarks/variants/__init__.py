@@ -1,1 +1,1 @@
-"""Variants of the problem as modules: published cases with noise, modules from the README alone, mistakes of authors."""
+"""Variants of the problem as modules: published cases with noise, modules from the README alone, authors' mistakes."""
