@@ -9,7 +9,7 @@ import scipy.stats.qmc
 
 import sysid
 from sysid.models import geometry
-from sysid.problem import formulation, problem, terms
+from sysid.problem import formulation, problem
 
 SPRINGS = np.array([2e4, 1.5e4, 1e4])
 FREQ = np.linspace(1.0, 30.0, 60)
@@ -68,7 +68,6 @@ def calls(monkeypatch):
         monkeypatch.setattr(module, name, called)
 
     counted(geometry, "find_poles")
-    counted(terms, "noise_level")
     counted(formulation, "noise_level")
     counted(problem, "weighed_mass")
     counted(ca, "nlpsol")
