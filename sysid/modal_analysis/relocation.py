@@ -15,6 +15,8 @@ from sysid.structure.structure import Array, ComplexArray
 
 _SHARE = 1e-8  # of noise in squares, below which they have not eight digits of it
 
+_FEW = 60  # channels, for which factors take no longer than squares that round-off may refuse
+
 Blocks = list[tuple[ComplexArray, ComplexArray]]  # base (inputs, n_freq) and channels (c, n_freq) of each
 
 
@@ -36,7 +38,8 @@ def relocate(
         tell()
         basis = stacked((numerators[:, None] * base).reshape(-1, w.size))
         bases.append(np.linalg.qr(basis / np.maximum(np.linalg.norm(basis, axis=0), np.finfo(float).tiny))[0])
-    rows = _rows_by_squares(blocks, bases, sigma, tell)
+    few = sum(len(channels) for _, channels in blocks) <= _FEW
+    rows = None if few else _rows_by_squares(blocks, bases, sigma, tell)
     if rows is None:
         rows = _rows_by_factors(blocks, bases, sigma, tell)
     # Relaxation: the sum of Re sigma over the lines is fixed instead of its constant term.
