@@ -16,9 +16,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError
+from sysid.models.refusal import refuse
 from sysid.structure.structure import Array
 
 _PART = 0.05  # of its range: the least step of an unknown
+
+
+def _same(x: Any) -> Any:
+    """What is searched on a linear scale."""
+    return x
 
 
 class Unknown:
@@ -33,11 +39,11 @@ class Unknown:
     unit : str
         For tables.
     sampling : callable, optional
-        CasADi expression of the swarm's coordinates (size,) to the unknowns, both in
-        [lower, upper]: where the swarm had better search another distribution than the uniform
-        one (eq. 18 of the paper). Gradient methods never see it.
+        CasADi expression of the swarm's coordinates (size,) to the unknowns, both in [lower, upper]: where the swarm
+        had better search another distribution than the uniform one (eq. 18 of the paper). Gradient methods never see
+        it.
     unsampling : callable, optional
-        Its inverse on numbers, shape (size,) to (size,).
+        Its inverse on numbers, (size,) to (size,).
     scale : str
         How the swarm spreads its candidates over the bounds, in a word: "linear", "log", "by row".
     relative : bool
@@ -67,8 +73,8 @@ class Unknown:
         upper: ArrayLike,
         *,
         unit: str = "",
-        sampling: Callable[[ca.SX], ca.SX] | None = None,
-        unsampling: Callable[[Array], Array] | None = None,
+        sampling: Callable[[ca.SX], ca.SX] = _same,
+        unsampling: Callable[[Array], Array] = _same,
         scale: str = "linear",
         relative: bool = False,
     ) -> None:
@@ -79,13 +85,12 @@ class Unknown:
         if not (np.all(np.isfinite(self.lower + self.upper)) and np.all(self.lower <= self.upper)):
             raise InputError(f"variable {name}: bounds must be finite with lower <= upper")
         self.shape: tuple[int, ...] = (self.lower.size,)
-        self._sampling, self._unsampling = sampling, unsampling
+        self.sampling, self.unsampling = sampling, unsampling
 
     @cached_property
     def guess(self) -> Array:
         """The middle of the swarm's search space."""
-        middle = (self.lower + self.upper) / 2
-        return middle if self._sampling is None else np.asarray(self.sampled()(middle)).ravel()
+        return np.asarray(self.sampled()((self.lower + self.upper) / 2)).ravel()
 
     @property
     def size(self) -> int:
@@ -102,14 +107,6 @@ class Unknown:
         """A name an entry, counted from 1: ``spring 1``."""
         return (self.title,) if self.size == 1 else tuple(f"{self.title} {i + 1}" for i in range(self.size))
 
-    def sampling(self, s: ca.SX) -> ca.SX:
-        """The unknowns that the swarm's coordinates `s` stand for, (size,) each."""
-        return s if self._sampling is None else self._sampling(s)
-
-    def unsampling(self, x: Array) -> Array:
-        """The inverse of `sampling`, on numbers."""
-        return x if self._unsampling is None else self._unsampling(x)
-
     def sampled(self) -> ca.Function:
         """`sampling` as a function of numbers."""
         s = ca.SX.sym("s", self.size)
@@ -118,6 +115,16 @@ class Unknown:
     def shaped(self, flat: Array) -> Array:
         """Numbers of its entries, column by column, as an array of its shape."""
         return np.reshape(flat, self.shape, order="F")
+
+
+def _of_symbols(operation: Callable[..., Any]) -> Callable[..., Any]:
+    """A method of `Variable` that carries out an operation on the symbols of what it is given."""
+    return lambda *operands: operation(*map(expression_of, operands))
+
+
+def _from_the_right(operation: Callable[..., Any]) -> Callable[..., Any]:
+    """The same of two operands, the variable the second of them."""
+    return lambda variable, other: operation(expression_of(other), variable.symbol)
 
 
 class Variable(Unknown):
@@ -186,32 +193,34 @@ class Variable(Unknown):
         self.name, self.log, self.fixed, self.unit = name, bool(log), bool(fixed), str(unit)
         self.scale = "log" if log else "linear"
         self.shape = self._check_shape(shape)
-        lower, upper = self._flat("lower", lower), self._flat("upper", upper)
-        self.lower, self.upper = lower, upper
-        if not (np.all(np.isfinite(lower)) and np.all(np.isfinite(upper))):
-            self._refuse(
-                "its bounds are not all finite; the search space must be bounded (state the widest you believe)"
-            )
-        if np.any(lower > upper):
-            at = int(np.argmax(lower > upper))
-            self._refuse(f"its bounds are reversed: lower {lower[at]:g} is above upper {upper[at]:g}")
-        if not fixed and np.all(lower == upper):
-            self._refuse(f"its bounds are equal ({lower[0]:g}): state fixed=True with a guess for what is known")
-        if log and np.any(lower <= 0):
-            self._refuse(f"log=True needs positive bounds, and lower is {lower.min():g}")
-        if fixed and guess is None:
-            self._refuse("fixed=True needs a guess, at which it is held")
-        self._sampling, self._unsampling = log_sampling(lower, upper) if log else (None, None)
+        self.lower, self.upper = lower, upper = self._flat("lower", lower), self._flat("upper", upper)
+        at = int(np.argmax(lower > upper))
+        self._refuse_where(
+            (
+                not np.all(np.isfinite([lower, upper])),
+                "its bounds are not all finite; the search space must be bounded (state the widest you believe)",
+            ),
+            (lower[at] > upper[at], f"its bounds are reversed: lower {lower[at]:g} is above upper {upper[at]:g}"),
+            (
+                not fixed and np.all(lower == upper),
+                f"its bounds are equal ({lower[0]:g}): state fixed=True with a guess for what is known",
+            ),
+            (log and np.any(lower <= 0), f"log=True needs positive bounds, and lower is {lower.min():g}"),
+            (fixed and guess is None, "fixed=True needs a guess, at which it is held"),
+        )
+        self.sampling, self.unsampling = log_sampling(lower, upper) if log else (_same, _same)
         middle = np.exp((np.log(lower) + np.log(upper)) / 2) if log else (lower + upper) / 2
         self.has_guess = guess is not None
-        self.guess = np.clip(middle, lower, upper) if guess is None else self._flat("guess", guess)
-        if not np.all(np.isfinite(self.guess)):
-            self._refuse("its guess is not finite")
-        if np.any((self.guess < lower) | (self.guess > upper)):
-            at = int(np.argmax((self.guess < lower) | (self.guess > upper)))
-            self._refuse(f"its guess {self.guess[at]:g} is outside the bounds {lower[at]:g} to {upper[at]:g}")
-        rows_columns = (*self.shape, 1, 1)[:2]
-        self.symbol = ca.MX.sym(self.name, *rows_columns)
+        self.guess = given = np.clip(middle, lower, upper) if guess is None else self._flat("guess", guess)
+        at = int(np.argmax((given < lower) | (given > upper)))
+        self._refuse_where(
+            (not np.all(np.isfinite(given)), "its guess is not finite"),
+            (
+                not lower[at] <= given[at] <= upper[at],
+                f"its guess {given[at]:g} is outside the bounds {lower[at]:g} to {upper[at]:g}",
+            ),
+        )
+        self.symbol = ca.MX.sym(self.name, *(*self.shape, 1, 1)[:2])
         self.order = len(_declared)
         _declared[self.symbol.__hash__()] = self
 
@@ -228,14 +237,17 @@ class Variable(Unknown):
     def _flat(self, what: str, value: ArrayLike) -> Array:
         """Entries column by column, as CasADi has them."""
         try:
-            value = np.asarray(value).reshape(self.shape) if isinstance(value, ca.DM) else value
-            array = np.broadcast_to(np.asarray(value, dtype=float), self.shape)
+            array = np.asarray(value, dtype=float)
+            array = np.broadcast_to(array.reshape(self.shape) if isinstance(value, ca.DM) else array, self.shape)
         except (TypeError, ValueError):
             self._refuse(f"{what} = {value!r} is no number, nor numbers of its shape {self.shape}")
         return array.ravel(order="F").copy()
 
     def _refuse(self, what: str) -> None:
         raise InputError(f"variable {self.name!r} ({self.declared}): {what}")
+
+    def _refuse_where(self, *mistakes: tuple[Any, str]) -> None:
+        refuse(*((made, f"variable {self.name!r} ({self.declared}): {what}") for made, what in mistakes))
 
     @property
     def title(self) -> str:
@@ -283,70 +295,18 @@ class Variable(Unknown):
         return self.shape[0]
 
     def __iter__(self) -> Any:
-        return iter([self.symbol[i, :] if len(self.shape) == 2 else self.symbol[i] for i in range(len(self))])
+        return iter([self.symbol[i, :] for i in range(len(self))])
 
-    def __pos__(self) -> ca.MX:
-        return self.symbol
-
-    def __neg__(self) -> ca.MX:
-        return -self.symbol
-
-    def __abs__(self) -> ca.MX:
-        return ca.fabs(self.symbol)
-
-    def __add__(self, other: Any) -> ca.MX:
-        return self.symbol + expression_of(other)
-
-    def __radd__(self, other: Any) -> ca.MX:
-        return expression_of(other) + self.symbol
-
-    def __sub__(self, other: Any) -> ca.MX:
-        return self.symbol - expression_of(other)
-
-    def __rsub__(self, other: Any) -> ca.MX:
-        return expression_of(other) - self.symbol
-
-    def __mul__(self, other: Any) -> ca.MX:
-        return self.symbol * expression_of(other)
-
-    def __rmul__(self, other: Any) -> ca.MX:
-        return expression_of(other) * self.symbol
-
-    def __truediv__(self, other: Any) -> ca.MX:
-        return self.symbol / expression_of(other)
-
-    def __rtruediv__(self, other: Any) -> ca.MX:
-        return expression_of(other) / self.symbol
-
-    def __pow__(self, other: Any) -> ca.MX:
-        return self.symbol ** expression_of(other)
-
-    def __rpow__(self, other: Any) -> ca.MX:
-        return expression_of(other) ** self.symbol
-
-    def __matmul__(self, other: Any) -> ca.MX:
-        return self.symbol @ expression_of(other)
-
-    def __rmatmul__(self, other: Any) -> ca.MX:
-        return expression_of(other) @ self.symbol
-
-    def __le__(self, other: Any) -> ca.MX:
-        return self.symbol <= expression_of(other)
-
-    def __ge__(self, other: Any) -> ca.MX:
-        return self.symbol >= expression_of(other)
-
-    def __lt__(self, other: Any) -> ca.MX:
-        return self.symbol < expression_of(other)
-
-    def __gt__(self, other: Any) -> ca.MX:
-        return self.symbol > expression_of(other)
-
-    def __eq__(self, other: object) -> Any:
-        return self.symbol == expression_of(other)
-
-    def __ne__(self, other: object) -> Any:
-        return self.symbol != expression_of(other)
+    __pos__, __neg__, __abs__ = _of_symbols(operator.pos), _of_symbols(operator.neg), _of_symbols(ca.fabs)
+    __add__, __radd__ = _of_symbols(operator.add), _from_the_right(operator.add)
+    __sub__, __rsub__ = _of_symbols(operator.sub), _from_the_right(operator.sub)
+    __mul__, __rmul__ = _of_symbols(operator.mul), _from_the_right(operator.mul)
+    __truediv__, __rtruediv__ = _of_symbols(operator.truediv), _from_the_right(operator.truediv)
+    __pow__, __rpow__ = _of_symbols(operator.pow), _from_the_right(operator.pow)
+    __matmul__, __rmatmul__ = _of_symbols(operator.matmul), _from_the_right(operator.matmul)
+    __lt__, __le__ = _of_symbols(operator.lt), _of_symbols(operator.le)
+    __gt__, __ge__ = _of_symbols(operator.gt), _of_symbols(operator.ge)
+    __eq__, __ne__ = _of_symbols(operator.eq), _of_symbols(operator.ne)
 
 
 # The one global of the package: a CasADi symbol knows no Python object, so this is how an expression's symbols lead
