@@ -9,19 +9,10 @@ import casadi as ca
 import numpy as np
 
 from sysid.errors import InputError
-from sysid.models.expressions import (
-    as_matrix,
-    at_point,
-    check_finite,
-    check_size,
-    is_column,
-    square,
-    values_of_written,
-    written_in,
-)
+from sysid.models.expressions import as_matrix, at_point, check_finite, is_column, written_in
 from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import Geometry
-from sysid.models.model import MassBlocks, Stated, StiffnessBlocks
+from sysid.models.model import MassBlocks, Stated, StiffnessBlocks, Written
 from sysid.models.unknowns import Unknown
 from sysid.structure.structure import Array, Structure
 
@@ -100,8 +91,7 @@ class ProportionalDamping(FieldTree):
         return Stated()
 
 
-@dataclass(frozen=True, eq=False)
-class WrittenDamping:
+class WrittenDamping(Written):
     """Damping written in variables or numbers.
 
     Parameters
@@ -110,19 +100,13 @@ class WrittenDamping:
         C (n, n) on the motion relative to the base, base rows are cut off; or one ratio a mode, (n,).
     """
 
-    written: Any
-
-    def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
-        """None of its own: its variables are the problem's."""
-        return ()
+    name = "damping"
 
     def blocks(self, geometry: Geometry, y: ca.MX, mass: MassBlocks, stiffness: StiffnessBlocks) -> ca.MX | None:
         """C (n, n), or None where ratios are written."""
         if self._by_ratios(geometry):
             return None
-        C = square("damping", self.written)
-        check_size("damping", C, geometry.n, geometry.d)
-        return C[: geometry.n, : geometry.n]
+        return self.whole(geometry)[: geometry.n, : geometry.n]
 
     def ratios(self, geometry: Geometry, y: ca.MX, omega: ca.MX) -> ca.MX | None:
         """The ratios (n,); None where C is written."""
@@ -138,21 +122,3 @@ class WrittenDamping:
     def _by_ratios(self, geometry: Geometry) -> bool:
         given, n = as_matrix("damping", self.written), geometry.n
         return given.shape == (n, 1) and (n > 1 or is_column(self.written))
-
-    def values(self, geometry: Geometry, structure: Structure) -> Array:
-        """None of its own; refused where it is written in variables."""
-        return values_of_written("damping", self.written)
-
-    def stated(self, geometry: Geometry) -> Stated:
-        """Nothing that is read off an expression."""
-        return Stated()
-
-
-def physical_damping(mass: ca.SX, mode_shapes: ca.SX, omega: ca.SX, ratios: ca.SX) -> ca.SX:
-    """Physical damping matrix ``C = M Phi diag(2 zeta w) Phi' M`` of mass-normalised modes.
-
-    Equal to ``Phi^-T diag(2 zeta w) Phi^-1`` (eq. 33) where there are as many modes as sensors;
-    with fewer, the modes that are left out are undamped. N s/m.
-    """
-    momentum = mass @ mode_shapes
-    return momentum @ ca.diag(2 * ratios * omega) @ momentum.T

@@ -15,21 +15,22 @@ from sysid.structure.structure import Array, finite_array
 
 def is_expression(value: Any) -> bool:
     """Whether a matrix is written in variables, rather than a model or numbers."""
-    if isinstance(value, Variable | ca.MX | ca.SX):
-        return True
     if isinstance(value, list | tuple):
-        return any(is_expression(entry) for entry in value)
+        return any(map(is_expression, value))
+    return isinstance(value, Variable | ca.MX | ca.SX) or _is_objects(value)
+
+
+def _is_objects(value: Any) -> bool:
+    """Whether a value is an array of Python objects, such as NumPy makes of lists of expressions."""
     return isinstance(value, np.ndarray) and value.dtype == object
 
 
 def as_matrix(name: str, value: Any) -> ca.MX:
     """An expression, numbers or rows of both, as an expression."""
-    value = expression_of(value)
-    if isinstance(value, ca.MX):
-        return value
-    if isinstance(value, ca.SX):
-        return ca.MX(ca.DM(_constant(name, value)))
-    if isinstance(value, np.ndarray) and value.dtype == object:
+    value = _without_sx(name, value)
+    if isinstance(value, ca.MX | ca.DM):
+        return ca.MX(value)
+    if _is_objects(value):
         value = value.tolist()
     if isinstance(value, list | tuple) and is_expression(value):
         rows = [row if isinstance(row, list | tuple) else [row] for row in value]
@@ -41,16 +42,12 @@ def as_matrix(name: str, value: Any) -> ca.MX:
             raise InputError(
                 f"{name} ({user_site()}): its rows do not fit together; they have {sizes} entries"
             ) from None
-    if isinstance(value, ca.DM):
-        return ca.MX(value)
     return ca.MX(ca.sparsify(ca.DM(np.atleast_1d(finite_array(name, value)))))
 
 
 def _entry(name: str, value: Any) -> Any:
     """An entry of a matrix that is given by rows."""
-    value = expression_of(value)
-    if isinstance(value, ca.SX):
-        return ca.DM(_constant(name, value))
+    value = _without_sx(name, value)
     if isinstance(value, ca.MX | ca.DM | np.ndarray) or (np.isscalar(value) and not isinstance(value, str | bytes)):
         return value
     raise InputError(
@@ -58,12 +55,15 @@ def _entry(name: str, value: Any) -> Any:
     )
 
 
-def _constant(name: str, value: ca.SX) -> ca.SX:
-    if not value.is_constant():
-        raise InputError(
-            f"{name} ({user_site()}) is a CasADi SX with symbols of its own: write it in sysid.Variable (or MX)"
-        )
-    return value
+def _without_sx(name: str, value: Any) -> Any:
+    """The symbol of a variable, the numbers of a constant SX, and anything else as it is."""
+    if not isinstance(value, ca.SX):
+        return expression_of(value)
+    if value.is_constant():
+        return ca.DM(value)
+    raise InputError(
+        f"{name} ({user_site()}) is a CasADi SX with symbols of its own: write it in sysid.Variable (or MX)"
+    )
 
 
 def square(name: str, value: Any) -> ca.MX:
@@ -71,12 +71,9 @@ def square(name: str, value: Any) -> ca.MX:
     matrix = as_matrix(name, value)
     if matrix.size1() != matrix.size2():
         raise InputError(f"{name} is {size_of(matrix)}, and a square matrix is needed{written_in(matrix)}")
-    for place, numbers in (
-        ("at the guess", at_point(name, matrix, None)),
-        ("away from the guess", at_point(name, matrix, 0.37)),
-    ):
-        if place == "at the guess":
-            check_finite(name, numbers, matrix)
+    at_guess = at_point(name, matrix, None)
+    check_finite(name, at_guess, matrix)
+    for place, numbers in (("at the guess", at_guess), ("away from the guess", at_point(name, matrix, 0.37))):
         size = np.sqrt(np.abs(np.diag(numbers)))
         off = np.abs(numbers - numbers.T)
         if np.any(off > 1e-9 * (np.outer(size, size) + np.abs(numbers).max())):
@@ -90,13 +87,13 @@ def square(name: str, value: Any) -> ca.MX:
 
 
 def check_finite(name: str, numbers: Array, expression: ca.MX) -> None:
-    """Refuse what is no number at the guess."""
-    bad = np.argwhere(~np.isfinite(numbers))
-    if bad.size:
-        at = tuple(int(i) for i in bad[0])
-        entry = expression[at[0], at[1]] if len(at) == 2 else expression[at[0]]
-        where = f"[{', '.join(map(str, at))}] " if numbers.size > 1 else ""
-        raise InputError(f"{name} {where}is {numbers[tuple(bad[0])]:g} at the guess{written_in(entry)}")
+    """Refuse what is no number at the guess: a matrix, or the numbers (size,) of a column."""
+    bad = np.argwhere(~np.isfinite(numbers)).tolist()
+    if bad:
+        at = bad[0]
+        where = f"{at} " if numbers.size > 1 else ""
+        entry = expression[tuple([*at, 0][:2])]
+        raise InputError(f"{name} {where}is {numbers[tuple(at)]:g} at the guess{written_in(entry)}")
 
 
 def written_in(expression: ca.MX) -> str:
@@ -111,35 +108,21 @@ def written_in(expression: ca.MX) -> str:
 def at_point(name: str, expression: ca.MX, share: float | None) -> Array:
     """Numbers of an expression with its variables at their guesses, or at this share of their search space."""
     symbols = ca.symvar(expression)
-    found = [variable_of(symbol) for symbol in symbols]
-    check_free(name, symbols, found)
-    values = [v.guess if share is None else v.lower + share * (v.upper - v.lower) for v in found if v is not None]
+    variables = variables_of(name, symbols)
+    values = [v.guess if share is None else v.lower + share * (v.upper - v.lower) for v in variables]
     shaped = [ca.reshape(ca.DM(value), *symbol.shape) for value, symbol in zip(values, symbols, strict=True)]
     return np.asarray(ca.densify(ca.Function("at", symbols, [expression]).call(shaped)[0]))
 
 
-def check_free(name: str, symbols: Sequence[ca.MX], found: Sequence[Variable | None]) -> None:
-    """Refuse symbols that are no variables."""
-    free = [symbol.name() for symbol, variable in zip(symbols, found, strict=True) if variable is None]
+def variables_of(name: str, symbols: Sequence[ca.MX]) -> list[Variable]:
+    """The variables that symbols stand for; refused where one stands for none."""
+    free = [repr(symbol.name()) for symbol in symbols if variable_of(symbol) is None]
     if free:
         raise InputError(
-            f"{', '.join(map(repr, free))} in {name} ({user_site()}) is a free CasADi symbol: declare it "
-            "as a sysid.Variable with bounds"
+            f"{', '.join(free)} in {name} ({user_site()}) is a free CasADi symbol: declare it as a sysid.Variable "
+            "with bounds"
         )
-
-
-def values_of_written(name: str, value: Any) -> Array:
-    """The unknowns of a written matrix's own: none.
-
-    Raises
-    ------
-    InputError
-        Where it is written in variables that are searched: an expression has no inverse.
-    """
-    found = map(variable_of, ca.symvar(as_matrix(name, value)))
-    if any(v is not None and not v.fixed for v in found):
-        raise InputError(f"a {name} written in expressions has no inverse: give the unknowns, not a Structure")
-    return np.zeros(0)
+    return [variable for variable in map(variable_of, symbols) if variable is not None]
 
 
 def cholesky(M: ca.SX | ca.MX) -> ca.SX | ca.MX:
@@ -150,11 +133,9 @@ def cholesky(M: ca.SX | ca.MX) -> ca.SX | ca.MX:
 
 def is_column(damping: Any) -> bool:
     """Whether a matrix was given in one dimension, as damping ratios are."""
-    if isinstance(damping, Variable):
-        return len(damping.shape) == 1
     if isinstance(damping, list | tuple):
         return not any(isinstance(entry, list | tuple) for entry in damping)
-    return isinstance(damping, np.ndarray) and damping.ndim == 1
+    return len(getattr(damping, "shape", ())) == 1
 
 
 def check_size(name: str, matrix: ca.MX, n: int, d: int) -> None:

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError
-from sysid.models.expressions import check_size, square, values_of_written
 from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import FACTOR_FLOOR, Geometry
-from sysid.models.model import MassBlocks, Stated, Totals, constant
+from sysid.models.model import MassBlocks, Stated, Totals, Written, constant
 from sysid.models.unknowns import Unknown
 from sysid.structure.structure import Array, Structure, finite_array
 from sysid.structure.triangular import lower_triangle, triangle_entries
@@ -44,7 +43,7 @@ def spread_rows(x: ca.SX | Array, exponents: Array) -> ca.SX | Array:
 
 def gather_rows(y: Array, exponents: Array) -> Array:
     """Inverse of `spread_rows` on numbers."""
-    return np.sign(y) * (1 - (1 - np.minimum(np.abs(y), 1.0)) ** (1 / exponents))
+    return spread_rows(y, 1 / exponents)
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,35 +265,14 @@ class KnownMass(FieldTree):
         return matrix
 
 
-@dataclass(frozen=True, eq=False)
-class WrittenMass:
-    """A mass matrix written in variables.
+class WrittenMass(Written):
+    """A mass matrix written in variables."""
 
-    Parameters
-    ----------
-    written : expression
-        (n, n), or with the base's rows last (n + d, n + d).
-    """
-
-    written: Any
-
-    def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
-        """None of its own: its variables are the problem's."""
-        return ()
+    name = "mass"
 
     def blocks(self, geometry: Geometry, y: ca.MX) -> ca.MX:
         """The expression; no coupling and no base mass where it has no base rows."""
-        whole = square("mass", self.written)
-        check_size("mass", whole, geometry.n, geometry.d)
-        return whole
-
-    def values(self, geometry: Geometry, structure: Structure) -> Array:
-        """None of its own; refused where it is written in variables."""
-        return values_of_written("mass", self.written)
-
-    def stated(self, geometry: Geometry) -> Stated:
-        """Nothing that is read off an expression."""
-        return Stated()
+        return self.whole(geometry)
 
 
 def total_of(geometry: Geometry, mass: Array, kind: str) -> Array:

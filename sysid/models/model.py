@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import casadi as ca
 import numpy as np
 
 from sysid.errors import InputError
-from sysid.models.expressions import cholesky
+from sysid.models.expressions import as_matrix, check_size, cholesky, square
 from sysid.models.geometry import Geometry
-from sysid.models.unknowns import Unknown
+from sysid.models.unknowns import Unknown, variable_of
 from sysid.structure.structure import Array, Structure
 
 
@@ -116,6 +116,42 @@ class MatrixModel(Protocol):
 
     def stated(self, geometry: Geometry) -> Stated:
         """What is stated of the matrix."""
+
+
+@dataclass(frozen=True, eq=False)
+class Written:
+    """A matrix written in variables or numbers; each subclass has the blocks of one matrix.
+
+    Parameters
+    ----------
+    written : expression or array_like
+        (n, n), or with the base's rows last (n + d, n + d).
+    """
+
+    written: Any
+
+    name: ClassVar[str]  # of the matrix
+
+    def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
+        """None of its own: its variables are the problem's."""
+        return ()
+
+    def whole(self, geometry: Geometry) -> ca.MX:
+        """The matrix as it is written, square, symmetric and finite at the guess."""
+        matrix = square(self.name, self.written)
+        check_size(self.name, matrix, geometry.n, geometry.d)
+        return matrix
+
+    def values(self, geometry: Geometry, structure: Structure) -> Array:
+        """None of its own; refused where it is written in variables, because an expression has no inverse."""
+        found = map(variable_of, ca.symvar(as_matrix(self.name, self.written)))
+        if any(v is not None and not v.fixed for v in found):
+            raise InputError(f"a {self.name} written in expressions has no inverse: give the unknowns, not a Structure")
+        return np.zeros(0)
+
+    def stated(self, geometry: Geometry) -> Stated:
+        """Nothing that is read off an expression."""
+        return Stated()
 
 
 def mass_blocks(given: Any, geometry: Geometry) -> MassBlocks:

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError
-from sysid.models.expressions import at_point, check_size, square, values_of_written, written_in
+from sysid.models.expressions import at_point, written_in
 from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import FACTOR_FLOOR, Geometry
-from sysid.models.model import MassBlocks, Stated, StiffnessBlocks
+from sysid.models.model import MassBlocks, Stated, StiffnessBlocks, Written
 from sysid.models.unknowns import Unknown, log_sampling
 from sysid.structure.structure import Array, Structure, finite_array
 from sysid.structure.triangular import lower_triangle, triangle_entries
@@ -159,38 +158,17 @@ class ChainStiffness(FieldTree):
         )
 
 
-@dataclass(frozen=True, eq=False)
-class WrittenStiffness:
-    """A stiffness matrix written in variables or numbers.
+class WrittenStiffness(Written):
+    """A stiffness matrix written in variables or numbers."""
 
-    Parameters
-    ----------
-    written : expression or array_like
-        (n, n), or with the base's rows last (n + d, n + d).
-    """
-
-    written: Any
-
-    def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
-        """None of its own: its variables are the problem's."""
-        return ()
+    name = "stiffness"
 
     def blocks(self, geometry: Geometry, y: ca.MX, mass: MassBlocks) -> ca.MX:
         """K_SS (n, n)."""
-        n = geometry.n
-        whole = square("stiffness", self.written)
-        check_size("stiffness", whole, n, geometry.d)
-        if whole.size1() > n:
+        whole = self.whole(geometry)
+        if whole.size1() > geometry.n:
             check_rigid(whole, geometry.rigid_body)
-        return whole[:n, :n]
-
-    def values(self, geometry: Geometry, structure: Structure) -> Array:
-        """None of its own; refused where it is written in variables."""
-        return values_of_written("stiffness", self.written)
-
-    def stated(self, geometry: Geometry) -> Stated:
-        """Nothing that is read off an expression."""
-        return Stated()
+        return whole[: geometry.n, : geometry.n]
 
 
 def check_rigid(stiffness: ca.MX, rigid_body: Array) -> None:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.complex_frequency import noise_level
-from sysid.models.expressions import as_matrix, check_free, written_in
+from sysid.models.expressions import as_matrix, variables_of, written_in
 from sysid.models.geometry import Geometry
 from sysid.models.model import MatrixModel, Stated
 from sysid.models.unknowns import (
@@ -31,7 +31,6 @@ from sysid.models.unknowns import (
     split,
     upper_of,
     user_site,
-    variable_of,
 )  # fmt: skip
 from sysid.problem.matrices import Blocks, Matrices, blocks_of, symbols_in
 from sysid.problem.terms import Builder, ExpressionTerm, Prior, Residual, Term, TermSource, TestTerm, column_of
@@ -440,13 +439,8 @@ def _contain(expressions: Sequence[ca.MX], symbols: set[int]) -> bool:
 
 def _variables(expressions: Sequence[ca.MX]) -> tuple[Variable, ...]:
     """The variables of expressions, in the order of their declaration; refused where a symbol is none."""
-    found: dict[int, Variable] = {}
-    for expression in expressions:
-        symbols = ca.symvar(expression)
-        variables = [variable_of(symbol) for symbol in symbols]
-        check_free("healing", symbols, variables)
-        found |= {s.__hash__(): v for s, v in zip(symbols, variables, strict=True) if v is not None}
-    return tuple(sorted(found.values(), key=lambda variable: variable.order))
+    found = {variable for e in expressions for variable in variables_of("healing", ca.symvar(e))}
+    return tuple(sorted(found, key=lambda variable: variable.order))
 
 
 def _check_names(unknowns: Sequence[Unknown]) -> None:

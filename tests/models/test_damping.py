@@ -6,7 +6,7 @@ import pytest
 
 import sysid
 from sysid import InputError, ModalDamping, ProportionalDamping
-from sysid.models.damping import WrittenDamping, physical_damping
+from sysid.models.damping import WrittenDamping
 from sysid.models.model import MassBlocks, StiffnessBlocks
 
 SEEDS = range(5)
@@ -17,24 +17,11 @@ def numbers(expression):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_physical_damping_is_eq_33(random_structure, seed):
+def test_the_damping_of_ratios_is_eq_33(random_structure, seed):
     s = random_structure(np.random.default_rng(seed), n=5, d=2)
-    omega, n = 2 * np.pi * s.natural_frequencies, s.n
-    C = numbers(physical_damping(*(ca.DM(v) for v in (s.mass[:n, :n], s.mode_shapes, omega, s.damping_ratios))))
     inverse = np.linalg.inv(s.mode_shapes)
-    expected = inverse.T @ np.diag(2 * s.damping_ratios * omega) @ inverse
-    np.testing.assert_allclose(C, expected, atol=1e-10 * np.abs(expected).max())
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_with_fewer_modes_those_left_out_are_undamped(random_structure, seed):
-    s = random_structure(np.random.default_rng(seed), n=5, d=2)
-    omega, n, m = 2 * np.pi * s.natural_frequencies, s.n, 3
-    pieces = (s.mass[:n, :n], s.mode_shapes[:, :m], omega[:m], s.damping_ratios[:m])
-    C = numbers(physical_damping(*(ca.DM(v) for v in pieces)))
-    modal = s.mode_shapes.T @ C @ s.mode_shapes
-    expected = np.diag([*(2 * s.damping_ratios * omega)[:m], 0, 0])
-    np.testing.assert_allclose(modal, expected, atol=1e-10 * expected.max())
+    expected = inverse.T @ np.diag(2 * s.damping_ratios * 2 * np.pi * s.natural_frequencies) @ inverse
+    np.testing.assert_allclose(s.damping, expected, atol=1e-10 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("seed", SEEDS)
