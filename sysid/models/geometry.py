@@ -146,36 +146,37 @@ class Geometry:
 
     def totals(self, total_mass: ArrayLike | None) -> Array:
         """Total mass in each base direction, (d,): kg, or kg m² where the direction is a rotation."""
-        if total_mass is None and self.weighed is not None:
-            return self.weighed
         if total_mass is None:
-            # Unit mass; a rotation carries it at the radius of gyration of the sensors.
-            lever = np.sqrt(np.mean(self.rigid_body**2, axis=0))
-            return np.where(self.translational, 1.0, np.where(lever > 0, lever**2, 1.0))
-        whole = self.rigid_total(total_mass)
-        given = finite_array("total_mass", total_mass) if whole is None else np.diag(whole)
-        if given.ndim == 0:
-            if not np.all(self.translational):
-                raise InputError(
-                    f"total_mass = {given:g} kg is one number but the base also rotates; "
-                    f"give {self.d} numbers, kg for translations and kg m² for rotations"
-                )
-            given = np.full(self.d, float(given))
-        if given.shape != (self.d,):
+            return self._unstated_totals if self.weighed is None else self.weighed
+        given = finite_array("total_mass", total_mass)
+        whole = self.rigid_total(given)
+        if whole is not None:
+            return np.diag(whole)
+        if given.ndim == 0 and not np.all(self.translational):
+            raise InputError(
+                f"total_mass = {given:g} kg is one number but the base also rotates; "
+                f"give {self.d} numbers, kg for translations and kg m² for rotations"
+            )
+        if given.shape not in ((), (self.d,)):
             raise InputError(
                 f"total_mass has shape {given.shape}; one number, ({self.d},) or ({self.d}, {self.d}) is needed"
             )
+        given = np.full(self.d, given)
         if np.any(given <= 0):
             raise InputError(f"total_mass = {np.array2string(given)}: masses must be positive")
         return given
 
+    @property
+    def _unstated_totals(self) -> Array:
+        """Unit mass, (d,); a rotation carries it at the radius of gyration of the sensors."""
+        lever = np.where(self.translational, 1.0, np.sqrt(np.mean(self.rigid_body**2, axis=0)))
+        return np.where(lever > 0, lever**2, 1.0)
+
     def rigid_total(self, total_mass: ArrayLike | None) -> Array | None:
         """The rigid-body mass (d, d) where all of it is stated, else None."""
-        if total_mass is None:
+        if total_mass is None or np.ndim(total_mass) < 2:
             return None
         given = finite_array("total_mass", total_mass)
-        if given.ndim < 2:
-            return None
         if given.shape != (self.d, self.d):
             raise InputError(f"total_mass has shape {given.shape}; ({self.d}, {self.d}) is needed of a rigid-body mass")
         if np.any(np.diag(given) <= 0):

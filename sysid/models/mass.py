@@ -194,7 +194,7 @@ class LumpedMass(FieldTree):
         scales = {
             i: totals[i] / ca.sum1(share[np.flatnonzero(groups == i).tolist()]) for i in set(groups.tolist()) - {-1}
         }
-        free = sum(scales.values()) / max(len(scales), 1) if scales else 1.0
+        free = sum(scales.values()) / len(scales) if scales else 1.0
         masses = [share[j] * scales.get(g, free) for j, g in enumerate(groups.tolist())]
         return MassBlocks(
             ca.diag(ca.sqrt(ca.vertcat(*masses))), ca.SX(geometry.n, geometry.d), ca.SX(geometry.d, geometry.d)
@@ -277,15 +277,10 @@ class WrittenMass(Written):
 
 def total_of(geometry: Geometry, mass: Array, kind: str) -> Array:
     """What a kind of healing calls the total of `mass` (n + d, n + d), (d,)."""
-    if kind == "rigid_body":
-        return rigid_body_masses(geometry, mass)
+    if kind == "rigid_body":  # the diagonal of [G; I]' M [G; I]
+        rigid = np.vstack([geometry.rigid_body, np.eye(geometry.d)])
+        return np.einsum("ni,nm,mi->i", rigid, mass, rigid)
     return np.array([mass.diagonal()[geometry.directions == i].sum() for i in range(geometry.d)])
-
-
-def rigid_body_masses(geometry: Geometry, mass: Array) -> Array:
-    """Diagonal of ``[G; I]' M [G; I]``, (d,)."""
-    rigid = np.vstack([geometry.rigid_body, np.eye(geometry.d)])
-    return np.einsum("ni,nm,mi->i", rigid, mass, rigid)
 
 
 def heal(factor: ca.SX, geometry: Geometry, totals: ca.SX | Array, kind: str) -> ca.SX:
@@ -294,17 +289,16 @@ def heal(factor: ca.SX, geometry: Geometry, totals: ca.SX | Array, kind: str) ->
     Rows of no direction take the mean of the scales: their mass has no total to obey.
     """
     d, groups = geometry.d, geometry.directions
-    members = [np.flatnonzero(groups == i).tolist() for i in range(d)]
-    if kind == "trace":
-        scales = [ca.sqrt(totals[i] / ca.sumsqr(factor[rows, :])) for i, rows in enumerate(members)]
+    if kind == "rigid_body":
+        scales = _rigid_body_scales(factor, geometry, totals)
     else:
-        scales = _rigid_body_scales(factor, geometry, totals, members)
-    free = sum(scales) / d
-    by_row = ca.vertcat(*(scales[g] if g >= 0 else free for g in groups.tolist()))
-    return ca.diag(by_row) @ factor
+        members = [np.flatnonzero(groups == i).tolist() for i in range(d)]
+        scales = [ca.sqrt(totals[i] / ca.sumsqr(factor[rows, :])) for i, rows in enumerate(members)]
+    of_groups = [*scales, sum(scales) / d]  # -1, no direction, is the last
+    return ca.diag(ca.vertcat(*(of_groups[g] for g in groups.tolist()))) @ factor
 
 
-def _rigid_body_scales(factor: ca.SX, geometry: Geometry, totals: ca.SX | Array, members: list[list[int]]) -> list:
+def _rigid_body_scales(factor: ca.SX, geometry: Geometry, totals: ca.SX | Array) -> list[ca.SX]:
     """Scales s with ``r_i' D(s) M D(s) r_i = totals[i]`` for every direction i, r_i column i of [G; I].
 
     Where no sensor's row of G has two entries the equations are uncoupled and closed. Otherwise
@@ -313,18 +307,11 @@ def _rigid_body_scales(factor: ca.SX, geometry: Geometry, totals: ca.SX | Array,
     """
     d, groups = geometry.d, geometry.directions
     rigid = np.vstack([geometry.rigid_body, np.eye(d)])
-    free = np.flatnonzero(groups < 0).tolist()
-    # Total i is |sum_a s_a row_a|² with row_a = (part of r_i in group a)' L; Gram matrices hold all.
-    grams = []
-    for i in range(d):
-        parts = []
-        for rows in members:
-            part = ca.SX(rigid[rows, i]).T @ factor[rows, :]
-            if free:
-                part = part + ca.SX(rigid[free, i]).T @ factor[free, :] / d
-            parts.append(part)
-        stacked = ca.vertcat(*parts)
-        grams.append(stacked @ stacked.T / totals[i])
+    # Total i is |sum_a s_a row_a|² with row_a = (part of r_i in group a)' L; Gram matrices hold all. Rows of no
+    # direction have an equal part in each group.
+    shares = np.where(groups < 0, 1 / d, groups == np.arange(d)[:, None])
+    parts = [constant(shares * rigid[:, i]) @ factor for i in range(d)]
+    grams = [part @ part.T / totals[i] for i, part in enumerate(parts)]
     own = ca.vertcat(*(1 / ca.sqrt(gram[i, i]) for i, gram in enumerate(grams)))
     if not any(np.any(rigid[groups != i, i]) for i in range(d)):
         return ca.vertsplit(own)

@@ -17,19 +17,16 @@ _OWN: dict[str, Any] = {
         FullMass, LumpedMass, KnownMass, SpectralStiffness, ChainStiffness, ModalDamping, ProportionalDamping,
     )
 }  # fmt: skip
+_TREE, _MODEL = ("to_tree", "from_tree"), ("unknowns", "blocks", "values", "stated")
 
 
 def is_storable(model: Any) -> bool:
     """Whether something is a model: its class has `to_tree` and `from_tree`, or the methods of a matrix model."""
-    return _has_tree(type(model)) or _is_model(type(model))
+    return _has(type(model), _TREE) or _has(type(model), _MODEL)
 
 
-def _has_tree(kind: type) -> bool:
-    return all(callable(getattr(kind, name, None)) for name in ("to_tree", "from_tree"))
-
-
-def _is_model(kind: type) -> bool:
-    return all(callable(getattr(kind, name, None)) for name in ("unknowns", "blocks", "values", "stated"))
+def _has(kind: type, methods: tuple[str, ...]) -> bool:
+    return all(callable(getattr(kind, name, None)) for name in methods)
 
 
 def model_to_tree(model: Any) -> dict[str, Any]:
@@ -47,13 +44,13 @@ def model_to_tree(model: Any) -> dict[str, Any]:
             "other program finds it; move the class to the top of its module"
         )
     name = kind.__name__ if _OWN.get(kind.__name__) is kind else f"{kind.__module__}:{kind.__qualname__}"
-    return {"kind": name, "fields": model.to_tree() if _has_tree(kind) else _attributes(model)}
+    return {"kind": name, "fields": model.to_tree() if _has(kind, _TREE) else _attributes(model)}
 
 
 def _attributes(model: Any) -> dict[str, Any]:
     """Attributes of a model whose class tells no tree of its own."""
     try:
-        if _is_model(type(model)):
+        if _has(type(model), _MODEL):
             return {name: plain(value) for name, value in vars(model).items()}
     except (TypeError, ValueError):
         pass
@@ -75,7 +72,7 @@ def model_from_tree(tree: dict[str, Any]) -> Any:
     if not colon and name not in _OWN:
         raise InputError(f"model {name!r} is unknown to this sysid: a later one is needed")
     kind = _imported(module, name) if colon else _OWN[name]
-    if _has_tree(kind):
+    if _has(kind, _TREE):
         return kind.from_tree(tree["fields"])
     model = object.__new__(kind)
     vars(model).update(tree["fields"])
@@ -88,7 +85,7 @@ def _imported(module: str, name: str) -> Any:
         kind: Any = importlib.import_module(module)
         for part in name.split("."):
             kind = getattr(kind, part)
-        if isinstance(kind, type) and (_has_tree(kind) or _is_model(kind)):
+        if isinstance(kind, type) and (_has(kind, _TREE) or _has(kind, _MODEL)):
             return kind
         problem = "it is no class of a matrix model"
     except Exception as error:  # a module of the user's may fail in any way

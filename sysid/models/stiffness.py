@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError
 from sysid.models.expressions import at_point, written_in
 from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import FACTOR_FLOOR, Geometry
 from sysid.models.model import MassBlocks, Stated, StiffnessBlocks, Written
+from sysid.models.refusal import refuse
 from sysid.models.unknowns import Unknown, log_sampling
 from sysid.structure.structure import Array, Structure, finite_array
 from sysid.structure.triangular import lower_triangle, triangle_entries
@@ -47,38 +48,41 @@ class SpectralStiffness(FieldTree):
         if self.natural_frequencies is None:
             return geometry.poles.omega[: geometry.n]
         given = np.atleast_1d(finite_array("natural_frequencies", self.natural_frequencies))
-        if given.ndim != 1 or given.size == 0 or np.any(given <= 0):
-            raise InputError("natural_frequencies must be a list of positive numbers in Hz")
-        if np.any(np.diff(given) < 0):
-            raise InputError("natural_frequencies must be in ascending order")
-        if given.size > geometry.n:
-            raise InputError(
-                f"{given.size} natural frequencies are given for {geometry.n} sensors; at most {geometry.n} fit"
-            )
+        n = geometry.n
+        refuse(
+            (
+                given.ndim != 1 or given.size == 0 or np.any(given <= 0),
+                "natural_frequencies must be a list of positive numbers in Hz",
+            ),
+            (np.any(np.diff(given) < 0), "natural_frequencies must be in ascending order"),
+            (given.size > n, f"{given.size} natural frequencies are given for {n} sensors; at most {n} fit"),
+        )
         return 2 * np.pi * given
 
     def limit(self, geometry: Geometry) -> float:
         """Bound on the frequencies of an n-degree-of-freedom model, rad/s (w_lim of eq. 37)."""
         targets, n = self.targets(geometry), geometry.n
-        if self.max_frequency is None:
-            if targets.size == n:
-                return float(targets[-1])
-            if self.natural_frequencies is None:
-                # With fewer modes in the data than sensors nothing tells the model's other frequencies.
-                return float(max(2 * np.pi * geometry.test.freq[-1], targets[-1]))
-            raise InputError(
-                f"{targets.size} natural frequencies are given for {n} sensors: "
-                "state max_frequency (Hz), at or above the highest frequency of the whole model"
+        if self.max_frequency is not None:
+            limit = 2 * np.pi * float(finite_array("max_frequency", self.max_frequency))
+            given = f"max_frequency = {self.max_frequency:g} Hz"
+            refuse(
+                (limit <= 0, f"{given}: a positive number is needed"),
+                (
+                    limit < targets[-1],
+                    f"{given} is below the given natural frequency {targets[-1] / (2 * np.pi):g} Hz: the truth would "
+                    "lie outside the search space",
+                ),
             )
-        if not finite_array("max_frequency", self.max_frequency) > 0:
-            raise InputError(f"max_frequency = {self.max_frequency:g} Hz: a positive number is needed")
-        limit = 2 * np.pi * float(self.max_frequency)
-        if limit < targets[-1]:
-            raise InputError(
-                f"max_frequency = {self.max_frequency:g} Hz is below the given natural frequency "
-                f"{targets[-1] / (2 * np.pi):g} Hz: the truth would lie outside the search space"
-            )
-        return limit
+            return limit
+        if targets.size == n:
+            return float(targets[-1])
+        if self.natural_frequencies is None:
+            # With fewer modes in the data than sensors nothing tells the model's other frequencies.
+            return float(max(2 * np.pi * geometry.test.freq[-1], targets[-1]))
+        raise InputError(
+            f"{targets.size} natural frequencies are given for {n} sensors: "
+            "state max_frequency (Hz), at or above the highest frequency of the whole model"
+        )
 
     def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """Entries of L_H, row by row, rad/s (eq. 37)."""
@@ -130,12 +134,8 @@ class ChainStiffness(FieldTree):
             raise InputError(f"ChainStiffness: bounds are one number, or one a sensor ({geometry.n}), in N/m") from None
         if not (np.all(np.isfinite(high)) and np.all(low > 0) and np.all(low < high)):
             raise InputError("ChainStiffness: bounds must be finite with 0 < lower < upper (N/m)")
-        sampling, unsampling = log_sampling(low, high)
-        return (
-            Unknown(
-                "spring", low, high, unit="N/m", sampling=sampling, unsampling=unsampling, scale="log",
-            ),
-        )  # fmt: skip
+        to, back = log_sampling(low, high)
+        return (Unknown("spring", low, high, unit="N/m", sampling=to, unsampling=back, scale="log"),)
 
     def blocks(self, geometry: Geometry, y: ca.SX, mass: MassBlocks) -> ca.SX:
         """K_SS (n, n)."""
@@ -151,7 +151,8 @@ class ChainStiffness(FieldTree):
         """Zeros where no spring couples; springs that do not push."""
         strain = np.abs(_elongations(geometry))
         pattern = strain.T @ strain
-        to_base = np.abs(_pattern_to_base(geometry))
+        # The first spring of a chain ties its sensor to the base.
+        to_base = np.where(_previous(geometry)[:, None] < 0, np.abs(geometry.rigid_body), 0.0)
         entries = np.where(np.hstack([pattern, to_base]) > 0, np.nan, 0.0)
         return Stated(
             entries=entries, positive=_spring_weights(geometry), sentence="the stiffness is stated to be a chain"
@@ -198,35 +199,25 @@ def _arms(geometry: Geometry) -> Array:
     return arms
 
 
-def _previous(geometry: Geometry) -> list[int]:
-    """The sensor below each one in its chain; -1 for the base."""
+def _previous(geometry: Geometry) -> NDArray[np.int_]:
+    """The sensor below each one in its chain, (n,); -1 for the base."""
     groups = geometry.directions[: geometry.n].tolist()
-    return [max((j for j in range(i) if groups[j] == groups[i]), default=-1) for i in range(geometry.n)]
+    return np.array([max((j for j in range(i) if groups[j] == group), default=-1) for i, group in enumerate(groups)])
 
 
 def _elongations(geometry: Geometry) -> Array:
     """Elongation of each spring for unit motion of each sensor, (n, n)."""
-    arms = _arms(geometry)
-    strain = np.diag(arms)
-    for i, below in enumerate(_previous(geometry)):
-        if below >= 0:
-            strain[i, below] = -arms[below]
+    arms, below = _arms(geometry), _previous(geometry)
+    strain, between = np.diag(arms), np.flatnonzero(below >= 0)
+    strain[between, below[between]] = -arms[below[between]]
     return strain
 
 
 def _spring_weights(geometry: Geometry) -> Array:
     """Weights W with ``spring_i = sum(W_i * K_SS)``, (n, n, n)."""
-    weights, arms = np.zeros((geometry.n,) * 3), _arms(geometry)
-    for i, below in enumerate(_previous(geometry)):
-        # A spring is minus the coupling to the sensor below, or what the row adds up to at the base.
-        if below < 0:
-            weights[i, i] = arms[i] * arms
-        else:
-            weights[i, i, below] = -arms[i] * arms[below]
+    weights, arms, below = np.zeros((geometry.n,) * 3), _arms(geometry), _previous(geometry)
+    # A spring is minus the coupling to the sensor below, or what the row adds up to at the base.
+    between, first = np.flatnonzero(below >= 0), np.flatnonzero(below < 0)
+    weights[between, between, below[between]] = -arms[between] * arms[below[between]]
+    weights[first, first] = np.outer(arms[first], arms)
     return weights
-
-
-def _pattern_to_base(geometry: Geometry) -> Array:
-    """Which sensors a chain's springs tie to the base, (n, d)."""
-    first = np.array([below < 0 for below in _previous(geometry)])
-    return np.where(first[:, None], geometry.rigid_body, 0.0)
