@@ -19,6 +19,14 @@ from sysid.models.model import MatrixModel
 from sysid.models.stiffness import WrittenStiffness
 from sysid.structure.structure import Array, finite_array
 
+_WRITTEN: dict[str, Any] = {"mass": WrittenMass, "stiffness": WrittenStiffness, "damping": WrittenDamping}
+_DIMENSIONS = {"mass": (2,), "stiffness": (2,), "damping": (1, 2)}  # one ratio a mode
+_WANTED = {
+    "mass": "a model such as FullMass(kg) or a matrix",
+    "stiffness": "a stiffness model of sysid, an expression or a matrix",
+    "damping": "a damping model of sysid, an expression or a matrix",
+}
+
 
 def as_models(mass: Any, stiffness: Any, damping: Any) -> tuple[MatrixModel, MatrixModel, MatrixModel]:
     """Models as they are, numbers and expressions as models.
@@ -28,13 +36,15 @@ def as_models(mass: Any, stiffness: Any, damping: Any) -> tuple[MatrixModel, Mat
     InputError
         Where something is none of these.
     """
-    if not _is_model(mass, 0):
-        mass = WrittenMass(mass) if is_expression(mass) else KnownMass(_numbers("mass", mass))
-    if not _is_model(stiffness, 1):
-        stiffness = WrittenStiffness(stiffness if is_expression(stiffness) else _numbers("stiffness", stiffness))
-    if not _is_model(damping, 2):
-        damping = WrittenDamping(damping if is_expression(damping) else _numbers("damping", damping, least=1))
-    return mass, stiffness, damping
+    found: list[Any] = []
+    for name, value in (("mass", mass), ("stiffness", stiffness), ("damping", damping)):
+        if _is_model(value, len(found)):
+            found.append(value)
+        elif is_expression(value):
+            found.append(_WRITTEN[name](value))
+        else:
+            found.append((_WRITTEN | {"mass": KnownMass})[name](_numbers(name, value)))
+    return found[0], found[1], found[2]
 
 
 def _is_model(value: object, before: int) -> bool:
@@ -48,16 +58,13 @@ def _is_model(value: object, before: int) -> bool:
     return True
 
 
-def _numbers(name: str, value: object, least: int = 2) -> Array:
+def _numbers(name: str, value: object) -> Array:
     try:
         matrix = np.asarray(value, dtype=float)
     except (TypeError, ValueError):
         matrix = np.zeros(())
-    if not least <= matrix.ndim <= 2:
-        wanted = "a model such as FullMass(kg) or a matrix"
-        if name != "mass":
-            wanted = f"a {name} model of sysid, an expression or a matrix"
-        raise InputError(f"Problem: {name} is a {type(value).__name__}; give {wanted}")
+    if matrix.ndim not in _DIMENSIONS[name]:
+        raise InputError(f"Problem: {name} is a {type(value).__name__}; give {_WANTED[name]}")
     return matrix
 
 
@@ -75,8 +82,6 @@ def geometry_of(
     InputError
         Where recovery, rigid_body_dofs and the sensors do not fit together.
     """
-    if recovery is None and rigid_body_dofs is None:
-        return Geometry(test, weighed=weighed)
     R = np.eye(test.n_sensors) if recovery is None else finite_array("recovery", recovery)
     if R.ndim != 2 or len(R) != test.n_sensors:
         raise InputError(f"recovery is {R.shape}; ({test.n_sensors}, n) takes n degrees of freedom to the sensors")
@@ -87,7 +92,7 @@ def geometry_of(
             f"recovery @ rigid_body_dofs differs from the measurement's rigid_body by up to {moved:.3g}: the order of "
             "the degrees of freedom, or signs and axes of the sensors, are not what the matrices have"
         )
-    return Geometry(test, G, None if recovery is None else R, weighed)
+    return Geometry(test, G, R, weighed)
 
 
 def _rigid_body_dofs(test: Measurement, stiffness: MatrixModel, R: Array, other: bool, stated: Any) -> Array:

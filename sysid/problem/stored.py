@@ -15,7 +15,7 @@ import numpy as np
 from sysid.errors import InputError
 from sysid.files.tree import check
 from sysid.measurement.measurement import Measurement
-from sysid.models.expressions import as_matrix, is_expression
+from sysid.models.expressions import as_matrix, is_column, is_expression
 from sysid.models.registry import is_storable, model_from_tree, model_to_tree
 from sysid.models.unknowns import Variable, variable_of
 from sysid.problem.terms import FurtherTest, Prior
@@ -41,14 +41,13 @@ def to_tree(given: Mapping[str, Any]) -> Tree:
         Where a Python callback stands in an expression, or a model cannot be stored.
     """
     outputs = _Outputs()
-    misfit = given.get("misfit")
     tree = {
         **_matrices_to_tree(given, outputs),
         "residuals": [_residual_to_tree(i, r, outputs) for i, r in enumerate(given.get("residuals", ()), start=1)],
         "constraints": np.array(
             [outputs.add(f"constraint {i}", c) for i, c in enumerate(given.get("constraints", ()), start=1)], np.int64
         ),
-        "misfit": None if misfit is None else outputs.add("misfit", misfit),
+        "misfit": outputs.add("misfit", given.get("misfit")),
         "healing": [
             {"variable": variable.name, "expression": outputs.add("healing", expression)}
             for variable, expression in given.get("healing", {}).items()
@@ -71,7 +70,7 @@ def from_tree(tree: Tree) -> dict[str, Any]:
         **_matrices_from_tree(tree, outputs),
         "residuals": [_residual_from_tree(part, outputs) for part in tree["residuals"]],
         "constraints": [outputs[i] for i in tree["constraints"].tolist()],
-        "misfit": None if tree["misfit"] is None else outputs[tree["misfit"]],
+        "misfit": outputs[tree["misfit"]],
         "healing": {variables[part["variable"]]: outputs[part["expression"]] for part in tree["healing"]},
     }
 
@@ -93,8 +92,10 @@ class _Outputs:
     def __init__(self) -> None:
         self.expressions: list[tuple[str, ca.MX]] = []
 
-    def add(self, name: str, expression: Any) -> int:
-        """Number of an expression; the name is for messages."""
+    def add(self, name: str, expression: Any) -> int | None:
+        """Number of an expression, None where none is given; the name is for messages."""
+        if expression is None:
+            return None
         self.expressions.append((name, as_matrix(name, expression)))
         return len(self.expressions) - 1
 
@@ -102,8 +103,6 @@ class _Outputs:
         """The variables of all expressions, and the function that gives the expressions."""
         found = {variable_of(s) for _, expression in self.expressions for s in ca.symvar(expression)}
         variables = sorted((v for v in found if v is not None), key=lambda variable: variable.order)
-        if not self.expressions:
-            return {"variables": [], "expressions": None, "casadi_version": ca.__version__}
         symbols = [variable.symbol for variable in variables]
         text = _text(symbols, [expression for _, expression in self.expressions])
         if text is None:
@@ -114,7 +113,7 @@ class _Outputs:
             )
         return {
             "variables": [_variable_to_tree(variable) for variable in variables],
-            "expressions": text,
+            "expressions": text if self.expressions else None,
             "casadi_version": ca.__version__,
         }
 
@@ -130,9 +129,10 @@ def _text(symbols: Sequence[ca.MX], expressions: Sequence[ca.MX]) -> str | None:
     return text
 
 
-def _outputs_from_tree(tree: Tree, variables: Sequence[Variable]) -> list[ca.MX]:
+def _outputs_from_tree(tree: Tree, variables: Sequence[Variable]) -> dict[int | None, ca.MX | None]:
+    """The expressions by their numbers; None by None."""
     if tree["expressions"] is None:
-        return []
+        return {None: None}
     try:
         function = ca.Function.deserialize(tree["expressions"])
     except RuntimeError as error:
@@ -141,7 +141,7 @@ def _outputs_from_tree(tree: Tree, variables: Sequence[Variable]) -> list[ca.MX]
             f"them ({str(error).strip().splitlines()[-1]})"
         ) from error
     # Inlined: each expression is written in its own variables only, as it was.
-    return list(function.call([variable.symbol for variable in variables], True, False))
+    return {None: None, **dict(enumerate(function.call([variable.symbol for variable in variables], True, False)))}
 
 
 def _matrices_to_tree(given: Mapping[str, Any], outputs: _Outputs) -> Tree:
@@ -152,7 +152,7 @@ def _matrices_to_tree(given: Mapping[str, Any], outputs: _Outputs) -> Tree:
     }
 
 
-def _matrices_from_tree(tree: Tree, outputs: Sequence[ca.MX]) -> Tree:
+def _matrices_from_tree(tree: Tree, outputs: Mapping[int | None, Any]) -> Tree:
     return {name: _matrix_from_tree(tree[name], outputs) for name in _MATRICES} | {n: tree[n] for n in _ARRAYS}
 
 
@@ -161,26 +161,17 @@ def _matrix_to_tree(name: str, value: Any, outputs: _Outputs) -> Any:
     value = getattr(value, "written", value)
     if is_expression(value):
         # A single ratio in one dimension is no 1 x 1 matrix.
-        return {"expression": outputs.add(name, value), "dimensions": _dimensions(value)}
+        return {"expression": outputs.add(name, value), "dimensions": 1 if is_column(value) else 2}
     return model_to_tree(value) if is_storable(value) else np.array(value, dtype=float)
 
 
-def _matrix_from_tree(tree: Any, outputs: Sequence[ca.MX]) -> Any:
+def _matrix_from_tree(tree: Any, outputs: Mapping[int | None, Any]) -> Any:
     if not isinstance(tree, dict):
         return tree
     if "expression" not in tree:
         return model_from_tree(tree)
     expression = outputs[tree["expression"]]
     return [expression] if tree["dimensions"] == 1 else expression
-
-
-def _dimensions(value: Any) -> int:
-    """Whether an expression was given in one dimension or in two."""
-    if isinstance(value, Variable):
-        return 1 if len(value.shape) == 1 else 2
-    if isinstance(value, list | tuple):
-        return 2 if any(isinstance(entry, list | tuple) for entry in value) else 1
-    return int(value.ndim) if isinstance(value, np.ndarray) else 2
 
 
 def _residual_to_tree(number: int, value: Any, outputs: _Outputs) -> Tree:
@@ -195,7 +186,7 @@ def _residual_to_tree(number: int, value: Any, outputs: _Outputs) -> Tree:
     return {"kind": "rows", "expression": outputs.add(name, value)}
 
 
-def _residual_from_tree(tree: Tree, outputs: Sequence[ca.MX]) -> Any:
+def _residual_from_tree(tree: Tree, outputs: Mapping[int | None, Any]) -> Any:
     if tree["kind"] == "test":
         return FurtherTest(Measurement.from_tree(tree["measurement"]), **_matrices_from_tree(tree, outputs))
     if tree["kind"] == "prior":
@@ -214,13 +205,10 @@ def _variable_to_tree(variable: Variable) -> Tree:
 
 def _variable_from_tree(tree: Tree) -> Variable:
     shape = tuple(tree["shape"].tolist())
-    lower, upper, guess = (
-        None if tree[name] is None else np.reshape(tree[name], shape, order="F") for name in ("lower", "upper", "guess")
-    )
-    assert lower is not None and upper is not None
-    variable = Variable(
-        tree["name"], shape, lower=lower, upper=upper, guess=guess, log=tree["log"], fixed=tree["fixed"],
-        unit=tree["unit"],
-    )  # fmt: skip
+    numbers: dict[str, Any] = {
+        name: np.reshape(tree[name], shape, order="F") for name in ("lower", "upper", "guess") if tree[name] is not None
+    }
+    plain = {name: tree[name] for name in ("log", "fixed", "unit")}
+    variable = Variable(tree["name"], shape, **numbers, **plain)
     variable.declared = tree["declared"]  # messages name the author's line
     return variable
