@@ -36,6 +36,11 @@ class Totals:
     values: Array
     kind: Literal["trace", "rigid_body", "sensors"]
 
+    @property
+    def by_direction(self) -> Array:
+        """One total a base direction, (d,)."""
+        return np.diag(self.values) if self.values.ndim == 2 else self.values
+
 
 @dataclass(frozen=True, eq=False)
 class Stated:
@@ -64,6 +69,11 @@ class Stated:
     spectrum: Array | None = None
     positive: Array | None = None
     sentence: str = ""
+
+    @property
+    def rigid_total(self) -> Array | None:
+        """Rigid-body mass (d, d) where all of it is stated, else None."""
+        return self.totals.values if self.totals is not None and self.totals.values.ndim == 2 else None
 
 
 class MassBlocks(NamedTuple):
@@ -185,11 +195,18 @@ def stiffness_blocks(given: Any, factor: Any) -> StiffnessBlocks:
     return StiffnessBlocks(given, mass_normalised(ca.tril(factor), given))
 
 
-def check_shape(name: str, given: Any, *shapes: tuple[int, int]) -> None:
-    """Refuse what a matrix model gives in another shape."""
+def check_shape(name: str, given: Any, *shapes: tuple[int, int]) -> Any:
+    """What a matrix model gives; refused where it has another shape."""
     if tuple(given.shape) not in shapes:
         needed = " or ".join(map(str, shapes))
         raise InputError(f"the {name} model gives a matrix of the shape {tuple(given.shape)}; {needed} is needed")
+    return given
+
+
+def ratios_of(damping: MatrixModel, geometry: Geometry, y: Any, omega: Any) -> Any:
+    """Damping ratios (n,) of a damping model at circular frequencies `omega` (n,); None where it has a matrix alone."""
+    of_modes = getattr(damping, "ratios", None)
+    return None if of_modes is None else of_modes(geometry, y, omega)
 
 
 def constant(matrix: Array) -> ca.DM:

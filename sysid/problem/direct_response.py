@@ -101,13 +101,12 @@ def relative_misfit(test: Measurement, motion: Motion, *, weighted: bool = False
     """Relative residuals, stacked, as `response.residual` has them: of accelerations, then of a measured force."""
     a, f = relative_response(test, motion, shift=shift)
     R = ca.DM(motion.recovery)
-    (weight, scale), *of_force = weights_of_test(test, weighted=weighted)
-    a_re, a_im = parts_of(test.relative)
-    pieces = [weight * (R @ a.real - a_re) / scale, weight * (R @ a.imag - a_im) / scale]
-    if test.force is not None:
-        ((weight, scale),) = of_force
-        f_re, f_im = parts_of(test.force)
-        pieces += [weight * (f.real - f_re) / scale, weight * (f.imag - f_im) / scale]
+    records = [(test.relative, Response(R @ a.real, R @ a.imag))]
+    records += [] if test.force is None else [(test.force, f)]
+    pieces: list[ca.MX] = []
+    for (record, made), (weight, scale) in zip(records, weights_of_test(test, weighted=weighted), strict=True):
+        real, imag = parts_of(record)
+        pieces += [weight * (made.real - real) / scale, weight * (made.imag - imag) / scale]
     return ca.vertcat(*(ca.vec(ca.densify(piece)) for piece in pieces))
 
 

@@ -22,7 +22,8 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.complex_frequency import noise_level
 from sysid.models.expressions import as_matrix, variables_of, written_in
 from sysid.models.geometry import Geometry
-from sysid.models.model import MatrixModel, Stated
+from sysid.models.model import MatrixModel, Stated, ratios_of
+from sysid.models.refusal import refuse
 from sysid.models.unknowns import (
     Unknown,
     Variable,
@@ -102,7 +103,10 @@ class Formulation:
         self.sources: list[tuple[str, TermSource]] = []
         if misfit is not None:
             self.sources.append(("misfit", Residual(misfit, is_misfit=True)))
-        self.sources += [(f"residual {i}", as_source(given)) for i, given in enumerate(residuals, start=1)]
+        self.sources += [
+            (f"residual {i}", given if isinstance(given, TermSource) else Residual(given))
+            for i, given in enumerate(residuals, start=1)
+        ]
         self.fits_records = misfit is None
         self._constraints, self._healing = constraints, healing or {}
         self.monitor: Callable[[int, float], object] | None = None  # of a search for poles
@@ -118,17 +122,19 @@ class Formulation:
         """
         _check_names([*(unknown for group in self.of_models for unknown in group), *self.variables])
         _check_healing(self.healed, self.unknowns)
-        if not self.unknowns:
-            raise InputError("this problem has no unknowns: nothing is to be identified")
-        if not self.fits_records and any(isinstance(source, Prior) for _, source in self.sources):
-            raise InputError("Prior beside a misfit of your own: put it into that misfit, in the units of its rows")
-        stated = self.mass
-        whole = stated.totals is not None and stated.totals.values.ndim == 2
-        if stated.free and (stated.entries is not None or whole) and not self.free_modes:
-            raise InputError(
+        known = self.mass.entries is not None or self.mass.rigid_total is not None
+        refuse(
+            (not self.unknowns, "this problem has no unknowns: nothing is to be identified"),
+            (
+                not self.fits_records and any(isinstance(source, Prior) for _, source in self.sources),
+                "Prior beside a misfit of your own: put it into that misfit, in the units of its rows",
+            ),
+            (
+                self.mass.free and known and not self.free_modes,
                 "known entries of a FullMass, and a total_mass that is a matrix, go with the modal strategy only, and "
-                "that with SpectralStiffness and damping ratios alone: write them as constraints"
-            )
+                "that with SpectralStiffness and damping ratios alone: write them as constraints",
+            ),
+        )
 
     # -- what is searched --------------------------------------------------------------------------
 
@@ -216,8 +222,7 @@ class Formulation:
 
     def ratios(self, y: Any, omega: Any) -> Any:
         """Damping ratios of the damping model's unknowns `y` at circular frequencies; None where it has a matrix."""
-        of_modes = getattr(self.models[2], "ratios", None)  # a model of a matrix alone need not have it
-        return None if of_modes is None else of_modes(self.geometry, y, omega)
+        return ratios_of(self.models[2], self.geometry, y, omega)
 
     @property
     def test_alone(self) -> bool:
@@ -295,14 +300,12 @@ class Formulation:
     @cached_property
     def constraints(self) -> Constraints:
         """The constraints; no rows where there are none."""
-        relations = self._relations
-        rows = [row.expression for row in relations]
-        lower = [np.full(row.expression.numel(), 0.0 if row.equal else -np.inf) for row in relations]
+        relations = [(row, row.expression.numel()) for row in self._relations]
         return Constraints(
-            self._function("constraints", [ca.vertcat(ca.MX(0, 1), *rows)]),
-            np.concatenate([np.zeros(0), *lower]),
-            np.zeros(sum(row.numel() for row in rows)),
-            tuple(row.source for row in relations for _ in range(row.expression.numel())),
+            self._function("constraints", [ca.vertcat(ca.MX(0, 1), *(row.expression for row, _ in relations))]),
+            np.repeat([row.lower for row, _ in relations], [size for _, size in relations]),
+            np.zeros(sum(size for _, size in relations)),
+            tuple(row.source for row, size in relations for _ in range(size)),
         )
 
     @cached_property
@@ -387,7 +390,7 @@ class Formulation:
 
     @cached_property
     def _relations(self) -> list[_Row]:
-        return [row for i, c in enumerate(self._constraints, start=1) for row in _relation(i, c)]
+        return [_relation(i, constraint) for i, constraint in enumerate(self._constraints, start=1)]
 
     @cached_property
     def _of_models(self) -> list[list[ca.MX]]:
@@ -402,11 +405,11 @@ class Formulation:
         return list(zip(self.unknowns, symbols, strict=True))
 
     def _touches(self, expressions: Sequence[ca.MX]) -> bool:
-        return _contain(expressions, {symbol.__hash__() for group in self._in_matrices for symbol in group})
+        symbols = {symbol.__hash__() for group in self._in_matrices for symbol in group}
+        return any(symbol.__hash__() in symbols for e in expressions for symbol in ca.symvar(e))
 
     def _matrices(self, blocks: Blocks, geometry: Geometry) -> Matrices:
-        ratios = blocks.ratios if blocks.ratios.numel() else ca.MX(0, 1)
-        by_frequency = self._function("ratios", [ratios], blocks.omega)
+        by_frequency = self._function("ratios", [blocks.ratios], blocks.omega)
         function = self._function("matrices", blocks.outputs)
         return Matrices(function, by_frequency, geometry.rigid_body, geometry.recovery, blocks.mass.mass is None)
 
@@ -420,21 +423,12 @@ class Formulation:
         return ca.Function(name, [x, *further], inner.call([*pieces, *further, *constants], True, False))
 
 
-def as_source(given: Any) -> TermSource:
-    """What makes a term of one of the `residuals` of a problem: it itself, or a column of expressions."""
-    return given if isinstance(given, TermSource) else Residual(given)
-
-
 class _Row(NamedTuple):
-    """A constraint ``expression <= 0`` or ``== 0``, and what messages call it."""
+    """A constraint ``lower <= expression <= 0``, an equality where `lower` is 0, and what messages call it."""
 
     expression: ca.MX
-    equal: bool
+    lower: float
     source: str
-
-
-def _contain(expressions: Sequence[ca.MX], symbols: set[int]) -> bool:
-    return any(symbol.__hash__() in symbols for e in expressions for symbol in ca.symvar(e))
 
 
 def _variables(expressions: Sequence[ca.MX]) -> tuple[Variable, ...]:
@@ -444,44 +438,53 @@ def _variables(expressions: Sequence[ca.MX]) -> tuple[Variable, ...]:
 
 
 def _check_names(unknowns: Sequence[Unknown]) -> None:
-    for i, unknown in enumerate(unknowns):
-        same = next((other for other in unknowns[:i] if other.name == unknown.name), None)
-        if same is None:
-            continue
-        if not isinstance(unknown, Variable):
-            raise InputError(f"two matrix models have unknowns called {unknown.name!r}: rename those of one")
-        if not isinstance(same, Variable):
-            raise InputError(
-                f"variable {unknown.name!r} ({unknown.declared}) has the name of a model's unknowns: rename it"
-            )
-        raise InputError(
-            f"two variables are called {unknown.name!r} ({same.declared}; {unknown.declared}): tables and results "
-            "need a name each"
+    first: dict[str, Unknown] = {}
+    for unknown in unknowns:
+        same = first.setdefault(unknown.name, unknown)
+        twice = same is not unknown
+        there, here = (getattr(u, "declared", None) for u in (same, unknown))  # None for a model's
+        refuse(
+            (
+                twice and here is None,
+                f"two matrix models have unknowns called {unknown.name!r}: rename those of one",
+            ),
+            (
+                twice and there is None,
+                f"variable {unknown.name!r} ({here}) has the name of a model's unknowns: rename it",
+            ),
+            (
+                twice,
+                f"two variables are called {unknown.name!r} ({there}; {here}): tables and results need a name each",
+            ),
         )
 
 
 def _check_healing(healed: Mapping[Variable, ca.MX], free: Sequence[Unknown]) -> None:
     for variable, expression in healed.items():
-        if not any(variable is v for v in free):
-            raise InputError(f"healing: {variable!r} is no unknown of this problem")
-        if expression.shape != variable.symbol.shape:
-            raise InputError(
+        refuse(
+            (
+                not any(variable is v for v in free),
+                f"healing: {variable!r} is no unknown of this problem",
+            ),
+            (
+                expression.shape != variable.symbol.shape,
                 f"healing of {variable.name!r} ({variable.declared}) has the shape {expression.shape}; that of the "
-                f"variable is {variable.symbol.shape}"
-            )
+                f"variable is {variable.symbol.shape}",
+            ),
+        )
 
 
-def _relation(number: int, value: Any) -> list[_Row]:
-    """Rows of a constraint."""
+def _relation(number: int, value: Any) -> _Row:
+    """A constraint that was given."""
     relation = expression_of(value)
     name = f"constraint {number}"
-    kinds = {ca.OP_LE: False, ca.OP_LT: False, ca.OP_EQ: True}
-    kind = next((k for k in kinds if isinstance(relation, ca.MX) and relation.is_op(k)), None)
-    if kind is None:
+    kinds = {ca.OP_LE: -np.inf, ca.OP_LT: -np.inf, ca.OP_EQ: 0.0}
+    lower = next((low for k, low in kinds.items() if isinstance(relation, ca.MX) and relation.is_op(k)), None)
+    if lower is None:
         what = type(value).__name__ if not isinstance(value, ca.MX) else f"the expression {str(value)[:60]}"
         raise InputError(
             f"{name} is {what} ({user_site()}): a constraint is a relation of variables, such as "
             f"k[0] <= k[1] or ca.sum1(m) == 9{written_in(relation) if isinstance(relation, ca.MX) else ''}"
         )
     row = column_of(name, relation.dep(0) - relation.dep(1))
-    return [_Row(row, kinds[kind], name + written_in(relation).replace("; it is", ","))]
+    return _Row(row, lower, name + written_in(relation).replace("; it is", ","))

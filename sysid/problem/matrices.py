@@ -17,6 +17,7 @@ from sysid.models.model import (
     StiffnessBlocks,
     check_shape,
     mass_blocks,
+    ratios_of,
     stiffness_blocks,
 )
 from sysid.models.unknowns import Unknown
@@ -73,12 +74,11 @@ class Matrices:
         """The blocks at `x`."""
         M, M_S0, M_00, K, C, _, H = (np.asarray(ca.densify(part)) for part in self.function(x))
         symmetric = lambda A: (A + A.T) / 2  # noqa: E731
-        return Numbers(symmetric(M), M_S0, symmetric(M_00), symmetric(K), symmetric(C) if C.size else C, symmetric(H))
+        return Numbers(symmetric(M), M_S0, symmetric(M_00), symmetric(K), symmetric(C), symmetric(H))
 
     def motion(self, x: ca.MX) -> Motion:
         """The same as expressions of the symbol `x`."""
-        mass, coupling, base, stiffness, damping, *_ = self.function(x)
-        return Motion(mass, coupling, base, stiffness, damping, self.rigid_body, self.recovery)
+        return Motion._make([*self.function(x)[:5], self.rigid_body, self.recovery])
 
     def inverse(self, factor: ca.MX) -> ca.MX:
         """Inverse of the Cholesky factor, an expression."""
@@ -152,8 +152,7 @@ class Blocks(NamedTuple):
 
     def motion(self, geometry: Geometry) -> Motion:
         """What direct solves of the response need."""
-        mass, coupling, base, stiffness, damping, *_ = self.outputs
-        return Motion(mass, coupling, base, stiffness, damping, geometry.rigid_body, geometry.recovery)
+        return Motion._make([*self.outputs[:5], geometry.rigid_body, geometry.recovery])
 
     @property
     def outputs(self) -> list[ca.MX]:
@@ -170,7 +169,7 @@ def blocks_of(
     They are written in the `symbols` of each model's unknowns, and in the variables of models without.
     """
     mass, stiffness, damping = models
-    n, empty = geometry.n, ca.MX(0, 0)
+    n = geometry.n
     y_mass, y_stiffness, y_damping = (ca.vertcat(ca.MX(0, 1), *group) for group in symbols)
 
     made = MassBlocks(*_evaluated(lambda y: mass_blocks(mass.blocks(geometry, y), geometry), y_mass, ()))
@@ -186,12 +185,12 @@ def blocks_of(
         (*of_mass, *K),
     )  # fmt: skip
     omega = ca.MX.sym("omega", n)
-    of_modes = getattr(damping, "ratios", None)  # a model of a matrix alone need not have it
-    (ratios,) = _evaluated(lambda y, w: (of_modes and of_modes(geometry, y, w),), y_damping, (omega,))
-    for part, shape in ((C, (n, n)), (ratios, (n, 1))):
-        if part is not None:
-            check_shape("damping", part, shape)
-    return Blocks(made, K, empty if C is None else C, empty if ratios is None else ratios, omega)
+    (ratios,) = _evaluated(lambda y, w: (ratios_of(damping, geometry, y, w),), y_damping, (omega,))
+    C, ratios = (
+        ca.MX(0, 0) if part is None else check_shape("damping", part, shape)
+        for part, shape in ((C, (n, n)), (ratios, (n, 1)))
+    )
+    return Blocks(made, K, C, ratios, omega)
 
 
 def _evaluated(expressions: Any, y: ca.MX, before: tuple[ca.MX, ...]) -> list[ca.MX | None]:

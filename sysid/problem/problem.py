@@ -17,6 +17,7 @@ from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.damping import ModalDamping
 from sysid.models.geometry import Geometry
 from sysid.models.model import MatrixModel
+from sysid.models.refusal import refuse
 from sysid.models.stiffness import SpectralStiffness
 from sysid.models.unknowns import Unknown, Variable, user_site
 from sysid.problem import stored
@@ -109,8 +110,24 @@ class Problem:
     site: str = field(init=False, default="?")
 
     def __post_init__(self) -> None:
-        if not isinstance(self.measurement, Measurement):
-            raise InputError(f"Problem: measurement is a {type(self.measurement).__name__}, not a sysid.Measurement")
+        refuse(
+            (
+                not isinstance(self.measurement, Measurement),
+                f"Problem: measurement is a {type(self.measurement).__name__}, not a sysid.Measurement",
+            ),
+            (
+                not isinstance(self.healing, Mapping) or not all(isinstance(v, Variable) for v in self.healing),
+                "Problem: healing is a dictionary from variables to expressions: healing={m: 9 * m / ca.sum1(m)}",
+            ),
+            (
+                not isinstance(self.reference, Structure | None),
+                f"Problem: reference is a {type(self.reference).__name__}, not a sysid.Structure",
+            ),
+            (
+                self.goal is not None and not finite_array("goal", self.goal) > 0,
+                f"goal = {self.goal}: a positive relative residual is needed",
+            ),
+        )
         for name, model in zip(MATRICES, as_models(self.mass, self.stiffness, self.damping), strict=True):
             object.__setattr__(self, name, model)
         for name in ("residuals", "constraints", "validation"):
@@ -118,14 +135,6 @@ class Problem:
             if not isinstance(given, list | tuple):
                 raise InputError(f"Problem: {name} is a {type(given).__name__}; give a list of them: {name}=[...]")
             object.__setattr__(self, name, tuple(given))
-        if not isinstance(self.healing, Mapping) or not all(isinstance(v, Variable) for v in self.healing):
-            raise InputError(
-                "Problem: healing is a dictionary from variables to expressions: healing={m: 9 * m / ca.sum1(m)}"
-            )
-        if self.reference is not None and not isinstance(self.reference, Structure):
-            raise InputError(f"Problem: reference is a {type(self.reference).__name__}, not a sysid.Structure")
-        if self.goal is not None and not finite_array("goal", self.goal) > 0:
-            raise InputError(f"goal = {self.goal}: a positive relative residual is needed")
         object.__setattr__(self, "site", user_site())
         self._check_records()
         self._check_declarations()
@@ -133,19 +142,28 @@ class Problem:
     def _check_records(self) -> None:
         """Refuse records from which nothing can be identified, and tests and structures of other sensors."""
         test = self.measurement
-        if test.force is not None and not np.all(np.any(test.force, axis=(0, 2))):
-            at = np.flatnonzero(~np.any(test.force, axis=(0, 2)))
-            names = ", ".join(test.base_axes[i] if test.base_axes else f"direction {i + 1}" for i in at)
-            raise InputError(
-                f"the base force is zero in {names}: is a load cell dead? Leave the force or that axis out"
-            )
-        if np.linalg.norm(test.relative) <= 1e-12 * np.linalg.norm(test.response):
-            raise InputError("no sensor moves relative to the base: there is nothing to identify from")
-        for other in self.validation:
-            if other.rigid_body.shape != test.rigid_body.shape:
-                raise InputError("a validation measurement has other sensors or base directions than the one fitted")
-        if self.reference is not None and self.reference.rigid_body.shape != test.rigid_body.shape:
-            raise InputError("the reference structure has other sensors or base directions than the measurement")
+        dead = [] if test.force is None else np.flatnonzero(~np.any(test.force, axis=(0, 2))).tolist()
+        axes = test.base_axes or [f"direction {i + 1}" for i in range(test.n_base)]
+        others, shape = [other.rigid_body.shape for other in self.validation], test.rigid_body.shape
+        refuse(
+            (
+                dead,
+                f"the base force is zero in {', '.join(axes[i] for i in dead)}: is a load cell dead? Leave the force "
+                "or that axis out",
+            ),
+            (
+                np.linalg.norm(test.relative) <= 1e-12 * np.linalg.norm(test.response),
+                "no sensor moves relative to the base: there is nothing to identify from",
+            ),
+            (
+                any(other != shape for other in others),
+                "a validation measurement has other sensors or base directions than the one fitted",
+            ),
+            (
+                self.reference is not None and self.reference.rigid_body.shape != shape,
+                "the reference structure has other sensors or base directions than the measurement",
+            ),
+        )
 
     def _check_declarations(self) -> None:
         """Refuse models that do not fit the test, and what is written wrong; nothing is searched for it."""
@@ -305,7 +323,7 @@ class Problem:
         """
         stated, geometry = self.formulation.mass, self.geometry
         if stated.totals is not None:
-            return np.diag(stated.totals.values) if stated.totals.values.ndim == 2 else stated.totals.values
+            return stated.totals.by_direction
         if self._leaves_total:
             return geometry.totals(None)
         M, M_S0, M_00, *_ = self.formulation.matrices.numbers(self.formulation.guess)
@@ -333,8 +351,7 @@ class Problem:
     @property
     def rigid_total(self) -> Array | None:
         """Rigid-body mass (d, d) where all of it is stated, else None."""
-        totals = self.formulation.mass.totals
-        return totals.values if totals is not None and totals.values.ndim == 2 else None
+        return self.formulation.mass.rigid_total
 
     @property
     def free_modes(self) -> bool:
@@ -373,23 +390,20 @@ class Problem:
 
     def _weigh(self) -> Array:
         """Rough rigid-body mass of each base direction from the base force, (d,): it only places the search."""
-        spectrum = self.stiffness.stated(self.geometry).spectrum
-        return _weigh(self.measurement, np.zeros(0) if spectrum is None else spectrum)
-
-
-def _weigh(test: Measurement, omega: Array) -> Array:
-    """Rough rigid-body mass of each base direction from the base force, (d,): it only places the search."""
-    assert test.force is not None
-    freq = omega / (2 * np.pi)
-    # Away from resonance the damping, which is not known yet, hardly matters.
-    away = np.all(np.abs(test.freq / freq[:, None] - 1) > 0.1, axis=0)
-    quiet = test if np.count_nonzero(away) < 2 * (freq.size + 1) else test.at(away)
-    mass = np.diag(weighed_mass(quiet, omega, np.full(omega.size, 0.01)))
-    if np.all(mass > 0):
-        return mass
-    if freq.size and test.freq[0] < 0.3 * freq[0]:
-        raise InputError(
-            f"the base force gives a mass of {mass.min():.3g} kg, with lines well below the first mode: check its sign "
-            "(it is the base's on the structure, in phase with the base acceleration at low frequency) and its unit"
-        )
-    return np.linalg.norm(columns(test.force), axis=1) / np.linalg.norm(columns(test.base), axis=1)
+        test, spectrum = self.measurement, self.stiffness.stated(self.geometry).spectrum
+        assert test.force is not None
+        omega = np.zeros(0) if spectrum is None else spectrum
+        freq = omega / (2 * np.pi)
+        # Away from resonance the damping, which is not known yet, hardly matters.
+        away = np.all(np.abs(test.freq / freq[:, None] - 1) > 0.1, axis=0)
+        quiet = test if np.count_nonzero(away) < 2 * (freq.size + 1) else test.at(away)
+        mass = np.diag(weighed_mass(quiet, omega, np.full(omega.size, 0.01)))
+        if np.all(mass > 0):
+            return mass
+        if freq.size and test.freq[0] < 0.3 * freq[0]:
+            raise InputError(
+                f"the base force gives a mass of {mass.min():.3g} kg, with lines well below the first mode: check its "
+                "sign (it is the base's on the structure, in phase with the base acceleration at low frequency) and "
+                "its unit"
+            )
+        return np.linalg.norm(columns(test.force), axis=1) / np.linalg.norm(columns(test.base), axis=1)

@@ -14,7 +14,7 @@ import numpy as np
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.misfit import inflation_of, records_of
-from sysid.modal_analysis.response import columns
+from sysid.modal_analysis.response import weights_of_test
 from sysid.problem.matrices import Matrices
 from sysid.structure.structure import Array, ComplexArray, Structure
 
@@ -150,19 +150,13 @@ def rows_of_test(
         d_f = d_f + np.einsum("ie,fidc,rdf->erfc", s.push, dX, u, optimize=True)
         d_f = d_f + np.einsum("edc,rdf->erfc", s.d_rigid, u, optimize=True)
         parts.append(d_f.reshape(d_f.shape[0], -1, d_f.shape[-1]))
-    measured = [columns(test.relative)] + ([] if test.force is None else [columns(test.force)])
-    both_stated = test.response_std is not None and test.force_std is not None
     rows: list[Rows] = []
-    scale = 1.0
     records = records_of(test, s.structure, unknowns)
     inflation = 1.0 if as_stated else inflation_of(test, records, unknowns)
-    for i, (record, change, target) in enumerate(zip(records, parts, measured, strict=True)):
-        weight = record.by_channel[:, None] * record.by_line
-        if i == 0 or not both_stated:
-            scale = float(np.linalg.norm(weight * target))
-        weight = share * weight / scale
-        flat = (weight[..., None] * change).reshape(-1, change.shape[-1])
-        left, std = (-weight * record.misfit).ravel(), inflation * (weight * record.std).ravel() / np.sqrt(2)
+    for record, change, (weight, scale) in zip(records, parts, weights_of_test(test, weighted=True), strict=True):
+        weights = share * np.asarray(weight) / scale
+        flat = (weights[..., None] * change).reshape(-1, change.shape[-1])
+        left, std = (-weights * record.misfit).ravel(), inflation * (weights * record.std).ravel() / np.sqrt(2)
         rows.append(Rows(_real(left), _real(flat), np.concatenate([std, std])))
     return rows
 
