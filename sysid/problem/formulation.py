@@ -24,15 +24,7 @@ from sysid.models.expressions import as_matrix, variables_of, written_in
 from sysid.models.geometry import Geometry
 from sysid.models.model import MatrixModel, Stated, ratios_of
 from sysid.models.refusal import refuse
-from sysid.models.unknowns import (
-    Unknown,
-    Variable,
-    expression_of,
-    lower_of,
-    split,
-    upper_of,
-    user_site,
-)  # fmt: skip
+from sysid.models.unknowns import Unknown, Variable, expression_of, lower_of, split, upper_of, user_site  # fmt: skip
 from sysid.problem.matrices import Blocks, Matrices, blocks_of, symbols_in
 from sysid.problem.terms import Builder, ExpressionTerm, Prior, Residual, Term, TermSource, TestTerm, column_of
 from sysid.structure.structure import Array, Structure
@@ -444,10 +436,7 @@ def _check_names(unknowns: Sequence[Unknown]) -> None:
         twice = same is not unknown
         there, here = (getattr(u, "declared", None) for u in (same, unknown))  # None for a model's
         refuse(
-            (
-                twice and here is None,
-                f"two matrix models have unknowns called {unknown.name!r}: rename those of one",
-            ),
+            (twice and here is None, f"two matrix models have unknowns called {unknown.name!r}: rename those of one"),
             (
                 twice and there is None,
                 f"variable {unknown.name!r} ({here}) has the name of a model's unknowns: rename it",
@@ -462,10 +451,7 @@ def _check_names(unknowns: Sequence[Unknown]) -> None:
 def _check_healing(healed: Mapping[Variable, ca.MX], free: Sequence[Unknown]) -> None:
     for variable, expression in healed.items():
         refuse(
-            (
-                not any(variable is v for v in free),
-                f"healing: {variable!r} is no unknown of this problem",
-            ),
+            (not any(variable is v for v in free), f"healing: {variable!r} is no unknown of this problem"),
             (
                 expression.shape != variable.symbol.shape,
                 f"healing of {variable.name!r} ({variable.declared}) has the shape {expression.shape}; that of the "
