@@ -332,14 +332,10 @@ def expression_of(value: Any) -> Any:
 def user_site() -> str:
     """Where the user's code called into the package, for messages: "file, line n"."""
     frame: FrameType | None = sys._getframe(1)
-    while frame is not None and _is_ours(frame):
+    # The package's own frames, and those of what carries out its cached properties; bundled problems are a user's code.
+    while frame is not None and str(frame.f_globals.get("__name__", "")).split(".")[0] in ("sysid", "functools"):
         frame = frame.f_back
     return "?" if frame is None else f"{_short(frame.f_code.co_filename)}, line {frame.f_lineno}"
-
-
-def _is_ours(frame: FrameType) -> bool:
-    """Whether a frame is the package's own, or of what carries out its cached properties; bundled problems' are not."""
-    return str(frame.f_globals.get("__name__", "")).split(".")[0] in ("sysid", "functools")
 
 
 def _short(filename: str) -> str:

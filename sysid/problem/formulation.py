@@ -25,11 +25,10 @@ from sysid.models.geometry import Geometry
 from sysid.models.model import MatrixModel, Stated, ratios_of
 from sysid.models.refusal import refuse
 from sysid.models.unknowns import Unknown, Variable, expression_of, lower_of, split, upper_of, user_site  # fmt: skip
+from sysid.problem.given import MATRICES
 from sysid.problem.matrices import Blocks, Matrices, blocks_of, symbols_in
 from sysid.problem.terms import Builder, ExpressionTerm, Prior, Residual, Term, TermSource, TestTerm, column_of
 from sysid.structure.structure import Array, Structure
-
-MATRICES = ("mass", "stiffness", "damping")
 
 
 class Parts(NamedTuple):

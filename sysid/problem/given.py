@@ -19,6 +19,7 @@ from sysid.models.model import MatrixModel
 from sysid.models.stiffness import WrittenStiffness
 from sysid.structure.structure import Array, finite_array
 
+MATRICES = ("mass", "stiffness", "damping")
 _WRITTEN: dict[str, Any] = {"mass": WrittenMass, "stiffness": WrittenStiffness, "damping": WrittenDamping}
 _DIMENSIONS = {"mass": (2,), "stiffness": (2,), "damping": (1, 2)}  # one ratio a mode
 _WANTED = {
@@ -37,7 +38,7 @@ def as_models(mass: Any, stiffness: Any, damping: Any) -> tuple[MatrixModel, Mat
         Where something is none of these.
     """
     found: list[Any] = []
-    for name, value in (("mass", mass), ("stiffness", stiffness), ("damping", damping)):
+    for name, value in zip(MATRICES, (mass, stiffness, damping), strict=True):
         if _is_model(value, len(found)):
             found.append(value)
         elif is_expression(value):

@@ -22,8 +22,8 @@ from sysid.models.stiffness import SpectralStiffness
 from sysid.models.unknowns import Unknown, Variable, user_site
 from sysid.problem import stored
 from sysid.problem.feasibility import HELD, LOOSE, check_constraints, check_matrices, points_of, scale_of  # fmt: skip
-from sysid.problem.formulation import MATRICES, Formulation
-from sysid.problem.given import as_models, geometry_of
+from sysid.problem.formulation import Formulation
+from sysid.problem.given import MATRICES, as_models, geometry_of
 from sysid.structure.structure import Array, Structure, finite_array
 
 

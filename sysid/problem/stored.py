@@ -18,9 +18,9 @@ from sysid.measurement.measurement import Measurement
 from sysid.models.expressions import as_matrix, is_column, is_expression
 from sysid.models.registry import is_storable, model_from_tree, model_to_tree
 from sysid.models.unknowns import Variable, variable_of
+from sysid.problem.given import MATRICES
 from sysid.problem.terms import FurtherTest, Prior
 
-_MATRICES = ("mass", "stiffness", "damping")
 _ARRAYS = ("recovery", "rigid_body_dofs")
 
 Tree = dict[str, Any]
@@ -146,14 +146,16 @@ def _outputs_from_tree(tree: Tree, variables: Sequence[Variable]) -> dict[int | 
 
 def _matrices_to_tree(given: Mapping[str, Any], outputs: _Outputs) -> Tree:
     """Mass, stiffness, damping and what takes their degrees of freedom to the sensors."""
-    arrays = {name: given.get(name) for name in _ARRAYS}
-    return {name: _matrix_to_tree(name, given[name], outputs) for name in _MATRICES} | {
-        name: None if value is None else np.array(value, dtype=float) for name, value in arrays.items()
+    arrays = {name: given[name] for name in _ARRAYS if given.get(name) is not None}
+    return {
+        **{name: _matrix_to_tree(name, given[name], outputs) for name in MATRICES},
+        **dict.fromkeys(_ARRAYS),
+        **{name: np.array(value, dtype=float) for name, value in arrays.items()},
     }
 
 
 def _matrices_from_tree(tree: Tree, outputs: Mapping[int | None, Any]) -> Tree:
-    return {name: _matrix_from_tree(tree[name], outputs) for name in _MATRICES} | {n: tree[n] for n in _ARRAYS}
+    return {name: _matrix_from_tree(tree[name], outputs) for name in MATRICES} | {n: tree[n] for n in _ARRAYS}
 
 
 def _matrix_to_tree(name: str, value: Any, outputs: _Outputs) -> Any:

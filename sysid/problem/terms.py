@@ -22,7 +22,7 @@ from sysid.models.geometry import Geometry
 from sysid.models.unknowns import user_site, variable_of
 from sysid.problem.batch_objective import TestObjective
 from sysid.problem.direct_response import Response, absolute_response, relative_misfit, relative_response
-from sysid.problem.given import as_models, geometry_of
+from sysid.problem.given import MATRICES, as_models, geometry_of
 from sysid.problem.matrices import Blocks, Matrices, blocks_of
 from sysid.problem.slopes import Rows, Slopes, rows_of_test, slopes_of, stacked_rows
 from sysid.structure.structure import Array, finite_array
@@ -276,7 +276,7 @@ class FurtherTest:
             )
         models = as_models(self.mass, self.stiffness, self.damping)
         geometry = geometry_of(self.measurement, models[1], self.recovery, self.rigid_body_dofs)
-        for name, model in zip(("mass", "stiffness", "damping"), models, strict=True):
+        for name, model in zip(MATRICES, models, strict=True):
             if model.unknowns(geometry.unsearched()):
                 raise InputError(f"FurtherTest: {name} is a model; write the matrix in the variables of the problem")
         blocks = blocks_of(models, geometry)
