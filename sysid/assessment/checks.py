@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import chdtri
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.residues import Records, ResidueFit, beyond_chance, force_residual_left
 from sysid.modal_analysis.response import weighed_mass
 from sysid.models.mass import total_of
-from sysid.models.model import Stated
 from sysid.problem.formulation import Formulation
 from sysid.problem.problem import Problem
 from sysid.structure.structure import Array, Structure
@@ -44,13 +44,15 @@ def doubts(problem: Problem, structure: Structure, x: Array | None) -> tuple[str
     tuple of str
     """
     formulation = problem.formulation
-    found = [] if x is None else [*_priors(formulation, x), *(d for term in formulation.beside for d in term.doubts(x))]
-    tests = [(problem.measurement, structure)] if formulation.fits_records else []
-    if formulation.fits_records:
-        found += [*_stated_mass(problem, structure), *_known_entries(problem, structure)]
-        found += _lumped_total(problem, structure)
+    found: list[str] = []
+    tests: list[tuple[Measurement, Structure]] = []
     if x is not None:
+        found += [*_priors(formulation, x), *(sentence for term in formulation.beside for sentence in term.doubts(x))]
         tests += [(term.test, term.matrices.structure(x, term.test)) for term in formulation.further_tests]
+    if formulation.fits_records:
+        for check in (_stated_mass, _known_entries, _lumped_total):
+            found += check(problem, structure)
+        tests.insert(0, (problem.measurement, structure))
     for i, (test, its) in enumerate(tests, start=1):
         told = _of_records(formulation, test, its)
         found += told if len(tests) == 1 else [f"test {i}: {sentence}" for sentence in told]
@@ -64,12 +66,8 @@ def _of_records(formulation: Formulation, test: Measurement, structure: Structur
     if records.data.shape[0] <= _LINES * poles[0].size * records.n_base * (2 if velocity else 1):
         return []
     free = records.fit(*poles, velocity=velocity)
-    model = _called(formulation.mass)
-    misses = list(_no_fit(test, structure, records, free, model))
-    if not (misses or formulation.free_modes):
-        misses += _other_poles(test, structure, records, model)
-    rigid = list(_rigid(test, records, free))
-    found = [*misses, *_force(test, structure, _is_lumped(formulation)), *rigid]
+    misses, rigid = list(_misfit(formulation, test, structure, records, free)), list(_rigid(test, records, free))
+    found = [*misses, *_force(formulation, test, structure), *rigid]
     # Beside what those say, quadrature and likeness mean nothing.
     if structure.modal_damping and not rigid:
         found += _damping(records, poles, free)
@@ -78,30 +76,11 @@ def _of_records(formulation: Formulation, test: Measurement, structure: Structur
     return found
 
 
-def _called(mass: Stated) -> str:
-    """What sentences call the model."""
-    if mass.free:
-        return "the structure"
-    return "the written model" if mass.entries is None else "the stated mass model"
-
-
-def _is_lumped(formulation: Formulation) -> bool:
-    """Whether masses are open, and none of them is below the sensors."""
-    mass, n = formulation.mass, formulation.geometry.n
-    if mass.free or mass.entries is None:
-        return False
-    return bool(np.any(np.isnan(mass.entries)) and np.all(mass.entries[:, n:] == 0))
-
-
 def _priors(formulation: Formulation, x: Array) -> Iterator[str]:
     """Values that are stated as known, where errors as stated do not miss them all so far."""
     names = [name for term in formulation.priors for name in term.labels]
-    if not names:
-        return
-    from scipy.stats import chi2
-
-    off = np.concatenate([term.numbers(x) for term in formulation.priors])
-    if np.sum(off**2) > chi2.isf(_CHANCE, off.size) and np.all(np.abs(off) <= _FAR):
+    off = np.concatenate([np.zeros(0), *(term.numbers(x) for term in formulation.priors)])
+    if np.sum(off**2) > chdtri(max(off.size, 1), _CHANCE) and np.all(np.abs(off) <= _FAR):
         told = ", ".join(f"{name} by {z:+.2g}" for name, z in zip(names, off, strict=True))
         yield (
             f"the values that are stated as known are missed together, in standard deviations: {told}; they, another "
@@ -109,31 +88,31 @@ def _priors(formulation: Formulation, x: Array) -> Iterator[str]:
         )
 
 
-def _other_poles(test: Measurement, structure: Structure, records: Records, model: str) -> Iterator[str]:
-    """Whether poles of the data's own leave clearly less than the structure does."""
-    poles = PolesAndResidues.of(test)
-    if poles is None:
-        return
-    left = replace(test, response=test.response - test.predict(structure))
-    misfit = float(np.sqrt(Records(left).size / records.size))
-    possible = max(poles.of_accelerations, _ROUND_OFF)
-    if misfit > _MISFIT * possible:
-        yield (
-            f"{model} misses {100 * misfit:.3g} % of the accelerations, the poles of the data with free "
-            f"residues {100 * possible:.3g} %: the form of its mass, stiffness or damping, recovery, or a bound is not "
-            "the structure's"
-        )
-
-
-def _no_fit(test: Measurement, structure: Structure, records: Records, free: ResidueFit, model: str) -> Iterator[str]:
-    """Whether the structure leaves clearly more of the accelerations than free residues at its own poles."""
-    left = replace(test, response=test.response - test.predict(structure))
-    misfit = float(np.sqrt(Records(left).size / records.size))
+def _misfit(
+    formulation: Formulation, test: Measurement, structure: Structure, records: Records, free: ResidueFit
+) -> Iterator[str]:
+    """Whether the structure leaves clearly more of the accelerations than free residues, at its poles or the data's."""
+    mass = formulation.mass
+    stated = "the written model" if mass.entries is None else "the stated mass model"
+    model = "the structure" if mass.free else stated
+    left = Records(replace(test, response=test.response - test.predict(structure)))
+    misfit = float(np.sqrt(left.size / records.size))
+    misses = f"{model} misses {100 * misfit:.3g} % of the accelerations"
     possible = max(float(np.sqrt(free.squared_error / records.size)), _ROUND_OFF)
     if misfit > _MISFIT * possible:
         yield (
-            f"{model} misses {100 * misfit:.3g} % of the accelerations, its poles with free residues "
-            f"{100 * possible:.3g} %: the model, a sign or axis in rigid_body, or a record is not what it is said to be"
+            f"{misses}, its poles with free residues {100 * possible:.3g} %: the model, a sign or axis in rigid_body, "
+            "or a record is not what it is said to be"
+        )
+        return
+    poles = None if formulation.free_modes else PolesAndResidues.of(test)
+    if poles is None:
+        return
+    possible = max(poles.of_accelerations, _ROUND_OFF)
+    if misfit > _MISFIT * possible:
+        yield (
+            f"{misses}, the poles of the data with free residues {100 * possible:.3g} %: the form of its mass, "
+            "stiffness or damping, recovery, or a bound is not the structure's"
         )
 
 
@@ -153,8 +132,7 @@ def _stated_mass(problem: Problem, structure: Structure) -> Iterator[str]:
         return
     poles = _poles(structure)
     weighed, own = np.diag(weighed_mass(test, *poles)), np.diag(structure.rigid_body_mass)
-    off = np.abs(weighed / own - 1)
-    if np.any(off >= max(0.01, 3 * force_residual_left(test, *poles) / np.sqrt(test.freq.size))):
+    if np.any(np.abs(weighed / own - 1) >= max(0.01, 3 * force_residual_left(test, *poles) / np.sqrt(test.freq.size))):
         given, told = (", ".join(f"{m:.4g}" for m in masses) for masses in (own, weighed))
         yield (
             f"the stated mass makes {given} kg in the base directions, but the base force weighs {told} kg: one of "
@@ -203,10 +181,13 @@ def _lumped_total(problem: Problem, structure: Structure) -> Iterator[str]:
             )
 
 
-def _force(test: Measurement, structure: Structure, lumped: bool) -> Iterator[str]:
+def _force(formulation: Formulation, test: Measurement, structure: Structure) -> Iterator[str]:
     """Whether the base force is that of the modes that the accelerations show."""
     if test.force is None:
         return
+    entries, n = formulation.mass.entries, formulation.geometry.n
+    # Masses are open, and none of them is below the sensors.
+    lumped = not formulation.mass.free and entries is not None and np.isnan(entries).any() and not entries[:, n:].any()
     fixture = ", and mass below the sensors (base ring, fixture), which a lumped mass has not" if lumped else ""
     # Both misfits in units of the stated noise: what is left at a noisy peak speaks against nothing.
     left = replace(test, force=test.force - test.predict_force(structure))
@@ -228,24 +209,21 @@ def _rigid(test: Measurement, records: Records, free: ResidueFit) -> Iterator[st
     Q, R = np.linalg.qr(extra)
     along = Q.T @ free.left
     left = free.left - Q @ along
-    gained = np.sum(along**2, axis=0)
-    if records.unit:
-        gained = gained.reshape(test.n_base, test.n_sensors).sum(axis=0)
+    gained = np.sum(along**2, axis=0).reshape(-1, test.n_sensors).sum(axis=0)
     noise = records.noise(left, free.residues.size + along.size, least=_ROUND_OFF)
     moved = records.by_sensor(np.linalg.solve(R, along)[None])[0]
     reach = np.abs(test.rigid_body).max(axis=0)
     moved /= np.where(reach > 0, reach, np.inf)
-    clear = gained > noise * beyond_chance(test.n_base)
-    wrong = np.flatnonzero(clear & (np.abs(moved).max(axis=1) > _GAIN))
+    most, size = np.abs(moved).argmax(axis=1), np.abs(moved).max(axis=1)
+    wrong = np.flatnonzero((gained > noise * beyond_chance(test.n_base)) & (size > _GAIN))
     if wrong.size:
-        worst = wrong[np.argsort(-np.abs(moved[wrong]).max(axis=1))][:3]
-        told = []
-        for i in worst:
-            j = int(np.argmax(np.abs(moved[i])))
-            told.append(f"{test.sensor_names[i]} by {moved[i, j]:.2g} times base direction {j + 1}")
+        told = ", ".join(
+            f"{test.sensor_names[i]} by {moved[i, most[i]]:.2g} times base direction {most[i] + 1}"
+            for i in wrong[np.argsort(-size[wrong])][:3]
+        )
         yield (
             f"{wrong.size} of {test.n_sensors} sensors move with the base beside their modes and what rigid_body says "
-            f"({', '.join(told)}): their sign, gain or axis is wrong, or their accelerations are not absolute"
+            f"({told}): their sign, gain or axis is wrong, or their accelerations are not absolute"
         )
 
 
@@ -269,11 +247,8 @@ def _twins(test: Measurement, structure: Structure) -> Iterator[str]:
     relative = np.moveaxis(test.relative, 0, 1).reshape(test.n_sensors, -1)
     misfit = np.linalg.norm(np.moveaxis(test.predict(structure), 0, 1).reshape(test.n_sensors, -1) - relative, axis=1)
     size, names = np.linalg.norm(relative, axis=1), test.sensor_names
-    for i in range(test.n_sensors):
-        for j in range(i):
-            bound = _ALIKE * np.hypot(misfit[i], misfit[j]) + 1e-9 * max(size[i], size[j])
-            apart = min(np.linalg.norm(relative[i] - relative[j]), np.linalg.norm(relative[i] + relative[j]))
-            if size[i] > bound and apart <= bound:
-                yield (
-                    f"sensors {names[j]} and {names[i]} record one motion and are one degree of freedom: leave one out"
-                )
+    for i, j in zip(*np.tril_indices(test.n_sensors, -1), strict=True):
+        bound = _ALIKE * np.hypot(misfit[i], misfit[j]) + 1e-9 * max(size[i], size[j])
+        apart = min(np.linalg.norm(relative[i] - relative[j]), np.linalg.norm(relative[i] + relative[j]))
+        if size[i] > bound and apart <= bound:
+            yield f"sensors {names[j]} and {names[i]} record one motion and are one degree of freedom: leave one out"
