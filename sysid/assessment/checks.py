@@ -11,7 +11,7 @@ from scipy.special import chdtri
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.residues import Records, ResidueFit, beyond_chance, force_residual_left
-from sysid.modal_analysis.response import weighed_mass
+from sysid.modal_analysis.response import columns, weighed_mass
 from sysid.models.mass import total_of
 from sysid.problem.formulation import Formulation
 from sysid.problem.problem import Problem
@@ -244,8 +244,8 @@ def _damping(records: Records, poles: tuple[Array, Array], free: ResidueFit) -> 
 
 def _twins(test: Measurement, structure: Structure) -> Iterator[str]:
     """Sensors that record one motion."""
-    relative = np.moveaxis(test.relative, 0, 1).reshape(test.n_sensors, -1)
-    misfit = np.linalg.norm(np.moveaxis(test.predict(structure), 0, 1).reshape(test.n_sensors, -1) - relative, axis=1)
+    relative = columns(test.relative)
+    misfit = np.linalg.norm(columns(test.predict(structure)) - relative, axis=1)
     size, names = np.linalg.norm(relative, axis=1), test.sensor_names
     for i, j in zip(*np.tril_indices(test.n_sensors, -1), strict=True):
         bound = _ALIKE * np.hypot(misfit[i], misfit[j]) + 1e-9 * max(size[i], size[j])

@@ -49,8 +49,6 @@ def forms(left: Array, right: Array, pairs: Pairs) -> Array:
 
 def null_space(system: Array) -> Array:
     """Directions of the unknowns that the equations leave open, one a row, orthonormal."""
-    if not len(system):
-        return np.eye(system.shape[1])
     _, s, vt = np.linalg.svd(system)
     return vt[np.count_nonzero(s > _RANK_TOLERANCE) :]
 
@@ -67,7 +65,10 @@ class Region(NamedTuple):
 
     Attributes
     ----------
+    width : int
+        Order of the limited block t of T.
     pairs : list of (int, int)
+        Entries of t that are unknowns.
     start : (m,)
         The unknowns of T = I.
     open : (k, m)
@@ -76,11 +77,29 @@ class Region(NamedTuple):
         That T >= 0, and the bounds from above.
     """
 
+    width: int
     pairs: Pairs
     start: Array
     open: Array
     signs: list[Affine]
     limits: list[Affine]
+
+    def coefficients(self, functions: Array) -> Array:
+        """Coefficients (q, m) of the unknowns in ``trace(C t)``, C (q, width, width) symmetric."""
+        k, m = self.indices
+        return functions[:, k, m] * np.where(k == m, 1, 2)
+
+    def block(self, values: Array) -> Array:
+        """The symmetric t, (q, width, width), of values (q, m) of the unknowns."""
+        t, (k, m) = np.zeros((len(values), self.width, self.width)), self.indices
+        t[:, k, m] = t[:, m, k] = values
+        return t
+
+    @property
+    def indices(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows and columns of the unknowns in t, (m,) each."""
+        k, m = np.array(self.pairs, dtype=int).reshape(-1, 2).T
+        return k, m
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +117,8 @@ class Cone:
     matrices : sequence of (n, w)
         Weights with ``W' T W <= I`` in the sense of Loewner.
     equations : (e, m), optional
-        Linear functions of the unknowns (`unknowns`) that keep the value that they have for T = I.
+        Linear functions of the unknowns (`unknowns`) that keep the value that they have for T = I; they count beside
+        `signs` only.
     signs : (p, m), optional
         Linear functions, all positive for T = I, that are nonnegative exactly where T >= 0, given that the equations
         hold: the masses of a lumped model, the springs of a chain.
@@ -108,13 +128,13 @@ class Cone:
     fixed: Sequence[Array] = ()
     traces: Sequence[Array] = ()
     matrices: Sequence[Array] = ()
-    equations: Array | None = None
+    equations: Array | Sequence[Array] = ()
     signs: Array | None = None
 
     @property
     def n(self) -> int:
         """Number of modes."""
-        return sum(len(cluster) for cluster in self.clusters)
+        return sum(map(len, self.clusters))
 
     @cached_property
     def bases(self) -> list[tuple[Array, Array]]:
@@ -138,8 +158,7 @@ class Cone:
     @cached_property
     def region(self) -> Region:
         """What the limited directions may do; the others follow (`_follow`)."""
-        pairs = unknowns(self.groups)
-        width = sum(len(group) for group in self.groups)
+        pairs, width = unknowns(self.groups), sum(map(len, self.groups))
         scale, own = np.zeros((self.n, width)), np.zeros((width, width))
         for cluster, group, (bound, _) in zip(self.clusters, self.groups, self.bases, strict=True):
             inverse = np.linalg.pinv(bound)
@@ -148,18 +167,17 @@ class Cone:
         start = np.array([own[pair] for pair in pairs])
         of = lambda W: forms(scale.T @ W, scale.T @ W, pairs)  # noqa: E731
 
-        rows = [of(W)[np.triu_indices(W.shape[1])] for W in self.fixed]
-        if self.equations is not None and self.signs is not None:
-            rows.append(self.equations)
-        open_ = null_space(np.vstack(rows)) if rows else np.eye(len(pairs))
-        if self.signs is not None:
-            signs = [Affine(np.eye(1), (row @ open_.T / (row @ start))[None, None]) for row in self.signs]
-        else:
+        rows = [np.zeros((0, len(pairs))), *(of(W)[np.triu_indices(W.shape[1])] for W in self.fixed)]
+        if self.signs is None:
+            open_ = null_space(np.vstack(rows))
             units = [np.eye(width)[:, group] for group in self.groups if group]
             signs = [Affine(unit.T @ own @ unit, forms(unit, unit, pairs) @ open_.T) for unit in units]
+        else:
+            open_ = null_space(np.vstack([*rows, *self.equations]))
+            signs = [Affine(np.eye(1), (row @ open_.T / (row @ start))[None, None]) for row in self.signs]
         limits = [np.einsum("iiu->u", of(W))[None, None] for W in self.traces] + [of(W) for W in self.matrices]
         bounds = [_varying(np.eye(len(form)) - form @ start, -form @ open_.T) for form in limits]
-        return Region(pairs, start, open_, signs, [bound for bound in bounds if len(bound.at_start)])
+        return Region(width, pairs, start, open_, signs, [bound for bound in bounds if len(bound.at_start)])
 
     def largest(self, functions: Array) -> tuple[Array, Array]:
         """Suprema of the linear functions ``trace(C T)`` over the cone.
@@ -181,22 +199,18 @@ class Cone:
         RuntimeError
             Where a linear programme or the barrier method does not end at an extreme.
         """
-        q = len(functions)
-        values, members = np.full(q, np.inf), np.full((q, self.n, self.n), np.nan)
+        values, members = np.full(len(functions), np.inf), np.full_like(functions, np.nan, dtype=float)
         followers, finite = self._follow(functions)
-        width = sum(len(group) for group in self.groups)
-        C = np.zeros((q, width, width))
+        region = self.region
+        C = np.zeros((len(functions), region.width, region.width))
         for cluster, group, Z in zip(self.clusters, self.groups, followers, strict=True):
             block = functions[:, cluster][:, :, cluster]
             C[:, np.array(group, dtype=int)[:, None], group] = np.swapaxes(Z, 1, 2) @ block @ Z
-        pairs = self.region.pairs
-        coefficients = np.array([C[:, k, m] * (1 if k == m else 2) for k, m in pairs]).reshape(-1, q).T
+        coefficients = region.coefficients(C)
         finite[finite] = self._bounded(coefficients[finite])
         best = self._best(coefficients[finite])
         values[finite] = np.sum(coefficients[finite] * best, axis=1)
-        t, T = np.zeros((len(best), width, width)), np.zeros((len(best), self.n, self.n))
-        for at, (k, m) in enumerate(pairs):
-            t[:, k, m] = t[:, m, k] = best[:, at]
+        t, T = region.block(best), np.zeros((len(best), self.n, self.n))
         for cluster, group, Z in zip(self.clusters, self.groups, followers, strict=True):
             block = t[:, group][:, :, group]
             T[:, np.array(cluster)[:, None], cluster] = Z[finite] @ block @ np.swapaxes(Z[finite], 1, 2)
@@ -226,14 +240,14 @@ class Cone:
 
     def _bounded(self, coefficients: Array) -> NDArray[np.bool_]:
         """Whether equations and limits keep each function from growing for ever, (q,)."""
-        answer = np.ones(len(coefficients), dtype=bool)
         escape = self._escape
         if escape is None:
-            return answer
-        slopes = coefficients @ self.region.open.T
-        for i, c in enumerate(slopes):
-            answer[i] = _programme(c, escape, np.zeros(len(escape)), box=1.0) @ c <= _ZERO * max(1.0, np.abs(c).max())
-        return answer
+            return np.ones(len(coefficients), dtype=bool)
+        gains = [
+            _programme(c, escape, np.zeros(len(escape)), box=1.0) @ c / max(1.0, np.abs(c).max())
+            for c in coefficients @ self.region.open.T
+        ]
+        return np.array(gains) <= _ZERO
 
     @cached_property
     def _escape(self) -> Array | None:
@@ -279,16 +293,11 @@ class Cone:
 
     def _one_limit(self, coefficients: Array) -> Array:
         """With the scaled ``trace(t) <= 1`` alone all the trace goes to the largest eigenvalue, or nowhere."""
-        pairs, q = self.region.pairs, len(coefficients)
-        width = sum(len(group) for group in self.groups)
-        C = np.zeros((q, width, width))
-        for at, (k, m) in enumerate(pairs):
-            C[:, k, m] = C[:, m, k] = coefficients[:, at] / (1 if k == m else 2)
-        lam, V = np.linalg.eigh(
-            C
-        )  # an eigenvector over two blocks is one in each: T without its cross part does as well
-        T = np.where(lam[:, -1] > 0, 1.0, 0.0)[:, None, None] * V[:, :, -1:] @ np.swapaxes(V[:, :, -1:], 1, 2)
-        return np.array([T[:, k, m] for k, m in pairs]).T
+        k, m = self.region.indices
+        # An eigenvector over two blocks is one in each: T without its cross part does as well.
+        lam, V = np.linalg.eigh(self.region.block(coefficients / np.where(k == m, 1, 2)))
+        T = (lam[:, -1] > 0)[:, None, None] * V[:, :, -1:] @ np.swapaxes(V[:, :, -1:], 1, 2)
+        return np.asarray(T[:, k, m])
 
 
 def _varying(at_start: Array, slopes: Array) -> Affine:
@@ -302,12 +311,10 @@ def _varying(at_start: Array, slopes: Array) -> Affine:
     return Affine(constant, np.einsum("ia,ijk,jb->abk", V, slopes, V))
 
 
-def _programme(function: Array, rows: Array, at_start: Array, box: float | None = None) -> Array:
-    """The z with the largest ``function @ z`` where ``at_start + rows @ z >= 0`` (and |z| <= box)."""
-    size = np.abs(function).max()
+def _programme(function: Array, rows: Array, at_start: Array, box: float = np.inf) -> Array:
+    """The z with the largest ``function @ z`` where ``at_start + rows @ z >= 0`` and |z| <= box."""
     answer = linprog(
-        -function / size if size > 0 else function, A_ub=-rows, b_ub=at_start,
-        bounds=(None, None) if box is None else (-box, box),
+        -function / (np.abs(function).max() or 1.0), A_ub=-rows, b_ub=at_start, bounds=(-box, box),
         options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
     )  # fmt: skip
     if answer.status != 0:
@@ -338,11 +345,9 @@ def _room(region: Region) -> _Room:
     stay = np.zeros_like(falling)
     starts = [z for z in (falling, stay) if least(region.signs, z) > 0]
     inside = max(starts, key=lambda z: float(least(region.limits, z)))
-    opened = [
-        Affine(p.at_start + max(0.0, _OPENED - least([p], inside)) * np.eye(len(p.at_start)), p.slopes)
-        for p in region.limits
-    ]
-    parts = [*region.signs, *opened]
+    parts = [*region.signs]
+    for p in region.limits:
+        parts.append(Affine(p.at_start + max(0.0, _OPENED - least([p], inside)) * np.eye(len(p.at_start)), p.slopes))
     single = [p for p in parts if len(p.at_start) == 1]
     at_start = np.array([p.at_start[0, 0] for p in single])
     rows = np.array([p.slopes[0, 0] for p in single]).reshape(-1, len(inside))

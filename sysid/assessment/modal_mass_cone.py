@@ -56,35 +56,15 @@ def verdict(problem: Problem, structure: Structure) -> tuple[tuple[str, ...], tu
     """
     test = problem.measurement
     misfit = test.residual(structure)
-    closed, open_ = [], list(_unseen(problem, structure, misfit))
     known = _known(problem, structure, misfit)
     free, common = _open_modes(known)
-    responses = _responses(test, structure)
-    for cluster in known.clusters:
-        if len(cluster) > 1:
-            names = " and ".join(_mode(structure, k) for k in cluster)
-            seen = _seen(test, structure, cluster, structure.mode_shapes, responses).shape[1]
-            if seen < len(cluster):
-                open_.append(f"{names} are too close to be told apart, and the data show {seen or 'none'} of them only")
-            elif not set(cluster).isdisjoint(free):
-                open_.append(f"{names} are too close to be told apart: only the sum of their residues is known")
-    if known.sentence:
-        closed.append(known.sentence)
-    if test.force is not None:
-        closed.append("the measured base force weighs each mode that the base moves")
+    open_ = [*_unseen(problem, structure, misfit), *_merged(known, test, structure, free)]
     if free:
-        if common:
-            what = "one common scale of mass, stiffness and damping is open"
-        elif len(free) == structure.n:
-            what = "all modal masses are open"
-        else:
-            masses = [f"the modal mass of {_mode(structure, k)}" for k in free]
-            listed = masses if len(masses) == 1 else [", ".join(masses[:-1]), masses[-1]]
-            what = " and ".join(listed) + (" is open" if len(masses) == 1 else " are open")
         bounded = ", within what is stated" if len(known.equations) else ""
-        open_.append(f"{what}: other mass and stiffness matrices answer identically{bounded}")
-        if problem.unit_mass:
-            open_.append(UNIT_MASS)
+        open_.append(
+            f"{_what_is_open(structure, free, common)}: other mass and stiffness matrices answer identically{bounded}"
+        )
+        open_ += [UNIT_MASS] if problem.unit_mass else []
     if not structure.at_sensors:
         how_far = "completely" if test.force is not None and not free else "up to the modal masses"
         alike = ", which do not all move independently" if structure.n == structure.n_sensors else ""
@@ -93,7 +73,30 @@ def verdict(problem: Problem, structure: Structure) -> tuple[tuple[str, ...], tu
             "hold for the stated degrees of freedom only; the Craig-Bampton form (to_craig_bampton(), modal and base "
             f"coordinates) is what the data determine, {how_far}"
         )
-    return () if free else tuple(closed), tuple(open_)
+    weighed = "" if test.force is None else "the measured base force weighs each mode that the base moves"
+    closed = () if free else tuple(filter(None, (known.sentence, weighed)))
+    return closed, tuple(open_)
+
+
+def _merged(known: _Known, test: Measurement, structure: Structure, free: list[int]) -> Iterator[str]:
+    """Modes that cannot be told apart, as far as something of them is open, in sentences."""
+    responses = _responses(test, structure)
+    for cluster in (cluster for cluster in known.clusters if len(cluster) > 1):
+        names = " and ".join(_mode(structure, k) for k in cluster)
+        seen = _seen(test, structure, cluster, structure.mode_shapes, responses).shape[1]
+        if seen < len(cluster):
+            yield f"{names} are too close to be told apart, and the data show {seen or 'none'} of them only"
+        elif not set(cluster).isdisjoint(free):
+            yield f"{names} are too close to be told apart: only the sum of their residues is known"
+
+
+def _what_is_open(structure: Structure, free: list[int], common: bool) -> str:
+    if common:
+        return "one common scale of mass, stiffness and damping is open"
+    if len(free) == structure.n:
+        return "all modal masses are open"
+    *others, last = (f"the modal mass of {_mode(structure, k)}" for k in free)
+    return f"{', '.join(others)} and {last} are open" if others else f"{last} is open"
 
 
 def open_modes(problem: Problem, structure: Structure) -> list[int]:
@@ -120,14 +123,13 @@ def ends(problem: Problem, structure: Structure) -> tuple[Array, Array]:
     """
     n = structure.n
     known = _known(problem, structure, problem.measurement.residual(structure))
-    matrices = structure.mass[:n, :n], structure.stiffness[:n, :n]
+    mass, stiffness = structure.mass[:n, :n], structure.stiffness[:n, :n]
     if not _open_modes(known)[0]:
-        mass, stiffness = (np.stack([matrix, matrix]) for matrix in matrices)
-        return mass, stiffness
+        return np.stack([mass, mass]), np.stack([stiffness, stiffness])
     cone = _cone(problem, structure, known)
     P = np.linalg.inv(structure.normal_modes)
     omega = 2 * np.pi * structure.natural_frequencies[:, None]
-    return _entries(cone, P, matrices[0]), _entries(cone, P * omega, matrices[1])
+    return _entries(cone, P, mass), _entries(cone, P * omega, stiffness)
 
 
 def _entries(cone: Cone, rows: Array, own: Array) -> Array:
@@ -194,16 +196,14 @@ def _cone(problem: Problem, structure: Structure, known: _Known) -> Cone:
     """The modal-mass cone, with the bounds that a total mass or a rigid-body mass puts on it."""
     totals, n = problem.formulation.mass.totals, structure.n
     visible = sum((W @ (W.T @ structure.participation) for W in _moved(structure, known.clusters)), np.zeros((n, 1)))
-    traces, matrices = [], []
-    if problem.measurement.force is not None:
-        matrices.append(_below(visible, structure.rigid_body_mass))
-    if totals is not None and totals.values.ndim == 2:
-        matrices.append(_below(visible, totals.values))
-    elif totals is not None and totals.kind == "rigid_body":
-        traces += [_at_most(column[:, None], total) for column, total in zip(visible.T, totals.values, strict=True)]
-    elif totals is not None and totals.kind == "trace" and structure.at_sensors:
-        weights = _by_direction(problem.geometry, structure)
-        traces += [_at_most(W, total) for W, total in zip(weights, totals.values, strict=True)]
+    weighed = None if problem.measurement.force is None else structure.rigid_body_mass
+    matrices = [_below(visible, bound) for bound in (weighed, problem.rigid_total) if bound is not None]
+    traces: list[Array] = []
+    if totals is not None and problem.rigid_total is None:
+        if totals.kind == "rigid_body":
+            traces = list(map(_at_most, visible.T[:, :, None], totals.values))
+        elif totals.kind == "trace" and structure.at_sensors:
+            traces = list(map(_at_most, _by_direction(problem.geometry, structure), totals.values))
     return Cone(known.clusters, known.weighed, traces, matrices, known.equations, known.signs)
 
 
@@ -224,7 +224,7 @@ def _below(weights: Array, bound: Array) -> Array:
     """Weights W for ``W' T W <= I``, of ``weights' T weights <= bound``; what the structure has is never too much."""
     own = weights.T @ weights
     size = np.sqrt(np.maximum(np.diag(own), np.diag(bound)))
-    size[size == 0] = 1.0
+    size = np.where(size > 0, size, 1.0)
     lam, V = np.linalg.eigh((bound - own) / np.outer(size, size))
     lam, V = np.linalg.eigh(own / np.outer(size, size) + (V * np.maximum(lam, 0.0)) @ V.T)
     some = lam > 1e-12 * lam[-1]
@@ -274,14 +274,13 @@ class _Record(NamedTuple):
     level: float
 
 
-def _like_rigid(problem: Problem, structure: Structure, k: int) -> str:
+def _like_rigid(test: Measurement, structure: Structure, k: int) -> str:
     """What else a mode below the lines may be: far above it, it moves sensors by a constant times the base's motion."""
-    test, G = problem.measurement, problem.measurement.rigid_body
     moved = -np.outer(structure.mode_shapes[:, k], structure.participation[k])
-    reach = np.abs(G).max(axis=0)
+    reach = np.abs(test.rigid_body).max(axis=0)
     wrong = np.abs(moved) / np.where(reach > 0, reach, np.inf)
     i, j = np.unravel_index(np.argmax(wrong), wrong.shape)
-    if wrong[i, j] < _GAIN:
+    if wrong[i, j] < _GAIN or structure.natural_frequencies[k] > test.freq[-1]:
         return ""
     return (
         f"; or sign, gain or axis of {test.sensor_names[i]} are wrong, which in all these lines moves by "
@@ -345,13 +344,12 @@ def _unseen(problem: Problem, structure: Structure, misfit: float) -> Iterator[s
     if 2 * test.response.size < count:
         yield f"{2 * test.response.size} measured numbers cannot fix {count} unknowns"
     responses, forces = _responses(test, structure), _forces(test, structure)
-    level = responses.level
     for k in range(structure.n):
         f, push = structure.natural_frequencies[k], structure.participation[[k]]
         (share,) = _shares(test, structure, k, structure.mode_shapes[:, [k]], push, responses)
         if share < _INVISIBLE:
             yield f"{_mode(structure, k)} is not moved by the base: nothing in these data tells its mass"
-        elif share < level:
+        elif share < responses.level:
             yield (
                 f"{_mode(structure, k)} makes {100 * share:.2g} % of the response, which does not stand out of the "
                 f"misfit of {100 * responses.misfit:.2g} %: its mass is not known"
@@ -359,8 +357,8 @@ def _unseen(problem: Problem, structure: Structure, misfit: float) -> Iterator[s
         elif not test.freq[0] <= f <= test.freq[-1]:
             yield (
                 f"{_mode(structure, k)} lies outside the lines ({test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz) and "
-                "answers for all modes there"
-            ) + (_like_rigid(problem, structure, k) if f < test.freq[0] else "")
+                f"answers for all modes there{_like_rigid(test, structure, k)}"
+            )
         elif forces and _shares(test, structure, k, push.T, push, forces)[0] < forces.level:
             yield f"{_mode(structure, k)} does not stand out of the misfit of the base force: its mass is not weighed"
 
@@ -368,15 +366,9 @@ def _unseen(problem: Problem, structure: Structure, misfit: float) -> Iterator[s
 def _clusters(structure: Structure, misfit: float) -> list[list[int]]:
     """Modes that the misfit cannot tell apart: of them only the sum of the residues is seen."""
     poles = structure.natural_frequencies * (1 + 1j * structure.damping_ratios)
-    clusters = [[0]]
-    for k in range(1, structure.n):
-        apart = abs(poles[k] - poles[clusters[-1][-1]])
-        width = structure.damping_ratios[k] * structure.natural_frequencies[k]
-        if apart < max(_SAME_POLE * abs(poles[k]), min(_UNRESOLVED * misfit, 1.0) * width):
-            clusters[-1].append(k)
-        else:
-            clusters.append([k])
-    return clusters
+    widths = min(_UNRESOLVED * misfit, 1.0) * structure.damping_ratios * structure.natural_frequencies
+    apart = np.abs(np.diff(poles)) >= np.maximum(_SAME_POLE * np.abs(poles), widths)[1:]
+    return [part.tolist() for part in np.split(np.arange(structure.n), np.flatnonzero(apart) + 1)]
 
 
 def _model_equations(problem: Problem, structure: Structure, pairs: Pairs) -> tuple[Array, Array | None, str]:
@@ -391,7 +383,7 @@ def _model_equations(problem: Problem, structure: Structure, pairs: Pairs) -> tu
     # Modes that share a block have no such rows: their intervals do without the equations.
     modal = np.eye(len(pairs)) if len(rows) and len(pairs) == structure.n else None
     signs = next((signs for signs in (masses, springs) if signs is not None), modal)
-    return rows, signs, "; ".join(stated.sentence for stated in (mass, stiffness) if stated.sentence)
+    return rows, signs, "; ".join(filter(None, (mass.sentence, stiffness.sentence)))
 
 
 def _of_mass(
@@ -408,10 +400,9 @@ def _of_mass(
     known = np.isfinite(stated.entries)
     rows = [entries[known[:, :n]], coupling[known[:, n:]]]
     if stated.totals is not None and stated.totals.kind == "sensors":
-        for i in range(geometry.d):
+        for i in np.unique(geometry.directions[:n][geometry.directions[:n] >= 0]):
             own = P[:, geometry.directions[:n] == i]
-            if own.size:
-                rows.append(np.einsum("iiu->u", forms(own, own, pairs))[None] / np.sum(own**2))
+            rows.append(np.einsum("iiu->u", forms(own, own, pairs))[None] / np.sum(own**2))
     diagonal = np.all(known[:, :n] | np.eye(n, dtype=bool))
     return rows, None if stated.free or not diagonal else np.einsum("iiu->iu", entries)
 
