@@ -14,11 +14,13 @@ import numpy as np
 from sysid.assessment import modal_mass_cone
 from sysid.assessment.sensitivity import (
     Sensitivity,
+    blocks_and_slopes,
+    blocks_of,
     directions_in_words,
     meaningful,
-    of_formulation,
     of_outside,
     outside_variables,
+    sensitivity,
     with_totals,
 )  # fmt: skip
 from sysid.errors import InputError
@@ -98,12 +100,11 @@ def determine(problem: Problem, structure: Structure, x: Array | None, rivals: S
     """
     if modal_mass_cone.speaks(problem.formulation):
         closed, open_ = modal_mass_cone.verdict(problem, structure)
-        # Where the cone is open, other answers are members of it.
-        others = () if x is None or open_ else tuple(_others(problem, structure, x, rivals))
-        beside = () if x is None else tuple(_open_outside(problem.formulation, x))
-        open_ = (*open_, *beside) if open_ else others
-        return Determination(not open_, closed if open_ else (*closed, *beside), open_, BY_CONE)
-    x = _needed(x)
+        beside = tuple(_open_outside(problem.formulation, x))
+        if open_:  # other answers are members of the cone
+            return Determination(False, closed, (*open_, *beside), BY_CONE)
+        others = tuple(_others(problem, structure, x, rivals))
+        return Determination(not others, closed if others else (*closed, *beside), others, BY_CONE)
     closed, open_ = _by_rank(problem, structure, x)
     open_ = (*open_, *_others(problem, structure, x, rivals))
     return Determination(not open_, () if open_ else closed, open_, BY_RANK)
@@ -117,17 +118,12 @@ def intervals(problem: Problem, structure: Structure, x: Array | None) -> Interv
     """
     if modal_mass_cone.speaks(problem.formulation):
         return Intervals(*modal_mass_cone.ends(problem, structure))
-    x = _needed(x)
-    formulation, x = with_totals(problem, structure, x)
-    slopes = slopes_of(formulation.matrices, x, problem.measurement)
-    known = of_formulation(formulation, x, slopes)
+    _, _, slopes, known = _about(problem, structure, x)
     ends = []
-    for value, slope in _pairs(structure, slopes)[:2]:
+    for value, slope in blocks_and_slopes(structure, slopes)[:2]:
         open_ = _open_entries(value, slope, known)
-        low, high = value.copy(), value.copy()
-        low[open_], high[open_] = -np.inf, np.inf
-        low[open_ & np.eye(len(value), dtype=bool)] = 0.0
-        ends.append(np.stack([low, high]))
+        lowest = np.where(np.eye(len(value)), 0.0, -np.inf)
+        ends.append(np.stack([np.where(open_, lowest, value), np.where(open_, np.inf, value)]))
     return Intervals(*ends)
 
 
@@ -136,29 +132,31 @@ def open_masses(problem: Problem, structure: Structure) -> list[int]:
     return modal_mass_cone.open_modes(problem, structure) if modal_mass_cone.speaks(problem.formulation) else []
 
 
-def _needed(x: Array | None) -> Array:
+# -- by the rank of the Jacobian -----------------------------------------------------------------
+
+
+def _about(problem: Problem, structure: Structure, x: Array | None) -> tuple[Formulation, Array, Slopes, Sensitivity]:
+    """Formulation and unknowns with all totals, derivatives of the matrices, and what the data say of the unknowns."""
     if x is None:
         raise InputError(
             "the rank of the Jacobian is taken at the unknowns of the problem: give x beside the structure"
         )
-    return x
-
-
-# -- by the rank of the Jacobian -----------------------------------------------------------------
-
-
-def _by_rank(problem: Problem, structure: Structure, x: Array) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """What fixes the matrices, and what is left open, in sentences."""
     formulation, x = with_totals(problem, structure, x)
     slopes = slopes_of(formulation.matrices, x, problem.measurement)
-    known = of_formulation(formulation, x, slopes)
+    return formulation, x, slopes, sensitivity(formulation, x, slopes)
+
+
+def _by_rank(problem: Problem, structure: Structure, x: Array | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """What fixes the matrices, and what is left open, in sentences."""
+    formulation, x, slopes, known = _about(problem, structure, x)
     count, rank = known.free.shape[1], known.rank
     named, factors = _by_name(formulation, known.unseen)
     words = directions_in_words(formulation.unknowns, x, known.unit, named)
     seen = f"the records see {rank} of {count} directions of the {x.size} unknowns; no record sees a change of"
     open_: list[str] = []
-    if any(np.any(_open_entries(*pair, known)) for pair in _pairs(structure, slopes)):
-        factors = _moving(_pairs(structure, slopes), known.unit, factors)
+    pairs = blocks_and_slopes(structure, slopes)
+    if any(np.any(_open_entries(*pair, known)) for pair in pairs):
+        factors = _moving(pairs, known.unit, factors)
         open_.append(f"{seen} {'; nor of '.join([*words, *_factors_in_words(formulation, factors)])}")
         open_ += [modal_mass_cone.UNIT_MASS] if problem.unit_mass else []
     misfit = formulation.objective(x)
@@ -166,14 +164,17 @@ def _by_rank(problem: Problem, structure: Structure, x: Array) -> tuple[tuple[st
         (weakest,) = directions_in_words(formulation.unknowns, x, known.unit, known.seen[:, -1:])
         open_.append(f"the search ended at {misfit:.2g} of the records, by which {weakest} is hardly held")
     if known.unseen.shape[1]:
-        closed = ["the data and the written model fix mass, stiffness and damping"]
-        closed += [f"{seen} {'; nor of '.join(words)}; {_SAME_MATRICES}"] if words else []
-        return tuple(closed), tuple(open_)
-    only = rank - of_formulation(formulation, x, slopes, priors=False).rank if formulation.priors else 0
-    closed = [f"the data and the written model fix all {x.size} unknowns"]
-    closed += [f"{only} of them by what is stated as known alone"] if only else []
-    closed += [f"{x.size - count} of them by constraints"] if count < x.size else []
-    return (f"{', '.join(closed)} about this answer; what is written as a number counts as exact",), tuple(open_)
+        fixed = "the data and the written model fix mass, stiffness and damping"
+        same = (f"{seen} {'; nor of '.join(words)}; {_SAME_MATRICES}",) if words else ()
+        return (fixed, *same), tuple(open_)
+    only = rank - sensitivity(formulation, x, slopes, priors=False).rank if formulation.priors else 0
+    closed = (
+        (x.size, f"the data and the written model fix all {x.size} unknowns"),
+        (only, f"{only} of them by what is stated as known alone"),
+        (x.size - count, f"{x.size - count} of them by constraints"),
+    )
+    told = ", ".join(sentence for number, sentence in closed if number)
+    return (f"{told} about this answer; what is written as a number counts as exact",), tuple(open_)
 
 
 def _by_name(formulation: Formulation, directions: Array) -> tuple[Array, Array]:
@@ -203,15 +204,6 @@ def _factors_in_words(formulation: Formulation, directions: Array) -> Iterator[s
         yield f"{', '.join(titles)} together, in {count} {'way' if count == 1 else 'ways'}"
 
 
-def _pairs(structure: Structure, slopes: Slopes) -> list[tuple[Array, Array]]:
-    """M_SS, K_SS and C, and their slopes."""
-    n = structure.n
-    return [
-        (structure.mass[:n, :n], slopes.mass), (structure.stiffness[:n, :n], slopes.stiffness),
-        (structure.damping, slopes.damping),
-    ]  # fmt: skip
-
-
 def _open_entries(matrix: Array, slope: Array, known: Sensitivity) -> Array:
     """Which entries (n, n) of a matrix something unseen moves."""
     size = np.sqrt(np.abs(np.diag(matrix)))
@@ -222,19 +214,20 @@ def _open_entries(matrix: Array, slope: Array, known: Sensitivity) -> Array:
 # -- of what else was found, and of variables beside ---------------------------------------------
 
 
-def _open_outside(formulation: Formulation, x: Array) -> Iterator[str]:
+def _open_outside(formulation: Formulation, x: Array | None) -> Iterator[str]:
     """Variables that enter no matrix and that no term sees, in a sentence."""
-    outside = formulation.outside
-    if not np.any(outside):
+    if x is None or not np.any(formulation.outside):
         return
     known = of_outside(formulation, x)
-    if known.unseen.shape[1]:
-        words = directions_in_words(outside_variables(formulation), x[outside], known.unit, known.unseen)
+    words = directions_in_words(outside_variables(formulation), x[formulation.outside], known.unit, known.unseen)
+    if words:
         yield f"no term sees a change of {'; nor of '.join(words)}; {_SAME_MATRICES}"
 
 
-def _others(problem: Problem, structure: Structure, x: Array, rivals: Sequence[Array]) -> Iterator[str]:
+def _others(problem: Problem, structure: Structure, x: Array | None, rivals: Sequence[Array]) -> Iterator[str]:
     """Other answers whose matrices are others."""
+    if x is None:
+        return
     formulation = problem.formulation
     unit, named, labels = scales_of(formulation.unknowns, x), meaningful(formulation), formulation.labels
     for other in rivals:
@@ -242,7 +235,7 @@ def _others(problem: Problem, structure: Structure, x: Array, rivals: Sequence[A
         far = [j for j in np.argsort(-off, kind="stable")[:_TOLD] if off[j] > _OTHER]
         told = ", ".join(f"{labels[j]} = {other[j]:.4g} in place of {x[j]:.4g}" for j in sorted(far))
         if _other_matrices(problem, structure, other):
-            yield f"another structure explains the data as well{': ' if told else ''}{told}"
+            yield ": ".join(filter(None, ("another structure explains the data as well", told)))
 
 
 def _other_matrices(problem: Problem, mine: Structure, other: Array) -> bool:
@@ -251,10 +244,8 @@ def _other_matrices(problem: Problem, mine: Structure, other: Array) -> bool:
         its = problem.structure(other)
     except InputError:  # of no structure
         return False
-    n = mine.n
-    pairs = (mine.mass[:n, :n], its.mass[:n, :n]), (mine.stiffness[:n, :n], its.stiffness[:n, :n])
-    for a, b in (*pairs, (mine.damping, its.damping)):
-        size = np.sqrt(np.abs(np.diag(a))) + np.finfo(float).tiny
-        if np.any(np.abs(a - b) > _OTHER * np.outer(size, size)):
-            return True
-    return False
+    sizes = [np.sqrt(np.abs(np.diag(a))) + np.finfo(float).tiny for a in blocks_of(mine)]
+    return any(
+        np.any(np.abs(a - b) > _OTHER * np.outer(size, size))
+        for a, b, size in zip(blocks_of(mine), blocks_of(its), sizes, strict=True)
+    )

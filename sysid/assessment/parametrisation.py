@@ -26,10 +26,9 @@ def parametrisation(problem: Problem, structure: Structure, modes: Modes, index:
     unit[index.gamma] = np.repeat(np.max(strength * np.linalg.norm(gamma, axis=1)) / strength, d)
     weight = np.sqrt(problem.totals)
     unit[index.rigid] = [weight[i] * weight[j] for i, j in index.pairs]
-    gauge = np.zeros((index.size, 0))
+    gauge, of_mode = np.zeros((index.size, 0)), np.eye(m)
     if test.force is None:
         gauge = np.zeros((index.size, m))
-        of_mode = np.eye(m)
         gauge[index.phi] = -(phi[:, :, None] * of_mode).reshape(-1, m)
         gauge[index.gamma] = (gamma[:, :, None] * of_mode[:, None]).reshape(-1, m)
     else:
@@ -67,11 +66,10 @@ def _tied_masses(problem: Problem, modes: Modes, index: Index) -> Iterator[tuple
     totals, geometry, (phi, gamma, _, _) = problem.formulation.mass.totals, problem.geometry, modes
     if totals is None:
         return
-    every = totals.values.ndim == 2  # the whole matrix is stated
     for at, (i, j) in zip(index.rigid.tolist(), index.pairs, strict=True):
-        row = np.zeros(index.size)
-        if i != j and not every:
+        if i != j and problem.rigid_total is None:  # its diagonal alone is stated
             continue
+        row = np.zeros(index.size)
         # With other degrees of freedom than the sensors the fit ties M_rb itself.
         if totals.kind == "trace" and phi.shape[0] == phi.shape[1]:
             # M_rb,ii = total - sum of the sensors' M_jj - (delta' delta)_ii + (Gamma' Gamma)_ii, delta = Gamma - P G
@@ -96,24 +94,20 @@ def held_by_entries(
     if problem.measurement.force is not None or not structure.at_sensors or not np.any(np.isfinite(known)):
         return moves
     phi, gamma, _, _ = modes
-    n = len(phi)
+    n, d = gamma.shape
     P = np.linalg.inv(phi)
-    M, push = P.T @ P, P.T @ gamma
+    M, push, steps = P.T @ P, P.T @ gamma, np.hstack([-np.eye(n), G])
     size = np.sqrt(np.diag(M))
+    scale = np.outer(size, np.concatenate([size, np.full(d, size.max())]))
     rows = []
     for i, j in np.argwhere(np.isfinite(known)):
         row = np.zeros(index.size)
-        if j < n:
-            by_phi = -(np.outer(M[i], P[:, j]) + np.outer(M[j], P[:, i]))
-        else:
-            # M_S0 = P' Gamma - M G
-            by_phi = (
-                -np.outer(push[:, j - n], P[:, i])
-                + np.outer(M[i], P @ G[:, j - n])
-                + np.outer(M @ G[:, j - n], P[:, i])
-            )
+        # Of -M_ij, or of the second part of M_S0 = P' Gamma - M G.
+        by_phi = np.outer(M[i], P @ steps[:, j]) + np.outer(M @ steps[:, j], P[:, i])
+        if j >= n:
+            by_phi -= np.outer(push[:, j - n], P[:, i])
             row[index.gamma].reshape(gamma.shape)[:, j - n] = P[:, i]
         row[index.phi] = by_phi.ravel()
-        rows.append(row / (size[i] * (size[j] if j < n else size.max())))
+        rows.append(row / scale[i, j])
     C, gauge = np.array(rows), path.slope @ path.gauge
     return moves - gauge @ (np.linalg.pinv(C @ gauge, rcond=1e-9) @ (C @ moves))

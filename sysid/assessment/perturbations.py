@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -53,69 +53,60 @@ class Perturbations(NamedTuple):
         return np.where(moved > _MOVED * size, np.nan, np.sqrt(np.maximum(variance, 0.0)))
 
 
-class Spectra(Protocol):
-    """What tells standard deviations of predicted spectra."""
-
-    def transmissibility(self, freq: Array) -> Array:
-        """Standard deviations, (n_sensors, d, n_freq)."""
-
-    def base_force(self, freq: Array) -> Array:
-        """Standard deviations, kg, (d, d, n_freq)."""
-
-
 @dataclass(frozen=True, eq=False)
 class ModalSpectra:
-    """Where the damping is by ratios: by modes."""
+    """Standard deviations of predicted spectra where the damping is by ratios: by modes."""
 
     modes: Modes
     moves: Perturbations
     rigid_body_mass: Array
 
     def transmissibility(self, freq: Array) -> Array:
-        """As in `Spectra`."""
-        (phi, gamma, _, _), moves = self.modes, self.moves
-        g, slopes = gains_of(freq, self.modes)
-        size = float(np.max(np.abs(np.einsum("ik,kj,kf->ijf", phi, gamma, g))))
-        std = np.empty((len(phi), gamma.shape[1], g.shape[1]))
-        for i, j in np.ndindex(*std.shape[:2]):
-            residue = np.tile(phi[i] * gamma[:, j], 2)[:, None]
-            change = np.vstack([moves.phi[i], moves.gamma[:, j], moves.log_omega, moves.log_ratios])
-            std[i, j] = moves.std_of_lines(change, [gamma[:, [j]] * g, phi[i, :, None] * g, residue * slopes], size)
-        return std
+        """Standard deviations, (n_sensors, d, n_freq)."""
+        phi, gamma, _, _ = self.modes
+        g, _ = gains_of(freq, self.modes)
+        size = np.full((len(phi), gamma.shape[1]), np.max(np.abs(np.einsum("ik,kj,kf->ijf", phi, gamma, g))))
+        return self._std(freq, phi, self.moves.phi, np.zeros((*size.shape, self.moves.phi.shape[2])), size)
 
     def base_force(self, freq: Array) -> Array:
-        """As in `Spectra`."""
+        """Standard deviations, kg, (d, d, n_freq)."""
+        weight = np.sqrt(np.diag(self.rigid_body_mass))
+        gamma, moved = self.modes.gamma.T, self.moves.gamma.swapaxes(0, 1)
+        return self._std(freq, gamma, moved, self.moves.rigid, np.outer(weight, weight))
+
+    def _std(self, freq: Array, left: Array, d_left: Array, d_constant: Array, size: Array) -> Array:
+        """Of ``sum_k left_ik g_k gamma_kj + constant_ij``, whose parts move by d_left (a, m, moves), d_constant."""
         gamma, moves = self.modes.gamma, self.moves
         g, slopes = gains_of(freq, self.modes)
-        weight = np.sqrt(np.diag(self.rigid_body_mass)).tolist()
-        std = np.empty((len(weight), len(weight), g.shape[1]))
-        for i, j in np.ndindex(*std.shape[:2]):
-            residue = np.tile(gamma[:, i] * gamma[:, j], 2)[:, None]
-            change = np.vstack(
-                [moves.gamma[:, i], moves.gamma[:, j], moves.log_omega, moves.log_ratios, moves.rigid[i, [j]]]
-            )
-            factors = [gamma[:, [j]] * g, gamma[:, [i]] * g, residue * slopes, np.ones((1, g.shape[1]))]
-            std[i, j] = moves.std_of_lines(change, factors, weight[i] * weight[j])
+        std = np.empty((*size.shape, g.shape[1]))
+        for i, j in np.ndindex(*size.shape):
+            residue = np.tile(left[i] * gamma[:, j], 2)[:, None]
+            change = np.vstack([d_left[i], moves.gamma[:, j], moves.log_omega, moves.log_ratios, d_constant[i, [j]]])
+            factors = [gamma[:, [j]] * g, left[i, :, None] * g, residue * slopes, np.ones((1, g.shape[1]))]
+            std[i, j] = moves.std_of_lines(change, factors, float(size[i, j]))
         return std
 
 
 @dataclass(frozen=True, eq=False)
 class DirectSpectra:
-    """Where the damping is a matrix: by direct solves; `steps` (p, moves) of x, `normals` of a standard normal each."""
+    """The same where the damping is a matrix: by direct solves.
+
+    Moves of x are in `steps` (p, moves), `normals` of them of a standard normal each.
+    """
 
     slopes: Slopes
     steps: Array
     normals: int
 
     def transmissibility(self, freq: Array) -> Array:
-        """As in `Spectra`."""
+        """Standard deviations, (n_sensors, d, n_freq)."""
         X, dX = response_slopes(self.slopes, freq)
         R = self.slopes.structure.recovery
         change = np.einsum("si,fidc->sdfc", R, dX, optimize=True)
         return std_of(change @ self.steps, self.normals, float(np.abs(X).max()))
 
     def base_force(self, freq: Array) -> Array:
-        """As in `Spectra`."""
+        """Standard deviations, kg, (d, d, n_freq)."""
         s = self.slopes
         X, dX = response_slopes(s, freq)
         change = np.einsum("iec,fid->edfc", s.d_push, X, optimize=True) + s.d_rigid[:, :, None]

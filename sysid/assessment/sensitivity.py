@@ -61,13 +61,13 @@ class Sensitivity:
 
 
 def sensitivity(
-    problem: Problem, x: Array, slopes: Slopes | None = None, *, priors: bool = True, as_stated: bool = False
+    formulation: Formulation, x: Array, slopes: Slopes | None = None, *, priors: bool = True, as_stated: bool = False
 ) -> Sensitivity:
     """Rank, null directions and noise of all unknowns at `x`.
 
     Parameters
     ----------
-    problem : Problem
+    formulation : Formulation
     x : (n_variables,)
     slopes : Slopes, optional
         Those of the problem's own matrices at x, where they are known.
@@ -80,21 +80,12 @@ def sensitivity(
     -------
     Sensitivity
     """
-    return of_formulation(problem.formulation, x, slopes, priors=priors, as_stated=as_stated)
-
-
-def of_formulation(
-    formulation: Formulation, x: Array, slopes: Slopes | None = None, *, priors: bool = True, as_stated: bool = False
-) -> Sensitivity:
-    """The same of a formulation."""
     rows: list[Rows] = []
     if formulation.fits_records:
         rows.append(formulation.own_test.linearised(x, slopes=slopes, as_stated=as_stated))
-    left_out = () if priors else formulation.priors
-    for term in formulation.beside:
-        if term not in left_out:
-            noise = float(np.sqrt(np.mean(rows[0].std ** 2))) if rows else np.nan
-            rows.append(term.linearised(x, noise, as_stated=as_stated))
+    for term in (term for term in formulation.beside if priors or term not in formulation.priors):
+        noise = float(np.sqrt(np.mean(rows[0].std ** 2))) if rows else np.nan
+        rows.append(term.linearised(x, noise, as_stated=as_stated))
     return _judged(formulation, x, rows, np.full(x.size, True))
 
 
@@ -115,6 +106,17 @@ def with_totals(problem: Problem, structure: Structure, x: Array) -> tuple[Formu
     geometry = problem.geometry.weighing(problem.totals)
     of_mass = formulation.models[0].values(geometry, structure)
     return problem.formulate(geometry), np.concatenate([of_mass, x[formulation.parts.mass.stop :]])
+
+
+def blocks_of(structure: Structure) -> tuple[Array, Array, Array]:
+    """M_SS, K_SS and C, (n, n) each."""
+    n = structure.n
+    return structure.mass[:n, :n], structure.stiffness[:n, :n], structure.damping
+
+
+def blocks_and_slopes(structure: Structure, slopes: Slopes) -> list[tuple[Array, Array]]:
+    """M_SS, K_SS and C, (n, n), each with its derivatives by the unknowns, (n, n, p)."""
+    return list(zip(blocks_of(structure), (slopes.mass, slopes.stiffness, slopes.damping), strict=True))
 
 
 def meaningful(formulation: Formulation) -> NDArray[np.bool_]:
@@ -139,10 +141,9 @@ def _judged(formulation: Formulation, x: Array, rows: list[Rows], part: NDArray[
     J, std = all_rows.jacobian[:, part] * unit, all_rows.std
     free = _left_by_constraints(formulation, x, unit, J, part)
     J = J @ free
-    U, s, Vt = np.linalg.svd(J, full_matrices=False)
+    U, s, Vt = np.linalg.svd(J, full_matrices=len(J) < J.shape[1])
+    rank, V = _rank(s, _NULL), Vt.T
     s = np.concatenate([s, np.zeros(J.shape[1] - s.size)])
-    rank = int(np.count_nonzero(s > _NULL * max(s[0], np.finfo(float).tiny))) if s.size else 0
-    V = np.linalg.svd(J, full_matrices=True)[2].T if rank < J.shape[1] and len(J) < J.shape[1] else Vt.T
     # x = unit V (1/s) U' e: each column of U carries the noise of its rows.
     mixed = (U[:, :rank].T * std**2) @ U[:, :rank]
     # Where the lines are too few to tell a noise that is not stated, no deviation is known.
@@ -176,10 +177,13 @@ def _left_by_constraints(
 
 def _null_space(rows: Array, least: float = 1e-9) -> Array:
     """Orthonormal basis of what rows (count, p) do not see, (p, free); `least` of the largest singular value."""
-    if not len(rows):
-        return np.eye(rows.shape[1])
     _, s, Vt = np.linalg.svd(rows, full_matrices=len(rows) < rows.shape[1])
-    return Vt[int(np.count_nonzero(s > least * max(s[0], np.finfo(float).tiny))) :].T
+    return Vt[_rank(s, least) :].T
+
+
+def _rank(singular_values: Array, least: float) -> int:
+    """How many singular values are more than `least` of the largest."""
+    return int(np.count_nonzero(singular_values > least * singular_values.max(initial=np.finfo(float).tiny)))
 
 
 def directions_in_words(unknowns: Sequence[Unknown], x: Array, unit: Array, directions: Array) -> list[str]:
@@ -205,18 +209,16 @@ def directions_in_words(unknowns: Sequence[Unknown], x: Array, unit: Array, dire
 def _sparse(directions: Array) -> Array:
     """The same space by vectors with as few entries as elimination gives, the largest entry of each 1 %."""
     V = directions.copy()
-    count = V.shape[1]
     used: list[int] = []
-    for j in range(count):
+    for j in range(V.shape[1]):
         weight = np.abs(V[:, j:]).max(axis=1)
         weight[used] = 0.0
         row = int(np.argmax(weight))
         column = j + int(np.argmax(np.abs(V[row, j:])))
         V[:, [j, column]] = V[:, [column, j]]
         V[:, j] /= V[row, j]
-        for other in range(count):
-            if other != j:
-                V[:, other] -= V[row, other] * V[:, j]
+        others = np.arange(V.shape[1]) != j
+        V[:, others] -= np.outer(V[:, j], V[row, others])
         used.append(row)
     V[np.abs(V) < 1e-9] = 0.0
     return 0.01 * V / np.abs(V).max(axis=0)

@@ -21,16 +21,16 @@ from sysid.assessment.perturbations import (
     DirectSpectra,
     ModalSpectra,
     Perturbations,
-    Spectra,
     matrices_of_modes,
     std_of,
 )  # fmt: skip
 from sysid.assessment.sensitivity import (
     Sensitivity,
+    blocks_and_slopes,
     meaningful,
-    of_formulation,
     of_outside,
     outside_variables,
+    sensitivity,
     with_totals,
 )  # fmt: skip
 from sysid.errors import InputError
@@ -106,7 +106,7 @@ class Uncertainty:
     parameters: tuple[str, ...]
     covariance: Array
     inflation: float
-    _spectra: Spectra = field(repr=False)
+    _spectra: ModalSpectra | DirectSpectra = field(repr=False)
     values: dict[str, Array] = field(default_factory=dict)
     variables: dict[str, Array] = field(default_factory=dict)
 
@@ -145,11 +145,10 @@ class Uncertainty:
             raise InputError(f"level = {level}: a probability between 0 and 1 is needed")
         z = float(norm.ppf((1 + level) / 2))
         if name in self.variables:
-            return np.stack(
-                [self.values[name] - z * self.variables[name], self.values[name] + z * self.variables[name]]
-            )
-        n, value, std = self.structure.n, np.asarray(getattr(self.structure, name)), getattr(self, name)
-        value = value[:n, :n] if name in _MATRICES else value
+            value, std = self.values[name], self.variables[name]
+            return np.stack([value - z * std, value + z * std])
+        std = getattr(self, name)
+        value = np.asarray(getattr(self.structure, name))[tuple(map(slice, std.shape))]  # without the rows of the base
         ends = np.stack([value - z * std, value + z * std])
         if name == "effective_masses":
             i = np.arange(self.structure.n_base)
@@ -157,7 +156,7 @@ class Uncertainty:
             ends[:, :, i, i] = np.stack([np.maximum(size - spread, 0.0), size + spread]) ** 2
         positive = value > 0
         if name in _MATRICES:
-            positive &= np.eye(n, dtype=bool)
+            positive &= np.eye(self.structure.n, dtype=bool)
         if name in _POSITIVE + _MATRICES:
             with np.errstate(over="ignore"):  # what is hardly known may be anything above zero
                 factor = np.exp(z * std[positive] / value[positive])
@@ -235,23 +234,19 @@ def _by_unknowns(problem: Problem, structure: Structure, x: Array) -> Uncertaint
     test, modes = problem.measurement, modes_of(structure)
     formulation, x = with_totals(problem, structure, x)
     slopes = slopes_of(formulation.matrices, x, test, modes.omega)
-    known = of_formulation(formulation, x, slopes)
-    steps, normals = known.steps, known.rank
+    known = sensitivity(formulation, x, slopes)
+    steps = known.steps
     inflation = inflation_of(test, records_of(test, structure, x.size), x.size) if formulation.fits_records else 1.0
     shapes = np.einsum("si,ikc->skc", structure.recovery, slopes.d_shapes)
     parts = (shapes, slopes.d_participation, slopes.d_log_omega, slopes.d_log_ratios, slopes.d_rigid)
-    moves = Perturbations(normals, *(part @ steps for part in parts))
-    n = structure.n
+    moves = Perturbations(known.rank, *(part @ steps for part in parts))
     matrices = []
-    for matrix, slope in (
-        (structure.mass[:n, :n], slopes.mass), (structure.stiffness[:n, :n], slopes.stiffness),
-        (structure.damping, slopes.damping),
-    ):  # fmt: skip
+    for matrix, slope in blocks_and_slopes(structure, slopes):
         size = np.sqrt(np.abs(np.diag(matrix)))
-        matrices.append(std_of(slope @ steps, normals, np.outer(size, size)))
+        matrices.append(std_of(slope @ steps, known.rank, np.outer(size, size)))
     found = _quantities(problem, structure, modes, moves, inflation, matrices)
     if not structure.modal_damping:
-        found = replace(found, _spectra=DirectSpectra(slopes, steps, normals))
+        found = replace(found, _spectra=DirectSpectra(slopes, steps, known.rank))
     return _with_unknowns(found, problem, formulation, x, known)
 
 
@@ -259,20 +254,15 @@ def _with_unknowns(
     found: Uncertainty, problem: Problem, formulation: Formulation, x: Array, known: Sensitivity
 ) -> Uncertainty:
     """The same with the unknowns that mean something by themselves; with their covariance where all do."""
-    steps, unknowns, names = known.steps, formulation.unknowns, {unknown.name for unknown in problem.variables}
-    std = std_of(steps, known.rank, known.unit)
-    told = [
-        bool(np.all(part)) and unknown.name in names
-        for unknown, part in zip(unknowns, split(unknowns, meaningful(formulation)), strict=True)
-    ]
-    values, variables = (
-        {name: part for (name, part), one in zip(by_name(unknowns, of_all).items(), told, strict=True) if one}
-        for of_all in (x, std)
-    )
+    unknowns, names = formulation.unknowns, {unknown.name for unknown in problem.variables}
+    std = std_of(known.steps, known.rank, known.unit)
+    of_unknowns = zip(unknowns, split(unknowns, meaningful(formulation)), strict=True)
+    told = [unknown.name for unknown, part in of_unknowns if np.all(part) and unknown.name in names]
+    values, variables = ({name: by_name(unknowns, every)[name] for name in told} for every in (x, std))
     found = replace(found, values=values, variables=variables)
-    if not all(told):
+    if len(told) < len(unknowns):
         return found
-    covariance = steps[:, : known.rank] @ steps[:, : known.rank].T
+    covariance = known.normals @ known.normals.T
     covariance[np.isnan(std)], covariance[:, np.isnan(std)] = np.nan, np.nan
     return replace(found, parameters=formulation.labels, covariance=covariance)
 

@@ -186,7 +186,7 @@ def _feasible(problem: Problem, x: Array, where: str) -> tuple[Array, str]:
 def _judged(problem: Problem, x: Array, where: str, sentences: tuple[str, ...] = ()) -> _Point:
     with np.errstate(all="ignore"):  # what is not finite is passed over
         slopes = slopes_of(problem.formulation.matrices, x, problem.measurement)
-        known = sensitivity(problem, x, slopes, as_stated=True)
+        known = sensitivity(problem.formulation, x, slopes, as_stated=True)
     if not np.all(np.isfinite(known.singular_values)):
         raise np.linalg.LinAlgError("the Jacobian is not finite")
     return _Point(x, slopes, known, where, sentences)
@@ -370,7 +370,7 @@ def _moves(problem: Problem, point: _Point) -> Array:
         for r in problem.residuals
     ]
     noisy = replace(problem, measurement=_with_noise(problem.measurement), residuals=residuals)
-    return sensitivity(noisy, point.x, point.slopes, as_stated=True).normals
+    return sensitivity(noisy.formulation, point.x, point.slopes, as_stated=True).normals
 
 
 def _all_stated(problem: Problem) -> bool:

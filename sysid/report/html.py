@@ -129,19 +129,24 @@ def matrix(
     columns: Sequence[object],
     caption: object,
     *,
-    below: Sequence[Sequence[tuple[str, ...]]] | None = None,
+    below: Sequence[Sequence[tuple[str, ...]]] = (),
     label: str = "",
 ) -> str:
     """Set a matrix with named rows and columns, four significant digits; what is round-off beside the largest is 0.
 
-    `below` holds smaller lines for each entry.
+    `below` holds smaller lines for each entry, or nothing.
     """
     values = np.where(np.abs(values) > ROUND_OFF * np.abs(values).max(), values, 0.0)
-    lines: list[list[object]] = []
-    for i, (name, line) in enumerate(zip(rows, values.tolist(), strict=True)):
-        under = [()] * len(line) if below is None else below[i]
-        lines.append([name, *(Cell(number(v), lower) for v, lower in zip(line, under, strict=True))])
+    lines = [
+        [name, *(Cell(number(v), lower) for v, lower in zip(line, under, strict=True))]
+        for name, line, under in zip(rows, values, below or no_lines(values.shape), strict=True)
+    ]
     return table(["", *columns], lines, caption, label=label)
+
+
+def no_lines(shape: tuple[int, ...]) -> list[list[tuple[str, ...]]]:
+    """Nothing below any entry of a matrix of this shape, for `matrix`."""
+    return [[()] * shape[1] for _ in range(shape[0])]
 
 
 def picture(

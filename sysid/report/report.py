@@ -15,7 +15,7 @@ from sysid.plot.panels import is_unit, run_names
 from sysid.problem.formulation import MATRICES
 from sysid.problem.problem import Problem
 from sysid.report.html import Cell, beside, bullets, fold, matrix, number, page, paragraph, picture, table, text
-from sysid.report.matrices import CHOSEN, ONE_OF_MANY, SAME, half_widths, matrices, stated
+from sysid.report.matrices import CHOSEN, ONE_OF_MANY, SAME, Lines, half_widths, matrices, stated
 from sysid.results.identification import Identification
 from sysid.results.storage import atomically, file_or_folder
 from sysid.results.summary import (
@@ -36,6 +36,11 @@ from sysid.structure.structure import Array, ComplexArray, Structure
 FILE_NAME = "report.html"
 _SUFFIXES = (".html", ".htm")
 _TOTALS = {"trace": "total of the diagonal", "rigid_body": "rigid-body total", "sensors": "total on the sensors"}
+_PER_UNIT = "Absolute acceleration of each sensor per unit base acceleration (transmissibility), magnitude and phase."
+_AS_MOVED = (
+    "Spectra of each sensor's absolute acceleration in each run, as the base moved: not transmissibilities. The phase "
+    "is told against the base direction that moved most."
+)
 _MANY_PANELS = 40  # beyond which the pictures are drawn with fewer pixels
 
 
@@ -115,8 +120,7 @@ def render(identification: Identification) -> str:
 
 
 def _title(it: Identification) -> str:
-    name = PurePath(it.recipe.module).stem if it.recipe else ""
-    return f"Identification of {name}" if name else "Identification"
+    return f"Identification of {PurePath(it.recipe.module).stem}" if it.recipe else "Identification"
 
 
 def _verdict(it: Identification) -> str:
@@ -129,37 +133,40 @@ def _verdict(it: Identification) -> str:
         "soft",
     )
     word = "Interrupted: the best until then" if it.interrupted else "Success" if it.success else "No success"
-    lines = [f"<strong>{word}</strong>", paragraph(it.message)]
-    of = "over the relative accelerations of all runs, sensors and lines, unweighted"
-    if not it.residuals:
-        of = "of the misfit that the problem states"
-    lines.append(paragraph(f"Relative residual {residual_in_words(it)}, {of}."))
-    lines.append(paragraph(f"Objective {it.objective:.3e}: all that is fitted, each record weighted by its noise."))
+    all_records = "over the relative accelerations of all runs, sensors and lines, unweighted"
+    of = all_records if it.residuals else "of the misfit that the problem states"
+    lines = [
+        it.message,
+        f"Relative residual {residual_in_words(it)}, {of}.",
+        f"Objective {it.objective:.3e}: all that is fitted, each record weighted by its noise.",
+    ]
     if it.force_residual is not None:
-        lines.append(paragraph(f"Of the base force: {it.force_residual:.3e}."))
-    head += f'<div class="verdict {"good" if it.success else "bad"}">{"".join(lines)}</div>'
-    kind, steps = "good" if it.determined else "warn", next_steps(it)
-    lines = [f"<strong>{text(verdict(it))}</strong>"]
+        lines.append(f"Of the base force: {it.force_residual:.3e}.")
+    head += _framed("good" if it.success else "bad", word, "".join(map(paragraph, lines)))
+    steps, lines = next_steps(it), []
     if it.closed_by:
-        lines.append(paragraph("What fixes it:"))
+        lines.append("What fixes it:")
     if steps:
         lines.append(
-            paragraph(
-                "Frequencies, damping ratios and the responses to base motion hold for all of them; the mass, "
-                "stiffness and damping matrices below are one choice. What is open:"
-            )
+            "Frequencies, damping ratios and the responses to base motion hold for all of them; the mass, "
+            "stiffness and damping matrices below are one choice. What is open:"
         )
-    lines.append(bullets(_sentence(s) for s in it.closed_by + it.undetermined))
-    lines += [paragraph(_sentence(step)) for step in steps]
-    head += f'<div class="verdict {kind}">{"".join(lines)}</div>'
+    told = bullets(map(_sentence, it.closed_by + it.undetermined))
+    content = "".join(map(paragraph, lines)) + told + "".join(paragraph(_sentence(step)) for step in steps)
+    head += _framed("good" if it.determined else "warn", verdict(it), content)
     return head + "".join(paragraph(_sentence(remark), "soft") for remark in it.remarks)
+
+
+def _framed(kind: str, heading: str, content: str) -> str:
+    """A box with a coloured edge: "good", "warn" or "bad"."""
+    return f'<div class="verdict {kind}"><strong>{text(heading)}</strong>{content}</div>'
 
 
 def _unknowns(it: Identification) -> str:
     rows = [
         (
             row.label, number(row.value, 6), half_width(row.std, row.value), row.unit, number(row.lower),
-            number(row.upper), f"on its {row.on_bound} bound" if row.on_bound else "",
+            number(row.upper), row.on_bound,
         )
         for row in rows_of(it)
     ]  # fmt: skip
@@ -172,17 +179,16 @@ def _unknowns(it: Identification) -> str:
 
 def _modes(it: Identification) -> str:
     structure, reference, u = it.structure, it.problem.reference, it.quick_uncertainty
-    many = is_one_of_many(it)
-    frequencies, ratios = structure.natural_frequencies, structure.damping_ratios
+    many, frequencies, percent = is_one_of_many(it), structure.natural_frequencies, 100 * structure.damping_ratios
     columns: list[list[object]] = [
         ["mode", *range(1, structure.n + 1), "sum"],
         ["frequency [Hz]", *(number(f, 6) for f in frequencies), ""],
-        ["damping [%]", *(number(100 * zeta) for zeta in ratios), ""],
+        ["damping [%]", *map(number, percent), ""],
     ]
     notes = ["Effective mass in % of the rigid-body mass of its base direction."]
     if u is not None:
-        columns.insert(2, _widths(u.natural_frequencies, frequencies))
-        columns.append(_widths(100 * u.damping_ratios, 100 * ratios))
+        columns.insert(2, ["±", *map(half_width, u.natural_frequencies, frequencies), ""])
+        columns.append(["±", *map(half_width, 100 * u.damping_ratios, percent), ""])
         notes.append("±: half of the 95 % interval that the noise of the records makes; 0 where it is round-off.")
         if it.measurement.response_std is None:
             notes.append("No noise is stated, so the misfit is taken for it.")
@@ -190,7 +196,7 @@ def _modes(it: Identification) -> str:
     if reference is not None and reference.n == structure.n:
         for name, ours, theirs, digits in (
             ("reference [Hz]", frequencies, reference.natural_frequencies, 6),
-            ("reference damping [%]", 100 * ratios, 100 * reference.damping_ratios, 4),
+            ("reference damping [%]", percent, 100 * reference.damping_ratios, 4),
         ):
             columns.append([name, *(number(value, digits) for value in theirs), ""])
             columns.append(["difference [%]", *map(_difference, ours, theirs), ""])
@@ -198,11 +204,6 @@ def _modes(it: Identification) -> str:
         notes.append("~: one of many values that explain the data.")
     head, *rows = zip(*columns, strict=True)
     return table(head, rows, " ".join(notes))
-
-
-def _widths(std: Array, values: Array) -> list[object]:
-    """A column of half-widths."""
-    return ["±", *map(half_width, std, values), ""]
 
 
 def _effective_mass_columns(it: Identification, many: Array) -> Iterator[list[object]]:
@@ -217,37 +218,27 @@ def _effective_mass_columns(it: Identification, many: Array) -> Iterator[list[ob
 def _rigid_body_mass(it: Identification) -> str:
     axes, turns = it.measurement.base_axes or (), ~it.measurement.translational
     rigid, reference = it.structure.rigid_body_mass, it.problem.reference
-    parts = []
+    unit = "kg; kg m where one axis is a rotation, kg m² where both are" if turns.any() else "kg"
+    told, u = "", it.quick_uncertainty
+    below: Lines = []
     if it.problem.unit_mass:
-        parts.append(
-            paragraph(
-                "No mass is stated and no base force was measured: the masses are normalised to 1 kg in each base "
-                "direction. All mass, stiffness and damping entries carry this scale, which the data do not tell."
-            )
+        told = paragraph(
+            "No mass is stated and no base force was measured: the masses are normalised to 1 kg in each base "
+            "direction. All mass, stiffness and damping entries carry this scale, which the data do not tell."
         )
-    unit = "kg" if not turns.any() else "kg; kg m where one axis is a rotation, kg m² where both are"
-    u = it.quick_uncertainty
-    below = None if u is None or it.problem.unit_mass else half_widths(rigid, u.rigid_body_mass, stated(it))
-    parts.append(matrix(rigid, axes, axes, f"Total mass M_rb = [G; I]' M [G; I], {unit}.", below=below))
+    elif u is not None:
+        below = half_widths(rigid, u.rigid_body_mass, stated(it))
+    told += matrix(rigid, axes, axes, f"Total mass M_rb = [G; I]' M [G; I], {unit}.", below=below)
     if reference is not None:
-        parts.append(matrix(reference.rigid_body_mass, axes, axes, f"Of the reference, {unit}."))
-    return "".join(parts)
+        told += matrix(reference.rigid_body_mass, axes, axes, f"Of the reference, {unit}.")
+    return told
 
 
 def _responses(it: Identification, test: Measurement) -> str:
-    if is_unit(test):
-        words = (
-            "Absolute acceleration of each sensor per unit base acceleration (transmissibility), magnitude and phase. "
-            "The difference of the two is drawn faint."
-        )
-    else:
-        words = (
-            "Spectra of each sensor's absolute acceleration in each run, as the base moved: not transmissibilities. "
-            "The phase is told against the base direction that moved most. The difference of the two is drawn faint."
-        )
-    u = it.quick_uncertainty
-    band = None if u is None else u.transmissibility(test.freq)
-    if band is not None:
+    words = (_PER_UNIT if is_unit(test) else _AS_MOVED) + " The difference of the two is drawn faint."
+    u, band = it.quick_uncertainty, None
+    if u is not None:
+        band = u.transmissibility(test.freq)
         words += " The shade around the identified curve, where it is wide enough to be seen, is its 95 % interval."
     dpi = 130 if test.n_sensors * test.n_runs <= _MANY_PANELS else 92
     parts = [paragraph(words, "soft")]
@@ -280,14 +271,9 @@ def _further(it: Identification) -> str:
         rows = zip(structure.natural_frequencies, 100 * structure.damping_ratios, strict=True)
         cells = [(k, number(f, 6), number(ratio)) for k, (f, ratio) in enumerate(rows, start=1)]
         parts.append(table(("mode", "frequency [Hz]", "damping [%]"), cells))
-        scored = zip(test.sensor_names, scores(structure, test).relative, strict=True)
-        parts.append(
-            table(
-                ("sensor", "score"),
-                [(name, number(score)) for name, score in scored],
-                "1 - ‖predicted - measured‖ / ‖measured‖ of the accelerations relative to the base.",
-            )
-        )
+        scored = zip(test.sensor_names, map(number, scores(structure, test).relative), strict=True)
+        caption = "1 - ‖predicted - measured‖ / ‖measured‖ of the accelerations relative to the base."
+        parts.append(table(("sensor", "score"), scored, caption))
     return "\n".join(parts)
 
 
@@ -298,9 +284,9 @@ def _residual(test: Measurement, structure: Structure) -> str:
 
 def _validation(it: Identification) -> str:
     parts = []
-    for i, test in enumerate(it.problem.validation):
-        parts.append(f"<h3>Test {i + 1} of {len(it.problem.validation)}: predicted, never fitted</h3>")
+    for i, test in enumerate(it.problem.validation, start=1):
         parts += [
+            f"<h3>Test {i} of {len(it.problem.validation)}: predicted, never fitted</h3>",
             paragraph(f"{_residual(test, it.structure)}."),
             _score_table(it, test),
             _responses(it, test),
@@ -354,10 +340,9 @@ def _convergence(it: Identification) -> str:
 
 
 def _mac(it: Identification) -> str:
-    known = it.problem.reference is not None
     words = (
         "Identified mode shapes against those of the reference at the sensors: 1 on the diagonal where they agree."
-        if known
+        if it.problem.reference
         else "Mode shapes against each other (no reference is known): off-diagonal entries near 1 tell modes that "
         "these sensors cannot tell apart."
     )
@@ -366,11 +351,9 @@ def _mac(it: Identification) -> str:
 
 def _effective_masses(it: Identification) -> str:
     words = "Bars: each mode; lines: their running sum. What is missing to 100 % moves with the base."
-    drawn = plot.effective_masses(it)
-    many = bool(is_one_of_many(it).any())
-    label, caption = (ONE_OF_MANY, CHOSEN) if many else ("", "")
+    label, caption = (ONE_OF_MANY, CHOSEN) if is_one_of_many(it).any() else ("", "")
     alt = "effective masses by mode and base direction"
-    return paragraph(words, "soft") + picture(drawn, alt, caption, label=label)
+    return paragraph(words, "soft") + picture(plot.effective_masses(it), alt, caption, label=label)
 
 
 def _mode_shapes(it: Identification) -> str:
@@ -383,15 +366,16 @@ def _mode_shapes(it: Identification) -> str:
 
 def _what_ran(it: Identification) -> str:
     problem, recipe = it.problem, it.recipe
-    facts: list[list[object]] = [
+    facts: list[list[object]] = []
+    if recipe is not None:
+        facts += [["problem", recipe.module], ["data", recipe.data or "its own"], ["problem's rng", recipe.rng]]
+    facts += [
         ["strategy", it.strategy],
         ["seed", "–" if it.seed is None else it.seed],
         ["wall time", f"{it.history.wall_time:.1f} s"],
         *_models(problem),
         ["sysid", __version__],
     ]
-    if recipe is not None:
-        facts[:0] = [["problem", recipe.module], ["data", recipe.data or "its own"], ["problem's rng", recipe.rng]]
     counts = [*problem.unknowns, ("together", problem.n_variables)]
     log = f"<h3>Log</h3><pre>{text(chr(10).join(it.history.log))}</pre>" if it.history.log else ""
     return (

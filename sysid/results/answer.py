@@ -201,16 +201,23 @@ class Answer:
     def degrees_of_freedom(self) -> tuple[str, ...]:
         """What the rows of M_SS, K_SS and C stand for: a sensor's name, or "coordinate of mode 7"."""
         names, structure = self.measurement.sensor_names, self.structure
-        return tuple(
-            names[sensor] if sensor >= 0 else f"coordinate of mode {mode + 1}" if mode >= 0 else f"coordinate {j + 1}"
-            for j, (sensor, mode) in enumerate(zip(structure.dof_sensors, structure.dof_modes, strict=True))
-        )
+        called = [f"coordinate {j + 1}" for j in range(structure.n)]
+        for j in np.flatnonzero(structure.dof_modes >= 0):
+            called[j] = f"coordinate of mode {structure.dof_modes[j] + 1}"
+        for j in np.flatnonzero(structure.dof_sensors >= 0):
+            called[j] = names[structure.dof_sensors[j]]
+        return tuple(called)
 
     @property
     def quick_uncertainty(self) -> Uncertainty | None:
         """`uncertainty` where it is known already or takes no longer than about a second; else None."""
         known = "uncertainty" in self.__dict__
         return self.uncertainty if known or self.structure.mode_shapes.size <= _QUICK_SHAPES else None
+
+    def quick_std(self, name: str) -> Array:
+        """Standard deviations of a quantity of the structure, in its shape, by `quick_uncertainty`; NaN without it."""
+        u = self.quick_uncertainty
+        return np.asarray(np.full_like(getattr(self.structure, name), np.nan) if u is None else getattr(u, name))
 
     @property
     def quick_intervals(self) -> Intervals | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -71,8 +72,8 @@ class Identification(Answer):
 
     def to_dict(self) -> dict[str, Any]:
         """The figures of ``summary.json``; None for what the data leave open or what was not computed."""
-        u, n = self.quick_uncertainty, self.structure.n
-        values, std = self.values, {} if u is None else u.variables
+        u, values = self.quick_uncertainty, self.values
+        std = {} if u is None else u.variables
         reported = () if self.x is None else reported_unknowns(self.problem, damping_ratios=True)
         return {
             "problem": self.recipe.module if self.recipe else None,
@@ -85,9 +86,9 @@ class Identification(Answer):
             "objective": self.objective,
             "force_residual": self.force_residual,
             "natural_frequencies_hz": self.structure.natural_frequencies.tolist(),
-            "natural_frequencies_std_hz": _plain(np.full(n, np.nan) if u is None else u.natural_frequencies),
+            "natural_frequencies_std_hz": _plain(self.quick_std("natural_frequencies")),
             "damping_ratios": self.structure.damping_ratios.tolist(),
-            "damping_ratios_std": _plain(np.full(n, np.nan) if u is None else u.damping_ratios),
+            "damping_ratios_std": _plain(self.quick_std("damping_ratios")),
             "unknowns": {v.name: values[v.name].tolist() for v in reported},
             "unknowns_std": {v.name: _plain(std[v.name]) for v in reported if v.name in std},
             "unknown_units": {v.name: v.unit for v in reported},
@@ -107,9 +108,9 @@ class Identification(Answer):
             **{name: getattr(self, name) for name in _PLAIN},
             "structure": self.structure.to_tree(),
             "problem": self.problem.to_tree(),
-            "seed": None if self.seed is None else str(self.seed),  # a number of any size
+            "seed": _if_given(str, self.seed),  # a number of any size
             "history": self.history.to_tree(),
-            "recipe": None if self.recipe is None else self.recipe.to_tree(),
+            "recipe": _if_given(Recipe.to_tree, self.recipe),
         }
 
     @classmethod
@@ -119,9 +120,9 @@ class Identification(Answer):
             **{name: tree[name] for name in _PLAIN},
             structure=Structure.from_tree(tree["structure"]),
             problem=Problem.from_tree(tree["problem"]),
-            seed=None if tree["seed"] is None else int(tree["seed"]),
+            seed=_if_given(int, tree["seed"]),
             history=History.from_tree(tree["history"]),
-            recipe=None if tree["recipe"] is None else Recipe.from_tree(tree["recipe"]),
+            recipe=_if_given(Recipe.from_tree, tree["recipe"]),
         )
 
     def save(self, path: str | Path) -> Path:
@@ -171,3 +172,8 @@ def _plain(values: Array) -> Any:
     plain = values.astype(object)
     plain[~np.isfinite(values)] = None
     return plain.tolist()
+
+
+def _if_given(convert: Callable[[Any], Any], value: Any) -> Any:
+    """What `convert` makes of a value; None where there is none."""
+    return None if value is None else convert(value)

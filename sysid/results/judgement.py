@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from sysid.assessment.checks import doubts
 from sysid.assessment.determination import determine
+from sysid.assessment.sensitivity import blocks_of
 from sysid.nlp import EXACT
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification
@@ -40,8 +42,6 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
     judged = end.stopped is None and (success or problem.free_modes)
     doubtful = doubts(problem, end.structure, end.x) if judged else ()
     open_ = (*doubtful, *known.undetermined)
-    if doubtful:
-        message += "; " + "; ".join(doubtful)
     if not success:
         open_ = ("the search did not end in a fit, so this is not yet any structure that explains the data", *open_)
     it = Identification(
@@ -51,7 +51,7 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
         strategy=end.strategy,
         seed=seed,
         success=success,
-        message=message,
+        message="; ".join((message, *doubtful)),
         history=replace(end.history, log=tuple(session.lines), wall_time=session.seconds),
         determined=not open_,
         closed_by=() if open_ else known.closed_by,
@@ -64,21 +64,18 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
 
 def _success(problem: Problem, end: Outcome) -> tuple[bool, str]:
     """Whether this is a fit, and the message."""
-    success, message = end.success, end.message
-    residual = residual_of(problem, end)
-    if end.x is not None and success and not problem.keeps_constraints(end.x):
-        success = False
-        message += "; a constraint does not hold"
-    if problem.goal is not None and residual > problem.goal:
-        success = False
-        message += f"; the residual {residual:.3g} is above the goal {problem.goal:.3g}"
-    elif problem.goal is None and residual > _NO_FIT and end.stopped is None:
-        success = False
-        message += (
-            f"; the residual {residual:.3g} is no fit: are the frequencies in Hz, the responses absolute and complex "
+    residual, goal = residual_of(problem, end), problem.goal
+    wrong = []
+    if end.x is not None and end.success and not problem.keeps_constraints(end.x):
+        wrong.append("a constraint does not hold")
+    if goal is not None and residual > goal:
+        wrong.append(f"the residual {residual:.3g} is above the goal {goal:.3g}")
+    if goal is None and residual > _NO_FIT and end.stopped is None:
+        wrong.append(
+            f"the residual {residual:.3g} is no fit: are the frequencies in Hz, the responses absolute and complex "
             "with exp(+iwt), the axes and signs of rigid_body right, the bounds wide enough?"
         )
-    return success, message
+    return end.success and not wrong, "; ".join((end.message, *wrong))
 
 
 def residual_of(problem: Problem, end: Outcome) -> float:
@@ -88,19 +85,17 @@ def residual_of(problem: Problem, end: Outcome) -> float:
     return problem.residual(end.x)
 
 
-def _remarks(problem: Problem, end: Outcome) -> tuple[str, ...]:
+def _remarks(problem: Problem, end: Outcome) -> Iterator[str]:
     """What the user should know of the unknowns and of the misfit."""
     formulation = problem.formulation
-    remarks: tuple[str, ...] = ()
     if end.x is not None and formulation.variables:
         near = _ON_BOUND * (problem.upper - problem.lower)
         at = (end.x - problem.lower < near) | (problem.upper - end.x < near)
         names = [label for label, on in zip(formulation.labels, at, strict=True) if on]
         if names:
-            remarks += (f"on a bound of the search space, beyond which the truth may lie: {', '.join(names)}",)
+            yield f"on a bound of the search space, beyond which the truth may lie: {', '.join(names)}"
     if not formulation.fits_records:
-        remarks += ("the problem states a misfit of its own; pictures and scores compare with the records as they are",)
-    return remarks
+        yield "the problem states a misfit of its own; pictures and scores compare with the records as they are"
 
 
 def _as_certain(it: Identification) -> Identification:
@@ -117,16 +112,14 @@ def _as_certain(it: Identification) -> Identification:
     if it.structure.mode_shapes.size > _LARGE:
         told = "whether noise leaves each entry known was not judged, as that takes minutes: see uncertainty"
         return replace(it, remarks=(*it.remarks, told))
-    s, u = it.structure, it.uncertainty
-    n, open_ = s.n, []
-    pairs = ("M_SS", s.mass[:n, :n], u.mass), ("K_SS", s.stiffness[:n, :n], u.stiffness), ("C", s.damping, u.damping)
-    for name, matrix, std in pairs:
+    u, open_ = it.uncertainty, []
+    stds = (u.mass, u.stiffness, u.damping)
+    for name, matrix, std in zip(("M_SS", "K_SS", "C"), blocks_of(it.structure), stds, strict=True):
         size = np.sqrt(np.diag(matrix))
         size[size == 0] = max(size.max(), np.finfo(float).tiny)  # a degree of freedom without a damper
-        relative = std / np.outer(size, size)
-        if not np.all(relative <= _KNOWN):
-            told = (
-                "open" if np.any(np.isnan(relative)) else f"with standard deviations up to {100 * relative.max():.2g} %"
-            )
-            open_.append(f"noise leaves entries of {name} {told}")
+        largest = np.max(std / np.outer(size, size))
+        if np.isnan(largest):
+            open_.append(f"noise leaves entries of {name} open")
+        elif largest > _KNOWN:
+            open_.append(f"noise leaves entries of {name} with standard deviations up to {100 * largest:.2g} %")
     return replace(it, determined=False, closed_by=(), undetermined=tuple(open_)) if open_ else it

@@ -92,9 +92,9 @@ def _measurement(old: Tree) -> Tree:
 
 def _sensors(old: Tree) -> list[Tree] | None:
     """Tables become one tree a sensor; an empty axis stands for a vector."""
-    if "sensors" not in old:
+    table = old.get("sensors")
+    if table is None:
         return None
-    table = old["sensors"]
     rows = zip(table["name"], table["position"], table["axis"], table["axis_vector"], strict=True)
     return [{"name": name, "position": r, "axis": word or vector} for name, r, word, vector in rows]
 
@@ -130,7 +130,7 @@ def _written(old: Tree) -> dict[str, Any]:
     x = ca.vertcat(*pieces)
 
     def outputs(place: Tree, name: str) -> list[ca.MX]:
-        return list(ca.Function.deserialize(place[name]).call([x], True, False))
+        return list(ca.Function.deserialize(place[name]).call([x], True, False)) if name in place else []
 
     given = _matrices(old["matrices"], outputs)
     # Fixed variables are numbers in the functions: a zero written in them keeps them in the problem.
@@ -140,11 +140,9 @@ def _written(old: Tree) -> dict[str, Any]:
         FurtherTest(Measurement.from_tree(_measurement(test["measurement"])), **_matrices(test, outputs))
         for test in (others[str(i)] for i in range(len(others)))
     ]
-    residuals += outputs(old, "residuals") if "residuals" in old else []
-    residuals += [Prior(outputs(old, "known")[0], 0.0, 1.0)] if "known" in old else []
-    given |= {"residuals": residuals, "constraints": []}
-    if "misfit" in old:
-        given["misfit"] = outputs(old, "misfit")[0]
+    residuals += outputs(old, "residuals")
+    residuals += [Prior(known, 0.0, 1.0) for known in outputs(old, "known")]
+    given |= {"residuals": residuals, "constraints": [], "misfit": next(iter(outputs(old, "misfit")), None)}
     if "healing" in old:
         healed = split(searched, outputs(old, "healing")[0])
         given["healing"] = {v: ca.reshape(part, *v.symbol.shape) for v, part in zip(searched, healed, strict=True)}

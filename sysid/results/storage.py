@@ -36,24 +36,7 @@ T = TypeVar("T")
 
 
 def write(tree: Tree, path: str | Path) -> Path:
-    """Write the tree of a result to an HDF5 file, whole or not at all.
-
-    Parameters
-    ----------
-    tree : dict
-    path : str or Path
-        The file (``.h5``, ``.hdf5``), or the folder in which it becomes ``result.h5``; folders are made.
-
-    Returns
-    -------
-    Path
-        The file.
-
-    Raises
-    ------
-    InputError
-        Where the file cannot be written, or something stands in the tree that cannot be stored.
-    """
+    """Write the tree of a result to an HDF5 file, whole or not at all; path and errors as in `Identification.save`."""
     target = file_or_folder(path, FILE_NAME, _SUFFIXES)
     # Built in memory: on a full disk HDF5 loses the error when it closes, or takes the process down.
     image = to_bytes({"content": CONTENT, "format": FORMAT, "sysid_version": __version__, **tree}, FORMAT)
@@ -63,24 +46,11 @@ def write(tree: Tree, path: str | Path) -> Path:
 
 
 def read(path: str | Path, build: Callable[[Tree], T]) -> T:
-    """Read what `write` wrote, or an earlier sysid, and give what `build` makes of its tree.
+    """What `build` makes of the tree that `write` wrote, or an earlier sysid; path and errors as in `load`.
 
-    Parameters
-    ----------
-    path : str or Path
-        The file, or the folder that holds its ``result.h5``.
-    build : callable
-        Of the tree; what is wrong with it is an error of the file.
-
-    Raises
-    ------
-    InputError
-        Where there is no such file, or it is not a result of sysid, or damaged, or one of a later format; names the
-        file.
+    What is wrong with `build`'s tree is an error of the file.
     """
-    source = Path(path)
-    if source.is_dir():
-        source = source / FILE_NAME
+    source = Path(path) / FILE_NAME if Path(path).is_dir() else Path(path)
     if not source.is_file():
         raise InputError(f"no result at {source}: give the .h5 file that 'sysid run' wrote, or its folder")
     try:

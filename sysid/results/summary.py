@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sysid.assessment.sensitivity import blocks_of
 from sysid.results.answer import Answer
 from sysid.results.unknowns_table import MANY, rows_of, stated_values
 from sysid.structure.structure import Array
@@ -108,37 +109,35 @@ def counted(number: int, what: str) -> str:
 
 def mass_percent_std(it: Answer) -> Array:
     """Standard deviations of `Structure.effective_mass_percent`, (n, d); NaN where open or not computed."""
-    u, rigid = it.quick_uncertainty, np.diag(it.structure.rigid_body_mass)
-    if u is None:
-        return np.full((it.structure.n, it.structure.n_base), np.nan)
-    return 100 * np.einsum("kii->ki", u.effective_masses) / np.where(rigid > 0, rigid, np.inf)
+    rigid = np.diag(it.structure.rigid_body_mass)
+    return 100 * np.einsum("kii->ki", it.quick_std("effective_masses")) / np.where(rigid > 0, rigid, np.inf)
 
 
 def is_one_of_many(it: Answer) -> Array:
     """Which effective masses are one choice among many, (n, d) of bool."""
-    if it.determined:
-        return np.zeros((it.structure.n, it.structure.n_base), dtype=bool)
-    return np.isnan(mass_percent_std(it))
+    return np.logical_and(np.isnan(mass_percent_std(it)), not it.determined)
 
 
 def _mode_table(it: Answer) -> list[str]:
     """Frequencies, damping and effective masses, with half-widths where they are known and there is room."""
     s, u, axes = it.structure, it.quick_uncertainty, it.measurement.base_axes or ()
     std, many = mass_percent_std(it), is_one_of_many(it)
-    k = range(s.n)
-    columns = [["mode", *(f"{i + 1}" for i in k), "sum"]]
-    columns.append(["frequency, Hz", *(f"{f:.5g}" for f in s.natural_frequencies), ""])
-    columns.append(["damping, %", *(f"{100 * zeta:.4g}" for zeta in s.damping_ratios), ""])
+    shares, k = s.effective_mass_percent, range(s.n)
+    columns = [
+        ["mode", *(f"{i + 1}" for i in k), "sum"],
+        ["frequency, Hz", *(f"{f:.5g}" for f in s.natural_frequencies), ""],
+        ["damping, %", *(f"{100 * zeta:.4g}" for zeta in s.damping_ratios), ""],
+    ]
     if u is not None:
-        widths = [half_width(u.natural_frequencies[i], s.natural_frequencies[i]) for i in k]
-        columns.insert(2, ["+-", *widths, ""])
-        columns.append(["+-", *(half_width(100 * u.damping_ratios[i], 100 * s.damping_ratios[i]) for i in k), ""])
-    shares = s.effective_mass_percent
-    masses, mass_widths = [], []
-    for j, axis in enumerate(axes):
-        cells = [f"{tilde(many[i, j])}{shares[i, j]:.1f}" for i in k]
-        masses.append([f"mass {axis}, %", *cells, f"{tilde(many[:, j])}{shares[:, j].sum():.1f}"])
-        mass_widths.append(["+-", *(half_width(value, 100.0) for value in std[:, j]), ""])
+        columns.insert(2, ["+-", *map(half_width, u.natural_frequencies, s.natural_frequencies), ""])
+        columns.append(["+-", *map(half_width, 100 * u.damping_ratios, 100 * s.damping_ratios), ""])
+    cells = np.vstack([shares, shares.sum(axis=0)])
+    marks = np.vstack([many, many.any(axis=0)])
+    masses = [
+        [f"mass {axis}, %", *(f"{tilde(mark)}{share:.1f}" for share, mark in zip(*own, strict=True))]
+        for axis, *own in zip(axes, cells.T, marks.T, strict=True)
+    ]
+    mass_widths = [["+-", *(half_width(value, 100.0) for value in own), ""] for own in std.T]
     both = [column for pair in zip(masses, mass_widths, strict=True) for column in pair]
     lines = _aligned(columns + both)
     if not np.any(np.isfinite(std)) or len(lines[0]) > _WIDTH:
@@ -155,7 +154,7 @@ def _unknowns(it: Answer) -> list[str]:
     if not 0 < len(rows) <= MANY:
         return []
     told = [[row.label, f"{row.value:.6g}", half_width(row.std, row.value), row.unit] for row in rows]
-    at = [f"on its {row.on_bound} bound" if row.on_bound else f"{row.lower:.4g} to {row.upper:.4g}" for row in rows]
+    at = [row.on_bound or f"{row.lower:.4g} to {row.upper:.4g}" for row in rows]
     columns = [list(column) for column in zip(["unknown", "value", "+- (95 %)", "unit"], *told, strict=True)]
     return [*_aligned([*columns, ["search space", *at]]), ""]
 
@@ -171,11 +170,9 @@ def _aligned(columns: list[list[str]]) -> list[str]:
 
 def _rigid_masses(it: Answer, axes: Sequence[str]) -> Iterator[str]:
     """Rigid-body mass by base direction, with its half-width where noise moves it."""
-    u = it.quick_uncertainty
-    for i, axis in enumerate(axes):
-        mass = it.structure.rigid_body_mass[i, i]
-        told = "" if u is None else known_half_width(u.rigid_body_mass[i, i], mass, " +-")
-        yield f"{axis} {mass:.6g}{told} kg{' m²' * (axis[0] == 'r')}"
+    masses, std = np.diag(it.structure.rigid_body_mass), np.diag(it.quick_std("rigid_body_mass"))
+    for axis, mass, own in zip(axes, masses, std, strict=True):
+        yield f"{axis} {mass:.6g}{known_half_width(own, mass, ' +-')} kg{' m²' * (axis[0] == 'r')}"
 
 
 def _ranges(it: Answer) -> Iterator[str]:
@@ -183,10 +180,10 @@ def _ranges(it: Answer) -> Iterator[str]:
     ends = it.quick_intervals
     if ends is None:
         return
-    n, words = it.structure.n, []
-    pairs = ("M_SS", it.structure.mass, ends.mass), ("K_SS", it.structure.stiffness, ends.stiffness)
-    for name, matrix, (lower, upper) in pairs:
-        own = np.diag(matrix)[:n]
+    words = []
+    M, K, _ = blocks_of(it.structure)
+    for name, matrix, (lower, upper) in (("M_SS", M, ends.mass), ("K_SS", K, ends.stiffness)):
+        own = np.diag(matrix)
         low, high = abs(float(np.min(np.diag(lower) / own))), float(np.max(np.diag(upper) / own))
         if high - low > 1e-6:
             top = f"{high:.3g} times" if np.isfinite(high) else "any number of times"

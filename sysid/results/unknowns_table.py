@@ -24,9 +24,10 @@ class Row(NamedTuple):
 
     @property
     def on_bound(self) -> str:
-        """The bound on which the value rests, "lower" or "upper", else nothing."""
+        """Words for the bound on which the value rests: "on its lower bound"; nothing elsewhere."""
         near = _ON_BOUND * (self.upper - self.lower)
-        return "lower" if self.value - self.lower < near else "upper" if self.upper - self.value < near else ""
+        rests = ("lower", self.value - self.lower < near), ("upper", self.upper - self.value < near)
+        return next((f"on its {name} bound" for name, there in rests if there), "")
 
 
 def stated_values(it: Answer) -> list[str]:
@@ -47,14 +48,9 @@ def rows_of(it: Answer) -> list[Row]:
     u = it.quick_uncertainty
     known = {} if u is None else u.variables
     rows: list[Row] = []
-    for unknown in reported_unknowns(it.problem):
-        if unknown.fixed:
-            continue
-        values = np.ravel(it.values[unknown.name], order="F")
-        std = np.ravel(known.get(unknown.name, np.full(unknown.shape, np.nan)), order="F")
-        columns = zip(unknown.labels, values, std, unknown.lower, unknown.upper, strict=True)
-        rows += [
-            Row(label, float(value), float(s), unknown.unit, float(low), float(high))
-            for label, value, s, low, high in columns
-        ]
+    for unknown in (unknown for unknown in reported_unknowns(it.problem) if not unknown.fixed):
+        values = np.ravel(it.values[unknown.name], order="F").tolist()
+        std = np.ravel(known.get(unknown.name, np.full(unknown.shape, np.nan)), order="F").tolist()
+        units = [unknown.unit] * unknown.size
+        rows += map(Row, unknown.labels, values, std, units, unknown.lower.tolist(), unknown.upper.tolist())
     return rows

@@ -152,7 +152,7 @@ TRUTH = np.concatenate([MASSES, SPRINGS, DAMPERS])
 
 def test_a_chain_without_a_weight_leaves_its_common_scale_open():
     problem = everything_free()
-    known = sensitivity(problem, TRUTH)
+    known = sensitivity(problem.formulation, TRUTH)
     assert known.rank == 8
     direction = known.unit * known.unseen[:, 0] / TRUTH
     np.testing.assert_allclose(direction / direction[0], 1.0, rtol=1e-6)
@@ -180,7 +180,7 @@ def test_a_chain_without_a_weight_leaves_its_common_scale_open():
 )
 def test_one_number_with_a_unit_of_mass_closes_the_scale(build):
     problem = everything_free(build=build)
-    known = sensitivity(problem, TRUTH)
+    known = sensitivity(problem.formulation, TRUTH)
     constrained = bool(problem.constraints)
     assert known.rank == 9 - constrained
     assert known.unseen.shape[1] == 0
@@ -189,14 +189,14 @@ def test_one_number_with_a_unit_of_mass_closes_the_scale(build):
 
 
 def test_the_base_force_closes_the_scale():
-    assert sensitivity(everything_free(force=True), TRUTH).rank == 9
+    assert sensitivity(everything_free(force=True).formulation, TRUTH).rank == 9
 
 
 @pytest.mark.parametrize("limit", [7.0, 6.0], ids=["away from its bound", "at its bound, on which nothing presses"])
 def test_an_inequality_closes_nothing_that_the_records_leave(limit):
     """Half of every mass, spring and damper answers alike, and keeps to it."""
     problem = everything_free(build=lambda m, k, c: {"constraints": [ca.sum1(m) <= limit]})
-    known = sensitivity(problem, TRUTH)
+    known = sensitivity(problem.formulation, TRUTH)
     assert known.rank == 8
     assert known.free.shape == (9, 9)
     assert not determine(problem, problem.structure(TRUTH), TRUTH).determined
@@ -206,7 +206,7 @@ def test_an_inequality_closes_nothing_that_the_records_leave(limit):
 
 def test_normals_stay_on_active_constraints():
     problem = everything_free(build=lambda m, k, c: {"constraints": [ca.sum1(m) == 6.0, k[0] * k[1] == 3e8]})
-    known = sensitivity(problem, TRUTH)
+    known = sensitivity(problem.formulation, TRUTH)
     np.testing.assert_allclose(known.normals[:3].sum(axis=0), 0, atol=1e-10 * np.abs(known.normals[:3]).max())
     along = known.normals[3] * SPRINGS[1] + known.normals[4] * SPRINGS[0]
     np.testing.assert_allclose(along, 0, atol=1e-9 * np.abs(known.normals[3] * SPRINGS[1]).max())
@@ -218,7 +218,7 @@ def test_two_unknowns_of_which_only_the_sum_counts_are_one_null_direction():
     k = ca.vertcat(a + b, SPRINGS[1], SPRINGS[2])
     problem = sysid.Problem(test, mass=np.diag(MASSES), stiffness=chain(k), damping=chain(DAMPERS) + 1e-9 * chain(k))
     x = np.array([1e4, 1e4])
-    known = sensitivity(problem, x)
+    known = sensitivity(problem.formulation, x)
     assert known.rank == 1
     moved = known.unit * known.unseen[:, 0]
     np.testing.assert_allclose(moved[0], -moved[1], rtol=1e-6)
@@ -240,7 +240,7 @@ def test_a_further_test_adds_what_it_sees():
         sysid.simulate(chain_structure(), FREQ), mass=ca.diag(m), stiffness=chain(k), damping=chain(c),
         residuals=[sysid.FurtherTest(second, mass=ca.diag(m) + added, stiffness=chain(k), damping=chain(c))],
     )  # fmt: skip
-    assert sensitivity(problem, TRUTH).rank == 9
+    assert sensitivity(problem.formulation, TRUTH).rank == 9
     assert determine(problem, problem.structure(TRUTH), TRUTH).determined
 
 
@@ -252,7 +252,7 @@ def test_an_own_misfit_has_its_own_jacobian():
         test, mass=np.diag(MASSES), stiffness=K, damping=1e-4 * K,
         misfit=ca.vertcat(k[0] * k[1] - 6, 2 * k[0] * k[1] - 12, (k[0] * k[1]) ** 2 - 36),
     )  # fmt: skip
-    known = sensitivity(problem, np.array([2.0, 3.0]))
+    known = sensitivity(problem.formulation, np.array([2.0, 3.0]))
     assert known.rank == 1
     moved = known.unit * known.unseen[:, 0]
     np.testing.assert_allclose(moved[0] * 3 + moved[1] * 2, 0, atol=1e-9)

@@ -97,7 +97,7 @@ def test_a_chain_whose_total_nobody_knows_is_open_to_a_common_factor_and_to_noth
     problem = dataclasses.replace(own["problem"](), constraints=(), healing={})
     x = np.concatenate([own["MASSES"], own["SPRINGS"], own["DAMPERS"]])
     assert problem.residual(x) < 1e-12
-    known = sensitivity(problem, x)
+    known = sensitivity(problem.formulation, x)
     assert known.unseen.shape[1] == 1
     moved = known.unit * known.unseen[:, 0] / x
     np.testing.assert_allclose(moved / moved[0], 1.0, atol=1e-6)
@@ -121,7 +121,7 @@ def test_a_branched_structure_with_no_mass_known_is_open_likewise():
         damping=T[:, :n].T @ ca.diag(c) @ T[:, :n],
     )  # fmt: skip
     x = np.concatenate([own["MASSES"], own["SPRINGS"], own["DAMPERS"]])
-    known = sensitivity(problem, x)
+    known = sensitivity(problem.formulation, x)
     assert known.unseen.shape[1] == 1
     moved = known.unit * known.unseen[:, 0] / x
     np.testing.assert_allclose(moved / moved[0], 1.0, atol=1e-6)
