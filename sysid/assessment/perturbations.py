@@ -42,7 +42,7 @@ class Perturbations(NamedTuple):
     rigid: Array
 
     def std(self, change: Array, size: ArrayLike) -> Array:
-        """As `std_of`."""
+        """Standard deviations of quantities that change so, (...): see `std_of`."""
         return std_of(change, self.normals, size)
 
     def std_of_lines(self, change: Array, factors: Sequence[NDArray[np.inexact[Any]]], size: float) -> Array:

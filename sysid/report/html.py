@@ -111,16 +111,17 @@ def table(
     words: bool = False,
     label: str = "",
 ) -> str:
-    """Set a table in a box that scrolls: numbers to the right, or words to the left.
+    """Set a table in a box that scrolls: numbers to the right, or words to the left; nothing without rows.
 
     Cells are plain, or a `Cell`; `label` is a grey mark before the caption.
     """
-    above = _caption(caption, label)
     kind = _class("words" if words else "wide" if len(head) > _WIDE else "")
     names = "".join(f'<th scope="col">{text(cell)}</th>' for cell in head)
     body = "".join("<tr>" + "".join(f"<td>{_cell(cell)}</td>" for cell in row) + "</tr>" for row in rows)
     top = f"<thead><tr>{names}</tr></thead>" if any(head) else ""
-    return f'<figure class="scroll">{above}<table{kind}>{top}<tbody>{body}</tbody></table></figure>'
+    if not body:
+        return ""
+    return f'<figure class="scroll">{_caption(caption, label)}<table{kind}>{top}<tbody>{body}</tbody></table></figure>'
 
 
 def matrix(
@@ -155,8 +156,8 @@ def picture(
     """Embed a figure as PNG; shown at 92 pixels an inch, so that it is sharp on paper and on dense screens."""
     width = round(92 * float(figure.get_size_inches()[0]))
     data = base64.b64encode(to_png(figure, dpi=dpi, colours=colours)).decode("ascii")
-    below = _caption(caption, label)
-    return f'<figure><img width="{width}" alt="{text(alt)}" src="data:image/png;base64,{data}">{below}</figure>'
+    image = f'<img width="{width}" alt="{text(alt)}" src="data:image/png;base64,{data}">'
+    return f"<figure>{image}{_caption(caption, label)}</figure>"
 
 
 def page(title: object, head: str, sections: Iterable[tuple[str, str]]) -> str:

@@ -332,10 +332,8 @@ def _convergence(it: Identification) -> str:
     ]
     ran = [[phase, number(objective), words] for phase, objective, words in rows if np.isfinite(objective)]
     parts = [picture(plot.convergence(it), f"objective through {', '.join(phase for phase, *_ in ran) or 'no search'}")]
-    if ran:
-        parts.append(table(["after", "objective", ""], ran, words=True))
-    if history.states:
-        parts.append(table(["state of the swarm", "iterations"], history.states))
+    parts.append(table(["after", "objective", ""], ran, words=True))
+    parts.append(table(["state of the swarm", "iterations"], history.states))
     return "".join(parts)
 
 

@@ -64,8 +64,10 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
 
 def _success(problem: Problem, end: Outcome) -> tuple[bool, str]:
     """Whether this is a fit, and the message."""
-    residual, goal = residual_of(problem, end), problem.goal
-    wrong = []
+    residual = (
+        problem.measurement.residual(end.structure) if end.x is None or problem.free_modes else problem.residual(end.x)
+    )
+    goal, wrong = problem.goal, []
     if end.x is not None and end.success and not problem.keeps_constraints(end.x):
         wrong.append("a constraint does not hold")
     if goal is not None and residual > goal:
@@ -76,13 +78,6 @@ def _success(problem: Problem, end: Outcome) -> tuple[bool, str]:
             "with exp(+iwt), the axes and signs of rigid_body right, the bounds wide enough?"
         )
     return end.success and not wrong, "; ".join((end.message, *wrong))
-
-
-def residual_of(problem: Problem, end: Outcome) -> float:
-    """The residual where a search ended; where modes are free it is the structure's."""
-    if end.x is None or problem.free_modes:
-        return problem.measurement.residual(end.structure)
-    return problem.residual(end.x)
 
 
 def _remarks(problem: Problem, end: Outcome) -> Iterator[str]:
