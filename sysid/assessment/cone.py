@@ -283,7 +283,7 @@ class Cone:
         c = slopes[moving]
         parts = [*region.signs, *region.limits]
         if all(len(part.at_start) == 1 for part in parts):
-            rows, at_start = np.array([p.slopes[0, 0] for p in parts]), np.array([p.at_start[0, 0] for p in parts])
+            at_start, rows = _rows(parts, c.shape[1])
             z = np.array([_programme(one / np.abs(one).max(), rows, at_start) for one in c])
         else:
             z = _barrier(c, _room(region))
@@ -330,12 +330,6 @@ class _Room(NamedTuple):
     blocks: list[Affine]
     inside: Array
 
-    def slacks(self, z: Array) -> tuple[Array, list[Array]]:
-        """Values of the rows, (q, rows), and of the blocks, (q, s, s) each, for z (q, k)."""
-        return self.at_start + z @ self.rows.T, [
-            b.at_start + np.einsum("qk,ijk->qij", z, b.slopes) for b in self.blocks
-        ]
-
 
 def _room(region: Region) -> _Room:
     """The region as the barrier wants it."""
@@ -348,10 +342,13 @@ def _room(region: Region) -> _Room:
     parts = [*region.signs]
     for p in region.limits:
         parts.append(Affine(p.at_start + max(0.0, _OPENED - least([p], inside)) * np.eye(len(p.at_start)), p.slopes))
+    return _Room(*_rows(parts, inside.size), [p for p in parts if len(p.at_start) > 1], inside)
+
+
+def _rows(parts: Sequence[Affine], k: int) -> tuple[Array, Array]:
+    """Start (rows,) and slopes (rows, k) of the conditions on one number each."""
     single = [p for p in parts if len(p.at_start) == 1]
-    at_start = np.array([p.at_start[0, 0] for p in single])
-    rows = np.array([p.slopes[0, 0] for p in single]).reshape(-1, len(inside))
-    return _Room(at_start, rows, [p for p in parts if len(p.at_start) > 1], inside)
+    return np.array([p.at_start[0, 0] for p in single]), np.array([p.slopes[0, 0] for p in single]).reshape(-1, k)
 
 
 def _barrier(functions: Array, room: _Room) -> Array:
@@ -397,11 +394,10 @@ def _centred(pull: Array, room: _Room, z: Array) -> Array:
 
 def _derivatives(room: _Room, z: Array) -> tuple[Array, Array, Callable[[Array], Array]]:
     """Of log det of all slacks: gradient (q, k), root (q, r, k) of the negative Hessian, and rates along a step."""
-    slacks, matrices = room.slacks(z)
-    relative = room.rows / slacks[:, :, None]
+    relative = room.rows / (room.at_start + z @ room.rows.T)[:, :, None]
     gradient, roots, whitened = relative.sum(axis=1), [relative], []
-    for block, S in zip(room.blocks, matrices, strict=True):
-        inverse = np.linalg.inv(np.linalg.cholesky(S))
+    for block in room.blocks:
+        inverse = np.linalg.inv(np.linalg.cholesky(block.at_start + np.einsum("qk,ijk->qij", z, block.slopes)))
         slopes = np.einsum("qai,ijk,qbj->qabk", inverse, block.slopes, inverse, optimize=True)
         gradient = gradient + np.einsum("qaak->qk", slopes)
         roots.append(slopes.reshape(len(z), -1, z.shape[1]))

@@ -58,7 +58,8 @@ def verdict(problem: Problem, structure: Structure) -> tuple[tuple[str, ...], tu
     misfit = test.residual(structure)
     known = _known(problem, structure, misfit)
     free, common = _open_modes(known)
-    open_ = [*_unseen(problem, structure, misfit), *_merged(known, test, structure, free)]
+    responses = _responses(test, structure)
+    open_ = [*_unseen(problem, structure, misfit, responses), *_merged(known, test, structure, free, responses)]
     if free:
         bounded = ", within what is stated" if len(known.equations) else ""
         open_.append(
@@ -78,9 +79,10 @@ def verdict(problem: Problem, structure: Structure) -> tuple[tuple[str, ...], tu
     return closed, tuple(open_)
 
 
-def _merged(known: _Known, test: Measurement, structure: Structure, free: list[int]) -> Iterator[str]:
-    """Modes that cannot be told apart, as far as something of them is open, in sentences."""
-    responses = _responses(test, structure)
+def _merged(
+    known: _Known, test: Measurement, structure: Structure, free: list[int], responses: _Record
+) -> Iterator[str]:
+    """Modes that cannot be distinguished, as far as something of them is open, in sentences."""
     for cluster in (cluster for cluster in known.clusters if len(cluster) > 1):
         names = " and ".join(_mode(structure, k) for k in cluster)
         seen = _seen(test, structure, cluster, structure.mode_shapes, responses).shape[1]
@@ -91,6 +93,7 @@ def _merged(known: _Known, test: Measurement, structure: Structure, free: list[i
 
 
 def _what_is_open(structure: Structure, free: list[int], common: bool) -> str:
+    """Which modal masses are open, in words."""
     if common:
         return "one common scale of mass, stiffness and damping is open"
     if len(free) == structure.n:
@@ -308,10 +311,12 @@ def _record(record: ComplexArray, predicted: ComplexArray, std: Array | None, ti
 
 
 def _responses(test: Measurement, structure: Structure) -> _Record:
+    """The relative accelerations."""
     return _record(test.relative, test.predict(structure), test.response_std, _CLEAR)
 
 
 def _forces(test: Measurement, structure: Structure) -> _Record | None:
+    """The base force, where it was measured."""
     if test.force is None:
         return None
     return _record(test.force, test.predict_force(structure), test.force_std, 1.0)
@@ -331,7 +336,7 @@ def _seen(test: Measurement, structure: Structure, cluster: list[int], rows: Arr
     return W[:, shares >= record.level]
 
 
-def _unseen(problem: Problem, structure: Structure, misfit: float) -> Iterator[str]:
+def _unseen(problem: Problem, structure: Structure, misfit: float, responses: _Record) -> Iterator[str]:
     """What the records do not show, in sentences."""
     test = problem.measurement
     base = columns(test.base)
@@ -343,7 +348,7 @@ def _unseen(problem: Problem, structure: Structure, misfit: float) -> Iterator[s
     count = int(np.count_nonzero(~problem.formulation.outside))
     if 2 * test.response.size < count:
         yield f"{2 * test.response.size} measured numbers cannot fix {count} unknowns"
-    responses, forces = _responses(test, structure), _forces(test, structure)
+    forces = _forces(test, structure)
     for k in range(structure.n):
         f, push = structure.natural_frequencies[k], structure.participation[[k]]
         (share,) = _shares(test, structure, k, structure.mode_shapes[:, [k]], push, responses)
