@@ -38,10 +38,6 @@ def doubts(problem: Problem, structure: Structure, x: Array | None) -> tuple[str
         The answer, with the sensors of the problem's own test.
     x : (n_variables,) or None
         The unknowns that stand for it; None where it has other degrees of freedom than the sensors.
-
-    Returns
-    -------
-    tuple of str
     """
     formulation = problem.formulation
     found: list[str] = []

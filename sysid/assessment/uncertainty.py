@@ -17,13 +17,7 @@ from numpy.typing import ArrayLike
 from sysid.assessment.information import Index, information, spectra_of, spread
 from sysid.assessment.modal_mass_cone import open_modes
 from sysid.assessment.parametrisation import held_by_entries, parametrisation
-from sysid.assessment.perturbations import (
-    DirectSpectra,
-    ModalSpectra,
-    Perturbations,
-    matrices_of_modes,
-    std_of,
-)  # fmt: skip
+from sysid.assessment.perturbations import DirectSpectra, ModalSpectra, Perturbations, matrices_of_modes, std_of
 from sysid.assessment.sensitivity import (
     Sensitivity,
     blocks_and_slopes,

@@ -88,11 +88,6 @@ def bullets(sentences: Iterable[object]) -> str:
     return f"<ul>{items}</ul>" if items else ""
 
 
-def mark(words: str) -> str:
-    """Set a grey label; nothing where there are no words."""
-    return f'<span class="mark">{text(words)}</span>' if words else ""
-
-
 def fold(heading: object, content: str, *, opened: bool = False) -> str:
     """Set content that its heading unfolds."""
     return f"<details{' open' if opened else ''}><summary>{text(heading)}</summary>\n{content}\n</details>"
@@ -113,7 +108,7 @@ def table(
 ) -> str:
     """Set a table in a box that scrolls: numbers to the right, or words to the left; nothing without rows.
 
-    Cells are plain, or a `Cell`; `label` is a grey mark before the caption.
+    Cells are plain, or a `Cell`; `label` stands in grey before the caption.
     """
     kind = _class("words" if words else "wide" if len(head) > _WIDE else "")
     names = "".join(f'<th scope="col">{text(cell)}</th>' for cell in head)
@@ -184,7 +179,8 @@ def _cell(cell: object) -> str:
 
 
 def _caption(words: object, label: str) -> str:
-    return f"<figcaption>{mark(label)}{text(words)}</figcaption>" if words or label else ""
+    mark = f'<span class="mark">{text(label)}</span>' if label else ""
+    return f"<figcaption>{mark}{text(words)}</figcaption>" if words or label else ""
 
 
 def _class(kind: str) -> str:

@@ -61,11 +61,8 @@ def scores(structure: Structure, test: Measurement) -> Scores:
     """How well `structure` predicts a test, sensor by sensor; 1 is perfect."""
     with_base = np.einsum("sd,rdf->rsf", test.rigid_body, test.base)
     predicted = test.predict(structure)
-    return Scores(
-        _score(predicted, test.relative),
-        _score(predicted + with_base, test.response),
-        _score(with_base, test.response),
-    )
+    absolute, rigid = (_score(moved, test.response) for moved in (predicted + with_base, with_base))
+    return Scores(_score(predicted, test.relative), absolute, rigid)
 
 
 def write(identification: Identification, path: str | Path) -> Path:

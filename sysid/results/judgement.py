@@ -23,18 +23,7 @@ _ON_BOUND = 1e-6  # of an unknown's range
 
 
 def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session) -> Identification:
-    """Judge where a search ended.
-
-    Parameters
-    ----------
-    problem : Problem
-    end : Outcome
-    why : str
-        Why the strategy was taken.
-    seed : int
-    session : Session
-        Its log and clock.
-    """
+    """Judge where a search ended: `why` tells why its strategy was taken, the session has its log and clock."""
     success, message = _success(problem, end)
     session.log(f"done: {message}")
     known = determine(problem, end.structure, end.x, end.alternatives)
@@ -64,10 +53,8 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
 
 def _success(problem: Problem, end: Outcome) -> tuple[bool, str]:
     """Whether this is a fit, and the message."""
-    residual = (
-        problem.measurement.residual(end.structure) if end.x is None or problem.free_modes else problem.residual(end.x)
-    )
-    goal, wrong = problem.goal, []
+    test, goal, wrong = problem.measurement, problem.goal, []
+    residual = test.residual(end.structure) if end.x is None or problem.free_modes else problem.residual(end.x)
     if end.x is not None and end.success and not problem.keeps_constraints(end.x):
         wrong.append("a constraint does not hold")
     if goal is not None and residual > goal:

@@ -82,19 +82,7 @@ def _tree(source: Path) -> Tree:
 
 
 def file_or_folder(path: str | Path, name: str, suffixes: Sequence[str]) -> Path:
-    """Give the file to write where a path may be that file or the folder for it.
-
-    Parameters
-    ----------
-    path : str or Path
-    name : str
-        What the file is called in a folder.
-    suffixes : sequence of str
-        Endings that tell a file from a folder, the usual one first.
-
-    Returns
-    -------
-    Path
+    """Give the file to write: `path` where it ends in one of `suffixes`, the usual one first, else `name` in it.
 
     Raises
     ------
@@ -111,17 +99,12 @@ def file_or_folder(path: str | Path, name: str, suffixes: Sequence[str]) -> Path
 
 @contextlib.contextmanager
 def atomically(path: Path) -> Iterator[Path]:
-    """Give a temporary file beside `path` that takes its place at the end, and vanishes after any failure.
+    """Give a temporary file beside `path`, whose folder is made; it takes its place at the end, or vanishes on failure.
 
-    Parameters
-    ----------
-    path : Path
-        What to write; its folder is made.
-
-    Yields
+    Raises
     ------
-    Path
-        Where to write it.
+    InputError
+        Where `path` cannot be written.
     """
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
