@@ -56,7 +56,7 @@ def doubts(problem: Problem, structure: Structure, x: Array | None) -> tuple[str
 
 
 def _of_records(formulation: Formulation, test: Measurement, structure: Structure) -> list[str]:
-    """What the records of one test say against a structure."""
+    """Signs in the records of one test that a structure is not theirs, in sentences."""
     records, poles = Records(test), _poles(structure)
     velocity = not structure.modal_damping
     if records.data.shape[0] <= _LINES * poles[0].size * records.n_base * (2 if velocity else 1):
@@ -167,14 +167,14 @@ def _lumped_total(problem: Problem, structure: Structure) -> Iterator[str]:
     totals, geometry = problem.formulation.mass.totals, problem.geometry
     if totals is None or totals.kind != "sensors":
         return
-    own, groups = np.diag(structure.mass)[: geometry.n], geometry.directions[: geometry.n]
-    moves = np.einsum("j,ji->i", own, geometry.rigid_body**2)
-    for i in np.flatnonzero(geometry.translational):
-        if np.any(groups == i) and abs(moves[i] / totals.values[i] - 1) > 1e-6:
-            yield (
-                f"{totals.values[i]:.4g} kg are stated over the sensors of base direction {i + 1}, but their masses "
-                f"make {moves[i]:.4g} kg in it: a lumped mass needs sensors along the base directions, not skew ones"
-            )
+    moves = np.einsum("j,ji->i", np.diag(structure.mass)[: geometry.n], geometry.rigid_body**2)
+    has_sensors = np.isin(np.arange(geometry.d), geometry.directions[: geometry.n])
+    off = np.abs(moves / totals.values - 1) > 1e-6
+    for i in np.flatnonzero(geometry.translational & has_sensors & off):
+        yield (
+            f"{totals.values[i]:.4g} kg are stated over the sensors of base direction {i + 1}, but their masses "
+            f"make {moves[i]:.4g} kg in it: a lumped mass needs sensors along the base directions, not skew ones"
+        )
 
 
 def _force(formulation: Formulation, test: Measurement, structure: Structure) -> Iterator[str]:
@@ -197,7 +197,7 @@ def _force(formulation: Formulation, test: Measurement, structure: Structure) ->
 
 
 def _rigid(test: Measurement, records: Records, free: ResidueFit) -> Iterator[str]:
-    """Whether sensors move in a constant proportion to the base beside their modes: G is not what it is said to be."""
+    """Whether sensors move in a constant proportion to the base beside their modes: then rigid_body is wrong."""
     ones = records.basis(np.ones((1, test.freq.size), dtype=complex))
     extra = ones - free.Q @ (free.Q.T @ ones)
     if np.linalg.norm(extra) < _MIMICKED * np.linalg.norm(ones):

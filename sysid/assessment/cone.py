@@ -332,7 +332,7 @@ class _Room(NamedTuple):
 
 
 def _room(region: Region) -> _Room:
-    """The region as the barrier wants it."""
+    """The region for the barrier method: conditions on one number, on matrices, and a start inside all of them."""
     # T falls towards zero along what is open: that leaves room under the limits, if anything does.
     falling = -0.5 * region.open @ region.start
     least = lambda parts, z: min((np.linalg.eigvalsh(p.at_start + p.slopes @ z)[0] for p in parts), default=1.0)  # noqa: E731

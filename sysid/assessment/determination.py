@@ -136,7 +136,7 @@ def open_masses(problem: Problem, structure: Structure) -> list[int]:
 
 
 def _about(problem: Problem, structure: Structure, x: Array | None) -> tuple[Formulation, Array, Slopes, Sensitivity]:
-    """Formulation and unknowns with all totals, derivatives of the matrices, and what the data say of the unknowns."""
+    """Formulation and unknowns with all totals, derivatives of the matrices, and the sensitivity to the unknowns."""
     if x is None:
         raise InputError(
             "the rank of the Jacobian is taken at the unknowns of the problem: give x beside the structure"

@@ -1,4 +1,4 @@
-"""What all that is fitted sees of the unknowns about an answer: rank, null directions and noise, by the exact Jacobian.
+"""Sensitivity of all that is fitted to the unknowns at an answer: rank, null directions and noise, by exact Jacobian.
 
 To first order: what is said of a direction holds for small steps along it.
 """
@@ -90,7 +90,7 @@ def sensitivity(
 
 
 def of_outside(formulation: Formulation, x: Array) -> Sensitivity:
-    """The same of the variables that enter no matrix (`Formulation.outside`), by the terms beside the records alone."""
+    """Sensitivity to the variables that enter no matrix (`Formulation.outside`), by the terms beside the records."""
     rows = [term.linearised(x, formulation.noise) for term in formulation.beside]
     return _judged(formulation, x, rows, formulation.outside)
 
@@ -134,7 +134,7 @@ def outside_variables(formulation: Formulation) -> tuple[Unknown, ...]:
 
 
 def _judged(formulation: Formulation, x: Array, rows: list[Rows], part: NDArray[np.bool_]) -> Sensitivity:
-    """Of the unknowns in `part`, the others held."""
+    """Sensitivity of the stacked rows to the unknowns in `part`, the others held."""
     unit = scales_of(formulation.unknowns, x)[part]
     none = Rows(np.zeros(0), np.zeros((0, x.size)), np.zeros(0))
     all_rows = stacked_rows([none, *rows])

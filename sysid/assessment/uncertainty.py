@@ -196,7 +196,7 @@ def uncertainty(problem: Problem, structure: Structure, x: Array | None) -> Unce
 
 
 def _by_modes(problem: Problem, structure: Structure, x: Array | None) -> Uncertainty:
-    """Where the modal parameters are free: by their information."""
+    """Standard deviations where the modal parameters are free, from their Fisher information."""
     test, modes = problem.measurement, modes_of(structure)
     index = Index(structure.n_sensors, structure.n, structure.n_base)
     path = parametrisation(problem, structure, modes, index)
@@ -224,7 +224,7 @@ def _by_modes(problem: Problem, structure: Structure, x: Array | None) -> Uncert
 
 
 def _by_unknowns(problem: Problem, structure: Structure, x: Array) -> Uncertainty:
-    """By the Jacobian of all that is fitted, in the problem's unknowns."""
+    """Standard deviations from the Jacobian of all that is fitted, in the problem's unknowns."""
     test, modes = problem.measurement, modes_of(structure)
     formulation, x = with_totals(problem, structure, x)
     slopes = slopes_of(formulation.matrices, x, test, modes.omega)
@@ -247,7 +247,7 @@ def _by_unknowns(problem: Problem, structure: Structure, x: Array) -> Uncertaint
 def _with_unknowns(
     found: Uncertainty, problem: Problem, formulation: Formulation, x: Array, known: Sensitivity
 ) -> Uncertainty:
-    """The same with the unknowns that mean something by themselves; with their covariance where all do."""
+    """Add the unknowns that mean something by themselves, and their covariance where all do."""
     unknowns, names = formulation.unknowns, {unknown.name for unknown in problem.variables}
     std = std_of(known.steps, known.rank, known.unit)
     of_unknowns = zip(unknowns, split(unknowns, meaningful(formulation)), strict=True)
@@ -278,7 +278,7 @@ def _quantities(
     problem: Problem, structure: Structure, modes: Modes, moves: Perturbations, inflation: float,
     matrices: Sequence[Array],
 ) -> Uncertainty:  # fmt: skip
-    """Everything that follows from the perturbations; `matrices` are the deviations of M_SS, K_SS and C."""
+    """Standard deviations of all quantities from the perturbations; `matrices` are those of M_SS, K_SS and C."""
     phi, gamma, omega, ratios = modes
     frequencies, n = omega / (2 * np.pi), structure.n
     d_frequencies, d_ratios = frequencies[:, None] * moves.log_omega, ratios[:, None] * moves.log_ratios

@@ -1,4 +1,4 @@
-"""What an outcome is worth: success, what is determined, and what the user should know, in sentences."""
+"""Judgement of where a search ended: success, what is determined, and what the user should know, in sentences."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def _remarks(problem: Problem, end: Outcome) -> Iterator[str]:
 
 
 def _as_certain(it: Identification) -> Identification:
-    """The same; not determined where noise leaves matrices open that are fixed without it.
+    """Call the matrices not determined where noise leaves entries open that are fixed without it.
 
     Null directions of exact records are closed by their noise, and show as large standard deviations only.
     """
