@@ -34,23 +34,18 @@ def vector3(value: ArrayLike, label: str) -> Array:
     return vector
 
 
-def cross_matrix(r: Array) -> Array:
-    """Return the matrix [r] with [r] a = r × a, (3, 3)."""
-    return np.array([[0.0, -r[2], r[1]], [r[2], 0.0, -r[0]], [-r[1], r[0], 0.0]])
-
-
 def sensor_row(axis: str | ArrayLike, label: str) -> Array:
-    """Return what a sensor picks of its node's six motions, (6,).
+    """Factors of a node's six motions in the signal of a sensor on it, (6,).
 
     `axis` is a vector (3,), of any length, or a string: "x", "-y", and "rx", "-rz" for rotations.
     """
     row = np.zeros(6)
     if isinstance(axis, str):
-        match = re.fullmatch(r"([+-]?)(r?)([xyz])", axis)
+        match = re.fullmatch(r"([+-]?)(r?[xyz])", axis)
         if match is None:
             raise InputError(f"the axis of {label} must be a vector or one of x y z rx ry rz (signed), got {axis!r}")
-        sign, rotation, letter = match.groups()
-        row["xyz".index(letter) + 3 * bool(rotation)] = -1.0 if sign == "-" else 1.0
+        sign, name = match.groups()
+        row[BASE_AXES.index(name)] = float(f"{sign}1")
     else:
         row[:3] = unit_vector(axis, f"the axis of {label}")
     return row
@@ -61,7 +56,7 @@ def base_columns(base_axes: str | Iterable[str]) -> list[int]:
     text = base_axes if isinstance(base_axes, str) else " ".join(base_axes)
     if re.fullmatch(r"([\s,]*r?[xyz])+[\s,]*", text) is None:
         raise InputError(f"base_axes must be any of x y z rx ry rz, got {base_axes!r}")
-    columns = ["xyz".index(axis[-1]) + 3 * (len(axis) == 2) for axis in re.findall(r"r?[xyz]", text)]
+    columns = [BASE_AXES.index(axis) for axis in re.findall(r"r?[xyz]", text)]
     if len(set(columns)) < len(columns):
         raise InputError(f"base_axes names an axis twice: {base_axes!r}")
     return columns
@@ -71,6 +66,5 @@ def rigid_motion(points: Array, origin: ArrayLike) -> Array:
     """Motion of `points` (n, 3) for unit motions of `origin` in x y z rx ry rz, (6 n, 6)."""
     arms = points - vector3(origin, "origin")
     motion = np.tile(np.eye(6), (len(arms), 1, 1))
-    for node, arm in enumerate(arms):
-        motion[node, :3, 3:] = -cross_matrix(arm)  # theta × r = -[r] theta
+    motion[:, :3, 3:] = np.cross(np.eye(3), arms[:, None]).swapaxes(1, 2)  # theta × r
     return motion.reshape(-1, 6)

@@ -1,15 +1,11 @@
-"""What a frame is put together from.
-
-Element matrices and geometry, in numbers; then the few matrix operations that numbers and CasADi
-expressions do not share by themselves.
-"""
+"""Element matrices and geometry of beams, and matrix operations on numbers and CasADi expressions alike."""
 
 from __future__ import annotations
 
 import numbers
-from collections.abc import Sequence
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import scipy.linalg
 import scipy.sparse
@@ -37,6 +33,17 @@ _BENDING_XZ = np.array([2, 4, 8, 10])  # w and the rotation about y
 # dw/dx is minus the rotation about y, where dv/dx is plus the rotation about z.
 _FLIP = np.outer([1, -1, 1, -1], [1, -1, 1, -1])
 
+# Of a rod and of bending, for unit length: EA/L, EI/L³ and rho A L times these, with rotations multiplied by L.
+_ROD = np.array([[1, -1], [-1, 1]])
+_BENDING = np.array([[12, 6, -12, 6], [6, 4, -6, 2], [-12, -6, 12, -6], [6, 2, -6, 4]])
+_MASS = {
+    "consistent": (
+        np.array([[2, 1], [1, 2]]) / 6,
+        np.array([[156, 22, 54, -13], [22, 4, 13, -3], [54, 13, 156, -22], [-13, -3, -22, 4]]) / 420,
+    ),
+    "lumped": (np.eye(2) / 2, np.diag([1 / 2, 1 / 78, 1 / 2, 1 / 78])),
+}
+
 _PARALLEL = 1e-6  # sine of the smallest angle between a beam and its orientation vector
 
 
@@ -57,27 +64,9 @@ def stiffness_patterns(length: float) -> Array:
     ----------
     Przemieniecki, Theory of Matrix Structural Analysis (1968), section 5.6, without shear.
     """
-    L = length
-    rod = np.array([[1, -1], [-1, 1]]) / L
-    bending = (
-        np.array(
-            [
-                [12, 6 * L, -12, 6 * L],
-                [6 * L, 4 * L**2, -6 * L, 2 * L**2],
-                [-12, -6 * L, 12, -6 * L],
-                [6 * L, 2 * L**2, -6 * L, 4 * L**2],
-            ]
-        )
-        / L**3
-    )
-    return np.stack(
-        [
-            _placed((_AXIAL, rod)),
-            _placed((_BENDING_XZ, _FLIP * bending)),
-            _placed((_BENDING_XY, bending)),
-            _placed((_TORSION, rod)),
-        ]
-    )
+    rod, bending = _ROD / length, _BENDING * _turns(length) / length**3
+    parts = [(_AXIAL, rod), (_BENDING_XZ, _FLIP * bending), (_BENDING_XY, bending), (_TORSION, rod)]
+    return np.stack([_placed(part) for part in parts])
 
 
 def mass_patterns(length: float, kind: str) -> Array:
@@ -101,26 +90,15 @@ def mass_patterns(length: float, kind: str) -> Array:
     ----------
     Przemieniecki (1968), section 11.4, without the rotary inertia of the cross-section in bending.
     """
-    L = length
-    if kind == "lumped":
-        rod = np.eye(2) * L / 2
-        bending = np.diag([L / 2, L**3 / 78, L / 2, L**3 / 78])
-    else:
-        rod = np.array([[2, 1], [1, 2]]) * L / 6
-        bending = (
-            np.array(
-                [
-                    [156, 22 * L, 54, -13 * L],
-                    [22 * L, 4 * L**2, 13 * L, -3 * L**2],
-                    [54, 13 * L, 156, -22 * L],
-                    [-13 * L, -3 * L**2, -22 * L, 4 * L**2],
-                ]
-            )
-            * L
-            / 420
-        )
+    rod, bending = (length * matrix for matrix in _MASS[kind])
+    bending = bending * _turns(length)
     along = _placed((_AXIAL, rod), (_BENDING_XY, bending), (_BENDING_XZ, _FLIP * bending))
     return np.stack([along, _placed((_TORSION, rod))])
+
+
+def _turns(length: float) -> Array:
+    """Factors of the entries in bending, a rotation times the length being a deflection."""
+    return np.outer([1, length, 1, length], [1, length, 1, length])
 
 
 def _placed(*blocks: tuple[NDArray[np.intp], Array]) -> Array:
@@ -149,7 +127,7 @@ def local_axes(start: Array, end: Array, orientation: ArrayLike, label: str) -> 
 
 
 class WeightedSum:
-    """A matrix that is linear in some scalars, sum_k weight_k pattern_k.
+    """A square matrix that is linear in some scalars, sum_k weight_k pattern_k.
 
     The patterns are always numbers; so the sum is one product of a sparse matrix and a vector,
     the same for numbers and for expressions.
@@ -157,15 +135,15 @@ class WeightedSum:
 
     def __init__(self, size: int) -> None:
         self.size = size
-        self.weights: list[Scalar] = []
+        self.weights: dict[tuple[int, str], Scalar] = {}
         self.columns: dict[tuple[int, str], int] = {}
-        self.entries: list[tuple[NDArray[Any], ...]] = []
+        # Values, places and columns of the patterns; none to begin with, so that a sum of nothing is zero.
+        self.entries: list[tuple[NDArray[Any], ...]] = [(np.empty(0), np.empty(0, int), np.empty(0, int))]
 
     def add(self, key: tuple[int, str], weight: Scalar, dofs: NDArray[np.intp], pattern: Array) -> None:
         """Add `weight` times `pattern` at `dofs`; entries with the same key share their weight."""
-        column = self.columns.setdefault(key, len(self.weights))
-        if column == len(self.weights):
-            self.weights.append(weight)
+        column = self.columns.setdefault(key, len(self.columns))
+        self.weights.setdefault(key, weight)
         pattern = 0.5 * (pattern + pattern.T)  # a rotated element is symmetric only to rounding
         rows, columns = np.nonzero(pattern)
         place = dofs[rows] + self.size * dofs[columns]
@@ -173,15 +151,11 @@ class WeightedSum:
 
     def total(self) -> Matrix:
         """Return the sum, (size, size)."""
-        weights = self.weights
-        if not weights:
-            return np.zeros((self.size, self.size))
+        weights = list(self.weights.values())
         values, places, columns = (np.concatenate(part) for part in zip(*self.entries, strict=True))
         patterns = scipy.sparse.csc_matrix((values, (places, columns)), shape=(self.size**2, len(weights)))
         if all(is_number(weight) for weight in weights):
             return (patterns @ np.array(weights)).reshape(self.size, self.size, order="F")
-        import casadi as ca
-
         try:
             stacked = ca.vertcat(*weights)
         except NotImplementedError:
@@ -201,8 +175,6 @@ def scalar(value: Any, name: str) -> Scalar:
         if not np.isfinite(number):
             raise InputError(f"{name} must be finite, got {number}")
         return number
-    import casadi as ca
-
     try:
         product = 1.0 * value
     except (TypeError, NotImplementedError):
@@ -213,71 +185,48 @@ def scalar(value: Any, name: str) -> Scalar:
 
 
 def inertia_entries(inertia: Any, node: int) -> dict[tuple[int, int], Scalar]:
-    """Upper triangle of a 3 x 3 inertia; its entries may be numbers or CasADi scalars."""
+    """Upper triangle of a 3 x 3 inertia; its entries may be numbers or CasADi scalars. Zeros beside the diagonal go."""
     label = f"the inertia of the point mass on node {node}"
-    # CasADi matrices index like two-dimensional arrays, and do not iterate.
-    shape = getattr(inertia, "shape", None)
-    if shape is not None and len(shape) == 2:
+    shape: tuple[int, ...] = getattr(inertia, "shape", ())
+    if len(shape) == 2:  # CasADi matrices index like two-dimensional arrays, and do not iterate
         rows = [[inertia[i, j] for j in range(shape[1])] for i in range(shape[0])]
-        rows = [row[0] for row in rows] if shape[1] == 1 else rows
     else:
-        rows = list(inertia) if isinstance(inertia, Sequence | np.ndarray) else []
-    if len(rows) == 3 and not any(isinstance(row, Sequence | np.ndarray) and np.ndim(row) == 1 for row in rows):
-        return _checked({(i, i): scalar(rows[i], label) for i in range(3)}, label)
-    if len(rows) != 3 or any(not isinstance(row, Sequence | np.ndarray) or len(row) != 3 for row in rows):
+        rows = [list(row) if np.iterable(row) else [row] for row in inertia] if np.iterable(inertia) else []
+    lengths = [len(row) for row in rows]
+    if lengths == [1, 1, 1]:
+        rows = [[row[0] if i == j else 0.0 for j in range(3)] for i, row in enumerate(rows)]
+    elif lengths != [3, 3, 3]:
         raise InputError(f"{label} must be three values or 3 x 3")
-    full = {(i, j): scalar(rows[i][j], label) for i in range(3) for j in range(3)}
-    for i, j in ((0, 1), (0, 2), (1, 2)):
-        pair = full[i, j], full[j, i]
-        if is_number(pair[0]) and is_number(pair[1]) and not np.isclose(*pair, rtol=1e-9, atol=0.0):
-            raise InputError(f"{label} is not symmetric: {pair[0]:g} and {pair[1]:g}")
-    return _checked({(i, j): value for (i, j), value in full.items() if i <= j}, label)
-
-
-def _checked(upper: dict[tuple[int, int], Scalar], label: str) -> dict[tuple[int, int], Scalar]:
-    if all(is_number(value) for value in upper.values()):
-        matrix = np.zeros((3, 3))
-        for (i, j), value in upper.items():
-            matrix[i, j] = matrix[j, i] = value
-        lowest, *_, highest = np.linalg.eigvalsh(matrix)
+    full = [[scalar(value, label) for value in row] for row in rows]
+    known = np.array([[value if is_number(value) else np.nan for value in row] for row in full])
+    unequal = np.argwhere(np.abs(known - known.T) > 1e-9 * np.abs(known.T))
+    if unequal.size:
+        i, j = unequal[0]
+        raise InputError(f"{label} is not symmetric: {known[i, j]:g} and {known[j, i]:g}")
+    if np.all(np.isfinite(known)):
+        lowest, *_, highest = np.linalg.eigvalsh(known)
         if lowest < -1e-12 * abs(highest):
             raise InputError(f"{label} is not positive semidefinite: its lowest eigenvalue is {lowest:g} kg m²")
-    return upper
+    return {(i, j): full[i][j] for i in range(3) for j in range(i, 3) if i == j or known[i, j] != 0}
 
 
 def block(matrix: Matrix, dofs: NDArray[np.intp]) -> Matrix:
     """Return the rows and columns `dofs` of a square matrix."""
-    return matrix[np.ix_(dofs, dofs)] if isinstance(matrix, np.ndarray) else matrix[dofs.tolist(), dofs.tolist()]
+    return matrix[dofs, :][:, dofs]
 
 
 def symmetric(matrix: Matrix) -> Matrix:
     """Return a dense matrix that is symmetric to the last bit."""
     half = 0.5 * (matrix + matrix.T)
-    if isinstance(half, np.ndarray):
-        return half
-    import casadi as ca
-
-    return ca.densify(half)
+    return half if isinstance(half, np.ndarray) else ca.densify(half)
 
 
 def placed_rows(matrix: Matrix, rows: NDArray[np.intp], size: int) -> Matrix:
     """Return a matrix of `size` rows that holds `matrix` in its `rows` and zeros elsewhere."""
-    if isinstance(matrix, np.ndarray):
-        out = np.zeros((size, matrix.shape[1]))
-        out[rows] = matrix
-        return out
-    out = type(matrix).zeros(size, matrix.shape[1])
-    out[rows.tolist(), :] = matrix
+    zeros = np.zeros if isinstance(matrix, np.ndarray) else type(matrix).zeros
+    out = zeros((size, matrix.shape[1]))
+    out[rows, :] = matrix
     return out
-
-
-def joined(left: Matrix, right: Matrix) -> Matrix:
-    """Return two matrices side by side."""
-    if isinstance(left, np.ndarray):
-        return np.hstack([left, right])
-    import casadi as ca
-
-    return ca.horzcat(left, right)
 
 
 def solve(matrix: Matrix, right: Array) -> Matrix:
@@ -287,8 +236,6 @@ def solve(matrix: Matrix, right: Array) -> Matrix:
             return scipy.linalg.cho_solve(scipy.linalg.cho_factor(matrix), right)
         except scipy.linalg.LinAlgError:
             raise InputError(SINGULAR) from None
-    import casadi as ca
-
     if isinstance(matrix, ca.SX):
         # Sparse L D L' is a fraction of the operations of SX's own solve, and positive definite needs no pivots.
         return ca.densify(ca.ldl_solve(ca.SX(ca.DM(right)), *ca.ldl(matrix)))

@@ -24,7 +24,7 @@ import scipy.sparse.csgraph
 from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError
-from sysid.structure.axes import base_columns, cross_matrix, rigid_motion, sensor_row, vector3
+from sysid.structure.axes import base_columns, rigid_motion, sensor_row, vector3
 from sysid.structure.beam import (
     SINGULAR,
     Array,
@@ -34,7 +34,6 @@ from sysid.structure.beam import (
     block,
     inertia_entries,
     is_number,
-    joined,
     local_axes,
     mass_patterns,
     placed_rows,
@@ -43,7 +42,7 @@ from sysid.structure.beam import (
     stiffness_patterns,
     symmetric,
 )
-from sysid.structure.structure import Structure
+from sysid.structure.structure import Structure, shaped_array
 
 SensorAxis = tuple[int, str | ArrayLike]
 """Node of a sensor and its axis: a vector (3,), or a string such as "x", "-y", "rz"."""
@@ -197,12 +196,7 @@ class Frame:
     mass: Literal["consistent", "lumped"] = "consistent"
 
     def __post_init__(self) -> None:
-        try:
-            nodes = np.array(self.nodes, dtype=float)
-        except (TypeError, ValueError):
-            raise InputError("nodes must be numbers, (N, 3)") from None
-        if nodes.ndim != 2 or nodes.shape[1] != 3 or not np.all(np.isfinite(nodes)):
-            raise InputError(f"nodes must be finite positions (N, 3), got shape {nodes.shape}")
+        nodes = shaped_array("nodes", self.nodes, "N", 3)
         nodes.flags.writeable = False
         object.__setattr__(self, "nodes", nodes)
         object.__setattr__(self, "beams", tuple(self.beams))
@@ -244,10 +238,9 @@ class Frame:
                 mass.add((id(s), name), weight, dofs, turn.T @ pattern @ turn)
         for point in self.point_masses:
             dofs = _dofs([point.node])
-            # What the centre of mass does for unit motions of the node.
-            motion = np.hstack([np.eye(3), -cross_matrix(np.asarray(point.offset))])
+            motion = rigid_motion(np.array([point.offset]), np.zeros(3))[:3]  # of the centre of mass
             mass.add((id(point), "mass"), point.mass, dofs, motion.T @ motion)
-            for (i, j), value in {} if point.inertia is None else point.inertia.items():
+            for (i, j), value in (point.inertia or {}).items():
                 pattern = np.zeros((6, 6))
                 pattern[3 + i, 3 + j] = pattern[3 + j, 3 + i] = 1.0
                 mass.add((id(point), f"{i}{j}"), value, dofs, pattern)
@@ -321,10 +314,10 @@ class Frame:
             T_f, K_SS = _modal(block(mass, free), block(stiffness, free), S_f)
 
         G = S @ R
-        T_S = placed_rows(T_f, free, len(R))
-        T = joined(T_S, R - T_S @ G)
-        # K R = 0 exactly, so the base's rows follow from K_SS; T' K T would leave rounding in them.
+        # [u_S; u_0] to the motion of the sensors relative to the base, and of all nodes.
         relative = np.hstack([np.eye(len(S)), -G])
+        T = placed_rows(T_f, free, len(R)) @ relative + np.hstack([np.zeros((len(R), len(S))), R])
+        # K R = 0 exactly, so the base's rows follow from K_SS; T' K T would leave rounding in them.
         return symmetric(T.T @ (mass @ T)), symmetric(relative.T @ K_SS @ relative), G
 
     def structure(
@@ -384,10 +377,10 @@ class Frame:
         return int(node)
 
     def _base(self, base_nodes: int | Iterable[int]) -> tuple[int, ...]:
-        """Return the base nodes, after a look that every other node hangs on them.
+        """Return the base nodes; an error where another node is not joined to them.
 
         Beams hold their nodes in all six motions, so K_ff is singular exactly when a node has no
-        path to the base; this needs no numbers.
+        path to the base; that can be told without section properties.
         """
         given = [int(base_nodes)] if isinstance(base_nodes, int | np.integer) else list(base_nodes)
         base = tuple(sorted({self._node(node, "the base") for node in given}))

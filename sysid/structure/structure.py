@@ -127,18 +127,17 @@ class Structure:
         recovery: ArrayLike | None = None,
         sensors: Sequence[Any] | None = None,
     ) -> None:
-        self.mass = _square("mass", mass)
-        self.stiffness = _square("stiffness", stiffness)
+        self.mass = _symmetric("mass", mass, "n + d")
+        self.stiffness = _symmetric("stiffness", stiffness, "n + d")
         if self.mass.shape != self.stiffness.shape:
             raise InputError(f"mass is {self.mass.shape} but stiffness is {self.stiffness.shape}; both are (n+d, n+d)")
+        size = len(self.mass)
         self.n_base = int(n_base)
-        self.n = self.mass.shape[0] - self.n_base
-        if self.n_base < 1 or self.n < 1:
+        self.n = n = size - self.n_base
+        if self.n_base < 1 or n < 1:
             raise InputError(
-                f"n_base = {n_base} leaves {self.n} structural degrees of freedom of {self.mass.shape[0]}; "
-                "at least one of each is needed"
+                f"n_base = {n_base} leaves {n} structural degrees of freedom of {size}; at least one of each is needed"
             )
-        n = self.n
         self.rigid_body_dofs: Array = self._check_matrices()
 
         lam, phi = scipy.linalg.eigh(self.stiffness[:n, :n], self.mass[:n, :n])
@@ -149,7 +148,7 @@ class Structure:
         self.natural_frequencies: Array = self._omega / (2 * np.pi)
         self._set_damping(damping_ratios, damping_matrix)
 
-        self.recovery: Array = np.eye(n) if recovery is None else _matrix("recovery", recovery, (None, n))
+        self.recovery: Array = np.eye(n) if recovery is None else shaped_array("recovery", recovery, "n_sensors", n)
         self.rigid_body: Array = self._sensor_rigid_body(rigid_body, recovery is not None)
         self.sensors = None if sensors is None else tuple(sensors)
         if self.sensors is not None and len(self.sensors) != self.n_sensors:
@@ -274,16 +273,11 @@ class Structure:
         ----------
         R. R. Craig, M. C. C. Bampton, AIAA J. 6 (1968) 1313-1319.
         """
-        if not self.modal_damping:
-            damping = self.normal_modes.T @ self.damping @ self.normal_modes
-        else:
-            damping = np.diag(2 * self.damping_ratios * self._omega)
-        n, d = self.n, self.n_base
-        none, base = np.zeros((n, d)), np.zeros((d, d))
+        base = np.zeros((self.n_base, self.n_base))
         return CraigBampton(
-            mass=np.block([[np.eye(n), self.participation], [self.participation.T, self.rigid_body_mass]]),
-            stiffness=np.block([[np.diag(self._omega**2), none], [none.T, base]]),
-            damping=np.block([[damping, none], [none.T, base]]),
+            mass=np.block([[np.eye(self.n), self.participation], [self.participation.T, self.rigid_body_mass]]),
+            stiffness=scipy.linalg.block_diag(np.diag(self._omega**2), base),
+            damping=scipy.linalg.block_diag(self._modal_damping_matrix, base),
             recovery=np.hstack([self.mode_shapes, self.rigid_body]),
         )
 
@@ -305,10 +299,7 @@ class Structure:
         n = self.n
         for name, matrix in (("mass", self.mass), ("stiffness", self.stiffness)):
             _check_positive_definite(f"the structure's block of {name} ({n} x {n})", matrix[:n, :n])
-        # Each row in units of its own diagonal, so that kg and kg m² can be judged together.
-        scale = np.sqrt(np.maximum(np.diag(self.mass), 0.0))
-        scale[scale == 0] = scale.max()
-        lowest = np.linalg.eigvalsh(self.mass / np.outer(scale, scale))[0]
+        lowest = _lowest_eigenvalue(self.mass)
         if lowest < -_TOLERANCE:
             raise InputError(
                 f"mass is not positive semidefinite: its lowest eigenvalue is {lowest:.3g} of its diagonal; "
@@ -334,42 +325,34 @@ class Structure:
             raise InputError("give exactly one of damping_ratios (n,) and damping_matrix (n, n)")
         self.modal_damping = ratios is not None
         if ratios is not None:
-            self.damping_ratios: Array = finite_array("damping_ratios", ratios)
-            if self.damping_ratios.shape != (n,):
-                raise InputError(
-                    f"damping_ratios has shape {self.damping_ratios.shape}; one ratio a mode is ({n},) (fractions)"
-                )
+            self.damping_ratios: Array = shaped_array("damping_ratios", ratios, n)
             if np.any(self.damping_ratios < 0):
                 raise InputError(f"damping ratio {self.damping_ratios.min():.3g} is negative")
+            modal = np.diag(2 * self.damping_ratios * self._omega)
             momentum = self.mass[:n, :n] @ self.normal_modes
-            self.damping: Array = (momentum * (2 * self.damping_ratios * self._omega)) @ momentum.T
+            self.damping: Array = momentum @ modal @ momentum.T
         else:
             assert matrix is not None
-            self.damping = _square("damping_matrix", matrix)
-            if self.damping.shape != (n, n):
-                raise InputError(
-                    f"damping_matrix has shape {self.damping.shape}; on the relative motion it is ({n}, {n})"
-                )
+            self.damping = _symmetric("damping_matrix", matrix, n)
             modal = self.normal_modes.T @ self.damping @ self.normal_modes
             if np.linalg.eigvalsh(modal)[0] < -_TOLERANCE * np.abs(modal).max():
                 raise InputError("damping_matrix is not positive semidefinite: the structure would feed energy in")
             self.damping_ratios = np.diag(modal) / (2 * self._omega)
+        self._modal_damping_matrix: Array = modal
 
     def _sensor_rigid_body(self, given: ArrayLike | None, recovered: bool) -> Array:
-        shape = (self.recovery.shape[0], self.n_base)
+        own = self.recovery @ self.rigid_body_dofs
+        if given is None:
+            return own
+        stated = shaped_array("rigid_body", given, *own.shape)
         if recovered:
-            if given is None:
-                return self.recovery @ self.rigid_body_dofs
-            return _matrix("rigid_body", given, shape)
-        G = self.rigid_body_dofs
-        if given is not None:
-            stated = _matrix("rigid_body", given, shape)
-            worst = np.max(np.abs(stated - G))
-            if worst > 1e-6 * max(1.0, float(np.max(np.abs(G)))):
-                raise InputError(
-                    f"rigid_body differs from -K_SS^-1 K_S0 by up to {worst:.3g}; leave it out, or check axes and signs"
-                )
-        return G
+            return stated
+        worst = np.max(np.abs(stated - own))
+        if worst > 1e-6 * max(1.0, float(np.max(np.abs(own)))):
+            raise InputError(
+                f"rigid_body differs from -K_SS^-1 K_S0 by up to {worst:.3g}; leave it out, or check axes and signs"
+            )
+        return own
 
 
 def check_frequencies(freq: ArrayLike, *, increasing: bool = True) -> Array:
@@ -402,18 +385,18 @@ def finite_array(name: str, value: ArrayLike) -> Array:
     return array
 
 
-def _matrix(name: str, value: ArrayLike, shape: tuple[int | None, int]) -> Array:
+def shaped_array(name: str, value: ArrayLike, *shape: int | str) -> Array:
+    """`finite_array` of this shape; a word in the shape stands for any length, the same wherever it occurs."""
     array = finite_array(name, value)
-    if array.ndim != 2 or array.shape[1] != shape[1] or (shape[0] is not None and array.shape[0] != shape[0]):
-        rows = "n_sensors" if shape[0] is None else shape[0]
-        raise InputError(f"{name} has shape {array.shape}; it is ({rows}, {shape[1]})")
+    lengths: dict[int | str, int] = dict(zip(shape, array.shape, strict=False))
+    lengths |= {length: length for length in shape if isinstance(length, int)}
+    if array.shape != tuple(lengths.get(length) for length in shape):
+        raise InputError(f"{name} has shape {array.shape}; it must be {shape}".replace("'", ""))
     return array
 
 
-def _square(name: str, value: ArrayLike) -> Array:
-    array = finite_array(name, value)
-    if array.ndim != 2 or array.shape[0] != array.shape[1]:
-        raise InputError(f"{name} has shape {array.shape}; a square matrix is needed")
+def _symmetric(name: str, value: ArrayLike, size: int | str) -> Array:
+    array = shaped_array(name, value, size, size)
     scale = np.sqrt(np.abs(np.diag(array)))
     asymmetry = np.abs(array - array.T)
     if np.any(asymmetry > _TOLERANCE * np.outer(scale, scale) + 1e-12 * np.max(np.abs(array), initial=0.0)):
@@ -429,7 +412,13 @@ def _check_positive_definite(name: str, matrix: Array) -> None:
     if np.any(diagonal <= 0):
         at = int(np.argmin(diagonal))
         raise InputError(f"{name} is not positive definite: diagonal entry {at} is {diagonal[at]:.6g}")
-    scale = np.sqrt(diagonal)
-    lowest = np.linalg.eigvalsh(matrix / np.outer(scale, scale))[0]
+    lowest = _lowest_eigenvalue(matrix)
     if lowest <= 10 * len(matrix) * np.finfo(float).eps:  # below that a factorisation finds only round-off
         raise InputError(f"{name} is not positive definite: its lowest eigenvalue is {lowest:.3g} of its diagonal")
+
+
+def _lowest_eigenvalue(matrix: Array) -> float:
+    """Lowest eigenvalue with each row in units of its own diagonal, so that kg and kg m² can be judged together."""
+    scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    scale[scale == 0] = scale.max()
+    return float(np.linalg.eigvalsh(matrix / np.outer(scale, scale))[0])
