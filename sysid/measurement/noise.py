@@ -1,4 +1,4 @@
-"""Weights of a fit: stated standard deviations as one factor a channel times one a line of each run."""
+"""Weights of a fit from stated standard deviations: a factor for each channel times one for each line of each run."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import numpy as np
 
 from sysid.structure.structure import Array
 
-_LEAST = 1e-6  # of the median standard deviation: no sample may count for more than this allows
+_LEAST = 1e-6  # of the median standard deviation; smaller ones are raised to it, so that no sample dominates
 
 
 def separable(std: Array | None, shape: tuple[int, int, int]) -> tuple[Array, Array]:
     """Weights 1/std as a product: of the channels (channels,) and of the lines of each run (runs, n_freq).
 
-    The geometric means over the other axes: exact where the noise is a channel's times a line's, as it is where
-    one number, one number a channel or one spectrum is stated. Fits with other weights than 1/std are
+    They are geometric means over the other axes: exact where the noise is a product of the two, as it is where
+    one number, one number for each channel or one spectrum is stated. Fits with other weights than 1/std are
     unbiased all the same, and their covariance is computed with the stated noise.
 
     Parameters

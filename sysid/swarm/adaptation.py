@@ -1,4 +1,4 @@
-"""How the swarm adapts its coefficients: pure functions, no state, no random numbers of their own.
+"""Adaptation of the swarm's coefficients, as pure functions: they hold no state and draw no random numbers.
 
 Two separate mechanisms, both fed with positions scaled to the range of each variable:
 
@@ -140,7 +140,7 @@ def evolutionary_factor(distances: FloatArray, leader: int) -> float:
     Returns
     -------
     float
-        f in [0, 1]; 0 where all d_i are equal: a swarm fallen together has converged.
+        f in [0, 1]; 0 where all d_i are equal: a collapsed swarm has converged.
     """
     smallest, largest = float(distances.min()), float(distances.max())
     if largest == smallest:
@@ -159,7 +159,7 @@ def memberships(f: float) -> dict[EvolutionaryState, float]:
     Returns
     -------
     dict
-        One number in [0, 1] a state. At most two are above zero, neighbours; they do not sum to 1, and should not.
+        One number in [0, 1] for each state. At most two, of neighbouring states, are above zero; they do not sum to 1.
     """
     return {
         _S1: _trapezoid(5 * f - 2, -10 * f + 8),
@@ -174,7 +174,7 @@ def _trapezoid(rising: float, falling: float) -> float:
 
 
 def next_state(f: float, previous: EvolutionaryState) -> EvolutionaryState:
-    """Decide the state of the swarm, the previous one deciding where two memberships overlap.
+    """State of the swarm; where two memberships overlap, the previous state decides.
 
     Parameters
     ----------
@@ -234,12 +234,12 @@ def next_accelerations(
 
 
 def elitist_sigma(done: float, start: float = 1.0, end: float = 0.1) -> float:
-    """Narrow the standard deviation of elitist learning, in parts of the range (Zhan et al. 2009, eq. 15).
+    """Standard deviation of elitist learning, in parts of the range (Zhan et al. 2009, eq. 15).
 
     Parameters
     ----------
     done : float
-        The part of the run that is over; above 1 counts as 1.
+        Fraction of the run that is over; above 1 counts as 1.
     start, end : float
         Values at `done` = 0 and 1; linear between.
 

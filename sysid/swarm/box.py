@@ -1,4 +1,4 @@
-"""The search box: between the caller's units and coordinates scaled to the range of each variable."""
+"""The search box: conversion between the caller's units and coordinates scaled to the range of each variable."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ FloatArray = NDArray[np.float64]
 
 
 class Box:
-    """Lower and upper bounds, and the unit cube of the variables that are free between them.
+    """Lower and upper bounds, and the scaling of the free variables to the unit cube.
 
-    The swarm lives in the unit cube of the free variables alone; a fixed variable (lower == upper) has no range to
-    be scaled with, takes no part in distances, and comes back exactly.
+    Particles are points of this cube; a fixed variable (lower == upper) has no range, is left out of distances, and
+    is returned exactly.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class Box:
         return np.clip(x, self.lower, self.upper)
 
     def point(self, x: ArrayLike, name: str) -> FloatArray:
-        """Return a copy of `x` as an (n_dim,) array, once it is known to be one inside the bounds."""
+        """Return `x` as a new (n_dim,) array; an error if it is not a point inside the bounds."""
         try:
             point = np.array(x, dtype=float)
         except (TypeError, ValueError):

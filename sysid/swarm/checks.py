@@ -1,4 +1,4 @@
-"""What is asked of the arguments: one clear sentence for each mistake."""
+"""Checks of arguments, with one error message for each mistake."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def whole_number(value: Any, name: str, *, at_least: int) -> int:
 
 
 def checked_costs(costs: ArrayLike, n_rows: int, origin: str) -> FloatArray:
-    """Return the costs as an array of floats; `origin` goes on from "The costs" in an error.
+    """Return the costs as an array of floats; `origin` follows "The costs" in an error.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""A whole search with the swarm: budgets, stop rules, refinement of the best, the result."""
+"""A complete search with the swarm: budgets, stop rules, refinement of the best, the result."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class SwarmProgress:
-    """What a callback is given after each iteration.
+    """Progress of a search, given to the callback after each iteration.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ def minimize_swarm(
     max_iterations : int
         Largest number of iterations; the Latin hypercube sample is the first.
     max_evaluations : int, optional
-        Largest number of rows given to `fun`, never passed; evaluations inside `improve` are not seen. At least
+        Largest number of rows given to `fun`, never exceeded; evaluations inside `improve` do not count. At least
         `n_particles`.
     max_time : float, optional
         Seconds after which no further iteration starts.
@@ -99,13 +99,13 @@ def minimize_swarm(
     callback : callable, optional
         Called with a `SwarmProgress` after each iteration; StopIteration from it ends the search with the best so far.
     improve : callable, optional
-        Takes the best point (n_dim,) to a better one (n_dim,), by exact gradients for instance. Its answer is clipped
-        to the bounds, evaluated with `fun`, and becomes the global best if it is better; an answer that is not finite
-        is dropped. It is not called again for a best that it has already seen.
+        Called with the best point (n_dim,), returns a better one (n_dim,), found by exact gradients for instance. It
+        is clipped to the bounds, evaluated with `fun`, and becomes the global best if it is better; a point that is
+        not finite is dropped. It is called once for each best point.
     improve_every : int
-        Iterations between two calls of `improve`; 0 is never.
+        Iterations between two calls of `improve`; with 0 it is never called.
     x0 : (n_dim,) array-like, optional
-        A start guess inside the bounds: it takes the place of the first row of the sample.
+        A starting point inside the bounds: it takes the place of the first row of the sample.
     settings : SwarmSettings, optional
         The constants of the swarm.
 
@@ -126,10 +126,10 @@ def minimize_swarm(
 
     Notes
     -----
-    Any other exception of `fun`, `improve` or `callback`, and KeyboardInterrupt, goes through to the caller. To keep
+    Any other exception of `fun`, `improve` or `callback`, and KeyboardInterrupt, is passed on to the caller. To keep
     the best so far then, keep the last `SwarmProgress` that the callback was given, or drive a `ParticleSwarm`.
 
-    Elitist learning narrows over `max_iterations`, or over what `max_evaluations` leaves of them.
+    The steps of elitist learning shrink over `max_iterations`, or over as many as `max_evaluations` allows.
 
     Examples
     --------
@@ -179,7 +179,7 @@ def _run(
     improve_every: int,
     callback: Callable[[SwarmProgress], object] | None,
 ) -> tuple[StopReason, int]:
-    """Iterate until a stop rule or the callback ends it; why it ended, and how often `improve` gave a better point."""
+    """Iterate until a stop rule or the callback ends it; return the reason, and how often `improve` found better."""
     started = time.perf_counter()
     n_improved = 0
     refined: FloatArray | None = None
@@ -199,7 +199,7 @@ def _run(
             try:
                 callback(SwarmProgress(swarm.best_x, swarm.best_cost, swarm.nit, swarm.nfev, swarm.state))
             except StopIteration:
-                # A search that had ended anyway was not cut short.
+                # A stop rule that holds as well comes first: the search was not cut short.
                 reason = reason or StopReason.CALLBACK
     return reason, n_improved
 
@@ -207,7 +207,7 @@ def _run(
 def _refine(
     swarm: ParticleSwarm, fun: Callable[[FloatArray], ArrayLike], improve: Callable[[FloatArray], ArrayLike]
 ) -> bool:
-    """Offer the swarm the improved best; whether it was better."""
+    """Evaluate and inject the improved best point; return whether it was better."""
     point = np.asarray(improve(swarm.best_x), dtype=float)
     if point.shape != swarm.best_x.shape:
         raise InputError(f"improve returned shape {point.shape}; return one point, shape {swarm.best_x.shape}.")

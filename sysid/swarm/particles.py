@@ -25,13 +25,13 @@ class ParticleSwarm:
         v <- w v + c1 r (own best - p) + c2 s (global best - p),    |v| <= 0.4 range,    p <- p + v
 
     (r, s uniform on [0, 1], one draw a particle and variable), and, in the convergence state, adds one row: the
-    global best with one coordinate moved at random (elitist learning, Zhan et al. 2009, IEEE Trans. SMC-B 39(6)). Told
-    its cost, that row becomes the global best if it is better, else it takes the place of the worst particle.
+    global best with one coordinate moved at random (elitist learning, Zhan et al. 2009, IEEE Trans. SMC-B 39(6)). That
+    row becomes the global best if its cost is lower, else it takes the place of the worst particle.
 
     A particle that would leave the box stops at the bound, and the velocity component that led out is reversed.
 
-    Costs that are not finite are counted and read as +inf: they never become anyone's best. While no finite cost is
-    known at all, each `ask` is a fresh Latin hypercube, since there is nothing to follow.
+    Costs that are not finite are counted and read as +inf: such a point never becomes a best. While no finite cost is
+    known at all, each `ask` is a new Latin hypercube, since there is no best to move towards.
 
     The same seed gives the same bits on one machine with one number of BLAS threads. The object may be copied
     (`copy.deepcopy`) or pickled at any moment, and the copy goes on with the same bits. If the evaluation of the rows
@@ -42,22 +42,22 @@ class ParticleSwarm:
     bounds : (n_dim, 2) array-like or scipy.optimize.Bounds
         Lower and upper bound of each variable, finite; lower == upper fixes the variable.
     rng : int, numpy.random.Generator, numpy.random.SeedSequence or None
-        Source of random numbers; None is a fresh one.
+        Source of random numbers; None is a new one.
     n_particles : int, optional
         At least 2; five for each free variable by default.
     horizon : int
-        Iterations over which elitist learning narrows; asking beyond it is allowed.
+        Iterations over which the steps of elitist learning shrink; more may be asked for.
     x0 : (n_dim,) array-like, optional
-        A start guess inside the bounds: it takes the place of the first row of the sample.
+        A starting point inside the bounds: it takes the place of the first row of the sample.
     settings : SwarmSettings
         The constants.
 
     Attributes
     ----------
     box : Box
-        The bounds, and the unit cube the swarm lives in.
+        The bounds, and the scaling to the unit cube of the free variables.
     nit : int
-        Iterations told so far; the sample is the first.
+        Iterations whose costs are known; the sample is the first.
     nfev : int
         Rows whose cost is known.
     n_nan : int
@@ -67,14 +67,14 @@ class ParticleSwarm:
     state : EvolutionaryState
         The present evolutionary state.
     state_counts : dict
-        How many iterations were moved in each state; their sum is nit - 1.
+        Number of iterations that moved in each state; their sum is nit - 1.
     inertia, cognitive, social : float
         The present w, c1 and c2.
 
     Raises
     ------
     InputError
-        If the bounds, the number of particles, the horizon, the start guess or the random source cannot be used.
+        If the bounds, the number of particles, the horizon, the starting point or the random source cannot be used.
 
     Examples
     --------
@@ -113,7 +113,7 @@ class ParticleSwarm:
         self.inertia = 0.0
         self.cognitive = self.social = self._settings.acceleration_start
 
-        # Everything below lives in the unit cube of the free variables.
+        # All that follows is in the unit cube of the free variables.
         self._positions = self._sample()
         if x0 is not None:
             self._positions[0] = self.box.to_unit(self.box.point(x0, "x0"))
@@ -140,12 +140,12 @@ class ParticleSwarm:
 
     @property
     def positions(self) -> FloatArray:
-        """Where the particles are (n_particles, n_dim), in the caller's units."""
+        """Positions of the particles (n_particles, n_dim), in the caller's units."""
         return self.box.to_rows(self._positions)
 
     @property
     def velocities(self) -> FloatArray:
-        """Their velocities (n_particles, n_dim), in the caller's units an iteration."""
+        """Velocities of the particles (n_particles, n_dim), in the caller's units per iteration."""
         return self.box.scaled(self._velocities)
 
     def ask(self) -> FloatArray:
@@ -299,14 +299,14 @@ class ParticleSwarm:
         velocities = self.inertia * self._velocities + self.cognitive * towards_own + self.social * towards_best
         np.clip(velocities, -self._settings.max_velocity, self._settings.max_velocity, out=velocities)
         positions = self._positions + velocities
-        # Turned round rather than stopped: with many variables, a swarm that loses its speed at the walls stays there.
+        # Reversed rather than set to zero: with many variables, a swarm that loses its speed at the bounds stays there.
         inwards = np.abs(velocities)
         velocities = np.where(positions <= 0.0, inwards, np.where(positions >= 1.0, -inwards, velocities))
         self._velocities = velocities
         self._positions = np.clip(positions, 0.0, 1.0)
 
     def _lead(self, unit: FloatArray, x: FloatArray, cost: float) -> None:
-        """Make a point the global best, carried by the leading particle."""
+        """Make a point the global best: position and own best of the leading particle."""
         self._positions[self._leader] = unit
         self._costs[self._leader] = cost
         self._own[self._leader] = unit
@@ -321,7 +321,7 @@ class ParticleSwarm:
             worst = int(np.argmax(self._costs))
             self._positions[worst] = unit
             self._costs[worst] = cost
-            # The worst particle of the moment may have a good past, which it keeps.
+            # The particle of the highest present cost may have a lower own best, which it keeps.
             if cost < self._own_costs[worst]:
                 self._own[worst] = unit
                 self._own_costs[worst] = cost

@@ -1,4 +1,4 @@
-"""When a search ends, and what is said about it."""
+"""Stop rules of a search, and the message at its end."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class StopRules:
             raise InputError(f"stall_tolerance is {self.stall_tolerance!r}; give a part of the cost, in [0, 1).")
 
     def room_for(self, n_rows: int, nfev: int) -> bool:
-        """Whether so many further rows may be evaluated."""
+        """Whether `n_rows` more rows may be evaluated after `nfev`."""
         return self.max_evaluations is None or nfev + n_rows <= self.max_evaluations
 
     def reason(self, swarm: ParticleSwarm, seconds: float) -> StopReason | None:
@@ -70,7 +70,7 @@ class StopRules:
         return None
 
     def message(self, reason: StopReason, swarm: ParticleSwarm) -> str:
-        """Say what happened, and what to do about it."""
+        """Message that says why the search ended, and what to do next."""
         if math.isinf(swarm.best_cost):
             return (
                 f"None of the {swarm.nfev} costs was finite: evaluate fun at a point that should work, "
