@@ -1,1 +1,1 @@
-"""What records show without mass and stiffness: poles, residues, modes."""
+"""Modal analysis of records, without mass and stiffness: poles, residues, modes."""

@@ -1,4 +1,4 @@
-"""Noise and misfit of the records of a test: what a structure leaves of them, beside what is stated of their noise."""
+"""Noise and misfit of the records of a test: what a structure leaves of them, and their stated or inferred noise."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.noise import separable
 from sysid.modal_analysis.residues import line_correlation
-from sysid.modal_analysis.response import columns
+from sysid.modal_analysis.response import columns, stacked
 from sysid.structure.structure import Array, ComplexArray, Structure
 
-_DEVIATIONS = 4.0  # ... nor chance, in standard deviations of the chi-squared law
 _EXACT = 1e-14  # of a record's rms: what counts as noise where there is none
-_SUSPECT = 1.2  # reduced chi-squared above which the stated noise does not explain the misfit ...
+_SUSPECT = 1.2  # reduced chi-squared above which the stated noise does not explain the misfit, unless chance does:
+_DEVIATIONS = 4.0  # its least excess above one, in standard deviations of the chi-squared law
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,11 +43,11 @@ class Record:
 
 
 def records_of(test: Measurement, structure: Structure, unknowns: int) -> list[Record]:
-    """Responses and, where measured, force; each bears its share of the unknowns."""
+    """Records of the responses and, where measured, of the force; inferred noise allows for the number of unknowns."""
     parts = [(test.response, test.response_std, test.relative - test.predict(structure))]
     if test.force is not None:
         parts.append((test.force, test.force_std, test.force - test.predict_force(structure)))
-    left = max(1 - unknowns / _measured(test), 0.5)
+    left = max(1 - unknowns / (2 * sum(misfit.size for *_, misfit in parts)), 0.5)
     records = []
     for record, stated, misfit in parts:
         noise = np.sqrt(np.mean(np.abs(misfit) ** 2) / left) if stated is None else stated
@@ -58,17 +58,12 @@ def records_of(test: Measurement, structure: Structure, unknowns: int) -> list[R
     return records
 
 
-def _measured(test: Measurement) -> int:
-    """How many real numbers were measured."""
-    return 2 * test.response.size + (0 if test.force is None else 2 * test.force.size)
-
-
 def inflation_of(test: Measurement, records: list[Record], unknowns: int) -> float:
-    """Factor by which errors exceed what the stated noise explains; NaN where nothing tells the noise.
+    """Factor by which errors exceed what the stated noise explains; NaN where the noise is unknown.
 
-    By the misfit's size, and by what neighbouring lines share of it, as lines of averaged spectra do.
+    From the size of the misfit, and from its correlation between neighbouring lines, as in averaged spectra.
     """
-    freedom = _measured(test) - unknowns
+    freedom = 2 * sum(record.misfit.size for record in records) - unknowns
     if freedom <= 0:
         stated = test.response_std is not None and (test.force is None or test.force_std is not None)
         return 1.0 if stated else np.nan
@@ -81,5 +76,5 @@ def inflation_of(test: Measurement, records: list[Record], unknowns: int) -> flo
 
 
 def _gram(vectors: ComplexArray) -> Array:
-    stacked = np.hstack([vectors.real, vectors.imag])
-    return stacked @ stacked.T
+    real = stacked(vectors)
+    return real.T @ real

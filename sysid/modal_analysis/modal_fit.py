@@ -15,14 +15,15 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.noise import separable
 from sysid.modal_analysis.residues import force_residual_left, linear_residues
-from sysid.modal_analysis.response import columns
+from sysid.modal_analysis.response import columns, parts_of, stacked
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram
-from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.structure import Array
 from sysid.structure.triangular import lower_triangle, triangle_entries
 
 _RIDGE = 1e-14  # of the modes' own size
@@ -47,7 +48,7 @@ def rank_one(residues: Array, omega: Array, ratios: Array, size: Array) -> Modes
 
 @dataclass(frozen=True, eq=False)
 class ModalFit:
-    """Where a fit in modal coordinates ended.
+    """Result of a fit in modal coordinates.
 
     Attributes
     ----------
@@ -59,7 +60,7 @@ class ModalFit:
     of_accelerations : float
         That of the accelerations alone.
     status : str
-        IPOPT's.
+        Return status of IPOPT.
     bounds : str
         Bounds that the solution presses on, in words.
     """
@@ -137,7 +138,7 @@ def fit_modes(
 
 
 def _gauge(first: Modes, unit: Array, weighed: bool) -> tuple[Array, NDArray[np.bool_]]:
-    """Participations in one of the forms that answer alike, and which of them are held to keep it.
+    """Participations in one of the equivalent forms, and which of them are held to keep it.
 
     Accelerations leave the scale of each mode open: its largest participation is held. Of modes that share a pole they
     leave every mixture open, and the block in as many directions is held to a unit matrix; a force leaves only
@@ -146,7 +147,8 @@ def _gauge(first: Modes, unit: Array, weighed: bool) -> tuple[Array, NDArray[np.
     gauge, held = first.gamma / unit, np.zeros(first.gamma.shape, dtype=bool)
     _, start = np.unique(first.omega + 1j * first.ratios, return_index=True)
     for same in np.split(np.arange(first.omega.size), np.sort(start)[1:]):
-        block = np.ix_(same, _pivots(gauge[same]))
+        pivots = scipy.linalg.qr(gauge[same], pivoting=True, mode="r")[1]  # directions best conditioned together first
+        block = np.ix_(same, pivots[: same.size])
         if weighed:
             gauge[same] = np.linalg.qr(gauge[block])[0].T @ gauge[same]
             lower = np.tril(np.ones((same.size, same.size), dtype=bool), -1)
@@ -158,13 +160,6 @@ def _gauge(first: Modes, unit: Array, weighed: bool) -> tuple[Array, NDArray[np.
     return gauge, held
 
 
-def _pivots(block: Array) -> Array:
-    """Columns of a wide matrix that are best conditioned together."""
-    from scipy.linalg import qr
-
-    return np.asarray(qr(block, pivoting=True, mode="r")[1][: len(block)])
-
-
 class _Error:
     """Weighted squared error as a CasADi expression, its shapes eliminated, and what its derivatives are made of."""
 
@@ -173,14 +168,14 @@ class _Error:
     ) -> None:
         self.gamma, self.rigid = gamma, rigid
         channel, line = separable(test.response_std, test.response.shape)
-        target = _flat(test.relative * channel[:, None] * line[:, None])
+        target = stacked(columns(test.relative * channel[:, None] * line[:, None])).T
         size = float(np.linalg.norm(target))
         self.motion = _Motion(test, line, gamma, omega, ratios)
         q = self.motion.q
         # Rows of very different size would spoil the solve.
         scale = ca.sqrt(ca.sum2(q**2))
         scaled = q / ca.repmat(scale, 1, q.size2())
-        # The spare keeps the solve alive where two modes become one; it moves shapes by less than they are known.
+        # The ridge keeps the system regular where two modes become one; it changes shapes by less than their error.
         self.normal = scaled @ scaled.T + _RIDGE * ca.DM.eye(q.size1())
         shapes = ca.solve(self.normal, scaled @ ca.DM(target).T) / ca.repmat(scale, 1, test.n_sensors)
         self.scale, self.shapes = scale, shapes.T / size  # of weighted sensors, in units of all their records
@@ -194,7 +189,7 @@ class _Error:
             if same:
                 channel, force_line = channel * force_line.mean() / line.mean(), line
             self.force_motion = self.motion if same else _Motion(test, force_line, gamma, omega, ratios)
-            target = _flat(test.force * channel[:, None] * force_line[:, None])
+            target = stacked(columns(test.force * channel[:, None] * force_line[:, None])).T
             weight = _force_weight(test, first, size, float(np.linalg.norm(target)))
             self.force_channel = ca.DM(weight * channel)
             answered = gamma.T @ self.force_motion.q + rigid @ self.force_motion.base
@@ -213,16 +208,16 @@ class _Error:
         modes = motion.q.T
         onto = ca.vertcat(*(v @ modes for v in motion.vectors)) / ca.repmat(self.scale.T, m * (d + 2), 1)
         # Records that weigh their lines alike have their products in common.
-        both = _gram([*motion.vectors, motion.base]) if self.force_motion is motion else None
-        inner = _gram(motion.vectors) if both is None else both[: m * (d + 2), : m * (d + 2)]
-        inner = inner - onto @ ca.solve(self.normal, onto.T)
+        same = self.force_motion is motion
+        gram = _gram([*motion.vectors, motion.base] if same else motion.vectors)
+        inner = gram[: m * (d + 2), : m * (d + 2)] - onto @ ca.solve(self.normal, onto.T)
         alike = ca.repmat(self.shapes.T @ self.shapes, d + 2, d + 2)
         hessian = ca.diagcat(2 * inner * alike, ca.MX(d * d, d * d))
         if self.force_motion is None:
             return gradient, hessian
         motion = self.force_motion
         full = [*motion.vectors, motion.base]
-        gram = _gram(full) if both is None else both
+        gram = gram if same else _gram(full)
         onto = ca.horzcat(*(self.force_left @ v.T for v in full))
         for j in range(d):
             blocks = [[ca.MX(m, m)] * (d + 2) for _ in range(d + 2)]
@@ -248,9 +243,7 @@ class _Motion:
     """
 
     def __init__(self, test: Measurement, line: Array, gamma: ca.MX, omega: ca.MX, ratios: ca.MX) -> None:
-        base = test.base * line[:, None]
-        # Zeros are structural, so that unit runs cost no imaginary arithmetic and no other direction's.
-        u_re, u_im = (ca.sparsify(ca.DM(part)) for part in (columns(base).real, columns(base).imag))
+        u_re, u_im = parts_of(test.base * line[:, None])  # zeros are structural, so that they cost no arithmetic
         w = ca.DM(np.tile(2 * np.pi * test.freq, test.n_runs)).T
         m, d = gamma.shape
         squared, ones = ca.repmat(w**2, m, 1), ca.DM.ones(1, w.numel())
@@ -283,12 +276,6 @@ def _gram(blocks: list[ca.MX]) -> ca.MX:
 
 def _times(a: tuple[ca.MX, ca.MX], b: tuple[ca.MX, ca.MX]) -> tuple[ca.MX, ca.MX]:
     return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
-
-
-def _flat(record: ComplexArray) -> Array:
-    """All runs side by side, real parts beside imaginary ones, (channels, 2 L)."""
-    flat = columns(record)
-    return np.hstack([flat.real, flat.imag])
 
 
 def _force_weight(test: Measurement, first: Modes, size: float, force_size: float) -> float:

@@ -9,12 +9,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sysid.modal_analysis.residues import Records, stacked
-from sysid.modal_analysis.response import gains
+from sysid.modal_analysis.residues import Records, unit_columns
+from sysid.modal_analysis.response import gains_with_velocity, stacked
 from sysid.structure.structure import Array, ComplexArray
 
 _SHARE = 1e-8  # of noise in squares, below which they have not eight digits of it
-
 _FEW = 60  # channels, for which factors take no longer than squares that round-off may refuse
 
 Blocks = list[tuple[ComplexArray, ComplexArray]]  # base (inputs, n_freq) and channels (c, n_freq) of each
@@ -28,16 +27,17 @@ def relocate(
     tell: Callable[[], object],
 ) -> tuple[Array, Array]:
     """One step of relaxed vector fitting: the zeros of sigma in ``sigma a = sum of (r_1 + r_2 i w) g``."""
-    w, g = 2 * np.pi * records.freq, gains(records.freq, omega, ratios)
-    numerators = np.concatenate([g, 1j * w / omega[:, None] * g])
+    w = 2 * np.pi * records.freq
+    g, velocity = gains_with_velocity(records.freq, omega, ratios)
+    numerators = np.concatenate([g, velocity])
     with np.errstate(divide="ignore", invalid="ignore"):
         partial = np.where(w > 0, (omega[:, None] / w) ** 2 * g, 1.0)  # w_k² over the same denominator
     sigma = np.concatenate([np.ones((1, w.size)), partial, 1j * w / omega[:, None] * partial])
     bases = []
     for base, _ in blocks:
         tell()
-        basis = stacked((numerators[:, None] * base).reshape(-1, w.size))
-        bases.append(np.linalg.qr(basis / np.maximum(np.linalg.norm(basis, axis=0), np.finfo(float).tiny))[0])
+        basis, _ = unit_columns(stacked((numerators[:, None] * base).reshape(-1, w.size)))
+        bases.append(np.linalg.qr(basis)[0])
     few = sum(len(channels) for _, channels in blocks) <= _FEW
     rows = None if few else _rows_by_squares(blocks, bases, sigma, tell)
     if rows is None:
@@ -47,13 +47,13 @@ def relocate(
     system = np.vstack([rows, weight * sigma.real.sum(axis=1)])
     wanted = np.zeros(len(system))
     wanted[-1] = weight * w.size
-    scale = np.maximum(np.linalg.norm(system, axis=0), np.finfo(float).tiny)
-    c = np.linalg.lstsq(system / scale, wanted, rcond=1e-14)[0] / scale
+    system, size = unit_columns(system)
+    c = np.linalg.lstsq(system, wanted, rcond=1e-14)[0] / size
     return _zeros(c, omega, ratios)
 
 
 def _rows_by_factors(blocks: Blocks, bases: list[Array], sigma: ComplexArray, tell: Callable[[], object]) -> Array:
-    """Triangle of the equations for sigma of all channels: what the numerators cannot answer of ``sigma a``."""
+    """Triangle of the equations for sigma of all channels: what the numerators cannot fit of ``sigma a``."""
     triangle = np.empty((0, len(sigma)))
     for (_, channels), Q in zip(blocks, bases, strict=True):
         for record in channels:
@@ -70,7 +70,7 @@ def _rows_by_squares(
     """The same, several times faster, from sums of squares; None where round-off would show in them.
 
     In functions U for which the sum over channels of ``|U a|²`` is one, the matrix of the equations is one less what
-    the numerators answer. Its least eigenvalue is the share of noise in ``|sigma a|²``, however close the poles.
+    the numerators fit. Its least eigenvalue is the share of noise in ``|sigma a|²``, however close the poles.
     """
     size = np.sqrt(sum(np.sum(np.abs(channels) ** 2, axis=0) for _, channels in blocks))
     U, triangle = np.linalg.qr(stacked(size * sigma))
@@ -92,7 +92,7 @@ def _rows_by_squares(
 def _zeros(c: Array, omega: Array, ratios: Array) -> tuple[Array, Array]:
     """Zeros of sigma with coefficients c (1 + 2m,), as modes: eigenvalues of its second-order blocks after feedback."""
     m = omega.size
-    constant = c[0] if abs(c[0]) > 1e-8 else np.copysign(1e-8, c[0])
+    constant = np.copysign(max(abs(c[0]), 1e-8), c[0])
     A, b, out = np.zeros((2 * m, 2 * m)), np.zeros(2 * m), np.zeros(2 * m)
     i = 2 * np.arange(m)
     A[i, i + 1], A[i + 1, i], A[i + 1, i + 1] = omega, -omega, -2 * ratios * omega

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement, unit_runs
 from sysid.measurement.noise import separable
-from sysid.modal_analysis.response import columns, gains
+from sysid.modal_analysis.response import columns, gains, gains_with_velocity, stacked
 from sysid.structure.structure import Array, ComplexArray
 
 _DEVIATIONS = 12.0  # of the chi-squared law, by which a squared error must fall to mean something
 ROUND_OFF = 1e-11  # of the records: what counts as noise where there is none
 _LARGE = 1e-6  # of the squared records: a squared error so large follows to ten digits as the difference of two squares
-_NEIGHBOURS = 3  # lines on either side that may share their noise
+_LAGS = range(1, 4)  # distances of lines that may share their noise
 _CHANCE = 5.0  # standard deviations of the correlation of white noise
 _DEPENDENT = 1e-9  # of the largest singular value of the base records
 
@@ -30,7 +30,7 @@ class ResidueFit:
     Attributes
     ----------
     Q : (rows, columns)
-        Orthonormal basis of what the poles can answer.
+        Orthonormal basis of the functions of the poles.
     residues : (m, inputs, channels)
     spread : (m, inputs, columns)
         Residues that one unit of each column of Q makes: scatter of the residues is ``spread @ spread'``.
@@ -87,9 +87,9 @@ class ResidueFit:
         return np.sum(self.whitened**2, axis=(1, 2))
 
     def rise_with_one_less(self, poles: NDArray[np.intp]) -> float:
-        """What the squared error would at least rise by if one pole less answered for these, and all others stayed.
+        """What the squared error would at least rise by with one pole less for these, all others unchanged.
 
-        A pole answers with one function of frequency for each input, whatever its place.
+        A pole has one function of frequency for each input, whatever its frequency.
         """
         spread = self.spread[poles].reshape(-1, self.spread.shape[-1])
         beta = self.residues[poles].reshape(len(spread), -1)
@@ -152,35 +152,29 @@ class Records:
 
     def functions(self, omega: Array, ratios: Array, *, velocity: bool = False) -> Array:
         """Columns of ``g`` for each input; with `velocity` those of ``i w / w_k g`` too, as further inputs."""
-        g = gains(self.freq, omega, ratios)
         if velocity:
-            g = np.stack([g, 2j * np.pi * self.freq / omega[:, None] * g], axis=1).reshape(-1, self.freq.size)
-        return self.basis(g)
+            both = gains_with_velocity(self.freq, omega, ratios)
+            return self.basis(both.swapaxes(0, 1).reshape(-1, self.freq.size))
+        return self.basis(gains(self.freq, omega, ratios))
 
     def fit(self, omega: Array, ratios: Array, *, velocity: bool = False) -> ResidueFit:
         """Best real residues of `functions`."""
         return _least_squares(self.functions(omega, ratios, velocity=velocity), self.data, omega.size, self.size)
 
     def noise(self, left: Array, unknowns: int, *, least: float = ROUND_OFF) -> float:
-        """Variance of a real number of the records about a fit of so many unknowns, as smooth functions feel it."""
-        return self.variance(self.line_correlation(left) * float(np.sum(left**2)), unknowns, least=least)
+        """Variance of a real number of the records about a fit of so many unknowns, as it affects smooth functions."""
+        power = float(np.sum(left**2))
+        shared = (float(np.sum(left * self.neighbours(left, lag))) for lag in _LAGS)
+        return self.variance(self.correlation_factor(power, shared) * power, unknowns, least=least)
 
     def variance(self, squared_error: float, unknowns: int, *, least: float = ROUND_OFF) -> float:
         """Share of one real number of the records in a squared error that a fit of so many unknowns leaves."""
         freedom = max(self.data.size - unknowns, 1)
         return max(squared_error / freedom, least**2 * self.size / self.data.size)
 
-    def line_correlation(self, left: Array) -> float:
-        """Factor by which noise weighs more on smooth functions as neighbouring lines share it; one for white noise.
-
-        Windows of averaged spectra smear each error over some lines: of H1 with Hann's it is 1.9.
-        """
-        shared = (float(np.sum(left * self.neighbours(left, lag))) for lag in range(1, _NEIGHBOURS + 1))
-        return self.correlation_factor(float(np.sum(left**2)), shared)
-
     def correlation_factor(self, power: float, shared: Iterable[float]) -> float:
         """`line_correlation` from the sum of squares of an error, and of its products with neighbours at each lag."""
-        return 1.0 if self.freq.size <= 2 * _NEIGHBOURS else _correlation_factor(power, shared, self.data.size // 2)
+        return _correlation_factor(power, shared, self.data.size // 2, self.freq.size)
 
     def neighbours(self, rows: Array, lag: int) -> Array:
         """Mean of what stands `lag` lines before and after, within each run, (rows, columns); zero beyond the ends."""
@@ -224,10 +218,8 @@ class SubsetFits:
     """
 
     def __init__(self, records: Records, omega: Array, ratios: Array, *, velocity: bool = False) -> None:
-        X = records.functions(omega, ratios, velocity=velocity)
-        scale = np.linalg.norm(X, axis=0)
-        scale[scale == 0] = 1.0
-        Q, R = np.linalg.qr(X / scale)
+        X, _ = unit_columns(records.functions(omega, ratios, velocity=velocity))
+        Q, R = np.linalg.qr(X)
         self.records, self.size = records, omega.size
         self.per_pole = X.shape[1] // omega.size * records.data.shape[1] + 2
         self._columns = R.reshape(len(R), omega.size, -1)  # by pole; no gain depends on their scale
@@ -236,9 +228,8 @@ class SubsetFits:
         self._size = float(np.vdot(self._answered, self._answered))
         self._outside = float(np.sum(left**2))
         # Products of an error `left + Q z` with its neighbours: constant, linear and quadratic in z, for each lag.
-        lags = range(1, _NEIGHBOURS + 1)
-        shifted = [records.neighbours(Q, lag).T for lag in lags]
-        self._constant = [float(np.sum(left * records.neighbours(left, lag))) for lag in lags]
+        shifted = [records.neighbours(Q, lag).T for lag in _LAGS]
+        self._constant = [float(np.sum(left * records.neighbours(left, lag))) for lag in _LAGS]
         self._linear = [2 * lagged @ left for lagged in shifted]
         self._quadratic = [lagged @ Q for lagged in shifted]
 
@@ -265,12 +256,11 @@ class SubsetFits:
 
 def _least_squares(X: Array, data: Array, m: int, size: float) -> ResidueFit:
     """Fit of data (rows, channels), whose sum of squares is `size`, on columns X (rows, m * inputs)."""
-    scale = np.linalg.norm(X, axis=0)
-    scale[scale == 0] = 1.0
-    Q, R = np.linalg.qr(X / scale)
+    X, size_of_column = unit_columns(X)
+    Q, R = np.linalg.qr(X)
     y = Q.T @ data
     inverse = scipy.linalg.solve_triangular(R, np.eye(R.shape[0]), check_finite=False)
-    inverse /= scale[:, None]
+    inverse /= size_of_column[:, None]
     beta = (inverse @ y).reshape(m, -1, data.shape[1])
     return ResidueFit(Q, beta, inverse.reshape(m, beta.shape[1], -1), data, y, size)
 
@@ -281,36 +271,33 @@ def beyond_chance(freedom: float) -> float:
 
 
 def line_correlation(error: ComplexArray) -> float:
-    """Sum of the correlations of errors (..., n_freq) with those of their neighbours, where these are no chance."""
-    if error.shape[-1] <= 2 * _NEIGHBOURS:
-        return 1.0
-    lags = range(1, _NEIGHBOURS + 1)
-    shared = (float(np.sum(error[..., lag:] * error[..., :-lag].conj()).real) for lag in lags)
-    return _correlation_factor(float(np.sum(np.abs(error) ** 2)), shared, error.size)
+    """Factor by which errors (..., n_freq) weigh more on smooth functions as neighbouring lines share them.
+
+    One for white noise. Windows of averaged spectra smear each error over some lines: of H1 with Hann's it is 1.9.
+    """
+    shared = (float(np.sum(error[..., lag:] * error[..., :-lag].conj()).real) for lag in _LAGS)
+    return _correlation_factor(float(np.sum(np.abs(error) ** 2)), shared, error.size, error.shape[-1])
 
 
-def _correlation_factor(power: float, shared: Iterable[float], size: int) -> float:
+def _correlation_factor(power: float, shared: Iterable[float], size: int, lines: int) -> float:
     """One, and twice the correlation of `size` complex errors at each lag up to the first that may be chance."""
     factor = 1.0
-    if power == 0:
-        return factor
-    for products in shared:
-        if products / power < _CHANCE / np.sqrt(2 * size):
-            break
-        factor += 2 * products / power
+    if lines > 2 * len(_LAGS):
+        for products in shared:
+            if products <= _CHANCE / np.sqrt(2 * size) * power:
+                break
+            factor += 2 * products / power
     return factor
 
 
 def independent(base: ComplexArray) -> Array:
     """Combinations D (d, r) of base records (runs, d, n_freq) that are independent inputs ``D' u_0``.
 
-    Each direction counts in units of its own size. What r < d inputs answer is taken to be due to the directions
+    Each direction counts in units of its own size. Responses to r < d inputs are taken to be due to the directions
     that move: residues R by base direction follow as ``R D'``.
     """
-    flat = stacked(columns(base))
-    size = np.linalg.norm(flat, axis=0)
-    size[size == 0] = 1.0
-    left, s, _ = np.linalg.svd((flat / size).T, full_matrices=False)
+    flat, size = unit_columns(stacked(columns(base)))
+    left, s, _ = np.linalg.svd(flat.T, full_matrices=False)
     return left[:, s > _DEPENDENT * s[0]] / size[:, None]
 
 
@@ -320,9 +307,11 @@ def _singular(matrix: Array) -> tuple[Array, Array]:
     return np.linalg.svd(small, full_matrices=False)[1:]
 
 
-def stacked(record: ComplexArray) -> Array:
-    """Channels (c, rows) as columns, real parts above imaginary ones, (2 rows, c)."""
-    return np.vstack([record.real.T, record.imag.T])
+def unit_columns(matrix: Array) -> tuple[Array, Array]:
+    """Columns divided by their lengths, and these lengths; one for a column of zeros."""
+    size = np.linalg.norm(matrix, axis=0)
+    size[size == 0] = 1.0
+    return matrix / size, size
 
 
 def linear_residues(test: Measurement, omega: Array, ratios: Array) -> tuple[Array, float]:
@@ -347,10 +336,25 @@ def linear_residues(test: Measurement, omega: Array, ratios: Array) -> tuple[Arr
 
 def force_residual_left(test: Measurement, omega: Array, ratios: Array, *, velocity: bool = False) -> float:
     """Relative residual of the base force with its own residues and rigid-body mass free at given poles."""
+    return force_residues(test, omega, ratios, velocity=velocity)[1]
+
+
+def force_residues(test: Measurement, omega: Array, ratios: Array, *, velocity: bool) -> tuple[Array, float]:
+    """Free residues of the base force, and the relative residual that they leave.
+
+    Returns
+    -------
+    residues : (1 + 2m, d, d)
+        Of the base itself, of ``g_k`` and of ``s / w_k g_k`` (zero without `velocity`).
+    residual : float
+    """
     records = Records(test, force=True)
-    own = gains(test.freq, omega, ratios)
-    turned = [2j * np.pi * test.freq / omega[:, None] * own] if velocity else []
-    g = np.concatenate([np.ones((1, test.freq.size)), own, *turned])
-    basis = records.basis(g)
-    Q = np.linalg.qr(basis / np.maximum(np.linalg.norm(basis, axis=0), np.finfo(float).tiny))[0]
-    return float(np.linalg.norm(records.data - Q @ (Q.T @ records.data)) / np.sqrt(records.size))
+    g = gains_with_velocity(test.freq, omega, ratios)[: 1 + velocity].reshape(-1, test.freq.size)
+    basis, size = unit_columns(records.basis(np.concatenate([np.ones((1, test.freq.size)), g])))
+    Q, R = np.linalg.qr(basis)
+    answered = Q.T @ records.data
+    beta = np.linalg.lstsq(R, answered, rcond=np.finfo(float).eps * len(basis))[0] / size[:, None]
+    known = records.by_sensor(beta.reshape(1 + len(g), -1, beta.shape[1]))
+    residues = np.zeros((1 + 2 * omega.size, *known.shape[1:]))
+    residues[: len(known)] = known
+    return residues, float(np.linalg.norm(records.data - Q @ answered) / np.sqrt(records.size))

@@ -15,6 +15,11 @@ def columns(record: ComplexArray) -> ComplexArray:
     return np.moveaxis(record, 0, 1).reshape(record.shape[1], -1)
 
 
+def stacked(record: ComplexArray) -> Array:
+    """Channels (c, rows) as columns, real parts above imaginary ones, (2 rows, c)."""
+    return np.vstack([record.real.T, record.imag.T])
+
+
 def parts_of(record: ComplexArray) -> tuple[ca.DM, ca.DM]:
     """Real and imaginary part; zeros are structural, so that real unit runs cost no imaginary arithmetic."""
     flat = columns(record)
@@ -75,10 +80,7 @@ def residual(
         ``(A_estimated - A_target) / ‖A_target‖`` (eq. 15), real then imaginary parts, then the
         same of the base force.
     """
-    runs = test.base.shape[0]
-    g_re, g_im = modal_gains(omega, ratios, test.freq, shift)
-    if runs > 1:
-        g_re, g_im = ca.repmat(g_re, 1, runs), ca.repmat(g_im, 1, runs)
+    g_re, g_im = (ca.repmat(part, 1, test.n_runs) for part in modal_gains(omega, ratios, test.freq, shift))
     u_re, u_im = parts_of(test.base)
     push_re, push_im = gamma @ u_re, gamma @ u_im
     q_re, q_im = g_re * push_re - g_im * push_im, g_re * push_im + g_im * push_re
@@ -129,23 +131,30 @@ def weights_of(record: ComplexArray, std: Array | None) -> tuple[ca.DM, float]:
 
 
 def weighed_mass(test: Measurement, omega: Array, ratios: Array) -> Array:
-    """Rigid-body mass (d, d) that the base force tells, its modal part free at the given poles; kg.
+    """Rigid-body mass (d, d) that follows from the base force, its modal part free at the given poles; kg.
 
     Lines weigh by what is stated of the force's noise.
     """
     assert test.force is not None
-    weight = separable(test.force_std, test.force.shape)[1].ravel()[:, None]
-    design = np.hstack([columns(test.base).T, _modal_basis(test, omega, ratios)])
-    return _real_least_squares(weight * design, weight * columns(test.force).T)[: test.n_base].T
+    weight = separable(test.force_std, test.force.shape)[1].ravel()
+    u = columns(test.base)
+    modal = np.tile(gains(test.freq, omega, ratios), test.n_runs)[:, None] * u
+    design = np.concatenate([u, modal.reshape(-1, u.shape[1])])
+    return np.linalg.lstsq(stacked(weight * design), stacked(weight * columns(test.force)), rcond=None)[0][
+        : test.n_base
+    ].T
 
 
 def gains(freq: Array, omega: Array, ratios: Array, shift: float = 0.0) -> ComplexArray:
     """Numbers of ``g_k = w² / (w_k² - w² + 2 i zeta_k w_k w)`` at lines in Hz, (m, n_freq); `shift` as above."""
-    if shift:
-        s = shift + 2j * np.pi * freq
-        return -(s**2) / (omega[:, None] ** 2 + s**2 + 2 * (ratios * omega)[:, None] * s)
-    w = 2 * np.pi * freq
-    return w**2 / (omega[:, None] ** 2 - w**2 + 2j * (ratios * omega)[:, None] * w)
+    s = shift + 2j * np.pi * freq
+    return -(s**2) / (omega[:, None] ** 2 + s**2 + 2 * (ratios * omega)[:, None] * s)
+
+
+def gains_with_velocity(freq: Array, omega: Array, ratios: Array, shift: float = 0.0) -> ComplexArray:
+    """`gains`, then ``s / w_k`` times them, with ``s = shift + i w``, (2, m, n_freq)."""
+    g = gains(freq, omega, ratios, shift)
+    return np.stack([g, (shift + 2j * np.pi * freq) / omega[:, None] * g])
 
 
 def gain_slopes(freq: Array, omega: Array, ratios: Array) -> ComplexArray:
@@ -156,15 +165,3 @@ def gain_slopes(freq: Array, omega: Array, ratios: Array) -> ComplexArray:
         over = np.where(w > 0, g / w**2, 0.0)  # one over the denominator; at rest nothing moves
     loss = 2j * (ratios * omega)[:, None] * w
     return np.concatenate([-g * over * (2 * omega[:, None] ** 2 + loss), -g * over * loss])
-
-
-def _modal_basis(test: Measurement, omega: Array, ratios: Array) -> ComplexArray:
-    """Response of each mode to each base direction, (runs * n_freq, m * d)."""
-    g = gains(test.freq, omega, ratios)
-    u = columns(test.base)
-    return (np.tile(g, test.n_runs)[:, None] * u[None]).reshape(-1, u.shape[1]).T
-
-
-def _real_least_squares(design: ComplexArray, records: ComplexArray) -> Array:
-    stacked = np.vstack([design.real, design.imag])
-    return np.linalg.lstsq(stacked, np.vstack([records.real, records.imag]), rcond=None)[0]

@@ -1,12 +1,12 @@
-"""A second opinion on the modes: stabilisation diagram (pLSCF) and complex mode indicator function, as numbers.
+"""Independent check of the modes: stabilisation diagram (pLSCF) and complex mode indicator function, as numbers.
 
 The polyreference least-squares complex frequency-domain method fits a right matrix fraction ``B(z) A(z)^-1`` with
 real coefficients, d x d in the denominator, to the FRFs of relative acceleration, for a rising order. Poles of the
-structure come back at every order, poles that fit noise wander. It shares nothing with the vector fitting of `poles`.
+structure recur at every order, poles that fit noise do not. The method has nothing in common with vector fitting.
 
-The field takes ``z = exp(i w dt)``. Any analytic map of frequency carries poles to poles, and this one winds log w
-round the circle instead: modes of one damping ratio are then equally far inside it wherever they lie, and the lowest
-modes of a wide band are not crowded together next to z = 1.
+The field takes ``z = exp(i w dt)``. Any analytic map of frequency takes poles to poles, and the one used here
+maps log w onto the circle instead: modes of one damping ratio are then equally far inside it wherever they lie, and the
+lowest modes of a wide band are not crowded together next to z = 1.
 """
 
 from __future__ import annotations
@@ -19,14 +19,15 @@ from numpy.typing import NDArray
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.response import gains
+from sysid.modal_analysis.residues import unit_columns
+from sysid.modal_analysis.response import gains, stacked
 from sysid.structure.structure import Array, ComplexArray
 
 LEVELS = ("new", "frequency", "frequency, damping", "frequency, damping, shape")  # what is stable
 _SAME_FREQUENCY, _SAME_RATIO, _SAME_SHAPE = 0.01, 0.05, 0.98
 _DAMPED = 0.2  # a pole with more damping than this is not shown
 _EDGE = 0.05  # how far outside the lines a pole may lie, as a fraction of their ends
-_MOST_MODES = 100  # the highest order that is looked at unasked
+_MOST_MODES = 100  # the highest order by default
 _GAP = 0.1  # of the half circle, free at either end: a polynomial fits a smooth function badly up to where it wraps
 _WIDER = 5  # powers by which numerators reach beyond the denominator at either end: all that modes outside the band add
 _ROUND_OFF = 1e-14
@@ -192,11 +193,11 @@ def _reduced_system(theta: Array, H: ComplexArray, degree: int) -> Array:
     leading columns are those of the lower orders.
     """
     numerators = np.exp(1j * theta[:, None] * np.arange(-_WIDER, degree + 1 + _WIDER))
-    Q = np.linalg.qr(_stacked(numerators))[0]
+    Q = np.linalg.qr(stacked(numerators.T))[0]  # real and imaginary parts, as unknowns are real
     powers = np.exp(1j * theta[:, None] * np.arange(degree + 1))
     rows = []
     for sensor in H:
-        products = _stacked((powers[:, :, None] * sensor.T[:, None, :]).reshape(theta.size, -1))
+        products = stacked((powers[:, :, None] * sensor.T[:, None, :]).reshape(theta.size, -1).T)
         products = products - Q @ (Q.T @ products)
         products = products - Q @ (Q.T @ products)  # twice is enough
         rows.append(np.linalg.qr(products, mode="r"))
@@ -207,7 +208,7 @@ def _poles(system: Array, d: int) -> tuple[ComplexArray, Array]:
     """Poles z (d * degree,) of the least-squares denominator, and their participations, one row a pole.
 
     Participations are turned to be as real as can be. With the lowest coefficient fixed to the identity, poles that
-    fit noise come out unstable (|z| > 1) and can be told.
+    fit noise come out unstable (|z| > 1) and can be recognised.
     """
     A = np.linalg.lstsq(system[:, d:], -system[:, :d], rcond=_ROUND_OFF)[0].reshape(-1, d, d)
     size = d * len(A)
@@ -233,10 +234,8 @@ def _shapes(freq: Array, H: ComplexArray, frequency: Array, ratio: Array, partic
     for j in range(d):
         design[j, :, m + j] = 1.0
         design[j, :, m + d + j] = (freq / freq[-1]) ** 2
-    stacked = _stacked(design.reshape(d * freq.size, -1))
-    size = np.linalg.norm(stacked, axis=0)
-    stacked = stacked / np.where(size > 0, size, 1.0)
-    answer: Array = np.linalg.lstsq(stacked, _stacked(H.reshape(len(H), -1).T), rcond=_ROUND_OFF)[0][:m]
+    basis, _ = unit_columns(stacked(design.reshape(d * freq.size, -1).T))
+    answer: Array = np.linalg.lstsq(basis, stacked(H.reshape(len(H), -1)), rcond=_ROUND_OFF)[0][:m]
     return answer.T
 
 
@@ -249,8 +248,3 @@ def _level(found: tuple[Array, Array, Array], before: tuple[Array, Array, Array]
     same_shape = same_ratio & ((shapes.T @ old_shapes) ** 2 > _SAME_SHAPE * size**2)
     level: Array = np.sum([same.any(axis=1) for same in (same_frequency, same_ratio, same_shape)], axis=0, dtype=float)
     return level
-
-
-def _stacked(record: ComplexArray) -> Array:
-    """Real parts above imaginary ones: unknowns are real."""
-    return np.vstack([record.real, record.imag])

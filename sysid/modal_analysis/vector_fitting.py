@@ -4,7 +4,7 @@ Relaxed vector fitting of the relative accelerations with common poles (Gustavse
 2006), in the basis ``g_k = w² / (w_k² - w² + 2 i zeta_k w_k w)`` so that errors weigh as accelerations, from more
 poles than there can be modes. Those that do not earn their place are removed one by one (the rise of the squared error
 without a pole against the noise), what stays is polished by variable projection over (log w, log zeta) with real
-residues, further poles are tried beside and between them, and close ones that one can stand for are merged.
+residues, further poles are tried beside and between them, and close ones that a single one can replace are merged.
 """
 
 from __future__ import annotations
@@ -57,22 +57,22 @@ Monitor = Callable[[int, float], object]
 
 
 class _Progress:
-    """Count of iterations and the relative residual so far, which a monitor is told."""
+    """Count of iterations and the relative residual so far, which a monitor is called with."""
 
     def __init__(self, monitor: Monitor | None, records: Records) -> None:
-        self.monitor, self.size = monitor, records.size
+        self.monitor: Monitor = monitor or (lambda iterations, residual: None)
+        self.size = max(records.size, np.finfo(float).tiny)
         self.iterations, self.residual = 0, 1.0
 
     def step(self, squared_error: float) -> None:
-        """One iteration more, and what it leaves."""
+        """Count an iteration that ended with this squared error, and call the monitor."""
         self.iterations += 1
-        self.residual = float(np.sqrt(squared_error / self.size)) if self.size else 0.0
+        self.residual = float(np.sqrt(squared_error / self.size))
         self.tell()
 
     def tell(self) -> None:
-        """Within an iteration that takes long: what the monitor raises stops the search."""
-        if self.monitor is not None:
-            self.monitor(self.iterations, self.residual)
+        """Call the monitor, also within an iteration that takes long: what it raises stops the search."""
+        self.monitor(self.iterations, self.residual)
 
 
 def find_poles(test: Measurement, *, monitor: Monitor | None = None) -> Poles:
@@ -96,21 +96,21 @@ def find_poles(test: Measurement, *, monitor: Monitor | None = None) -> Poles:
     B. Gustavsen, A. Semlyen, IEEE Trans. Power Delivery 14 (1999) 1052-1061; B. Gustavsen, ibid. 21 (2006)
     1587-1592. G. H. Golub, V. Pereyra, SIAM J. Numer. Anal. 10 (1973) 413-432, with Kaufman's Jacobian (1975).
     """
-    with threadpool_limits(limits=1):  # the same bits whatever the machine does beside
+    with threadpool_limits(limits=1):  # the same bits whatever else the machine does
         records = Records(test)
         return _find(records, _Progress(monitor, records))
 
 
 def _find(records: Records, progress: _Progress) -> Poles:
     count = _count(records, progress)
-    while True:
-        if not _lines_suffice(records, count):
-            n = records.freq.size
-            raise InputError(f"{n} lines are too few to look for {count} poles: state natural_frequencies or add lines")
+    while _lines_suffice(records, count):
         omega, ratios = _search(records, count, progress)
         if omega.size <= count - _SPARE // 2:
             break
         count += max(count // 2, _SPARE)  # too few were spare
+    else:
+        n = records.freq.size
+        raise InputError(f"{n} lines are too few to look for {count} poles: state natural_frequencies or add lines")
     lines = 2 * np.pi * records.freq
     if not np.any((omega > (1 - _BESIDE) * lines[0]) & (omega < (1 + _BESIDE) * lines[-1])):
         raise InputError(
@@ -121,7 +121,7 @@ def _find(records: Records, progress: _Progress) -> Poles:
 
 
 def poles_near(test: Measurement, omega: Array, window: float, *, monitor: Monitor | None = None) -> Poles:
-    """Poles for frequencies that somebody states, rad/s: polished from there, each held within `window` (relative).
+    """Poles near stated frequencies: polished from there, each held within `window` (relative).
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def poles_near(test: Measurement, omega: Array, window: float, *, monitor: Monit
     Raises
     ------
     InputError
-        Where a stated frequency is none of the data's.
+        Where a stated frequency is not one of the data.
     """
     records = Records(test)
     distinct = np.unique(omega)
@@ -158,15 +158,11 @@ def poles_near(test: Measurement, omega: Array, window: float, *, monitor: Monit
 def _count(records: Records, progress: _Progress) -> int:
     """How many poles to begin with."""
     progress.tell()
-    independent = _independent(records)
-    progress.tell()
-    return max(min(records.n_sensors, max(2 * independent, _MANY)), independent) + _SPARE
-
-
-def _independent(records: Records) -> int:
-    """Number of independent functions of frequency in the channels, where it stands out of the noise."""
     sizes, _ = records.singular
-    return int(np.count_nonzero(sizes > max(1.5 * np.median(sizes), 1e-9 * sizes[0])))
+    progress.tell()
+    # Functions of frequency in the channels that stand out of the noise.
+    independent = int(np.count_nonzero(sizes > max(1.5 * np.median(sizes), 1e-9 * sizes[0])))
+    return max(min(records.n_sensors, max(2 * independent, _MANY)), independent) + _SPARE
 
 
 def poles_of_any_damping(records: Records, *, monitor: Monitor | None = None) -> tuple[Array, Array]:
@@ -209,59 +205,54 @@ def _relocated(records: Records, count: int, progress: _Progress) -> tuple[Array
         progress.step(error)
         if error < _EXACT**2 * records.size or error > 0.97 * before:
             break
-    # A pole of a structure with other than classical damping needs its velocity too, or others would stand in for it.
+    # A pole of a structure with other than classical damping needs its velocity too, or more poles would replace it.
     return _prune(records, omega, ratios, progress, velocity=True)
 
 
 def _search(records: Records, count: int, progress: _Progress) -> tuple[Array, Array]:
     """Poles that stand out of the noise."""
     first = _relocated(records, count, progress)
-    if first[0].size == 0:
-        return first
-    omega, ratios = _settled(records, *first, progress)
+    poles = _settled(records, *first, progress)
+    if poles[0].size == 0:
+        return poles
     for _ in range(count):
-        more = _with_another(records, omega, ratios, progress) if omega.size else None
+        more = _with_another(records, *poles, progress)
         if more is None:
             break
-        omega, ratios = more
-    omega, ratios = _merged(records, omega, ratios, progress)
-    if omega.size and _explains(records, (omega, ratios), True) < _explains(records, (omega, ratios), False):
+        poles = more
+    poles = _merged(records, *poles, progress)
+    criterion = _criterion(records, poles, velocity=False)
+    if _criterion(records, poles, velocity=True) < criterion:
         with_velocity = _settled(records, *first, progress, velocity=True)
-        if _explains(records, with_velocity, True) < _explains(records, (omega, ratios), False):
+        if with_velocity[0].size and _criterion(records, with_velocity, velocity=True) < criterion:
             return with_velocity
-    return omega, ratios
+    return poles
 
 
-def _explains(records: Records, poles: tuple[Array, Array], velocity: bool) -> float:
-    """How badly poles explain the records for the unknowns they take: Schwarz's criterion."""
-    if poles[0].size == 0:
-        return np.inf
+def _criterion(records: Records, poles: tuple[Array, Array], *, velocity: bool) -> float:
+    """Schwarz's criterion of the fit on these poles: the lower, the better for the unknowns it takes."""
     fit = records.fit(*poles, velocity=velocity)
-    unknowns = poles[0].size * (fit.whitened[0].size + 2)
+    unknowns = poles[0].size * (fit.residues[0].size + 2)
     error = max(fit.squared_error / records.size, ROUND_OFF**2)
     return float(records.data.size * np.log(error) + unknowns * np.log(records.data.size))
 
 
 def _merged(records: Records, omega: Array, ratios: Array, progress: _Progress) -> tuple[Array, Array]:
-    """Poles without those that a neighbour, once it may move, stands in for: close poles trade their residues."""
+    """Poles without those that a neighbour replaces once it may move: close poles can exchange their residues."""
     order = np.argsort(omega)
     omega, ratios = omega[order], ratios[order]
     k = 0
     while k < omega.size:
         progress.tell()
         close = np.flatnonzero(np.abs(np.log(omega / omega[k])) < ratios[k] / 2)
+        k += 1
         if close.size > 1:
             fit = records.fit(omega, ratios)
             allowed = _least_gain(fit) * _noise(records, fit, omega.size)
-            if fit.rise_with_one_less(close) > _FAR * allowed:
-                k += 1
-                continue
-            fewer = _polish(records, np.delete(omega, k), np.delete(ratios, k), progress)
-            rise = records.fit(*fewer).squared_error - fit.squared_error
-            if rise <= allowed:
-                omega, ratios = fewer
-                continue
-        k += 1
+            if fit.rise_with_one_less(close) <= _FAR * allowed:
+                fewer = _polish(records, np.delete(omega, k - 1), np.delete(ratios, k - 1), progress)
+                if records.fit(*fewer).squared_error - fit.squared_error <= allowed:
+                    (omega, ratios), k = fewer, k - 1
     return omega, ratios
 
 
@@ -269,20 +260,19 @@ def _settled(
     records: Records, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False
 ) -> tuple[Array, Array]:
     """Poles polished, and pruned until all that stay earn their place."""
-    while omega.size:
+    size = omega.size + 1
+    while 0 < omega.size < size:
         size = omega.size
         omega, ratios = _polish(records, omega, ratios, progress, velocity=velocity)
         omega, ratios = _prune(records, omega, ratios, progress, velocity=velocity)
-        if omega.size == size:
-            break
     return omega, ratios
 
 
 def _with_another(records: Records, omega: Array, ratios: Array, progress: _Progress) -> tuple[Array, Array] | None:
-    """The poles and one more, settled; None where what they leave calls for none.
+    """The poles and one more, settled; None where what they leave needs none.
 
     Candidates lie beside each pole, for two modes that share it, and between the poles. Damping that is not classical
-    calls for no pole: one more must answer what the velocities of the poles cannot, or more than they all can.
+    needs no pole: one more must fit what the velocities of the poles cannot, or more than they all can.
     """
     shift = np.concatenate([1 + ratios, 1 - ratios, 1 + 3 * ratios, 1 - 3 * ratios])
     between = np.geomspace(omega.min(), omega.max(), 4 * omega.size)
@@ -315,12 +305,12 @@ def _in_order(records: Records, omega: Array, ratios: Array) -> Poles:
 
 def _least_gain(fit: ResidueFit) -> float:
     """What a pole must lower the squared error by to earn its place, in units of the noise's variance."""
-    return beyond_chance(fit.whitened[0].size + 2)  # real parameters that come with a pole
+    return beyond_chance(fit.residues[0].size + 2)  # real parameters that come with a pole
 
 
 def _noise(records: Records, fit: ResidueFit, m: int) -> float:
     """Variance of a record's real number about the fit of m poles."""
-    return records.noise(fit.left, m * (fit.whitened[0].size + 2))
+    return records.noise(fit.left, m * (fit.residues[0].size + 2))
 
 
 def _prune(

@@ -1,1 +1,1 @@
-"""Structures as numbers: matrices, modes, responses, frames of beams."""
+"""Structures in numbers: matrices, modes, responses, frames of beams."""

@@ -162,7 +162,7 @@ class Frame:
         Rigid bodies on nodes.
     mass : {"consistent", "lumped"}
         "consistent": element masses from the element's own displacement functions; frequencies
-        from above. "lumped": half of each beam's mass on each of its nodes, with rotary terms
+        converge from above. "lumped": half of each beam's mass on each of its nodes, with rotary terms
         (beam mass) L² / 78 in bending and rho (Iy + Iz) L / 2 in torsion, diagonal in the beam's
         axes. Offset point masses couple translations and rotations in both.
 
@@ -275,7 +275,7 @@ class Frame:
             The base point: rotations turn about it, moments refer to it; m.
         condensation : {"static", "modal"}
             "static": Guyan's, in its general form for sensors along any axes; exact for static
-            loads at the sensors, frequencies from above. "modal" (numbers only): T_S = Phi_f
+            loads at the sensors, frequencies too high. "modal" (numbers only): T_S = Phi_f
             (S Phi_f)^-1 with the n lowest modes on the fixed base, whose frequencies, shapes
             and participations are then exact.
 
@@ -340,7 +340,7 @@ class Frame:
         damping_ratios : float or array_like, shape (n,)
             Fractions of critical damping, in ascending order of frequency; one number for all modes.
         descriptions : sequence, optional
-            What the structure carries along as its `sensors`, one for each.
+            Descriptions of the sensors, kept as the structure's `sensors`.
 
         Returns
         -------
@@ -399,7 +399,7 @@ class Frame:
         return base
 
     def _sensor_rows(self, sensors: Sequence[SensorAxis], base: Sequence[int]) -> tuple[Array, list[int]]:
-        """Return S, (n, 6N), and the sensors' nodes."""
+        """Return S (n, 6N), the rows of the sensors in the motions of all nodes, and the sensors' nodes."""
         rows = np.zeros((len(sensors), np.asarray(self.nodes).size * 2))
         nodes: list[int] = []
         for number, sensor in enumerate(sensors):
@@ -428,7 +428,7 @@ def _modal(mass: Matrix, stiffness: Matrix, S: Array) -> tuple[Array, Array]:
     if not (isinstance(mass, np.ndarray) and isinstance(stiffness, np.ndarray)):
         raise InputError('condensation="modal" needs numbers; with CasADi expressions use "static"')
     n, size = len(S), len(mass)
-    # M phi = (1/w²) K phi: massless motions are then no trouble, and the low modes the accurate ones.
+    # M phi = (1/w²) K phi: motions without mass then do no harm, and the low modes are the accurate ones.
     try:
         inverse, shapes = scipy.linalg.eigh(mass, stiffness, subset_by_index=[size - n, size - 1])
     except scipy.linalg.LinAlgError:

@@ -18,7 +18,7 @@ class Sensor:
     Parameters
     ----------
     name : str
-        As it should stand in tables and pictures.
+        Shown in tables and figures.
     position : tuple of float, shape (3,)
         m.
     axis : str or tuple of float, shape (3,)
@@ -30,24 +30,24 @@ class Sensor:
     axis: str | tuple[float, float, float]
 
     def to_tree(self) -> dict[str, Any]:
-        """Give name, position and axis as texts and arrays; `from_tree` takes them back."""
+        """Name, position and axis as strings and arrays, for `from_tree`."""
         axis = self.axis if isinstance(self.axis, str) else np.array(self.axis, dtype=float)
         return {"name": self.name, "position": np.array(self.position, dtype=float), "axis": axis}
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Sensor:
-        """Give the sensor of a tree that `to_tree` made."""
+        """Sensor from a dictionary that `to_tree` made."""
         axis = tree["axis"] if isinstance(tree["axis"], str) else tuple(tree["axis"].tolist())
         return cls(tree["name"], tuple(tree["position"].tolist()), axis)
 
 
 def sensors_to_tree(sensors: Sequence[Any] | None) -> list[dict[str, Any]] | None:
-    """Trees of the sensors of a test or a structure; None where they are not described.
+    """Dictionaries of the sensors of a test or a structure; None where they are not described.
 
     Raises
     ------
     InputError
-        Where something else than a `Sensor` describes one.
+        If a sensor is described by anything but a `Sensor`.
     """
     if sensors is None:
         return None
@@ -58,5 +58,5 @@ def sensors_to_tree(sensors: Sequence[Any] | None) -> list[dict[str, Any]] | Non
 
 
 def sensors_from_tree(trees: Sequence[dict[str, Any]] | None) -> tuple[Sensor, ...] | None:
-    """Sensors of what `sensors_to_tree` made."""
+    """Sensors from what `sensors_to_tree` made."""
     return None if trees is None else tuple(Sensor.from_tree(tree) for tree in trees)

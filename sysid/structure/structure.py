@@ -63,13 +63,13 @@ class Structure:
         Symmetric viscous damping on the relative motion, N s/m. Exactly one of `damping_ratios`
         and `damping_matrix` is given.
     rigid_body : array_like, shape (n_sensors, d), optional
-        Motion of the sensors for unit base motion. Follows from the stiffness, through `recovery` where that is given;
-        a stated one that disagrees is an error where the degrees of freedom are the sensors, and else geometry that
-        modes left out would spoil.
+        Motion of the sensors for unit base motion. By default it follows from the stiffness and `recovery`. Without
+        `recovery`, a stated one that disagrees is an error; with it, the stated one counts, as modes that are left out
+        make the product inexact.
     recovery : array_like, shape (n_sensors, n), optional
         Takes the degrees of freedom to the sensors; the identity by default.
     sensors : sequence, optional
-        Descriptions of the sensors (`sysid.Sensor`), carried along for tables and pictures.
+        Descriptions of the sensors (`sysid.Sensor`), for tables and figures.
 
     Attributes
     ----------
@@ -103,7 +103,7 @@ class Structure:
 
     Notes
     -----
-    Frequencies at this surface are in Hz, spectra follow ``exp(+i w t)``.
+    Frequencies are in Hz, spectra follow ``exp(+i w t)``.
 
     Examples
     --------
@@ -164,7 +164,7 @@ class Structure:
         self._coupling = B
 
     def to_tree(self) -> dict[str, Any]:
-        """Give what the structure was made of as a dictionary of numbers and arrays; `from_tree` takes it back."""
+        """Arguments of the constructor as a dictionary of numbers and arrays, for `from_tree`."""
         return {
             "mass": self.mass, "stiffness": self.stiffness,
             # Which of the two was given; the other follows from it.
@@ -176,7 +176,7 @@ class Structure:
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Structure:
-        """Give the structure of a tree that `to_tree` made; exact to the bit."""
+        """Structure from a dictionary that `to_tree` made, exact to the bit."""
         return cls(**{**tree, "sensors": sensors_from_tree(tree["sensors"])})
 
     @property
@@ -266,8 +266,8 @@ class Structure:
     def to_craig_bampton(self) -> CraigBampton:
         """Fixed-base modal coordinates beside the base's own degrees of freedom.
 
-        Base-shake tests see a structure through nothing but this form, and with the base force measured they
-        determine all of it, whatever the number of sensors.
+        The response to base motion depends on the structure through this form alone; with the base force measured, a
+        test determines all of it, whatever the number of sensors.
 
         References
         ----------
@@ -308,7 +308,7 @@ class Structure:
         G = -scipy.linalg.cho_solve(scipy.linalg.cho_factor(self.stiffness[:n, :n]), self.stiffness[:n, n:])
         expected = G.T @ self.stiffness[:n, :n] @ G
         size = np.sqrt(np.abs(np.diag(expected)))
-        # A direction that strains nothing has no stiffness of its own to be compared with.
+        # A base direction that strains nothing has no stiffness to compare with.
         allowed = 1e-6 * np.outer(size, size) + 1e-10 * np.max(np.abs(self.stiffness))
         residue = np.abs(self.stiffness[n:, n:] - expected)
         if np.any(residue > allowed):
@@ -372,7 +372,7 @@ def check_frequencies(freq: ArrayLike, *, increasing: bool = True) -> Array:
 
 
 def finite_array(name: str, value: ArrayLike) -> Array:
-    """Real, finite numbers as an array of their own; what is wrong, by name, where they are not."""
+    """A new array of real, finite numbers; an error that names what was given where they are not."""
     try:
         given = np.array(value)
         array = given.real.astype(float)
