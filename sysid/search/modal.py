@@ -28,7 +28,7 @@ from sysid.problem.problem import Problem
 from sysid.search.local import LocalResult, fit_apart, solve
 from sysid.search.modal_coordinates import FREQUENCY_WINDOW, End
 from sysid.search.modal_scaling import nearest_lumped, of_known_mass, to_stated_totals
-from sysid.search.mode_fit import Integers, fit, held_to_totals
+from sysid.search.mode_fit import Integers, ModeFit, held_to_totals
 from sysid.search.session import Session, Stop
 from sysid.search.strategy import DoesNotApplyError, History, Outcome
 from sysid.structure.structure import Array, Structure
@@ -261,7 +261,7 @@ def modal_structure(
     """
     test, mass = problem.measurement, problem.formulation.mass
     poles = problem.poles or _stated_poles(problem)
-    end = fit(test, poles, np.sqrt(problem.totals), monitor, options.max_iterations)
+    end = ModeFit(test, poles, np.sqrt(problem.totals), monitor, options.max_iterations).best()
     held = held_to_totals(problem, end, monitor, options.max_iterations)
     end = held or end
     chosen = degrees_of_freedom(problem, end.modes, end.of_accelerations, options.sensors)

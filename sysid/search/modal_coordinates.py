@@ -80,15 +80,6 @@ def _linear_starts(test: Measurement, ended: ModalFit, first: Modes) -> Iterator
         yield rank_one(residues, poles.omega, poles.ratios, np.linalg.norm(poles.phi, axis=0))
 
 
-def _modes(structure: Structure) -> Modes:
-    return Modes(
-        structure.mode_shapes,
-        structure.participation,
-        2 * np.pi * structure.natural_frequencies,
-        structure.damping_ratios,
-    )
-
-
 def modes_of(structure: Structure) -> Modes:
     """The modes of a structure, rad/s."""
     omega = 2 * np.pi * structure.natural_frequencies

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -25,82 +26,131 @@ _AS_GOOD = 1.02  # times the residual without it, that a stated total may leave
 _AGREES = 0.01  # relative; a stated total that the base force weighs within this is held in the fit
 
 
-def fit(test: Measurement, poles: Poles, unit: Array, monitor: IterationMonitor, max_iterations: int) -> ModalFit:
-    """Fit of rank-one modes at `poles`; a pole whose residue needs it stands for several modes.
+@dataclass(frozen=True, eq=False)
+class ModeFit:
+    """Fit of rank-one modes at the poles of a test; a pole whose residue needs it stands for several modes.
 
-    Parameters
+    Attributes
     ----------
+    test : Measurement
+    poles : Poles
     unit : (d,)
         Size of participations, kg^½, m kg^½ for rotations.
-
-    Raises
-    ------
-    DoesNotApplyError
-        Fewer measured numbers than unknowns, or base directions that do not move by themselves.
+    monitor : IterationMonitor
+    max_iterations : int
+        Of each run of IPOPT.
     """
-    records = Records(test)
-    moving = independent(test.base).shape[1]
-    if moving < test.n_base:
-        raise DoesNotApplyError(
-            f"the base moves in only {moving} of {test.n_base} independent directions: add runs that move the others, "
-            "or describe the test by the directions that move"
-        )
-    m, n, d = poles.omega.size, test.n_sensors, test.n_base
-    if 2 * test.response.size < m * (n + d + 1) or len(records.data) < m * len(records.base):
-        raise DoesNotApplyError(
-            f"{test.freq.size} lines ({2 * test.response.size} measured numbers) cannot fix {m * (n + d + 1)} "
-            "unknowns: add lines or runs"
-        )
-    best = _grown(records, test, poles, np.ones(m, dtype=int), unit, monitor, max_iterations)
-    # Modes of rank one may have dragged poles away from where several modes share one.
-    free = records.fit(poles.omega, poles.ratios)
-    noise = records.noise(free.left, free.residues.size)
-    excess = best.of_accelerations**2 * records.size - free.squared_error
-    ranks = _ranks(free, noise, n, d)
-    wanting = excess > noise * beyond_chance(m * (n - 1) * (d - 1)) or ranks.sum() < best.modes.omega.size
-    if monitor.stopped is None and wanting and np.any(ranks > 1):
-        other = _grown(records, test, poles, ranks, unit, monitor, max_iterations)
-        more = other.modes.omega.size - best.modes.omega.size
-        gained = (best.of_accelerations**2 - other.of_accelerations**2) * records.size / noise
-        if gained > (beyond_chance(more * (n + d)) if more > 0 else -beyond_chance(-more * (n + d))):
-            best = other
-    order = np.argsort(best.modes.omega, kind="stable")
-    end = best.modes
-    modes = Modes(end.phi[:, order], end.gamma[order], end.omega[order], end.ratios[order])
-    return replace(best, modes=modes)
 
+    test: Measurement
+    poles: Poles
+    unit: Array
+    monitor: IterationMonitor
+    max_iterations: int
 
-def _grown(
-    records: Records,
-    test: Measurement,
-    poles: Poles,
-    multiplicity: Integers,
-    unit: Array,
-    monitor: IterationMonitor,
-    max_iterations: int,
-) -> ModalFit:
-    """Fit with so many modes at each pole, and with more where their free residues call for it."""
-    n, d = test.n_sensors, test.n_base
-    best = _fit_with(test, poles, multiplicity, unit, monitor, max_iterations)
-    while monitor.stopped is None:
-        lacking = _lacking_rank(records, best, multiplicity)
-        if lacking is None:
-            break
-        more = multiplicity.copy()
-        more[lacking] += 1
-        again = _fit_with(test, poles, more, unit, monitor, max_iterations)
-        gained = (best.of_accelerations**2 - again.of_accelerations**2) * records.size
-        if gained < beyond_chance(n + d) * _noise(records, again, more):
-            break
-        best, multiplicity = again, more
-    return best
+    @cached_property
+    def records(self) -> Records:
+        """What residues are fitted to."""
+        return Records(self.test)
 
+    def best(self) -> ModalFit:
+        """The fit, its modes in ascending order.
 
-def _noise(records: Records, end: ModalFit, multiplicity: Integers) -> float:
-    """Variance of a real number of the records about free residues at a fit's poles."""
-    first = np.concatenate([[0], np.cumsum(multiplicity)[:-1]])
-    free = records.fit(end.modes.omega[first], end.modes.ratios[first])
-    return records.noise(free.left, free.residues.size)
+        Raises
+        ------
+        DoesNotApplyError
+            Fewer measured numbers than unknowns, or base directions that do not move by themselves.
+        """
+        self._check()
+        test, records, poles = self.test, self.records, self.poles
+        m, n, d = poles.omega.size, test.n_sensors, test.n_base
+        best = self._grown(np.ones(m, dtype=int))
+        # Modes of rank one may have dragged poles away from where several modes share one.
+        free = records.fit(poles.omega, poles.ratios)
+        noise = records.noise(free.left, free.residues.size)
+        excess = best.of_accelerations**2 * records.size - free.squared_error
+        ranks = _ranks(free, noise, n, d)
+        wanting = excess > noise * beyond_chance(m * (n - 1) * (d - 1)) or ranks.sum() < best.modes.omega.size
+        if self.monitor.stopped is None and wanting and np.any(ranks > 1):
+            other = self._grown(ranks)
+            more = other.modes.omega.size - best.modes.omega.size
+            gained = (best.of_accelerations**2 - other.of_accelerations**2) * records.size / noise
+            if gained > np.sign(more) * beyond_chance(abs(more) * (n + d)):
+                best = other
+        order = np.argsort(best.modes.omega, kind="stable")
+        end = best.modes
+        return replace(best, modes=Modes(end.phi[:, order], end.gamma[order], end.omega[order], end.ratios[order]))
+
+    def _check(self) -> None:
+        """Refuse records that cannot fix the modes."""
+        test, moving = self.test, independent(self.test.base).shape[1]
+        if moving < test.n_base:
+            raise DoesNotApplyError(
+                f"the base moves in only {moving} of {test.n_base} independent directions: add runs that move the "
+                "others, or describe the test by the directions that move"
+            )
+        m = self.poles.omega.size
+        unknowns = m * (test.n_sensors + test.n_base + 1)
+        if 2 * test.response.size < unknowns or len(self.records.data) < m * len(self.records.base):
+            raise DoesNotApplyError(
+                f"{test.freq.size} lines ({2 * test.response.size} measured numbers) cannot fix {unknowns} unknowns: "
+                "add lines or runs"
+            )
+
+    def _grown(self, multiplicity: Integers) -> ModalFit:
+        """Fit with so many modes at each pole, and with more where their free residues call for it."""
+        best = self._with(multiplicity)
+        while self.monitor.stopped is None and (lacking := self._lacking_rank(best, multiplicity)) is not None:
+            more = multiplicity.copy()
+            more[lacking] += 1
+            again = self._with(more)
+            gained = (best.of_accelerations**2 - again.of_accelerations**2) * self.records.size
+            noise = self._free(again, more)[1]
+            if gained < beyond_chance(self.test.n_sensors + self.test.n_base) * noise:
+                break
+            best, multiplicity = again, more
+        return best
+
+    def _free(self, end: ModalFit, multiplicity: Integers) -> tuple[ResidueFit, float]:
+        """Free residues at a fit's poles, and the variance of a real number of the records about them."""
+        first = np.cumsum(multiplicity) - multiplicity
+        free = self.records.fit(end.modes.omega[first], end.modes.ratios[first])
+        return free, self.records.noise(free.left, free.residues.size)
+
+    def _lacking_rank(self, best: ModalFit, multiplicity: Integers) -> int | None:
+        """The pole whose free residue most lacks in the modes that it has; None where none does."""
+        n, d = self.records.n_sensors, self.records.n_base
+        if n < 2 or d < 2 or best.of_accelerations <= EXACT:
+            return None
+        free, noise = self._free(best, multiplicity)
+        freedom = float(np.sum((n - multiplicity) * (d - multiplicity)))
+        excess = best.of_accelerations**2 * self.records.size - free.squared_error
+        if excess < noise * beyond_chance(freedom):
+            return None
+        s = np.linalg.svd(free.whitened.reshape(multiplicity.size, -1, n), compute_uv=False)
+        left = np.array([np.sum(row[r:] ** 2) for row, r in zip(s, multiplicity, strict=True)])
+        left[multiplicity >= min(n, d)] = 0.0
+        return int(np.argmax(left)) if left.max() > 0 else None
+
+    def _with(self, multiplicity: Integers) -> ModalFit:
+        """Fit with so many modes at each pole, from its free residue's largest singular values."""
+        test, poles, unit = self.test, self.poles, self.unit
+        residues, _ = linear_residues(test, poles.omega, poles.ratios)
+        pole = np.repeat(np.arange(poles.omega.size), multiplicity)
+        rank = np.concatenate([np.arange(r) for r in multiplicity])
+        u, s, vt = np.linalg.svd(residues * unit)  # participations of order one whatever the direction's unit
+        root = np.sqrt(s[pole, rank])
+        phi, gamma = u[pole, :, rank].T * root, vt[pole, rank] * root[:, None] / unit
+        modes = Modes(phi, gamma, poles.omega[pole], poles.ratios[pole])
+        rigid = np.diag(unit**2)
+        if test.force is not None:
+            t, rigid = weigh(test, modes)
+            modes = modes._replace(phi=modes.phi / np.sqrt(t), gamma=modes.gamma * np.sqrt(t)[:, None])
+        lam, vectors = np.linalg.eigh((rigid - modes.gamma.T @ modes.gamma) / np.outer(unit, unit))
+        remainder = (vectors * np.maximum(lam, 0.0)) @ vectors.T * np.outer(unit, unit)
+        return fit_modes(
+            test, modes, _free_spectrum(poles.omega, poles.ratios, pole), unit=unit, remainder=remainder,
+            monitor=self.monitor, max_iterations=self.max_iterations,
+        )  # fmt: skip
 
 
 def _ranks(free: ResidueFit, noise: float, n: int, d: int) -> Integers:
@@ -108,53 +158,6 @@ def _ranks(free: ResidueFit, noise: float, n: int, d: int) -> Integers:
     s = np.linalg.svd(free.whitened.reshape(len(free.whitened), -1, n), compute_uv=False)
     needed = np.count_nonzero(s**2 > noise * beyond_chance(n + d), axis=1)  # unknowns of a further mode, at most
     return np.clip(needed, 1, min(n, d))
-
-
-def _lacking_rank(records: Records, best: ModalFit, multiplicity: Integers) -> int | None:
-    """The pole whose free residue most lacks in the modes that it has; None where none does."""
-    first = np.concatenate([[0], np.cumsum(multiplicity)[:-1]])
-    omega, ratios = best.modes.omega[first], best.modes.ratios[first]
-    free = records.fit(omega, ratios)
-    n, d = records.n_sensors, records.n_base
-    if n < 2 or d < 2 or best.of_accelerations <= EXACT:
-        return None
-    freedom = float(np.sum((n - multiplicity) * (d - multiplicity)))
-    excess = best.of_accelerations**2 * records.size - free.squared_error
-    noise = records.noise(free.left, free.residues.size)
-    if excess < noise * beyond_chance(freedom):
-        return None
-    residues = free.whitened.reshape(omega.size, -1, n)
-    s = np.linalg.svd(residues, compute_uv=False)
-    left = np.array([np.sum(row[r:] ** 2) for row, r in zip(s, multiplicity, strict=True)])
-    left[multiplicity >= min(n, d)] = 0.0
-    return int(np.argmax(left)) if left.max() > 0 else None
-
-
-def _fit_with(
-    test: Measurement,
-    poles: Poles,
-    multiplicity: Integers,
-    unit: Array,
-    monitor: IterationMonitor,
-    max_iterations: int,
-) -> ModalFit:
-    residues, _ = linear_residues(test, poles.omega, poles.ratios)
-    pole = np.repeat(np.arange(poles.omega.size), multiplicity)
-    rank = np.concatenate([np.arange(r) for r in multiplicity])
-    u, s, vt = np.linalg.svd(residues * unit)  # participations of order one whatever the direction's unit
-    root = np.sqrt(s[pole, rank])
-    phi, gamma = u[pole, :, rank].T * root, vt[pole, rank] * root[:, None] / unit
-    modes = Modes(phi, gamma, poles.omega[pole], poles.ratios[pole])
-    rigid = np.diag(unit**2)
-    if test.force is not None:
-        t, rigid = weigh(test, modes)
-        modes = modes._replace(phi=modes.phi / np.sqrt(t), gamma=modes.gamma * np.sqrt(t)[:, None])
-    lam, vectors = np.linalg.eigh((rigid - modes.gamma.T @ modes.gamma) / np.outer(unit, unit))
-    remainder = (vectors * np.maximum(lam, 0.0)) @ vectors.T * np.outer(unit, unit)
-    return fit_modes(
-        test, modes, _free_spectrum(poles.omega, poles.ratios, pole), unit=unit, remainder=remainder, monitor=monitor,
-        max_iterations=max_iterations,
-    )  # fmt: skip
 
 
 def held_to_totals(problem: Problem, end: ModalFit, monitor: IterationMonitor, max_iterations: int) -> ModalFit | None:
