@@ -9,6 +9,10 @@
 The command line turns an ``InputError`` into one line and exit status 2.
 """
 
+from __future__ import annotations
+
+from typing import Any
+
 
 class SysidError(Exception):
     """Base of every error that this package raises on purpose."""
@@ -20,3 +24,10 @@ class InputError(SysidError, ValueError):
 
 class SolverError(SysidError):
     """A numerical solver ended without a usable answer; the message has its status."""
+
+
+def refuse(*mistakes: tuple[Any, str]) -> None:
+    """Raise an `InputError` with the sentence of the first of ``(whether it was made, sentence)`` that was made."""
+    for made, sentence in mistakes:
+        if made:
+            raise InputError(sentence)

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError
+from sysid.errors import InputError, refuse
 from sysid.measurement import spectra
+from sysid.measurement.spectra import checked
 from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
 from sysid.structure.sensor import Sensor, sensors_from_tree, sensors_to_tree
 from sysid.structure.structure import Array, ComplexArray, Structure, check_frequencies
+
+_RECORDS = ("freq", "base", "response", "force", "response_std", "force_std")  # what has lines
 
 
 def rigid_body(
@@ -46,18 +49,13 @@ def rigid_body(
     >>> rigid_body([[0, 0, 2.0]], ["x"], base_axes=["x", "ry"])
     array([[1., 2.]])
     """
-    points = np.atleast_2d(_checked("positions", positions, float))
+    points = np.atleast_2d(checked("positions", positions, float))
     if points.ndim != 2 or points.shape[1] != 3 or len(points) != len(axes):
         raise InputError(f"positions {points.shape} and {len(axes)} axes disagree; both have one row of three a sensor")
     columns = base_columns(base_axes)
     motion = rigid_motion(points, origin).reshape(len(points), 6, 6)
     rows = [axis_vector(axis, f"sensor {i}") @ motion[i, :3] for i, axis in enumerate(axes)]
     return np.array(rows)[:, columns]
-
-
-def base_axis_names(base_axes: str | Sequence[str]) -> tuple[str, ...]:
-    """Spell out base axes: "xyz" → ("x", "y", "z"); "x rz" → ("x", "rz")."""
-    return tuple(BASE_AXES[column] for column in base_columns(base_axes))
 
 
 def axis_vector(axis: str | Sequence[float], label: str = "a sensor") -> Array:
@@ -114,61 +112,60 @@ class Measurement:
         put("freq", check_frequencies(self.freq))
         put("base", _records("base", self.base, self.freq.size))
         put("response", _records("response", self.response, self.freq.size))
-        put("rigid_body", np.atleast_2d(_checked("rigid_body", self.rigid_body, float)))
+        put("rigid_body", np.atleast_2d(checked("rigid_body", self.rigid_body, float)))
         (runs, d, _), (response_runs, sensors, _) = self.base.shape, self.response.shape
-        if runs != response_runs:
-            raise InputError(f"base has {runs} runs but response has {response_runs}")
-        if self.rigid_body.shape != (sensors, d):
-            raise InputError(
-                f"rigid_body is {self.rigid_body.shape}, but response has {sensors} sensors and base {d} directions: "
-                f"({sensors}, {d}) is needed"
-            )
-        if not np.any(self.base):
-            raise InputError("base is zero everywhere: there is no excitation to identify from")
         if self.force is not None:
             put("force", _records("force", self.force, self.freq.size))
             if self.force.shape != self.base.shape:
                 raise InputError(f"force is {self.force.shape} but base is {self.base.shape}; they have the same axes")
         if self.sensors is not None:
             put("sensors", tuple(self.sensors))
-            if len(self.sensors) != sensors:
-                raise InputError(f"{len(self.sensors)} sensors are described but response has {sensors}")
+        refuse(
+            (runs != response_runs, f"base has {runs} runs but response has {response_runs}"),
+            (
+                self.rigid_body.shape != (sensors, d),
+                f"rigid_body is {self.rigid_body.shape}, but response has {sensors} sensors and base {d} directions: "
+                f"({sensors}, {d}) is needed",
+            ),
+            (not np.any(self.base), "base is zero everywhere: there is no excitation to identify from"),
+            (
+                self.sensors is not None and len(self.sensors) != sensors,
+                f"{len(self.sensors or ())} sensors are described but response has {sensors}",
+            ),
+        )
         put("base_axes", self._check_base_axes(d))
         put("response_std", _std("response_std", self.response_std, self.response))
         put("force_std", _std("force_std", self.force_std, self.force))
 
     def _check_base_axes(self, d: int) -> tuple[str, ...]:
         if self.base_axes is not None:
-            names = base_axis_names(self.base_axes)
+            names = tuple(BASE_AXES[column] for column in base_columns(self.base_axes))
             if len(names) != d:
                 raise InputError(f"base_axes names {len(names)} directions but base has {d}")
             return names
-        if d > 6:
-            raise InputError(f"base has {d} directions; a rigid base has at most six")
-        told = self._axes_of_sensors()
-        if told is not None:
-            return told
-        if d <= 3 and np.any(np.linalg.norm(self.rigid_body, axis=1) > 1 + 1e-6):
-            raise InputError(
+        names = self._axes_of_sensors()
+        turns = not names and d <= 3 and np.any(np.linalg.norm(self.rigid_body, axis=1) > 1 + 1e-6)
+        refuse(
+            (d > 6, f"base has {d} directions; a rigid base has at most six"),
+            (
+                turns,
                 "rigid_body has rows longer than 1, as only a rotation gives (a unit axis under translations has a row "
-                "of at most 1): state base_axes, such as ['x', 'ry']"
-            )
-        return BASE_AXES[:d]
+                "of at most 1): state base_axes, such as ['x', 'ry']",
+            ),
+        )
+        return names or BASE_AXES[:d]
 
-    def _axes_of_sensors(self) -> tuple[str, ...] | None:
-        """Translations that the sensors' axes make of the columns of G; None where they tell no names, or several."""
+    def _axes_of_sensors(self) -> tuple[str, ...]:
+        """Names of the columns of G as translations along the sensors' axes; none where no or several names fit."""
         if not self.sensors or not all(isinstance(sensor, Sensor) for sensor in self.sensors):
-            return None
+            return ()
         axes = np.array([axis_vector(sensor.axis, sensor.name) for sensor in self.sensors])
-        names: list[str] = []
-        for column in self.rigid_body.T:
-            alike = [
-                name for name, own in zip(BASE_AXES[:3], axes.T, strict=True) if np.allclose(own, column, atol=1e-6)
-            ]
-            if len(alike) != 1 or not np.any(column):
-                return None
-            names += alike
-        return tuple(names) if len(set(names)) == len(names) else None
+        columns = self.rigid_body.T
+        alike = np.array(
+            [[np.any(column) and np.allclose(own, column, atol=1e-6) for own in axes.T] for column in columns]
+        )
+        unique = np.all(alike.sum(axis=1) == 1) and np.all(alike.sum(axis=0) <= 1)
+        return tuple(BASE_AXES[i] for i in np.argmax(alike, axis=1)) if unique else ()
 
     def to_tree(self) -> dict[str, Any]:
         """Give records, geometry and sensors as dictionaries, arrays and texts; `from_tree` takes them back."""
@@ -259,12 +256,8 @@ class Measurement:
 
     def at(self, keep: NDArray[np.bool_]) -> Measurement:
         """The lines where `keep`, (n_freq,), is true."""
-        cut = lambda record: None if record is None else record[..., keep]  # noqa: E731
-        return Measurement(
-            self.freq[keep], self.base[..., keep], self.response[..., keep], rigid_body=self.rigid_body,
-            force=cut(self.force), sensors=self.sensors,
-            response_std=cut(self.response_std), force_std=cut(self.force_std), base_axes=self.base_axes,
-        )  # fmt: skip
+        given = {name: getattr(self, name) for name in _RECORDS}
+        return replace(self, **{name: record[..., keep] for name, record in given.items() if record is not None})
 
     @classmethod
     def from_frf(
@@ -302,27 +295,17 @@ class Measurement:
         one_direction = np.ndim(frf) == 2  # (n_sensors, n_freq)
         H = _records("frf", np.expand_dims(np.asarray(frf), 1) if one_direction else frf, lines.size)
         d = H.shape[1]
-
-        def by_run(name: str, value: ArrayLike | None, like: ComplexArray | None) -> Any:
-            """Base direction first: it becomes the run."""
-            if value is None:
-                return None
-            if like is None:
-                raise InputError(f"{name} is given without its record")
-            try:
-                return np.moveaxis(np.broadcast_to(np.asarray(value), like.shape), 1, 0)
-            except ValueError:
-                raise InputError(f"{name} {np.shape(value)} does not broadcast to its record {like.shape}") from None
-
         F = None if force is None else _records("force", force, lines.size)
-        if F is not None and F.shape[:2] != (d, d):
-            raise InputError(f"force is {F.shape}; with {d} base directions it is ({d}, {d}, {lines.size})")
+        wanted = (d, d, lines.size)
+        if F is not None and F.shape != wanted:
+            raise InputError(f"force is {F.shape}; with {d} base directions it is {wanted}")
+        # The base direction comes first: it becomes the run.
+        by_run: Any = lambda record: None if record is None else np.moveaxis(record, 1, 0)  # noqa: E731
+        named: Any = {"sensors": sensors, "base_axes": base_axes}
         return cls(
-            lines, unit_runs(d, lines.size), by_run("frf", H, H), rigid_body=np.asarray(rigid_body),
-            force=by_run("force", F, F),
-            sensors=None if sensors is None else tuple(sensors),
-            response_std=by_run("response_std", response_std, H), force_std=by_run("force_std", force_std, F),
-            base_axes=None if base_axes is None else base_axis_names(base_axes),
+            lines, unit_runs(d, lines.size), by_run(H), rigid_body=np.asarray(rigid_body), force=by_run(F),
+            response_std=by_run(_std("response_std", response_std, H)),
+            force_std=by_run(_std("force_std", force_std, F)), **named,
         )  # fmt: skip
 
     @classmethod
@@ -363,16 +346,15 @@ class Measurement:
         """
         G = np.atleast_2d(np.asarray(rigid_body, dtype=float))
         records = spectra.check_runs(runs, sample_rate, G.shape)
-        described = None if sensors is None else tuple(sensors)
-        axes = None if base_axes is None else base_axis_names(base_axes)
+        given: Any = {"rigid_body": G, "sensors": sensors, "base_axes": base_axes}
         if estimator == "spectra":
             freq, base, response, force = spectra.whole_record(records, sample_rate)
-            test = cls(freq, base, response, rigid_body=G, force=force, sensors=described, base_axes=axes)
+            test = cls(freq, base, response, force=force, **given)
         elif estimator in ("h1", "h2"):
             estimate = spectra.averaged(records, sample_rate, kind=estimator, segment=segment)
             test = cls.from_frf(
-                estimate.freq, estimate.frf, rigid_body=G, force=estimate.force, sensors=described,
-                response_std=estimate.frf_std, force_std=estimate.force_std, base_axes=axes,
+                estimate.freq, estimate.frf, force=estimate.force, response_std=estimate.frf_std,
+                force_std=estimate.force_std, **given,
             )  # fmt: skip
         else:
             raise InputError(f"estimator {estimator!r} is unknown; give 'spectra', 'h1' or 'h2'")
@@ -414,16 +396,14 @@ def simulate(
         raise InputError(f"noise = {noise}: a finite fraction >= 0 is needed")
     lines = check_frequencies(freq)
     random = np.random.default_rng(rng)
-    response = np.moveaxis(structure.transmissibility(lines), 1, 0)
-    base_force = np.moveaxis(structure.base_force(lines), 1, 0) if force else None
-    response, response_std = _with_noise(response, noise, random)
-    force_std = None
-    if base_force is not None:
-        base_force, force_std = _with_noise(base_force, noise, random)
+    response, response_std = _with_noise(np.moveaxis(structure.transmissibility(lines), 1, 0), noise, random)
+    base_force = force_std = None
+    if force:
+        base_force, force_std = _with_noise(np.moveaxis(structure.base_force(lines), 1, 0), noise, random)
+    named: Any = {"sensors": structure.sensors, "base_axes": base_axes}
     return Measurement(
         lines, unit_runs(structure.n_base, lines.size), response, rigid_body=structure.rigid_body,
-        force=base_force, sensors=structure.sensors, response_std=response_std, force_std=force_std,
-        base_axes=None if base_axes is None else base_axis_names(base_axes),
+        force=base_force, response_std=response_std, force_std=force_std, **named,
     )  # fmt: skip
 
 
@@ -440,22 +420,8 @@ def _with_noise(record: ComplexArray, noise: float, random: np.random.Generator)
     return record + error * std / np.sqrt(2), np.array(std)
 
 
-def _checked(name: str, value: ArrayLike, kind: type) -> NDArray[Any]:
-    if kind is float and np.iscomplexobj(value):
-        raise InputError(f"{name} is complex; real numbers are needed")
-    try:
-        array: NDArray[Any] = np.array(value, dtype=kind)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} is not an array of numbers") from None
-    bad = ~np.isfinite(array)
-    if np.any(bad):
-        first = tuple(int(i) for i in np.argwhere(bad)[0])
-        raise InputError(f"{name} holds {int(bad.sum())} NaN or infinite samples, the first at index {first}")
-    return array
-
-
 def _records(name: str, value: ArrayLike, n_freq: int) -> ComplexArray:
-    array = _checked(name, value, complex)
+    array = checked(name, value, complex)
     if array.ndim == 2:
         array = array[None]
     if array.ndim != 3 or array.shape[-1] != n_freq:
@@ -466,7 +432,7 @@ def _records(name: str, value: ArrayLike, n_freq: int) -> ComplexArray:
 def _std(name: str, value: ArrayLike | None, record: ComplexArray | None) -> Array | None:
     if value is None:
         return None
-    array = _checked(name, value, float)
+    array = checked(name, value, float)
     if record is None:
         raise InputError(f"{name} is given without its record")
     try:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError
+from sysid.errors import InputError, refuse
 from sysid.structure.structure import Array, ComplexArray
 
 
@@ -19,6 +19,11 @@ class Run(NamedTuple):
     base: Array
     response: Array
     force: Array | None
+
+    @property
+    def outputs(self) -> Array:
+        """Responses and, below them, forces where there are any."""
+        return np.vstack([record for record in self[1:] if record is not None])
 
 
 @dataclass(frozen=True)
@@ -47,12 +52,15 @@ def check_runs(
     runs: Sequence[tuple[ArrayLike, ArrayLike, ArrayLike | None]], sample_rate: float, shape: tuple[int, ...]
 ) -> list[Run]:
     """Check time records against ``shape = (n_sensors, d)`` and each other."""
-    if not (np.isfinite(sample_rate) and sample_rate > 0):
-        raise InputError(f"sample_rate = {sample_rate}: a positive number of samples a second is needed")
-    if not runs:
-        raise InputError("no runs: give a list of (base, response, force or None)")
+    refuse(
+        (
+            not (np.isfinite(sample_rate) and sample_rate > 0),
+            f"sample_rate = {sample_rate}: a positive number of samples a second is needed",
+        ),
+        (not runs, "no runs: give a list of (base, response, force or None)"),
+    )
     sensors, d = shape
-    checked = []
+    records = []
     for index, run in enumerate(runs):
         if len(run) != 3:
             raise InputError(f"run {index} has {len(run)} records; give (base, response, force or None)")
@@ -62,10 +70,10 @@ def check_runs(
         lengths = {record.shape[1] for record in (base, response, force) if record is not None}
         if len(lengths) > 1:
             raise InputError(f"run {index}: its records have different lengths {sorted(lengths)}")
-        checked.append(Run(base, response, force))
-    if len({run.force is None for run in checked}) > 1:
+        records.append(Run(base, response, force))
+    if len({run.force is None for run in records}) > 1:
         raise InputError("some runs have a force and some have none; give it for all or for none")
-    return checked
+    return records
 
 
 def whole_record(
@@ -127,22 +135,17 @@ def averaged(runs: Sequence[Run], sample_rate: float, *, kind: str, segment: int
             f"take a shorter segment than {length} samples or add runs"
         )
 
-    def cross(a: str, b: str) -> ComplexArray:
-        """E[conj(a_i) b_j] over segments of all runs, (i, j, n_freq)."""
-        parts = []
-        for run, count in zip(runs, counts, strict=True):
-            x, y = _channels(run, a), _channels(run, b)
-            _, S = signal.csd(
-                x[:, None], y[None], sample_rate, window=window, noverlap=length - step, detrend="constant"
-            )
-            parts.append(count * S)
+    def cross(pairs: Iterable[tuple[Array, Array]]) -> ComplexArray:
+        """E[conj(x) y] over the segments of all runs, the line last."""
+        options: Any = {"window": window, "noverlap": length - step, "detrend": "constant"}
+        parts = [n * signal.csd(x, y, sample_rate, **options)[1] for n, (x, y) in zip(counts, pairs, strict=True)]
         return sum(parts)[..., 1:] / counts.sum()
 
     freq = np.fft.rfftfreq(length, 1 / sample_rate)[1:]
-    S_xx = np.moveaxis(cross("base", "base"), -1, 0).swapaxes(1, 2)  # [line, a, b] = E[x_a conj(x_b)]
+    S_xx = cross((run.base[:, None], run.base[None]) for run in runs).T  # [line, a, b] = E[x_a conj(x_b)]
     _check_independent(S_xx)
-    S_yx = np.moveaxis(cross("base", "outputs"), -1, 0).swapaxes(1, 2)  # [line, output, input] = E[y conj(x)]
-    S_yy = np.moveaxis(_auto(runs, counts, sample_rate, window, length - step), -1, 0)
+    S_yx = cross((run.base[:, None], run.outputs[None]) for run in runs).T  # [line, output, input] = E[y conj(x)]
+    S_yy = cross((y, y) for y in (run.outputs for run in runs)).T.real  # [line, output]
     inverse = np.linalg.inv(S_xx)
     H = S_yx @ inverse
     explained = np.einsum("fsi,fsi->fs", H, S_yx.conj()).real
@@ -155,13 +158,13 @@ def averaged(runs: Sequence[Run], sample_rate: float, *, kind: str, segment: int
         H, std = H * ratio, std * ratio
     frf, frf_std = np.moveaxis(H, 0, -1), np.moveaxis(std, 0, -1)
     n = runs[0].response.shape[0]
-    forced = runs[0].force is not None
+    force, force_std = (None, None) if runs[0].force is None else (frf[n:], frf_std[n:])
     return Estimate(
         freq=freq,
         frf=frf[:n],
         frf_std=frf_std[:n],
-        force=frf[n:] if forced else None,
-        force_std=frf_std[n:] if forced else None,
+        force=force,
+        force_std=force_std,
         coherence=coherence[:, :n].T,
     )
 
@@ -214,15 +217,25 @@ def resample(
     for index, (time, values) in enumerate(records):
         t = np.asarray(time, dtype=float)
         x = np.atleast_2d(np.asarray(values, dtype=float))
-        if t.ndim != 1 or x.shape[-1] != t.size or t.size < 4:
-            raise InputError(f"record {index}: time {t.shape} and samples {x.shape} disagree (or fewer than 4 samples)")
-        if not (np.all(np.isfinite(t)) and np.all(np.isfinite(x))):
-            raise InputError(f"record {index} holds NaN or infinite samples")
+        refuse(
+            (
+                t.ndim != 1 or x.shape[-1] != t.size or t.size < 4,
+                f"record {index}: time {t.shape} and samples {x.shape} disagree (or fewer than 4 samples)",
+            ),
+            (
+                not (np.all(np.isfinite(t)) and np.all(np.isfinite(x))),
+                f"record {index} holds NaN or infinite samples",
+            ),
+        )
         gaps = np.diff(t)
-        if np.any(gaps <= 0):
-            raise InputError(f"record {index}: time does not rise at sample {int(np.argmax(gaps <= 0)) + 1}")
-        if gaps.max() > 3 * np.median(gaps):
-            raise InputError(f"record {index}: a gap of {gaps.max():.4g} s at {t[np.argmax(gaps)]:.6g} s; cut it there")
+        widest, back = np.argmax(gaps), np.argmax(gaps <= 0)
+        refuse(
+            (gaps[back] <= 0, f"record {index}: time does not rise at sample {back + 1}"),
+            (
+                gaps[widest] > 3 * np.median(gaps),
+                f"record {index}: a gap of {gaps[widest]:.4g} s at {t[widest]:.6g} s; cut it there",
+            ),
+        )
         clocks.append(t)
         samples.append(x)
     rates = np.array([(t.size - 1) / (t[-1] - t[0]) for t in clocks])
@@ -234,43 +247,36 @@ def resample(
     if stop <= start or count < 2:
         raise InputError("the records have no time in common; check that their clocks have one origin")
     time = start + np.arange(count) / rate
-    out = []
-    folding = bool(np.any(rates > 1.1 * rate))
-    for index, (t, x, own) in enumerate(zip(clocks, samples, rates, strict=True)):
-        if folding:
+    if np.any(rates > 1.1 * rate):
+        for index, t in enumerate(clocks):
             if t.size < 60:
                 raise InputError(f"record {index}: {t.size} samples are too few to low-pass before resampling")
-            x = sosfiltfilt(butter(8, 0.8 * rate / own, output="sos"), x, axis=-1)
-        out.append(np.asarray(CubicSpline(t, x, axis=-1)(np.minimum(time, t[-1]))))
-    return time, out
+        filters = [butter(8, 0.8 * rate / own, output="sos") for own in rates]
+        samples = [sosfiltfilt(sos, x, axis=-1) for sos, x in zip(filters, samples, strict=True)]
+    splines = [CubicSpline(t, x, axis=-1) for t, x in zip(clocks, samples, strict=True)]
+    return time, [np.asarray(spline(np.minimum(time, spline.x[-1]))) for spline in splines]
 
 
-def _record(name: str, value: ArrayLike, channels: int) -> Array:
+def checked(name: str, value: ArrayLike, kind: type) -> NDArray[Any]:
+    """`value` as an array of finite numbers, float or complex; an InputError where it is none."""
+    numbers = {float: "real numbers", complex: "numbers"}[kind]
+    if kind is float and np.iscomplexobj(value):
+        raise InputError(f"{name} is complex; {numbers} are needed")
     try:
-        array = np.atleast_2d(np.array(value, dtype=float))
+        array: NDArray[Any] = np.array(value, dtype=kind)
     except (TypeError, ValueError):
-        raise InputError(f"{name} is not an array of real numbers") from None
-    if array.ndim != 2 or array.shape[0] != channels:
-        raise InputError(f"{name} has shape {array.shape}; ({channels}, n_samples) is needed")
-    if not np.all(np.isfinite(array)):
-        raise InputError(f"{name} holds {int(np.sum(~np.isfinite(array)))} NaN or infinite samples")
+        raise InputError(f"{name} is not an array of {numbers}") from None
+    bad = np.argwhere(~np.isfinite(array)).tolist()
+    if bad:
+        raise InputError(f"{name} holds {len(bad)} NaN or infinite samples, the first at index {tuple(bad[0])}")
     return array
 
 
-def _channels(run: Run, which: str) -> Array:
-    if which == "base":
-        return run.base
-    return run.response if run.force is None else np.vstack([run.response, run.force])
-
-
-def _auto(runs: Sequence[Run], counts: Array, sample_rate: float, window: Array, overlap: int) -> Array:
-    from scipy import signal
-
-    total = 0.0
-    for run, count in zip(runs, counts, strict=True):
-        _, S = signal.welch(_channels(run, "outputs"), sample_rate, window=window, noverlap=overlap, detrend="constant")
-        total = total + count * S
-    return np.asarray(total)[..., 1:] / counts.sum()
+def _record(name: str, value: ArrayLike, channels: int) -> Array:
+    array = np.atleast_2d(checked(name, value, float))
+    if array.ndim != 2 or array.shape[0] != channels:
+        raise InputError(f"{name} has shape {array.shape}; ({channels}, n_samples) is needed")
+    return array
 
 
 def _smoothing(H: ComplexArray) -> Array:
@@ -285,15 +291,6 @@ def _smoothing(H: ComplexArray) -> Array:
 
 
 def _effective_averages(window: Array, step: int, counts: Array) -> float:
-    """Independent averages that the overlapped segments of all runs are worth (Welch 1967, eq. 12)."""
-    energy = np.sum(window**2)
-    total = 0.0
-    for count in counts:
-        correlation = [
-            (np.sum(window[: -j * step] * window[j * step :]) / energy) ** 2
-            for j in range(1, int(count))
-            if j * step < window.size
-        ]
-        spread = 1 + 2 * sum((1 - (j + 1) / count) * c for j, c in enumerate(correlation))
-        total += count / spread
-    return total
+    """Independent averages that the segments of all runs are worth, which overlap by half (Welch 1967, eq. 12)."""
+    correlation = (np.sum(window[:-step] * window[step:]) / np.sum(window**2)) ** 2  # of neighbours alone
+    return float(np.sum(counts / (1 + 2 * (1 - 1 / counts) * correlation)))
