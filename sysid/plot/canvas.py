@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from sysid.structure.structure import Array
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -60,18 +62,17 @@ def new_figure(width: float, height: float, layout: Literal["constrained"] | Non
     return _figure_class()(figsize=(width, height), layout=layout)
 
 
-def new_axes(ax: Axes | None, width: float, height: float) -> tuple[Figure | None, Any]:
-    """The figure, where it had to be made, and the axes."""
+def new_axes(ax: Axes | None, width: float, height: float) -> tuple[Axes | Figure, Any]:
+    """What a picture returns, and the axes it is drawn into: those given, or a new figure and its axes."""
     if ax is not None:
-        return None, ax
+        return ax, ax
     figure = new_figure(width, height)
     return figure, figure.subplots()
 
 
 def dress(ax: Axes, title: str, x: str, y: str, *, grid: bool = True, math: bool = False) -> None:
     """Set title, labels and the common style of axes."""
-    if title:
-        ax.set_title(title, fontsize=10, color=INK, parse_math=math, y=1.0)  # a stated y is not searched for: faster
+    ax.set_title(title, fontsize=10, color=INK, parse_math=math, y=1.0)  # a stated y is not searched for: faster
     ax.set_xlabel(x, fontsize=9, color=INK)
     ax.set_ylabel(y, fontsize=9, color=INK)
     ax.tick_params(which="both", labelsize=8, color=FAINT, labelcolor=INK)
@@ -103,6 +104,19 @@ def count_modes(ax: Axes, n: int) -> None:
     """Count modes 1 to n along the x axis, not all where they are many."""
     ax.set_xlim(0.4, n + 0.6)
     ax.set_xticks(np.arange(1, n + 1, max(1, -(-n // 12))))
+
+
+def frequency_axis(ax: Axes, freq: Array) -> None:
+    """Limit the x axis to `freq` (n_freq,), Hz; logarithmic over more than a decade."""
+    if freq[0] > 0 and freq[-1] > 10 * freq[0]:
+        ax.set_xscale("log")
+        plain_log(ax.xaxis)
+    ax.set_xlim(freq[0], freq[-1] if freq.size > 1 else freq[0] + 1)
+
+
+def positive(values: Array) -> Array:
+    """NaN, which is not drawn, in place of what a logarithmic axis cannot show."""
+    return np.where(values > 0, values, np.nan)
 
 
 def plain_log(axis: Any) -> None:

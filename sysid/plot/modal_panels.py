@@ -11,8 +11,7 @@ from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.stabilisation import LEVELS, relative_frf, singular_values, stabilisation
 from sysid.modal_analysis.vector_fitting import find_poles
-from sysid.plot.canvas import COLOURS, FAINT, IDENTIFIED, INK, MEASURED, dress, plain_log
-from sysid.plot.panels import positive
+from sysid.plot.canvas import COLOURS, FAINT, IDENTIFIED, INK, MEASURED, dress, frequency_axis, positive
 from sysid.results.identification import Identification
 from sysid.structure.structure import Array
 
@@ -29,7 +28,11 @@ _MARKS: tuple[dict[str, Any], ...] = (
 )
 
 
-_ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth")
+_ORDINALS = ("second", "third", "fourth", "fifth", "sixth")
+_CURVES: tuple[dict[str, Any], ...] = (
+    {"color": MEASURED["color"], "linewidth": 1.2, "label": "first"},
+    *({"color": colour, "linewidth": 1.0, "label": name} for colour, name in zip(COLOURS, _ORDINALS, strict=False)),
+)
 
 
 def draw_stabilisation(ax: Axes, subject: Identification | Measurement) -> None:
@@ -42,7 +45,7 @@ def draw_stabilisation(ax: Axes, subject: Identification | Measurement) -> None:
     behind.plot(test.freq, positive(values[0]), color=FAINT, linewidth=0.8)
     ax.set_zorder(behind.get_zorder() + 1)
     ax.patch.set_visible(False)
-    _frequency_axis(ax, test.freq)
+    frequency_axis(ax, test.freq)
     _mode_lines(ax, modes, label)
     words, quantity = "", "order [modes]"
     try:
@@ -72,11 +75,9 @@ def draw_cmif(ax: Axes, subject: Identification | Measurement) -> None:
     """All singular values of the FRFs at each line; found modes as vertical lines."""
     test, modes, label = _modes_of(subject)
     values, reason, unit = _indicator(test)
-    for k, curve in enumerate(values):
-        colour = MEASURED["color"] if k == 0 else COLOURS[(k - 1) % len(COLOURS)]
-        width = 1.2 if k == 0 else 1.0
-        ax.plot(test.freq, positive(curve), color=colour, linewidth=width, label=_ORDINALS[k], zorder=3)
-    _frequency_axis(ax, test.freq)
+    for curve, style in zip(values, _CURVES, strict=False):
+        ax.plot(test.freq, positive(curve), zorder=3, **style)
+    frequency_axis(ax, test.freq)
     _mode_lines(ax, modes, label)
     _log_magnitude(ax, values, room=bool(reason))
     if reason:
@@ -104,13 +105,6 @@ def _indicator(test: Measurement) -> tuple[Array, str, str]:
         return singular_values(np.moveaxis(test.relative, 0, 1)), str(error), "\n[m/s², own scale]"
 
 
-def _frequency_axis(ax: Axes, freq: Array) -> None:
-    if freq[0] > 0 and freq[-1] > 10 * freq[0]:
-        ax.set_xscale("log")
-        plain_log(ax.xaxis)
-    ax.set_xlim(freq[0], freq[-1] if freq.size > 1 else freq[0] + 1)
-
-
 def _log_magnitude(ax: Axes, values: Array, *, room: bool) -> None:
     """Logarithmic axis over seven decades at most (what lies below is arithmetic), with room for a remark on top."""
     if np.any(values > 0):
@@ -130,9 +124,9 @@ def _remark(ax: Axes, words: str) -> None:
 
 def _mode_lines(ax: Axes, modes: Array, label: str) -> None:
     low, high = ax.get_xlim()
-    style = {**IDENTIFIED, "linewidth": 0.9, "zorder": 1.5}
-    for k, mode in enumerate(modes[(modes >= low) & (modes <= high)]):
-        ax.axvline(mode, **{**style, "label": label if k == 0 else "_"})
+    shown = modes[(modes >= low) & (modes <= high)]
+    for mode, name in zip(shown, [label, *["_"] * shown.size], strict=False):
+        ax.axvline(mode, **{**IDENTIFIED, "linewidth": 0.9, "zorder": 1.5, "label": name})
 
 
 def _legend_below(ax: Axes, lines: Sequence[Line2D], columns: int) -> None:

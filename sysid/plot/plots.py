@@ -1,4 +1,7 @@
-"""The pictures of `sysid.plot`."""
+"""The pictures of `sysid.plot`.
+
+What takes `ax` draws into the axes that it is given and returns them; without, it returns a new figure.
+"""
 
 from __future__ import annotations
 
@@ -21,20 +24,18 @@ from sysid.plot.canvas import (
     new_axes,
     new_figure,
     plain_log,
+    positive,
 )  # fmt: skip
 from sysid.plot.modal_panels import draw_cmif, draw_stabilisation
 from sysid.plot.panels import (
-    band_of,
     draw,
     force_channel,
     index_of,
     key,
     panels,
     place,
-    positive,
     response_channel,
     run_index,
-    sensor_index,
     strongest,
     with_force,
 )  # fmt: skip
@@ -91,9 +92,9 @@ def transmissibility(
     >>> band = result.uncertainty.transmissibility(result.measurement.freq)  # doctest: +SKIP
     >>> sysid.plot.transmissibility(result, sensor="x5", run="x", band=band)  # doctest: +SKIP
     """
-    test = identification.measurement if measurement is None else measurement
+    test = measurement or identification.measurement
     chosen = strongest(test, 1, sensor=sensor, run=run)[0]
-    return place(ax, response_channel(identification, test, *chosen, band=band_of(test, band, test.n_sensors)))
+    return place(ax, response_channel(identification, test, *chosen, band=band))
 
 
 def responses(
@@ -104,9 +105,9 @@ def responses(
     band: ArrayLike | None = None,
 ) -> Figure:
     """All runs of one sensor side by side; see `transmissibility`."""
-    test = identification.measurement if measurement is None else measurement
-    s, std = sensor_index(test, sensor), band_of(test, band, test.n_sensors)
-    return panels([response_channel(identification, test, s, r, band=std) for r in range(test.n_runs)], alone=10.0)
+    test = measurement or identification.measurement
+    s = index_of("sensor", sensor, test.sensor_names)
+    return panels([response_channel(identification, test, s, r, band=band) for r in range(test.n_runs)], alone=10.0)
 
 
 def base_force(
@@ -138,10 +139,10 @@ def base_force(
     -------
     Figure, Axes or the sequence given
     """
-    test = with_force(identification.measurement if measurement is None else measurement)
+    test = with_force(measurement or identification.measurement)
     i = index_of("base direction", direction, test.base_axes or ())
     r = int(np.argmax(np.linalg.norm(test.base[:, i], axis=-1))) if run is None else run_index(test, run)
-    return place(ax, force_channel(identification, test, i, r, band=band_of(test, band, test.n_base)))
+    return place(ax, force_channel(identification, test, i, r, band=band))
 
 
 def base_forces(
@@ -152,9 +153,9 @@ def base_forces(
     band: ArrayLike | None = None,
 ) -> Figure:
     """All directions of the base force of one run side by side; see `base_force`."""
-    test = with_force(identification.measurement if measurement is None else measurement)
-    r, std = run_index(test, run), band_of(test, band, test.n_base)
-    return panels([force_channel(identification, test, i, r, band=std) for i in range(test.n_base)], alone=10.0)
+    test = with_force(measurement or identification.measurement)
+    r = run_index(test, run)
+    return panels([force_channel(identification, test, i, r, band=band) for i in range(test.n_base)], alone=10.0)
 
 
 def convergence(identification: Identification, ax: Axes | None = None) -> Any:
@@ -162,17 +163,8 @@ def convergence(identification: Identification, ax: Axes | None = None) -> Any:
 
     It is the root of the sum of squares of all that is fitted, so it may differ from the residual, which is of
     accelerations alone and unweighted.
-
-    Parameters
-    ----------
-    identification : Identification
-    ax : Axes, optional
-
-    Returns
-    -------
-    Figure or Axes
     """
-    figure, ax = new_axes(ax, 6.0, 3.6)
+    shown, ax = new_axes(ax, 6.0, 3.6)
     history = identification.history
     swarm, local = positive(history.swarm_curve), positive(history.local_curve)
     _draw_curves(ax, swarm, local, history.refinement)
@@ -191,7 +183,7 @@ def convergence(identification: Identification, ax: Axes | None = None) -> Any:
         ax.text(0.5, 0.5, "no search is recorded", transform=ax.transAxes, ha="center", color=FAINT)
     told = "iteration, swarm then local phase" if swarm.size else "iteration"
     dress(ax, "Convergence", told, "objective [–]")
-    return ax if figure is None else figure
+    return shown
 
 
 def _draw_curves(ax: Axes, swarm: Array, local: Array, refinement: float) -> None:
@@ -216,71 +208,49 @@ def _draw_curves(ax: Axes, swarm: Array, local: Array, refinement: float) -> Non
 
 
 def mac(identification: Identification, ax: Axes | None = None) -> Any:
-    """Modal assurance criterion against the reference where one is known, else the AutoMAC.
-
-    Parameters
-    ----------
-    identification : Identification
-    ax : Axes, optional
-
-    Returns
-    -------
-    Figure or Axes
-    """
+    """Modal assurance criterion against the reference where one is known, else the AutoMAC."""
     values = identification.mac
-    known = identification.problem.reference is not None
     side = min(2.6 + 0.3 * max(values.shape), 7.0)
-    figure, ax = new_axes(ax, side + 0.6, side)
+    shown, ax = new_axes(ax, side + 0.6, side)
     image = ax.imshow(values, cmap="Blues", vmin=0, vmax=1, origin="lower")
     count_cells(ax, values.shape)
     if max(values.shape) <= _MAX_NUMBERS:
         size = 8 if max(values.shape) <= 6 else 6
-        for (i, j), value in np.ndenumerate(values):
-            if value >= 0.005:
-                colour = "white" if value > 0.55 else INK
-                ax.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=size, color=colour)
+        for i, j in np.argwhere(values >= 0.005):
+            colour = "white" if values[i, j] > 0.55 else INK
+            ax.text(j, i, f"{values[i, j]:.2f}", ha="center", va="center", fontsize=size, color=colour)
     colour_bar(image, ax, "MAC [–]")
-    other = "mode of the reference" if known else "mode"
-    dress(ax, "MAC against the reference" if known else "AutoMAC", other, "identified mode", grid=False)
-    return ax if figure is None else figure
+    known = identification.problem.reference is not None
+    words = ("MAC against the reference", "mode of the reference") if known else ("AutoMAC", "mode")
+    dress(ax, *words, "identified mode", grid=False)
+    return shown
 
 
 def effective_masses(identification: Identification, ax: Axes | None = None) -> Any:
-    """Effective mass of each mode (bars) and their running sum (lines), % of the rigid-body mass.
-
-    Parameters
-    ----------
-    identification : Identification
-    ax : Axes, optional
-
-    Returns
-    -------
-    Figure or Axes
-    """
+    """Effective mass of each mode (bars) and their running sum (lines), % of the rigid-body mass."""
     structure = identification.structure
     names = identification.measurement.base_axes or ()
     share = structure.effective_mass_percent
     modes = np.arange(1, structure.n + 1)
-    figure, ax = new_axes(ax, min(5.0 + 0.18 * structure.n, 9.0), 3.6)
+    shown, ax = new_axes(ax, min(5.0 + 0.18 * structure.n, 9.0), 3.6)
     width = 0.8 / structure.n_base
-    for i, name in enumerate(names):
-        colour = COLOURS[i % len(COLOURS)]
-        total = np.cumsum(share[:, i])
-        at = modes + (i - (structure.n_base - 1) / 2) * width
-        ax.bar(at, share[:, i], width, color=colour, alpha=0.85, label=f"base {name}")
-        ax.plot(modes, total, color=colour, linewidth=1.2, marker="o", markersize=3)
-        reference = identification.problem.reference
-        if reference is not None and reference.n == structure.n:
-            last = i == structure.n_base - 1
-            size = max(80 / (structure.n * structure.n_base), 4)
-            label = "reference" if last else None
-            ax.plot(at, reference.effective_mass_percent[:, i], "_", color=INK, markersize=size, label=label)
+    total = np.cumsum(share, axis=0)
+    at = modes[:, None] + (np.arange(structure.n_base) - (structure.n_base - 1) / 2) * width
+    for i, (name, colour) in enumerate(zip(names, COLOURS, strict=False)):
+        ax.bar(at[:, i], share[:, i], width, color=colour, alpha=0.85, label=f"base {name}")
+        ax.plot(modes, total[:, i], color=colour, linewidth=1.2, marker="o", markersize=3)
+    reference = identification.problem.reference
+    if reference is not None and reference.n == structure.n:
+        size = max(80 / at.size, 4)
+        ax.plot(
+            at.ravel(), reference.effective_mass_percent.ravel(), "_", color=INK, markersize=size, label="reference"
+        )
     ax.axhline(100, color=FAINT, linewidth=0.8, linestyle=":")
-    ax.set_ylim(0, max(105.0, 1.05 * float(np.cumsum(share, axis=0).max())))
+    ax.set_ylim(0, max(105.0, 1.05 * float(total.max())))
     count_modes(ax, structure.n)
     ax.legend(frameon=False, fontsize="small", loc="center right")
     dress(ax, "Effective masses and their sum", "mode", "% of rigid-body mass")
-    return ax if figure is None else figure
+    return shown
 
 
 def matrices(identification: Identification, ax: Sequence[Axes] | None = None) -> Any:
@@ -295,19 +265,20 @@ def matrices(identification: Identification, ax: Sequence[Axes] | None = None) -
     -------
     Figure, or the axes given
     """
-    figure = None
+    shown: Any = ax
     if ax is None:
-        figure = new_figure(10.0, 3.6)
-        ax = figure.subplots(1, 3)
+        shown = new_figure(10.0, 3.6)
+        ax = shown.subplots(1, 3)
     structure = identification.structure
     n = structure.n
     blocks = {"$M_{SS}$": structure.mass[:n, :n], "$K_{SS}$": structure.stiffness[:n, :n], "$C$": structure.damping}
-    for one, (name, matrix) in zip(ax, blocks.items(), strict=True):
+    rows = ("degree of freedom", "", "")
+    for one, (name, matrix), row in zip(ax, blocks.items(), rows, strict=True):
         image = one.imshow(normalised(matrix), cmap="RdBu_r", vmin=-1, vmax=1)
         count_cells(one, matrix.shape)
-        dress(one, name, "degree of freedom", "degree of freedom" if one is ax[0] else "", grid=False, math=True)
+        dress(one, name, "degree of freedom", row, grid=False, math=True)
     colour_bar(image, list(ax), r"$a_{ij} / \sqrt{a_{ii} a_{jj}}$ [–]")
-    return ax if figure is None else figure
+    return shown
 
 
 def mode_shapes(identification: Identification, modes: Sequence[int] | None = None) -> Figure:
@@ -377,22 +348,13 @@ def stabilisation(subject: Identification | Measurement, ax: Axes | None = None)
     relative acceleration. Dashed lines are the modes of the result or, for a measurement alone, those that vector
     fitting finds. Where no FRF follows from the runs, the spectra and the modes are shown without poles, and why.
 
-    Parameters
-    ----------
-    subject : Identification or Measurement
-    ax : Axes, optional
-
-    Returns
-    -------
-    Figure or Axes
-
     See Also
     --------
     sysid.modal_analysis.stabilisation.stabilisation : The same as numbers.
     """
-    figure, ax = new_axes(ax, 6.4, 4.2)
+    shown, ax = new_axes(ax, 6.4, 4.2)
     draw_stabilisation(ax, subject)
-    return ax if figure is None else figure
+    return shown
 
 
 def cmif(subject: Identification | Measurement, ax: Axes | None = None) -> Any:
@@ -401,22 +363,13 @@ def cmif(subject: Identification | Measurement, ax: Axes | None = None) -> Any:
     Two that peak at one line are two modes there. Dashed lines as in `stabilisation`. Where no FRF follows from the
     runs, the singular values are those of the runs' own spectra, and the picture says so.
 
-    Parameters
-    ----------
-    subject : Identification or Measurement
-    ax : Axes, optional
-
-    Returns
-    -------
-    Figure or Axes
-
     See Also
     --------
     sysid.modal_analysis.stabilisation.cmif : The same as numbers.
     """
-    figure, ax = new_axes(ax, 6.4, 3.8)
+    shown, ax = new_axes(ax, 6.4, 3.8)
     draw_cmif(ax, subject)
-    return ax if figure is None else figure
+    return shown
 
 
 def overview(identification: Identification, *, title: str | None = None) -> Figure:
@@ -440,15 +393,12 @@ def overview(identification: Identification, *, title: str | None = None) -> Fig
     for column, (sensor, run) in enumerate(chosen):
         channel = response_channel(identification, test, sensor, run)
         draw(above[:, column], channel)
-        if column:
-            for ax in above[:, column]:
-                ax.set_ylabel("")
+    for ax in above[:, 1:].ravel():
+        ax.set_ylabel("")
     above[0, 0].legend(handles=key(above[0, 0]), frameon=False, fontsize="small")
     below = bottom.subplots(1, 3, width_ratios=[1.15, 1, 1.25])
-    if identification.history.swarm_curve.size:
-        convergence(identification, below[0])
-    else:
-        stabilisation(identification, below[0])
+    search = convergence if identification.history.swarm_curve.size else stabilisation
+    search(identification, below[0])
     mac(identification, below[1])
     effective_masses(identification, below[2])
     if title is None:
