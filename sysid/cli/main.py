@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from sysid.problem.problem import Problem
-
 SUCCESS, NOT_REACHED, MISTAKE, BUG, INTERRUPTED = 0, 1, 2, 70, 130
 
 _PLAIN_EVERY = 5.0  # s between lines where the display is no terminal
@@ -139,12 +137,14 @@ def _run(options: argparse.Namespace, out: _Output) -> int:
     problem = catalogue.build(recipe)
     _check_folder(folder)
     test = problem.measurement
+    # Poles of the data, which may take long, are left to the search and its progress and time limit.
+    unknowns = problem.formulate(problem.geometry.unsearched()).size
     out.write(
         f"{recipe.module}: {test.n_sensors} sensors, base moving along {' '.join(test.base_axes or ())}, "
         f"{test.freq.size} lines from {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz, "
-        f"{_count_unknowns(problem)} unknowns, seed {options.seed}\n"
+        f"{unknowns} unknowns, seed {options.seed}\n"
     )
-    with _Display(out) as display:
+    with _display(out) as display:
         result = identify(
             problem, strategy=options.strategy, rng=options.seed, max_time=options.max_time, progress=display
         )
@@ -160,11 +160,6 @@ def _run(options: argparse.Namespace, out: _Output) -> int:
         _complain(f"interrupted; the best so far is in {folder}")
         return INTERRUPTED
     return SUCCESS if result.success else NOT_REACHED
-
-
-def _count_unknowns(problem: Problem) -> int:
-    """Number of unknowns; poles, which may take long, are left to the search and its progress and time limit."""
-    return problem.formulate(problem.geometry.unsearched()).size
 
 
 def _report(options: argparse.Namespace, out: _Output) -> int:
@@ -262,23 +257,17 @@ def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
 
 
 def _seed(text: str) -> int:
-    try:
-        seed = int(text)
-    except ValueError:
-        seed = -1
-    if seed < 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a nonnegative integer")
-    return seed
+    with contextlib.suppress(ValueError):
+        if (seed := int(text)) >= 0:
+            return seed
+    raise argparse.ArgumentTypeError(f"{text!r} is not a nonnegative integer")
 
 
 def _seconds(text: str) -> float:
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = math.nan
-    if not 0 < seconds < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number of seconds")
-    return seconds
+    with contextlib.suppress(ValueError):
+        if 0 < (seconds := float(text)) < math.inf:
+            return seconds
+    raise argparse.ArgumentTypeError(f"{text!r} is not a positive number of seconds")
 
 
 # -- files --------------------------------------------------------------------------------------
@@ -287,9 +276,7 @@ def _seconds(text: str) -> float:
 def _check_folder(folder: Path) -> None:
     """Refuse a folder of results that cannot be written, before the search and without making it."""
     try:
-        place = folder
-        while not place.exists() and place != place.parent:
-            place = place.parent
+        place = next((place for place in (folder, *folder.parents) if place.exists()), folder)
         if not place.is_dir():
             raise InputError(f"folder of results {folder}: {place} is not a folder")
     except OSError as error:
@@ -307,7 +294,7 @@ def _save(result: Identification, folder: Path, out: _Output) -> None:
         out.write(f"result   {result.save(folder / FILE_NAME)}\n")
         summary = folder / "summary.json"
         with atomically(summary) as temporary:
-            temporary.write_text(_summary(result), encoding="utf-8")
+            temporary.write_text(_strict_json(result.to_dict()), encoding="utf-8")
         out.write(f"summary  {summary}\n")
         from sysid.report import report
 
@@ -319,17 +306,10 @@ def _save(result: Identification, folder: Path, out: _Output) -> None:
         raise
 
 
-def _summary(result: Identification) -> str:
-    """``summary.json``: strict JSON, null for what is not a number."""
-    return json.dumps(_finite(result.to_dict()), indent=2, allow_nan=False) + "\n"
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _strict_json(value: object) -> str:
+    """JSON with null for what is not a number."""
+    finite = json.loads(json.dumps(value), parse_constant=lambda _: None)
+    return json.dumps(finite, indent=2, allow_nan=False) + "\n"
 
 
 def _write_log() -> str:
@@ -359,17 +339,16 @@ class _Output:
         self.failed: OSError | None = None
 
     def write(self, text: str) -> int:
-        if self.failed is None:
-            try:
-                self._stream.write(text.encode(self.encoding, "replace").decode(self.encoding))
-            except OSError as error:
-                self.failed = error
+        self._try(self._stream.write, text.encode(self.encoding, "replace").decode(self.encoding))
         return len(text)
 
     def flush(self) -> None:
+        self._try(self._stream.flush)
+
+    def _try(self, do: Callable[..., object], *arguments: str) -> None:
         if self.failed is None:
             try:
-                self._stream.flush()
+                do(*arguments)
             except OSError as error:
                 self.failed = error
 
@@ -395,59 +374,72 @@ def _collected_warnings() -> Iterator[list[str]]:
         yield lines
 
 
-def _console(out: _Output) -> Console:
-    """Console without markup; no control codes unless it is a terminal, whatever the environment asks."""
+def _display(out: _Output) -> _LiveTable | _Lines:
+    """Display of progress: a table that updates in a terminal, elsewhere a line at times."""
     from rich.console import Console
 
     terminal = out.isatty()
-    return Console(
-        file=cast(IO[str], out), force_terminal=terminal, force_jupyter=False, width=None if terminal else 100,
-        markup=False, emoji=False, highlight=False,
+    # No markup, and no control codes unless it is a terminal, whatever the environment asks.
+    console = Console(
+        file=cast(IO[str], out), force_terminal=terminal, force_jupyter=False, markup=False, emoji=False,
+        highlight=False,
     )  # fmt: skip
+    return _LiveTable(console) if console.is_terminal and not console.is_dumb_terminal else _Lines(out)
 
 
-class _Display:
-    """Live progress: a table that updates in a terminal, elsewhere a line at times."""
+class _Lines:
+    """Progress as lines: the first and the last of each phase, and one every few seconds."""
 
     def __init__(self, out: _Output) -> None:
-        from rich.live import Live
-
         self._out = out
-        self._phases: dict[str, Progress] = {}
-        self._begun = time.perf_counter()
-        self._printed, self._pending = -math.inf, False
-        console = _console(out)
-        live = console.is_terminal and not console.is_dumb_terminal
-        self._live = Live(get_renderable=self._table, console=console, refresh_per_second=8) if live else None
+        self._phase = ""
+        self._printed = -math.inf
+        self._pending: Progress | None = None  # the newest, where it is not printed
 
-    def __enter__(self) -> _Display:
-        if self._live is not None:
-            self._live.start()
+    def __enter__(self) -> _Lines:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        if self._live is not None:
-            self._live.stop()
-        elif self._pending:
-            self._print(next(reversed(self._phases.values())))
+        self._print()
 
     def __call__(self, progress: Progress) -> None:
-        """Take the news."""
-        if self._live is None:
-            last = next(reversed(self._phases.values()), None)
-            changed = last is None or last.phase != progress.phase
-            if changed and last is not None and self._pending:
-                self._print(last)
-            self._pending = True
-            if changed or progress.seconds - self._printed >= _PLAIN_EVERY:
-                self._print(progress)
+        """Take the newest progress."""
+        begins = progress.phase != self._phase
+        if begins:
+            self._print()
+        self._phase, self._pending = progress.phase, progress
+        if begins or progress.seconds - self._printed >= _PLAIN_EVERY:
+            self._print()
+
+    def _print(self) -> None:
+        if self._pending is not None:
+            self._printed = self._pending.seconds
+            self._out.write(f"{self._pending}\n")
+            self._out.flush()
+        self._pending = None
+
+
+class _LiveTable:
+    """Progress as a table that updates: a row a phase."""
+
+    def __init__(self, console: Console) -> None:
+        from rich.live import Live
+
+        self._phases: dict[str, Progress] = {}
+        self._begun = time.perf_counter()
+        self._live = Live(get_renderable=self._table, console=console, refresh_per_second=8)
+
+    def __enter__(self) -> _LiveTable:
+        self._live.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._live.stop()
+
+    def __call__(self, progress: Progress) -> None:
+        """Take the newest progress."""
         self._phases.pop(progress.phase, None)  # the phase at work is the last
         self._phases[progress.phase] = progress
-
-    def _print(self, progress: Progress) -> None:
-        self._printed, self._pending = progress.seconds, False
-        self._out.write(f"{progress}\n")
-        self._out.flush()
 
     def _table(self) -> Table:
         from rich import box
@@ -457,16 +449,14 @@ class _Display:
         table.add_column("phase", min_width=12)
         for name, width in (("iteration", 10), ("objective", 10), ("time", 8)):
             table.add_column(name, justify="right", min_width=width, no_wrap=True)
+        now = time.perf_counter() - self._begun
         rows = list(self._phases.values())
-        for p in rows:
-            # The clock of the phase at work runs on between its news.
-            seconds = p.seconds if p is not rows[-1] or not self._running else time.perf_counter() - self._begun
+        seconds = [p.seconds for p in rows]
+        if rows and self._live.is_started:
+            seconds[-1] = now  # the clock of the phase at work runs on between its reports
+        for p, elapsed in zip(rows, seconds, strict=True):
             count = f"{p.iteration} / {p.of}" if p.of else f"{p.iteration}"
-            table.add_row(p.phase, count, f"{p.objective:.3e}", f"{seconds:.1f} s")
+            table.add_row(p.phase, count, f"{p.objective:.3e}", f"{elapsed:.1f} s")
         if not rows:
-            table.add_row("preparation", "", "", f"{time.perf_counter() - self._begun:.1f} s")
+            table.add_row("preparation", "", "", f"{now:.1f} s")
         return table
-
-    @property
-    def _running(self) -> bool:
-        return self._live is not None and self._live.is_started

@@ -10,7 +10,7 @@ import re
 import sys
 from pathlib import Path
 
-from sysid.errors import InputError
+from sysid.errors import InputError, refuse
 from sysid.results.storage import atomically
 
 
@@ -35,7 +35,7 @@ def write(name: str, folder: Path | None = None) -> tuple[Path, Path]:
         Where the name is no module's name, or one of the two files exists or cannot be written.
     """
     _check(name)
-    folder = Path() if folder is None else folder
+    folder = folder or Path()
     module, test = folder / f"{name}.py", folder / f"test_{name}.py"
     for path in (module, test):
         if os.path.lexists(path):
@@ -63,23 +63,26 @@ def _check(name: str) -> None:
             f"{name!r} cannot be imported: a name of letters, digits and underscores is needed that starts with no "
             f"digit{where}; such as: sysid new {near}"
         )
-    if keyword.iskeyword(name):
-        raise InputError(f"{name!r} is a word of Python itself and names no module; such as: sysid new my_{name}")
-    if name == "conftest" or _is_taken(name):
-        raise InputError(
+    refuse(
+        (
+            keyword.iskeyword(name),
+            f"{name!r} is a word of Python itself and names no module; such as: sysid new my_{name}",
+        ),
+        (
+            name == "conftest" or _is_taken(name),
             f"{name!r} is a module that Python imports from elsewhere, and {name}.py would hide it; such as: "
-            f"sysid new my_{name}"
-        )
+            f"sysid new my_{name}",
+        ),
+    )
 
 
 def _is_taken(name: str) -> bool:
     """Whether a module of this name can be imported, the current folder aside."""
-    if name in sys.stdlib_module_names:
-        return True
     here = Path.cwd()
     elsewhere = [place for place in sys.path if Path(place or ".").absolute() != here]
     spec = importlib.machinery.PathFinder.find_spec(name, elsewhere)
-    return spec is not None and spec.origin is not None  # a folder that happens to be there has none
+    found = spec is not None and spec.origin is not None  # a folder that happens to be there has none
+    return found or name in sys.stdlib_module_names
 
 
 _MODULE = '''"""NAME: three masses in a row on a shaken base, simulated.

@@ -6,6 +6,7 @@ IPOPT counts it in (`sysid.assessment.sensitivity`).
 
 from __future__ import annotations
 
+import contextlib
 import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -72,9 +73,12 @@ def _test(problem: Problem, name: str) -> Iterator[str]:
     yield f"{name}: {_records(problem.measurement)}"
     for i, term in enumerate(problem.formulation.further_tests, start=1):
         yield f"further test {i}: {_records(term.test)}"
-    known = ["the reference is known"] if problem.reference is not None else []
-    known += [f"predicted and never fitted: {counted(len(problem.validation), 'test')}"] if problem.validation else []
-    known += [f"goal {problem.goal:.3g}"] if problem.goal is not None else []
+    stated = (
+        (problem.reference is not None, "the reference is known"),
+        (problem.validation, f"predicted and never fitted: {counted(len(problem.validation), 'test')}"),
+        (problem.goal is not None, f"goal {problem.goal or 0:.3g}"),
+    )
+    known = [sentence for holds, sentence in stated if holds]
     yield "; ".join([f"degrees of freedom {problem.geometry.n}, unknowns {problem.n_variables}", *known])
     yield f"--strategy auto takes {choose('auto', problem, None)[1].removeprefix('strategy ')}"
 
@@ -149,15 +153,21 @@ def _at_guess(problem: Problem, sentences: tuple[str, ...]) -> _Point:
     free = problem.formulation.stiffness.free
     why = "as the guess has all frequencies equal" if free else "as the guess makes no structure with derivatives"
     names = ["the guess", *[f"a point of the search space, {why}"] * (_TRIED - 1)]
-    for x, where in list(zip(points_of(problem.formulation), names, strict=False))[free:]:
-        try:
-            return _judged(problem, *_feasible(problem, x, where), sentences)
-        except (InputError, np.linalg.LinAlgError):
-            continue
-    raise InputError(
-        f"neither the guess nor any of {_TRIED - 1} points of the search space makes a structure with finite "
-        "derivatives: state a guess, or tighter bounds"
-    )
+    point = _first_judged(problem, names, free)
+    if point is None:
+        raise InputError(
+            f"neither the guess nor any of {_TRIED - 1} points of the search space makes a structure with finite "
+            "derivatives: state a guess, or tighter bounds"
+        )
+    return replace(point, sentences=sentences)
+
+
+def _first_judged(problem: Problem, names: Sequence[str], start: int) -> _Point | None:
+    """The first of the named points of the search space, from `start` on, at which there are derivatives."""
+    for x, where in list(zip(points_of(problem.formulation), names, strict=False))[start:]:
+        with contextlib.suppress(InputError, np.linalg.LinAlgError):
+            return _judged(problem, *_feasible(problem, x, where))
+    return None
 
 
 def _feasible(problem: Problem, x: Array, where: str) -> tuple[Array, str]:
@@ -183,13 +193,13 @@ def _feasible(problem: Problem, x: Array, where: str) -> tuple[Array, str]:
     return x, f"{where}, where the constraints do not hold"
 
 
-def _judged(problem: Problem, x: Array, where: str, sentences: tuple[str, ...] = ()) -> _Point:
+def _judged(problem: Problem, x: Array, where: str) -> _Point:
     with np.errstate(all="ignore"):  # what is not finite is passed over
         slopes = slopes_of(problem.formulation.matrices, x, problem.measurement)
         known = sensitivity(problem.formulation, x, slopes, as_stated=True)
     if not np.all(np.isfinite(known.singular_values)):
         raise np.linalg.LinAlgError("the Jacobian is not finite")
-    return _Point(x, slopes, known, where, sentences)
+    return _Point(x, slopes, known, where)
 
 
 def _at_reference(problem: Problem) -> _Point | None:
@@ -209,11 +219,14 @@ def _at_reference(problem: Problem) -> _Point | None:
 
 
 def _differ(a: Structure, b: Structure) -> bool:
-    for one, other in ((a.mass, b.mass), (a.stiffness, b.stiffness), (a.damping, b.damping)):
-        size = np.sqrt(np.abs(np.diag(one)))
-        if np.any(np.abs(one - other) > _SAME * (np.outer(size, size) + np.abs(one).max() * _SAME)):
-            return True
-    return False
+    pairs = ((a.mass, b.mass), (a.stiffness, b.stiffness), (a.damping, b.damping))
+    return any(np.any(np.abs(A - B) > _SAME * (_sizes(A) + np.abs(A).max() * _SAME)) for A, B in pairs)
+
+
+def _sizes(matrix: Array) -> Array:
+    """Root of the product of the two diagonal entries of each entry, (n, n)."""
+    root = np.sqrt(np.abs(np.diag(matrix))) + np.finfo(float).tiny
+    return np.outer(root, root)
 
 
 def _at_modes(problem: Problem) -> tuple[_Point | None, tuple[str, ...]]:
@@ -225,7 +238,8 @@ def _at_modes(problem: Problem) -> tuple[_Point | None, tuple[str, ...]]:
     sentences = (*found.closed_by, *found.undetermined)
     if found.x is None:
         return None, sentences
-    return _judged(problem, found.x, "what the modal strategy finds in the data", sentences), sentences
+    point = _judged(problem, found.x, "what the modal strategy finds in the data")
+    return replace(point, sentences=sentences), sentences
 
 
 # -- what the data determine --------------------------------------------------------------------
@@ -297,18 +311,22 @@ def _unseen(problem: Problem, point: _Point) -> Iterator[str]:
     words = sorted(directions_in_words(problem.variables, x, known.unit, known.unseen), key=len)
     own, base = _moved_matrices(point)
     left = len(words) - own - base
-    kinds = [f"mass, stiffness or damping change along {own}"] if own else []
-    kinds += [f"only mass and coupling of the base along {base}"] if base else []
-    kinds += [f"no matrix (the same structure, written otherwise) along {left}"] if left else []
-    yield f"  - no record sees {counted(len(words), 'direction')}; of these {', '.join(kinds)}"
+    kinds = (
+        (own, f"mass, stiffness or damping change along {own}"),
+        (base, f"only mass and coupling of the base along {base}"),
+        (left, f"no matrix (the same structure, written otherwise) along {left}"),
+    )
+    changed = ", ".join(sentence for number, sentence in kinds if number)
+    yield f"  - no record sees {counted(len(words), 'direction')}; of these {changed}"
     more = f" (the {_SHORTEST} shortest of {len(words)})" if len(words) > _SHORTEST else ""
     yield f"  - unseen{more}:"
     yield from (f"      {word}" for word in words[:_SHORTEST])
-    where, rank = _generic(problem, point)
-    if rank > known.rank:
+    guessed = point.where.startswith("the guess")
+    other = _first_judged(problem, ["another point of the search space"] * _TRIED, 1) if guessed else None
+    if other is not None and other.known.rank > known.rank:
         yield (
-            f"  - this point is special, by a symmetry for instance: at {where} the records see {rank} directions; "
-            "state a guess off it"
+            "  - this point is special, by a symmetry for instance: at another point of the search space the records "
+            f"see {other.known.rank} directions; state a guess off it"
         )
 
 
@@ -321,29 +339,13 @@ def _moved_matrices(point: _Point) -> tuple[int, int]:
     def moved(slope: Array, size: Array) -> Array:
         return ((slope @ steps) / size[..., None]).reshape(-1, steps.shape[1])
 
-    def sizes(matrix: Array) -> Array:
-        root = np.sqrt(np.abs(np.diag(matrix))) + np.finfo(float).tiny
-        return np.outer(root, root)
-
-    own = np.concatenate([moved(slope, sizes(A)) for slope, A in ((s.mass, M), (s.stiffness, K), (s.damping, C))])
+    blocks = ((s.mass, M), (s.stiffness, K), (s.damping, C))
+    own = np.concatenate([moved(slope, _sizes(A)) for slope, A in blocks])
     rigid = np.sqrt(np.abs(np.diag(s.structure.rigid_body_mass)))
     push = moved(s.d_push, np.sqrt(np.diag(M))[:, None] * rigid)
     base = np.concatenate([push, moved(s.d_rigid, np.outer(rigid, rigid))])
     rank = int(np.linalg.matrix_rank(own, tol=_SAME))
     return rank, int(np.linalg.matrix_rank(np.concatenate([own, base]), tol=_SAME)) - rank
-
-
-def _generic(problem: Problem, point: _Point) -> tuple[str, int]:
-    """Rank at another point of the search space, where this one is a guess; nothing where it is not."""
-    if not point.where.startswith("the guess"):
-        return "", 0
-    for x in points_of(problem.formulation)[1:_TRIED]:
-        where = "another point of the search space"
-        try:
-            return where, _judged(problem, *_feasible(problem, x, where)).known.rank
-        except (InputError, np.linalg.LinAlgError):
-            continue
-    return "", 0
 
 
 def _seen_least(problem: Problem, point: _Point, moves: Array, noise: str) -> str:
@@ -412,4 +414,4 @@ def _table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
 def _folded(line: str) -> str:
     """Fold a long line at the width of a terminal, the rest indented."""
     indent = " " * (len(line) - len(line.lstrip()) + 4)
-    return textwrap.fill(line, _WIDTH, subsequent_indent=indent, break_on_hyphens=False) if len(line) > _WIDTH else line
+    return textwrap.fill(line, _WIDTH, subsequent_indent=indent, break_on_hyphens=False)

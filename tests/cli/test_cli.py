@@ -237,8 +237,9 @@ def test_warnings_are_told_after_the_run_a_line_each_and_not_beside_a_mistake(he
 def test_what_is_not_a_number_is_null_in_the_summary(finished):
     result = sysid.load(finished)
     history = replace(result.history, wall_time=np.nan)
-    assert json.loads(cli._summary(replace(result, history=history)), parse_constant=pytest.fail)["wall_time_s"] is None
-    assert cli._finite({"a": [np.nan, 1.0, (float("inf"), "x")], "b": None, "c": True}) == {
+    strict = lambda value: json.loads(cli._strict_json(value), parse_constant=pytest.fail)  # noqa: E731
+    assert strict(replace(result, history=history).to_dict())["wall_time_s"] is None
+    assert strict({"a": [np.nan, 1.0, (float("inf"), "x")], "b": None, "c": True}) == {
         "a": [None, 1.0, [None, "x"]], "b": None, "c": True,
     }  # fmt: skip
 
