@@ -270,6 +270,17 @@ def test_without_an_frf_the_pictures_of_the_modes_say_so(runs):
     assert ax.get_ylabel() == "singular value\n[m/s², own scale]"
 
 
+def test_the_cmif_of_more_than_six_runs_shows_six_singular_values():
+    """Two base directions, one of which never moves: there is no FRF, and eight runs have eight singular values."""
+    rng = np.random.default_rng(0)
+    base = np.zeros((8, 2, FREQ.size), complex)
+    base[:, 0] = 1.0
+    response = rng.standard_normal((8, 8, FREQ.size)) + 0j
+    test = sysid.Measurement(FREQ, base, response, rigid_body=np.eye(2)[[0] * 8])
+    expected = np.linalg.svd((response - 1.0).transpose(2, 0, 1), compute_uv=False)[:, 5]
+    np.testing.assert_allclose(lines(plot.cmif(test).axes[0])["sixth"].get_ydata(), expected)
+
+
 def test_a_band_is_the_interval_of_the_identified_magnitude(unit, runs):
     std = 0.01 * (1 + np.random.default_rng(0).random((3, 2, FREQ.size)))
     for it, expected in (
