@@ -66,11 +66,11 @@ def entries() -> tuple[Entry, ...]:
 
     Modules are read, not imported.
     """
-    found: dict[str, Entry] = {}
-    for folder in (bundled_folder(), own_folder()):
-        for path in _modules(folder):
-            found[path.stem] = Entry(path.stem, path, _is_bundled(path), _first_line(path))
-    return tuple(found[name] for name in sorted(found))
+    paths = {path.stem: path for folder in (bundled_folder(), own_folder()) for path in _modules(folder)}
+    home = bundled_folder().resolve()
+    return tuple(
+        Entry(name, path, path.resolve().parent == home, _first_line(path)) for name, path in sorted(paths.items())
+    )
 
 
 def short_name(problem: str) -> str:
@@ -96,14 +96,14 @@ def build(recipe: Recipe) -> Problem:
         Whatever is wrong with the module, its data or what it gives, a problem that cannot be searched too; an
         InputError from inside the module passes as it is, any other exception is told with its line of the module.
     """
-    if recipe.data is not None and not (recipe.data and _exists(Path(recipe.data))):
+    data = None if recipe.data is None else Path(recipe.data)
+    if recipe.data is not None and not os.path.exists(recipe.data):  # noqa: PTH110 - a path may be "", or too long
         raise InputError(f"data {recipe.data!r}: there is no such file or folder")
     before = len(declared())
     module, path = _load(recipe.module)
     function = getattr(module, "problem", None)
     if not callable(function):
         raise InputError(f"{path} has no function problem(); it needs one: {_SIGNATURE}")
-    data = None if recipe.data is None else Path(recipe.data)
     try:
         inspect.signature(function).bind(data=data, rng=recipe.rng)
     except TypeError as error:
@@ -188,8 +188,8 @@ def _telling_the_line(path: Path) -> Iterator[None]:
             raise InputError(f"{path}, line {error.lineno}: syntax error: {error.msg}") from None
         lines = [line for frame, line in traceback.walk_tb(error.__traceback__) if frame.f_code.co_filename == full]
         where = f"{path}, line {lines[-1]}" if lines else f"{path}"
-        text = f": {error}" if str(error) else ""
-        raise InputError(f"{where}: {type(error).__name__}{text}") from error
+        told = f"{type(error).__name__}: {error}".removesuffix(": ")
+        raise InputError(f"{where}: {told}") from error
 
 
 def _unknown(name: str) -> InputError:
@@ -197,13 +197,13 @@ def _unknown(name: str) -> InputError:
     if Path(f"{name}.py").is_file():
         return InputError(f"problem {name!r} is unknown, but there is a {name}.py here: sysid run {name}.py")
     close = difflib.get_close_matches(name, names, n=1)
-    hint = f"did you mean {close[0]!r}? " if close else ""
-    known = ", ".join(names) if names else "none"
+    hint = "".join(f"did you mean {near!r}? " for near in close)
+    known = ", ".join(names) or "none"
     return InputError(f"problem {name!r} is unknown: {hint}known are {known}; a path to a module does as well")
 
 
 def _is_path(name: str) -> bool:
-    return name.endswith(".py") or os.sep in name or (os.altsep is not None and os.altsep in name)
+    return name.endswith(".py") or os.sep in name or (os.altsep or os.sep) in name
 
 
 def _modules(folder: Path) -> list[Path]:
@@ -212,17 +212,6 @@ def _modules(folder: Path) -> list[Path]:
         return sorted(p for p in folder.glob("*.py") if not p.name.startswith("_"))
     except OSError:
         return []
-
-
-def _is_bundled(path: Path) -> bool:
-    return path.resolve().parent == bundled_folder().resolve()
-
-
-def _exists(path: Path) -> bool:
-    try:
-        return path.exists()
-    except OSError:
-        return False
 
 
 def _first_line(path: Path) -> str:

@@ -172,6 +172,8 @@ def _header(number: int, length: int, digest: bytes) -> bytes:
 
 
 def _write(group: Any, tree: Tree) -> None:
+    import h5py
+
     for name in sorted(tree):
         value = tree[name]
         if isinstance(value, dict):
@@ -188,17 +190,7 @@ def _write(group: Any, tree: Tree) -> None:
             text = _texts((value,))[0]
             (group.attrs if text.nbytes <= _LONGEST_ATTRIBUTE else group)[name] = text
         else:
-            group.attrs[name] = _scalar(value)
-
-
-def _scalar(value: Any) -> Any:
-    import h5py
-
-    if value is None:
-        return h5py.Empty("f8")
-    if isinstance(value, bool | np.bool_):
-        return np.bool_(value)
-    return np.int64(value) if isinstance(value, int | np.integer) else np.float64(value)
+            group.attrs[name] = h5py.Empty("f8") if value is None else np.asarray(value).item()
 
 
 def _texts(values: tuple[str, ...]) -> Any:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sysid.errors import InputError
+from sysid.errors import InputError, refuse
 from sysid.structure.structure import Array
 
 _TIME = "SampleTimeFine"
@@ -54,10 +54,10 @@ def read(path: str | Path) -> UnitRecord:
         raise InputError(f"{file} has no header line with {_TIME}: is it an Xsens DOT export?")
     columns = lines[header].split(",")
     missing = [name for name in (*_ACCELERATION, *_ROTATION) if name not in columns]
-    if missing:
-        raise InputError(f"{file} lacks the columns {', '.join(missing)}")
-    if not any(line.strip() for line in lines[header + 1 :]):
-        raise InputError(f"{file} has a header but no rows")
+    refuse(
+        (missing, f"{file} lacks the columns {', '.join(missing)}"),
+        (not any(line.strip() for line in lines[header + 1 :]), f"{file} has a header but no rows"),
+    )
     try:
         table = np.loadtxt(lines[header + 1 :], delimiter=",", ndmin=2)
     except ValueError as error:
@@ -69,8 +69,9 @@ def read(path: str | Path) -> UnitRecord:
     pick = lambda names: table[1:, [columns.index(name) for name in names]].T  # noqa: E731
     time = pick((_TIME,))[0] * 1e-6
     acceleration, rotation = pick(_ACCELERATION), np.deg2rad(pick(_ROTATION))
-    if not all(np.all(np.isfinite(values)) for values in (time, acceleration, rotation)):
+    if not np.all(np.isfinite([time, *acceleration, *rotation])):
         raise InputError(f"{file} holds NaN or infinite samples")
-    if np.any(np.diff(time) <= 0):
-        raise InputError(f"{file}: {_TIME} does not rise at row {int(np.argmax(np.diff(time) <= 0)) + 2}")
+    falls = np.diff(time) <= 0
+    if np.any(falls):
+        raise InputError(f"{file}: {_TIME} does not rise at row {int(np.argmax(falls)) + 2}")
     return UnitRecord(time, acceleration, rotation)
