@@ -125,7 +125,7 @@ def noise_level(test: Measurement, *, monitor: Monitor | None = None) -> float:
     """
     if test.response_std is not None:
         weight, scale = weights_of(test.relative, test.response_std)
-        std = np.asarray(weight) * columns(test.response_std.astype(complex)).real
+        std = weight * columns(test.response_std.astype(complex)).real
         return max(float(np.sqrt(np.mean(std**2) / 2)) / scale, _LEAST)
     poles = PolesAndResidues.of(test, monitor=monitor)
     if poles is None:

@@ -84,16 +84,18 @@ def residual(
     u_re, u_im = parts_of(test.base)
     push_re, push_im = gamma @ u_re, gamma @ u_im
     q_re, q_im = g_re * push_re - g_im * push_im, g_re * push_im + g_im * push_re
-    (weight, scale), *of_force = weights_of_test(test, weighted=weighted)
     a_re, a_im = parts_of(test.relative)
-    pieces = [weight * (phi @ q_re - a_re) / scale, weight * (phi @ q_im - a_im) / scale]
+    made = [(phi @ q_re - a_re, phi @ q_im - a_im)]
     if test.force is not None:
-        ((weight, scale),) = of_force
         f_re, f_im = parts_of(test.force)
-        pieces += [
-            weight * (gamma.T @ q_re + rigid_body_mass @ u_re - f_re) / scale,
-            weight * (gamma.T @ q_im + rigid_body_mass @ u_im - f_im) / scale,
-        ]
+        made.append(
+            tuple(gamma.T @ q + rigid_body_mass @ u - f for q, u, f in ((q_re, u_re, f_re), (q_im, u_im, f_im)))
+        )
+    pieces = [
+        ca.DM(weight / scale) * part
+        for parts, (weight, scale) in zip(made, weights_of_test(test, weighted=weighted), strict=True)
+        for part in parts
+    ]
     return ca.vertcat(*(ca.vec(ca.densify(piece)) for piece in pieces))
 
 
@@ -104,13 +106,13 @@ def weighted_error(test: Measurement, structure: Structure) -> float:
         made.append((test.force, test.predict_force(structure)))
     weights = weights_of_test(test, weighted=True)
     rows = [
-        np.linalg.norm(np.asarray(weight) * columns(predicted - record)) / scale
+        np.linalg.norm(weight * columns(predicted - record)) / scale
         for (record, predicted), (weight, scale) in zip(made, weights, strict=True)
     ]
     return float(np.linalg.norm(rows))
 
 
-def weights_of_test(test: Measurement, *, weighted: bool) -> list[tuple[ca.DM, float]]:
+def weights_of_test(test: Measurement, *, weighted: bool) -> list[tuple[Array, float]]:
     """`weights_of` the relative accelerations and, where it was measured, the base force.
 
     Where the noise of both is stated, both have the size of the accelerations, so that they weigh by their noise alone.
@@ -123,11 +125,11 @@ def weights_of_test(test: Measurement, *, weighted: bool) -> list[tuple[ca.DM, f
     return found
 
 
-def weights_of(record: ComplexArray, std: Array | None) -> tuple[ca.DM, float]:
+def weights_of(record: ComplexArray, std: Array | None) -> tuple[Array, float]:
     """Weights of a record's channels and lines as `columns` has them, and the size of the weighted record."""
     channel, line = separable(std, record.shape)
     weight = channel[:, None] * line.ravel()
-    return ca.DM(weight), float(np.linalg.norm(weight * columns(record)))
+    return weight, float(np.linalg.norm(weight * columns(record)))
 
 
 def weighed_mass(test: Measurement, omega: Array, ratios: Array) -> Array:

@@ -8,12 +8,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError
+from sysid.errors import InputError, refuse
 from sysid.models.expressions import at_point, written_in
 from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import FACTOR_FLOOR, Geometry
 from sysid.models.model import MassBlocks, Stated, StiffnessBlocks, Written
-from sysid.models.refusal import refuse
 from sysid.models.unknowns import Unknown, log_sampling
 from sysid.structure.structure import Array, Structure, finite_array
 from sysid.structure.triangular import lower_triangle, triangle_entries

@@ -15,8 +15,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError
-from sysid.models.refusal import refuse
+from sysid.errors import InputError, refuse
 from sysid.structure.structure import Array
 
 _PART = 0.05  # of its range: the least step of an unknown

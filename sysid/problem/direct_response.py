@@ -106,7 +106,7 @@ def relative_misfit(test: Measurement, motion: Motion, *, weighted: bool = False
     pieces: list[ca.MX] = []
     for (record, made), (weight, scale) in zip(records, weights_of_test(test, weighted=weighted), strict=True):
         real, imag = parts_of(record)
-        pieces += [weight * (made.real - real) / scale, weight * (made.imag - imag) / scale]
+        pieces += [ca.DM(weight / scale) * part for part in (made.real - real, made.imag - imag)]
     return ca.vertcat(*(ca.vec(ca.densify(piece)) for piece in pieces))
 
 

@@ -17,13 +17,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.errors import InputError
+from sysid.errors import InputError, refuse
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.complex_frequency import noise_level
 from sysid.models.expressions import as_matrix, variables_of, written_in
 from sysid.models.geometry import Geometry
 from sysid.models.model import MatrixModel, Stated, ratios_of
-from sysid.models.refusal import refuse
 from sysid.models.unknowns import Unknown, Variable, expression_of, lower_of, split, upper_of, user_site  # fmt: skip
 from sysid.problem.given import MATRICES
 from sysid.problem.matrices import Blocks, Matrices, blocks_of, symbols_in

@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError
+from sysid.errors import InputError, refuse
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.response import columns, weighed_mass
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.damping import ModalDamping
 from sysid.models.geometry import Geometry
 from sysid.models.model import MatrixModel
-from sysid.models.refusal import refuse
 from sysid.models.stiffness import SpectralStiffness
 from sysid.models.unknowns import Unknown, Variable, user_site
 from sysid.problem import stored

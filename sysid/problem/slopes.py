@@ -154,7 +154,7 @@ def rows_of_test(
     records = records_of(test, s.structure, unknowns)
     inflation = 1.0 if as_stated else inflation_of(test, records, unknowns)
     for record, change, (weight, scale) in zip(records, parts, weights_of_test(test, weighted=True), strict=True):
-        weights = share * np.asarray(weight) / scale
+        weights = share * weight / scale
         flat = (weights[..., None] * change).reshape(-1, change.shape[-1])
         left, std = (-weights * record.misfit).ravel(), inflation * (weights * record.std).ravel() / np.sqrt(2)
         rows.append(Rows(_real(left), _real(flat), np.concatenate([std, std])))
