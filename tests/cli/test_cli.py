@@ -1,7 +1,6 @@
 """The command line: what each command shows and writes, and one line and a status for every way it can end."""
 
 import contextlib
-import io
 import json
 import os
 import re
@@ -16,9 +15,9 @@ import pytest
 
 import sysid
 from sysid.cli import main as cli
+from sysid.report import report
 
 FREQUENCIES = "truth.natural_frequencies"
-MODULE = Path(__file__).with_name("pair_problem.py").read_text()
 KEYS = {
     "problem", "strategy", "seed", "success", "message", "residual", "natural_frequencies_hz", "damping_ratios",
     "total_mass_kg", "determined", "evaluations", "wall_time_s", "version", "natural_frequencies_std_hz",
@@ -26,48 +25,10 @@ KEYS = {
 }  # fmt: skip
 
 
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    """Work in an empty folder that is the temporary one too."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "pair.py").write_text(MODULE)
-    return tmp_path
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """Run the pair once: its folder of results."""
-    folder = tmp_path_factory.mktemp("finished")
-    (folder / "pair.py").write_text(MODULE)
-    with contextlib.redirect_stdout(io.StringIO()):
-        assert cli.main(["run", str(folder / "pair.py"), "--out", str(folder / "out")]) == 0
-    return folder / "out"
-
-
-def complaint(capsys):
-    """Return the one line on standard error."""
-    error = capsys.readouterr().err
-    assert error.startswith("sysid: ")
-    assert error.count("\n") == 1
-    assert error.endswith("\n")
-    assert "Traceback" not in error
-    return error
-
-
-def files(folder):
-    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
-
-
-def process(*arguments, **options):
-    return subprocess.run(
-        [sys.executable, "-m", "sysid", *map(str, arguments)], capture_output=True, timeout=120, **options
-    )
-
-
 # -- success ------------------------------------------------------------------------------------
 
 
-def test_run_writes_three_files_under_the_name_of_the_module_and_tells_where(here, capsys):
+def test_run_writes_three_files_under_the_name_of_the_module_and_tells_where(here, capsys, files, no_pictures):
     assert cli.main(["run", "pair.py", "--seed", "3"]) == 0
     out, error = capsys.readouterr()
     assert error == ""
@@ -106,7 +67,7 @@ def test_run_writes_three_files_under_the_name_of_the_module_and_tells_where(her
     assert result.residual == summary["residual"]
 
 
-def test_the_same_seed_gives_the_same_figures_and_the_default_seed_is_zero(here):
+def test_the_same_seed_gives_the_same_figures_and_the_default_seed_is_zero(here, no_pictures):
     again = {}
     for out, seed in (("a", ["--seed", "0"]), ("b", ["--seed", "1"]), ("c", [])):
         assert cli.main(["run", "pair.py", "--strategy", "swarm", "--out", out, *seed]) == 0
@@ -117,13 +78,18 @@ def test_the_same_seed_gives_the_same_figures_and_the_default_seed_is_zero(here)
     assert again["a"]["residual"] != again["b"]["residual"]
 
 
-def test_report_is_written_again_from_the_file_or_its_folder(finished, capsys):
+def test_report_is_written_again_from_the_file_or_its_folder(finished, capsys, monkeypatch):
     target = finished / "report.html"
-    for given in (finished, finished / "result.h5"):
-        target.unlink()
-        assert cli.main(["report", str(given)]) == 0
-        assert capsys.readouterr().out == f"{target}\n"
-        assert target.stat().st_size > 1000
+    page = target.read_text()
+    assert len(page) > 1000
+    target.unlink()
+    assert cli.main(["report", str(finished)]) == 0
+    assert capsys.readouterr().out == f"{target}\n"
+    assert target.read_text() == page  # the same result, the same page
+    monkeypatch.setattr(report, "render", lambda result: f"residual {result.residual}")
+    assert cli.main(["report", str(finished / "result.h5")]) == 0
+    assert capsys.readouterr().out == f"{target}\n"
+    assert target.read_text() == f"residual {sysid.load(finished).residual}"
 
 
 def test_list_names_each_bundled_problem_on_a_line(here, capsys):
@@ -142,7 +108,8 @@ def test_version_and_help_end_with_zero(capsys):
         assert "usage: sysid" in capsys.readouterr().out
 
 
-def test_plain_output_has_no_control_codes_whatever_the_environment_asks(here):
+def test_plain_output_has_no_control_codes_whatever_the_environment_asks(here, process, without_pictures):
+    (here / "pair.py").write_text(without_pictures)
     environment = os.environ | {"FORCE_COLOR": "1", "TTY_COMPATIBLE": "1", "PYTHONIOENCODING": "ascii", "COLUMNS": "40"}
     done = process("run", "pair.py", "--strategy", "swarm", env=environment, cwd=here)
     assert done.returncode == 0
@@ -154,7 +121,7 @@ def test_plain_output_has_no_control_codes_whatever_the_environment_asks(here):
         assert re.search(rf"^{phase} +iteration +\d+ +objective +\S+ +[\d.]+ s$", text, re.M)
 
 
-def test_the_modal_strategy_tells_its_only_phase(here, capsys):
+def test_the_modal_strategy_tells_its_only_phase(here, capsys, no_pictures):
     assert cli.main(["run", "pair.py", "--strategy", "modal"]) == 0
     out = capsys.readouterr().out
     assert re.search(r"^local phase +iteration +\d+ +objective +\S+ +[\d.]+ s$", out, re.M)
@@ -163,17 +130,18 @@ def test_the_modal_strategy_tells_its_only_phase(here, capsys):
     assert "nan" not in out
 
 
-def test_what_the_module_prints_cannot_end_the_run_by_its_letters(here):
-    (here / "pair.py").write_text("print('ζ²')\n" + MODULE)
+def test_what_the_module_prints_cannot_end_the_run_by_its_letters(here, process, without_pictures):
+    (here / "pair.py").write_text("print('ζ²')\n" + without_pictures)
     done = process("run", "pair.py", env=os.environ | {"PYTHONIOENCODING": "ascii"}, cwd=here)
     assert done.returncode == 0
     assert done.stdout.startswith(b"??")
 
 
 @pytest.mark.skipif(os.name != "posix", reason="pseudo-terminals")
-def test_a_terminal_sees_a_table_that_updates(here):
+def test_a_terminal_sees_a_table_that_updates(here, without_pictures):
     import pty
 
+    (here / "pair.py").write_text(without_pictures)
     main_end, process_end = pty.openpty()
     environment = os.environ | {"TERM": "xterm", "COLUMNS": "100", "LINES": "40"}
     command = [sys.executable, "-m", "sysid", "run", "pair.py", "--strategy", "swarm"]
@@ -191,7 +159,7 @@ def test_a_terminal_sees_a_table_that_updates(here):
         assert word in text
 
 
-def test_a_closed_pipe_and_a_full_disk_behind_standard_output(here):
+def test_a_closed_pipe_and_a_full_disk_behind_standard_output(here, process):
     command = f"{sys.executable} -m sysid list | head -c 1; echo ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", command], capture_output=True, timeout=60, check=True)
     assert done.stderr == b""
@@ -219,19 +187,18 @@ def _closed_standard_output():
     os.close(writer)
 
 
-def test_warnings_are_told_after_the_run_a_line_each_and_not_beside_a_mistake(here, capsys):
-
-    warned = MODULE.replace("# a mistake goes here", "import warnings; warnings.warn('thin\\nice')")
+def test_warnings_are_told_after_the_run_a_line_each_and_not_beside_a_mistake(here, complaint, module, no_pictures):
+    warned = module.replace("# a mistake goes here", "import warnings; warnings.warn('thin\\nice')")
     (here / "pair.py").write_text(warned)
     with warnings.catch_warnings():
         warnings.simplefilter("default")
         assert cli.main(["run", "pair.py"]) == 0
-        error = complaint(capsys)
+        error = complaint()
         assert "pair.py:" in error
         assert "thin ice" in error
         (here / "pair.py").write_text(warned.replace("thin\\nice')", "thin'); freq[3] = np.nan"))
         assert cli.main(["run", "pair.py"]) == 2
-        assert "thin" not in complaint(capsys)
+        assert "thin" not in complaint()
 
 
 def test_what_is_not_a_number_is_null_in_the_summary(finished):
@@ -276,16 +243,16 @@ IN_THE_MODULE = {
 
 
 @pytest.mark.parametrize("case", IN_THE_MODULE)
-def test_a_mistake_in_the_problem_is_one_line_and_nothing_is_written(here, capsys, case):
+def test_a_mistake_in_the_problem_is_one_line_and_nothing_is_written(here, complaint, files, module, case):
     *change, message = IN_THE_MODULE[case]
     old, new = change if len(change) == 2 else ("# a mistake goes here", change[0])
-    assert old in MODULE
-    text = MODULE.replace(old, new)
+    assert old in module
+    text = module.replace(old, new)
     if new.startswith("return dict("):
         text = text.replace("rigid_body=G),\n        mass", "rigid_body=G), mass")
     (here / "pair.py").write_text(text)
     assert cli.main(["run", "pair.py"]) == 2
-    assert re.search(message, complaint(capsys).rstrip())
+    assert re.search(message, complaint().rstrip())
     assert files(here) == {"pair.py"}
 
 
@@ -312,15 +279,15 @@ ON_THE_LINE = {
 
 
 @pytest.mark.parametrize("case", ON_THE_LINE)
-def test_a_mistake_on_the_line_is_one_line_and_nothing_is_written(here, capsys, case):
+def test_a_mistake_on_the_line_is_one_line_and_nothing_is_written(here, complaint, files, case):
     arguments, message = ON_THE_LINE[case]
     assert cli.main(arguments) == 2
-    assert re.search(message, complaint(capsys))
+    assert re.search(message, complaint())
     assert files(here) == {"pair.py"}
 
 
-def test_a_mistake_in_a_process_is_one_line_too(here):
-    (here / "pair.py").write_text(MODULE.replace("# a mistake goes here", "response[0, 1, 5] = np.nan"))
+def test_a_mistake_in_a_process_is_one_line_too(here, files, process, module):
+    (here / "pair.py").write_text(module.replace("# a mistake goes here", "response[0, 1, 5] = np.nan"))
     done = process("run", "pair.py", cwd=here)
     assert done.returncode == 2
     assert done.stderr.count(b"\n") == 1
@@ -329,37 +296,37 @@ def test_a_mistake_in_a_process_is_one_line_too(here):
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")
-def test_a_folder_that_cannot_be_written_is_refused_before_the_search(here, capsys):
+def test_a_folder_that_cannot_be_written_is_refused_before_the_search(here, complaint):
     locked = here / "locked"
     locked.mkdir(mode=0o500)
     assert cli.main(["run", "pair.py", "--out", "locked/out"]) == 2
-    assert "locked cannot be written" in complaint(capsys)
+    assert "locked cannot be written" in complaint()
 
 
-def test_a_file_that_cannot_be_read_is_refused(here, capsys, monkeypatch):
+def test_a_file_that_cannot_be_read_is_refused(here, complaint, monkeypatch):
     def refuse(self):
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(Path, "read_bytes", refuse)
     assert cli.main(["run", "pair.py"]) == 2
-    assert "pair.py cannot be read: Permission denied" in complaint(capsys)
+    assert "pair.py cannot be read: Permission denied" in complaint()
 
 
-def test_a_disk_that_is_full_is_one_line_and_leaves_no_half_file(here, capsys, monkeypatch):
+def test_a_disk_that_is_full_is_one_line_and_leaves_no_half_file(here, complaint, files, monkeypatch):
     def full(self, *arguments, **options):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "mkdir", full)
     assert cli.main(["run", "pair.py"]) == 2
-    assert "No space left on device" in complaint(capsys)
+    assert "No space left on device" in complaint()
     assert files(here) == {"pair.py"}
 
 
-def test_a_summary_that_cannot_be_written_takes_no_result_away(here, capsys, monkeypatch):
+def test_a_summary_that_cannot_be_written_takes_no_result_away(here, complaint, files, monkeypatch):
     def full(self, *arguments, **options):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "write_text", full)
     assert cli.main(["run", "pair.py"]) == 2
-    assert "summary.json cannot be written: No space left on device" in complaint(capsys)
+    assert "summary.json cannot be written: No space left on device" in complaint()
     assert files(here) == {"pair.py", "results", "results/pair", "results/pair/result.h5"}

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
@@ -15,33 +14,9 @@ from sysid.cli import main as cli
 from sysid.report import report
 from sysid.search.swarm_objective import SwarmObjective
 
-MODULE = Path(__file__).with_name("pair_problem.py").read_text()
 
-
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    """Work in an empty folder that is the temporary one too."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "pair.py").write_text(MODULE)
-    return tmp_path
-
-
-def complaint(capsys):
-    """Return the one line on standard error."""
-    error = capsys.readouterr().err
-    assert error.startswith("sysid: ")
-    assert error.count("\n") == 1
-    assert error.endswith("\n")
-    assert "Traceback" not in error
-    return error
-
-
-def files(folder):
-    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
-
-
-def test_a_goal_that_is_not_reached_ends_with_one_and_writes_all(here, capsys):
-    (here / "pair.py").write_text(MODULE.replace("noise=0.0", "noise=0.05"))
+def test_a_goal_that_is_not_reached_ends_with_one_and_writes_all(here, capsys, module, no_pictures):
+    (here / "pair.py").write_text(module.replace("noise=0.0", "noise=0.05"))
     assert cli.main(["run", "pair.py"]) == 1
     out, error = capsys.readouterr()
     assert error == ""
@@ -52,23 +27,23 @@ def test_a_goal_that_is_not_reached_ends_with_one_and_writes_all(here, capsys):
     assert (here / "results/pair/report.html").exists()
 
 
-def test_a_search_without_a_candidate_ends_with_one_and_writes_nothing(here, capsys, monkeypatch):
+def test_a_search_without_a_candidate_ends_with_one_and_writes_nothing(here, complaint, files, monkeypatch):
     def identify(*arguments, **options):
         raise sysid.SolverError("no candidate\nat all")
 
     monkeypatch.setattr(cli, "identify", identify)
     assert cli.main(["run", "pair.py"]) == 1
-    assert complaint(capsys) == "sysid: no candidate at all\n"
+    assert complaint() == "sysid: no candidate at all\n"
     assert files(here) == {"pair.py"}
 
 
-def test_an_error_of_ours_is_one_line_and_its_traceback_is_in_the_log(here, capsys, monkeypatch):
+def test_an_error_of_ours_is_one_line_and_its_traceback_is_in_the_log(here, complaint, files, monkeypatch):
     def identify(*arguments, **options):
         raise RuntimeError("two\nlines")
 
     monkeypatch.setattr(cli, "identify", identify)
     assert cli.main(["run", "pair.py"]) == 70
-    error = complaint(capsys)
+    error = complaint()
     assert "RuntimeError: two lines" in error
     assert str(here / "sysid-error.log") in error
     log = (here / "sysid-error.log").read_text()
@@ -79,7 +54,7 @@ def test_an_error_of_ours_is_one_line_and_its_traceback_is_in_the_log(here, caps
 
 
 def test_the_log_goes_to_the_temporary_folder_where_the_current_one_cannot_be_written(
-    here, capsys, monkeypatch, tmp_path_factory
+    here, complaint, monkeypatch, tmp_path_factory
 ):
     def identify(*arguments, **options):
         raise RuntimeError("a bug")
@@ -89,12 +64,12 @@ def test_the_log_goes_to_the_temporary_folder_where_the_current_one_cannot_be_wr
     monkeypatch.setattr(cli, "identify", identify)
     monkeypatch.setattr("tempfile.gettempdir", lambda: str(elsewhere))
     assert cli.main(["run", "pair.py"]) == 70
-    assert str(elsewhere / "sysid-error.log") in complaint(capsys)
+    assert str(elsewhere / "sysid-error.log") in complaint()
     assert "a bug" in (elsewhere / "sysid-error.log").read_text()
     (elsewhere / "sysid-error.log").unlink()
     (elsewhere / "sysid-error.log").mkdir()
     assert cli.main(["run", "pair.py"]) == 70
-    assert "no log file could be written" in complaint(capsys)
+    assert "no log file could be written" in complaint()
 
 
 def test_a_report_that_fails_takes_no_result_away(here, capsys, monkeypatch):
@@ -107,7 +82,7 @@ def test_a_report_that_fails_takes_no_result_away(here, capsys, monkeypatch):
     assert sysid.load(here / "results/pair").success
 
 
-def test_an_interrupted_search_saves_the_best_so_far_and_ends_with_130(here, capsys, monkeypatch):
+def test_an_interrupted_search_saves_the_best_so_far_and_ends_with_130(here, complaint, monkeypatch, no_pictures):
     original = sysid.identify
 
     def identify(*arguments, **options):
@@ -119,29 +94,29 @@ def test_an_interrupted_search_saves_the_best_so_far_and_ends_with_130(here, cap
 
     monkeypatch.setattr(cli, "identify", identify)
     assert cli.main(["run", "pair.py", "--strategy", "swarm"]) == 130
-    assert "the best so far is in results/pair" in complaint(capsys)
+    assert "the best so far is in results/pair" in complaint()
     assert sysid.load(here / "results/pair").interrupted
     assert json.loads((here / "results/pair/summary.json").read_text())["success"] is False
     assert (here / "results/pair/report.html").exists()
 
 
-def test_ctrl_c_before_any_candidate_writes_nothing(here, capsys, monkeypatch):
+def test_ctrl_c_before_any_candidate_writes_nothing(here, complaint, files, monkeypatch):
     def identify(*arguments, **options):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(cli, "identify", identify)
     assert cli.main(["run", "pair.py"]) == 130
-    assert complaint(capsys) == "sysid: interrupted; nothing was saved\n"
+    assert complaint() == "sysid: interrupted; nothing was saved\n"
     assert files(here) == {"pair.py"}
 
 
-def test_ctrl_c_while_saving_says_that_files_are_missing(here, capsys, monkeypatch):
+def test_ctrl_c_while_saving_says_that_files_are_missing(here, complaint, files, monkeypatch):
     def write(*arguments, **options):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(report, "write", write)
     assert cli.main(["run", "pair.py"]) == 130
-    assert "not every file is in results/pair" in complaint(capsys)
+    assert "not every file is in results/pair" in complaint()
     assert not [name for name in files(here) if name.endswith(".tmp")]
 
 
@@ -158,9 +133,9 @@ raise SystemExit(cli.main(["run", "free.py"]))
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 @pytest.mark.parametrize("delay", [0.0, 0.1, 0.27])
-def test_the_signal_itself_saves_the_best_so_far_wherever_it_strikes(here, delay):
+def test_the_signal_itself_saves_the_best_so_far_wherever_it_strikes(here, without_pictures, delay):
     (here / "endless.py").write_text(ENDLESS)
-    (here / "free.py").write_text(MODULE.replace("goal=1e-6", "goal=1e-30"))
+    (here / "free.py").write_text(without_pictures.replace("goal=1e-6", "goal=1e-30"))
     running = interruptible("endless.py", cwd=here)
     with running:
         for line in running.stdout:
@@ -176,7 +151,7 @@ def test_the_signal_itself_saves_the_best_so_far_wherever_it_strikes(here, delay
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-def test_the_signal_before_any_candidate_writes_nothing(here):
+def test_the_signal_before_any_candidate_writes_nothing(here, files):
     (here / "pair.py").write_text("import time\nprint('here', flush=True)\ntime.sleep(60)\n")
     running = interruptible("-m", "sysid", "run", "pair.py", cwd=here)
     with running:
@@ -197,7 +172,7 @@ def interruptible(*arguments, **options):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-def test_a_second_ctrl_c_acts_at_once_and_what_it_breaks_is_no_error_of_ours(here, capsys, monkeypatch):
+def test_a_second_ctrl_c_acts_at_once_and_what_it_breaks_is_no_error_of_ours(here, complaint, files, monkeypatch):
     """As CasADi does it, the interrupt comes out as another exception."""
     original = signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -214,12 +189,12 @@ def test_a_second_ctrl_c_acts_at_once_and_what_it_breaks_is_no_error_of_ours(her
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         signal.signal(signal.SIGINT, original)
-    assert complaint(capsys) == "sysid: interrupted; nothing was saved\n"
+    assert complaint() == "sysid: interrupted; nothing was saved\n"
     assert files(here) == {"pair.py"}
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-def test_a_run_that_was_told_to_ignore_ctrl_c_ignores_it(here, monkeypatch):
+def test_a_run_that_was_told_to_ignore_ctrl_c_ignores_it(here, monkeypatch, no_pictures):
     original = sysid.identify
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
 
@@ -236,7 +211,7 @@ def test_a_run_that_was_told_to_ignore_ctrl_c_ignores_it(here, monkeypatch):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="limits of POSIX")
-def test_files_that_cannot_grow_are_one_line(here):
+def test_files_that_cannot_grow_are_one_line(here, files):
     import resource
 
     limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))  # noqa: E731

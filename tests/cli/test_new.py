@@ -18,18 +18,6 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def files(folder):
-    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
-
-
-def complaint(capsys):
-    """Return the one line on standard error."""
-    error = capsys.readouterr().err
-    assert error.startswith("sysid: ")
-    assert error.count("\n") == 1
-    return error
-
-
 def test_what_is_written_passes_its_own_test_with_warnings_as_errors(here):
     assert cli.main(["new", "my_tower"]) == 0
     command = [sys.executable, "-W", "error", "-m", "pytest", "-q", "-W", "error", "-p", "no:cacheprovider"]
@@ -38,7 +26,7 @@ def test_what_is_written_passes_its_own_test_with_warnings_as_errors(here):
     assert "5 passed" in done.stdout
 
 
-def test_what_is_written_runs_from_the_command_line_in_seconds(here, capsys):
+def test_what_is_written_runs_from_the_command_line_in_seconds(here, capsys, no_pictures):
     assert cli.main(["new", "my_tower"]) == 0
     told = capsys.readouterr().out
     for command in ("sysid show my_tower.py", "sysid run my_tower.py", "python -m pytest test_my_tower.py"):
@@ -63,25 +51,25 @@ def test_the_module_reads_like_the_bundled_ones(here):
 
 
 @pytest.mark.parametrize("there", ["chain.py", "test_chain.py"])
-def test_nothing_is_written_over_a_file_nor_beside_it(here, capsys, there):
+def test_nothing_is_written_over_a_file_nor_beside_it(here, complaint, files, there):
     (here / there).write_text("mine")
     assert cli.main(["new", "chain"]) == 2
-    assert f"{there} exists already" in complaint(capsys)
+    assert f"{there} exists already" in complaint()
     assert files(here) == {there}
     assert (here / there).read_text() == "mine"
 
 
-def test_a_link_to_nowhere_and_a_folder_are_files_that_exist(here, capsys):
+def test_a_link_to_nowhere_and_a_folder_are_files_that_exist(here, complaint, files):
     (here / "chain.py").symlink_to("nowhere")
     (here / "test_tower.py").mkdir()
     for name in ("chain", "tower"):
         assert cli.main(["new", name]) == 2
-        assert "exists already" in complaint(capsys)
+        assert "exists already" in complaint()
     assert files(here) == {"chain.py", "test_tower.py"}
 
 
 @pytest.mark.parametrize("failing", [1, 2])
-def test_both_files_or_neither(here, monkeypatch, failing):
+def test_both_files_or_neither(here, files, monkeypatch, failing):
     calls, replace = [], os.replace
 
     def fail(source, target):
@@ -113,7 +101,7 @@ NAMES = {
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_name_that_python_cannot_import_is_refused_with_one_that_it_can(here, name):
+def test_a_name_that_python_cannot_import_is_refused_with_one_that_it_can(here, files, name):
     with pytest.raises(sysid.InputError, match=NAMES[name]) as refused:
         new.write(name)
     assert files(here) == set()
@@ -121,7 +109,7 @@ def test_a_name_that_python_cannot_import_is_refused_with_one_that_it_can(here, 
     assert new.write(proposed)[0].exists()
 
 
-def test_a_name_too_long_for_the_disk_is_one_line(here, capsys):
+def test_a_name_too_long_for_the_disk_is_one_line(here, complaint, files):
     assert cli.main(["new", "x" * 300]) == 2
-    assert "cannot be written" in complaint(capsys)
+    assert "cannot be written" in complaint()
     assert files(here) == set()
