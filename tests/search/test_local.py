@@ -73,9 +73,9 @@ LEAST = {
 
 @pytest.mark.parametrize(("mass", "damping"), list(itertools.product(MASSES, DAMPINGS)))
 def test_from_random_starts_most_searches_end_at_the_truth_of_a_noise_free_test(random_case, mass, damping):
-    """A spectral stiffness, n = 4 to 6. The problem is not convex: some starts end in another minimum."""
+    """A spectral stiffness, n = 4, once 5 and 6. The problem is not convex: some starts end in another minimum."""
     residuals = []
-    for n, seed in [*itertools.product((4, 5), range(5)), (6, 0), (6, 1)]:
+    for n, seed in [*itertools.product((4,), range(10)), (5, 0), (6, 0)]:
         rng = np.random.default_rng([seed, n])
         _, problem = random_case(rng, mass, "spectral", damping, n=n)
         answer = local.solve(problem, random_start(rng, problem), max_iterations=300)
@@ -109,8 +109,8 @@ def test_a_local_minimum_of_the_residues_is_seen_and_left(random_case, mass):
 @pytest.mark.parametrize(("mass", "damping", "force"), list(itertools.product(MASSES, DAMPINGS, (False, True))))
 def test_from_near_the_truth_every_search_of_a_spectral_stiffness_ends_there(random_case, mass, damping, force):
     for seed in range(2):
-        rng = np.random.default_rng([seed, 5])
-        truth, problem = random_case(rng, mass, "spectral", damping, n=5, force=force)
+        rng = np.random.default_rng([seed, 4])
+        truth, problem = random_case(rng, mass, "spectral", damping, n=4, force=force)
         answer = local.solve(problem, near(rng, problem, truth, 0.05), max_iterations=300)
         assert sound(problem, answer) < 1e-8
         if force:
@@ -197,7 +197,7 @@ def test_a_damping_ratio_outside_its_bounds_is_said(random_case):
     rng = np.random.default_rng(0)
     truth, problem = random_case(rng, "rigid_body", n=4)
     narrow = dataclasses.replace(problem, damping=sysid.ModalDamping(0.04, 0.05))
-    answer = local.solve(narrow, near(rng, problem, truth, 0.02))
+    answer = local.solve(narrow, near(rng, problem, truth, 0.02), max_iterations=60)
     assert "damping ratio 1 (lower)" in answer.message
 
 

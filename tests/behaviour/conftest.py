@@ -1,0 +1,28 @@
+"""Results that tests of several files look at: identifying a problem takes seconds."""
+
+import runpy
+
+import pytest
+
+import sysid
+from sysid import catalogue
+
+
+@pytest.fixture(scope="session")
+def identified():
+    """Give a function that identifies a bundled problem without noise, strategy "auto" and seed 0: once for all tests.
+
+    Keywords are options of its function ``problem``.
+    """
+    known = {}
+
+    def result(name, **options):
+        key = (name, *options.items())
+        if key not in known:
+            path = str(catalogue.bundled_folder() / f"{name}.py")
+            recipe = sysid.Recipe(path, None, 0)
+            problem = runpy.run_path(path)["problem"](**options) if options else catalogue.build(recipe)
+            known[key] = sysid.identify(problem, rng=0)
+        return known[key]
+
+    return result
