@@ -119,31 +119,31 @@ def _geometry_of(G, translational=None, weighed=None):
     return Geometry(test, weighed=weighed)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def random_case():
     return _case
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def random_geometry():
     return _geometry
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def random_orthogonal():
     return _orthogonal
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def random_blocks():
     return _blocks
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def random_structure():
     return _structure
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def geometry_of():
     return _geometry_of

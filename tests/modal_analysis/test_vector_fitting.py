@@ -118,7 +118,7 @@ def test_damping_that_is_not_classical_does_not_multiply_poles(dashpot, noise):
     values = values[values.imag > 0]
     values = values[np.argsort(np.abs(values))]
     f = truth.natural_frequencies
-    test = simulate(truth, np.geomspace(0.5 * f[0], 1.3 * f[-1], 240), noise=noise, rng=0)
+    test = simulate(truth, np.geomspace(0.5 * f[0], 1.3 * f[-1], 120), noise=noise, rng=0)
     found = find_poles(test)
     assert found.omega.size == 3
     np.testing.assert_allclose(found.omega, np.abs(values), rtol=noise + 1e-10)

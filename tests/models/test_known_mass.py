@@ -74,7 +74,9 @@ def test_what_known_masses_leave_uncertain_is_what_scatters():
     truth = building(2.0)
     known = with_entries(*((i, i, m) for i, m in enumerate(MASSES)))
     draws = [
-        identify(Problem(simulate(truth, FREQ, noise=0.02, rng=seed), mass=FullMass(known=known)), strategy="modal")
+        identify(
+            Problem(simulate(truth, FREQ[::3], noise=0.02, rng=seed), mass=FullMass(known=known)), strategy="modal"
+        )
         for seed in range(60)
     ]
     u, n = draws[0].uncertainty, 3
@@ -91,7 +93,7 @@ def test_what_known_masses_leave_uncertain_is_what_scatters():
 
 def test_known_coupling_gives_uncertainties_too(random_structure):
     truth = random_structure(np.random.default_rng(3), 4, 1)
-    freq = np.geomspace(0.5 * truth.natural_frequencies[0], 1.5 * truth.natural_frequencies[-1], 400)
+    freq = np.geomspace(0.5 * truth.natural_frequencies[0], 1.5 * truth.natural_frequencies[-1], 150)
     known = np.full((4, 5), np.nan)
     known[:, 4] = truth.mass[:4, 4]
     draws = [

@@ -64,12 +64,12 @@ class Page(HTMLParser):
         return " ".join(" ".join(self.words).split())
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def truth(random_structure):
     return random_structure(np.random.default_rng(8), 3, 2, G=np.array([[1.0, 0.0], [0.6, 0.8], [0.0, 1.0]]))
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def complete(truth):
     """Unit runs with force, reference and a validation of two runs in which everything moves."""
     random = np.random.default_rng(4)
@@ -108,15 +108,10 @@ def complete(truth):
     )  # fmt: skip
 
 
-PAGES = {}  # a page takes seconds, and the same result gives the same page
-
-
-@pytest.fixture
+@pytest.fixture(scope="module")
 def page(complete):
-    """The page of `complete`."""
-    if "complete" not in PAGES:
-        PAGES["complete"] = report.render(complete)
-    return PAGES["complete"]
+    """The page of `complete`: it takes seconds."""
+    return report.render(complete)
 
 
 @pytest.fixture
@@ -268,8 +263,19 @@ def test_a_place_that_cannot_be_written_gets_one_sentence(plain, tmp_path, no_pi
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
-def test_a_report_of_a_loaded_result_is_the_same(complete, page, tmp_path):
-    assert report.render(sysid.load(complete.save(tmp_path))) == page
+def test_a_report_of_a_loaded_result_is_the_same(complete, tmp_path, monkeypatch):
+    """Curve by curve and image by image, without painting them."""
+
+    def told(figure, alt, caption="", *, label="", **_):
+        curves = [line.get_xydata().tolist() for ax in figure.axes for line in ax.get_lines()]
+        shades = [path.vertices.tolist() for ax in figure.axes for it in ax.collections for path in it.get_paths()]
+        images = [np.asarray(image.get_array()).tolist() for ax in figure.axes for image in ax.images]
+        bars = [patch.get_bbox().bounds for ax in figure.axes for patch in ax.patches if hasattr(patch, "get_bbox")]
+        return f"<p>{label} {alt} {caption} {curves} {shades} {images} {bars}</p>"
+
+    for room in (report, _report_matrices):
+        monkeypatch.setattr(room, "picture", told)
+    assert report.render(sysid.load(complete.save(tmp_path))) == report.render(complete)
 
 
 @pytest.fixture
@@ -405,8 +411,9 @@ def test_what_is_no_fit_at_all_has_its_page(complete, factor, no_pictures):
 
 
 @pytest.mark.slow
-def test_a_page_of_36_panels_stays_below_3_megabytes(random_structure, tmp_path):
-    truth = random_structure(np.random.default_rng(1), 12, 3)
+def test_a_page_of_12_panels_stays_below_1_megabyte(random_structure, tmp_path):
+    """So one of 36 panels stays below 3: what else is on the page does not grow with them."""
+    truth = random_structure(np.random.default_rng(1), 12, 1)
     problem = sysid.Problem(
         sysid.simulate(truth, np.geomspace(2, 100, 400), noise=0.02, rng=1),
         mass=sysid.FullMass(),
@@ -415,7 +422,7 @@ def test_a_page_of_36_panels_stays_below_3_megabytes(random_structure, tmp_path)
     it = sysid.Identification(
         truth, problem, problem.values(truth), "swarm", 0, True, "", sysid.History(), False, (), (), ()
     )
-    assert report.write(it, tmp_path).stat().st_size < 3e6
+    assert report.write(it, tmp_path).stat().st_size < 1e6
 
 
 @pytest.fixture
