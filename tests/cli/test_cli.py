@@ -159,7 +159,8 @@ def test_a_terminal_sees_a_table_that_updates(here, without_pictures):
         assert word in text
 
 
-def test_a_closed_pipe_and_a_full_disk_behind_standard_output(here, process):
+def test_a_closed_pipe_and_a_full_disk_behind_standard_output(here, process, without_pictures):
+    (here / "pair.py").write_text(without_pictures)
     command = f"{sys.executable} -m sysid list | head -c 1; echo ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", command], capture_output=True, timeout=60, check=True)
     assert done.stderr == b""
