@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -78,12 +78,13 @@ class NonlinearProgram:
         derivatives: dict[str, ca.Function] | None = None,
         *,
         acceptable: float = 1e2,
+        barrier: Literal["adaptive", "monotone"] = "adaptive",
     ) -> tuple[Array, str]:
         """Run IPOPT on `objective`, which is 1 where nothing is explained; the unknowns at its end, and its status.
 
         `derivatives` are functions in the place of CasADi's own, as `nlpsol` names them; `acceptable` is the tolerance
-        that five iterates in a row must meet, in units of the tolerance. Where the monitor was stopped
-        the status is "stopped", and the unknowns are the last iterate's.
+        that five iterates in a row must meet, in units of the tolerance; `barrier` is IPOPT's way to lower its barrier
+        parameter. Where the monitor was stopped the status is "stopped", and the unknowns are the last iterate's.
         """
         z = self.z
         constraints = ca.vertcat(ca.MX(0, 1), *self.constraints)
@@ -103,7 +104,7 @@ class NonlinearProgram:
                 "iteration_callback": call,
                 "ipopt": {
                     "print_level": 0, "sb": "yes", "tol": tolerance, "acceptable_tol": acceptable * tolerance,
-                    "acceptable_iter": 5, "constr_viol_tol": 1e-11, "mu_strategy": "adaptive", **limits,
+                    "acceptable_iter": 5, "constr_viol_tol": 1e-11, "mu_strategy": barrier, **limits,
                 },
                 **(derivatives or {}),
             }  # fmt: skip

@@ -50,7 +50,7 @@ def fit_in_modes(problem: Problem, x: Array, monitor: IterationMonitor, max_iter
 
     def attempt(modes: Modes) -> ModalFit:
         return fit_modes(
-            test, modes, lambda z: _spectrum(problem, start, modes, z), unit=np.sqrt(problem.totals),
+            test, modes, lambda z: spectrum_near(problem, start, modes, z), unit=np.sqrt(problem.totals),
             remainder=remainder, ties=stated_totals(problem), monitor=monitor, max_iterations=max_iterations,
         )  # fmt: skip
 
@@ -96,8 +96,8 @@ def frequencies(problem: Problem, start: Array, z: NonlinearProgram) -> tuple[ca
     return ca.DM(center) * ca.exp(z.variable("frequency", shift, -window, window)), center
 
 
-def _spectrum(problem: Problem, structure: Structure, start: Modes, z: NonlinearProgram) -> tuple[ca.MX, ca.MX]:
-    """Circular frequencies and damping ratios as expressions."""
+def spectrum_near(problem: Problem, structure: Structure, start: Modes, z: NonlinearProgram) -> tuple[ca.MX, ca.MX]:
+    """Circular frequencies and damping ratios as expressions of new unknowns: log w near what is stated, log zeta."""
     formulation = problem.formulation
     omega, _ = frequencies(problem, start.omega, z)
     damping, unknowns = formulation.models[2], formulation.of_models[2]

@@ -10,10 +10,8 @@ from sysid.structure.structure import Array
 
 def lower_triangle(entries: ca.SX | ca.MX, size: int) -> ca.SX | ca.MX:
     """Lower-triangular expression from its entries, row by row."""
-    matrix = type(entries)(ca.Sparsity.lower(size))
-    for at, (i, j) in enumerate(zip(*(index.tolist() for index in np.tril_indices(size)), strict=True)):
-        matrix[i, j] = entries[at]
-    return matrix
+    rows, columns = np.tril_indices(size)
+    return type(entries)(ca.Sparsity.lower(size), entries[np.lexsort((rows, columns)).tolist()])
 
 
 def lower_entries(matrix: ca.SX | ca.MX) -> ca.SX | ca.MX:
