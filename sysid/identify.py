@@ -20,7 +20,12 @@ from sysid.search.strategy import DoesNotApplyError, Outcome, Strategy
 from sysid.search.swarm import Swarm
 from sysid.structure.structure import Structure
 
-STRATEGIES: tuple[type[Modal] | type[Continuation] | type[Swarm], ...] = (Modal, Continuation, Swarm)
+STRATEGIES: tuple[type[Modal] | type[Continuation] | type[Swarm], ...] = (Modal, Continuation, Swarm)  # as "auto" goes
+NAMED: dict[str, Callable[[], Strategy]] = {
+    **{kind.name: kind for kind in STRATEGIES},
+    "hpso-ls": Swarm.published,
+}
+NAMES = ", ".join(map(repr, ("auto", *NAMED)))
 
 
 def identify(
@@ -41,9 +46,10 @@ def identify(
     problem : Problem
     strategy : str, Swarm, Modal or Continuation
         "modal" takes poles and residues from the data and polishes them in modal coordinates: no swarm, no
-        frequencies needed, mostly within a second or two. "swarm" is the paper's hPSO-LS. "continuation" is for
-        matrices with a form of their own: gradients from the guess and from further starts,
-        through responses whose peaks were widened. A `Modal`, `Swarm` or `Continuation` object is that with other
+        frequencies needed, mostly within a second or two. "hpso-ls" is the paper's algorithm (`Swarm.published`);
+        "swarm" has constants of ours and ends in modal coordinates where mass and stiffness are free. "continuation" is
+        for matrices with a form of their own: gradients from the guess and from further starts, through responses
+        whose peaks were widened. A `Modal`, `Swarm` or `Continuation` object is that with other
         settings. "auto" takes the first of modal, continuation and swarm that applies, and the next where that one
         turns out not to apply or finds no good fit; the result's remarks say which and why.
     rng : int, numpy Generator or None
@@ -89,16 +95,14 @@ def prepare(problem: Problem, session: Session) -> None:
 
 def choose(strategy: str | Strategy, problem: Problem, start: ArrayLike | Structure | None) -> tuple[Strategy, str]:
     """The strategy that is taken, and why it is."""
-    names = ", ".join(repr(name) for name in ("auto", *(kind.name for kind in STRATEGIES)))
     if not isinstance(strategy, str | Modal | Continuation | Swarm):
-        raise InputError(f"strategy is a {type(strategy).__name__}; give one of {names}, or one with its settings")
+        raise InputError(f"strategy is a {type(strategy).__name__}; give one of {NAMES}, or one with its settings")
     if not isinstance(strategy, str):
         return strategy, f"strategy {strategy.name!r}, as asked"
+    if strategy in NAMED:
+        return NAMED[strategy](), f"strategy {strategy!r}, as asked"
     if strategy != "auto":
-        for kind in STRATEGIES:
-            if kind.name == strategy:
-                return kind(), f"strategy {strategy!r}, as asked"
-        raise InputError(f"strategy {strategy!r} is unknown; give one of {names}")
+        raise InputError(f"strategy {strategy!r} is unknown; give one of {NAMES}")
     refusals: list[str] = []
     for kind in STRATEGIES:
         refusal = kind().refusal(problem, start)

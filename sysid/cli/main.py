@@ -25,7 +25,7 @@ from typing import IO, TYPE_CHECKING, Any, NoReturn, cast
 
 from sysid import catalogue
 from sysid.errors import InputError, SolverError
-from sysid.identify import STRATEGIES, identify
+from sysid.identify import NAMED, identify
 from sysid.results.identification import Identification, Recipe, load
 from sysid.results.version import __version__
 from sysid.search.session import Progress
@@ -243,7 +243,7 @@ def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
     )
     run.add_argument(
         "--strategy",
-        choices=("auto", *(kind.name for kind in STRATEGIES)),
+        choices=("auto", *NAMED),
         default="auto",
         metavar="S",
         help="modal: modes from the data, without a search; continuation: gradients through widened peaks, for "

@@ -112,6 +112,12 @@ def weighted_error(test: Measurement, structure: Structure) -> float:
     return float(np.linalg.norm(rows))
 
 
+def error_of_accelerations(test: Measurement, structure: Structure) -> float:
+    """`weighted_error` of the relative accelerations alone."""
+    weight, scale = weights_of(test.relative, test.response_std)
+    return float(np.linalg.norm(weight * columns(test.predict(structure) - test.relative))) / scale
+
+
 def weights_of_test(test: Measurement, *, weighted: bool) -> list[tuple[Array, float]]:
     """`weights_of` the relative accelerations and, where it was measured, the base force.
 

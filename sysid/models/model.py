@@ -101,7 +101,8 @@ class MatrixModel(Protocol):
 
     Symbols are CasADi SX in a model with unknowns, and MX (as those of `sysid.Variable` s) in one without. A damping
     whose ratios are a function of the frequency has one method more, ``ratios(geometry, y, omega)``: one ratio a mode,
-    (n,), at the circular frequencies `omega` (n,), in ascending order; None where C tells them.
+    (n,), at the circular frequencies `omega` (n,), in ascending order; None where C tells them. A stiffness that can
+    give its unknowns a spectrum has ``with_spectrum``, see `SpectralStiffness`; the swarm then refines its candidates.
     """
 
     def unknowns(self, geometry: Geometry) -> Sequence[Unknown]:

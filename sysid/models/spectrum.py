@@ -53,6 +53,15 @@ def replace_spectrum(lam: Array, targets: Array) -> Array:
     return out
 
 
+def nearest_factors(factors: Array, targets: Array) -> Array:
+    """`closed_form` of many factors (k, n, n) at once: their refined factors, with positive diagonals."""
+    lam, psi = np.linalg.eigh(factors @ factors.swapaxes(1, 2))
+    # The triangular factor by QR of a square root keeps the small eigenvalues that a Cholesky of H loses.
+    upper: Array = np.linalg.qr(np.sqrt(replace_spectrum(lam, targets))[:, :, None] * psi.swapaxes(1, 2))[1]
+    signs = np.where(np.diagonal(upper, axis1=1, axis2=2) < 0, -1.0, 1.0)
+    return (upper * signs[:, :, None]).swapaxes(1, 2)
+
+
 def closed_form(factor: Array, targets: Array) -> Refinement:
     """The matrix nearest to ``L_H L_H'`` (Frobenius) with the target spectrum: its own eigenvectors.
 
@@ -64,10 +73,7 @@ def closed_form(factor: Array, targets: Array) -> Refinement:
         Measured circular frequencies, rad/s.
     """
     targets = _check(factor, targets)
-    lam, psi = np.linalg.eigh(factor @ factor.T)
-    # The triangular factor by QR of a square root keeps the small eigenvalues that a Cholesky of H loses.
-    root = np.sqrt(replace_spectrum(lam, targets))[:, None] * psi.T
-    return _finish(np.linalg.qr(root)[1].T, targets, True, "closed form")
+    return _finish(nearest_factors(factor[None], targets)[0], targets, True, "closed form")
 
 
 def by_ipopt(factor: Array, targets: Array) -> Refinement:

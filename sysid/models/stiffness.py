@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import casadi as ca
@@ -13,6 +14,7 @@ from sysid.models.expressions import at_point, written_in
 from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import FACTOR_FLOOR, Geometry
 from sysid.models.model import MassBlocks, Stated, StiffnessBlocks, Written
+from sysid.models.spectrum import by_ipopt, nearest_factors
 from sysid.models.unknowns import Unknown, log_sampling
 from sysid.structure.structure import Array, Structure, finite_array
 from sysid.structure.triangular import lower_triangle, triangle_entries
@@ -103,6 +105,23 @@ class SpectralStiffness(FieldTree):
         half = np.linalg.solve(L, structure.stiffness[:n, :n])
         H = np.linalg.solve(L, half.T)
         return triangle_entries(np.linalg.cholesky((H + H.T) / 2))
+
+    def with_spectrum(self, rows: Array, omega: Array, *, by_solver: bool = False) -> tuple[Array, int]:
+        """Entries of L_H (k, size) with the lowest eigenvalues of H at `omega` (m,), rad/s: eq. 31, from each own L_H.
+
+        In closed form, or of each row by IPOPT; where IPOPT does not succeed the closed form stands, and how many rows
+        that are is the second answer.
+        """
+        n = (math.isqrt(8 * rows.shape[1] + 1) - 1) // 2
+        factors, lower = np.zeros((len(rows), n, n)), np.tril_indices(n)
+        factors[:, *lower] = rows
+        refined = nearest_factors(factors, omega)[:, *lower]
+        if not by_solver:
+            return refined, 0
+        solved = [by_ipopt(factor, omega) for factor in factors]
+        for row, answer in zip(refined, solved, strict=True):
+            row[:] = triangle_entries(answer.factor) if answer.success else row
+        return refined, sum(not answer.success for answer in solved)
 
     def stated(self, geometry: Geometry) -> Stated:
         """The spectrum, stated or found."""

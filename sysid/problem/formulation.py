@@ -229,8 +229,18 @@ class Formulation:
     @property
     def refinable(self) -> bool:
         """Whether the spectrum of each candidate can be replaced by the measured one."""
-        stated = self.stiffness.free and self.stiffness.spectrum is not None
-        return stated and self.by_ratios and self.test_alone and not self.healed
+        return (
+            self.stiffness.free
+            and self.with_spectrum is not None
+            and self.by_ratios
+            and self.test_alone
+            and not self.healed
+        )
+
+    @property
+    def with_spectrum(self) -> Any:
+        """What gives unknowns of the stiffness a spectrum, see `SpectralStiffness`; None where its model cannot."""
+        return getattr(self.models[1], "with_spectrum", None)
 
     # -- matrices, terms, constraints --------------------------------------------------------------
 

@@ -18,6 +18,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.measurement.noise import separable
 from sysid.modal_analysis.modal_error import ModalError
 from sysid.modal_analysis.response import weights_of_test
+from sysid.models.model import mass_blocks
 from sysid.models.spectrum import SOLVED
 from sysid.models.unknowns import lower_of, upper_of
 from sysid.nlp import EXACT, OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram
@@ -69,7 +70,7 @@ class CholeskyError:
         n, n_mass = geometry.n, formulation.parts.mass.stop
         mass, skew = ca.MX.sym("mass", n_mass), ca.MX.sym("skew", n * (n - 1) // 2)
         pole, psi_0 = ca.MX.sym("pole", 2 * n), ca.MX.sym("psi_0", n, n)
-        made = formulation.models[0].blocks(geometry, mass)
+        made = mass_blocks(formulation.models[0].blocks(geometry, mass), geometry)
         L, G = ca.tril(made.factor), ca.DM(geometry.rigid_body)
         inverse = ca.solve(L, ca.MX.eye(n))
         psi = psi_0 @ cayley(skew_symmetric(skew, n))

@@ -17,7 +17,7 @@ from sysid.problem.feasibility import latin_hypercube
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.search import local
-from sysid.search.local import LocalResult
+from sysid.search.local import Coordinates, LocalResult
 from sysid.search.session import Session, Stop
 from sysid.search.strategy import History, Outcome, as_unknowns
 from sysid.structure.structure import Array, Structure
@@ -124,13 +124,16 @@ def smooth_fit(
     return answer
 
 
-def descend(problem: Problem, x: Array, steps: list[tuple[TestTerm, ...]], session: Session) -> LocalResult:
+def descend(
+    problem: Problem, x: Array, steps: list[tuple[TestTerm, ...]], session: Session, coordinates: Coordinates = "modal"
+) -> LocalResult:
     """Fit every step, and at last the records."""
     monitor = session.reporter("local phase")
     way = smooth_fit(problem, x, steps, session, monitor)
     if way is not None and way.stopped is not None:
         return way
-    return local.solve(problem, x if way is None else way.x, max_time=session.left, monitor=monitor)
+    at = x if way is None else way.x
+    return local.solve(problem, at, max_time=session.left, monitor=monitor, coordinates=coordinates)
 
 
 class _Run:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import casadi as ca
 import numpy as np
@@ -12,10 +13,13 @@ from sysid.models.spectrum import SOLVED
 from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
+from sysid.search.cholesky_coordinates import fit_in_cholesky
 from sysid.search.matrix_coordinates import fit_in_matrices
 from sysid.search.modal_coordinates import End, fit_in_modes
 from sysid.search.scaled_unknowns import add_unknowns
 from sysid.structure.structure import Array
+
+Coordinates = Literal["modal", "cholesky", "entries"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +55,7 @@ def solve(
     max_time: float | None = None,
     monitor: Callable[[int, float], object] | None = None,
     smoothed: Sequence[TestTerm] = (),
+    coordinates: Coordinates = "modal",
 ) -> LocalResult:
     """Minimise the objective from the unknowns `x`.
 
@@ -67,13 +72,16 @@ def solve(
         and is handed back in `stopped`.
     smoothed : sequence of TestTerm, optional
         To be fitted in the place of the problem's tests, where modes are not free.
+    coordinates : {"modal", "cholesky", "entries"}
+        Where modes are free: mode shapes and participations; healed entries of L_M, the spectrum of H near the stated
+        one and log zeta, as in the paper; or the paper's plain x, the spectrum of H free, which goes nowhere from
+        most starts and serves comparison. Other problems are searched in their own unknowns, whatever is given.
     """
     watched = IterationMonitor(monitor, max_time)
-    if problem.free_modes:
-        end = fit_apart(problem, fit_in_modes(problem, x, watched, max_iterations), watched, max_iterations)
-    else:
-        end = fit_in_matrices(problem, x, watched, max_iterations, smoothed)
-    return _result(end, watched)
+    if not problem.free_modes or coordinates == "entries":
+        return _result(fit_in_matrices(problem, x, watched, max_iterations, smoothed), watched)
+    fit = fit_in_cholesky if coordinates == "cholesky" else fit_in_modes
+    return _result(fit_apart(problem, fit(problem, x, watched, max_iterations), watched, max_iterations), watched)
 
 
 def fit_apart(problem: Problem, end: End, monitor: IterationMonitor, max_iterations: int = 500) -> End:

@@ -35,12 +35,13 @@ def fit_in_matrices(
     """
     formulation, z = problem.formulation, NonlinearProgram()
     modal = needs_modes(formulation)
-    # The modes themselves stand for a free stiffness.
-    held = formulation.parts.stiffness if modal and formulation.stiffness.free else slice(0, 0)
+    # The modes themselves stand for a free stiffness; of free modes only the plain entries are asked for here.
+    apart = modal and formulation.stiffness.free and not problem.free_modes
+    held = formulation.parts.stiffness if apart else slice(0, 0)
     x = np.clip(x, formulation.lower, formulation.upper)
     unknowns = add_unknowns(z, formulation.unknowns, x, held)
     _add_constraints(problem, unknowns, z)
-    modes = _add_modes(problem, unknowns, problem.structure(x), z) if modal else None
+    modes = _add_modes(problem, unknowns, problem.structure(x), z, tied=not apart) if modal else None
     rows = ca.vertcat(*(term.rows(unknowns, modes) for term in terms_with(formulation, smoothed)))
     derivatives = None if modal else {"hess_lag": _gauss_newton(z, rows)}
     # Beside noise the objective's round-off stops the line search first: the gradient is then small, not at tolerance.
@@ -50,7 +51,7 @@ def fit_in_matrices(
     ended, shapes, omega, objective = (np.asarray(value) for value in end(best))
     ended = ended.ravel()
     if modes is not None:
-        ended = _in_order(problem, ended, shapes, omega.ravel())
+        ended = _in_order(problem, ended, shapes, omega.ravel(), tied=not apart)
     ended = np.clip(ended, formulation.lower, formulation.upper)
     return End(ended, float(objective.item()), status, z.on_bounds(best))
 
@@ -76,28 +77,28 @@ def _add_constraints(problem: Problem, unknowns: ca.MX, z: NonlinearProgram) -> 
         z.constrain(constraints.function(unknowns) / ca.DM(unit), constraints.lower / unit, constraints.upper / unit)
 
 
-def _add_modes(problem: Problem, unknowns: ca.MX, start: Structure, z: NonlinearProgram) -> ModeSymbols:
-    """Mode shapes and frequencies as new unknowns, bound to the matrices."""
+def _add_modes(problem: Problem, unknowns: ca.MX, start: Structure, z: NonlinearProgram, *, tied: bool) -> ModeSymbols:
+    """Mode shapes and frequencies as new unknowns, bound to the mass and, where they are `tied`, to the stiffness."""
     formulation = problem.formulation
     n = start.n
-    omega, center = frequencies(problem, 2 * np.pi * start.natural_frequencies, z)
+    omega, center = frequencies(problem, 2 * np.pi * start.natural_frequencies, z, near=not problem.free_modes)
     _, inverse = formulation.matrices.factors(unknowns)
     psi = z.variable("mode shape", np.linalg.cholesky(start.mass[:n, :n]).T @ start.normal_modes)
     z.constrain(lower_entries(psi.T @ psi - ca.MX.eye(n)))
-    if not formulation.stiffness.free:
+    if tied:
         scaled = psi @ ca.diag(1 / ca.DM(center))
         H = inverse @ formulation.matrices.motion(unknowns).stiffness @ inverse.T
         z.constrain(lower_entries(scaled.T @ H @ scaled - ca.diag((omega / ca.DM(center)) ** 2)))
     return ModeSymbols(inverse.T @ psi, omega)
 
 
-def _in_order(problem: Problem, x: Array, shapes: Array, omega: Array) -> Array:
-    """Unknowns with modes in ascending order, and a free stiffness that has these modes."""
+def _in_order(problem: Problem, x: Array, shapes: Array, omega: Array, *, tied: bool) -> Array:
+    """Unknowns with modes in ascending order, and a stiffness that is not `tied` to them made of these modes."""
     formulation, order = problem.formulation, np.argsort(omega)
     if formulation.damping.free:
         at = formulation.parts.damping
         x[at] = x[at][order]
-    if not formulation.stiffness.free:
+    if tied:
         return x
     M_SS, M_S0, M_00, *_ = formulation.matrices.numbers(x)
     L = np.linalg.cholesky(M_SS)

@@ -80,17 +80,22 @@ def _linear_starts(test: Measurement, ended: ModalFit, first: Modes) -> Iterator
         yield rank_one(residues, poles.omega, poles.ratios, np.linalg.norm(poles.phi, axis=0))
 
 
+def fits_worse_than_free_residues(test: Measurement, modes: Modes, error: float) -> bool:
+    """Whether a relative error of the accelerations is clearly above what free residues leave: a local minimum."""
+    return error > max(EXACT, _SUSPECT * linear_residues(test, modes.omega, modes.ratios)[1])
+
+
 def modes_of(structure: Structure) -> Modes:
     """The modes of a structure, rad/s."""
     omega = 2 * np.pi * structure.natural_frequencies
     return Modes(structure.mode_shapes, structure.participation, omega, structure.damping_ratios)
 
 
-def frequencies(problem: Problem, start: Array, z: NonlinearProgram) -> tuple[ca.MX, Array]:
-    """Circular frequencies as new unknowns, held near those that were given, and what they are relative to, rad/s."""
+def frequencies(problem: Problem, start: Array, z: NonlinearProgram, *, near: bool = True) -> tuple[ca.MX, Array]:
+    """Circular frequencies as new unknowns, and what they are relative to, rad/s; held `near` those that were given."""
     center, window = start.copy(), np.full(start.size, np.log(_OPEN_WINDOW))
     spectrum = problem.formulation.stiffness.spectrum
-    if spectrum is not None:
+    if near and spectrum is not None:
         center[: spectrum.size], window[: spectrum.size] = spectrum, np.log1p(FREQUENCY_WINDOW)
     shift = np.clip(np.log(start / center), -window, window)
     return ca.DM(center) * ca.exp(z.variable("frequency", shift, -window, window)), center

@@ -15,6 +15,30 @@ from sysid.structure.structure import Array, Structure
 
 
 @dataclass(frozen=True, eq=False)
+class Phase:
+    """Where a phase of a search ended.
+
+    Attributes
+    ----------
+    name : str
+        "start", "swarm", "refinement", "continuation" or "local phase".
+    objective : float
+    x : (n_variables,)
+        The best unknowns then; empty where the phase had none.
+    seconds : float
+        Since the start of the identification.
+    evaluations : int
+        Of the phase: candidates, or iterates of a local solver.
+    """
+
+    name: str
+    objective: float
+    x: Array
+    seconds: float
+    evaluations: int
+
+
+@dataclass(frozen=True, eq=False)
 class History:
     """What ran, phase by phase; NaN where a phase did not run.
 
@@ -35,7 +59,11 @@ class History:
     states : tuple of (str, int)
         How often the swarm was in each evolutionary state.
     evaluations : int
-        Candidates that the swarm evaluated.
+        Candidates that the swarm evaluated, over all swarms.
+    restarts : int
+        Further swarms after the first.
+    phases : tuple of Phase
+        In their order, of the swarm that gave the answer.
     wall_time : float
         s.
     log : tuple of str
@@ -51,20 +79,24 @@ class History:
     refinement_error: float = np.nan
     states: tuple[tuple[str, int], ...] = ()
     evaluations: int = 0
+    restarts: int = 0
+    phases: tuple[Phase, ...] = ()
     wall_time: float = 0.0
     log: tuple[str, ...] = ()
 
     def to_tree(self) -> dict[str, Any]:
         """Give all of it as numbers, arrays and texts; `from_tree` takes them back."""
         names, counts = tuple(name for name, _ in self.states), [count for _, count in self.states]
-        return {**vars(self), "states": names, "state_counts": np.array(counts, dtype=np.int64)}
+        phases = [vars(phase) for phase in self.phases]
+        return {**vars(self), "states": names, "state_counts": np.array(counts, dtype=np.int64), "phases": phases}
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> History:
         """Give the history of a tree that `to_tree` made."""
         given = dict(tree)
         counts = given.pop("state_counts").tolist()
-        return cls(**{**given, "states": tuple(zip(tree["states"], counts, strict=True))})
+        phases = tuple(Phase(**phase) for phase in given.pop("phases", ()))  # files made before have none
+        return cls(**{**given, "states": tuple(zip(tree["states"], counts, strict=True)), "phases": phases})
 
 
 @dataclass(frozen=True, eq=False)

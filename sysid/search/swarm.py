@@ -4,31 +4,41 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import SolverError
-from sysid.models.spectrum import Refinement, by_ipopt, closed_form
-from sysid.problem.matrices import assemble
+from sysid.modal_analysis.response import error_of_accelerations
+from sysid.models.spectrum import by_ipopt, closed_form
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.search import local
 from sysid.search.continuation import descend, smoothed_tests
+from sysid.search.local import Coordinates
+from sysid.search.modal_coordinates import fits_worse_than_free_residues, modes_of
 from sysid.search.session import Session, Stop
-from sysid.search.strategy import DoesNotApplyError, History, Outcome, as_unknowns
+from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, as_unknowns
 from sysid.search.swarm_objective import SwarmObjective
 from sysid.structure.structure import Array, Structure
+from sysid.structure.triangular import triangle, triangle_entries
 from sysid.swarm import SwarmProgress, SwarmSettings, minimize_swarm
 
 _SETTINGS = SwarmSettings(inertia_b1=0.8, inertia_b2=0.5, acceleration_lower=0.5, acceleration_sum=3.0)
+_IDLE = (
+    "mass and stiffness are free, so the modal local phase finds this answer from wherever the swarm ends, two random "
+    "candidates too: what the swarm itself found stands in the history (strategy 'hpso-ls' depends on it)"
+)
 _DOUBTFUL = 0.1  # objective above which a problem without free modes is searched again
 
 
 @dataclass(frozen=True)
 class Swarm:
-    """Strategy "swarm", the paper's hPSO-LS, with its settings.
+    """Strategy "swarm": particle swarm, eigenvalue refinement, local phase, and again while there is no fit.
+
+    `Swarm.published` gives the paper's hPSO-LS; the defaults differ from it in the constants and in the coordinates
+    of the local phase.
 
     Parameters
     ----------
@@ -39,18 +49,34 @@ class Swarm:
     stall_iterations, stall_tolerance :
         The swarm ends where its best has not improved by this fraction in so many iterations.
     refine : bool
-        Give each candidate the measured spectrum (closed form).
+        Give each candidate the measured spectrum, from its own L_H (eq. 31).
+    refine_by : {"closed form", "ipopt"}
+        The nearest matrix of that spectrum; or the paper's nonlinear programme by IPOPT with exact derivatives for each
+        candidate, 30 ms each with 6 unknown frequencies, for small problems. Either way the swarm's best is refined by
+        both at the end, and the better taken.
+    write_back : bool
+        Whether the refined L_H takes the candidate's place in the swarm, or serves its objective alone. The paper does
+        not say; alone, the swarm keeps its own motion.
     gradient_every : int
         Refine the swarm's best by a few iterations of the local phase every so many iterations; 0: never.
-    local_phase : bool
-        Whether the local phase follows. Without it no solver vouches for the result, and `success` is False.
+    local : {"modal", "cholesky", "entries"} or None
+        Coordinates of the local phase by IPOPT where mass and stiffness are free: mode shapes and participations
+        (Gauss-Newton Hessian); healed entries of L_M, the spectrum of H and log zeta (exact Hessian), the paper's; the
+        paper's plain x, for comparison. Problems with a form of their own are searched in their own unknowns. None:
+        no local phase; no solver then vouches for the result, and `success` is False.
     restarts : int
-        How many further swarms may follow where the goal is missed, or, without a goal and where modes are not free,
-        the objective is above 0.1.
+        How many further swarms may follow where the goal is missed, or, without a goal, where the local phase ended in
+        a local minimum or, where modes are not free, the objective is above 0.1.
     settings : SwarmSettings
         Constants of the swarm itself. The paper leaves b1 and b2 of its eq. 11 to the user; with the
         usual 0.3 and 0.2 and c1 + c2 up to 4 (``SwarmSettings()``) the swarm of this problem contracts
         too early. These keep it moving: ``python -m benchmarks swarm_alone`` measures both.
+    name : str
+        As results call it.
+
+    References
+    ----------
+    Cerini, Yotov, Aglietti, Mech. Syst. Signal Process. 209 (2024) 111084.
     """
 
     max_iterations: int = 150
@@ -58,11 +84,25 @@ class Swarm:
     stall_iterations: int = 40
     stall_tolerance: float = 1e-3
     refine: bool = True
+    refine_by: Literal["closed form", "ipopt"] = "closed form"
+    write_back: bool = False
     gradient_every: int = 0
-    local_phase: bool = True
+    local: Coordinates | None = "modal"
     restarts: int = 4
     settings: SwarmSettings = _SETTINGS
-    name: ClassVar[str] = "swarm"
+    name: str = "swarm"
+
+    @classmethod
+    def published(cls, **changes: Any) -> Swarm:
+        """The paper's hPSO-LS, under the name "hpso-ls"; `changes` are fields that shall differ.
+
+        The usual constants of the sources that the paper names (b1 = 0.3, b2 = 0.2; c1 + c2 up to 4), the spectrum of
+        each candidate refined from its own L_H, and the local phase in Cholesky coordinates. What the paper leaves
+        open, or its printed text has lost, is chosen here: refinement in closed form, not written back; 150 iterations,
+        the stop rules, and up to four restarts; steps that leave the box are reflected; the state of the swarm is
+        estimated with the leader's present position (`sysid.swarm.ParticleSwarm`).
+        """
+        return cls(**{"settings": SwarmSettings(), "local": "cholesky", "name": "hpso-ls", **changes})
 
     def refusal(self, problem: Problem, start: ArrayLike | Structure | None) -> str | None:
         """Why it cannot search a problem: what healing cannot meet, or more modes than degrees of freedom."""
@@ -93,9 +133,10 @@ class Swarm:
         if refusal:
             raise DoesNotApplyError(refusal)
         best: _Search | None = None
-        evaluations, most = 0, session.max_evaluations
+        evaluations, restarts, most = 0, -1, session.max_evaluations
         for child in session.random.spawn(1 + self.restarts):
             search = _Search(problem, self, session)
+            restarts += 1
             stopped: BaseException | None = None
             try:
                 search.run(child, start, None if most is None else most - evaluations)
@@ -110,14 +151,18 @@ class Swarm:
                 raise SolverError("the search ended before it had a single candidate; give it more time")
             late = session.max_time is not None and session.seconds > session.max_time / 2
             spent = most is not None and 2 * evaluations > most
-            if stopped or late or spent or not self.local_phase or best.good_enough:
+            if stopped or late or spent or self.local is None or best.good_enough:
                 break
             session.log(f"{best.objective:.4g} is no good fit: another swarm")
         assert best is not None
         if stopped is not None:
             best.success, best.message = False, str(stopped) or "interrupted"
-        history = replace(best.history, evaluations=evaluations)
-        return Outcome(problem.structure(best.found), best.found, "swarm", best.success, best.message, history, stopped)
+        history = replace(best.history, evaluations=evaluations, restarts=restarts, phases=tuple(best.phases))
+        idle = problem.free_modes and self.local == "modal"
+        return Outcome(
+            problem.structure(best.found), best.found, self.name, best.success, best.message, history, stopped,
+            remarks=(_IDLE,) if idle else (),
+        )  # fmt: skip
 
 
 class _Search:
@@ -127,8 +172,11 @@ class _Search:
         self.problem, self.options, self.session = problem, options, session
         self.x: Array | None = None
         self.raw: Array = np.zeros(0)
+        self.unrefined = 0  # candidates that IPOPT could not refine
         self.steps: list[tuple[TestTerm, ...]] = []
         self.history = History()
+        self.phases: list[Phase] = []
+        self.trapped = False
         self.success, self.message = False, "ended before the local phase, as asked"
 
     @property
@@ -154,8 +202,7 @@ class _Search:
         """Whether another swarm is not worth its time."""
         if self.problem.goal is not None:
             return self.meets_goal is True
-        # Without a goal: modal coordinates notice their local minima themselves, others cannot.
-        return self.problem.free_modes or self.objective <= _DOUBTFUL
+        return not self.trapped if self.problem.free_modes else self.objective <= _DOUBTFUL
 
     @property
     def spectrum(self) -> Array | None:
@@ -170,8 +217,12 @@ class _Search:
         self.swarm(random, start, max_evaluations)
         if self.spectrum is not None:
             self.refine(self.spectrum)
-        if self.options.local_phase:
-            self.local()
+        if self.options.local is not None:
+            self.local(self.options.local)
+
+    def ended(self, phase: str, evaluations: int) -> None:
+        """Add a phase that ended at the best so far."""
+        self.phases.append(Phase(phase, self.objective, self.found, self.session.seconds, evaluations))
 
     def swarm(
         self, random: np.random.SeedSequence, start: ArrayLike | Structure | None, max_evaluations: int | None
@@ -189,14 +240,18 @@ class _Search:
             if np.isfinite(state.fun):
                 self.raw = objective.unknowns(state.x)
                 self.x = self.refined(self.raw)
+                if not self.phases:
+                    self.ended("start", state.nfev)
             curve.append(state.fun)
             self.history = replace(
                 self.history, start=curve[0], swarm=curve[-1], swarm_curve=np.array(curve), evaluations=state.nfev
             )
             session.report("swarm", state.nit, options.max_iterations, state.fun)
 
+        repair = None if self.spectrum is None else self.refined_rows
+        slow = options.refine_by == "ipopt" and not options.write_back and repair is not None
         result = minimize_swarm(
-            objective,
+            (lambda rows: objective(self.refined_rows(rows))) if slow else objective,
             np.column_stack([problem.lower, problem.upper]),
             rng=np.random.default_rng(random),
             n_particles=options.n_particles,
@@ -209,6 +264,7 @@ class _Search:
             callback=listen,
             improve=self._improver(objective) if options.gradient_every else None,
             improve_every=options.gradient_every,
+            repair=repair if options.write_back else None,
             x0=None if start is None else problem.formulation.to_sampling(as_unknowns(problem, start)),
             settings=options.settings,
         )
@@ -222,6 +278,9 @@ class _Search:
             self.history = replace(self.history, start=np.nan, swarm=self.objective)
         if result.n_nan:
             session.log(f"{result.n_nan} of {result.nfev} candidates were no structure (not a number)")
+        if self.unrefined:
+            session.log(f"IPOPT refined all but {self.unrefined} candidates, which took the closed form")
+        self.ended("swarm", result.nfev)
 
     def _target(self) -> float | None:
         """The objective at which the swarm may end: the goal, where objective and residual are one."""
@@ -248,16 +307,29 @@ class _Search:
 
         return improve
 
+    def refined_rows(self, rows: Array) -> Array:
+        """Rows (k, n_variables), of the swarm or of unknowns alike, with refined entries of L_H."""
+        assert self.spectrum is not None
+        part, with_spectrum = self.problem.formulation.parts.stiffness, self.problem.formulation.with_spectrum
+        refined = rows.copy()
+        refined[:, part], failed = with_spectrum(
+            rows[:, part], self.spectrum, by_solver=self.options.refine_by == "ipopt"
+        )
+        self.unrefined += failed
+        return refined
+
     def refined(self, x: Array) -> Array:
         """The unknowns of the structure that `x` was given its objective for: its spectrum replaced."""
-        return x if self.spectrum is None else self._with_factor(x, closed_form(self._factor(x), self.spectrum))
+        return x if self.spectrum is None else self.refined_rows(x[None])[0]
 
     def refine(self, spectrum: Array) -> None:
         """Refine the swarm's best from its own L_H through IPOPT, as the paper does, beside the closed form."""
         self.session.report("refinement", 0, 1, self.history.swarm)
-        factor, n = self._factor(self.raw), self.problem.geometry.n
+        part, n = self.problem.formulation.parts.stiffness, self.problem.geometry.n
+        factor = triangle(self.raw[part], n)
         chosen, solved = closed_form(factor, spectrum), by_ipopt(factor, spectrum)
-        x = self._with_factor(self.raw, solved)
+        x = self.raw.copy()
+        x[part] = triangle_entries(solved.factor)
         objective, other = self.objective, self.problem.objective(x)
         self.session.log(
             f"refinement of eigenvalues 1 to {spectrum.size} of {n}: {solved.message}, within "
@@ -266,28 +338,12 @@ class _Search:
         if solved.success and other < objective:
             self.x, chosen, objective = x, solved, other
         self.history = replace(self.history, refinement=objective, refinement_error=chosen.error)
+        self.ended("refinement", 1)
 
-    def _factor(self, x: Array) -> Array:
-        """L_H at `x`, rad/s."""
-        return np.linalg.cholesky(self.problem.formulation.matrices.numbers(x).mass_normalised)
-
-    def _with_factor(self, x: Array, refined: Refinement) -> Array:
-        """Unknowns with this L_H in the place of their own."""
-        formulation = self.problem.formulation
-        M_SS, M_S0, M_00, *_ = formulation.matrices.numbers(x)
-        root = np.linalg.cholesky(M_SS) @ refined.factor
-        structure = assemble(
-            M_SS, M_S0, M_00, root @ root.T, formulation.matrices.rigid_body, ratios=np.full(len(root), 0.01),
-            test=self.problem.measurement,
-        )  # fmt: skip
-        x = x.copy()
-        x[formulation.parts.stiffness] = formulation.models[1].values(formulation.geometry, structure)
-        return x
-
-    def local(self) -> None:
+    def local(self, coordinates: Coordinates) -> None:
         """Run the local phase; keep its answer where it is better."""
         before = self.objective
-        answer = descend(self.problem, self.found, self.steps, self.session)
+        answer = descend(self.problem, self.found, self.steps, self.session, coordinates)
         after = self.problem.objective(answer.x)
         self.session.log(f"local phase: {answer.message}, {answer.curve.size} iterates, objective {after:.4e}")
         self.success, self.message = answer.success, answer.message
@@ -298,5 +354,15 @@ class _Search:
             self.success = self.meets_goal is True
             self.message += f"; it did not improve on {before:.3g}, so its start is kept"
         self.history = replace(self.history, local=min(after, before), local_curve=answer.curve)
+        self.ended("local phase", answer.curve.size)
         if answer.stopped is not None:
             raise answer.stopped
+        # Modal coordinates notice their local minima themselves, and start again.
+        self.trapped = self.problem.free_modes and coordinates != "modal" and self._in_local_minimum()
+        if self.trapped:
+            self.success = self.meets_goal is True
+            self.message += "; that is a local minimum, as free residues at these poles fit clearly better"
+
+    def _in_local_minimum(self) -> bool:
+        test, structure = self.problem.measurement, self.problem.structure(self.found)
+        return fits_worse_than_free_residues(test, modes_of(structure), error_of_accelerations(test, structure))

@@ -64,8 +64,8 @@ class Box:
         return rows
 
     def to_unit(self, x: FloatArray) -> FloatArray:
-        """One point in the caller's units (n_dim,) as a point of the unit cube (n_free,)."""
-        unit: FloatArray = (x[self.free] - self.lower[self.free]) / self._span
+        """Points in the caller's units (..., n_dim) as points of the unit cube (..., n_free)."""
+        unit: FloatArray = (x[..., self.free] - self.lower[self.free]) / self._span
         return np.clip(unit, 0.0, 1.0)
 
     def clip(self, x: FloatArray) -> FloatArray:

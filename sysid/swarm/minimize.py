@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from sysid.errors import InputError
 
 from .adaptation import EvolutionaryState
-from .checks import RandomSource, checked_costs, whole_number
+from .checks import RandomSource, checked_costs, checked_rows, whole_number
 from .particles import ParticleSwarm
 from .settings import SwarmSettings
 from .stop import StopReason, StopRules
@@ -63,6 +63,7 @@ def minimize_swarm(
     callback: Callable[[SwarmProgress], object] | None = None,
     improve: Callable[[FloatArray], ArrayLike] | None = None,
     improve_every: int = 0,
+    repair: Callable[[FloatArray], ArrayLike] | None = None,
     x0: ArrayLike | None = None,
     settings: SwarmSettings | None = None,
 ) -> OptimizeResult:
@@ -160,7 +161,15 @@ def minimize_swarm(
                 "raise it or lower n_particles."
             )
         swarm.horizon = min(max_iterations, max_evaluations // swarm.n_particles)
-    reason, n_improved = _run(swarm, fun, rules, improve if improve_every else None, improve_every, callback)
+    if repair is None:
+        tell = lambda rows: swarm.tell(checked_costs(fun(rows), len(rows), "that fun returned"))  # noqa: E731
+    else:
+
+        def tell(rows: FloatArray) -> None:
+            repaired = swarm.box.clip(checked_rows(repair(rows), rows.shape, "that repair returned"))
+            swarm.tell(checked_costs(fun(repaired.copy()), len(rows), "that fun returned"), repaired)
+
+    reason, n_improved = _run(swarm, fun, tell, rules, improve if improve_every else None, improve_every, callback)
     found = math.isfinite(swarm.best_cost)
     reached = target is None or swarm.best_cost <= target
     return OptimizeResult(
@@ -174,6 +183,7 @@ def minimize_swarm(
 def _run(
     swarm: ParticleSwarm,
     fun: Callable[[FloatArray], ArrayLike],
+    tell: Callable[[FloatArray], None],
     rules: StopRules,
     improve: Callable[[FloatArray], ArrayLike] | None,
     improve_every: int,
@@ -188,7 +198,7 @@ def _run(
         rows = swarm.ask()
         if not rules.room_for(len(rows), swarm.nfev):
             return StopReason.MAX_EVALUATIONS, n_improved
-        swarm.tell(checked_costs(fun(rows), len(rows), "that fun returned"))
+        tell(rows)
         if improve is not None and swarm.nit % improve_every == 0 and math.isfinite(swarm.best_cost):
             seen = refined is not None and np.array_equal(refined, swarm.best_x)
             if not seen and rules.room_for(1, swarm.nfev):

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from . import adaptation
 from .adaptation import EvolutionaryState
 from .box import Box
-from .checks import RandomSource, checked_costs, random_generator, whole_number
+from .checks import RandomSource, checked_costs, checked_rows, random_generator, whole_number
 from .settings import SwarmSettings
 
 FloatArray = NDArray[np.float64]
@@ -163,13 +163,16 @@ class ParticleSwarm:
             self._asked = self.box.to_rows(unit)
         return self._asked.copy()
 
-    def tell(self, costs: ArrayLike) -> None:
+    def tell(self, costs: ArrayLike, repaired: ArrayLike | None = None) -> None:
         """Take the costs of the rows that `ask` gave.
 
         Parameters
         ----------
         costs : (n_rows,) array-like
             One real number a row, in the order of the rows.
+        repaired : (n_rows, n_dim) array-like, optional
+            The rows that these are the costs of, where they are not those of `ask`: clipped to the bounds, they become
+            the particles' positions.
 
         Raises
         ------
@@ -183,6 +186,12 @@ class ParticleSwarm:
         rows = self._asked
         values = self._finite_or_inf(checked_costs(costs, len(rows), "told"))
         self._asked = None
+        if repaired is not None:
+            rows = self.box.clip(checked_rows(repaired, rows.shape, "told"))
+            unit = self.box.to_unit(rows)
+            self._positions = unit[: self.n_particles]
+            if self._candidate is not None:
+                self._candidate = unit[-1]
         if self.nit > 0:
             self.state_counts[self.state] += 1
         self.nit += 1

@@ -141,7 +141,7 @@ def test_constraints_and_all_residuals_still_act():
 def test_healing_still_acts():
     """The sum of the masses, which a swarm of a few particles would not meet by itself."""
     it = sysid.load(STORED / "expressions.h5")
-    few = sysid.Swarm(max_iterations=2, n_particles=12, local_phase=False, restarts=0)
+    few = sysid.Swarm(max_iterations=2, n_particles=12, local=None, restarts=0)
     assert sysid.identify(it.problem, rng=0, strategy=few).values["m"].sum() == pytest.approx(5.02, rel=1e-12)
 
 

@@ -37,7 +37,7 @@ def test_the_refinement_by_ipopt_is_taken_where_its_residual_is_lower(problem):
     """The swarm's best has its cost with the closed form."""
     gains = []
     for seed in range(6):
-        quick = sysid.Swarm(max_iterations=5, n_particles=20, local_phase=False)
+        quick = sysid.Swarm(max_iterations=5, n_particles=20, local=None)
         result = sysid.identify(problem, strategy=quick, rng=seed)
         history = result.history
         assert result.residual == pytest.approx(history.refinement, rel=1e-9)
