@@ -47,7 +47,8 @@ class TestStrategy:
     @pytest.mark.parametrize("strategy", ["magic", "", "Swarm"])
     def test_unknown(self, problem, strategy):
         with pytest.raises(
-            InputError, match=f"'{strategy}' is unknown; give one of 'auto', 'modal', 'continuation', 'swarm', 'hpso-ls'$"
+            InputError,
+            match=f"'{strategy}' is unknown; give one of 'auto', 'modal', 'continuation', 'swarm', 'hpso-ls'$",
         ):
             identify(problem, strategy=strategy)
 

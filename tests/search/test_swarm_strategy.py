@@ -47,3 +47,73 @@ def test_the_refinement_by_ipopt_is_taken_where_its_residual_is_lower(problem):
         gains.append(1 - history.refinement / history.swarm)
     assert min(gains) > -1e-9
     assert max(gains) > 1e-2
+
+
+class TestPublished:
+    """Strategy "hpso-ls": the paper's algorithm by one name."""
+
+    def test_its_settings_are_those_of_the_sources_that_the_paper_names(self):
+        strategy = sysid.Swarm.published()
+        assert (strategy.settings.inertia_b1, strategy.settings.inertia_b2) == (0.3, 0.2)
+        assert strategy.settings.acceleration_sum == 4.0
+        assert (strategy.local, strategy.refine, strategy.name) == ("cholesky", True, "hpso-ls")
+        assert sysid.Swarm.published(local=None).local is None
+
+    def test_it_finds_an_exact_fit_and_tells_what_each_phase_left(self, problem):
+        result = sysid.identify(problem, strategy="hpso-ls", rng=1)
+        assert result.strategy == "hpso-ls"
+        assert result.success, result.message
+        assert result.residual < 1e-6
+        phases = result.history.phases
+        assert [phase.name for phase in phases] == ["start", "swarm", "refinement", "local phase"]
+        left = [phase.objective for phase in phases]
+        assert left == sorted(left, reverse=True)
+        for phase in phases:
+            assert problem.objective(phase.x) == pytest.approx(phase.objective, rel=1e-9, abs=1e-12)
+        assert left[1] > 1e-3 > 1e-6 > left[3]  # the local phase does depend on it, and does its part
+
+    def test_written_back_the_swarm_itself_holds_candidates_of_the_spectrum(self, problem, monkeypatch):
+        from sysid.search import swarm
+
+        asked = {}
+        minimize = swarm.minimize_swarm
+
+        def spy(fun, bounds, **options):
+            asked.update(options)
+            return minimize(fun, bounds, **options)
+
+        monkeypatch.setattr(swarm, "minimize_swarm", spy)
+        few = {"max_iterations": 3, "n_particles": 12, "local": None, "write_back": True}
+        result = sysid.identify(problem, strategy=sysid.Swarm(**few), rng=0)
+        rows = np.random.default_rng(0).uniform(problem.lower, problem.upper, (4, problem.n_variables))
+        for row in asked["repair"](rows):
+            x = np.asarray(problem.formulation.from_sampling(row)).ravel()
+            f = problem.structure(x).natural_frequencies
+            np.testing.assert_allclose(f, problem.reference.natural_frequencies, rtol=1e-8)
+        np.testing.assert_allclose(
+            result.structure.natural_frequencies, problem.reference.natural_frequencies, rtol=1e-8
+        )
+
+    def test_each_candidate_may_be_refined_by_ipopt(self, problem):
+        few = {"max_iterations": 2, "n_particles": 6, "local": None, "refine_by": "ipopt"}
+        result = sysid.identify(problem, strategy=sysid.Swarm(**few), rng=0)
+        np.testing.assert_allclose(
+            result.structure.natural_frequencies, problem.reference.natural_frequencies, rtol=1e-7
+        )
+        closed = sysid.identify(problem, strategy=sysid.Swarm(**{**few, "refine_by": "closed form"}), rng=0)
+        # Another solution of eq. 31 than the nearest matrix: the same particles have other objectives.
+        assert result.history.start != pytest.approx(closed.history.start, rel=1e-6)
+
+    def test_a_local_minimum_is_no_success(self, problem, monkeypatch):
+        """A local phase that ends beside the truth, as where it stops at once, is told by free residues."""
+        from sysid.search import swarm
+
+        def stays(problem, x, steps, session, coordinates):
+            return swarm.local.LocalResult(x, True, "IPOPT: Solve_Succeeded", np.array([1.0]))
+
+        monkeypatch.setattr(swarm, "descend", stays)
+        few = sysid.Swarm.published(max_iterations=3, n_particles=12, restarts=1)
+        result = sysid.identify(problem, strategy=few, rng=0)
+        assert not result.success
+        assert "local minimum" in result.message
+        assert result.history.restarts == 1
