@@ -17,6 +17,7 @@ from sysid.problem.problem import Problem
 from sysid.report.html import Cell, beside, bullets, fold, matrix, number, page, paragraph, picture, table, text
 from sysid.report.matrices import CHOSEN, ONE_OF_MANY, SAME, Lines, half_widths, matrices, stated
 from sysid.results.identification import Identification
+from sysid.results.phases import COLUMNS, rows_of_phases
 from sysid.results.storage import atomically, file_or_folder
 from sysid.results.summary import (
     counted,
@@ -321,15 +322,18 @@ def _convergence(it: Identification) -> str:
     refined = "eigenvalues replaced by those given"
     if np.isfinite(history.refinement_error):
         refined += f", within {history.refinement_error:.1e} (relative, ω²)"
-    rows = [
-        ("start", history.start, "best of the first candidates, or the start given"),
-        ("swarm", history.swarm, f"{history.evaluations} candidates in {history.swarm_curve.size} iterations"),
-        ("refinement", history.refinement, refined),
-        ("local phase", history.local, f"{counted(steps, 'iteration')}, exact derivatives"),
+    ran = rows_of_phases(it)
+    swarm = f"{history.evaluations} candidates in {history.swarm_curve.size} iterations of the swarm; {refined}; "
+    told = swarm * bool(history.swarm_curve.size) + f"{counted(steps, 'local iteration')}, exact gradients"
+    parts = [
+        picture(plot.convergence(it), f"objective through {', '.join(row[0] for row in ran) or 'no search'}"),
+        table(
+            COLUMNS, ran, f"{told}. Errors are those of the reference: M_SS, K_SS and C in Frobenius norm.", words=True
+        ),
     ]
-    ran = [[phase, number(objective), words] for phase, objective, words in rows if np.isfinite(objective)]
-    parts = [picture(plot.convergence(it), f"objective through {', '.join(phase for phase, *_ in ran) or 'no search'}")]
-    parts.append(table(["after", "objective", ""], ran, words=True))
+    if history.restarts:
+        again = f"{counted(history.restarts, 'further swarm')} followed, as the first ended in no good fit"
+        parts.append(paragraph(f"{again}; {history.evaluations} candidates are those of all.", "soft"))
     parts.append(table(["state of the swarm", "iterations"], history.states))
     return "".join(parts)
 

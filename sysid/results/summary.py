@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from sysid.assessment.sensitivity import blocks_of
 from sysid.results.answer import Answer
+from sysid.results.phases import COLUMNS, rows_of_phases
 from sysid.results.unknowns_table import MANY, rows_of, stated_values
 from sysid.structure.structure import Array
 
@@ -28,6 +29,7 @@ def summary(it: Answer) -> str:
         *_unknowns(it),
         f"{'success' if it.success else 'no success'}: {it.message}",
         f"relative residual {residual_in_words(it)}{force}; seed {it.seed}, {it.history.wall_time:.1f} s",
+        *_phases(it),
         *it.remarks,
         "rigid-body mass " + ", ".join(_rigid_masses(it, axes)),
     ]
@@ -47,6 +49,12 @@ def summary(it: Answer) -> str:
         lines += _ranges(it)
     lines += [f"  > {sentence}" for sentence in next_steps(it)]
     return "\n".join(_folded(line) for line in lines)
+
+
+def _phases(it: Answer) -> list[str]:
+    """Table of what each phase left, where there was more than one."""
+    rows = rows_of_phases(it)
+    return _aligned([list(column) for column in zip(COLUMNS, *rows, strict=True)]) if len(rows) > 1 else []
 
 
 def residual_in_words(it: Answer) -> str:

@@ -19,7 +19,7 @@ from sysid.problem.terms import TestTerm
 from sysid.search import local
 from sysid.search.local import Coordinates, LocalResult
 from sysid.search.session import Session, Stop
-from sysid.search.strategy import History, Outcome, as_unknowns
+from sysid.search.strategy import History, Outcome, Phase, as_unknowns
 from sysid.structure.structure import Array, Structure
 
 SHIFTS = (0.5, 0.2, 0.08, 0.03, 0.01)  # of the geometric mean of the natural frequencies
@@ -146,6 +146,7 @@ class _Run:
         self.ends: list[tuple[float, LocalResult]] = []
         self.ways: list[Array] = []
         self.stopped: BaseException | None = None
+        self.begun = session.seconds
         self.wrong: InputError | None = None
 
     def outcome(self, starts: int, start: ArrayLike | Structure | None) -> Outcome:
@@ -170,9 +171,14 @@ class _Run:
         success, message = best.success, best.message
         if self.stopped is not None:
             success, message = False, str(self.stopped) or "interrupted"
+        begun = _objective_at(problem, first)
+        phases = (
+            *((Phase("start", begun, first, self.begun, 1),) if np.isfinite(begun) else ()),
+            Phase("local phase", objective, best.x, session.seconds, best.curve.size),
+        )
         return Outcome(
             structure, best.x, Continuation.name, success, message,
-            History(start=_objective_at(problem, first), local=objective, local_curve=best.curve), self.stopped,
+            History(start=begun, local=objective, local_curve=best.curve, phases=phases), self.stopped,
             alternatives=tuple(_alternatives(problem, best.x, objective, self.ends)) if success else (),
             good=self._good(objective, best),
         )  # fmt: skip

@@ -30,7 +30,7 @@ from sysid.search.modal_coordinates import FREQUENCY_WINDOW, End
 from sysid.search.modal_scaling import nearest_lumped, of_known_mass, to_stated_totals
 from sysid.search.mode_fit import Integers, ModeFit, held_to_totals
 from sysid.search.session import Session, Stop
-from sysid.search.strategy import DoesNotApplyError, History, Outcome
+from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase
 from sysid.structure.structure import Array, Structure
 
 _SCATTER = 5.0  # times the misfit of all lines together: what noise makes of the shapes' singular values
@@ -202,7 +202,9 @@ def run_modal(problem: Problem, options: Modal, session: Session) -> Outcome:
             "as many modes as sensors in the lines; leave sensors out or widen the lines"
         )
     x = answer.x if answer.x.size else None
-    history = History(local=_objective(problem, structure, x), local_curve=answer.curve)
+    left = _objective(problem, structure, x)
+    ended = Phase("local phase", left, answer.x, session.seconds, answer.curve.size)
+    history = History(local=left, local_curve=answer.curve, phases=(ended,))
     session.log(f"local phase: {answer.message}, {answer.curve.size} iterates, objective {history.local:.4e}")
     success, message, stopped = answer.success, answer.message, answer.stopped
     if stopped is not None:

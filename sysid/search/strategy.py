@@ -60,14 +60,14 @@ class History:
         How often the swarm was in each evolutionary state.
     evaluations : int
         Candidates that the swarm evaluated, over all swarms.
-    restarts : int
-        Further swarms after the first.
-    phases : tuple of Phase
-        In their order, of the swarm that gave the answer.
     wall_time : float
         s.
     log : tuple of str
         What ran, one line a step.
+    restarts : int
+        Further swarms after the first.
+    phases : tuple of Phase
+        In their order, of the swarm that gave the answer; none in results of older versions.
     """
 
     start: float = np.nan
@@ -79,10 +79,10 @@ class History:
     refinement_error: float = np.nan
     states: tuple[tuple[str, int], ...] = ()
     evaluations: int = 0
-    restarts: int = 0
-    phases: tuple[Phase, ...] = ()
     wall_time: float = 0.0
     log: tuple[str, ...] = ()
+    restarts: int = 0
+    phases: tuple[Phase, ...] = ()
 
     def to_tree(self) -> dict[str, Any]:
         """Give all of it as numbers, arrays and texts; `from_tree` takes them back."""

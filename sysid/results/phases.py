@@ -1,0 +1,66 @@
+"""What each phase of a search left, in residual and, where the truth is known, in its modes and matrices."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from sysid.problem.problem import Problem
+from sysid.search.strategy import History, Phase
+from sysid.structure.structure import Array, Structure
+
+COLUMNS = ("after", "objective", "residual", "frequencies, %", "1 - MAC", "M, %", "K, %", "C, %", "candidates", "s")
+
+
+class Searched(Protocol):
+    """A result, as far as its phases go."""
+
+    @property
+    def problem(self) -> Problem:
+        """What was identified."""
+
+    @property
+    def history(self) -> History:
+        """How."""
+
+
+def rows_of_phases(it: Searched) -> list[list[str]]:
+    """A row of `COLUMNS` for each phase of the search that gave the answer; the truth's columns "-" without one.
+
+    Frequencies: largest relative error; MAC: of the mode that is told least; M_SS, K_SS and C: relative error in
+    Frobenius norm. An iterate of a local solver counts as a candidate. Of a result that tells no unknowns only
+    objectives are known.
+    """
+    history = it.history
+    rows = [_row(it.problem, phase) for phase in history.phases if phase.x.size]
+    left = ("start", history.start), ("swarm", history.swarm), ("refinement", history.refinement)
+    plain = [(name, value) for name, value in (*left, ("local phase", history.local)) if np.isfinite(value)]
+    return rows or [[name, f"{value:.4g}", *["-"] * (len(COLUMNS) - 2)] for name, value in plain]
+
+
+def errors(found: Structure, truth: Structure) -> Array:
+    """Largest relative error of a frequency and largest 1 - MAC; relative errors of M_SS, K_SS and C: (5,)."""
+    n = truth.n
+    pairs = (
+        (found.mass[:n, :n], truth.mass[:n, :n]),
+        (found.stiffness[:n, :n], truth.stiffness[:n, :n]),
+        (found.damping, truth.damping),
+    )
+    own, other = found.mode_shapes, truth.mode_shapes
+    mac = np.einsum("ik,ik->k", own, other) ** 2 / np.einsum("ik,ik->k", own, own) / np.einsum("ik,ik->k", other, other)
+    return np.array([
+        np.max(np.abs(found.natural_frequencies / truth.natural_frequencies - 1)),
+        1 - mac.min(),
+        *(np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in pairs),
+    ])  # fmt: skip
+
+
+def _row(problem: Problem, phase: Phase) -> list[str]:
+    structure, truth = problem.structure(phase.x), problem.reference
+    known = truth is not None and truth.n == structure.n and truth.n_base == structure.n_base
+    off = errors(structure, truth) if known and truth is not None else np.full(5, np.nan)
+    of_truth = [f"{value:.2g}" if np.isfinite(value) else "-" for value in off * [100, 1, 100, 100, 100]]
+    residual = problem.measurement.residual(structure) if problem.free_modes else problem.residual(phase.x)
+    objective = [f"{value:.4g}" for value in (phase.objective, residual)]
+    return [phase.name, *objective, *of_truth, str(phase.evaluations), f"{phase.seconds:.1f}"]

@@ -1,0 +1,51 @@
+"""The table of phases: what each left, with errors of a known truth."""
+
+import numpy as np
+import pytest
+
+import sysid
+from sysid.report.report import render
+from sysid.results.phases import COLUMNS, errors, rows_of_phases
+
+
+@pytest.fixture(scope="module")
+def result(request):
+    case = request.getfixturevalue("random_case")
+    problem = case(np.random.default_rng(0), "rigid_body", n=3, d=1, force=True)[1]
+    strategy = sysid.Swarm.published(max_iterations=10, n_particles=20)
+    return sysid.identify(problem, strategy=strategy, rng=1)
+
+
+def test_errors_are_zero_of_the_truth_and_those_of_a_matrix_that_is_off(random_structure):
+    truth = random_structure(np.random.default_rng(1), n=3, d=1)
+    np.testing.assert_allclose(errors(truth, truth), 0, atol=1e-14)
+    n = truth.n
+    scaled = sysid.Structure(1.1 * truth.mass, 1.1 * truth.stiffness, truth.damping_ratios, n_base=1)
+    off = errors(scaled, truth)  # frequencies and shapes stay
+    np.testing.assert_allclose(off, [0, 0, 0.1, 0.1, 0.1], atol=1e-12)
+    stiff = sysid.Structure(truth.mass, 1.21 * truth.stiffness, truth.damping_ratios, n_base=1)
+    # sqrt(1.21) = 1.1 in frequency and, with the same ratios, in damping
+    np.testing.assert_allclose(errors(stiff, truth), [0.1, 0, 0, 0.21, 0.1], atol=1e-12)
+    assert n == 3
+
+
+def test_each_phase_has_its_row_with_its_residual_and_errors(result):
+    rows = rows_of_phases(result)
+    assert [row[0] for row in rows] == ["start", "swarm", "refinement", "local phase"]
+    assert all(len(row) == len(COLUMNS) for row in rows)
+    last = dict(zip(COLUMNS, rows[-1], strict=True))
+    assert float(last["residual"]) == pytest.approx(result.residual, rel=5e-3)
+    assert float(last["M, %"]) < 0.1 < 1 < float(dict(zip(COLUMNS, rows[1], strict=True))["M, %"])
+
+
+def test_summary_and_report_show_them(result):
+    assert "after  objective" in result.summary()
+    assert "1 - MAC" in result.summary()
+    assert "1 - MAC" in render(result)
+
+
+def test_phases_are_stored(result, tmp_path):
+    path = tmp_path / "r.h5"
+    result.save(path)
+    again = sysid.load(path)
+    assert rows_of_phases(again) == rows_of_phases(result)
