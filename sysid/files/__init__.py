@@ -1,1 +1,1 @@
-"""Files of the field, one module a format."""
+"""Readers of measured records, one module a format; `tree` is the container of stored results."""
