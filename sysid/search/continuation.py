@@ -37,7 +37,8 @@ class Continuation:
 
     The misfit of a lightly damped structure has minima as narrow as its peaks. So each search begins with the
     responses at complex frequencies, where the peaks are wide, and takes smaller and smaller shifts to the records
-    themselves; IPOPT with exact derivatives does each step.
+    themselves; IPOPT with exact gradients does each step (Hessian: Gauss-Newton
+    where the response is a direct solve, exact where modes are unknowns).
 
     Parameters
     ----------

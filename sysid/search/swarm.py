@@ -299,7 +299,7 @@ class _Search:
         self.session.log(f"swarm over {problem.n_variables} unknowns ({unknowns})")
 
     def _improver(self, objective: SwarmObjective) -> Callable[[Array], Array]:
-        """The exact-gradient refinement of the swarm's best, in the swarm's coordinates."""
+        """The refinement of the swarm's best by gradients, in the swarm's coordinates."""
 
         def improve(s: Array) -> Array:
             better = local.solve(self.problem, self.refined(objective.unknowns(s)), max_iterations=30)

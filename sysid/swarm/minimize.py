@@ -105,6 +105,9 @@ def minimize_swarm(
         not finite is dropped. It is called once for each best point.
     improve_every : int
         Iterations between two calls of `improve`; with 0 it is never called.
+    repair : callable, optional
+        Takes the rows (k, n_dim) of an iteration to finite rows of the same shape, which are clipped to the bounds,
+        evaluated, and become the particles' positions: a correction that is written back.
     x0 : (n_dim,) array-like, optional
         A starting point inside the bounds: it takes the place of the first row of the sample.
     settings : SwarmSettings, optional
