@@ -29,7 +29,7 @@ def test_told_rows_become_the_positions_and_the_best():
 def test_told_rows_are_clipped_to_the_bounds():
     swarm = ParticleSwarm(BOUNDS, rng=0, n_particles=4)
     rows = swarm.ask()
-    swarm.tell(sphere(rows), rows + [0.0, 100.0, 0.0])
+    swarm.tell(sphere(rows), rows + np.array([0.0, 100.0, 0.0]))
     assert np.all(swarm.positions[:, 1] == 10.0)
 
 
@@ -48,7 +48,7 @@ def test_a_search_sees_and_keeps_only_repaired_rows():
 
 
 def test_elitist_learning_places_the_repaired_candidate():
-    """In the convergence state a row more is asked for; where it replaces the worst particle, it does so as repaired."""
+    """In the convergence state one row more is asked for; it replaces the worst particle as it was repaired."""
     swarm = ParticleSwarm(BOUNDS, rng=3, n_particles=8)
     for _ in range(60):
         rows = rounded(swarm.ask())
