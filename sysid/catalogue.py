@@ -12,7 +12,7 @@ import os
 import sys
 import traceback
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,7 +88,7 @@ def build(recipe: Recipe) -> Problem:
     recipe : Recipe
         ``module`` is a path to a module (it ends in .py or holds a separator), else a module in
         ``./problems``, else a bundled problem, else a dotted module that Python can import.
-        ``data`` reaches ``problem()`` as a `pathlib.Path`, or as None.
+        ``data`` reaches ``problem()`` as a `pathlib.Path`, or as None, ``parameters`` each by its name.
 
     Raises
     ------
@@ -100,16 +100,18 @@ def build(recipe: Recipe) -> Problem:
     if recipe.data is not None and not os.path.exists(recipe.data):  # noqa: PTH110 - a path may be "", or too long
         raise InputError(f"data {recipe.data!r}: there is no such file or folder")
     before = len(declared())
-    module, path = _load(recipe.module)
-    function = getattr(module, "problem", None)
-    if not callable(function):
-        raise InputError(f"{path} has no function problem(); it needs one: {_SIGNATURE}")
+    function, path = _function(recipe.module)
+    signature = inspect.signature(function)
     try:
-        inspect.signature(function).bind(data=data, rng=recipe.rng)
+        signature.bind_partial(data=data, rng=recipe.rng)
     except TypeError as error:
         raise InputError(f"{path}: problem() does not take data and rng ({error}); write {_SIGNATURE}") from None
+    try:
+        signature.bind(data=data, rng=recipe.rng, **recipe.parameters)
+    except TypeError as error:
+        raise InputError(f"{path}: problem() {error}; {_in_words(signature)}") from None
     with _telling_the_line(path):
-        problem = function(data=data, rng=recipe.rng)
+        problem = function(data=data, rng=recipe.rng, **recipe.parameters)
     if not isinstance(problem, Problem):
         raise InputError(f"{path}: problem() gives a {type(problem).__name__}, not a sysid.Problem")
     used = set(problem.formulation.variables)
@@ -119,6 +121,26 @@ def build(recipe: Recipe) -> Problem:
         raise InputError(f"{path}: variable {told} enters no matrix, residual or constraint: use it, or take it out")
     problem.check()
     return problem
+
+
+def parameters_in_words(problem: str) -> str:
+    """The keyword parameters of a problem module beside data and rng, for a message."""
+    return _in_words(inspect.signature(_function(problem)[0]))
+
+
+def _in_words(signature: inspect.Signature) -> str:
+    own = [value for name, value in signature.parameters.items() if name not in ("data", "rng")]
+    told = ", ".join(" ".join(str(value.replace(annotation=value.empty)).split()) for value in own)
+    return f"parameters of this module: {told or 'none'}"
+
+
+def _function(name: str) -> tuple[Callable[..., object], Path]:
+    """The function ``problem()`` of a module; also the path that messages call it by."""
+    module, path = _load(name)
+    function = getattr(module, "problem", None)
+    if not callable(function):
+        raise InputError(f"{path} has no function problem(); it needs one: {_SIGNATURE}")
+    return function, path
 
 
 def _load(name: str) -> tuple[ModuleType, Path]:

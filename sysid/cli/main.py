@@ -10,36 +10,27 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
-import json
 import math
 import os
 import sys
 import tempfile
-import time
 import traceback
-import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, NoReturn, cast
+from typing import IO, NoReturn, cast
 
 from sysid import catalogue
+from sysid.cli import parameters
+from sysid.cli.display import Output, collected_warnings, complain, display_on
+from sysid.cli.files import check_folder, strict_json
+from sysid.cli.status import BUG, INTERRUPTED, MISTAKE, NOT_REACHED, SUCCESS
 from sysid.errors import InputError, SolverError
 from sysid.identify import NAMED, identify
-from sysid.results.identification import Identification, Recipe, load
+from sysid.results.identification import Identification, load
 from sysid.results.version import __version__
-from sysid.search.session import Progress
 
-if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
-
-SUCCESS, NOT_REACHED, MISTAKE, BUG, INTERRUPTED = 0, 1, 2, 70, 130
-
-_PLAIN_EVERY = 5.0  # s between lines where the display is no terminal
 _LOG = "sysid-error.log"
-_PROBLEM = "a path to a module, else a module in ./problems, else a bundled problem, else a dotted module"
-_DATA = "file or folder of records, for problems that read some"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -55,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     int
         Exit status.
     """
-    out = _Output(sys.stdout)
+    out = Output(sys.stdout)
     # Whatever argparse, a problem module or CasADi prints passes through it too.
     with contextlib.redirect_stdout(cast(IO[str], out)):
         status = _run_command(argv, out)
@@ -65,41 +56,41 @@ def main(argv: Sequence[str] | None = None) -> int:
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if not isinstance(out.failed, BrokenPipeError):  # a reader that has seen enough is no mistake
-            _complain(f"standard output cannot be written: {out.failed.strerror}")
+            complain(f"standard output cannot be written: {out.failed.strerror}")
             status = status or MISTAKE
     return status
 
 
-def _run_command(argv: Sequence[str] | None, out: _Output) -> int:
+def _run_command(argv: Sequence[str] | None, out: Output) -> int:
     """Parse and run; every exception becomes one line and a status."""
     try:
         options = _parser().parse_args(argv)
-        with _collected_warnings() as remarks:
+        with collected_warnings() as remarks:
             status = int(options.command(options, out))
         for remark in remarks:
-            _complain(f"warning: {remark}")
+            complain(f"warning: {remark}")
         return status
     except SystemExit as end:  # argparse, after --help or --version
         return int(end.code or 0)
     except InputError as error:
-        _complain(error)
+        complain(error)
         return MISTAKE
     except SolverError as error:
-        _complain(error)
+        complain(error)
         return NOT_REACHED
     except KeyboardInterrupt:
-        _complain("interrupted; nothing was saved")
+        complain("interrupted; nothing was saved")
         return INTERRUPTED
     except Exception as error:
         log = _write_log()
-        _complain(f"an error of sysid itself ({type(error).__name__}: {error}); {log}")
+        complain(f"an error of sysid itself ({type(error).__name__}: {error}); {log}")
         return BUG
 
 
 # -- the commands -------------------------------------------------------------------------------
 
 
-def _list(options: argparse.Namespace, out: _Output) -> int:
+def _list(options: argparse.Namespace, out: Output) -> int:
     entries = catalogue.entries()
     width = max((len(entry.name) for entry in entries), default=0)
     for entry in entries:
@@ -110,7 +101,7 @@ def _list(options: argparse.Namespace, out: _Output) -> int:
     return SUCCESS
 
 
-def _new(options: argparse.Namespace, out: _Output) -> int:
+def _new(options: argparse.Namespace, out: Output) -> int:
     from sysid.cli import new
 
     module, test = new.write(options.name)
@@ -123,28 +114,28 @@ def _new(options: argparse.Namespace, out: _Output) -> int:
     return SUCCESS
 
 
-def _show(options: argparse.Namespace, out: _Output) -> int:
+def _show(options: argparse.Namespace, out: Output) -> int:
     from sysid.cli.show import show
 
-    recipe = Recipe(options.problem, options.data, options.seed)
-    out.write(f"{show(catalogue.build(recipe), recipe.module)}\n")
+    recipe = parameters.recipe_of(options, options.seed)
+    out.write(f"{show(catalogue.build(recipe), recipe.title)}\n")
     return SUCCESS
 
 
-def _run(options: argparse.Namespace, out: _Output) -> int:
-    recipe = Recipe(options.problem, options.data)
+def _run(options: argparse.Namespace, out: Output) -> int:
+    recipe = parameters.recipe_of(options)
     folder = Path("results") / catalogue.short_name(recipe.module) if options.out is None else Path(options.out)
     problem = catalogue.build(recipe)
-    _check_folder(folder)
+    check_folder(folder)
     test = problem.measurement
     # Poles of the data, which may take long, are left to the search and its progress and time limit.
     unknowns = problem.formulate(problem.geometry.unsearched()).size
     out.write(
-        f"{recipe.module}: {test.n_sensors} sensors, base moving along {' '.join(test.base_axes or ())}, "
+        f"{recipe.title}: {test.n_sensors} sensors, base moving along {' '.join(test.base_axes or ())}, "
         f"{test.freq.size} lines from {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz, "
         f"{unknowns} unknowns, seed {options.seed}\n"
     )
-    with _display(out) as display:
+    with display_on(out) as display:
         result = identify(
             problem, strategy=options.strategy, rng=options.seed, max_time=options.max_time, progress=display
         )
@@ -154,15 +145,15 @@ def _run(options: argparse.Namespace, out: _Output) -> int:
     try:
         _save(result, folder, out)
     except KeyboardInterrupt:
-        _complain(f"interrupted while saving; not every file is in {folder}")
+        complain(f"interrupted while saving; not every file is in {folder}")
         return INTERRUPTED
     if result.interrupted:
-        _complain(f"interrupted; the best so far is in {folder}")
+        complain(f"interrupted; the best so far is in {folder}")
         return INTERRUPTED
     return SUCCESS if result.success else NOT_REACHED
 
 
-def _report(options: argparse.Namespace, out: _Output) -> int:
+def _report(options: argparse.Namespace, out: Output) -> int:
     from sysid.report import report
 
     source = Path(options.result)
@@ -211,11 +202,10 @@ def _parser() -> argparse.ArgumentParser:
         description="Tell the unknowns of a problem, their bounds and scaling, and what the data determine: rank and "
         "unseen directions of the exact Jacobian at the reference, where it is known, or at a guess.",
     )
-    show.add_argument("problem", metavar="PROBLEM", help=_PROBLEM)
+    parameters.add_arguments(show)
     show.add_argument(
-        "--seed", type=_seed, default=0, metavar="N", help="reaches problem() as rng: of simulated noise; 0 by default"
+        "--seed", type=_seed, metavar="N", help="reaches problem() as rng: of simulated noise; 0 by default"
     )
-    show.add_argument("--data", metavar="PATH", help=_DATA)
     show.set_defaults(command=_show)
 
     _add_run(command)
@@ -232,7 +222,7 @@ def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
         help="identify the structure of a problem",
         description="Identify the structure of a problem. Writes result.h5, summary.json and report.html.",
     )
-    run.add_argument("problem", metavar="PROBLEM", help=_PROBLEM)
+    parameters.add_arguments(run)
     run.add_argument(
         "--seed",
         type=_seed,
@@ -250,7 +240,6 @@ def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
         "structured models and variables of your own; swarm: the particle swarm and its refinement; auto, by default: "
         "modal where the models of the problem allow it, continuation where they have a form of their own, else swarm",
     )
-    run.add_argument("--data", metavar="PATH", help=_DATA)
     run.add_argument("--out", metavar="DIR", help="folder of the results, results/NAME by default")
     run.add_argument("--max-time", type=_seconds, metavar="S", help="end the search after about so many seconds")
     run.set_defaults(command=_run)
@@ -273,19 +262,7 @@ def _seconds(text: str) -> float:
 # -- files --------------------------------------------------------------------------------------
 
 
-def _check_folder(folder: Path) -> None:
-    """Refuse a folder of results that cannot be written, before the search and without making it."""
-    try:
-        place = next((place for place in (folder, *folder.parents) if place.exists()), folder)
-        if not place.is_dir():
-            raise InputError(f"folder of results {folder}: {place} is not a folder")
-    except OSError as error:
-        raise InputError(f"folder of results {folder}: {error.strerror or error}") from None
-    if not os.access(place, os.W_OK | os.X_OK):
-        raise InputError(f"folder of results {folder}: {place} cannot be written")
-
-
-def _save(result: Identification, folder: Path, out: _Output) -> None:
+def _save(result: Identification, folder: Path, out: Output) -> None:
     """Write the three files, each whole or not at all; a folder made for nothing is taken away again."""
     from sysid.results.storage import FILE_NAME, atomically
 
@@ -294,7 +271,7 @@ def _save(result: Identification, folder: Path, out: _Output) -> None:
         out.write(f"result   {result.save(folder / FILE_NAME)}\n")
         summary = folder / "summary.json"
         with atomically(summary) as temporary:
-            temporary.write_text(_strict_json(result.to_dict()), encoding="utf-8")
+            temporary.write_text(strict_json(result.to_dict()), encoding="utf-8")
         out.write(f"summary  {summary}\n")
         from sysid.report import report
 
@@ -306,12 +283,6 @@ def _save(result: Identification, folder: Path, out: _Output) -> None:
         raise
 
 
-def _strict_json(value: object) -> str:
-    """JSON with null for what is not a number."""
-    finite = json.loads(json.dumps(value), parse_constant=lambda _: None)
-    return json.dumps(finite, indent=2, allow_nan=False) + "\n"
-
-
 def _write_log() -> str:
     """Write the traceback of the exception at hand; what to tell about it."""
     text = f"sysid {__version__}, Python {sys.version}\n{sys.argv}\n\n{traceback.format_exc()}"
@@ -321,142 +292,3 @@ def _write_log() -> str:
             log.write_text(text, encoding="utf-8", errors="backslashreplace")
             return f"the traceback is in {log.absolute()}"
     return "no log file could be written"
-
-
-# -- what the user sees -------------------------------------------------------------------------
-
-
-class _Output:
-    """A text stream that takes any character and never raises.
-
-    A closed pipe or a full disk must not end a search whose result goes elsewhere; `failed` keeps
-    the first such error.
-    """
-
-    def __init__(self, stream: IO[str]) -> None:
-        self._stream = stream
-        self.encoding = getattr(stream, "encoding", None) or "utf-8"
-        self.failed: OSError | None = None
-
-    def write(self, text: str) -> int:
-        self._try(self._stream.write, text.encode(self.encoding, "replace").decode(self.encoding))
-        return len(text)
-
-    def flush(self) -> None:
-        self._try(self._stream.flush)
-
-    def _try(self, do: Callable[..., object], *arguments: str) -> None:
-        if self.failed is None:
-            try:
-                do(*arguments)
-            except OSError as error:
-                self.failed = error
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
-
-
-def _complain(message: object) -> None:
-    """One line on standard error, whatever the message holds."""
-    with contextlib.suppress(OSError):
-        print("sysid:", " ".join(str(message).split()), file=sys.stderr, flush=True)
-
-
-@contextlib.contextmanager
-def _collected_warnings() -> Iterator[list[str]]:
-    """Keep warnings for the end: they would tear the live display, or stand beside the one line of a mistake."""
-    lines: list[str] = []
-    with warnings.catch_warnings():
-        # An assignment, and not record=True: warnings that are errors stay so.
-        warnings.showwarning = lambda message, category, filename, lineno, file=None, line=None: lines.append(
-            f"{filename}:{lineno}: {category.__name__}: {message}"
-        )
-        yield lines
-
-
-def _display(out: _Output) -> _LiveTable | _Lines:
-    """Display of progress: a table that updates in a terminal, elsewhere a line at times."""
-    from rich.console import Console
-
-    terminal = out.isatty()
-    # No markup, and no control codes unless it is a terminal, whatever the environment asks.
-    console = Console(
-        file=cast(IO[str], out), force_terminal=terminal, force_jupyter=False, markup=False, emoji=False,
-        highlight=False,
-    )  # fmt: skip
-    return _LiveTable(console) if console.is_terminal and not console.is_dumb_terminal else _Lines(out)
-
-
-class _Lines:
-    """Progress as lines: the first and the last of each phase, and one every few seconds."""
-
-    def __init__(self, out: _Output) -> None:
-        self._out = out
-        self._phase = ""
-        self._printed = -math.inf
-        self._pending: Progress | None = None  # the newest, where it is not printed
-
-    def __enter__(self) -> _Lines:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._print()
-
-    def __call__(self, progress: Progress) -> None:
-        """Take the newest progress."""
-        begins = progress.phase != self._phase
-        if begins:
-            self._print()
-        self._phase, self._pending = progress.phase, progress
-        if begins or progress.seconds - self._printed >= _PLAIN_EVERY:
-            self._print()
-
-    def _print(self) -> None:
-        if self._pending is not None:
-            self._printed = self._pending.seconds
-            self._out.write(f"{self._pending}\n")
-            self._out.flush()
-        self._pending = None
-
-
-class _LiveTable:
-    """Progress as a table that updates: a row a phase."""
-
-    def __init__(self, console: Console) -> None:
-        from rich.live import Live
-
-        self._phases: dict[str, Progress] = {}
-        self._begun = time.perf_counter()
-        self._live = Live(get_renderable=self._table, console=console, refresh_per_second=8)
-
-    def __enter__(self) -> _LiveTable:
-        self._live.start()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._live.stop()
-
-    def __call__(self, progress: Progress) -> None:
-        """Take the newest progress."""
-        self._phases.pop(progress.phase, None)  # the phase at work is the last
-        self._phases[progress.phase] = progress
-
-    def _table(self) -> Table:
-        from rich import box
-        from rich.table import Table
-
-        table = Table(box=box.SIMPLE, pad_edge=False)
-        table.add_column("phase", min_width=12)
-        for name, width in (("iteration", 10), ("objective", 10), ("time", 8)):
-            table.add_column(name, justify="right", min_width=width, no_wrap=True)
-        now = time.perf_counter() - self._begun
-        rows = list(self._phases.values())
-        seconds = [p.seconds for p in rows]
-        if rows and self._live.is_started:
-            seconds[-1] = now  # the clock of the phase at work runs on between its reports
-        for p, elapsed in zip(rows, seconds, strict=True):
-            count = f"{p.iteration} / {p.of}" if p.of else f"{p.iteration}"
-            table.add_row(p.phase, count, f"{p.objective:.3e}", f"{elapsed:.1f} s")
-        if not rows:
-            table.add_row("preparation", "", "", f"{now:.1f} s")
-        return table

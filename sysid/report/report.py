@@ -367,7 +367,7 @@ def _what_ran(it: Identification) -> str:
     problem, recipe = it.problem, it.recipe
     facts: list[list[object]] = []
     if recipe is not None:
-        facts += [["problem", recipe.module], ["data", recipe.data or "its own"], ["problem's rng", recipe.rng]]
+        facts += [["problem", recipe.title], ["data", recipe.data or "its own"], ["problem's rng", recipe.rng]]
     facts += [
         ["strategy", it.strategy],
         ["seed", "–" if it.seed is None else it.seed],

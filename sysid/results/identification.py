@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import ast
+import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sysid.errors import InputError
 from sysid.problem.problem import Problem
 from sysid.results import storage
 from sysid.results.answer import Answer, reported_unknowns
@@ -33,20 +36,49 @@ class Recipe:
         As given on the command line: a name, a path, or a dotted module.
     data : str or None
     rng : int
+    parameters : dict
+        What else is passed to ``problem()``, by name: numbers, texts, bools, None, and lists, tuples and dictionaries
+        of them.
+
+    Raises
+    ------
+    InputError
+        Where a parameter is something else, or one of the other fields.
     """
 
     module: str
     data: str | None = None
     rng: int = 0
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "parameters", dict(self.parameters))
+        for name, value in self.parameters.items():
+            if name in ("data", "rng"):
+                raise InputError(f"parameter {name!r} is a field of the recipe itself")
+            if not _is_plain(value):
+                raise InputError(f"parameter {name} = {value!r}: give a number, a text, or a list of them")
+
+    def __hash__(self) -> int:
+        return hash((self.module, self.data, self.rng, frozenset(self.parameters)))  # values may be lists
+
+    @property
+    def title(self) -> str:
+        """The module and its parameters: "cantilever_tower (elements=3)"."""
+        given = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items())
+        return f"{self.module} ({given})" if given else self.module
 
     def to_tree(self) -> dict[str, Any]:
         """Give the fields by their names; `from_tree` takes them back."""
-        return {"module": self.module, "data": self.data, "rng": str(self.rng)}  # a number of any size
+        parameters = {name: repr(value) for name, value in self.parameters.items()}
+        # A number of any size, and values of any shape, as texts.
+        return {"module": self.module, "data": self.data, "rng": str(self.rng), "parameters": parameters}
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Recipe:
-        """Give the recipe of a tree that `to_tree` made."""
-        return cls(tree["module"], tree["data"], int(tree["rng"]))
+        """Give the recipe of a tree that `to_tree` made; earlier ones have no parameters."""
+        parameters = {name: ast.literal_eval(text) for name, text in tree.get("parameters", {}).items()}
+        return cls(tree["module"], tree["data"], int(tree["rng"]), parameters)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -77,6 +109,7 @@ class Identification(Answer):
         reported = () if self.x is None else reported_unknowns(self.problem, damping_ratios=True)
         return {
             "problem": self.recipe.module if self.recipe else None,
+            "parameters": self.recipe.parameters if self.recipe else {},
             "strategy": self.strategy,
             "seed": self.seed,
             "success": bool(self.success),
@@ -165,6 +198,15 @@ def load(path: str | Path) -> Identification:
         matrix model of the user's own is not to be found; names the file.
     """
     return storage.read(path, Identification.from_tree)
+
+
+def _is_plain(value: Any) -> bool:
+    """Whether a value can be written as text and read again, here and in JSON."""
+    try:
+        json.dumps(value, allow_nan=False)
+        return bool(ast.literal_eval(repr(value)) == value)
+    except (ValueError, TypeError, SyntaxError, RecursionError):
+        return False
 
 
 def _plain(values: Array) -> Any:

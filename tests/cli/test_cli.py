@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import sysid
+from sysid.cli import files as writing
 from sysid.cli import main as cli
 from sysid.report import report
 
@@ -205,7 +206,7 @@ def test_warnings_are_told_after_the_run_a_line_each_and_not_beside_a_mistake(he
 def test_what_is_not_a_number_is_null_in_the_summary(finished):
     result = sysid.load(finished)
     history = replace(result.history, wall_time=np.nan)
-    strict = lambda value: json.loads(cli._strict_json(value), parse_constant=pytest.fail)  # noqa: E731
+    strict = lambda value: json.loads(writing.strict_json(value), parse_constant=pytest.fail)  # noqa: E731
     assert strict(replace(result, history=history).to_dict())["wall_time_s"] is None
     assert strict({"a": [np.nan, 1.0, (float("inf"), "x")], "b": None, "c": True}) == {
         "a": [None, 1.0, [None, "x"]], "b": None, "c": True,

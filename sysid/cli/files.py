@@ -1,0 +1,27 @@
+"""What the commands share that write: whether a folder can be written, and strict JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+from sysid.errors import InputError
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse a folder of results that cannot be written, before the search and without making it."""
+    try:
+        place = next((place for place in (folder, *folder.parents) if place.exists()), folder)
+        if not place.is_dir():
+            raise InputError(f"folder of results {folder}: {place} is not a folder")
+    except OSError as error:
+        raise InputError(f"folder of results {folder}: {error.strerror or error}") from None
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise InputError(f"folder of results {folder}: {place} cannot be written")
+
+
+def strict_json(value: object) -> str:
+    """JSON with null for what is not a number."""
+    finite = json.loads(json.dumps(value), parse_constant=lambda _: None)
+    return json.dumps(finite, indent=2, allow_nan=False) + "\n"
