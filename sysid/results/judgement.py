@@ -24,7 +24,7 @@ _ON_BOUND = 1e-6  # of an unknown's range
 
 def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session) -> Identification:
     """Judge where a search ended: `why` tells why its strategy was taken, the session has its log and clock."""
-    success, message = _success(problem, end)
+    success, message = succeeded(problem, end)
     session.log(f"done: {message}")
     known = determine(problem, end.structure, end.x, end.alternatives)
     # What was stopped on its way has misfits of another kind.
@@ -51,8 +51,8 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
     return _as_certain(it)
 
 
-def _success(problem: Problem, end: Outcome) -> tuple[bool, str]:
-    """Whether this is a fit, and the message."""
+def succeeded(problem: Problem, end: Outcome) -> tuple[bool, str]:
+    """Whether where a search ended is a fit, and the message."""
     test, goal, wrong = problem.measurement, problem.goal, []
     residual = test.residual(end.structure) if end.x is None or problem.free_modes else problem.residual(end.x)
     if end.x is not None and end.success and not problem.keeps_constraints(end.x):

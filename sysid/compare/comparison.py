@@ -1,0 +1,168 @@
+"""The comparison: every strategy of the package, then the peers with the budget of its swarm."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from sysid.compare import peers
+from sysid.compare.method_result import MethodResult, Recorder, Status, errors_of, status_of
+from sysid.errors import InputError, SolverError
+from sysid.identify import STRATEGIES, identify, prepare
+from sysid.problem.problem import Problem
+from sysid.results.identification import Identification
+from sysid.search.session import DeferredInterrupt, Session
+from sysid.search.strategy import DoesNotApplyError, Strategy
+from sysid.search.swarm import Swarm
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Methods side by side on one problem.
+
+    Attributes
+    ----------
+    problem : Problem
+    seed : int
+    max_time : float or None
+        s, of each method.
+    results : tuple of MethodResult
+        In the order in which the methods ran.
+    interrupted : bool
+        Ctrl-C ended it, and `results` holds what there was until then.
+    """
+
+    problem: Problem
+    seed: int
+    max_time: float | None
+    results: tuple[MethodResult, ...]
+    interrupted: bool = False
+
+    @property
+    def quantity(self) -> str:
+        """What is minimised: "residual" where the relative residual is all of it, else "objective"."""
+        test = self.problem.measurement
+        alone = test.response_std is None and test.force is None and len(self.problem.formulation.terms) == 1
+        return "residual" if alone else "objective"
+
+    @property
+    def success(self) -> bool:
+        """Whether any method found a fit."""
+        return any(result.status is Status.FIT for result in self.results)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything, as numbers, texts, lists and dictionaries."""
+        rows = [
+            {
+                **result.to_dict(),
+                "phases": [
+                    {"phase": name, "seconds": curve[:, 0].tolist(), "objective": curve[:, 1].tolist()}
+                    for name, curve in result.phases
+                ],
+            }
+            for result in self.results
+        ]
+        told = {name: getattr(self, name) for name in ("seed", "max_time", "interrupted", "quantity")}
+        return {**told, "unknowns": self.problem.n_variables, "methods": rows}
+
+
+def compare(
+    problem: Problem,
+    *,
+    rng: int = 0,
+    max_time: float | None = None,
+    listener: Callable[[MethodResult], object] = lambda result: None,
+) -> Comparison:
+    """Run every strategy that applies, and the peers where the extra "benchmark" is installed.
+
+    A peer has as many evaluations as the swarm took, searches what the swarm searches (the same objective, with the
+    same refinement), and the same local phase follows. Without a time limit the same seed gives the same bits.
+
+    Parameters
+    ----------
+    problem : Problem
+    rng : int
+        Seed of each strategy, as of `identify`; a peer's is drawn from it.
+    max_time : float, optional
+        s, of each method.
+    listener : callable
+        Called with each method's result when it has ended.
+
+    Returns
+    -------
+    Comparison
+        Also where Ctrl-C ended it.
+
+    Raises
+    ------
+    InputError
+        Where no strategy applies, with the reason of each, or the problem cannot be searched.
+    """
+    results: list[MethodResult] = []
+    try:
+        for result in _results(problem, rng, max_time):
+            results.append(result)
+            listener(result)
+            if result.status is Status.INTERRUPTED:
+                raise KeyboardInterrupt
+    except KeyboardInterrupt:
+        return Comparison(problem, rng, max_time, tuple(results), interrupted=True)
+    return Comparison(problem, rng, max_time, tuple(results))
+
+
+def _results(problem: Problem, rng: int, max_time: float | None) -> Iterator[MethodResult]:
+    """Run one method after the other."""
+    with DeferredInterrupt() as interrupt:
+        prepare(problem, Session([], interrupt))
+    own = {}
+    for kind in STRATEGIES:
+        own[kind.name] = _strategy(kind(), problem, rng, max_time)
+        yield own[kind.name]
+    if all(result.status is Status.REFUSED for result in own.values()):
+        raise InputError(f"no strategy applies: {'; '.join(f'{name}: {r.message}' for name, r in own.items())}")
+    most = own[Swarm.name].evaluations
+    if most == 0:
+        yield from (MethodResult(name, Status.REFUSED, "the swarm did not run") for name in peers.names())
+        return
+    for number, name in enumerate(peers.names()):
+        random = np.random.SeedSequence(rng, spawn_key=(number,))
+        with threadpool_limits(limits=1), DeferredInterrupt() as interrupt:
+            recorder = Recorder()
+            landscape = peers.Landscape.of(problem)
+            yield peers.run(name, landscape, most, Session([recorder], interrupt, max_time, random), recorder)
+
+
+def _strategy(strategy: Strategy, problem: Problem, rng: int, max_time: float | None) -> MethodResult:
+    """Run a strategy of the package, unless it refuses the problem."""
+    refusal, recorder = strategy.refusal(problem, None), Recorder()
+    if refusal is not None:
+        return MethodResult(strategy.name, Status.REFUSED, refusal)
+    try:
+        result = identify(problem, strategy=strategy, rng=rng, max_time=max_time, callback=recorder)
+    except DoesNotApplyError as error:
+        return MethodResult(strategy.name, Status.REFUSED, str(error))
+    except (InputError, SolverError) as error:
+        return MethodResult(strategy.name, Status.FAILED, str(error))
+    return _own(strategy.name, result, recorder)
+
+
+def _own(name: str, result: Identification, recorder: Recorder) -> MethodResult:
+    """The row of an identification."""
+    history = result.history
+    before = [value for value in (history.refinement, history.swarm, history.start) if np.isfinite(value)]
+    return MethodResult(
+        name,
+        status_of(result.success, result.interrupted),
+        result.message,
+        before[0] if before else np.nan,
+        result.objective,
+        result.residual,
+        errors_of(result.structure, result.problem.reference),
+        history.evaluations,
+        history.wall_time,
+        recorder.phases,
+    )

@@ -1,0 +1,237 @@
+"""Optimisers of other packages on the swarm's own objective, with its budget and its local phase.
+
+All of them search the unit cube that stands for the search space. None is imported before it is used.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.compare.method_result import MethodResult, Recorder, Status, errors_of, status_of
+from sysid.errors import InputError, SolverError
+from sysid.problem.problem import Problem
+from sysid.problem.terms import TestTerm
+from sysid.results.judgement import succeeded
+from sysid.search.continuation import descend, smoothed_tests
+from sysid.search.session import Session
+from sysid.search.strategy import History, Outcome
+from sysid.search.swarm_objective import SwarmObjective
+from sysid.structure.structure import Array
+
+PACKAGES = ("pymoo", "cma")  # of the extra "benchmark"
+HOW_TO_INSTALL = 'python -m pip install ".[benchmark]"'
+
+_SHARE = 2 / 3  # of the time, that a search may take before its local phase: as the swarm's
+_WORST = 1e30  # an objective in the place of what is not a number: above that of any broken constraint
+_STEP = 1e-7  # of the search space, for differences
+_SIGMA = 0.3  # of the search space: where CMA-ES starts from its middle
+
+Evaluate = Callable[[Array], Array]  # points of the unit cube (k, size) to objectives (k,)
+
+
+class Spent(Exception):  # noqa: N818 - not an error
+    """The evaluations or the time are spent."""
+
+
+def missing_packages() -> list[str]:
+    """Packages of the extra "benchmark" that are not installed."""
+    return [name for name in PACKAGES if importlib.util.find_spec(name) is None]
+
+
+@dataclass(frozen=True)
+class Landscape:
+    """What the swarm searches, and every peer with it.
+
+    Attributes
+    ----------
+    problem : Problem
+    objective : SwarmObjective
+    steps : list of tuple of TestTerm
+        Tests with widened peaks for the local phase, where the swarm takes them.
+    """
+
+    problem: Problem
+    objective: SwarmObjective
+    steps: list[tuple[TestTerm, ...]]
+
+    @classmethod
+    def of(cls, problem: Problem) -> Landscape:
+        """The objective and the steps that the strategy "swarm" takes for a problem; both compiled."""
+        formulation = problem.formulation
+        smoother = None if formulation.refinable else smoothed_tests(problem)
+        steps = [] if smoother is None else smoother.steps[1:]
+        spectrum = formulation.stiffness.spectrum if formulation.refinable else None
+        objective = SwarmObjective(problem, steps[0] if steps else (), spectrum)
+        objective(problem.lower[None])
+        return cls(problem, objective, steps)
+
+    def at(self, unit: Array) -> Array:
+        """The swarm's coordinates of points of the unit cube."""
+        lower, upper = self.problem.lower, self.problem.upper
+        return lower + np.clip(unit, 0.0, 1.0) * (upper - lower)
+
+
+class Evaluator:
+    """The objective with a count, a clock and the best so far.
+
+    Raises `Spent` once the evaluations or the time are spent, and KeyboardInterrupt where the user asked for it.
+    """
+
+    def __init__(self, landscape: Landscape, most: int, session: Session) -> None:
+        self.landscape, self.most, self.session = landscape, most, session
+        self.count, self.best, self.curve = 0, np.inf, list[tuple[float, float]]()
+        self.s = landscape.at(np.full(landscape.problem.n_variables, 0.5))
+
+    def __call__(self, unit: Array) -> Array:
+        """Objectives of points (k, size) of the unit cube, as many as the budget allows."""
+        self.session.interrupt.check()
+        rows = self.landscape.at(np.asarray(unit, dtype=float)[: self.most - self.count])
+        values = self.landscape.objective(rows)
+        values = np.where(np.isfinite(values), values, _WORST)
+        least = int(np.argmin(values))
+        if values[least] < self.best:
+            self.best, self.s = float(values[least]), rows[least]
+        self.count += len(rows)
+        self.curve.append((self.session.seconds, self.best))
+        late = self.session.max_time is not None and self.session.seconds > _SHARE * self.session.max_time
+        if late or self.count >= self.most:
+            raise Spent
+        return values
+
+
+def run(name: str, landscape: Landscape, most: int, session: Session, recorder: Recorder) -> MethodResult:
+    """Search with a peer, then the local phase: where it ended.
+
+    Parameters
+    ----------
+    name : str
+        One of `PEERS`.
+    landscape : Landscape
+    most : int
+        Evaluations.
+    session : Session
+        Its random source seeds the peer.
+    recorder : Recorder
+        Hears the session.
+    """
+    problem, evaluator = landscape.problem, Evaluator(landscape, most, session)
+    words, stopped = _search(name, evaluator, session)
+    answer = None
+    try:
+        start = landscape.objective.refined(landscape.objective.unknowns(evaluator.s))
+        if stopped is None:
+            answer = descend(problem, start, landscape.steps, session)
+            words, stopped = f"{words}; {answer.message}", answer.stopped
+        x = min([start] if answer is None else [start, answer.x], key=problem.rank_of)
+        structure = problem.structure(x)
+    except (InputError, SolverError, np.linalg.LinAlgError) as error:  # the best candidate is no structure
+        return MethodResult(name, Status.FAILED, str(error), evaluations=evaluator.count, seconds=session.seconds)
+    solved = answer is not None and answer.success
+    success, message = succeeded(problem, Outcome(structure, x, name, solved, words, History(), stopped))
+    return MethodResult(
+        name,
+        status_of(success, isinstance(stopped, KeyboardInterrupt)),
+        message,
+        problem.objective(start),
+        problem.objective(x),
+        problem.residual(x),
+        errors_of(structure, problem.reference),
+        evaluator.count,
+        session.seconds,
+        (("search", np.array(evaluator.curve).reshape(-1, 2)), *recorder.phases),
+    )
+
+
+def _search(name: str, evaluator: Evaluator, session: Session) -> tuple[str, BaseException | None]:
+    """Let a peer search: how it ended in words, and what interrupted it."""
+    try:
+        PEERS[name](evaluator, evaluator.landscape.problem.n_variables, np.random.default_rng(session.random))
+    except Spent:
+        return "spent its budget", None
+    except KeyboardInterrupt as stop:
+        return "interrupted before the local phase", stop
+    return "ended by itself", None
+
+
+# -- the peers ----------------------------------------------------------------------------------
+
+
+def _population(size: int) -> int:
+    return max(5 * size, 10)  # as the swarm's
+
+
+def _pymoo(kind: str) -> Callable[[Evaluate, int, np.random.Generator], None]:
+    """An algorithm of pymoo for one objective, with its own settings."""
+
+    def search(evaluate: Evaluate, size: int, rng: np.random.Generator) -> None:
+        from pymoo.core.problem import Problem as Box
+        from pymoo.core.termination import NoTermination
+
+        algorithm = getattr(importlib.import_module(f"pymoo.algorithms.soo.nonconvex.{kind.lower()}"), kind)
+        run = algorithm(pop_size=_population(size))
+        run.setup(Box(n_var=size, n_obj=1, xl=0.0, xu=1.0), termination=NoTermination(), seed=int(rng.integers(2**31)))
+        while run.has_next():
+            candidates = run.ask()
+            candidates.set("F", evaluate(candidates.get("X"))[:, None])
+            run.tell(infills=candidates)
+
+    return search
+
+
+def _cma_es(evaluate: Evaluate, size: int, rng: np.random.Generator) -> None:
+    """CMA-ES from the middle of the search space; its own rules end it."""
+    import cma
+
+    run = cma.CMAEvolutionStrategy(
+        np.full(size, 0.5),
+        _SIGMA,
+        # "seed": not a number leaves NumPy's global source alone.
+        {"bounds": [0, 1], "seed": np.nan, "randn": lambda *s: rng.standard_normal(s), "verbose": -9},
+    )
+    while not run.stop():
+        points = run.ask()
+        run.tell(points, evaluate(np.array(points)).tolist())
+
+
+def _scipy_de(evaluate: Evaluate, size: int, rng: np.random.Generator) -> None:
+    """SciPy's differential evolution with its own settings, whole generations at a time."""
+    from scipy.optimize import differential_evolution
+
+    differential_evolution(
+        lambda columns: evaluate(columns.T), [(0.0, 1.0)] * size, popsize=5, tol=0.0, maxiter=10**9, polish=False,
+        init="latinhypercube", updating="deferred", vectorized=True, rng=rng,
+    )  # fmt: skip
+
+
+def _l_bfgs_b(evaluate: Evaluate, size: int, rng: np.random.Generator) -> None:
+    """SciPy's L-BFGS-B from the best of a Latin hypercube; gradients by forward differences, all at once."""
+    from scipy.optimize import minimize
+    from scipy.stats import qmc
+
+    def slope(point: Array) -> tuple[float, Array]:
+        steps = np.where(point > 0.5, -_STEP, _STEP)  # into the cube
+        values = evaluate(np.vstack([point, point + np.diag(steps)]))
+        return float(values[0]), (values[1:] - values[0]) / steps
+
+    sample = qmc.LatinHypercube(size, rng=rng).random(_population(size))
+    best = sample[np.argmin(evaluate(sample))]
+    limits = {"maxiter": 10**9, "maxfun": 10**9}
+    minimize(slope, best, jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * size, options=limits)
+
+
+PEERS: dict[str, Callable[[Evaluate, int, np.random.Generator], None]] = {
+    "pymoo PSO": _pymoo("PSO"),
+    "pymoo DE": _pymoo("DE"),
+    "CMA-ES": _cma_es,
+    "SciPy DE": _scipy_de,
+    "SciPy L-BFGS-B": _l_bfgs_b,
+}
+
+
+def names() -> Sequence[str]:
+    """The peers that can run: all of them or none, as the extra is installed or not."""
+    return () if missing_packages() else tuple(PEERS)

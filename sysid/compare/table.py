@@ -1,0 +1,88 @@
+"""The table of a comparison: as text for a terminal, and as CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import textwrap
+from collections.abc import Iterator
+
+import numpy as np
+
+from sysid.compare.comparison import Comparison
+from sysid.compare.method_result import MATRICES, MethodResult, Status
+
+_WIDTH = 120
+
+
+def text(comparison: Comparison) -> str:
+    """Table for a terminal: a line a method, below it what the columns are, and why a method is no fit."""
+    results = comparison.results
+    columns = [
+        ("method", [result.name for result in results]),
+        ("before", [_number(result.before, ".2e") for result in results]),
+        ("after", [_number(result.after, ".2e") for result in results]),
+        *_residual(comparison),
+        *_errors(comparison),
+        ("evaluations", [_number(result.evaluations or np.nan, ",.0f") for result in results]),
+        ("seconds", [_number(result.seconds, ".2f") for result in results]),
+        ("status", [result.status.value for result in results]),
+    ]
+    cells = [[head, *column] for head, column in columns]
+    widths = [max(map(len, column)) for column in cells]
+    lines = [
+        f"{row[0]:{widths[0]}}  "
+        + "  ".join(f"{cell:>{width}}" for cell, width in zip(row[1:-1], widths[1:-1], strict=True))
+        + f"  {row[-1]}"
+        for row in zip(*cells, strict=True)
+    ]
+    return "\n".join([*lines, *_notes(comparison)])
+
+
+def line(result: MethodResult) -> str:
+    """One method in a line, as it has ended."""
+    if not result.ran:
+        return f"{result.name}: {result.status.value}"
+    before = f"{_number(result.before, '.2e')} -> " if np.isfinite(result.before) else ""
+    return f"{result.name}: {result.status.value}, {before}{result.after:.2e}, {result.seconds:.1f} s"
+
+
+def as_csv(comparison: Comparison) -> str:
+    """Rows of `MethodResult.to_dict`; empty cells for what is not known."""
+    rows = [result.to_dict() for result in comparison.results]
+    out = io.StringIO()
+    writer = csv.DictWriter(out, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: "" if value != value else value for name, value in row.items()} for row in rows)
+    return out.getvalue()
+
+
+def _residual(comparison: Comparison) -> Iterator[tuple[str, list[str]]]:
+    """The residual in a column of its own, where another quantity is minimised."""
+    if comparison.quantity != "residual":
+        yield "residual", [_number(result.residual, ".2e") for result in comparison.results]
+
+
+def _errors(comparison: Comparison) -> Iterator[tuple[str, list[str]]]:
+    """Columns of the errors, where there is a reference."""
+    if comparison.problem.reference is not None:
+        for i, name in enumerate(MATRICES):
+            yield f"{name}, %", [_number(result.errors[i], ".2g") for result in comparison.results]
+
+
+def _notes(comparison: Comparison) -> Iterator[str]:
+    """What the columns are, and the words of the methods that are no fit."""
+    what = {
+        "residual": "relative residual",
+        "objective": "objective (all that is fitted, weighed by its stated noise)",
+    }[comparison.quantity]
+    errors = "; M, K, C: error against the reference" * (comparison.problem.reference is not None)
+    yield f"before, after: {what} before and after the local phase{errors}"
+    for result in comparison.results:
+        if result.status is not Status.FIT:
+            told = f"{result.name}: {' '.join(result.message.split())}"
+            yield textwrap.fill(told, _WIDTH, initial_indent="  - ", subsequent_indent="    ", break_on_hyphens=False)
+
+
+def _number(value: float, form: str) -> str:
+    return f"{value:{form}}" if np.isfinite(value) else "-"
