@@ -35,7 +35,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("results",),
     ("export",),
     ("identify",),
-    ("catalogue", "jobs"),
+    ("catalogue", "compare", "jobs"),
     ("plot",),
     ("report",),
     ("cli",),

@@ -1,4 +1,4 @@
-"""The command line: ``sysid list``, ``new NAME``, ``show PROBLEM``, ``run PROBLEM``, ``report RESULT``.
+"""The command line: ``sysid list``, ``new NAME``, ``show``, ``run``, ``compare PROBLEM``, ``report RESULT``.
 
 Exit status: 0 success; 1 the search did not reach its goal; 2 a mistake in what was given, told in
 one line; 130 interrupted, with the best so far saved; 70 an error of sysid itself, told in one line
@@ -153,6 +153,12 @@ def _run(options: argparse.Namespace, out: Output) -> int:
     return SUCCESS if result.success else NOT_REACHED
 
 
+def _compare(options: argparse.Namespace, out: Output) -> int:
+    from sysid.cli import compare
+
+    return compare.run(options, out)
+
+
 def _report(options: argparse.Namespace, out: Output) -> int:
     from sysid.report import report
 
@@ -209,6 +215,7 @@ def _parser() -> argparse.ArgumentParser:
     show.set_defaults(command=_show)
 
     _add_run(command)
+    _add_compare(command)
 
     report = command("report", help="write report.html again, beside a result")
     report.add_argument("result", metavar="RESULT", help="a result.h5, or the folder that holds it")
@@ -243,6 +250,25 @@ def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
     run.add_argument("--out", metavar="DIR", help="folder of the results, results/NAME by default")
     run.add_argument("--max-time", type=_seconds, metavar="S", help="end the search after about so many seconds")
     run.set_defaults(command=_run)
+
+
+def _add_compare(command: Callable[..., argparse.ArgumentParser]) -> None:
+    compare = command(
+        "compare",
+        help="run all strategies on a problem, and other optimisers, side by side",
+        description="Run every strategy that applies and, where the extra 'benchmark' is installed, optimisers of "
+        "pymoo, cma and SciPy on the objective of the swarm, with its number of evaluations and the same local phase. "
+        "Prints one table and writes one picture, comparison.png.",
+    )
+    parameters.add_arguments(compare)
+    compare.add_argument("--seed", type=_seed, default=0, metavar="N", help="of all methods, 0 by default")
+    compare.add_argument(
+        "--out",
+        metavar="DIR",
+        help="folder of the picture, results/NAME by default; the table goes there too (CSV, JSON)",
+    )
+    compare.add_argument("--max-time", type=_seconds, metavar="S", help="end each method after about so many seconds")
+    compare.set_defaults(command=_compare)
 
 
 def _seed(text: str) -> int:

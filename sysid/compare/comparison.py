@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -116,31 +116,38 @@ def compare(
 
 def _results(problem: Problem, rng: int, max_time: float | None) -> Iterator[MethodResult]:
     """Run one method after the other."""
-    with DeferredInterrupt() as interrupt:
-        prepare(problem, Session([], interrupt))
-    own = {}
+    with threadpool_limits(limits=1), DeferredInterrupt() as interrupt:
+        session = Session([], interrupt)
+        prepare(problem, session)
+        refusals = {kind.name: kind().refusal(problem, None) for kind in STRATEGIES}
+        if all(refusals.values()):
+            raise InputError(f"no strategy applies: {'; '.join(f'{name}: {why}' for name, why in refusals.items())}")
+        landscape = None if refusals[Swarm.name] else peers.Landscape.of(problem, session)
+        interrupt.check()
+    most = 0
     for kind in STRATEGIES:
-        own[kind.name] = _strategy(kind(), problem, rng, max_time)
-        yield own[kind.name]
-    if all(result.status is Status.REFUSED for result in own.values()):
-        raise InputError(f"no strategy applies: {'; '.join(f'{name}: {r.message}' for name, r in own.items())}")
-    most = own[Swarm.name].evaluations
-    if most == 0:
-        yield from (MethodResult(name, Status.REFUSED, "the swarm did not run") for name in peers.names())
-        return
+        result = _strategy(kind(), refusals[kind.name], problem, rng, max_time)
+        yield replace(result, widened=result.widened or (landscape is not None and bool(landscape.steps)))
+        most += result.evaluations * (kind is Swarm)
     for number, name in enumerate(peers.names()):
+        if landscape is None or most == 0:
+            yield MethodResult(name, Status.REFUSED, "the swarm, whose objective and budget it takes, did not run")
+            continue
         random = np.random.SeedSequence(rng, spawn_key=(number,))
         with threadpool_limits(limits=1), DeferredInterrupt() as interrupt:
             recorder = Recorder()
-            landscape = peers.Landscape.of(problem)
-            yield peers.run(name, landscape, most, Session([recorder], interrupt, max_time, random), recorder)
+            session = Session([recorder], interrupt, max_time, random)
+            result = peers.run(name, landscape, most, session, recorder)
+        yield result
 
 
-def _strategy(strategy: Strategy, problem: Problem, rng: int, max_time: float | None) -> MethodResult:
+def _strategy(
+    strategy: Strategy, refusal: str | None, problem: Problem, rng: int, max_time: float | None
+) -> MethodResult:
     """Run a strategy of the package, unless it refuses the problem."""
-    refusal, recorder = strategy.refusal(problem, None), Recorder()
     if refusal is not None:
         return MethodResult(strategy.name, Status.REFUSED, refusal)
+    recorder = Recorder()
     try:
         result = identify(problem, strategy=strategy, rng=rng, max_time=max_time, callback=recorder)
     except DoesNotApplyError as error:
@@ -165,4 +172,5 @@ def _own(name: str, result: Identification, recorder: Recorder) -> MethodResult:
         history.evaluations,
         history.wall_time,
         recorder.phases,
+        any(name == "continuation" for name, _ in recorder.phases),
     )

@@ -48,6 +48,8 @@ class MethodResult:
     seconds : float
     phases : tuple of (str, (k, 2))
         Name of each phase, and what it reported: seconds since the start of the method, and objective.
+    widened : bool
+        The phases report of records with widened peaks, so that no step to the next is one of the records.
     """
 
     name: str
@@ -60,6 +62,7 @@ class MethodResult:
     evaluations: int = 0
     seconds: float = np.nan
     phases: tuple[tuple[str, Array], ...] = ()
+    widened: bool = False
 
     @property
     def ran(self) -> bool:

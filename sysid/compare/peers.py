@@ -59,10 +59,10 @@ class Landscape:
     steps: list[tuple[TestTerm, ...]]
 
     @classmethod
-    def of(cls, problem: Problem) -> Landscape:
+    def of(cls, problem: Problem, session: Session) -> Landscape:
         """The objective and the steps that the strategy "swarm" takes for a problem; both compiled."""
         formulation = problem.formulation
-        smoother = None if formulation.refinable else smoothed_tests(problem)
+        smoother = None if formulation.refinable else smoothed_tests(problem, session.preparing)
         steps = [] if smoother is None else smoother.steps[1:]
         spectrum = formulation.stiffness.spectrum if formulation.refinable else None
         objective = SwarmObjective(problem, steps[0] if steps else (), spectrum)
@@ -134,7 +134,7 @@ def run(name: str, landscape: Landscape, most: int, session: Session, recorder: 
     success, message = succeeded(problem, Outcome(structure, x, name, solved, words, History(), stopped))
     return MethodResult(
         name,
-        status_of(success, isinstance(stopped, KeyboardInterrupt)),
+        status_of(success, isinstance(stopped, KeyboardInterrupt) or session.interrupt.asked),
         message,
         problem.objective(start),
         problem.objective(x),
@@ -143,6 +143,7 @@ def run(name: str, landscape: Landscape, most: int, session: Session, recorder: 
         evaluator.count,
         session.seconds,
         (("search", np.array(evaluator.curve).reshape(-1, 2)), *recorder.phases),
+        bool(landscape.steps),
     )
 
 

@@ -77,11 +77,15 @@ def _notes(comparison: Comparison) -> Iterator[str]:
         "objective": "objective (all that is fitted, weighed by its stated noise)",
     }[comparison.quantity]
     errors = "; M, K, C: error against the reference" * (comparison.problem.reference is not None)
-    yield f"before, after: {what} before and after the local phase{errors}"
+    yield from _folded(f"before, after: {what} before and after the local phase{errors}", "")
     for result in comparison.results:
         if result.status is not Status.FIT:
-            told = f"{result.name}: {' '.join(result.message.split())}"
-            yield textwrap.fill(told, _WIDTH, initial_indent="  - ", subsequent_indent="    ", break_on_hyphens=False)
+            yield from _folded(f"{result.name}: {' '.join(result.message.split())}", "  - ")
+
+
+def _folded(words: str, mark: str) -> list[str]:
+    indent = " " * (len(mark) or 2)
+    return textwrap.wrap(words, _WIDTH, initial_indent=mark, subsequent_indent=indent, break_on_hyphens=False)
 
 
 def _number(value: float, form: str) -> str:

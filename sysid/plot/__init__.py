@@ -7,6 +7,7 @@ notebook shows the one that a cell ends with. ``sysid.plot.mac(result).savefig("
 Measured is thin and dark, identified dashed and coloured above it, their difference faint.
 """
 
+from sysid.plot.comparison import comparison
 from sysid.plot.plots import (
     base_force,
     base_forces,
@@ -26,6 +27,7 @@ __all__ = [
     "base_force",
     "base_forces",
     "cmif",
+    "comparison",
     "convergence",
     "effective_masses",
     "mac",

@@ -1,0 +1,65 @@
+"""``sysid compare PROBLEM``: all methods side by side, as a table and a picture."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from sysid import catalogue
+from sysid.cli import parameters
+from sysid.cli.display import Output, complain
+from sysid.cli.files import check_folder, strict_json
+from sysid.cli.status import INTERRUPTED, NOT_REACHED, SUCCESS
+from sysid.compare import peers, table
+from sysid.compare.comparison import Comparison, compare
+from sysid.compare.method_result import MethodResult
+from sysid.results.identification import Recipe
+from sysid.results.storage import atomically
+from sysid.results.version import __version__
+
+PICTURE = "comparison.png"
+
+
+def run(options: argparse.Namespace, out: Output) -> int:
+    """Compare, tell each method's end in a line, and write table and picture."""
+    recipe = parameters.recipe_of(options)
+    problem = catalogue.build(recipe)
+    folder = Path("results") / catalogue.short_name(recipe.module) if options.out is None else Path(options.out)
+    check_folder(folder)
+    out.write(f"{recipe.title}: {problem.n_variables} unknowns, seed {options.seed}\n")
+    if peers.missing_packages():
+        out.write(f"without pymoo, CMA-ES and SciPy's optimisers, which need: {peers.HOW_TO_INSTALL}\n")
+    if problem.reference is None:
+        out.write("the problem has no reference, so errors of M, K and C are not known\n")
+
+    def tell(result: MethodResult) -> None:
+        out.write(f"{table.line(result)}\n")
+        out.flush()
+
+    compared = compare(problem, rng=options.seed, max_time=options.max_time, listener=tell)
+    if not compared.results:
+        raise KeyboardInterrupt
+    out.write(f"\n{table.text(compared)}\n\n")
+    _write(compared, recipe, folder, out, rows=options.out is not None)
+    if compared.interrupted:
+        complain("interrupted; the table holds what there was until then")
+        return INTERRUPTED
+    return SUCCESS if compared.success else NOT_REACHED
+
+
+def _write(compared: Comparison, recipe: Recipe, folder: Path, out: Output, *, rows: bool) -> None:
+    """Write the picture, and the rows of the table as CSV and JSON where they are wanted."""
+    from sysid.plot.canvas import to_png
+    from sysid.plot.comparison import comparison
+
+    files = {}
+    if any(result.ran for result in compared.results):
+        files[PICTURE] = to_png(comparison(compared, recipe.title), dpi=130)
+    if rows:
+        head = {"problem": recipe.module, "parameters": recipe.parameters, "version": __version__}
+        files["comparison.csv"] = table.as_csv(compared).encode()
+        files["comparison.json"] = strict_json({**head, **compared.to_dict()}).encode()
+    for name, content in files.items():
+        with atomically(folder / name) as temporary:
+            temporary.write_bytes(content)
+        out.write(f"{folder / name}\n")
