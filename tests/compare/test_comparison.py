@@ -1,0 +1,148 @@
+"""Methods side by side: who runs, who refuses and why, what the figures are, and how it ends."""
+
+import csv
+import io
+import json
+
+import numpy as np
+import pytest
+
+import sysid
+from sysid.cli.files import strict_json
+from sysid.compare import comparison, peers, table
+from sysid.compare.method_result import Status, errors_of
+from sysid.search.modal import Modal
+
+K = 4e3 * np.array([[2.0, -1.0, -1.0], [-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
+TRUTH = sysid.Structure(np.diag([2.0, 1.0, 0.5]), K, [0.01, 0.02], n_base=1)
+FREQ = np.linspace(2.0, 20.0, 40)
+
+
+def two_masses(*, noise=0.0, **given):
+    test = sysid.simulate(TRUTH, FREQ, noise=noise, rng=0)
+    return sysid.Problem(test, mass=sysid.LumpedMass(3.0), **{"reference": TRUTH, "goal": 2 * noise or 1e-6} | given)
+
+
+@pytest.fixture
+def alone(monkeypatch):
+    """No extra is installed."""
+    monkeypatch.setattr(peers, "missing_packages", lambda: ["pymoo"])
+
+
+@pytest.fixture(scope="module")
+def compared():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(peers, "missing_packages", lambda: ["pymoo"])
+        return comparison.compare(two_masses(), rng=3)
+
+
+def test_every_strategy_has_a_row_and_the_one_that_refuses_its_own_reason(compared):
+    results = {result.name: result for result in compared.results}
+    assert list(results) == [kind.name for kind in comparison.STRATEGIES]
+    assert results["modal"].status is results["swarm"].status is Status.FIT
+    assert results["continuation"].status is Status.REFUSED
+    assert results["continuation"].message == sysid.Continuation().refusal(two_masses(), None)
+    assert compared.success
+    assert not compared.interrupted
+
+
+def test_figures_are_those_of_the_same_identification(compared):
+    swarm = next(result for result in compared.results if result.name == "swarm")
+    result = sysid.identify(two_masses(), strategy="swarm", rng=3)
+    assert (swarm.residual, swarm.after) == (result.residual, result.objective)
+    assert swarm.evaluations == result.history.evaluations > 0
+    assert swarm.before == result.history.refinement
+    # A lumped mass with its total is determined: the truth itself is found.
+    np.testing.assert_allclose(swarm.errors, 0.0, atol=1e-5)
+    phases = dict(swarm.phases)
+    assert phases["swarm"][-1, 1] == result.history.swarm
+    assert np.all(np.diff(np.concatenate([curve[:, 0] for curve in phases.values()])) >= 0)
+
+
+def test_errors_are_frobenius_norms_over_the_references_in_percent():
+    other = sysid.Structure(np.diag([2.0, 2.0, 0.5]), 3 * K, damping_matrix=TRUTH.damping, n_base=1)
+    # |diag(0, 1)| / |diag(2, 1)|, and three times the matrix.
+    np.testing.assert_allclose(errors_of(other, TRUTH), [100 / np.sqrt(5), 200.0, 0.0], atol=1e-9)
+    assert np.all(np.isnan(errors_of(other, None)))
+    other = sysid.Structure(np.diag([2.0, 0.5]), 4e3 * np.array([[1.0, -1.0], [-1.0, 1.0]]), [0.01], n_base=1)
+    assert np.all(np.isnan(errors_of(other, TRUTH)))
+
+
+def test_what_is_compared_is_the_residual_where_nothing_else_is_minimised(alone):
+    assert comparison.Comparison(two_masses(), 0, None, ()).quantity == "residual"
+    compared = comparison.compare(two_masses(noise=0.01), max_time=5.0)
+    assert compared.quantity == "objective"
+    assert " residual  " in table.text(compared)
+    assert "weighed by its stated noise" in table.text(compared)
+
+
+def test_the_table_has_a_line_a_method_and_no_errors_without_a_reference(compared):
+    head, *lines = table.text(compared).splitlines()
+    assert head.split() == ["method", "before", "after", "M,", "%", "K,", "%", "C,", "%", "evaluations", "seconds",
+                            "status"]  # fmt: skip
+    assert [line.split()[0] for line in lines[:3]] == ["modal", "continuation", "swarm"]
+    assert lines[1].split()[1:8] == ["-"] * 7
+    assert any("continuation: neither mass nor stiffness has a form of its own" in line for line in lines)
+    assert max(map(len, (head, *lines))) <= 120
+    unknown = comparison.Comparison(two_masses(reference=None), 3, None, compared.results)
+    assert "%" not in table.text(unknown)
+
+
+def test_rows_go_to_csv_and_strict_json(compared):
+    rows = list(csv.DictReader(io.StringIO(table.as_csv(compared))))
+    told = json.loads(strict_json(compared.to_dict()), parse_constant=pytest.fail)
+    assert [row["method"] for row in rows] == [row["method"] for row in told["methods"]]
+    for row, method, result in zip(rows, told["methods"], compared.results, strict=True):
+        assert row["status"] == method["status"] == result.status.value
+        assert (float(row["after"]) if result.ran else row["after"]) == (result.after if result.ran else "")
+        assert method["after"] == (result.after if result.ran else None)
+    assert told["seed"] == 3
+    assert told["methods"][2]["phases"][0]["phase"] == "swarm"
+
+
+def test_a_problem_that_every_strategy_refuses_is_told_with_all_reasons(alone):
+    known = sysid.FullMass(3.0, known=[[2.0, np.nan], [np.nan, np.nan]])
+    damping = sysid.ProportionalDamping((0.0, 5.0), (0.0, 1e-3))
+    problem = sysid.Problem(two_masses().measurement, mass=known, damping=damping)
+    with pytest.raises(sysid.InputError, match=r"no strategy applies: modal: .*; continuation: .*; swarm: .*"):
+        comparison.compare(problem)
+
+
+@pytest.mark.parametrize("at", [0, 1])
+def test_an_interrupted_comparison_keeps_what_was_finished(alone, monkeypatch, at):
+    heard = []
+
+    def identify(problem, *, strategy, **options):
+        if at == 0 or strategy.name == "swarm":
+            raise KeyboardInterrupt
+        return sysid.identify(problem, strategy=strategy, **options)
+
+    monkeypatch.setattr(comparison, "identify", identify)
+    compared = comparison.compare(two_masses(), listener=heard.append)
+    assert compared.interrupted
+    assert [result.name for result in compared.results] == ["modal", "continuation"][: 2 * at]
+    assert heard == list(compared.results)
+
+
+def test_a_method_that_was_interrupted_is_the_last(alone, monkeypatch):
+    real = sysid.identify
+
+    def identify(problem, *, callback, **options):
+        def stop(progress):
+            callback(progress)
+            if progress.phase == "swarm" and progress.iteration == 3:
+                raise KeyboardInterrupt
+
+        return real(problem, callback=stop, **options)
+
+    monkeypatch.setattr(comparison, "identify", identify)
+    compared = comparison.compare(two_masses())
+    assert compared.interrupted
+    assert [result.status for result in compared.results] == [Status.FIT, Status.REFUSED, Status.INTERRUPTED]
+    assert len(dict(compared.results[-1].phases)["swarm"]) == 3
+
+
+def test_a_strategy_that_fails_is_a_row(alone, monkeypatch):
+    monkeypatch.setattr(Modal, "run", lambda *given: (_ for _ in ()).throw(sysid.SolverError("nothing came out")))
+    failed = comparison.compare(two_masses()).results[0]
+    assert (failed.status, failed.message) == (Status.FAILED, "nothing came out")
