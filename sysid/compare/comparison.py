@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from sysid.compare import peers
 from sysid.compare.method_result import MethodResult, Recorder, Status, errors_of, status_of
 from sysid.errors import InputError, SolverError
-from sysid.identify import STRATEGIES, identify, prepare
+from sysid.identify import NAMED, identify, prepare
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification
 from sysid.search.session import DeferredInterrupt, Session
@@ -119,16 +119,17 @@ def _results(problem: Problem, rng: int, max_time: float | None) -> Iterator[Met
     with threadpool_limits(limits=1), DeferredInterrupt() as interrupt:
         session = Session([], interrupt)
         prepare(problem, session)
-        refusals = {kind.name: kind().refusal(problem, None) for kind in STRATEGIES}
+        strategies = {name: make() for name, make in NAMED.items()}
+        refusals = {name: strategy.refusal(problem, None) for name, strategy in strategies.items()}
         if all(refusals.values()):
             raise InputError(f"no strategy applies: {'; '.join(f'{name}: {why}' for name, why in refusals.items())}")
         landscape = None if refusals[Swarm.name] else peers.Landscape.of(problem, session)
         interrupt.check()
     most = 0
-    for kind in STRATEGIES:
-        result = _strategy(kind(), refusals[kind.name], problem, rng, max_time)
+    for name, strategy in strategies.items():
+        result = _strategy(strategy, refusals[name], problem, rng, max_time)
         yield replace(result, widened=result.widened or (landscape is not None and bool(landscape.steps)))
-        most += result.evaluations * (kind is Swarm)
+        most += result.evaluations * (name == Swarm.name)
     for number, name in enumerate(peers.names()):
         if landscape is None or most == 0:
             yield MethodResult(name, Status.REFUSED, "the swarm, whose objective and budget it takes, did not run")

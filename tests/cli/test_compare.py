@@ -33,8 +33,8 @@ def test_a_line_a_method_then_one_table_and_one_picture(here, capsys):
     assert lines[0].startswith("pair.py: ")
     assert 'python -m pip install ".[benchmark]"' in lines[1]
     assert "no reference" in lines[2]
-    assert [line.partition(":")[0] for line in lines[3:6]] == ["modal", "continuation", "swarm"]
-    assert lines[7].split() == ["method", "before", "after", "evaluations", "seconds", "status"]
+    assert [line.partition(":")[0] for line in lines[3:7]] == ["modal", "continuation", "swarm", "hpso-ls"]
+    assert lines[8].split() == ["method", "before", "after", "evaluations", "seconds", "status"]
     assert out.endswith("results/pair/comparison.png\n\n") or out.endswith("results/pair/comparison.png\n")
     assert files(here / "results/pair") == {"comparison.png"}
     assert (here / "results/pair/comparison.png").read_bytes().startswith(PNG)
@@ -48,7 +48,7 @@ def test_a_folder_takes_the_rows_too(here, capsys):
     assert files(here / "side") == {"comparison.png", "comparison.csv", "comparison.json"}
     told = json.loads((here / "side/comparison.json").read_text(), parse_constant=pytest.fail)
     assert (told["problem"], told["parameters"], told["seed"]) == ("pair.py", {"goal": 1e-30}, 2)
-    assert [row["status"] for row in told["methods"]] == ["no fit", "does not apply", "no fit"]
+    assert [row["status"] for row in told["methods"]] == ["no fit", "does not apply", "no fit", "no fit"]
     assert "pair.py (goal=1e-30)" in capsys.readouterr().out
 
 

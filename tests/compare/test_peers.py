@@ -151,5 +151,5 @@ def test_where_the_swarm_refuses_peers_do_too(monkeypatch):
     problem = two_masses(sysid.FullMass(3.0, known=[[2.0, np.nan], [np.nan, np.nan]]))
     results = comparison.compare(problem).results
     assert results[0].status is Status.FIT
-    assert {result.name for result in results[1:]} == {"continuation", "swarm", *peers.PEERS}
+    assert {result.name for result in results[1:]} == {"continuation", "swarm", "hpso-ls", *peers.PEERS}
     assert {result.status for result in results[1:]} == {Status.REFUSED}
