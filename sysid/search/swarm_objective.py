@@ -7,9 +7,7 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
-from sysid.models.spectrum import closed_form
 from sysid.problem.batch_objective import Batch, expanded, in_chunks
-from sysid.problem.matrices import assemble
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.search.matrix_coordinates import terms_with
@@ -69,20 +67,10 @@ class SwarmObjective:
         return np.asarray(self._unknowns(s)).ravel()
 
     def refined(self, x: Array) -> Array:
-        """The unknowns of the structure whose objective `x` was given: with the measured spectrum, where there is one.
-
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            Where `x` is no structure.
-        """
+        """The unknowns of the structure whose objective `x` was given: its spectrum replaced by the measured one."""
         if self.spectrum is None:
             return x
-        formulation, test = self.problem.formulation, self.problem.measurement
-        M_SS, M_S0, M_00, *_ = blocks = formulation.matrices.numbers(x)
-        root = np.linalg.cholesky(M_SS) @ closed_form(np.linalg.cholesky(blocks.mass_normalised), self.spectrum).factor
-        ratios = np.full(len(root), 0.01)  # not read: the stiffness alone is taken over
-        structure = assemble(M_SS, M_S0, M_00, root @ root.T, formulation.matrices.rigid_body, ratios=ratios, test=test)
-        x = x.copy()
-        x[formulation.parts.stiffness] = formulation.models[1].values(formulation.geometry, structure)
-        return x
+        formulation, refined = self.problem.formulation, x.copy()
+        part = formulation.parts.stiffness
+        refined[part] = formulation.with_spectrum(x[None, part], self.spectrum)[0][0]
+        return refined
