@@ -38,6 +38,10 @@ class ModalDamping(FieldTree):
         """Damping ratios (n,), in ascending order of frequency."""
         return y
 
+    def batch(self, geometry: Geometry, s: Array) -> Array:
+        """Ratios (count, n) of swarm coordinates."""
+        return s
+
     def values(self, geometry: Geometry, structure: Structure) -> Array:
         """Damping ratios of a structure."""
         return structure.damping_ratios

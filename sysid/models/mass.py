@@ -106,16 +106,13 @@ class FullMass(FieldTree):
 
     def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """Entries of the factor's lower triangle, row by row, in [-1, 1] (eq. 35)."""
-        size = geometry.n + geometry.d
-        rows, columns = np.tril_indices(size)
-        exponents = np.array([sampling_exponent(k) for k in range(1, size + 1)])[rows]
-        lower = np.where(rows == columns, FACTOR_FLOOR, -1.0)
+        exponents, lower = _spread(geometry)
         return (
             *geometry.total_unknowns(self.total_mass),
             Unknown(
                 "mass_factor",
                 lower,
-                np.ones(rows.size),
+                np.ones(lower.size),
                 sampling=lambda x: ca.fmax(spread_rows(x, exponents), lower),
                 unsampling=lambda y: gather_rows(y, exponents),
                 scale="by row",
@@ -129,6 +126,14 @@ class FullMass(FieldTree):
         healed = heal(lower_triangle(entries, n + geometry.d), geometry, totals, self.healing)
         L, low, base = healed[:n, :n], healed[n:, :n], healed[n:, n:]
         return MassBlocks(L, L @ low.T, low @ low.T + base @ base.T)
+
+    def batch(self, geometry: Geometry, s: Array) -> Array | None:
+        """Healed factors (n + d, n + d, count) of swarm coordinates (count, size); None where scales are coupled."""
+        totals, entries = geometry.split_totals(self.total_mass, np.ascontiguousarray(s.T))
+        exponents, lower = (part[:, None] for part in _spread(geometry))
+        factors = np.zeros((geometry.n + geometry.d, geometry.n + geometry.d, len(s)))
+        factors[np.tril_indices(len(factors))] = np.maximum(spread_rows(entries, exponents), lower)
+        return heal_batch(factors, geometry, totals.reshape(geometry.d, -1), self.healing)
 
     def values(self, geometry: Geometry, structure: Structure) -> Array:
         """Factor entries that `blocks` takes back to the structure's mass, which has the stated totals."""
@@ -275,6 +280,14 @@ class WrittenMass(Written):
         return self.whole(geometry)
 
 
+def _spread(geometry: Geometry) -> tuple[Array, Array]:
+    """Exponent of eq. 18 and lower bound of each entry of the factor, row by row."""
+    size = geometry.n + geometry.d
+    rows, columns = np.tril_indices(size)
+    exponents = np.array([sampling_exponent(k) for k in range(1, size + 1)])[rows]
+    return exponents, np.where(rows == columns, FACTOR_FLOOR, -1.0)
+
+
 def total_of(geometry: Geometry, mass: Array, kind: str) -> Array:
     """What a kind of healing calls the total of `mass` (n + d, n + d), (d,)."""
     if kind == "rigid_body":  # the diagonal of [G; I]' M [G; I]
@@ -298,6 +311,33 @@ def heal(factor: ca.SX, geometry: Geometry, totals: ca.SX | Array, kind: str) ->
     return ca.diag(ca.vertcat(*(of_groups[g] for g in groups.tolist()))) @ factor
 
 
+def heal_batch(factors: Array, geometry: Geometry, totals: Array, kind: str) -> Array | None:
+    """`heal` in numbers: factors (n + d, n + d, count) and totals (d, 1 or count); None where scales are coupled."""
+    groups = geometry.directions
+    if kind == "rigid_body":
+        parts, coupled = _rigid_parts(geometry)
+        if coupled:
+            return None
+        moved = np.tensordot(np.einsum("iij->ij", parts), factors, axes=1)
+        sums = np.einsum("ijp,ijp->ip", moved, moved)
+    else:
+        sums = (groups == np.arange(geometry.d)[:, None]) @ np.einsum("ijp,ijp->ip", factors, factors)
+    scales = np.sqrt(totals / sums)
+    factors *= np.concatenate([scales, scales.mean(axis=0, keepdims=True)])[groups][:, None]
+    return factors
+
+
+def _rigid_parts(geometry: Geometry) -> tuple[Array, bool]:
+    """Part of r_i in group a, (d, d, n + d) with i first and a second; and whether any is not zero where a is not i.
+
+    r_i is column i of [G; I]; rows of no direction have an equal part in each group.
+    """
+    d, groups = geometry.d, geometry.directions
+    rigid = np.vstack([geometry.rigid_body, np.eye(d)])
+    shares = np.where(groups < 0, 1 / d, groups == np.arange(d)[:, None])
+    return shares * rigid.T[:, None], any(np.any(rigid[groups != i, i]) for i in range(d))
+
+
 def _rigid_body_scales(factor: ca.SX, geometry: Geometry, totals: ca.SX | Array) -> list[ca.SX]:
     """Scales s with ``r_i' D(s) M D(s) r_i = totals[i]`` for every direction i, r_i column i of [G; I].
 
@@ -305,15 +345,12 @@ def _rigid_body_scales(factor: ca.SX, geometry: Geometry, totals: ca.SX | Array)
     they are d quadratics, solved by Newton's method inside the expression; where that has not
     converged, mostly because no positive scales exist, they are NaN, and the candidate is passed over.
     """
-    d, groups = geometry.d, geometry.directions
-    rigid = np.vstack([geometry.rigid_body, np.eye(d)])
-    # Total i is |sum_a s_a row_a|² with row_a = (part of r_i in group a)' L; Gram matrices hold all. Rows of no
-    # direction have an equal part in each group.
-    shares = np.where(groups < 0, 1 / d, groups == np.arange(d)[:, None])
-    parts = [constant(shares * rigid[:, i]) @ factor for i in range(d)]
+    d, (parts_of, coupled) = geometry.d, _rigid_parts(geometry)
+    # Total i is |sum_a s_a row_a|² with row_a = (part of r_i in group a)' L; Gram matrices hold all.
+    parts = [constant(part) @ factor for part in parts_of]
     grams = [part @ part.T / totals[i] for i, part in enumerate(parts)]
     own = ca.vertcat(*(1 / ca.sqrt(gram[i, i]) for i, gram in enumerate(grams)))
-    if not any(np.any(rigid[groups != i, i]) for i in range(d)):
+    if not coupled:
         return ca.vertsplit(own)
     z, q = ca.SX.sym("z", d), ca.SX.sym("q", d, d * d)
     # In logarithms scales stay positive and the equations are nearly linear; long steps are cut.

@@ -103,6 +103,11 @@ class MatrixModel(Protocol):
     whose ratios are a function of the frequency has one method more, ``ratios(geometry, y, omega)``: one ratio a mode,
     (n,), at the circular frequencies `omega` (n,), in ascending order; None where C tells them. A stiffness that can
     give its unknowns a spectrum has ``with_spectrum``, see `SpectralStiffness`; the swarm then refines its candidates.
+
+    A model may have ``batch(geometry, s)`` besides: the same in numbers for many candidates of the swarm, from their
+    coordinates s (count, size). A mass gives the Cholesky factors of M, (n + d, n + d, count), or None where it has
+    them as expressions only; a stiffness the factors of ``H = L_H L_H'``, (count, n, n); a damping the ratios of the
+    modes, (count, n).
     """
 
     def unknowns(self, geometry: Geometry) -> Sequence[Unknown]:

@@ -98,6 +98,13 @@ class SpectralStiffness(FieldTree):
         H = L_H @ L_H.T
         return StiffnessBlocks(L @ H @ L.T, H)
 
+    def batch(self, geometry: Geometry, s: Array) -> Array:
+        """Factors L_H, (count, n, n), of swarm coordinates (count, size)."""
+        rows, columns = np.tril_indices(geometry.n)
+        factors = np.zeros((len(s), geometry.n, geometry.n))
+        factors[:, rows, columns] = s
+        return factors
+
     def values(self, geometry: Geometry, structure: Structure) -> Array:
         """Entries of L_H."""
         n = geometry.n

@@ -10,6 +10,7 @@ import numpy as np
 from sysid.problem.batch_objective import Batch, expanded, in_chunks
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
+from sysid.search.held_spectrum_objective import held_spectrum_objective
 from sysid.search.matrix_coordinates import terms_with
 from sysid.structure.structure import Array
 
@@ -43,24 +44,31 @@ class SwarmObjective:
             x = ca.fmin(ca.fmax(formulation.healing(x), ca.DM(formulation.lower)), ca.DM(formulation.upper))
         self._unknowns = expanded(ca.Function("unknowns", [s], [ca.densify(x)]))
         self._all_unknowns = Batch(self._unknowns)
+        self._held = held_spectrum_objective(problem, self.terms[0], spectrum)
 
     def __call__(self, particles: Array) -> Array:
         """Objective of each row; NaN where a candidate is no structure."""
-        x = in_chunks(lambda chunk: self._all_unknowns(chunk)[0][:, :, 0], particles)
-        squared = np.zeros(len(x))
-        for i, term in enumerate(self.terms):
-            if i == 0 and isinstance(term, TestTerm):
-                squared = squared + term.squared(x, self.spectrum)
-            else:
-                squared = squared + term.squared(x)
-        objective = np.sqrt(squared)
         constraints = self.problem.formulation.constraints
+        if self._held is not None and len(self.terms) == 1 and not constraints.lower.size:
+            return np.sqrt(self._held(particles, self._by_lines))
+        x = self._x(particles)
+        squared = self._by_lines(particles) if self._held is None else self._held(particles, self._by_lines)
+        objective = np.sqrt(sum((term.squared(x) for term in self.terms[1:]), squared))
         if not constraints.lower.size:
             return objective
         over = np.array([constraints.violation(row) for row in x]) / self.problem.tolerance
         over = np.where(np.isfinite(over), over, np.inf)
         broken = np.sum(np.where(over > 1, over, 0.0), axis=1)
         return np.where(broken > 0, _WORST * (1 + broken), np.minimum(objective, _WORST))
+
+    def _x(self, particles: Array) -> Array:
+        """Unknowns of each row, (n_particles, n_variables)."""
+        return in_chunks(lambda chunk: self._all_unknowns(chunk)[0][:, :, 0], particles)
+
+    def _by_lines(self, particles: Array) -> Array:
+        """The first term's part of the squared objective, summed over all lines, (n_particles,)."""
+        first, x = self.terms[0], self._x(particles)
+        return first.squared(x, self.spectrum) if isinstance(first, TestTerm) else first.squared(x)
 
     def unknowns(self, s: Array) -> Array:
         """The unknowns x that the swarm coordinates `s` stand for, healed."""

@@ -27,6 +27,15 @@ def triangle(entries: Array, size: int) -> Array:
     return matrix
 
 
+def inverse_triangles(stack: Array) -> Array:
+    """Inverses of lower-triangular matrices that stand side by side, (n, n, count) each."""
+    inverse = np.zeros_like(stack)
+    for i, row in enumerate(stack):  # forward substitution
+        inverse[i, i] = 1 / row[i]
+        inverse[i, :i] = -inverse[i, i] * np.einsum("jp,jkp->kp", row[:i], inverse[:i, :i])
+    return inverse
+
+
 def triangle_entries(matrix: Array) -> Array:
     """Entries of a matrix's lower triangle, row by row."""
     return matrix[np.tril_indices(len(matrix))]

@@ -1,0 +1,240 @@
+"""Squared error of a record in modes of fixed frequencies, without a sum over lines.
+
+The gain of a mode whose frequency is fixed depends on its damping ratio alone, and smoothly: it is a short Chebyshev
+series in the logarithm of the ratio. All sums over lines are then made once, and what is left for each candidate are
+products of small matrices.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sysid.modal_analysis.response import gains
+from sysid.structure.structure import Array, ComplexArray
+
+_TERMS_MORE = 4  # than the asymptotic rate of the series asks for
+_RANK = 1e-6  # of the largest singular value: directions of the gains below it are left out
+_ALIKE = 1e-12  # up to which two base motions count as proportional at all lines
+
+
+class GainSeries:
+    """Gains of modes with fixed frequencies, ``g_k(f; zeta) = sum_j T_j(u) b_kj(f)``, T_j Chebyshev's polynomials.
+
+    u runs from -1 to 1 while log zeta runs over its range. The nearest singularity, at ``zeta = ± i``-fold ratios
+    ``pi / 2`` off the real axis of log zeta, sets the rate at which the series converges.
+
+    Parameters
+    ----------
+    freq : (n_freq,), Hz
+    omega : (n,), rad/s
+    lower, upper : (n,)
+        Range of each mode's damping ratio, ``0 < lower < upper``.
+    shift : float, 1/s
+        Of the complex frequencies, see `sysid.modal_analysis.response.modal_gains`.
+    tolerance : float
+        Of the gains, relative to their largest.
+
+    Attributes
+    ----------
+    basis : (n, terms, n_freq) complex
+        The b_kj.
+    """
+
+    def __init__(
+        self, freq: Array, omega: Array, lower: Array, upper: Array, shift: float = 0.0, tolerance: float = 1e-9
+    ) -> None:
+        self.lower, self.upper = lower, upper
+        self.terms = terms_needed(float(np.max(upper / lower)), tolerance)
+        angles = np.pi * (np.arange(self.terms) + 0.5) / self.terms
+        centre, half = self._range
+        ratios = np.exp(centre + half * np.cos(angles)[:, None])  # at the nodes, (terms, n)
+        values = np.stack([gains(freq, omega, at, shift) for at in ratios])
+        weights = np.cos(np.arange(self.terms)[:, None] * angles) * 2 / self.terms
+        weights[0] /= 2
+        self.basis: ComplexArray = np.tensordot(weights, values, axes=1).swapaxes(0, 1)
+
+    @property
+    def _range(self) -> tuple[Array, Array]:
+        """Middle of the range of log zeta, and half its length, (n,) each."""
+        low, high = np.log(self.lower), np.log(self.upper)
+        return (low + high) / 2, (high - low) / 2
+
+    def polynomials(self, ratios: Array) -> Array:
+        """T_j at ratios (n, count): (terms, n, count)."""
+        centre, half = self._range
+        u = (np.log(ratios) - centre[:, None]) / half[:, None]
+        T = np.ones((self.terms, *u.shape))
+        T[1] = u
+        # T_{m + j} = 2 T_m T_j - T_{m - j} doubles what is there at each step.
+        done = 1
+        while done < self.terms - 1:
+            more = min(done, self.terms - 1 - done)
+            new = T[done + 1 : done + 1 + more]
+            np.multiply(2 * T[done], T[1 : more + 1], out=new)
+            new -= T[done - more : done][::-1]
+            done += more
+        return T
+
+    def holds(self, ratios: Array) -> Array:
+        """Which candidates' ratios (count, n) are all within the range, to round-off, (count,)."""
+        slack = 1 + 1e-12
+        return np.all((ratios >= self.lower / slack) & (ratios <= self.upper * slack), axis=1)
+
+
+def terms_needed(ratio: float, tolerance: float) -> int:
+    """Terms of a gain's Chebyshev series over damping ratios with this quotient of the largest to the least.
+
+    The gain's pole stands at ``i pi / 2`` off the middle of log zeta or farther, which after scaling to [-1, 1] is
+    ``i pi / log(ratio)``.
+
+    >>> terms_needed(10.0, 1e-8), terms_needed(100.0, 1e-8)
+    (21, 36)
+    """
+    return int(np.ceil(np.log(1 / tolerance) / np.arcsinh(np.pi / np.log(ratio)))) + _TERMS_MORE
+
+
+class SummedRecord:
+    """Squared error of one record as a form of second degree in modal residues, all lines summed beforehand.
+
+    The record is ``sum_k shape_k g_k load_k u``, relative accelerations; a base force has besides what moves with the
+    base as a rigid body, which counts as d modes of gain 1.
+
+    Parameters
+    ----------
+    record, base : (runs, channels, n_freq), (runs, d, n_freq) complex
+    channel, line : (channels,), (runs, n_freq)
+        Weights, whose product is the weight of a number of the record.
+    series : GainSeries
+    static : bool
+        Whether there are d modes of gain 1 behind those of the series.
+
+    Notes
+    -----
+    The square of a small error is a difference of large numbers: at a relative error of 1e-6 half of its digits are
+    lost.
+    """
+
+    def __init__(
+        self,
+        record: ComplexArray,
+        base: ComplexArray,
+        channel: Array,
+        line: Array,
+        series: GainSeries,
+        *,
+        static: bool = False,
+    ) -> None:
+        self._channel = channel
+        made, u = channel[:, None] * line[:, None] * record, line[:, None] * base
+        self.size = float(np.sum(np.abs(made) ** 2))
+        d, (n, terms, lines) = base.shape[1], series.basis.shape
+        functions = np.concatenate([series.basis.reshape(-1, lines), np.ones((int(static), lines))])
+        # Of all runs together; the gains are the same in each.
+        spectrum, onto_base = np.einsum("rdf,ref->def", u.conj(), u), np.einsum("rcf,rdf->cdf", made, u.conj())
+        overlap = (functions.conj() @ onto_base.reshape(-1, lines).T).real
+        self._blocks = [_block(group, spectrum[np.ix_(group, group)], functions) for group in _coupled(spectrum)]
+        columns = [*(block.coordinates for block in self._blocks), overlap]
+        self._ends = np.cumsum([part.shape[1] for part in columns])[:-1]
+        together = np.hstack(columns)
+        self._of_modes = np.ascontiguousarray(together[: n * terms].reshape(n, terms, -1))
+        self._static = np.repeat(together[n * terms :, None], d, axis=0)
+
+    def squared(self, shapes: Array, loads: Array, polynomials: Array) -> Array:
+        """Squared error of candidates, (count,).
+
+        Parameters
+        ----------
+        shapes : (count, m, channels)
+            Of the modes at the record's channels, a row each; the static ones last.
+        loads : (count, m, d)
+            Participations of the modes, rows of the rigid-body mass of the static ones.
+        polynomials : (terms, n, count)
+            `GainSeries.polynomials` of the modes' ratios.
+        """
+        made = np.matmul(polynomials.transpose(1, 2, 0), self._of_modes)
+        if len(self._static):
+            made = np.concatenate([made, np.repeat(self._static, len(shapes), axis=1)])
+        *gains_of, overlap = np.split(made.transpose(1, 0, 2), self._ends, axis=2)
+        shapes = shapes * self._channel
+        residues = (shapes[..., :, None] * loads[..., None, :]).reshape(overlap.shape)
+        squared = self.size - 2 * np.einsum("pmr,pmr->p", overlap, residues)
+        products = sum(block.products(loads, part) for block, part in zip(self._blocks, gains_of, strict=True))
+        return squared + np.einsum("pkl,pkl->p", _gram(shapes), products)
+
+
+class _Proportional:
+    """Inner products of modal accelerations, for base directions with one spectrum but for a constant matrix.
+
+    As in tests where each run moves one direction, and one direction alone always.
+
+    Attributes
+    ----------
+    coordinates : (functions, rank)
+        Of the gains in an orthonormal basis over the lines. What the basis leaves out is at right angles to it, so
+        that its square is all that is lost.
+    """
+
+    def __init__(self, group: list[int], ratios: Array, power: Array, functions: ComplexArray) -> None:
+        lam, vectors = np.linalg.eigh(ratios)
+        self._group, self._root = group, vectors * np.sqrt(np.maximum(lam, 0.0))
+        self.coordinates = _orthonormal(functions * np.sqrt(power), _RANK)[0]
+
+    def products(self, loads: Array, gains_of: Array) -> Array:
+        """(count, m, m) from loads (count, m, d) and coordinates of the gains (count, m, rank)."""
+        return _gram(loads[..., self._group] @ self._root) * _gram(gains_of)
+
+
+class _Correlated:
+    """The same for base directions whose spectra vary over the lines as they like."""
+
+    def __init__(self, group: list[int], spectrum: ComplexArray, functions: ComplexArray) -> None:
+        self._group = group
+        root = np.sqrt(np.einsum("ddf->f", spectrum).real)
+        self.coordinates, basis = _orthonormal(functions * root, _RANK**1.5)
+        inside = np.divide(spectrum, root**2, out=np.zeros_like(spectrum), where=root > 0)
+        A = np.block([[((basis.conj() * part) @ basis.T).real for part in row] for row in inside])
+        lam, vectors = np.linalg.eigh((A + A.T) / 2)
+        kept = lam > _RANK**2 * lam[-1]
+        self._root = vectors[:, kept] * np.sqrt(lam[kept])
+
+    def products(self, loads: Array, gains_of: Array) -> Array:
+        """As above."""
+        count, m, _ = gains_of.shape
+        both = loads[..., self._group, None] * gains_of[..., None, :]
+        return _gram((both.reshape(count * m, -1) @ self._root).reshape(count, m, -1))
+
+
+def _block(group: list[int], spectrum: ComplexArray, functions: ComplexArray) -> _Proportional | _Correlated:
+    """What makes the inner products for a group of base directions with this spectrum, (d, d, n_freq)."""
+    power = np.einsum("ddf->f", spectrum).real
+    ratios = spectrum.sum(axis=2) / power.sum()
+    if np.abs(spectrum - ratios.real[..., None] * power).max() < _ALIKE * power.max():
+        return _Proportional(group, ratios.real, power, functions)
+    return _Correlated(group, spectrum, functions)
+
+
+def _coupled(spectrum: ComplexArray) -> list[list[int]]:
+    """Groups of base directions, those that correlate in one; those with the same spectrum are one group as well."""
+    power = np.einsum("ddf->df", spectrum).real
+    coupled = np.any(spectrum != 0, axis=2)
+    coupled |= np.array([[np.allclose(a, b, rtol=_ALIKE, atol=0) and np.any(a) for b in power] for a in power])
+    for _ in range(len(coupled)):  # whatever is coupled through others
+        coupled = coupled @ coupled
+    return [list(group) for group in sorted({tuple(np.flatnonzero(row).tolist()) for row in coupled if row.any()})]
+
+
+def _orthonormal(functions: ComplexArray, tolerance: float) -> tuple[Array, ComplexArray]:
+    """Coordinates (count, rank) of functions (count, n_freq), real combinations of an orthonormal basis (rank, n_freq).
+
+    Orthonormal are real and imaginary parts, side by side; the tolerance is relative to the largest singular value.
+    """
+    left, values, right = np.linalg.svd(np.hstack([functions.real, functions.imag]), full_matrices=False)
+    kept = values > tolerance * values[0]
+    real, imaginary = np.split(right[kept], 2, axis=1)
+    return left[:, kept] * values[kept], real + 1j * imaginary
+
+
+def _gram(rows: Array) -> Array:
+    """Inner products of the rows of each matrix, (count, m, k) to (count, m, m)."""
+    # A copy, because BLAS's kernel for products of small matrices is faster than that for a matrix with itself.
+    return rows @ np.array(rows).swapaxes(1, 2)

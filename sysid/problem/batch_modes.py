@@ -1,0 +1,56 @@
+"""Modes of many candidates at once, from the factors of their matrices by batched products and LAPACK's `eigh`."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sysid.structure.structure import Array
+from sysid.structure.triangular import inverse_triangles
+
+
+class BatchModes(NamedTuple):
+    """Mass-normalised modes of many candidates, those of a candidate in ascending order of frequency.
+
+    Attributes
+    ----------
+    shapes : (count, n, n)
+        One mode a row.
+    loads : (count, n, d)
+        Participations.
+    rigid_body_mass : (count, d, d)
+    """
+
+    shapes: Array
+    loads: Array
+    rigid_body_mass: Array
+
+
+def batch_modes(mass_factors: Array, stiffness_factors: Array, rigid_body: Array) -> BatchModes:
+    """Modes of ``M = L_M L_M'`` and ``K_SS = L H L'``, ``H = L_H L_H'``, L the leading block of L_M.
+
+    With ``H = Psi Lambda Psi'``, ``L_M = [[L, 0], [Z, L_00]]`` and G the rigid-body motion, the modes are
+    ``Phi = L^-T Psi``, their participations ``Phi' (M_SS G + M_S0) = Psi' (L' G + Z')``, and the rigid-body mass is
+    the square of ``L_M' [G; I]``, whose first n rows are those in brackets.
+
+    Parameters
+    ----------
+    mass_factors : (n + d, n + d, count)
+        The L_M.
+    stiffness_factors : (count, n, n)
+        The L_H. A candidate with numbers that are not finite has modes that are no numbers.
+    rigid_body : (n, d)
+    """
+    n, d = rigid_body.shape
+    moved = np.tensordot(np.vstack([rigid_body, np.eye(d)]).T, mass_factors, axes=1)  # (d, n + d, count)
+    right = np.concatenate([inverse_triangles(mass_factors[:n, :n]), moved[:, :n].swapaxes(0, 1)], axis=1)
+    # A copy, because BLAS's kernel for products of small matrices is faster than that for a matrix with itself.
+    H = stiffness_factors @ np.array(stiffness_factors).swapaxes(1, 2)
+    broken = ~np.all(np.isfinite(H), axis=(1, 2))
+    H[broken] = np.eye(n)  # must not stop the eigensolver for the others
+    psi = np.linalg.eigh(H)[1]
+    psi[broken] = np.nan
+    made = psi.swapaxes(1, 2) @ np.ascontiguousarray(right.transpose(2, 0, 1))
+    base = np.ascontiguousarray(moved.transpose(2, 0, 1))
+    return BatchModes(made[..., :n], made[..., n:], base @ np.array(base).swapaxes(1, 2))
