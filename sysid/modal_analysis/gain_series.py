@@ -20,8 +20,7 @@ _ALIKE = 1e-12  # up to which two base motions count as proportional at all line
 class GainSeries:
     """Gains of modes with fixed frequencies, ``g_k(f; zeta) = sum_j T_j(u) b_kj(f)``, T_j Chebyshev's polynomials.
 
-    u runs from -1 to 1 while log zeta runs over its range. The nearest singularity, at ``zeta = ± i``-fold ratios
-    ``pi / 2`` off the real axis of log zeta, sets the rate at which the series converges.
+    u runs from -1 to 1 while log zeta runs over its range.
 
     Parameters
     ----------
@@ -84,11 +83,11 @@ class GainSeries:
 def terms_needed(ratio: float, tolerance: float) -> int:
     """Terms of a gain's Chebyshev series over damping ratios with this quotient of the largest to the least.
 
-    The gain's pole stands at ``i pi / 2`` off the middle of log zeta or farther, which after scaling to [-1, 1] is
-    ``i pi / log(ratio)``.
+    A gain is infinite at imaginary ratios only, where log zeta is ``pi / 2`` off the real axis, and u
+    ``pi / log(ratio)`` off its own: that sets the rate of convergence.
 
     >>> terms_needed(10.0, 1e-8), terms_needed(100.0, 1e-8)
-    (21, 36)
+    (21, 33)
     """
     return int(np.ceil(np.log(1 / tolerance) / np.arcsinh(np.pi / np.log(ratio)))) + _TERMS_MORE
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,9 +39,9 @@ class ModalDamping(FieldTree):
         """Damping ratios (n,), in ascending order of frequency."""
         return y
 
-    def batch(self, geometry: Geometry, s: Array) -> Array:
+    def batch(self, geometry: Geometry) -> Callable[[Array], Array]:
         """Ratios (count, n) of swarm coordinates."""
-        return s
+        return lambda s: s
 
     def values(self, geometry: Geometry, structure: Structure) -> Array:
         """Damping ratios of a structure."""

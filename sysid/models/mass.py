@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -18,6 +19,7 @@ from sysid.structure.structure import Array, Structure, finite_array
 from sysid.structure.triangular import lower_triangle, triangle_entries
 
 _ROW_EXPECTATION = 1.0  # the paper's c
+_ROUND_OFF = 1e-12  # of the largest entry of G: a matrix that was solved for has no exact zeros
 _NEWTON_STEPS = 20  # for the coupled scales of the rigid-body healing; quadratic from a good start
 
 
@@ -127,13 +129,22 @@ class FullMass(FieldTree):
         L, low, base = healed[:n, :n], healed[n:, :n], healed[n:, n:]
         return MassBlocks(L, L @ low.T, low @ low.T + base @ base.T)
 
-    def batch(self, geometry: Geometry, s: Array) -> Array | None:
+    def batch(self, geometry: Geometry) -> Callable[[Array], Array] | None:
         """Healed factors (n + d, n + d, count) of swarm coordinates (count, size); None where scales are coupled."""
-        totals, entries = geometry.split_totals(self.total_mass, np.ascontiguousarray(s.T))
+        healed = batch_healing(geometry, self.healing)
+        if healed is None:
+            return None
         exponents, lower = (part[:, None] for part in _spread(geometry))
-        factors = np.zeros((geometry.n + geometry.d, geometry.n + geometry.d, len(s)))
-        factors[np.tril_indices(len(factors))] = np.maximum(spread_rows(entries, exponents), lower)
-        return heal_batch(factors, geometry, totals.reshape(geometry.d, -1), self.healing)
+        size = geometry.n + geometry.d
+        triangle = np.tril_indices(size)
+
+        def factors(s: Array) -> Array:
+            totals, entries = geometry.split_totals(self.total_mass, np.ascontiguousarray(s.T))
+            made = np.zeros((size, size, len(s)))
+            made[triangle] = np.maximum(spread_rows(entries, exponents), lower)
+            return healed(made, totals.reshape(geometry.d, -1))
+
+        return factors
 
     def values(self, geometry: Geometry, structure: Structure) -> Array:
         """Factor entries that `blocks` takes back to the structure's mass, which has the stated totals."""
@@ -311,20 +322,27 @@ def heal(factor: ca.SX, geometry: Geometry, totals: ca.SX | Array, kind: str) ->
     return ca.diag(ca.vertcat(*(of_groups[g] for g in groups.tolist()))) @ factor
 
 
-def heal_batch(factors: Array, geometry: Geometry, totals: Array, kind: str) -> Array | None:
-    """`heal` in numbers: factors (n + d, n + d, count) and totals (d, 1 or count); None where scales are coupled."""
+def batch_healing(geometry: Geometry, kind: str) -> Callable[[Array, Array], Array] | None:
+    """`heal` in numbers, of factors (n + d, n + d, count) and totals (d, 1 or count); None where scales are coupled."""
     groups = geometry.directions
-    if kind == "rigid_body":
-        parts, coupled = _rigid_parts(geometry)
-        if coupled:
-            return None
-        moved = np.tensordot(np.einsum("iij->ij", parts), factors, axes=1)
-        sums = np.einsum("ijp,ijp->ip", moved, moved)
-    else:
-        sums = (groups == np.arange(geometry.d)[:, None]) @ np.einsum("ijp,ijp->ip", factors, factors)
-    scales = np.sqrt(totals / sums)
-    factors *= np.concatenate([scales, scales.mean(axis=0, keepdims=True)])[groups][:, None]
-    return factors
+    parts, coupled = _rigid_parts(geometry)
+    own, members = np.einsum("iij->ij", parts), 1.0 * (groups == np.arange(geometry.d)[:, None])
+
+    def rigid_body(factors: Array) -> Array:
+        moved = (own @ factors.reshape(len(factors), -1)).reshape(-1, *factors.shape[1:])
+        return np.einsum("ijp,ijp->ip", moved, moved)
+
+    def trace(factors: Array) -> Array:
+        return members @ np.einsum("ijp,ijp->ip", factors, factors)
+
+    total = rigid_body if kind == "rigid_body" else trace
+
+    def healed(factors: Array, totals: Array) -> Array:
+        scales = np.sqrt(totals / total(factors))
+        factors *= np.concatenate([scales, scales.mean(axis=0, keepdims=True)])[groups][:, None]
+        return factors
+
+    return None if coupled and kind == "rigid_body" else healed
 
 
 def _rigid_parts(geometry: Geometry) -> tuple[Array, bool]:
@@ -335,7 +353,8 @@ def _rigid_parts(geometry: Geometry) -> tuple[Array, bool]:
     d, groups = geometry.d, geometry.directions
     rigid = np.vstack([geometry.rigid_body, np.eye(d)])
     shares = np.where(groups < 0, 1 / d, groups == np.arange(d)[:, None])
-    return shares * rigid.T[:, None], any(np.any(rigid[groups != i, i]) for i in range(d))
+    across = np.where(groups != np.arange(d)[:, None], rigid.T, 0.0)
+    return shares * rigid.T[:, None], bool(np.abs(across).max() > _ROUND_OFF * np.abs(rigid).max())
 
 
 def _rigid_body_scales(factor: ca.SX, geometry: Geometry, totals: ca.SX | Array) -> list[ca.SX]:

@@ -104,10 +104,9 @@ class MatrixModel(Protocol):
     (n,), at the circular frequencies `omega` (n,), in ascending order; None where C tells them. A stiffness that can
     give its unknowns a spectrum has ``with_spectrum``, see `SpectralStiffness`; the swarm then refines its candidates.
 
-    A model may have ``batch(geometry, s)`` besides: the same in numbers for many candidates of the swarm, from their
-    coordinates s (count, size). A mass gives the Cholesky factors of M, (n + d, n + d, count), or None where it has
-    them as expressions only; a stiffness the factors of ``H = L_H L_H'``, (count, n, n); a damping the ratios of the
-    modes, (count, n).
+    A model may have ``batch(geometry)`` besides: the same in numbers, as a function of the coordinates (count, size) of
+    many candidates of the swarm; None where there is none. A mass's function gives the Cholesky factors of M,
+    (n + d, n + d, count); a stiffness's those of H, (count, n, n); a damping's the ratios of the modes, (count, n).
     """
 
     def unknowns(self, geometry: Geometry) -> Sequence[Unknown]:

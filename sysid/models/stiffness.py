@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import casadi as ca
@@ -98,11 +99,15 @@ class SpectralStiffness(FieldTree):
         H = L_H @ L_H.T
         return StiffnessBlocks(L @ H @ L.T, H)
 
-    def batch(self, geometry: Geometry, s: Array) -> Array:
+    def batch(self, geometry: Geometry) -> Callable[[Array], Array]:
         """Factors L_H, (count, n, n), of swarm coordinates (count, size)."""
-        rows, columns = np.tril_indices(geometry.n)
-        factors = np.zeros((len(s), geometry.n, geometry.n))
-        factors[:, rows, columns] = s
+        n, (rows, columns) = geometry.n, np.tril_indices(geometry.n)
+
+        def factors(s: Array) -> Array:
+            made = np.zeros((len(s), n, n))
+            made[:, rows, columns] = s
+            return made
+
         return factors
 
     def values(self, geometry: Geometry, structure: Structure) -> Array:

@@ -43,11 +43,12 @@ def batch_modes(mass_factors: Array, stiffness_factors: Array, rigid_body: Array
     rigid_body : (n, d)
     """
     n, d = rigid_body.shape
-    moved = np.tensordot(np.vstack([rigid_body, np.eye(d)]).T, mass_factors, axes=1)  # (d, n + d, count)
+    rigid = np.vstack([rigid_body, np.eye(d)])
+    moved = (rigid.T @ mass_factors.reshape(n + d, -1)).reshape(d, n + d, -1)
     right = np.concatenate([inverse_triangles(mass_factors[:n, :n]), moved[:, :n].swapaxes(0, 1)], axis=1)
     # A copy, because BLAS's kernel for products of small matrices is faster than that for a matrix with itself.
     H = stiffness_factors @ np.array(stiffness_factors).swapaxes(1, 2)
-    broken = ~np.all(np.isfinite(H), axis=(1, 2))
+    broken = ~np.isfinite(np.einsum("pii->p", H))  # the trace of a square with a number that is not finite is not
     H[broken] = np.eye(n)  # must not stop the eigensolver for the others
     psi = np.linalg.eigh(H)[1]
     psi[broken] = np.nan

@@ -7,7 +7,7 @@ The frequencies are then the same for all candidates, so that all sums over line
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -16,6 +16,7 @@ from sysid.measurement.noise import separable
 from sysid.modal_analysis.gain_series import GainSeries, SummedRecord
 from sysid.modal_analysis.response import weights_of_test
 from sysid.problem.batch_modes import BatchModes, batch_modes
+from sysid.problem.given import MATRICES
 from sysid.problem.problem import Problem
 from sysid.problem.terms import Term, TestTerm
 from sysid.structure.structure import Array
@@ -36,16 +37,9 @@ def held_spectrum_objective(problem: Problem, term: Term, spectrum: Array | None
     formulation = problem.formulation
     if spectrum is None or not isinstance(term, TestTerm) or len(spectrum) != problem.geometry.n:
         return None
-    if not all(hasattr(model, "batch") for model in problem.models):
-        return None
-    if formulation.models[0].batch(formulation.geometry, _middle(problem)[:, formulation.parts.mass]) is None:
-        return None
-    return HeldSpectrumObjective(problem, term, spectrum)
-
-
-def _middle(problem: Problem) -> Array:
-    """One candidate, (1, n_variables)."""
-    return (problem.lower + problem.upper)[None] / 2
+    makers = [model.batch for model in formulation.models if hasattr(model, "batch")]
+    batches = [batch for maker in makers if (batch := maker(formulation.geometry)) is not None]
+    return HeldSpectrumObjective(problem, term, spectrum, batches) if len(batches) == len(MATRICES) else None
 
 
 class HeldSpectrumObjective:
@@ -54,18 +48,26 @@ class HeldSpectrumObjective:
     Parameters
     ----------
     problem : Problem
-        Its models have ``batch``.
     term : TestTerm
         The problem's own test, or one in its place.
     spectrum : (n,), rad/s
         All natural frequencies, which take the place of each candidate's own.
+    batches : sequence of callable
+        The ``batch`` of the models of mass, stiffness and damping.
     threads : int, optional
         The result does not depend on it, to the last bit; the machine's processors, at most eight, by default.
     """
 
-    def __init__(self, problem: Problem, term: TestTerm, spectrum: Array, threads: int | None = None) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        term: TestTerm,
+        spectrum: Array,
+        batches: Sequence[Callable[[Array], Array]],
+        threads: int | None = None,
+    ) -> None:
         formulation, test = problem.formulation, term.test
-        self._models, self._geometry, self._parts = formulation.models, formulation.geometry, formulation.parts
+        self._batches, self._parts, self._rigid_body = batches, formulation.parts, formulation.geometry.rigid_body
         self._share, self._recovery = term.weight**2, term.matrices.recovery
         ranges = formulation.lower[self._parts.damping], formulation.upper[self._parts.damping]
         self._series = GainSeries(test.freq, np.sort(spectrum), *ranges, shift=term.shift)
@@ -90,7 +92,7 @@ class HeldSpectrumObjective:
         """
         starts = range(0, len(particles), CHUNK)
         squared = np.concatenate(list(self._pool.map(lambda at: self._chunk(particles[at : at + CHUNK]), starts)))
-        held = self._series.holds(particles[:, self._parts.damping]) & (squared > _LEAST)
+        held = np.logical_and(self._series.holds(particles[:, self._parts.damping]), squared > _LEAST)
         if not np.all(held):
             squared[~held] = by_lines(particles[~held]) / self._share
         return self._share * squared
@@ -103,14 +105,12 @@ class HeldSpectrumObjective:
             return self._squared(full)[:count]
 
     def _squared(self, particles: Array) -> Array:
-        mass, stiffness, damping = (
-            model.batch(self._geometry, particles[:, part])
-            for model, part in zip(self._models, self._parts, strict=True)
-        )
-        modes = batch_modes(mass, stiffness, self._geometry.rigid_body)
+        pieces = zip(self._batches, self._parts, strict=True)
+        mass, stiffness, damping = (batch(particles[:, part]) for batch, part in pieces)
+        modes = batch_modes(mass, stiffness, self._rigid_body)
         polynomials = self._series.polynomials(damping.T)
         parts = zip(self._records, (self._accelerations, self._force), strict=False)
-        return sum(record.squared(*made(modes), polynomials) / size for (record, size), made in parts)
+        return np.sum([record.squared(*made(modes), polynomials) / size for (record, size), made in parts], axis=0)
 
     def _accelerations(self, modes: BatchModes) -> tuple[Array, Array]:
         """Shapes at the sensors, and participations."""
