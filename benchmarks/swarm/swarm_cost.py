@@ -1,0 +1,81 @@
+"""Microseconds that the swarm's objective takes a candidate, without lines and line by line."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+import sysid
+from benchmarks.line import Line, above, below
+from benchmarks.modal.random_structures import frequency_lines, random_structure
+from benchmarks.swarm.by_lines import ByLines
+from sysid.search.swarm_objective import SwarmObjective
+
+SEED = 3
+DIRECTIONS = 3
+CASES = ((10, 200, 20.0), (10, 1000, 22.0), (20, 200, 90.0))  # degrees of freedom, lines, bound in microseconds
+FASTER = 3.0
+AGREES = 1e-9  # of the records' or the candidate's square, whichever is larger
+WELL_POSED = 100.0  # relative residual: beyond it candidates are worthless, and their mass so ill-conditioned that
+# round-off in it is all that a comparison would show
+
+Objective = Callable[[np.ndarray], np.ndarray]
+
+
+def lines(reduced: bool) -> Iterator[Line]:
+    """All particles of a swarm, 5·D, BLAS on one thread, two threads in all."""
+    repeats = 10 if reduced else 60
+    with threadpool_limits(limits=1):
+        for n, count, bound in CASES[:1] if reduced else CASES:
+            problem = _problem(n, count)
+            fast = SwarmObjective(problem, spectrum=problem.formulation.stiffness.spectrum)
+            slow = ByLines(problem)
+            swarm = np.random.default_rng(0).uniform(
+                problem.lower, problem.upper, (5 * problem.n_variables, problem.n_variables)
+            )
+            what = f"n = {n}, d = {DIRECTIONS}, {count} lines"
+            took = _alternated((fast, slow), swarm, repeats)
+            quartiles = np.quantile(took, [0.25, 0.5, 0.75], axis=0)
+            spread = ", ".join(f"{low:.0f}-{high:.0f}" for low, _, high in quartiles.T)
+            least = took.min(axis=0)
+            yield below(f"{what}: microseconds a candidate, least of {repeats}", float(least[0]), bound)
+            yield Line(f"{what}: by line in batched NumPy, least of {repeats}", f"{least[1]:.4g}")
+            ratio = float(quartiles[1, 1] / quartiles[1, 0])
+            yield above(f"{what}: times faster, alternated, by medians (quartiles {spread})", ratio, FASTER)
+            yield below(f"{what}: largest difference from the sum over lines", _difference(fast, slow, swarm), AGREES)
+
+
+def _problem(n: int, count: int) -> sysid.Problem:
+    truth = random_structure(SEED, n=n, d=DIRECTIONS)
+    test = sysid.simulate(truth, frequency_lines(truth, count))
+    return sysid.Problem(
+        test,
+        mass=sysid.FullMass(np.diag(truth.rigid_body_mass)),
+        stiffness=sysid.SpectralStiffness(truth.natural_frequencies),
+        damping=sysid.ModalDamping(0.005, 0.05),
+    )
+
+
+def _alternated(objectives: tuple[Objective, ...], swarm: np.ndarray, repeats: int) -> np.ndarray:
+    """Microseconds a candidate, (repeats, objectives), one objective after the other in each repeat."""
+    took = np.zeros((repeats, len(objectives)))
+    for objective in objectives:
+        objective(swarm)  # what is made once is made
+    for row in took:
+        for i, objective in enumerate(objectives):
+            start = time.perf_counter()
+            objective(swarm)
+            row[i] = 1e6 * (time.perf_counter() - start) / len(swarm)
+    return took
+
+
+def _difference(fast: Objective, slow: Objective, swarm: np.ndarray) -> float:
+    """Largest difference of squares over the candidates that count, relative to the larger of 1 and the square."""
+    found = np.random.default_rng(1).permutation(swarm)
+    expected = slow(found) ** 2
+    difference = np.abs(fast(found) ** 2 - expected) / np.maximum(expected, 1.0)
+    well_posed = expected < max(WELL_POSED**2, float(np.quantile(expected, 0.1)))
+    return float(difference[well_posed].max())
