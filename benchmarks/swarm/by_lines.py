@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 
 import numpy as np
 
@@ -16,9 +17,8 @@ THREADS = 2
 class ByLines:
     """Relative residual of candidates with the stated spectrum, (count, n_variables) swarm coordinates to (count,).
 
-    Of a test with unit runs in directions of their own, sensors along the base directions, and a `sysid.FullMass`
-    healed by its trace. Everything is written out from the paper's equations, for all candidates of a chunk at once
-    and with two threads; in real arithmetic, because the base motion is real.
+    Of a test with any base motion, sensors along the base directions, and a `sysid.FullMass` healed by its trace.
+    Everything is written out from the paper's equations, for all candidates of a chunk at once and with two threads.
 
     Parameters
     ----------
@@ -35,10 +35,8 @@ class ByLines:
         self.of_mass, self.of_factor = np.tril_indices(size), np.tril_indices(self.n)
         self.exponents = np.array([sampling_exponent(k) for k in range(1, size + 1)])[self.of_mass[0]]
         self.lower = problem.lower[: self.exponents.size]
-        # Sensors and runs are the rows, real and imaginary parts side by side the columns.
-        target = test.relative.swapaxes(0, 1).reshape(self.n * self.d, -1)
-        self.target = np.hstack([target.real, target.imag])
-        self.size = np.linalg.norm(target)
+        self.base, self.target = test.base, test.relative
+        self.size = np.linalg.norm(self.target)
         self.pool = ThreadPoolExecutor(THREADS)
 
     def __call__(self, particles: np.ndarray) -> np.ndarray:
@@ -50,12 +48,18 @@ class ByLines:
         ends = np.cumsum([self.exponents.size, self.of_factor[0].size])
         of_mass, of_stiffness, ratios = np.split(s, ends, axis=1)
         phi, gamma = self._modes(self._mass_factors(of_mass), of_stiffness)
-        gains = self._gains(ratios)
-        residues = phi[:, :, None, :] * gamma.swapaxes(1, 2)[:, None]  # (count, n, d, modes)
-        made = residues.reshape(len(s), self.n * self.d, self.n) @ gains
-        made -= self.target
-        flat = made.reshape(len(s), -1)
-        return np.sqrt(np.einsum("pi,pi->p", flat, flat)) / self.size
+        return np.sqrt(self._squared(phi, gamma, ratios)) / self.size
+
+    def _squared(self, phi: np.ndarray, gamma: np.ndarray, ratios: np.ndarray) -> np.ndarray:
+        """Eq. 14 and 15: squared difference from the records, (count,)."""
+        loss = (2j * ratios * self.omega)[:, :, None] * self.w
+        gains = self.w**2 / (self.omega[:, None] ** 2 - self.w**2 + loss)
+        squared = np.zeros(len(phi))
+        for base, target in zip(self.base, self.target, strict=True):
+            made = phi @ (gains * (gamma @ base)) - target
+            flat = made.reshape(len(phi), -1).view(float)
+            squared += np.einsum("pi,pi->p", flat, flat)
+        return squared
 
     def _mass_factors(self, s: np.ndarray) -> np.ndarray:
         """Eq. 18 and 21-22: Cholesky factors of the healed mass, (count, n + d, n + d)."""
@@ -77,9 +81,24 @@ class ByLines:
         phi = np.linalg.inv(L).swapaxes(1, 2) @ psi
         return phi, psi.swapaxes(1, 2) @ (L.swapaxes(1, 2) @ self.G + Z.swapaxes(1, 2))
 
-    def _gains(self, ratios: np.ndarray) -> np.ndarray:
-        """Eq. 14: real and imaginary parts side by side, (count, modes, 2 n_freq)."""
+
+class ByLinesOfUnitRuns(ByLines):
+    """The same where each run moves one direction by one unit: in real arithmetic, all runs in one product."""
+
+    def _squared(self, phi: np.ndarray, gamma: np.ndarray, ratios: np.ndarray) -> np.ndarray:
+        """As above."""
         detuning = self.omega[:, None] ** 2 - self.w**2
         loss = (2 * ratios * self.omega)[:, :, None] * self.w
         size = self.w**2 / (detuning**2 + loss**2)
-        return np.concatenate([size * detuning, -size * loss], axis=2)
+        gains = np.concatenate([size * detuning, -size * loss], axis=2)
+        residues = gamma.swapaxes(1, 2)[:, :, None] * phi[:, None]  # (count, runs, n, modes)
+        made = residues.reshape(len(phi), self.d * self.n, self.n) @ gains
+        made -= self.parts
+        flat = made.reshape(len(phi), -1)
+        return np.einsum("pi,pi->p", flat, flat)
+
+    @cached_property
+    def parts(self) -> np.ndarray:
+        """The records, a run's sensors below each other, real and imaginary parts side by side."""
+        target = self.target.reshape(self.d * self.n, -1)
+        return np.hstack([target.real, target.imag])

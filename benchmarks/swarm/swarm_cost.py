@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_limits
 import sysid
 from benchmarks.line import Line, above, below
 from benchmarks.modal.random_structures import frequency_lines, random_structure
-from benchmarks.swarm.by_lines import ByLines
+from benchmarks.swarm.by_lines import ByLines, ByLinesOfUnitRuns
 from sysid.search.swarm_objective import SwarmObjective
 
 SEED = 3
@@ -32,17 +32,18 @@ def lines(reduced: bool) -> Iterator[Line]:
         for n, count, bound in CASES[:1] if reduced else CASES:
             problem = _problem(n, count)
             fast = SwarmObjective(problem, spectrum=problem.formulation.stiffness.spectrum)
-            slow = ByLines(problem)
+            slow, real = ByLines(problem), ByLinesOfUnitRuns(problem)
             swarm = np.random.default_rng(0).uniform(
                 problem.lower, problem.upper, (5 * problem.n_variables, problem.n_variables)
             )
             what = f"n = {n}, d = {DIRECTIONS}, {count} lines"
-            took = _alternated((fast, slow), swarm, repeats)
+            took = _alternated((fast, slow, real), swarm, repeats)
             quartiles = np.quantile(took, [0.25, 0.5, 0.75], axis=0)
-            spread = ", ".join(f"{low:.0f}-{high:.0f}" for low, _, high in quartiles.T)
+            spread = ", ".join(f"{low:.0f}-{high:.0f}" for low, _, high in quartiles.T[:2])
             least = took.min(axis=0)
             yield below(f"{what}: microseconds a candidate, least of {repeats}", float(least[0]), bound)
             yield Line(f"{what}: by line in batched NumPy, least of {repeats}", f"{least[1]:.4g}")
+            yield Line(f"{what}: the same in real arithmetic, as unit runs allow", f"{least[2]:.4g}")
             ratio = float(quartiles[1, 1] / quartiles[1, 0])
             yield above(f"{what}: times faster, alternated, by medians (quartiles {spread})", ratio, FASTER)
             yield below(f"{what}: largest difference from the sum over lines", _difference(fast, slow, swarm), AGREES)

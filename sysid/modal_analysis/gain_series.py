@@ -129,7 +129,7 @@ class SummedRecord:
         d, (n, terms, lines) = base.shape[1], series.basis.shape
         functions = np.concatenate([series.basis.reshape(-1, lines), np.ones((int(static), lines))])
         # Of all runs together; the gains are the same in each.
-        spectrum, onto_base = np.einsum("rdf,ref->def", u.conj(), u), np.einsum("rcf,rdf->cdf", made, u.conj())
+        spectrum, onto_base = np.einsum("rdf,ref->def", u.conj(), u), np.einsum("rcf,rdf->dcf", made, u.conj())
         overlap = (functions.conj() @ onto_base.reshape(-1, lines).T).real
         self._blocks = [_block(group, spectrum[np.ix_(group, group)], functions) for group in _coupled(spectrum)]
         columns = [*(block.coordinates for block in self._blocks), overlap]
@@ -155,7 +155,7 @@ class SummedRecord:
             made = np.concatenate([made, np.repeat(self._static, len(shapes), axis=1)])
         *gains_of, overlap = np.split(made.transpose(1, 0, 2), self._ends, axis=2)
         shapes = shapes * self._channel
-        residues = (shapes[..., :, None] * loads[..., None, :]).reshape(overlap.shape)
+        residues = (loads[..., None] * shapes[:, :, None]).reshape(overlap.shape)
         squared = self.size - 2 * np.einsum("pmr,pmr->p", overlap, residues)
         products = sum(block.products(loads, part) for block, part in zip(self._blocks, gains_of, strict=True))
         return squared + np.einsum("pkl,pkl->p", _gram(shapes), products)
