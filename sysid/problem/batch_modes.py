@@ -19,20 +19,26 @@ class BatchModes(NamedTuple):
         One mode a row.
     loads : (count, n, d)
         Participations.
-    rigid_body_mass : (count, d, d)
+    base : (count, d, n + d)
+        ``[G; I]' L_M``.
     """
 
     shapes: Array
     loads: Array
-    rigid_body_mass: Array
+    base: Array
+
+    @property
+    def rigid_body_mass(self) -> Array:
+        """``[G; I]' M [G; I]``, (count, d, d)."""
+        return self.base @ np.array(self.base).swapaxes(1, 2)
 
 
 def batch_modes(mass_factors: Array, stiffness_factors: Array, rigid_body: Array) -> BatchModes:
     """Modes of ``M = L_M L_M'`` and ``K_SS = L H L'``, ``H = L_H L_H'``, L the leading block of L_M.
 
     With ``H = Psi Lambda Psi'``, ``L_M = [[L, 0], [Z, L_00]]`` and G the rigid-body motion, the modes are
-    ``Phi = L^-T Psi``, their participations ``Phi' (M_SS G + M_S0) = Psi' (L' G + Z')``, and the rigid-body mass is
-    the square of ``L_M' [G; I]``, whose first n rows are those in brackets.
+    ``Phi = L^-T Psi`` and their participations ``Phi' (M_SS G + M_S0) = Psi' (L' G + Z')``. In brackets are the first
+    n rows of ``L_M' [G; I]``.
 
     Parameters
     ----------
@@ -53,5 +59,4 @@ def batch_modes(mass_factors: Array, stiffness_factors: Array, rigid_body: Array
     psi = np.linalg.eigh(H)[1]
     psi[broken] = np.nan
     made = psi.swapaxes(1, 2) @ np.ascontiguousarray(right.transpose(2, 0, 1))
-    base = np.ascontiguousarray(moved.transpose(2, 0, 1))
-    return BatchModes(made[..., :n], made[..., n:], base @ np.array(base).swapaxes(1, 2))
+    return BatchModes(made[..., :n], made[..., n:], moved.transpose(2, 0, 1))
