@@ -131,7 +131,7 @@ class SummedRecord:
         # Of all runs together; the gains are the same in each.
         spectrum, onto_base = np.einsum("rdf,ref->def", u.conj(), u), np.einsum("rcf,rdf->dcf", made, u.conj())
         overlap = (functions.conj() @ onto_base.reshape(-1, lines).T).real
-        self._blocks = [_block(group, spectrum[np.ix_(group, group)], functions) for group in _coupled(spectrum)]
+        self._blocks = [_block(group, spectrum, functions) for group in _coupled(spectrum)]
         columns = [*(block.coordinates for block in self._blocks), overlap]
         self._ends = np.cumsum([part.shape[1] for part in columns])[:-1]
         together = np.hstack(columns)
@@ -173,14 +173,14 @@ class _Proportional:
         that its square is all that is lost.
     """
 
-    def __init__(self, group: list[int], ratios: Array, power: Array, functions: ComplexArray) -> None:
+    def __init__(self, ratios: Array, power: Array, functions: ComplexArray) -> None:
         lam, vectors = np.linalg.eigh(ratios)
-        self._group, self._root = group, vectors * np.sqrt(np.maximum(lam, 0.0))
+        self._root = vectors * np.sqrt(np.maximum(lam, 0.0))
         self.coordinates = _orthonormal(functions * np.sqrt(power), _RANK)[0]
 
     def products(self, loads: Array, gains_of: Array) -> Array:
         """(count, m, m) from loads (count, m, d) and coordinates of the gains (count, m, rank)."""
-        return _gram(loads[..., self._group] @ self._root) * _gram(gains_of)
+        return _gram(loads @ self._root) * _gram(gains_of)
 
 
 class _Correlated:
@@ -204,12 +204,14 @@ class _Correlated:
 
 
 def _block(group: list[int], spectrum: ComplexArray, functions: ComplexArray) -> _Proportional | _Correlated:
-    """What makes the inner products for a group of base directions with this spectrum, (d, d, n_freq)."""
-    power = np.einsum("ddf->f", spectrum).real
-    ratios = spectrum.sum(axis=2) / power.sum()
-    if np.abs(spectrum - ratios.real[..., None] * power).max() < _ALIKE * power.max():
-        return _Proportional(group, ratios.real, power, functions)
-    return _Correlated(group, spectrum, functions)
+    """What makes the inner products for a group of base directions; the spectrum is that of all, (d, d, n_freq)."""
+    inside = np.zeros_like(spectrum)
+    inside[np.ix_(group, group)] = spectrum[np.ix_(group, group)]
+    power = np.einsum("ddf->f", inside).real
+    ratios = inside.sum(axis=2).real / power.sum()
+    if np.abs(inside - ratios[..., None] * power).max() < _ALIKE * power.max():
+        return _Proportional(ratios, power, functions)
+    return _Correlated(group, spectrum[np.ix_(group, group)], functions)
 
 
 def _coupled(spectrum: ComplexArray) -> list[list[int]]:
