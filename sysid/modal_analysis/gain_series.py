@@ -127,16 +127,16 @@ class SummedRecord:
         made, u = channel[:, None] * line[:, None] * record, line[:, None] * base
         self.size = float(np.sum(np.abs(made) ** 2))
         d, (n, terms, lines) = base.shape[1], series.basis.shape
-        functions = np.concatenate([series.basis.reshape(-1, lines), np.ones((int(static), lines))])
+        still = d if static else 0
         # Of all runs together; the gains are the same in each.
         spectrum, onto_base = np.einsum("rdf,ref->def", u.conj(), u), np.einsum("rcf,rdf->dcf", made, u.conj())
-        overlap = (functions.conj() @ onto_base.reshape(-1, lines).T).real
-        self._blocks = [_block(group, spectrum, functions) for group in _coupled(spectrum)]
+        overlap = (_functions(series.basis, still).conj() @ onto_base.reshape(-1, lines).T).real
+        self._blocks = [_block(group, spectrum, series.basis, still) for group in _coupled(spectrum)]
         columns = [*(block.coordinates for block in self._blocks), overlap]
         self._ends = np.cumsum([part.shape[1] for part in columns])[:-1]
         together = np.hstack(columns)
         self._of_modes = np.ascontiguousarray(together[: n * terms].reshape(n, terms, -1))
-        self._static = np.repeat(together[n * terms :, None], d, axis=0)
+        self._static = np.repeat(together[n * terms :, None], still, axis=0)
 
     def squared(self, shapes: Array, loads: Array, polynomials: Array) -> Array:
         """Squared error of candidates, (count,).
@@ -184,34 +184,66 @@ class _Proportional:
 
 
 class _Correlated:
-    """The same for base directions whose spectra vary over the lines as they like."""
+    """The same for base directions whose spectra vary over the lines as they like: each mode has a basis of its own.
 
-    def __init__(self, group: list[int], spectrum: ComplexArray, functions: ComplexArray) -> None:
+    Attributes
+    ----------
+    coordinates : (functions, rank)
+        Of each mode's gains in that mode's basis.
+    """
+
+    def __init__(self, group: list[int], spectrum: ComplexArray, gains_of: ComplexArray, static: int) -> None:
         self._group = group
         root = np.sqrt(np.einsum("ddf->f", spectrum).real)
-        self.coordinates, basis = _orthonormal(functions * root, _RANK**1.5)
+        parts = [_orthonormal(functions * root, _RANK**1.5) for functions in gains_of]
+        parts += [_orthonormal(root[None] + 0j, _RANK)] * min(static, 1)
+        rank = max(coordinates.shape[1] for coordinates, _ in parts)
+        padded = [np.pad(part, ((0, 0), (0, rank - part.shape[1]))) for part, _ in parts]
+        self.coordinates = np.concatenate(padded)
+        bases = [np.pad(basis, ((0, rank - len(basis)), (0, 0))) for _, basis in parts]
+        bases += bases[-1:] * (static - 1)
         inside = np.divide(spectrum, root**2, out=np.zeros_like(spectrum), where=root > 0)
-        A = np.block([[((basis.conj() * part) @ basis.T).real for part in row] for row in inside])
-        lam, vectors = np.linalg.eigh((A + A.T) / 2)
-        kept = lam > _RANK**2 * lam[-1]
-        self._root = vectors[:, kept] * np.sqrt(lam[kept])
+        # Of mode k, direction d, function i: (k, d i, l e j), k and l modes, d and e directions, i and j functions.
+        basis, m = np.concatenate(bases), len(bases)
+        products = np.array([[((basis.conj() * part) @ basis.T).real for part in row] for row in inside])
+        products = products.reshape(len(group), len(group), m, rank, m, rank).transpose(2, 0, 3, 4, 1, 5)
+        self._products = np.ascontiguousarray(products).reshape(m, len(group) * rank, -1)
 
     def products(self, loads: Array, gains_of: Array) -> Array:
         """As above."""
         count, m, _ = gains_of.shape
-        both = loads[..., self._group, None] * gains_of[..., None, :]
-        return _gram((both.reshape(count * m, -1) @ self._root).reshape(count, m, -1))
+        both = (loads[..., self._group, None] * gains_of[..., None, :]).reshape(count, m, -1)
+        onto = (both.swapaxes(0, 1) @ self._products).reshape(m, count, m, -1)
+        return np.einsum("kplq,plq->pkl", onto, both)
 
 
-def _block(group: list[int], spectrum: ComplexArray, functions: ComplexArray) -> _Proportional | _Correlated:
-    """What makes the inner products for a group of base directions; the spectrum is that of all, (d, d, n_freq)."""
+def _block(
+    group: list[int], spectrum: ComplexArray, gains_of: ComplexArray, static: int
+) -> _Proportional | _Correlated:
+    """What makes the inner products for a group of base directions.
+
+    Parameters
+    ----------
+    group : list of int
+    spectrum : (d, d, n_freq) complex
+        Of all base directions.
+    gains_of : (n, terms, n_freq) complex
+    static : int
+        Number of modes of gain 1.
+    """
     inside = np.zeros_like(spectrum)
     inside[np.ix_(group, group)] = spectrum[np.ix_(group, group)]
     power = np.einsum("ddf->f", inside).real
     ratios = inside.sum(axis=2).real / power.sum()
     if np.abs(inside - ratios[..., None] * power).max() < _ALIKE * power.max():
-        return _Proportional(ratios, power, functions)
-    return _Correlated(group, spectrum[np.ix_(group, group)], functions)
+        return _Proportional(ratios, power, _functions(gains_of, static))
+    return _Correlated(group, spectrum[np.ix_(group, group)], gains_of, static)
+
+
+def _functions(gains_of: ComplexArray, static: int) -> ComplexArray:
+    """Terms of all gains, one below the other, and 1 where there are static modes."""
+    lines = gains_of.shape[-1]
+    return np.concatenate([gains_of.reshape(-1, lines), np.ones((min(static, 1), lines))])
 
 
 def _coupled(spectrum: ComplexArray) -> list[list[int]]:
