@@ -131,10 +131,9 @@ class SummedRecord:
         # Of all runs together; the gains are the same in each.
         spectrum, onto_base = np.einsum("rdf,ref->def", u.conj(), u), np.einsum("rcf,rdf->dcf", made, u.conj())
         overlap = (_functions(series.basis, still).conj() @ onto_base.reshape(-1, lines).T).real
-        self._blocks = [_block(group, spectrum, series.basis, still) for group in _coupled(spectrum)]
-        columns = [*(block.coordinates for block in self._blocks), overlap]
-        self._ends = np.cumsum([part.shape[1] for part in columns])[:-1]
-        together = np.hstack(columns)
+        self._inner = _inner_products(spectrum, series.basis, still)
+        self._rank = self._inner.coordinates.shape[1]
+        together = np.hstack([self._inner.coordinates, overlap])
         self._of_modes = np.ascontiguousarray(together[: n * terms].reshape(n, terms, -1))
         self._static = np.repeat(together[n * terms :, None], still, axis=0)
 
@@ -153,18 +152,17 @@ class SummedRecord:
         made = np.matmul(polynomials.transpose(1, 2, 0), self._of_modes)
         if len(self._static):
             made = np.concatenate([made, np.repeat(self._static, len(shapes), axis=1)])
-        *gains_of, overlap = np.split(made.transpose(1, 0, 2), self._ends, axis=2)
+        gains_of, overlap = np.split(made.transpose(1, 0, 2), [self._rank], axis=2)
         shapes = shapes * self._channel
         residues = (loads[..., None] * shapes[:, :, None]).reshape(overlap.shape)
         squared = self.size - 2 * np.einsum("pmr,pmr->p", overlap, residues)
-        products = sum(block.products(loads, part) for block, part in zip(self._blocks, gains_of, strict=True))
-        return squared + np.einsum("pkl,pkl->p", _gram(shapes), products)
+        return squared + np.einsum("pkl,pkl->p", _gram(shapes), self._inner.products(loads, gains_of))
 
 
 class _Proportional:
-    """Inner products of modal accelerations, for base directions with one spectrum but for a constant matrix.
+    """Inner products of modal accelerations where the base's spectrum is the same at all lines but for its size.
 
-    As in tests where each run moves one direction, and one direction alone always.
+    As in tests where each run moves one direction, all alike, and with one direction alone always.
 
     Attributes
     ----------
@@ -184,7 +182,7 @@ class _Proportional:
 
 
 class _Correlated:
-    """The same for base directions whose spectra vary over the lines as they like: each mode has a basis of its own.
+    """The same for a spectrum that varies over the lines as it likes: each mode has a basis of its own.
 
     Attributes
     ----------
@@ -192,8 +190,7 @@ class _Correlated:
         Of each mode's gains in that mode's basis.
     """
 
-    def __init__(self, group: list[int], spectrum: ComplexArray, gains_of: ComplexArray, static: int) -> None:
-        self._group = group
+    def __init__(self, spectrum: ComplexArray, gains_of: ComplexArray, static: int) -> None:
         root = np.sqrt(np.einsum("ddf->f", spectrum).real)
         parts = [_orthonormal(functions * root, _RANK**1.5) for functions in gains_of]
         parts += [_orthonormal(root[None] + 0j, _RANK)] * min(static, 1)
@@ -206,54 +203,39 @@ class _Correlated:
         # Of mode k, direction d, function i: (k, d i, l e j), k and l modes, d and e directions, i and j functions.
         basis, m = np.concatenate(bases), len(bases)
         products = np.array([[((basis.conj() * part) @ basis.T).real for part in row] for row in inside])
-        products = products.reshape(len(group), len(group), m, rank, m, rank).transpose(2, 0, 3, 4, 1, 5)
-        self._products = np.ascontiguousarray(products).reshape(m, len(group) * rank, -1)
+        products = products.reshape(*inside.shape[:2], m, rank, m, rank).transpose(2, 0, 3, 4, 1, 5)
+        self._products = np.ascontiguousarray(products).reshape(m, len(inside) * rank, -1)
 
     def products(self, loads: Array, gains_of: Array) -> Array:
         """As above."""
         count, m, _ = gains_of.shape
-        both = (loads[..., self._group, None] * gains_of[..., None, :]).reshape(count, m, -1)
+        both = (loads[..., None] * gains_of[..., None, :]).reshape(count, m, -1)
         onto = (both.swapaxes(0, 1) @ self._products).reshape(m, count, m, -1)
         return np.einsum("kplq,plq->pkl", onto, both)
 
 
-def _block(
-    group: list[int], spectrum: ComplexArray, gains_of: ComplexArray, static: int
-) -> _Proportional | _Correlated:
-    """What makes the inner products for a group of base directions.
+def _inner_products(spectrum: ComplexArray, gains_of: ComplexArray, static: int) -> _Proportional | _Correlated:
+    """What makes the inner products of modal accelerations.
 
     Parameters
     ----------
-    group : list of int
     spectrum : (d, d, n_freq) complex
-        Of all base directions.
+        Of the base.
     gains_of : (n, terms, n_freq) complex
     static : int
         Number of modes of gain 1.
     """
-    inside = np.zeros_like(spectrum)
-    inside[np.ix_(group, group)] = spectrum[np.ix_(group, group)]
-    power = np.einsum("ddf->f", inside).real
-    ratios = inside.sum(axis=2).real / power.sum()
-    if np.abs(inside - ratios[..., None] * power).max() < _ALIKE * power.max():
+    power = np.einsum("ddf->f", spectrum).real
+    ratios = spectrum.sum(axis=2).real / power.sum()
+    if np.abs(spectrum - ratios[..., None] * power).max() < _ALIKE * power.max():
         return _Proportional(ratios, power, _functions(gains_of, static))
-    return _Correlated(group, spectrum[np.ix_(group, group)], gains_of, static)
+    return _Correlated(spectrum, gains_of, static)
 
 
 def _functions(gains_of: ComplexArray, static: int) -> ComplexArray:
     """Terms of all gains, one below the other, and 1 where there are static modes."""
     lines = gains_of.shape[-1]
     return np.concatenate([gains_of.reshape(-1, lines), np.ones((min(static, 1), lines))])
-
-
-def _coupled(spectrum: ComplexArray) -> list[list[int]]:
-    """Groups of base directions, those that correlate in one; those with the same spectrum are one group as well."""
-    power = np.einsum("ddf->df", spectrum).real
-    coupled = np.any(spectrum != 0, axis=2)
-    coupled |= np.array([[np.allclose(a, b, rtol=_ALIKE, atol=0) and np.any(a) for b in power] for a in power])
-    for _ in range(len(coupled)):  # whatever is coupled through others
-        coupled = coupled @ coupled
-    return [list(group) for group in sorted({tuple(np.flatnonzero(row).tolist()) for row in coupled if row.any()})]
 
 
 def _orthonormal(functions: ComplexArray, tolerance: float) -> tuple[Array, ComplexArray]:
