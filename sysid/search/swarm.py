@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import SolverError
+from sysid.errors import InputError, SolverError
 from sysid.modal_analysis.response import error_of_accelerations
 from sysid.models.spectrum import by_ipopt, closed_form
 from sysid.problem.problem import Problem
@@ -91,6 +91,12 @@ class Swarm:
     restarts: int = 4
     settings: SwarmSettings = _SETTINGS
     name: str = "swarm"
+
+    def __post_init__(self) -> None:
+        for field, known in (("local", (*get_args(Coordinates), None)), ("refine_by", ("closed form", "ipopt"))):
+            value = getattr(self, field)
+            if value not in known:
+                raise InputError(f"Swarm: {field} = {value!r} is unknown; give one of {', '.join(map(repr, known))}")
 
     @classmethod
     def published(cls, **changes: Any) -> Swarm:

@@ -49,6 +49,12 @@ def test_the_refinement_by_ipopt_is_taken_where_its_residual_is_lower(problem):
     assert max(gains) > 1e-2
 
 
+@pytest.mark.parametrize(("field", "value"), [("local", "cholesky "), ("local", True), ("refine_by", "eigh")])
+def test_a_setting_that_is_not_known_is_refused_by_name(field, value):
+    with pytest.raises(sysid.InputError, match=f"Swarm: {field} = {value!r} is unknown; give one of '"):
+        sysid.Swarm(**{field: value})
+
+
 class TestPublished:
     """Strategy "hpso-ls": the paper's algorithm by one name."""
 
