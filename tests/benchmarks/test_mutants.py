@@ -57,3 +57,13 @@ def test_what_is_not_found_is_not_noticed(mutants, code, tests, detail):
 def test_an_unknown_identifier_is_an_error_that_names_those_there_are(mutants):
     with pytest.raises(ValueError, match="no mutant is called A0; give some of A07, "):
         mutants.run(["A0"])
+
+
+def test_the_code_of_each_wrong_change_stands_once_in_the_package(mutants):
+    """So that a change of the code that a mutant names is seen at once, and not when all of them run next."""
+    files = sorted((ROOT / "sysid").rglob("*.py"))
+    found = {
+        mutant.identifier: sum(len(mutants.occurrences(mutant.code, path)) for path in files)
+        for mutant in mutants.MUTANTS
+    }
+    assert {identifier: count for identifier, count in found.items() if count != 1} == {}
