@@ -130,7 +130,7 @@ def run(name: str, landscape: Landscape, most: int, session: Session, recorder: 
         structure = problem.structure(x)
     except (InputError, SolverError, np.linalg.LinAlgError) as error:  # the best candidate is no structure
         return MethodResult(name, Status.FAILED, str(error), evaluations=evaluator.count, seconds=session.seconds)
-    solved = answer is not None and answer.success
+    solved = answer is not None and answer.success and x is answer.x
     success, message = succeeded(problem, Outcome(structure, x, name, solved, words, History(), stopped))
     return MethodResult(
         name,

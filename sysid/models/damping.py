@@ -14,7 +14,7 @@ from sysid.models.expressions import as_matrix, at_point, check_finite, is_colum
 from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import Geometry
 from sysid.models.model import MassBlocks, Stated, StiffnessBlocks, Written
-from sysid.models.unknowns import Unknown
+from sysid.models.unknowns import Unknown, lower_of, upper_of
 from sysid.structure.structure import Array, Structure
 
 
@@ -86,10 +86,20 @@ class ProportionalDamping(FieldTree):
         return y[0] / (2 * omega) + y[1] * omega / 2
 
     def values(self, geometry: Geometry, structure: Structure) -> Array:
-        """Least-squares alpha and beta for a structure's ratios."""
+        """Least-squares alpha and beta for a structure's ratios: inside the search space where these leave it."""
+        from scipy.optimize import lsq_linear
+
         omega = 2 * np.pi * structure.natural_frequencies
         columns = np.column_stack([1 / (2 * omega), omega / 2])
-        return np.linalg.lstsq(columns, structure.damping_ratios, rcond=None)[0]
+        free = np.linalg.lstsq(columns, structure.damping_ratios, rcond=None)[0]
+        unknowns = self.unknowns(geometry)
+        lower, upper = lower_of(unknowns), upper_of(unknowns)
+        if np.all((free >= lower) & (free <= upper)) or np.any(lower >= upper):
+            return free
+        # In units of the bounds, which are decades apart.
+        unit = upper * np.linalg.norm(columns * upper)
+        held = lsq_linear(columns * unit, structure.damping_ratios, (lower / unit, upper / unit), tol=1e-15)
+        return np.clip(held.x * unit, lower, upper)
 
     def stated(self, geometry: Geometry) -> Stated:
         """Nothing that the modes would tell."""

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 import casadi as ca
 import numpy as np
 
+from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.noise import separable
 from sysid.modal_analysis.modal_error import ModalError
@@ -31,19 +32,25 @@ from sysid.structure.structure import Array
 _ROUND = 150  # iterations, after which Psi_0 is taken anew
 _GAIN = 0.9  # a round that leaves more of the objective than this was the last
 _ROUNDS = 6
+_LEAST_TIME = 1.0  # s, that a round is worth beginning with
+_NOT_BEGUN = "not begun"
 
 
 def fit_in_cholesky(problem: Problem, x: Array, monitor: IterationMonitor, max_iterations: int) -> End:
     """Minimise the objective of a problem with free modes, from the unknowns `x`."""
     error = CholeskyError(problem)
-    best = End(x, problem.objective(x), "not begun", "")
+    best = first = End(x, problem.objective(x), _NOT_BEGUN, "")
     for _ in range(_ROUNDS):
         end = _fit_about(problem, best.x, error, monitor, min(_ROUND, max_iterations))
         gained = end.objective < _GAIN * best.objective
-        best = end if end.objective <= best.objective else best._replace(status=end.status)
-        if end.status in SOLVED or best.objective <= EXACT or not gained or monitor.stopped is not None:
+        # A status belongs to the point that it was given for; only where nothing was better it tells why.
+        best = end if end.objective <= best.objective or best.status == _NOT_BEGUN else best
+        over = monitor.stopped is not None or monitor.left < _LEAST_TIME
+        if end.status in SOLVED or best.objective <= EXACT or not gained or over:
             break
-    return best
+    if best.objective > first.objective:
+        return first._replace(status=f"{best.status}, above the start")
+    return best._replace(status="stopped") if monitor.stopped is not None else best
 
 
 class CholeskyError:
@@ -150,9 +157,10 @@ def _fit_about(problem: Problem, x: Array, error: CholeskyError, monitor: Iterat
     )
     end = ca.Function("end", [z.z], [mass, error.eigenvectors(skew, psi_0), omega, ratios, objective])
     entries, psi, omega, ratios, squared = (np.asarray(part) for part in end(best))
-    if not np.isfinite(squared.item()):
-        return End(x, np.inf, status, "")
-    found = _unknowns(problem, x, entries.ravel(), psi, omega.ravel(), ratios.ravel())
+    try:
+        found = _unknowns(problem, x, entries.ravel(), psi, omega.ravel(), ratios.ravel())
+    except (InputError, np.linalg.LinAlgError) as error:  # an L_M so ill-conditioned that it stands for no structure
+        return End(x, np.inf, f"{status}, at no structure ({error})", "")
     return End(found, float(np.sqrt(squared.item())), status, z.on_bounds(best))
 
 

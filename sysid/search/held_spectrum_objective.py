@@ -14,7 +14,7 @@ import numpy as np
 
 from sysid.measurement.noise import separable
 from sysid.modal_analysis.gain_series import GainSeries, SummedRecord
-from sysid.modal_analysis.response import weights_of_test
+from sysid.modal_analysis.response import weights_of, weights_of_test
 from sysid.problem.batch_modes import BatchModes, batch_modes
 from sysid.problem.given import MATRICES
 from sysid.problem.problem import Problem
@@ -73,11 +73,15 @@ class HeldSpectrumObjective:
         self._series = GainSeries(test.freq, np.sort(spectrum), *ranges, shift=term.shift)
         records = [(test.relative, test.response_std), (test.force, test.force_std)]
         self._records: list[tuple[SummedRecord, float]] = []
+        sizes: list[tuple[float, float]] = []
         for (record, std), (_, scale) in zip(records, weights_of_test(test, weighted=True), strict=False):
             assert record is not None
             weights = separable(std, record.shape)
             summed = SummedRecord(record, test.base, *weights, self._series, static=bool(self._records))
             self._records.append((summed, scale**2))
+            sizes.append((weights_of(record, std)[1], scale))
+        # A record that weighs more than the accelerations loses its digits earlier.
+        self._least = _LEAST * max(1.0, *(weighed**2 / scale**2 for weighed, scale in sizes))
         self._pool = ThreadPoolExecutor(threads or min(os.cpu_count() or 1, _MOST_THREADS))
 
     def __call__(self, particles: Array, by_lines: Callable[[Array], Array]) -> Array:
@@ -92,7 +96,7 @@ class HeldSpectrumObjective:
         """
         starts = range(0, len(particles), CHUNK)
         squared = np.concatenate(list(self._pool.map(lambda at: self._chunk(particles[at : at + CHUNK]), starts)))
-        held = np.logical_and(self._series.holds(particles[:, self._parts.damping]), squared > _LEAST)
+        held = np.logical_and(self._series.holds(particles[:, self._parts.damping]), squared > self._least)
         if not np.all(held):
             squared[~held] = by_lines(particles[~held]) / self._share
         return self._share * squared

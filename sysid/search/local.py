@@ -29,7 +29,8 @@ class LocalResult:
     Attributes
     ----------
     x : (n_variables,)
-        The problem's unknowns; not held by the box where the coordinates are modal.
+        The problem's unknowns; not held by the box where the coordinates are modal, nor, in Cholesky coordinates, are
+        the entries of L_H: frequencies have windows about those stated.
     success : bool
         IPOPT's status is Solve_Succeeded or Solved_To_Acceptable_Level, or the fit is exact to round-off.
     message : str

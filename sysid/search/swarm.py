@@ -30,6 +30,7 @@ _IDLE = (
     "mass and stiffness are free, so the modal local phase finds this answer from wherever the swarm ends, two random "
     "candidates too: what the swarm itself found stands in the history (strategy 'hpso-ls' depends on it)"
 )
+_TRAPPED = "that is a local minimum, as free residues at these poles fit clearly better"
 _DOUBTFUL = 0.1  # objective above which a problem without free modes is searched again
 
 
@@ -148,6 +149,7 @@ class Swarm:
                 search.run(child, start, None if most is None else most - evaluations)
             except (Stop, KeyboardInterrupt) as stop:
                 stopped, search.success, search.message = stop, False, str(stop) or "interrupted"
+                search.stopped()
             evaluations += search.history.evaluations
             if search.x is not None and (best is None or problem.rank_of(search.x) < problem.rank_of(best.found)):
                 best = search
@@ -164,7 +166,7 @@ class Swarm:
         if stopped is not None:
             best.success, best.message = False, str(stopped) or "interrupted"
         history = replace(best.history, evaluations=evaluations, restarts=restarts, phases=tuple(best.phases))
-        idle = problem.free_modes and self.local == "modal"
+        idle = problem.free_modes and self.local == "modal" and best.success
         return Outcome(
             problem.structure(best.found), best.found, self.name, best.success, best.message, history, stopped,
             remarks=(_IDLE,) if idle else (),
@@ -286,7 +288,7 @@ class _Search:
             session.log(f"{result.n_nan} of {result.nfev} candidates were no structure (not a number)")
         if self.unrefined:
             session.log(f"IPOPT refined all but {self.unrefined} candidates, which took the closed form")
-        self.ended("swarm", result.nfev)
+        self.ended("swarm", result.nfev - sum(phase.evaluations for phase in self.phases))
 
     def _target(self) -> float | None:
         """The objective at which the swarm may end: the goal, where objective and residual are one."""
@@ -308,41 +310,54 @@ class _Search:
         """The refinement of the swarm's best by gradients, in the swarm's coordinates."""
 
         def improve(s: Array) -> Array:
-            better = local.solve(self.problem, self.refined(objective.unknowns(s)), max_iterations=30)
+            at, coordinates = self.refined(objective.unknowns(s)), self.options.local or "modal"
+            better = local.solve(self.problem, at, max_iterations=30, coordinates=coordinates)
             return self.problem.formulation.to_sampling(better.x)
 
         return improve
 
+    def stopped(self) -> None:
+        """Add the swarm where it was stopped, which is then the last phase."""
+        if self.x is not None and [phase.name for phase in self.phases] == ["start"]:
+            self.ended("swarm", self.history.evaluations - self.phases[0].evaluations)
+
     def refined_rows(self, rows: Array) -> Array:
         """Rows (k, n_variables), of the swarm or of unknowns alike, with refined entries of L_H."""
-        assert self.spectrum is not None
-        part, with_spectrum = self.problem.formulation.parts.stiffness, self.problem.formulation.with_spectrum
-        refined = rows.copy()
-        refined[:, part], failed = with_spectrum(
-            rows[:, part], self.spectrum, by_solver=self.options.refine_by == "ipopt"
-        )
+        refined, failed = self._with_spectrum(rows, by_solver=self.options.refine_by == "ipopt")
         self.unrefined += failed
         return refined
 
+    def _with_spectrum(self, rows: Array, *, by_solver: bool) -> tuple[Array, int]:
+        """Rows with refined entries of L_H, and of how many IPOPT failed."""
+        assert self.spectrum is not None
+        part, with_spectrum = self.problem.formulation.parts.stiffness, self.problem.formulation.with_spectrum
+        refined = rows.copy()
+        refined[:, part], failed = with_spectrum(rows[:, part], self.spectrum, by_solver=by_solver)
+        return refined, failed
+
     def refined(self, x: Array) -> Array:
         """The unknowns of the structure that `x` was given its objective for: its spectrum replaced."""
-        return x if self.spectrum is None else self.refined_rows(x[None])[0]
+        if self.spectrum is None:
+            return x
+        return self._with_spectrum(x[None], by_solver=self.options.refine_by == "ipopt")[0][0]
 
     def refine(self, spectrum: Array) -> None:
         """Refine the swarm's best from its own L_H through IPOPT, as the paper does, beside the closed form."""
         self.session.report("refinement", 0, 1, self.history.swarm)
         part, n = self.problem.formulation.parts.stiffness, self.problem.geometry.n
         factor = triangle(self.raw[part], n)
-        chosen, solved = closed_form(factor, spectrum), by_ipopt(factor, spectrum)
-        x = self.raw.copy()
-        x[part] = triangle_entries(solved.factor)
-        objective, other = self.objective, self.problem.objective(x)
+        ways = closed_form(factor, spectrum), by_ipopt(factor, spectrum)
+        ends = []
+        for way in ways:
+            x = self.raw.copy()
+            x[part] = triangle_entries(way.factor)
+            ends.append((self.problem.objective(x), x, way))
+        (closed, _, _), (other, _, solved) = ends
         self.session.log(
             f"refinement of eigenvalues 1 to {spectrum.size} of {n}: {solved.message}, within "
-            f"{solved.error:.1e} of the given ones, objective {other:.4e} (closed form {objective:.4e})"
+            f"{solved.error:.1e} of the given ones, objective {other:.4e} (closed form {closed:.4e})"
         )
-        if solved.success and other < objective:
-            self.x, chosen, objective = x, solved, other
+        objective, self.x, chosen = ends[1] if solved.success and other < closed else ends[0]
         self.history = replace(self.history, refinement=objective, refinement_error=chosen.error)
         self.ended("refinement", 1)
 
@@ -367,7 +382,9 @@ class _Search:
         self.trapped = self.problem.free_modes and coordinates != "modal" and self._in_local_minimum()
         if self.trapped:
             self.success = self.meets_goal is True
-            self.message += "; that is a local minimum, as free residues at these poles fit clearly better"
+            self.message += f"; {_TRAPPED}"
+            if self.problem.measurement.force is not None and self.problem.formulation.mass.totals is not None:
+                self.message += ", or the stated total contradicts the base force"
 
     def _in_local_minimum(self) -> bool:
         test, structure = self.problem.measurement, self.problem.structure(self.found)

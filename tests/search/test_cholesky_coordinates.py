@@ -68,7 +68,7 @@ def test_gradient_and_exact_hessian_agree_with_differences_at_random_points(case
         assert np.linalg.norm(central(slopes) - hessian @ along) < 1e-6 * np.linalg.norm(hessian @ along)
 
 
-def test_from_near_the_truth_it_ends_at_an_exact_fit_inside_the_box(case):
+def test_from_near_the_truth_it_ends_at_an_exact_fit_with_the_mass_inside_the_box(case):
     truth, problem, *_ = case
     rng = np.random.default_rng(2)
     x = problem.values(truth)
@@ -93,3 +93,36 @@ def test_the_plain_entries_find_the_truth_of_a_small_structure(random_case):
     end = local.solve(problem, start, coordinates="entries", max_iterations=60)
     assert end.success, end.message
     assert problem.objective(end.x) < 1e-7
+
+
+@pytest.mark.parametrize("coordinates", ["modal", "cholesky"])
+@pytest.mark.parametrize("n", [1, 2])
+def test_proportional_damping_ends_where_it_is_said_to(random_case, coordinates, n):
+    """One ratio has many alpha and beta; those of the answer lie in the search space and make it."""
+    _, problem = random_case(np.random.default_rng(7), damping="proportional", n=n, d=1)
+    start = np.clip(problem.values(problem.reference), problem.lower, problem.upper)
+    start[problem.formulation.parts.damping] *= 0.9
+    end = local.solve(problem, start, coordinates=coordinates)
+    assert end.success, end.message
+    assert problem.objective(end.x) < 1e-6
+    damping = problem.formulation.parts.damping
+    assert np.all((end.x[damping] >= problem.lower[damping]) & (end.x[damping] <= problem.upper[damping]))
+
+
+def test_a_status_stays_with_the_point_that_it_was_given_for(random_case, monkeypatch):
+    """A further round that solves but ends worse vouches for nothing."""
+    from sysid.search import cholesky_coordinates as room
+
+    _, problem = random_case(np.random.default_rng(4), n=2, d=1)
+    x = np.clip(problem.values(problem.reference) * 1.3, problem.lower, problem.upper)
+    left = problem.objective(x)
+    rounds = iter([room.End(x, 0.5 * left, "Maximum_Iterations_Exceeded", ""), room.End(x, 9.0, "Solve_Succeeded", "")])
+    monkeypatch.setattr(room, "_fit_about", lambda *given: next(rounds))
+    end = local.solve(problem, x, coordinates="cholesky")
+    assert not end.success
+    assert "Maximum_Iterations_Exceeded" in end.message
+    worse = iter([room.End(x, 9.0, "Solve_Succeeded", "")])
+    monkeypatch.setattr(room, "_fit_about", lambda *given: next(worse))
+    end = local.solve(problem, x, coordinates="cholesky")
+    assert not end.success
+    assert "above the start" in end.message

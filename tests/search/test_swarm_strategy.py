@@ -1,5 +1,7 @@
 """Strategy "swarm" as the paper has it: its defaults, and the refinement of the swarm's best by IPOPT."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -109,6 +111,26 @@ class TestPublished:
         closed = sysid.identify(problem, strategy=sysid.Swarm(**{**few, "refine_by": "closed form"}), rng=0)
         # Another solution of eq. 31 than the nearest matrix: the same particles have other objectives.
         assert result.history.start != pytest.approx(closed.history.start, rel=1e-6)
+
+    def test_of_both_refinements_of_the_best_the_better_is_taken(self, problem):
+        """Whichever refines the candidates; the log tells both."""
+        for seed in range(3):
+            few = sysid.Swarm(max_iterations=2, n_particles=6, local=None, refine_by="ipopt")
+            history = sysid.identify(problem, strategy=few, rng=seed).history
+            line = next(line for line in history.log if "refinement of eigenvalues" in line)
+            solved, closed = (float(value) for value in re.findall(r"(?:objective|closed form) ([0-9.e+-]+)", line))
+            assert solved != closed
+            assert history.refinement == pytest.approx(min(solved, closed), rel=1e-4)
+
+    def test_a_search_that_is_stopped_tells_how_far_the_swarm_came(self, problem):
+        def stop(progress):
+            if progress.iteration == 3:
+                raise StopIteration
+
+        result = sysid.identify(problem, strategy="hpso-ls", rng=0, callback=stop)
+        assert [phase.name for phase in result.history.phases] == ["start", "swarm"]
+        assert sum(phase.evaluations for phase in result.history.phases) == result.history.evaluations
+        assert result.history.phases[-1].objective == pytest.approx(result.objective)
 
     def test_a_local_minimum_is_no_success(self, problem, monkeypatch):
         """A local phase that ends beside the truth, as where it stops at once, is told by free residues."""
