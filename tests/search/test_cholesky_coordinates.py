@@ -1,5 +1,7 @@
 """The paper's local phase: its error against the problem's own, exact derivatives, and where it ends."""
 
+import dataclasses
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -126,3 +128,20 @@ def test_a_status_stays_with_the_point_that_it_was_given_for(random_case, monkey
     end = local.solve(problem, x, coordinates="cholesky")
     assert not end.success
     assert "above the start" in end.message
+
+
+def test_channels_and_lines_weigh_as_in_the_objective(random_case):
+    """Noise that is stated by channel and line, of accelerations and force."""
+    _, problem = random_case(np.random.default_rng(8), "trace", n=3, d=2, force=True)
+    rng, test = np.random.default_rng(9), problem.measurement
+    stated = dataclasses.replace(
+        test,
+        response_std=rng.uniform(0.1, 1.0, (test.n_sensors, 1)) * rng.uniform(0.1, 1.0, test.freq.size),
+        force_std=rng.uniform(1.0, 9.0, (test.n_base, 1)) * rng.uniform(0.1, 1.0, test.freq.size),
+    )
+    noisy = dataclasses.replace(problem, measurement=stated)
+    x = problem.values(problem.reference)
+    other = np.clip(x * rng.uniform(0.7, 1.3, x.size), problem.lower, problem.upper)
+    at = coordinates_of(noisy, noisy.structure(other))
+    assert noisy.objective(other) != pytest.approx(problem.objective(other), rel=1e-2)
+    assert float(CholeskyError(noisy).gradient(*at)[0]) == pytest.approx(noisy.objective(other) ** 2, rel=1e-9)
