@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.assessment.sensitivity import blocks_of
+from sysid.results.phases import matrix_errors
 from sysid.search.session import Progress
 from sysid.structure.structure import Array, Structure
 
@@ -111,8 +111,7 @@ def errors_of(structure: Structure, reference: Structure | None) -> tuple[float,
     """Errors of M_SS, K_SS and C in %: see `MethodResult.errors`."""
     if reference is None or not _alike(structure.recovery, reference.recovery):
         return MethodResult.errors
-    pairs = zip(blocks_of(structure), blocks_of(reference), strict=True)
-    return tuple(100 * float(np.linalg.norm(found - true) / np.linalg.norm(true)) for found, true in pairs)
+    return tuple(100 * error for error in matrix_errors(structure, reference))
 
 
 def _alike(recovery: Array, other: Array) -> bool:

@@ -6,6 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
+from sysid.assessment.sensitivity import blocks_of
 from sysid.problem.problem import Problem
 from sysid.search.strategy import History, Phase
 from sysid.structure.structure import Array, Structure
@@ -41,19 +42,19 @@ def rows_of_phases(it: Searched) -> list[list[str]]:
 
 def errors(found: Structure, truth: Structure) -> Array:
     """Largest relative error of a frequency and largest 1 - MAC; relative errors of M_SS, K_SS and C: (5,)."""
-    n = truth.n
-    pairs = (
-        (found.mass[:n, :n], truth.mass[:n, :n]),
-        (found.stiffness[:n, :n], truth.stiffness[:n, :n]),
-        (found.damping, truth.damping),
-    )
     own, other = found.mode_shapes, truth.mode_shapes
     mac = np.einsum("ik,ik->k", own, other) ** 2 / np.einsum("ik,ik->k", own, own) / np.einsum("ik,ik->k", other, other)
     return np.array([
         np.max(np.abs(found.natural_frequencies / truth.natural_frequencies - 1)),
         1 - mac.min(),
-        *(np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in pairs),
+        *matrix_errors(found, truth),
     ])  # fmt: skip
+
+
+def matrix_errors(found: Structure, truth: Structure) -> tuple[float, ...]:
+    """Relative errors of M_SS, K_SS and C in Frobenius norm."""
+    pairs = zip(blocks_of(found), blocks_of(truth), strict=True)
+    return tuple(float(np.linalg.norm(a - b) / np.linalg.norm(b)) for a, b in pairs)
 
 
 def _row(problem: Problem, phase: Phase) -> list[str]:

@@ -33,18 +33,18 @@ _ROUND = 150  # iterations, after which Psi_0 is taken anew
 _GAIN = 0.9  # a round that leaves more of the objective than this was the last
 _ROUNDS = 6
 _LEAST_TIME = 1.0  # s, that a round is worth beginning with
-_NOT_BEGUN = "not begun"
 
 
 def fit_in_cholesky(problem: Problem, x: Array, monitor: IterationMonitor, max_iterations: int) -> End:
     """Minimise the objective of a problem with free modes, from the unknowns `x`."""
     error = CholeskyError(problem)
-    best = first = End(x, problem.objective(x), _NOT_BEGUN, "")
+    best = first = End(x, problem.objective(x), "not begun", "")
     for _ in range(_ROUNDS):
         end = _fit_about(problem, best.x, error, monitor, min(_ROUND, max_iterations))
         gained = end.objective < _GAIN * best.objective
-        # A status belongs to the point that it was given for; only where nothing was better it tells why.
-        best = end if end.objective <= best.objective or best.status == _NOT_BEGUN else best
+        # A status belongs to the point that it was given for; that of the first round tells why where none is better.
+        if end.objective <= best.objective or best is first:
+            best = end
         over = monitor.stopped is not None or monitor.left < _LEAST_TIME
         if end.status in SOLVED or best.objective <= EXACT or not gained or over:
             break
@@ -103,9 +103,9 @@ class CholeskyError:
             hessian += chain.T @ curvature @ chain + ca.diagcat(bent, ca.MX(2 * n, 2 * n))
         symbols = ca.MX.sym("y", y.numel())
         parts = ca.vertsplit(symbols, np.cumsum([0, n_mass, skew.numel(), 2 * n]).tolist())
-        inner = ca.Function("inner", [mass, skew, pole, psi_0], [value, gradient, psi])
+        inner = ca.Function("inner", [mass, skew, pole, psi_0], [value, gradient])
         outer = ca.Function("outer", [mass, skew, pole, psi_0], [hessian])
-        self.gradient = ca.Function("gradient", [symbols, psi_0], inner(*parts, psi_0)[:2])
+        self.gradient = ca.Function("gradient", [symbols, psi_0], inner(*parts, psi_0))
         self.hessian = ca.Function("hessian", [symbols, psi_0], [outer(*parts, psi_0)])
         self.eigenvectors = ca.Function("eigenvectors", [skew, psi_0], [psi])
 
@@ -159,8 +159,8 @@ def _fit_about(problem: Problem, x: Array, error: CholeskyError, monitor: Iterat
     entries, psi, omega, ratios, squared = (np.asarray(part) for part in end(best))
     try:
         found = _unknowns(problem, x, entries.ravel(), psi, omega.ravel(), ratios.ravel())
-    except (InputError, np.linalg.LinAlgError) as error:  # an L_M so ill-conditioned that it stands for no structure
-        return End(x, np.inf, f"{status}, at no structure ({error})", "")
+    except (InputError, np.linalg.LinAlgError) as wrong:  # an L_M so ill-conditioned that it stands for no structure
+        return End(x, np.inf, f"{status}, at no structure ({wrong})", "")
     return End(found, float(np.sqrt(squared.item())), status, z.on_bounds(best))
 
 
