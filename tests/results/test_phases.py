@@ -49,3 +49,11 @@ def test_phases_are_stored(result, tmp_path):
     result.save(path)
     again = sysid.load(path)
     assert rows_of_phases(again) == rows_of_phases(result)
+
+
+def test_the_answer_is_told_without_building_it_again(random_case, monkeypatch):
+    """A graph of the matrices has some n³ operations; the modal strategy needs none, and its summary neither."""
+    problem = random_case(np.random.default_rng(2), n=3, d=1)[1]
+    result = sysid.identify(problem, strategy="modal", rng=0)
+    monkeypatch.setattr(type(problem), "structure", lambda *given: pytest.fail("the matrices were built"))
+    assert [row[0] for row in rows_of_phases(result)] == ["local phase"]
