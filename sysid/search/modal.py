@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike
 from sysid.errors import InputError, SolverError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import ModalFit, Modes
-from sysid.modal_analysis.response import weighted_error
+from sysid.modal_analysis.residues import ROUND_OFF, beyond_chance, line_correlation
+from sysid.modal_analysis.response import columns, gains, weighted_error, weights_of
 from sysid.modal_analysis.vector_fitting import Poles, find_poles, poles_near
 from sysid.models.spectrum import SOLVED
 from sysid.nlp import EXACT, IterationMonitor
@@ -33,7 +34,6 @@ from sysid.search.session import Session, Stop
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase
 from sysid.structure.structure import Array, Structure
 
-_SCATTER = 5.0  # times the misfit of all lines together: what noise makes of the shapes' singular values
 _DEPENDENT = 1e-6  # of the largest singular value of the shapes: below, sensors move alike in all modes
 
 
@@ -97,20 +97,15 @@ class DegreesOfFreedom:
     modes: Integers
 
 
-def degrees_of_freedom(
-    problem: Problem, modes: Modes, residual: float, stated: Sequence[str | int] | None
-) -> DegreesOfFreedom:
+def degrees_of_freedom(problem: Problem, modes: Modes, stated: Sequence[str | int] | None) -> DegreesOfFreedom:
     """Sensors, and modal coordinates where they do not suffice, whose motions tell all modes' apart.
 
     Sensors by a pivoted QR of the mode shapes, each mode in units of its own size, so that the chosen rows are
     best conditioned. With more modes than independent sensors the modes that the sensors tell least become coordinates.
-    The relative `residual` of the fit tells how well shapes are known, and so what is independent.
     """
-    n, m = modes.phi.shape
+    m = modes.omega.size
     shapes = modes.phi / np.linalg.norm(modes.phi, axis=0)
-    s = np.linalg.svd(shapes, compute_uv=False)
-    least = max(_DEPENDENT, _SCATTER * residual / np.sqrt(problem.measurement.freq.size))
-    rank = int(np.count_nonzero(s > least * s[0]))
+    rank = _independent_sensors(problem.measurement, modes)
     if stated is not None:
         sensors = _by_name(problem.measurement, stated)
         if sensors.size > m or np.linalg.svd(shapes[sensors], compute_uv=False)[-1] < _DEPENDENT:
@@ -118,12 +113,29 @@ def degrees_of_freedom(
                 f"{sensors.size} sensors are stated as degrees of freedom, but the {m} modes do not tell them apart "
                 f"(at most {rank} move independently)"
             )
-    elif rank == n:
-        sensors = np.arange(n)
     else:
         sensors = np.sort(scipy.linalg.qr(shapes.T, pivoting=True, mode="r")[1][:rank])
     order = scipy.linalg.qr(shapes[sensors], pivoting=True, mode="r")[1]
     return DegreesOfFreedom(sensors, np.sort(order[sensors.size :]))
+
+
+def _independent_sensors(test: Measurement, modes: Modes) -> int:
+    """How many combinations of sensors move in the modes by more than noise would make of them.
+
+    Motions are judged, not shapes: two modes that nearly share a pole have shapes that are uncertain and nearly
+    parallel, while their sum and their difference in the records are well known.
+    """
+    q = gains(test.freq, modes.omega, modes.ratios) * np.einsum("md,rdf->rmf", modes.gamma, test.base)
+    weight, size = weights_of(test.relative, test.response_std)
+    motion = np.einsum("nm,rmf->rnf", modes.phi, q)
+    error = weight * columns(test.relative - motion) / size
+    unknowns = modes.phi.size + modes.gamma.size + modes.omega.size
+    variance = float(np.sum(np.abs(error) ** 2)) / max(2 * error.size - unknowns, 1)
+    variance = max(variance * line_correlation(error.reshape(len(error), -1, test.freq.size)), ROUND_OFF**2)
+    s = np.linalg.svd(weight * columns(motion) / size, compute_uv=False)
+    moving = np.count_nonzero(s**2 > variance * beyond_chance(modes.omega.size))
+    shapes = np.linalg.svd(modes.phi / np.linalg.norm(modes.phi, axis=0), compute_uv=False)
+    return int(min(moving, np.count_nonzero(shapes > _DEPENDENT * shapes[0])))
 
 
 def _by_name(test: Measurement, stated: Sequence[str | int]) -> Integers:
@@ -266,7 +278,7 @@ def modal_structure(
     end = ModeFit(test, poles, np.sqrt(problem.totals), monitor, options.max_iterations).best()
     held = held_to_totals(problem, end, monitor, options.max_iterations)
     end = held or end
-    chosen = degrees_of_freedom(problem, end.modes, end.of_accelerations, options.sensors)
+    chosen = degrees_of_freedom(problem, end.modes, options.sensors)
     modes, remainder = end.modes, end.rigid - end.modes.gamma.T @ end.modes.gamma
     if test.force is None:
         t = _modal_masses(problem, modes, chosen)

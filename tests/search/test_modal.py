@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 import sysid
+from sysid.modal_analysis.modal_fit import Modes
 from sysid.models.damping import ProportionalDamping
+from sysid.search.modal import degrees_of_freedom
 
 
 def structure(seed, n, d):
@@ -318,3 +320,25 @@ def test_time_records_of_a_random_test_with_force(random_structure, seed):
     np.testing.assert_allclose(result.structure.natural_frequencies, truth.natural_frequencies, rtol=1e-3)
     np.testing.assert_allclose(result.structure.damping_ratios, truth.damping_ratios, rtol=0.05)
     within(result, truth, 0.03)
+
+
+@pytest.mark.parametrize("alike", [False, True])
+def test_the_motions_of_modes_that_nearly_share_a_pole_are_judged_not_their_shapes(alike):
+    """Their shapes are large and nearly parallel; sum and difference of their motions are as large as any other."""
+    freq, split = np.linspace(2.0, 30.0, 600), 1e-4
+    omega = 2 * np.pi * np.array([7.0, 15.0, 15.0 * (1 + split)])
+    ratios, gamma = np.full(3, 0.03), np.array([[3.0], [2.0], [2.0]])
+    together, apart = np.array([0.2, 0.4, 0.1]), np.array([0.01, -0.02, 0.015])
+    if alike:
+        apart = 0.1 * together
+    phi = np.column_stack([[0.1, 0.2, 0.4], together / 2 - apart / split, together / 2 + apart / split])
+    s = 2j * np.pi * freq
+    gain = -(s**2) / (omega[:, None] ** 2 + s**2 + 2 * (ratios * omega)[:, None] * s)
+    motion = phi @ (gamma * gain)
+    noise = 0.003 * np.abs(motion).mean() * complex_noise(np.random.default_rng(0), motion.shape)
+    base = np.ones((1, 1, 600), dtype=complex)
+    test = sysid.Measurement(freq, base, (1 + motion + noise)[None], rigid_body=np.ones((3, 1)))
+    chosen = degrees_of_freedom(sysid.Problem(test, mass=sysid.FullMass(1.0)), Modes(phi, gamma, omega, ratios), None)
+    shapes = np.linalg.svd(phi / np.linalg.norm(phi, axis=0), compute_uv=False)
+    assert shapes[-1] < 1e-3 * shapes[0]
+    assert (chosen.sensors.size, chosen.modes.size) == ((2, 1) if alike else (3, 0))
