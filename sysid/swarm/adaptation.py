@@ -53,7 +53,7 @@ def focusing_change_rate(positions: FloatArray, best: FloatArray) -> float:
     positions : (n_particles, n_dim) array
         Positions, scaled to the range of each variable.
     best : (n_dim,) array
-        The global best, scaled likewise.
+        The global best, scaled likewise: the best position visited so far, at which no particle need be now.
 
     Returns
     -------
@@ -135,7 +135,8 @@ def evolutionary_factor(distances: FloatArray, leader: int) -> float:
     distances : (n_particles,) array
         Mean distances d_i of `mean_distances`.
     leader : int
-        Index of the particle that holds the global best.
+        Index of the particle whose own best is the global best. Its present position counts, as that of all others; the
+        source's "globally best particle" could also be read as the global best itself.
 
     Returns
     -------
@@ -206,15 +207,19 @@ def next_accelerations(
 ) -> tuple[float, float]:
     """Cognitive and social coefficients of the next iteration (Zhan et al. 2009, section III-C).
 
+    Both move by the step, in the directions of the state; then each is clamped; then, where their sum is too large,
+    both are multiplied by the same factor. They are not clamped again: with the source's constants no need is left, but
+    where `lower` + `upper` > `largest_sum` one of them can end below `lower`.
+
     Parameters
     ----------
     c1, c2 : float
         The present cognitive and social coefficient.
     state : EvolutionaryState
-        Exploration moves (c1, c2) by (+, -) a step, exploitation by (+½, -½), convergence by (+½, +½), jumping out
-        by (-, +).
+        Of this iteration, just estimated. Exploration moves (c1, c2) by (+, -) a step, exploitation by (+½, -½),
+        convergence by (+½, +½), jumping out by (-, +); the source's "slightly" is half a step.
     step : float
-        A number drawn from the uniform distribution on [0.05, 0.1].
+        A number drawn from the uniform distribution on [0.05, 0.1], the same for both.
     lower, upper : float
         Each coefficient is clamped to this interval.
     largest_sum : float

@@ -15,8 +15,9 @@ FloatArray = NDArray[np.float64]
 class Box:
     """Lower and upper bounds, and the scaling of the free variables to the unit cube.
 
-    Particles are points of this cube; a fixed variable (lower == upper) has no range, is left out of distances, and
-    is returned exactly.
+    Particles are points of this cube, and all distances and velocities of the swarm are counted in it; a fixed variable
+    (lower == upper) has no range, is left out of distances, and is returned exactly. Conversions clip to the bounds;
+    what a particle's velocity does there is told by `ParticleSwarm`.
 
     Parameters
     ----------

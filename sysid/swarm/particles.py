@@ -28,7 +28,16 @@ class ParticleSwarm:
     global best with one coordinate moved at random (elitist learning, Zhan et al. 2009, IEEE Trans. SMC-B 39(6)). That
     row becomes the global best if its cost is lower, else it takes the place of the worst particle.
 
-    A particle that would leave the box stops at the bound, and the velocity component that led out is reversed.
+    Four things the sources leave open, or can be read in two ways; here:
+
+    - State estimation takes the leader's present position: d_best is the mean distance of the particle whose own best
+      is the global best from the others, all where they are now. The focusing distance of the inertia weight (eq. 8-10)
+      is measured from the global best itself, the best position ever visited.
+    - A particle that reaches or passes a bound is put on it, and its velocity in that variable, limited to 0.4 of the
+      range, points back inwards with the same size. Its other variables go on as they were.
+    - c1 and c2 change by one step, drawn anew each iteration, before the move; direction, clamping and the limit of
+      their sum: `sysid.swarm.adaptation.next_accelerations`.
+    - A particle that is moved to the row of elitist learning, or to a point of `inject`, keeps its velocity.
 
     Costs that are not finite are counted and read as +inf: such a point never becomes a best. While no finite cost is
     known at all, each `ask` is a new Latin hypercube, since there is no best to move towards.
