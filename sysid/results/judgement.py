@@ -13,13 +13,13 @@ from sysid.assessment.sensitivity import blocks_of
 from sysid.nlp import EXACT
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification
+from sysid.results.unknowns_table import ON_BOUND
 from sysid.search.session import Session
 from sysid.search.strategy import Outcome
 
 _KNOWN = 0.1  # of the root of two diagonal entries; an entry with a larger standard deviation is not known
 _LARGE = 4000  # entries of the mode shapes, beyond which the covariance takes minutes and gigabytes
 _NO_FIT = 0.5  # relative residual above which nothing is explained
-_ON_BOUND = 1e-6  # of an unknown's range
 
 
 def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session) -> Identification:
@@ -71,7 +71,7 @@ def _remarks(problem: Problem, end: Outcome) -> Iterator[str]:
     """What the user should know of the unknowns and of the misfit."""
     formulation = problem.formulation
     if end.x is not None and formulation.variables:
-        near = _ON_BOUND * (problem.upper - problem.lower)
+        near = ON_BOUND * (problem.upper - problem.lower)
         at = (end.x - problem.lower < near) | (problem.upper - end.x < near)
         names = [label for label, on in zip(formulation.labels, at, strict=True) if on]
         if names:

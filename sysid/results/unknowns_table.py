@@ -8,7 +8,7 @@ import numpy as np
 
 from sysid.results.answer import Answer, reported_unknowns
 
-_ON_BOUND = 1e-6  # of the range
+ON_BOUND = 1e-6  # of an unknown's range: nearer than that it rests on the bound
 MANY = 60  # rows beyond which a terminal shows none
 
 
@@ -25,7 +25,7 @@ class Row(NamedTuple):
     @property
     def on_bound(self) -> str:
         """Words for the bound on which the value rests: "on its lower bound"; nothing elsewhere."""
-        near = _ON_BOUND * (self.upper - self.lower)
+        near = ON_BOUND * (self.upper - self.lower)
         rests = ("lower", self.value - self.lower < near), ("upper", self.upper - self.value < near)
         return next((f"on its {name} bound" for name, there in rests if there), "")
 
