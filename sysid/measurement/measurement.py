@@ -210,6 +210,11 @@ class Measurement:
         return int(self.response.shape[1])
 
     @property
+    def has_unit_runs(self) -> bool:
+        """Whether run i is unit motion in base direction i alone, so that responses are transmissibilities."""
+        return self.n_runs == self.n_base and np.array_equal(self.base, unit_runs(self.n_base, self.freq.size))
+
+    @property
     def relative(self) -> ComplexArray:
         """Acceleration relative to the moving base, ``response - G base``, (runs, n_sensors, n_freq)."""
         return self.response - np.einsum("sd,rdf->rsf", self.rigid_body, self.base)

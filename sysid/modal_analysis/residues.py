@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from sysid.measurement.measurement import Measurement, unit_runs
+from sysid.measurement.measurement import Measurement
 from sysid.measurement.noise import separable
 from sysid.modal_analysis.response import columns, gains, gains_with_velocity, stacked
 from sysid.structure.structure import Array, ComplexArray
@@ -114,7 +114,7 @@ class Records:
         self.n_sensors, self.n_base = record.shape[1], test.n_base
         channel, line = separable(std, record.shape)
         relative = record * channel[:, None]
-        self.unit = test.n_runs == test.n_base and np.array_equal(test.base, unit_runs(test.n_base, test.freq.size))
+        self.unit = test.has_unit_runs
         if self.unit:
             size = np.exp(np.log(line).mean(axis=1, keepdims=True))  # of each run
             shared = np.exp(np.log(line / size).mean(axis=0))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError
-from sysid.measurement.measurement import Measurement, unit_runs
+from sysid.measurement.measurement import Measurement
 from sysid.plot.canvas import (
     FAINT,
     IDENTIFIED,
@@ -53,14 +53,9 @@ class Channel(NamedTuple):
     std: Array  # of the identified spectrum
 
 
-def is_unit(test: Measurement) -> bool:
-    """Whether run i is unit motion in base direction i alone, so that responses are transmissibilities."""
-    return test.n_runs == test.n_base and np.array_equal(test.base, unit_runs(test.n_base, test.freq.size))
-
-
 def run_names(test: Measurement) -> tuple[str, ...]:
     """What each run is called in a title: "base x" for unit runs, else "run 1"."""
-    if is_unit(test):
+    if test.has_unit_runs:
         return tuple(f"base {name}" for name in test.base_axes or ())
     return tuple(f"run {r + 1}" for r in range(test.n_runs))
 
@@ -118,7 +113,7 @@ def _channel(
     name, per_base, spectrum = words
     title = f"{name}, {run_names(test)[run]}"
     negligible = bool(np.abs(measured).max() <= _ROUND_OFF * largest)
-    if is_unit(test):
+    if test.has_unit_runs:
         ones = np.ones_like(measured)
         return Channel(test.freq, measured, predicted, ones, title, per_base, "phase [°]", negligible, std)
     moved = int(np.argmax(np.linalg.norm(test.base[run], axis=-1)))
@@ -234,7 +229,7 @@ def index_of(what: str, value: int | str, names: Sequence[str]) -> int:
 
 def run_index(test: Measurement, run: int | str) -> int:
     """Index of a run by name or number; runs of unit base motion are called as the base axes."""
-    names = (test.base_axes or ()) if is_unit(test) else run_names(test)
+    names = (test.base_axes or ()) if test.has_unit_runs else run_names(test)
     return index_of("run", run, names)
 
 

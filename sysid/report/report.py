@@ -11,7 +11,7 @@ import numpy as np
 from sysid import plot
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
-from sysid.plot.panels import is_unit, run_names
+from sysid.plot.panels import run_names
 from sysid.problem.formulation import MATRICES
 from sysid.problem.problem import Problem
 from sysid.report.html import Cell, beside, bullets, fold, matrix, number, page, paragraph, picture, table, text
@@ -233,7 +233,7 @@ def _rigid_body_mass(it: Identification) -> str:
 
 
 def _responses(it: Identification, test: Measurement) -> str:
-    words = (_PER_UNIT if is_unit(test) else _AS_MOVED) + " The difference of the two is drawn faint."
+    words = (_PER_UNIT if test.has_unit_runs else _AS_MOVED) + " The difference of the two is drawn faint."
     u, band = it.quick_uncertainty, None
     if u is not None:
         band = u.transmissibility(test.freq)
