@@ -43,7 +43,7 @@ class ModalError:
     gradient : casadi.Function
         Coordinates to the squared error and its gradient.
     hessian : casadi.Function
-        Coordinates to the gradient and the Hessian.
+        Coordinates to the Hessian.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class ModalError:
         of_motion = (slopes @ slopes.T) * alike + motion.curvature(pull)
         hessian = ca.vertcat(ca.horzcat(of_factors, mixed), ca.horzcat(mixed.T, of_motion))
         self.gradient = ca.Function("gradient", [y], [value, gradient])
-        self.hessian = ca.Function("hessian", [y], [gradient, ca.densify(hessian)])
+        self.hessian = ca.Function("hessian", [y], [ca.densify(hessian)])
 
 
 class _Motion:

@@ -93,7 +93,7 @@ class CholeskyError:
             moved = ca.veccat(*factors, gamma)
             at = ca.vertcat(moved, pole)
             squared, slope = error.gradient(at)
-            curvature = error.hessian(at)[1]
+            curvature = error.hessian(at)
             chain = ca.diagcat(ca.densify(ca.jacobian(moved, shapes)), ca.DM.eye(2 * n))
             pull = ca.MX.sym("pull", moved.numel())
             bend = ca.Function("bend", [shapes, psi_0, pull], [ca.hessian(ca.dot(pull, moved), shapes)[0]])

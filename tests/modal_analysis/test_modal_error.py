@@ -41,8 +41,7 @@ def test_the_error_is_the_sum_over_runs_channels_and_lines(with_base):
 @pytest.mark.parametrize("with_base", [False, True])
 def test_gradient_and_hessian_agree_with_differences(with_base):
     error, y, _ = drawn(with_base)
-    gradient, hessian = (np.asarray(part) for part in error.hessian(y))
-    assert np.asarray(error.gradient(y)[1]) == pytest.approx(gradient, rel=1e-13)
+    gradient, hessian = np.asarray(error.gradient(y)[1]), np.asarray(error.hessian(y))
     h = 1e-5
     rng = np.random.default_rng(6)
     for _ in range(4):
