@@ -118,14 +118,18 @@ def error_of_accelerations(test: Measurement, structure: Structure) -> float:
     return float(np.linalg.norm(weight * columns(test.predict(structure) - test.relative))) / scale
 
 
+def records_of(test: Measurement) -> list[tuple[ComplexArray, Array | None]]:
+    """The relative accelerations and, where it was measured, the base force, each with its stated deviations."""
+    records = [(test.relative, test.response_std)]
+    return records if test.force is None else [*records, (test.force, test.force_std)]
+
+
 def weights_of_test(test: Measurement, *, weighted: bool) -> list[tuple[Array, float]]:
-    """`weights_of` the relative accelerations and, where it was measured, the base force.
+    """`weights_of` the `records_of` a test.
 
     Where the noise of both is stated, both have the size of the accelerations, so that they weigh by their noise alone.
     """
-    records = [(test.relative, test.response_std)]
-    records += [] if test.force is None else [(test.force, test.force_std)]
-    found = [weights_of(record, std if weighted else None) for record, std in records]
+    found = [weights_of(record, std if weighted else None) for record, std in records_of(test)]
     if weighted and test.response_std is not None and test.force_std is not None:
         found = [(weight, found[0][1]) for weight, _ in found]
     return found

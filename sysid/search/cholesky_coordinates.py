@@ -18,7 +18,7 @@ from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.noise import separable
 from sysid.modal_analysis.modal_error import ModalError
-from sysid.modal_analysis.response import weights_of_test
+from sysid.modal_analysis.response import records_of, weights_of_test
 from sysid.models.model import mass_blocks
 from sysid.models.spectrum import SOLVED
 from sysid.models.unknowns import lower_of, upper_of
@@ -112,11 +112,8 @@ class CholeskyError:
 
 def _errors_of(test: Measurement, modes: int) -> Iterator[tuple[ModalError, bool]]:
     """The errors of accelerations and, where it was measured, base force, in the weights of the objective."""
-    records = [(test.relative, test.response_std)]
-    records += [] if test.force is None else [(test.force, test.force_std)]
-    for of_force, ((record, std), (_, scale)) in enumerate(
-        zip(records, weights_of_test(test, weighted=True), strict=True)
-    ):
+    weighed = zip(records_of(test), weights_of_test(test, weighted=True), strict=True)
+    for of_force, ((record, std), (_, scale)) in enumerate(weighed):
         channel, line = separable(std, record.shape)
         yield (
             ModalError(test.base, record, test.freq, channel / scale, line, modes=modes, with_base=bool(of_force)),

@@ -14,7 +14,7 @@ import numpy as np
 
 from sysid.measurement.noise import separable
 from sysid.modal_analysis.gain_series import GainSeries, SummedRecord
-from sysid.modal_analysis.response import weights_of, weights_of_test
+from sysid.modal_analysis.response import records_of, weights_of, weights_of_test
 from sysid.problem.batch_modes import BatchModes, batch_modes
 from sysid.problem.given import MATRICES
 from sysid.problem.problem import Problem
@@ -71,11 +71,9 @@ class HeldSpectrumObjective:
         self._share, self._recovery = term.weight**2, term.matrices.recovery
         ranges = formulation.lower[self._parts.damping], formulation.upper[self._parts.damping]
         self._series = GainSeries(test.freq, np.sort(spectrum), *ranges, shift=term.shift)
-        records = [(test.relative, test.response_std), (test.force, test.force_std)]
         self._records: list[tuple[SummedRecord, float]] = []
         sizes: list[tuple[float, float]] = []
-        for (record, std), (_, scale) in zip(records, weights_of_test(test, weighted=True), strict=False):
-            assert record is not None
+        for (record, std), (_, scale) in zip(records_of(test), weights_of_test(test, weighted=True), strict=True):
             weights = separable(std, record.shape)
             summed = SummedRecord(record, test.base, *weights, self._series, static=bool(self._records))
             self._records.append((summed, scale**2))
