@@ -16,9 +16,10 @@ from sysid.errors import InputError, SolverError
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.results.judgement import succeeded
-from sysid.search.continuation import descend, smoothed_tests
+from sysid.search.continuation import descend
 from sysid.search.session import Session
 from sysid.search.strategy import History, Outcome
+from sysid.search.swarm import Swarm
 from sysid.search.swarm_objective import SwarmObjective
 from sysid.structure.structure import Array
 
@@ -61,11 +62,7 @@ class Landscape:
     @classmethod
     def of(cls, problem: Problem, session: Session) -> Landscape:
         """The objective and the steps that the strategy "swarm" takes for a problem; both compiled."""
-        formulation = problem.formulation
-        smoother = None if formulation.refinable else smoothed_tests(problem, session.preparing)
-        steps = [] if smoother is None else smoother.steps[1:]
-        spectrum = formulation.stiffness.spectrum if formulation.refinable else None
-        objective = SwarmObjective(problem, steps[0] if steps else (), spectrum)
+        objective, steps = Swarm().searched(problem, session)
         objective(problem.lower[None])
         return cls(problem, objective, steps)
 

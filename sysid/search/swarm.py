@@ -128,6 +128,15 @@ class Swarm:
             "one a sensor: narrow the band, or use strategy 'modal'"
         )
 
+    def searched(self, problem: Problem, session: Session) -> tuple[SwarmObjective, list[tuple[TestTerm, ...]]]:
+        """What the swarm minimises, and the tests with widened peaks, if any, through which the local phase goes."""
+        formulation = problem.formulation
+        smoother = None if formulation.refinable else smoothed_tests(problem, session.preparing)
+        # With wide peaks more of the swarm is on a slope that leads somewhere.
+        steps = [] if smoother is None else smoother.steps[1:]
+        spectrum = formulation.stiffness.spectrum if self.refine and formulation.refinable else None
+        return SwarmObjective(problem, steps[0] if steps else (), spectrum), steps
+
     def run(self, problem: Problem, session: Session, start: ArrayLike | Structure | None) -> Outcome:
         """Search, and again from another swarm while there is no good fit; the best.
 
@@ -182,6 +191,7 @@ class _Search:
         self.raw: Array = np.zeros(0)
         self.unrefined = 0  # candidates that IPOPT could not refine
         self.steps: list[tuple[TestTerm, ...]] = []
+        self.spectrum: Array | None = None  # the measured one, where each candidate is given it
         self.history = History()
         self.phases: list[Phase] = []
         self.trapped = False
@@ -212,12 +222,6 @@ class _Search:
             return self.meets_goal is True
         return not self.trapped if self.problem.free_modes else self.objective <= _DOUBTFUL
 
-    @property
-    def spectrum(self) -> Array | None:
-        """The measured spectrum, where each candidate is given it."""
-        formulation = self.problem.formulation
-        return formulation.stiffness.spectrum if self.options.refine and formulation.refinable else None
-
     def run(
         self, random: np.random.SeedSequence, start: ArrayLike | Structure | None, max_evaluations: int | None
     ) -> None:
@@ -237,10 +241,8 @@ class _Search:
     ) -> None:
         """The swarm itself."""
         problem, options, session = self.problem, self.options, self.session
-        if not problem.formulation.refinable and (smoother := smoothed_tests(problem, session.preparing)):
-            # With wide peaks more of the swarm is on a slope that leads somewhere.
-            self.steps = smoother.steps[1:]
-        objective = SwarmObjective(problem, self.steps[0] if self.steps else (), self.spectrum)
+        objective, self.steps = options.searched(problem, session)
+        self.spectrum = objective.spectrum
         self._log_start()
         curve: list[float] = []
 

@@ -11,8 +11,6 @@ import sysid
 from sysid import FullMass, SpectralStiffness
 from sysid.models.spectrum import SOLVED
 from sysid.search import local
-from sysid.search.session import DeferredInterrupt, Session
-from sysid.search.swarm import Swarm, _Search
 from sysid.search.swarm_objective import SwarmObjective
 
 MASSES, DAMPINGS = ("trace", "rigid_body", "lumped", "known"), ("modal", "proportional")
@@ -20,7 +18,11 @@ MASSES, DAMPINGS = ("trace", "rigid_body", "lumped", "known"), ("modal", "propor
 
 def refined(problem, x):
     """The unknowns with the measured spectrum."""
-    return _Search(problem, Swarm(), Session([], DeferredInterrupt())).refined(x)
+    formulation, x = problem.formulation, x.copy()
+    if formulation.refinable:
+        part = formulation.parts.stiffness
+        x[part] = formulation.with_spectrum(x[None, part], formulation.stiffness.spectrum)[0][0]
+    return x
 
 
 def random_start(rng, problem):
