@@ -42,7 +42,7 @@ class MethodResult:
         Relative residual at the end, unweighted, as `Identification.residual`.
     errors : (3,)
         Of M_SS, K_SS and C: Frobenius norm of the difference from the reference's, in % of the reference's; NaN where
-        there is no reference, or one of other degrees of freedom.
+        there is no reference, or one of other degrees of freedom, and of C where the reference has no damping.
     evaluations : int
         Candidates whose objective was computed before the local phase; 0 for a method without candidates.
     seconds : float

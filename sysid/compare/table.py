@@ -48,10 +48,10 @@ def line(result: MethodResult) -> str:
 
 
 def as_csv(comparison: Comparison) -> str:
-    """Rows of `MethodResult.to_dict`; empty cells for what is not known."""
+    """Rows of `MethodResult.to_dict`, below their names; empty cells for what is not known."""
     rows = [result.to_dict() for result in comparison.results]
     out = io.StringIO()
-    writer = csv.DictWriter(out, list(rows[0]), lineterminator="\n")
+    writer = csv.DictWriter(out, list(MethodResult("", Status.FAILED).to_dict()), lineterminator="\n")
     writer.writeheader()
     writer.writerows({name: "" if value != value else value for name, value in row.items()} for row in rows)
     return out.getvalue()
@@ -76,7 +76,10 @@ def _notes(comparison: Comparison) -> Iterator[str]:
         "residual": "relative residual",
         "objective": "objective (all that is fitted, weighed by its stated noise)",
     }[comparison.quantity]
-    errors = "; M, K, C: error against the reference" * (comparison.problem.reference is not None)
+    truth, errors = comparison.problem.reference, ""
+    if truth is not None:
+        undamped = ", which has no damping, so that C has no relative error" * (not np.any(truth.damping))
+        errors = f"; M, K, C: error against the reference{undamped}"
     yield from _folded(f"before, after: {what} before and after the local phase{errors}", "")
     for result in comparison.results:
         if result.status is not Status.FIT:

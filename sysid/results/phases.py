@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from sysid.assessment.sensitivity import blocks_of
+from sysid.errors import InputError
 from sysid.problem.problem import Problem
 from sysid.search.strategy import History, Phase
 from sysid.structure.structure import Array, Structure
@@ -38,8 +39,8 @@ def rows_of_phases(it: Searched) -> list[list[str]]:
     """A row of `COLUMNS` for each phase of the search that gave the answer; the truth's columns "-" without one.
 
     Frequencies: largest relative error; MAC: of the mode that is told least; M_SS, K_SS and C: relative error in
-    Frobenius norm. An iterate of a local solver counts as a candidate. Of a result that tells no unknowns only
-    objectives are known.
+    Frobenius norm, "-" for C where the truth has no damping. An iterate of a local solver counts as a candidate. Of a
+    phase that ended at no structure, and of a result that tells no unknowns, only objectives are known.
     """
     history = it.history
     rows = [_row(it, phase) for phase in history.phases if phase.x.size]
@@ -60,16 +61,20 @@ def errors(found: Structure, truth: Structure) -> Array:
 
 
 def matrix_errors(found: Structure, truth: Structure) -> tuple[float, ...]:
-    """Relative errors of M_SS, K_SS and C in Frobenius norm."""
+    """Relative errors of M_SS, K_SS and C in Frobenius norm; NaN of C where the truth has no damping."""
     pairs = zip(blocks_of(found), blocks_of(truth), strict=True)
-    return tuple(float(np.linalg.norm(a - b) / np.linalg.norm(b)) for a, b in pairs)
+    return tuple(float(np.linalg.norm(a - b) / np.linalg.norm(b)) if np.any(b) else np.nan for a, b in pairs)
 
 
 def _row(it: Searched, phase: Phase) -> list[str]:
     problem, truth = it.problem, it.problem.reference
     # The graph of the matrices, which a hundred sensors cannot wait for, is not built for the answer itself.
     answered = it.x is not None and np.array_equal(phase.x, it.x)
-    structure = it.structure if answered else problem.structure(phase.x)
+    try:
+        structure = it.structure if answered else problem.structure(phase.x)
+    except (InputError, np.linalg.LinAlgError):
+        left = [f"{phase.objective:.4g}", "no structure", *["-"] * 5]
+        return [phase.name, *left, str(phase.evaluations), f"{phase.seconds:.1f}"]
     known = truth is not None and truth.n == structure.n and truth.n_base == structure.n_base
     off = errors(structure, truth) if known and truth is not None else np.full(5, np.nan)
     of_truth = [f"{value:.2g}" if np.isfinite(value) else "-" for value in off * [100, 1, 100, 100, 100]]

@@ -68,6 +68,20 @@ def test_errors_are_frobenius_norms_over_the_references_in_percent():
     assert np.all(np.isnan(errors_of(other, TRUTH)))
 
 
+def test_an_undamped_reference_leaves_no_relative_error_of_damping_and_says_so(compared):
+    undamped = sysid.Structure(TRUTH.mass, TRUTH.stiffness, [0.0, 0.0], n_base=1)
+    np.testing.assert_allclose(errors_of(TRUTH, undamped), [0.0, 0.0, np.nan], atol=1e-9)
+    told = table.text(comparison.Comparison(two_masses(reference=undamped), 3, None, compared.results))
+    assert "which has no damping" in " ".join(told.split())
+    assert "no damping" not in " ".join(table.text(compared).split())
+
+
+def test_a_comparison_without_results_is_a_head_without_rows(compared):
+    empty = comparison.Comparison(two_masses(), 0, None, ())
+    assert table.as_csv(empty).splitlines() == table.as_csv(compared).splitlines()[:1]
+    assert table.text(empty).startswith("method ")
+
+
 def test_what_is_compared_is_the_residual_where_nothing_else_is_minimised(alone):
     assert comparison.Comparison(two_masses(), 0, None, ()).quantity == "residual"
     compared = comparison.compare(two_masses(noise=0.01), max_time=5.0)

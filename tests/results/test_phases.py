@@ -1,5 +1,7 @@
 """The table of phases: what each left, with errors of a known truth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -27,6 +29,23 @@ def test_errors_are_zero_of_the_truth_and_those_of_a_matrix_that_is_off(random_s
     # sqrt(1.21) = 1.1 in frequency and, with the same ratios, in damping
     np.testing.assert_allclose(errors(stiff, truth), [0.1, 0, 0, 0.21, 0.1], atol=1e-12)
     assert n == 3
+
+
+def test_an_undamped_truth_has_no_relative_error_of_damping(random_structure):
+    truth = random_structure(np.random.default_rng(1), n=3, d=1)
+    undamped = sysid.Structure(truth.mass, truth.stiffness, np.zeros(3), n_base=1)
+    np.testing.assert_allclose(errors(truth, undamped), [0, 0, 0, 0, np.nan], atol=1e-14)
+
+
+def test_a_phase_that_ended_at_no_structure_says_so(result):
+    nowhere = replace(result.history.phases[0], x=np.zeros(result.problem.n_variables))  # no mass at all
+    history = replace(result.history, phases=(nowhere, *result.history.phases[1:]))
+    first, *others = rows_of_phases(replace(result, history=history))
+    cells = dict(zip(COLUMNS, first, strict=True))
+    assert cells["residual"] == "no structure"
+    assert cells["M, %"] == cells["1 - MAC"] == "-"
+    assert cells["candidates"] == str(nowhere.evaluations)
+    assert others == rows_of_phases(result)[1:]
 
 
 def test_each_phase_has_its_row_with_its_residual_and_errors(result):
