@@ -15,7 +15,7 @@ from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import FACTOR_FLOOR, Geometry
 from sysid.models.model import MassBlocks, Stated, Totals, Written, constant
 from sysid.models.unknowns import Unknown
-from sysid.structure.structure import Array, Structure, finite_array
+from sysid.structure.structure import Array, Structure, finite_array, lowest_eigenvalue
 from sysid.structure.triangular import lower_triangle, triangle_entries
 
 _ROW_EXPECTATION = 1.0  # the paper's c
@@ -272,8 +272,12 @@ class KnownMass(FieldTree):
             raise InputError(f"the known mass matrix is {matrix.shape}; ({n}, {n}) or ({size}, {size}) is needed")
         if np.abs(matrix - matrix.T).max() > 1e-9 * np.abs(matrix).max():
             raise InputError("the known mass matrix is not symmetric")
-        scale = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
-        if np.any(np.diag(matrix)[:n] <= 0) or np.linalg.eigvalsh(matrix / np.outer(scale, scale))[0] < -1e-8:
+        if np.any(np.abs(matrix[n:][np.diag(matrix)[n:] == 0]) > 1e-9 * np.abs(matrix).max()):
+            raise InputError(
+                "the known mass matrix couples a base direction that has no mass: its diagonal entry is 0, others of "
+                "its row are not; state its mass there, or make the whole row and column 0"
+            )
+        if np.any(np.diag(matrix)[:n] <= 0) or lowest_eigenvalue(matrix) < -1e-8:
             raise InputError(
                 "the known mass matrix is not positive semidefinite (M_00 >= M_S0' M_SS^-1 M_S0), "
                 "or a sensor has no mass"

@@ -299,7 +299,7 @@ class Structure:
         n = self.n
         for name, matrix in (("mass", self.mass), ("stiffness", self.stiffness)):
             _check_positive_definite(f"the structure's block of {name} ({n} x {n})", matrix[:n, :n])
-        lowest = _lowest_eigenvalue(self.mass)
+        lowest = lowest_eigenvalue(self.mass)
         if lowest < -_TOLERANCE:
             raise InputError(
                 f"mass is not positive semidefinite: its lowest eigenvalue is {lowest:.3g} of its diagonal; "
@@ -412,12 +412,12 @@ def _check_positive_definite(name: str, matrix: Array) -> None:
     if np.any(diagonal <= 0):
         at = int(np.argmin(diagonal))
         raise InputError(f"{name} is not positive definite: diagonal entry {at} is {diagonal[at]:.6g}")
-    lowest = _lowest_eigenvalue(matrix)
+    lowest = lowest_eigenvalue(matrix)
     if lowest <= 10 * len(matrix) * np.finfo(float).eps:  # below that a factorisation finds only round-off
         raise InputError(f"{name} is not positive definite: its lowest eigenvalue is {lowest:.3g} of its diagonal")
 
 
-def _lowest_eigenvalue(matrix: Array) -> float:
+def lowest_eigenvalue(matrix: Array) -> float:
     """Lowest eigenvalue with each row in units of its own diagonal, so that kg and kg m² can be judged together."""
     scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
     scale[scale == 0] = scale.max()

@@ -386,6 +386,29 @@ class TestKnownMass:
             KnownMass(np.ones((4, 4))).blocks(geometry, y)
         with pytest.raises(InputError, match="not positive semidefinite .* or a sensor has no mass"):
             KnownMass(np.diag([1.0, 1, -1, 1])).blocks(geometry, y)
+        with pytest.raises(InputError, match="a sensor has no mass"):
+            KnownMass([[0.0, 1.0], [1.0, 2.0]]).blocks(geometry_of(np.ones((2, 1))), y)
+
+    # [[m, c], [c, 0]] has the determinant -c²: indefinite.
+    @pytest.mark.parametrize(("row", "column"), [(0, 2), (1, 3), (2, 3)])
+    @pytest.mark.parametrize("coupling", [1e-6, 0.5, 5.0])
+    def test_a_base_direction_without_mass_couples_with_nothing(self, geometry_of, row, column, coupling):
+        M = np.diag([2.0, 2.0, 0.0, 0.0])
+        geometry, y = geometry_of(np.eye(2)), ca.SX(0, 1)
+        blocks = KnownMass(M).blocks(geometry, y)
+        np.testing.assert_allclose(blocks.base, np.zeros((2, 2)))
+        M[row, column] = M[column, row] = coupling
+        with pytest.raises(InputError, match="couples a base direction that has no mass"):
+            KnownMass(M).blocks(geometry, y)
+
+    def test_a_base_direction_with_mass_may_couple_up_to_its_bound(self, geometry_of):
+        geometry, y = geometry_of(np.eye(2)), ca.SX(0, 1)
+        M = np.diag([2.0, 2.0, 0.5, 0.0])  # M_00 = 0.5 >= c² / 2 for |c| <= 1
+        M[0, 2] = M[2, 0] = 0.999
+        np.testing.assert_allclose(np.asarray(ca.DM(KnownMass(M).blocks(geometry, y).coupling))[0, 0], 0.999)
+        M[0, 2] = M[2, 0] = 1.001
+        with pytest.raises(InputError, match="not positive semidefinite"):
+            KnownMass(M).blocks(geometry, y)
 
 
 class TestWrittenMass:
