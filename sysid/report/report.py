@@ -42,6 +42,7 @@ _AS_MOVED = (
     "Spectra of each sensor's absolute acceleration in each run, as the base moved: not transmissibilities. The phase "
     "is told against the base direction that moved most."
 )
+_LAST_PHASE = "Only the last phase, of the start that ended best: any fits with widened peaks before it are left out."
 _MANY_PANELS = 40  # beyond which the pictures are drawn with fewer pixels
 
 
@@ -305,14 +306,16 @@ def _score_table(it: Identification, test: Measurement) -> str:
 
 
 def _poles(it: Identification) -> str:
-    words = (
-        "What the records show without the model. Left: poles of models of rising order, over the largest singular "
-        "value of the FRFs; a mode is a column of poles that stay where they are. Right: all singular values; two that "
-        "peak at one line are two modes there."
+    diagram = plot.stabilisation(it)
+    left = (
+        "poles of models of rising order, over the largest singular value of the FRFs; a mode is a column of poles "
+        "that stay where they are"
     )
-    return paragraph(words, "soft") + beside(
-        picture(plot.stabilisation(it), "stabilisation diagram"),
-        picture(plot.cmif(it), "complex mode indicator function"),
+    if diagram.axes[0].texts:
+        left = "the largest singular value; why it is without poles stands in the picture"
+    right = "all singular values; two that peak at one line are two modes there"
+    return paragraph(f"What the records show without the model. Left: {left}. Right: {right}.", "soft") + beside(
+        picture(diagram, "stabilisation diagram"), picture(plot.cmif(it), "complex mode indicator function")
     )
 
 
@@ -325,12 +328,11 @@ def _convergence(it: Identification) -> str:
     ran = rows_of_phases(it)
     swarm = f"{history.evaluations} candidates in {history.swarm_curve.size} iterations of the swarm; {refined}; "
     told = swarm * bool(history.swarm_curve.size) + f"{counted(steps, 'local iteration')}, exact gradients"
-    parts = [
-        picture(plot.convergence(it), f"objective through {', '.join(row[0] for row in ran) or 'no search'}"),
-        table(
-            COLUMNS, ran, f"{told}. Errors are those of the reference: M_SS, K_SS and C in Frobenius norm.", words=True
-        ),
-    ]
+    if it.problem.reference is not None:
+        told += ". Errors are those of the reference: M_SS, K_SS and C in Frobenius norm"
+    alt = f"objective through {', '.join(row[0] for row in ran) or 'no search'}"
+    caption = _LAST_PHASE * (it.strategy == "continuation")
+    parts = [picture(plot.convergence(it), alt, caption), table(COLUMNS, ran, f"{told}.", words=True)]
     if history.restarts:
         again = f"{counted(history.restarts, 'further swarm')} followed, as the first ended in no good fit"
         parts.append(paragraph(f"{again}; {history.evaluations} candidates are those of all.", "soft"))
@@ -349,7 +351,9 @@ def _mac(it: Identification) -> str:
 
 
 def _effective_masses(it: Identification) -> str:
-    words = "Bars: each mode; lines: their running sum. What is missing to 100 % moves with the base."
+    words, reference = "Bars: each mode; lines: their running sum", it.problem.reference
+    words += "; short dashes: each mode of the reference" * (reference is not None and reference.n == it.structure.n)
+    words += ". What is missing to 100 % moves with the base."
     label, caption = (ONE_OF_MANY, CHOSEN) if is_one_of_many(it).any() else ("", "")
     alt = "effective masses by mode and base direction"
     return paragraph(words, "soft") + picture(plot.effective_masses(it), alt, caption, label=label)

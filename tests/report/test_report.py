@@ -204,6 +204,20 @@ def test_what_is_absent_leaves_no_section(plain, no_pictures):
     assert "Interrupted" in page.text and "AutoMAC" not in page.text and "no reference is known" in page.text
 
 
+def test_captions_tell_what_is_in_the_pictures(complete, plain, page, no_pictures):
+    assert "Left: poles of models of rising order" in page and "short dashes: each mode of the reference" in page
+    assert "Only the last phase" not in page and "Errors are those of the reference" in page
+    # One run cannot move the base in two directions, so that no FRF and no pole follows.
+    test = plain.measurement
+    one = dataclasses.replace(test, base=test.base[:1], response=test.response[:1])
+    problem = sysid.Problem(one, mass=sysid.FullMass(), stiffness=plain.problem.stiffness)
+    other = dataclasses.replace(plain, problem=problem, strategy="continuation")
+    assert "Left: the largest singular value; why it is without poles" in report._poles(other)
+    assert "dashes" not in report._effective_masses(other)
+    told = report._convergence(other)
+    assert "Only the last phase" in told and "Errors" not in told
+
+
 def test_a_stated_mass_is_not_called_normalised(page):
     assert "normalised" not in Page(page).text
 
