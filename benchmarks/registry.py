@@ -56,7 +56,10 @@ BENCHMARKS = (
     Benchmark(
         "swarm.swarm_alone", "residual that the swarm reaches without a gradient step, and others", "25 min", "30 s"
     ),
-    Benchmark("swarm.hpso_ls", "fits of the tower by the paper's algorithm, and what they keep", "10 min", "40 s"),
+    Benchmark("swarm.hpso_ls", "fits of the tower by the paper's algorithm, and what they keep", "25 min", "40 s"),
+    Benchmark(
+        "swarm.structured", "springs, dampers, masses from wide bounds by swarm and simpler searches", "40 min", "30 s"
+    ),
     Benchmark("swarm.swarm_cost", "microseconds of the swarm's objective a candidate, by line too", "40 s", "5 s"),
     Benchmark("swarm.spacecraft", "successes and seconds of the swarm strategy on the spacecraft", "7 min", "90 s"),
     Benchmark("swarm.shake_table", "measured records: fit of one event, prediction of another", "5 s", "5 s"),

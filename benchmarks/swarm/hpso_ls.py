@@ -9,6 +9,7 @@ import numpy as np
 import sysid
 from benchmarks.line import Line, above, below
 from benchmarks.problem_modules import load_module
+from benchmarks.swarm import controls
 from sysid.search.cholesky_coordinates import CholeskyError
 
 SEEDS = range(9100, 9110)
@@ -31,7 +32,9 @@ def lines(reduced: bool) -> Iterator[Line]:
         late = max(result.history.wall_time for result in results)
         yield below(what + "most seconds of a run", late, SECONDS)
         yield from _sound(what, problem, fits)
-        yield _controls(what, results)
+        yield _phases(what, results)
+        if not reduced:
+            yield from controls.lines(what, sysid.Swarm.published(), results, seeds)
     yield below("exact Hessian against differences of the gradient, 5 random points, n = 6, relative", _hessian(), 1e-6)
 
 
@@ -47,7 +50,7 @@ def _sound(what: str, problem: sysid.Problem, fits: list[sysid.Identification]) 
     yield Line(what + "least eigenvalue of M_SS and K_SS", f"{least:.3g}", "> 0", bool(least > 0))
 
 
-def _controls(what: str, results: list[sysid.Identification]) -> Line:
+def _phases(what: str, results: list[sysid.Identification]) -> Line:
     """What the swarm and the local phase left, medians."""
     left = [{phase.name: phase.objective for phase in result.history.phases} for result in results]
     told = ", ".join(f"{name} {np.median([one[name] for one in left]):.2g}" for name in left[0])

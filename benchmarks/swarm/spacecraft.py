@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import sysid
 from benchmarks.line import Line, above, below
 from benchmarks.problem_modules import load_module
+from benchmarks.swarm import controls
 
 
 def lines(reduced: bool) -> Iterator[Line]:
@@ -22,4 +23,5 @@ def lines(reduced: bool) -> Iterator[Line]:
         good,
         4 if len(seeds) == 5 else len(seeds),
     )
+    yield from controls.lines(f"spacecraft_dummy, {len(seeds)} seeds: ", sysid.Swarm(), results, seeds)
     yield below("spacecraft_dummy: slowest run, s", max(r.history.wall_time for r in results), 600)

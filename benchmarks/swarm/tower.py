@@ -9,6 +9,7 @@ import numpy as np
 import sysid
 from benchmarks.line import Line, below
 from benchmarks.problem_modules import load_module
+from benchmarks.swarm import controls
 
 
 def lines(reduced: bool) -> Iterator[Line]:
@@ -17,9 +18,9 @@ def lines(reduced: bool) -> Iterator[Line]:
     module = load_module("cantilever_tower")
     problem = module.problem()
     truth = problem.reference.natural_frequencies
+    results = [sysid.identify(problem, strategy="swarm", rng=seed) for seed in seeds]
     figures = []
-    for seed in seeds:
-        result = sysid.identify(problem, strategy="swarm", rng=seed)
+    for result in results:
         s, n = result.structure, result.structure.n
         blocks = (s.mass[:n, :n], s.stiffness[:n, :n])
         figures.append(
@@ -45,4 +46,5 @@ def lines(reduced: bool) -> Iterator[Line]:
         what + "M_SS and K_SS positive definite (least ratio of extreme eigenvalues)",
         f"{worst[:, 4].min():.3g}", "> 0", bool(worst[:, 4].min() > 0),
     )  # fmt: skip
+    yield from controls.lines(what, sysid.Swarm(), results, seeds)
     yield Line(what + "seconds a run, and successes", f"{worst[:, 5].round(1).tolist()}, {int(worst[:, 6].sum())}")

@@ -7,17 +7,15 @@ from collections.abc import Iterator
 import sysid
 from benchmarks.line import Line, below
 from benchmarks.problem_modules import load_module
+from benchmarks.swarm import controls
 
 
 def lines(reduced: bool) -> Iterator[Line]:
     """cantilever_tower with 1 % noise, a new draw each seed."""
     seeds = range(1 if reduced else 5)
     module = load_module("cantilever_tower")
-    ratios = []
-    for seed in seeds:
-        problem = module.problem(noise=0.01, rng=seed)
-        result = sysid.identify(problem, strategy="swarm", rng=seed)
-        ratios.append(result.residual / problem.measurement.residual(problem.reference))
+    results = [sysid.identify(module.problem(noise=0.01, rng=seed), strategy="swarm", rng=seed) for seed in seeds]
+    ratios = [r.residual / r.problem.measurement.residual(r.problem.reference) for r in results]
     worst = max(abs(ratio - 1) for ratio in ratios)
     yield below(
         f"cantilever_tower, 1 % noise, {len(seeds)} draws: |residual / noise floor - 1| (ratios "
@@ -26,3 +24,4 @@ def lines(reduced: bool) -> Iterator[Line]:
         worst,
         0.05,
     )
+    yield from controls.lines(f"cantilever_tower, 1 % noise, {len(seeds)} draws: ", sysid.Swarm(), results, seeds)
