@@ -14,6 +14,7 @@ from sysid.structure.structure import Array, ComplexArray
 
 _TERMS_MORE = 4  # than the asymptotic rate of the series asks for
 _RANK = 1e-6  # of the largest singular value: directions of the gains below it are left out
+_BLOCK = 32  # candidates whose gains are made at once: those of more leave a processor's cache before they are used
 _ALIKE = 1e-12  # up to which two base motions count as proportional at all lines
 
 
@@ -62,16 +63,12 @@ class GainSeries:
         """T_j at ratios (n, count): (terms, n, count)."""
         centre, half = self._range
         u = (np.log(ratios) - centre[:, None]) / half[:, None]
-        T = np.ones((self.terms, *u.shape))
-        T[1] = u
-        # T_{m + j} = 2 T_m T_j - T_{m - j} doubles what is there at each step.
-        done = 1
-        while done < self.terms - 1:
-            more = min(done, self.terms - 1 - done)
-            new = T[done + 1 : done + 1 + more]
-            np.multiply(2 * T[done], T[1 : more + 1], out=new)
-            new -= T[done - more : done][::-1]
-            done += more
+        T = np.empty((self.terms, *u.shape))
+        T[0], T[1] = 1.0, u
+        u *= 2
+        for j in range(2, self.terms):  # T_j = 2 u T_{j - 1} - T_{j - 2}
+            np.multiply(u, T[j - 1], out=T[j])
+            T[j] -= T[j - 2]
         return T
 
     def holds(self, ratios: Array) -> Array:
@@ -103,6 +100,8 @@ class SummedRecord:
     record, base : (runs, channels, n_freq), (runs, d, n_freq) complex
     channel, line : (channels,), (runs, n_freq)
         Weights, whose product is the weight of a number of the record.
+    recovery : (channels, s)
+        Takes the modes' shapes to the channels.
     series : GainSeries
     static : bool
         Whether there are d modes of gain 1 behind those of the series.
@@ -119,44 +118,57 @@ class SummedRecord:
         base: ComplexArray,
         channel: Array,
         line: Array,
+        recovery: Array,
         series: GainSeries,
         *,
         static: bool = False,
     ) -> None:
-        self._channel = channel
+        recovery = channel[:, None] * recovery
+        self._metric = recovery.T @ recovery
         made, u = channel[:, None] * line[:, None] * record, line[:, None] * base
         self.size = float(np.sum(np.abs(made) ** 2))
         d, (n, terms, lines) = base.shape[1], series.basis.shape
         still = d if static else 0
         # Of all runs together; the gains are the same in each.
-        spectrum, onto_base = np.einsum("rdf,ref->def", u.conj(), u), np.einsum("rcf,rdf->dcf", made, u.conj())
+        spectrum = np.einsum("rdf,ref->def", u.conj(), u)
+        onto_base = recovery.T @ np.einsum("rcf,rdf->dcf", made, u.conj())
         overlap = (_functions(series.basis, still).conj() @ onto_base.reshape(-1, lines).T).real
         self._inner = _inner_products(spectrum, series.basis, still)
-        self._rank = self._inner.coordinates.shape[1]
-        together = np.hstack([self._inner.coordinates, overlap])
-        self._of_modes = np.ascontiguousarray(together[: n * terms].reshape(n, terms, -1))
-        self._static = np.repeat(together[n * terms :, None], still, axis=0)
+        coordinates, overlap = self._inner.coordinates[:, None], overlap[..., None]
+        self._gains, self._static_gains = coordinates[: n * terms].reshape(n, terms, -1), coordinates[n * terms :]
+        self._overlap = np.ascontiguousarray(overlap[: n * terms].reshape(n, terms, -1).swapaxes(1, 2))
+        self._static_overlap = overlap[n * terms :]
 
     def squared(self, shapes: Array, loads: Array, polynomials: Array) -> Array:
         """Squared error of candidates, (count,).
 
         Parameters
         ----------
-        shapes : (count, m, channels)
-            Of the modes at the record's channels, a row each; the static ones last.
+        shapes : (count, m, s)
+            Of the modes, a row each; the static ones last.
         loads : (count, m, d)
             Participations of the modes, rows of the rigid-body mass of the static ones.
         polynomials : (terms, n, count)
             `GainSeries.polynomials` of the modes' ratios.
         """
-        made = np.matmul(polynomials.transpose(1, 2, 0), self._of_modes)
-        if len(self._static):
-            made = np.concatenate([made, np.repeat(self._static, len(shapes), axis=1)])
-        gains_of, overlap = np.split(made.transpose(1, 0, 2), [self._rank], axis=2)
-        shapes = shapes * self._channel
-        residues = (loads[..., None] * shapes[:, :, None]).reshape(overlap.shape)
-        squared = self.size - 2 * np.einsum("pmr,pmr->p", overlap, residues)
-        return squared + np.einsum("pkl,pkl->p", _gram(shapes), self._inner.products(loads, gains_of))
+        (n, count), (m, d) = polynomials.shape[1:], loads.shape[1:]
+        overlap = np.empty((m, self._overlap.shape[1], count))
+        np.matmul(self._overlap, polynomials.swapaxes(0, 1), out=overlap[:n])
+        overlap[n:] = self._static_overlap
+        by_mode = [np.ascontiguousarray(part.transpose(1, 2, 0)) for part in (shapes, loads)]
+        onto_loads = np.einsum("kdsp,ksp->kdp", overlap.reshape(m, d, -1, count), by_mode[0])
+        squared = self.size - 2 * np.einsum("kdp,kdp->p", onto_loads, by_mode[1])
+        blocks = [slice(at, at + _BLOCK) for at in range(0, count, _BLOCK)]
+        inner = [self._inner.products(loads[at], self._gains_of(polynomials[..., at], m)) for at in blocks]
+        return squared + np.einsum("pkl,pkl->p", shapes @ self._metric @ shapes.swapaxes(1, 2), np.concatenate(inner))
+
+    def _gains_of(self, polynomials: Array, m: int) -> Array:
+        """Coordinates of the gains of m modes, (count, m, rank)."""
+        n, count = polynomials.shape[1:]
+        made = np.empty((m, count, self._gains.shape[2]))
+        np.matmul(polynomials.transpose(1, 2, 0), self._gains, out=made[:n])
+        made[n:] = self._static_gains
+        return made.swapaxes(0, 1)
 
 
 class _Proportional:
@@ -172,13 +184,17 @@ class _Proportional:
     """
 
     def __init__(self, ratios: Array, power: Array, functions: ComplexArray) -> None:
-        lam, vectors = np.linalg.eigh(ratios)
-        self._root = vectors * np.sqrt(np.maximum(lam, 0.0))
+        self._ratios = ratios
         self.coordinates = _orthonormal(functions * np.sqrt(power), _RANK)[0]
 
     def products(self, loads: Array, gains_of: Array) -> Array:
         """(count, m, m) from loads (count, m, d) and coordinates of the gains (count, m, rank)."""
-        return _gram(loads @ self._root) * _gram(gains_of)
+        count, m, _ = gains_of.shape
+        gram = np.empty((count, m, m))
+        for half in (slice(m // 2), slice(m // 2, m)):  # because BLAS's kernel for a matrix with itself is slower
+            np.matmul(gains_of[:, half], gains_of.swapaxes(1, 2), out=gram[:, half])
+        gram *= loads @ self._ratios @ loads.swapaxes(1, 2)
+        return gram
 
 
 class _Correlated:
@@ -247,9 +263,3 @@ def _orthonormal(functions: ComplexArray, tolerance: float) -> tuple[Array, Comp
     kept = values > tolerance * values[0]
     real, imaginary = np.split(right[kept], 2, axis=1)
     return left[:, kept] * values[kept], real + 1j * imaginary
-
-
-def _gram(rows: Array) -> Array:
-    """Inner products of the rows of each matrix, (count, m, k) to (count, m, m)."""
-    # A copy, because BLAS's kernel for products of small matrices is faster than that for a matrix with itself.
-    return rows @ np.array(rows).swapaxes(1, 2)

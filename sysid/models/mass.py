@@ -38,7 +38,8 @@ def sampling_exponent(k: int, c: float = _ROW_EXPECTATION) -> float:
 def spread_rows(x: ca.SX | Array, exponents: Array) -> ca.SX | Array:
     """Eq. 18: ``y = sgn(x) (1 - (1 - |x|)^alpha)``, from the swarm's uniform coordinates to factor entries."""
     if isinstance(x, np.ndarray):
-        return np.sign(x) * (1 - (1 - np.minimum(np.abs(x), 1.0)) ** exponents)
+        left = 1 - np.minimum(np.abs(x), 1.0)
+        return np.copysign(1 - np.power(left, exponents, out=left), x)
     size = ca.fmin(ca.fabs(x), 1.0)  # a round-off beyond 1 would be a power of a negative number
     return ca.sign(x) * (1 - (1 - size) ** exponents)
 
@@ -136,13 +137,15 @@ class FullMass(FieldTree):
             return None
         exponents, lower = (part[:, None] for part in _spread(geometry))
         size = geometry.n + geometry.d
-        triangle = np.tril_indices(size)
+        triangle, entries = np.tril_indices(size), len(lower)
+        unknown = self.total_mass is None and geometry.weighs
+        stated = None if unknown else geometry.totals(self.total_mass)[:, None]
 
         def factors(s: Array) -> Array:
-            totals, entries = geometry.split_totals(self.total_mass, np.ascontiguousarray(s.T))
+            y = np.ascontiguousarray(s.T)
             made = np.zeros((size, size, len(s)))
-            made[triangle] = np.maximum(spread_rows(entries, exponents), lower)
-            return healed(made, totals.reshape(geometry.d, -1))
+            made[triangle] = np.maximum(spread_rows(y[-entries:], exponents), lower)
+            return healed(made, y[:-entries] if stated is None else stated)
 
         return factors
 

@@ -51,12 +51,14 @@ def batch_modes(mass_factors: Array, stiffness_factors: Array, rigid_body: Array
     n, d = rigid_body.shape
     rigid = np.vstack([rigid_body, np.eye(d)])
     moved = (rigid.T @ mass_factors.reshape(n + d, -1)).reshape(d, n + d, -1)
-    right = np.concatenate([inverse_triangles(mass_factors[:n, :n]), moved[:, :n].swapaxes(0, 1)], axis=1)
+    right = np.empty((len(stiffness_factors), n, n + d))
+    right[..., :n] = inverse_triangles(mass_factors[:n, :n]).transpose(2, 0, 1)
+    right[..., n:] = moved[:, :n].transpose(2, 1, 0)
     # A copy, because BLAS's kernel for products of small matrices is faster than that for a matrix with itself.
     H = stiffness_factors @ np.array(stiffness_factors).swapaxes(1, 2)
     broken = ~np.isfinite(np.einsum("pii->p", H))  # the trace of a square with a number that is not finite is not
     H[broken] = np.eye(n)  # must not stop the eigensolver for the others
     psi = np.linalg.eigh(H)[1]
     psi[broken] = np.nan
-    made = psi.swapaxes(1, 2) @ np.ascontiguousarray(right.transpose(2, 0, 1))
+    made = psi.swapaxes(1, 2) @ right
     return BatchModes(made[..., :n], made[..., n:], moved.transpose(2, 0, 1))

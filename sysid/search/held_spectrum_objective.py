@@ -6,9 +6,11 @@ The frequencies are then the same for all candidates, so that all sums over line
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 
@@ -21,7 +23,8 @@ from sysid.problem.problem import Problem
 from sysid.problem.terms import Term, TestTerm
 from sysid.structure.structure import Array
 
-CHUNK = 64  # candidates a task: fixed, so that the bits do not depend on the number of threads or candidates
+_MOST = 60_000  # coordinates a chunk: fewer take more calls of NumPy for each, and more leave a processor's cache
+_STEP = 16  # chunks are multiples of it, because BLAS's products round alike at each of so many places
 _MOST_THREADS = 8
 # Relative squared error below which lines are summed: the difference of large numbers that stands for it has lost
 # half of its digits at 1e-12.
@@ -68,14 +71,16 @@ class HeldSpectrumObjective:
     ) -> None:
         formulation, test = problem.formulation, term.test
         self._batches, self._parts, self._rigid_body = batches, formulation.parts, formulation.geometry.rigid_body
-        self._share, self._recovery = term.weight**2, term.matrices.recovery
+        self._share = term.weight**2
         ranges = formulation.lower[self._parts.damping], formulation.upper[self._parts.damping]
         self._series = GainSeries(test.freq, np.sort(spectrum), *ranges, shift=term.shift)
+        recovery = term.matrices.recovery, np.eye(formulation.geometry.d)
         self._records: list[tuple[SummedRecord, float]] = []
         sizes: list[tuple[float, float]] = []
-        for (record, std), (_, scale) in zip(records_of(test), weights_of_test(test, weighted=True), strict=True):
+        scales = weights_of_test(test, weighted=True)
+        for (record, std), (_, scale), seen in zip(records_of(test), scales, recovery, strict=False):
             weights = separable(std, record.shape)
-            summed = SummedRecord(record, test.base, *weights, self._series, static=bool(self._records))
+            summed = SummedRecord(record, test.base, *weights, seen, self._series, static=bool(self._records))
             self._records.append((summed, scale**2))
             sizes.append((weights_of(record, std)[1], scale))
         # A record that weighs more than the accelerations loses its digits earlier.
@@ -92,34 +97,46 @@ class HeldSpectrumObjective:
         by_lines : callable
             The same summed over lines, for candidates near the records and those outside of the range of damping.
         """
-        starts = range(0, len(particles), CHUNK)
-        squared = np.concatenate(list(self._pool.map(lambda at: self._chunk(particles[at : at + CHUNK]), starts)))
+        ends = chunk_ends(*particles.shape)
+        squared = np.concatenate(list(self._pool.map(partial(self._chunk, particles), [0, *ends[:-1]], ends)))
         held = np.logical_and(self._series.holds(particles[:, self._parts.damping]), squared > self._least)
         if not np.all(held):
             squared[~held] = by_lines(particles[~held]) / self._share
         return self._share * squared
 
-    def _chunk(self, particles: Array) -> Array:
+    def _chunk(self, particles: Array, start: int, end: int) -> Array:
         count = len(particles)
-        # Products of other sizes may round otherwise: the last candidate again and again fills the chunk.
-        full = particles if count == CHUNK else particles[np.minimum(np.arange(CHUNK), count - 1)]
+        full = particles[np.minimum(np.arange(start, end), count - 1)]  # the last one again and again fills the last
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            return self._squared(full)[:count]
+            return self._squared(full)[: count - start]
 
     def _squared(self, particles: Array) -> Array:
         pieces = zip(self._batches, self._parts, strict=True)
         mass, stiffness, damping = (batch(particles[:, part]) for batch, part in pieces)
         modes = batch_modes(mass, stiffness, self._rigid_body)
         polynomials = self._series.polynomials(damping.T)
-        parts = zip(self._records, (self._accelerations, self._force), strict=False)
+        parts = zip(self._records, (_accelerations, _force), strict=False)
         return np.sum([record.squared(*made(modes), polynomials) / size for (record, size), made in parts], axis=0)
 
-    def _accelerations(self, modes: BatchModes) -> tuple[Array, Array]:
-        """Shapes at the sensors, and participations."""
-        return modes.shapes @ self._recovery.T, modes.loads
 
-    def _force(self, modes: BatchModes) -> tuple[Array, Array]:
-        """The same of the base force, with the rigid-body mass behind the modes."""
-        rigid = modes.rigid_body_mass
-        still = np.broadcast_to(np.eye(rigid.shape[1]), rigid.shape)
-        return np.concatenate([modes.loads, still], axis=1), np.concatenate([modes.loads, rigid], axis=1)
+def chunk_ends(count: int, size: int) -> list[int]:
+    """Where chunks of candidates of this size end: an even number, nearly equal, the same for any number of threads.
+
+    >>> chunk_ends(781, 156), chunk_ends(3, 156)
+    ([192, 384, 576, 784], [16])
+    """
+    steps = math.ceil(count / _STEP)
+    chunks = min(2 * math.ceil(count * size / (2 * _MOST)), steps)
+    return [_STEP * (i * steps // chunks) for i in range(1, chunks + 1)]
+
+
+def _accelerations(modes: BatchModes) -> tuple[Array, Array]:
+    """Shapes and participations."""
+    return modes.shapes, modes.loads
+
+
+def _force(modes: BatchModes) -> tuple[Array, Array]:
+    """The same of the base force, with the rigid-body mass behind the modes."""
+    rigid = modes.rigid_body_mass
+    still = np.broadcast_to(np.eye(rigid.shape[1]), rigid.shape)
+    return np.concatenate([modes.loads, still], axis=1), np.concatenate([modes.loads, rigid], axis=1)

@@ -30,12 +30,11 @@ def triangle(entries: Array, size: int) -> Array:
 def inverse_triangles(stack: Array) -> Array:
     """Inverses of lower-triangular matrices that stand side by side, (n, n, count) each."""
     scale = 1 / np.einsum("iip->ip", stack)
-    unit, inverse = stack * -scale[:, None], np.zeros_like(stack)
-    inverse[0, 0] = 1
-    for i in range(1, len(stack)):  # forward substitution
-        np.einsum("jp,jkp->kp", unit[i, :i], inverse[:i, :i], out=inverse[i, :i])
-        inverse[i, i] = 1
-    return inverse * scale
+    inverse = np.zeros_like(stack)
+    for i, row in enumerate(inverse):  # forward substitution
+        np.einsum("jp,jkp->kp", stack[i, :i] * -scale[i], inverse[:i, :i], out=row[:i])
+        row[i] = scale[i]
+    return inverse
 
 
 def triangle_entries(matrix: Array) -> Array:

@@ -60,15 +60,16 @@ def test_the_square_is_that_of_the_difference_at_all_lines(base, static):
     channel = rng.uniform(0.5, 2, channels)
     shapes, loads = rng.normal(size=(count, m, channels)), rng.normal(size=(count, m, d))
     ratios = rng.uniform(LOW, HIGH, (count, m))
-    made = np.einsum("pkc,pkf,pkd,rdf->prcf", shapes, np.array([gains(at) for at in ratios]), loads, u)
+    recovery = rng.normal(size=(channels, channels))
+    made = np.einsum("cs,pks,pkf,pkd,rdf->prcf", recovery, shapes, np.array([gains(at) for at in ratios]), loads, u)
     if static:
         rigid = rng.normal(size=(count, d, d))
-        made = made + np.einsum("pcd,rdf->prcf", rigid, u)
+        made = made + np.einsum("cs,psd,rdf->prcf", recovery, rigid, u)
         shapes = np.concatenate([shapes, np.broadcast_to(np.eye(d), (count, d, d))], axis=1)
         loads = np.concatenate([loads, rigid], axis=1)
     record = made[0] * 1.1
     series = GainSeries(FREQ, OMEGA, LOW, HIGH)
-    summed = SummedRecord(record, u, channel, line, series, static=static)
+    summed = SummedRecord(record, u, channel, line, recovery, series, static=static)
     weight = channel[:, None] * line[:, None]
     expected = np.sum(np.abs(weight * (made - record)) ** 2, axis=(1, 2, 3))
     squared = summed.squared(shapes, loads, series.polynomials(ratios.T))

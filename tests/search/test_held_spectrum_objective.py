@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.search.held_spectrum_objective import CHUNK, HeldSpectrumObjective
+from sysid.search.held_spectrum_objective import HeldSpectrumObjective, chunk_ends
 from sysid.search.swarm_objective import SwarmObjective
 
 N, D = 5, 2
@@ -136,9 +136,14 @@ def test_ratios_outside_of_the_range_go_by_lines_and_no_number_stays_none():
     np.testing.assert_allclose(costs[:2] ** 2, by_lines(made, cost, rows[:2]), rtol=1e-9)
 
 
-def test_neither_threads_nor_the_other_candidates_change_a_bit():
+@pytest.mark.parametrize(("count", "ends"), [(1, [16]), (17, [16, 32]), (480, [240, 480]), (496, [112, 240, 368, 496])])
+def test_chunks_are_nearly_equal_and_as_many_for_each_of_two_threads(count, ends):
+    assert chunk_ends(count, 250) == ends
+
+
+def test_neither_threads_nor_the_place_among_candidates_change_a_bit():
     made = problem(force=True)
-    cost, rows = objective(made), particles(made, 2 * CHUNK + 5)
+    cost, rows = objective(made), particles(made, 2601)  # of four chunks
     formulation = made.formulation
     batches = [model.batch(formulation.geometry) for model in made.models]
     alone = HeldSpectrumObjective(made, formulation.own_test, formulation.stiffness.spectrum, batches, threads=1)
@@ -147,7 +152,7 @@ def test_neither_threads_nor_the_other_candidates_change_a_bit():
     np.testing.assert_array_equal(many(rows, None), expected)
     order = np.random.default_rng(0).permutation(len(rows))
     np.testing.assert_array_equal(alone(rows[order], None), expected[order])
-    np.testing.assert_array_equal(np.concatenate([alone(row[None], None) for row in rows[:4]]), expected[:4])
+    np.testing.assert_allclose(np.concatenate([alone(row[None], None) for row in rows[:4]]), expected[:4], rtol=1e-13)
     np.testing.assert_allclose(cost(rows), np.sqrt(expected), rtol=1e-15)
 
 
