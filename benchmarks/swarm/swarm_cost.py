@@ -1,7 +1,8 @@
-"""Microseconds that the swarm's objective takes a candidate, without lines and line by line."""
+"""Microseconds that the swarm's objective takes a candidate, without lines and line by line, and the swarm itself."""
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 
@@ -12,6 +13,7 @@ import sysid
 from benchmarks.line import Line, above, below
 from benchmarks.modal.random_structures import frequency_lines, random_structure
 from benchmarks.swarm.by_lines import ByLines, ByLinesOfUnitRuns
+from sysid.compare import peers
 from sysid.search.swarm_objective import SwarmObjective
 
 SEED = 3
@@ -22,6 +24,9 @@ FASTER = 3.0
 AGREES = 1e-9  # of the records' or the candidate's square, whichever is larger
 WELL_POSED = 100.0  # relative residual: beyond it candidates are worthless, and their mass so ill-conditioned that
 # round-off in it is all that a comparison would show
+SPHERE = 100  # variables of the sphere function, which takes next to no time
+ITERATIONS = 5  # of both swarms on it
+LIGHTER = 5.0  # than pymoo's swarm, at least
 
 Objective = Callable[[np.ndarray], np.ndarray]
 
@@ -53,6 +58,54 @@ def lines(reduced: bool) -> Iterator[Line]:
             text = f"{what}: times faster, alternated, by medians (quartiles {spread})"
             yield Line(text, f"{ratio:.3g}") if reduced else above(text, ratio, FASTER)
             yield below(f"{what}: largest difference from the sum over lines", _difference(fast, slow, swarm), AGREES)
+        yield from _overhead(reduced)
+
+
+def _overhead(reduced: bool) -> Iterator[Line]:
+    """What the swarm takes a particle and iteration beside the objective, and pymoo's with as many particles.
+
+    In process time of one thread, which other work on the machine changes little.
+    """
+    what = f"sphere of {SPHERE} variables, {5 * SPHERE} particles, {ITERATIONS} iterations: "
+    repeats = 1 if reduced else 5
+    if "pymoo PSO" not in peers.names():
+        yield Line(what + "the swarm beside pymoo's", "pymoo is not there: sysid[benchmark]")
+        return
+    took = np.zeros((repeats + 1, 2))
+    for seed, row in enumerate(took):
+        for i, swarm in enumerate((_own_swarm, _pymoo_swarm)):
+            start = time.process_time()
+            swarm(seed)
+            row[i] = 1e6 * (time.process_time() - start) / (ITERATIONS * 5 * SPHERE)
+    took = took[1:]  # what is imported and made once is made
+    own, other = np.median(took, axis=0)
+    low, ratio, high = np.quantile(took[:, 1] / took[:, 0], [0.25, 0.5, 0.75])
+    yield Line(what + f"microseconds a particle and iteration, median of {repeats}", f"{own:.3g}, pymoo {other:.4g}")
+    text = what + f"times less than pymoo's, alternated (quartiles {low:.3g}-{high:.3g})"
+    yield Line(text, f"{ratio:.3g}") if reduced else above(text, float(ratio), LIGHTER)
+
+
+def _own_swarm(seed: int) -> None:
+    box = np.tile([0.0, 1.0], (SPHERE, 1))
+    sysid.minimize_swarm(_sphere, box, rng=seed, max_iterations=ITERATIONS, stall_iterations=None)
+
+
+def _pymoo_swarm(seed: int) -> None:
+    left = ITERATIONS
+
+    def evaluate(rows: np.ndarray) -> np.ndarray:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise peers.Spent
+        return _sphere(rows)
+
+    with contextlib.suppress(peers.Spent):
+        peers.PEERS["pymoo PSO"](evaluate, SPHERE, np.random.default_rng(seed))
+
+
+def _sphere(rows: np.ndarray) -> np.ndarray:
+    return np.einsum("ij,ij->i", rows, rows)
 
 
 def _problem(n: int, count: int) -> sysid.Problem:
