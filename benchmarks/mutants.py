@@ -21,33 +21,13 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks import search_mutants
 from benchmarks.line import Line
+from benchmarks.mutant import Mutant
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE, TESTS = ROOT / "sysid", ROOT / "tests"
 SECONDS = 900.0  # that the tests of one change may take
-
-
-@dataclass(frozen=True)
-class Mutant:
-    """A wrong change.
-
-    Attributes
-    ----------
-    identifier : str
-    idea : str
-        What is wrong with it.
-    code, replacement : str
-        What stands in the package, and what takes its place, on one line.
-    tests : str
-        Names of the test files that are to notice it, without ``.py``, or ``FILE::TEST``; the quickest first.
-    """
-
-    identifier: str
-    idea: str
-    code: str
-    replacement: str
-    tests: str
 
 
 @dataclass(frozen=True)
@@ -264,12 +244,12 @@ NOTICED = (
         "self.inertia = adaptation.inertia_weight(kappa, rng.random(), settings.inertia_b1, settings.inertia_b2)",
         "self.inertia = 0.3 + 0 * rng.random()", "test_moves"),
 )  # fmt: skip
-MUTANTS = MISSED + NOTICED
+MUTANTS = MISSED + NOTICED + search_mutants.MISSED + search_mutants.NOTICED
 
 
 def lines(reduced: bool) -> Iterator[Line]:
     """One line a change; the reduced form takes those that were once missed."""
-    for mutant in MISSED if reduced else MUTANTS:
+    for mutant in MISSED + search_mutants.MISSED if reduced else MUTANTS:
         result = examine(mutant)
         yield Line(
             f"{mutant.identifier}, {mutant.idea}",

@@ -1,5 +1,6 @@
 """Strategy "swarm" as the paper has it: its defaults, and the refinement of the swarm's best by IPOPT."""
 
+import dataclasses
 import re
 
 import numpy as np
@@ -51,6 +52,52 @@ def test_the_refinement_by_ipopt_is_taken_where_its_residual_is_lower(problem):
     assert max(gains) > 1e-2
 
 
+@pytest.fixture
+def swarms(monkeypatch):
+    """What each swarm of the strategy is asked with; its local phase returns its start, and calls that solved."""
+    from sysid.search import swarm
+
+    asked, minimize = [], swarm.minimize_swarm
+
+    def spy(fun, bounds, **options):
+        asked.append(options)
+        return minimize(fun, bounds, **options)
+
+    def stays(problem, x, steps, session, coordinates):
+        return swarm.local.LocalResult(x, True, "IPOPT: Solve_Succeeded", np.array([1.0]))
+
+    monkeypatch.setattr(swarm, "minimize_swarm", spy)
+    monkeypatch.setattr(swarm, "descend", stays)
+    return asked
+
+
+FEW = {"max_iterations": 3, "n_particles": 12, "restarts": 1}
+
+
+def test_a_local_phase_that_made_nothing_better_vouches_for_nothing(problem, swarms):
+    result = sysid.identify(problem, strategy=sysid.Swarm(**FEW), rng=0)
+    assert not result.success
+    assert "its start is kept" in result.message
+
+
+def test_all_swarms_together_keep_to_the_evaluations_that_are_allowed(problem, swarms):
+    result = sysid.identify(problem, strategy=sysid.Swarm.published(**FEW), rng=0, max_evaluations=90)
+    first, second = (asked["max_evaluations"] for asked in swarms)
+    assert first == 90
+    assert 36 <= 90 - second <= 39  # three iterations of twelve particles, and one more row in each at most
+    assert result.history.restarts == 1
+
+
+def test_the_swarm_ends_at_the_goal_where_its_objective_is_the_residual(problem, swarms):
+    """Stated noise weighs the objective, which is then another number than the residual of the goal."""
+    few, test = sysid.Swarm(**{**FEW, "restarts": 0}), problem.measurement
+    noise = np.linspace(1.0, 3.0, test.n_sensors)[:, None] * np.ones(test.freq.size)
+    for stated in (None, noise):
+        measured = dataclasses.replace(test, response_std=stated)
+        sysid.identify(dataclasses.replace(problem, measurement=measured, goal=1e-3), strategy=few, rng=0)
+    assert [asked["target"] for asked in swarms] == [1e-3, None]
+
+
 @pytest.mark.parametrize(("field", "value"), [("local", "cholesky "), ("local", True), ("refine_by", "eigh")])
 def test_a_setting_that_is_not_known_is_refused_by_name(field, value):
     with pytest.raises(sysid.InputError, match=f"Swarm: {field} = {value!r} is unknown; give one of '"):
@@ -80,21 +127,11 @@ class TestPublished:
             assert problem.objective(phase.x) == pytest.approx(phase.objective, rel=1e-9, abs=1e-12)
         assert left[1] > 1e-3 > 1e-6 > left[3]  # the local phase does depend on it, and does its part
 
-    def test_written_back_the_swarm_itself_holds_candidates_of_the_spectrum(self, problem, monkeypatch):
-        from sysid.search import swarm
-
-        asked = {}
-        minimize = swarm.minimize_swarm
-
-        def spy(fun, bounds, **options):
-            asked.update(options)
-            return minimize(fun, bounds, **options)
-
-        monkeypatch.setattr(swarm, "minimize_swarm", spy)
+    def test_written_back_the_swarm_itself_holds_candidates_of_the_spectrum(self, problem, swarms):
         few = {"max_iterations": 3, "n_particles": 12, "local": None, "write_back": True}
         result = sysid.identify(problem, strategy=sysid.Swarm(**few), rng=0)
         rows = np.random.default_rng(0).uniform(problem.lower, problem.upper, (4, problem.n_variables))
-        for row in asked["repair"](rows):
+        for row in swarms[0]["repair"](rows):
             x = np.asarray(problem.formulation.from_sampling(row)).ravel()
             f = problem.structure(x).natural_frequencies
             np.testing.assert_allclose(f, problem.reference.natural_frequencies, rtol=1e-8)
@@ -132,16 +169,9 @@ class TestPublished:
         assert sum(phase.evaluations for phase in result.history.phases) == result.history.evaluations
         assert result.history.phases[-1].objective == pytest.approx(result.objective)
 
-    def test_a_local_minimum_is_no_success(self, problem, monkeypatch):
+    def test_a_local_minimum_is_no_success(self, problem, swarms):
         """A local phase that ends beside the truth, as where it stops at once, is told by free residues."""
-        from sysid.search import swarm
-
-        def stays(problem, x, steps, session, coordinates):
-            return swarm.local.LocalResult(x, True, "IPOPT: Solve_Succeeded", np.array([1.0]))
-
-        monkeypatch.setattr(swarm, "descend", stays)
-        few = sysid.Swarm.published(max_iterations=3, n_particles=12, restarts=1)
-        result = sysid.identify(problem, strategy=few, rng=0)
+        result = sysid.identify(problem, strategy=sysid.Swarm.published(**FEW), rng=0)
         assert not result.success
         assert "local minimum" in result.message
         assert result.history.restarts == 1

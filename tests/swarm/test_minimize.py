@@ -164,6 +164,12 @@ def test_stall_stops_after_so_many_iterations_without_a_fall():
     assert "refine x locally" in result.message
 
 
+def test_a_stall_is_counted_from_the_last_fall():
+    costs = iter([2.0, *np.ones(50)])  # a fall in the second iteration, and three without one after it
+    result = minimize_swarm(lambda rows: np.full(len(rows), next(costs)), SQUARE, rng=0, stall_iterations=3)
+    assert (result.reason, result.nit) == (StopReason.STALL, 5)
+
+
 def test_the_stall_tolerance_is_relative_to_the_cost():
     # Each iteration lowers the cost by a thousandth of itself.
     def falling(factor):
@@ -186,10 +192,11 @@ def test_no_stall_rule_no_stall():
     assert (result.reason, result.nit) == (StopReason.MAX_ITERATIONS, 150)
 
 
-@pytest.mark.parametrize("budget", [10, 57, 300])
-def test_the_evaluation_budget_is_spent_and_never_passed(budget):
+@pytest.mark.parametrize(("budget", "every"), [(10, 1), (10, 2), (57, 2), (300, 2)])
+def test_the_evaluation_budget_is_spent_and_never_passed(budget, every):
+    """Nor by `improve`, where the particles have just spent it."""
     fun = Counted(sphere)
-    result = minimize_swarm(fun, SQUARE, rng=0, max_evaluations=budget, improve=lambda x: x * 0.9, improve_every=2)
+    result = minimize_swarm(fun, SQUARE, rng=0, max_evaluations=budget, improve=lambda x: x * 0.9, improve_every=every)
     assert result.reason is StopReason.MAX_EVALUATIONS
     assert result.success
     assert result.nfev == sum(fun.calls)
