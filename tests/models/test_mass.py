@@ -8,7 +8,7 @@ import scipy.integrate
 import sysid
 from sysid import FullMass, InputError, KnownMass, LumpedMass
 from sysid.models.geometry import FACTOR_FLOOR
-from sysid.models.mass import WrittenMass, gather_rows, sampling_exponent, spread_rows, total_of
+from sysid.models.mass import WrittenMass, batch_healing, gather_rows, heal, sampling_exponent, spread_rows, total_of
 from sysid.models.model import mass_blocks
 
 SEEDS = range(4)
@@ -322,6 +322,16 @@ class TestFullMass:
                 M, _ = evaluate(model, geometry)(y)
                 assert np.linalg.eigvalsh(M)[0] > 0
                 np.testing.assert_allclose(total_of(geometry, M, healing), [5, 7], rtol=1e-10)
+
+    @pytest.mark.parametrize("healing", HEALINGS)
+    def test_a_sensor_of_no_direction_takes_the_mean_of_the_scales(self, geometry_of, healing):
+        """Of unit rows a sensor and its base row total 2: scales 2 and 3 make 8 and 18, and their mean is 2.5."""
+        geometry, totals = geometry_of([[1, 0], [0, 0], [0, 1]]), np.array([8.0, 18.0])
+        expected = np.diag([2.0, 2.5, 3.0, 2.0, 3.0])
+        healed = heal(ca.SX.eye(5), geometry, totals, healing)
+        np.testing.assert_allclose(np.asarray(ca.evalf(ca.densify(healed))), expected, rtol=1e-12)
+        in_numbers = batch_healing(geometry, healing)(np.eye(5)[:, :, None].copy(), totals[:, None])
+        np.testing.assert_allclose(in_numbers[:, :, 0], expected, rtol=1e-12)
 
     def test_healing_that_is_unknown(self):
         with pytest.raises(InputError, match="'magic' is unknown"):

@@ -9,6 +9,7 @@ import sysid
 from sysid import ChainStiffness, InputError, SpectralStiffness
 from sysid.models.geometry import FACTOR_FLOOR, Geometry
 from sysid.models.model import MassBlocks, stiffness_blocks
+from sysid.models.spectrum import Refinement
 from sysid.models.stiffness import WrittenStiffness
 
 SEEDS = range(5)
@@ -91,8 +92,24 @@ class TestSpectral:
         q = random_orthogonal(rng, 5)
         H = (q * rng.uniform(1e2, 1e5, 5)) @ q.T
         geometry, model = geometry_of(np.ones((5, 1))), SpectralStiffness([1, 2, 3, 4, 5])
-        y = model.values(geometry, holding(geometry, (H + H.T) / 2))
-        np.testing.assert_allclose(mass_normalised(model, geometry, y, np.eye(5)), H, rtol=1e-10, atol=1e-7)
+        M = random_mass(rng, 5)
+        L = np.linalg.cholesky(M)
+        K = L @ H @ L.T
+        y = model.values(geometry, holding(geometry, (K + K.T) / 2, M))
+        np.testing.assert_allclose(mass_normalised(model, geometry, y, L), H, rtol=1e-9, atol=1e-6)
+        np.testing.assert_allclose(blocks(model, geometry, y, L)[0], K, rtol=1e-9, atol=1e-6)
+
+    def test_a_candidate_that_ipopt_could_not_refine_takes_the_closed_form(self, monkeypatch):
+        """Of a diagonal H that is the spectrum itself on the diagonal."""
+        answers = iter([
+            Refinement(np.array([[1.0, 0.0], [2.0, 3.0]]), 0.0, True, "solved"),
+            Refinement(np.array([[8.0, 0.0], [9.0, 8.0]]), 0.5, False, "not solved"),
+        ])  # fmt: skip
+        monkeypatch.setattr("sysid.models.stiffness.by_ipopt", lambda factor, targets: next(answers))
+        rows = np.array([[5.0, 1.0, 6.0], [3.0, 0.0, 5.0]])
+        refined, failed = SpectralStiffness().with_spectrum(rows, np.array([4.0, 7.0]), by_solver=True)
+        np.testing.assert_allclose(refined, [[1, 2, 3], [4, 0, 7]], atol=1e-12)
+        assert failed == 1
 
     def test_targets_are_the_given_frequencies_in_radians_a_second(self, geometry_of):
         geometry = geometry_of(np.ones((3, 1)))

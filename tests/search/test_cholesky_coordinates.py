@@ -6,8 +6,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from sysid.nlp import NonlinearProgram
 from sysid.search import local
-from sysid.search.cholesky_coordinates import CholeskyError, cayley, skew_symmetric
+from sysid.search.cholesky_coordinates import CholeskyError, _derivatives, _unknowns, cayley, skew_symmetric
 
 CASES = {
     "trace": {"mass": "trace"},
@@ -145,3 +146,31 @@ def test_channels_and_lines_weigh_as_in_the_objective(random_case):
     at = coordinates_of(noisy, noisy.structure(other))
     assert noisy.objective(other) != pytest.approx(problem.objective(other), rel=1e-2)
     assert float(CholeskyError(noisy).gradient(*at)[0]) == pytest.approx(noisy.objective(other) ** 2, rel=1e-9)
+
+
+def test_derivatives_by_the_programs_unknowns_agree_with_differences(random_case):
+    """Where the coordinates bend with the unknowns, as logarithms and scaled totals do."""
+    truth, problem = random_case(np.random.default_rng(3), "trace", n=2, d=1)
+    y, psi = coordinates_of(problem, truth)
+    z = NonlinearProgram()
+    v = z.variable("v", np.zeros(y.size))
+    made = _derivatives(z.z, ca.DM(y) + v + v**2, CholeskyError(problem), psi)
+    rng, h = np.random.default_rng(1), 1e-5
+    at, along = 0.05 * rng.standard_normal(y.size), rng.standard_normal(y.size)
+    slopes = [np.asarray(made["grad_f"](at + k * h * along, [])[1]).ravel() for k in (-2, -1, 1, 2)]
+    change = (slopes[0] - 8 * slopes[1] + 8 * slopes[2] - slopes[3]) / (12 * h)
+    upper = np.asarray(made["hess_lag"](at, [], 1.0, []))
+    hessian = upper + np.triu(upper, 1).T
+    assert np.linalg.norm(change - hessian @ along) < 1e-6 * np.linalg.norm(hessian @ along)
+
+
+def test_modes_that_changed_places_are_put_in_order(random_case):
+    truth, problem = random_case(np.random.default_rng(6), "trace", n=3, d=1)
+    y, psi = coordinates_of(problem, truth)
+    mixed = [2, 0, 1]
+    omega, ratios = 2 * np.pi * truth.natural_frequencies[mixed], truth.damping_ratios[mixed]
+    x = problem.values(truth)
+    found = problem.structure(_unknowns(problem, x, y[problem.formulation.parts.mass], psi[:, mixed], omega, ratios))
+    for name in ("mass", "stiffness", "damping"):
+        a, b = getattr(found, name)[:3, :3], getattr(truth, name)[:3, :3]
+        np.testing.assert_allclose(a, b, atol=1e-8 * np.abs(b).max())

@@ -1,5 +1,7 @@
 """The swarm's objective without lines, beside the one by lines on compiled CasADi functions."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -125,6 +127,22 @@ def test_candidates_near_the_records_go_by_lines():
     costs = cost(rows)
     assert costs[1] == np.sqrt(by_lines(made, cost, rows[1:2])[0]) < 1e-9
     assert np.all(costs[[0, 2]] > 1e-3)
+
+
+def test_candidates_near_a_record_that_weighs_more_than_the_accelerations_go_by_lines():
+    """The square of a force that is a thousand times as exact is a difference of numbers a million times as large."""
+    made = problem("three runs", healing="rigid_body", force=True)
+    test = made.measurement
+    std = np.sqrt(np.mean(np.abs(test.relative) ** 2)), 1e-3 * np.sqrt(np.mean(np.abs(test.force) ** 2))
+    stated = dataclasses.replace(
+        test, response_std=std[0] * np.ones((N, FREQ.size)), force_std=std[1] * np.ones((D, FREQ.size))
+    )
+    made = dataclasses.replace(made, measurement=stated)
+    cost, exact = objective(made), made.formulation.to_sampling(made.values(truth()))
+    rows = exact * (1 + 1e-5 * np.random.default_rng(0).normal(size=(4, exact.size)))
+    expected = by_lines(made, cost, rows)
+    assert np.all((expected > 1e-6) & (expected < 1.0))
+    np.testing.assert_allclose(cost(rows) ** 2, expected, rtol=1e-9)
 
 
 def test_ratios_outside_of_the_range_go_by_lines_and_no_number_stays_none():

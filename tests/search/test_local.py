@@ -3,14 +3,20 @@
 import dataclasses
 import itertools
 import time
+from types import SimpleNamespace
 
+import casadi as ca
 import numpy as np
 import pytest
 
 import sysid
 from sysid import FullMass, SpectralStiffness
+from sysid.modal_analysis.residues import linear_residues
 from sysid.models.spectrum import SOLVED
+from sysid.nlp import NonlinearProgram
 from sysid.search import local
+from sysid.search.modal_coordinates import _linear_starts, _regular_inverse, frequencies, modes_of
+from sysid.search.scaled_unknowns import add_unknowns
 from sysid.search.swarm_objective import SwarmObjective
 
 MASSES, DAMPINGS = ("trace", "rigid_body", "lumped", "known"), ("modal", "proportional")
@@ -209,6 +215,58 @@ def test_a_solution_inside_says_nothing_of_bounds(random_case):
     answer = local.solve(problem, near(rng, problem, truth, 0.05))
     assert answer.success
     assert "bound" not in answer.message
+
+
+def at_start(z, expression):
+    return np.asarray(ca.Function("start", [z.z], [expression])(np.concatenate(z.start))).ravel()
+
+
+class TestStarts:
+    """What a fit in modal coordinates begins with."""
+
+    def test_frequencies_start_where_they_are_unless_that_is_outside_their_window(self, random_case):
+        """Of five per cent about those that were given, on the side that they are on."""
+        _, problem = random_case(np.random.default_rng(0), n=3, d=1)
+        given, z = problem.formulation.stiffness.spectrum, NonlinearProgram()
+        omega, _ = frequencies(problem, given * [1.02, 0.97, 1.3], z)
+        np.testing.assert_allclose(at_start(z, omega), given * [1.02, 0.97, 1.05], rtol=1e-12)
+
+    def test_of_a_local_minimum_at_its_own_poles_then_at_the_first(self, random_case):
+        """Also where its own poles allow nothing better than what was reached."""
+        truth, problem = random_case(np.random.default_rng(1), n=3, d=2)
+        test, first = problem.measurement, modes_of(truth)
+        ended = first._replace(omega=1.3 * first.omega)
+        left = linear_residues(test, ended.omega, ended.ratios)[1]
+        assert left > 0.1
+        own, other = _linear_starts(test, SimpleNamespace(modes=ended, of_accelerations=left), first)
+        np.testing.assert_array_equal(own.omega, ended.omega)
+        np.testing.assert_array_equal(other.omega, first.omega)
+        residues = np.einsum("nk,kd->knd", other.phi, other.gamma)
+        expected = np.einsum("nk,kd->knd", first.phi, first.gamma)
+        np.testing.assert_allclose(residues, expected, atol=1e-8 * np.abs(expected).max())
+
+    def test_shapes_that_are_nearly_alike_have_a_regular_inverse(self):
+        """Singular values 2, 1 and 1e-9: the last counts as a millionth of the first."""
+        turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+        inverse = _regular_inverse(turn * [2.0, 1.0, 1e-9])
+        np.testing.assert_allclose(inverse, (turn * [0.5, 1.0, 5e5]).T, rtol=1e-6)
+
+    def test_unknowns_in_units_of_their_scale_keep_their_bounds(self):
+        z = NonlinearProgram()
+        wide = sysid.Variable("wide", lower=-50.0, upper=200.0)
+        narrow = sysid.Variable("narrow", lower=1e-4, upper=0.02)
+        x = add_unknowns(z, [wide, narrow], np.array([40.0, 0.01]))
+        made = ca.Function("made", [z.z], [x])
+        for bounds, expected in ((z.lower, [-50, 1e-4]), (z.start, [40, 0.01]), (z.upper, [200, 0.02])):
+            np.testing.assert_allclose(np.asarray(made(np.concatenate(bounds))).ravel(), expected, rtol=1e-12)
+
+
+    def test_near_a_bound_is_within_a_millionth_of_the_range(self):
+        z = NonlinearProgram()
+        z.variable("spring", np.zeros(3), np.zeros(3), np.array([1e6, 1e6, 1e6]))
+        z.variable("ratio", np.zeros(2), np.zeros(2), np.array([1e-6, 0.0]))
+        at = np.array([0.5, 1e6 - 0.5, 2.0, 5e-7, 0.0])
+        assert z.on_bounds(at) == "spring 1 (lower), 2 (upper)"
 
 
 class TestControl:
