@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[1]
 CEILINGS = {
     # 18,800 for what the package could do when it was rebuilt in rooms; since then the published algorithm with its own
     # local phase (600), an objective of the swarm without lines (600), and methods side by side with parameters (900).
-    "lines": 20_900,
+    "lines": 21_000,
 }
 
 # The counting is a benchmark, which prints the same figures; `sysid` itself is not imported from the checkout.
