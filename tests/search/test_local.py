@@ -260,7 +260,6 @@ class TestStarts:
         for bounds, expected in ((z.lower, [-50, 1e-4]), (z.start, [40, 0.01]), (z.upper, [200, 0.02])):
             np.testing.assert_allclose(np.asarray(made(np.concatenate(bounds))).ravel(), expected, rtol=1e-12)
 
-
     def test_near_a_bound_is_within_a_millionth_of_the_range(self):
         z = NonlinearProgram()
         z.variable("spring", np.zeros(3), np.zeros(3), np.array([1e6, 1e6, 1e6]))
