@@ -25,7 +25,7 @@ from sysid.structure.structure import Array, Structure
 from sysid.structure.triangular import triangle, triangle_entries
 from sysid.swarm import SwarmProgress, SwarmSettings, minimize_swarm
 
-_SETTINGS = SwarmSettings(inertia_b1=0.8, inertia_b2=0.5, acceleration_lower=0.5, acceleration_sum=3.0)
+_SETTINGS = SwarmSettings(inertia_b1=0.8, inertia_b2=0.5, acceleration_lower=0.5, acceleration_sum=3.0, guides=3)
 _IDLE = (
     "mass and stiffness are free, so the modal local phase finds this answer from wherever the swarm ends, two random "
     "candidates too: what the swarm itself found stands in the history (strategy 'hpso-ls' depends on it)"
@@ -38,8 +38,8 @@ _DOUBTFUL = 0.1  # objective above which a problem without free modes is searche
 class Swarm:
     """Strategy "swarm": particle swarm, eigenvalue refinement, local phase, and again while there is no fit.
 
-    `Swarm.published` gives the paper's hPSO-LS; the defaults differ from it in the constants and in the coordinates
-    of the local phase.
+    `Swarm.published` gives the paper's hPSO-LS; the defaults differ from it in the constants, in what draws a particle
+    (`settings`) and in the coordinates of the local phase.
 
     Parameters
     ----------
@@ -69,9 +69,14 @@ class Swarm:
         How many further swarms may follow where the goal is missed, or, without a goal, where the local phase ended in
         a local minimum or, where modes are not free, the objective is above 0.1.
     settings : SwarmSettings
-        Constants of the swarm itself. The paper leaves b1 and b2 of its eq. 11 to the user; with the
-        usual 0.3 and 0.2 and c1 + c2 up to 4 (``SwarmSettings()``) the swarm of this problem contracts
-        too early. These keep it moving: ``python -m benchmarks swarm_alone`` measures both.
+        Constants of the swarm itself. The paper leaves b1 and b2 of its eq. 11 to the user; with the usual 0.3 and 0.2
+        and c1 + c2 up to 4 (``SwarmSettings()``) the swarm of this problem contracts too early. These keep it moving,
+        and draw each particle to the mean of three random ones of the best quarter (as Mendes, Kennedy, Neves 2004,
+        IEEE Trans. Evol. Comput. 8, 204-210, to that of its neighbours): what is wrong in one alone averages out, and
+        no single best ends the search. On a tower with
+        400 iterations of the swarm alone the median residual is then 0.05 (6 sensors) and 0.11 (10), against 0.42 and
+        0.62 for these constants with the global best, 0.20 and 0.65 for the means with the usual constants; 2 or 5
+        guides, or the best sixth or half, leave 0.05 to 0.13 (6). ``python -m benchmarks swarm_alone`` measures it.
     name : str
         As results call it.
 

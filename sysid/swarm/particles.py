@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,9 @@ class ParticleSwarm:
     (r, s uniform on [0, 1], one draw a particle and variable), and, in the convergence state, adds one row: the
     global best with one coordinate moved at random (elitist learning, Zhan et al. 2009, IEEE Trans. SMC-B 39(6)). That
     row becomes the global best if its cost is lower, else it takes the place of the worst particle.
+
+    With `SwarmSettings.guides` of m > 0 a mean takes the place of the global best in eq. 7: that of the own bests of m
+    particles, drawn for each particle from the best ones.
 
     Four things the sources leave open, or can be read in two ways; here:
 
@@ -309,11 +313,23 @@ class ParticleSwarm:
         candidate[i] = np.clip(candidate[i] + self._rng.normal(0.0, sigma), 0.0, 1.0)
         return candidate
 
+    def _attractor(self) -> FloatArray:
+        """What the social term draws to: the global best (n_free,), or each particle's own mean, a row each."""
+        count = self._settings.guides
+        if count == 0:
+            return self._own[self._leader]
+        # A particle that never met a finite cost guides nobody.
+        most = min(math.ceil(self._settings.guide_share * self.n_particles), int(np.isfinite(self._own_costs).sum()))
+        best = np.argsort(self._own_costs, kind="stable")[:most]
+        means: FloatArray = self._own[best[self._rng.integers(most, size=(count, self.n_particles))]].mean(axis=0)
+        return means
+
     def _move(self) -> None:
+        attractor = self._attractor()
         towards_own = self._rng.random(self._positions.shape)
         towards_own *= self._own - self._positions
         towards_best = self._rng.random(self._positions.shape)
-        towards_best *= self._own[self._leader] - self._positions
+        towards_best *= attractor - self._positions
         velocities = self.inertia * self._velocities + self.cognitive * towards_own + self.social * towards_best
         np.clip(velocities, -self._settings.max_velocity, self._settings.max_velocity, out=velocities)
         positions = self._positions + velocities

@@ -7,6 +7,8 @@ from dataclasses import dataclass, fields
 
 from sysid.errors import InputError
 
+from .checks import whole_number
+
 
 @dataclass(frozen=True, kw_only=True)
 class SwarmSettings:
@@ -29,11 +31,17 @@ class SwarmSettings:
         The step of c1 and c2 is uniform between these.
     elitist_sigma_start, elitist_sigma_end : float
         Standard deviation of elitist learning at the start and end of the run, in parts of the range.
+    guides : int
+        Above 0, the social term of eq. 7 draws each particle to the mean of the own bests of so many particles, instead
+        of to the global best; they are drawn anew for each particle and iteration, independently, from the best ones.
+    guide_share : float
+        Part of the swarm that they are drawn from, in (0, 1].
 
     Raises
     ------
     InputError
-        If a number is negative or not finite, or an upper number lies below its lower one.
+        If a number is negative or not finite, an upper number lies below its lower one, `guides` is not whole, or
+        `guide_share` is 0 or above 1.
     """
 
     max_velocity: float = 0.4
@@ -47,6 +55,8 @@ class SwarmSettings:
     acceleration_step_upper: float = 0.1
     elitist_sigma_start: float = 1.0
     elitist_sigma_end: float = 0.1
+    guides: int = 0
+    guide_share: float = 0.25
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -55,6 +65,9 @@ class SwarmSettings:
                 raise InputError(f"SwarmSettings.{field.name} is {value!r}; give a finite number, zero or above.")
         if self.max_velocity == 0:
             raise InputError("SwarmSettings.max_velocity is 0, so no particle could move; give a number above zero.")
+        whole_number(self.guides, "SwarmSettings.guides", at_least=0)
+        if not 0 < self.guide_share <= 1:
+            raise InputError(f"SwarmSettings.guide_share is {self.guide_share!r}; give a part of the swarm, in (0, 1].")
         for name in ("acceleration", "acceleration_step"):
             lower, upper = getattr(self, f"{name}_lower"), getattr(self, f"{name}_upper")
             if lower > upper:

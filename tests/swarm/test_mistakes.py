@@ -83,6 +83,10 @@ def test_calls_out_of_order_are_refused():
         ({"inertia_b1": -1}, "inertia_b1 is -1"),
         ({"elitist_sigma_end": np.nan}, "elitist_sigma_end is nan"),
         ({"acceleration_lower": 3}, "acceleration_lower = 3 is above"),
+        ({"guides": -1}, "guides is -1"),
+        ({"guides": 1.5}, "SwarmSettings.guides is 1.5; give a whole number"),
+        ({"guide_share": 0.0}, "guide_share is 0.0; give a part of the swarm"),
+        ({"guide_share": 1.1}, "guide_share is 1.1; give a part of the swarm"),
     ],
 )
 def test_constants_that_cannot_be_used_are_refused(constants, words):

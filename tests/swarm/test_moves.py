@@ -36,13 +36,14 @@ def state_after(f, previous):
 class Transcription:
     """The swarm in the unit cube, particle by particle and variable by variable."""
 
-    def __init__(self, first_rows, seed, horizon):
+    def __init__(self, first_rows, seed, horizon, guides=0, among=0):
         self.rng = np.random.default_rng(seed)
         self.rng.integers(2**63)  # the seed of the first sample
         self.p, self.horizon, self.nit = first_rows.copy(), horizon, 0
         self.v, self.own = np.zeros_like(self.p), self.p.copy()
         self.own_costs, self.best_cost, self.best, self.leader = np.full(len(self.p), np.inf), np.inf, None, 0
         self.state, self.c1, self.c2, self.w, self.candidate = EXPLORATION, 2.0, 2.0, 0.0, None
+        self.guides, self.among = guides, among
 
     def move(self):
         rng, p = self.rng, self.p
@@ -64,10 +65,15 @@ class Transcription:
             j = rng.integers(p.shape[1])
             sigma = 1.0 - 0.9 * min(self.nit / self.horizon, 1.0)
             self.candidate[j] = min(max(self.candidate[j] + rng.normal(0.0, sigma), 0.0), 1.0)
+        towards = [self.best] * len(p)
+        if self.guides:
+            best = sorted(range(len(p)), key=lambda i: self.own_costs[i])[: self.among]
+            drawn = rng.integers(self.among, size=(self.guides, len(p)))
+            towards = [sum(self.own[best[k]] for k in drawn[:, i]) / self.guides for i in range(len(p))]
         r, s = rng.random(p.shape), rng.random(p.shape)
         for i, j in np.ndindex(*p.shape):
             cognitive = self.c1 * r[i, j] * (self.own[i, j] - p[i, j])
-            social = self.c2 * s[i, j] * (self.best[j] - p[i, j])
+            social = self.c2 * s[i, j] * (towards[i][j] - p[i, j])
             v = min(max(self.w * self.v[i, j] + cognitive + social, -0.4), 0.4)
             p[i, j] += v
             if p[i, j] <= 0.0:
@@ -99,10 +105,12 @@ class Transcription:
                 self.own[worst], self.own_costs[worst] = self.candidate, cost
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_sixty_iterations_are_those_of_a_transcription_with_the_same_random_stream(seed):
-    swarm = ParticleSwarm([(0.0, 1.0)] * 3, rng=seed, n_particles=12, horizon=40)
-    expected, noise = Transcription(swarm.ask(), seed, horizon=40), np.random.default_rng(100 + seed)
+@pytest.mark.parametrize(("seed", "guides"), [(0, 0), (1, 0), (2, 0), (0, 3), (1, 1)])
+def test_sixty_iterations_are_those_of_a_transcription_with_the_same_random_stream(seed, guides):
+    """With guides too: 4 of the 12 particles are the best 30 %, rounded up."""
+    settings = SwarmSettings(guides=guides, guide_share=0.3)
+    swarm = ParticleSwarm([(0.0, 1.0)] * 3, rng=seed, n_particles=12, horizon=40, settings=settings)
+    expected, noise = Transcription(swarm.ask(), seed, 40, guides, among=4), np.random.default_rng(100 + seed)
     for k in range(60):
         rows = swarm.ask()
         if k:
@@ -250,3 +258,34 @@ def test_every_particle_and_variable_has_an_own_draw_towards_either_best():
     for draws in (s, centred):
         shared = np.corrcoef(draws.T)[np.triu_indices(d, 1)]
         assert np.mean(shared) == pytest.approx(0.0, abs=0.03)  # four standard deviations of 15 pairs
+
+
+def test_guides_draw_to_the_mean_of_own_bests_among_the_best_quarter():
+    """Eight particles on the diagonal of a cube, at rest: of the two that are best, at 0.2 and 0.6, two draws have the
+    mean 0.2, 0.4 or 0.6, with 1, 2 and 1 of 4 chances. The mean step over all variables is c2 / 2 of the way there.
+    """
+    size, at = 1500, np.array([0.9, 0.2, 0.8, 0.1, 0.6, 0.3, 1.0, 0.5])
+    half = {"acceleration_start": 0.5, "acceleration_lower": 0.5, "acceleration_upper": 0.5}
+    means = []
+    for seed in range(12):
+        settings = SwarmSettings(**half, guides=2, guide_share=0.25, max_velocity=1.0)
+        swarm = ParticleSwarm([(0.0, 1.0)] * size, rng=seed, n_particles=8, settings=settings)
+        swarm.ask()
+        swarm.tell([7.0, 1.0, 5.0, 6.0, 2.0, 4.0, np.inf, 3.0], np.repeat(at[:, None], size, axis=1))
+        means.extend(at + (swarm.ask()[:8].mean(axis=1) - at) / 0.25)
+    nearest = np.array([0.2, 0.4, 0.6])[np.abs(np.subtract.outer(means, [0.2, 0.4, 0.6])).argmin(axis=1)]
+    np.testing.assert_allclose(means, nearest, rtol=0, atol=0.055)  # four standard deviations of 2 · 0.9 s over 1500
+    assert [np.mean(nearest == mean) for mean in (0.2, 0.4, 0.6)] == pytest.approx([0.25, 0.5, 0.25], abs=0.15)
+
+
+def test_a_particle_without_a_finite_cost_guides_nobody():
+    """One particle of six has a cost: with all six as guides, it alone is drawn to, in steps of its own side."""
+    swarm = ParticleSwarm(
+        [(0.0, 1.0)] * 3, rng=3, n_particles=6, settings=SwarmSettings(guides=3, guide_share=1.0, max_velocity=1.0)
+    )
+    start = swarm.ask()
+    swarm.tell([np.nan, np.inf, 1.0, np.nan, np.inf, np.nan])
+    step = swarm.ask()[:6] - start
+    assert not step[2].any()
+    assert np.all(step * (start[2] - start) >= 0)
+    assert np.delete(step, 2, axis=0).all()
