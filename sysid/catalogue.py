@@ -23,6 +23,7 @@ from sysid.models.unknowns import declared
 from sysid.problem.problem import Problem
 from sysid.results.identification import Recipe
 
+_PRIVATE = "_sysid_problem_"  # the modules' names in Python
 _SIGNATURE = "def problem(*, data=None, rng=0) -> sysid.Problem"
 
 
@@ -110,7 +111,7 @@ def build(recipe: Recipe) -> Problem:
         signature.bind(data=data, rng=recipe.rng, **recipe.parameters)
     except TypeError as error:
         raise InputError(f"{path}: problem() {error}; {_in_words(signature)}") from None
-    with _telling_the_line(path):
+    with _telling_the_line(path), _neighbours(path):
         problem = function(data=data, rng=recipe.rng, **recipe.parameters)
     if not isinstance(problem, Problem):
         raise InputError(f"{path}: problem() gives a {type(problem).__name__}, not a sysid.Problem")
@@ -143,14 +144,19 @@ def _function(name: str) -> tuple[Callable[..., object], Path]:
     return function, path
 
 
+def file_of(name: str) -> Path | None:
+    """The file of a problem module; None where it is a dotted module, or unknown."""
+    if _is_path(name):
+        return Path(name)
+    paths = (folder / f"{name}.py" for folder in (own_folder(), bundled_folder()))
+    return next((path for path in paths if path in _modules(path.parent)), None)
+
+
 def _load(name: str) -> tuple[ModuleType, Path]:
     """Import a problem module; also the path that messages call it by."""
-    if _is_path(name):
-        return _load_file(Path(name))
-    for folder in (own_folder(), bundled_folder()):
-        path = folder / f"{name}.py"
-        if path in _modules(folder):
-            return _load_file(path)
+    file = file_of(name)
+    if file is not None:
+        return _load_file(file)
     parts = name.split(".")
     if len(parts) > 1 and all(part.isidentifier() for part in parts):
         return _load_dotted(name)
@@ -164,7 +170,7 @@ def _load_file(path: Path) -> tuple[ModuleType, Path]:
     except OSError as error:
         raise InputError(f"problem {path} cannot be read: {error.strerror or error}") from None
     full = path.absolute()
-    name = f"_sysid_problem_{zlib.crc32(os.fsencode(full)):08x}_{path.stem}"
+    name = f"{_PRIVATE}{zlib.crc32(os.fsencode(full)):08x}_{path.stem}"
     loader = importlib.machinery.SourceFileLoader(name, str(full))
     spec = importlib.util.spec_from_file_location(name, full, loader=loader)
     assert spec is not None
@@ -172,7 +178,7 @@ def _load_file(path: Path) -> tuple[ModuleType, Path]:
     # Dataclasses and pickles look their module up by its name.
     sys.modules[name] = module
     try:
-        with _telling_the_line(path):
+        with _telling_the_line(path), _neighbours(path):
             # dont_inherit: this file's own __future__ imports are not the module's.
             exec(compile(source, str(full), "exec", dont_inherit=True), module.__dict__)
     except BaseException:
@@ -195,6 +201,22 @@ def _load_dotted(name: str) -> tuple[ModuleType, Path]:
     path = Path(spec.origin) if spec.has_location and spec.origin else Path(name)
     with _telling_the_line(path):
         return importlib.import_module(name), path
+
+
+@contextmanager
+def _neighbours(path: Path) -> Iterator[None]:
+    """Let a module of the user's import the files beside it; they are imported anew for each problem."""
+    folder, before = path.absolute().parent, set(sys.modules)
+    sys.path.insert(0, str(folder))
+    try:
+        yield
+    finally:
+        sys.path.remove(str(folder))
+        for name in set(sys.modules) - before:
+            file = getattr(sys.modules[name], "__file__", None)
+            # Another folder may have a file of the same name.
+            if file is not None and Path(file).parent == folder and not name.startswith(_PRIVATE):
+                del sys.modules[name]
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from sysid.results.answer import Answer, reported_unknowns
 from sysid.results.summary import summary
 from sysid.results.version import __version__
 from sysid.search.strategy import History
-from sysid.structure.structure import Array, Structure
+from sysid.structure.structure import Array, Structure, finite_array
 
 # Fields that are texts, numbers or arrays themselves.
 _PLAIN = (
@@ -39,6 +39,8 @@ class Recipe:
     parameters : dict
         What else is passed to ``problem()``, by name: numbers, texts, bools, None, and lists, tuples and dictionaries
         of them.
+    start : array_like (n_variables,), optional
+        Unknowns where a refinement starts, such as the `x` of a result.
 
     Raises
     ------
@@ -50,9 +52,12 @@ class Recipe:
     data: str | None = None
     rng: int = 0
     parameters: dict[str, Any] = field(default_factory=dict)
+    start: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", dict(self.parameters))
+        if self.start is not None:
+            object.__setattr__(self, "start", tuple(finite_array("Recipe: start", self.start).ravel().tolist()))
         for name, value in self.parameters.items():
             if name in ("data", "rng"):
                 raise InputError(f"parameter {name!r} is a field of the recipe itself")
@@ -72,13 +77,14 @@ class Recipe:
         """Give the fields by their names; `from_tree` takes them back."""
         parameters = {name: repr(value) for name, value in self.parameters.items()}
         # A number of any size, and values of any shape, as texts.
-        return {"module": self.module, "data": self.data, "rng": str(self.rng), "parameters": parameters}
+        tree = {"module": self.module, "data": self.data, "rng": str(self.rng), "parameters": parameters}
+        return tree if self.start is None else {**tree, "start": np.array(self.start)}
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Recipe:
         """Give the recipe of a tree that `to_tree` made; earlier ones have no parameters."""
         parameters = {name: ast.literal_eval(text) for name, text in tree.get("parameters", {}).items()}
-        return cls(tree["module"], tree["data"], int(tree["rng"]), parameters)
+        return cls(tree["module"], tree["data"], int(tree["rng"]), parameters, tree.get("start"))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -158,7 +158,7 @@ class _Run:
         )
         session.log(f"continuation over {problem.n_variables} unknowns in {len(self.steps)} steps{floor}")
         first = problem.formulation.guess if start is None else as_unknowns(problem, start)
-        for x in (first, *_starts(problem, starts - 1, session.random)):
+        for x in (first, *random_starts(problem, starts - 1, session.random)):
             self._from(x)
             if self.stopped is not None or (self.ends and not session.time_for_more):
                 break
@@ -244,7 +244,7 @@ def _best(problem: Problem, ends: list[tuple[float, LocalResult]]) -> tuple[floa
     )
 
 
-def _starts(problem: Problem, count: int, random: np.random.SeedSequence) -> list[Array]:
+def random_starts(problem: Problem, count: int, random: np.random.SeedSequence) -> list[Array]:
     """Points spread over the search space as the swarm's are, of those that stand for a structure."""
     if count < 1:
         return []

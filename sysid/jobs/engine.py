@@ -1,0 +1,138 @@
+"""Run tasks on an executor, whatever kind it is; rebuild it where its workers died."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from typing import TypeVar
+
+from sysid.errors import InputError
+
+Task = TypeVar("Task")
+Answer = TypeVar("Answer")
+
+_IN_VAIN = 3  # pools in a row that broke before any of their tasks ended
+
+
+def processes(workers: int | None = None) -> Callable[[], Executor]:
+    """A maker of process pools for `submit`: workers are spawned, each with one thread.
+
+    Parameters
+    ----------
+    workers : int, optional
+        As many as processors by default.
+
+    Raises
+    ------
+    InputError
+        Where it is not a positive whole number.
+    """
+    count = workers if workers is not None else os.cpu_count() or 1
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+        raise InputError(f"workers = {workers!r}: a whole number from 1 is needed")
+
+    def make() -> Executor:
+        # A fork would copy locks of threads that do not exist in the child.
+        return ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), initializer=_end_at_interrupt)
+
+    return make
+
+
+def checked(executor: object) -> Executor:
+    """The executor itself.
+
+    Raises
+    ------
+    InputError
+        Where it is none, or one of threads, which IPOPT does not bear.
+    """
+    if not isinstance(executor, Executor):
+        raise InputError(f"executor is a {type(executor).__name__}: give an Executor, or a function that makes one")
+    if isinstance(executor, ThreadPoolExecutor):
+        raise InputError("executor is a pool of threads, and IPOPT bears none: give sysid.jobs.processes(4)")
+    return executor
+
+
+def _end_at_interrupt() -> None:
+    """Let Ctrl-C end a worker without a word: the submitting process tells the user."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def each(
+    function: Callable[[Task], Answer],
+    tasks: Sequence[Task],
+    executor: Executor | Callable[[], Executor] | None,
+    lost: Callable[[Task, str], Answer],
+) -> Iterator[Answer]:
+    """Answers to all tasks, as they come.
+
+    Parameters
+    ----------
+    function : callable
+        At the top of a module, so that a worker finds it.
+    tasks : sequence
+    executor : Executor, callable or None
+        None runs them here, one after the other. Of a function that makes an executor a new one is made where the last
+        one broke, and what was unfinished is submitted again; with an executor itself it is lost.
+    lost : callable
+        The answer to a task whose worker died or raised, and why.
+    """
+    if executor is None:
+        yield from map(function, tasks)
+    elif isinstance(executor, Executor):
+        yield from (_answer(task, future, lost) for task, future in _submitted(function, tasks, executor))
+    else:
+        yield from _rebuilding(function, list(tasks), executor, lost)
+
+
+def _rebuilding(
+    function: Callable[[Task], Answer],
+    left: list[Task],
+    make: Callable[[], Executor],
+    lost: Callable[[Task, str], Answer],
+) -> Iterator[Answer]:
+    """Answers by as many executors as it takes."""
+    in_vain = 0
+    while left:
+        executor, unfinished, ended = checked(make()), list[Task](), 0
+        try:
+            for task, future in _submitted(function, left, executor):
+                if isinstance(future.exception(), BrokenExecutor):
+                    unfinished.append(task)
+                else:
+                    ended += 1
+                    yield _answer(task, future, lost)
+        finally:
+            executor.shutdown(wait=False, cancel_futures=True)
+        in_vain = 0 if ended else in_vain + 1
+        if in_vain == _IN_VAIN:
+            for task in unfinished:
+                yield lost(task, f"its worker died, and {_IN_VAIN} pools in a row: is there enough memory?")
+            return
+        left = unfinished
+
+
+def _submitted(
+    function: Callable[[Task], Answer], tasks: Sequence[Task], executor: Executor
+) -> Iterator[tuple[Task, Future[Answer]]]:
+    """Tasks with their futures as these end."""
+    futures: dict[Future[Answer], Task] = {}
+    broken: list[tuple[Task, Future[Answer]]] = []
+    for task in tasks:
+        try:
+            futures[executor.submit(function, task)] = task
+        except BrokenExecutor as error:  # while tasks were still handed over
+            future: Future[Answer] = Future()
+            future.set_exception(error)
+            broken.append((task, future))
+    for future in as_completed(futures):
+        yield futures[future], future
+    yield from broken
+
+
+def _answer(task: Task, future: Future[Answer], lost: Callable[[Task, str], Answer]) -> Answer:
+    error = future.exception()
+    return future.result() if error is None else lost(task, f"its worker failed ({type(error).__name__}: {error})")

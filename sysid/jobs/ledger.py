@@ -1,0 +1,93 @@
+"""Results of jobs in a SQLite file, each written whole as it comes, so that an interrupted submission goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import sqlite3
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+
+from sysid import catalogue
+from sysid.errors import InputError
+from sysid.jobs.job import Job, JobResult
+
+FILE_NAME = "jobs.sqlite"
+
+_TABLE = """CREATE TABLE IF NOT EXISTS jobs (
+    job TEXT PRIMARY KEY, success INTEGER NOT NULL, message TEXT NOT NULL, x BLOB NOT NULL, residual REAL
+)"""
+
+
+class Ledger:
+    """Results of some jobs, in a folder.
+
+    A job is known by its recipe, the number of its start and the text of its problem module: where one of these
+    differs it is another job. Records that the module reads are known by their path alone.
+
+    Parameters
+    ----------
+    folder : Path
+        It is made where there is none.
+    jobs : sequence of Job
+
+    Raises
+    ------
+    InputError
+        Where the folder cannot be written, or its file is no ledger or damaged; later too, such as on a full disk.
+    """
+
+    def __init__(self, folder: Path, jobs: Sequence[Job]) -> None:
+        self.path = folder / FILE_NAME
+        self._keys = {job.index: _key(job) for job in jobs}
+        self._seeds = {job.index: job.seed for job in jobs}
+        with self._told():
+            folder.mkdir(parents=True, exist_ok=True)
+            self._file = sqlite3.connect(self.path)
+            self._file.execute(_TABLE)
+
+    def results(self) -> dict[int, JobResult]:
+        """What is there of the jobs, by index."""
+        with self._told():
+            rows = {
+                row[0]: row[1:] for row in self._file.execute("SELECT job, success, message, x, residual FROM jobs")
+            }
+        return {
+            index: JobResult(
+                index, self._seeds[index], bool(success), message, np.frombuffer(x), np.nan if left is None else left
+            )
+            for index, key in self._keys.items()
+            if key in rows
+            for success, message, x, left in (rows[key],)
+        }
+
+    def add(self, result: JobResult) -> None:
+        """Write a result; it is on the disk when this returns."""
+        x, left = np.ascontiguousarray(result.x, dtype=float).tobytes(), float(result.residual)
+        row = (self._keys[result.index], int(result.success), result.message, x, left)
+        with self._told(), self._file:
+            self._file.execute("INSERT OR REPLACE INTO jobs VALUES (?, ?, ?, ?, ?)", row)
+
+    def __enter__(self) -> Ledger:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._file.close()
+
+    @contextlib.contextmanager
+    def _told(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, sqlite3.Error) as error:
+            raise InputError(f"the ledger of jobs {self.path} cannot be used: {error}") from error
+
+
+def _key(job: Job) -> str:
+    file = catalogue.file_of(job.recipe.module)
+    source = "" if file is None else hashlib.sha256(file.read_bytes()).hexdigest()
+    start = job.recipe.start if job.start == 0 else None
+    return json.dumps([{**job.recipe.to_tree(), "start": start}, job.start, source], sort_keys=True)

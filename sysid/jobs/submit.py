@@ -1,0 +1,78 @@
+"""Submit refinement jobs, keep their results in a ledger, and hand them out as they come."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import nullcontext
+from pathlib import Path
+
+from sysid.errors import InputError
+from sysid.jobs.engine import checked, each
+from sysid.jobs.job import Job, JobResult, run, without_result
+from sysid.jobs.ledger import Ledger
+from sysid.results.identification import Recipe
+
+
+def submit(
+    recipe: Recipe | Sequence[Recipe],
+    *,
+    starts: int = 1,
+    executor: Executor | Callable[[], Executor] | None = None,
+    out: str | Path | None = None,
+) -> Iterator[JobResult]:
+    """Refine each recipe's problem from several starts, by gradients.
+
+    Parameters
+    ----------
+    recipe : Recipe or sequence of Recipe
+        A problem module with what is passed to its ``problem()``. `Recipe.start` is where the first start begins; the
+        others are fresh points of the search space, by the recipe's ``rng``.
+    starts : int
+        Of each recipe.
+    executor : Executor or callable, optional
+        None runs the jobs in this process. ``sysid.jobs.processes(4)`` makes pools of four processes, a new one where
+        a worker died; a function of your own that makes an executor does as well, such as one that gives
+        ``dask.distributed.Client(address).get_executor()``. An executor itself is used as it is: what its workers lose
+        is reported without a result. IPOPT bears no threads: a pool of threads is refused.
+    out : str or Path, optional
+        Folder of the ledger ``jobs.sqlite``: results that stand there are not computed again.
+
+    Returns
+    -------
+    iterator of JobResult
+        As they come; jobs are numbered recipe by recipe, start by start. The result of a job does not depend on where
+        it runs, nor on how many run beside it.
+
+    Raises
+    ------
+    InputError
+        Where a recipe does not make a problem, or the folder holds other jobs. At once, before any job runs.
+    """
+    recipes = [recipe] if isinstance(recipe, Recipe) else list(recipe)
+    for one in recipes:
+        if not isinstance(one, Recipe):
+            raise InputError(
+                f"submit takes recipes, not a {type(one).__name__}: a job is rebuilt where it runs, so save the "
+                "problem as a module, problem.py, and give sysid.Recipe('problem.py')"
+            )
+    if isinstance(starts, bool) or not isinstance(starts, int) or starts < 1:
+        raise InputError(f"starts = {starts!r}: a whole number from 1 is needed")
+    if isinstance(executor, Executor) or not (executor is None or callable(executor)):
+        checked(executor)
+    jobs = [Job(i * starts + k, one, k) for i, one in enumerate(recipes) for k in range(starts)]
+    ledger = None if out is None else Ledger(Path(out), jobs)
+    return _results(jobs, executor, ledger)
+
+
+def _results(
+    jobs: list[Job], executor: Executor | Callable[[], Executor] | None, ledger: Ledger | None
+) -> Iterator[JobResult]:
+    with ledger or nullcontext():
+        known = {} if ledger is None else ledger.results()
+        yield from known.values()
+        left = [job for job in jobs if job.index not in known]
+        for result in each(run, left, executor, without_result):
+            if ledger is not None and result.x.size:
+                ledger.add(result)
+            yield result
