@@ -1,4 +1,4 @@
-"""The command line: ``sysid list``, ``new NAME``, ``show``, ``run``, ``compare PROBLEM``, ``report RESULT``.
+"""The command line: ``sysid list``, ``new``, ``show``, ``run``, ``compare``, ``refine`` and ``report``.
 
 Exit status: 0 success; 1 the search did not reach its goal; 2 a mistake in what was given, told in
 one line; 130 interrupted, with the best so far saved; 70 an error of sysid itself, told in one line
@@ -159,6 +159,12 @@ def _compare(options: argparse.Namespace, out: Output) -> int:
     return compare.run(options, out)
 
 
+def _refine(options: argparse.Namespace, out: Output) -> int:
+    from sysid.cli import refine
+
+    return refine.run(options, out)
+
+
 def _report(options: argparse.Namespace, out: Output) -> int:
     from sysid.report import report
 
@@ -216,6 +222,7 @@ def _parser() -> argparse.ArgumentParser:
 
     _add_run(command)
     _add_compare(command)
+    _add_refine(command)
 
     report = command("report", help="write report.html again, beside a result")
     report.add_argument("result", metavar="RESULT", help="a result.h5, or the folder that holds it")
@@ -269,6 +276,29 @@ def _add_compare(command: Callable[..., argparse.ArgumentParser]) -> None:
     )
     compare.add_argument("--max-time", type=_seconds, metavar="S", help="end each method after about so many seconds")
     compare.set_defaults(command=_compare)
+
+
+def _add_refine(command: Callable[..., argparse.ArgumentParser]) -> None:
+    refine = command(
+        "refine",
+        help="refine a result by gradients, from it and from many other starts",
+        description="Run the local phase from the result and from fresh points of the search space, on all processors "
+        "or a cluster. Prints the distinct minima and how often each was reached, and writes starts.csv and "
+        "minima.png. Results are kept as they come: the same command goes on where it was interrupted.",
+    )
+    refine.add_argument("result", metavar="RESULT", help="a result.h5 that 'sysid run' wrote, or its folder")
+    refine.add_argument("--starts", type=_count, default=16, metavar="N", help="16 by default; the first is the result")
+    refine.add_argument("--workers", type=_count, metavar="N", help="processes, as many as processors by default")
+    refine.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster, such as tcp://host:8786")
+    refine.add_argument("--out", metavar="DIR", help="folder, RESULT's folder/refine by default")
+    refine.set_defaults(command=_refine)
+
+
+def _count(text: str) -> int:
+    with contextlib.suppress(ValueError):
+        if (count := int(text)) >= 1:
+            return count
+    raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1")
 
 
 def _seed(text: str) -> int:

@@ -1,7 +1,7 @@
 """Refinement jobs: many starts and many problems, in this process, a pool of processes or a cluster."""
 
-from sysid.jobs.engine import processes
+from sysid.jobs.engine import cluster, processes
 from sysid.jobs.job import JobResult
 from sysid.jobs.submit import submit
 
-__all__ = ["JobResult", "processes", "submit"]
+__all__ = ["JobResult", "cluster", "processes", "submit"]

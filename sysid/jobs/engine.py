@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
 import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
-from typing import TypeVar
+from typing import TypeVar, cast
 
 from sysid.errors import InputError
 
@@ -37,6 +38,38 @@ def processes(workers: int | None = None) -> Callable[[], Executor]:
     def make() -> Executor:
         # A fork would copy locks of threads that do not exist in the child.
         return ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), initializer=_end_at_interrupt)
+
+    return make
+
+
+def cluster(address: str) -> Callable[[], Executor]:
+    """A maker of executors on a Dask cluster for `submit`; it needs the extra "dask".
+
+    Parameters
+    ----------
+    address : str
+        Of the scheduler, such as ``tcp://host:8786``.
+
+    Raises
+    ------
+    InputError
+        Where Dask is not installed, no scheduler answers, or a worker has several threads.
+    """
+    if importlib.util.find_spec("distributed") is None:
+        raise InputError('a cluster needs Dask: python -m pip install ".[dask]"')
+
+    def make() -> Executor:
+        from distributed import Client
+
+        try:
+            client = Client(address, timeout="10s", set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise InputError(f"no Dask scheduler answers at {address}: {error or type(error).__name__}") from None
+        workers = client.scheduler_info(n_workers=-1)["workers"]
+        if any(worker["nthreads"] > 1 for worker in workers.values()):
+            client.close()
+            raise InputError(f"workers at {address} have several threads: start them with --nthreads 1")
+        return cast(Executor, client.get_executor(pure=False))
 
     return make
 

@@ -190,7 +190,7 @@ class _Run:
         try:
             way = smooth_fit(problem, x, self.steps, session, session.reporter("continuation"))
             if way is not None and way.stopped is None:
-                if any(_apart(problem, way.x, other) < _TOGETHER for other in self.ways):
+                if any(apart(problem, way.x, other) < _TOGETHER for other in self.ways):
                     session.log("another start comes the same way")
                     return
                 self.ways.append(way.x)
@@ -278,12 +278,12 @@ def _alternatives(problem: Problem, x: Array, objective: float, ends: list[tuple
     found: list[Array] = []
     for other, answer in ends:
         good = np.isfinite(other) and other <= max(as_good, EXACT)
-        if good and all(_apart(problem, answer.x, known) > _APART for known in (x, *found)):
+        if good and all(apart(problem, answer.x, known) > _APART for known in (x, *found)):
             found.append(answer.x)
     return found
 
 
-def _apart(problem: Problem, x: Array, other: Array) -> float:
+def apart(problem: Problem, x: Array, other: Array) -> float:
     """Largest difference of two sets of unknowns, of their size or, where that is less, of the search space."""
     width = np.where(problem.upper > problem.lower, problem.upper - problem.lower, 1.0)
     return float(np.max(np.abs(x - other) / np.minimum(width, np.maximum(np.abs(other), np.finfo(float).tiny))))
