@@ -8,14 +8,14 @@ import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 from sysid.errors import InputError
 
 Task = TypeVar("Task")
 Answer = TypeVar("Answer")
 
-_IN_VAIN = 3  # pools in a row that broke before any of their tasks ended
+_IN_VAIN = 2  # pools in a row that a task alone may break
 
 
 def processes(workers: int | None = None) -> Callable[[], Executor]:
@@ -69,9 +69,25 @@ def cluster(address: str) -> Callable[[], Executor]:
         if any(worker["nthreads"] > 1 for worker in workers.values()):
             client.close()
             raise InputError(f"workers at {address} have several threads: start them with --nthreads 1")
-        return cast(Executor, client.get_executor(pure=False))
+        return _OnCluster(client)
 
     return make
+
+
+class _OnCluster(Executor):
+    """Dask's executor, with a client of its own."""
+
+    def __init__(self, client: Any) -> None:
+        self._client, self._executor = client, client.get_executor(pure=False)
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Hand a task to the scheduler."""
+        return cast(Future[Any], self._executor.submit(fn, *args, **kwargs))
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Leave the cluster; its workers go on without us."""
+        self._executor.shutdown(wait=wait)
+        self._client.close()
 
 
 def checked(executor: object) -> Executor:
@@ -127,25 +143,29 @@ def _rebuilding(
     make: Callable[[], Executor],
     lost: Callable[[Task, str], Answer],
 ) -> Iterator[Answer]:
-    """Answers by as many executors as it takes."""
+    """Answers by as many executors as it takes.
+
+    A dead worker takes all tasks of its pool with it. Where none of them had ended, the first goes alone: if its
+    pool breaks too, again and again, the task is to blame.
+    """
     in_vain = 0
     while left:
-        executor, unfinished, ended = checked(make()), list[Task](), 0
+        tasks = left[:1] if in_vain else left
+        left = left[len(tasks) :]
+        executor, unfinished = checked(make()), list[Task]()
         try:
-            for task, future in _submitted(function, left, executor):
+            for task, future in _submitted(function, tasks, executor):
                 if isinstance(future.exception(), BrokenExecutor):
                     unfinished.append(task)
                 else:
-                    ended += 1
                     yield _answer(task, future, lost)
         finally:
-            executor.shutdown(wait=False, cancel_futures=True)
-        in_vain = 0 if ended else in_vain + 1
-        if in_vain == _IN_VAIN:
-            for task in unfinished:
-                yield lost(task, f"its worker died, and {_IN_VAIN} pools in a row: is there enough memory?")
-            return
-        left = unfinished
+            executor.shutdown(wait=False)
+        in_vain = in_vain + 1 if len(unfinished) == len(tasks) else 0
+        if in_vain > _IN_VAIN:
+            yield lost(unfinished.pop(), f"its worker died, {_IN_VAIN} times in a row: is there enough memory?")
+            in_vain = 0
+        left = unfinished + left
 
 
 def _submitted(
@@ -161,9 +181,13 @@ def _submitted(
             future: Future[Answer] = Future()
             future.set_exception(error)
             broken.append((task, future))
-    for future in as_completed(futures):
-        yield futures[future], future
-    yield from broken
+    try:
+        for future in as_completed(futures):
+            yield futures[future], future
+        yield from broken
+    finally:
+        for future in futures:
+            future.cancel()
 
 
 def _answer(task: Task, future: Future[Answer], lost: Callable[[Task, str], Answer]) -> Answer:

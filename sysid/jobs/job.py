@@ -33,11 +33,14 @@ class Job:
     recipe : Recipe
     start : int
         0 is the recipe's own start where it has one; all others are fresh points of the search space.
+    source : str
+        Tells one text of the problem module from another.
     """
 
     index: int
     recipe: Recipe
     start: int
+    source: str
 
     @property
     def seed(self) -> int:
@@ -90,7 +93,7 @@ def without_result(job: Job, why: str) -> JobResult:
 
 
 def _refined(job: Job, session: Session) -> JobResult:
-    problem, steps = _built(replace(job.recipe, start=None))
+    problem, steps = _built(replace(job.recipe, start=None), job.source)
     own = job.start == 0 and job.recipe.start is not None
     if own:
         x = as_unknowns(problem, np.array(job.recipe.start))
@@ -109,7 +112,7 @@ def _refined(job: Job, session: Session) -> JobResult:
 
 
 @lru_cache(maxsize=_BUILT)
-def _built(recipe: Recipe) -> tuple[Problem, list[tuple[TestTerm, ...]]]:
+def _built(recipe: Recipe, source: str) -> tuple[Problem, list[tuple[TestTerm, ...]]]:
     """The problem and its tests with widened peaks, once a worker."""
     problem = catalogue.build(recipe)
     smoother = None if problem.free_modes else smoothed_tests(problem)

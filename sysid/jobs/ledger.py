@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import sqlite3
 from collections.abc import Iterator, Sequence
@@ -12,7 +11,6 @@ from types import TracebackType
 
 import numpy as np
 
-from sysid import catalogue
 from sysid.errors import InputError
 from sysid.jobs.job import Job, JobResult
 
@@ -87,7 +85,5 @@ class Ledger:
 
 
 def _key(job: Job) -> str:
-    file = catalogue.file_of(job.recipe.module)
-    source = "" if file is None else hashlib.sha256(file.read_bytes()).hexdigest()
     start = job.recipe.start if job.start == 0 else None
-    return json.dumps([{**job.recipe.to_tree(), "start": start}, job.start, source], sort_keys=True)
+    return json.dumps([{**job.recipe.to_tree(), "start": start}, job.start, job.source], sort_keys=True)

@@ -44,14 +44,13 @@ def distinct(problem: Problem, results: Iterable[JobResult]) -> list[Minimum]:
     groups: list[list[JobResult]] = []
     ended = (result for result in results if result.x.size)
     for result in sorted(ended, key=lambda one: (one.residual, one.index)):
-        near = (group for group in groups if apart(problem, result.x, group[0].x) < _ONE)
-        next(near, _new(groups)).append(result)
-    return [Minimum(tuple(sorted(group, key=lambda one: one.index))) for group in groups if group]
-
-
-def _new(groups: list[list[JobResult]]) -> list[JobResult]:
-    groups.append([])
-    return groups[-1]
+        for group in groups:
+            if apart(problem, result.x, group[0].x) < _ONE:
+                group.append(result)
+                break
+        else:
+            groups.append([result])
+    return [Minimum(tuple(sorted(group, key=lambda one: one.index))) for group in groups]
 
 
 def as_good(minima: list[Minimum]) -> list[Minimum]:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
+from sysid import catalogue
 from sysid.errors import InputError
 from sysid.jobs.engine import checked, each
 from sysid.jobs.job import Job, JobResult, run, without_result
@@ -49,7 +52,9 @@ def submit(
     InputError
         Where a recipe does not make a problem, or the folder holds other jobs. At once, before any job runs.
     """
-    recipes = [recipe] if isinstance(recipe, Recipe) else list(recipe)
+    recipes = list(recipe) if isinstance(recipe, Sequence) else [recipe]
+    if not recipes:
+        raise InputError("submit was given no recipe")
     for one in recipes:
         if not isinstance(one, Recipe):
             raise InputError(
@@ -60,9 +65,29 @@ def submit(
         raise InputError(f"starts = {starts!r}: a whole number from 1 is needed")
     if isinstance(executor, Executor) or not (executor is None or callable(executor)):
         checked(executor)
-    jobs = [Job(i * starts + k, one, k) for i, one in enumerate(recipes) for k in range(starts)]
+    jobs = [
+        Job(i * starts + k, _rooted(one), k, source)
+        for i, (one, source) in enumerate(zip(recipes, map(_source, recipes), strict=True))
+        for k in range(starts)
+    ]
     ledger = None if out is None else Ledger(Path(out), jobs)
     return _results(jobs, executor, ledger)
+
+
+def _source(recipe: Recipe) -> str:
+    """SHA-256 of the problem module's text; building its problem first tells what is wrong before any job runs."""
+    catalogue.build(replace(recipe, start=None))
+    file = catalogue.file_of(recipe.module)
+    return "" if file is None else hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def _rooted(recipe: Recipe) -> Recipe:
+    """The same recipe for a worker that stands in another folder."""
+    file = catalogue.file_of(recipe.module)
+    if file is None or file.parent == catalogue.bundled_folder():
+        return recipe
+    data = None if recipe.data is None else str(Path(recipe.data).absolute())
+    return replace(recipe, module=str(file.absolute()), data=data)
 
 
 def _results(

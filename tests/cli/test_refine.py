@@ -1,0 +1,66 @@
+"""``sysid refine``: the distinct minima of many starts, told, written, and gone on with."""
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from sysid.cli import main as cli
+
+PNG = b"\x89PNG"
+
+
+@pytest.fixture(scope="module")
+def here(tmp_path_factory):
+    """A folder with a result of two springs that a chain of known masses hides well."""
+    folder = tmp_path_factory.mktemp("refine")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert cli.main(["run", "physical_damping"]) == 0
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def inside(here, monkeypatch):
+    monkeypatch.chdir(here)
+
+
+def test_a_line_a_start_then_the_minima_a_table_and_a_picture(capsys):
+    assert cli.main(["refine", "results/physical_damping", "--starts", "3", "--workers", "1"]) == 0
+    out, error = capsys.readouterr()
+    assert error == ""
+    lines = out.splitlines()
+    assert lines[0] == "physical_damping: 3 starts, the first at the result"
+    assert [line.split()[:5] for line in lines[1:4]] == [[str(i + 1), "of", "3", "start", str(i)] for i in range(3)]
+    folder = Path("results/physical_damping/refine")
+    assert lines[-3:] == [str(folder / name) for name in ("starts.csv", "minima.png", "jobs.sqlite")]
+    rows = list(csv.DictReader((folder / "starts.csv").read_text().splitlines()))
+    assert [row["start"] for row in rows] == ["0", "1", "2"]
+    reached = sum(int(line.split()[2]) for line in lines if line[:7].strip().isdigit() and "of" not in line)
+    assert reached == 3
+    assert (folder / "minima.png").read_bytes().startswith(PNG)
+    # Once more, with one start more: what is there is told at once.
+    assert cli.main(["refine", "results/physical_damping/result.h5", "--starts", "4", "--workers", "1"]) == 0
+    again = list(csv.DictReader((folder / "starts.csv").read_text().splitlines()))
+    assert again[:3] == rows and len(again) == 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["nowhere"], "no result at nowhere"),
+        (["results/physical_damping", "--starts", "0"], "not a whole number from 1"),
+        (["results/physical_damping", "--workers", "2", "--scheduler", "tcp://host:1"], "exclude each other"),
+        (["results/physical_damping", "--out", "results/physical_damping/result.h5"], "is not a folder"),
+    ],
+)
+def test_mistakes_are_one_line(arguments, told, capsys):
+    assert cli.main(["refine", *arguments]) == 2
+    out, error = capsys.readouterr()
+    assert out == "" and told in error and error.count("\n") == 1
+
+
+def test_no_scheduler_is_told(capsys):
+    pytest.importorskip("distributed", reason="needs the extra 'dask'")
+    assert cli.main(["refine", "results/physical_damping", "--scheduler", "nonsense://here"]) == 2
+    assert "no Dask scheduler answers at nonsense://here" in capsys.readouterr().err

@@ -1,0 +1,187 @@
+"""Refinement jobs: the same results wherever they run, whatever dies, and never twice."""
+
+import sqlite3
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sysid
+from sysid.jobs import JobResult, processes, submit
+from sysid.jobs.engine import each
+from sysid.jobs.minima import as_good, distinct
+
+MODULE = '''"""Two floors."""
+
+import casadi as ca
+import numpy as np
+
+import sysid
+from stretch import STRETCH
+
+
+def problem(*, data=None, rng=0, second=2e5):
+    M, C = np.diag([300.0, 200.0, 0.0]), STRETCH.T @ np.diag([300.0, 200.0]) @ STRETCH
+    K = STRETCH.T @ np.diag([3e5, second]) @ STRETCH
+    truth = sysid.Structure(M, K, damping_matrix=C[:2, :2], n_base=1)
+    k = sysid.Variable("spring", 2, lower=1e4, upper=1e6, log=True)
+    test = sysid.simulate(truth, np.linspace(0.5, 10, 60))
+    return sysid.Problem(test, mass=M, stiffness=STRETCH.T @ ca.diag(k) @ STRETCH, damping=C, goal=1e-6)
+'''
+NEIGHBOUR = "import numpy as np\n\nSTRETCH = np.array([[1.0, 0, -1], [-1, 1, 0]])\n"
+SPRINGS = [3e5, 2e5]
+DIES = "__import__('os')._exit(7)"
+
+
+@pytest.fixture
+def recipe(tmp_path, monkeypatch):
+    """A module with a neighbour, by a path that holds in this folder only."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "floors.py").write_text(MODULE)
+    (tmp_path / "stretch.py").write_text(NEIGHBOUR)
+    return sysid.Recipe("floors.py", start=np.array([2.9e5, 2.1e5]))
+
+
+def by_index(results):
+    return sorted(results, key=lambda result: result.index)
+
+
+def same(one, other):
+    return all(
+        (a.index, a.seed, a.success, a.message, a.residual) == (b.index, b.seed, b.success, b.message, b.residual)
+        and a.x.tobytes() == b.x.tobytes()
+        for a, b in zip(one, other, strict=True)
+    )
+
+
+def test_many_starts_find_the_springs_with_the_same_bits_here_and_in_processes(recipe):
+    here = list(submit(recipe, starts=4))
+    assert [result.index for result in here] == [0, 1, 2, 3]
+    assert len({result.seed for result in here}) == 4
+    for result in here:
+        assert result.success and result.residual < 1e-8
+        np.testing.assert_allclose(result.x, SPRINGS, rtol=1e-6)
+    assert same(by_index(submit(recipe, starts=4, executor=processes(2))), here)
+
+
+def test_several_recipes_are_numbered_one_after_the_other(recipe):
+    other = replace(recipe, parameters={"second": 1.5e5}, start=None)
+    found = list(submit([recipe, other], starts=2))
+    np.testing.assert_allclose([result.x[1] for result in found], [2e5, 2e5, 1.5e5, 1.5e5], rtol=1e-6)
+    assert [result.index for result in found] == [0, 1, 2, 3]
+
+
+def test_a_job_without_a_structure_to_start_from_says_so(recipe):
+    result = next(submit(replace(recipe, start=[1.0, 2.0, 3.0])))
+    assert not result.success and result.x.size == 0 and np.isnan(result.residual)
+    assert "start has shape (3,)" in result.message
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (dict(recipe=3), "a int: a job is rebuilt where it runs, so save the problem as a module"),
+        (dict(recipe=[]), "no recipe"),
+        (dict(starts=0), "starts = 0"),
+        (dict(executor=4), "executor is a int"),
+        (dict(recipe=sysid.Recipe("nowhere.py")), "nowhere.py cannot be read"),
+    ],
+)
+def test_mistakes_are_told_before_any_job(recipe, given, told):
+    with pytest.raises(sysid.InputError, match=told):
+        submit(**{"recipe": recipe, **given})
+
+
+def test_threads_are_refused(recipe):
+    with ThreadPoolExecutor(1) as threads, pytest.raises(sysid.InputError, match="IPOPT bears none"):
+        submit(recipe, executor=threads)
+    with pytest.raises(sysid.InputError, match="IPOPT bears none"):
+        list(submit(recipe, executor=lambda: ThreadPoolExecutor(1)))
+    with pytest.raises(sysid.InputError, match="workers = 0"):
+        processes(0)
+
+
+def test_a_pool_whose_worker_dies_is_built_again_and_only_the_task_to_blame_is_lost():
+    """`eval` stands for a job: it is a function that every worker finds."""
+    tasks = ["1", DIES, "3", "4"]
+    answers = list(each(eval, tasks, processes(1), lambda task, why: (task, why)))
+    assert [answer for answer in answers if isinstance(answer, int)] == [1, 3, 4]
+    ((task, why),) = [answer for answer in answers if isinstance(answer, tuple)]
+    assert task == DIES and "its worker died" in why
+
+
+def test_what_a_worker_raises_is_the_answer_of_its_task_alone():
+    answers = list(each(eval, ["1/0", "2"], processes(1), lambda task, why: (task, why)))
+    assert sorted(map(str, answers)) == [str(("1/0", "its worker failed (ZeroDivisionError: division by zero)")), "2"]
+
+
+def test_a_pool_of_the_callers_own_is_not_built_again():
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        answers = list(each(eval, [DIES, "2"], pool, lambda task, why: why))
+    assert len(answers) == 2 and all("BrokenProcessPool" in str(answer) for answer in answers)
+
+
+class TestLedger:
+    """The file in which results are kept."""
+
+    def test_what_stands_there_is_not_computed_again(self, recipe, tmp_path):
+        first = list(submit(recipe, starts=2, out=tmp_path / "jobs"))
+        with sqlite3.connect(tmp_path / "jobs" / "jobs.sqlite") as file:
+            file.execute("UPDATE jobs SET message = 'from the ledger'")
+        file.close()
+        again = by_index(submit(recipe, starts=3, out=tmp_path / "jobs"))
+        assert [result.message == "from the ledger" for result in again] == [True, True, False]
+        assert same([replace(r, message="") for r in again[:2]], [replace(r, message="") for r in first])
+
+    def test_an_iterator_that_was_left_keeps_what_it_gave(self, recipe, tmp_path):
+        results = submit(recipe, starts=3, out=tmp_path)
+        next(results)
+        results.close()
+        with sqlite3.connect(tmp_path / "jobs.sqlite") as file:
+            assert file.execute("SELECT COUNT(*) FROM jobs").fetchone() == (1,)
+        file.close()
+
+    def test_another_text_of_the_module_is_another_job(self, recipe, tmp_path):
+        list(submit(recipe, out=tmp_path))
+        (tmp_path / "floors.py").write_text(MODULE.replace("second=2e5", "second=1.9e5"))
+        (result,) = submit(recipe, out=tmp_path)
+        assert result.x[1] == pytest.approx(1.9e5, rel=1e-6)
+
+    def test_a_folder_that_cannot_be_one_is_told(self, recipe, tmp_path):
+        (tmp_path / "taken").write_text("a file")
+        with pytest.raises(sysid.InputError, match=r"taken.*cannot be used"):
+            submit(recipe, out=tmp_path / "taken")
+        (tmp_path / "jobs.sqlite").write_text("no ledger" * 200)
+        with pytest.raises(sysid.InputError, match=r"jobs\.sqlite cannot be used: file is not a database"):
+            submit(recipe, out=tmp_path)
+
+
+def test_ends_at_one_point_are_one_minimum(recipe):
+    problem = sysid.catalogue.build(replace(recipe, start=None))
+
+    def end(index, springs, residual):
+        return JobResult(index, 0, residual < 1e-6, "", np.array(springs), residual)
+
+    near = [3e5 * (1 + 1e-5), 2e5]
+    ends = [end(0, SPRINGS, 1e-9), end(1, [9e5, 2e4], 0.3), end(2, near, 2e-9), end(3, [], np.nan)]
+    first, second = distinct(problem, ends)
+    assert ([r.index for r in first.results], first.residual) == ([0, 2], 1e-9)
+    assert ([r.index for r in second.results], second.residual) == ([1], 0.3)
+    assert as_good([first, second]) == [first]
+    alike = distinct(problem, [end(0, SPRINGS, 0.01), end(1, [2e5, 3e5], 0.010001)])
+    assert len(as_good(alike)) == 2
+
+
+def test_a_cluster_gives_the_same_bits(recipe):
+    distributed = pytest.importorskip("distributed", reason="needs the extra 'dask'")
+    from sysid.jobs import cluster
+
+    here = list(submit(recipe, starts=3))
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50, local_directory=str(Path.cwd())
+    ) as workers:
+        found = by_index(submit(recipe, starts=3, executor=cluster(workers.scheduler_address)))
+    assert same(found, here)
