@@ -2,7 +2,7 @@
 
 import casadi as _casadi
 
-from sysid import plot
+from sysid import jobs, plot
 from sysid.errors import InputError, SolverError, SysidError
 from sysid.identify import identify
 from sysid.measurement.measurement import Measurement, Sensor, rigid_body, simulate
@@ -33,5 +33,5 @@ __all__ = [
     "KnownMass", "LumpedMass", "MassBlocks", "MatrixModel", "Measurement", "Modal", "ModalDamping", "Prior", "Problem",
     "Progress", "ProportionalDamping", "Recipe", "Sensor", "SolverError", "SpectralStiffness", "Stated",
     "StiffnessBlocks", "Structure", "Swarm", "SwarmSettings", "SysidError", "Totals", "Unknown", "Variable",
-    "__version__", "identify", "load", "minimize_swarm", "plot", "resample", "rigid_body", "simulate",
+    "__version__", "identify", "jobs", "load", "minimize_swarm", "plot", "resample", "rigid_body", "simulate",
 ]  # fmt: skip

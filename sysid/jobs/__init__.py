@@ -2,6 +2,7 @@
 
 from sysid.jobs.engine import cluster, processes
 from sysid.jobs.job import JobResult
+from sysid.jobs.minima import Minimum, distinct
 from sysid.jobs.submit import submit
 
-__all__ = ["JobResult", "cluster", "processes", "submit"]
+__all__ = ["JobResult", "Minimum", "cluster", "distinct", "processes", "submit"]

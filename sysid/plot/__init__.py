@@ -8,6 +8,7 @@ Measured is thin and dark, identified dashed and coloured above it, their differ
 """
 
 from sysid.plot.comparison import comparison
+from sysid.plot.minima import minima
 from sysid.plot.plots import (
     base_force,
     base_forces,
@@ -32,6 +33,7 @@ __all__ = [
     "effective_masses",
     "mac",
     "matrices",
+    "minima",
     "mode_shapes",
     "overview",
     "responses",

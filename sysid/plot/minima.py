@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.ticker import MaxNLocator
 
 from sysid.jobs.minima import Minimum
 from sysid.plot.canvas import COLOURS, FAINT, dress, new_figure
@@ -32,6 +31,8 @@ def minima(found: Sequence[Minimum], title: str = "", *, goal: float | None = No
     -------
     Figure
     """
+    from matplotlib.ticker import MaxNLocator
+
     figure = new_figure(7.2, 4.2)
     ax = figure.subplots()
     begun = 0
