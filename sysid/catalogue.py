@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import difflib
+import dis
 import importlib
 import importlib.machinery
 import importlib.util
@@ -165,6 +166,8 @@ def _load(name: str) -> tuple[ModuleType, Path]:
 
 def _load_file(path: Path) -> tuple[ModuleType, Path]:
     """Run a file as a module of a private name; no ``__pycache__`` is left beside it."""
+    if path.exists() and not path.is_file():  # a device, or a pipe, may never end
+        raise InputError(f"problem {path} is not a file")
     try:
         source = path.read_bytes()
     except OSError as error:
@@ -227,6 +230,10 @@ def _telling_the_line(path: Path) -> Iterator[None]:
         yield
     except InputError:
         raise
+    except KeyboardInterrupt as interrupt:
+        if not _was_raised(interrupt):
+            raise
+        raise InputError(f"{path} raised KeyboardInterrupt, which is Ctrl-C's alone") from interrupt
     except (Exception, SystemExit) as error:
         if isinstance(error, SyntaxError) and error.filename == full:
             raise InputError(f"{path}, line {error.lineno}: syntax error: {error.msg}") from None
@@ -234,6 +241,15 @@ def _telling_the_line(path: Path) -> Iterator[None]:
         where = f"{path}, line {lines[-1]}" if lines else f"{path}"
         told = f"{type(error).__name__}: {error}".removesuffix(": ")
         raise InputError(f"{where}: {told}") from error
+
+
+def _was_raised(interrupt: KeyboardInterrupt) -> bool:
+    """Whether a statement raised it, and not Ctrl-C at some other instruction."""
+    last = interrupt.__traceback__
+    assert last is not None
+    while last.tb_next is not None:
+        last = last.tb_next
+    return dis.opname[last.tb_frame.f_code.co_code[last.tb_lasti]] == "RAISE_VARARGS"
 
 
 def _unknown(name: str) -> InputError:

@@ -8,7 +8,7 @@ from pathlib import Path
 from sysid import catalogue
 from sysid.cli import parameters
 from sysid.cli.display import Output, complain
-from sysid.cli.files import check_folder, strict_json
+from sysid.cli.files import results_folder, strict_json
 from sysid.cli.status import INTERRUPTED, NOT_REACHED, SUCCESS
 from sysid.compare import peers, table
 from sysid.compare.comparison import Comparison, compare
@@ -24,8 +24,7 @@ def run(options: argparse.Namespace, out: Output) -> int:
     """Compare, tell each method's end in a line, and write table and picture."""
     recipe = parameters.recipe_of(options)
     problem = catalogue.build(recipe)
-    folder = Path("results") / catalogue.short_name(recipe.module) if options.out is None else Path(options.out)
-    check_folder(folder)
+    folder = results_folder(options.out, Path("results") / catalogue.short_name(recipe.module))
     out.write(f"{recipe.title}: {problem.n_variables} unknowns, seed {options.seed}\n")
     if peers.missing_packages():
         out.write(f"without pymoo, CMA-ES and SciPy's optimisers, which need: {peers.HOW_TO_INSTALL}\n")
@@ -49,12 +48,13 @@ def run(options: argparse.Namespace, out: Output) -> int:
 
 def _write(compared: Comparison, recipe: Recipe, folder: Path, out: Output, *, rows: bool) -> None:
     """Write the picture, and the rows of the table as CSV and JSON where they are wanted."""
-    from sysid.plot.canvas import to_png
+    from sysid.plot.canvas import own_style, to_png
     from sysid.plot.comparison import comparison
 
     files = {}
     if any(result.ran for result in compared.results):
-        files[PICTURE] = to_png(comparison(compared, recipe.title), dpi=130)
+        with own_style():
+            files[PICTURE] = to_png(comparison(compared, recipe.title), dpi=130)
     if rows:
         head = {"problem": recipe.module, "parameters": recipe.parameters, "version": __version__}
         files["comparison.csv"] = table.as_csv(compared).encode()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import io
 import math
 import sys
 import time
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+_CLOSED = OSError(errno.EBADF, "it is closed")
 _PLAIN_EVERY = 5.0  # s between lines where the display is no terminal
 
 
@@ -23,13 +26,13 @@ class Output:
     """A text stream that takes any character and never raises.
 
     A closed pipe or a full disk must not end a search whose result goes elsewhere; `failed` keeps
-    the first such error.
+    the first such error. None is a stream that was closed before the process began.
     """
 
-    def __init__(self, stream: IO[str]) -> None:
-        self._stream = stream
+    def __init__(self, stream: IO[str] | None) -> None:
+        self._stream = io.StringIO() if stream is None else stream
         self.encoding = getattr(stream, "encoding", None) or "utf-8"
-        self.failed: OSError | None = None
+        self.failed = _CLOSED if stream is None else None
 
     def write(self, text: str) -> int:
         """Write what the stream can show of a text; its length."""
@@ -40,20 +43,27 @@ class Output:
         """Flush the stream."""
         self._try(self._stream.flush)
 
+    def close(self) -> None:
+        """Leave the stream open: it is not a problem module's to close."""
+
     def _try(self, do: Callable[..., object], *arguments: str) -> None:
         if self.failed is None:
             try:
                 do(*arguments)
             except OSError as error:
                 self.failed = error
+            except ValueError:  # a closed file
+                self.failed = _CLOSED
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
 
 def complain(message: object) -> None:
-    """One line on standard error, whatever the message holds."""
-    with contextlib.suppress(OSError):
+    """One line on standard error, whatever the message holds; nothing where that is closed."""
+    if sys.stderr is None:
+        return
+    with contextlib.suppress(OSError, ValueError):
         print("sysid:", " ".join(str(message).split()), file=sys.stderr, flush=True)
 
 

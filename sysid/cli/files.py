@@ -9,8 +9,11 @@ from pathlib import Path
 from sysid.errors import InputError
 
 
-def check_folder(folder: Path) -> None:
-    """Refuse a folder of results that cannot be written, before the search and without making it."""
+def results_folder(given: str | None, default: Path) -> Path:
+    """The folder of results; one that cannot be written is refused before the search, without making it."""
+    folder = default if given is None else Path(given)
+    if given is not None and (not given.strip() or "\0" in given):
+        raise InputError(f"folder of results {given!r}: give the name of a folder")
     try:
         place = next((place for place in (folder, *folder.parents) if place.exists()), folder)
         if not place.is_dir():
@@ -19,6 +22,7 @@ def check_folder(folder: Path) -> None:
         raise InputError(f"folder of results {folder}: {error.strerror or error}") from None
     if not os.access(place, os.W_OK | os.X_OK):
         raise InputError(f"folder of results {folder}: {place} cannot be written")
+    return folder
 
 
 def strict_json(value: object) -> str:

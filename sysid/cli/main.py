@@ -23,7 +23,7 @@ from typing import IO, NoReturn, cast
 from sysid import catalogue
 from sysid.cli import parameters
 from sysid.cli.display import Output, collected_warnings, complain, display_on
-from sysid.cli.files import check_folder, strict_json
+from sysid.cli.files import results_folder, strict_json
 from sysid.cli.status import BUG, INTERRUPTED, MISTAKE, NOT_REACHED, SUCCESS
 from sysid.errors import InputError, SolverError
 from sysid.identify import NAMED, identify
@@ -53,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     out.flush()
     if out.failed is not None:
         # What is left in the interpreter's own buffer would fail once more at exit.
-        with contextlib.suppress(OSError, ValueError):
+        with contextlib.suppress(OSError, ValueError, AttributeError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if not isinstance(out.failed, BrokenPipeError):  # a reader that has seen enough is no mistake
             complain(f"standard output cannot be written: {out.failed.strerror}")
@@ -124,9 +124,8 @@ def _show(options: argparse.Namespace, out: Output) -> int:
 
 def _run(options: argparse.Namespace, out: Output) -> int:
     recipe = parameters.recipe_of(options)
-    folder = Path("results") / catalogue.short_name(recipe.module) if options.out is None else Path(options.out)
     problem = catalogue.build(recipe)
-    check_folder(folder)
+    folder = results_folder(options.out, Path("results") / catalogue.short_name(recipe.module))
     test = problem.measurement
     # Poles of the data, which may take long, are left to the search and its progress and time limit.
     unknowns = problem.formulate(problem.geometry.unsearched()).size

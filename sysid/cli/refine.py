@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sysid.cli.display import Output, complain
-from sysid.cli.files import check_folder
+from sysid.cli.files import results_folder
 from sysid.cli.status import INTERRUPTED, NOT_REACHED, SUCCESS
 from sysid.errors import InputError
 from sysid.jobs.engine import cluster, processes
@@ -31,8 +31,7 @@ def run(options: argparse.Namespace, out: Output) -> int:
     source = Path(options.result)
     result = load(source)
     recipe = _recipe(result, source)
-    folder = Path(options.out) if options.out is not None else (source if source.is_dir() else source.parent) / "refine"
-    check_folder(folder)
+    folder = results_folder(options.out, (source if source.is_dir() else source.parent) / "refine")
     executor = _executor(options)
     ends: list[JobResult] = []
     interrupted = False
@@ -97,7 +96,7 @@ def _write(
     folder: Path, recipe: Recipe, ends: list[JobResult], minima: list[Minimum], problem: Problem, out: Output
 ) -> None:
     """Write the ends of all starts as CSV, and the picture."""
-    from sysid.plot.canvas import to_png
+    from sysid.plot.canvas import own_style, to_png
     from sysid.plot.minima import minima as picture
 
     of = {end.index: i + 1 for i, minimum in enumerate(minima) for end in minimum.results}
@@ -111,7 +110,8 @@ def _write(
         ])  # fmt: skip
     files = {"starts.csv": text.getvalue().encode()}
     if minima:
-        files["minima.png"] = to_png(picture(minima, recipe.title, goal=problem.goal), dpi=130)
+        with own_style():
+            files["minima.png"] = to_png(picture(minima, recipe.title, goal=problem.goal), dpi=130)
     for name, content in files.items():
         with atomically(folder / name) as temporary:
             temporary.write_bytes(content)

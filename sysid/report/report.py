@@ -11,6 +11,7 @@ import numpy as np
 from sysid import plot
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
+from sysid.plot.canvas import own_style
 from sysid.plot.panels import run_names
 from sysid.problem.formulation import MATRICES
 from sysid.problem.problem import Problem
@@ -87,7 +88,8 @@ def write(identification: Identification, path: str | Path) -> Path:
         Where the file cannot be written.
     """
     target = file_or_folder(path, FILE_NAME, _SUFFIXES)
-    content = render(identification).encode("utf-8", "replace")
+    with own_style():
+        content = render(identification).encode("utf-8", "replace")
     with atomically(target) as temporary:
         temporary.write_bytes(content)
     return target
