@@ -12,7 +12,7 @@ CEILINGS = {
     # 18,800 for what the package could do when it was rebuilt in rooms; since then the published algorithm with its own
     # local phase (600), an objective of the swarm without lines (600), methods side by side with parameters (900), and
     # refinement jobs (800).
-    "lines": 21_800,
+    "lines": 21_900,
 }
 
 # The counting is a benchmark, which prints the same figures; `sysid` itself is not imported from the checkout.

@@ -15,7 +15,7 @@ import os
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, NoReturn, cast
@@ -28,7 +28,10 @@ from sysid.cli.status import BUG, INTERRUPTED, MISTAKE, NOT_REACHED, SUCCESS
 from sysid.errors import InputError, SolverError
 from sysid.identify import NAMED, identify
 from sysid.results.identification import Identification, load
+from sysid.results.storage import FILE_NAME as RESULT
+from sysid.results.storage import atomically
 from sysid.results.version import __version__
+from sysid.search.session import DeferredInterrupt
 
 _LOG = "sysid-error.log"
 
@@ -134,20 +137,30 @@ def _run(options: argparse.Namespace, out: Output) -> int:
         f"{test.freq.size} lines from {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz, "
         f"{unknowns} unknowns, seed {options.seed}\n"
     )
-    with display_on(out) as display:
-        result = identify(
-            problem, strategy=options.strategy, rng=options.seed, max_time=options.max_time, progress=display
-        )
-    result = replace(result, recipe=recipe)
-    out.write(f"\n{result.summary()}\n\n")
-    out.flush()
+    failed: InputError | None = None
+    # From the search's end until the result is on the disk Ctrl-C waits, however often.
+    with DeferredInterrupt(patience=None) as late:
+        with display_on(out) as display:
+            result = identify(
+                problem, strategy=options.strategy, rng=options.seed, max_time=options.max_time, progress=display
+            )
+        result = replace(result, recipe=recipe)
+        try:
+            with _no_folder_for_nothing(folder):
+                result.save(folder / RESULT)
+        except InputError as error:
+            failed = error
     try:
-        _save(result, folder, out)
+        out.write(f"\n{result.summary()}\n\n")
+        out.flush()
+        if failed is not None:
+            raise failed
+        _write_pages(result, folder, out)
     except KeyboardInterrupt:
-        complain(f"interrupted while saving; not every file is in {folder}")
+        complain(f"interrupted while saving; the result is there, but not every file is in {folder}")
         return INTERRUPTED
-    if result.interrupted:
-        complain(f"interrupted; the best so far is in {folder}")
+    if late.asked or result.interrupted:
+        complain(f"interrupted; the {'best so far' if result.interrupted else 'result'} is in {folder}")
         return INTERRUPTED
     return SUCCESS if result.success else NOT_REACHED
 
@@ -317,20 +330,24 @@ def _seconds(text: str) -> float:
 # -- files --------------------------------------------------------------------------------------
 
 
-def _save(result: Identification, folder: Path, out: Output) -> None:
-    """Write the three files, each whole or not at all; a folder made for nothing is taken away again."""
-    from sysid.results.storage import FILE_NAME, atomically
+def _write_pages(result: Identification, folder: Path, out: Output) -> None:
+    """Write what people and scripts read of a result that is saved, each file whole or not at all."""
+    from sysid.report import report
 
+    out.write(f"result   {folder / RESULT}\n")
+    summary = folder / "summary.json"
+    with atomically(summary) as temporary:
+        temporary.write_text(strict_json(result.to_dict()), encoding="utf-8")
+    out.write(f"summary  {summary}\n")
+    out.write(f"report   {report.write(result, folder / report.FILE_NAME)}\n")
+
+
+@contextlib.contextmanager
+def _no_folder_for_nothing(folder: Path) -> Iterator[None]:
+    """Take a folder away again that was made for a file that could not be written."""
     missing = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
-        out.write(f"result   {result.save(folder / FILE_NAME)}\n")
-        summary = folder / "summary.json"
-        with atomically(summary) as temporary:
-            temporary.write_text(strict_json(result.to_dict()), encoding="utf-8")
-        out.write(f"summary  {summary}\n")
-        from sysid.report import report
-
-        out.write(f"report   {report.write(result, folder / report.FILE_NAME)}\n")
+        yield
     except BaseException:
         with contextlib.suppress(OSError):
             for place in missing:

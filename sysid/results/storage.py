@@ -110,6 +110,9 @@ def atomically(path: Path) -> Iterator[Path]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
+        # A power cut must not leave the new name with no content behind it.
+        with temporary.open("rb+") as written:
+            os.fsync(written.fileno())
         os.replace(temporary, path)  # noqa: PTH105 - the atomic one; its name says so
     except BaseException as error:  # Ctrl-C too leaves nothing half-written
         with contextlib.suppress(OSError):

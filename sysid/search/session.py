@@ -44,35 +44,50 @@ class Progress:
 class DeferredInterrupt:
     """Hold Ctrl-C back until the search next reports: raised inside compiled code it would lose the best so far.
 
-    A second Ctrl-C acts at once. Where somebody else handles the signal, or outside the main thread, nothing changes.
+    Where somebody else handles the signal, or outside the main thread, nothing changes. Within another one this one
+    answers the signal, and hands what it held on at its end.
+
+    Parameters
+    ----------
+    patience : int or None
+        How many are held; the next one acts at once, whatever is lost. None holds all.
     """
 
-    def __init__(self) -> None:
-        self.asked = False
+    def __init__(self, patience: int | None = 2) -> None:
+        self.patience = patience
+        self.count = 0
         self.raised = False
         self.ours = False
 
+    @property
+    def asked(self) -> bool:
+        """Whether there was a Ctrl-C."""
+        return self.count > 0
+
     def __enter__(self) -> DeferredInterrupt:
-        self.ours = (
-            threading.current_thread() is threading.main_thread()
-            and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-        )
+        self._before = signal.getsignal(signal.SIGINT)
+        outer = getattr(self._before, "__self__", None)
+        self._outer = outer if isinstance(outer, DeferredInterrupt) else None
+        standard = self._outer is not None or self._before is signal.default_int_handler
+        self.ours = standard and threading.current_thread() is threading.main_thread()
         if self.ours:
             signal.signal(signal.SIGINT, self._hold)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
         if self.ours:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+            signal.signal(signal.SIGINT, self._before)
+            if self._outer is not None:
+                self._outer.count += self.count
         # CasADi turns a KeyboardInterrupt that strikes inside it into some other exception.
         if self.raised and isinstance(error, Exception):
             raise KeyboardInterrupt from error
 
     def _hold(self, number: int, frame: object) -> None:
-        if self.asked:
+        self.count += 1
+        if self.patience is not None and self.count > self.patience:
             self.raised = True
             raise KeyboardInterrupt
-        self.asked = True
 
     def check(self) -> None:
         """Raise the KeyboardInterrupt that was held back."""

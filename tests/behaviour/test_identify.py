@@ -350,10 +350,11 @@ class TestStopping:
         assert result.residual <= result.history.swarm * (1 + 1e-7)
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
-    def test_a_second_ctrl_c_acts_at_once(self, problem):
+    def test_a_second_ctrl_c_waits_too_and_a_third_acts_at_once(self, problem):
         seen = []
 
         def callback(progress):
+            signal.raise_signal(signal.SIGINT)
             signal.raise_signal(signal.SIGINT)
             seen.append("went on")
             signal.raise_signal(signal.SIGINT)

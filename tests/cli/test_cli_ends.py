@@ -12,6 +12,7 @@ import pytest
 import sysid
 from sysid.cli import main as cli
 from sysid.report import report
+from sysid.results import storage
 from sysid.search.swarm_objective import SwarmObjective
 
 
@@ -172,12 +173,13 @@ def interruptible(*arguments, **options):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-def test_a_second_ctrl_c_acts_at_once_and_what_it_breaks_is_no_error_of_ours(here, complaint, files, monkeypatch):
+def test_a_third_ctrl_c_acts_at_once_and_what_it_breaks_is_no_error_of_ours(here, complaint, files, monkeypatch):
     """As CasADi does it, the interrupt comes out as another exception."""
     original = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def judge(self, particles):
-        signal.raise_signal(signal.SIGINT)  # the first waits for the next news
+        for _ in range(2):  # they wait for the next report
+            signal.raise_signal(signal.SIGINT)
         try:
             signal.raise_signal(signal.SIGINT)
         except KeyboardInterrupt as error:
@@ -191,6 +193,32 @@ def test_a_second_ctrl_c_acts_at_once_and_what_it_breaks_is_no_error_of_ours(her
         signal.signal(signal.SIGINT, original)
     assert complaint() == "sysid: interrupted; nothing was saved\n"
     assert files(here) == {"pair.py"}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+@pytest.mark.parametrize("times", [1, 5])
+@pytest.mark.parametrize("place", ["search", "save", "report"])
+def test_ctrl_c_after_the_search_loses_nothing(here, complaint, files, monkeypatch, no_pictures, place, times):
+    """As soon as the search is done, while the result is written, and while the page is made."""
+    owner, name = {"search": (cli, "identify"), "save": (storage, "write"), "report": (report, "write")}[place]
+    original, before = getattr(owner, name), signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def struck(*arguments, **options):
+        if place == "search":
+            found = original(*arguments, **options)
+        for _ in range(times):
+            signal.raise_signal(signal.SIGINT)
+        return found if place == "search" else original(*arguments, **options)
+
+    monkeypatch.setattr(owner, name, struck)
+    try:
+        assert cli.main(["run", "pair.py"]) == 130
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert ("not every file" if place == "report" else "the result is in results/pair") in complaint()
+    written = files(here / "results/pair")
+    assert written == {"result.h5", "summary.json"} | ({"report.html"} if place != "report" else set())
+    assert sysid.load(here / "results/pair").success
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
