@@ -14,6 +14,7 @@ import math
 import os
 import sys
 import tempfile
+import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -22,6 +23,7 @@ from typing import IO, NoReturn, cast
 
 from sysid import catalogue
 from sysid.cli import parameters
+from sysid.cli.deadline import TimeIsOver, within
 from sysid.cli.display import Output, collected_warnings, complain, display_on
 from sysid.cli.files import results_folder, strict_json
 from sysid.cli.status import BUG, INTERRUPTED, MISTAKE, NOT_REACHED, SUCCESS
@@ -126,6 +128,7 @@ def _show(options: argparse.Namespace, out: Output) -> int:
 
 
 def _run(options: argparse.Namespace, out: Output) -> int:
+    begun = time.perf_counter()
     recipe = parameters.recipe_of(options)
     problem = catalogue.build(recipe)
     folder = results_folder(options.out, Path("results") / catalogue.short_name(recipe.module))
@@ -155,7 +158,8 @@ def _run(options: argparse.Namespace, out: Output) -> int:
         out.flush()
         if failed is not None:
             raise failed
-        _write_pages(result, folder, out)
+        left = None if options.max_time is None else options.max_time - (time.perf_counter() - begun)
+        _write_pages(result, folder, out, left)
     except KeyboardInterrupt:
         complain(f"interrupted while saving; the result is there, but not every file is in {folder}")
         return INTERRUPTED
@@ -267,7 +271,12 @@ def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
         "modal where the models of the problem allow it, continuation where they have a form of their own, else swarm",
     )
     run.add_argument("--out", metavar="DIR", help="folder of the results, results/NAME by default")
-    run.add_argument("--max-time", type=_seconds, metavar="S", help="end the search after about so many seconds")
+    run.add_argument(
+        "--max-time",
+        type=_seconds,
+        metavar="S",
+        help="end after about so many seconds; a report that they do not suffice for is left to 'sysid report'",
+    )
     run.set_defaults(command=_run)
 
 
@@ -330,8 +339,11 @@ def _seconds(text: str) -> float:
 # -- files --------------------------------------------------------------------------------------
 
 
-def _write_pages(result: Identification, folder: Path, out: Output) -> None:
-    """Write what people and scripts read of a result that is saved, each file whole or not at all."""
+def _write_pages(result: Identification, folder: Path, out: Output, left: float | None) -> None:
+    """Write what people and scripts read of a result that is saved, each file whole or not at all.
+
+    The page is left out where it takes more than the seconds that are `left`.
+    """
     from sysid.report import report
 
     out.write(f"result   {folder / RESULT}\n")
@@ -339,7 +351,12 @@ def _write_pages(result: Identification, folder: Path, out: Output) -> None:
     with atomically(summary) as temporary:
         temporary.write_text(strict_json(result.to_dict()), encoding="utf-8")
     out.write(f"summary  {summary}\n")
-    out.write(f"report   {report.write(result, folder / report.FILE_NAME)}\n")
+    (folder / report.FILE_NAME).unlink(missing_ok=True)  # one of another result must not stand beside this one
+    try:
+        with within(left):
+            out.write(f"report   {report.write(result, folder / report.FILE_NAME)}\n")
+    except TimeIsOver:
+        out.write(f"no report, as the time is over: 'sysid report {folder}' writes it\n")
 
 
 @contextlib.contextmanager

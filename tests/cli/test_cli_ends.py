@@ -111,6 +111,22 @@ def test_ctrl_c_before_any_candidate_writes_nothing(here, complaint, files, monk
     assert files(here) == {"pair.py"}
 
 
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_a_report_that_takes_more_time_than_is_left_is_left_out(here, capsys, files, monkeypatch, no_pictures):
+    (here / "results/pair").mkdir(parents=True)
+    (here / "results/pair/report.html").write_text("of another result")
+
+    def write(*arguments, **options):
+        while True:
+            time.sleep(0.01)
+
+    monkeypatch.setattr(report, "write", write)
+    assert cli.main(["run", "pair.py", "--max-time", "1.5"]) == 0
+    assert "no report, as the time is over: 'sysid report results/pair' writes it" in capsys.readouterr().out
+    assert files(here / "results/pair") == {"result.h5", "summary.json"}
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+
+
 def test_ctrl_c_while_saving_says_that_files_are_missing(here, complaint, files, monkeypatch):
     def write(*arguments, **options):
         raise KeyboardInterrupt
