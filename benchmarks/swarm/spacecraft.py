@@ -23,5 +23,6 @@ def lines(reduced: bool) -> Iterator[Line]:
         good,
         4 if len(seeds) == 5 else len(seeds),
     )
-    yield from controls.lines(f"spacecraft_dummy, {len(seeds)} seeds: ", sysid.Swarm(), results, seeds)
+    if not reduced:
+        yield from controls.lines(f"spacecraft_dummy, {len(seeds)} seeds: ", sysid.Swarm(), results, seeds)
     yield below("spacecraft_dummy: slowest run, s", max(r.history.wall_time for r in results), 600)

@@ -46,5 +46,6 @@ def lines(reduced: bool) -> Iterator[Line]:
         what + "M_SS and K_SS positive definite (least ratio of extreme eigenvalues)",
         f"{worst[:, 4].min():.3g}", "> 0", bool(worst[:, 4].min() > 0),
     )  # fmt: skip
-    yield from controls.lines(what, sysid.Swarm(), results, seeds)
+    if not reduced:
+        yield from controls.lines(what, sysid.Swarm(), results, seeds)
     yield Line(what + "seconds a run, and successes", f"{worst[:, 5].round(1).tolist()}, {int(worst[:, 6].sum())}")

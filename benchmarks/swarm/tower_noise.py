@@ -24,4 +24,5 @@ def lines(reduced: bool) -> Iterator[Line]:
         worst,
         0.05,
     )
-    yield from controls.lines(f"cantilever_tower, 1 % noise, {len(seeds)} draws: ", sysid.Swarm(), results, seeds)
+    if not reduced:
+        yield from controls.lines(f"cantilever_tower, 1 % noise, {len(seeds)} draws: ", sysid.Swarm(), results, seeds)
