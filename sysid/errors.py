@@ -1,4 +1,4 @@
-"""What can go wrong, as a tree.
+"""What can go wrong, as a tree, and the checks of arguments that all rooms share.
 
 ::
 
@@ -7,11 +7,25 @@
     └── SolverError             a solver ended in a state that its caller cannot use
 
 The command line turns an ``InputError`` into one line and exit status 2.
+
+A check takes the argument's name, as messages call it, and its value; it gives the value as the plain type that was
+asked for, or raises an ``InputError``.
 """
 
 from __future__ import annotations
 
+import math
+import operator
+import textwrap
+from collections.abc import Sequence
+from numbers import Real
+from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+RandomSource = int | np.random.Generator | np.random.SeedSequence | None
 
 
 class SysidError(Exception):
@@ -31,3 +45,120 @@ def refuse(*mistakes: tuple[Any, str]) -> None:
     for made, sentence in mistakes:
         if made:
             raise InputError(sentence)
+
+
+def _shown(value: Any) -> str:
+    """A value in a message, which stays one line."""
+    return textwrap.shorten(repr(value), 80, placeholder="...")
+
+
+def number(
+    name: str, value: Any, wanted: str = "a finite number", *, above: float = -math.inf, at_least: float = -math.inf,
+    below: float = math.inf, finite: bool = True,
+) -> float:  # fmt: skip
+    """One real number, no bool, within bounds; `wanted` says in the message what is."""
+    plain = value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
+    try:
+        given = float(plain) if isinstance(plain, Real) and not isinstance(plain, bool) else math.nan
+    except OverflowError:  # an int of more than 308 digits
+        given = math.nan
+    fits = above < given < below or (not finite and math.isinf(given))
+    if not (fits and given >= at_least):
+        raise InputError(f"{name} = {_shown(value)}: {wanted} is needed")
+    return given
+
+
+def whole_number(name: str, value: Any, *, at_least: int) -> int:
+    """A whole number, no bool; a float such as 4.0 is one."""
+    plain: Any = int(value) if isinstance(value, float) and value.is_integer() else value
+    try:
+        given = operator.index("" if isinstance(plain, bool) else plain)  # type: ignore[arg-type]
+    except TypeError:
+        raise InputError(f"{name} is {_shown(value)}; give a whole number, {at_least} or above.") from None
+    if given < at_least:
+        raise InputError(f"{name} is {given}; give {at_least} or above.")
+    return given
+
+
+def text(name: str, value: Any) -> str:
+    """A text that is not empty."""
+    if not isinstance(value, str) or not value:
+        raise InputError(f"{name} is {_shown(value)}; give a text, such as 'top'")
+    return value
+
+
+def flag(name: str, value: Any) -> bool:
+    """True or False, NumPy's too."""
+    if not isinstance(value, bool | np.bool_):
+        raise InputError(f"{name} is {_shown(value)}; give True or False")
+    return bool(value)
+
+
+def choice(name: str, value: Any, known: Sequence[str | None]) -> None:
+    """Refuse what is none of the known words."""
+    if not isinstance(value, str | None) or value not in known:
+        raise InputError(f"{name} = {_shown(value)} is unknown; give one of {', '.join(map(repr, known))}")
+
+
+def instance(name: str, value: Any, kind: type) -> None:
+    """Refuse what is no object of this class of the package."""
+    if not isinstance(value, kind):
+        raise InputError(f"{name} is a {type(value).__name__}, not a sysid.{kind.__name__}")
+
+
+def function(name: str, value: Any) -> None:
+    """Refuse what cannot be called; None passes."""
+    if value is not None and not callable(value):
+        raise InputError(f"{name} is {_shown(value)}; give a function, or None")
+
+
+def sequence(name: str, value: Any, wanted: str) -> tuple[Any, ...]:
+    """The entries of a list, a tuple or anything else but a text that can be gone through."""
+    try:
+        return tuple(None if isinstance(value, str | bytes) else value)  # type: ignore[arg-type]
+    except TypeError:
+        raise InputError(f"{name} is {_shown(value)}; give {wanted}") from None
+
+
+def path_of(name: str, value: Any) -> Path:
+    """A path of a file or a folder."""
+    try:
+        return Path(value)
+    except TypeError:
+        raise InputError(f"{name} is {_shown(value)}; give a path") from None
+
+
+def random_generator(rng: RandomSource) -> np.random.Generator:
+    """The random source as a Generator: of an int of zero or above, a Generator, a SeedSequence or None."""
+    try:
+        return np.random.default_rng(rng)
+    except (TypeError, ValueError):
+        raise InputError(f"rng is {_shown(rng)}; give an int of zero or above, a numpy Generator, or None.") from None
+
+
+def numbers(name: str, value: ArrayLike, kind: type = float) -> NDArray[Any]:
+    """A new array of numbers, float or complex, which may be NaN or infinite; texts and masked entries are none."""
+    words = {float: "real numbers", complex: "numbers"}[kind]
+    if np.ma.is_masked(value):
+        raise InputError(f"{name} has masked entries: drop those lines, or fill them with numbers (numpy.ma.filled)")
+    try:
+        given = np.array(value)
+        code = given.dtype.kind
+        array: NDArray[Any] = given.astype(complex if code == "c" else kind, copy=False)
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # CasADi's symbols raise the last
+        code = "U"
+    refuse(
+        (code not in "biufcO", f"{name} is not an array of {words}: {_shown(value)}"),
+        (kind is float and code == "c", f"{name} is complex; real numbers are needed"),
+    )
+    return array
+
+
+def finite_array(name: str, value: ArrayLike, kind: type = float) -> NDArray[Any]:
+    """A new array of finite numbers, float or complex."""
+    array = numbers(name, value, kind)
+    bad = np.argwhere(~np.isfinite(array)).tolist()
+    if bad:
+        first = f", the first at index {tuple(bad[0])}" if array.ndim else ""
+        raise InputError(f"{name} holds NaN or infinite entries ({len(bad)} of {array.size}{first})")
+    return array

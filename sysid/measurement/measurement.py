@@ -9,11 +9,21 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError, refuse
+from sysid.errors import (
+    InputError,
+    RandomSource,
+    choice,
+    finite_array,
+    flag,
+    instance,
+    number,
+    random_generator,
+    refuse,
+    sequence,
+)  # fmt: skip
 from sysid.measurement import spectra
-from sysid.measurement.spectra import checked
 from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
-from sysid.structure.sensor import Sensor, sensors_from_tree, sensors_to_tree
+from sysid.structure.sensor import Sensor, checked_sensors, sensors_from_tree, sensors_to_tree
 from sysid.structure.structure import Array, ComplexArray, Structure, check_frequencies
 
 _RECORDS = ("freq", "base", "response", "force", "response_std", "force_std")  # what has lines
@@ -49,12 +59,13 @@ def rigid_body(
     >>> rigid_body([[0, 0, 2.0]], ["x"], base_axes=["x", "ry"])
     array([[1., 2.]])
     """
-    points = np.atleast_2d(checked("positions", positions, float))
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) != len(axes):
-        raise InputError(f"positions {points.shape} and {len(axes)} axes disagree; both have one row of three a sensor")
+    points = np.atleast_2d(finite_array("positions", positions))
+    given = sequence("axes", axes, "a list with one axis a sensor, such as ['x', '-y']")
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) != len(given):
+        raise InputError(f"positions {points.shape} and {len(given)} axes disagree; both have one row a sensor")
     columns = base_columns(base_axes)
     motion = rigid_motion(points, origin).reshape(len(points), 6, 6)
-    rows = [axis_vector(axis, f"sensor {i}") @ motion[i, :3] for i, axis in enumerate(axes)]
+    rows = [axis_vector(axis, f"sensor {i}") @ motion[i, :3] for i, axis in enumerate(given)]
     return np.array(rows)[:, columns]
 
 
@@ -112,14 +123,13 @@ class Measurement:
         put("freq", check_frequencies(self.freq))
         put("base", _records("base", self.base, self.freq.size))
         put("response", _records("response", self.response, self.freq.size))
-        put("rigid_body", np.atleast_2d(checked("rigid_body", self.rigid_body, float)))
+        put("rigid_body", np.atleast_2d(finite_array("rigid_body", self.rigid_body)))
         (runs, d, _), (response_runs, sensors, _) = self.base.shape, self.response.shape
         if self.force is not None:
             put("force", _records("force", self.force, self.freq.size))
             if self.force.shape != self.base.shape:
                 raise InputError(f"force is {self.force.shape} but base is {self.base.shape}; they have the same axes")
-        if self.sensors is not None:
-            put("sensors", tuple(self.sensors))
+        put("sensors", checked_sensors(self.sensors))
         refuse(
             (runs != response_runs, f"base has {runs} runs but response has {response_runs}"),
             (
@@ -157,7 +167,7 @@ class Measurement:
 
     def _axes_of_sensors(self) -> tuple[str, ...]:
         """Names of the columns of G as translations along the sensors' axes; none where no or several names fit."""
-        if not self.sensors or not all(isinstance(sensor, Sensor) for sensor in self.sensors):
+        if not self.sensors:
             return ()
         axes = np.array([axis_vector(sensor.axis, sensor.name) for sensor in self.sensors])
         columns = self.rigid_body.T
@@ -252,6 +262,7 @@ class Measurement:
 
     def in_band(self, low: float, high: float) -> Measurement:
         """The lines from `low` to `high` Hz, both included."""
+        low, high = number("the lower end of the band", low), number("the upper end of the band", high)
         keep = (self.freq >= low) & (self.freq <= high)
         if not np.any(keep):
             raise InputError(
@@ -297,8 +308,10 @@ class Measurement:
         base_axes : str or sequence of str, optional
         """
         lines = check_frequencies(freq)
-        one_direction = np.ndim(frf) == 2  # (n_sensors, n_freq)
-        H = _records("frf", np.expand_dims(np.asarray(frf), 1) if one_direction else frf, lines.size)
+        H = finite_array("frf", frf, complex)
+        if H.ndim == 2:  # (n_sensors, n_freq)
+            H = np.expand_dims(H, 1)
+        H = _records("frf", H, lines.size)
         d = H.shape[1]
         F = None if force is None else _records("force", force, lines.size)
         wanted = (d, d, lines.size)
@@ -349,21 +362,25 @@ class Measurement:
         sensors : sequence of Sensor, optional
         base_axes : str or sequence of str, optional
         """
-        G = np.atleast_2d(np.asarray(rigid_body, dtype=float))
+        G = np.atleast_2d(finite_array("rigid_body", rigid_body))
+        choice("estimator", estimator, ("spectra", "h1", "h2"))
         records = spectra.check_runs(runs, sample_rate, G.shape)
         given: Any = {"rigid_body": G, "sensors": sensors, "base_axes": base_axes}
         if estimator == "spectra":
             freq, base, response, force = spectra.whole_record(records, sample_rate)
             test = cls(freq, base, response, force=force, **given)
-        elif estimator in ("h1", "h2"):
+        else:
             estimate = spectra.averaged(records, sample_rate, kind=estimator, segment=segment)
             test = cls.from_frf(
                 estimate.freq, estimate.frf, force=estimate.force, response_std=estimate.frf_std,
                 force_std=estimate.force_std, **given,
             )  # fmt: skip
-        else:
-            raise InputError(f"estimator {estimator!r} is unknown; give 'spectra', 'h1' or 'h2'")
-        return test if band is None else test.in_band(*band)
+        if band is None:
+            return test
+        ends = sequence("band", band, "(low, high) in Hz")
+        if len(ends) != 2:
+            raise InputError(f"band has {len(ends)} numbers; give (low, high) in Hz")
+        return test.in_band(*ends)
 
 
 def simulate(
@@ -372,7 +389,7 @@ def simulate(
     *,
     noise: float = 0.0,
     force: bool = False,
-    rng: int | np.random.Generator | None = None,
+    rng: RandomSource = None,
     base_axes: str | Sequence[str] | None = None,
 ) -> Measurement:
     """The virtual test: d runs of unit base motion, noise on the responses (and force) only.
@@ -397,13 +414,13 @@ def simulate(
         Its standard deviations are set where `noise` is not zero. The *noise floor* of a draw is
         ``measurement.residual(structure)``.
     """
-    if not (np.isfinite(noise) and noise >= 0):
-        raise InputError(f"noise = {noise}: a finite fraction >= 0 is needed")
+    instance("structure", structure, Structure)
+    noise = number("noise", noise, "a finite fraction >= 0", at_least=0)
     lines = check_frequencies(freq)
-    random = np.random.default_rng(rng)
+    random = random_generator(rng)
     response, response_std = _with_noise(np.moveaxis(structure.transmissibility(lines), 1, 0), noise, random)
     base_force = force_std = None
-    if force:
+    if flag("force", force):
         base_force, force_std = _with_noise(np.moveaxis(structure.base_force(lines), 1, 0), noise, random)
     named: Any = {"sensors": structure.sensors, "base_axes": base_axes}
     return Measurement(
@@ -426,7 +443,7 @@ def _with_noise(record: ComplexArray, noise: float, random: np.random.Generator)
 
 
 def _records(name: str, value: ArrayLike, n_freq: int) -> ComplexArray:
-    array = checked(name, value, complex)
+    array = finite_array(name, value, complex)
     if array.ndim == 2:
         array = array[None]
     if array.ndim != 3 or array.shape[-1] != n_freq:
@@ -437,7 +454,7 @@ def _records(name: str, value: ArrayLike, n_freq: int) -> ComplexArray:
 def _std(name: str, value: ArrayLike | None, record: ComplexArray | None) -> Array | None:
     if value is None:
         return None
-    array = checked(name, value, float)
+    array = finite_array(name, value)
     if record is None:
         raise InputError(f"{name} is given without its record")
     try:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, refuse
+from sysid.errors import InputError, finite_array, number, refuse, sequence, whole_number
 from sysid.structure.structure import Array, ComplexArray
 
 
@@ -52,16 +52,14 @@ def check_runs(
     runs: Sequence[tuple[ArrayLike, ArrayLike, ArrayLike | None]], sample_rate: float, shape: tuple[int, ...]
 ) -> list[Run]:
     """Check time records against ``shape = (n_sensors, d)`` and each other."""
-    refuse(
-        (
-            not (np.isfinite(sample_rate) and sample_rate > 0),
-            f"sample_rate = {sample_rate}: a positive number of samples a second is needed",
-        ),
-        (not runs, "no runs: give a list of (base, response, force or None)"),
-    )
+    number("sample_rate", sample_rate, "a positive number of samples a second", above=0)
+    given = sequence("runs", runs, "a list of (base, response, force or None)")
+    if not given:
+        raise InputError("no runs: give a list of (base, response, force or None)")
     sensors, d = shape
     records = []
-    for index, run in enumerate(runs):
+    for index, entry in enumerate(given):
+        run = sequence(f"run {index}", entry, "(base, response, force or None)")
         if len(run) != 3:
             raise InputError(f"run {index} has {len(run)} records; give (base, response, force or None)")
         base = _record(f"run {index}, base", run[0], d)
@@ -122,7 +120,7 @@ def averaged(runs: Sequence[Run], sample_rate: float, *, kind: str, segment: int
     if kind == "h2" and d > 1:
         raise InputError("'h2' divides by one input; with several base directions use 'h1'")
     shortest = min(run.base.shape[1] for run in runs)
-    length = max(shortest // 4, 2) if segment is None else int(segment)
+    length = max(shortest // 4, 2) if segment is None else whole_number("segment", segment, at_least=2)
     if not 2 <= length <= shortest:
         raise InputError(f"segment = {segment}: between 2 and the {shortest} samples of the shortest run are needed")
     window = signal.get_window("hann", length)
@@ -211,22 +209,18 @@ def resample(
     from scipy.interpolate import CubicSpline
     from scipy.signal import butter, sosfiltfilt
 
-    if not records:
+    given = sequence("records", records, "a list of (time, samples)")
+    if not given:
         raise InputError("no records to resample")
     clocks, samples = [], []
-    for index, (time, values) in enumerate(records):
-        t = np.asarray(time, dtype=float)
-        x = np.atleast_2d(np.asarray(values, dtype=float))
-        refuse(
-            (
-                t.ndim != 1 or x.shape[-1] != t.size or t.size < 4,
-                f"record {index}: time {t.shape} and samples {x.shape} disagree (or fewer than 4 samples)",
-            ),
-            (
-                not (np.all(np.isfinite(t)) and np.all(np.isfinite(x))),
-                f"record {index} holds NaN or infinite samples",
-            ),
-        )
+    for index, entry in enumerate(given):
+        record = sequence(f"record {index}", entry, "(time, samples)")
+        if len(record) != 2:
+            raise InputError(f"record {index} has {len(record)} parts; give (time, samples)")
+        t = finite_array(f"time of record {index}", record[0])
+        x = np.atleast_2d(finite_array(f"samples of record {index}", record[1]))
+        if t.ndim != 1 or x.ndim != 2 or x.shape[1] != t.size or t.size < 4:
+            raise InputError(f"record {index}: time {t.shape} and samples {x.shape} disagree (or fewer than 4 samples)")
         gaps = np.diff(t)
         widest, back = np.argmax(gaps), np.argmax(gaps <= 0)
         refuse(
@@ -239,7 +233,7 @@ def resample(
         clocks.append(t)
         samples.append(x)
     rates = np.array([(t.size - 1) / (t[-1] - t[0]) for t in clocks])
-    rate = float(rates.min()) if sample_rate is None else float(sample_rate)
+    rate = float(rates.min()) if sample_rate is None else number("sample_rate", sample_rate)
     if not 0 < rate <= 1.01 * rates.min():
         raise InputError(f"sample_rate = {rate:g} Hz is not between 0 and the slowest instrument's {rates.min():g} Hz")
     start, stop = max(t[0] for t in clocks), min(t[-1] for t in clocks)
@@ -257,23 +251,8 @@ def resample(
     return time, [np.asarray(spline(np.minimum(time, spline.x[-1]))) for spline in splines]
 
 
-def checked(name: str, value: ArrayLike, kind: type) -> NDArray[Any]:
-    """`value` as an array of finite numbers, float or complex; an InputError where it is none."""
-    numbers = {float: "real numbers", complex: "numbers"}[kind]
-    if kind is float and np.iscomplexobj(value):
-        raise InputError(f"{name} is complex; {numbers} are needed")
-    try:
-        array: NDArray[Any] = np.array(value, dtype=kind)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} is not an array of {numbers}") from None
-    bad = np.argwhere(~np.isfinite(array)).tolist()
-    if bad:
-        raise InputError(f"{name} holds {len(bad)} NaN or infinite samples, the first at index {tuple(bad[0])}")
-    return array
-
-
 def _record(name: str, value: ArrayLike, channels: int) -> Array:
-    array = np.atleast_2d(checked(name, value, float))
+    array = np.atleast_2d(finite_array(name, value))
     if array.ndim != 2 or array.shape[0] != channels:
         raise InputError(f"{name} has shape {array.shape}; ({channels}, n_samples) is needed")
     return array

@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from sysid.errors import InputError
+from sysid.errors import InputError, finite_array, number
 from sysid.models.expressions import as_matrix, at_point, check_finite, is_column, written_in
 from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import Geometry
@@ -25,10 +25,13 @@ class ModalDamping(FieldTree):
     lower: float = 0.005
     upper: float = 0.05
 
+    def __post_init__(self) -> None:
+        lower, upper = (number(f"ModalDamping: {name}", getattr(self, name)) for name in ("lower", "upper"))
+        if not 0 < lower < upper < 1:
+            raise InputError(f"ModalDamping: 0 < lower < upper < 1 is needed, not {lower} and {upper}")
+
     def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """Damping ratios, in ascending order of frequency."""
-        if not 0 < self.lower < self.upper < 1:
-            raise InputError(f"ModalDamping: 0 < lower < upper < 1 is needed, not {self.lower} and {self.upper}")
         return (Unknown("damping_ratio", np.full(geometry.n, self.lower), np.full(geometry.n, self.upper)),)
 
     def blocks(self, geometry: Geometry, y: ca.SX, mass: MassBlocks, stiffness: StiffnessBlocks) -> None:
@@ -65,6 +68,12 @@ class ProportionalDamping(FieldTree):
     alpha: tuple[float, float]
     beta: tuple[float, float]
 
+    def __post_init__(self) -> None:
+        for name in ("alpha", "beta"):
+            pair = finite_array(f"ProportionalDamping: {name}", getattr(self, name))
+            if pair.shape != (2,) or not 0 <= pair[0] < pair[1]:
+                raise InputError(f"ProportionalDamping: {name} needs 0 <= lower < upper, not {pair.tolist()}")
+
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> ProportionalDamping:
         """Give the model of a tree that `to_tree` made; its fields are pairs."""
@@ -72,9 +81,6 @@ class ProportionalDamping(FieldTree):
 
     def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """The two factors."""
-        for name, (low, high) in (("alpha", self.alpha), ("beta", self.beta)):
-            if not 0 <= low < high < np.inf:
-                raise InputError(f"ProportionalDamping: {name} needs 0 <= lower < upper, not ({low}, {high})")
         return Unknown("rayleigh_alpha", *self.alpha, unit="1/s"), Unknown("rayleigh_beta", *self.beta, unit="s")
 
     def blocks(self, geometry: Geometry, y: ca.SX, mass: MassBlocks, stiffness: StiffnessBlocks) -> ca.SX:

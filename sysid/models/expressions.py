@@ -8,9 +8,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from sysid.errors import InputError
+from sysid.errors import InputError, finite_array
 from sysid.models.unknowns import Variable, expression_of, user_site, variable_of
-from sysid.structure.structure import Array, finite_array
+from sysid.structure.structure import Array
 
 
 def is_expression(value: Any) -> bool:

@@ -12,15 +12,38 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError
+from sysid.errors import InputError, finite_array, refuse
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.models.unknowns import Unknown
-from sysid.structure.structure import Array, finite_array
+from sysid.structure.structure import Array
 
 # A Cholesky diagonal of zero makes the mode shapes infinite; one of 1e-3 already spans a
 # condition number of 1e6, more than any test resolves.
 FACTOR_FLOOR = 1e-3
+_LIGHTEST, _HEAVIEST = 1e-12, 1e15  # kg or kg m²: beyond them no unit is right, and squares leave the range of floats
+
+
+def check_total_mass(total_mass: ArrayLike | None) -> None:
+    """Refuse a stated total that is wrong for any base: see `Geometry.totals` and `Geometry.rigid_total`."""
+    if total_mass is None:
+        return
+    given = finite_array("total_mass", total_mass)
+    masses = np.diag(given) if given.ndim == 2 else given
+    refuse(
+        (given.ndim > 2 or not given.size, f"total_mass has shape {given.shape}; one number, (d,) or (d, d) is needed"),
+        (np.any(masses <= 0), f"total_mass = {np.array2string(masses)}: masses must be positive"),
+    )
+    check_sane("total_mass", masses)
+
+
+def check_sane(name: str, masses: Array) -> None:
+    """Refuse masses that no structure has; zeros pass."""
+    if np.any((masses != 0) & ((np.abs(masses) < _LIGHTEST) | (np.abs(masses) > _HEAVIEST))):
+        raise InputError(
+            f"{name} = {np.array2string(masses)} is outside {_LIGHTEST:g} to {_HEAVIEST:g}; the unit is kg "
+            "(kg m² where the base rotates)"
+        )
 
 
 class Geometry:
@@ -148,7 +171,8 @@ class Geometry:
         """Total mass in each base direction, (d,): kg, or kg m² where the direction is a rotation."""
         if total_mass is None:
             return self._unstated_totals if self.weighed is None else self.weighed
-        given = finite_array("total_mass", total_mass)
+        check_total_mass(total_mass)
+        given = np.array(total_mass, dtype=float)
         whole = self.rigid_total(given)
         if whole is not None:
             return np.diag(whole)
@@ -161,10 +185,7 @@ class Geometry:
             raise InputError(
                 f"total_mass has shape {given.shape}; one number, ({self.d},) or ({self.d}, {self.d}) is needed"
             )
-        given = np.full(self.d, given)
-        if np.any(given <= 0):
-            raise InputError(f"total_mass = {np.array2string(given)}: masses must be positive")
-        return given
+        return np.full(self.d, given)
 
     @property
     def _unstated_totals(self) -> Array:
@@ -176,11 +197,10 @@ class Geometry:
         """The rigid-body mass (d, d) where all of it is stated, else None."""
         if total_mass is None or np.ndim(total_mass) < 2:
             return None
-        given = finite_array("total_mass", total_mass)
+        check_total_mass(total_mass)
+        given = np.array(total_mass, dtype=float)
         if given.shape != (self.d, self.d):
             raise InputError(f"total_mass has shape {given.shape}; ({self.d}, {self.d}) is needed of a rigid-body mass")
-        if np.any(np.diag(given) <= 0):
-            raise InputError(f"total_mass = {np.array2string(np.diag(given))} on its diagonal: masses must be positive")
         size = np.sqrt(np.diag(given))
         scaled = given / np.outer(size, size)
         if np.abs(scaled - scaled.T).max() > 1e-9 or np.linalg.eigvalsh(scaled)[0] <= 0:

@@ -10,12 +10,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError
+from sysid.errors import InputError, choice, finite_array, numbers, refuse
 from sysid.models.field_tree import FieldTree
-from sysid.models.geometry import FACTOR_FLOOR, Geometry
+from sysid.models.geometry import FACTOR_FLOOR, Geometry, check_sane, check_total_mass
 from sysid.models.model import MassBlocks, Stated, Totals, Written, constant
 from sysid.models.unknowns import Unknown
-from sysid.structure.structure import Array, Structure, finite_array, lowest_eigenvalue
+from sysid.structure.structure import Array, Structure, lowest_eigenvalue
 from sysid.structure.triangular import lower_triangle, triangle_entries
 
 _ROW_EXPECTATION = 1.0  # the paper's c
@@ -79,8 +79,16 @@ class FullMass(FieldTree):
     known: ArrayLike | None = None
 
     def __post_init__(self) -> None:
-        if self.healing not in ("trace", "rigid_body"):
-            raise InputError(f"healing {self.healing!r} is unknown; give 'trace' or 'rigid_body'")
+        choice("FullMass: healing", self.healing, ("trace", "rigid_body"))
+        check_total_mass(self.total_mass)
+        if self.known is not None:
+            given = numbers("FullMass: known", self.known)
+            refuse(
+                (given.ndim != 2, f"FullMass: known is {given.shape}; (n, n) or (n, n + d) is needed"),
+                (np.any(np.isinf(given)), "FullMass: known is infinite somewhere; NaN is what is not known"),
+                (np.any(np.diag(given) <= 0), "FullMass: known masses must be positive"),
+            )
+            check_sane("FullMass: known", np.diag(given))
         if self.total_mass is not None and np.ndim(self.total_mass) == 2 and self.healing != "rigid_body":
             raise InputError("a matrix of total mass is the rigid-body mass: state healing='rigid_body' with it")
 
@@ -90,20 +98,13 @@ class FullMass(FieldTree):
         entries = np.full((n, n + d), np.nan)
         if self.known is None:
             return entries
-        try:
-            given = np.asarray(self.known, dtype=float)
-        except (TypeError, ValueError):
-            raise InputError("FullMass: known must hold numbers, NaN where an entry is not known") from None
+        given = numbers("FullMass: known", self.known)
         if given.shape not in ((n, n), (n, n + d)):
             raise InputError(f"FullMass: known is {given.shape}; ({n}, {n}) or ({n}, {n + d}) is needed")
         entries[:, : given.shape[1]] = given
         across = np.where(np.isnan(entries[:, :n]), entries[:, :n].T, entries[:, :n])
-        if np.any(np.isinf(entries)) or np.nanmax(np.abs(across - across.T), initial=0.0) > 1e-9 * np.nanmax(
-            np.abs(across), initial=0.0
-        ):
-            raise InputError("FullMass: known is infinite somewhere, or not symmetric over the sensors")
-        if np.nanmin(np.diag(across), initial=np.inf) <= 0:
-            raise InputError("FullMass: known masses must be positive")
+        if np.nanmax(np.abs(across - across.T), initial=0.0) > 1e-9 * np.nanmax(np.abs(across), initial=0.0):
+            raise InputError("FullMass: known is not symmetric over the sensors")
         entries[:, :n] = across
         return entries
 
@@ -201,6 +202,9 @@ class LumpedMass(FieldTree):
 
     total_mass: ArrayLike | None = None
 
+    def __post_init__(self) -> None:
+        check_total_mass(self.total_mass)
+
     def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """Shares of the masses, scaled afterwards to their direction's total."""
         share = Unknown("mass_share", np.full(geometry.n, FACTOR_FLOOR), np.ones(geometry.n), relative=True)
@@ -243,6 +247,14 @@ class KnownMass(FieldTree):
 
     matrix: ArrayLike
 
+    def __post_init__(self) -> None:
+        matrix = finite_array("the known mass matrix", self.matrix)
+        if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1] or not matrix.size:
+            raise InputError(f"the known mass matrix is {matrix.shape}; a square one is needed")
+        if np.abs(matrix - matrix.T).max() > 1e-9 * np.abs(matrix).max():
+            raise InputError("the known mass matrix is not symmetric")
+        check_sane("the diagonal of the known mass matrix", np.diag(matrix))
+
     def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """No unknowns."""
         return ()
@@ -267,14 +279,12 @@ class KnownMass(FieldTree):
 
     def full(self, geometry: Geometry) -> Array:
         """The matrix over sensors and base, (n + d, n + d)."""
-        matrix = finite_array("the known mass matrix", self.matrix)
+        matrix = np.array(self.matrix, dtype=float)
         n, size = geometry.n, geometry.n + geometry.d
         if matrix.shape == (n, n):
             matrix = np.pad(matrix, (0, geometry.d))
         if matrix.shape != (size, size):
             raise InputError(f"the known mass matrix is {matrix.shape}; ({n}, {n}) or ({size}, {size}) is needed")
-        if np.abs(matrix - matrix.T).max() > 1e-9 * np.abs(matrix).max():
-            raise InputError("the known mass matrix is not symmetric")
         if np.any(np.abs(matrix[n:][np.diag(matrix)[n:] == 0]) > 1e-9 * np.abs(matrix).max()):
             raise InputError(
                 "the known mass matrix couples a base direction that has no mass: its diagonal entry is 0, others of "

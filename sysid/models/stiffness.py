@@ -10,14 +10,14 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError, refuse
+from sysid.errors import InputError, finite_array, number, refuse
 from sysid.models.expressions import at_point, written_in
 from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import FACTOR_FLOOR, Geometry
 from sysid.models.model import MassBlocks, Stated, StiffnessBlocks, Written
 from sysid.models.spectrum import by_ipopt, nearest_factors
 from sysid.models.unknowns import Unknown, log_sampling
-from sysid.structure.structure import Array, Structure, finite_array
+from sysid.structure.structure import Array, Structure
 from sysid.structure.triangular import lower_triangle, triangle_entries
 
 
@@ -45,37 +45,43 @@ class SpectralStiffness(FieldTree):
     natural_frequencies: ArrayLike | None = None
     max_frequency: float | None = None
 
+    def __post_init__(self) -> None:
+        highest = 0.0
+        if self.natural_frequencies is not None:
+            given = np.atleast_1d(finite_array("natural_frequencies", self.natural_frequencies))
+            refuse(
+                (
+                    given.ndim != 1 or given.size == 0 or np.any(given <= 0),
+                    "natural_frequencies must be a list of positive numbers in Hz",
+                ),
+                (np.any(np.diff(given) < 0), "natural_frequencies must be in ascending order"),
+            )
+            highest = given[-1]
+        if self.max_frequency is not None:
+            self._check_limit(number("max_frequency", self.max_frequency, "a positive number of Hz", above=0), highest)
+
+    def _check_limit(self, limit: float, highest: float) -> None:
+        if limit < highest:
+            raise InputError(
+                f"max_frequency = {limit:g} Hz is below the given natural frequency {highest:g} Hz: the truth would "
+                "lie outside the search space"
+            )
+
     def targets(self, geometry: Geometry) -> Array:
         """Circular frequencies that are stated, else those that stand out of the data, rad/s, ascending, at most n."""
         if self.natural_frequencies is None:
             return geometry.poles.omega[: geometry.n]
-        given = np.atleast_1d(finite_array("natural_frequencies", self.natural_frequencies))
-        n = geometry.n
-        refuse(
-            (
-                given.ndim != 1 or given.size == 0 or np.any(given <= 0),
-                "natural_frequencies must be a list of positive numbers in Hz",
-            ),
-            (np.any(np.diff(given) < 0), "natural_frequencies must be in ascending order"),
-            (given.size > n, f"{given.size} natural frequencies are given for {n} sensors; at most {n} fit"),
-        )
+        given, n = np.atleast_1d(np.array(self.natural_frequencies, dtype=float)), geometry.n
+        if given.size > n:
+            raise InputError(f"{given.size} natural frequencies are given for {n} sensors; at most {n} fit")
         return 2 * np.pi * given
 
     def limit(self, geometry: Geometry) -> float:
         """Bound on the frequencies of an n-degree-of-freedom model, rad/s (w_lim of eq. 37)."""
         targets, n = self.targets(geometry), geometry.n
         if self.max_frequency is not None:
-            limit = 2 * np.pi * float(finite_array("max_frequency", self.max_frequency))
-            given = f"max_frequency = {self.max_frequency:g} Hz"
-            refuse(
-                (limit <= 0, f"{given}: a positive number is needed"),
-                (
-                    limit < targets[-1],
-                    f"{given} is below the given natural frequency {targets[-1] / (2 * np.pi):g} Hz: the truth would "
-                    "lie outside the search space",
-                ),
-            )
-            return limit
+            self._check_limit(float(self.max_frequency), targets[-1] / (2 * np.pi))
+            return 2 * np.pi * float(self.max_frequency)
         if targets.size == n:
             return float(targets[-1])
         if self.natural_frequencies is None:
@@ -156,14 +162,18 @@ class ChainStiffness(FieldTree):
     lower: ArrayLike
     upper: ArrayLike
 
+    def __post_init__(self) -> None:
+        low, high = (finite_array("ChainStiffness: bounds", bound) for bound in (self.lower, self.upper))
+        alike = low.ndim < 2 and high.ndim < 2 and (low.shape == high.shape or 1 in (low.size, high.size))
+        if not (alike and np.all(low > 0) and np.all(low < high)):
+            raise InputError("ChainStiffness: bounds must be one number, or one a sensor, with 0 < lower < upper (N/m)")
+
     def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """One spring a sensor, N/m."""
         try:
             low, high = (np.broadcast_to(np.asarray(v, dtype=float), (geometry.n,)) for v in (self.lower, self.upper))
-        except (TypeError, ValueError):
+        except ValueError:
             raise InputError(f"ChainStiffness: bounds are one number, or one a sensor ({geometry.n}), in N/m") from None
-        if not (np.all(np.isfinite(high)) and np.all(low > 0) and np.all(low < high)):
-            raise InputError("ChainStiffness: bounds must be finite with 0 < lower < upper (N/m)")
         to, back = log_sampling(low, high)
         return (Unknown("spring", low, high, unit="N/m", sampling=to, unsampling=back, scale="log"),)
 

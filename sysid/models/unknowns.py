@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, refuse
+from sysid.errors import InputError, finite_array, flag, numbers, refuse
 from sysid.structure.structure import Array
 
 _PART = 0.05  # of its range: the least step of an unknown
@@ -78,10 +78,10 @@ class Unknown:
         relative: bool = False,
     ) -> None:
         self.name, self.unit, self.scale, self.relative = name, unit, scale, relative
-        self.lower, self.upper = (np.atleast_1d(np.asarray(bound, float)) for bound in (lower, upper))
+        self.lower, self.upper = (np.atleast_1d(finite_array(f"variable {name}: a bound", b)) for b in (lower, upper))
         if self.lower.shape != self.upper.shape or self.lower.ndim != 1:
             raise InputError(f"variable {name}: bounds {self.lower.shape} and {self.upper.shape} disagree")
-        if not (np.all(np.isfinite(self.lower + self.upper)) and np.all(self.lower <= self.upper)):
+        if np.any(self.lower > self.upper):
             raise InputError(f"variable {name}: bounds must be finite with lower <= upper")
         self.shape: tuple[int, ...] = (self.lower.size,)
         self.sampling, self.unsampling = sampling, unsampling
@@ -189,7 +189,10 @@ class Variable(Unknown):
         self.declared = user_site()
         if not isinstance(name, str) or not name:
             raise InputError(f"a Variable ({self.declared}) needs a name, and {name!r} is none")
-        self.name, self.log, self.fixed, self.unit = name, bool(log), bool(fixed), str(unit)
+        where = f"variable {name!r} ({self.declared})"
+        self.name, self.unit = name, unit
+        self.log, self.fixed = flag(f"{where}: log", log), flag(f"{where}: fixed", fixed)
+        self._refuse_where((not isinstance(unit, str), f"its unit {unit!r} is no text"))
         self.scale = "log" if log else "linear"
         self.shape = self._check_shape(shape)
         self.lower, self.upper = lower, upper = self._flat("lower", lower), self._flat("upper", upper)
@@ -235,10 +238,10 @@ class Variable(Unknown):
 
     def _flat(self, what: str, value: ArrayLike) -> Array:
         """Entries column by column, as CasADi has them."""
+        array = numbers(f"variable {self.name!r} ({self.declared}): {what}", value)
         try:
-            array = np.asarray(value, dtype=float)
             array = np.broadcast_to(array.reshape(self.shape) if isinstance(value, ca.DM) else array, self.shape)
-        except (TypeError, ValueError):
+        except ValueError:
             self._refuse(f"{what} = {value!r} is no number, nor numbers of its shape {self.shape}")
         return array.ravel(order="F").copy()
 

@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from sysid.errors import InputError
+from sysid.errors import InputError, finite_array
 from sysid.measurement.measurement import Measurement
 from sysid.models.damping import WrittenDamping
 from sysid.models.expressions import at_point, check_size, is_expression, square
@@ -17,7 +17,7 @@ from sysid.models.geometry import Geometry
 from sysid.models.mass import KnownMass, WrittenMass
 from sysid.models.model import MatrixModel
 from sysid.models.stiffness import WrittenStiffness
-from sysid.structure.structure import Array, finite_array
+from sysid.structure.structure import Array
 
 MATRICES = ("mass", "stiffness", "damping")
 _WRITTEN: dict[str, Any] = {"mass": WrittenMass, "stiffness": WrittenStiffness, "damping": WrittenDamping}

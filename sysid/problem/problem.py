@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, refuse
+from sysid.errors import InputError, instance, number, refuse
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.response import columns, weighed_mass
 from sysid.modal_analysis.vector_fitting import Poles
@@ -23,7 +23,7 @@ from sysid.problem import stored
 from sysid.problem.feasibility import HELD, LOOSE, check_constraints, check_matrices, points_of, scale_of  # fmt: skip
 from sysid.problem.formulation import Formulation
 from sysid.problem.given import MATRICES, as_models, geometry_of
-from sysid.structure.structure import Array, Structure, finite_array
+from sysid.structure.structure import Array, Structure
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -102,22 +102,15 @@ class Problem:
     site: str = field(init=False, default="?")
 
     def __post_init__(self) -> None:
+        instance("Problem: measurement", self.measurement, Measurement)
+        if self.reference is not None:
+            instance("Problem: reference", self.reference, Structure)
+        if self.goal is not None:
+            number("Problem: goal", self.goal, "a positive relative residual", above=0)
         refuse(
-            (
-                not isinstance(self.measurement, Measurement),
-                f"Problem: measurement is a {type(self.measurement).__name__}, not a sysid.Measurement",
-            ),
             (
                 not isinstance(self.healing, Mapping) or not all(isinstance(v, Variable) for v in self.healing),
                 "Problem: healing is a dictionary from variables to expressions: healing={m: 9 * m / ca.sum1(m)}",
-            ),
-            (
-                not isinstance(self.reference, Structure | None),
-                f"Problem: reference is a {type(self.reference).__name__}, not a sysid.Structure",
-            ),
-            (
-                self.goal is not None and not finite_array("goal", self.goal) > 0,
-                f"goal = {self.goal}: a positive relative residual is needed",
             ),
         )
         for name, model in zip(MATRICES, as_models(self.mass, self.stiffness, self.damping), strict=True):
@@ -127,6 +120,8 @@ class Problem:
             if not isinstance(given, list | tuple):
                 raise InputError(f"Problem: {name} is a {type(given).__name__}; give a list of them: {name}=[...]")
             object.__setattr__(self, name, tuple(given))
+        for at, test in enumerate(self.validation):
+            instance(f"Problem: validation[{at}]", test, Measurement)
         object.__setattr__(self, "site", user_site())
         self._check_records()
         self._check_declarations()

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 import casadi as ca
 import numpy as np
 
-from sysid.errors import InputError
+from sysid.errors import InputError, finite_array, instance
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.response import residual
 from sysid.models.expressions import as_matrix, at_point, check_finite, written_in
@@ -25,7 +25,7 @@ from sysid.problem.direct_response import Response, absolute_response, relative_
 from sysid.problem.given import MATRICES, as_models, geometry_of
 from sysid.problem.matrices import Blocks, Matrices, blocks_of
 from sysid.problem.slopes import Rows, Slopes, rows_of_test, slopes_of, stacked_rows
-from sysid.structure.structure import Array, finite_array
+from sysid.structure.structure import Array
 
 _FAR = 4.0  # standard deviations from a stated value, beyond which something is wrong
 
@@ -267,13 +267,13 @@ class FurtherTest:
 
     kind: ClassVar[str] = "further tests"  # what its unknowns are listed under
 
+    def __post_init__(self) -> None:
+        instance("FurtherTest: measurement", self.measurement, Measurement)
+        _ = self.blocks
+
     @cached_property
     def blocks(self) -> tuple[Blocks, Geometry]:
         """The blocks of its matrices, and their geometry."""
-        if not isinstance(self.measurement, Measurement):
-            raise InputError(
-                f"FurtherTest: measurement is a {type(self.measurement).__name__}, not a sysid.Measurement"
-            )
         models = as_models(self.mass, self.stiffness, self.damping)
         geometry = geometry_of(self.measurement, models[1], self.recovery, self.rigid_body_dofs)
         for name, model in zip(MATRICES, models, strict=True):
@@ -332,6 +332,9 @@ class Prior:
     expression: Any
     value: Any
     std: Any
+
+    def __post_init__(self) -> None:
+        self.column("Prior")
 
     def column(self, name: str) -> tuple[ca.MX, Array, Array]:
         """The expression as a column, its values and standard deviations, (rows,) each."""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError
-from sysid.structure.structure import Array
+from sysid.errors import InputError, finite_array, sequence
 
+Array = NDArray[np.floating[Any]]
 BASE_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
@@ -25,11 +26,8 @@ def unit_vector(value: ArrayLike, label: str) -> Array:
 
 def vector3(value: ArrayLike, label: str) -> Array:
     """`value` as a finite vector (3,)."""
-    try:
-        vector = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        vector = np.empty(0)
-    if vector.shape != (3,) or not np.all(np.isfinite(vector)):
+    vector = finite_array(label, value)
+    if vector.shape != (3,):
         raise InputError(f"{label} must be three finite numbers, got {value!r}")
     return vector
 
@@ -53,7 +51,8 @@ def sensor_row(axis: str | ArrayLike, label: str) -> Array:
 
 def base_columns(base_axes: str | Iterable[str]) -> list[int]:
     """Return the indices 0 to 5 of the base axes: "xyz", "x rz" or ["x", "rz"]."""
-    text = base_axes if isinstance(base_axes, str) else " ".join(base_axes)
+    names = base_axes if isinstance(base_axes, str) else sequence("base_axes", base_axes, "names such as ['x', 'rz']")
+    text = names if isinstance(names, str) else " ".join(map(str, names))
     if re.fullmatch(r"([\s,]*r?[xyz])+[\s,]*", text) is None:
         raise InputError(f"base_axes must be any of x y z rx ry rz, got {base_axes!r}")
     columns = [BASE_AXES.index(axis) for axis in re.findall(r"r?[xyz]", text)]

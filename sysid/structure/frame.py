@@ -339,7 +339,7 @@ class Frame:
             As for `condense`.
         damping_ratios : float or array_like, shape (n,)
             Fractions of critical damping, in ascending order of frequency; one number for all modes.
-        descriptions : sequence, optional
+        descriptions : sequence of Sensor, optional
             Descriptions of the sensors, kept as the structure's `sensors`.
 
         Returns

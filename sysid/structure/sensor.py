@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from sysid.errors import InputError
+from sysid.errors import instance, sequence, text
+from sysid.structure.axes import sensor_row, vector3
 
 
 @dataclass(frozen=True)
@@ -23,11 +24,21 @@ class Sensor:
         m.
     axis : str or tuple of float, shape (3,)
         "x", "-y", ..., or a direction vector.
+
+    Raises
+    ------
+    InputError
+        Where the name is no text, or position or axis is not as above.
     """
 
     name: str
     position: tuple[float, float, float]
     axis: str | tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        label = f"sensor {text('the name of a Sensor', self.name)!r}"
+        vector3(self.position, f"the position of {label}")
+        sensor_row(self.axis, label)
 
     def to_tree(self) -> dict[str, Any]:
         """Name, position and axis as strings and arrays, for `from_tree`."""
@@ -41,20 +52,25 @@ class Sensor:
         return cls(tree["name"], tuple(tree["position"].tolist()), axis)
 
 
-def sensors_to_tree(sensors: Sequence[Any] | None) -> list[dict[str, Any]] | None:
-    """Dictionaries of the sensors of a test or a structure; None where they are not described.
+def checked_sensors(given: Sequence[Any] | None) -> tuple[Sensor, ...] | None:
+    """The sensors of a test or a structure as a tuple; None where they are not described.
 
     Raises
     ------
     InputError
-        If a sensor is described by anything but a `Sensor`.
+        Where one is described by anything but a `Sensor`.
     """
-    if sensors is None:
+    if given is None:
         return None
-    for sensor in sensors:
-        if not isinstance(sensor, Sensor):
-            raise InputError(f"a sensor is described by a {type(sensor).__name__}; only a sysid.Sensor can be saved")
-    return [sensor.to_tree() for sensor in sensors]
+    sensors = sequence("sensors", given, "a list of sysid.Sensor")
+    for at, sensor in enumerate(sensors):
+        instance(f"sensors[{at}]", sensor, Sensor)
+    return sensors
+
+
+def sensors_to_tree(sensors: Sequence[Any] | None) -> list[dict[str, Any]] | None:
+    """Dictionaries of the sensors of a test or a structure; None where they are not described."""
+    return None if sensors is None else [sensor.to_tree() for sensor in sensors]
 
 
 def sensors_from_tree(trees: Sequence[dict[str, Any]] | None) -> tuple[Sensor, ...] | None:

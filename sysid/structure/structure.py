@@ -10,8 +10,8 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError
-from sysid.structure.sensor import sensors_from_tree, sensors_to_tree
+from sysid.errors import InputError, finite_array, whole_number
+from sysid.structure.sensor import checked_sensors, sensors_from_tree, sensors_to_tree
 
 if TYPE_CHECKING:
     from scipy.signal import StateSpace
@@ -68,8 +68,8 @@ class Structure:
         make the product inexact.
     recovery : array_like, shape (n_sensors, n), optional
         Takes the degrees of freedom to the sensors; the identity by default.
-    sensors : sequence, optional
-        Descriptions of the sensors (`sysid.Sensor`), for tables and figures.
+    sensors : sequence of Sensor, optional
+        Descriptions of the sensors, for tables and figures.
 
     Attributes
     ----------
@@ -132,9 +132,9 @@ class Structure:
         if self.mass.shape != self.stiffness.shape:
             raise InputError(f"mass is {self.mass.shape} but stiffness is {self.stiffness.shape}; both are (n+d, n+d)")
         size = len(self.mass)
-        self.n_base = int(n_base)
+        self.n_base = whole_number("n_base", n_base, at_least=1)
         self.n = n = size - self.n_base
-        if self.n_base < 1 or n < 1:
+        if n < 1:
             raise InputError(
                 f"n_base = {n_base} leaves {n} structural degrees of freedom of {size}; at least one of each is needed"
             )
@@ -150,7 +150,7 @@ class Structure:
 
         self.recovery: Array = np.eye(n) if recovery is None else shaped_array("recovery", recovery, "n_sensors", n)
         self.rigid_body: Array = self._sensor_rigid_body(rigid_body, recovery is not None)
-        self.sensors = None if sensors is None else tuple(sensors)
+        self.sensors = checked_sensors(sensors)
         if self.sensors is not None and len(self.sensors) != self.n_sensors:
             raise InputError(f"{len(self.sensors)} sensors are described but the structure has {self.n_sensors}")
 
@@ -369,20 +369,6 @@ def check_frequencies(freq: ArrayLike, *, increasing: bool = True) -> Array:
             "sort the lines and drop repeated ones"
         )
     return lines
-
-
-def finite_array(name: str, value: ArrayLike) -> Array:
-    """A new array of real, finite numbers; an error that names what was given where they are not."""
-    try:
-        given = np.array(value)
-        array = given.real.astype(float)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} = {value!r} is not an array of real numbers") from None
-    if np.iscomplexobj(given):
-        raise InputError(f"{name} is complex; real numbers are needed")
-    if not np.all(np.isfinite(array)):
-        raise InputError(f"{name} holds NaN or infinite entries ({int(np.sum(~np.isfinite(array)))} of {array.size})")
-    return array
 
 
 def shaped_array(name: str, value: ArrayLike, *shape: int | str) -> Array:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError
+from sysid.errors import InputError, numbers
 
 FloatArray = NDArray[np.float64]
 
@@ -75,10 +75,7 @@ class Box:
 
     def point(self, x: ArrayLike, name: str) -> FloatArray:
         """Return `x` as a new (n_dim,) array; an error if it is not a point inside the bounds."""
-        try:
-            point = np.array(x, dtype=float)
-        except (TypeError, ValueError):
-            raise InputError(f"{name} is not an array of numbers; give one number a variable.") from None
+        point = numbers(name, x)
         if point.shape != self.lower.shape:
             raise InputError(f"{name} has shape {point.shape}; give one number a variable, shape ({self.n_dim},).")
         outside = np.flatnonzero(~((point >= self.lower) & (point <= self.upper)))
@@ -93,15 +90,11 @@ class Box:
 
 def _lower_and_upper(bounds: Any) -> tuple[FloatArray, FloatArray]:
     if hasattr(bounds, "lb") and hasattr(bounds, "ub"):
-        pairs = np.stack(np.broadcast_arrays(np.atleast_1d(bounds.lb), np.atleast_1d(bounds.ub)), axis=-1)
-    else:
-        try:
-            pairs = np.asarray(bounds, dtype=float)
-        except (TypeError, ValueError):
-            raise InputError("bounds is not an array of numbers; give one pair (lower, upper) a variable.") from None
+        bounds = np.stack(np.broadcast_arrays(np.atleast_1d(bounds.lb), np.atleast_1d(bounds.ub)), axis=-1)
+    pairs = numbers("bounds", bounds)
     if pairs.ndim != 2 or pairs.shape[1] != 2 or pairs.shape[0] == 0:
         raise InputError(f"bounds has shape {pairs.shape}; give one pair (lower, upper) a variable, shape (n_dim, 2).")
-    lower, upper = pairs[:, 0].astype(float), pairs[:, 1].astype(float)
+    lower, upper = pairs[:, 0].copy(), pairs[:, 1].copy()
     with np.errstate(over="ignore", invalid="ignore"):
         endless = np.flatnonzero(~np.isfinite(upper - lower))
     if endless.size:

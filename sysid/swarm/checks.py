@@ -2,47 +2,12 @@
 
 from __future__ import annotations
 
-import operator
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError
 
 FloatArray = NDArray[np.float64]
-RandomSource = int | np.random.Generator | np.random.SeedSequence | None
-
-
-def random_generator(rng: RandomSource) -> np.random.Generator:
-    """Return the random source as a Generator.
-
-    Raises
-    ------
-    InputError
-        If it is not an int of zero or above, a Generator, a SeedSequence or None.
-    """
-    try:
-        return np.random.default_rng(rng)
-    except (TypeError, ValueError):
-        raise InputError(f"rng is {rng!r}; give an int of zero or above, a numpy Generator, or None.") from None
-
-
-def whole_number(value: Any, name: str, *, at_least: int) -> int:
-    """Return the value as an int.
-
-    Raises
-    ------
-    InputError
-        If it is not a whole number or is too small.
-    """
-    try:
-        number = operator.index(value)
-    except TypeError:
-        raise InputError(f"{name} is {value!r}; give a whole number, {at_least} or above.") from None
-    if number < at_least:
-        raise InputError(f"{name} is {number}; give {at_least} or above.")
-    return number
 
 
 def checked_costs(costs: ArrayLike, n_rows: int, origin: str) -> FloatArray:

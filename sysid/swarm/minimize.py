@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError
+from sysid.errors import InputError, RandomSource, function, refuse, whole_number
 
 from .adaptation import EvolutionaryState
-from .checks import RandomSource, checked_costs, checked_rows, whole_number
+from .checks import checked_costs, checked_rows
 from .particles import ParticleSwarm
 from .settings import SwarmSettings
 from .stop import StopReason, StopRules
@@ -153,7 +153,10 @@ def minimize_swarm(
         stall_iterations=stall_iterations,
         stall_tolerance=stall_tolerance,
     )
-    improve_every = whole_number(improve_every, "improve_every", at_least=0)
+    for name, given in (("callback", callback), ("improve", improve), ("repair", repair)):
+        function(name, given)
+    refuse((not callable(fun), f"fun is {fun!r}; give a function of rows (k, n_dim) that returns their costs."))
+    improve_every = whole_number("improve_every", improve_every, at_least=0)
     if improve_every and improve is None:
         raise InputError(f"improve_every is {improve_every} but improve is not given; give improve, or leave both out.")
     swarm = ParticleSwarm(bounds, rng=rng, n_particles=n_particles, horizon=max_iterations, x0=x0, settings=settings)

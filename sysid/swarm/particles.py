@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sysid.errors import RandomSource, instance, random_generator, whole_number
+
 from . import adaptation
 from .adaptation import EvolutionaryState
 from .box import Box
-from .checks import RandomSource, checked_costs, checked_rows, random_generator, whole_number
+from .checks import checked_costs, checked_rows
 from .settings import SwarmSettings
 
 FloatArray = NDArray[np.float64]
@@ -111,11 +113,12 @@ class ParticleSwarm:
     ) -> None:
         self.box = Box(bounds)
         self._rng = random_generator(rng)
-        self._settings = settings or SwarmSettings()
+        self._settings = SwarmSettings() if settings is None else settings
+        instance("settings", self._settings, SwarmSettings)
         if n_particles is None:
             n_particles = 5 * max(self.box.n_free, 1)
-        self.n_particles = whole_number(n_particles, "n_particles", at_least=2)
-        self.horizon = whole_number(horizon, "horizon", at_least=1)
+        self.n_particles = whole_number("n_particles", n_particles, at_least=2)
+        self.horizon = whole_number("horizon", horizon, at_least=1)
 
         self.nit = 0
         self.nfev = 0

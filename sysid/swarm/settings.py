@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
 
-from sysid.errors import InputError
-
-from .checks import whole_number
+from sysid.errors import InputError, number, whole_number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,12 +57,10 @@ class SwarmSettings:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            value = getattr(self, field.name)
-            if not (math.isfinite(value) and value >= 0):
-                raise InputError(f"SwarmSettings.{field.name} is {value!r}; give a finite number, zero or above.")
+            number(f"SwarmSettings.{field.name}", getattr(self, field.name), "a finite number >= 0", at_least=0)
         if self.max_velocity == 0:
             raise InputError("SwarmSettings.max_velocity is 0, so no particle could move; give a number above zero.")
-        whole_number(self.guides, "SwarmSettings.guides", at_least=0)
+        whole_number("SwarmSettings.guides", self.guides, at_least=0)
         if not 0 < self.guide_share <= 1:
             raise InputError(f"SwarmSettings.guide_share is {self.guide_share!r}; give a part of the swarm, in (0, 1].")
         for name in ("acceleration", "acceleration_step"):

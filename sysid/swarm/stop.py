@@ -6,9 +6,8 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 
-from sysid.errors import InputError
+from sysid.errors import number, whole_number
 
-from .checks import whole_number
 from .particles import ParticleSwarm
 
 
@@ -41,17 +40,16 @@ class StopRules:
     stall_tolerance: float
 
     def __post_init__(self) -> None:
-        whole_number(self.max_iterations, "max_iterations", at_least=1)
+        whole_number("max_iterations", self.max_iterations, at_least=1)
         if self.max_evaluations is not None:
-            whole_number(self.max_evaluations, "max_evaluations", at_least=1)
+            whole_number("max_evaluations", self.max_evaluations, at_least=1)
         if self.stall_iterations is not None:
-            whole_number(self.stall_iterations, "stall_iterations", at_least=1)
-        if self.max_time is not None and not self.max_time >= 0:
-            raise InputError(f"max_time is {self.max_time!r}; give seconds, zero or above, or None for no limit.")
-        if self.target is not None and math.isnan(self.target):
-            raise InputError("target is NaN, which no cost can reach; give a number, or None for no target.")
-        if not 0 <= self.stall_tolerance < 1:
-            raise InputError(f"stall_tolerance is {self.stall_tolerance!r}; give a part of the cost, in [0, 1).")
+            whole_number("stall_iterations", self.stall_iterations, at_least=1)
+        if self.max_time is not None:
+            number("max_time", self.max_time, "zero or more seconds, or None for no limit,", at_least=0, finite=False)
+        if self.target is not None:
+            number("target", self.target, "a number that a cost can reach, or None for no target,", finite=False)
+        number("stall_tolerance", self.stall_tolerance, "a part of the cost, in [0, 1),", at_least=0, below=1)
 
     def room_for(self, n_rows: int, nfev: int) -> bool:
         """Whether `n_rows` more rows may be evaluated after `nfev`."""

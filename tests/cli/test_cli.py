@@ -216,8 +216,8 @@ def test_what_is_not_a_number_is_null_in_the_summary(finished):
 # -- mistakes -----------------------------------------------------------------------------------
 
 IN_THE_MODULE = {
-    "NaN samples": ("response[0, 1, 5] = np.nan", "response holds 1 NaN"),
-    "infinite samples": ("base = base * 1.0; base[0, 0, 5] = np.inf", "base holds 1 NaN or infinite"),
+    "NaN samples": ("response[0, 1, 5] = np.nan", "response holds NaN"),
+    "infinite samples": ("base = base * 1.0; base[0, 0, 5] = np.inf", "base holds NaN or infinite"),
     "NaN frequency": ("freq[3] = np.nan", "freq holds NaN"),
     "unsorted frequencies": ("freq[[3, 4]] = freq[[4, 3]]", "freq must rise strictly"),
     "repeated frequencies": ("freq[4] = freq[3]", "drop repeated ones"),

@@ -85,21 +85,18 @@ def test_what_is_stated(geometry_of):
     assert not WrittenDamping(np.eye(4)).stated(geometry).free
 
 
-@pytest.mark.parametrize(
-    "bounds", [(0.0, 0.1), (-0.1, 0.1), (0.1, 0.1), (0.2, 0.1), (0.1, 1.0), (np.nan, 0.1), (0.1, np.nan)]
-)
-def test_modal_bounds_that_are_none(geometry_of, bounds):
+@pytest.mark.parametrize("bounds", [(0.0, 0.1), (-0.1, 0.1), (0.1, 0.1), (0.2, 0.1), (0.1, 1.0)])
+def test_modal_bounds_that_are_none(bounds):
     with pytest.raises(InputError, match="ModalDamping: 0 < lower < upper < 1"):
-        ModalDamping(*bounds).unknowns(geometry_of(np.ones((4, 1))))
+        ModalDamping(*bounds)
 
 
 @pytest.mark.parametrize("bad", [(-1.0, 1.0), (1.0, 1.0), (2.0, 1.0), (0.0, np.inf), (np.nan, 1.0)])
-def test_proportional_bounds_that_are_none(geometry_of, bad):
-    geometry = geometry_of(np.ones((4, 1)))
-    with pytest.raises(InputError, match="alpha needs"):
-        ProportionalDamping(bad, (0, 1)).unknowns(geometry)
-    with pytest.raises(InputError, match="beta needs"):
-        ProportionalDamping((0, 1), bad).unknowns(geometry)
+def test_proportional_bounds_that_are_none(bad):
+    with pytest.raises(InputError, match="alpha (needs|holds)"):
+        ProportionalDamping(bad, (0, 1))
+    with pytest.raises(InputError, match="beta (needs|holds)"):
+        ProportionalDamping((0, 1), bad)
 
 
 class TestWritten:

@@ -185,7 +185,7 @@ def test_the_swarm_says_that_it_cannot_hold_them():
         (lambda: FullMass(known=np.ones((2, 3))), r"known is \(2, 3\)"),
         (lambda: FullMass(known=with_entries((0, 0, -1.0))), "must be positive"),
         (lambda: FullMass(known=with_entries((0, 1, 1.0), (1, 0, 2.0))), "not symmetric"),
-        (lambda: FullMass(known="much"), "must hold numbers"),
+        (lambda: FullMass(known="much"), "known is not an array of real numbers"),
     ],
 )
 def test_mistakes_are_named(mass, words):

@@ -130,8 +130,8 @@ class TestSpectral:
             ("max_frequency = 2.5 Hz is below the given natural frequency 3 Hz", [1.0, 2, 3], 2.5),
             ("max_frequency", [1.0, 2, 3], np.nan),
             ("max_frequency", [1.0, 2, 3], np.inf),
-            ("max_frequency = 0 Hz: a positive number", None, 0.0),
-            ("max_frequency = -2 Hz: a positive number", None, -2.0),
+            ("max_frequency = 0.0: a positive number", None, 0.0),
+            ("max_frequency = -2.0: a positive number", None, -2.0),
             ("max_frequency", None, "high"),
         ],
     )

@@ -8,7 +8,7 @@ import scipy.optimize
 
 from sysid.errors import InputError
 from sysid.frame import Beam, Frame, PointMass, Section
-from sysid.measurement.measurement import rigid_body
+from sysid.measurement.measurement import Sensor, rigid_body
 
 BETA_L = np.array([1.875104068711961, 4.694091132974175, 7.854757438237613])  # cos x cosh x = -1
 E, G, A, IY, IZ, J, RHO = 70e9, 26e9, 3e-4, 2e-9, 7e-9, 5e-9, 2700.0
@@ -336,9 +336,9 @@ def test_modal_condensation_answers_as_the_lowest_modes_of_the_frame():
 
 
 def test_structure_carries_descriptions_and_ratios():
-    frame = cantilever(4)
-    bar = frame.structure([(2, "y"), (4, "y")], [0.01, 0.03], base_nodes=[0], descriptions=["mid", "tip"])
-    assert bar.sensors == ("mid", "tip")
+    frame, described = cantilever(4), (Sensor("mid", (0, 0, 0), "y"), Sensor("tip", (1, 0, 0), "y"))
+    bar = frame.structure([(2, "y"), (4, "y")], [0.01, 0.03], base_nodes=[0], descriptions=described)
+    assert bar.sensors == described
     np.testing.assert_array_equal(bar.damping_ratios, [0.01, 0.03])
     assert bar.rigid_body.shape == (2, 3)
 

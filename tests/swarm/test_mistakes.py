@@ -20,8 +20,8 @@ CENTRE = BOUNDS.mean(axis=1)
         ([0, 1], r"shape \(2,\).*\(n_dim, 2\)"),
         ([(0, 1, 2)], r"shape \(1, 3\)"),
         (np.empty((0, 2)), r"shape \(0, 2\)"),
-        ("box", "not an array of numbers"),
-        ([(0, 1), (0,)], "not an array of numbers"),
+        ("box", "not an array of real numbers"),
+        ([(0, 1), (0,)], "not an array of real numbers"),
     ],
 )
 def test_bounds_that_cannot_be_used_are_refused(bounds, words):
@@ -40,7 +40,7 @@ def test_bounds_that_cannot_be_used_are_refused(bounds, words):
         ({"x0": [0, 0]}, r"x0 has shape \(2,\)"),
         ({"x0": [9, 5, -1.5, 5.2]}, r"x0\[0\] = 9.0 is outside its bounds \[-1.0, 3.0\]"),
         ({"x0": [0, np.nan, -1.5, 5.2]}, r"x0\[1\] = nan is outside"),
-        ({"x0": "start"}, "x0 is not an array of numbers"),
+        ({"x0": "start"}, "x0 is not an array of real numbers"),
     ],
 )
 def test_arguments_that_cannot_be_used_are_refused(arguments, words):
@@ -80,10 +80,10 @@ def test_calls_out_of_order_are_refused():
     ("constants", "words"),
     [
         ({"max_velocity": 0}, "max_velocity is 0"),
-        ({"inertia_b1": -1}, "inertia_b1 is -1"),
-        ({"elitist_sigma_end": np.nan}, "elitist_sigma_end is nan"),
+        ({"inertia_b1": -1}, "inertia_b1 = -1: a finite number >= 0"),
+        ({"elitist_sigma_end": np.nan}, "elitist_sigma_end = nan"),
         ({"acceleration_lower": 3}, "acceleration_lower = 3 is above"),
-        ({"guides": -1}, "guides is -1"),
+        ({"guides": -1}, "guides = -1"),
         ({"guides": 1.5}, "SwarmSettings.guides is 1.5; give a whole number"),
         ({"guide_share": 0.0}, "guide_share is 0.0; give a part of the swarm"),
         ({"guide_share": 1.1}, "guide_share is 1.1; give a part of the swarm"),
