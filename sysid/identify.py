@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
-from sysid.errors import InputError, SolverError
+from sysid.errors import InputError, SolverError, function, instance, number, whole_number
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification
 from sysid.results.judgement import judge
@@ -73,8 +73,13 @@ def identify(
         Also where Ctrl-C stopped the search, with `interrupted` set.
     """
     seed, random = _seed(rng)
-    if max_time is not None and not max_time > 0:
-        raise InputError(f"max_time = {max_time}: a positive number of seconds is needed")
+    instance("problem", problem, Problem)
+    if max_time is not None:
+        max_time = number("max_time", max_time, "a positive number of seconds", above=0)
+    if max_evaluations is not None:
+        max_evaluations = whole_number("max_evaluations", max_evaluations, at_least=1)
+    for name, given in (("callback", callback), ("progress", progress)):
+        function(name, given)
     listeners = [listener for listener in (progress, callback) if listener is not None]
     with threadpool_limits(limits=1), DeferredInterrupt() as interrupt:
         session = Session(listeners, interrupt, max_time, random, max_evaluations)

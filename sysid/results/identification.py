@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import ast
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sysid.errors import InputError
+from sysid.errors import InputError, finite_array, text, whole_number
 from sysid.problem.problem import Problem
 from sysid.results import storage
 from sysid.results.answer import Answer, reported_unknowns
 from sysid.results.summary import summary
 from sysid.results.version import __version__
 from sysid.search.strategy import History
-from sysid.structure.structure import Array, Structure, finite_array
+from sysid.structure.structure import Array, Structure
 
 # Fields that are texts, numbers or arrays themselves.
 _PLAIN = (
@@ -55,6 +55,12 @@ class Recipe:
     start: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
+        text("Recipe: module", self.module)
+        whole_number("Recipe: rng", self.rng, at_least=0)
+        if self.data is not None:
+            text("Recipe: data", self.data)
+        if not isinstance(self.parameters, Mapping) or not all(isinstance(name, str) for name in self.parameters):
+            raise InputError("Recipe: parameters is a dictionary from names to values: parameters={'floors': 3}")
         object.__setattr__(self, "parameters", dict(self.parameters))
         if self.start is not None:
             object.__setattr__(self, "start", tuple(finite_array("Recipe: start", self.start).ravel().tolist()))

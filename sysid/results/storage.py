@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from sysid.errors import InputError
+from sysid.errors import InputError, path_of
 from sysid.files.tree import Tree, from_bytes, is_tree, to_bytes
 from sysid.results.old_formats import CONTENT, SIGNATURE, tree_of
 from sysid.results.version import __version__
@@ -50,7 +50,8 @@ def read(path: str | Path, build: Callable[[Tree], T]) -> T:
 
     What is wrong with `build`'s tree is an error of the file.
     """
-    source = Path(path) / FILE_NAME if Path(path).is_dir() else Path(path)
+    given = path_of("path", path)
+    source = given / FILE_NAME if given.is_dir() else given
     if not source.is_file():
         raise InputError(f"no result at {source}: give the .h5 file that 'sysid run' wrote, or its folder")
     try:
@@ -89,7 +90,7 @@ def file_or_folder(path: str | Path, name: str, suffixes: Sequence[str]) -> Path
     InputError
         Where `path` is a file with another ending, which is somebody else's.
     """
-    target = Path(path)
+    target = path_of("path", path)
     if target.suffix.lower() in suffixes:
         return target
     if target.is_file():

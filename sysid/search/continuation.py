@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, SolverError
+from sysid.errors import InputError, SolverError, whole_number
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.nlp import EXACT
 from sysid.problem.feasibility import latin_hypercube
@@ -49,6 +49,9 @@ class Continuation:
 
     starts: int = 3
     name: ClassVar[str] = "continuation"
+
+    def __post_init__(self) -> None:
+        whole_number("Continuation: starts", self.starts, at_least=1)
 
     def refusal(self, problem: Problem, start: ArrayLike | Structure | None) -> str | None:
         """Why "auto" does not take it: poles and residues make the matrices, or entries of a free mass are stated."""

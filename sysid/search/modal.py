@@ -16,7 +16,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, SolverError
+from sysid.errors import InputError, SolverError, sequence, whole_number
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import ModalFit, Modes
 from sysid.modal_analysis.residues import ROUND_OFF, beyond_chance, line_correlation
@@ -54,6 +54,12 @@ class Modal:
     sensors: Sequence[str | int] | None = None
     max_iterations: int = 200
     name: ClassVar[str] = "modal"
+
+    def __post_init__(self) -> None:
+        whole_number("Modal: max_iterations", self.max_iterations, at_least=1)
+        for sensor in () if self.sensors is None else sequence("Modal: sensors", self.sensors, "a list of sensors"):
+            if not isinstance(sensor, str):
+                whole_number("Modal: a sensor", sensor, at_least=0)
 
     def refusal(self, problem: Problem, start: ArrayLike | Structure | None) -> str | None:
         """Why poles and residues do not make the matrices, or a start that it would not read."""

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError
+from sysid.errors import InputError, finite_array
 from sysid.problem.problem import Problem
 from sysid.search.session import Session
 from sysid.structure.structure import Array, Structure
@@ -169,8 +169,8 @@ def as_unknowns(problem: Problem, start: ArrayLike | Structure) -> Array:
         if (start.n, start.n_base, start.n_sensors) != (geometry.n, geometry.d, problem.measurement.n_sensors):
             raise InputError("start: the structure has other degrees of freedom or base directions than the problem")
         return problem.values(start)
-    x = np.asarray(start, dtype=float)
-    if x.shape != (problem.n_variables,) or not np.all(np.isfinite(x)):
+    x = finite_array("start", start)
+    if x.shape != (problem.n_variables,):
         raise InputError(
             f"start has shape {x.shape}; ({problem.n_variables},) finite unknowns, or a Structure, is needed"
         )

@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, SolverError
+from sysid.errors import SolverError, choice, flag, instance, number, text, whole_number
 from sysid.modal_analysis.response import error_of_accelerations
 from sysid.models.spectrum import by_ipopt, closed_form
 from sysid.problem.problem import Problem
@@ -100,10 +100,18 @@ class Swarm:
     name: str = "swarm"
 
     def __post_init__(self) -> None:
-        for field, known in (("local", (*get_args(Coordinates), None)), ("refine_by", ("closed form", "ipopt"))):
+        choice("Swarm: local", self.local, (*get_args(Coordinates), None))
+        choice("Swarm: refine_by", self.refine_by, ("closed form", "ipopt"))
+        least = {"max_iterations": 1, "n_particles": 2, "stall_iterations": 1, "gradient_every": 0, "restarts": 0}
+        for field, at_least in least.items():
             value = getattr(self, field)
-            if value not in known:
-                raise InputError(f"Swarm: {field} = {value!r} is unknown; give one of {', '.join(map(repr, known))}")
+            if value is not None or field not in ("n_particles", "stall_iterations"):  # None has a meaning there
+                whole_number(f"Swarm: {field}", value, at_least=at_least)
+        number("Swarm: stall_tolerance", self.stall_tolerance, "a part of it, in [0, 1),", at_least=0, below=1)
+        for field in ("refine", "write_back"):
+            flag(f"Swarm: {field}", getattr(self, field))
+        instance("Swarm: settings", self.settings, SwarmSettings)
+        text("Swarm: name", self.name)
 
     @classmethod
     def published(cls, **changes: Any) -> Swarm:
