@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import math
 import operator
-import textwrap
 from collections.abc import Sequence
 from numbers import Real
 from pathlib import Path
@@ -47,9 +46,10 @@ def refuse(*mistakes: tuple[Any, str]) -> None:
             raise InputError(sentence)
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
     """A value in a message, which stays one line."""
-    return textwrap.shorten(repr(value), 80, placeholder="...")
+    words = " ".join(repr(value).split())
+    return words if len(words) < 80 else f"{words[:77]}..."
 
 
 def number(
@@ -57,47 +57,47 @@ def number(
     below: float = math.inf, finite: bool = True,
 ) -> float:  # fmt: skip
     """One real number, no bool, within bounds; `wanted` says in the message what is."""
-    plain = value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
+    plain = value.item() if type(value) is np.ndarray and value.ndim == 0 else value
     try:
         given = float(plain) if isinstance(plain, Real) and not isinstance(plain, bool) else math.nan
     except OverflowError:  # an int of more than 308 digits
         given = math.nan
     fits = above < given < below or (not finite and math.isinf(given))
     if not (fits and given >= at_least):
-        raise InputError(f"{name} = {_shown(value)}: {wanted} is needed")
+        raise InputError(f"{name} = {shown(value)}: {wanted} is needed")
     return given
 
 
-def whole_number(name: str, value: Any, *, at_least: int) -> int:
+def whole_number(name: str, value: Any, *, at_least: int, at_most: float = math.inf) -> int:
     """A whole number, no bool; a float such as 4.0 is one."""
-    plain: Any = int(value) if isinstance(value, float) and value.is_integer() else value
+    plain: Any = int(value) if isinstance(value, float) and value.is_integer() and abs(value) < 2**53 else value
     try:
         given = operator.index("" if isinstance(plain, bool) else plain)  # type: ignore[arg-type]
     except TypeError:
-        raise InputError(f"{name} is {_shown(value)}; give a whole number, {at_least} or above.") from None
-    if given < at_least:
-        raise InputError(f"{name} is {given}; give {at_least} or above.")
+        raise InputError(f"{name} is {shown(value)}; give a whole number, {at_least} or above.") from None
+    refuse(
+        (given < at_least, f"{name} is {given}; give {at_least} or above."),
+        (given > at_most, f"{name} is {shown(given)}; give {at_most:g} or below."),
+    )
     return given
 
 
 def text(name: str, value: Any) -> str:
     """A text that is not empty."""
-    if not isinstance(value, str) or not value:
-        raise InputError(f"{name} is {_shown(value)}; give a text, such as 'top'")
+    refuse((not isinstance(value, str) or not value, f"{name} is {shown(value)}; give a text, such as 'top'"))
     return value
 
 
 def flag(name: str, value: Any) -> bool:
     """True or False, NumPy's too."""
-    if not isinstance(value, bool | np.bool_):
-        raise InputError(f"{name} is {_shown(value)}; give True or False")
+    refuse((not isinstance(value, bool | np.bool_), f"{name} is {shown(value)}; give True or False"))
     return bool(value)
 
 
 def choice(name: str, value: Any, known: Sequence[str | None]) -> None:
     """Refuse what is none of the known words."""
     if not isinstance(value, str | None) or value not in known:
-        raise InputError(f"{name} = {_shown(value)} is unknown; give one of {', '.join(map(repr, known))}")
+        raise InputError(f"{name} = {shown(value)} is unknown; give one of {', '.join(map(repr, known))}")
 
 
 def instance(name: str, value: Any, kind: type) -> None:
@@ -108,16 +108,18 @@ def instance(name: str, value: Any, kind: type) -> None:
 
 def function(name: str, value: Any) -> None:
     """Refuse what cannot be called; None passes."""
-    if value is not None and not callable(value):
-        raise InputError(f"{name} is {_shown(value)}; give a function, or None")
+    refuse((value is not None and not callable(value), f"{name} is {shown(value)}; give a function, or None"))
 
 
-def sequence(name: str, value: Any, wanted: str) -> tuple[Any, ...]:
-    """The entries of a list, a tuple or anything else but a text that can be gone through."""
+def sequence(name: str, value: Any, wanted: str, length: int | None = None) -> tuple[Any, ...]:
+    """The entries, so many or one and more, of a list, a tuple or anything else but a text that can be gone through."""
     try:
-        return tuple(None if isinstance(value, str | bytes) else value)  # type: ignore[arg-type]
+        entries = tuple(None if isinstance(value, str | bytes) else value)  # type: ignore[arg-type]
     except TypeError:
-        raise InputError(f"{name} is {_shown(value)}; give {wanted}") from None
+        raise InputError(f"{name} is {shown(value)}; give {wanted}") from None
+    if len(entries) != length and (length or not entries):
+        raise InputError(f"{name} has {len(entries)} entries; give {wanted}")
+    return entries
 
 
 def path_of(name: str, value: Any) -> Path:
@@ -125,7 +127,7 @@ def path_of(name: str, value: Any) -> Path:
     try:
         return Path(value)
     except TypeError:
-        raise InputError(f"{name} is {_shown(value)}; give a path") from None
+        raise InputError(f"{name} is {shown(value)}; give a path") from None
 
 
 def random_generator(rng: RandomSource) -> np.random.Generator:
@@ -133,22 +135,25 @@ def random_generator(rng: RandomSource) -> np.random.Generator:
     try:
         return np.random.default_rng(rng)
     except (TypeError, ValueError):
-        raise InputError(f"rng is {_shown(rng)}; give an int of zero or above, a numpy Generator, or None.") from None
+        raise InputError(f"rng is {shown(rng)}; give an int of zero or above, a numpy Generator, or None.") from None
 
 
 def numbers(name: str, value: ArrayLike, kind: type = float) -> NDArray[Any]:
     """A new array of numbers, float or complex, which may be NaN or infinite; texts and masked entries are none."""
     words = {float: "real numbers", complex: "numbers"}[kind]
-    if np.ma.is_masked(value):
+    parts = value if isinstance(value, list | tuple) else [value]
+    if any(isinstance(part, np.ma.MaskedArray) and np.ma.is_masked(part) for part in parts):
         raise InputError(f"{name} has masked entries: drop those lines, or fill them with numbers (numpy.ma.filled)")
     try:
         given = np.array(value)
         code = given.dtype.kind
+        if code == "O" and any(entry is None for entry in given.flat):  # which NumPy makes NaN
+            code = "U"
         array: NDArray[Any] = given.astype(complex if code == "c" else kind, copy=False)
     except (TypeError, ValueError, OverflowError, RuntimeError):  # CasADi's symbols raise the last
         code = "U"
     refuse(
-        (code not in "biufcO", f"{name} is not an array of {words}: {_shown(value)}"),
+        (code not in "biufcO", f"{name} is not an array of {words}: {shown(value)}"),
         (kind is float and code == "c", f"{name} is complex; real numbers are needed"),
     )
     return array

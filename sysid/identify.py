@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
-from sysid.errors import InputError, SolverError, function, instance, number, whole_number
+from sysid.errors import InputError, SolverError, finite_array, function, instance, number, whole_number
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification
 from sysid.results.judgement import judge
@@ -74,6 +74,9 @@ def identify(
     """
     seed, random = _seed(rng)
     instance("problem", problem, Problem)
+    _check_strategy(strategy)
+    if not isinstance(start, Structure | None):
+        start = finite_array("start", start)
     if max_time is not None:
         max_time = number("max_time", max_time, "a positive number of seconds", above=0)
     if max_evaluations is not None:
@@ -100,14 +103,11 @@ def prepare(problem: Problem, session: Session) -> None:
 
 def choose(strategy: str | Strategy, problem: Problem, start: ArrayLike | Structure | None) -> tuple[Strategy, str]:
     """The strategy that is taken, and why it is."""
-    if not isinstance(strategy, str | Modal | Continuation | Swarm):
-        raise InputError(f"strategy is a {type(strategy).__name__}; give one of {NAMES}, or one with its settings")
+    _check_strategy(strategy)
     if not isinstance(strategy, str):
         return strategy, f"strategy {strategy.name!r}, as asked"
     if strategy in NAMED:
         return NAMED[strategy](), f"strategy {strategy!r}, as asked"
-    if strategy != "auto":
-        raise InputError(f"strategy {strategy!r} is unknown; give one of {NAMES}")
     refusals: list[str] = []
     for kind in STRATEGIES:
         refusal = kind().refusal(problem, start)
@@ -116,6 +116,14 @@ def choose(strategy: str | Strategy, problem: Problem, start: ArrayLike | Struct
             return kind(), f"strategy {kind.name!r}: {why}"
         refusals.append(refusal)
     raise InputError(f"no strategy applies: {'; '.join(refusals)}")
+
+
+def _check_strategy(strategy: str | Strategy) -> None:
+    """Refuse what is no strategy, before anything is looked for."""
+    if not isinstance(strategy, str | Modal | Continuation | Swarm):
+        raise InputError(f"strategy is a {type(strategy).__name__}; give one of {NAMES}, or one with its settings")
+    if isinstance(strategy, str) and strategy not in ("auto", *NAMED):
+        raise InputError(f"strategy {strategy!r} is unknown; give one of {NAMES}")
 
 
 def _run(
@@ -179,8 +187,6 @@ def _seed(rng: int | np.random.Generator | None) -> tuple[int, np.random.SeedSeq
         seed = int(rng.integers(2**63))
     elif rng is None:
         seed = int(np.random.SeedSequence().generate_state(1, np.uint64)[0] >> 1)
-    elif isinstance(rng, int | np.integer) and rng >= 0:
-        seed = int(rng)
     else:
-        raise InputError(f"rng = {rng!r}: a nonnegative integer, a numpy Generator or None is needed")
+        seed = whole_number("rng", rng, at_least=0)
     return seed, np.random.SeedSequence(seed)

@@ -9,18 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import (
-    InputError,
-    RandomSource,
-    choice,
-    finite_array,
-    flag,
-    instance,
-    number,
-    random_generator,
-    refuse,
-    sequence,
-)  # fmt: skip
+from sysid.errors import InputError, choice, finite_array, flag, instance, number, random_generator, refuse, sequence
 from sysid.measurement import spectra
 from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
 from sysid.structure.sensor import Sensor, checked_sensors, sensors_from_tree, sensors_to_tree
@@ -319,9 +308,9 @@ class Measurement:
             raise InputError(f"force is {F.shape}; with {d} base directions it is {wanted}")
         # The base direction comes first: it becomes the run.
         by_run: Any = lambda record: None if record is None else np.moveaxis(record, 1, 0)  # noqa: E731
-        named: Any = {"sensors": sensors, "base_axes": base_axes}
+        named: Any = {"rigid_body": rigid_body, "sensors": sensors, "base_axes": base_axes}
         return cls(
-            lines, unit_runs(d, lines.size), by_run(H), rigid_body=np.asarray(rigid_body), force=by_run(F),
+            lines, unit_runs(d, lines.size), by_run(H), force=by_run(F),
             response_std=by_run(_std("response_std", response_std, H)),
             force_std=by_run(_std("force_std", force_std, F)), **named,
         )  # fmt: skip
@@ -375,12 +364,7 @@ class Measurement:
                 estimate.freq, estimate.frf, force=estimate.force, response_std=estimate.frf_std,
                 force_std=estimate.force_std, **given,
             )  # fmt: skip
-        if band is None:
-            return test
-        ends = sequence("band", band, "(low, high) in Hz")
-        if len(ends) != 2:
-            raise InputError(f"band has {len(ends)} numbers; give (low, high) in Hz")
-        return test.in_band(*ends)
+        return test if band is None else test.in_band(*sequence("band", band, "(low, high) in Hz", 2))
 
 
 def simulate(
@@ -389,7 +373,7 @@ def simulate(
     *,
     noise: float = 0.0,
     force: bool = False,
-    rng: RandomSource = None,
+    rng: int | np.random.Generator | None = None,
     base_axes: str | Sequence[str] | None = None,
 ) -> Measurement:
     """The virtual test: d runs of unit base motion, noise on the responses (and force) only.

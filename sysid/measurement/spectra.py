@@ -54,14 +54,12 @@ def check_runs(
     """Check time records against ``shape = (n_sensors, d)`` and each other."""
     number("sample_rate", sample_rate, "a positive number of samples a second", above=0)
     given = sequence("runs", runs, "a list of (base, response, force or None)")
-    if not given:
-        raise InputError("no runs: give a list of (base, response, force or None)")
+    if len(shape) != 2:
+        raise InputError(f"rigid_body has shape {shape}; (n_sensors, d) is needed")
     sensors, d = shape
     records = []
     for index, entry in enumerate(given):
-        run = sequence(f"run {index}", entry, "(base, response, force or None)")
-        if len(run) != 3:
-            raise InputError(f"run {index} has {len(run)} records; give (base, response, force or None)")
+        run = sequence(f"run {index}", entry, "(base, response, force or None)", 3)
         base = _record(f"run {index}, base", run[0], d)
         response = _record(f"run {index}, response", run[1], sensors)
         force = None if run[2] is None else _record(f"run {index}, force", run[2], d)
@@ -210,15 +208,11 @@ def resample(
     from scipy.signal import butter, sosfiltfilt
 
     given = sequence("records", records, "a list of (time, samples)")
-    if not given:
-        raise InputError("no records to resample")
     clocks, samples = [], []
     for index, entry in enumerate(given):
-        record = sequence(f"record {index}", entry, "(time, samples)")
-        if len(record) != 2:
-            raise InputError(f"record {index} has {len(record)} parts; give (time, samples)")
-        t = finite_array(f"time of record {index}", record[0])
-        x = np.atleast_2d(finite_array(f"samples of record {index}", record[1]))
+        time, values = sequence(f"record {index}", entry, "(time, samples)", 2)
+        t = finite_array(f"time of record {index}", time)
+        x = np.atleast_2d(finite_array(f"samples of record {index}", values))
         if t.ndim != 1 or x.ndim != 2 or x.shape[1] != t.size or t.size < 4:
             raise InputError(f"record {index}: time {t.shape} and samples {x.shape} disagree (or fewer than 4 samples)")
         gaps = np.diff(t)

@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from sysid.errors import InputError, finite_array, number
+from sysid.errors import InputError, finite_array, number, shown
 from sysid.models.expressions import as_matrix, at_point, check_finite, is_column, written_in
 from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import Geometry
@@ -72,7 +72,7 @@ class ProportionalDamping(FieldTree):
         for name in ("alpha", "beta"):
             pair = finite_array(f"ProportionalDamping: {name}", getattr(self, name))
             if pair.shape != (2,) or not 0 <= pair[0] < pair[1]:
-                raise InputError(f"ProportionalDamping: {name} needs 0 <= lower < upper, not {pair.tolist()}")
+                raise InputError(f"ProportionalDamping: {name} needs 0 <= lower < upper, not {shown(pair.tolist())}")
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> ProportionalDamping:

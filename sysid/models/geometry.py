@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, finite_array, refuse
+from sysid.errors import InputError, finite_array, refuse, shown
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.models.unknowns import Unknown
@@ -32,7 +32,7 @@ def check_total_mass(total_mass: ArrayLike | None) -> None:
     masses = np.diag(given) if given.ndim == 2 else given
     refuse(
         (given.ndim > 2 or not given.size, f"total_mass has shape {given.shape}; one number, (d,) or (d, d) is needed"),
-        (np.any(masses <= 0), f"total_mass = {np.array2string(masses)}: masses must be positive"),
+        (np.any(masses <= 0), f"total_mass = {shown(masses.tolist())}: masses must be positive"),
     )
     check_sane("total_mass", masses)
 
@@ -41,7 +41,7 @@ def check_sane(name: str, masses: Array) -> None:
     """Refuse masses that no structure has; zeros pass."""
     if np.any((masses != 0) & ((np.abs(masses) < _LIGHTEST) | (np.abs(masses) > _HEAVIEST))):
         raise InputError(
-            f"{name} = {np.array2string(masses)} is outside {_LIGHTEST:g} to {_HEAVIEST:g}; the unit is kg "
+            f"{name} = {shown(masses.tolist())} is outside {_LIGHTEST:g} to {_HEAVIEST:g}; the unit is kg "
             "(kg m² where the base rotates)"
         )
 

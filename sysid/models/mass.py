@@ -83,8 +83,9 @@ class FullMass(FieldTree):
         check_total_mass(self.total_mass)
         if self.known is not None:
             given = numbers("FullMass: known", self.known)
+            if given.ndim != 2:
+                raise InputError(f"FullMass: known is {given.shape}; (n, n) or (n, n + d) is needed")
             refuse(
-                (given.ndim != 2, f"FullMass: known is {given.shape}; (n, n) or (n, n + d) is needed"),
                 (np.any(np.isinf(given)), "FullMass: known is infinite somewhere; NaN is what is not known"),
                 (np.any(np.diag(given) <= 0), "FullMass: known masses must be positive"),
             )

@@ -51,14 +51,15 @@ class SpectralStiffness(FieldTree):
             given = np.atleast_1d(finite_array("natural_frequencies", self.natural_frequencies))
             refuse(
                 (
-                    given.ndim != 1 or given.size == 0 or np.any(given <= 0),
+                    given.ndim != 1 or given.size == 0 or np.any((given <= 0) | (given > 1e12)),
                     "natural_frequencies must be a list of positive numbers in Hz",
                 ),
                 (np.any(np.diff(given) < 0), "natural_frequencies must be in ascending order"),
             )
             highest = given[-1]
         if self.max_frequency is not None:
-            self._check_limit(number("max_frequency", self.max_frequency, "a positive number of Hz", above=0), highest)
+            limit = number("max_frequency", self.max_frequency, "a positive number of Hz", above=0, below=1e12)
+            self._check_limit(limit, highest)
 
     def _check_limit(self, limit: float, highest: float) -> None:
         if limit < highest:

@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, finite_array, flag, numbers, refuse
+from sysid.errors import InputError, finite_array, flag, numbers, refuse, shown, text
 from sysid.structure.structure import Array
 
 _PART = 0.05  # of its range: the least step of an unknown
@@ -77,10 +77,13 @@ class Unknown:
         scale: str = "linear",
         relative: bool = False,
     ) -> None:
-        self.name, self.unit, self.scale, self.relative = name, unit, scale, relative
-        self.lower, self.upper = (np.atleast_1d(finite_array(f"variable {name}: a bound", b)) for b in (lower, upper))
+        self.name, self.unit, self.scale = text("the name of an Unknown", name), unit, scale
+        refuse((not isinstance(unit, str), f"variable {name}: its unit {unit!r} is no text"))
+        self.relative = flag(f"variable {name}: relative", relative)
+        self.lower = np.atleast_1d(finite_array(f"variable {name}: lower", lower))
+        self.upper = np.atleast_1d(finite_array(f"variable {name}: upper", upper))
         if self.lower.shape != self.upper.shape or self.lower.ndim != 1:
-            raise InputError(f"variable {name}: bounds {self.lower.shape} and {self.upper.shape} disagree")
+            raise InputError(f"variable {name}: lower {self.lower.shape} and upper {self.upper.shape} disagree")
         if np.any(self.lower > self.upper):
             raise InputError(f"variable {name}: bounds must be finite with lower <= upper")
         self.shape: tuple[int, ...] = (self.lower.size,)
@@ -188,7 +191,7 @@ class Variable(Unknown):
     ) -> None:
         self.declared = user_site()
         if not isinstance(name, str) or not name:
-            raise InputError(f"a Variable ({self.declared}) needs a name, and {name!r} is none")
+            raise InputError(f"a Variable ({self.declared}) needs a name, and {shown(name)} is none")
         where = f"variable {name!r} ({self.declared})"
         self.name, self.unit = name, unit
         self.log, self.fixed = flag(f"{where}: log", log), flag(f"{where}: fixed", fixed)
@@ -227,13 +230,13 @@ class Variable(Unknown):
         _declared[self.symbol.__hash__()] = self
 
     def _check_shape(self, shape: int | Sequence[int]) -> tuple[int, ...]:
-        given = (shape,) if isinstance(shape, int | np.integer) else shape
+        given = shape if isinstance(shape, tuple | list | np.ndarray) else (shape,)
         try:
             sizes = tuple(0 if isinstance(size, bool) else operator.index(size) for size in given)
         except TypeError:
             sizes = (0,)
         if len(sizes) > 2 or any(size < 1 for size in sizes):
-            self._refuse(f"its shape {shape!r} is not (), n or (n, m)")
+            self._refuse(f"its shape {shown(shape)} is not (), n or (n, m)")
         return sizes
 
     def _flat(self, what: str, value: ArrayLike) -> Array:
@@ -242,7 +245,7 @@ class Variable(Unknown):
         try:
             array = np.broadcast_to(array.reshape(self.shape) if isinstance(value, ca.DM) else array, self.shape)
         except ValueError:
-            self._refuse(f"{what} = {value!r} is no number, nor numbers of its shape {self.shape}")
+            self._refuse(f"{what} = {shown(value)} is no number, nor numbers of its shape {self.shape}")
         return array.ravel(order="F").copy()
 
     def _refuse(self, what: str) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from sysid.errors import InputError, finite_array
+from sysid.errors import InputError, finite_array, numbers
 from sysid.measurement.measurement import Measurement
 from sysid.models.damping import WrittenDamping
 from sysid.models.expressions import at_point, check_size, is_expression, square
@@ -59,10 +59,10 @@ def _is_model(value: object, before: int) -> bool:
     return True
 
 
-def _numbers(name: str, value: object) -> Array:
+def _numbers(name: str, value: Any) -> Array:
     try:
-        matrix = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
+        matrix = numbers(name, value)
+    except InputError:
         matrix = np.zeros(())
     if matrix.ndim not in _DIMENSIONS[name]:
         raise InputError(f"Problem: {name} is a {type(value).__name__}; give {_WANTED[name]}")

@@ -107,12 +107,8 @@ class Problem:
             instance("Problem: reference", self.reference, Structure)
         if self.goal is not None:
             number("Problem: goal", self.goal, "a positive relative residual", above=0)
-        refuse(
-            (
-                not isinstance(self.healing, Mapping) or not all(isinstance(v, Variable) for v in self.healing),
-                "Problem: healing is a dictionary from variables to expressions: healing={m: 9 * m / ca.sum1(m)}",
-            ),
-        )
+        if not isinstance(self.healing, Mapping) or not all(isinstance(v, Variable) for v in self.healing):
+            raise InputError("Problem: healing is a dictionary from variables to expressions: {m: 9 * m / ca.sum1(m)}")
         for name, model in zip(MATRICES, as_models(self.mass, self.stiffness, self.damping), strict=True):
             object.__setattr__(self, name, model)
         for name in ("residuals", "constraints", "validation"):

@@ -339,6 +339,8 @@ class Prior:
     def column(self, name: str) -> tuple[ca.MX, Array, Array]:
         """The expression as a column, its values and standard deviations, (rows,) each."""
         column = ca.vec(ca.densify(as_matrix(name, self.expression)))
+        if not ca.symvar(column):
+            raise InputError(f"{name}: expression holds no variable: there is nothing that its value could tell")
         given = []
         for what, numbers in (("value", self.value), ("std", self.std)):
             array = finite_array(f"{name}: {what}", numbers).ravel(order="F")

@@ -294,7 +294,7 @@ class _Search:
         )
         if self.x is None:
             raise SolverError(f"the swarm found no candidate that is a structure: {result.message}")
-        states = tuple((state.name.lower().replace("_", " "), int(n)) for state, n in result.state_counts.items())
+        states = tuple((state.lower().replace("_", " "), int(n)) for state, n in result.state_counts.items())
         self.history = replace(self.history, states=states)
         session.log(f"swarm ended after {result.nit} iterations at {result.fun:.4e}: {result.message}")
         if self.steps:

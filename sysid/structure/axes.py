@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError, finite_array, sequence
+from sysid.errors import InputError, finite_array, sequence, shown
 
 Array = NDArray[np.floating[Any]]
 BASE_AXES = ("x", "y", "z", "rx", "ry", "rz")
@@ -28,7 +28,7 @@ def vector3(value: ArrayLike, label: str) -> Array:
     """`value` as a finite vector (3,)."""
     vector = finite_array(label, value)
     if vector.shape != (3,):
-        raise InputError(f"{label} must be three finite numbers, got {value!r}")
+        raise InputError(f"{label} must be three finite numbers, got {shown(value)}")
     return vector
 
 
@@ -41,7 +41,9 @@ def sensor_row(axis: str | ArrayLike, label: str) -> Array:
     if isinstance(axis, str):
         match = re.fullmatch(r"([+-]?)(r?[xyz])", axis)
         if match is None:
-            raise InputError(f"the axis of {label} must be a vector or one of x y z rx ry rz (signed), got {axis!r}")
+            raise InputError(
+                f"the axis of {label} must be a vector or one of x y z rx ry rz (signed), got {shown(axis)}"
+            )
         sign, name = match.groups()
         row[BASE_AXES.index(name)] = float(f"{sign}1")
     else:
@@ -52,9 +54,9 @@ def sensor_row(axis: str | ArrayLike, label: str) -> Array:
 def base_columns(base_axes: str | Iterable[str]) -> list[int]:
     """Return the indices 0 to 5 of the base axes: "xyz", "x rz" or ["x", "rz"]."""
     names = base_axes if isinstance(base_axes, str) else sequence("base_axes", base_axes, "names such as ['x', 'rz']")
-    text = names if isinstance(names, str) else " ".join(map(str, names))
+    text = names if isinstance(names, str) else " ".join(n if isinstance(n, str) else repr(n) for n in names)
     if re.fullmatch(r"([\s,]*r?[xyz])+[\s,]*", text) is None:
-        raise InputError(f"base_axes must be any of x y z rx ry rz, got {base_axes!r}")
+        raise InputError(f"base_axes must be any of x y z rx ry rz, got {shown(base_axes)}")
     columns = [BASE_AXES.index(axis) for axis in re.findall(r"r?[xyz]", text)]
     if len(set(columns)) < len(columns):
         raise InputError(f"base_axes names an axis twice: {base_axes!r}")

@@ -53,17 +53,9 @@ class Sensor:
 
 
 def checked_sensors(given: Sequence[Any] | None) -> tuple[Sensor, ...] | None:
-    """The sensors of a test or a structure as a tuple; None where they are not described.
-
-    Raises
-    ------
-    InputError
-        Where one is described by anything but a `Sensor`.
-    """
-    if given is None:
-        return None
-    sensors = sequence("sensors", given, "a list of sysid.Sensor")
-    for at, sensor in enumerate(sensors):
+    """The sensors of a test or a structure, each a `Sensor`, as a tuple; None where they are not described."""
+    sensors = None if given is None else sequence("sensors", given, "a list of sysid.Sensor")
+    for at, sensor in enumerate(sensors or ()):
         instance(f"sensors[{at}]", sensor, Sensor)
     return sensors
 

@@ -360,8 +360,8 @@ def check_frequencies(freq: ArrayLike, *, increasing: bool = True) -> Array:
     lines = np.atleast_1d(finite_array("freq", freq))
     if lines.ndim != 1 or lines.size == 0:
         raise InputError(f"freq has shape {lines.shape}; a list of lines in Hz is needed")
-    if np.any(lines < 0):
-        raise InputError(f"freq holds a negative line ({lines.min():g} Hz)")
+    if np.any((lines < 0) | (lines > 1e12)):
+        raise InputError(f"freq holds a negative line, or one above 1e12 Hz: {lines.min():g} to {lines.max():g} Hz")
     if increasing and np.any(np.diff(lines) <= 0):
         at = int(np.argmax(np.diff(lines) <= 0))
         raise InputError(

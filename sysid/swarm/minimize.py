@@ -120,7 +120,7 @@ def minimize_swarm(
         cost was finite, the target was reached where one was given, and the callback did not cut the search short (a
         swarm has no test of optimality, so a spent budget is its normal end); `message`; `reason`, a `StopReason`;
         `history` (nit,), the best cost after each iteration; `n_nan`, the number of costs that were not finite;
-        `n_improved`, how often `improve` gave a better point; `state_counts`, a dict from `EvolutionaryState` to the
+        `n_improved`, how often `improve` gave a better point; `state_counts`, a dict from names of states to the
         iterations moved in it.
 
     Raises
@@ -182,7 +182,7 @@ def minimize_swarm(
         x=swarm.best_x, fun=swarm.best_cost, nfev=swarm.nfev, nit=swarm.nit,
         success=found and reached and reason is not StopReason.CALLBACK,
         message=rules.message(reason, swarm), reason=reason, history=np.array(swarm.history), n_nan=swarm.n_nan,
-        n_improved=n_improved, state_counts=dict(swarm.state_counts),
+        n_improved=n_improved, state_counts={state.name: count for state, count in swarm.state_counts.items()},
     )  # fmt: skip
 
 

@@ -117,7 +117,7 @@ class ParticleSwarm:
         instance("settings", self._settings, SwarmSettings)
         if n_particles is None:
             n_particles = 5 * max(self.box.n_free, 1)
-        self.n_particles = whole_number("n_particles", n_particles, at_least=2)
+        self.n_particles = whole_number("n_particles", n_particles, at_least=2, at_most=10**6)
         self.horizon = whole_number("horizon", horizon, at_least=1)
 
         self.nit = 0
