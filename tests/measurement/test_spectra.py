@@ -266,9 +266,9 @@ class TestMistakes:
 
     def test_shapes(self):
         x, y, f = self.run()
-        with pytest.raises(InputError, match="no runs"):
+        with pytest.raises(InputError, match="runs has 0 entries; give a list of .base"):
             self.read([])
-        with pytest.raises(InputError, match="run 0 has 2 records"):
+        with pytest.raises(InputError, match="run 0 has 2 entries"):
             self.read([(x, y)])
         with pytest.raises(InputError, match="run 0, base has shape"):
             self.read([(x[:1], y, f)])
@@ -356,7 +356,7 @@ class TestResample:
     @pytest.mark.parametrize(
         ("match", "records", "rate"),
         [
-            ("no records", [], None),
+            ("records has 0 entries", [], None),
             ("record 0: time", [([0, 1, 2], [1, 2, 3])], None),
             ("record 0: time", [(np.arange(5), np.ones((2, 6)))], None),
             (

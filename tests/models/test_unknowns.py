@@ -267,7 +267,7 @@ def test_unknowns_refuse_bounds_that_disagree():
         Unknown("x", np.zeros(2), np.ones(3))
     with pytest.raises(sysid.InputError, match="finite with lower <= upper"):
         Unknown("x", np.ones(2), np.zeros(2))
-    with pytest.raises(sysid.InputError, match="x: a bound holds NaN or infinite"):
+    with pytest.raises(sysid.InputError, match="x: upper holds NaN or infinite"):
         Unknown("x", np.ones(2), [2.0, np.inf])
 
 

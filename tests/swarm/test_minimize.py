@@ -111,7 +111,8 @@ def test_the_result_agrees_with_the_cost_and_its_calls():
     assert result.history[-1] == result.fun
     assert np.all(np.diff(result.history) <= 0)
     assert result.n_nan == 0
-    assert set(result.state_counts) == set(EvolutionaryState)
+    assert set(result.state_counts) == {state.name for state in EvolutionaryState}
+    assert "EXPLORATION" in repr(result)
     assert sum(result.state_counts.values()) == 39
 
 
@@ -122,7 +123,7 @@ def test_the_search_is_that_many_steps_of_the_swarm():
         swarm.tell(sphere(swarm.ask()))
     np.testing.assert_array_equal(result.x, swarm.best_x)
     np.testing.assert_array_equal(result.history, swarm.history)
-    assert result.state_counts == swarm.state_counts
+    assert result.state_counts == {state.name: count for state, count in swarm.state_counts.items()}
 
 
 def test_a_cost_may_write_into_its_rows():
