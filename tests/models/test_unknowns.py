@@ -197,7 +197,7 @@ REFUSED = {
     "infinite upper": (dict(lower=0, upper=np.inf), "finite"),
     "infinite lower": (dict(lower=-np.inf, upper=0), "finite"),
     "NaN bound": (dict(lower=np.nan, upper=0), "finite"),
-    "None bound": (dict(lower=None, upper=0), "finite"),
+    "None bound": (dict(lower=None, upper=0), "lower is not an array of real numbers: None"),
     "guess outside": (dict(lower=0, upper=1, guess=2), "guess 2 is outside the bounds 0 to 1"),
     "one guess outside": (dict(shape=2, lower=0, upper=1, guess=[0, -3]), "guess -3"),
     "NaN guess": (dict(lower=0, upper=1, guess=np.nan), "guess is not finite"),
