@@ -20,7 +20,7 @@ from sysid.errors import InputError, SolverError, sequence, whole_number
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import ModalFit, Modes
 from sysid.modal_analysis.residues import ROUND_OFF, beyond_chance, line_correlation
-from sysid.modal_analysis.response import columns, gains, weighted_error, weights_of
+from sysid.modal_analysis.response import columns, gains, stacked, weighted_error, weights_of
 from sysid.modal_analysis.vector_fitting import Poles, find_poles, poles_near
 from sysid.models.spectrum import SOLVED
 from sysid.nlp import EXACT, IterationMonitor
@@ -129,8 +129,10 @@ def _independent_sensors(test: Measurement, modes: Modes) -> int:
     """How many combinations of sensors move in the modes by more than noise would make of them.
 
     Motions are judged, not shapes: two modes that nearly share a pole have shapes that are uncertain and nearly
-    parallel, while their sum and their difference in the records are well known.
+    parallel, while their sum and their difference in the records are well known. Of r combinations the sum of all
+    smaller singular values squared is (n - r) (m - r) numbers of noise, for n sensors and m modes.
     """
+    n, m = modes.phi.shape
     q = gains(test.freq, modes.omega, modes.ratios) * np.einsum("md,rdf->rmf", modes.gamma, test.base)
     weight, size = weights_of(test.relative, test.response_std)
     motion = np.einsum("nm,rmf->rnf", modes.phi, q)
@@ -138,8 +140,10 @@ def _independent_sensors(test: Measurement, modes: Modes) -> int:
     unknowns = modes.phi.size + modes.gamma.size + modes.omega.size
     variance = float(np.sum(np.abs(error) ** 2)) / max(2 * error.size - unknowns, 1)
     variance = max(variance * line_correlation(error.reshape(len(error), -1, test.freq.size)), ROUND_OFF**2)
-    s = np.linalg.svd(weight * columns(motion) / size, compute_uv=False)
-    moving = np.count_nonzero(s**2 > variance * beyond_chance(modes.omega.size))
+    s = np.linalg.svd(stacked(weight * columns(motion) / size), compute_uv=False)[: min(n, m)]
+    beyond = np.cumsum(s[::-1] ** 2)[::-1]
+    chance = np.array([beyond_chance((n - r) * (m - r)) for r in range(s.size)])
+    moving = 1 + np.max(np.flatnonzero(beyond > variance * chance), initial=-1)
     shapes = np.linalg.svd(modes.phi / np.linalg.norm(modes.phi, axis=0), compute_uv=False)
     return int(min(moving, np.count_nonzero(shapes > _DEPENDENT * shapes[0])))
 

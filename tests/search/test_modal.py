@@ -342,3 +342,19 @@ def test_the_motions_of_modes_that_nearly_share_a_pole_are_judged_not_their_shap
     shapes = np.linalg.svd(phi / np.linalg.norm(phi, axis=0), compute_uv=False)
     assert shapes[-1] < 1e-3 * shapes[0]
     assert (chosen.sensors.size, chosen.modes.size) == ((2, 1) if alike else (3, 0))
+
+
+@pytest.mark.parametrize(("n", "m"), [(60, 2), (30, 30)])
+def test_many_sensors_that_all_modes_move_alike_are_one_motion_whatever_noise_adds(n, m):
+    """Residues of least squares scatter by noise in all n sensors and m modes."""
+    freq, rng = np.linspace(2.0, 40.0, 300), np.random.default_rng(0)
+    omega, ratios = 2 * np.pi * np.linspace(6.0, 34.0, m), np.full(m, 0.02)
+    s = 2j * np.pi * freq
+    gain = -(s**2) / (omega[:, None] ** 2 + s**2 + 2 * (ratios * omega)[:, None] * s)
+    motion = rng.normal(size=(n, 1)) * gain.sum(axis=0)
+    motion = motion + 0.01 * np.abs(motion).mean() * complex_noise(rng, motion.shape)
+    phi = np.linalg.lstsq(np.hstack([gain.real, gain.imag]).T, np.hstack([motion.real, motion.imag]).T, rcond=None)[0].T
+    test = sysid.Measurement(freq, np.ones((1, 1, 300), complex), (1 + motion)[None], rigid_body=np.ones((n, 1)))
+    modes = Modes(phi, np.ones((m, 1)), omega, ratios)
+    chosen = degrees_of_freedom(sysid.Problem(test, mass=sysid.FullMass(1.0)), modes, None)
+    assert (chosen.sensors.size, chosen.modes.size) == (1, m - 1)
