@@ -14,7 +14,7 @@ import sys
 import traceback
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -166,9 +166,9 @@ def _load(name: str) -> tuple[ModuleType, Path]:
 
 def _load_file(path: Path) -> tuple[ModuleType, Path]:
     """Run a file as a module of a private name; no ``__pycache__`` is left beside it."""
-    if path.exists() and not path.is_file():  # a device, or a pipe, may never end
-        raise InputError(f"problem {path} is not a file")
     try:
+        if path.exists() and not path.is_file():  # a device, or a pipe, may never end
+            raise InputError(f"problem {path} is not a file")
         source = path.read_bytes()
     except OSError as error:
         raise InputError(f"problem {path} cannot be read: {error.strerror or error}") from None
@@ -214,7 +214,8 @@ def _neighbours(path: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        sys.path.remove(str(folder))
+        with suppress(ValueError):  # the module may have set a path of its own
+            sys.path.remove(str(folder))
         for name in set(sys.modules) - before:
             file = getattr(sys.modules[name], "__file__", None)
             # Another folder may have a file of the same name.
@@ -231,7 +232,7 @@ def _telling_the_line(path: Path) -> Iterator[None]:
     except InputError:
         raise
     except KeyboardInterrupt as interrupt:
-        if not _was_raised(interrupt):
+        if not _was_raised(interrupt, full):
             raise
         raise InputError(f"{path} raised KeyboardInterrupt, which is Ctrl-C's alone") from interrupt
     except (Exception, SystemExit) as error:
@@ -243,13 +244,14 @@ def _telling_the_line(path: Path) -> Iterator[None]:
         raise InputError(f"{where}: {told}") from error
 
 
-def _was_raised(interrupt: KeyboardInterrupt) -> bool:
-    """Whether a statement raised it, and not Ctrl-C at some other instruction."""
+def _was_raised(interrupt: KeyboardInterrupt, file: str) -> bool:
+    """Whether a statement of a file raised it, and not Ctrl-C at some other instruction."""
     last = interrupt.__traceback__
     assert last is not None
     while last.tb_next is not None:
         last = last.tb_next
-    return dis.opname[last.tb_frame.f_code.co_code[last.tb_lasti]] == "RAISE_VARARGS"
+    code = last.tb_frame.f_code
+    return code.co_filename == file and dis.opname[code.co_code[last.tb_lasti]] == "RAISE_VARARGS"
 
 
 def _unknown(name: str) -> InputError:

@@ -1,6 +1,7 @@
 """Problem modules are found where the rules say, and every mistake in one is told with its place."""
 
 import ast
+import signal
 import sys
 
 import pytest
@@ -214,11 +215,30 @@ def test_what_cannot_be_searched_is_refused_when_it_is_built(here):
     assert "no point within the bounds satisfies constraint 1" in refused("written.py")
 
 
-def test_ctrl_c_inside_a_module_is_no_mistake_of_the_module(here):
-    (here / "slow.py").write_text("raise KeyboardInterrupt\n")
-    with pytest.raises(KeyboardInterrupt):
-        catalogue.build(Recipe("slow.py"))
-    assert not any("slow" in name for name in sys.modules if name.startswith("_sysid_problem_"))
+def test_ctrl_c_inside_a_module_is_no_mistake_of_the_module(here, monkeypatch):
+    """Nor where a library that it calls raises it anew, as asyncio does."""
+    monkeypatch.setattr(signal, "wakeup", interrupted, raising=False)
+    for line in ("signal.raise_signal(signal.SIGINT)", "signal.wakeup()"):
+        (here / "slow.py").write_text(f"import signal\n\n{line}\n")
+        with pytest.raises(KeyboardInterrupt):
+            catalogue.build(Recipe("slow.py"))
+        assert not any("slow" in name for name in sys.modules if name.startswith("_sysid_problem_"))
+
+
+def interrupted():
+    raise KeyboardInterrupt
+
+
+def test_a_module_that_raises_what_ctrl_c_raises_is_a_mistake(here):
+    (here / "raises.py").write_text("raise KeyboardInterrupt\n")
+    assert refused("raises.py") == "raises.py raised KeyboardInterrupt, which is Ctrl-C's alone"
+
+
+def test_a_module_may_have_a_search_path_of_its_own(here):
+    (here / "chain.py").write_text(f"import sys\n\nsys.path.pop(0)\n{CHAIN}")
+    before = list(sys.path)
+    catalogue.build(Recipe("chain.py"))
+    assert sys.path == before
 
 
 def test_an_unknown_name_lists_the_known_ones_and_the_closest(here):
@@ -237,7 +257,7 @@ def test_a_file_that_is_not_there_or_not_a_file(here):
     assert "nowhere.py cannot be read: No such file" in refused("nowhere.py")
     assert "No such file" in refused("some/where/chain")
     (here / "folder.py").mkdir()
-    assert "folder.py cannot be read" in refused("folder.py")
+    assert refused("folder.py") == "problem folder.py is not a file"
     assert "cannot be read" in refused("x" * 5000 + ".py")
 
 
