@@ -45,7 +45,7 @@ class DeferredInterrupt:
     """Hold Ctrl-C back until the search next reports: raised inside compiled code it would lose the best so far.
 
     Where somebody else handles the signal, or outside the main thread, nothing changes. Within another one this one
-    answers the signal, and hands what it held on at its end.
+    answers the signal: it takes over what that one holds, and hands all back at its end.
 
     Parameters
     ----------
@@ -72,6 +72,8 @@ class DeferredInterrupt:
         self.ours = standard and threading.current_thread() is threading.main_thread()
         if self.ours:
             signal.signal(signal.SIGINT, self._hold)
+            if self._outer is not None:
+                self.count, self._outer.count = self.count + self._outer.count, 0
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:

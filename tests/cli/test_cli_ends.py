@@ -1,5 +1,6 @@
 """How the command line ends where it does not succeed: goals missed, errors of ours, Ctrl-C, files that cannot grow."""
 
+import contextlib
 import json
 import os
 import signal
@@ -11,8 +12,10 @@ import pytest
 
 import sysid
 from sysid.cli import main as cli
+from sysid.cli.deadline import TimeIsOver, within
 from sysid.report import report
 from sysid.results import storage
+from sysid.search.session import DeferredInterrupt
 from sysid.search.swarm_objective import SwarmObjective
 
 
@@ -235,6 +238,34 @@ def test_ctrl_c_after_the_search_loses_nothing(here, complaint, files, monkeypat
     written = files(here / "results/pair")
     assert written == {"result.h5", "summary.json"} | ({"report.html"} if place != "report" else set())
     assert sysid.load(here / "results/pair").success
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_a_ctrl_c_that_one_holds_is_known_to_another_within_it():
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with DeferredInterrupt(patience=None) as outer:
+            signal.raise_signal(signal.SIGINT)
+            with DeferredInterrupt() as inner, pytest.raises(KeyboardInterrupt):
+                inner.check()
+            assert outer.count == 1
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_a_time_limit_outlives_what_swallows_it_once():
+    """Libraries take any Exception, and compiled code makes another one of it."""
+    with pytest.raises(TimeIsOver), within(0.05), contextlib.suppress(Exception):
+        time.sleep(0.1)
+    with pytest.raises(TimeIsOver), within(0.05):
+        try:
+            time.sleep(0.1)
+        except TimeIsOver as error:
+            raise SystemError("returned a result with an exception set") from error
+    with pytest.raises(SystemError), within(60.0):
+        raise SystemError("of its own")
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
