@@ -29,6 +29,7 @@ _NEAR = 1.1  # times the misfit of free residues at the poles of the data: what 
 _CHANCE = 1e-3  # that noise alone makes the misfit of one of two answers so much larger
 _APART = 0.01  # of an unknown's size, from which two solutions are two ...
 _TOGETHER = 1e-3  # ... and up to which two ways are one
+_SMALL = 1e-3  # of its range: the least size of an unknown that may be zero
 
 
 @dataclass(frozen=True)
@@ -287,6 +288,10 @@ def _alternatives(problem: Problem, x: Array, objective: float, ends: list[tuple
 
 
 def apart(problem: Problem, x: Array, other: Array) -> float:
-    """Largest difference of two sets of unknowns, of their size or, where that is less, of the search space."""
+    """Largest difference of two sets of unknowns, of their size or, where that is less, of the search space.
+
+    An unknown that may be zero has at least a thousandth of its range as its size.
+    """
     width = np.where(problem.upper > problem.lower, problem.upper - problem.lower, 1.0)
-    return float(np.max(np.abs(x - other) / np.minimum(width, np.maximum(np.abs(other), np.finfo(float).tiny))))
+    least = np.where(problem.lower * problem.upper > 0, np.finfo(float).tiny, _SMALL * width)
+    return float(np.max(np.abs(x - other) / np.minimum(width, np.maximum(np.abs(other), least))))
