@@ -16,10 +16,13 @@ Task = TypeVar("Task")
 Answer = TypeVar("Answer")
 
 _IN_VAIN = 2  # pools in a row that a task alone may break
+_WHY = 'is there enough memory, and does the script submit below if __name__ == "__main__"?'
 
 
 def processes(workers: int | None = None) -> Callable[[], Executor]:
     """A maker of process pools for `submit`: workers are spawned, each with one thread.
+
+    A worker imports the script that was started, which therefore submits below ``if __name__ == "__main__":``.
 
     Parameters
     ----------
@@ -155,7 +158,7 @@ def _rebuilding(
         executor, unfinished = checked(make()), list[Task]()
         try:
             for task, future in _submitted(function, tasks, executor):
-                if isinstance(future.exception(), BrokenExecutor):
+                if isinstance(_error(future), BrokenExecutor):
                     unfinished.append(task)
                 else:
                     yield _answer(task, future, lost)
@@ -163,7 +166,7 @@ def _rebuilding(
             executor.shutdown(wait=False)
         in_vain = in_vain + 1 if len(unfinished) == len(tasks) else 0
         if in_vain > _IN_VAIN:
-            yield lost(unfinished.pop(), f"its worker died, {_IN_VAIN} times in a row: is there enough memory?")
+            yield lost(unfinished.pop(), f"its worker died, {_IN_VAIN} times in a row: {_WHY}")
             in_vain = 0
         left = unfinished + left
 
@@ -191,5 +194,10 @@ def _submitted(
 
 
 def _answer(task: Task, future: Future[Answer], lost: Callable[[Task, str], Answer]) -> Answer:
-    error = future.exception()
+    error = _error(future)
     return future.result() if error is None else lost(task, f"its worker failed ({type(error).__name__}: {error})")
+
+
+def _error(future: Future[Answer]) -> BaseException | None:
+    """What a task ended in; Dask cancels its futures where the link to the scheduler breaks."""
+    return BrokenExecutor("it was cancelled") if future.cancelled() else future.exception()

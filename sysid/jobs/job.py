@@ -82,9 +82,13 @@ def run(job: Job) -> JobResult:
     """Run a job where it stands; the same bits wherever that is on one kind of machine."""
     try:
         with threadpool_limits(limits=1), DeferredInterrupt() as interrupt:
-            return _refined(job, Session([], interrupt))
+            result = _refined(job, Session([], interrupt))
+            interrupt.check()
+            return result
     except (InputError, SolverError) as error:
         return without_result(job, str(error))
+    except Exception as error:  # whatever one start leads to, all others go on
+        return without_result(job, f"{type(error).__name__}: {error}")
 
 
 def without_result(job: Job, why: str) -> JobResult:

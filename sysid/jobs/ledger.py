@@ -25,7 +25,8 @@ class Ledger:
     """Results of some jobs, in a folder.
 
     A job is known by its recipe, the number of its start and the text of its problem module: where one of these
-    differs it is another job. Records that the module reads are known by their path alone.
+    differs it is another job. Records that the module reads are known by their path alone, files beside it that it
+    imports not at all: after a change of these, give another folder.
 
     Parameters
     ----------

@@ -50,7 +50,7 @@ def submit(
     Raises
     ------
     InputError
-        Where a recipe does not make a problem, or the folder holds other jobs. At once, before any job runs.
+        Where a recipe does not make a problem, or the folder cannot be written. At once, before any job runs.
     """
     recipes = list(recipe) if isinstance(recipe, Sequence) else [recipe]
     if not recipes:
@@ -84,10 +84,10 @@ def _source(recipe: Recipe) -> str:
 def _rooted(recipe: Recipe) -> Recipe:
     """The same recipe for a worker that stands in another folder."""
     file = catalogue.file_of(recipe.module)
-    if file is None or file.parent == catalogue.bundled_folder():
-        return recipe
-    data = None if recipe.data is None else str(Path(recipe.data).absolute())
-    return replace(recipe, module=str(file.absolute()), data=data)
+    module, data = recipe.module, None if recipe.data is None else str(Path(recipe.data).absolute())
+    if file is not None and file.parent != catalogue.bundled_folder():
+        module = str(file.absolute())
+    return replace(recipe, module=module, data=data)
 
 
 def _results(

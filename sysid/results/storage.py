@@ -10,7 +10,7 @@
     │   └── given      mass, stiffness, damping: a model's kind and fields, numbers, or an expression's number;
     │                  residuals, constraints, misfit, healing; variables, and CasADi's text of all expressions
     ├── history        residual after each phase, both curves, states, log
-    └── recipe         module, data, rng, parameters
+    └── recipe         module, data, rng, parameters, start
 """
 
 from __future__ import annotations

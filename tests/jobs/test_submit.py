@@ -1,7 +1,7 @@
 """Refinement jobs: the same results wherever they run, whatever dies, and never twice."""
 
 import sqlite3
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -124,6 +124,59 @@ def test_a_pool_of_the_callers_own_is_not_built_again():
     assert len(answers) == 2 and all("BrokenProcessPool" in str(answer) for answer in answers)
 
 
+class Cancelling(Executor):
+    """One that cancels its first futures, as Dask's does where the link to the scheduler breaks."""
+
+    made = 0
+
+    def __init__(self):
+        Cancelling.made += 1
+
+    def submit(self, fn, /, *args, **kwargs):
+        future = Future()
+        if Cancelling.made == 1:
+            future.cancel()
+            future.set_running_or_notify_cancel()
+        else:
+            future.set_result(fn(*args))
+        return future
+
+
+def test_tasks_that_an_executor_cancels_are_submitted_again_to_a_new_one_and_else_lost(monkeypatch):
+    monkeypatch.setattr(Cancelling, "made", 0)
+    lost = list(each(eval, ["1", "2"], Cancelling(), lambda task, why: why))
+    assert len(lost) == 2 and all("it was cancelled" in why for why in lost)
+    monkeypatch.setattr(Cancelling, "made", 0)
+    assert sorted(each(eval, ["1", "2"], Cancelling, lambda task, why: why)) == [1, 2]
+
+
+def test_a_start_that_leads_to_an_error_of_any_kind_leaves_the_others(recipe, monkeypatch):
+    from sysid.jobs import job
+
+    original, seen = job.descend, []
+
+    def descend(*arguments):
+        seen.append(1)
+        if len(seen) == 1:
+            raise np.linalg.LinAlgError("Singular matrix")
+        return original(*arguments)
+
+    monkeypatch.setattr(job, "descend", descend)
+    first, second = submit(recipe, starts=2)
+    assert (first.success, first.x.size, first.message) == (False, 0, "LinAlgError: Singular matrix")
+    assert second.success
+
+
+def test_a_worker_in_another_folder_finds_module_and_data(recipe, tmp_path, monkeypatch):
+    """A module of the package is found by its name there too; what it reads is the user's."""
+    from sysid.jobs.submit import _rooted
+
+    (tmp_path / "records").mkdir()
+    for module in ("mini_shake_table", "some.dotted.module"):
+        assert _rooted(sysid.Recipe(module, "records")) == sysid.Recipe(module, str(tmp_path / "records"))
+    assert _rooted(recipe).module == str(tmp_path / "floors.py")
+
+
 class TestLedger:
     """The file in which results are kept."""
 
@@ -173,6 +226,22 @@ def test_ends_at_one_point_are_one_minimum(recipe):
     assert as_good([first, second]) == [first]
     alike = distinct(problem, [end(0, SPRINGS, 0.01), end(1, [2e5, 3e5], 0.010001)])
     assert len(as_good(alike)) == 2
+
+
+def test_an_unknown_that_is_zero_but_for_round_off_makes_no_further_minimum(recipe):
+    """The brace may be within 5e4 N/m of zero, and is zero; the spring has no size but its own."""
+    brace, spring = sysid.Variable("brace", lower=-5e4, upper=5e4), sysid.Variable("spring", lower=1.0, upper=1e9)
+    built = sysid.catalogue.build(replace(recipe, start=None))
+    K = np.array([[1.0, -1.0], [-1.0, 1.0]]) * spring + np.array([[1.0, 0.0], [0.0, 0.0]]) * (brace + 3e5)
+    problem = sysid.Problem(built.measurement, mass=np.diag([300.0, 200.0]), stiffness=K, damping=np.eye(2))
+
+    def apart(one, other):
+        ends = [JobResult(i, 0, True, "", np.array(x), 1e-9) for i, x in enumerate((one, other))]
+        return len(distinct(problem, ends)) == 2
+
+    assert not apart([-4.4e-9, 2e5], [4.1e-9, 2e5])
+    assert apart([0.0, 2e5], [1.0, 2e5])
+    assert apart([0.0, 10.0], [0.0, 10.1])
 
 
 def test_a_cluster_gives_the_same_bits(recipe):
