@@ -17,7 +17,8 @@ README = Path(__file__).resolve().parents[2] / "README.md"
 
 @pytest.mark.skipif(not README.exists(), reason="no README beside the tests")
 def test_the_examples_find_their_own_structure(tmp_path):
-    first, second, third = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+    """Those of the notebook; that of jobs, the first, is run beside a result of the command line."""
+    _, first, second, third = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
     before, names = Path.cwd(), {}
     os.chdir(tmp_path)
     try:

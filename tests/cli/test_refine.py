@@ -1,12 +1,15 @@
 """``sysid refine``: the distinct minima of many starts, told, written, and gone on with."""
 
 import csv
+import re
 from pathlib import Path
 
 import pytest
 
+import sysid
 from sysid.cli import main as cli
 
+README = Path(__file__).resolve().parents[2] / "README.md"
 PNG = b"\x89PNG"
 
 
@@ -43,6 +46,14 @@ def test_a_line_a_start_then_the_minima_a_table_and_a_picture(capsys):
     assert cli.main(["refine", "results/physical_damping/result.h5", "--starts", "4", "--workers", "1"]) == 0
     again = list(csv.DictReader((folder / "starts.csv").read_text().splitlines()))
     assert again[:3] == rows and len(again) == 4
+
+
+@pytest.mark.skipif(not README.exists(), reason="no README beside the tests")
+def test_the_example_of_the_readme_refines_that_result():
+    names = {"sysid": sysid}
+    exec(re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)[0], names)
+    assert [end.index for end in names["ends"]] == [0, 1, 2, 3]
+    assert names["ends"][0].residual <= names["result"].residual * (1 + 1e-6)
 
 
 @pytest.mark.parametrize(
