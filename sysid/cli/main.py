@@ -36,6 +36,7 @@ from sysid.results.version import __version__
 from sysid.search.session import DeferredInterrupt
 
 _LOG = "sysid-error.log"
+_SUMMARY = "summary.json"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -128,6 +129,8 @@ def _show(options: argparse.Namespace, out: Output) -> int:
 
 
 def _run(options: argparse.Namespace, out: Output) -> int:
+    from sysid.report import report
+
     begun = time.perf_counter()
     recipe = parameters.recipe_of(options)
     problem = catalogue.build(recipe)
@@ -151,6 +154,10 @@ def _run(options: argparse.Namespace, out: Output) -> int:
         try:
             with _no_folder_for_nothing(folder):
                 result.save(folder / RESULT)
+                for name in (_SUMMARY, report.FILE_NAME):  # those of another result must not stand beside this one
+                    (folder / name).unlink(missing_ok=True)
+        except OSError as error:
+            failed = InputError(f"folder of results {folder}: {error.strerror or error}")
         except InputError as error:
             failed = error
     try:
@@ -347,11 +354,10 @@ def _write_pages(result: Identification, folder: Path, out: Output, left: float 
     from sysid.report import report
 
     out.write(f"result   {folder / RESULT}\n")
-    summary = folder / "summary.json"
+    summary = folder / _SUMMARY
     with atomically(summary) as temporary:
         temporary.write_text(strict_json(result.to_dict()), encoding="utf-8")
     out.write(f"summary  {summary}\n")
-    (folder / report.FILE_NAME).unlink(missing_ok=True)  # one of another result must not stand beside this one
     try:
         with within(left):
             out.write(f"report   {report.write(result, folder / report.FILE_NAME)}\n")
