@@ -18,11 +18,11 @@ def chain(masses, springs, ratios, *, arms=None):
     return sysid.Structure(np.diag(np.append(m, 0.0)), full, ratios, n_base=1)
 
 
-def solve(truth, *, mass, band, force=True, noise=0.0, rng=0, lines=150, **options):
+def solve(truth, *, mass, band, force=True, noise=0.0, rng=0, lines=150, strategy=QUICK, **options):
     test = sysid.simulate(truth, np.linspace(*band, lines), noise=noise, force=force, rng=rng)
     given = [float(f"{f:.4g}") for f in truth.natural_frequencies]
     return sysid.identify(
-        sysid.Problem(test, mass=mass, stiffness=sysid.SpectralStiffness(given), **options), rng=rng, strategy=QUICK
+        sysid.Problem(test, mass=mass, stiffness=sysid.SpectralStiffness(given), **options), rng=rng, strategy=strategy
     )
 
 
@@ -149,7 +149,8 @@ def test_two_skew_sensors_of_a_lumped_mass_weigh_what_the_force_says():
     full = np.block([[K, -K @ G], [-(K @ G).T, G.T @ K @ G]])
     truth = sysid.Structure(np.diag([1.0, 3.0, 0.0, 0.0]), full, [0.01, 0.012], n_base=2)
     f = truth.natural_frequencies
-    result = solve(truth, mass=sysid.LumpedMass(), band=(0.3 * f[0], 1.4 * f[-1]), goal=1e-6)
+    again = sysid.Swarm(max_iterations=15)  # one small swarm may end in a local minimum
+    result = solve(truth, mass=sysid.LumpedMass(), band=(0.3 * f[0], 1.4 * f[-1]), goal=1e-6, strategy=again)
     np.testing.assert_allclose(np.diag(result.structure.mass)[:2], [1.0, 3.0], rtol=1e-6)
 
 

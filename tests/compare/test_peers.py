@@ -111,7 +111,7 @@ def test_ctrl_c_ends_a_peer_with_its_best(landscape, monkeypatch):
 
     def search(evaluate, size, rng):
         evaluate(rng.random((10, size)))
-        session.interrupt.asked = True
+        session.interrupt.count = 1
         evaluate(rng.random((10, size)))
 
     monkeypatch.setitem(peers.PEERS, "stopped", search)
