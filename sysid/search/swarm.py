@@ -81,6 +81,13 @@ class Swarm:
     name : str
         As results call it.
 
+    Notes
+    -----
+    The swarm earns its time where nothing else reaches the fit. Of 100 chains and branched structures without noise,
+    their masses, springs and dampers searched within two decades, it found 98, two random points with the same local
+    phase and restarts 98, one continuation 91: peaks that are widened first do most of the work there
+    (``python -m benchmarks structured``).
+
     References
     ----------
     Cerini, Yotov, Aglietti, Mech. Syst. Signal Process. 209 (2024) 111084.
