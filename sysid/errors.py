@@ -108,7 +108,8 @@ def instance(name: str, value: Any, kind: type) -> None:
 
 def function(name: str, value: Any) -> None:
     """Refuse what cannot be called; None passes."""
-    refuse((value is not None and not callable(value), f"{name} is {shown(value)}; give a function, or None"))
+    if value is not None and not callable(value):
+        raise InputError(f"{name} is {shown(value)}; give a function, or None")
 
 
 def sequence(name: str, value: Any, wanted: str, length: int | None = None) -> tuple[Any, ...]:
@@ -152,10 +153,9 @@ def numbers(name: str, value: ArrayLike, kind: type = float) -> NDArray[Any]:
         array: NDArray[Any] = given.astype(complex if code == "c" else kind, copy=False)
     except (TypeError, ValueError, OverflowError, RuntimeError):  # CasADi's symbols raise the last
         code = "U"
-    refuse(
-        (code not in "biufcO", f"{name} is not an array of {words}: {shown(value)}"),
-        (kind is float and code == "c", f"{name} is complex; real numbers are needed"),
-    )
+    if code not in "biufcO":  # the words for a record take longer than all else here: only where they are needed
+        raise InputError(f"{name} is not an array of {words}: {shown(value)}")
+    refuse((kind is float and code == "c", f"{name} is complex; real numbers are needed"))
     return array
 
 
