@@ -121,7 +121,7 @@ MISSED = (
 
 NOTICED = (
     Mutant("A01", "exponent of the mass distribution as misprinted in eq. 20", "(4 * (2 * k - c))", "(2 * (2 * k - c))",
-        "test_mass"),
+        "test_mass_sampling"),
     Mutant("A02", "healing by the trace without its square root", "ca.sqrt(totals[i] / ca.sumsqr(factor[rows, :]))",
         "(totals[i] / ca.sumsqr(factor[rows, :]))", "test_mass"),
     Mutant("A03", "healing by the trace without the base row",

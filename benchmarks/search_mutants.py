@@ -102,7 +102,7 @@ NOTICED = (
     Mutant("R08", "IPOPT's refinement of the swarm's best begins where the closed form ended",
         "factor = triangle(self.raw[part], n)", "factor = triangle(self.found[part], n)", "test_swarm_strategy"),
     Mutant("P01", "exponent of the mass distribution by the column, not the row",
-        "for k in range(1, size + 1)])[rows]", "for k in range(1, size + 1)])[columns]", "test_mass"),
+        "for k in range(1, size + 1)])[rows]", "for k in range(1, size + 1)])[columns]", "test_mass_sampling"),
     Mutant("P03", "base mass by a transposed factor", "low @ low.T + base @ base.T", "low @ low.T + base.T @ base",
         "test_mass"),
     Mutant("P04", "signs of the base's factor turned in rows, not columns",
