@@ -9,12 +9,14 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import null_space
 
 Array = NDArray[np.floating[Any]]
 
 OBJECTIVE_SCALE = 1e3  # lifts a residual of 1e-8 above IPOPT's tolerance
 EXACT = 1e-8  # a relative residual that needs no second look
 _TOLERANCE = 1e-9  # of IPOPT
+_ROUND_OFF = 1e-11  # of constraints
 
 
 def quiet_options(max_iterations: int) -> dict[str, Any]:
@@ -122,6 +124,31 @@ class NonlinearProgram:
         if monitor.stopped is not None:
             return monitor.z, "stopped"
         return best, status
+
+    def finished(self, rows: ca.MX, at: Array) -> Array:
+        """Unknowns nearer to a zero of `rows`, by Gauss-Newton steps for as long as each halves what is left.
+
+        For small residuals: a step solves the linear least squares by orthogonal factors, so that neither squares nor a
+        barrier hide what `rows` hardly shows. Equalities are kept; a step over a bound is not taken.
+        """
+        below, above = (np.concatenate([np.zeros(0), *part]) for part in (self._lower, self._upper))
+        lower, upper = np.concatenate(self.lower), np.concatenate(self.upper)
+        held = below == above
+        g = ca.vertcat(ca.MX(0, 1), *self.constraints)
+        outputs = [rows, ca.densify(ca.jacobian(rows, self.z)), g, ca.densify(ca.jacobian(g, self.z))]
+        function = ca.Function("rows", [self.z], outputs)
+        best, left, violated = at, np.inf, np.inf
+        while np.all((at >= lower) & (at <= upper)):
+            r, J, c, A = (np.asarray(part) for part in function(at))
+            r, c = r.ravel(), c.ravel()
+            over = np.concatenate([below - c, c - above, [_ROUND_OFF]]).max()
+            if not (np.linalg.norm(r) < left / 2 and over <= violated):
+                break
+            best, left, violated = at, float(np.linalg.norm(r)), over
+            free = null_space(A[held]) if np.any(held) else np.eye(at.size)
+            back = np.linalg.lstsq(A[held], (below - c)[held])[0]
+            at = at + back - free @ np.linalg.lstsq(J @ free, r + J @ back)[0]
+        return best
 
     def on_bounds(self, at: Array) -> str:
         """Which unknowns press against a finite bound at a solution, in words."""

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
+from sysid.models.spectrum import SOLVED
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram
 from sysid.problem.feasibility import HELD, LOOSE
 from sysid.problem.formulation import Formulation
@@ -24,6 +25,8 @@ from sysid.search.modal_coordinates import End, frequencies
 from sysid.search.scaled_unknowns import add_unknowns
 from sysid.structure.structure import Array, Structure
 from sysid.structure.triangular import lower_entries
+
+_NEARLY_EXACT = 1e-6  # an objective so small tells of records without noise
 
 
 def fit_in_matrices(
@@ -48,6 +51,8 @@ def fit_in_matrices(
     best, status = z.minimize(ca.sumsqr(rows), monitor, max_iterations, derivatives, acceptable=1e2 if modal else 1e3)
     symbols = (modes.shapes, modes.omega) if modes else (ca.MX(0, 1), ca.MX(0, 1))
     end = ca.Function("end", [z.z], [unknowns, *symbols, ca.norm_2(rows)])
+    if not smoothed and status in SOLVED and 0 < float(end(best)[-1]) < _NEARLY_EXACT:
+        best = z.finished(rows, best)
     ended, shapes, omega, objective = (np.asarray(value) for value in end(best))
     ended = ended.ravel()
     if modes is not None:

@@ -217,6 +217,23 @@ def test_a_solution_inside_says_nothing_of_bounds(random_case):
     assert "bound" not in answer.message
 
 
+def test_what_noise_free_records_hardly_show_is_found_too():
+    """A damper of a hundred-thousandth of the others: where IPOPT's tolerance is met it is off by two percent."""
+    true = np.array([2e6, 1e6, 1.5e6, 800.0, 0.006, 500.0])
+    mass, stretch = ca.diag(ca.DM([1000, 1200, 900, 0])), np.diff(np.eye(4), axis=0)[:, [1, 2, 3, 0]]
+    spring = sysid.Variable("spring", 3, lower=1e5, upper=1e7, log=True)
+    damper = sysid.Variable("damper", 3, lower=1e-4, upper=1e4, log=True)
+    chain = lambda at: stretch.T @ ca.diag(at) @ stretch  # noqa: E731
+    matrices = [np.asarray(ca.DM(part)) for part in (mass, chain(ca.DM(true[:3])), chain(ca.DM(true[3:])))]
+    truth = sysid.Structure(*matrices[:2], damping_matrix=matrices[2][:3, :3], n_base=1)
+    test = sysid.simulate(truth, np.geomspace(2.0, 20.0, 200))
+    problem = sysid.Problem(test, mass=mass, stiffness=chain(spring), damping=chain(damper))
+    start = true * [1.0, 1.0, 1.0, 1.0, 1.5, 1.0]
+    answer = local.solve(problem, start)
+    assert answer.success
+    np.testing.assert_allclose(answer.x, true, rtol=1e-6)
+
+
 def at_start(z, expression):
     return np.asarray(ca.Function("start", [z.z], [expression])(np.concatenate(z.start))).ravel()
 
@@ -259,6 +276,15 @@ class TestStarts:
         made = ca.Function("made", [z.z], [x])
         for bounds, expected in ((z.lower, [-50, 1e-4]), (z.start, [40, 0.01]), (z.upper, [200, 0.02])):
             np.testing.assert_allclose(np.asarray(made(np.concatenate(bounds))).ravel(), expected, rtol=1e-12)
+
+    def test_steps_that_finish_keep_equalities_and_bounds(self):
+        """x y = 2 with x near 1, and y near 2 by a millionth of the weight: (1, 2), unless y has an upper bound."""
+        for upper, expected in ((np.inf, [1.0, 2.0]), (1.95, [1.1, 1.9])):
+            z = NonlinearProgram()
+            x = z.variable("x", np.zeros(2), upper=np.array([np.inf, upper]))
+            z.constrain(x[0] * x[1], 2.0, 2.0)
+            found = z.finished(ca.vertcat(x[0] - 1, 1e-6 * (x[1] - 2)), np.array([1.1, 1.9]))
+            np.testing.assert_allclose(found, expected, rtol=1e-9)
 
     def test_near_a_bound_is_within_a_millionth_of_the_range(self):
         z = NonlinearProgram()
