@@ -231,9 +231,9 @@ NOTICED = (
     Mutant("F06", "refinement by IPOPT left out",
         "self.refine(self.spectrum)", "pass", "test_swarm_strategy test_identify"),
     Mutant("F07", "the first best of the swarm kept",
-        "self.raw = objective.unknowns(state.x) self.x = self.refined(self.raw)",
-        "self.raw, self.x = objective.unknowns(state.x), self.x if self.x is not None else "
-        "self.refined(objective.unknowns(state.x))", "test_identify"),
+        "search.raw = self.objective.unknowns(x) search.x = search.refined(search.raw)",
+        "search.raw, search.x = self.objective.unknowns(x), search.x if search.x is not None else "
+        "search.refined(self.objective.unknowns(x))", "test_identify"),
     Mutant("F08", "gradient steps of the swarm left out", "improve_every=options.gradient_every,", "improve_every=0,",
         "test_identify"),
     Mutant("G05", "social pull towards the first particle's best",

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
-from sysid.errors import InputError, SolverError, finite_array, function, instance, number, whole_number
+from sysid.errors import InputError, SolverError, finite_array, function, instance, number, path_of, whole_number
 from sysid.problem.problem import Problem
+from sysid.results.checkpoint import Checkpoint, identity
 from sysid.results.identification import Identification
 from sysid.results.judgement import judge
 from sysid.search.continuation import Continuation
+from sysid.search.journal import Journal
 from sysid.search.modal import Modal
 from sysid.search.session import DeferredInterrupt, Progress, Session, Stop
 from sysid.search.strategy import DoesNotApplyError, Outcome, Strategy
@@ -38,6 +42,7 @@ def identify(
     max_evaluations: int | None = None,
     callback: Callable[[Progress], object] | None = None,
     progress: Callable[[Progress], object] | None = None,
+    checkpoint: str | Path | Checkpoint | None = None,
 ) -> Identification:
     """Identify a structure.
 
@@ -66,6 +71,10 @@ def identify(
         result holds the best until then.
     progress : callable, optional
         Called likewise, only to show: ``progress=print`` prints a line an iteration.
+    checkpoint : str, Path or Checkpoint, optional
+        File in which the state of a swarm or a continuation is kept every few seconds, and at Ctrl-C. Where it is there
+        of the same search (problem, strategy, `rng`), the search goes on from it, and ends with the bits that it would
+        have ended with. A file given by its name is gone once the search has ended by itself.
 
     Returns
     -------
@@ -84,12 +93,21 @@ def identify(
     for name, given in (("callback", callback), ("progress", progress)):
         function(name, given)
     listeners = [listener for listener in (progress, callback) if listener is not None]
-    with threadpool_limits(limits=1), DeferredInterrupt() as interrupt:
-        session = Session(listeners, interrupt, max_time, random, max_evaluations)
+    kept: contextlib.AbstractContextManager[Journal] = contextlib.nullcontext(Journal())
+    if checkpoint is not None:
+        if rng is None:
+            raise InputError("checkpoint needs rng=: a search without a seed is another one each time")
+        file = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(path_of("checkpoint", checkpoint))
+        kept = file.journal(identity(problem, strategy, seed, start, max_evaluations))
+    with threadpool_limits(limits=1), DeferredInterrupt() as interrupt, kept as journal:
+        session = Session(listeners, interrupt, max_time, random, max_evaluations, journal)
         prepare(problem, session)
         chosen, why = choose(strategy, problem, start)
         outcome, why = _run(chosen, why, problem, session, start, follow=strategy == "auto")
-        return judge(problem, outcome, why, seed, session)
+        result = judge(problem, outcome, why, seed, session)
+    if checkpoint is not None and file is not checkpoint and not result.interrupted:
+        file.remove()
+    return result
 
 
 def prepare(problem: Problem, session: Session) -> None:

@@ -16,22 +16,24 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, NoReturn, cast
 
 from sysid import catalogue
-from sysid.cli import parameters
+from sysid.cli import parameters, unfinished
 from sysid.cli.deadline import TimeIsOver, within
 from sysid.cli.display import Output, collected_warnings, complain, display_on
-from sysid.cli.files import results_folder, strict_json
+from sysid.cli.files import strict_json
 from sysid.cli.status import BUG, INTERRUPTED, MISTAKE, NOT_REACHED, SUCCESS
 from sysid.errors import InputError, SolverError
 from sysid.identify import NAMED, identify
+from sysid.results.checkpoint import FILE_NAME as UNFINISHED
+from sysid.results.checkpoint import Checkpoint
 from sysid.results.identification import Identification, load
 from sysid.results.storage import FILE_NAME as RESULT
-from sysid.results.storage import atomically
+from sysid.results.storage import atomically, missing_folders, remove_empty
 from sysid.results.version import __version__
 from sysid.search.session import DeferredInterrupt
 
@@ -129,35 +131,30 @@ def _show(options: argparse.Namespace, out: Output) -> int:
 
 
 def _run(options: argparse.Namespace, out: Output) -> int:
-    from sysid.report import report
-
     begun = time.perf_counter()
-    recipe = parameters.recipe_of(options)
+    search, folder = unfinished.begun(options, out)
+    recipe = search.recipe
     problem = catalogue.build(recipe)
-    folder = results_folder(options.out, Path("results") / catalogue.short_name(recipe.module))
+    checkpoint = Checkpoint(folder / UNFINISHED, search)
     test = problem.measurement
     # Poles of the data, which may take long, are left to the search and its progress and time limit.
     unknowns = problem.formulate(problem.geometry.unsearched()).size
     out.write(
         f"{recipe.title}: {test.n_sensors} sensors, base moving along {' '.join(test.base_axes or ())}, "
         f"{test.freq.size} lines from {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz, "
-        f"{unknowns} unknowns, seed {options.seed}\n"
+        f"{unknowns} unknowns, seed {search.seed}\n"
     )
     failed: InputError | None = None
     # From the search's end until the result is on the disk Ctrl-C waits, however often.
     with DeferredInterrupt(patience=None) as late:
         with display_on(out) as display:
             result = identify(
-                problem, strategy=options.strategy, rng=options.seed, max_time=options.max_time, progress=display
-            )
+                problem, strategy=search.strategy, rng=search.seed, max_time=options.max_time, progress=display,
+                checkpoint=checkpoint,
+            )  # fmt: skip
         result = replace(result, recipe=recipe)
         try:
-            with _no_folder_for_nothing(folder):
-                result.save(folder / RESULT)
-                for name in (_SUMMARY, report.FILE_NAME):  # those of another result must not stand beside this one
-                    (folder / name).unlink(missing_ok=True)
-        except OSError as error:
-            failed = InputError(f"folder of results {folder}: {error.strerror or error}")
+            _save(result, folder, checkpoint)
         except InputError as error:
             failed = error
     try:
@@ -171,7 +168,8 @@ def _run(options: argparse.Namespace, out: Output) -> int:
         complain(f"interrupted while saving; the result is there, but not every file is in {folder}")
         return INTERRUPTED
     if late.asked or result.interrupted:
-        complain(f"interrupted; the {'best so far' if result.interrupted else 'result'} is in {folder}")
+        on = f"; 'sysid run --resume {folder}' goes on" if checkpoint.exists else ""
+        complain(f"interrupted; the {'best so far' if result.interrupted else 'result'} is in {folder}{on}")
         return INTERRUPTED
     return SUCCESS if result.success else NOT_REACHED
 
@@ -259,11 +257,10 @@ def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
         help="identify the structure of a problem",
         description="Identify the structure of a problem. Writes result.h5, summary.json and report.html.",
     )
-    parameters.add_arguments(run)
+    parameters.add_arguments(run, optional=True)
     run.add_argument(
         "--seed",
         type=_seed,
-        default=0,
         metavar="N",
         help="of the search, 0 by default: the same seed gives the same result. The simulated noise of a problem is "
         "part of the problem and does not change with it",
@@ -271,7 +268,6 @@ def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
     run.add_argument(
         "--strategy",
         choices=("auto", *NAMED),
-        default="auto",
         metavar="S",
         help="modal: modes from the data, without a search; continuation: gradients through widened peaks, for "
         "structured models and variables of your own; swarm: the particle swarm and its refinement; auto, by default: "
@@ -284,6 +280,13 @@ def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
         metavar="S",
         help="end after about so many seconds; a report that they do not suffice for is left to 'sysid report'",
     )
+    run.add_argument(
+        "--resume",
+        metavar="DIR",
+        help="go on with the run in this folder that was killed or interrupted; PROBLEM and its options need not be "
+        "said again",
+    )
+    run.add_argument("--fresh", action="store_true", help="begin anew where there is an unfinished run in the folder")
     run.set_defaults(command=_run)
 
 
@@ -346,6 +349,23 @@ def _seconds(text: str) -> float:
 # -- files --------------------------------------------------------------------------------------
 
 
+def _save(result: Identification, folder: Path, checkpoint: Checkpoint) -> None:
+    """Write a result, then take away what it replaces."""
+    from sysid.report import report
+
+    missing = missing_folders(folder)
+    try:
+        result.save(folder / RESULT)
+        for name in (_SUMMARY, report.FILE_NAME):  # those of another result must not stand beside this one
+            (folder / name).unlink(missing_ok=True)
+        if not result.interrupted:
+            checkpoint.remove()
+    except OSError as error:
+        raise InputError(f"folder of results {folder}: {error.strerror or error}") from error
+    finally:
+        remove_empty(missing)  # where nothing could be written
+
+
 def _write_pages(result: Identification, folder: Path, out: Output, left: float | None) -> None:
     """Write what people and scripts read of a result that is saved, each file whole or not at all.
 
@@ -363,19 +383,6 @@ def _write_pages(result: Identification, folder: Path, out: Output, left: float 
             out.write(f"report   {report.write(result, folder / report.FILE_NAME)}\n")
     except TimeIsOver:
         out.write(f"no report, as the time is over: 'sysid report {folder}' writes it\n")
-
-
-@contextlib.contextmanager
-def _no_folder_for_nothing(folder: Path) -> Iterator[None]:
-    """Take a folder away again that was made for a file that could not be written."""
-    missing = [place for place in (folder, *folder.parents) if not place.exists()]
-    try:
-        yield
-    except BaseException:
-        with contextlib.suppress(OSError):
-            for place in missing:
-                place.rmdir()  # only where it is empty
-        raise
 
 
 def _write_log() -> str:

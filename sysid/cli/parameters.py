@@ -13,9 +13,9 @@ from sysid.results.identification import Recipe
 _PROBLEM = "a path to a module, else a module in ./problems, else a bundled problem, else a dotted module"
 
 
-def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Give a command the problem module and what is handed on to it."""
-    command.add_argument("problem", metavar="PROBLEM", help=_PROBLEM)
+def add_arguments(command: argparse.ArgumentParser, *, optional: bool = False) -> None:
+    """Give a command the problem module, which may be `optional`, and what is handed on to it."""
+    command.add_argument("problem", metavar="PROBLEM", nargs="?" if optional else None, help=_PROBLEM)
     command.add_argument("--data", metavar="PATH", help="file or folder of records, for problems that read some")
     command.add_argument(
         "--set",

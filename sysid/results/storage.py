@@ -121,3 +121,15 @@ def atomically(path: Path) -> Iterator[Path]:
         if isinstance(error, OSError):
             raise InputError(f"{path} cannot be written: {error.strerror or error}") from error
         raise
+
+
+def missing_folders(folder: Path) -> list[Path]:
+    """Give those of a folder and the folders around it that do not exist, the innermost first."""
+    return [place for place in (folder, *folder.parents) if not place.exists()]
+
+
+def remove_empty(folders: Sequence[Path]) -> None:
+    """Take folders away until one is not empty."""
+    with contextlib.suppress(OSError):
+        for place in folders:
+            place.rmdir()

@@ -117,7 +117,7 @@ def smooth_fit(
         taken = len(curve)
         listener = lambda i, objective, taken=taken: monitor(taken + i, objective)  # noqa: E731
         try:
-            new = local.solve(problem, x, max_iterations=_STEPS, max_time=session.left, monitor=listener, smoothed=step)
+            new = local.solve_or_read(problem, x, session, max_iterations=_STEPS, monitor=listener, smoothed=step)
         except InputError:  # modes are needed, and this is no structure
             break
         curve += new.curve.tolist()
@@ -138,7 +138,7 @@ def descend(
     if way is not None and way.stopped is not None:
         return way
     at = x if way is None else way.x
-    return local.solve(problem, at, max_time=session.left, monitor=monitor, coordinates=coordinates)
+    return local.solve_or_read(problem, at, session, monitor=monitor, coordinates=coordinates)
 
 
 class _Run:
@@ -201,9 +201,7 @@ class _Run:
                 x = way.x
             stopped = way is not None and way.stopped is not None
             answer = (
-                way
-                if stopped
-                else local.solve(problem, x, max_time=session.left, monitor=session.reporter("local phase"))
+                way if stopped else local.solve_or_read(problem, x, session, monitor=session.reporter("local phase"))
             )
         except InputError as error:
             self.wrong = error

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -17,6 +17,7 @@ from sysid.search.cholesky_coordinates import fit_in_cholesky
 from sysid.search.matrix_coordinates import fit_in_matrices
 from sysid.search.modal_coordinates import End, fit_in_modes
 from sysid.search.scaled_unknowns import add_unknowns
+from sysid.search.session import Session
 from sysid.structure.structure import Array
 
 Coordinates = Literal["modal", "cholesky", "entries"]
@@ -83,6 +84,17 @@ def solve(
         return _result(fit_in_matrices(problem, x, watched, max_iterations, smoothed), watched)
     fit = fit_in_cholesky if coordinates == "cholesky" else fit_in_modes
     return _result(fit_apart(problem, fit(problem, x, watched, max_iterations), watched, max_iterations), watched)
+
+
+def solve_or_read(problem: Problem, x: Array, session: Session, **settings: Any) -> LocalResult:
+    """`solve`, or its end where the session's journal has it from an earlier run."""
+    part = session.journal.part("local phase")
+    if part.found is not None:
+        return LocalResult(**part.found)
+    result = solve(problem, x, max_time=session.left, **settings)
+    if result.stopped is None:
+        part.ended(lambda: {name: value for name, value in vars(result).items() if name != "stopped"})
+    return result
 
 
 def fit_apart(problem: Problem, end: End, monitor: IterationMonitor, max_iterations: int = 500) -> End:

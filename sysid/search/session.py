@@ -11,6 +11,8 @@ from typing import Literal
 
 import numpy as np
 
+from sysid.search.journal import Journal
+
 Phase = Literal["poles", "swarm", "refinement", "continuation", "local phase"]
 
 
@@ -114,6 +116,8 @@ class Session:
     random : SeedSequence
     max_evaluations : int or None
         Candidates that a swarm may evaluate.
+    journal : Journal, optional
+        Keeps what the search has reached.
     """
 
     def __init__(
@@ -123,7 +127,9 @@ class Session:
         max_time: float | None = None,
         random: np.random.SeedSequence | None = None,
         max_evaluations: int | None = None,
+        journal: Journal | None = None,
     ) -> None:
+        self.journal = journal or Journal()
         self.listeners, self.interrupt, self.max_time = listeners, interrupt, max_time
         self.random = random or np.random.SeedSequence(0)
         self.max_evaluations = max_evaluations

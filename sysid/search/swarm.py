@@ -16,6 +16,7 @@ from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.search import local
 from sysid.search.continuation import descend, smoothed_tests
+from sysid.search.journal import Part
 from sysid.search.local import Coordinates
 from sysid.search.modal_coordinates import fits_worse_than_free_residues, modes_of
 from sysid.search.session import Session, Stop
@@ -265,20 +266,7 @@ class _Search:
         objective, self.steps = options.searched(problem, session)
         self.spectrum = objective.spectrum
         self._log_start()
-        curve: list[float] = []
-
-        def listen(state: SwarmProgress) -> None:
-            if np.isfinite(state.fun):
-                self.raw = objective.unknowns(state.x)
-                self.x = self.refined(self.raw)
-                if not self.phases:
-                    self.ended("start", state.nfev)
-            curve.append(state.fun)
-            self.history = replace(
-                self.history, start=curve[0], swarm=curve[-1], swarm_curve=np.array(curve), evaluations=state.nfev
-            )
-            session.report("swarm", state.nit, options.max_iterations, state.fun)
-
+        record = _SwarmRecord(self, objective, session.journal.part("swarm"))
         repair = None if self.spectrum is None else self.refined_rows
         slow = options.refine_by == "ipopt" and not options.write_back and repair is not None
         result = minimize_swarm(
@@ -292,13 +280,15 @@ class _Search:
             target=self._target(),
             stall_iterations=options.stall_iterations,
             stall_tolerance=options.stall_tolerance,
-            callback=listen,
+            callback=record.take,
             improve=self._improver(objective) if options.gradient_every else None,
             improve_every=options.gradient_every,
             repair=repair if options.write_back else None,
             x0=None if start is None else problem.formulation.to_sampling(as_unknowns(problem, start)),
             settings=options.settings,
+            resume=record.resumed(),
         )
+        record.keep()
         if self.x is None:
             raise SolverError(f"the swarm found no candidate that is a structure: {result.message}")
         states = tuple((state.lower().replace("_", " "), int(n)) for state, n in result.state_counts.items())
@@ -412,3 +402,57 @@ class _Search:
     def _in_local_minimum(self) -> bool:
         test, structure = self.problem.measurement, self.problem.structure(self.found)
         return fits_worse_than_free_residues(test, modes_of(structure), error_of_accelerations(test, structure))
+
+
+class _SwarmRecord:
+    """What is told and kept of a swarm while it runs: its best, its curve, its state."""
+
+    def __init__(self, search: _Search, objective: SwarmObjective, part: Part) -> None:
+        self.search, self.objective, self.part = search, objective, part
+        self.curve: list[float] = []
+        self.last: SwarmProgress | None = None
+
+    def resumed(self) -> dict[str, Any] | None:
+        """The state of an earlier run's swarm, whose record is taken up; None where there was none."""
+        found = self.part.found
+        if found is None:
+            return None
+        swarm = found["search"]["swarm"]
+        self.search.phases, self.search.unrefined = [Phase(**found["start"])], found["unrefined"]
+        self.curve = swarm["history"].tolist()
+        self._tell(swarm["best_x"], swarm["best_cost"], swarm["nfev"])
+        return dict(found["search"])
+
+    def take(self, state: SwarmProgress) -> None:
+        """Take an iteration."""
+        self.last = state
+        self.curve.append(state.fun)
+        self._tell(state.x, state.fun, state.nfev)
+        if self.search.phases:
+            self.part.running(self._content)
+        try:
+            self.search.session.report("swarm", state.nit, self.search.options.max_iterations, state.fun)
+        except (Stop, KeyboardInterrupt):
+            self.keep()
+            raise
+
+    def keep(self) -> None:
+        """Keep the state after the last iteration."""
+        if self.last is not None and self.search.phases:
+            self.part.ended(self._content)
+
+    def _tell(self, x: Array, objective: float, evaluations: int) -> None:
+        search, curve = self.search, self.curve
+        if np.isfinite(objective):
+            search.raw = self.objective.unknowns(x)
+            search.x = search.refined(search.raw)
+            if not search.phases:
+                search.ended("start", evaluations)
+        search.history = replace(
+            search.history, start=curve[0], swarm=curve[-1], swarm_curve=np.array(curve), evaluations=evaluations
+        )
+
+    def _content(self) -> dict[str, Any]:
+        assert self.last is not None
+        start = dict(vars(self.search.phases[0]))
+        return {"search": self.last.snapshot(), "start": start, "unrefined": self.search.unrefined}

@@ -39,6 +39,9 @@ class SwarmProgress:
         Iterations and evaluations so far.
     state : EvolutionaryState
         The present evolutionary state of the swarm.
+    snapshot : callable
+        Gives the whole search as a dictionary of numbers, arrays and texts, for ``resume=`` of `minimize_swarm`; to be
+        called within the callback.
     """
 
     x: FloatArray
@@ -46,6 +49,7 @@ class SwarmProgress:
     nit: int
     nfev: int
     state: EvolutionaryState
+    snapshot: Callable[[], dict[str, Any]]
 
 
 def minimize_swarm(
@@ -66,6 +70,7 @@ def minimize_swarm(
     repair: Callable[[FloatArray], ArrayLike] | None = None,
     x0: ArrayLike | None = None,
     settings: SwarmSettings | None = None,
+    resume: dict[str, Any] | None = None,
 ) -> OptimizeResult:
     """Minimise a batched function over a box with the adaptive particle swarm.
 
@@ -112,6 +117,9 @@ def minimize_swarm(
         A starting point inside the bounds: it takes the place of the first row of the sample.
     settings : SwarmSettings, optional
         The constants of the swarm.
+    resume : dict, optional
+        A `SwarmProgress.snapshot` of a search with the same other arguments: the search goes on from there, and ends
+        with the bits that it would have ended with. The callback is not called again for what is past.
 
     Returns
     -------
@@ -167,57 +175,72 @@ def minimize_swarm(
                 "raise it or lower n_particles."
             )
         swarm.horizon = min(max_iterations, max_evaluations // swarm.n_particles)
-    if repair is None:
-        tell = lambda rows: swarm.tell(checked_costs(fun(rows), len(rows), "that fun returned"))  # noqa: E731
-    else:
-
-        def tell(rows: FloatArray) -> None:
-            repaired = swarm.box.clip(checked_rows(repair(rows), rows.shape, "that repair returned"))
-            swarm.tell(checked_costs(fun(repaired.copy()), len(rows), "that fun returned"), repaired)
-
-    reason, n_improved = _run(swarm, fun, tell, rules, improve if improve_every else None, improve_every, callback)
+    search = _Search(swarm, fun, repair, rules, improve if improve_every else None, improve_every)
+    if resume is not None:
+        search.resume(resume)
+    reason = search.run(callback)
     found = math.isfinite(swarm.best_cost)
     reached = target is None or swarm.best_cost <= target
     return OptimizeResult(
         x=swarm.best_x, fun=swarm.best_cost, nfev=swarm.nfev, nit=swarm.nit,
         success=found and reached and reason is not StopReason.CALLBACK,
         message=rules.message(reason, swarm), reason=reason, history=np.array(swarm.history), n_nan=swarm.n_nan,
-        n_improved=n_improved, state_counts={state.name: count for state, count in swarm.state_counts.items()},
+        n_improved=search.n_improved, state_counts={state.name: count for state, count in swarm.state_counts.items()},
     )  # fmt: skip
 
 
-def _run(
-    swarm: ParticleSwarm,
-    fun: Callable[[FloatArray], ArrayLike],
-    tell: Callable[[FloatArray], None],
-    rules: StopRules,
-    improve: Callable[[FloatArray], ArrayLike] | None,
-    improve_every: int,
-    callback: Callable[[SwarmProgress], object] | None,
-) -> tuple[StopReason, int]:
-    """Iterate until a stop rule or the callback ends it; return the reason, and how often `improve` found better."""
-    started = time.perf_counter()
-    n_improved = 0
-    refined: FloatArray | None = None
-    reason = None
-    while reason is None:
-        rows = swarm.ask()
-        if not rules.room_for(len(rows), swarm.nfev):
-            return StopReason.MAX_EVALUATIONS, n_improved
-        tell(rows)
-        if improve is not None and swarm.nit % improve_every == 0 and math.isfinite(swarm.best_cost):
-            seen = refined is not None and np.array_equal(refined, swarm.best_x)
-            if not seen and rules.room_for(1, swarm.nfev):
-                n_improved += _refine(swarm, fun, improve)
-                refined = swarm.best_x
-        reason = rules.reason(swarm, time.perf_counter() - started)
-        if callback is not None:
-            try:
-                callback(SwarmProgress(swarm.best_x, swarm.best_cost, swarm.nit, swarm.nfev, swarm.state))
-            except StopIteration:
-                # A stop rule that holds as well comes first: the search was not cut short.
-                reason = reason or StopReason.CALLBACK
-    return reason, n_improved
+@dataclass
+class _Search:
+    """The iterations of a swarm, until a stop rule or the callback ends them."""
+
+    swarm: ParticleSwarm
+    fun: Callable[[FloatArray], ArrayLike]
+    repair: Callable[[FloatArray], ArrayLike] | None
+    rules: StopRules
+    improve: Callable[[FloatArray], ArrayLike] | None
+    improve_every: int
+    n_improved: int = 0  # how often `improve` found better
+    refined: FloatArray | None = None  # the last point that it was given, or gave
+
+    def snapshot(self) -> dict[str, Any]:
+        return {"swarm": self.swarm.to_tree(), "n_improved": self.n_improved, "refined": self.refined}
+
+    def resume(self, snapshot: dict[str, Any]) -> None:
+        self.swarm.resume(snapshot["swarm"])
+        self.n_improved, self.refined = snapshot["n_improved"], snapshot["refined"]
+
+    def run(self, callback: Callable[[SwarmProgress], object] | None) -> StopReason:
+        """Iterate; why it ended."""
+        swarm, rules = self.swarm, self.rules
+        started = time.perf_counter()
+        reason = rules.reason(swarm, 0.0) if swarm.nit else None  # what is resumed may have been at its end
+        while reason is None:
+            rows = swarm.ask()
+            if not rules.room_for(len(rows), swarm.nfev):
+                return StopReason.MAX_EVALUATIONS
+            self._tell(rows)
+            if self.improve is not None and swarm.nit % self.improve_every == 0 and math.isfinite(swarm.best_cost):
+                seen = self.refined is not None and np.array_equal(self.refined, swarm.best_x)
+                if not seen and rules.room_for(1, swarm.nfev):
+                    self.n_improved += _refine(swarm, self.fun, self.improve)
+                    self.refined = swarm.best_x
+            reason = rules.reason(swarm, time.perf_counter() - started)
+            if callback is not None:
+                state = SwarmProgress(swarm.best_x, swarm.best_cost, swarm.nit, swarm.nfev, swarm.state, self.snapshot)
+                try:
+                    callback(state)
+                except StopIteration:
+                    # A stop rule that holds as well comes first: the search was not cut short.
+                    reason = reason or StopReason.CALLBACK
+        return reason
+
+    def _tell(self, rows: FloatArray) -> None:
+        """Give the swarm the costs of its rows, or of what they are repaired to."""
+        swarm, repaired = self.swarm, None
+        if self.repair is not None:
+            repaired = swarm.box.clip(checked_rows(self.repair(rows), rows.shape, "that repair returned"))
+            rows = repaired.copy()
+        swarm.tell(checked_costs(self.fun(rows), len(rows), "that fun returned"), repaired)
 
 
 def _refine(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import RandomSource, instance, random_generator, whole_number
+from sysid.errors import InputError, RandomSource, instance, random_generator, whole_number
 
 from . import adaptation
 from .adaptation import EvolutionaryState
@@ -17,6 +18,10 @@ from .checks import checked_costs, checked_rows
 from .settings import SwarmSettings
 
 FloatArray = NDArray[np.float64]
+
+# What changes while the swarm moves: arrays over its particles, or none, and numbers.
+_ARRAYS = ("positions", "velocities", "costs", "own", "own_costs", "candidate", "asked")
+_NUMBERS = ("nit", "nfev", "n_nan", "horizon", "inertia", "cognitive", "social")
 
 
 class ParticleSwarm:
@@ -143,6 +148,38 @@ class ParticleSwarm:
         self._asked: FloatArray | None = None
         # One tuple, so that an interrupt never leaves a point with another point's cost.
         self._best: tuple[FloatArray, float] = (self.box.to_rows(self._positions[:1])[0], np.inf)
+
+    def to_tree(self) -> dict[str, Any]:
+        """Give all that changes while it moves, as numbers, arrays and texts; `resume` takes it back."""
+        x, cost = self._best
+        return {
+            **{name: _copied(getattr(self, f"_{name}")) for name in _ARRAYS},
+            **{name: getattr(self, name) for name in _NUMBERS}, "leader": self._leader, "best_x": x.copy(),
+            "best_cost": cost, "history": np.array(self.history), "state": int(self.state),
+            "state_counts": np.array([self.state_counts[state] for state in EvolutionaryState]),
+            "random": json.dumps(self._rng.bit_generator.state, default=np.ndarray.tolist),
+        }  # fmt: skip
+
+    def resume(self, tree: dict[str, Any]) -> None:
+        """Go on where `to_tree` was called of a swarm made alike: the same bits follow.
+
+        Raises
+        ------
+        InputError
+            Where that one had another number of particles or variables, or another kind of random source.
+        """
+        random = json.loads(tree["random"])
+        same = tree["positions"].shape == self._positions.shape and tree["best_x"].shape == self.box.lower.shape
+        if not same or random["bit_generator"] != self._rng.bit_generator.state["bit_generator"]:
+            raise InputError("the swarm to go on with has other particles, variables or another random source")
+        for name in _ARRAYS:
+            setattr(self, f"_{name}", _copied(tree[name]))
+        for name in _NUMBERS:
+            setattr(self, name, tree[name])
+        self._leader, self._best = tree["leader"], (np.array(tree["best_x"]), tree["best_cost"])
+        self.history, self.state = tree["history"].tolist(), EvolutionaryState(tree["state"])
+        self.state_counts = dict(zip(EvolutionaryState, tree["state_counts"].tolist(), strict=True))
+        self._rng.bit_generator.state = random
 
     @property
     def best_x(self) -> FloatArray:
@@ -362,3 +399,7 @@ class ParticleSwarm:
             if cost < self._own_costs[worst]:
                 self._own[worst] = unit
                 self._own_costs[worst] = cost
+
+
+def _copied(array: FloatArray | None) -> FloatArray | None:
+    return None if array is None else array.copy()

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -78,3 +79,16 @@ def process():
         return subprocess.run(command, capture_output=True, timeout=120, **options)
 
     return run
+
+
+@pytest.fixture
+def interruptible():
+    """Give a function that starts Python with Ctrl-C as a terminal has it, however these tests were started."""
+
+    def start(*arguments, **options):
+        return subprocess.Popen(
+            [sys.executable, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL), **options,
+        )  # fmt: skip
+
+    return start

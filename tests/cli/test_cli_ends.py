@@ -153,7 +153,7 @@ raise SystemExit(cli.main(["run", "free.py"]))
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 @pytest.mark.parametrize("delay", [0.0, 0.1, 0.27])
-def test_the_signal_itself_saves_the_best_so_far_wherever_it_strikes(here, without_pictures, delay):
+def test_the_signal_itself_saves_the_best_so_far_wherever_it_strikes(here, without_pictures, delay, interruptible):
     (here / "endless.py").write_text(ENDLESS)
     (here / "free.py").write_text(without_pictures.replace("goal=1e-6", "goal=1e-30"))
     running = interruptible("endless.py", cwd=here)
@@ -164,14 +164,15 @@ def test_the_signal_itself_saves_the_best_so_far_wherever_it_strikes(here, witho
         time.sleep(delay)
         running.send_signal(signal.SIGINT)
         out, error = running.communicate(timeout=60)
-    assert error == "sysid: interrupted; the best so far is in results/free\n"
+    on = "'sysid run --resume results/free' goes on"
+    assert error == f"sysid: interrupted; the best so far is in results/free; {on}\n"
     assert running.returncode == 130
     assert "no success: interrupted" in out
     assert sysid.load(here / "results/free").interrupted
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-def test_the_signal_before_any_candidate_writes_nothing(here, files):
+def test_the_signal_before_any_candidate_writes_nothing(here, files, interruptible):
     (here / "pair.py").write_text("import time\nprint('here', flush=True)\ntime.sleep(60)\n")
     running = interruptible("-m", "sysid", "run", "pair.py", cwd=here)
     with running:
@@ -181,14 +182,6 @@ def test_the_signal_before_any_candidate_writes_nothing(here, files):
     assert error == "sysid: interrupted; nothing was saved\n"
     assert running.returncode == 130
     assert files(here) == {"pair.py"}
-
-
-def interruptible(*arguments, **options):
-    """Start Python with Ctrl-C as a terminal has it, however these tests were started."""
-    return subprocess.Popen(
-        [sys.executable, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL), **options,
-    )  # fmt: skip
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")

@@ -1,0 +1,79 @@
+"""``sysid run --resume DIR`` and ``--fresh``: which search is run, and what becomes of an unfinished one."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from sysid import catalogue
+from sysid.cli import parameters
+from sysid.cli.display import Output
+from sysid.cli.files import results_folder
+from sysid.errors import InputError
+from sysid.results.checkpoint import FILE_NAME, Begun, Checkpoint
+
+
+def begun(options: argparse.Namespace, out: Output) -> tuple[Begun, Path]:
+    """The search that the arguments of ``run`` ask for, and the folder of its results.
+
+    Raises
+    ------
+    InputError
+        Where the folder holds an unfinished search and nothing is said of it, or another one than is to be resumed.
+    """
+    if options.resume is not None:
+        return _resumed(options, out)
+    search = _asked(options)
+    folder = results_folder(options.out, Path("results") / catalogue.short_name(search.recipe.module))
+    checkpoint = Checkpoint(folder / FILE_NAME)
+    if checkpoint.exists:
+        if not options.fresh:
+            raise InputError(
+                f"{folder} holds {_in_words(checkpoint, search)}: 'sysid run --resume {folder}' goes on with it, "
+                "--fresh begins anew, --out DIR writes elsewhere"
+            )
+        checkpoint.remove()
+    return search, folder
+
+
+def _resumed(options: argparse.Namespace, out: Output) -> tuple[Begun, Path]:
+    if options.fresh or options.out is not None:
+        raise InputError(f"--resume and {'--fresh' if options.fresh else '--out'} exclude each other")
+    folder = results_folder(options.resume, Path(options.resume))
+    checkpoint = Checkpoint(folder / FILE_NAME)
+    asked = _asked(options) if options.problem is not None else None
+    if not checkpoint.exists:
+        if asked is None:
+            raise InputError(
+                f"no unfinished run in {folder}: 'sysid run PROBLEM --resume {folder}' begins one there, and goes on "
+                "with it where there is one"
+            )
+        out.write(f"no unfinished run in {folder}: it begins anew\n")
+        return asked, folder
+    tree = checkpoint.read()
+    if tree["begun"] is None:
+        raise InputError(f"{checkpoint.path} was not begun by 'sysid run': go on with it as it was begun")
+    search = Begun.from_tree(tree["begun"])
+    if asked is not None and asked != search:
+        raise InputError(f"{folder} holds an unfinished run of {search}, not of {asked}")
+    if (asked is None and (options.seed, options.strategy, options.data) != (None, None, None)) or options.settings:
+        raise InputError(f"--resume takes --seed, --strategy, --data and --set from the run in {folder}: {search}")
+    out.write(f"going on with {search}\n" if tree["entries"] else f"{search} had reached nothing: it begins anew\n")
+    return search, folder
+
+
+def _asked(options: argparse.Namespace) -> Begun:
+    if options.problem is None:
+        raise InputError("PROBLEM is missing (see 'sysid run --help')")
+    return Begun(parameters.recipe_of(options), options.strategy or "auto", options.seed or 0)
+
+
+def _in_words(checkpoint: Checkpoint, search: Begun) -> str:
+    """What stands in the file, as far as it can be read."""
+    try:
+        tree = checkpoint.read()["begun"]
+    except InputError:
+        return f"an unfinished run that is damaged ({FILE_NAME})"
+    if tree is None or (found := Begun.from_tree(tree)) == search:
+        return "an unfinished run of this problem"
+    return f"an unfinished run of {found}"

@@ -1,0 +1,167 @@
+"""The state of an unfinished search in a file: numbers and text only, with the SHA-256 of its bytes, as results are."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sysid.errors import InputError, path_of
+from sysid.files.tree import Tree, from_bytes, to_bytes
+from sysid.problem.problem import Problem
+from sysid.results.identification import Recipe
+from sysid.results.storage import atomically, missing_folders, remove_empty
+from sysid.results.version import __version__
+from sysid.search.journal import EVERY, Journal
+from sysid.search.strategy import Strategy
+from sysid.structure.structure import Structure
+
+FILE_NAME = "unfinished.h5"
+_CONTENT, _FORMAT = "unfinished search", 1
+
+
+@dataclass(frozen=True)
+class Begun:
+    """How a command line began a search.
+
+    Attributes
+    ----------
+    recipe : Recipe
+    strategy : str
+    seed : int
+        Of the search.
+    """
+
+    recipe: Recipe
+    strategy: str
+    seed: int
+
+    def __str__(self) -> str:
+        return f"{self.recipe.title}, strategy {self.strategy}, seed {self.seed}"
+
+    def to_tree(self) -> Tree:
+        """Give the fields by their names; `from_tree` takes them back."""
+        return {"recipe": self.recipe.to_tree(), "strategy": self.strategy, "seed": str(self.seed)}
+
+    @classmethod
+    def from_tree(cls, tree: Tree) -> Begun:
+        """Give what `to_tree` made a tree of."""
+        return cls(Recipe.from_tree(tree["recipe"]), tree["strategy"], int(tree["seed"]))
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """The file of an unfinished search: there from its start until its result is safe.
+
+    Attributes
+    ----------
+    path : str or Path
+    begun : Begun, optional
+        Stands in the file for whoever is to go on.
+    every : float
+        s between two writings.
+    """
+
+    path: Path
+    begun: Begun | None = None
+    every: float = field(default=EVERY, kw_only=True)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "path", path_of("checkpoint", self.path))
+
+    @property
+    def exists(self) -> bool:
+        """Whether there is an unfinished search."""
+        return self.path.is_file()
+
+    def read(self) -> Tree:
+        """Everything in the file.
+
+        Raises
+        ------
+        InputError
+            Where it is no unfinished search, is damaged, or comes from another sysid.
+        """
+        try:
+            tree, number = from_bytes(self.path.read_bytes())
+        except OSError as error:
+            raise InputError(f"{self.path} cannot be read: {error.strerror or error}") from error
+        except InputError as error:
+            raise InputError(f"{self.path} cannot be read: {error}") from error
+        if tree.get("content") != _CONTENT or number != _FORMAT:
+            raise InputError(f"{self.path} is not the state of an unfinished search of this sysid")
+        return tree
+
+    def remove(self) -> None:
+        """Take the file away."""
+        self.path.unlink(missing_ok=True)
+
+    @contextlib.contextmanager
+    def journal(self, search: str) -> Iterator[Journal]:
+        """Give the journal of a search, with what the file has of it; at the end all is written.
+
+        Where the search then has nothing to go on with, the file vanishes, and the folders that were made for it.
+
+        Raises
+        ------
+        InputError
+            Where the file is of another search than `search` (see `identity`), or cannot be written.
+        """
+        entries: Tree = {}
+        if self.exists:
+            tree = self.read()
+            if tree["search"] != search:
+                raise InputError(
+                    f"{self.path} is of another search: the problem, its records, the strategy, the seed or sysid has "
+                    "changed since; take it away, or give another file"
+                )
+            entries = tree["entries"]
+        begun = None if self.begun is None else self.begun.to_tree()
+
+        def write(kept: Tree) -> None:
+            tree = {"content": _CONTENT, "search": search, "begun": begun, "entries": kept}
+            with atomically(self.path) as temporary:
+                temporary.write_bytes(to_bytes(tree, _FORMAT))
+
+        def try_to_write(kept: Tree) -> None:
+            try:
+                write(kept)
+            except InputError as error:  # no reason to lose the search itself
+                warnings.warn(f"the search goes on, but its state is not kept: {error}", stacklevel=2)
+
+        journal, missing = Journal(try_to_write, entries, self.every), missing_folders(self.path.parent)
+        try:
+            write(entries)
+            yield journal
+        finally:
+            journal.flush()
+            if not journal.entries:
+                with contextlib.suppress(OSError):
+                    self.remove()
+                remove_empty(missing)
+
+
+def identity(
+    problem: Problem, strategy: str | Strategy, seed: int, start: ArrayLike | Structure | None,
+    max_evaluations: int | None,
+) -> str:  # fmt: skip
+    """A text that tells one search from another: a digest of all that its bits depend on.
+
+    Raises
+    ------
+    InputError
+        Where the problem holds what cannot be stored.
+    """
+    begin: Any = start.to_tree() if isinstance(start, Structure) else start if start is None else np.asarray(start)
+    tree = {
+        "problem": problem.to_tree(), "start": begin, "strategy": repr(strategy), "seed": str(seed),
+        "max_evaluations": max_evaluations, "sysid": __version__, "numpy": np.__version__,
+    }  # fmt: skip
+    return hashlib.sha256(to_bytes(tree, _FORMAT)).hexdigest()

@@ -1,0 +1,135 @@
+"""``sysid run --resume`` and ``--fresh``: what a folder with an unfinished run allows, and what is said of it."""
+
+import signal
+import time
+
+import pytest
+
+import sysid
+from sysid.cli import main as cli
+from sysid.results.checkpoint import FILE_NAME, Checkpoint
+
+RUN = ["run", "pair.py", "--strategy", "swarm", "--out", "out"]
+
+
+@pytest.fixture
+def stopped(here, monkeypatch, no_pictures, capsys):
+    """Leave a run of pair.py that Ctrl-C ended in iteration 3 of its swarm; its folder."""
+    original = sysid.identify
+
+    def identify(*arguments, **options):
+        def interrupt(progress):
+            if (progress.phase, progress.iteration) == ("swarm", 3):
+                raise KeyboardInterrupt
+
+        return original(*arguments, **options, callback=interrupt)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(cli, "identify", identify)
+        assert cli.main(RUN) == 130
+    assert "interrupted; the best so far is in out; 'sysid run --resume out' goes on" in capsys.readouterr().err
+    return here / "out"
+
+
+def test_a_resumed_run_ends_as_one_that_was_not_stopped(stopped, capsys, files):
+    assert cli.main(["run", "--resume", "out", "--max-time", "60"]) == 0
+    assert capsys.readouterr().out.startswith("going on with pair.py, strategy swarm, seed 0\npair.py: 2 sensors")
+    assert files(stopped) == {"result.h5", "summary.json", "report.html"}
+    assert cli.main([*RUN[:-1], "other"]) == 0
+    resumed, whole = sysid.load(stopped), sysid.load(stopped.with_name("other"))
+    assert resumed.x.tobytes() == whole.x.tobytes()
+    assert resumed.history.swarm_curve.tobytes() == whole.history.swarm_curve.tobytes()
+    assert resumed.recipe == whole.recipe
+
+
+def test_without_a_word_on_the_unfinished_run_nothing_is_done(stopped, complaint, files):
+    before, state = files(stopped), (stopped / FILE_NAME).read_bytes()
+    assert cli.main(RUN) == 2
+    error = complaint()
+    assert "out holds an unfinished run of this problem: 'sysid run --resume out' goes on with it" in error
+    assert "--fresh begins anew" in error
+    assert cli.main([*RUN, "--seed", "1"]) == 2
+    assert "an unfinished run of pair.py, strategy swarm, seed 0: " in complaint()
+    assert files(stopped) == before
+    assert (stopped / FILE_NAME).read_bytes() == state
+
+
+def test_fresh_begins_anew(stopped, capsys, files):
+    assert cli.main([*RUN, "--fresh", "--seed", "1"]) == 0
+    assert "iteration    0" not in capsys.readouterr().out.partition("swarm")[0]
+    assert files(stopped) == {"result.h5", "summary.json", "report.html"}
+    assert sysid.load(stopped).seed == 1
+
+
+def test_the_problem_may_be_said_again_and_must_be_the_same(stopped, complaint):
+    again = ["run", "pair.py", "--strategy", "swarm", "--resume", "out"]
+    assert cli.main([*again, "--seed", "2"]) == 2
+    assert "out holds an unfinished run of pair.py, strategy swarm, seed 0, not of pair.py, strategy swarm, seed 2" in (
+        complaint()
+    )
+    assert cli.main(again) == 0
+
+
+def test_a_module_that_was_changed_gives_no_mixture(stopped, complaint, here):
+    (here / "pair.py").write_text((here / "pair.py").read_text().replace("[0.01, 0.02]", "[0.01, 0.03]"))
+    assert cli.main(["run", "--resume", "out"]) == 2
+    assert "is of another search: the problem, its records" in complaint()
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--fresh"], "--resume and --fresh exclude each other"),
+        (["--out", "x"], "--resume and --out exclude each other"),
+        (["--seed", "3"], "--resume takes --seed, --strategy, --data and --set from the run in out"),
+        (["--set", "n=3"], "--resume takes --seed, --strategy, --data and --set from the run in out"),
+    ],
+)
+def test_what_does_not_go_together_is_told(stopped, complaint, more, said):
+    assert cli.main(["run", "--resume", "out", *more]) == 2
+    assert said in complaint()
+
+
+def test_where_nothing_is_unfinished_it_begins_anew_or_asks_for_the_problem(here, complaint, capsys, no_pictures):
+    assert cli.main(["run", "--resume", "out"]) == 2
+    assert "no unfinished run in out: 'sysid run PROBLEM --resume out' begins one there" in complaint()
+    assert cli.main(["run"]) == 2
+    assert "PROBLEM is missing" in complaint()
+    assert cli.main(["run", "pair.py", "--resume", "out"]) == 0
+    assert capsys.readouterr().out.startswith("no unfinished run in out: it begins anew\n")
+    assert (here / "out/result.h5").is_file()
+
+
+def test_a_run_that_had_reached_nothing_begins_anew_and_says_so(stopped, capsys, monkeypatch):
+    """As after a kill before the first state is written: the file tells how the run was begun."""
+    tree = Checkpoint(stopped / FILE_NAME).read()
+    monkeypatch.setattr(Checkpoint, "read", lambda self: {**tree, "entries": {}})
+    assert cli.main(["run", "--resume", "out"]) == 0
+    assert capsys.readouterr().out.startswith("pair.py, strategy swarm, seed 0 had reached nothing: it begins anew\n")
+
+
+def test_a_damaged_state_is_told_and_fresh_leads_on(stopped, complaint):
+    (stopped / FILE_NAME).write_bytes((stopped / FILE_NAME).read_bytes()[:700])
+    assert cli.main(["run", "--resume", "out"]) == 2
+    assert "out/unfinished.h5 cannot be read: it is damaged" in complaint()
+    assert cli.main(RUN) == 2
+    assert "out holds an unfinished run that is damaged" in complaint()
+    assert cli.main([*RUN, "--fresh"]) == 0
+
+
+def test_a_killed_process_goes_on(here, process, without_pictures, interruptible):
+    """By -9, whatever it is doing."""
+    (here / "pair.py").write_text(without_pictures.replace("goal=1e-6", "goal=1e-30"))
+    running = interruptible("-m", "sysid", "run", "pair.py", "--strategy", "swarm", "--out", "out", cwd=here)
+    with running:
+        for line in running.stdout:
+            if line.startswith("swarm"):
+                break
+        time.sleep(0.2)
+        running.send_signal(signal.SIGKILL)
+    assert running.wait() == -signal.SIGKILL
+    assert (here / "out" / FILE_NAME).is_file()
+    done = process("run", "--resume", "out", cwd=here)
+    assert done.returncode == 1  # that goal is beyond round-off
+    assert not (here / "out" / FILE_NAME).exists()
+    assert sysid.load(here / "out").residual < 1e-9
