@@ -1,8 +1,6 @@
 """``python -m sysid`` is the ``sysid`` command."""
 
-import sys
-
-from sysid.cli.main import main
+from sysid.cli.main import command
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command()

@@ -12,6 +12,7 @@ import contextlib
 import functools
 import math
 import os
+import signal
 import sys
 import tempfile
 import time
@@ -67,6 +68,17 @@ def main(argv: Sequence[str] | None = None) -> int:
             complain(f"standard output cannot be written: {out.failed.strerror}")
             status = status or MISTAKE
     return status
+
+
+def command() -> NoReturn:
+    """Run the command line and end the process, which no Ctrl-C breaks any more once its status is known."""
+    try:
+        status = main()
+    except KeyboardInterrupt:  # one more, while the first one was told
+        status = INTERRUPTED
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    sys.exit(status)
 
 
 def _run_command(argv: Sequence[str] | None, out: Output) -> int:

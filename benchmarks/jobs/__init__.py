@@ -1,0 +1,1 @@
+"""Searches and jobs that are killed, interrupted or cut off."""
