@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from threadpoolctl import threadpool_limits
 
 from sysid.errors import InputError, SolverError, finite_array, function, instance, number, path_of, whole_number
+from sysid.nlp import one_thread
 from sysid.problem.problem import Problem
 from sysid.results.checkpoint import Checkpoint, identity
 from sysid.results.identification import Identification
@@ -99,7 +99,7 @@ def identify(
             raise InputError("checkpoint needs rng=: a search without a seed is another one each time")
         file = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(path_of("checkpoint", checkpoint))
         kept = file.journal(identity(problem, strategy, seed, start, max_evaluations))
-    with threadpool_limits(limits=1), DeferredInterrupt() as interrupt, kept as journal:
+    with one_thread(), DeferredInterrupt() as interrupt, kept as journal:
         session = Session(listeners, interrupt, max_time, random, max_evaluations, journal)
         prepare(problem, session)
         chosen, why = choose(strategy, problem, start)

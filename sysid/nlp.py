@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import null_space
+from threadpoolctl import OpenBLASController, register, threadpool_limits
 
 Array = NDArray[np.floating[Any]]
 
@@ -23,6 +25,23 @@ def quiet_options(max_iterations: int) -> dict[str, Any]:
     """Options of a small run of IPOPT that prints nothing."""
     ipopt = {"print_level": 0, "sb": "yes", "max_iter": max_iterations}
     return {"print_time": False, "show_eval_warnings": False, "ipopt": ipopt}
+
+
+class _BlasOfIpopt(OpenBLASController):
+    """The OpenBLAS that CasADi's wheels bring for IPOPT, under a name that threadpoolctl does not know."""
+
+    filename_prefixes = ("libcasadi-tp-openblas", "casadi-tp-openblas")
+
+
+register(_BlasOfIpopt)
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Hold NumPy's, SciPy's and IPOPT's linear algebra to one thread: the same bits on any number of processors."""
+    ca.has_nlpsol("ipopt")  # loads it, as only libraries that are loaded can be limited
+    with threadpool_limits(limits=1):
+        yield
 
 
 class NonlinearProgram:

@@ -24,7 +24,7 @@ OVERHEAD = 20.0  # ms a job
 GAIN = 0.9  # of what bare NumPy gains
 REPEATS = 5
 BATCH = 16  # jobs of one measurement of the gain
-_MODULE = '''
+MODULE = '''
 """A chain of storeys, each with a spring and a damper."""
 
 import casadi as ca
@@ -54,10 +54,10 @@ def lines(reduced: bool) -> Iterator[Line]:
     """Results and bits under kills; time beside the jobs' own; gain of a second worker, alternated with bare NumPy."""
     with tempfile.TemporaryDirectory() as folder, threadpool_limits(limits=1):
         module = Path(folder) / "chain.py"
-        module.write_text(_MODULE)
+        module.write_text(MODULE)
         recipe = sysid.Recipe(str(module))
-        yield from _survival(recipe, Path(folder) / "ledger", 12 if reduced else JOBS, EVERY)
-        own, beside = _overhead(recipe, 8 if reduced else 40)
+        yield from _survival(recipe, Path(folder) / "ledger", 8 if reduced else JOBS, EVERY)
+        own, beside = _overhead(recipe, 4 if reduced else 40)
         yield Line("seconds that a job takes in this process, median", f"{own:.3g}")
         text = "milliseconds a job on a worker, with its ledger, beside its own time"
         yield Line(text, f"{beside:.3g}") if reduced else below(text, beside, OVERHEAD)
@@ -66,13 +66,13 @@ def lines(reduced: bool) -> Iterator[Line]:
 
 
 def _survival(recipe: sysid.Recipe, ledger: Path, count: int, every: float) -> Iterator[Line]:
-    expected = {result.index: _bits(result) for result in jobs.submit(recipe, starts=count, executor=jobs.processes(2))}
+    expected = {result.index: bits(result) for result in jobs.submit(recipe, starts=count, executor=jobs.processes(2))}
     stop, killed = threading.Event(), list[int]()
     killer = threading.Thread(target=_kill_now_and_then, args=(stop, every, killed))
     killer.start()
     try:
         found = {
-            result.index: _bits(result)
+            result.index: bits(result)
             for result in jobs.submit(recipe, starts=count, executor=jobs.processes(WORKERS), out=ledger)
         }
     finally:
@@ -83,7 +83,8 @@ def _survival(recipe: sysid.Recipe, ledger: Path, count: int, every: float) -> I
     yield above(text, alike, count)
 
 
-def _bits(result: jobs.JobResult) -> tuple[object, ...]:
+def bits(result: jobs.JobResult) -> tuple[object, ...]:
+    """All of a result."""
     return result.seed, result.success, result.message, repr(result.residual), result.x.tobytes()
 
 

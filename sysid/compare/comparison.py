@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from sysid.compare import peers
 from sysid.compare.method_result import MethodResult, Recorder, Status, errors_of, status_of
 from sysid.errors import InputError, SolverError
 from sysid.identify import NAMED, identify, prepare
+from sysid.nlp import one_thread
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification
 from sysid.search.session import DeferredInterrupt, Session
@@ -116,7 +116,7 @@ def compare(
 
 def _results(problem: Problem, rng: int, max_time: float | None) -> Iterator[MethodResult]:
     """Run one method after the other."""
-    with threadpool_limits(limits=1), DeferredInterrupt() as interrupt:
+    with one_thread(), DeferredInterrupt() as interrupt:
         session = Session([], interrupt)
         prepare(problem, session)
         strategies = {name: make() for name, make in NAMED.items()}
@@ -135,7 +135,7 @@ def _results(problem: Problem, rng: int, max_time: float | None) -> Iterator[Met
             yield MethodResult(name, Status.REFUSED, "the swarm, whose objective and budget it takes, did not run")
             continue
         random = np.random.SeedSequence(rng, spawn_key=(number,))
-        with threadpool_limits(limits=1), DeferredInterrupt() as interrupt:
+        with one_thread(), DeferredInterrupt() as interrupt:
             recorder = Recorder()
             session = Session([recorder], interrupt, max_time, random)
             result = peers.run(name, landscape, most, session, recorder)

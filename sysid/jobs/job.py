@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from sysid import catalogue
 from sysid.errors import InputError, SolverError
+from sysid.nlp import one_thread
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.results.identification import Recipe
@@ -81,7 +81,7 @@ class JobResult:
 def run(job: Job) -> JobResult:
     """Run a job where it stands; the same bits wherever that is on one kind of machine."""
     try:
-        with threadpool_limits(limits=1), DeferredInterrupt() as interrupt:
+        with one_thread(), DeferredInterrupt() as interrupt:
             result = _refined(job, Session([], interrupt))
             interrupt.check()
             return result

@@ -13,13 +13,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.relocation import relocate
 from sysid.modal_analysis.residues import ROUND_OFF, Records, ResidueFit, SubsetFits, beyond_chance
 from sysid.modal_analysis.response import gain_slopes, gains
+from sysid.nlp import one_thread
 from sysid.structure.structure import Array
 
 _SPARE = 6  # poles beyond those expected: without spare ones noise moves true poles
@@ -96,7 +96,7 @@ def find_poles(test: Measurement, *, monitor: Monitor | None = None) -> Poles:
     B. Gustavsen, A. Semlyen, IEEE Trans. Power Delivery 14 (1999) 1052-1061; B. Gustavsen, ibid. 21 (2006)
     1587-1592. G. H. Golub, V. Pereyra, SIAM J. Numer. Anal. 10 (1973) 413-432, with Kaufman's Jacobian (1975).
     """
-    with threadpool_limits(limits=1):  # the same bits whatever else the machine does
+    with one_thread():  # the same bits whatever else the machine does
         records = Records(test)
         return _find(records, _Progress(monitor, records))
 
@@ -178,7 +178,7 @@ def poles_of_any_damping(records: Records, *, monitor: Monitor | None = None) ->
         As in `find_poles`.
     """
     progress = _Progress(monitor, records)
-    with threadpool_limits(limits=1):
+    with one_thread():
         count = _count(records, progress)
         while _lines_suffice(records, count):
             omega, ratios = _settled(records, *_relocated(records, count, progress), progress, velocity=True)

@@ -51,8 +51,12 @@ def read(path: str | Path, build: Callable[[Tree], T]) -> T:
     What is wrong with `build`'s tree is an error of the file.
     """
     given = path_of("path", path)
-    source = given / FILE_NAME if given.is_dir() else given
-    if not source.is_file():
+    try:
+        source = given / FILE_NAME if given.is_dir() else given
+        there = source.is_file()
+    except OSError as error:  # such as a name that is too long
+        raise InputError(f"{given} cannot be read: {error.strerror or error}") from None
+    if not there:
         raise InputError(f"no result at {source}: give the .h5 file that 'sysid run' wrote, or its folder")
     try:
         return build(_tree(source))

@@ -1,6 +1,9 @@
 """Refinement jobs: the same results wherever they run, whatever dies, and never twice."""
 
+import os
 import sqlite3
+import subprocess
+import sys
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
@@ -254,3 +257,35 @@ def test_a_cluster_gives_the_same_bits(recipe):
     ) as workers:
         found = by_index(submit(recipe, starts=3, executor=cluster(workers.scheduler_address)))
     assert same(found, here)
+
+
+CHAIN = """
+import casadi as ca
+import numpy as np
+import sysid
+
+n = 5
+stretch = np.eye(n, n + 1) - np.eye(n, n + 1, -1)
+stretch[0, n] = -1.0
+M, K, C = (stretch.T @ np.diag(size * (1 + 0.1 * np.arange(n))) @ stretch for size in (0.0, 1e6, 600.0))
+M[:n, :n] = 1000.0 * np.eye(n)
+truth = sysid.Structure(M, K, damping_matrix=C[:n, :n], n_base=1)
+test = sysid.simulate(truth, np.geomspace(0.5, 12, 150), noise=0.01, rng=0)
+k, c = (sysid.Variable(name, n, lower=at / 10, upper=10 * at, log=True) for name, at in (("k", 1e6), ("c", 600.0)))
+K, C = (stretch.T @ ca.diag(part) @ stretch for part in (k, c))
+problem = sysid.Problem(test, mass=M, stiffness=K, damping=C)
+print(sysid.identify(problem, strategy=sysid.Continuation(1), rng=0).x.tobytes().hex())
+"""
+
+
+def test_the_bits_do_not_depend_on_the_threads_that_linear_algebra_may_have():
+    """IPOPT's own is another library than NumPy's; what the environment allows is what it starts with."""
+    found = [
+        subprocess.run(
+            [sys.executable, "-c", CHAIN], env={**os.environ, "OPENBLAS_NUM_THREADS": threads}, capture_output=True,
+            check=True, timeout=120,
+        ).stdout
+        for threads in ("1", "2")
+    ]  # fmt: skip
+    assert len(found[0]) > 100
+    assert found[0] == found[1]

@@ -60,8 +60,8 @@ def test_each_of_300_damaged_files_is_refused(sound, kind, tmp_path, monkeypatch
             sysid.load(path)
 
 
-# A problem in models takes 20 ms to load, one in expressions half a second: CasADi reads its text in another process.
-@pytest.mark.parametrize(("name", "count"), [("open_masses", 60), ("lumped", 40), ("own_misfit", 6)])
+# Another process reads each, which takes half a second.
+@pytest.mark.parametrize(("name", "count"), [("open_masses", 12), ("own_misfit", 8)])
 @pytest.mark.parametrize("kind", ["flipped", "cut", "appended", "zeroed"])
 def test_a_damaged_file_of_an_old_format_never_ends_in_a_foreign_exception(name, count, kind, tmp_path):
     """It has no SHA-256, so that it may be read: but then all of it."""
@@ -101,5 +101,5 @@ def test_a_text_of_casadi_that_is_damaged_is_read_in_another_process(tmp_path):
         place = file["problem/formulation/matrices"]
         text = place["function"][()]
         place["function"][()] = text[:7063] + b"h" * 40 + text[7103:]
-    with pytest.raises(sysid.InputError, match="CasADi cannot read the expressions"):
+    with pytest.raises(sysid.InputError, match="it is damaged: the library that reads it crashed"):
         sysid.load(path)

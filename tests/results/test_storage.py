@@ -239,6 +239,8 @@ def test_each_wrong_file_gets_its_own_sentence(tmp_path):
         sysid.load(tmp_path / "nowhere.h5")
     with pytest.raises(sysid.InputError, match=r"no result at .*result\.h5"):
         sysid.load(tmp_path)
+    with pytest.raises(sysid.InputError, match="x cannot be read: File name too long"):
+        sysid.load("x" * 5000)
     for name, content, sentence in (
         ("text.h5", b"not this", "it is not a result of sysid"),
         ("empty.h5", b"", "it is not a result of sysid"),

@@ -1,0 +1,1 @@
+"""Files and arguments that nobody should have given."""

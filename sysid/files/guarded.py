@@ -1,0 +1,69 @@
+"""Files of somebody else's making, read in a process of their own.
+
+A parser that crashes, hangs or fills the memory there takes nothing with it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+from sysid.errors import InputError
+from sysid.files.tree import Tree, from_bytes, to_bytes
+
+_SECONDS = 30.0
+_MEMORY = 2**32  # bytes
+_CHILD = f"import sys; from {__name__} import give; give(*sys.argv[1:])"
+_REFUSED = 3  # exit status: what was wrong is on standard error
+
+
+def guarded(reader: str, path: Path, seconds: float = _SECONDS) -> Tree:
+    """What a function of the package gives of a file, called in another process.
+
+    Parameters
+    ----------
+    reader : str
+        ``module:function``; the function takes a Path and gives a tree, see `sysid.files.tree`.
+    path : Path
+    seconds : float
+        After which the other process is ended.
+
+    Raises
+    ------
+    InputError
+        What the function raised; or that the process crashed, took too long or too much memory.
+    """
+    command = [sys.executable, "-W", "ignore", "-c", _CHILD, reader, str(path.absolute())]
+    try:
+        done = subprocess.run(command, capture_output=True, timeout=seconds, stdin=subprocess.DEVNULL)
+    except subprocess.TimeoutExpired:
+        raise InputError(f"it is damaged: reading it takes more than {seconds:g} s") from None
+    if done.returncode == _REFUSED:
+        raise InputError(done.stderr.decode("utf-8", "replace").strip())
+    if done.returncode < 0:
+        name = signal.Signals(-done.returncode).name
+        raise InputError(f"it is damaged: the library that reads it crashed ({name})")
+    if done.returncode:
+        last = done.stderr.decode("utf-8", "replace").strip().rpartition("\n")[2]
+        raise InputError(f"it is damaged ({last or f'its reader ended with {done.returncode}'})")
+    return from_bytes(done.stdout)[0]
+
+
+def give(reader: str, path: str) -> None:
+    """Write the tree that a reader gives to standard output: what the other process does."""
+    with contextlib.suppress(ImportError, OSError, ValueError):  # not every system has such limits
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    module, _, name = reader.partition(":")
+    try:
+        image = to_bytes(getattr(importlib.import_module(module), name)(Path(path)), 0)
+    except InputError as error:
+        print(error, file=sys.stderr)
+        sys.exit(_REFUSED)
+    sys.stdout.buffer.write(image)
