@@ -1,12 +1,17 @@
-"""What the commands share that write: whether a folder can be written, and strict JSON."""
+"""What the commands share that write: whether a folder can be written, files, CSV and strict JSON."""
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
+from sysid.cli.display import Output
 from sysid.errors import InputError
+from sysid.results.storage import atomically
 
 
 def results_folder(given: str | None, default: Path) -> Path:
@@ -29,3 +34,18 @@ def strict_json(value: object) -> str:
     """JSON with null for what is not a number."""
     finite = json.loads(json.dumps(value), parse_constant=lambda _: None)
     return json.dumps(finite, indent=2, allow_nan=False) + "\n"
+
+
+def table_as_csv(rows: Sequence[Sequence[object]]) -> bytes:
+    """Rows, the first of them the names of the columns."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue().encode()
+
+
+def write_files(folder: Path, files: dict[str, bytes], out: Output) -> None:
+    """Write files by their names, each whole or not at all, and tell their paths."""
+    for name, content in files.items():
+        with atomically(folder / name) as temporary:
+            temporary.write_bytes(content)
+        out.write(f"{folder / name}\n")

@@ -330,7 +330,14 @@ def _add_refine(command: Callable[..., argparse.ArgumentParser]) -> None:
         "minima.png. Results are kept as they come: the same command goes on where it was interrupted.",
     )
     refine.add_argument("result", metavar="RESULT", help="a result.h5 that 'sysid run' wrote, or its folder")
-    refine.add_argument("--starts", type=_count, default=16, metavar="N", help="16 by default; the first is the result")
+    refine.add_argument("--starts", type=_count, metavar="N", help="16 by default; the first is the result")
+    refine.add_argument(
+        "--draws",
+        type=_count,
+        metavar="N",
+        help="in the place of starts: fits of N sets of records that the result would have given, with noise drawn "
+        "anew; writes draws.csv, spreads.csv and draws.png, their spread beside the linear uncertainty",
+    )
     refine.add_argument("--workers", type=_count, metavar="N", help="processes, as many as processors by default")
     refine.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster, such as tcp://host:8786")
     refine.add_argument("--out", metavar="DIR", help="folder, RESULT's folder/refine by default")

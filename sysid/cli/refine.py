@@ -1,17 +1,16 @@
-"""``sysid refine RESULT --starts N``: the local phase from many starts, and the distinct minima that it ends in."""
+"""``sysid refine RESULT``: the local phase from many starts or of many draws of noise, and what they say together."""
 
 from __future__ import annotations
 
 import argparse
-import csv
-import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 
+from sysid.cli import draws
 from sysid.cli.display import Output, complain
-from sysid.cli.files import results_folder
+from sysid.cli.files import results_folder, table_as_csv, write_files
 from sysid.cli.status import INTERRUPTED, NOT_REACHED, SUCCESS
 from sysid.errors import InputError
 from sysid.jobs.engine import cluster, processes
@@ -19,38 +18,58 @@ from sysid.jobs.job import JobResult
 from sysid.jobs.ledger import FILE_NAME as LEDGER
 from sysid.jobs.minima import Minimum, as_good, distinct
 from sysid.jobs.submit import submit
+from sysid.nlp import EXACT
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification, Recipe, load
-from sysid.results.storage import atomically
 
 _SHOWN = 12  # minima in the table
+_STARTS = 16
 
 
 def run(options: argparse.Namespace, out: Output) -> int:
-    """Refine from the result and from fresh points, tell each end in a line, then the distinct minima."""
+    """Refine from many starts, or many draws of noise; tell each end in a line, then all of them together."""
     source = Path(options.result)
     result = load(source)
     recipe = _recipe(result, source)
     folder = results_folder(options.out, (source if source.is_dir() else source.parent) / "refine")
     executor = _executor(options)
-    ends: list[JobResult] = []
-    interrupted = False
-    out.write(f"{recipe.title}: {options.starts} starts, the first at the result\n")
-    try:
-        for end in submit(recipe, starts=options.starts, executor=executor, out=folder):
-            ends.append(end)
-            left = f"residual {end.residual:.4e}" if end.x.size else "no result"
-            out.write(f"{len(ends):4d} of {options.starts}  start {end.index:4d}  {left}  {end.message}\n")
-            out.flush()
-    except KeyboardInterrupt:
-        interrupted = True
-    minima = distinct(result.problem, ends)
-    out.write(f"\n{table(minima, len(ends))}\n\n")
-    _write(folder, recipe, ends, minima, result.problem, out)
+    if options.draws is not None and options.starts is not None:
+        raise InputError("--starts and --draws exclude each other")
+    if options.draws is not None:
+        if result.residual < EXACT:
+            raise InputError(f"{source} fits its records exactly: without noise there is nothing to draw")
+        count, word, told = options.draws, "draw", "draws of noise, each fitted from the result"
+        jobs = submit(recipe, draws=count, executor=executor, out=folder)
+    else:
+        count, word, told = options.starts or _STARTS, "start", "starts, the first at the result"
+        jobs = submit(recipe, starts=count, executor=executor, out=folder)
+    out.write(f"{recipe.title}: {count} {told}\n")
+    ends, interrupted = _ends(jobs, count, word, out)
+    if options.draws is not None:
+        draws.tell(folder, result, recipe, ends, out)
+        out.write(f"{folder / LEDGER}\n")
+    else:
+        minima = distinct(result.problem, ends)
+        out.write(f"\n{table(minima, len(ends))}\n\n")
+        _write(folder, recipe, ends, minima, result.problem, out)
     if interrupted:
-        complain(f"interrupted after {len(ends)} of {options.starts} starts; the same command goes on from there")
+        complain(f"interrupted after {len(ends)} of {count} {word}s; the same command goes on from there")
         return INTERRUPTED
     return SUCCESS if any(end.success for end in ends) else NOT_REACHED
+
+
+def _ends(jobs: Iterator[JobResult], count: int, word: str, out: Output) -> tuple[list[JobResult], bool]:
+    """Tell the ends of jobs as they come; whether Ctrl-C ended that."""
+    ends: list[JobResult] = []
+    try:
+        for end in jobs:
+            ends.append(end)
+            left = f"residual {end.residual:.4e}" if end.x.size else "no result"
+            out.write(f"{len(ends):4d} of {count}  {word} {end.index:4d}  {left}  {end.message}\n")
+            out.flush()
+    except KeyboardInterrupt:
+        return ends, True
+    return ends, False
 
 
 def table(minima: list[Minimum], starts: int) -> str:
@@ -100,20 +119,19 @@ def _write(
     from sysid.plot.minima import minima as picture
 
     of = {end.index: i + 1 for i, minimum in enumerate(minima) for end in minimum.results}
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["start", "seed", "success", "residual", "minimum", "message", *problem.formulation.labels])
-    for end in sorted(ends, key=lambda one: one.index):
-        writer.writerow([
+    rows: list[Sequence[object]] = [
+        ("start", "seed", "success", "residual", "minimum", "message", *problem.formulation.labels)
+    ]
+    rows += [
+        (
             end.index, end.seed, end.success, repr(end.residual) if end.x.size else "", of.get(end.index, ""),
             end.message, *map(repr, end.x.tolist()),
-        ])  # fmt: skip
-    files = {"starts.csv": text.getvalue().encode()}
+        )
+        for end in sorted(ends, key=lambda one: one.index)
+    ]  # fmt: skip
+    files = {"starts.csv": table_as_csv(rows)}
     if minima:
         with own_style():
             files["minima.png"] = to_png(picture(minima, recipe.title, goal=problem.goal), dpi=130)
-    for name, content in files.items():
-        with atomically(folder / name) as temporary:
-            temporary.write_bytes(content)
-        out.write(f"{folder / name}\n")
+    write_files(folder, files, out)
     out.write(f"{folder / LEDGER}\n")

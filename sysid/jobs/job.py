@@ -9,6 +9,7 @@ import numpy as np
 
 from sysid import catalogue
 from sysid.errors import InputError, SolverError
+from sysid.jobs.draws import drawn
 from sysid.nlp import one_thread
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
@@ -35,19 +36,21 @@ class Job:
         0 is the recipe's own start where it has one; all others are fresh points of the search space.
     source : str
         Tells one text of the problem module from another.
+    draw : int
+        Of noise, by number from 1; the job then starts where the recipe does. 0 fits the records themselves.
     """
 
     index: int
     recipe: Recipe
     start: int
     source: str
+    draw: int = 0
 
     @property
     def seed(self) -> int:
-        """Of the fresh point: the recipe's and the number of the start make it."""
-        return int(
-            np.random.SeedSequence(self.recipe.rng, spawn_key=(self.start,)).generate_state(1, np.uint64)[0] >> 1
-        )
+        """Of the fresh point or the noise: the recipe's and the number of the start or the draw make it."""
+        key = (self.start, self.draw) if self.draw else (self.start,)
+        return int(np.random.SeedSequence(self.recipe.rng, spawn_key=key).generate_state(1, np.uint64)[0] >> 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +62,7 @@ class JobResult:
     index : int
         Of the job: recipe by recipe, start by start.
     seed : int
-        Of the start, where it was a fresh point.
+        Of the start, where it was a fresh point, or of the noise that was drawn.
     success : bool
         The solver's status is good and the residual meets the problem's goal, or is a fit at all where none is given.
     message : str
@@ -101,6 +104,8 @@ def _refined(job: Job, session: Session) -> JobResult:
     own = job.start == 0 and job.recipe.start is not None
     if own:
         x = as_unknowns(problem, np.array(job.recipe.start))
+        if job.draw:
+            problem = drawn(problem, x, np.random.SeedSequence(job.seed))
     else:
         found = random_starts(problem, 1, np.random.SeedSequence(job.seed))
         if not found:

@@ -87,4 +87,5 @@ class Ledger:
 
 def _key(job: Job) -> str:
     start = job.recipe.start if job.start == 0 else None
-    return json.dumps([{**job.recipe.to_tree(), "start": start}, job.start, job.source], sort_keys=True)
+    key = [{**job.recipe.to_tree(), "start": start}, job.start, job.source]
+    return json.dumps([*key, job.draw] if job.draw else key, sort_keys=True)

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sysid import catalogue
-from sysid.errors import InputError
+from sysid.errors import InputError, whole_number
 from sysid.jobs.engine import checked, each
 from sysid.jobs.job import Job, JobResult, run, without_result
 from sysid.jobs.ledger import Ledger
@@ -21,6 +21,7 @@ def submit(
     recipe: Recipe | Sequence[Recipe],
     *,
     starts: int = 1,
+    draws: int = 0,
     executor: Executor | Callable[[], Executor] | None = None,
     out: str | Path | None = None,
 ) -> Iterator[JobResult]:
@@ -33,6 +34,9 @@ def submit(
         others are fresh points of the search space, by the recipe's ``rng``.
     starts : int
         Of each recipe.
+    draws : int
+        In the place of starts: fits of records that the structure at `Recipe.start` would have given, with noise of the
+        size that was stated or found, drawn anew for each.
     executor : Executor or callable, optional
         None runs the jobs in this process. ``sysid.jobs.processes(4)`` makes pools of four processes, a new one where
         a worker died; a function of your own that makes an executor does as well, such as one that gives
@@ -63,12 +67,16 @@ def submit(
             )
     if isinstance(starts, bool) or not isinstance(starts, int) or starts < 1:
         raise InputError(f"starts = {starts!r}: a whole number from 1 is needed")
+    whole_number("draws", draws, at_least=0)
+    if draws and (starts > 1 or any(one.start is None for one in recipes)):
+        raise InputError("draws need Recipe.start, the unknowns that were identified, and exclude starts")
     if isinstance(executor, Executor) or not (executor is None or callable(executor)):
         checked(executor)
+    many = draws or starts
     jobs = [
-        Job(i * starts + k, _rooted(one), k, source)
+        Job(i * many + k, _rooted(one), 0, source, k + 1) if draws else Job(i * many + k, _rooted(one), k, source)
         for i, (one, source) in enumerate(zip(recipes, map(_source, recipes), strict=True))
-        for k in range(starts)
+        for k in range(many)
     ]
     ledger = None if out is None else Ledger(Path(out), jobs)
     return _results(jobs, executor, ledger)

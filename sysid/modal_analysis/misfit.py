@@ -42,19 +42,30 @@ class Record:
         return (_gram(spectra * row) for row in (self.by_channel[:, None] * self.by_line) ** 2 * self.std)
 
 
-def records_of(test: Measurement, structure: Structure, unknowns: int) -> list[Record]:
-    """Records of the responses and, where measured, of the force; inferred noise allows for the number of unknowns."""
+def misfits_of(test: Measurement, structure: Structure, unknowns: int) -> list[tuple[ComplexArray, Array]]:
+    """Misfit and standard deviations of the noise, stated or inferred from the misfit, of each number of the records.
+
+    Of the responses and, where measured, of the force, (runs, channels, n_freq); inferred noise allows for the number
+    of unknowns.
+    """
     parts = [(test.response, test.response_std, test.relative - test.predict(structure))]
     if test.force is not None:
         parts.append((test.force, test.force_std, test.force - test.predict_force(structure)))
     left = max(1 - unknowns / (2 * sum(misfit.size for *_, misfit in parts)), 0.5)
-    records = []
+    made: list[tuple[ComplexArray, Array]] = []
     for record, stated, misfit in parts:
         noise = np.sqrt(np.mean(np.abs(misfit) ** 2) / left) if stated is None else stated
         least = _EXACT * np.sqrt(np.mean(np.abs(record) ** 2))
-        std = np.broadcast_to(np.maximum(noise, least), record.shape)
-        by_channel, by_line = separable(std, record.shape)
-        records.append(Record(columns(std).real, columns(misfit), by_channel, by_line.ravel()))
+        made.append((misfit, np.broadcast_to(np.maximum(noise, least), record.shape)))
+    return made
+
+
+def records_of(test: Measurement, structure: Structure, unknowns: int) -> list[Record]:
+    """Records of the responses and, where measured, of the force; inferred noise allows for the number of unknowns."""
+    records = []
+    for misfit, std in misfits_of(test, structure, unknowns):
+        by_channel, by_line = separable(std, std.shape)
+        records.append(Record(columns(std + 0j).real, columns(misfit), by_channel, by_line.ravel()))
     return records
 
 

@@ -48,6 +48,30 @@ def test_a_line_a_start_then_the_minima_a_table_and_a_picture(capsys):
     assert again[:3] == rows and len(again) == 4
 
 
+def test_draws_of_noise_are_told_beside_the_linear_deviations(capsys, tmp_path):
+    assert cli.main(["run", "shear_building", "--set", "noise=0.02", "--out", str(tmp_path)]) == 0
+    capsys.readouterr()
+    assert cli.main(["refine", str(tmp_path), "--draws", "4", "--workers", "1"]) == 0
+    out, error = capsys.readouterr()
+    assert error == ""
+    lines = out.splitlines()
+    assert lines[0] == "shear_building (noise=0.02): 4 draws of noise, each fitted from the result"
+    assert lines[6].split() == ["value", "linear", "std", "draws", "std", "ratio", "within,", "%"]
+    assert lines[7].startswith("mode 1: frequency, Hz")
+    folder = tmp_path / "refine"
+    assert lines[-4:] == [str(folder / name) for name in ("spreads.csv", "draws.csv", "draws.png", "jobs.sqlite")]
+    rows = list(csv.DictReader((folder / "spreads.csv").read_text().splitlines()))
+    assert [row["quantity"] for row in rows[6:9]] == ["spring 1", "spring 2", "spring 3"]
+    assert all(0 < float(row["draws_std"]) < 4 * float(row["linear_std"]) for row in rows)
+    assert len((folder / "draws.csv").read_text().splitlines()) == 5
+    assert (folder / "draws.png").read_bytes().startswith(PNG)
+
+
+def test_without_noise_there_is_nothing_to_draw(capsys):
+    assert cli.main(["refine", "results/physical_damping", "--draws", "3"]) == 2
+    assert "fits its records exactly: without noise there is nothing to draw" in capsys.readouterr().err
+
+
 @pytest.mark.skipif(not README.exists(), reason="no README beside the tests")
 def test_the_example_of_the_readme_refines_that_result():
     names = {"sysid": sysid}
@@ -61,6 +85,7 @@ def test_the_example_of_the_readme_refines_that_result():
     [
         (["nowhere"], "no result at nowhere"),
         (["results/physical_damping", "--starts", "0"], "not a whole number from 1"),
+        (["results/physical_damping", "--starts", "2", "--draws", "2"], "--starts and --draws exclude each other"),
         (["results/physical_damping", "--workers", "2", "--scheduler", "tcp://host:1"], "exclude each other"),
         (["results/physical_damping", "--out", "results/physical_damping/result.h5"], "is not a folder"),
     ],

@@ -1,0 +1,60 @@
+"""Noise drawn anew: the problem with the records that a structure would have given."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sysid.errors import InputError
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.misfit import misfits_of
+from sysid.problem.problem import Problem
+from sysid.problem.terms import FurtherTest, Prior
+from sysid.structure.structure import Array, ComplexArray, Structure
+
+
+def drawn(problem: Problem, x: Array, random: np.random.SeedSequence) -> Problem:
+    """The problem with records simulated from the structure of `x` in the place of the measured ones.
+
+    Their noise has the stated standard deviations, else the size of the misfit that `x` leaves; values known to some
+    accuracy are drawn too (parametric bootstrap: B. Efron and R. Tibshirani, An Introduction to the Bootstrap, 1993).
+
+    Raises
+    ------
+    InputError
+        Where no records are fitted, but a misfit of the user's own.
+    """
+    formulation, rng = problem.formulation, np.random.default_rng(random)
+    if not formulation.fits_records:
+        raise InputError("draws of noise need fitted records; this problem states a misfit of its own")
+    tests = iter(formulation.further_tests)
+    priors = iter(formulation.priors)
+    residuals = []
+    for given in problem.residuals:
+        again = given
+        if isinstance(given, FurtherTest):
+            term = next(tests)
+            structure = term.matrices.structure(x, term.test)
+            again = replace(given, measurement=_again(term.test, structure, problem.n_variables, rng))
+        elif isinstance(given, Prior):
+            _, value, std = given.column("Prior")
+            at = value + std * next(priors).numbers(x)
+            again = replace(given, value=at + std * rng.standard_normal(at.size))
+        residuals.append(again)
+    test = _again(problem.measurement, problem.structure(x), problem.n_variables, rng)
+    return replace(problem, measurement=test, residuals=residuals, validation=(), reference=None)
+
+
+def _again(test: Measurement, structure: Structure, unknowns: int, rng: np.random.Generator) -> Measurement:
+    """The test with the records that the structure makes, and noise of the same size."""
+    response, *force = [_noise(std, rng) - misfit for misfit, std in misfits_of(test, structure, unknowns)]
+    other = replace(test, response=test.response + response)
+    return other if test.force is None else replace(other, force=test.force + force[0])
+
+
+def _noise(std: Array, rng: np.random.Generator) -> ComplexArray:
+    """Circular complex noise, ``E|e|² = std²``."""
+    real, imaginary = rng.standard_normal((2, *std.shape))
+    noise: ComplexArray = std * (real + 1j * imaginary) / np.sqrt(2)
+    return noise
