@@ -15,22 +15,29 @@ from sysid.results.identification import Identification, Recipe
 
 
 def tell(folder: Path, result: Identification, recipe: Recipe, ends: list[JobResult], out: Output) -> None:
-    """Print the spreads, and write them, all draws and the picture."""
+    """Write all draws; where two of them or more are fits, print their spreads and write these and the picture."""
     from sysid.plot.canvas import own_style, to_png
     from sysid.plot.draws import draws as picture
 
-    found, count = spreads(result, ends), sum(end.success for end in ends)
-    out.write(f"\n{table(found, count, len(ends))}\n\n")
-    of_all: list[Sequence[object]] = [("quantity", "value", "linear_std", "draws_std", "inside_share")]
-    of_all += [(s.name, repr(s.value), repr(s.std), repr(s.drawn), repr(s.inside)) for s in found]
     each: list[Sequence[object]] = [
         ("draw", "seed", "success", "residual", "message", *result.problem.formulation.labels)
     ]
     for end in sorted(ends, key=lambda one: one.index):
-        each.append((end.index, end.seed, end.success, repr(end.residual), end.message, *map(repr, end.x.tolist())))
-    with own_style():
-        image = to_png(picture(found, count, recipe.title), dpi=130)
-    write_files(folder, {"spreads.csv": table_as_csv(of_all), "draws.csv": table_as_csv(each), "draws.png": image}, out)
+        left = repr(end.residual) if end.x.size else ""
+        each.append((end.index, end.seed, end.success, left, end.message, *map(repr, end.x.tolist())))
+    files, count = {"draws.csv": table_as_csv(each)}, sum(end.success for end in ends)
+    if count < 2:
+        out.write(f"\n{count} of {len(ends)} draws ended in a fit; two are needed for a spread\n\n")
+    else:
+        found = spreads(result, ends)
+        out.write(f"\n{table(found, count, len(ends))}\n\n")
+        of_all: list[Sequence[object]] = [("quantity", "value", "linear_std", "draws_std", "inside_share")]
+        of_all += [(s.name, repr(s.value), repr(s.std), repr(s.drawn), repr(s.inside)) for s in found]
+        files["spreads.csv"] = table_as_csv(of_all)
+        if any(np.isfinite(spread.ratio) for spread in found):
+            with own_style():
+                files["draws.png"] = to_png(picture(found, count, recipe.title), dpi=130)
+    write_files(folder, files, out)
 
 
 def table(found: Sequence[Spread], count: int, asked: int) -> str:
@@ -38,8 +45,8 @@ def table(found: Sequence[Spread], count: int, asked: int) -> str:
     width = max(len(spread.name) for spread in found)
     lines = [f"{'':{width}}  {'value':>10}  {'linear std':>10}  {'draws std':>10}  ratio  within, %"]
     for spread in found:
-        known = np.isfinite(spread.std) and spread.std > 0
-        beside = f"{spread.drawn / spread.std:5.2f}  {100 * spread.inside:9.0f}" if known else "    -          -"
+        known = np.isfinite(spread.ratio)
+        beside = f"{spread.ratio:5.2f}  {100 * spread.inside:9.0f}" if known else "    -          -"
         linear = f"{spread.std:10.3g}" if known else "         -"
         lines.append(f"{spread.name:{width}}  {spread.value:10.5g}  {linear}  {spread.drawn:10.3g}  {beside}")
     lines += [

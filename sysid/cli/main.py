@@ -148,6 +148,8 @@ def _run(options: argparse.Namespace, out: Output) -> int:
     recipe = search.recipe
     problem = catalogue.build(recipe)
     checkpoint = Checkpoint(folder / UNFINISHED, search)
+    if options.fresh:
+        checkpoint.remove()
     test = problem.measurement
     # Poles of the data, which may take long, are left to the search and its progress and time limit.
     unknowns = problem.formulate(problem.geometry.unsearched()).size

@@ -26,13 +26,11 @@ def begun(options: argparse.Namespace, out: Output) -> tuple[Begun, Path]:
     search = _asked(options)
     folder = results_folder(options.out, Path("results") / catalogue.short_name(search.recipe.module))
     checkpoint = Checkpoint(folder / FILE_NAME)
-    if checkpoint.exists:
-        if not options.fresh:
-            raise InputError(
-                f"{folder} holds {_in_words(checkpoint, search)}: 'sysid run --resume {folder}' goes on with it, "
-                "--fresh begins anew, --out DIR writes elsewhere"
-            )
-        checkpoint.remove()
+    if checkpoint.exists and not options.fresh:
+        raise InputError(
+            f"{folder} holds {_in_words(checkpoint, search)}: 'sysid run --resume {folder}' goes on with it, "
+            "--fresh begins anew, --out DIR writes elsewhere"
+        )
     return search, folder
 
 
@@ -56,7 +54,7 @@ def _resumed(options: argparse.Namespace, out: Output) -> tuple[Begun, Path]:
     search = Begun.from_tree(tree["begun"])
     if asked is not None and asked != search:
         raise InputError(f"{folder} holds an unfinished run of {search}, not of {asked}")
-    if (asked is None and (options.seed, options.strategy, options.data) != (None, None, None)) or options.settings:
+    if asked is None and ((options.seed, options.strategy, options.data) != (None, None, None) or options.settings):
         raise InputError(f"--resume takes --seed, --strategy, --data and --set from the run in {folder}: {search}")
     out.write(f"going on with {search}\n" if tree["entries"] else f"{search} had reached nothing: it begins anew\n")
     return search, folder

@@ -17,7 +17,8 @@ from sysid.files.tree import Tree, from_bytes, to_bytes
 
 _SECONDS = 30.0
 _MEMORY = 2**32  # bytes
-_CHILD = f"import sys; from {__name__} import give; give(*sys.argv[1:])"
+# With the modules that this process finds: a file of the user's in the working folder must not stand for one of them.
+_CHILD = f"import sys; sys.path[:] = sys.argv.pop(1).split('|'); from {__name__} import give; give(*sys.argv[1:])"
 _REFUSED = 3  # exit status: what was wrong is on standard error
 
 
@@ -37,7 +38,7 @@ def guarded(reader: str, path: Path, seconds: float = _SECONDS) -> Tree:
     InputError
         What the function raised; or that the process crashed, took too long or too much memory.
     """
-    command = [sys.executable, "-W", "ignore", "-c", _CHILD, reader, str(path.absolute())]
+    command = [sys.executable, "-W", "ignore", "-c", _CHILD, "|".join(sys.path), reader, str(path.absolute())]
     try:
         done = subprocess.run(command, capture_output=True, timeout=seconds, stdin=subprocess.DEVNULL)
     except subprocess.TimeoutExpired:

@@ -8,7 +8,7 @@ import numpy as np
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.misfit import misfits_of
+from sysid.modal_analysis.misfit import inflation_of, misfits_of, records_of
 from sysid.problem.problem import Problem
 from sysid.problem.terms import FurtherTest, Prior
 from sysid.structure.structure import Array, ComplexArray, Structure
@@ -17,27 +17,26 @@ from sysid.structure.structure import Array, ComplexArray, Structure
 def drawn(problem: Problem, x: Array, random: np.random.SeedSequence) -> Problem:
     """The problem with records simulated from the structure of `x` in the place of the measured ones.
 
-    Their noise has the stated standard deviations, else the size of the misfit that `x` leaves; values known to some
-    accuracy are drawn too (parametric bootstrap: B. Efron and R. Tibshirani, An Introduction to the Bootstrap, 1993).
+    Their noise has the stated standard deviations, raised as the linear uncertainty is where the misfit is larger, else
+    the size of the misfit that `x` leaves; values known to some accuracy are drawn too (parametric bootstrap: B. Efron
+    and R. Tibshirani, An Introduction to the Bootstrap, 1993).
 
     Raises
     ------
     InputError
-        Where no records are fitted, but a misfit of the user's own.
+        See `check_drawable`.
     """
+    check_drawable(problem)
     formulation, rng = problem.formulation, np.random.default_rng(random)
-    if not formulation.fits_records:
-        raise InputError("draws of noise need fitted records; this problem states a misfit of its own")
     tests = iter(formulation.further_tests)
     priors = iter(formulation.priors)
     residuals = []
     for given in problem.residuals:
-        again = given
         if isinstance(given, FurtherTest):
             term = next(tests)
             structure = term.matrices.structure(x, term.test)
             again = replace(given, measurement=_again(term.test, structure, problem.n_variables, rng))
-        elif isinstance(given, Prior):
+        else:
             _, value, std = given.column("Prior")
             at = value + std * next(priors).numbers(x)
             again = replace(given, value=at + std * rng.standard_normal(at.size))
@@ -46,9 +45,21 @@ def drawn(problem: Problem, x: Array, random: np.random.SeedSequence) -> Problem
     return replace(problem, measurement=test, residuals=residuals, validation=(), reference=None)
 
 
+def check_drawable(problem: Problem) -> None:
+    """Refuse a problem with something fitted whose noise nobody knows: a misfit or residuals of the user's own."""
+    own = [given for given in problem.residuals if not isinstance(given, FurtherTest | Prior)]
+    if own or not problem.formulation.fits_records:
+        raise InputError(
+            "draws of noise need records, and values known to some accuracy (Prior): what noise the misfit or the "
+            "residuals have that this problem states for itself is not known"
+        )
+
+
 def _again(test: Measurement, structure: Structure, unknowns: int, rng: np.random.Generator) -> Measurement:
     """The test with the records that the structure makes, and noise of the same size."""
-    response, *force = [_noise(std, rng) - misfit for misfit, std in misfits_of(test, structure, unknowns)]
+    inflation = inflation_of(test, records_of(test, structure, unknowns), unknowns)
+    more = inflation if np.isfinite(inflation) else 1.0
+    response, *force = [_noise(more * std, rng) - misfit for misfit, std in misfits_of(test, structure, unknowns)]
     other = replace(test, response=test.response + response)
     return other if test.force is None else replace(other, force=test.force + force[0])
 

@@ -39,6 +39,11 @@ class Spread:
     drawn: float
     inside: float
 
+    @property
+    def ratio(self) -> float:
+        """Of both standard deviations, 1 where the linear one is right; NaN where it is not known."""
+        return self.drawn / self.std if self.std > 0 else np.nan
+
 
 def spreads(result: Identification, ends: Sequence[JobResult]) -> list[Spread]:
     """Frequencies, damping ratios and unknowns of a result in the draws that succeeded.

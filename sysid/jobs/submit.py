@@ -11,6 +11,7 @@ from pathlib import Path
 
 from sysid import catalogue
 from sysid.errors import InputError, whole_number
+from sysid.jobs.draws import check_drawable
 from sysid.jobs.engine import checked, each
 from sysid.jobs.job import Job, JobResult, run, without_result
 from sysid.jobs.ledger import Ledger
@@ -75,16 +76,18 @@ def submit(
     many = draws or starts
     jobs = [
         Job(i * many + k, _rooted(one), 0, source, k + 1) if draws else Job(i * many + k, _rooted(one), k, source)
-        for i, (one, source) in enumerate(zip(recipes, map(_source, recipes), strict=True))
+        for i, (one, source) in enumerate((one, _source(one, draws > 0)) for one in recipes)
         for k in range(many)
     ]
     ledger = None if out is None else Ledger(Path(out), jobs)
     return _results(jobs, executor, ledger)
 
 
-def _source(recipe: Recipe) -> str:
+def _source(recipe: Recipe, drawn: bool) -> str:
     """SHA-256 of the problem module's text; building its problem first tells what is wrong before any job runs."""
-    catalogue.build(replace(recipe, start=None))
+    problem = catalogue.build(replace(recipe, start=None))
+    if drawn:
+        check_drawable(problem)
     file = catalogue.file_of(recipe.module)
     return "" if file is None else hashlib.sha256(file.read_bytes()).hexdigest()
 

@@ -32,11 +32,11 @@ def draws(found: Sequence[Spread], count: int, title: str = "") -> Figure:
     -------
     Figure
     """
-    shown = [spread for spread in found if np.isfinite(spread.std) and spread.std > 0]
+    shown = [spread for spread in found if np.isfinite(spread.ratio)]
     figure = new_figure(7.2, _MARGIN + _ROW * len(shown))
     ax = figure.subplots()
     rows = np.arange(len(shown))
-    ratios = [spread.drawn / spread.std for spread in shown]
+    ratios = [spread.ratio for spread in shown]
     chance = _LIKELY / np.sqrt(2 * count)
     ax.axvspan(1 - chance, 1 + chance, color=FAINT, alpha=0.25, linewidth=0, label=f"chance of {count} draws, 95 %")
     ax.axvline(1.0, color=FAINT, linewidth=0.9)

@@ -10,14 +10,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, path_of
+from sysid.errors import InputError, SolverError, path_of
 from sysid.files.tree import Tree, from_bytes, to_bytes
 from sysid.problem.problem import Problem
 from sysid.results.identification import Recipe
-from sysid.results.storage import atomically, missing_folders, remove_empty
+from sysid.results.storage import atomically, missing_folders, remove_empty, unfinished_writings
 from sysid.results.version import __version__
 from sysid.search.journal import EVERY, Journal
 from sysid.search.strategy import Strategy
@@ -44,7 +46,10 @@ class Begun:
     seed: int
 
     def __str__(self) -> str:
-        return f"{self.recipe.title}, strategy {self.strategy}, seed {self.seed}"
+        recipe = self.recipe
+        noise = f", rng {recipe.rng}" if recipe.rng else ""
+        data = "" if recipe.data is None else f", data {recipe.data}"
+        return f"{recipe.title}{noise}{data}, strategy {self.strategy}, seed {self.seed}"
 
     def to_tree(self) -> Tree:
         """Give the fields by their names; `from_tree` takes them back."""
@@ -100,8 +105,9 @@ class Checkpoint:
         return tree
 
     def remove(self) -> None:
-        """Take the file away."""
-        self.path.unlink(missing_ok=True)
+        """Take the file away, and what a kill left of writing it."""
+        for path in (self.path, *unfinished_writings(self.path)):
+            path.unlink(missing_ok=True)
 
     @contextlib.contextmanager
     def journal(self, search: str) -> Iterator[Journal]:
@@ -138,8 +144,13 @@ class Checkpoint:
 
         journal, missing = Journal(try_to_write, entries, self.every), missing_folders(self.path.parent)
         try:
+            for left in unfinished_writings(self.path):
+                left.unlink(missing_ok=True)
             write(entries)
             yield journal
+        except (SolverError, InputError):
+            journal.entries.clear()  # it has ended by itself, and would end so again
+            raise
         finally:
             journal.flush()
             if not journal.entries:
@@ -162,6 +173,7 @@ def identity(
     begin: Any = start.to_tree() if isinstance(start, Structure) else start if start is None else np.asarray(start)
     tree = {
         "problem": problem.to_tree(), "start": begin, "strategy": repr(strategy), "seed": str(seed),
-        "max_evaluations": max_evaluations, "sysid": __version__, "numpy": np.__version__,
+        "max_evaluations": max_evaluations,
+        "versions": (__version__, *(f"{module.__name__} {module.__version__}" for module in (ca, np, scipy))),
     }  # fmt: skip
     return hashlib.sha256(to_bytes(tree, _FORMAT)).hexdigest()

@@ -127,6 +127,11 @@ def atomically(path: Path) -> Iterator[Path]:
         raise
 
 
+def unfinished_writings(path: Path) -> list[Path]:
+    """Give the temporary files of `atomically` that are left where a process was killed while it wrote."""
+    return list(path.parent.glob(f".{path.name}.*.tmp"))
+
+
 def missing_folders(folder: Path) -> list[Path]:
     """Give those of a folder and the folders around it that do not exist, the innermost first."""
     return [place for place in (folder, *folder.parents) if not place.exists()]

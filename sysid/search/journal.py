@@ -60,6 +60,8 @@ class Journal:
         due = time.perf_counter() - self._written > max(self._every, self._took / _SHARE)
         if self._write is None or not (due or at_once):
             return
+        # What came after an older state of this part does not follow from this one.
+        self.entries = {key: entry for key, entry in self.entries.items() if int(key) < int(number)}
         self.entries[number] = {"part": name, "content": content()}
         self._unwritten = True
         if due:

@@ -241,7 +241,7 @@ class ParticleSwarm:
         self._asked = None
         if repaired is not None:
             rows = self.box.clip(checked_rows(repaired, rows.shape, "told"))
-            unit = self.box.to_unit(rows)
+            unit = np.ascontiguousarray(self.box.to_unit(rows))  # sums over it depend on how it lies in memory
             self._positions = unit[: self.n_particles]
             if self._candidate is not None:
                 self._candidate = unit[-1]

@@ -1,5 +1,7 @@
 """Searches that were ended in their midst go on from their checkpoint, and end with the bits they would have had."""
 
+import time
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -91,6 +93,36 @@ def test_ctrl_c_keeps_the_state_at_once_and_the_search_goes_on_from_there(tmp_pa
     )
     assert next(at for at in iterations if at[0] == "swarm") == ("swarm", 8)
     assert bits(again) == bits(sysid.identify(problem, strategy=SHORT, rng=0))
+
+
+def test_a_search_that_fails_by_itself_is_not_unfinished(tmp_path, monkeypatch):
+    import sysid.search.continuation as module
+
+    def no_structure(problem, ends):
+        raise sysid.SolverError("no search ended at a structure")
+
+    monkeypatch.setattr(module, "_best", no_structure)
+    checkpoint = Checkpoint(tmp_path / "state.h5", every=0.0)
+    with pytest.raises(sysid.SolverError):
+        sysid.identify(chain(), strategy="continuation", rng=0, checkpoint=checkpoint)
+    assert not checkpoint.exists
+
+
+def test_what_ran_out_of_time_is_done_again_with_more(tmp_path):
+    """Ctrl-C in the last phase of a search whose time was over before: its fits may have ended where no fit ends."""
+
+    def interrupt(progress):
+        if progress.phase == "continuation" and progress.seconds < 1.0:
+            time.sleep(1.0)
+        if progress.phase == "local phase":
+            raise KeyboardInterrupt
+
+    problem, file = chain(), tmp_path / "state.h5"
+    strategy = sysid.Continuation(starts=1)
+    first = sysid.identify(problem, strategy=strategy, rng=0, max_time=1.0, callback=interrupt, checkpoint=file)
+    assert first.interrupted
+    again = sysid.identify(problem, strategy=strategy, rng=0, checkpoint=file)
+    assert bits(again) == bits(sysid.identify(problem, strategy=strategy, rng=0))
 
 
 def test_a_search_that_had_no_candidate_leaves_nothing(tmp_path):

@@ -59,12 +59,19 @@ def test_draws_of_noise_are_told_beside_the_linear_deviations(capsys, tmp_path):
     assert lines[6].split() == ["value", "linear", "std", "draws", "std", "ratio", "within,", "%"]
     assert lines[7].startswith("mode 1: frequency, Hz")
     folder = tmp_path / "refine"
-    assert lines[-4:] == [str(folder / name) for name in ("spreads.csv", "draws.csv", "draws.png", "jobs.sqlite")]
+    assert lines[-4:] == [str(folder / name) for name in ("draws.csv", "spreads.csv", "draws.png", "jobs.sqlite")]
     rows = list(csv.DictReader((folder / "spreads.csv").read_text().splitlines()))
     assert [row["quantity"] for row in rows[6:9]] == ["spring 1", "spring 2", "spring 3"]
     assert all(0 < float(row["draws_std"]) < 4 * float(row["linear_std"]) for row in rows)
     assert len((folder / "draws.csv").read_text().splitlines()) == 5
     assert (folder / "draws.png").read_bytes().startswith(PNG)
+
+
+def test_one_draw_has_no_spread_and_is_written(capsys, tmp_path):
+    assert cli.main(["run", "shear_building", "--set", "noise=0.02", "--out", str(tmp_path)]) == 0
+    assert cli.main(["refine", str(tmp_path), "--draws", "1", "--workers", "1"]) == 0
+    assert "1 of 1 draws ended in a fit; two are needed for a spread" in capsys.readouterr().out
+    assert sorted(path.name for path in (tmp_path / "refine").iterdir()) == ["draws.csv", "jobs.sqlite"]
 
 
 def test_without_noise_there_is_nothing_to_draw(capsys):

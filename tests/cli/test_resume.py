@@ -61,6 +61,19 @@ def test_fresh_begins_anew(stopped, capsys, files):
     assert sysid.load(stopped).seed == 1
 
 
+def test_fresh_throws_nothing_away_where_the_problem_is_wrong(stopped, complaint):
+    state = (stopped / FILE_NAME).read_bytes()
+    assert cli.main([*RUN, "--fresh", "--set", "nois=0.01"]) == 2
+    assert "nois" in complaint()
+    assert (stopped / FILE_NAME).read_bytes() == state
+
+
+def test_what_a_kill_left_of_writing_the_state_goes_with_it(stopped, files):
+    (stopped / f".{FILE_NAME}.12ab34cd.tmp").write_bytes(b"half")
+    assert cli.main(["run", "--resume", "out"]) == 0
+    assert files(stopped) == {"result.h5", "summary.json", "report.html"}
+
+
 def test_the_problem_may_be_said_again_and_must_be_the_same(stopped, complaint):
     again = ["run", "pair.py", "--strategy", "swarm", "--resume", "out"]
     assert cli.main([*again, "--seed", "2"]) == 2

@@ -38,7 +38,11 @@ def fail(path):
 def reader(tmp_path, monkeypatch):
     """Give a function that reads a small file by one of the readers."""
     (tmp_path / "readers.py").write_text(READERS)
-    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{':'.join(path for path in sys.path if path)}")
+    monkeypatch.syspath_prepend(tmp_path)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "random.py").write_text("a file of the user's, which is none of Python's")
+    monkeypatch.chdir(elsewhere)
     file = tmp_path / "file.bin"
     file.write_bytes(b"\1\2\3")
     return lambda name, **options: guarded(f"readers:{name}", file, **options)

@@ -68,24 +68,33 @@ def test_further_tests_and_values_known_to_some_accuracy_are_drawn_too(result):
     K = [[k * 1e5, -1e5], [-1e5, 1e5]]
     known = sysid.Prior(k, 4.0, std=0.5)
     further = sysid.FurtherTest(test, mass=M, stiffness=K, damping=C)
-    problem = sysid.Problem(
-        test, mass=M, stiffness=K, damping=C, residuals=[known, further, 1e-3 * (k - 3.0)], goal=0.3
-    )
+    problem = sysid.Problem(test, mass=M, stiffness=K, damping=C, residuals=[known, further], goal=0.3)
     draws = [drawn(problem, np.array([5.0]), np.random.SeedSequence(seed)) for seed in range(200)]
     values = [draw.residuals[0].value.item() for draw in draws]
     assert np.mean(values) == pytest.approx(5.0, abs=4 * 0.5 / np.sqrt(200))
     assert np.std(values) == pytest.approx(0.5, rel=4 / np.sqrt(400))
-    assert draws[0].residuals[2] is problem.residuals[2]
     first, second = (draw.residuals[1].measurement.response for draw in draws[:2])
     assert not np.array_equal(first, second)
     assert not np.array_equal(first, draws[0].measurement.response)  # one noise each
 
 
-def test_a_misfit_of_ones_own_has_no_records_to_draw(result):
+@pytest.mark.parametrize("own", ["misfit", "residuals"])
+def test_what_has_no_known_noise_cannot_be_drawn(result, own):
     k = sysid.Variable("k", lower=1.0, upper=9.0)
-    problem = replace(result.problem, stiffness=np.eye(2) * ca.MX(1e5) * k, misfit=k - 3.0)
-    with pytest.raises(sysid.InputError, match="draws of noise need fitted records"):
+    stated = {"misfit": k - 3.0} if own == "misfit" else {"residuals": [k - 3.0]}
+    problem = replace(result.problem, stiffness=np.eye(2) * ca.MX(1e5) * k, **stated)
+    with pytest.raises(sysid.InputError, match="draws of noise need records"):
         drawn(problem, np.array([3.0]), np.random.SeedSequence(0))
+
+
+def test_noise_is_raised_as_the_linear_uncertainty_is_where_it_is_stated_too_small(result):
+    """A quarter of the true one: the misfit shows it, and both deviations allow for it."""
+    test = result.problem.measurement
+    small = replace(result.problem, measurement=replace(test, response_std=test.response_std / 4))
+    assert sysid.identify(small, rng=0).uncertainty.inflation == pytest.approx(4, rel=0.15)
+    predicted = test.response - test.relative + test.predict(result.structure)
+    noise = drawn(small, result.x, np.random.SeedSequence(0)).measurement.response - predicted
+    assert np.sqrt(np.mean(np.abs(noise / test.response_std) ** 2)) == pytest.approx(1, rel=0.2)
 
 
 def test_the_spread_of_draws_is_the_linear_one_and_their_bits_are_the_same_everywhere(recipe, result):
