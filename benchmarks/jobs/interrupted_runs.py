@@ -29,7 +29,7 @@ WROTE_ALL, BEST_SO_FAR, NOTHING = "all was written", "the best so far", "nothing
 def lines(reduced: bool) -> Iterator[Line]:
     """Of interrupts from the start of a run to its end: those after which all is as it was said."""
     rng = np.random.default_rng(12)
-    count = 4 if reduced else INTERRUPTS
+    count = 2 if reduced else INTERRUPTS
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(BESIDE) as pool:
         imported, ended = _whole(Path(folder) / "whole")
         times = rng.uniform(imported, ended, count)

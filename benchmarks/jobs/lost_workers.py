@@ -57,11 +57,10 @@ def lines(reduced: bool) -> Iterator[Line]:
         module.write_text(MODULE)
         recipe = sysid.Recipe(str(module))
         yield from _survival(recipe, Path(folder) / "ledger", 8 if reduced else JOBS, EVERY)
-        own, beside = _overhead(recipe, 4 if reduced else 40)
-        yield Line("seconds that a job takes in this process, median", f"{own:.3g}")
-        text = "milliseconds a job on a worker, with its ledger, beside its own time"
-        yield Line(text, f"{beside:.3g}") if reduced else below(text, beside, OVERHEAD)
         if not reduced:
+            own, beside = _overhead(recipe, 40)
+            yield Line("seconds that a job takes in this process, median", f"{own:.3g}")
+            yield below("milliseconds a job on a worker, with its ledger, beside its own time", beside, OVERHEAD)
             yield from _gain(recipe)
 
 
