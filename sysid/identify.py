@@ -103,7 +103,12 @@ def identify(
         session = Session(listeners, interrupt, max_time, random, max_evaluations, journal)
         prepare(problem, session)
         chosen, why = choose(strategy, problem, start)
-        outcome, why = _run(chosen, why, problem, session, start, follow=strategy == "auto")
+        try:
+            outcome, why = _run(chosen, why, problem, session, start, follow=strategy == "auto")
+        except (InputError, SolverError):
+            if max_time is None:  # it has ended by itself, and would end so again
+                journal.entries.clear()
+            raise
         result = judge(problem, outcome, why, seed, session)
     if checkpoint is not None and file is not checkpoint and not result.interrupted:
         file.remove()

@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, SolverError, path_of
+from sysid.errors import InputError, path_of
 from sysid.files.tree import Tree, from_bytes, to_bytes
 from sysid.problem.problem import Problem
 from sysid.results.identification import Recipe
@@ -148,9 +148,6 @@ class Checkpoint:
                 left.unlink(missing_ok=True)
             write(entries)
             yield journal
-        except (SolverError, InputError):
-            journal.entries.clear()  # it has ended by itself, and would end so again
-            raise
         finally:
             journal.flush()
             if not journal.entries:

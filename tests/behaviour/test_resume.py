@@ -108,6 +108,26 @@ def test_a_search_that_fails_by_itself_is_not_unfinished(tmp_path, monkeypatch):
     assert not checkpoint.exists
 
 
+def test_no_failure_that_another_try_may_mend_takes_the_state_away(tmp_path, monkeypatch):
+    """A full disk at the start of the next run, and a time limit that leaves no time."""
+    import sysid.results.checkpoint as module
+
+    file = unfinished(tmp_path / "state.h5")
+    before = file.read_bytes()
+
+    def full(path):
+        raise sysid.InputError(f"{path} cannot be written: no space left")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "atomically", full)
+        with pytest.raises(sysid.InputError, match="no space left"):
+            sysid.identify(chain(), strategy=SHORT, rng=0, checkpoint=file)
+    assert file.read_bytes() == before
+    with pytest.raises(sysid.SolverError, match="time"):
+        sysid.identify(chain(), strategy=SHORT, rng=0, checkpoint=file, max_time=1e-6)
+    assert Checkpoint(file).read()["entries"]
+
+
 def test_what_ran_out_of_time_is_done_again_with_more(tmp_path):
     """Ctrl-C in the last phase of a search whose time was over before: its fits may have ended where no fit ends."""
 
