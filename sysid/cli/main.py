@@ -326,24 +326,60 @@ def _add_compare(command: Callable[..., argparse.ArgumentParser]) -> None:
 def _add_refine(command: Callable[..., argparse.ArgumentParser]) -> None:
     refine = command(
         "refine",
-        help="refine a result by gradients, from it and from many other starts",
-        description="Run the local phase from the result and from fresh points of the search space, on all processors "
-        "or a cluster. Prints the distinct minima and how often each was reached, and writes starts.csv and "
-        "minima.png. Results are kept as they come: the same command goes on where it was interrupted.",
+        help="jobs about a result: many starts, draws of noise, parts of its test, other models",
+        description="Run many jobs about a result, on all processors or a cluster: the local phase from the result and "
+        "from fresh points of the search space, or one of the other kinds below. Prints one table, and writes it and a "
+        "picture. Results are kept as they come: the same command goes on where it was interrupted.",
     )
     refine.add_argument("result", metavar="RESULT", help="a result.h5 that 'sysid run' wrote, or its folder")
-    refine.add_argument("--starts", type=_count, metavar="N", help="16 by default; the first is the result")
-    refine.add_argument(
+    kinds = refine.add_mutually_exclusive_group()
+    kinds.add_argument(
+        "--starts",
+        type=_count,
+        metavar="N",
+        help="16 by default; the first is the result. Tells the distinct minima, and how often each was reached",
+    )
+    kinds.add_argument(
         "--draws",
         type=_count,
         metavar="N",
-        help="in the place of starts: fits of N sets of records that the result would have given, with noise drawn "
-        "anew; writes draws.csv, spreads.csv and draws.png, their spread beside the linear uncertainty",
+        help="fits of N sets of records that the result would have given, with noise drawn anew: their spread beside "
+        "the linear uncertainty",
+    )
+    kinds.add_argument(
+        "--leave-out",
+        choices=("run", "sensor"),
+        help="identify without each run, or each sensor, in turn: how far the answer moves, and how well it predicts "
+        "what was left out",
+    )
+    kinds.add_argument(
+        "--bands",
+        type=_band,
+        nargs="+",
+        metavar="LOW-HIGH",
+        help="identify from the lines of each band, in Hz: how far the answer moves with the band",
+    )
+    kinds.add_argument(
+        "--variants",
+        nargs="+",
+        metavar="MODULE",
+        help="identify by other problem modules from the same data: AIC, BIC and the residual of the validation tests",
     )
     refine.add_argument("--workers", type=_count, metavar="N", help="processes, as many as processors by default")
     refine.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster, such as tcp://host:8786")
     refine.add_argument("--out", metavar="DIR", help="folder, RESULT's folder/refine by default")
     refine.set_defaults(command=_refine)
+
+
+def _band(text: str) -> tuple[float, float]:
+    low, dash, high = text.rpartition("-")  # the first may be a minus of 1e-3
+    try:
+        ends = float(low), float(high)
+    except ValueError:
+        dash = ""
+    if not dash or not 0 <= ends[0] < ends[1] < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is no band: write its ends in Hz, such as 0.5-20")
+    return ends
 
 
 def _count(text: str) -> int:

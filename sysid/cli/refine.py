@@ -1,4 +1,4 @@
-"""``sysid refine RESULT``: the local phase from many starts or of many draws of noise, and what they say together."""
+"""``sysid refine RESULT``: jobs about a result (starts, draws of noise, parts of its test, other models)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 
-from sysid.cli import draws
+from sysid.cli import draws, sweeps
 from sysid.cli.display import Output, complain
 from sysid.cli.files import results_folder, table_as_csv, write_files
 from sysid.cli.status import INTERRUPTED, NOT_REACHED, SUCCESS
@@ -27,45 +27,55 @@ _STARTS = 16
 
 
 def run(options: argparse.Namespace, out: Output) -> int:
-    """Refine from many starts, or many draws of noise; tell each end in a line, then all of them together."""
+    """Run the jobs that are asked for; tell each end in a line, then all of them together."""
     source = Path(options.result)
     result = load(source)
     recipe = _recipe(result, source)
     folder = results_folder(options.out, (source if source.is_dir() else source.parent) / "refine")
     executor = _executor(options)
-    if options.draws is not None and options.starts is not None:
-        raise InputError("--starts and --draws exclude each other")
-    if options.draws is not None:
+    sweep = sweeps.sweep_of(options, result, recipe)
+    if sweep is not None:
+        titles, told = sweep.titles, sweep.told
+        by = "" if sweep.changes else "auto"
+        jobs = submit(sweep.recipes, changes=sweep.changes, strategy=by, executor=executor, out=folder)
+    elif options.draws is not None:
         if result.residual < EXACT:
             raise InputError(f"{source} fits its records exactly: without noise there is nothing to draw")
-        count, word, told = options.draws, "draw", "draws of noise, each fitted from the result"
-        jobs = submit(recipe, draws=count, executor=executor, out=folder)
+        titles, told = _numbered("draw", options.draws), "draws of noise, each fitted from the result"
+        jobs = submit(_started(recipe, source), draws=options.draws, executor=executor, out=folder)
     else:
-        count, word, told = options.starts or _STARTS, "start", "starts, the first at the result"
-        jobs = submit(recipe, starts=count, executor=executor, out=folder)
-    out.write(f"{recipe.title}: {count} {told}\n")
-    ends, interrupted = _ends(jobs, count, word, out)
-    if options.draws is not None:
+        count = options.starts or _STARTS
+        titles, told = _numbered("start", count), "starts, the first at the result"
+        jobs = submit(_started(recipe, source), starts=count, executor=executor, out=folder)
+    out.write(f"{recipe.title}: {len(titles)} {told}\n")
+    ends, interrupted = _ends(jobs, titles, out)
+    if sweep is not None:
+        sweeps.tell(folder, result, recipe, sweep, ends, out)
+    elif options.draws is not None:
         draws.tell(folder, result, recipe, ends, out)
-        out.write(f"{folder / LEDGER}\n")
     else:
         minima = distinct(result.problem, ends)
         out.write(f"\n{table(minima, len(ends))}\n\n")
         _write(folder, recipe, ends, minima, result.problem, out)
+    out.write(f"{folder / LEDGER}\n")
     if interrupted:
-        complain(f"interrupted after {len(ends)} of {count} {word}s; the same command goes on from there")
+        complain(f"interrupted after {len(ends)} of {len(titles)} jobs; the same command goes on from there")
         return INTERRUPTED
     return SUCCESS if any(end.success for end in ends) else NOT_REACHED
 
 
-def _ends(jobs: Iterator[JobResult], count: int, word: str, out: Output) -> tuple[list[JobResult], bool]:
+def _numbered(word: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{word} {i:4d}" for i in range(count))
+
+
+def _ends(jobs: Iterator[JobResult], titles: Sequence[str], out: Output) -> tuple[list[JobResult], bool]:
     """Tell the ends of jobs as they come; whether Ctrl-C ended that."""
     ends: list[JobResult] = []
     try:
         for end in jobs:
             ends.append(end)
-            left = f"residual {end.residual:.4e}" if end.x.size else "no result"
-            out.write(f"{len(ends):4d} of {count}  {word} {end.index:4d}  {left}  {end.message}\n")
+            left = f"residual {end.residual:.4e}" if end.has_result else "no result"
+            out.write(f"{len(ends):4d} of {len(titles)}  {titles[end.index]}  {left}  {end.message}\n")
             out.flush()
     except KeyboardInterrupt:
         return ends, True
@@ -96,11 +106,17 @@ def _recipe(result: Identification, source: Path) -> Recipe:
             f"{source} was not made from a problem module, so that no worker could rebuild its problem: save the "
             "problem as a module and run it with 'sysid run'"
         )
-    if result.x is None:
+    x = result.x
+    return replace(result.recipe, start=None if x is None else tuple(x.tolist()))
+
+
+def _started(recipe: Recipe, source: Path) -> Recipe:
+    """The recipe, where it has a start."""
+    if recipe.start is None:
         raise InputError(
             f"{source}: its degrees of freedom are not the sensors, so it has no unknowns of the problem to start from"
         )
-    return replace(result.recipe, start=tuple(result.x.tolist()))
+    return recipe
 
 
 def _executor(options: argparse.Namespace) -> Callable[[], Executor] | None:
@@ -134,4 +150,3 @@ def _write(
         with own_style():
             files["minima.png"] = to_png(picture(minima, recipe.title, goal=problem.goal), dpi=130)
     write_files(folder, files, out)
-    out.write(f"{folder / LEDGER}\n")

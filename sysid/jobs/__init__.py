@@ -1,9 +1,28 @@
-"""Refinement jobs: many starts and many problems, in this process, a pool of processes or a cluster."""
+"""Jobs: many starts, draws, parts of a test or problems, in this process, a pool of processes or a cluster."""
 
+from sysid.jobs.changes import Band, WithoutRun, WithoutSensor
 from sysid.jobs.engine import cluster, processes
 from sysid.jobs.job import JobResult
 from sysid.jobs.minima import Minimum, distinct
+from sysid.jobs.score import Compared, Move, Score, moves, scored
 from sysid.jobs.spread import Spread, spreads
 from sysid.jobs.submit import submit
 
-__all__ = ["JobResult", "Minimum", "Spread", "cluster", "distinct", "processes", "spreads", "submit"]
+__all__ = [
+    "Band",
+    "Compared",
+    "JobResult",
+    "Minimum",
+    "Move",
+    "Score",
+    "Spread",
+    "WithoutRun",
+    "WithoutSensor",
+    "cluster",
+    "distinct",
+    "moves",
+    "processes",
+    "scored",
+    "spreads",
+    "submit",
+]

@@ -1,4 +1,4 @@
-"""One refinement job: build the problem from its recipe, and run the local phase from one start."""
+"""One job: build the problem from its recipe, and run the local phase from one start, or identify it whole."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ import numpy as np
 
 from sysid import catalogue
 from sysid.errors import InputError, SolverError
+from sysid.identify import identify
+from sysid.jobs.changes import Change
 from sysid.jobs.draws import drawn
+from sysid.jobs.score import Score, scored
 from sysid.nlp import one_thread
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.results.identification import Recipe
-from sysid.results.judgement import succeeded
+from sysid.results.judgement import judge, succeeded
 from sysid.search.continuation import descend, random_starts, smoothed_tests
 from sysid.search.session import DeferredInterrupt, Session
 from sysid.search.strategy import History, Outcome, as_unknowns
@@ -38,6 +41,10 @@ class Job:
         Tells one text of the problem module from another.
     draw : int
         Of noise, by number from 1; the job then starts where the recipe does. 0 fits the records themselves.
+    strategy : str
+        By which the problem is identified whole; empty for the local phase alone.
+    change : Change or None
+        Of the problem that is identified whole.
     """
 
     index: int
@@ -45,10 +52,14 @@ class Job:
     start: int
     source: str
     draw: int = 0
+    strategy: str = ""
+    change: Change | None = None
 
     @property
     def seed(self) -> int:
         """Of the fresh point or the noise: the recipe's and the number of the start or the draw make it."""
+        if self.strategy:
+            return self.recipe.rng
         key = (self.start, self.draw) if self.draw else (self.start,)
         return int(np.random.SeedSequence(self.recipe.rng, spawn_key=key).generate_state(1, np.uint64)[0] >> 1)
 
@@ -68,9 +79,11 @@ class JobResult:
     message : str
         The solver's status, or why there is no result.
     x : (n_variables,)
-        The unknowns; empty where there is no result.
+        The unknowns; empty where there is no result, and where a whole identification chose other degrees of freedom.
     residual : float
         Relative residual of all fitted tests; NaN where there is no result.
+    score : Score or None
+        Of a whole identification.
     """
 
     index: int
@@ -79,13 +92,20 @@ class JobResult:
     message: str
     x: Array
     residual: float
+    score: Score | None = None
+
+    @property
+    def has_result(self) -> bool:
+        """Whether it came to anything, a fit or not."""
+        return self.x.size > 0 or self.score is not None
 
 
 def run(job: Job) -> JobResult:
     """Run a job where it stands; the same bits wherever that is on one kind of machine."""
     try:
         with one_thread(), DeferredInterrupt() as interrupt:
-            result = _refined(job, Session([], interrupt))
+            session = Session([], interrupt)
+            result = _identified(job, session) if job.strategy else _refined(job, session)
             interrupt.check()
             return result
     except (InputError, SolverError) as error:
@@ -97,6 +117,22 @@ def run(job: Job) -> JobResult:
 def without_result(job: Job, why: str) -> JobResult:
     """What stands for a job that came to nothing."""
     return JobResult(job.index, job.seed, False, why, np.zeros(0), float("nan"))
+
+
+def _identified(job: Job, session: Session) -> JobResult:
+    """The result of a whole identification; from the recipe's start where modes do not tell the matrices."""
+    problem = catalogue.build(replace(job.recipe, start=None))
+    changed = problem if job.change is None else job.change.of(problem)
+    if job.recipe.start is None or changed.free_modes:
+        result = identify(changed, strategy=job.strategy, rng=job.seed)
+        if result.interrupted:
+            raise KeyboardInterrupt
+    else:
+        x = as_unknowns(changed, np.array(job.recipe.start))
+        result = judge(changed, _descended(changed, x, [], session), "from the result's unknowns", job.seed, session)
+    score = scored(result, None if job.change is None else job.change.predicted(problem, result))
+    x = np.zeros(0) if result.x is None else result.x
+    return JobResult(job.index, job.seed, result.success, result.message, x, result.residual, score)
 
 
 def _refined(job: Job, session: Session) -> JobResult:
@@ -112,12 +148,20 @@ def _refined(job: Job, session: Session) -> JobResult:
             return without_result(job, "no point of the search space is a structure; state guesses that make one")
         x = found[0]
     # What ended a search needs no widened peaks.
-    answer = descend(problem, x, [] if own else steps, session)
+    end = _descended(problem, x, [] if own else steps, session)
+    assert end.x is not None
+    success, message = succeeded(problem, end)
+    return JobResult(job.index, job.seed, success, message, end.x, problem.residual(end.x))
+
+
+def _descended(problem: Problem, x: Array, steps: list[tuple[TestTerm, ...]], session: Session) -> Outcome:
+    """Where the local phase ends from `x`."""
+    answer = descend(problem, x, steps, session)
     if answer.stopped is not None:
         raise answer.stopped
-    end = Outcome(problem.structure(answer.x), answer.x, "local phase", answer.success, answer.message, History(), None)
-    success, message = succeeded(problem, end)
-    return JobResult(job.index, job.seed, success, message, answer.x, problem.residual(answer.x))
+    return Outcome(
+        problem.structure(answer.x), answer.x, "local phase", answer.success, answer.message, History(), None
+    )
 
 
 @lru_cache(maxsize=_BUILT)

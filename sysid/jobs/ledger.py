@@ -6,6 +6,7 @@ import contextlib
 import json
 import sqlite3
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 
@@ -13,11 +14,12 @@ import numpy as np
 
 from sysid.errors import InputError
 from sysid.jobs.job import Job, JobResult
+from sysid.jobs.score import Score
 
 FILE_NAME = "jobs.sqlite"
 
 _TABLE = """CREATE TABLE IF NOT EXISTS jobs (
-    job TEXT PRIMARY KEY, success INTEGER NOT NULL, message TEXT NOT NULL, x BLOB NOT NULL, residual REAL
+    job TEXT PRIMARY KEY, success INTEGER NOT NULL, message TEXT NOT NULL, x BLOB NOT NULL, residual REAL, score TEXT
 )"""
 
 
@@ -48,28 +50,31 @@ class Ledger:
             folder.mkdir(parents=True, exist_ok=True)
             self._file = sqlite3.connect(self.path)
             self._file.execute(_TABLE)
+            if "score" not in {row[1] for row in self._file.execute("PRAGMA table_info(jobs)")}:
+                self._file.execute("ALTER TABLE jobs ADD COLUMN score TEXT")  # made before there were scores
 
     def results(self) -> dict[int, JobResult]:
         """What is there of the jobs, by index."""
         with self._told():
-            rows = {
-                row[0]: row[1:] for row in self._file.execute("SELECT job, success, message, x, residual FROM jobs")
-            }
+            told = self._file.execute("SELECT job, success, message, x, residual, score FROM jobs")
+            rows = {row[0]: row[1:] for row in told}
         return {
             index: JobResult(
-                index, self._seeds[index], bool(success), message, np.frombuffer(x), np.nan if left is None else left
+                index, self._seeds[index], bool(success), message, np.frombuffer(x), np.nan if left is None else left,
+                None if score is None else Score.from_tree(json.loads(score)),
             )
             for index, key in self._keys.items()
             if key in rows
-            for success, message, x, left in (rows[key],)
-        }
+            for success, message, x, left, score in (rows[key],)
+        }  # fmt: skip
 
     def add(self, result: JobResult) -> None:
         """Write a result; it is on the disk when this returns."""
         x, left = np.ascontiguousarray(result.x, dtype=float).tobytes(), float(result.residual)
-        row = (self._keys[result.index], int(result.success), result.message, x, left)
+        score = None if result.score is None else json.dumps(asdict(result.score))
+        row = (self._keys[result.index], int(result.success), result.message, x, left, score)
         with self._told(), self._file:
-            self._file.execute("INSERT OR REPLACE INTO jobs VALUES (?, ?, ?, ?, ?)", row)
+            self._file.execute("INSERT OR REPLACE INTO jobs VALUES (?, ?, ?, ?, ?, ?)", row)
 
     def __enter__(self) -> Ledger:
         return self
@@ -88,4 +93,6 @@ class Ledger:
 def _key(job: Job) -> str:
     start = job.recipe.start if job.start == 0 else None
     key = [{**job.recipe.to_tree(), "start": start}, job.start, job.source]
+    if job.strategy:
+        key += [job.strategy, repr(job.change)]
     return json.dumps([*key, job.draw] if job.draw else key, sort_keys=True)

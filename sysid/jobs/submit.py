@@ -11,6 +11,8 @@ from pathlib import Path
 
 from sysid import catalogue
 from sysid.errors import InputError, whole_number
+from sysid.identify import NAMED, NAMES
+from sysid.jobs.changes import Change
 from sysid.jobs.draws import check_drawable
 from sysid.jobs.engine import checked, each
 from sysid.jobs.job import Job, JobResult, run, without_result
@@ -23,10 +25,12 @@ def submit(
     *,
     starts: int = 1,
     draws: int = 0,
+    changes: Sequence[Change | None] = (),
+    strategy: str = "",
     executor: Executor | Callable[[], Executor] | None = None,
     out: str | Path | None = None,
 ) -> Iterator[JobResult]:
-    """Refine each recipe's problem from several starts, by gradients.
+    """Refine each recipe's problem from several starts, by gradients, or identify it whole.
 
     Parameters
     ----------
@@ -38,6 +42,11 @@ def submit(
     draws : int
         In the place of starts: fits of records that the structure at `Recipe.start` would have given, with noise of the
         size that was stated or found, drawn anew for each.
+    changes : sequence of Band, WithoutRun, WithoutSensor or None
+        In the place of starts: whole identifications of the problem as each changes it; None leaves it as it is.
+    strategy : str
+        Of whole identifications, "auto" by default where there are changes, as in `sysid.identify`; without changes the
+        problem of each recipe is identified as it is. The seed of the search is ``Recipe.rng``.
     executor : Executor or callable, optional
         None runs the jobs in this process. ``sysid.jobs.processes(4)`` makes pools of four processes, a new one where
         a worker died; a function of your own that makes an executor does as well, such as one that gives
@@ -49,8 +58,8 @@ def submit(
     Returns
     -------
     iterator of JobResult
-        As they come; jobs are numbered recipe by recipe, start by start. The result of a job does not depend on where
-        it runs, nor on how many run beside it.
+        As they come; jobs are numbered recipe by recipe, start by start (or draw, or change). The result of a job does
+        not depend on where it runs, nor on how many run beside it.
 
     Raises
     ------
@@ -71,16 +80,33 @@ def submit(
     whole_number("draws", draws, at_least=0)
     if draws and (starts > 1 or any(one.start is None for one in recipes)):
         raise InputError("draws need Recipe.start, the unknowns that were identified, and exclude starts")
+    by = _strategy(strategy, changes, starts > 1 or draws > 0)
     if isinstance(executor, Executor) or not (executor is None or callable(executor)):
         checked(executor)
-    many = draws or starts
-    jobs = [
-        Job(i * many + k, _rooted(one), 0, source, k + 1) if draws else Job(i * many + k, _rooted(one), k, source)
-        for i, (one, source) in enumerate((one, _source(one, draws > 0)) for one in recipes)
-        for k in range(many)
-    ]
+    jobs: list[Job] = []
+    for one in recipes:
+        source, rooted = _source(one, draws > 0), _rooted(one)
+        if by:
+            made = [Job(0, rooted, 0, source, strategy=by, change=change) for change in changes or (None,)]
+        elif draws:
+            made = [Job(0, rooted, 0, source, draw=k + 1) for k in range(draws)]
+        else:
+            made = [Job(0, rooted, k, source) for k in range(starts)]
+        jobs += [replace(job, index=len(jobs) + k) for k, job in enumerate(made)]
     ledger = None if out is None else Ledger(Path(out), jobs)
     return _results(jobs, executor, ledger)
+
+
+def _strategy(strategy: str, changes: Sequence[Change | None], others: bool) -> str:
+    """The strategy of whole identifications; empty where none are asked for."""
+    for change in changes:
+        if not isinstance(change, Change | None):
+            raise InputError(f"changes holds a {type(change).__name__}; give Band, WithoutRun or WithoutSensor")
+    if others and (changes or strategy):
+        raise InputError("changes and strategy stand for whole identifications, and exclude starts and draws")
+    if strategy not in ("", "auto", *NAMED):
+        raise InputError(f"strategy {strategy!r} is unknown; give one of {NAMES}")
+    return strategy or ("auto" if changes else "")
 
 
 def _source(recipe: Recipe, drawn: bool) -> str:
@@ -109,6 +135,6 @@ def _results(
         yield from known.values()
         left = [job for job in jobs if job.index not in known]
         for result in each(run, left, executor, without_result):
-            if ledger is not None and result.x.size:
+            if ledger is not None and result.has_result:
                 ledger.add(result)
             yield result

@@ -1,0 +1,163 @@
+"""What a job identifies from in the place of the whole test: a band, or all runs or sensors but one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sysid.errors import InputError, number, whole_number
+from sysid.measurement.measurement import Measurement
+from sysid.models.stiffness import SpectralStiffness
+from sysid.problem.problem import Problem
+from sysid.results.identification import Identification
+from sysid.structure.structure import Array
+
+
+@dataclass(frozen=True)
+class Band:
+    """The lines from `low` to `high` Hz, both included.
+
+    Parameters
+    ----------
+    low, high : float
+    """
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        number("Band: low", self.low, "a frequency in Hz", at_least=0)
+        number("Band: high", self.high, f"a frequency in Hz above {self.low:g}", above=self.low)
+
+    @property
+    def title(self) -> str:
+        """Of its row in a table."""
+        return f"{self.low:g} to {self.high:g} Hz"
+
+    def of(self, problem: Problem) -> Problem:
+        """The problem with these lines alone."""
+        return _on(problem, problem.measurement.in_band(self.low, self.high))
+
+    def predicted(self, problem: Problem, result: Identification) -> float:
+        """Relative residual of the lines outside; NaN where there are none."""
+        test = problem.measurement
+        outside = (test.freq < self.low) | (test.freq > self.high)
+        return test.at(outside).residual(result.structure) if np.any(outside) else np.nan
+
+
+@dataclass(frozen=True)
+class WithoutRun:
+    """All runs but one.
+
+    Parameters
+    ----------
+    run : int
+        Counted from 0.
+    """
+
+    run: int
+
+    def __post_init__(self) -> None:
+        whole_number("WithoutRun: run", self.run, at_least=0)
+
+    @property
+    def title(self) -> str:
+        """Of its row in a table; runs are counted from 1 there."""
+        return f"without run {self.run + 1}"
+
+    def of(self, problem: Problem) -> Problem:
+        """The problem with the other runs."""
+        test = problem.measurement
+        if self.run >= test.n_runs:
+            raise InputError(f"there is no run {self.run + 1}: the test has {test.n_runs}")
+        if test.n_runs == 1:
+            raise InputError("the test has one run; without it nothing is left")
+        return _on(problem, _runs(test, np.arange(test.n_runs) != self.run))
+
+    def predicted(self, problem: Problem, result: Identification) -> float:
+        """Relative residual of the run that was left out."""
+        test = problem.measurement
+        return _runs(test, np.arange(test.n_runs) == self.run).residual(result.structure)
+
+
+@dataclass(frozen=True)
+class WithoutSensor:
+    """All sensors but one.
+
+    Where mass or stiffness have a form of their own, the degrees of freedom stay, and the sensor left out is one that
+    was not measured; full matrices are those of the other sensors.
+
+    Parameters
+    ----------
+    sensor : int
+        Counted from 0.
+    name : str
+        For tables.
+    """
+
+    sensor: int
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        whole_number("WithoutSensor: sensor", self.sensor, at_least=0)
+
+    @property
+    def title(self) -> str:
+        """Of its row in a table; sensors without a name are counted from 1 there."""
+        return f"without {self.name or f'sensor {self.sensor + 1}'}"
+
+    def of(self, problem: Problem) -> Problem:
+        """The problem with the other sensors."""
+        test = problem.measurement
+        if self.sensor >= test.n_sensors:
+            raise InputError(f"there is no sensor {self.sensor + 1}: the test has {test.n_sensors}")
+        kept = np.arange(test.n_sensors) != self.sensor
+        if not np.any(kept):
+            raise InputError("the test has one sensor; without it nothing is left")
+        other = _sensors(test, kept)
+        if problem.free_modes:
+            # Frequencies that are stated for all sensors are too many for fewer.
+            return _on(replace(problem, stiffness=SpectralStiffness(), validation=(), reference=None), other)
+        own = problem.recovery is None
+        G = test.rigid_body if own else problem.rigid_body_dofs
+        recovery = np.eye(test.n_sensors) if own else np.asarray(problem.recovery)
+        return _on(replace(problem, validation=(), reference=None, measurement=other, recovery=recovery[kept],
+                           rigid_body_dofs=G), other)  # fmt: skip
+
+    def predicted(self, problem: Problem, result: Identification) -> float:
+        """Relative residual of the sensor that was left out; NaN where the structure does not tell its motion."""
+        if problem.free_modes or result.x is None:
+            return np.nan
+        test = problem.measurement
+        left, measured = test.relative - test.predict(problem.structure(result.x)), test.relative
+        return float(np.linalg.norm(left[:, self.sensor]) / np.linalg.norm(measured[:, self.sensor]))
+
+
+Change = Band | WithoutRun | WithoutSensor
+
+
+def _on(problem: Problem, test: Measurement) -> Problem:
+    """The problem on another part of its test; a goal and the truth belonged to the whole one."""
+    if not problem.formulation.fits_records:
+        raise InputError("the problem states a misfit of its own: what part of the records it reads is not known")
+    return replace(problem, measurement=test, validation=(), reference=None, goal=None)
+
+
+def _runs(test: Measurement, kept: Array) -> Measurement:
+    """The runs where `kept` is true."""
+    names = ("base", "response", "force", "response_std", "force_std")
+    given = {name: getattr(test, name) for name in names}
+    return replace(test, **{name: record[kept] for name, record in given.items() if record is not None})
+
+
+def _sensors(test: Measurement, kept: Array) -> Measurement:
+    """The sensors where `kept` is true."""
+    std, described = test.response_std, test.sensors
+    return replace(
+        test,
+        response=test.response[:, kept],
+        rigid_body=test.rigid_body[kept],
+        response_std=None if std is None else std[:, kept],
+        sensors=None if described is None else tuple(one for one, keep in zip(described, kept, strict=True) if keep),
+    )

@@ -1,0 +1,91 @@
+"""Picture of identifications beside a result: what they leave, and how far their quantities are from its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sysid.jobs.score import Compared, Move, Score
+from sysid.plot.canvas import COLOURS, FAINT, dress, new_figure, plain_log, positive
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_ROW, _MARGIN = 0.28, 1.5  # inches
+_LIKELY = 1.96  # standard deviations either way that hold 95 % of a normal distribution
+_TICKS = (3.0, 10.0, 100.0, 1000.0, 1e4, 1e6)  # standard deviations; to the first the axis is linear
+_DECISIVE = 10.0  # difference of AIC or BIC
+
+
+def sweep(rows: Sequence[Compared], title: str = "", *, part: bool) -> Figure:
+    """A row an identification: residuals, and beside them the steps of its quantities, or AIC and BIC.
+
+    Parameters
+    ----------
+    rows : sequence of Compared
+        The result's own first.
+    title : str
+    part : bool
+        Whether they are of parts of the records, so that steps are told in standard deviations; else AIC and BIC are
+        drawn, above the least.
+
+    Returns
+    -------
+    Figure
+    """
+    figure = new_figure(8.6, _MARGIN + _ROW * len(rows))
+    left, right = figure.subplots(1, 2, sharey=True)
+    at = np.arange(len(rows))
+    left.plot(positive(np.array([row.residual for row in rows])), at, "o", color=COLOURS[0], label="fitted")
+    predicted = positive(np.array([row.score.predicted for row in rows]))
+    if np.any(np.isfinite(predicted)):
+        left.plot(predicted, at, "D", color=COLOURS[5], fillstyle="none", label="predicted")
+    left.set_xscale("log")
+    lowest, highest = left.get_xlim()
+    if highest < 100 * lowest:
+        plain_log(left.xaxis)
+    left.set_yticks(at, [row.title for row in rows])
+    left.set_ylim(len(rows) - 0.5, -0.5)
+    dress(left, title, "relative residual [–]", "")
+    if part:
+        _draw_moves(right, [row.moves for row in rows])
+    else:
+        _draw_criteria(right, [row.score for row in rows])
+    handles = [handle for ax in (left, right) for handle in ax.get_legend_handles_labels()[0]]
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize="small")
+    return figure
+
+
+def _draw_moves(ax: Any, steps: Sequence[Sequence[Move]]) -> None:
+    """All steps of a row, in standard deviations, or in per cent where none are known."""
+    from matplotlib.ticker import NullLocator
+
+    sizes = [abs(step.deviations) for row in steps for step in row if np.isfinite(step.deviations)]
+    known = bool(sizes)
+    for at, row in enumerate(steps):
+        values = [step.deviations if known else 100 * step.relative for step in row]
+        ax.plot(values, np.full(len(values), at), "|", color=COLOURS[0], markersize=9, label="" if at else "a quantity")
+    if known:
+        ax.axvspan(-_LIKELY, _LIKELY, color=FAINT, alpha=0.25, linewidth=0, label="noise alone, 95 %")
+        ax.set_xscale("symlog", linthresh=_TICKS[0], linscale=1.0)
+        ticks = [tick for tick in _TICKS if tick <= 2 * max(sizes)]
+        ax.set_xticks([*(-tick for tick in reversed(ticks)), 0, *ticks])
+        ax.xaxis.set_major_formatter("{x:g}")
+        ax.xaxis.set_minor_locator(NullLocator())
+        ax.set_xlim(-1.3 * max(*sizes, _TICKS[0]), 1.3 * max(*sizes, _TICKS[0]))
+    ax.axvline(0.0, color=FAINT, linewidth=0.9)
+    dress(ax, "steps from the first row", "standard deviations of a step" if known else "per cent", "")
+
+
+def _draw_criteria(ax: Any, scores: Sequence[Score]) -> None:
+    """AIC and BIC above the least."""
+    for name, marker, colour in (("aic", "o", COLOURS[2]), ("bic", "s", COLOURS[3])):
+        values = np.array([getattr(score, name) for score in scores])
+        if np.any(np.isfinite(values)):
+            at = np.arange(len(values))
+            ax.plot(values - np.nanmin(values), at, marker, color=colour, fillstyle="none", label=name.upper())
+    ax.axvspan(0, _DECISIVE, color=FAINT, alpha=0.25, linewidth=0, label="no decisive difference")
+    ax.set_xscale("symlog", linthresh=_DECISIVE)
+    dress(ax, "AIC and BIC above the least", "difference [–]", "")
