@@ -67,6 +67,70 @@ def test_draws_of_noise_are_told_beside_the_linear_deviations(capsys, tmp_path):
     assert (folder / "draws.png").read_bytes().startswith(PNG)
 
 
+FLOORS = """'Springs of two floors{more}.'
+import casadi as ca
+import numpy as np
+
+import sysid
+
+
+def problem(*, data=None, rng=0):
+    stretch = np.array([[1.0, 0, -1], [-1, 1, 0]])
+    M, C = np.diag([300.0, 200.0, 0.0]), stretch.T @ np.diag([900.0, 700.0]) @ stretch
+    truth = sysid.Structure(M, stretch.T @ np.diag([3e5, 2e5]) @ stretch, damping_matrix=C[:2, :2], n_base=1)
+    test = sysid.simulate(truth, np.linspace(0.5, 10, 60), noise=0.02, rng=7)
+    k = {springs}
+    return sysid.Problem(test, mass=M, stiffness=stretch.T @ ca.diag(k) @ stretch, damping=C)
+"""
+
+
+@pytest.fixture(scope="module")
+def floors(here):
+    """A folder with a result of two springs, and a module that takes both for one."""
+    springs = 'sysid.Variable("spring", 2, lower=1e4, upper=1e6, log=True)'
+    one = 'ca.repmat(sysid.Variable("spring", lower=1e4, upper=1e6, log=True), 2, 1)'
+    (here / "two.py").write_text(FLOORS.format(more="", springs=springs))
+    (here / "one.py").write_text(FLOORS.format(more=", alike", springs=one))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(here)
+        assert cli.main(["run", "two.py"]) == 0
+    return Path("results/two")
+
+
+def test_identifications_without_each_sensor_are_told_beside_the_result(floors, capsys):
+    assert cli.main(["refine", str(floors), "--leave-out", "sensor", "--workers", "1"]) == 0
+    out, error = capsys.readouterr()
+    assert error == ""
+    lines = out.splitlines()
+    assert lines[0] == "two.py: 2 identifications, each without one sensor"
+    assert [line.split()[4:6] for line in lines[1:3]] == [["sensor", "1"], ["sensor", "2"]]
+    assert lines[4].split() == ["a", "fit", "determined", "residual", "predicted", "farthest"]
+    assert [line.split()[0] for line in lines[5:8]] == ["two.py", "without", "without"]
+    files = ("identifications.csv", "moves.csv", "identifications.png", "jobs.sqlite")
+    assert lines[-4:] == [str(floors / "refine" / name) for name in files]
+    rows = list(csv.DictReader((floors / "refine" / "moves.csv").read_text().splitlines()))
+    assert [row["quantity"] for row in rows[4:6]] == ["spring 1", "spring 2"] and len(rows) == 12
+    assert (floors / "refine" / "identifications.png").read_bytes().startswith(PNG)
+
+
+def test_a_band_without_lines_is_a_line_without_a_result(floors, capsys):
+    assert cli.main(["refine", str(floors), "--bands", "0.5-8", "20-30", "--workers", "1"]) == 0
+    out = capsys.readouterr().out
+    assert "20 to 30 Hz  no result  no line between 20 and 30 Hz" in out
+    rows = list(csv.DictReader((floors / "refine" / "identifications.csv").read_text().splitlines()))
+    assert [(row["identification"], row["success"]) for row in rows] == [
+        ("two.py", "True"), ("0.5 to 8 Hz", "True"), ("20 to 30 Hz", "False"),
+    ]  # fmt: skip
+
+
+def test_a_model_that_is_too_simple_loses_by_aic_and_bic(floors, capsys):
+    assert cli.main(["refine", str(floors), "--variants", "one.py", "--workers", "1"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    rows = {line.split()[0]: line.split() for line in lines if line.startswith(("two.py ", "one.py "))}
+    assert rows["two.py"][4:7] == ["2", "0.0", "0.0"]
+    assert rows["one.py"][4] == "1" and min(map(float, rows["one.py"][5:7])) > 100
+
+
 def test_one_draw_has_no_spread_and_is_written(capsys, tmp_path):
     assert cli.main(["run", "shear_building", "--set", "noise=0.02", "--out", str(tmp_path)]) == 0
     assert cli.main(["refine", str(tmp_path), "--draws", "1", "--workers", "1"]) == 0
@@ -92,7 +156,10 @@ def test_the_example_of_the_readme_refines_that_result():
     [
         (["nowhere"], "no result at nowhere"),
         (["results/physical_damping", "--starts", "0"], "not a whole number from 1"),
-        (["results/physical_damping", "--starts", "2", "--draws", "2"], "--starts and --draws exclude each other"),
+        (["results/physical_damping", "--starts", "2", "--draws", "2"], "--draws: not allowed with argument --starts"),
+        (["results/physical_damping", "--leave-out", "run"], "the test has one run; without it nothing is left"),
+        (["results/physical_damping", "--bands", "5-1"], "'5-1' is no band: write its ends in Hz, such as 0.5-20"),
+        (["results/physical_damping", "--variants", "shear_building"], "shear_building has other records than"),
         (["results/physical_damping", "--workers", "2", "--scheduler", "tcp://host:1"], "exclude each other"),
         (["results/physical_damping", "--out", "results/physical_damping/result.h5"], "is not a folder"),
     ],
