@@ -43,9 +43,10 @@ def submit(
         In the place of starts: fits of records that the structure at `Recipe.start` would have given, with noise of the
         size that was stated or found, drawn anew for each.
     changes : sequence of Band, WithoutRun, WithoutSensor or None
-        In the place of starts: whole identifications of the problem as each changes it; None leaves it as it is.
+        In the place of starts: whole identifications of the problem as each changes it; None leaves it as it is. Where
+        poles and residues do not tell the matrices they begin at `Recipe.start`, if there is one.
     strategy : str
-        Of whole identifications, "auto" by default where there are changes, as in `sysid.identify`; without changes the
+        Of whole identifications, as in `sysid.identify`: "auto" by default where there are changes. Without changes the
         problem of each recipe is identified as it is. The seed of the search is ``Recipe.rng``.
     executor : Executor or callable, optional
         None runs the jobs in this process. ``sysid.jobs.processes(4)`` makes pools of four processes, a new one where
