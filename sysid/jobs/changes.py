@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -118,12 +119,11 @@ class WithoutSensor:
         other = _sensors(test, kept)
         if problem.free_modes:
             # Frequencies that are stated for all sensors are too many for fewer.
-            return _on(replace(problem, stiffness=SpectralStiffness(), validation=(), reference=None), other)
+            return _on(problem, other, stiffness=SpectralStiffness())
         own = problem.recovery is None
         G = test.rigid_body if own else problem.rigid_body_dofs
         recovery = np.eye(test.n_sensors) if own else np.asarray(problem.recovery)
-        return _on(replace(problem, validation=(), reference=None, measurement=other, recovery=recovery[kept],
-                           rigid_body_dofs=G), other)  # fmt: skip
+        return _on(problem, other, recovery=recovery[kept], rigid_body_dofs=G)
 
     def predicted(self, problem: Problem, result: Identification) -> float:
         """Relative residual of the sensor that was left out; NaN where the structure does not tell its motion."""
@@ -137,11 +137,11 @@ class WithoutSensor:
 Change = Band | WithoutRun | WithoutSensor
 
 
-def _on(problem: Problem, test: Measurement) -> Problem:
+def _on(problem: Problem, test: Measurement, **others: Any) -> Problem:
     """The problem on another part of its test; a goal and the truth belonged to the whole one."""
     if not problem.formulation.fits_records:
         raise InputError("the problem states a misfit of its own: what part of the records it reads is not known")
-    return replace(problem, measurement=test, validation=(), reference=None, goal=None)
+    return replace(problem, measurement=test, validation=(), reference=None, goal=None, **others)
 
 
 def _runs(test: Measurement, kept: Array) -> Measurement:
