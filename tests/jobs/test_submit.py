@@ -107,6 +107,17 @@ def test_threads_are_refused(recipe):
         processes(0)
 
 
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system binds no process to processors")
+def test_there_are_as_many_workers_as_processors_that_this_process_may_use():
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(allowed)})
+    try:
+        with processes()() as pool:
+            assert pool._max_workers == 1
+    finally:
+        os.sched_setaffinity(0, allowed)
+
+
 def test_a_pool_whose_worker_dies_is_built_again_and_only_the_task_to_blame_is_lost():
     """`eval` stands for a job: it is a function that every worker finds."""
     tasks = ["1", DIES, "3", "4"]
