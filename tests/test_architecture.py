@@ -14,7 +14,7 @@ CEILINGS = {
     # refinement jobs (1,050), arguments of a wrong type told by name (100), noise-free
     # fits finished by orthogonal factors (35), checkpoints of searches (450), files
     # read in a process of their own (80), draws of noise (280), and what a job is made from (90).
-    "lines": 23_180,
+    "lines": 23_184,
 }
 
 # The counting is a benchmark, which prints the same figures; `sysid` itself is not imported from the checkout.

@@ -45,13 +45,17 @@ def run(options: argparse.Namespace, out: Output) -> int:
         jobs = submit(recipe, starts=count, executor=executor, out=folder)
     out.write(f"{recipe.title}: {count} {told}\n")
     ends, interrupted = _ends(jobs, count, word, out)
-    if options.draws is not None:
-        draws.tell(folder, result, recipe, ends, out)
-        out.write(f"{folder / LEDGER}\n")
-    else:
-        minima = distinct(result.problem, ends)
-        out.write(f"\n{table(minima, len(ends))}\n\n")
-        _write(folder, recipe, ends, minima, result.problem, out)
+    try:
+        if options.draws is not None:
+            draws.tell(folder, result, recipe, ends, out)
+            out.write(f"{folder / LEDGER}\n")
+        else:
+            minima = distinct(result.problem, ends)
+            out.write(f"\n{table(minima, len(ends))}\n\n")
+            _write(folder, recipe, ends, minima, result.problem, out)
+    except KeyboardInterrupt:
+        complain(f"interrupted while saving; results are in {folder / LEDGER}: the same command writes the files")
+        return INTERRUPTED
     if interrupted:
         complain(f"interrupted after {len(ends)} of {count} {word}s; the same command goes on from there")
         return INTERRUPTED
