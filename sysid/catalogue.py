@@ -98,22 +98,31 @@ def build(recipe: Recipe) -> Problem:
         Whatever is wrong with the module, its data or what it gives, a problem that cannot be searched too; an
         InputError from inside the module passes as it is, any other exception is told with its line of the module.
     """
+    return built(recipe)[0]
+
+
+def built(recipe: Recipe) -> tuple[Problem, frozenset[Path]]:
+    """What `build` gives, and the files it was made from: the module, and what that imported from beside itself.
+
+    Of a dotted module, which Python imports, the module alone.
+    """
     data = None if recipe.data is None else Path(recipe.data)
     if recipe.data is not None and not os.path.exists(recipe.data):  # noqa: PTH110 - a path may be "", or too long
         raise InputError(f"data {recipe.data!r}: there is no such file or folder")
     before = len(declared())
-    function, path = _function(recipe.module)
-    signature = inspect.signature(function)
-    try:
-        signature.bind_partial(data=data, rng=recipe.rng)
-    except TypeError as error:
-        raise InputError(f"{path}: problem() does not take data and rng ({error}); write {_SIGNATURE}") from None
-    try:
-        signature.bind(data=data, rng=recipe.rng, **recipe.parameters)
-    except TypeError as error:
-        raise InputError(f"{path}: problem() {error}; {_in_words(signature)}") from None
-    with _telling_the_line(path), _neighbours(path):
-        problem = function(data=data, rng=recipe.rng, **recipe.parameters)
+    with _neighbours(file_of(recipe.module)) as imported:
+        function, path = _function(recipe.module)
+        signature = inspect.signature(function)
+        try:
+            signature.bind_partial(data=data, rng=recipe.rng)
+        except TypeError as error:
+            raise InputError(f"{path}: problem() does not take data and rng ({error}); write {_SIGNATURE}") from None
+        try:
+            signature.bind(data=data, rng=recipe.rng, **recipe.parameters)
+        except TypeError as error:
+            raise InputError(f"{path}: problem() {error}; {_in_words(signature)}") from None
+        with _telling_the_line(path):
+            problem = function(data=data, rng=recipe.rng, **recipe.parameters)
     if not isinstance(problem, Problem):
         raise InputError(f"{path}: problem() gives a {type(problem).__name__}, not a sysid.Problem")
     used = set(problem.formulation.variables)
@@ -122,12 +131,13 @@ def build(recipe: Recipe) -> Problem:
         told = ", ".join(f"{variable.name!r} ({variable.declared})" for variable in idle)
         raise InputError(f"{path}: variable {told} enters no matrix, residual or constraint: use it, or take it out")
     problem.check()
-    return problem
+    return problem, frozenset({path.absolute(), *imported})
 
 
 def parameters_in_words(problem: str) -> str:
     """The keyword parameters of a problem module beside data and rng, for a message."""
-    return _in_words(inspect.signature(_function(problem)[0]))
+    with _neighbours(file_of(problem)):
+        return _in_words(inspect.signature(_function(problem)[0]))
 
 
 def _in_words(signature: inspect.Signature) -> str:
@@ -181,7 +191,7 @@ def _load_file(path: Path) -> tuple[ModuleType, Path]:
     # Dataclasses and pickles look their module up by its name.
     sys.modules[name] = module
     try:
-        with _telling_the_line(path), _neighbours(path):
+        with _telling_the_line(path):
             # dont_inherit: this file's own __future__ imports are not the module's.
             exec(compile(source, str(full), "exec", dont_inherit=True), module.__dict__)
     except BaseException:
@@ -207,20 +217,50 @@ def _load_dotted(name: str) -> tuple[ModuleType, Path]:
 
 
 @contextmanager
-def _neighbours(path: Path) -> Iterator[None]:
-    """Let a module of the user's import the files beside it; they are imported anew for each problem."""
-    folder, before = path.absolute().parent, set(sys.modules)
-    sys.path.insert(0, str(folder))
+def _neighbours(module: Path | None) -> Iterator[set[Path]]:
+    """Let a module of the user's import the files and packages beside it, and gather the files at the end.
+
+    They are imported anew for each problem, also where the script at hand has imported them, and forgotten: their text
+    may change, and another folder may have some of the same name. No ``__pycache__`` is left beside them.
+    """
+    files: set[Path] = set()
+    if module is None:
+        yield files
+        return
+    folder, writes_none = str(module.absolute().parent), sys.dont_write_bytecode
+    others = _taken_out(folder)
+    sys.path.insert(0, folder)
+    sys.dont_write_bytecode = True
     try:
-        yield
+        yield files
     finally:
+        sys.dont_write_bytecode = writes_none
+        imported = _taken_out(folder)
+        files.update(Path(m.__file__) for m in imported.values() if m.__file__ is not None)
         with suppress(ValueError):  # the module may have set a path of its own
-            sys.path.remove(str(folder))
-        for name in set(sys.modules) - before:
-            file = getattr(sys.modules[name], "__file__", None)
-            # Another folder may have a file of the same name.
-            if file is not None and Path(file).parent == folder and not name.startswith(_PRIVATE):
-                del sys.modules[name]
+            sys.path.remove(folder)
+        sys.modules.update(others)
+
+
+def _taken_out(folder: str) -> dict[str, ModuleType]:
+    """Take out of Python the modules from files and packages of a folder.
+
+    But for sysid, the script that runs, and packages with compiled parts: many of those cannot be imported twice.
+    """
+    found, staying, within = {}, {"sysid", "__main__"}, folder.rstrip(os.sep) + os.sep
+    for name, module in list(sys.modules.items()):
+        given, top = getattr(module, "__dict__", {}), name.partition(".")[0]
+        # A package without __init__.py has no file, but a path.
+        for place in [given["__file__"]] if given.get("__file__") else given.get("__path__", ()):
+            inside = str(place).removeprefix(within)
+            if inside != place and inside.partition(os.sep)[0].partition(".")[0] == top:
+                found[name] = module
+                if inside.endswith(tuple(importlib.machinery.EXTENSION_SUFFIXES)):
+                    staying.add(top)
+    found = {name: module for name, module in found.items() if name.partition(".")[0] not in staying}
+    for name in found:
+        del sys.modules[name]
+    return found
 
 
 @contextmanager

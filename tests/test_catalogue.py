@@ -3,6 +3,8 @@
 import ast
 import signal
 import sys
+from importlib.machinery import EXTENSION_SUFFIXES
+from types import ModuleType
 
 import pytest
 
@@ -239,6 +241,69 @@ def test_a_module_may_have_a_search_path_of_its_own(here):
     before = list(sys.path)
     catalogue.build(Recipe("chain.py"))
     assert sys.path == before
+
+
+PACKAGE = """from . import numbers
+
+
+def stiffness():
+    from .further import deeper  # imported while the problem is built
+
+    return deeper.K
+"""
+
+
+@pytest.mark.parametrize("init", ["__init__.py", None])
+def test_a_package_beside_a_module_is_imported_anew_each_time_and_leaves_nothing(here, init, monkeypatch):
+    """With and without an ``__init__.py``; the module in ``problem()`` sees the same package as at its top."""
+    (here / "lab" / "further").mkdir(parents=True)
+    if init:
+        (here / "lab" / init).write_text("")
+    (here / "lab" / "numbers.py").write_text("K = 4e3\n")
+    (here / "lab" / "further" / "deeper.py").write_text("from lab.numbers import K\n")
+    (here / "lab" / "model.py").write_text(PACKAGE)
+    (here / "alone.py").write_text("TOTAL = 3.5\n")
+    text = "import lab.model\nfrom alone import TOTAL\n" + CHAIN.replace("FullMass(3.5)", "FullMass(TOTAL)").replace(
+        "k = np.diag([2.0, 1.0, 0.5]), 4e3", "k = np.diag([2.0, 1.0, 0.5]), lab.model.stiffness()"
+    )
+    (here / "chain.py").write_text(text)
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    before, path = set(sys.modules), list(sys.path)
+    first, files = catalogue.built(Recipe("chain.py"))
+    expected = {"chain.py", "alone.py", "lab/model.py", "lab/numbers.py", "lab/further/deeper.py"}
+    assert {file.relative_to(here).as_posix() for file in files} == expected | ({f"lab/{init}"} if init else set())
+    assert all("chain" in name for name in set(sys.modules) - before)
+    assert (sys.path, sys.dont_write_bytecode) == (path, False)
+    assert not list(here.rglob("__pycache__"))
+    (here / "lab" / "numbers.py").write_text("K = 1e3\n")
+    (here / "alone.py").write_text("TOTAL = 4.5\n")
+    second = catalogue.build(Recipe("chain.py"))
+    ratio = first.stiffness.natural_frequencies / second.stiffness.natural_frequencies
+    assert ratio == pytest.approx([2.0, 2.0])  # of the root of the springs' ratio
+    assert (first.totals, second.totals) == (pytest.approx([3.5]), pytest.approx([4.5]))
+
+
+def test_what_the_script_has_imported_from_beside_a_module_is_read_anew_and_given_back(here, monkeypatch):
+    """Unless it has compiled parts, which many packages cannot have twice."""
+    (here / "alone.py").write_text("TOTAL = 3.5\n")
+    (here / "fast").mkdir()
+    (here / "fast" / "__init__.py").write_text("TOTAL = 9.0\n")
+    (here / "chain.py").write_text(
+        "from alone import TOTAL\nfrom fast import TOTAL as LOADED\n" + CHAIN.replace("(3.5)", "(TOTAL + LOADED)")
+    )
+    for name, file, total in (
+        ("alone", "alone.py", 1.0),
+        ("fast", "fast/__init__.py", 2.0),
+        ("fast.inner", f"fast/inner{EXTENSION_SUFFIXES[0]}", 3.0),
+    ):
+        module = ModuleType(name)
+        module.__file__, module.TOTAL = str(here / file), total
+        monkeypatch.setitem(sys.modules, name, module)
+    before = dict(sys.modules)
+    problem, files = catalogue.built(Recipe("chain.py"))
+    assert problem.totals == pytest.approx([5.5])
+    assert files == {here / "chain.py", here / "alone.py"}
+    assert {name: sys.modules[name] for name in before} == before
 
 
 def test_an_unknown_name_lists_the_known_ones_and_the_closest(here):

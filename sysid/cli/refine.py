@@ -49,15 +49,19 @@ def run(options: argparse.Namespace, out: Output) -> int:
         jobs = submit(_started(recipe, source), starts=count, executor=executor, out=folder)
     out.write(f"{recipe.title}: {len(titles)} {told}\n")
     ends, interrupted = _ends(jobs, titles, out)
-    if sweep is not None:
-        sweeps.tell(folder, result, recipe, sweep, ends, out)
-    elif options.draws is not None:
-        draws.tell(folder, result, recipe, ends, out)
-    else:
-        minima = distinct(result.problem, ends)
-        out.write(f"\n{table(minima, len(ends))}\n\n")
-        _write(folder, recipe, ends, minima, result.problem, out)
-    out.write(f"{folder / LEDGER}\n")
+    try:
+        if sweep is not None:
+            sweeps.tell(folder, result, recipe, sweep, ends, out)
+        elif options.draws is not None:
+            draws.tell(folder, result, recipe, ends, out)
+        else:
+            minima = distinct(result.problem, ends)
+            out.write(f"\n{table(minima, len(ends))}\n\n")
+            _write(folder, recipe, ends, minima, result.problem, out)
+        out.write(f"{folder / LEDGER}\n")
+    except KeyboardInterrupt:
+        complain(f"interrupted while saving; results are in {folder / LEDGER}: the same command writes the files")
+        return INTERRUPTED
     if interrupted:
         complain(f"interrupted after {len(ends)} of {len(titles)} jobs; the same command goes on from there")
         return INTERRUPTED

@@ -6,6 +6,7 @@ import importlib.util
 import multiprocessing
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from typing import Any, TypeVar, cast
@@ -27,14 +28,14 @@ def processes(workers: int | None = None) -> Callable[[], Executor]:
     Parameters
     ----------
     workers : int, optional
-        As many as processors by default.
+        As many as processors that this process may use, by default.
 
     Raises
     ------
     InputError
         Where it is not a positive whole number.
     """
-    count = workers if workers is not None else os.cpu_count() or 1
+    count = workers if workers is not None else _processors()
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
         raise InputError(f"workers = {workers!r}: a whole number from 1 is needed")
 
@@ -106,6 +107,13 @@ def checked(executor: object) -> Executor:
     if isinstance(executor, ThreadPoolExecutor):
         raise InputError("executor is a pool of threads, and IPOPT bears none: give sysid.jobs.processes(4)")
     return executor
+
+
+def _processors() -> int:
+    """How many this process may use: a batch system or a container often grants fewer than the machine has."""
+    if sys.version_info >= (3, 13):
+        return os.process_cpu_count() or 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _end_at_interrupt() -> None:

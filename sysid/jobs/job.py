@@ -38,7 +38,7 @@ class Job:
     start : int
         0 is the recipe's own start where it has one; all others are fresh points of the search space.
     source : str
-        Tells one text of the problem module from another.
+        Tells what one problem is made from, from another's.
     draw : int
         Of noise, by number from 1; the job then starts where the recipe does. 0 fits the records themselves.
     strategy : str

@@ -15,6 +15,7 @@ import numpy as np
 from sysid.errors import InputError
 from sysid.jobs.job import Job, JobResult
 from sysid.jobs.score import Score
+from sysid.results.version import __version__
 
 FILE_NAME = "jobs.sqlite"
 
@@ -26,9 +27,8 @@ _TABLE = """CREATE TABLE IF NOT EXISTS jobs (
 class Ledger:
     """Results of some jobs, in a folder.
 
-    A job is known by its recipe, the number of its start and the text of its problem module: where one of these
-    differs it is another job. Records that the module reads are known by their path alone, files beside it that it
-    imports not at all: after a change of these, give another folder.
+    A job is known by sysid's version, its recipe, its start, draw or change, and `Job.source` (see `submit`):
+    where one of these differs it is another job. The file is open inside ``with`` alone.
 
     Parameters
     ----------
@@ -46,12 +46,6 @@ class Ledger:
         self.path = folder / FILE_NAME
         self._keys = {job.index: _key(job) for job in jobs}
         self._seeds = {job.index: job.seed for job in jobs}
-        with self._told():
-            folder.mkdir(parents=True, exist_ok=True)
-            self._file = sqlite3.connect(self.path)
-            self._file.execute(_TABLE)
-            if "score" not in {row[1] for row in self._file.execute("PRAGMA table_info(jobs)")}:
-                self._file.execute("ALTER TABLE jobs ADD COLUMN score TEXT")  # made before there were scores
 
     def results(self) -> dict[int, JobResult]:
         """What is there of the jobs, by index."""
@@ -77,6 +71,16 @@ class Ledger:
             self._file.execute("INSERT OR REPLACE INTO jobs VALUES (?, ?, ?, ?, ?, ?)", row)
 
     def __enter__(self) -> Ledger:
+        with self._told():
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = sqlite3.connect(self.path)
+            try:
+                self._file.execute(_TABLE)
+                if "score" not in {row[1] for row in self._file.execute("PRAGMA table_info(jobs)")}:
+                    self._file.execute("ALTER TABLE jobs ADD COLUMN score TEXT")  # made before there were scores
+            except sqlite3.Error:
+                self._file.close()
+                raise
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
@@ -92,7 +96,7 @@ class Ledger:
 
 def _key(job: Job) -> str:
     start = job.recipe.start if job.start == 0 else None
-    key = [{**job.recipe.to_tree(), "start": start}, job.start, job.source]
+    key = [__version__, {**job.recipe.to_tree(), "start": start}, job.start, job.source]
     if job.strategy:
         key += [job.strategy, repr(job.change)]
     return json.dumps([*key, job.draw] if job.draw else key, sort_keys=True)

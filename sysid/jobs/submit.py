@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
@@ -54,7 +55,10 @@ def submit(
         ``dask.distributed.Client(address).get_executor()``. An executor itself is used as it is: what its workers lose
         is reported without a result. IPOPT bears no threads: a pool of threads is refused.
     out : str or Path, optional
-        Folder of the ledger ``jobs.sqlite``: results that stand there are not computed again.
+        Folder of the ledger ``jobs.sqlite``: results that stand there are not computed again, as long as sysid's
+        version, the texts of the module and of what it imports from beside itself, and the data are what they were: of
+        a data file its bytes, of a folder the names, sizes and times of its files (those in `out` do not count). What
+        the module reads or imports from elsewhere is not looked at: after a change there, give another folder.
 
     Returns
     -------
@@ -65,7 +69,8 @@ def submit(
     Raises
     ------
     InputError
-        Where a recipe does not make a problem, or the folder cannot be written. At once, before any job runs.
+        Where a recipe does not make a problem, or the folder cannot be written. At once, before any job runs: each
+        distinct recipe is built here once, in a second or two, whatever its start.
     """
     recipes = list(recipe) if isinstance(recipe, Sequence) else [recipe]
     if not recipes:
@@ -85,8 +90,9 @@ def submit(
     if isinstance(executor, Executor) or not (executor is None or callable(executor)):
         checked(executor)
     jobs: list[Job] = []
-    for one in recipes:
-        source, rooted = _source(one, draws > 0), _rooted(one)
+    folder = None if out is None else Path(out).absolute()
+    for one, source in zip(recipes, _sources(recipes, draws > 0, folder), strict=True):
+        rooted = _rooted(one)
         if by:
             made = [Job(0, rooted, 0, source, strategy=by, change=change) for change in changes or (None,)]
         elif draws:
@@ -94,7 +100,9 @@ def submit(
         else:
             made = [Job(0, rooted, k, source) for k in range(starts)]
         jobs += [replace(job, index=len(jobs) + k) for k, job in enumerate(made)]
-    ledger = None if out is None else Ledger(Path(out), jobs)
+    ledger = None if folder is None else Ledger(folder, jobs)
+    with ledger or nullcontext():  # one that cannot be written is told now; it is open while there are results to come
+        pass
     return _results(jobs, executor, ledger)
 
 
@@ -110,13 +118,39 @@ def _strategy(strategy: str, changes: Sequence[Change | None], others: bool) -> 
     return strategy or ("auto" if changes else "")
 
 
-def _source(recipe: Recipe, drawn: bool) -> str:
-    """SHA-256 of the problem module's text; building its problem first tells what is wrong before any job runs."""
-    problem = catalogue.build(replace(recipe, start=None))
-    if drawn:
-        check_drawable(problem)
-    file = catalogue.file_of(recipe.module)
-    return "" if file is None else hashlib.sha256(file.read_bytes()).hexdigest()
+def _sources(recipes: list[Recipe], drawn: bool, out: Path | None) -> Iterator[str]:
+    """SHA-256 of what each recipe's problem is made from; building it first tells what is wrong before any job runs."""
+    texts: dict[str, list[tuple[str, str]]] = {}
+    of_data = functools.cache(functools.partial(_data, out=out))
+    for recipe in recipes:
+        bare = replace(recipe, start=None)
+        which = str(bare.to_tree())  # 1 and True are equal as parameters
+        if which not in texts:
+            problem, files = catalogue.built(bare)
+            if drawn:
+                check_drawable(problem)
+            texts[which] = sorted((str(file), _sha256(file)) for file in files if file.is_file())
+        yield hashlib.sha256(repr((texts[which], of_data(recipe.data))).encode()).hexdigest()
+
+
+def _data(path: str | None, out: Path | None) -> str | list[tuple[str, int, int]]:
+    """What tells the contents of a data file or folder from others."""
+    if path is None:
+        return ""
+    place = Path(path).resolve()
+    if place.is_file():
+        return _sha256(place)
+    apart = None if out is None else out.resolve()
+    files = [file for file in sorted(place.rglob("*")) if file.is_file() and apart not in file.parents]
+    return [(str(file.relative_to(place)), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+
+
+def _sha256(file: Path) -> str:
+    try:
+        with file.open("rb") as content:
+            return hashlib.file_digest(content, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{file} cannot be read: {error.strerror or error}") from error
 
 
 def _rooted(recipe: Recipe) -> Recipe:

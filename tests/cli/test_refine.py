@@ -138,6 +138,21 @@ def test_one_draw_has_no_spread_and_is_written(capsys, tmp_path):
     assert sorted(path.name for path in (tmp_path / "refine").iterdir()) == ["draws.csv", "jobs.sqlite"]
 
 
+@pytest.mark.parametrize("last", ["distinct", "write_files"])
+def test_ctrl_c_while_saving_tells_where_the_results_are(last, capsys, tmp_path, monkeypatch):
+    def interrupt(*arguments):
+        raise KeyboardInterrupt
+
+    command = ["refine", "results/physical_damping", "--starts", "1", "--workers", "1", "--out", str(tmp_path)]
+    with monkeypatch.context() as patch:
+        patch.setattr(f"sysid.cli.refine.{last}", interrupt)
+        assert cli.main(command) == 130
+    told = f"results are in {tmp_path / 'jobs.sqlite'}: the same command writes the files\n"
+    assert capsys.readouterr().err == f"sysid: interrupted while saving; {told}"
+    assert cli.main(command) == 0
+    assert (tmp_path / "starts.csv").is_file()
+
+
 def test_without_noise_there_is_nothing_to_draw(capsys):
     assert cli.main(["refine", "results/physical_damping", "--draws", "3"]) == 2
     assert "fits its records exactly: without noise there is nothing to draw" in capsys.readouterr().err

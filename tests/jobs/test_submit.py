@@ -1,5 +1,6 @@
 """Refinement jobs: the same results wherever they run, whatever dies, and never twice."""
 
+import json
 import os
 import sqlite3
 import subprocess
@@ -77,6 +78,14 @@ def test_several_recipes_are_numbered_one_after_the_other(recipe):
     assert [result.index for result in found] == [0, 1, 2, 3]
 
 
+def test_a_recipe_that_comes_again_is_built_once_whatever_its_start(recipe, monkeypatch):
+    built, original = [], sysid.catalogue.built
+    monkeypatch.setattr(sysid.catalogue, "built", lambda one: built.append(one) or original(one))
+    other = replace(recipe, parameters={"second": 1.5e5})
+    submit([recipe, other, replace(recipe, start=None), recipe], starts=2)
+    assert built == [replace(recipe, start=None), replace(other, start=None)]
+
+
 def test_a_job_without_a_structure_to_start_from_says_so(recipe):
     result = next(submit(replace(recipe, start=[1.0, 2.0, 3.0])))
     assert not result.success and result.x.size == 0 and np.isnan(result.residual)
@@ -105,6 +114,17 @@ def test_threads_are_refused(recipe):
         list(submit(recipe, executor=lambda: ThreadPoolExecutor(1)))
     with pytest.raises(sysid.InputError, match="workers = 0"):
         processes(0)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system binds no process to processors")
+def test_there_are_as_many_workers_as_processors_that_this_process_may_use():
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(allowed)})
+    try:
+        with processes()() as pool:
+            assert pool._max_workers == 1
+    finally:
+        os.sched_setaffinity(0, allowed)
 
 
 def test_a_pool_whose_worker_dies_is_built_again_and_only_the_task_to_blame_is_lost():
@@ -205,6 +225,82 @@ class TestLedger:
         (tmp_path / "floors.py").write_text(MODULE.replace("second=2e5", "second=1.9e5"))
         (result,) = submit(recipe, out=tmp_path)
         assert result.x[1] == pytest.approx(1.9e5, rel=1e-6)
+
+    @pytest.fixture
+    def ran(self, monkeypatch):
+        """Jobs that were run since: each gives a result at once."""
+        jobs = []
+        result = JobResult(0, 0, True, "ran", np.array(SPRINGS), 1e-9)
+        monkeypatch.setitem(submit.__globals__, "run", lambda job: jobs.append(job) or replace(result, index=job.index))
+        return jobs
+
+    def test_a_change_in_what_the_problem_is_made_from_makes_another_job(self, recipe, tmp_path, ran):
+        """Also a change that leaves a file's size and time as they were."""
+        (tmp_path / "parts" / "inner").mkdir(parents=True)
+        inner = tmp_path / "parts" / "inner" / "stretches.py"
+        inner.write_text(NEIGHBOUR)
+        (tmp_path / "stretch.py").write_text("from parts.inner.stretches import STRETCH\n")
+        (tmp_path / "record.csv").write_text("1, 2")
+        (tmp_path / "records" / "first").mkdir(parents=True)
+        (tmp_path / "records" / "first" / "run.csv").write_text("1, 2")
+
+        def again(data):
+            ran.clear()
+            (result,) = submit(replace(recipe, data=data), out=tmp_path / "records" / "jobs")
+            assert result.message == "ran"
+            return len(ran)
+
+        for data in (None, "record.csv", "records"):
+            assert [again(data), again(data)] == [1, 0]
+        before = inner.stat()
+        inner.write_text(NEIGHBOUR.replace("1.0", "1.5"))
+        os.utime(inner, ns=(before.st_atime_ns, before.st_mtime_ns))
+        assert [again(None), again(None)] == [1, 0]
+        before = (tmp_path / "record.csv").stat()
+        (tmp_path / "record.csv").write_text("1, 3")
+        os.utime(tmp_path / "record.csv", ns=(before.st_atime_ns, before.st_mtime_ns))
+        assert [again("record.csv"), again("record.csv")] == [1, 0]
+        again("records")
+        (tmp_path / "records" / "first" / "run.csv").write_text("1, 2, 3")
+        assert [again("records"), again("records")] == [1, 0]
+
+    def test_another_version_of_sysid_makes_other_jobs_and_opens_the_ledger(self, recipe, tmp_path, ran, monkeypatch):
+        from sysid.jobs import ledger
+
+        list(submit(recipe, starts=2, out=tmp_path))
+        with monkeypatch.context() as patch:
+            patch.setattr(ledger, "__version__", "0.0.9")
+            list(submit(recipe, starts=2, out=tmp_path))
+        assert len(ran) == 4
+        assert len(list(submit(recipe, starts=2, out=tmp_path))) == 2
+        assert len(ran) == 4
+
+    def test_a_ledger_of_before_jobs_knew_the_version_opens_and_keeps_its_rows(self, recipe, tmp_path, ran):
+        with sqlite3.connect(tmp_path / "jobs.sqlite") as file:
+            file.execute(
+                "CREATE TABLE jobs (job TEXT PRIMARY KEY, success INTEGER NOT NULL, message TEXT NOT NULL, "
+                "x BLOB NOT NULL, residual REAL)"
+            )
+            key = json.dumps([{**recipe.to_tree(), "start": list(recipe.start)}, 0, "0" * 64], sort_keys=True)
+            file.execute("INSERT INTO jobs VALUES (?, 1, 'old', x'', 0.0)", (key,))
+        file.close()
+        (result,) = submit(recipe, out=tmp_path)
+        assert result.message == "ran" and len(ran) == 1
+        with sqlite3.connect(tmp_path / "jobs.sqlite") as file:
+            assert file.execute("SELECT message FROM jobs ORDER BY message").fetchall() == [("old",), ("ran",)]
+        file.close()
+
+    def test_no_file_stays_open_where_no_result_is_asked_for_or_it_is_no_ledger(self, recipe, tmp_path, monkeypatch):
+        opened, connect = [], sqlite3.connect
+        monkeypatch.setattr(sqlite3, "connect", lambda path: opened.append(connect(path)) or opened[-1])
+        submit(recipe, out=tmp_path)
+        (tmp_path / "jobs.sqlite").write_text("no ledger" * 200)
+        with pytest.raises(sysid.InputError, match="not a database"):
+            submit(recipe, out=tmp_path)
+        assert len(opened) == 2
+        for file in opened:
+            with pytest.raises(sqlite3.ProgrammingError, match="closed"):
+                file.execute("SELECT 1")
 
     def test_a_folder_that_cannot_be_one_is_told(self, recipe, tmp_path):
         (tmp_path / "taken").write_text("a file")
