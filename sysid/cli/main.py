@@ -372,12 +372,12 @@ def _add_refine(command: Callable[..., argparse.ArgumentParser]) -> None:
 
 
 def _band(text: str) -> tuple[float, float]:
-    low, dash, high = text.rpartition("-")  # the first may be a minus of 1e-3
+    low, _, high = text.rpartition("-")  # at the last dash, as 1e-3 has one too
     try:
         ends = float(low), float(high)
     except ValueError:
-        dash = ""
-    if not dash or not 0 <= ends[0] < ends[1] < float("inf"):
+        ends = 0.0, 0.0
+    if not 0 <= ends[0] < ends[1] < float("inf"):
         raise argparse.ArgumentTypeError(f"{text!r} is no band: write its ends in Hz, such as 0.5-20")
     return ends
 

@@ -36,8 +36,7 @@ def run(options: argparse.Namespace, out: Output) -> int:
     sweep = sweeps.sweep_of(options, result, recipe)
     if sweep is not None:
         titles, told = sweep.titles, sweep.told
-        by = "" if sweep.changes else "auto"
-        jobs = submit(sweep.recipes, changes=sweep.changes, strategy=by, executor=executor, out=folder)
+        jobs = submit(sweep.recipes, changes=sweep.changes, strategy="auto", executor=executor, out=folder)
     elif options.draws is not None:
         if result.residual < EXACT:
             raise InputError(f"{source} fits its records exactly: without noise there is nothing to draw")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import textwrap
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from sysid.errors import InputError
 from sysid.jobs.changes import Band, Change, WithoutRun, WithoutSensor
 from sysid.jobs.job import JobResult
 from sysid.jobs.score import Compared, Move, moves, scored
-from sysid.measurement.measurement import Measurement
+from sysid.problem.problem import Problem
 from sysid.results.identification import Identification, Recipe
 
 _FAR = 3.0  # standard deviations of a step, beyond which it counts as far
@@ -30,54 +30,63 @@ class Sweep:
 
     Attributes
     ----------
+    name : str
+        Of its files.
+    told : str
+        Kind of the jobs, for the first line.
     titles : tuple of str
         Of the jobs, in their order.
     recipes : tuple of Recipe
     changes : tuple of Change
         Of the one recipe; empty where the recipes differ.
-    told : str
-        What they are together.
     """
 
+    name: str
+    told: str
     titles: tuple[str, ...]
     recipes: tuple[Recipe, ...]
-    changes: tuple[Change, ...]
-    told: str
+    changes: tuple[Change, ...] = ()
 
 
 def sweep_of(options: argparse.Namespace, result: Identification, recipe: Recipe) -> Sweep | None:
     """What the command line asks for; None where that is starts or draws."""
-    test = result.measurement
     if options.variants:
-        return _variants(options.variants, test, recipe)
+        recipes = tuple(Recipe(module, recipe.data, recipe.rng) for module in options.variants)
+        for one in recipes:
+            _check_records(result, catalogue.build(one), one)
+        return Sweep("variants", "other models of the same records", tuple(one.title for one in recipes), recipes)
     changes: tuple[Change, ...] = ()
-    told = ""
+    name = told = ""
     if options.leave_out == "run":
-        changes = tuple(WithoutRun(i) for i in range(test.n_runs))
-        told = "identifications, each without one run"
+        changes = tuple(WithoutRun(i) for i in range(result.measurement.n_runs))
+        name, told = "without_run", "identifications, each without one run"
     elif options.leave_out == "sensor":
-        changes = tuple(WithoutSensor(i, name) for i, name in enumerate(test.sensor_names))
-        told = "identifications, each without one sensor"
+        changes = tuple(WithoutSensor(i, sensor) for i, sensor in enumerate(result.measurement.sensor_names))
+        name, told = "without_sensor", "identifications, each without one sensor"
     elif options.bands:
         changes = tuple(Band(low, high) for low, high in options.bands)
-        told = "identifications, each of one band"
-    if len(changes) == 1 and options.leave_out:
-        raise InputError(f"the test has one {options.leave_out}; without it nothing is left")
-    return Sweep(tuple(change.title for change in changes), (recipe,), changes, told) if changes else None
+        name, told = "bands", "identifications, each of one band"
+    if not changes:
+        return None
+    if options.leave_out:
+        changes[0].of(result.problem)  # tells at once where nothing can be left out
+    _check_records(result, catalogue.build(replace(recipe, start=None)), recipe)
+    return Sweep(name, told, tuple(change.title for change in changes), (recipe,), changes)
 
 
-def _variants(modules: Sequence[str], test: Measurement, own: Recipe) -> Sweep:
-    """Other modules with the data and the noise of a result's."""
-    recipes = tuple(Recipe(module, own.data, own.rng) for module in modules)
-    for one in recipes:
-        other = catalogue.build(one).measurement
-        pairs = [(getattr(test, name), getattr(other, name)) for name in ("freq", "base", "response", "force")]
-        if not all(np.array_equal(mine, its) for mine, its in pairs):
-            raise InputError(
-                f"{one.module} has other records than the result of {own.module}: variants are compared on one test, "
-                "so let both modules read the same data"
-            )
-    return Sweep(tuple(one.title for one in recipes), recipes, (), "other models of the same records")
+def _check_records(result: Identification, other: Problem, recipe: Recipe) -> None:
+    """Refuse a problem of other records than the result's."""
+    own, its = (
+        [problem.measurement, *(term.test for term in problem.formulation.further_tests)]
+        for problem in (result.problem, other)
+    )
+    names = ("freq", "base", "response", "force")
+    pairs = [(getattr(mine, name), getattr(one, name)) for mine, one in zip(own, its, strict=False) for name in names]
+    if len(own) != len(its) or not all(np.array_equal(mine, one) for mine, one in pairs):
+        raise InputError(
+            f"{recipe.title} has other records than the result: all have to read the same test (a variant is built "
+            "with the result's data, and with its own parameters as they are by default)"
+        )
 
 
 def tell(
@@ -87,18 +96,20 @@ def tell(
     from sysid.plot.canvas import own_style, to_png
     from sysid.plot.sweep import sweep as picture
 
-    own, part = scored(result), bool(sweep.changes)
-    at = {end.index: end for end in ends if end.score is not None}
-    rows = [Compared(recipe.title, result.success, result.residual, own)]
-    for index, title in enumerate(sweep.titles):
-        if index in at and (score := at[index].score) is not None:
-            moved = moves(own, score, part=part)
-            rows.append(Compared(title, at[index].success, at[index].residual, score, moved))
+    part = bool(sweep.changes)
+    own = scored(result, np.nan if part else None)
+    rows = [Compared(recipe.title, result.success, result.residual, result.message, own)]
+    for end in sorted(ends, key=lambda one: one.index):
+        if end.score is not None:
+            moved = moves(own, end.score, part=part)
+            title = sweep.titles[end.index]
+            rows.append(Compared(title, end.success, end.residual, end.message, end.score, moved))
     out.write(f"\n{table(rows, part)}\n\n")
-    files = {"identifications.csv": _as_csv(rows, sweep, ends), "moves.csv": _moves_as_csv(rows)}
+    without = [(sweep.titles[end.index], end.message) for end in ends if end.score is None]
+    files = {f"{sweep.name}.csv": _as_csv(rows, without, part), f"{sweep.name}_moves.csv": _moves_as_csv(rows)}
     if len(rows) > 1:
         with own_style():
-            files["identifications.png"] = to_png(picture(rows, recipe.title, part=part), dpi=130)
+            files[f"{sweep.name}.png"] = to_png(picture(rows, recipe.title, part=part), dpi=130)
     write_files(folder, files, out)
 
 
@@ -138,55 +149,63 @@ def criteria(rows: Sequence[Compared]) -> dict[str, list[float]]:
 
 
 def _farthest(steps: Sequence[Move]) -> str:
-    if not steps:
-        return ""
     known = [step for step in steps if np.isfinite(step.deviations)]
-    step = max(known or steps, key=lambda one: abs(one.deviations if known else one.relative))
-    told = f", {abs(step.deviations):.1f} std" if known else ""
-    return f"{step.name}: {100 * step.relative:+.2g} %{told}"
+    relative = [step for step in steps if np.isfinite(step.relative)]
+    if known:
+        step = max(known, key=lambda one: abs(one.deviations))
+        return f"{step.name}: {100 * step.relative:+.2g} %, {abs(step.deviations):.1f} std"
+    if relative:
+        step = max(relative, key=lambda one: abs(one.relative))
+        return f"{step.name}: {100 * step.relative:+.2g} %"
+    return ""
 
 
 def _notes(rows: Sequence[Compared], part: bool) -> Iterator[str]:
     """What the columns are, and what all rows say together."""
-    steps = [step for row in rows if row.success for step in row.moves if np.isfinite(step.deviations)]
     if part:
-        yield "predicted: relative residual of what was left out, where the structure tells its motion"
-        text = (
-            "farthest: of frequencies, damping ratios and unknowns, the step from the first row that is largest in "
-            "standard deviations (std) of what noise alone would make of it"
-        )
+        notes = [
+            "predicted: relative residual of what was left out, where the rest tells its motion",
+            "farthest: of frequencies, damping ratios and unknowns, the step from the first row that is largest in the "
+            "standard deviations (std) that it has by noise alone",
+        ]
     else:
-        yield "predicted: relative residual of the validation tests; AIC, BIC: above the least, 10 and more is decisive"
-        text = "farthest: of frequencies, damping ratios and unknowns of one name, the largest step from the first row"
-    yield from textwrap.wrap(text, _WIDTH)
+        notes = [
+            "AIC, BIC: above the least; 10 and more is decisive",
+            "farthest: of frequencies, damping ratios and unknowns of one name, the step from the first row that is "
+            "largest in standard deviations (std), the larger ones of both rows",
+        ]
+        if np.any(np.isfinite([row.score.predicted for row in rows])):
+            notes.insert(0, "predicted: relative residual of the validation tests")
+    for note in notes:
+        yield from textwrap.wrap(note, _WIDTH)
+    steps = [step for row in rows if row.success for step in row.moves if np.isfinite(step.deviations)]
     if steps and part:
         far = sum(abs(step.deviations) > _FAR for step in steps)
         told = f"{far} of {len(steps)} steps of fits are beyond {_FAR:g} std; noise alone makes 0.3 %"
         yield told + (": more than noise moves them" if far > max(1, 0.01 * len(steps)) else "")
 
 
-def _as_csv(rows: Sequence[Compared], sweep: Sweep, ends: Sequence[JobResult]) -> bytes:
-    head: list[Sequence[object]] = [
+def _as_csv(rows: Sequence[Compared], without: Sequence[tuple[str, str]], part: bool) -> bytes:
+    """A row an identification; AIC and BIC only where the records are the same."""
+    lines: list[Sequence[object]] = [
         ("identification", "success", "determined", "residual", "predicted", "parameters", "aic", "bic", "message")
     ]
-    messages = {sweep.titles[end.index]: end.message for end in ends}
     for row in rows:
-        figures = (row.residual, row.score.predicted, row.score.parameters, row.score.aic, row.score.bic)
-        told = messages.get(row.title, "")
-        head.append((row.title, row.success, row.score.determined, *map(repr, figures), told))
-    for end in ends:
-        if end.score is None:
-            head.append((sweep.titles[end.index], False, False, "", "", "", "", "", end.message))
-    return table_as_csv(head)
+        score = row.score
+        criteria_of = ("", "") if part else (repr(score.aic), repr(score.bic))
+        figures = (repr(row.residual), repr(score.predicted), score.parameters, *criteria_of)
+        lines.append((row.title, row.success, score.determined, *figures, row.message))
+    lines += [(title, False, False, "", "", "", "", "", message) for title, message in without]
+    return table_as_csv(lines)
 
 
 def _moves_as_csv(rows: Sequence[Compared]) -> bytes:
-    head: list[Sequence[object]] = [("identification", "quantity", "value", "relative_step", "step_in_std")]
+    lines: list[Sequence[object]] = [("identification", "quantity", "value", "relative_step", "step_in_std")]
     for row in rows:
-        head += [
-            (row.title, step.name, repr(step.value), repr(step.relative), repr(step.deviations)) for step in row.moves
+        lines += [
+            (row.title, step.name, *map(repr, (step.value, step.relative, step.deviations))) for step in row.moves
         ]
-    return table_as_csv(head)
+    return table_as_csv(lines)
 
 
 def _number(value: float, form: str) -> str:

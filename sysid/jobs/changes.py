@@ -9,6 +9,7 @@ import numpy as np
 
 from sysid.errors import InputError, number, whole_number
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.residues import independent
 from sysid.models.stiffness import SpectralStiffness
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification
@@ -17,7 +18,7 @@ from sysid.structure.structure import Array
 
 @dataclass(frozen=True)
 class Band:
-    """The lines from `low` to `high` Hz, both included.
+    """The lines from `low` to `high` Hz, both included; further tests (`FurtherTest`) keep theirs.
 
     Parameters
     ----------
@@ -33,7 +34,7 @@ class Band:
 
     @property
     def title(self) -> str:
-        """Of its row in a table."""
+        """Name of its row in tables."""
         return f"{self.low:g} to {self.high:g} Hz"
 
     def of(self, problem: Problem) -> Problem:
@@ -41,15 +42,20 @@ class Band:
         return _on(problem, problem.measurement.in_band(self.low, self.high))
 
     def predicted(self, problem: Problem, result: Identification) -> float:
-        """Relative residual of the lines outside; NaN where there are none."""
+        """Relative residual of the lines outside; NaN where there are none, or mass and stiffness are free.
+
+        Free matrices are those of the modes inside.
+        """
         test = problem.measurement
         outside = (test.freq < self.low) | (test.freq > self.high)
-        return test.at(outside).residual(result.structure) if np.any(outside) else np.nan
+        if problem.free_modes or not np.any(outside):
+            return np.nan
+        return test.at(outside).residual(result.structure)
 
 
 @dataclass(frozen=True)
 class WithoutRun:
-    """All runs but one.
+    """All runs but one; further tests (`FurtherTest`) stay.
 
     Parameters
     ----------
@@ -64,7 +70,7 @@ class WithoutRun:
 
     @property
     def title(self) -> str:
-        """Of its row in a table; runs are counted from 1 there."""
+        """Name of its row in tables; runs are counted from 1 there."""
         return f"without run {self.run + 1}"
 
     def of(self, problem: Problem) -> Problem:
@@ -77,9 +83,11 @@ class WithoutRun:
         return _on(problem, _runs(test, np.arange(test.n_runs) != self.run))
 
     def predicted(self, problem: Problem, result: Identification) -> float:
-        """Relative residual of the run that was left out."""
-        test = problem.measurement
-        return _runs(test, np.arange(test.n_runs) == self.run).residual(result.structure)
+        """Relative residual of the run that was left out; NaN where the others do not tell free matrices' motion."""
+        test, left = problem.measurement, np.arange(problem.measurement.n_runs) == self.run
+        if problem.free_modes and independent(test.base[~left]).shape[1] < independent(test.base).shape[1]:
+            return np.nan
+        return _runs(test, left).residual(result.structure)
 
 
 @dataclass(frozen=True)
@@ -87,7 +95,7 @@ class WithoutSensor:
     """All sensors but one.
 
     Where mass or stiffness have a form of their own, the degrees of freedom stay, and the sensor left out is one that
-    was not measured; full matrices are those of the other sensors.
+    was not measured; full matrices are those of the other sensors. Further tests (`FurtherTest`) keep theirs.
 
     Parameters
     ----------
@@ -105,7 +113,7 @@ class WithoutSensor:
 
     @property
     def title(self) -> str:
-        """Of its row in a table; sensors without a name are counted from 1 there."""
+        """Name of its row in tables; sensors without a name are counted from 1 there."""
         return f"without {self.name or f'sensor {self.sensor + 1}'}"
 
     def of(self, problem: Problem) -> Problem:
@@ -118,8 +126,7 @@ class WithoutSensor:
             raise InputError("the test has one sensor; without it nothing is left")
         other = _sensors(test, kept)
         if problem.free_modes:
-            # Frequencies that are stated for all sensors are too many for fewer.
-            return _on(problem, other, stiffness=SpectralStiffness())
+            return _on(problem, other, stiffness=_for_fewer(problem.stiffness, test.n_sensors - 1))
         own = problem.recovery is None
         G = test.rigid_body if own else problem.rigid_body_dofs
         recovery = np.eye(test.n_sensors) if own else np.asarray(problem.recovery)
@@ -142,6 +149,14 @@ def _on(problem: Problem, test: Measurement, **others: Any) -> Problem:
     if not problem.formulation.fits_records:
         raise InputError("the problem states a misfit of its own: what part of the records it reads is not known")
     return replace(problem, measurement=test, validation=(), reference=None, goal=None, **others)
+
+
+def _for_fewer(stiffness: SpectralStiffness, sensors: int) -> SpectralStiffness:
+    """The stiffness without its stated frequencies, where these are too many for so few sensors."""
+    given = stiffness.natural_frequencies
+    if given is None or np.size(given) <= sensors:
+        return stiffness
+    return SpectralStiffness(max_frequency=stiffness.max_frequency)
 
 
 def _runs(test: Measurement, kept: Array) -> Measurement:

@@ -8,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from sysid import catalogue
+from sysid.assessment.sensitivity import sensitivity
 from sysid.errors import InputError, SolverError
 from sysid.identify import identify
 from sysid.jobs.changes import Change
@@ -16,7 +17,7 @@ from sysid.jobs.score import Score, scored
 from sysid.nlp import one_thread
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
-from sysid.results.identification import Recipe
+from sysid.results.identification import Identification, Recipe
 from sysid.results.judgement import judge, succeeded
 from sysid.search.continuation import descend, random_starts, smoothed_tests
 from sysid.search.session import DeferredInterrupt, Session
@@ -57,7 +58,10 @@ class Job:
 
     @property
     def seed(self) -> int:
-        """Of the fresh point or the noise: the recipe's and the number of the start or the draw make it."""
+        """Of the fresh point or the noise: the recipe's and the number of the start or the draw make it.
+
+        Of a whole identification it is the recipe's.
+        """
         if self.strategy:
             return self.recipe.rng
         key = (self.start, self.draw) if self.draw else (self.start,)
@@ -73,7 +77,7 @@ class JobResult:
     index : int
         Of the job: recipe by recipe, start by start.
     seed : int
-        Of the start, where it was a fresh point, or of the noise that was drawn.
+        Of the start, where it was a fresh point, of the noise that was drawn, or of a whole identification.
     success : bool
         The solver's status is good and the residual meets the problem's goal, or is a fit at all where none is given.
     message : str
@@ -102,15 +106,18 @@ class JobResult:
 
 def run(job: Job) -> JobResult:
     """Run a job where it stands; the same bits wherever that is on one kind of machine."""
+    interrupt = DeferredInterrupt()
     try:
-        with one_thread(), DeferredInterrupt() as interrupt:
+        with one_thread(), interrupt:
             session = Session([], interrupt)
             result = _identified(job, session) if job.strategy else _refined(job, session)
             interrupt.check()
             return result
     except (InputError, SolverError) as error:
+        interrupt.check()  # what a search that Ctrl-C stopped before its first fit raises is no result of the job
         return without_result(job, str(error))
     except Exception as error:  # whatever one start leads to, all others go on
+        interrupt.check()
         return without_result(job, f"{type(error).__name__}: {error}")
 
 
@@ -120,19 +127,36 @@ def without_result(job: Job, why: str) -> JobResult:
 
 
 def _identified(job: Job, session: Session) -> JobResult:
-    """The result of a whole identification; from the recipe's start where modes do not tell the matrices."""
+    """The result of a whole identification.
+
+    A change of a problem whose matrices do not follow from modes is fitted from the recipe's start, where there is one.
+    """
     problem = catalogue.build(replace(job.recipe, start=None))
     changed = problem if job.change is None else job.change.of(problem)
-    if job.recipe.start is None or changed.free_modes:
+    from_start = job.change is not None and job.strategy == "auto" and not changed.free_modes
+    if job.recipe.start is not None and from_start:
+        x = as_unknowns(changed, np.array(job.recipe.start))
+        result = judge(changed, _descended(changed, x, [], session), "from the result's unknowns", job.seed, session)
+    else:
         result = identify(changed, strategy=job.strategy, rng=job.seed)
         if result.interrupted:
             raise KeyboardInterrupt
-    else:
-        x = as_unknowns(changed, np.array(job.recipe.start))
-        result = judge(changed, _descended(changed, x, [], session), "from the result's unknowns", job.seed, session)
-    score = scored(result, None if job.change is None else job.change.predicted(problem, result))
+    score = scored(result, None if job.change is None else _predicted(problem, result, job.change))
     x = np.zeros(0) if result.x is None else result.x
     return JobResult(job.index, job.seed, result.success, result.message, x, result.residual, score)
+
+
+def _predicted(problem: Problem, result: Identification, change: Change) -> float:
+    """What was left out, as the rest predicts it; NaN where the rest does not tell all that the whole test does."""
+    x = result.x
+    if x is not None and not problem.free_modes:
+        part, whole = (sensitivity(one.formulation, x, priors=False).rank for one in (result.problem, problem))
+        if part < whole:
+            return np.nan
+    try:
+        return change.predicted(problem, result)
+    except InputError:  # such as a base that does not move outside a band
+        return np.nan
 
 
 def _refined(job: Job, session: Session) -> JobResult:

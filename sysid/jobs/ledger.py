@@ -55,7 +55,7 @@ class Ledger:
         return {
             index: JobResult(
                 index, self._seeds[index], bool(success), message, np.frombuffer(x), np.nan if left is None else left,
-                None if score is None else Score.from_tree(json.loads(score)),
+                None if score is None else Score(**json.loads(score)),
             )
             for index, key in self._keys.items()
             if key in rows

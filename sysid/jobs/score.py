@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from scipy.optimize import linear_sum_assignment
 
 from sysid.assessment.sensitivity import sensitivity
+from sysid.jobs.quantities import FREQUENCY, RATIO, label, labelled, quantities
 from sysid.nlp import EXACT
-from sysid.results.answer import reported_unknowns
 from sysid.results.identification import Identification
 from sysid.structure.structure import Array, ComplexArray
 
-_LEAST = 0.1  # of a variance, by which that of a part of the records must exceed the whole's
+_FLOOR = 1e-6  # of the median stated deviation: smaller ones are raised to it, as in the fit
+_LEAST = 0.01  # least variance of a step, as a share of the part's own
 _SAME = 0.1  # relative distance of frequencies up to which a mode is looked for
 
 
@@ -26,25 +26,25 @@ class Score:
     Attributes
     ----------
     determined : bool
-        As in `Identification`.
+        As in `Answer`.
     parameters : int
-        That the records see: the rank of their Jacobian, or the numbers of a modal model where mass and stiffness are
-        free.
+        That are fitted and told apart: the rank of the Jacobian, or the numbers of a modal model where mass and
+        stiffness are free; one more for the scale of each noise.
     numbers : int
         Real numbers of the records that were fitted.
     deviance : float
-        -2 log likelihood of normal noise of the stated relative size, its scale in the accelerations and in the force
-        of each test as the misfit has it; but for a constant that is the same for all models of the same records. NaN
-        of an exact fit, and where the problem states a misfit of its own.
+        -2 log likelihood of normal noise of the stated deviations, its scale as the misfit has it (where noise is not
+        stated: of one size in the accelerations, and in the force, of each test); but for a constant that is the same
+        for all models of the same records. NaN of an exact fit, and where the problem states a misfit of its own.
     predicted : float
         Relative residual of what was not fitted: what a change left out, else the problem's validation tests together;
-        NaN where there is none.
-    frequencies, ratios : tuple of float
-        Hz, ascending, and damping ratios.
-    unknowns : dict of str to tuple of float
-        Those that mean something by themselves, column by column.
-    frequency_stds, ratio_stds, unknown_stds
-        Their standard deviations; NaN where they are not known, and of an exact fit.
+        NaN where there is none, or where the rest does not tell its motion.
+    noise : float
+        Variance that `stds` suppose of the accelerations' noise, over the stated one where one is stated.
+    modes : int
+    values, stds : dict of str to float
+        Frequencies in Hz, damping ratios, and unknowns that mean something by themselves, by label; their standard
+        deviations, where they are known. None of an exact fit.
 
     Notes
     -----
@@ -57,22 +57,15 @@ class Score:
     numbers: int
     deviance: float
     predicted: float
-    frequencies: tuple[float, ...]
-    ratios: tuple[float, ...]
-    unknowns: dict[str, tuple[float, ...]]
-    frequency_stds: tuple[float, ...]
-    ratio_stds: tuple[float, ...]
-    unknown_stds: dict[str, tuple[float, ...]]
+    noise: float
+    modes: int
+    values: dict[str, float]
+    stds: dict[str, float]
 
-    @classmethod
-    def from_tree(cls, tree: dict[str, Any]) -> Score:
-        """Give the score of the dictionary that `dataclasses.asdict` made, also where JSON was between."""
-        as_tuples: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value for name, value in tree.items()
-        }
-        for name in ("unknowns", "unknown_stds"):
-            as_tuples[name] = {label: tuple(values) for label, values in tree[name].items()}
-        return cls(**as_tuples)
+    @property
+    def frequencies(self) -> Array:
+        """Of all modes, Hz, ascending, (modes,)."""
+        return np.array([self.values[label(i, FREQUENCY)] for i in range(self.modes)])
 
     @property
     def aic(self) -> float:
@@ -81,7 +74,7 @@ class Score:
 
     @property
     def bic(self) -> float:
-        """The Bayesian (Schwarz's) one."""
+        """Schwarz's Bayesian information criterion, likewise."""
         return self.deviance + self.parameters * float(np.log(self.numbers))
 
 
@@ -92,12 +85,13 @@ class Move:
     Attributes
     ----------
     name : str
+        With its unit, where it is a frequency.
     value : float
         Where it went.
     relative : float
-        The step, relative to where it was.
+        The step, relative to where it was; NaN where that is zero.
     deviations : float
-        The same in standard deviations of the step; NaN where these are not known.
+        The step in its standard deviations; NaN where these are not known.
     """
 
     name: str
@@ -116,6 +110,7 @@ class Compared:
     success : bool
     residual : float
         Relative, of all fitted tests.
+    message : str
     score : Score
     moves : tuple of Move
         From the one that the others are compared with; empty of itself.
@@ -124,6 +119,7 @@ class Compared:
     title: str
     success: bool
     residual: float
+    message: str
     score: Score
     moves: tuple[Move, ...] = ()
 
@@ -135,93 +131,114 @@ def scored(result: Identification, predicted: float | None = None) -> Score:
         tests = problem.validation
         wrong = [test.relative - test.predict(s) for test in tests]
         predicted = _norm(wrong) / _norm([test.relative for test in tests]) if tests else np.nan
-    groups = list(_weighted_misfits(result))
+    noises = list(_weighted_misfits(result))
+    exact = result.residual < EXACT
     deviance = np.nan
-    if result.residual > EXACT and problem.formulation.fits_records:
-        deviance = sum(2 * e.size * float(np.log(np.mean(np.abs(e) ** 2))) for e in groups)
-    free = [v.name for v in reported_unknowns(problem) if not v.fixed] if result.x is not None else []
-    u = None if result.residual < EXACT else result.quick_uncertainty
-    unknown = np.full(s.n, np.nan)
+    if not exact and problem.formulation.fits_records:
+        # Of 2 N real numbers whose variances are e^(2 log_std) times one that the misfit tells.
+        logs = [e.size * float(np.log(np.mean(np.abs(e) ** 2))) + 2 * log_std for e, log_std in noises]
+        deviance = 2 * sum(logs)
+    u = None if exact else result.quick_uncertainty
+    stds, noise = dict[str, float](), np.nan
+    if u is not None:
+        stds = labelled(u.natural_frequencies, u.damping_ratios, u.variables)
+        stated = problem.measurement.response_std is not None
+        misfit = noises[0][0][: problem.measurement.response.size]
+        noise = u.inflation**2 * (1.0 if stated else float(np.mean(np.abs(misfit) ** 2)))
     return Score(
         determined=result.determined,
-        parameters=_parameters(result),
-        numbers=sum(2 * e.size for e in groups),
+        parameters=_parameters(result) + len(noises),
+        numbers=sum(2 * e.size for e, _ in noises),
         deviance=deviance,
         predicted=predicted,
-        frequencies=_plain(s.natural_frequencies),
-        ratios=_plain(s.damping_ratios),
-        unknowns={name: _plain(result.values[name]) for name in free},
-        frequency_stds=_plain(unknown if u is None else u.natural_frequencies),
-        ratio_stds=_plain(unknown if u is None else u.damping_ratios),
-        unknown_stds={name: _plain(u.variables[name]) for name in free if u is not None and name in u.variables},
+        noise=noise,
+        modes=s.natural_frequencies.size,
+        values=quantities(result),
+        stds=stds,
     )
 
 
 def moves(own: Score, other: Score, *, part: bool) -> tuple[Move, ...]:
-    """How far frequencies, damping ratios and unknowns went from one result to another, in no order.
+    """How far frequencies, damping ratios and unknowns went from one result to another.
 
-    A mode goes to the nearest of the other's, where that one's nearest is this one and lies within 10 %.
+    Modes go to those that are nearest together, within 10 %.
 
     Parameters
     ----------
     own, other : Score
     part : bool
-        Whether the other is the same model on a part of the records, so that the variance of a step is the difference
-        of both variances (J. A. Hausman, Econometrica 46 (1978) 1251-1271; at least a tenth of the other's, as
-        rounding and model errors leave a step where noise leaves none). Else it is the larger of both.
+        Whether the other is the same model on a part of the records. A step is then told in the standard deviation that
+        it has by noise alone, see `_variance`; else in the larger of both results'.
     """
-    made: list[Move] = []
-    for i, j in _pairs(np.array(own.frequencies), np.array(other.frequencies)):
-        frequencies = own.frequencies[i], other.frequencies[j], own.frequency_stds[i], other.frequency_stds[j]
-        ratios = own.ratios[i], other.ratios[j], own.ratio_stds[i], other.ratio_stds[j]
-        made += [_move(f"mode {i + 1}: frequency, Hz", *frequencies, part=part)]
-        made += [_move(f"mode {i + 1}: damping ratio", *ratios, part=part)]
-    for name, values in own.unknowns.items():
-        ends = other.unknowns.get(name, ())
-        if len(ends) == len(values):
-            lacking = (np.nan,) * len(values)
-            stds = (score.unknown_stds.get(name, lacking) for score in (own, other))
-            for k, one in enumerate(zip(values, ends, *stds, strict=True)):
-                made.append(_move(name if len(values) == 1 else f"{name} {k + 1}", *one, part=part))
+    names = [name for name in own.values if not name.startswith("mode ") and name in other.values]
+    pairs = [(name, name) for name in names]
+    for i, j in _nearest(own.frequencies, other.frequencies):
+        pairs += [(label(i, what), label(j, what)) for what in (FREQUENCY, RATIO)]
+    made = []
+    for here, there in pairs:
+        was, step = own.values[here], other.values[there] - own.values[here]
+        whole, of_other = own.stds.get(here, np.nan) ** 2, other.stds.get(there, np.nan) ** 2
+        noise = other.noise / own.noise
+        variance = _variance(whole, of_other, noise) if part else float(np.maximum(whole, of_other))
+        known = float(np.sqrt(variance)) if variance > 0 else np.nan
+        made.append(Move(here, other.values[there], step / abs(was) if was else np.nan, step / known))
     return tuple(made)
 
 
-def _move(name: str, here: float, there: float, std: float, other: float, *, part: bool) -> Move:
-    variance = max(other**2 - std**2, _LEAST * other**2) if part else max(std**2, other**2)
-    step = there - here
-    return Move(name, there, step / abs(here) if here else np.nan, step / np.sqrt(variance) if variance > 0 else np.nan)
+def _variance(whole: float, part: float, noise: float) -> float:
+    """Variance of the step from a fit of all records to one of a part of them, by noise alone.
+
+    With w the share of the information that is in the part, the whole is the mean of the part and of what was left
+    out, and the step ``(1 - w) (part - left out)``. Where both fits see the same noise its variance is that of the part
+    less that of the whole (J. A. Hausman, Econometrica 46 (1978) 1251-1271). Where the noise was not stated, fits weigh
+    as if it were one, though a part may have more: `noise` is what the part has over the whole.
+    """
+    if not part > 0:
+        return np.nan
+    share = min(whole * noise / part, 1.0)
+    return max(whole + part * (1 - 2 * share), _LEAST * part)
 
 
-def _plain(values: ArrayLike) -> tuple[float, ...]:
-    return tuple(np.ravel(values, order="F").tolist())
-
-
-def _pairs(own: Array, other: Array) -> list[tuple[int, int]]:
-    if not (own.size and other.size):
-        return []
+def _nearest(own: Array, other: Array) -> list[tuple[int, int]]:
     apart = np.abs(np.log(own[:, None] / other))
-    nearest = apart.argmin(axis=1)
-    mutual = apart.argmin(axis=0)[nearest] == np.arange(own.size)
-    return [(i, int(j)) for i, j in enumerate(nearest) if mutual[i] and apart[i, j] < _SAME]
+    rows, columns = linear_sum_assignment(np.minimum(apart, _SAME) ** 2)
+    return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if apart[i, j] < _SAME]
 
 
-def _weighted_misfits(result: Identification) -> Iterator[ComplexArray]:
-    """Misfits over the stated noise; those of one array share a scale."""
+def _weighted_misfits(result: Identification) -> Iterator[tuple[ComplexArray, float]]:
+    """Misfits over the stated deviations, and the sum of the logarithms of these; those of one array share a scale."""
     for test, structure in ((result.measurement, result.structure), *result.further_tests):
         parts = [(test.relative - test.predict(structure), test.response_std)]
         if test.force is not None:
             parts.append((test.force - test.predict_force(structure), test.force_std))
-        over = [np.ravel(misfit if std is None else misfit / std) for misfit, std in parts]
-        yield from [np.concatenate(over)] if all(std is not None for _, std in parts) else over
+        weighed = [_over(misfit, std) for misfit, std in parts]
+        if all(std is not None for _, std in parts):
+            yield np.concatenate([e for e, _ in weighed]), sum(log_std for _, log_std in weighed)
+        else:
+            yield from weighed
+
+
+def _over(misfit: ComplexArray, std: Array | None) -> tuple[ComplexArray, float]:
+    if std is None or not np.any(std > 0):
+        return misfit.ravel(), 0.0
+    raised = np.maximum(std, _FLOOR * np.median(std[std > 0]))
+    return np.ravel(misfit / raised), float(np.sum(np.log(raised)))
 
 
 def _parameters(result: Identification) -> int:
     problem, s = result.problem, result.structure
+    formulation = problem.formulation
     if result.x is not None and not problem.free_modes:
-        return sensitivity(problem.formulation, result.x, priors=False).rank
+        return sensitivity(formulation, result.x, priors=False).rank
     (n, m), d = s.mode_shapes.shape, s.n_base
-    # Frequency, damping ratio, and a shape times a participation; the force weighs each mode, and what no mode carries.
-    return m * (n + d + 1) if problem.measurement.force is None else m * (n + d + 2) + d * (d + 1) // 2
+    ratios = m if formulation.damping.free else min(m, sum(v.size for v in formulation.of_models[2]))
+    if problem.measurement.force is None:
+        # A frequency, and a shape times a participation.
+        return m * (n + d) + ratios
+    # The force weighs each mode, and what no mode carries, unless that was stated.
+    totals = formulation.mass.totals
+    stated = 0 if totals is None else d if totals.values.ndim == 1 else d * (d + 1) // 2
+    return m * (n + d + 1) + ratios + d * (d + 1) // 2 - stated
 
 
 def _norm(records: Sequence[ComplexArray]) -> float:

@@ -9,9 +9,8 @@ import numpy as np
 
 from sysid.errors import InputError
 from sysid.jobs.job import JobResult
-from sysid.results.answer import reported_unknowns
+from sysid.jobs.quantities import labelled, quantities
 from sysid.results.identification import Identification
-from sysid.structure.structure import Array
 
 _LINEAR = 1.96  # standard deviations either way that hold 95 % of a normal distribution
 
@@ -57,31 +56,15 @@ def spreads(result: Identification, ends: Sequence[JobResult]) -> list[Spread]:
     if len(found) < 2:
         raise InputError(f"{len(found)} of {len(ends)} draws have a result; two are needed for a spread")
     u = result.uncertainty
-    stds = _labelled(u.natural_frequencies, u.damping_ratios, u.variables)
-    identified, draws = _quantities(result), [_quantities(_moved(result, end)) for end in found]
+    stds = labelled(u.natural_frequencies, u.damping_ratios, u.variables)
+    identified, draws = quantities(result), [quantities(_moved(result, end)) for end in found]
     made = []
-    for label, value in identified.items():
-        off, std = np.array([draw[label] for draw in draws]) - value, stds.get(label, np.nan)
+    for name, value in identified.items():
+        off, std = np.array([draw[name] for draw in draws]) - value, stds.get(name, np.nan)
         inside = float(np.mean(np.abs(off) <= _LINEAR * std)) if np.isfinite(std) else np.nan
-        made.append(Spread(label, value, std, float(np.sqrt(np.mean(off**2))), inside))
+        made.append(Spread(name, value, std, float(np.sqrt(np.mean(off**2))), inside))
     return made
 
 
 def _moved(result: Identification, end: JobResult) -> Identification:
     return replace(result, x=end.x, structure=result.problem.structure(end.x))
-
-
-def _quantities(result: Identification) -> dict[str, float]:
-    s, values = result.structure, result.values
-    unknowns = {v.name: values[v.name] for v in reported_unknowns(result.problem) if not v.fixed}
-    return _labelled(s.natural_frequencies, s.damping_ratios, unknowns)
-
-
-def _labelled(frequencies: Array, ratios: Array, unknowns: dict[str, Array]) -> dict[str, float]:
-    """All numbers by their names, entries of an unknown from 1, column by column."""
-    made = {f"mode {i + 1}: frequency, Hz": float(f) for i, f in enumerate(frequencies)}
-    made |= {f"mode {i + 1}: damping ratio": float(ratio) for i, ratio in enumerate(ratios)}
-    for name, value in unknowns.items():
-        entries = np.ravel(value, order="F").tolist()
-        made |= {name if len(entries) == 1 else f"{name} {i + 1}": entry for i, entry in enumerate(entries)}
-    return made

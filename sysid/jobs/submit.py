@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import nullcontext
@@ -11,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sysid import catalogue
-from sysid.errors import InputError, whole_number
+from sysid.errors import InputError, sequence, whole_number
 from sysid.identify import NAMED, NAMES
 from sysid.jobs.changes import Change
 from sysid.jobs.draws import check_drawable
@@ -44,11 +45,11 @@ def submit(
         In the place of starts: fits of records that the structure at `Recipe.start` would have given, with noise of the
         size that was stated or found, drawn anew for each.
     changes : sequence of Band, WithoutRun, WithoutSensor or None
-        In the place of starts: whole identifications of the problem as each changes it; None leaves it as it is. Where
-        poles and residues do not tell the matrices they begin at `Recipe.start`, if there is one.
+        In the place of starts: whole identifications of the problem as each changes it; None leaves it as it is.
     strategy : str
-        Of whole identifications, as in `sysid.identify`: "auto" by default where there are changes. Without changes the
-        problem of each recipe is identified as it is. The seed of the search is ``Recipe.rng``.
+        Of whole identifications, as in `sysid.identify`; without changes the problem of each recipe is identified as it
+        is. The seed of the search is ``Recipe.rng``. "auto", the default of changes, fits these from `Recipe.start`,
+        where there is one, and matrices do not follow from modes.
     executor : Executor or callable, optional
         None runs the jobs in this process. ``sysid.jobs.processes(4)`` makes pools of four processes, a new one where
         a worker died; a function of your own that makes an executor does as well, such as one that gives
@@ -86,20 +87,22 @@ def submit(
     whole_number("draws", draws, at_least=0)
     if draws and (starts > 1 or any(one.start is None for one in recipes)):
         raise InputError("draws need Recipe.start, the unknowns that were identified, and exclude starts")
+    if changes != ():
+        changes = sequence("changes", changes, "a list of Band, WithoutRun, WithoutSensor or None")
     by = _strategy(strategy, changes, starts > 1 or draws > 0)
     if isinstance(executor, Executor) or not (executor is None or callable(executor)):
         checked(executor)
     jobs: list[Job] = []
+    index = itertools.count()
     folder = None if out is None else Path(out).absolute()
     for one, source in zip(recipes, _sources(recipes, draws > 0, folder), strict=True):
         rooted = _rooted(one)
         if by:
-            made = [Job(0, rooted, 0, source, strategy=by, change=change) for change in changes or (None,)]
+            jobs += [Job(next(index), rooted, 0, source, strategy=by, change=change) for change in changes or (None,)]
         elif draws:
-            made = [Job(0, rooted, 0, source, draw=k + 1) for k in range(draws)]
+            jobs += [Job(next(index), rooted, 0, source, draw=k + 1) for k in range(draws)]
         else:
-            made = [Job(0, rooted, k, source) for k in range(starts)]
-        jobs += [replace(job, index=len(jobs) + k) for k, job in enumerate(made)]
+            jobs += [Job(next(index), rooted, k, source) for k in range(starts)]
     ledger = None if folder is None else Ledger(folder, jobs)
     with ledger or nullcontext():  # one that cannot be written is told now; it is open while there are results to come
         pass

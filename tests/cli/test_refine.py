@@ -106,18 +106,19 @@ def test_identifications_without_each_sensor_are_told_beside_the_result(floors, 
     assert [line.split()[4:6] for line in lines[1:3]] == [["sensor", "1"], ["sensor", "2"]]
     assert lines[4].split() == ["a", "fit", "determined", "residual", "predicted", "farthest"]
     assert [line.split()[0] for line in lines[5:8]] == ["two.py", "without", "without"]
-    files = ("identifications.csv", "moves.csv", "identifications.png", "jobs.sqlite")
+    files = ("without_sensor.csv", "without_sensor_moves.csv", "without_sensor.png", "jobs.sqlite")
     assert lines[-4:] == [str(floors / "refine" / name) for name in files]
-    rows = list(csv.DictReader((floors / "refine" / "moves.csv").read_text().splitlines()))
-    assert [row["quantity"] for row in rows[4:6]] == ["spring 1", "spring 2"] and len(rows) == 12
-    assert (floors / "refine" / "identifications.png").read_bytes().startswith(PNG)
+    rows = list(csv.DictReader((floors / "refine" / "without_sensor_moves.csv").read_text().splitlines()))
+    assert [row["quantity"] for row in rows[:2]] == ["spring 1", "spring 2"] and len(rows) == 12
+    assert all(abs(float(row["step_in_std"])) < 5 for row in rows)
+    assert (floors / "refine" / "without_sensor.png").read_bytes().startswith(PNG)
 
 
 def test_a_band_without_lines_is_a_line_without_a_result(floors, capsys):
     assert cli.main(["refine", str(floors), "--bands", "0.5-8", "20-30", "--workers", "1"]) == 0
     out = capsys.readouterr().out
     assert "20 to 30 Hz  no result  no line between 20 and 30 Hz" in out
-    rows = list(csv.DictReader((floors / "refine" / "identifications.csv").read_text().splitlines()))
+    rows = list(csv.DictReader((floors / "refine" / "bands.csv").read_text().splitlines()))
     assert [(row["identification"], row["success"]) for row in rows] == [
         ("two.py", "True"), ("0.5 to 8 Hz", "True"), ("20 to 30 Hz", "False"),
     ]  # fmt: skip
@@ -127,8 +128,8 @@ def test_a_model_that_is_too_simple_loses_by_aic_and_bic(floors, capsys):
     assert cli.main(["refine", str(floors), "--variants", "one.py", "--workers", "1"]) == 0
     lines = capsys.readouterr().out.splitlines()
     rows = {line.split()[0]: line.split() for line in lines if line.startswith(("two.py ", "one.py "))}
-    assert rows["two.py"][4:7] == ["2", "0.0", "0.0"]
-    assert rows["one.py"][4] == "1" and min(map(float, rows["one.py"][5:7])) > 100
+    assert rows["two.py"][4:7] == ["3", "0.0", "0.0"]
+    assert rows["one.py"][4] == "2" and min(map(float, rows["one.py"][5:7])) > 100
 
 
 def test_one_draw_has_no_spread_and_is_written(capsys, tmp_path):
