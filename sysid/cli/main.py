@@ -360,6 +360,13 @@ def _add_refine(command: Callable[..., argparse.ArgumentParser]) -> None:
         help="identify from the lines of each band, in Hz: how far the answer moves with the band",
     )
     kinds.add_argument(
+        "--orders",
+        type=_orders,
+        metavar="A-B",
+        help="identify with A to B modes of those that stand out of the noise, where mass and stiffness are free: AIC, "
+        "BIC and the residual of the validation tests",
+    )
+    kinds.add_argument(
         "--variants",
         nargs="+",
         metavar="MODULE",
@@ -380,6 +387,13 @@ def _band(text: str) -> tuple[float, float]:
     if not 0 <= ends[0] < ends[1] < float("inf"):
         raise argparse.ArgumentTypeError(f"{text!r} is no band: write its ends in Hz, such as 0.5-20")
     return ends
+
+
+def _orders(text: str) -> tuple[int, int]:
+    low, _, high = text.partition("-")
+    if not (low.isdecimal() and high.isdecimal() and 1 <= int(low) <= int(high)):
+        raise argparse.ArgumentTypeError(f"{text!r} is no range of numbers of modes: write 3-8")
+    return int(low), int(high)
 
 
 def _count(text: str) -> int:

@@ -1,4 +1,4 @@
-"""``sysid refine RESULT --leave-out, --bands, --variants``: whole identifications beside a result, compared."""
+"""``sysid refine RESULT --leave-out, --bands, --orders, --variants``: identifications beside a result."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sysid import catalogue
 from sysid.cli.display import Output
 from sysid.cli.files import table_as_csv, write_files
 from sysid.errors import InputError
-from sysid.jobs.changes import Band, Change, WithoutRun, WithoutSensor
+from sysid.jobs.changes import Band, Change, Modes, WithoutRun, WithoutSensor
 from sysid.jobs.job import JobResult
 from sysid.jobs.score import Compared, Move, moves, scored
 from sysid.problem.problem import Problem
@@ -47,6 +47,11 @@ class Sweep:
     recipes: tuple[Recipe, ...]
     changes: tuple[Change, ...] = ()
 
+    @property
+    def of_parts(self) -> bool:
+        """Whether each leaves some records out."""
+        return bool(self.changes) and not isinstance(self.changes[0], Modes)
+
 
 def sweep_of(options: argparse.Namespace, result: Identification, recipe: Recipe) -> Sweep | None:
     """What the command line asks for; None where that is starts or draws."""
@@ -66,6 +71,9 @@ def sweep_of(options: argparse.Namespace, result: Identification, recipe: Recipe
     elif options.bands:
         changes = tuple(Band(low, high) for low, high in options.bands)
         name, told = "bands", "identifications, each of one band"
+    elif options.orders:
+        changes = tuple(Modes(count) for count in range(options.orders[0], options.orders[1] + 1))
+        name, told = "orders", "identifications, each of so many modes"
     if not changes:
         return None
     if options.leave_out:
@@ -96,7 +104,7 @@ def tell(
     from sysid.plot.canvas import own_style, to_png
     from sysid.plot.sweep import sweep as picture
 
-    part = bool(sweep.changes)
+    part = sweep.of_parts
     own = scored(result, np.nan if part else None)
     rows = [Compared(recipe.title, result.success, result.residual, result.message, own)]
     for end in sorted(ends, key=lambda one: one.index):

@@ -1,4 +1,4 @@
-"""What a job identifies from in the place of the whole test: a band, or all runs or sensors but one."""
+"""What a job identifies in the place of all modes of a whole test: a band, all runs or sensors but one, some modes."""
 
 from __future__ import annotations
 
@@ -141,7 +141,36 @@ class WithoutSensor:
         return float(np.linalg.norm(left[:, self.sensor]) / np.linalg.norm(measured[:, self.sensor]))
 
 
-Change = Band | WithoutRun | WithoutSensor
+@dataclass(frozen=True)
+class Modes:
+    """So many modes, where mass and stiffness are free: see `sysid.Modal`.
+
+    Parameters
+    ----------
+    count : int
+    """
+
+    count: int
+
+    def __post_init__(self) -> None:
+        whole_number("Modes: count", self.count, at_least=1)
+
+    @property
+    def title(self) -> str:
+        """Of its row in a table."""
+        return f"{self.count} mode{'s' * (self.count > 1)}"
+
+    def of(self, problem: Problem) -> Problem:
+        """The problem itself, without the goal and the truth, which belong to all modes."""
+        if not problem.free_modes:
+            raise InputError("the number of modes is open only where mass and stiffness are free")
+        return replace(problem, goal=None, reference=None)
+
+    def predicted(self, problem: Problem, result: Identification) -> None:
+        """Nothing is left out: the validation tests are what is predicted."""
+
+
+Change = Band | WithoutRun | WithoutSensor | Modes
 
 
 def _on(problem: Problem, test: Measurement, **others: Any) -> Problem:

@@ -11,7 +11,7 @@ from sysid import catalogue
 from sysid.assessment.sensitivity import sensitivity
 from sysid.errors import InputError, SolverError
 from sysid.identify import identify
-from sysid.jobs.changes import Change
+from sysid.jobs.changes import Change, Modes
 from sysid.jobs.draws import drawn
 from sysid.jobs.score import Score, scored
 from sysid.nlp import one_thread
@@ -20,6 +20,7 @@ from sysid.problem.terms import TestTerm
 from sysid.results.identification import Identification, Recipe
 from sysid.results.judgement import judge, succeeded
 from sysid.search.continuation import descend, random_starts, smoothed_tests
+from sysid.search.modal import Modal
 from sysid.search.session import DeferredInterrupt, Session
 from sysid.search.strategy import History, Outcome, as_unknowns
 from sysid.structure.structure import Array
@@ -138,7 +139,8 @@ def _identified(job: Job, session: Session) -> JobResult:
         x = as_unknowns(changed, np.array(job.recipe.start))
         result = judge(changed, _descended(changed, x, [], session), "from the result's unknowns", job.seed, session)
     else:
-        result = identify(changed, strategy=job.strategy, rng=job.seed)
+        strategy = Modal(modes=job.change.count) if isinstance(job.change, Modes) else job.strategy
+        result = identify(changed, strategy=strategy, rng=job.seed)
         if result.interrupted:
             raise KeyboardInterrupt
     score = scored(result, None if job.change is None else _predicted(problem, result, job.change))
@@ -146,7 +148,7 @@ def _identified(job: Job, session: Session) -> JobResult:
     return JobResult(job.index, job.seed, result.success, result.message, x, result.residual, score)
 
 
-def _predicted(problem: Problem, result: Identification, change: Change) -> float:
+def _predicted(problem: Problem, result: Identification, change: Change) -> float | None:
     """What was left out, as the rest predicts it; NaN where the rest does not tell all that the whole test does."""
     x = result.x
     if x is not None and not problem.free_modes:

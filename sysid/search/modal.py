@@ -49,14 +49,20 @@ class Modal:
         where none are given.
     max_iterations : int
         Of IPOPT, in each fit.
+    modes : int, optional
+        So many modes, each of a pole of its own: of those that stand out of the noise, the ones that the records need
+        most. All by default.
     """
 
     sensors: Sequence[str | int] | None = None
     max_iterations: int = 200
+    modes: int | None = None
     name: ClassVar[str] = "modal"
 
     def __post_init__(self) -> None:
         whole_number("Modal: max_iterations", self.max_iterations, at_least=1)
+        if self.modes is not None:
+            whole_number("Modal: modes", self.modes, at_least=1)
         for sensor in () if self.sensors is None else sequence("Modal: sensors", self.sensors, "a list of sensors"):
             if not isinstance(sensor, str):
                 whole_number("Modal: a sensor", sensor, at_least=0)
@@ -285,7 +291,8 @@ def modal_structure(
     """
     test, mass = problem.measurement, problem.formulation.mass
     poles = problem.poles or _stated_poles(problem)
-    end = ModeFit(test, poles, np.sqrt(problem.totals), monitor, options.max_iterations).best()
+    fit = ModeFit(test, poles, np.sqrt(problem.totals), monitor, options.max_iterations)
+    end = fit.best() if options.modes is None else fit.of_strongest(options.modes)
     held = held_to_totals(problem, end, monitor, options.max_iterations)
     end = held or end
     chosen = degrees_of_freedom(problem, end.modes, options.sensors)

@@ -9,9 +9,17 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, Spectrum, fit_modes
-from sysid.modal_analysis.residues import Records, ResidueFit, beyond_chance, independent, linear_residues
+from sysid.modal_analysis.residues import (
+    Records,
+    ResidueFit,
+    SubsetFits,
+    beyond_chance,
+    independent,
+    linear_residues,
+)  # fmt: skip
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.spectrum import SOLVED
 from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram
@@ -76,9 +84,28 @@ class ModeFit:
             gained = (best.of_accelerations**2 - other.of_accelerations**2) * records.size / noise
             if gained > np.sign(more) * beyond_chance(abs(more) * (n + d)):
                 best = other
-        order = np.argsort(best.modes.omega, kind="stable")
-        end = best.modes
-        return replace(best, modes=Modes(end.phi[:, order], end.gamma[order], end.omega[order], end.ratios[order]))
+        return _ascending(best)
+
+    def of_strongest(self, count: int) -> ModalFit:
+        """The fit of one mode at each of so many poles: those whose loss the records would feel most.
+
+        Raises
+        ------
+        InputError
+            Where there are not so many poles.
+        DoesNotApplyError
+            As in `best`.
+        """
+        poles = self.poles
+        if count > poles.omega.size:
+            raise InputError(f"{poles.omega.size} modes stand out of the noise, fewer than the {count} asked for")
+        subsets, kept = SubsetFits(self.records, poles.omega, poles.ratios), np.arange(poles.omega.size)
+        while kept.size > count:
+            worth, _ = subsets.worth(kept)
+            kept = np.delete(kept, np.argmin(worth))
+        fit = replace(self, poles=replace(poles, omega=poles.omega[kept], ratios=poles.ratios[kept]))
+        fit._check()
+        return _ascending(fit._with(np.ones(count, dtype=int)))
 
     def _check(self) -> None:
         """Refuse records that cannot fix the modes."""
@@ -151,6 +178,13 @@ class ModeFit:
             test, modes, _free_spectrum(poles.omega, poles.ratios, pole), unit=unit, remainder=remainder,
             monitor=self.monitor, max_iterations=self.max_iterations,
         )  # fmt: skip
+
+
+def _ascending(fit: ModalFit) -> ModalFit:
+    """The same fit, its modes in ascending order."""
+    end = fit.modes
+    order = np.argsort(end.omega, kind="stable")
+    return replace(fit, modes=Modes(end.phi[:, order], end.gamma[order], end.omega[order], end.ratios[order]))
 
 
 def _ranks(free: ResidueFit, noise: float, n: int, d: int) -> Integers:

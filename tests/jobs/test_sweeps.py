@@ -5,6 +5,7 @@ import os
 import signal
 import sqlite3
 from dataclasses import asdict, replace
+from itertools import combinations
 
 import casadi as ca
 import numpy as np
@@ -13,8 +14,10 @@ from scipy.stats import norm
 
 import sysid
 from sysid.errors import InputError, SolverError
-from sysid.jobs import Band, Score, WithoutRun, WithoutSensor, moves, scored, submit
+from sysid.jobs import Band, Modes, Score, WithoutRun, WithoutSensor, moves, scored, submit
 from sysid.jobs.ledger import FILE_NAME
+from sysid.modal_analysis.residues import linear_residues
+from sysid.modal_analysis.vector_fitting import find_poles
 from sysid.results.judgement import judge
 from sysid.search.continuation import descend
 from sysid.search.session import DeferredInterrupt, Session
@@ -30,6 +33,12 @@ import sys
 sys.path.insert(0, {folder!r})
 from test_sweeps import problem
 '''
+
+FULL = """
+
+def problem(*, data=None, rng=0):
+    return whole(full=True)
+"""
 
 TWO_WAYS = """'A mass on two springs, shaken along each.'
 import casadi as ca
@@ -278,6 +287,31 @@ def _from_truth(made):
     answer = descend(made, as_unknowns(made, np.concatenate([SPRINGS, DAMPERS])), [], session)
     end = Outcome(made.structure(answer.x), answer.x, "local phase", answer.success, answer.message, History(), None)
     return judge(made, end, "from the truth", 0, session)
+
+
+def test_so_many_modes_are_those_that_the_records_need_most():
+    """Against all subsets of the poles, each with free residues."""
+    tower = sysid.catalogue.build(sysid.Recipe("cantilever_tower", parameters={"elements": 2, "noise": 0.01}))
+    test, poles = tower.measurement, find_poles(tower.measurement)
+    assert poles.omega.size == 4
+    for count in (2, 3):
+        subsets = [list(kept) for kept in combinations(range(4), count)]
+        best = min(subsets, key=lambda kept: linear_residues(test, poles.omega[kept], poles.ratios[kept])[1])
+        found = sysid.identify(Modes(count).of(tower), strategy=sysid.Modal(modes=count), rng=0)
+        expected = poles.omega[best] / (2 * np.pi)
+        np.testing.assert_allclose(found.structure.natural_frequencies, expected, rtol=0.02)
+    with pytest.raises(InputError, match="4 modes stand out of the noise, fewer than the 5 asked for"):
+        sysid.identify(tower, strategy=sysid.Modal(modes=5), rng=0)
+    with pytest.raises(InputError, match="open only where mass and stiffness are free"):
+        Modes(2).of(problem())
+
+
+def test_a_job_of_so_many_modes_predicts_the_validation_tests(tmp_path):
+    file = tmp_path / "full.py"
+    file.write_text(MODULE.format(folder=__file__.rpartition("/")[0]).replace("problem\n", "problem as whole\n") + FULL)
+    one, two = submit(sysid.Recipe(str(file)), changes=[Modes(1), Modes(2)])
+    assert len(one.score.frequencies) == 1 and one.score.aic > two.score.aic + 100
+    assert two.score.predicted < 0.03 < one.score.predicted < 1
 
 
 def test_jobs_go_on_from_the_ledger_with_their_scores(recipe, result, tmp_path):
