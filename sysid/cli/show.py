@@ -90,8 +90,8 @@ def _records(test: Measurement) -> str:
     noise = "noise stated" if _noise_is_stated(test) else "no noise stated"
     runs, axes = counted(test.n_runs, "run"), " ".join(test.base_axes or ())
     return (
-        f"{counted(len(names), 'sensor')} ({sensors}), base moving along {axes}, {runs}, {test.freq.size} lines from "
-        f"{test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz, {force}, {noise}"
+        f"{counted(len(names), 'sensor')} ({sensors}), base moving along {axes}, {runs}, "
+        f"{test.lines_in_words}, {force}, {noise}"
     )
 
 

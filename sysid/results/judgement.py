@@ -76,6 +76,9 @@ def _remarks(problem: Problem, end: Outcome) -> Iterator[str]:
         names = [label for label, on in zip(formulation.labels, at, strict=True) if on]
         if names:
             yield f"on a bound of the search space, beyond which the truth may lie: {', '.join(names)}"
+    dropped = sum(term.test.dropped for term in formulation.tests)
+    if dropped:
+        yield f"{dropped} lines at which a record holds NaN are left out"
     if not formulation.fits_records:
         yield "the problem states a misfit of its own; pictures and scores compare with the records as they are"
 
