@@ -371,7 +371,7 @@ def _moves(problem: Problem, point: _Point) -> Array:
         replace(r, measurement=_with_noise(r.measurement)) if isinstance(r, FurtherTest) else r
         for r in problem.residuals
     ]
-    noisy = replace(problem, measurement=_with_noise(problem.measurement), residuals=residuals)
+    noisy = replace(problem, measurement=_with_noise(problem.measurement), residuals=residuals, loss="squares")
     return sensitivity(noisy.formulation, point.x, point.slopes, as_stated=True).normals
 
 

@@ -15,7 +15,8 @@ from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.results.identification import Recipe
 from sysid.results.judgement import succeeded
-from sysid.search.continuation import descend, random_starts, smoothed_tests
+from sysid.search.continuation import Continuation, descend, random_starts, smoothed_tests
+from sysid.search.robust import settled
 from sysid.search.session import DeferredInterrupt, Session
 from sysid.search.strategy import History, Outcome, as_unknowns
 from sysid.structure.structure import Array
@@ -105,19 +106,25 @@ def _refined(job: Job, session: Session) -> JobResult:
     if own:
         x = as_unknowns(problem, np.array(job.recipe.start))
         if job.draw:
-            problem = drawn(problem, x, np.random.SeedSequence(job.seed))
+            # Noise of the size that counts: there are no outliers in it, so that squares are as good.
+            fitted = problem if problem.loss == "squares" else problem.pseudo_values(problem.structure(x), x)
+            problem = drawn(fitted, x, np.random.SeedSequence(job.seed))
     else:
         found = random_starts(problem, 1, np.random.SeedSequence(job.seed))
         if not found:
             return without_result(job, "no point of the search space is a structure; state guesses that make one")
         x = found[0]
     # What ended a search needs no widened peaks.
-    answer = descend(problem, x, [] if own else steps, session)
+    answer = descend(problem.screened, x, [] if own else steps, session)
     if answer.stopped is not None:
         raise answer.stopped
     end = Outcome(problem.structure(answer.x), answer.x, "local phase", answer.success, answer.message, History(), None)
-    success, message = succeeded(problem, end)
-    return JobResult(job.index, job.seed, success, message, answer.x, problem.residual(answer.x))
+    end = settled(problem, end, Continuation(), session)
+    if end.stopped is not None:
+        raise end.stopped
+    success, message = succeeded(problem.screened, end)
+    assert end.x is not None
+    return JobResult(job.index, job.seed, success, message, end.x, problem.residual(end.x))
 
 
 @lru_cache(maxsize=_BUILT)
