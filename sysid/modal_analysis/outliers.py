@@ -53,7 +53,7 @@ _ONE_LINE = 4.0  # times its next line, that a pole's highest one may reach with
 _ONE_CHANNEL = 0.9  # of the power at that line, in one channel: no motion of a structure
 _NARROW = 0.5  # of the distance of lines; poles of less half-width show at one line too
 _FLOOR = 1e-9  # of a record's rms: what counts as noise where there is none
-_SUSPECT, _DEVIATIONS = 1.2, 4.0  # as of stated noise in `misfit`: from when on it is too small
+_SUSPECT = 1.2  # times the variance that is stated, up to which the noise may be as stated
 _MEDIAN = 0.4549  # of the square of a standard normal number
 _ROUNDS, _BOUNDED = 8, 3
 
@@ -101,10 +101,8 @@ def whitened(test: Measurement, made: Sequence[ComplexArray], unknowns: int) -> 
     ]
     more = 1.0
     if by_stated:
-        squares = np.concatenate(by_stated) ** 2
-        reduced = float(np.median(squares)) / np.log(2) / left
-        # The median of so many exponential numbers scatters by 1 / (ln 2 sqrt(numbers)) of itself.
-        more = reduced if reduced > max(_SUSPECT, 1 + _DEVIATIONS / np.log(2) / np.sqrt(squares.size)) else 1.0
+        # Without a jump, at which rounds of a fit would turn to and fro.
+        more = max(1.0, float(np.median(np.concatenate(by_stated) ** 2)) / np.log(2) / left / _SUSPECT)
     return [
         Whitened(misfit / (size := unit if stated is None else np.sqrt(more) * unit), size)
         for (_, misfit, stated), unit in zip(found, units, strict=True)
