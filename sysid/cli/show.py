@@ -77,6 +77,7 @@ def _test(problem: Problem, name: str) -> Iterator[str]:
         (problem.reference is not None, "the reference is known"),
         (problem.validation, f"predicted and never fitted: {counted(len(problem.validation), 'test')}"),
         (problem.goal is not None, f"goal {problem.goal or 0:.3g}"),
+        (problem.loss == "huber", "numbers far from the fit count little (Huber's loss)"),
     )
     known = [sentence for holds, sentence in stated if holds]
     yield "; ".join([f"degrees of freedom {problem.geometry.n}, unknowns {problem.n_variables}", *known])

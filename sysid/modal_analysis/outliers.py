@@ -18,6 +18,9 @@ number's own; and the covariance of least squares, with the scatter of :math:`y^
 :math:`(J'J)^{-1} \sigma^2 \overline{|\psi|^2} / b^2`. Beyond c the slope is 0 along u and :math:`c/|u|` across it: on
 average :math:`c / 2|u|`.
 
+What an outlier may do is bounded by its pull, not by its place: one at a line that alone decides something, such as the
+highest of a peak narrower than two lines, moves that by up to three deviations.
+
 Of normal noise :math:`|u|^2` is exponential, so :math:`\overline{|\psi|^2} = 1 - e^{-c^2}` and
 :math:`b = 1 - e^{-c^2} + \tfrac12 \sqrt\pi\, c\, \mathrm{erfc}(c)`; `TUNING` makes :math:`b^2 / \overline{|\psi|^2}`
 0.95, as 1.345 does for real numbers (Holland and Welsch).
@@ -55,6 +58,8 @@ _NARROW = 0.5  # of the distance of lines; poles of less half-width show at one 
 _FLOOR = 1e-9  # of a record's rms: what counts as noise where there is none
 _SUSPECT = 1.2  # times the variance that is stated, up to which the noise may be as stated
 _MEDIAN = 0.4549  # of the square of a standard normal number
+_LEAST_LINES = 5  # with fewer, no number has neighbours enough
+_UNDAMPED, _TINY = 1e-9, np.finfo(float).tiny
 _ROUNDS, _BOUNDED = 8, 3
 
 Flags = NDArray[np.bool_]
@@ -91,22 +96,19 @@ def whitened(test: Measurement, made: Sequence[ComplexArray], unknowns: int) -> 
         found.append((test.force, test.force - made[1], test.force_std))
     numbers = sum(misfit.size for _, misfit, _ in found)
     left = max(1 - unknowns / (2 * numbers), 0.5)
-    units = []
+    squares, stds = [], []
     for record, misfit, stated in found:
         least = _FLOOR * float(np.sqrt(np.mean(np.abs(record) ** 2)))
         robust = np.sqrt(np.median(np.abs(misfit) ** 2) / np.log(2) / left) if stated is None else stated
-        units.append(np.broadcast_to(np.maximum(robust, least), record.shape))
-    by_stated = [
-        np.abs(misfit / unit).ravel() for (_, misfit, std), unit in zip(found, units, strict=True) if std is not None
-    ]
-    more = 1.0
-    if by_stated:
-        # Without a jump, at which rounds of a fit would turn to and fro.
-        more = max(1.0, float(np.median(np.concatenate(by_stated) ** 2)) / np.log(2) / left / _SUSPECT)
-    return [
-        Whitened(misfit / (size := unit if stated is None else np.sqrt(more) * unit), size)
-        for (_, misfit, stated), unit in zip(found, units, strict=True)
-    ]
+        stds.append(np.broadcast_to(np.maximum(robust, least), record.shape))
+        if stated is not None:
+            squares.append(np.abs(misfit / stds[-1]).ravel() ** 2)
+    # Without a jump, at which rounds of a fit would turn to and fro.
+    more = (
+        np.sqrt(max(1.0, float(np.median(np.concatenate(squares))) / np.log(2) / left / _SUSPECT)) if squares else 1.0
+    )
+    stds = [std if stated is None else more * std for std, (*_, stated) in zip(stds, found, strict=True)]
+    return [Whitened(misfit / std, std) for std, (_, misfit, _) in zip(stds, found, strict=True)]
 
 
 def predicted(test: Measurement, structure: Structure) -> list[ComplexArray]:
@@ -118,6 +120,12 @@ def weight(u: ComplexArray) -> Array:
     """By how much numbers count, 1 or c / |u|."""
     size: Array = 1 / np.maximum(1.0, np.abs(u) / TUNING)
     return size
+
+
+def loss(u: ComplexArray) -> float:
+    """Huber's, summed over whitened numbers."""
+    size = np.abs(u)
+    return float(np.sum(np.where(size > TUNING, 2 * TUNING * size - TUNING**2, size**2)))
 
 
 def pseudo_values(fits: Sequence[tuple[Measurement, list[ComplexArray]]], unknowns: int) -> list[Measurement]:
@@ -153,7 +161,7 @@ def stand_alone(
     not judged: its misfit stands alone too.
     """
     size = np.abs(u)
-    if freq.size < 5:
+    if freq.size < _LEAST_LINES:
         return np.zeros(size.shape, dtype=bool)
     others = size if known is None else np.where(known, 0.0, size)
     here = np.arange(freq.size)
@@ -171,7 +179,9 @@ def stand_alone(
 
 def one_line(freq: Array, omega: Array, ratios: Array) -> Flags:
     """Which poles (m,) reach far higher at one line than at any other."""
-    size = np.sort(np.abs(gains(freq, omega, ratios)), axis=1)
+    if freq.size < _LEAST_LINES:
+        return np.zeros(omega.size, dtype=bool)
+    size = np.sort(_heights(freq, omega, ratios), axis=1)
     flags: Flags = size[:, -1] > _ONE_LINE * size[:, -2]
     return flags
 
@@ -228,16 +238,30 @@ def _poles(test: Measurement, monitor: Monitor | None) -> PolesAndResidues | Non
 def _is_one_number(test: Measurement, records: Records, omega: Array, ratios: Array, k: int) -> bool:
     """Whether pole k, which stands at one line, shows there in one channel only, or explains nothing at other lines."""
     fit = PolesAndResidues.at(test, records, omega, ratios)
-    highest = int(np.argmax(np.abs(gains(test.freq, omega[[k]], ratios[[k]]))))
-    shown = np.einsum("sd,rd->rs", fit.residues[k] + 1j * fit.quadrature[k], test.base[:, :, highest])
-    power = np.abs(shown / (1.0 if test.response_std is None else test.response_std[:, :, highest])) ** 2
-    if power.size > 1 and power.max() > _ONE_CHANNEL * power.sum():
+    highest = int(np.argmax(_heights(test.freq, omega[[k]], ratios[[k]])))
+    if _one_channel(_shown(test, fit.residues[k] + 1j * fit.quadrature[k], highest)):
         return True
     others = Records(test.at(np.arange(test.freq.size) != highest))
     every = others.fit(omega, ratios, velocity=True)
     gained = others.fit(np.delete(omega, k), np.delete(ratios, k), velocity=True).squared_error - every.squared_error
     noise = float(np.median(every.left**2)) / _MEDIAN
     return gained < noise * beyond_chance(every.residues[k].size + 2)
+
+
+def _heights(freq: Array, omega: Array, ratios: Array) -> Array:
+    """How high poles reach at each line, (m, n_freq)."""
+    size: Array = np.abs(gains(freq, omega, np.maximum(ratios, _UNDAMPED)))
+    return size
+
+
+def _shown(test: Measurement, residue: ComplexArray, line: int) -> Array:
+    """Size of what a residue (n_sensors, d) of a pole shows at a line, (runs, n_sensors), in units of stated noise."""
+    size = np.abs(np.einsum("sd,rd->rs", residue, test.base[:, :, line]))
+    return size if test.response_std is None else size / np.maximum(test.response_std[:, :, line], _TINY)
+
+
+def _one_channel(shown: Array) -> bool:
+    return shown.size > 1 and bool(shown.max() ** 2 > _ONE_CHANNEL * np.sum(shown**2))
 
 
 def outliers(test: Measurement, structure: Structure, unknowns: int, *, alone: bool = True) -> list[Outlier]:
@@ -248,12 +272,18 @@ def outliers(test: Measurement, structure: Structure, unknowns: int, *, alone: b
     """
     names = (*test.sensor_names, *(f"force {axis}" for axis in test.base_axes or ()))
     omega, ratios = 2 * np.pi * structure.natural_frequencies, structure.damping_ratios
-    found: list[Outlier] = []
-    first = 0
-    for part in whitened(test, predicted(test, structure), unknowns):
+    parts, first, found = whitened(test, predicted(test, structure), unknowns), 0, []
+    for part in parts:
         far = stand_alone(part.u, test.freq, omega, ratios, times=_CERTAIN) if alone else np.abs(part.u) > _FAR
         for run, channel, line in np.argwhere(far):
             size = float(np.abs(part.u[run, channel, line]))
             found.append(Outlier(names[first + channel], float(test.freq[line]), size))
         first += part.u.shape[1]
+    for k in one_line(test.freq, omega, ratios).nonzero()[0].tolist() if alone else ():
+        line = int(np.argmax(_heights(test.freq, omega[[k]], ratios[[k]])))
+        shown = _shown(test, np.outer(structure.mode_shapes[:, k], structure.participation[k]) + 0j, line)
+        if _one_channel(shown):
+            run, channel = np.unravel_index(np.argmax(shown), shown.shape)
+            number = test.relative[run, channel, line] / parts[0].std[run, channel, line]
+            found.append(Outlier(names[channel], float(test.freq[line]), float(np.abs(number))))
     return found

@@ -7,17 +7,19 @@ from dataclasses import replace
 import numpy as np
 
 from sysid.errors import InputError, SolverError
-from sysid.modal_analysis.outliers import predicted
+from sysid.modal_analysis.outliers import loss, predicted, whitened
 from sysid.problem.problem import Problem
 from sysid.search.local import solve
 from sysid.search.modal import Modal, objective_of
 from sysid.search.session import Session, Stop
 from sysid.search.strategy import History, Outcome, Phase, Strategy
 from sysid.search.swarm import Swarm
+from sysid.structure.structure import Array, Structure
 
 _PHASE = "Huber's loss"
-_ROUNDS = 30
-_SETTLED = 1e-3  # standard deviations of the unknowns, root mean square
+_ROUNDS = 40
+_SETTLED, _NEAR = 2e-3, 0.05  # standard deviations of the unknowns, root mean square: is settled, is as good
+_FARTHEST = 64.0  # times a step
 _EXACT = 1e-10  # of the records: predictions that move by less stay, whatever the noise
 
 
@@ -41,6 +43,8 @@ def settled(problem: Problem, end: Outcome, strategy: Strategy, session: Session
     for number in range(1, _ROUNDS + 1):
         try:
             again = _fitted(fitted, end, strategy, session)
+            if again.stopped is None and end.strategy != Modal.name:
+                again = _farther(problem, end, again)
             fitted = problem.pseudo_values(again.structure, again.x)
         except (Stop, KeyboardInterrupt) as stop:
             return _cut_short(end, str(stop) or "interrupted", stop)
@@ -55,7 +59,8 @@ def settled(problem: Problem, end: Outcome, strategy: Strategy, session: Session
             return replace(end, remarks=(*end.remarks, f"Huber's loss settled after {number} rounds"))
         if session.max_time is not None and session.seconds > session.max_time:
             break
-    return _cut_short(end, f"Huber's loss did not settle in {number} rounds: the last moved by {moved:.2g} deviations")
+    told = f"Huber's loss did not settle in {number} rounds: the last moved by {moved:.2g} deviations"
+    return replace(end, remarks=(*end.remarks, told)) if moved < _NEAR else _cut_short(end, told)
 
 
 def check(problem: Problem, strategy: Strategy) -> None:
@@ -98,6 +103,37 @@ def _fitted(problem: Problem, end: Outcome, strategy: Strategy, session: Session
         end, structure=problem.structure(answer.x), x=answer.x, success=answer.success, message=answer.message,
         history=History(local_curve=answer.curve), stopped=answer.stopped,
     )  # fmt: skip
+
+
+def _farther(problem: Problem, before: Outcome, after: Outcome) -> Outcome:
+    """The answer, or one farther along its step, as far as the loss falls while steps double.
+
+    Where most of what tells an unknown is still far off, each number pulls as little as an outlier.
+    """
+    assert before.x is not None and after.x is not None
+    fits = problem.fits(after.structure, after.x)
+    stds = [part.std for test, its in fits for part in whitened(test, predicted(test, its), problem.n_variables)]
+
+    def left(x: Array, structure: Structure) -> float:
+        found = 0.0
+        units = iter(stds)
+        for test, its in problem.fits(structure, x):
+            records = [record for record in (test.relative, test.force) if record is not None]
+            found += sum(loss((y - f) / next(units)) for y, f in zip(records, predicted(test, its), strict=True))
+        return found
+
+    best, step, times = left(after.x, after.structure), after.x - before.x, 2.0
+    while times <= _FARTHEST:
+        x = np.clip(before.x + times * step, np.minimum(problem.lower, after.x), np.maximum(problem.upper, after.x))
+        try:
+            structure = problem.structure(x)
+        except InputError:
+            break
+        value = left(x, structure)
+        if not value < best:
+            break
+        after, best, times = replace(after, x=x, structure=structure), value, 2 * times
+    return after
 
 
 def _moved(problem: Problem, before: Outcome, after: Outcome) -> float:

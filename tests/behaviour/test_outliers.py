@@ -135,6 +135,15 @@ def test_clean_records_give_the_answer_of_least_squares_nearly():
     assert "deviations from the fit" not in squares.summary() + huber.summary()
 
 
+def test_a_wrong_model_is_doubted_as_it_is_by_squares():
+    """Spikes or not, springs and dampers cannot make up for a mass that is a third off."""
+    wrong = np.diag([1.3 * MASSES[0], MASSES[1], 0.0])
+    problem = dataclasses.replace(two_floors(measured(np.random.default_rng(2)), loss="huber"), mass=wrong)
+    result = sysid.identify(problem, strategy=ONE_START, rng=0)
+    assert not result.determined
+    assert any("misses" in sentence for sentence in result.undetermined), result.undetermined
+
+
 def test_what_cannot_be_is_refused():
     test = measured(np.random.default_rng(0))
     with pytest.raises(sysid.InputError, match="loss = 'l1' is unknown; give one of 'squares', 'huber'"):
