@@ -239,7 +239,7 @@ def _is_one_number(test: Measurement, records: Records, omega: Array, ratios: Ar
     """Whether pole k, which stands at one line, shows there in one channel only, or explains nothing at other lines."""
     fit = PolesAndResidues.at(test, records, omega, ratios)
     highest = int(np.argmax(_heights(test.freq, omega[[k]], ratios[[k]])))
-    if _one_channel(_shown(test, fit.residues[k] + 1j * fit.quadrature[k], highest)):
+    if _one_channel(_shown(test, fit.residues[k] + 1j * fit.quadrature[k], test.response_std, highest)):
         return True
     others = Records(test.at(np.arange(test.freq.size) != highest))
     every = others.fit(omega, ratios, velocity=True)
@@ -254,10 +254,10 @@ def _heights(freq: Array, omega: Array, ratios: Array) -> Array:
     return size
 
 
-def _shown(test: Measurement, residue: ComplexArray, line: int) -> Array:
-    """Size of what a residue (n_sensors, d) of a pole shows at a line, (runs, n_sensors), in units of stated noise."""
+def _shown(test: Measurement, residue: ComplexArray, std: Array | None, line: int) -> Array:
+    """Size of what a residue (n_sensors, d) of a pole shows at a line, (runs, n_sensors), in deviations if given."""
     size = np.abs(np.einsum("sd,rd->rs", residue, test.base[:, :, line]))
-    return size if test.response_std is None else size / np.maximum(test.response_std[:, :, line], _TINY)
+    return size if std is None else size / np.maximum(std[:, :, line], _TINY)
 
 
 def _one_channel(shown: Array) -> bool:
@@ -280,10 +280,11 @@ def outliers(test: Measurement, structure: Structure, unknowns: int, *, alone: b
             found.append(Outlier(names[first + channel], float(test.freq[line]), size))
         first += part.u.shape[1]
     for k in one_line(test.freq, omega, ratios).nonzero()[0].tolist() if alone else ():
-        line = int(np.argmax(_heights(test.freq, omega[[k]], ratios[[k]])))
-        shown = _shown(test, np.outer(structure.mode_shapes[:, k], structure.participation[k]) + 0j, line)
-        if _one_channel(shown):
-            run, channel = np.unravel_index(np.argmax(shown), shown.shape)
-            number = test.relative[run, channel, line] / parts[0].std[run, channel, line]
-            found.append(Outlier(names[channel], float(test.freq[line]), float(np.abs(number))))
+        heights = _heights(test.freq, omega[[k]], ratios[[k]])[0]
+        next_one, line = np.argsort(heights)[-2:].tolist()
+        residue = np.outer(structure.mode_shapes[:, k], structure.participation[k]) + 0j
+        there, beside = (heights[i] * _shown(test, residue, parts[0].std, i) for i in (line, next_one))
+        if _one_channel(there) and beside.max() < _FAR:
+            run, channel = np.unravel_index(np.argmax(there), there.shape)
+            found.append(Outlier(names[channel], float(test.freq[line]), float(there[run, channel])))
     return found

@@ -60,7 +60,7 @@ def by_scipy(*tests):
     return found * np.concatenate([SPRINGS, DAMPERS])
 
 
-@pytest.mark.parametrize("strategy", [ONE_START, sysid.Swarm(max_iterations=25, restarts=0)], ids=["start", "swarm"])
+@pytest.mark.parametrize("strategy", [ONE_START, sysid.Swarm(max_iterations=8, restarts=0)], ids=["start", "swarm"])
 def test_the_answer_has_the_least_huber_loss(strategy):
     test = measured(np.random.default_rng(3))
     result = sysid.identify(two_floors(test, loss="huber"), strategy=strategy, rng=0)
@@ -103,8 +103,8 @@ def test_modes_from_spoiled_records_have_honest_deviations(random_structure):
     frequencies, ratios = [6.0, 9.0, 12.0], np.array([0.02, 0.03, 0.02])
     truth = random_structure(np.random.default_rng(4), n=3, d=1, frequencies=frequencies, ratios=ratios)
     rng, off = np.random.default_rng(6), []
-    for draw in range(8):
-        test = sysid.simulate(truth, np.linspace(3, 16, 160), noise=0.01, force=True, rng=rng)
+    for draw in range(5):
+        test = sysid.simulate(truth, np.linspace(3, 16, 120), noise=0.01, force=True, rng=rng)
         spikes = {}
         for name in ("response", "force"):
             record, std = getattr(test, name), getattr(test, f"{name}_std")
@@ -121,7 +121,7 @@ def test_modes_from_spoiled_records_have_honest_deviations(random_structure):
         if draw == 0:
             squares = sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), rng=0)
             assert any("spikes and drop-outs state Problem(..., loss='huber')" in told for told in squares.remarks)
-    assert 0.75 < np.sqrt(np.mean(np.square(off))) < 1.25  # 48 numbers, the seed is fixed
+    assert 0.7 < np.sqrt(np.mean(np.square(off))) < 1.3  # 30 numbers, the seed is fixed
 
 
 def test_clean_records_give_the_answer_of_least_squares_nearly():

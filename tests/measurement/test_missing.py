@@ -102,7 +102,7 @@ def test_a_noisy_test_with_a_tenth_of_its_lines_missing_has_honest_deviations(ra
     rng = np.random.default_rng(8)
     truth = random_structure(rng, n=2, d=1, frequencies=[6.0, 11.0], ratios=np.array([0.02, 0.03]))
     freq, off, apart = np.linspace(3, 16, 160), [], []
-    for _ in range(12):
+    for _ in range(8):
         test = sysid.simulate(truth, freq, noise=0.01, force=True, rng=rng)
         holed = test.response.copy()
         holed[0, rng.integers(2, size=16), rng.permutation(160)[:16]] = np.nan
@@ -114,6 +114,6 @@ def test_a_noisy_test_with_a_tenth_of_its_lines_missing_has_honest_deviations(ra
             std = getattr(ends[1].uncertainty, name)
             off.append((getattr(ends[1].structure, name) - getattr(truth, name)) / std)
             apart.append((getattr(ends[1].structure, name) - getattr(ends[0].structure, name)) / std)
-    # 48 standard normal numbers, the seed is fixed; the two answers differ by what a tenth of the lines tells.
-    assert 0.75 < np.sqrt(np.mean(np.square(off))) < 1.25
+    # 32 standard normal numbers, the seed is fixed; the two answers differ by what a tenth of the lines tells.
+    assert 0.7 < np.sqrt(np.mean(np.square(off))) < 1.3
     assert np.sqrt(np.mean(np.square(apart))) < 0.6
