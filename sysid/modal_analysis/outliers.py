@@ -239,13 +239,18 @@ def _is_one_number(test: Measurement, records: Records, omega: Array, ratios: Ar
     """Whether pole k, which stands at one line, shows there in one channel only, or explains nothing at other lines."""
     fit = PolesAndResidues.at(test, records, omega, ratios)
     highest = int(np.argmax(_heights(test.freq, omega[[k]], ratios[[k]])))
-    if _one_channel(_shown(test, fit.residues[k] + 1j * fit.quadrature[k], test.response_std, highest)):
+    shown = np.einsum("sd,rd->rs", fit.residues[k] + 1j * fit.quadrature[k], test.base[:, :, highest])
+    std = 1.0 if test.response_std is None else np.maximum(test.response_std[:, :, highest], _TINY)
+    power = np.abs(shown / std) ** 2
+    if power.size > 1 and power.max() > _ONE_CHANNEL * power.sum():
         return True
     others = Records(test.at(np.arange(test.freq.size) != highest))
     every = others.fit(omega, ratios, velocity=True)
-    gained = others.fit(np.delete(omega, k), np.delete(ratios, k), velocity=True).squared_error - every.squared_error
+    left = others.size  # where it is the only pole
+    if omega.size > 1:
+        left = others.fit(np.delete(omega, k), np.delete(ratios, k), velocity=True).squared_error
     noise = float(np.median(every.left**2)) / _MEDIAN
-    return gained < noise * beyond_chance(every.residues[k].size + 2)
+    return left - every.squared_error < noise * beyond_chance(every.residues[k].size + 2)
 
 
 def _heights(freq: Array, omega: Array, ratios: Array) -> Array:
@@ -254,37 +259,18 @@ def _heights(freq: Array, omega: Array, ratios: Array) -> Array:
     return size
 
 
-def _shown(test: Measurement, residue: ComplexArray, std: Array | None, line: int) -> Array:
-    """Size of what a residue (n_sensors, d) of a pole shows at a line, (runs, n_sensors), in deviations if given."""
-    size = np.abs(np.einsum("sd,rd->rs", residue, test.base[:, :, line]))
-    return size if std is None else size / np.maximum(std[:, :, line], _TINY)
-
-
-def _one_channel(shown: Array) -> bool:
-    return shown.size > 1 and bool(shown.max() ** 2 > _ONE_CHANNEL * np.sum(shown**2))
-
-
 def outliers(test: Measurement, structure: Structure, unknowns: int, *, alone: bool = True) -> list[Outlier]:
     """Numbers of the records that are far from what a structure makes of them.
 
-    Only those that stand `alone`, or all; beside the former the modes that are one number's, as where a strategy took
-    outliers for modes.
+    Only those that stand `alone`, or all.
     """
     names = (*test.sensor_names, *(f"force {axis}" for axis in test.base_axes or ()))
     omega, ratios = 2 * np.pi * structure.natural_frequencies, structure.damping_ratios
-    parts, first, found = whitened(test, predicted(test, structure), unknowns), 0, []
-    for part in parts:
+    first, found = 0, []
+    for part in whitened(test, predicted(test, structure), unknowns):
         far = stand_alone(part.u, test.freq, omega, ratios, times=_CERTAIN) if alone else np.abs(part.u) > _FAR
         for run, channel, line in np.argwhere(far):
             size = float(np.abs(part.u[run, channel, line]))
             found.append(Outlier(names[first + channel], float(test.freq[line]), size))
         first += part.u.shape[1]
-    for k in one_line(test.freq, omega, ratios).nonzero()[0].tolist() if alone else ():
-        heights = _heights(test.freq, omega[[k]], ratios[[k]])[0]
-        next_one, line = np.argsort(heights)[-2:].tolist()
-        residue = np.outer(structure.mode_shapes[:, k], structure.participation[k]) + 0j
-        there, beside = (heights[i] * _shown(test, residue, parts[0].std, i) for i in (line, next_one))
-        if _one_channel(there) and beside.max() < _FAR:
-            run, channel = np.unravel_index(np.argmax(there), there.shape)
-            found.append(Outlier(names[channel], float(test.freq[line]), float(there[run, channel])))
     return found

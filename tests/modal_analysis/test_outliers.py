@@ -128,3 +128,13 @@ def test_poles_of_one_line_reach_far_above_the_others():
     omega = 2 * np.pi * np.array([6.0, FREQ[50], 12.0])
     half_width = np.array([1.0, 0.1, 0.6]) * 2 * np.pi * (FREQ[1] - FREQ[0])
     np.testing.assert_array_equal(one_line(FREQ, omega, half_width / omega), [False, True, False])
+
+
+def test_a_single_mode_of_one_line_stays_where_it_shows_beside_it(random_structure):
+    """An oscillator whose peak is a tenth as wide as the lines are apart, recorded by one sensor without noise."""
+    truth = random_structure(np.random.default_rng(0), n=1, d=1, frequencies=[FREQ[60]], ratios=np.array([5e-4]))
+    test = sysid.simulate(truth, FREQ)
+    assert screened(test) is test
+    two = np.concatenate([test.response, test.response], axis=1)
+    both = sysid.Measurement(FREQ, test.base, two, rigid_body=np.repeat(test.rigid_body, 2, axis=0))
+    assert screened(both) is both
