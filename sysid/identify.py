@@ -19,6 +19,7 @@ from sysid.results.judgement import judge
 from sysid.search.continuation import Continuation
 from sysid.search.journal import Journal
 from sysid.search.modal import Modal
+from sysid.search.robust import check, settled
 from sysid.search.session import DeferredInterrupt, Progress, Session, Stop
 from sysid.search.strategy import DoesNotApplyError, Outcome, Strategy
 from sysid.search.swarm import Swarm
@@ -103,8 +104,10 @@ def identify(
         session = Session(listeners, interrupt, max_time, random, max_evaluations, journal)
         prepare(problem, session)
         chosen, why = choose(strategy, problem, start)
+        check(problem, chosen)
         try:
-            outcome, why = _run(chosen, why, problem, session, start, follow=strategy == "auto")
+            outcome, why = _run(chosen, why, problem.screened, session, start, follow=strategy == "auto")
+            outcome = settled(problem, outcome, chosen, session)
         except (InputError, SolverError):
             if max_time is None:  # it has ended by itself, and would end so again
                 journal.entries.clear()

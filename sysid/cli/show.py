@@ -77,6 +77,7 @@ def _test(problem: Problem, name: str) -> Iterator[str]:
         (problem.reference is not None, "the reference is known"),
         (problem.validation, f"predicted and never fitted: {counted(len(problem.validation), 'test')}"),
         (problem.goal is not None, f"goal {problem.goal or 0:.3g}"),
+        (problem.loss == "huber", "numbers far from the fit count little (Huber's loss)"),
     )
     known = [sentence for holds, sentence in stated if holds]
     yield "; ".join([f"degrees of freedom {problem.geometry.n}, unknowns {problem.n_variables}", *known])
@@ -90,8 +91,8 @@ def _records(test: Measurement) -> str:
     noise = "noise stated" if _noise_is_stated(test) else "no noise stated"
     runs, axes = counted(test.n_runs, "run"), " ".join(test.base_axes or ())
     return (
-        f"{counted(len(names), 'sensor')} ({sensors}), base moving along {axes}, {runs}, {test.freq.size} lines from "
-        f"{test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz, {force}, {noise}"
+        f"{counted(len(names), 'sensor')} ({sensors}), base moving along {axes}, {runs}, "
+        f"{test.lines_in_words}, {force}, {noise}"
     )
 
 
@@ -371,7 +372,7 @@ def _moves(problem: Problem, point: _Point) -> Array:
         replace(r, measurement=_with_noise(r.measurement)) if isinstance(r, FurtherTest) else r
         for r in problem.residuals
     ]
-    noisy = replace(problem, measurement=_with_noise(problem.measurement), residuals=residuals)
+    noisy = replace(problem, measurement=_with_noise(problem.measurement), residuals=residuals, loss="squares")
     return sensitivity(noisy.formulation, point.x, point.slopes, as_stated=True).normals
 
 

@@ -102,6 +102,8 @@ def compare(
     InputError
         Where no strategy applies, with the reason of each, or the problem cannot be searched.
     """
+    if problem.loss != "squares":
+        raise InputError(f"compare minimises squares, and the problem has loss={problem.loss!r}: leave it out")
     results: list[MethodResult] = []
     try:
         for result in _results(problem, rng, max_time):

@@ -19,8 +19,9 @@ from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.results.identification import Identification, Recipe
 from sysid.results.judgement import judge, succeeded
-from sysid.search.continuation import descend, random_starts, smoothed_tests
+from sysid.search.continuation import Continuation, descend, random_starts, smoothed_tests
 from sysid.search.modal import Modal
+from sysid.search.robust import settled
 from sysid.search.session import DeferredInterrupt, Session
 from sysid.search.strategy import History, Outcome, as_unknowns
 from sysid.structure.structure import Array
@@ -167,7 +168,9 @@ def _refined(job: Job, session: Session) -> JobResult:
     if own:
         x = as_unknowns(problem, np.array(job.recipe.start))
         if job.draw:
-            problem = drawn(problem, x, np.random.SeedSequence(job.seed))
+            # Noise of the size that counts: there are no outliers in it, so that squares are as good.
+            fitted = problem if problem.loss == "squares" else problem.pseudo_values(problem.structure(x), x)
+            problem = drawn(fitted, x, np.random.SeedSequence(job.seed))
     else:
         found = random_starts(problem, 1, np.random.SeedSequence(job.seed))
         if not found:
@@ -176,18 +179,21 @@ def _refined(job: Job, session: Session) -> JobResult:
     # What ended a search needs no widened peaks.
     end = _descended(problem, x, [] if own else steps, session)
     assert end.x is not None
-    success, message = succeeded(problem, end)
+    success, message = succeeded(problem.screened, end)
     return JobResult(job.index, job.seed, success, message, end.x, problem.residual(end.x))
 
 
 def _descended(problem: Problem, x: Array, steps: list[tuple[TestTerm, ...]], session: Session) -> Outcome:
     """Where the local phase ends from `x`."""
-    answer = descend(problem, x, steps, session)
+    answer = descend(problem.screened, x, steps, session)
     if answer.stopped is not None:
         raise answer.stopped
-    return Outcome(
-        problem.structure(answer.x), answer.x, "local phase", answer.success, answer.message, History(), None
-    )
+    structure = problem.structure(answer.x)
+    end = Outcome(structure, answer.x, "local phase", answer.success, answer.message, History(), None)
+    end = settled(problem, end, Continuation(), session)
+    if end.stopped is not None:
+        raise end.stopped
+    return end
 
 
 @lru_cache(maxsize=_BUILT)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import InitVar, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError, choice, finite_array, flag, instance, number, random_generator, refuse, sequence
 from sysid.measurement import spectra
+from sysid.measurement.missing import Missing, complete, present
 from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
 from sysid.structure.sensor import Sensor, checked_sensors, sensors_from_tree, sensors_to_tree
 from sysid.structure.structure import Array, ComplexArray, Structure, check_frequencies
@@ -90,6 +91,10 @@ class Measurement:
     base_axes : str or sequence of str, optional
         Names of the base directions (see `sysid.rigid_body`); by default those that the sensors' axes tell, else
         x y z rx ry rz in this order. Needed where fewer than four directions hold a rotation.
+    missing : {"refuse", "drop"}
+        What is done with NaN in the records or their deviations: "drop" leaves out every line that holds any.
+    dropped : int
+        How many lines were left out so.
 
     Notes
     -----
@@ -106,10 +111,18 @@ class Measurement:
     response_std: Array | None = field(default=None, kw_only=True)
     force_std: Array | None = field(default=None, kw_only=True)
     base_axes: tuple[str, ...] | None = field(default=None, kw_only=True)
+    missing: InitVar[Missing] = field(default="refuse", kw_only=True)
+    dropped: int = field(default=0, kw_only=True)
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, missing: Missing) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 - a frozen class fills itself
+        choice("missing", missing, ("refuse", "drop"))
         put("freq", check_frequencies(self.freq))
+        if missing == "drop":
+            there = present({name: getattr(self, name) for name in _RECORDS})
+            put("dropped", self.dropped + self.freq.size - there["freq"].size)
+            for name, record in there.items():
+                put(name, record)
         put("base", _records("base", self.base, self.freq.size))
         put("response", _records("response", self.response, self.freq.size))
         put("rigid_body", np.atleast_2d(finite_array("rigid_body", self.rigid_body)))
@@ -172,6 +185,7 @@ class Measurement:
             "freq": self.freq, "base": self.base, "response": self.response, "rigid_body": self.rigid_body,
             "force": self.force, "sensors": sensors_to_tree(self.sensors), "response_std": self.response_std,
             "force_std": self.force_std, "base_axes": self.base_axes,
+            **({"dropped": self.dropped} if self.dropped else {}),  # so that an older sysid reads all others
         }  # fmt: skip
 
     @classmethod
@@ -188,10 +202,13 @@ class Measurement:
     def __repr__(self) -> str:
         axes = " ".join(self.base_axes or ())
         force = ", force" if self.force is not None else ""
-        return (
-            f"<Measurement: {self.n_sensors} sensors, base {axes}, {self.n_runs} runs, {self.freq.size} lines from "
-            f"{self.freq[0]:.4g} to {self.freq[-1]:.4g} Hz{force}>"
-        )
+        return f"<Measurement: {self.n_sensors} sensors, base {axes}, {self.n_runs} runs, {self.lines_in_words}{force}>"
+
+    @property
+    def lines_in_words(self) -> str:
+        """How many lines there are, from where to where, and how many were left out for what was missing."""
+        dropped = f" ({self.dropped} more hold NaN and are left out)" if self.dropped else ""
+        return f"{self.freq.size} lines from {self.freq[0]:.4g} to {self.freq[-1]:.4g} Hz{dropped}"
 
     @property
     def n_runs(self) -> int:
@@ -276,6 +293,7 @@ class Measurement:
         response_std: ArrayLike | None = None,
         force_std: ArrayLike | None = None,
         base_axes: str | Sequence[str] | None = None,
+        missing: Missing = "refuse",
     ) -> Measurement:
         """From frequency response functions: d unit runs, one a base direction.
 
@@ -295,9 +313,23 @@ class Measurement:
         force_std : array_like, optional
             Standard deviation of `force`, broadcast to (d, d, n_freq).
         base_axes : str or sequence of str, optional
+        missing : {"refuse", "drop"}
+            As in `Measurement`.
         """
         lines = check_frequencies(freq)
-        H = finite_array("frf", frf, complex)
+        choice("missing", missing, ("refuse", "drop"))
+        given: dict[str, Any] = {
+            "freq": lines,
+            "frf": frf,
+            "force": force,
+            "response_std": response_std,
+            "force_std": force_std,
+        }
+        if missing == "drop":
+            given = present(given)
+        dropped, lines = lines.size - given["freq"].size, given["freq"]
+        force, response_std, force_std = (given[name] for name in ("force", "response_std", "force_std"))
+        H = complete("frf", given["frf"], complex)
         if H.ndim == 2:  # (n_sensors, n_freq)
             H = np.expand_dims(H, 1)
         H = _records("frf", H, lines.size)
@@ -308,7 +340,7 @@ class Measurement:
             raise InputError(f"force is {F.shape}; with {d} base directions it is {wanted}")
         # The base direction comes first: it becomes the run.
         by_run: Any = lambda record: None if record is None else np.moveaxis(record, 1, 0)  # noqa: E731
-        named: Any = {"rigid_body": rigid_body, "sensors": sensors, "base_axes": base_axes}
+        named: Any = {"rigid_body": rigid_body, "sensors": sensors, "base_axes": base_axes, "dropped": dropped}
         return cls(
             lines, unit_runs(d, lines.size), by_run(H), force=by_run(F),
             response_std=by_run(_std("response_std", response_std, H)),
@@ -427,7 +459,7 @@ def _with_noise(record: ComplexArray, noise: float, random: np.random.Generator)
 
 
 def _records(name: str, value: ArrayLike, n_freq: int) -> ComplexArray:
-    array = finite_array(name, value, complex)
+    array = complete(name, value, complex)
     if array.ndim == 2:
         array = array[None]
     if array.ndim != 3 or array.shape[-1] != n_freq:
@@ -438,7 +470,7 @@ def _records(name: str, value: ArrayLike, n_freq: int) -> ComplexArray:
 def _std(name: str, value: ArrayLike | None, record: ComplexArray | None) -> Array | None:
     if value is None:
         return None
-    array = finite_array(name, value)
+    array = complete(name, value)
     if record is None:
         raise InputError(f"{name} is given without its record")
     try:

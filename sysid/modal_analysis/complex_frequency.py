@@ -57,7 +57,11 @@ class PolesAndResidues:
         if omega.size == 0:
             return None
         order = np.argsort(omega)
-        omega, ratios = omega[order], ratios[order]
+        return cls.at(test, records, omega[order], ratios[order])
+
+    @classmethod
+    def at(cls, test: Measurement, records: Records, omega: Array, ratios: Array) -> PolesAndResidues:
+        """Free residues of a test at given poles, (m,) each, ascending; `records` are those of its accelerations."""
         # Residues in quadrature too, where the lines suffice for them.
         many = records.data.shape[0] > 4 * omega.size * records.n_base
         fit = records.fit(omega, ratios, velocity=many)
@@ -80,18 +84,22 @@ class PolesAndResidues:
         g, velocity = gains_with_velocity(freq, self.omega, self.ratios, shift)
         return np.einsum("ksd,kf->sdf", self.residues, g) + np.einsum("ksd,kf->sdf", self.quadrature, velocity)
 
+    def records(self, freq: Array, base: ComplexArray, shift: float = 0.0) -> tuple[ComplexArray, ComplexArray | None]:
+        """Relative accelerations and, where it was measured, force for base records (runs, d, n_freq)."""
+        relative = np.einsum("sdf,rdf->rsf", self.response(freq, shift), base)
+        if self.force is None:
+            return relative, None
+        functions = [np.ones((1, freq.size)), *gains_with_velocity(freq, self.omega, self.ratios, shift)]
+        return relative, np.einsum("ked,kf,rdf->ref", self.force, np.concatenate(functions), base, optimize=True)
+
     def smoothed(self, test: Measurement, share: float) -> Smoothed:
         """The test with a shift of this share of its mean frequency, one run for each independent base motion."""
         shift = share * float(np.exp(np.log(self.omega).mean()))
         ends = self.omega[[0, -1]] / (2 * np.pi)
         freq = np.linspace(max((1 - _BEYOND) * ends[0], 1e-3 * ends[1]), (1 + _BEYOND) * ends[1], _LINES)
         base = np.repeat(self.inputs.T[:, :, None], freq.size, axis=2).astype(complex)
-        relative = np.einsum("sdf,rdf->rsf", self.response(freq, shift), base)
+        relative, force = self.records(freq, base, shift)
         absolute = relative + np.einsum("sd,rdf->rsf", test.rigid_body, base)
-        force = None
-        if self.force is not None:
-            functions = [np.ones((1, freq.size)), *gains_with_velocity(freq, self.omega, self.ratios, shift)]
-            force = np.einsum("ked,kf,rdf->ref", self.force, np.concatenate(functions), base, optimize=True)
         smooth = Measurement(freq, base, absolute, rigid_body=test.rigid_body, force=force, base_axes=test.base_axes)
         return Smoothed(smooth, shift)
 

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, instance, number, refuse
+from sysid.errors import InputError, choice, instance, number, refuse
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.outliers import predicted, pseudo_values, screened
 from sysid.modal_analysis.response import columns, weighed_mass
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.damping import ModalDamping
@@ -23,6 +24,7 @@ from sysid.problem import stored
 from sysid.problem.feasibility import HELD, LOOSE, check_constraints, check_matrices, points_of, scale_of  # fmt: skip
 from sysid.problem.formulation import Formulation
 from sysid.problem.given import MATRICES, as_models, geometry_of
+from sysid.problem.terms import FurtherTest
 from sysid.structure.structure import Array, Structure
 
 
@@ -63,6 +65,10 @@ class Problem:
         Tests that are predicted and never fitted.
     goal : float, optional
         `residual` at which the identification counts as a success.
+    loss : {"squares", "huber"}
+        "huber" makes numbers of the records count little that are far from the fit (`sysid.modal_analysis.outliers`):
+        for spikes and drop-outs at some lines of some channels. What else is fitted counts by its squares. A mode must
+        show at more than one line. `objective` and `residual` are of the records as `screened`.
 
     The constructor checks types, shapes and what is written. Poles, weights and feasibility are found when they are
     first asked for, once; `check` refuses what cannot be searched.
@@ -99,6 +105,7 @@ class Problem:
     reference: Structure | None = field(default=None, kw_only=True)
     validation: Sequence[Measurement] = field(default=(), kw_only=True)
     goal: float | None = field(default=None, kw_only=True)
+    loss: Literal["squares", "huber"] = field(default="squares", kw_only=True)
     site: str = field(init=False, default="?")
 
     def __post_init__(self) -> None:
@@ -107,6 +114,9 @@ class Problem:
             instance("Problem: reference", self.reference, Structure)
         if self.goal is not None:
             number("Problem: goal", self.goal, "a positive relative residual", above=0)
+        choice("Problem: loss", self.loss, ("squares", "huber"))
+        if self.loss == "huber" and self.misfit is not None:
+            raise InputError("Problem: loss='huber' is of records, and this problem fits a misfit of its own instead")
         if not isinstance(self.healing, Mapping) or not all(isinstance(v, Variable) for v in self.healing):
             raise InputError("Problem: healing is a dictionary from variables to expressions: {m: 9 * m / ca.sum1(m)}")
         for name, model in zip(MATRICES, as_models(self.mass, self.stiffness, self.damping), strict=True):
@@ -150,7 +160,7 @@ class Problem:
 
     def _check_declarations(self) -> None:
         """Refuse models that do not fit the test, and what is written wrong; nothing is searched for it."""
-        declared = self.formulate(self.geometry.unsearched())
+        declared = self.formulate(self._geometry.unsearched())
         for model in declared.models:
             model.stated(declared.geometry)
         declared.check()
@@ -160,10 +170,11 @@ class Problem:
         return {
             "measurement": self.measurement.to_tree(),
             "given": stored.to_tree(vars(self)),
-            "poles": self.geometry.found,
+            "poles": None if self.loss == "huber" else self.geometry.found,  # those of what is screened
             "reference": None if self.reference is None else self.reference.to_tree(),
             "validation": [test.to_tree() for test in self.validation],
             "goal": self.goal,
+            "loss": self.loss,
         }
 
     @classmethod
@@ -183,20 +194,59 @@ class Problem:
             reference=None if tree["reference"] is None else Structure.from_tree(tree["reference"]),
             validation=[Measurement.from_tree(test) for test in tree["validation"]],
             goal=tree["goal"],
+            loss=tree.get("loss", "squares"),  # earlier files have none
         )
-        problem.geometry.found = tree.get("poles")
+        if tree.get("poles") is not None:
+            problem.geometry.found = tree["poles"]
         return problem
 
     @cached_property
+    def screened(self) -> Problem:
+        """The problem in squares, its records without numbers that stand alone; with ``loss="squares"`` itself."""
+        return self if self.loss == "squares" else self._with_tests(screened)
+
+    def fits(self, structure: Structure, x: Array | None) -> list[tuple[Measurement, Structure]]:
+        """Each test that is fitted, as it was given, and what the structure was in it at an answer."""
+        own = [(self.measurement, structure)] if self.formulation.fits_records else []
+        further = [r.measurement for r in self.residuals if isinstance(r, FurtherTest) and x is not None]
+        terms = zip(further, self.formulation.further_tests, strict=False)
+        return own + [(test, term.matrices.structure(x, test)) for test, term in terms if x is not None]
+
+    def pseudo_values(self, structure: Structure, x: Array | None) -> Problem:
+        """The problem in squares, with pseudo-values about an answer in the place of its records.
+
+        See `sysid.modal_analysis.outliers`; poles that were found stay.
+        """
+        fits = [(test, predicted(test, its)) for test, its in self.fits(structure, x)]
+        made = iter(pseudo_values(fits, self.n_variables))
+        other = self._with_tests(lambda test: next(made))
+        other.geometry.found = self.geometry.found
+        return other
+
+    def _with_tests(self, change: Callable[[Measurement], Measurement]) -> Problem:
+        """The same in squares, with other records of all tests that are fitted."""
+        own = change(self.measurement)
+        residuals = [
+            replace(given, measurement=change(given.measurement)) if isinstance(given, FurtherTest) else given
+            for given in self.residuals
+        ]
+        return replace(self, measurement=own, residuals=residuals, loss="squares")
+
+    @property
     def geometry(self) -> Geometry:
         """The geometry of the degrees of freedom."""
+        return self.screened._geometry
+
+    @cached_property
+    def _geometry(self) -> Geometry:
+        """That of the records as they are given."""
         weighed = None if self.measurement.force is None else self._weigh
         return geometry_of(self.measurement, self.stiffness, self.recovery, self.rigid_body_dofs, weighed)
 
     @cached_property
     def formulation(self) -> Formulation:
         """Matrices, terms and constraints as CasADi functions of the unknowns."""
-        return self.formulate(self.geometry)
+        return self.formulate(self.geometry) if self.loss == "squares" else self.screened.formulation
 
     @property
     def models(self) -> tuple[MatrixModel, MatrixModel, MatrixModel]:
@@ -217,6 +267,8 @@ class Problem:
         monitor : callable, optional
             Called with (iteration, relative residual) while poles are looked for; what it raises passes through.
         """
+        if self.loss == "huber" and "screened" not in vars(self):
+            vars(self)["screened"] = self._with_tests(lambda test: screened(test, monitor=monitor))
         geometry, formulation = self.geometry, self.formulation
         geometry.monitor = formulation.monitor = monitor
         try:

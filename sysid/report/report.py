@@ -130,7 +130,7 @@ def _verdict(it: Identification) -> str:
     head = paragraph(
         f"{n} degrees of freedom{sensors}, {counted(d, 'base direction')} "
         f"({', '.join(test.base_axes or ())}), {counted(test.n_runs, 'run')}, "
-        f"{test.freq.size} lines from {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz",
+        f"{test.lines_in_words}",
         "soft",
     )
     word = "Interrupted: the best until then" if it.interrupted else "Success" if it.success else "No success"

@@ -87,7 +87,8 @@ class Answer:
         Of the accelerations relative to the base, over all runs, sensors and lines. Where the problem states a misfit
         of its own and no test is fitted beside it, the norm of that misfit.
         """
-        return self.measurement.residual(self.structure) if self._in_modes else self.problem.residual(self._unknowns)
+        records = self.problem.screened.measurement
+        return records.residual(self.structure) if self._in_modes else self.problem.residual(self._unknowns)
 
     @cached_property
     def residuals(self) -> tuple[float, ...]:
@@ -104,7 +105,7 @@ class Answer:
         else the problem states among its residuals.
         """
         if self._in_modes:
-            return weighted_error(self.measurement, self.structure)
+            return weighted_error(self.problem.screened.measurement, self.structure)
         return self.problem.objective(self._unknowns)
 
     @cached_property
@@ -131,7 +132,7 @@ class Answer:
     @property
     def force_residual(self) -> float | None:
         """``‖predicted - measured‖ / ‖measured‖`` over the base force; None where none was measured."""
-        return self.measurement.force_residual(self.structure)
+        return self.problem.screened.measurement.force_residual(self.structure)
 
     def predict(self, measurement: Measurement) -> ComplexArray:
         """Relative accelerations under another test's base motion, (runs, n_sensors, n_freq)."""
@@ -145,7 +146,9 @@ class Answer:
         """
         from sysid.assessment.uncertainty import uncertainty
 
-        return uncertainty(self.problem, self.structure, self.x)
+        huber = self.problem.loss == "huber"
+        fitted = self.problem.pseudo_values(self.structure, self.x) if huber else self.problem
+        return uncertainty(fitted, self.structure, self.x)
 
     @property
     def covariance(self) -> Array:
@@ -173,7 +176,7 @@ class Answer:
         """
         from sysid.assessment.determination import open_masses
 
-        return tuple(open_masses(self.problem, self.structure))
+        return tuple(open_masses(self.problem.screened, self.structure))
 
     @property
     def is_one_of_many(self) -> bool:
@@ -189,7 +192,7 @@ class Answer:
     def _intervals(self) -> Intervals:
         from sysid.assessment.determination import intervals
 
-        return intervals(self.problem, self.structure, self.x)
+        return intervals(self.problem.screened, self.structure, self.x)
 
     @property
     def mac(self) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -10,6 +11,7 @@ import numpy as np
 from sysid.assessment.checks import doubts
 from sysid.assessment.determination import determine
 from sysid.assessment.sensitivity import blocks_of
+from sysid.modal_analysis.outliers import outliers
 from sysid.nlp import EXACT
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification
@@ -19,17 +21,19 @@ from sysid.search.strategy import Outcome
 
 _KNOWN = 0.1  # of the root of two diagonal entries; an entry with a larger standard deviation is not known
 _LARGE = 4000  # entries of the mode shapes, beyond which the covariance takes minutes and gigabytes
+_OUTLIERS = "for spikes and drop-outs state Problem(..., loss='huber'), or leave these lines out"
 _NO_FIT = 0.5  # relative residual above which nothing is explained
 
 
 def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session) -> Identification:
     """Judge where a search ended: `why` tells why its strategy was taken, the session has its log and clock."""
-    success, message = succeeded(problem, end)
+    records = problem.screened
+    success, message = succeeded(records, end)
     session.log(f"done: {message}")
-    known = determine(problem, end.structure, end.x, end.alternatives)
+    known = determine(records, end.structure, end.x, end.alternatives)
     # What was stopped on its way has misfits of another kind.
     judged = end.stopped is None and (success or problem.free_modes)
-    doubtful = doubts(problem, end.structure, end.x) if judged else ()
+    doubtful = doubts(records, end.structure, end.x) if judged else ()
     open_ = (*doubtful, *known.undetermined)
     if not success:
         open_ = ("the search did not end in a fit, so this is not yet any structure that explains the data", *open_)
@@ -76,8 +80,34 @@ def _remarks(problem: Problem, end: Outcome) -> Iterator[str]:
         names = [label for label, on in zip(formulation.labels, at, strict=True) if on]
         if names:
             yield f"on a bound of the search space, beyond which the truth may lie: {', '.join(names)}"
+    dropped = sum(term.test.dropped for term in formulation.tests)
+    if dropped:
+        yield f"{dropped} lines at which a record holds NaN are left out"
+    yield from _outliers(problem, end)
     if not formulation.fits_records:
         yield "the problem states a misfit of its own; pictures and scores compare with the records as they are"
+
+
+def _outliers(problem: Problem, end: Outcome) -> Iterator[str]:
+    """Which numbers of the records are far from the fit: all where they count little, else those that stand alone."""
+    huber, fits = problem.loss == "huber", problem.fits(end.structure, end.x)
+    for i, (test, structure) in enumerate(fits, start=1):
+        found = outliers(test, structure, problem.n_variables, alone=not huber)
+        if not found:
+            continue
+        which = "the records" if len(fits) == 1 else f"test {i}"
+        numbers = test.response.size + (0 if test.force is None else test.force.size)
+        channels = ", ".join(f"{name} {count}" for name, count in Counter(one.channel for one in found).most_common(4))
+        far = max(found, key=lambda one: one.size)
+        told = (
+            f"{len(found)} of {numbers} numbers of {which} are up to {far.size:.3g} deviations from the fit "
+            f"({far.channel} at {far.freq:.5g} Hz; by channel {channels})"
+        )
+        yield (
+            f"{told}: they count little, by Huber's loss"
+            if huber
+            else f"{told}, and the lines beside them are not: {_OUTLIERS}"
+        )
 
 
 def _as_certain(it: Identification) -> Identification:

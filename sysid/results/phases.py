@@ -78,6 +78,6 @@ def _row(it: Searched, phase: Phase) -> list[str]:
     known = truth is not None and truth.n == structure.n and truth.n_base == structure.n_base
     off = errors(structure, truth) if known and truth is not None else np.full(5, np.nan)
     of_truth = [f"{value:.2g}" if np.isfinite(value) else "-" for value in off * [100, 1, 100, 100, 100]]
-    residual = problem.measurement.residual(structure) if problem.free_modes else problem.residual(phase.x)
+    residual = problem.screened.measurement.residual(structure) if problem.free_modes else problem.residual(phase.x)
     objective = [f"{value:.4g}" for value in (phase.objective, residual)]
     return [phase.name, *objective, *of_truth, str(phase.evaluations), f"{phase.seconds:.1f}"]

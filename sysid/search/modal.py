@@ -230,7 +230,7 @@ def run_modal(problem: Problem, options: Modal, session: Session) -> Outcome:
             "as many modes as sensors in the lines; leave sensors out or widen the lines"
         )
     x = answer.x if answer.x.size else None
-    left = _objective(problem, structure, x)
+    left = objective_of(problem, structure, x)
     ended = Phase("local phase", left, answer.x, session.seconds, answer.curve.size)
     history = History(local=left, local_curve=answer.curve, phases=(ended,))
     session.log(f"local phase: {answer.message}, {answer.curve.size} iterates, objective {history.local:.4e}")
@@ -259,7 +259,7 @@ def _in_unknowns(
     return problem.structure(answer.x), replace(answer, curve=np.concatenate([end.curve, answer.curve]))
 
 
-def _objective(problem: Problem, structure: Structure, x: Array | None) -> float:
+def objective_of(problem: Problem, structure: Structure, x: Array | None) -> float:
     """What the fit leaves; where modes are free from the structure alone, without any graph of the matrices."""
     if x is not None and not problem.free_modes:
         return problem.objective(x)

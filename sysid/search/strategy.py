@@ -21,7 +21,7 @@ class Phase:
     Attributes
     ----------
     name : str
-        "start", "swarm", "refinement", "continuation" or "local phase".
+        "start", "swarm", "refinement", "continuation", "local phase" or "Huber's loss" (its rounds together).
     objective : float
     x : (n_variables,)
         The best unknowns then; empty where the phase had none.

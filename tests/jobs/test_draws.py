@@ -131,3 +131,22 @@ def test_spreads_are_root_mean_squares_about_the_answer(result):
 def test_mistakes_are_told_before_any_job(recipe, given, told):
     with pytest.raises(sysid.InputError, match=told):
         submit(recipe, **given)
+
+
+def test_hubers_loss_is_that_of_every_job(tmp_path):
+    """Jobs end where the identification did; drawn noise has no spikes, and scatters as the uncertainty says."""
+    spikes = "    test.response[0, :, [11, 37]] += 60 * test.response_std[0, 0, 0]\n    return"
+    text = MODULE.replace("    return", spikes).replace("damping=C)", "damping=C, loss='huber')")
+    file = tmp_path / "spikes.py"
+    file.write_text(text)
+    recipe = sysid.Recipe(str(file))
+    problem = sysid.catalogue.build(recipe)
+    result = sysid.identify(problem, rng=0, strategy=sysid.Continuation(starts=1))
+    std = result.uncertainty.variables["spring"]
+    begun = replace(recipe, start=tuple(1.0002 * result.x))
+    (end,) = submit(begun)
+    assert end.success
+    np.testing.assert_array_less(np.abs(end.x - result.x), 1e-2 * std)
+    ends = list(submit(replace(recipe, start=tuple(result.x)), draws=6))
+    drawn_std = np.sqrt(np.mean([(one.x - result.x) ** 2 for one in ends], axis=0))
+    assert np.all((drawn_std > 0.4 * std) & (drawn_std < 1.8 * std))

@@ -1,0 +1,276 @@
+r"""Outliers in the records of a test, and Huber's loss, for which they count little.
+
+With the deviation :math:`\sigma` of a number of the records, :math:`u = (y - f(x)) / \sigma` is complex and
+:math:`E|u|^2 = 1`. Least squares minimise the sum of :math:`|u|^2`, Huber's loss that of
+
+.. math:: \rho(u) = |u|^2 \;\; (|u| \le c), \qquad 2 c |u| - c^2 \;\; (|u| > c),
+
+so that a number counts with the weight :math:`\min(1, c/|u|)`, or pulls with :math:`\psi(u) = u \min(1, c/|u|)`.
+
+Poles, residues and shapes are eliminated with weights that are a product of channels and lines, which weights of single
+numbers are not. So the records are changed in their place: least squares of the *pseudo-values*
+
+.. math:: y^* = f(x_0) + \sigma\, \psi(u_0) / b, \qquad b = \text{mean of the slope of } \psi,
+
+are repeated from their last answer :math:`x_0` until it stays. There :math:`J' W (y^* - f) = 0` is
+:math:`J' W \sigma \psi = 0`, as where the loss is least; a step is Newton's with the mean slope in place of each
+number's own; and the covariance of least squares, with the scatter of :math:`y^* - f` for noise, is Huber's:
+:math:`(J'J)^{-1} \sigma^2 \overline{|\psi|^2} / b^2`. Beyond c the slope is 0 along u and :math:`c/|u|` across it: on
+average :math:`c / 2|u|`.
+
+What an outlier may do is bounded by its pull, not by its place: one at a line that alone decides something, such as the
+highest of a peak narrower than two lines, moves that by up to three deviations.
+
+Of normal noise :math:`|u|^2` is exponential, so :math:`\overline{|\psi|^2} = 1 - e^{-c^2}` and
+:math:`b = 1 - e^{-c^2} + \tfrac12 \sqrt\pi\, c\, \mathrm{erfc}(c)`; `TUNING` makes :math:`b^2 / \overline{|\psi|^2}`
+0.95, as 1.345 does for real numbers (Holland and Welsch).
+
+References
+----------
+P. J. Huber, Robust Statistics (1981), sections 7.6 (covariance, with its correction for few numbers) and 7.8 (modified
+residuals); P. J. Bickel, Scand. J. Statist. 3 (1976) 145-168 (pseudo-values); P. W. Holland, R. E. Welsch, Commun.
+Statist. A6 (1977) 813-827.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.complex_frequency import PolesAndResidues
+from sysid.modal_analysis.residues import Records, beyond_chance
+from sysid.modal_analysis.response import gains
+from sysid.modal_analysis.vector_fitting import Monitor, poles_of_any_damping
+from sysid.structure.structure import Array, ComplexArray, Structure
+
+TUNING = 1.06147  # c, in units of sqrt(E|e|²): 95 % efficient where the noise is normal
+_FAR = 5.0  # deviations, beyond which one number in 10^10 is chance
+_BESIDE = 5.0  # times the numbers beside it: as much as a wrong pole leaves of a peak one line wide
+_CERTAIN = 10.0  # the same, where noise that differs from line to line must not be taken for outliers
+_ONE_LINE = 4.0  # times its next line, that a pole's highest one may reach without being doubted
+_ONE_CHANNEL = 0.9  # of the power at that line, in one channel: no motion of a structure
+_NARROW = 0.5  # of the distance of lines; poles of less half-width show at one line too
+_FLOOR = 1e-9  # of a record's rms: what counts as noise where there is none
+_SUSPECT = 1.2  # times the variance that is stated, up to which the noise may be as stated
+_MEDIAN = 0.4549  # of the square of a standard normal number
+_LEAST_LINES = 5  # with fewer, no number has neighbours enough
+_UNDAMPED, _TINY = 1e-9, np.finfo(float).tiny
+_ROUNDS, _BOUNDED = 8, 3
+
+Flags = NDArray[np.bool_]
+
+
+class Whitened(NamedTuple):
+    """Misfit of a record in units of its noise, and these units, (runs, channels, n_freq)."""
+
+    u: ComplexArray
+    std: Array
+
+
+class Outlier(NamedTuple):
+    """A number of the records: its channel, its line in Hz, its distance from the fit in deviations."""
+
+    channel: str
+    freq: float
+    size: float
+
+
+def whitened(test: Measurement, made: Sequence[ComplexArray], unknowns: int) -> list[Whitened]:
+    """Misfits of accelerations and, where measured, force, by stated deviations or a robust one of each record.
+
+    The latter follows from the median of |u|², ln 2 for normal noise, and so does a factor of stated deviations that
+    are too small. It allows for the number of unknowns.
+
+    Parameters
+    ----------
+    made : sequence of (runs, channels, n_freq)
+        What a model makes of relative accelerations and of the force.
+    """
+    found = [(test.response, test.relative - made[0], test.response_std)]
+    if test.force is not None:
+        found.append((test.force, test.force - made[1], test.force_std))
+    numbers = sum(misfit.size for _, misfit, _ in found)
+    left = max(1 - unknowns / (2 * numbers), 0.5)
+    squares, stds = [], []
+    for record, misfit, stated in found:
+        least = _FLOOR * float(np.sqrt(np.mean(np.abs(record) ** 2)))
+        robust = np.sqrt(np.median(np.abs(misfit) ** 2) / np.log(2) / left) if stated is None else stated
+        stds.append(np.broadcast_to(np.maximum(robust, least), record.shape))
+        if stated is not None:
+            squares.append(np.abs(misfit / stds[-1]).ravel() ** 2)
+    # Without a jump, at which rounds of a fit would turn to and fro.
+    more = (
+        np.sqrt(max(1.0, float(np.median(np.concatenate(squares))) / np.log(2) / left / _SUSPECT)) if squares else 1.0
+    )
+    stds = [std if stated is None else more * std for std, (*_, stated) in zip(stds, found, strict=True)]
+    return [Whitened(misfit / std, std) for std, (_, misfit, _) in zip(stds, found, strict=True)]
+
+
+def predicted(test: Measurement, structure: Structure) -> list[ComplexArray]:
+    """What a structure makes of relative accelerations and, where it was measured, of the force."""
+    return [test.predict(structure), *([] if test.force is None else [test.predict_force(structure)])]
+
+
+def weight(u: ComplexArray) -> Array:
+    """By how much numbers count, 1 or c / |u|."""
+    size: Array = 1 / np.maximum(1.0, np.abs(u) / TUNING)
+    return size
+
+
+def loss(u: ComplexArray) -> float:
+    """Huber's, summed over whitened numbers."""
+    size = np.abs(u)
+    return float(np.sum(np.where(size > TUNING, 2 * TUNING * size - TUNING**2, size**2)))
+
+
+def pseudo_values(fits: Sequence[tuple[Measurement, list[ComplexArray]]], unknowns: int) -> list[Measurement]:
+    """Tests with pseudo-values about what a model makes of each in the place of their records, and these deviations.
+
+    Least squares of them, repeated, end where Huber's loss is least, and their covariance is its own. All tests share
+    one mean slope, so that they count by their noise alone.
+    """
+    every = [(test, made, whitened(test, made, unknowns)) for test, made in fits]
+    u = np.concatenate([part.u.ravel() for *_, parts in every for part in parts])
+    w = weight(u)
+    slopes = np.where(w < 1, w / 2, 1.0)
+    slope, share = float(slopes.mean()), unknowns / (2 * u.size)
+    spread = np.sqrt(np.mean(np.abs(w * u) ** 2) / max(1 - share, 0.5)) / slope
+    spread *= 1 + share * np.var(slopes) / slope**2
+    changed = []
+    for test, made, parts in every:
+        values = [f + part.std * weight(part.u) * part.u / slope for f, part in zip(made, parts, strict=True)]
+        stds = [spread * part.std for part in parts]
+        other = replace(test, response=test.response - test.relative + values[0], response_std=stds[0])
+        changed.append(other if test.force is None else replace(other, force=values[1], force_std=stds[1]))
+    return changed
+
+
+def stand_alone(
+    u: ComplexArray, freq: Array, omega: Array, ratios: Array, *, times: float = _BESIDE, known: Flags | None = None
+) -> Flags:
+    """Which whitened numbers (..., n_freq) are far out, so many `times` those at the lines beside them.
+
+    Those that are `known` outliers are not compared with.
+
+    A misfit that a model leaves is smooth, and no outlier. Lines beside a pole that is narrower than their distance are
+    not judged: its misfit stands alone too.
+    """
+    size = np.abs(u)
+    if freq.size < _LEAST_LINES:
+        return np.zeros(size.shape, dtype=bool)
+    others = size if known is None else np.where(known, 0.0, size)
+    here = np.arange(freq.size)
+    first = np.clip(here - 2, 0, freq.size - 5)
+    near_by = others[..., first[:, None] + np.arange(5)]
+    near_by[..., here, here - first] = np.inf
+    beside = np.sort(near_by, axis=-1)[..., 2]  # of four the last but one: another outlier may be among them
+    lines = 2 * np.pi * freq
+    distance = np.interp(omega, lines, np.gradient(lines))
+    narrow = ratios * omega < _NARROW * distance
+    judged = ~np.any(np.abs(lines - omega[narrow, None]) < 1.5 * distance[narrow, None], axis=0)
+    flags: Flags = (size > _FAR) & (size > times * beside) & judged
+    return flags
+
+
+def one_line(freq: Array, omega: Array, ratios: Array) -> Flags:
+    """Which poles (m,) reach far higher at one line than at any other."""
+    if freq.size < _LEAST_LINES:
+        return np.zeros(omega.size, dtype=bool)
+    size = np.sort(_heights(freq, omega, ratios), axis=1)
+    flags: Flags = size[:, -1] > _ONE_LINE * size[:, -2]
+    return flags
+
+
+def screened(test: Measurement, *, monitor: Monitor | None = None) -> Measurement:
+    """The test with what the poles of its records make of it in the place of numbers that stand alone.
+
+    No model is asked, so that what a model misses stays as it is. Poles that answer for one line only are none.
+    The monitor is called as by `find_poles`.
+    """
+    clean, flags = test, [np.zeros(record.shape, dtype=bool) for record in (test.response, test.base)]
+    for _ in range(_ROUNDS):
+        fit = _poles(clean, monitor)
+        if fit is None:
+            return clean
+        made = _bounded_fit(test, fit)
+        parts, before = whitened(test, made, 2 * fit.omega.size), flags
+        flags = [
+            stand_alone(part.u, test.freq, fit.omega, fit.ratios, known=known)
+            for part, known in zip(parts, before, strict=False)
+        ]
+        if not any(np.any(now) for now in flags):
+            break
+        clean = replace(test, response=np.where(flags[0], made[0] + test.response - test.relative, test.response))
+        if test.force is not None:
+            clean = replace(clean, force=np.where(flags[1], made[1], test.force))
+        if all(np.array_equal(now, then) for now, then in zip(flags, before, strict=False)):
+            break
+    return clean
+
+
+def _bounded_fit(test: Measurement, fit: PolesAndResidues) -> list[ComplexArray]:
+    """What poles make of a test with residues that outliers hardly pull: those of pseudo-values, from a first `fit`."""
+    for step in range(1 + _BOUNDED):
+        made = [part for part in fit.records(test.freq, test.base) if part is not None]
+        if step < _BOUNDED:
+            other = pseudo_values([(test, made)], 2 * fit.omega.size)[0]
+            fit = PolesAndResidues.at(other, Records(other), fit.omega, fit.ratios)
+    return made
+
+
+def _poles(test: Measurement, monitor: Monitor | None) -> PolesAndResidues | None:
+    """Poles of a test but those that answer for one line only, and free residues at them; None where there are none."""
+    records = Records(test)
+    omega, ratios = poles_of_any_damping(records, monitor=monitor)
+    order = np.argsort(omega)
+    omega, ratios = omega[order], ratios[order]
+    doubted = one_line(test.freq, omega, ratios).nonzero()[0].tolist() if omega.size else []
+    lost = [k for k in doubted if _is_one_number(test, records, omega, ratios, k)]
+    omega, ratios = np.delete(omega, lost), np.delete(ratios, lost)
+    return PolesAndResidues.at(test, records, omega, ratios) if omega.size else None
+
+
+def _is_one_number(test: Measurement, records: Records, omega: Array, ratios: Array, k: int) -> bool:
+    """Whether pole k, which stands at one line, shows there in one channel only, or explains nothing at other lines."""
+    fit = PolesAndResidues.at(test, records, omega, ratios)
+    highest = int(np.argmax(_heights(test.freq, omega[[k]], ratios[[k]])))
+    shown = np.einsum("sd,rd->rs", fit.residues[k] + 1j * fit.quadrature[k], test.base[:, :, highest])
+    std = 1.0 if test.response_std is None else np.maximum(test.response_std[:, :, highest], _TINY)
+    power = np.abs(shown / std) ** 2
+    if power.size > 1 and power.max() > _ONE_CHANNEL * power.sum():
+        return True
+    others = Records(test.at(np.arange(test.freq.size) != highest))
+    every = others.fit(omega, ratios, velocity=True)
+    left = others.size  # where it is the only pole
+    if omega.size > 1:
+        left = others.fit(np.delete(omega, k), np.delete(ratios, k), velocity=True).squared_error
+    noise = float(np.median(every.left**2)) / _MEDIAN
+    return left - every.squared_error < noise * beyond_chance(every.residues[k].size + 2)
+
+
+def _heights(freq: Array, omega: Array, ratios: Array) -> Array:
+    """How high poles reach at each line, (m, n_freq)."""
+    size: Array = np.abs(gains(freq, omega, np.maximum(ratios, _UNDAMPED)))
+    return size
+
+
+def outliers(test: Measurement, structure: Structure, unknowns: int, *, alone: bool = True) -> list[Outlier]:
+    """Numbers of the records that are far from what a structure makes of them.
+
+    Only those that stand `alone`, or all.
+    """
+    names = (*test.sensor_names, *(f"force {axis}" for axis in test.base_axes or ()))
+    omega, ratios = 2 * np.pi * structure.natural_frequencies, structure.damping_ratios
+    first, found = 0, []
+    for part in whitened(test, predicted(test, structure), unknowns):
+        far = stand_alone(part.u, test.freq, omega, ratios, times=_CERTAIN) if alone else np.abs(part.u) > _FAR
+        for run, channel, line in np.argwhere(far):
+            size = float(np.abs(part.u[run, channel, line]))
+            found.append(Outlier(names[first + channel], float(test.freq[line]), size))
+        first += part.u.shape[1]
+    return found

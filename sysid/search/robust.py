@@ -1,0 +1,150 @@
+"""Huber's loss: least squares of pseudo-values, again and again from the last answer, until it stays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sysid.errors import InputError, SolverError
+from sysid.modal_analysis.outliers import loss, predicted, whitened
+from sysid.problem.problem import Problem
+from sysid.search.local import solve
+from sysid.search.modal import Modal, objective_of
+from sysid.search.session import Session, Stop
+from sysid.search.strategy import History, Outcome, Phase, Strategy
+from sysid.search.swarm import Swarm
+from sysid.structure.structure import Array, Structure
+
+_PHASE = "Huber's loss"
+_ROUNDS = 40
+_SETTLED, _NEAR = 2e-3, 0.05  # standard deviations of the unknowns, root mean square: is settled, is as good
+_FARTHEST = 64.0  # times a step
+_EXACT = 1e-10  # of the records: predictions that move by less stay, whatever the noise
+
+
+def settled(problem: Problem, end: Outcome, strategy: Strategy, session: Session) -> Outcome:
+    """Where Huber's loss is least, from the answer to the screened records.
+
+    The modal strategy fits each round anew; after all others the local phase goes on from the last unknowns.
+
+    Parameters
+    ----------
+    problem : Problem
+    end : Outcome
+        Of a search in ``problem.screened``.
+    strategy : Strategy
+        With the settings of that search, as far as it was its own.
+    session : Session
+    """
+    if problem.loss == "squares" or end.stopped is not None:
+        return end
+    moved, fitted = np.inf, problem.pseudo_values(end.structure, end.x)
+    for number in range(1, _ROUNDS + 1):
+        try:
+            again = _fitted(fitted, end, strategy, session)
+            if again.stopped is None and end.strategy != Modal.name:
+                again = _farther(problem, end, again)
+            fitted = problem.pseudo_values(again.structure, again.x)
+        except (Stop, KeyboardInterrupt) as stop:
+            return _cut_short(end, str(stop) or "interrupted", stop)
+        except (InputError, SolverError) as error:
+            return _cut_short(end, f"round {number} of Huber's loss came to nothing: {error}")
+        if again.stopped is not None:
+            return _cut_short(end, str(again.stopped) or "interrupted", again.stopped)
+        moved = _moved(fitted, end, again)
+        session.log(f"round {number} of Huber's loss: {again.message}; the unknowns move by {moved:.2g} deviations")
+        end = _with_round(problem.screened, end, again, session)
+        if moved < _SETTLED:
+            return replace(end, remarks=(*end.remarks, f"Huber's loss settled after {number} rounds"))
+        if session.max_time is not None and session.seconds > session.max_time:
+            break
+    told = f"Huber's loss did not settle in {number} rounds: the last moved by {moved:.2g} deviations"
+    return replace(end, remarks=(*end.remarks, told)) if moved < _NEAR else _cut_short(end, told)
+
+
+def check(problem: Problem, strategy: Strategy) -> None:
+    """Refuse settings that leave nothing to go on from.
+
+    Raises
+    ------
+    InputError
+        Where a swarm is to run without its local phase.
+    """
+    if problem.loss == "huber" and isinstance(strategy, Swarm) and strategy.local is None:
+        raise InputError("loss='huber' is fitted by the local phase, and Swarm(local=None) has none")
+
+
+def _with_round(problem: Problem, end: Outcome, again: Outcome, session: Session) -> Outcome:
+    """A round's answer, with all that ran before it in its history; objectives are of the screened records."""
+    left = objective_of(problem, again.structure, again.x)
+    curve = np.concatenate([end.history.local_curve, again.history.local_curve])
+    phases = [phase for phase in end.history.phases if phase.name != _PHASE]
+    if again.x is not None:
+        phases.append(Phase(_PHASE, left, again.x, session.seconds, again.history.local_curve.size))
+    history = replace(end.history, local=left, local_curve=curve, phases=tuple(phases))
+    return replace(again, remarks=end.remarks, history=history)
+
+
+def _cut_short(end: Outcome, why: str, stopped: BaseException | None = None) -> Outcome:
+    return replace(end, success=False, message=f"{end.message}; {why}", stopped=stopped)
+
+
+def _fitted(problem: Problem, end: Outcome, strategy: Strategy, session: Session) -> Outcome:
+    """The answer to pseudo-values, from the last one."""
+    if end.strategy == Modal.name:
+        return (strategy if isinstance(strategy, Modal) else Modal()).run(problem, session, None)
+    assert end.x is not None
+    coordinates = (strategy.local if isinstance(strategy, Swarm) else None) or "modal"
+    answer = solve(
+        problem, end.x, max_time=session.left, monitor=session.reporter("local phase"), coordinates=coordinates
+    )
+    return replace(
+        end, structure=problem.structure(answer.x), x=answer.x, success=answer.success, message=answer.message,
+        history=History(local_curve=answer.curve), stopped=answer.stopped,
+    )  # fmt: skip
+
+
+def _farther(problem: Problem, before: Outcome, after: Outcome) -> Outcome:
+    """The answer, or one farther along its step, as far as the loss falls while steps double.
+
+    Where most of what tells an unknown is still far off, each number pulls as little as an outlier.
+    """
+    assert before.x is not None and after.x is not None
+    fits = problem.fits(after.structure, after.x)
+    stds = [part.std for test, its in fits for part in whitened(test, predicted(test, its), problem.n_variables)]
+
+    def left(x: Array, structure: Structure) -> float:
+        found = 0.0
+        units = iter(stds)
+        for test, its in problem.fits(structure, x):
+            records = [record for record in (test.relative, test.force) if record is not None]
+            found += sum(loss((y - f) / next(units)) for y, f in zip(records, predicted(test, its), strict=True))
+        return found
+
+    best, step, times = left(after.x, after.structure), after.x - before.x, 2.0
+    while times <= _FARTHEST:
+        x = np.clip(before.x + times * step, np.minimum(problem.lower, after.x), np.maximum(problem.upper, after.x))
+        try:
+            structure = problem.structure(x)
+        except InputError:
+            break
+        value = left(x, structure)
+        if not value < best:
+            break
+        after, best, times = replace(after, x=x, structure=structure), value, 2 * times
+    return after
+
+
+def _moved(problem: Problem, before: Outcome, after: Outcome) -> float:
+    """Distance of two answers by what they make of the records, in standard deviations of an unknown; 0 where exact."""
+    squares = change = size = 0.0
+    fits = zip(problem.fits(before.structure, before.x), problem.fits(after.structure, after.x), strict=True)
+    for (test, one), (_, other) in fits:
+        # Pseudo-values state the noise as it counts.
+        stds = [std for std in (test.response_std, test.force_std) if std is not None]
+        for a, b, std in zip(predicted(test, one), predicted(test, other), stds, strict=True):
+            squares += 2 * float(np.sum(np.abs((a - b) / std) ** 2))
+            change += float(np.sum(np.abs(a - b) ** 2))
+            size += float(np.sum(np.abs(b) ** 2))
+    return 0.0 if change <= _EXACT**2 * size else float(np.sqrt(squares / problem.n_variables))
