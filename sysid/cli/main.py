@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import IO, NoReturn, cast
 
 from sysid import catalogue
-from sysid.cli import parameters, unfinished
+from sysid.cli import parameters, starting, unfinished
 from sysid.cli.deadline import TimeIsOver, within
 from sysid.cli.display import Output, collected_warnings, complain, display_on
 from sysid.cli.files import strict_json
@@ -84,6 +84,7 @@ def command() -> NoReturn:
 def _run_command(argv: Sequence[str] | None, out: Output) -> int:
     """Parse and run; every exception becomes one line and a status."""
     try:
+        starting.is_over()
         options = _parser().parse_args(argv)
         with collected_warnings() as remarks:
             status = int(options.command(options, out))
@@ -99,7 +100,7 @@ def _run_command(argv: Sequence[str] | None, out: Output) -> int:
         complain(error)
         return NOT_REACHED
     except KeyboardInterrupt:
-        complain("interrupted; nothing was saved")
+        complain(starting.NOTHING_SAVED)
         return INTERRUPTED
     except Exception as error:
         log = _write_log()
