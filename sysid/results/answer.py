@@ -227,10 +227,11 @@ class Answer:
 
 
 def modal_assurance(phi: Array, other: Array) -> Array:
-    """``|phi_i' phi_j|² / (phi_i' phi_i · phi_j' phi_j)``, (modes, other modes)."""
+    """``|phi_i' phi_j|² / (phi_i' phi_i · phi_j' phi_j)``, (modes, other modes); 0 for a shape that no sensor sees."""
     if phi.shape[0] != other.shape[0]:
         raise InputError(f"mode shapes at {phi.shape[0]} and {other.shape[0]} sensors cannot be compared")
-    return (phi.T @ other) ** 2 / np.outer(np.sum(phi**2, axis=0), np.sum(other**2, axis=0))
+    size = np.outer(np.sum(phi**2, axis=0), np.sum(other**2, axis=0))
+    return (phi.T @ other) ** 2 / np.where(size > 0, size, 1.0)
 
 
 def reported_unknowns(problem: Problem, *, damping_ratios: bool = False) -> tuple[Unknown, ...]:
