@@ -82,7 +82,7 @@ def short_name(problem: str) -> str:
     return problem.rpartition(".")[2]
 
 
-def build(recipe: Recipe) -> Problem:
+def build(recipe: Recipe, *, check: bool = True) -> Problem:
     """Load a problem module and call its ``problem()``.
 
     Parameters
@@ -91,6 +91,8 @@ def build(recipe: Recipe) -> Problem:
         ``module`` is a path to a module (it ends in .py or holds a separator), else a module in
         ``./problems``, else a bundled problem, else a dotted module that Python can import.
         ``data`` reaches ``problem()`` as a `pathlib.Path`, or as None, ``parameters`` each by its name.
+    check : bool
+        Whether to refuse a problem that cannot be searched, for which poles may be looked for: `identify` does it too.
 
     Raises
     ------
@@ -116,12 +118,13 @@ def build(recipe: Recipe) -> Problem:
         problem = function(data=data, rng=recipe.rng, **recipe.parameters)
     if not isinstance(problem, Problem):
         raise InputError(f"{path}: problem() gives a {type(problem).__name__}, not a sysid.Problem")
-    used = set(problem.formulation.variables)
+    used = set(problem.formulate(problem.geometry.unsearched()).variables)
     idle = [variable for variable in declared()[before:] if variable not in used]
     if idle:
         told = ", ".join(f"{variable.name!r} ({variable.declared})" for variable in idle)
         raise InputError(f"{path}: variable {told} enters no matrix, residual or constraint: use it, or take it out")
-    problem.check()
+    if check:
+        problem.check()
     return problem
 
 

@@ -12,9 +12,9 @@ import pytest
 
 import sysid
 from sysid.cli import main as cli
-from sysid.cli.deadline import TimeIsOver, within
 from sysid.report import report
 from sysid.results import storage
+from sysid.search.deadline import TimeIsOver, within
 from sysid.search.session import DeferredInterrupt
 from sysid.search.swarm_objective import SwarmObjective
 
@@ -144,7 +144,6 @@ ENDLESS = """
 import sysid
 from sysid import identify
 from sysid.cli import main as cli
-from sysid.cli.deadline import TimeIsOver, within
 
 endless = sysid.Swarm(10**6, stall_iterations=10**6)
 cli.identify = lambda *a, strategy, **k: identify(*a, **k, strategy=endless)
