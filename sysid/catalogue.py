@@ -82,7 +82,7 @@ def short_name(problem: str) -> str:
     return problem.rpartition(".")[2]
 
 
-def build(recipe: Recipe) -> Problem:
+def build(recipe: Recipe, *, check: bool = True) -> Problem:
     """Load a problem module and call its ``problem()``.
 
     Parameters
@@ -91,6 +91,8 @@ def build(recipe: Recipe) -> Problem:
         ``module`` is a path to a module (it ends in .py or holds a separator), else a module in
         ``./problems``, else a bundled problem, else a dotted module that Python can import.
         ``data`` reaches ``problem()`` as a `pathlib.Path`, or as None, ``parameters`` each by its name.
+    check : bool
+        Whether to refuse a problem that cannot be searched, for which poles may be looked for: `identify` does it too.
 
     Raises
     ------
@@ -98,10 +100,10 @@ def build(recipe: Recipe) -> Problem:
         Whatever is wrong with the module, its data or what it gives, a problem that cannot be searched too; an
         InputError from inside the module passes as it is, any other exception is told with its line of the module.
     """
-    return built(recipe)[0]
+    return built(recipe, check=check)[0]
 
 
-def built(recipe: Recipe) -> tuple[Problem, frozenset[Path]]:
+def built(recipe: Recipe, *, check: bool = True) -> tuple[Problem, frozenset[Path]]:
     """What `build` gives, and the files it was made from: the module, and what that imported from beside itself.
 
     Of a dotted module, which Python imports, the module alone.
@@ -125,12 +127,13 @@ def built(recipe: Recipe) -> tuple[Problem, frozenset[Path]]:
             problem = function(data=data, rng=recipe.rng, **recipe.parameters)
     if not isinstance(problem, Problem):
         raise InputError(f"{path}: problem() gives a {type(problem).__name__}, not a sysid.Problem")
-    used = set(problem.formulation.variables)
+    used = set(problem.formulate(problem.geometry.unsearched()).variables)
     idle = [variable for variable in declared()[before:] if variable not in used]
     if idle:
         told = ", ".join(f"{variable.name!r} ({variable.declared})" for variable in idle)
         raise InputError(f"{path}: variable {told} enters no matrix, residual or constraint: use it, or take it out")
-    problem.check()
+    if check:
+        problem.check()
     return problem, frozenset({path.absolute(), *imported})
 
 

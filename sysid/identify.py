@@ -64,7 +64,9 @@ def identify(
         A guess that joins the first swarm, or takes the place of the variables' guesses; "auto" then takes no modal
         strategy.
     max_time : float, optional
-        s; the swarm takes at most two thirds of it.
+        s; the swarm takes at most two thirds of it. It holds within a tenth or 2 s, whichever is more: what would not
+        be done in time is not begun, and a judgement that takes too long is given up (in the main thread, under POSIX),
+        which the result says.
     max_evaluations : int, optional
         Candidates that the swarm may evaluate.
     callback : callable, optional

@@ -19,6 +19,19 @@ OBJECTIVE_SCALE = 1e3  # lifts a residual of 1e-8 above IPOPT's tolerance
 EXACT = 1e-8  # a relative residual that needs no second look
 _TOLERANCE = 1e-9  # of IPOPT
 _ROUND_OFF = 1e-11  # of constraints
+_LOADED = 3.0  # times the seconds of an idle processor that work may take on a machine that does other things too
+_GRACE = 0.4  # s, by which work may end late
+_LATE = "Maximum_WallTime_Exceeded"  # IPOPT's word, which does not count the making of the graphs
+
+
+def suffices(left: float, seconds: float) -> bool:
+    """Whether the time that is `left` is enough for work that takes about so many seconds of a processor."""
+    return _LOADED * seconds < left + _GRACE
+
+
+def not_begun(seconds: float) -> str:
+    """The status of a run whose graphs would have taken so many seconds, and the time did not allow them."""
+    return f"not begun, as its derivatives take some {seconds:.1g} s to set up: too little time"
 
 
 def quiet_options(max_iterations: int) -> dict[str, Any]:
@@ -131,7 +144,8 @@ class NonlinearProgram:
             }  # fmt: skip
             solver = ca.nlpsol("local", "ipopt", nlp, options)
             answer = solver(x0=at, lbx=lower, ubx=upper, lbg=bounds_below, ubg=bounds_above)
-            return solver.stats()["return_status"], np.asarray(answer["x"]).ravel()
+            status = solver.stats()["return_status"]
+            return _LATE if status == "User_Requested_Stop" else status, np.asarray(answer["x"]).ravel()
 
         try:
             status, best = run(start, _TOLERANCE)
@@ -194,7 +208,7 @@ class IterationMonitor:
     listener : callable or None
         Called with (iteration, objective) after each iteration; whatever it raises stops the solver.
     max_time : float or None
-        s, for all runs.
+        s, for all runs and what is made before them.
     """
 
     def __init__(self, listener: Callable[[int, float], object] | None, max_time: float | None) -> None:
@@ -208,6 +222,15 @@ class IterationMonitor:
     def left(self) -> float:
         """Seconds until the deadline."""
         return self.deadline - time.perf_counter()
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the deadline has passed."""
+        return self.left <= 0
+
+    def allows(self, seconds: float) -> bool:
+        """Whether work that cannot be stopped, and takes about so many seconds of a processor, may begin."""
+        return suffices(self.left, seconds)
 
     @property
     def taken(self) -> int:
@@ -228,7 +251,7 @@ class IterationMonitor:
                 self.listener(len(self.curve) - 1, self.curve[-1])
         except BaseException as error:  # must not unwind through IPOPT; the caller raises it again
             self.stopped = error
-        return self.stopped is not None
+        return self.stopped is not None or self.is_over
 
 
 class _IterationCallback(ca.Callback):

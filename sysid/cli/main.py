@@ -20,11 +20,10 @@ import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, NoReturn, cast
+from typing import IO, Any, NoReturn, cast
 
 from sysid import catalogue
-from sysid.cli import parameters, unfinished
-from sysid.cli.deadline import TimeIsOver, within
+from sysid.cli import parameters, starting, unfinished
 from sysid.cli.display import Output, collected_warnings, complain, display_on
 from sysid.cli.files import strict_json
 from sysid.cli.status import BUG, INTERRUPTED, MISTAKE, NOT_REACHED, SUCCESS
@@ -36,7 +35,8 @@ from sysid.results.identification import Identification, load
 from sysid.results.storage import FILE_NAME as RESULT
 from sysid.results.storage import atomically, missing_folders, remove_empty
 from sysid.results.version import __version__
-from sysid.search.session import DeferredInterrupt
+from sysid.search.deadline import TimeIsOver, within
+from sysid.search.session import LEAST, DeferredInterrupt
 
 _LOG = "sysid-error.log"
 _SUMMARY = "summary.json"
@@ -84,6 +84,7 @@ def command() -> NoReturn:
 def _run_command(argv: Sequence[str] | None, out: Output) -> int:
     """Parse and run; every exception becomes one line and a status."""
     try:
+        starting.is_over()
         options = _parser().parse_args(argv)
         with collected_warnings() as remarks:
             status = int(options.command(options, out))
@@ -99,7 +100,7 @@ def _run_command(argv: Sequence[str] | None, out: Output) -> int:
         complain(error)
         return NOT_REACHED
     except KeyboardInterrupt:
-        complain("interrupted; nothing was saved")
+        complain(starting.NOTHING_SAVED)
         return INTERRUPTED
     except Exception as error:
         log = _write_log()
@@ -144,9 +145,14 @@ def _show(options: argparse.Namespace, out: Output) -> int:
 
 def _run(options: argparse.Namespace, out: Output) -> int:
     begun = time.perf_counter()
+
+    def left(least: float) -> float | None:
+        """Seconds that are left, at least so many; None without a limit."""
+        return None if options.max_time is None else max(options.max_time - (time.perf_counter() - begun), least)
+
     search, folder = unfinished.begun(options, out)
     recipe = search.recipe
-    problem = catalogue.build(recipe)
+    problem = catalogue.build(recipe, check=options.max_time is None)  # with a limit under the search's clock
     checkpoint = Checkpoint(folder / UNFINISHED, search)
     if options.fresh:
         checkpoint.remove()
@@ -163,7 +169,7 @@ def _run(options: argparse.Namespace, out: Output) -> int:
     with DeferredInterrupt(patience=None) as late:
         with display_on(out) as display:
             result = identify(
-                problem, strategy=search.strategy, rng=search.seed, max_time=options.max_time, progress=display,
+                problem, strategy=search.strategy, rng=search.seed, max_time=left(LEAST), progress=display,
                 checkpoint=checkpoint,
             )  # fmt: skip
         result = replace(result, recipe=recipe)
@@ -172,12 +178,12 @@ def _run(options: argparse.Namespace, out: Output) -> int:
         except InputError as error:
             failed = error
     try:
-        out.write(f"\n{result.summary()}\n\n")
+        words, figures = _told(result, left(LEAST))
+        out.write(f"\n{words}\n\n")
         out.flush()
         if failed is not None:
             raise failed
-        left = None if options.max_time is None else options.max_time - (time.perf_counter() - begun)
-        _write_pages(result, folder, out, left)
+        _write_pages(result, figures, folder, out, left(0.0))
     except KeyboardInterrupt:
         complain(f"interrupted while saving; the result is there, but not every file is in {folder}")
         return INTERRUPTED
@@ -437,7 +443,19 @@ def _save(result: Identification, folder: Path, checkpoint: Checkpoint) -> None:
         remove_empty(missing)  # where nothing could be written
 
 
-def _write_pages(result: Identification, folder: Path, out: Output, left: float | None) -> None:
+def _told(result: Identification, left: float | None) -> tuple[str, dict[str, Any]]:
+    """Summary and figures of a result; without what takes more than the seconds that are `left`."""
+    try:
+        with within(left):
+            return result.summary(), result.to_dict()
+    except TimeIsOver:
+        hurried = replace(result, hurried=True)
+        return hurried.summary(), hurried.to_dict()
+
+
+def _write_pages(
+    result: Identification, figures: dict[str, Any], folder: Path, out: Output, left: float | None
+) -> None:
     """Write what people and scripts read of a result that is saved, each file whole or not at all.
 
     The page is left out where it takes more than the seconds that are `left`.
@@ -447,7 +465,7 @@ def _write_pages(result: Identification, folder: Path, out: Output, left: float 
     out.write(f"result   {folder / RESULT}\n")
     summary = folder / _SUMMARY
     with atomically(summary) as temporary:
-        temporary.write_text(strict_json(result.to_dict()), encoding="utf-8")
+        temporary.write_text(strict_json(figures), encoding="utf-8")
     out.write(f"summary  {summary}\n")
     try:
         with within(left):

@@ -18,6 +18,7 @@ from sysid.structure.triangular import lower_entries, lower_triangle, triangle, 
 
 SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")  # IPOPT's statuses that count as success
 _REACHED = 1e-8  # relative error of an eigenvalue up to which it counts as the target
+_SECONDS, _POWER = 5.0, 6.5  # of a processor, that the graphs of 14 eigenvalues take, and how that grows with them
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,13 +77,18 @@ def closed_form(factor: Array, targets: Array) -> Refinement:
     return _finish(nearest_factors(factor[None], targets)[0], targets, True, "closed form")
 
 
-def by_ipopt(factor: Array, targets: Array) -> Refinement:
+def seconds_to_begin(n: int) -> float:
+    """About how long the graphs of `by_ipopt` take, once for n eigenvalues."""
+    return float(_SECONDS * (n / 14) ** _POWER)
+
+
+def by_ipopt(factor: Array, targets: Array, max_time: float | None = None) -> Refinement:
     """Minimise the distance of the spectrum to the target from the candidate's own factor (the paper's way).
 
     Eq. 31 is minimised in squares, relative to each target (its square root has no derivative at
     its own solution). Eigenvalues enter as unknowns beside the eigenvectors, tied to L_H by
     ``Psi' Psi = I`` and ``Psi' L_H L_H' Psi = diag(lam)``: polynomials, exact to any derivative, and with
-    independent gradients even where eigenvalues repeat, because L_H is free to move.
+    independent gradients even where eigenvalues repeat, because L_H is free to move. `max_time` is IPOPT's own, s.
     """
     targets = _check(factor, targets)
     n, m = factor.shape[0], targets.size
@@ -98,7 +104,7 @@ def by_ipopt(factor: Array, targets: Array) -> Refinement:
             (1 + 1e-6) * (targets[-1] / unit[m:]) ** 2,  # what is not replaced stays above what is
         ]
     )
-    solver = _programme(n, m)
+    solver = _programme(n, m, max_time)
     solution = solver(x0=start, lbx=lower, ubx=np.inf, lbg=0, ubg=0, p=np.concatenate([unit / scale, unit]))
     status = solver.stats()["return_status"]
     refined = triangle(np.asarray(solution["x"]).ravel()[: rows[0].size], n) * scale
@@ -119,7 +125,7 @@ def _units(own: Array, targets: Array) -> Array:
 
 
 @lru_cache(maxsize=16)
-def _programme(n: int, m: int) -> ca.Function:
+def _programme(n: int, m: int, max_time: float | None = None) -> ca.Function:
     """IPOPT programme of n eigenvalues with the lowest m given; parameters: unit / scale, unit (n each)."""
     x = ca.SX.sym("x", n * (n + 1) // 2)
     psi, lam = ca.SX.sym("psi", n, n), ca.SX.sym("lam", n)
@@ -134,7 +140,8 @@ def _programme(n: int, m: int) -> ca.Function:
     }
     options = {
         "print_time": False,
-        "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-13, "constr_viol_tol": 1e-13, "max_iter": 300},
+        "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-13, "constr_viol_tol": 1e-13, "max_iter": 300}
+        | ({} if max_time is None else {"max_wall_time": max_time}),
     }
     return ca.nlpsol("refinement", "ipopt", nlp, options)
 

@@ -161,13 +161,14 @@ def base_forces(
 def convergence(identification: Identification, ax: Axes | None = None) -> Any:
     """Objective through the phases that ran: the swarm's best, the refinement, each iterate of the local phase.
 
+    Fits with widened peaks on the way are left out; a swarm's curve of such responses is dashed, and says so.
     It is the root of the sum of squares of all that is fitted, so it may differ from the residual, which is of
     accelerations alone and unweighted.
     """
     shown, ax = new_axes(ax, 6.0, 3.6)
     history = identification.history
     swarm, local = positive(history.swarm_curve), positive(history.local_curve)
-    _draw_curves(ax, swarm, local, history.refinement)
+    _draw_curves(ax, swarm, local, history.refinement, widened=bool(swarm.size) and bool(np.isnan(history.start)))
     values = np.concatenate([swarm, local, [history.refinement]])
     values = values[values > 0]
     if values.size:
@@ -186,21 +187,22 @@ def convergence(identification: Identification, ax: Axes | None = None) -> Any:
     return shown
 
 
-def _draw_curves(ax: Axes, swarm: Array, local: Array, refinement: float) -> None:
+def _draw_curves(ax: Axes, swarm: Array, local: Array, refinement: float, *, widened: bool) -> None:
     """Best of the swarm, what the refinement made of it, and after them the iterates of the local phase."""
     from matplotlib.ticker import MaxNLocator
 
     end = max(swarm.size - 1, 0)
     if swarm.size:
-        ax.plot(np.arange(swarm.size), swarm, color=COLOURS[0], linewidth=1.6, label="swarm (best so far)")
+        label, style = ("swarm, of widened peaks", "--") if widened else ("swarm (best so far)", "-")
+        ax.plot(np.arange(swarm.size), swarm, color=COLOURS[0], linewidth=1.6, linestyle=style, label=label)
     else:
         ax.set_xlim(-0.5, max(local.size, 2) - 0.5)
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     if local.size:
-        # Without a swarm the iterates are few, and may be a single one.
-        marker = None if swarm.size else "o"
-        iterate = end + np.arange(local.size)
-        ax.plot(iterate, local, color=COLOURS[5], linewidth=1.6, marker=marker, markersize=3.5, label="local phase")
+        # Without a swarm the iterates are few; a single one is no line.
+        marker = None if swarm.size and local.size > 1 else "o"
+        iterate, ended = end + np.arange(local.size), "local phase, of the records" if widened else "local phase"
+        ax.plot(iterate, local, color=COLOURS[5], linewidth=1.6, marker=marker, markersize=3.5, label=ended)
     if swarm.size and local.size:
         ax.axvline(end, color=FAINT, linewidth=0.8, linestyle=":")
     if refinement > 0:

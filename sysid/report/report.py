@@ -44,6 +44,10 @@ _AS_MOVED = (
     "is told against the base direction that moved most."
 )
 _LAST_PHASE = "Only the last phase, of the start that ended best: any fits with widened peaks before it are left out."
+_WIDENED = (
+    "Dashed: the swarm's objective of responses with widened peaks, which does not compare with that of the records "
+    "themselves; what the phases leave of these stands below."
+)
 _MANY_PANELS = 40  # beyond which the pictures are drawn with fewer pixels
 
 
@@ -334,6 +338,8 @@ def _convergence(it: Identification) -> str:
         told += ". Errors are those of the reference: M_SS, K_SS and C in Frobenius norm"
     alt = f"objective through {', '.join(row[0] for row in ran) or 'no search'}"
     caption = _LAST_PHASE * (it.strategy == "continuation")
+    if history.swarm_curve.size and np.isnan(history.start):
+        caption = _WIDENED
     parts = [picture(plot.convergence(it), alt, caption), table(COLUMNS, ran, f"{told}.", words=True)]
     if history.restarts:
         again = f"{counted(history.restarts, 'further swarm')} followed, as the first ended in no good fit"

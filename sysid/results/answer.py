@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from sysid.assessment.determination import Intervals
     from sysid.assessment.uncertainty import Uncertainty
 
+NOT_JUDGED = "what data and model determine, and how far noise leaves it known, was not judged: the time was over"
 _QUICK_SHAPES = 1000  # entries of the mode shapes up to which uncertainty takes a second or less
 _QUICK_DOFS = 20  # degrees of freedom up to which intervals take a few seconds or less
 
@@ -51,6 +52,8 @@ class Answer:
         How it was done, and why so, in sentences.
     interrupted : bool
         The search was stopped by Ctrl-C, and this is the best until then.
+    hurried : bool
+        For want of time summaries leave out what is not computed yet; not stored.
     """
 
     structure: Structure
@@ -66,6 +69,7 @@ class Answer:
     undetermined: tuple[str, ...]
     remarks: tuple[str, ...] = ()
     interrupted: bool = False
+    hurried: bool = False
 
     @property
     def measurement(self) -> Measurement:
@@ -215,7 +219,8 @@ class Answer:
     def quick_uncertainty(self) -> Uncertainty | None:
         """`uncertainty` where it is known already or takes no longer than about a second; else None."""
         known = "uncertainty" in self.__dict__
-        return self.uncertainty if known or self.structure.mode_shapes.size <= _QUICK_SHAPES else None
+        quick = self.structure.mode_shapes.size <= _QUICK_SHAPES and not self.hurried
+        return self.uncertainty if known or quick else None
 
     def quick_std(self, name: str) -> Array:
         """Standard deviations of a quantity of the structure, in its shape, by `quick_uncertainty`; NaN without it."""
@@ -226,14 +231,15 @@ class Answer:
     def quick_intervals(self) -> Intervals | None:
         """Both intervals where they are known already or take no longer than a few seconds; else None."""
         known = "_intervals" in self.__dict__
-        return self._intervals if known or self.structure.n <= _QUICK_DOFS else None
+        return self._intervals if known or (self.structure.n <= _QUICK_DOFS and not self.hurried) else None
 
 
 def modal_assurance(phi: Array, other: Array) -> Array:
-    """``|phi_i' phi_j|² / (phi_i' phi_i · phi_j' phi_j)``, (modes, other modes)."""
+    """``|phi_i' phi_j|² / (phi_i' phi_i · phi_j' phi_j)``, (modes, other modes); 0 for a shape that no sensor sees."""
     if phi.shape[0] != other.shape[0]:
         raise InputError(f"mode shapes at {phi.shape[0]} and {other.shape[0]} sensors cannot be compared")
-    return (phi.T @ other) ** 2 / np.outer(np.sum(phi**2, axis=0), np.sum(other**2, axis=0))
+    size = np.outer(np.sum(phi**2, axis=0), np.sum(other**2, axis=0))
+    return (phi.T @ other) ** 2 / np.where(size > 0, size, 1.0)
 
 
 def reported_unknowns(problem: Problem, *, damping_ratios: bool = False) -> tuple[Unknown, ...]:

@@ -14,8 +14,10 @@ from sysid.assessment.sensitivity import blocks_of
 from sysid.modal_analysis.outliers import outliers
 from sysid.nlp import EXACT
 from sysid.problem.problem import Problem
+from sysid.results.answer import NOT_JUDGED
 from sysid.results.identification import Identification
 from sysid.results.unknowns_table import ON_BOUND
+from sysid.search.deadline import TimeIsOver, within
 from sysid.search.session import Session
 from sysid.search.strategy import Outcome
 
@@ -27,14 +29,20 @@ _NO_FIT = 0.5  # relative residual above which nothing is explained
 
 def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session) -> Identification:
     """Judge where a search ended: `why` tells why its strategy was taken, the session has its log and clock."""
-    records = problem.screened
-    success, message = succeeded(records, end)
+    cut_short, records = session.cut_short, problem.screened
+    success, message = succeeded(records, end, cut_short=cut_short)
     session.log(f"done: {message}")
-    known = determine(records, end.structure, end.x, end.alternatives)
     # What was stopped on its way has misfits of another kind.
-    judged = end.stopped is None and (success or problem.free_modes)
-    doubtful = doubts(records, end.structure, end.x) if judged else ()
-    open_ = (*doubtful, *known.undetermined)
+    judged = end.stopped is None and (success or (problem.free_modes and not cut_short))
+    closed_by: tuple[str, ...] = ()
+    doubtful: tuple[str, ...] = ()
+    try:
+        with within(session.left):
+            known = determine(records, end.structure, end.x, end.alternatives)
+            doubtful = doubts(records, end.structure, end.x) if judged else ()
+            open_, closed_by = (*doubtful, *known.undetermined), known.closed_by
+    except TimeIsOver:
+        open_ = (NOT_JUDGED,)
     if not success:
         open_ = ("the search did not end in a fit, so this is not yet any structure that explains the data", *open_)
     it = Identification(
@@ -47,23 +55,27 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
         message="; ".join((message, *doubtful)),
         history=replace(end.history, log=tuple(session.lines), wall_time=session.seconds),
         determined=not open_,
-        closed_by=() if open_ else known.closed_by,
+        closed_by=() if open_ else closed_by,
         undetermined=open_,
         remarks=(why, *end.remarks, *_remarks(problem, end)),
         interrupted=isinstance(end.stopped, KeyboardInterrupt),
     )
-    return _as_certain(it)
+    try:
+        with within(session.left):
+            return _as_certain(it)
+    except TimeIsOver:
+        return replace(it, determined=False, closed_by=(), undetermined=(NOT_JUDGED,))
 
 
-def succeeded(problem: Problem, end: Outcome) -> tuple[bool, str]:
-    """Whether where a search ended is a fit, and the message."""
+def succeeded(problem: Problem, end: Outcome, *, cut_short: bool = False) -> tuple[bool, str]:
+    """Whether where a search ended is a fit, and the message; `cut_short` by its time it is blamed on nothing else."""
     test, goal, wrong = problem.measurement, problem.goal, []
     residual = test.residual(end.structure) if end.x is None or problem.free_modes else problem.residual(end.x)
     if end.x is not None and end.success and not problem.keeps_constraints(end.x):
         wrong.append("a constraint does not hold")
     if goal is not None and residual > goal:
         wrong.append(f"the residual {residual:.3g} is above the goal {goal:.3g}")
-    if goal is None and residual > _NO_FIT and end.stopped is None:
+    if goal is None and residual > _NO_FIT and end.stopped is None and (end.success or not cut_short):
         wrong.append(
             f"the residual {residual:.3g} is no fit: are the frequencies in Hz, the responses absolute and complex "
             "with exp(+iwt), the axes and signs of rigid_body right, the bounds wide enough?"

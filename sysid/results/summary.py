@@ -9,11 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.assessment.sensitivity import blocks_of
-from sysid.results.answer import Answer
+from sysid.results.answer import NOT_JUDGED, Answer
 from sysid.results.phases import COLUMNS, rows_of_phases
 from sysid.results.unknowns_table import MANY, rows_of, stated_values
 from sysid.structure.structure import Array
 
+_NOT_COMPUTED = (
+    "uncertainty not computed, as the time was over: Identification.uncertainty and 'sysid report' compute it"
+)
 DEVIATES = 1.96  # standard deviations on either side of 95 % of a normal law
 _ROUND_OFF = 1e-10  # of a value: what is no noise of an instrument
 _WIDTH = 120
@@ -45,8 +48,9 @@ def summary(it: Answer) -> str:
         lines.append(f"test {i} of {len(problem.validation)} never fitted: relative residual {test.residual(s):.3e}")
     lines.append(f"{verdict(it)}.")
     lines += [f"  - {sentence}" for sentence in it.closed_by + it.undetermined]
-    if not it.determined and it.open_masses:
+    if not (it.determined or it.hurried) and it.open_masses:
         lines += _ranges(it)
+    lines += [_NOT_COMPUTED] if it.hurried else []
     lines += [f"  > {sentence}" for sentence in next_steps(it)]
     return "\n".join(_folded(line) for line in lines)
 
@@ -70,6 +74,10 @@ def verdict(it: Answer) -> str:
     """What the matrices are worth, in one sentence."""
     if it.determined:
         return "Determined: data and stated model leave one mass and one stiffness matrix"
+    if NOT_JUDGED in it.undetermined:
+        return "Not judged: the time was over"
+    if it.hurried:
+        return "Not determined"
     if it.is_one_of_many:
         return "Not determined: this is one of many models that explain the data"
     return "Not determined: something speaks against this model, or is not known well enough"
@@ -77,7 +85,7 @@ def verdict(it: Answer) -> str:
 
 def next_steps(it: Answer) -> list[str]:
     """What would close what is open, in sentences."""
-    if it.determined or not it.is_one_of_many:
+    if it.determined or it.hurried or NOT_JUDGED in it.undetermined or not it.is_one_of_many:
         return []
     if not it.open_masses:
         return [
@@ -123,7 +131,7 @@ def mass_percent_std(it: Answer) -> Array:
 
 def is_one_of_many(it: Answer) -> Array:
     """Which effective masses are one choice among many, (n, d) of bool."""
-    return np.logical_and(np.isnan(mass_percent_std(it)), not it.determined)
+    return np.logical_and(np.isnan(mass_percent_std(it)), not (it.determined or it.hurried))
 
 
 def _mode_table(it: Answer) -> list[str]:
@@ -161,7 +169,10 @@ def _unknowns(it: Answer) -> list[str]:
     rows = rows_of(it)
     if not 0 < len(rows) <= MANY:
         return []
-    told = [[row.label, f"{row.value:.6g}", half_width(row.std, row.value), row.unit] for row in rows]
+    computed = it.quick_uncertainty is not None
+    told = [
+        [row.label, f"{row.value:.6g}", half_width(row.std, row.value) if computed else "-", row.unit] for row in rows
+    ]
     at = [row.on_bound or f"{row.lower:.4g} to {row.upper:.4g}" for row in rows]
     columns = [list(column) for column in zip(["unknown", "value", "+- (95 %)", "unit"], *told, strict=True)]
     return [*_aligned([*columns, ["search space", *at]]), ""]

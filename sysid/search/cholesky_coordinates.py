@@ -22,7 +22,7 @@ from sysid.modal_analysis.response import records_of, weights_of_test
 from sysid.models.model import mass_blocks
 from sysid.models.spectrum import SOLVED
 from sysid.models.unknowns import lower_of, upper_of
-from sysid.nlp import EXACT, OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram
+from sysid.nlp import EXACT, OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, not_begun
 from sysid.problem.matrices import assemble
 from sysid.problem.problem import Problem
 from sysid.search.modal_coordinates import End, modes_of, spectrum_near
@@ -33,12 +33,19 @@ _ROUND = 150  # iterations, after which Psi_0 is taken anew
 _GAIN = 0.9  # a round that leaves more of the objective than this was the last
 _ROUNDS = 6
 _LEAST_TIME = 1.0  # s, that a round is worth beginning with
+_SECONDS, _POWER = 0.5, 5.2  # of a processor, that the graphs of 10 modes take, and how that grows with the modes
 
 
 def fit_in_cholesky(problem: Problem, x: Array, monitor: IterationMonitor, max_iterations: int) -> End:
-    """Minimise the objective of a problem with free modes, from the unknowns `x`."""
-    error = CholeskyError(problem)
+    """Minimise the objective of a problem with free modes, from the unknowns `x`.
+
+    Where the monitor's deadline would pass while the graph of the Hessian is made, nothing is begun.
+    """
     best = first = End(x, problem.objective(x), "not begun", "")
+    seconds = _SECONDS * (problem.geometry.n / 10) ** _POWER
+    if not monitor.allows(seconds):
+        return first._replace(status=not_begun(seconds))
+    error = CholeskyError(problem)
     for _ in range(_ROUNDS):
         end = _fit_about(problem, best.x, error, monitor, min(_ROUND, max_iterations))
         gained = end.objective < _GAIN * best.objective

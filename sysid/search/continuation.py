@@ -110,10 +110,12 @@ def smooth_fit(
     problem: Problem, x: Array, steps: list[tuple[TestTerm, ...]], session: Session,
     monitor: Callable[[int, float], object],
 ) -> LocalResult | None:  # fmt: skip
-    """Fit every step from where the one before ended; None without steps."""
+    """Fit every step from where the one before ended, while there is time; None without steps."""
     curve: list[float] = []
     answer = None
     for step in steps:
+        if session.is_over:
+            break
         taken = len(curve)
         listener = lambda i, objective, taken=taken: monitor(taken + i, objective)  # noqa: E731
         try:
@@ -136,7 +138,7 @@ def descend(
     monitor = session.reporter("local phase")
     way = smooth_fit(problem, x, steps, session, monitor)
     if way is not None and way.stopped is not None:
-        return way
+        return replace(way, curve=np.zeros(0))  # the records have none yet
     at = x if way is None else way.x
     return local.solve_or_read(problem, at, session, monitor=monitor, coordinates=coordinates)
 
@@ -199,10 +201,10 @@ class _Run:
                     return
                 self.ways.append(way.x)
                 x = way.x
-            stopped = way is not None and way.stopped is not None
-            answer = (
-                way if stopped else local.solve_or_read(problem, x, session, monitor=session.reporter("local phase"))
-            )
+            if way is not None and way.stopped is not None:
+                answer = replace(way, curve=np.zeros(0))  # the records have none yet
+            else:
+                answer = local.solve_or_read(problem, x, session, monitor=session.reporter("local phase"))
         except InputError as error:
             self.wrong = error
             session.log(f"a start is passed over: {error}")
@@ -210,7 +212,6 @@ class _Run:
         except (Stop, KeyboardInterrupt) as stop:
             self.stopped = stop
             return
-        assert answer is not None
         objective = _objective_at(problem, answer.x)
         session.log(f"local phase: {answer.message}, {answer.curve.size} iterates, objective {objective:.4e}")
         self.ends.append((objective, answer))

@@ -92,8 +92,9 @@ def solve_or_read(problem: Problem, x: Array, session: Session, **settings: Any)
     if part.found is not None:
         return LocalResult(**part.found)
     result = solve(problem, x, max_time=session.left, **settings)
-    late = session.max_time is not None and session.seconds >= session.max_time
-    if result.stopped is None and not late:  # with more time it may end elsewhere
+    if not result.curve.size:
+        session.leave_out()
+    if result.stopped is None and not session.cut_short:
         part.ended(lambda: {name: value for name, value in vars(result).items() if name != "stopped"})
     return result
 

@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from sysid.models.spectrum import SOLVED
-from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram
+from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, not_begun
 from sysid.problem.feasibility import HELD, LOOSE
 from sysid.problem.formulation import Formulation
 from sysid.problem.matrices import assemble
@@ -27,6 +27,8 @@ from sysid.structure.structure import Array, Structure
 from sysid.structure.triangular import lower_entries
 
 _NEARLY_EXACT = 1e-6  # an objective so small tells of records without noise
+_JACOBIAN = 6e-7  # s of a processor, that the graph of a Jacobian takes for a row and the square of an unknown
+_SECONDS, _POWER = 2.4, 4.6  # likewise, that those of 12 modes take, and how that grows with the modes
 
 
 def fit_in_matrices(
@@ -34,7 +36,8 @@ def fit_in_matrices(
 ) -> End:
     """Minimise the objective of a problem over its own unknowns, from `x`.
 
-    `smoothed` are fitted in the place of the tests, in their order.
+    `smoothed` are fitted in the place of the tests, in their order. Where the monitor's deadline would pass while the
+    graphs of the derivatives are made, nothing is begun.
     """
     formulation, z = problem.formulation, NonlinearProgram()
     modal = needs_modes(formulation)
@@ -46,12 +49,15 @@ def fit_in_matrices(
     _add_constraints(problem, unknowns, z)
     modes = _add_modes(problem, unknowns, problem.structure(x), z, tied=not apart) if modal else None
     rows = ca.vertcat(*(term.rows(unknowns, modes) for term in terms_with(formulation, smoothed)))
+    seconds = _SECONDS * (problem.geometry.n / 12) ** _POWER if modal else _JACOBIAN * rows.numel() * z.z.numel() ** 2
+    if not monitor.allows(seconds):
+        return End(x, np.inf, not_begun(seconds), "")
     derivatives = None if modal else {"hess_lag": _gauss_newton(z, rows)}
     # Beside noise the objective's round-off stops the line search first: the gradient is then small, not at tolerance.
     best, status = z.minimize(ca.sumsqr(rows), monitor, max_iterations, derivatives, acceptable=1e2 if modal else 1e3)
     symbols = (modes.shapes, modes.omega) if modes else (ca.MX(0, 1), ca.MX(0, 1))
     end = ca.Function("end", [z.z], [unknowns, *symbols, ca.norm_2(rows)])
-    if not smoothed and status in SOLVED and 0 < float(end(best)[-1]) < _NEARLY_EXACT:
+    if not smoothed and status in SOLVED and 0 < float(end(best)[-1]) < _NEARLY_EXACT and not monitor.is_over:
         best = z.finished(rows, best)
     ended, shapes, omega, objective = (np.asarray(value) for value in end(best))
     ended = ended.ravel()

@@ -218,6 +218,8 @@ def run_modal(problem: Problem, options: Modal, session: Session) -> Outcome:
         + f" Hz (free residues fit within {poles.residual:.2e})"
     )
     success, message = end.status in SOLVED or end.residual <= EXACT, f"IPOPT: {end.status}"
+    if monitor.is_over and end.residual > EXACT:
+        success, message = False, f"{message}; the time was over before every further fit was tried"
     answer = LocalResult(np.zeros(0), success, message, np.array(monitor.curve), monitor.stopped)
     remarks: tuple[str, ...] = ()
     if structure.at_sensors:

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.errors import InputError
+from sysid.errors import InputError, SolverError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, Spectrum, fit_modes
 from sysid.modal_analysis.residues import (
@@ -31,6 +31,7 @@ from sysid.structure.structure import Array
 Integers = NDArray[np.intp]
 
 _AS_GOOD = 1.02  # times the residual without it, that a stated total may leave
+_SECONDS = 8e-9  # of a processor, for a line and the square of its slopes
 _AGREES = 0.01  # relative; a stated total that the base force weighs within this is held in the fit
 
 
@@ -78,7 +79,7 @@ class ModeFit:
         excess = best.of_accelerations**2 * records.size - free.squared_error
         ranks = _ranks(free, noise, n, d)
         wanting = excess > noise * beyond_chance(m * (n - 1) * (d - 1)) or ranks.sum() < best.modes.omega.size
-        if self.monitor.stopped is None and wanting and np.any(ranks > 1):
+        if self._goes_on and wanting and np.any(ranks > 1):
             other = self._grown(ranks)
             more = other.modes.omega.size - best.modes.omega.size
             gained = (best.of_accelerations**2 - other.of_accelerations**2) * records.size / noise
@@ -107,8 +108,25 @@ class ModeFit:
         fit._check()
         return _ascending(fit._with(np.ones(count, dtype=int)))
 
+    @property
+    def _goes_on(self) -> bool:
+        """Whether nobody has stopped the fit, and there is time for another one."""
+        monitor = self.monitor
+        return monitor.stopped is None and not monitor.is_over and monitor.allows(self._seconds)
+
+    @property
+    def _seconds(self) -> float:
+        """About how long it takes until a fit has its first iterate."""
+        test = self.test
+        return float(_SECONDS * (self.poles.omega.size * (test.n_base + 2)) ** 2 * test.n_runs * test.freq.size)
+
     def _check(self) -> None:
-        """Refuse records that cannot fix the modes."""
+        """Refuse records that cannot fix the modes, and a time that cannot suffice."""
+        if not self.monitor.allows(self._seconds):
+            raise SolverError(
+                f"a fit of {self.poles.omega.size} modes takes some {self._seconds:.1g} s to set up: too little time, "
+                "nothing is identified"
+            )
         test, moving = self.test, independent(self.test.base).shape[1]
         if moving < test.n_base:
             raise DoesNotApplyError(
@@ -126,7 +144,7 @@ class ModeFit:
     def _grown(self, multiplicity: Integers) -> ModalFit:
         """Fit with so many modes at each pole, and with more where their free residues call for it."""
         best = self._with(multiplicity)
-        while self.monitor.stopped is None and (lacking := self._lacking_rank(best, multiplicity)) is not None:
+        while self._goes_on and (lacking := self._lacking_rank(best, multiplicity)) is not None:
             more = multiplicity.copy()
             more[lacking] += 1
             again = self._with(more)
@@ -197,7 +215,7 @@ def _ranks(free: ResidueFit, noise: float, n: int, d: int) -> Integers:
 def held_to_totals(problem: Problem, end: ModalFit, monitor: IterationMonitor, max_iterations: int) -> ModalFit | None:
     """The same fit with stated totals held, where what the base force weighs agrees with them; else None."""
     ties, test, modes = stated_totals(problem), problem.measurement, end.modes
-    if ties is None:
+    if ties is None or monitor.is_over:
         return None
     off = ca.vertcat(*ties(ca.DM(modes.phi), ca.DM(modes.gamma), ca.DM(end.rigid)))
     if np.any(np.abs(np.asarray(off)) > _AGREES):

@@ -11,7 +11,9 @@ from typing import Literal
 
 import numpy as np
 
+from sysid.nlp import suffices
 from sysid.search.journal import Journal
+from sysid.structure.structure import Array
 
 Phase = Literal["poles", "swarm", "refinement", "continuation", "local phase"]
 
@@ -41,6 +43,9 @@ class Progress:
 
     def __str__(self) -> str:
         return f"{self.phase:12s}  iteration {self.iteration:4d}  objective {self.objective:.3e}  {self.seconds:6.1f} s"
+
+
+LEAST = 0.4  # s, that each of the last steps has, however late it begins
 
 
 class DeferredInterrupt:
@@ -136,6 +141,7 @@ class Session:
         self.begun = time.perf_counter()
         self.lines: list[str] = []
         self.stop_asked: Stop | None = None  # by a callback, before there was anything to keep
+        self._left_out = False  # a part of the search, for want of time
 
     @property
     def seconds(self) -> float:
@@ -144,8 +150,26 @@ class Session:
 
     @property
     def left(self) -> float | None:
-        """Seconds that are left, at least one; None without a limit."""
-        return None if self.max_time is None else max(self.max_time - self.seconds, 1.0)
+        """Seconds that are left, at least `LEAST`; None without a limit."""
+        return None if self.max_time is None else max(self.max_time - self.seconds, LEAST)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the time is over."""
+        return self.max_time is not None and self.seconds >= self.max_time
+
+    @property
+    def cut_short(self) -> bool:
+        """Whether the time is over, or did not suffice for a part of the search: with more it may end elsewhere."""
+        return self.is_over or self._left_out
+
+    def leave_out(self) -> None:
+        """Note that a part of the search is left out for want of time."""
+        self._left_out = True
+
+    def allows(self, seconds: float) -> bool:
+        """Whether work that cannot be stopped, and takes about so many seconds of a processor, may begin."""
+        return self.left is None or suffices(self.left, seconds)
 
     @property
     def time_for_more(self) -> bool:
@@ -187,4 +211,18 @@ class Session:
         except Stop as stop:
             self.stop_asked = stop
         if self.max_time is not None and self.seconds > self.max_time:
-            raise Stop(f"the time of {self.max_time:g} s was over before the poles of the records were found")
+            raise Stop("the time was over before the poles of the records were found")
+
+
+def in_time(
+    function: Callable[[Array], Array], otherwise: Callable[[Array], Array], session: Session, at_once: int
+) -> Callable[[Array], Array]:
+    """A function of so many rows at once, and another one of the rows that the session has no time for any more."""
+
+    def of_rows(rows: Array) -> Array:
+        pieces = [rows[at : at + at_once] for at in range(0, len(rows), at_once)]
+        return np.concatenate(
+            [(otherwise if i and session.is_over else function)(rows) for i, rows in enumerate(pieces)]
+        )
+
+    return function if session.max_time is None else of_rows

@@ -52,7 +52,8 @@ class History:
         Objective of the best candidate after each phase: the Latin hypercube (or the start that was given; of
         continuation the guess), the swarm, the eigenvalue refinement, the local phase.
     swarm_curve, local_curve : ndarray
-        Best objective after each iteration of the swarm, and objective of each local iterate. Where modes are free and
+        Best objective after each iteration of the swarm, and objective of each local iterate. Where the swarm searched
+        responses with widened peaks its curve is theirs, and `start` is NaN. Where modes are free and
         the noise of a force is not stated, IPOPT weighs the force by what free residues leave of it.
     refinement_error : float
         Largest relative difference of a refined eigenvalue (w²) from the one that was given.

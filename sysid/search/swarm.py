@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from sysid.errors import SolverError, choice, flag, instance, number, text, whole_number
 from sysid.modal_analysis.response import error_of_accelerations
-from sysid.models.spectrum import by_ipopt, closed_form
+from sysid.models.spectrum import by_ipopt, closed_form, seconds_to_begin
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.search import local
@@ -19,7 +19,7 @@ from sysid.search.continuation import descend, smoothed_tests
 from sysid.search.journal import Part
 from sysid.search.local import Coordinates
 from sysid.search.modal_coordinates import fits_worse_than_free_residues, modes_of
-from sysid.search.session import Session, Stop
+from sysid.search.session import Session, Stop, in_time
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, as_unknowns
 from sysid.search.swarm_objective import SwarmObjective
 from sysid.structure.structure import Array, Structure
@@ -32,6 +32,9 @@ _IDLE = (
     "candidates too: what the swarm itself found stands in the history (strategy 'hpso-ls' depends on it)"
 )
 _TRAPPED = "that is a local minimum, as free residues at these poles fit clearly better"
+_MANY, _FEW = 256, 8  # candidates between two looks at the clock; few where IPOPT refines each
+_UNSEEN = 1e6  # in the place of the objective of candidates that there is no time for
+_SAMPLE = 1.6e-7  # s of a processor, that a coordinate of a particle of the first sample takes
 _DOUBTFUL = 0.1  # objective above which a problem without free modes is searched again
 
 
@@ -188,9 +191,8 @@ class Swarm:
                 if isinstance(stopped, KeyboardInterrupt):
                     raise stopped
                 raise SolverError("the search ended before it had a single candidate; give it more time")
-            late = session.max_time is not None and session.seconds > session.max_time / 2
             spent = most is not None and 2 * evaluations > most
-            if stopped or late or spent or self.local is None or best.good_enough:
+            if stopped or not session.time_for_more or spent or self.local is None or best.good_enough:
                 break
             session.log(f"{best.objective:.4g} is no good fit: another swarm")
         assert best is not None
@@ -263,14 +265,19 @@ class _Search:
     ) -> None:
         """The swarm itself."""
         problem, options, session = self.problem, self.options, self.session
+        self._check_time()
         objective, self.steps = options.searched(problem, session)
         self.spectrum = objective.spectrum
         self._log_start()
         record = _SwarmRecord(self, objective, session.journal.part("swarm"))
-        repair = None if self.spectrum is None else self.refined_rows
+        repair = None if self.spectrum is None else in_time(self.refined_rows, lambda rows: rows, session, _FEW)
         slow = options.refine_by == "ipopt" and not options.write_back and repair is not None
-        result = minimize_swarm(
+        evaluate = in_time(
             (lambda rows: objective(self.refined_rows(rows))) if slow else objective,
+            lambda rows: np.full(len(rows), _UNSEEN), session, _FEW if slow else _MANY,
+        )  # fmt: skip
+        result = minimize_swarm(
+            evaluate,
             np.column_stack([problem.lower, problem.upper]),
             rng=np.random.default_rng(random),
             n_particles=options.n_particles,
@@ -296,12 +303,22 @@ class _Search:
         session.log(f"swarm ended after {result.nit} iterations at {result.fun:.4e}: {result.message}")
         if self.steps:
             session.log(f"its best leaves {self.objective:.4e} of the records themselves")
-            self.history = replace(self.history, start=np.nan, swarm=self.objective)
+            self.history = replace(self.history, swarm=self.objective)
         if result.n_nan:
             session.log(f"{result.n_nan} of {result.nfev} candidates were no structure (not a number)")
         if self.unrefined:
             session.log(f"IPOPT refined all but {self.unrefined} candidates, which took the closed form")
         self.ended("swarm", result.nfev - sum(phase.evaluations for phase in self.phases))
+
+    def _check_time(self) -> None:
+        """Stop where the time cannot suffice for the first sample."""
+        problem, options = self.problem, self.options
+        particles = options.n_particles or 5 * problem.n_variables
+        seconds = _SAMPLE * particles * problem.n_variables
+        if options.refine_by == "ipopt":
+            seconds += seconds_to_begin(problem.geometry.n)
+        if not self.session.allows(seconds):
+            raise Stop(f"a swarm of {particles} particles takes some {seconds:.1g} s to begin: too little time")
 
     def _target(self) -> float | None:
         """The objective at which the swarm may end: the goal, where objective and residual are one."""
@@ -324,7 +341,9 @@ class _Search:
 
         def improve(s: Array) -> Array:
             at, coordinates = self.refined(objective.unknowns(s)), self.options.local or "modal"
-            better = local.solve(self.problem, at, max_iterations=30, coordinates=coordinates)
+            better = local.solve(
+                self.problem, at, max_iterations=30, max_time=self.session.left, coordinates=coordinates
+            )
             return self.problem.formulation.to_sampling(better.x)
 
         return improve
@@ -359,17 +378,25 @@ class _Search:
         self.session.report("refinement", 0, 1, self.history.swarm)
         part, n = self.problem.formulation.parts.stiffness, self.problem.geometry.n
         factor = triangle(self.raw[part], n)
-        ways = closed_form(factor, spectrum), by_ipopt(factor, spectrum)
+        session, seconds = self.session, seconds_to_begin(n)
+        ways = [closed_form(factor, spectrum)]
+        if session.allows(seconds):
+            ways.append(by_ipopt(factor, spectrum, session.left))
         ends = []
         for way in ways:
             x = self.raw.copy()
             x[part] = triangle_entries(way.factor)
             ends.append((self.problem.objective(x), x, way))
-        (closed, _, _), (other, _, solved) = ends
-        self.session.log(
-            f"refinement of eigenvalues 1 to {spectrum.size} of {n}: {solved.message}, within "
-            f"{solved.error:.1e} of the given ones, objective {other:.4e} (closed form {closed:.4e})"
-        )
+        (closed, _, _), (other, _, solved) = ends[0], ends[-1]
+        told = f"refinement of eigenvalues 1 to {spectrum.size} of {n}"
+        if len(ends) > 1:
+            session.log(
+                f"{told}: {solved.message}, within {solved.error:.1e} of the given ones, objective {other:.4e} "
+                f"(closed form {closed:.4e})"
+            )
+        else:
+            session.leave_out()
+            session.log(f"{told}: in closed form alone, as IPOPT takes some {seconds:.1g} s to set up: too little time")
         objective, self.x, chosen = ends[1] if solved.success and other < closed else ends[0]
         self.history = replace(self.history, refinement=objective, refinement_error=chosen.error)
         self.ended("refinement", 1)
@@ -392,7 +419,8 @@ class _Search:
         if answer.stopped is not None:
             raise answer.stopped
         # Modal coordinates notice their local minima themselves, and start again.
-        self.trapped = self.problem.free_modes and coordinates != "modal" and self._in_local_minimum()
+        ended = not self.session.cut_short
+        self.trapped = ended and self.problem.free_modes and coordinates != "modal" and self._in_local_minimum()
         if self.trapped:
             self.success = self.meets_goal is True
             self.message += f"; {_TRAPPED}"
@@ -448,8 +476,9 @@ class _SwarmRecord:
             search.x = search.refined(search.raw)
             if not search.phases:
                 search.ended("start", evaluations)
+        start, best = (np.nan, np.nan) if search.steps else (curve[0], curve[-1])  # the steps' are not the records' own
         search.history = replace(
-            search.history, start=curve[0], swarm=curve[-1], swarm_curve=np.array(curve), evaluations=evaluations
+            search.history, start=start, swarm=best, swarm_curve=np.array(curve), evaluations=evaluations
         )
 
     def _content(self) -> dict[str, Any]:

@@ -12,9 +12,9 @@ import pytest
 
 import sysid
 from sysid.cli import main as cli
-from sysid.cli.deadline import TimeIsOver, within
 from sysid.report import report
 from sysid.results import storage
+from sysid.search.deadline import TimeIsOver, within
 from sysid.search.session import DeferredInterrupt
 from sysid.search.swarm_objective import SwarmObjective
 
@@ -182,6 +182,23 @@ def test_the_signal_before_any_candidate_writes_nothing(here, files, interruptib
     assert error == "sysid: interrupted; nothing was saved\n"
     assert running.returncode == 130
     assert files(here) == {"pair.py"}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_the_signal_while_python_imports_is_one_line_of_the_command_alone(here, interruptible):
+    """What is imported first after sysid itself begins sends the signal."""
+    (here / "casadi.py").write_text("import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(60)\n")
+    (here / "sysid_script").write_text("from sysid.cli.main import command\ncommand()\n")
+    (here / "bin").mkdir()
+    (here / "sysid_script").rename(here / "bin/sysid")
+    paths = os.pathsep.join([str(here), *filter(None, [os.environ.get("PYTHONPATH")])])
+    for given in (["-m", "sysid", "list"], ["bin/sysid", "list"]):
+        with interruptible(*given, cwd=here, env={**os.environ, "PYTHONPATH": paths}) as running:
+            _, error = running.communicate(timeout=60)
+        assert (error, running.returncode) == ("sysid: interrupted; nothing was saved\n", 130)
+    with interruptible("-c", "import sysid", cwd=here, env={**os.environ, "PYTHONPATH": paths}) as running:
+        _, error = running.communicate(timeout=60)
+    assert error.endswith("KeyboardInterrupt\n")
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")

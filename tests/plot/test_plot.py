@@ -185,6 +185,13 @@ def test_convergence_without_a_swarm_marks_each_iterate(unit):
     assert plot.convergence(dataclasses.replace(unit, history=single)).axes[0].get_xlim() == (-0.5, 1.5)
 
 
+def test_convergence_tells_widened_peaks_from_the_records(unit):
+    history = dataclasses.replace(unit.history, start=np.nan, refinement=np.nan)
+    swarm, local, _ = plot.convergence(dataclasses.replace(unit, history=history)).axes[0].lines
+    assert (swarm.get_label(), swarm.get_linestyle()) == ("swarm, of widened peaks", "--")
+    assert (local.get_label(), local.get_linestyle()) == ("local phase, of the records", "-")
+
+
 def test_convergence_without_a_search_says_so(runs):
     ax = plot.convergence(runs).axes[0]
     assert [text.get_text() for text in ax.texts] == ["no search is recorded"]

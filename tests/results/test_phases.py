@@ -7,6 +7,7 @@ import pytest
 
 import sysid
 from sysid.report.report import render
+from sysid.results.answer import modal_assurance
 from sysid.results.phases import COLUMNS, errors, rows_of_phases
 
 
@@ -35,6 +36,16 @@ def test_an_undamped_truth_has_no_relative_error_of_damping(random_structure):
     truth = random_structure(np.random.default_rng(1), n=3, d=1)
     undamped = sysid.Structure(truth.mass, truth.stiffness, np.zeros(3), n_base=1)
     np.testing.assert_allclose(errors(truth, undamped), [0, 0, 0, 0, np.nan], atol=1e-14)
+
+
+def test_a_mode_that_no_sensor_sees_agrees_with_none():
+    """The second mass moves alone, and the only sensor is on the first."""
+    M, K = np.diag([1.0, 1.0, 0.0]), np.array([[100.0, 0.0, -100.0], [0.0, 400.0, -400.0], [-100.0, -400.0, 500.0]])
+    sensed = {"recovery": [[1.0, 0.0]], "rigid_body": [[1.0]]}
+    truth = sysid.Structure(M, K, [0.01, 0.01], n_base=1, **sensed)
+    np.testing.assert_array_equal(truth.mode_shapes[:, 1], 0)
+    np.testing.assert_array_equal(errors(truth, truth), [0, 1, 0, 0, 0])
+    np.testing.assert_array_equal(modal_assurance(truth.mode_shapes, truth.mode_shapes), [[1, 0], [0, 0]])
 
 
 def test_a_phase_that_ended_at_no_structure_says_so(result):

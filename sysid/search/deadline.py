@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from typing import NoReturn
 
 _AGAIN = 1.0  # s between further attempts, as compiled code and __del__ lose an exception that strikes inside them
+_AT_ONCE = 1e-6  # s; zero would set no alarm
 
 
 class TimeIsOver(BaseException):  # no library's ``except Exception`` must take it
@@ -20,7 +21,8 @@ class TimeIsOver(BaseException):  # no library's ``except Exception`` must take 
 def within(seconds: float | None) -> Iterator[None]:
     """Raise `TimeIsOver` in the midst of Python code once so many seconds have passed; None sets no limit.
 
-    Without POSIX signals, or outside the main thread, what has begun is not cut short.
+    Without POSIX signals, or outside the main thread, what has begun is not cut short. An alarm that somebody else has
+    set comes at its time, or where that has passed, at the end.
     """
     if seconds is not None and seconds <= 0:
         raise TimeIsOver
@@ -28,17 +30,21 @@ def within(seconds: float | None) -> Iterator[None]:
     if seconds is None or not in_main_thread or not hasattr(signal, "setitimer"):
         yield
         return
-    end, before = time.perf_counter() + seconds, signal.signal(signal.SIGALRM, _raise)
-    signal.setitimer(signal.ITIMER_REAL, seconds, _AGAIN)
+    begun, before = time.perf_counter(), signal.signal(signal.SIGALRM, _raise)
+    other, again = signal.setitimer(signal.ITIMER_REAL, seconds, _AGAIN)
     try:
         yield
     except Exception as error:  # compiled code makes another one of ours
-        if time.perf_counter() < end:
+        if time.perf_counter() < begun + seconds:
             raise
         raise TimeIsOver from error
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
+        try:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+        finally:  # the alarm may have come just before
+            signal.signal(signal.SIGALRM, before)
+            if other > 0:
+                signal.setitimer(signal.ITIMER_REAL, max(other - (time.perf_counter() - begun), _AT_ONCE), again)
 
 
 def _raise(number: int, frame: object) -> NoReturn:
