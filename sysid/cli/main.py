@@ -177,11 +177,13 @@ def _run(options: argparse.Namespace, out: Output) -> int:
         if failed is not None:
             raise failed
         left = None if options.max_time is None else options.max_time - (time.perf_counter() - begun)
-        _write_pages(result, folder, out, left)
+        # Raised while matplotlib's objects are collected it would be lost, with a traceback.
+        with DeferredInterrupt() as writing:
+            _write_pages(result, folder, out, left)
     except KeyboardInterrupt:
         complain(f"interrupted while saving; the result is there, but not every file is in {folder}")
         return INTERRUPTED
-    if late.asked or result.interrupted:
+    if late.asked or writing.asked or result.interrupted:
         on = f"; 'sysid run --resume {folder}' goes on" if checkpoint.exists else ""
         complain(f"interrupted; the {'best so far' if result.interrupted else 'result'} is in {folder}{on}")
         return INTERRUPTED
