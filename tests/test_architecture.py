@@ -15,7 +15,7 @@ CEILINGS = {
     # fits finished by orthogonal factors (35), checkpoints of searches (450), files
     # read in a process of their own (80), draws of noise (280), what a job is made from (90), and identifications of
     # parts of a test and by other models (900).
-    "lines": 24_093,
+    "lines": 24_096,
 }
 
 # The counting is a benchmark, which prints the same figures; `sysid` itself is not imported from the checkout.
