@@ -1,10 +1,20 @@
 """Random structures that the tests share, built from modes and geometry: their properties are known beforehand."""
 
+import signal
+
 import numpy as np
 import pytest
 
 import sysid
 from sysid.models.geometry import Geometry
+
+
+@pytest.fixture
+def ctrl_c():
+    """Python's own answer to Ctrl-C, also where the tests run in the background of a shell, which has it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 def _geometry(rng, n, d):

@@ -217,7 +217,7 @@ def test_what_cannot_be_searched_is_refused_when_it_is_built(here):
     assert "no point within the bounds satisfies constraint 1" in refused("written.py")
 
 
-def test_ctrl_c_inside_a_module_is_no_mistake_of_the_module(here, monkeypatch):
+def test_ctrl_c_inside_a_module_is_no_mistake_of_the_module(here, monkeypatch, ctrl_c):
     """Nor where a library that it calls raises it anew, as asyncio does."""
     monkeypatch.setattr(signal, "wakeup", interrupted, raising=False)
     for line in ("signal.raise_signal(signal.SIGINT)", "signal.wakeup()"):

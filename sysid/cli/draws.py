@@ -23,7 +23,7 @@ def tell(folder: Path, result: Identification, recipe: Recipe, ends: list[JobRes
         ("draw", "seed", "success", "residual", "message", *result.problem.formulation.labels)
     ]
     for end in sorted(ends, key=lambda one: one.index):
-        left = repr(end.residual) if end.x.size else ""
+        left = repr(end.residual) if end.has_result else ""
         each.append((end.index, end.seed, end.success, left, end.message, *map(repr, end.x.tolist())))
     files, count = {"draws.csv": table_as_csv(each)}, sum(end.success for end in ends)
     if count < 2:

@@ -183,11 +183,13 @@ def _run(options: argparse.Namespace, out: Output) -> int:
         out.flush()
         if failed is not None:
             raise failed
-        _write_pages(result, figures, folder, out, left(0.0))
+        # Raised while matplotlib's objects are collected it would be lost, with a traceback.
+        with DeferredInterrupt() as writing:
+            _write_pages(result, figures, folder, out, left(0.0))
     except KeyboardInterrupt:
         complain(f"interrupted while saving; the result is there, but not every file is in {folder}")
         return INTERRUPTED
-    if late.asked or result.interrupted:
+    if late.asked or writing.asked or result.interrupted:
         on = f"; 'sysid run --resume {folder}' goes on" if checkpoint.exists else ""
         complain(f"interrupted; the {'best so far' if result.interrupted else 'result'} is in {folder}{on}")
         return INTERRUPTED

@@ -143,7 +143,7 @@ def _write(
     ]
     rows += [
         (
-            end.index, end.seed, end.success, repr(end.residual) if end.x.size else "", of.get(end.index, ""),
+            end.index, end.seed, end.success, repr(end.residual) if end.has_result else "", of.get(end.index, ""),
             end.message, *map(repr, end.x.tolist()),
         )
         for end in sorted(ends, key=lambda one: one.index)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sysid.errors import InputError, number, whole_number
 from sysid.measurement.measurement import Measurement
@@ -13,7 +14,6 @@ from sysid.modal_analysis.residues import independent
 from sysid.models.stiffness import SpectralStiffness
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification
-from sysid.structure.structure import Array
 
 
 @dataclass(frozen=True)
@@ -76,18 +76,14 @@ class WithoutRun:
     def of(self, problem: Problem) -> Problem:
         """The problem with the other runs."""
         test = problem.measurement
-        if self.run >= test.n_runs:
-            raise InputError(f"there is no run {self.run + 1}: the test has {test.n_runs}")
-        if test.n_runs == 1:
-            raise InputError("the test has one run; without it nothing is left")
-        return _on(problem, _runs(test, np.arange(test.n_runs) != self.run))
+        return _on(problem, _runs(test, _all_but(self.run, test.n_runs, "run")))
 
     def predicted(self, problem: Problem, result: Identification) -> float:
         """Relative residual of the run that was left out; NaN where the others do not tell free matrices' motion."""
-        test, left = problem.measurement, np.arange(problem.measurement.n_runs) == self.run
-        if problem.free_modes and independent(test.base[~left]).shape[1] < independent(test.base).shape[1]:
+        test, kept = problem.measurement, _all_but(self.run, problem.measurement.n_runs, "run")
+        if problem.free_modes and independent(test.base[kept]).shape[1] < independent(test.base).shape[1]:
             return np.nan
-        return _runs(test, left).residual(result.structure)
+        return _runs(test, ~kept).residual(result.structure)
 
 
 @dataclass(frozen=True)
@@ -119,11 +115,7 @@ class WithoutSensor:
     def of(self, problem: Problem) -> Problem:
         """The problem with the other sensors."""
         test = problem.measurement
-        if self.sensor >= test.n_sensors:
-            raise InputError(f"there is no sensor {self.sensor + 1}: the test has {test.n_sensors}")
-        kept = np.arange(test.n_sensors) != self.sensor
-        if not np.any(kept):
-            raise InputError("the test has one sensor; without it nothing is left")
+        kept = _all_but(self.sensor, test.n_sensors, "sensor")
         other = _sensors(test, kept)
         if problem.free_modes:
             return _on(problem, other, stiffness=_for_fewer(problem.stiffness, test.n_sensors - 1))
@@ -180,6 +172,15 @@ def _on(problem: Problem, test: Measurement, **others: Any) -> Problem:
     return replace(problem, measurement=test, validation=(), reference=None, goal=None, **others)
 
 
+def _all_but(index: int, count: int, what: str) -> NDArray[np.bool_]:
+    """Which of so many runs or sensors are left without one, (count,)."""
+    if index >= count:
+        raise InputError(f"there is no {what} {index + 1}: the test has {count}")
+    if count == 1:
+        raise InputError(f"the test has one {what}; without it nothing is left")
+    return np.arange(count) != index
+
+
 def _for_fewer(stiffness: SpectralStiffness, sensors: int) -> SpectralStiffness:
     """The stiffness without its stated frequencies, where these are too many for so few sensors."""
     given = stiffness.natural_frequencies
@@ -188,14 +189,14 @@ def _for_fewer(stiffness: SpectralStiffness, sensors: int) -> SpectralStiffness:
     return SpectralStiffness(max_frequency=stiffness.max_frequency)
 
 
-def _runs(test: Measurement, kept: Array) -> Measurement:
+def _runs(test: Measurement, kept: NDArray[np.bool_]) -> Measurement:
     """The runs where `kept` is true."""
     names = ("base", "response", "force", "response_std", "force_std")
     given = {name: getattr(test, name) for name in names}
     return replace(test, **{name: record[kept] for name, record in given.items() if record is not None})
 
 
-def _sensors(test: Measurement, kept: Array) -> Measurement:
+def _sensors(test: Measurement, kept: NDArray[np.bool_]) -> Measurement:
     """The sensors where `kept` is true."""
     std, described = test.response_std, test.sensors
     return replace(

@@ -115,12 +115,10 @@ def run(job: Job) -> JobResult:
             result = _identified(job, session) if job.strategy else _refined(job, session)
             interrupt.check()
             return result
-    except (InputError, SolverError) as error:
-        interrupt.check()  # what a search that Ctrl-C stopped before its first fit raises is no result of the job
-        return without_result(job, str(error))
     except Exception as error:  # whatever one start leads to, all others go on
-        interrupt.check()
-        return without_result(job, f"{type(error).__name__}: {error}")
+        interrupt.check()  # what a search that Ctrl-C stopped before its first fit raises is no result of the job
+        ours = isinstance(error, InputError | SolverError)
+        return without_result(job, str(error) if ours else f"{type(error).__name__}: {error}")
 
 
 def without_result(job: Job, why: str) -> JobResult:
@@ -133,7 +131,7 @@ def _identified(job: Job, session: Session) -> JobResult:
 
     A change of a problem whose matrices do not follow from modes is fitted from the recipe's start, where there is one.
     """
-    problem = catalogue.build(replace(job.recipe, start=None))
+    problem = _built(replace(job.recipe, start=None), job.source)
     changed = problem if job.change is None else job.change.of(problem)
     from_start = job.change is not None and job.strategy == "auto" and not changed.free_modes
     if job.recipe.start is not None and from_start:
@@ -163,7 +161,8 @@ def _predicted(problem: Problem, result: Identification, change: Change) -> floa
 
 
 def _refined(job: Job, session: Session) -> JobResult:
-    problem, steps = _built(replace(job.recipe, start=None), job.source)
+    bare = replace(job.recipe, start=None)
+    problem = _built(bare, job.source)
     own = job.start == 0 and job.recipe.start is not None
     if own:
         x = as_unknowns(problem, np.array(job.recipe.start))
@@ -177,7 +176,7 @@ def _refined(job: Job, session: Session) -> JobResult:
             return without_result(job, "no point of the search space is a structure; state guesses that make one")
         x = found[0]
     # What ended a search needs no widened peaks.
-    end = _descended(problem, x, [] if own else steps, session)
+    end = _descended(problem, x, [] if own else _widened(bare, job.source), session)
     assert end.x is not None
     success, message = succeeded(problem.screened, end)
     return JobResult(job.index, job.seed, success, message, end.x, problem.residual(end.x))
@@ -197,8 +196,14 @@ def _descended(problem: Problem, x: Array, steps: list[tuple[TestTerm, ...]], se
 
 
 @lru_cache(maxsize=_BUILT)
-def _built(recipe: Recipe, source: str) -> tuple[Problem, list[tuple[TestTerm, ...]]]:
-    """The problem and its tests with widened peaks, once a worker."""
-    problem = catalogue.build(recipe)
+def _built(recipe: Recipe, source: str) -> Problem:
+    """The problem, once a worker."""
+    return catalogue.build(recipe)
+
+
+@lru_cache(maxsize=_BUILT)
+def _widened(recipe: Recipe, source: str) -> list[tuple[TestTerm, ...]]:
+    """Its tests with widened peaks, step by step, once a worker."""
+    problem = _built(recipe, source)
     smoother = None if problem.free_modes else smoothed_tests(problem)
-    return problem, [] if smoother is None else smoother.steps
+    return [] if smoother is None else smoother.steps

@@ -170,8 +170,8 @@ def moves(own: Score, other: Score, *, part: bool) -> tuple[Move, ...]:
         Whether the other is the same model on a part of the records. A step is then told in the standard deviation that
         it has by noise alone, see `_variance`; else in the larger of both results'.
     """
-    names = [name for name in own.values if not name.startswith("mode ") and name in other.values]
-    pairs = [(name, name) for name in names]
+    of_modes = {label(i, what) for i in range(own.modes) for what in (FREQUENCY, RATIO)}
+    pairs = [(name, name) for name in own.values if name not in of_modes and name in other.values]
     for i, j in _nearest(own.frequencies, other.frequencies):
         pairs += [(label(i, what), label(j, what)) for what in (FREQUENCY, RATIO)]
     made = []

@@ -245,6 +245,11 @@ def test_a_step_to_a_part_with_less_noise_is_the_difference_of_two_means():
     assert 0.1 / step.deviations == pytest.approx(0.5 * np.sqrt(1 / 100 + 99 / 100))
 
 
+def test_an_unknown_may_be_called_after_modes():
+    own, other = (replace(_score((), ()), values={"mode mass": value}) for value in (2.0, 2.5))
+    assert [(step.name, step.value) for step in moves(own, other, part=False)] == [("mode mass", 2.5)]
+
+
 def test_modes_that_share_a_frequency_go_to_one_each():
     steps = moves(_score((1.0, 1.001), (0.1, 0.1)), _score((1.0011, 1.0012), (0.1, 0.1)), part=False)
     assert [(step.name, step.value) for step in steps[::2]] == [
@@ -360,7 +365,7 @@ def test_what_the_rest_does_not_tell_is_not_predicted(tmp_path):
     assert np.isnan(one.score.predicted)
 
 
-def test_ctrl_c_before_a_first_fit_is_no_result(recipe, monkeypatch):
+def test_ctrl_c_before_a_first_fit_is_no_result(recipe, monkeypatch, ctrl_c):
     def stopped(*arguments, **options):
         os.kill(os.getpid(), signal.SIGINT)
         raise SolverError("stopped before there was a first fit: nothing is identified")
