@@ -9,6 +9,7 @@ import signal
 import string
 import tempfile
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -20,6 +21,9 @@ from benchmarks.line import Line, below
 from sysid.cli.main import main
 from sysid.cli.status import BUG
 from sysid.files import xsens_dot
+from sysid.jobs.job import Job, JobResult
+from sysid.jobs.ledger import FILE_NAME as LEDGER
+from sysid.jobs.ledger import Ledger
 from sysid.results.checkpoint import Checkpoint
 
 SECONDS, REDUCED = 600.0, 3.0  # a reader
@@ -54,7 +58,7 @@ def _attempts(folder: Path) -> dict[str, Attempt]:
     unfinished = state.read_bytes()
     file = folder / "fuzzed"
 
-    def of(sound: bytes, read: Callable[[], object]) -> Attempt:
+    def of(sound: bytes, read: Callable[[], object], file: Path = file) -> Attempt:
         def attempt(rng: np.random.Generator) -> None:
             data = sound
             for _ in range(int(rng.integers(1, 4))):
@@ -68,6 +72,7 @@ def _attempts(folder: Path) -> dict[str, Attempt]:
     return {
         "results": of(result, lambda: sysid.load(file)),
         "states of unfinished searches": of(unfinished, Checkpoint(file).read),
+        "ledgers of jobs": of(_ledger(folder), lambda: _ledger(folder), folder / LEDGER),
         "CSV of inertial units": of(_xsens(), lambda: xsens_dot.read(file)),
         "the command line": _command,
     }
@@ -76,6 +81,19 @@ def _attempts(folder: Path) -> dict[str, Attempt]:
 def _stop(progress: sysid.Progress) -> None:
     if (progress.phase, progress.iteration) == ("swarm", 3):
         raise KeyboardInterrupt
+
+
+def _ledger(folder: Path) -> bytes:
+    """Bytes of a ledger after its results were read, and others written."""
+    x = np.linspace(0.1, 0.9, 30)
+    tasks = [Job(index, sysid.Recipe("of_nothing.py"), index, "0" * 64) for index in range(20)]
+    with warnings.catch_warnings(action="ignore"), Ledger(folder, tasks) as ledger:
+        for result in ledger.results().values():
+            if not np.array_equal(result.x, x + result.index):
+                raise RuntimeError(f"other numbers: {result}")
+        for task in tasks:
+            ledger.add(JobResult(task.index, task.seed, True, "converged", x + task.index, 1e-3))
+    return (folder / LEDGER).read_bytes()
 
 
 def _xsens() -> bytes:
@@ -89,6 +107,7 @@ def _command(rng: np.random.Generator) -> None:
     words = (
         *("list", "new", "show", "run", "compare", "refine", "report", "--help", "--version", "--seed", "--strategy"),
         *("--out", "--max-time", "--set", "--data", "--resume", "--fresh", "--starts", "--workers", "--scheduler"),
+        *("--draws", "--orders", "--bands", "--variants", "--leave-out", "1-2", "3-1", "0.5-8", "sensor", "run"),
         *("swarm", "modal", "0", "-1", "1e999", "nan", "a=b", "n=", "=3", "", " ", "/", "..", "/dev/null", "/dev/zero"),
         *(
             "sound.h5",

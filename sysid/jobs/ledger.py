@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import sqlite3
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +22,7 @@ from sysid.results.version import __version__
 
 FILE_NAME = "jobs.sqlite"
 
-_TABLE = """CREATE TABLE IF NOT EXISTS jobs (
-    job TEXT PRIMARY KEY, success INTEGER NOT NULL, message TEXT NOT NULL, x BLOB NOT NULL, residual REAL, score TEXT
-)"""
+_TABLE = "CREATE TABLE IF NOT EXISTS results (job TEXT PRIMARY KEY, result TEXT NOT NULL, sha256 TEXT NOT NULL)"
 
 
 class Ledger:
@@ -48,27 +49,29 @@ class Ledger:
         self._seeds = {job.index: job.seed for job in jobs}
 
     def results(self) -> dict[int, JobResult]:
-        """What is there of the jobs, by index."""
+        """What is there of the jobs, by index; a damaged one counts as none, with a warning."""
         with self._told():
-            told = self._file.execute("SELECT job, success, message, x, residual, score FROM jobs")
-            rows = {row[0]: row[1:] for row in told}
-        return {
-            index: JobResult(
-                index, self._seeds[index], bool(success), message, np.frombuffer(x), np.nan if left is None else left,
-                None if score is None else Score(**json.loads(score)),
-            )
-            for index, key in self._keys.items()
-            if key in rows
-            for success, message, x, left, score in (rows[key],)
-        }  # fmt: skip
+            rows = {row[0]: row[1:] for row in self._file.execute("SELECT job, result, sha256 FROM results")}
+        wanted = {index: rows[key] for index, key in self._keys.items() if key in rows}
+        sound = {index: text for index, (text, digest) in wanted.items() if _digest(text) == digest}
+        if len(sound) < len(wanted):
+            damaged = len(wanted) - len(sound)
+            warnings.warn(f"{damaged} results in {self.path} are damaged and are computed again", stacklevel=3)
+        return {index: self._result(index, *json.loads(text)) for index, text in sound.items()}
+
+    def _result(
+        self, index: int, success: bool, message: str, x: list[float], residual: float, score: dict[str, Any] | None
+    ) -> JobResult:
+        told = None if score is None else Score(**score)
+        return JobResult(index, self._seeds[index], success, message, np.array(x, dtype=float), residual, told)
 
     def add(self, result: JobResult) -> None:
         """Write a result; it is on the disk when this returns."""
-        x, left = np.ascontiguousarray(result.x, dtype=float).tobytes(), float(result.residual)
-        score = None if result.score is None else json.dumps(asdict(result.score))
-        row = (self._keys[result.index], int(result.success), result.message, x, left, score)
+        score = None if result.score is None else asdict(result.score)
+        text = json.dumps([bool(result.success), result.message, result.x.tolist(), float(result.residual), score])
         with self._told(), self._file:
-            self._file.execute("INSERT OR REPLACE INTO jobs VALUES (?, ?, ?, ?, ?, ?)", row)
+            row = (self._keys[result.index], text, _digest(text))
+            self._file.execute("INSERT OR REPLACE INTO results VALUES (?, ?, ?)", row)
 
     def __enter__(self) -> Ledger:
         with self._told():
@@ -76,8 +79,6 @@ class Ledger:
             self._file = sqlite3.connect(self.path)
             try:
                 self._file.execute(_TABLE)
-                if "score" not in {row[1] for row in self._file.execute("PRAGMA table_info(jobs)")}:
-                    self._file.execute("ALTER TABLE jobs ADD COLUMN score TEXT")  # made before there were scores
             except sqlite3.Error:
                 self._file.close()
                 raise
@@ -90,8 +91,12 @@ class Ledger:
     def _told(self) -> Iterator[None]:
         try:
             yield
-        except (OSError, sqlite3.Error) as error:
+        except (OSError, sqlite3.Error, UnicodeDecodeError) as error:  # the last where SQLite quotes a damaged name
             raise InputError(f"the ledger of jobs {self.path} cannot be used: {error}") from error
+
+
+def _digest(text: object) -> str:
+    return hashlib.sha256(str(text).encode(errors="replace")).hexdigest()
 
 
 def _key(job: Job) -> str:

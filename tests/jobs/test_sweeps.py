@@ -1,9 +1,7 @@
 """Whole identifications as jobs: parts of a test and other models, and the figures that compare them."""
 
-import contextlib
 import os
 import signal
-import sqlite3
 from dataclasses import asdict, replace
 from itertools import combinations
 
@@ -15,7 +13,6 @@ from scipy.stats import norm
 import sysid
 from sysid.errors import InputError, SolverError
 from sysid.jobs import Band, Modes, Score, WithoutRun, WithoutSensor, moves, scored, submit
-from sysid.jobs.ledger import FILE_NAME
 from sysid.modal_analysis.residues import linear_residues
 from sysid.modal_analysis.vector_fitting import find_poles
 from sysid.results.judgement import judge
@@ -329,16 +326,6 @@ def test_jobs_go_on_from_the_ledger_with_their_scores(recipe, result, tmp_path):
     again = list(submit(recipe, changes=changes[:2], out=tmp_path, executor=lambda: pytest.fail("computed again")))
     for one, other in zip(again, ends, strict=False):
         np.testing.assert_equal(asdict(one.score), asdict(other.score))
-
-
-def test_a_ledger_made_before_there_were_scores_goes_on(recipe, tmp_path):
-    with contextlib.closing(sqlite3.connect(tmp_path / FILE_NAME)) as file, file:
-        file.execute("CREATE TABLE jobs (job TEXT PRIMARY KEY, success INTEGER, message TEXT, x BLOB, residual REAL)")
-        file.execute("INSERT INTO jobs VALUES ('of another job', 1, '', x'', 0.5)")
-    (end,) = submit(recipe, changes=[WithoutRun(0)], out=tmp_path)
-    assert end.success
-    with contextlib.closing(sqlite3.connect(tmp_path / FILE_NAME)) as file:
-        assert file.execute("SELECT count(*), count(score) FROM jobs").fetchall() == [(2, 1)]
 
 
 def test_changes_begin_at_the_unknowns_of_a_result(recipe, result, monkeypatch):
