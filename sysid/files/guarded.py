@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import math
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 from sysid.errors import InputError
 from sysid.files.tree import Tree, from_bytes, to_bytes
 
-_SECONDS = 30.0
+_SECONDS = 30.0  # imports included, on a loaded machine too
+_PROCESSOR_SECONDS = 3  # of the reader itself
 _MEMORY = 2**32  # bytes
 # With the modules that this process finds: a file of the user's in the working folder must not stand for one of them.
 _CHILD = f"import sys; sys.path[:] = sys.argv.pop(1).split('|'); from {__name__} import give; give(*sys.argv[1:])"
@@ -47,6 +50,8 @@ def guarded(reader: str, path: Path, seconds: float = _SECONDS) -> Tree:
         raise InputError(done.stderr.decode("utf-8", "replace").strip())
     if done.returncode < 0:
         name = signal.Signals(-done.returncode).name
+        if name == "SIGXCPU":
+            raise InputError(f"it is damaged: reading it takes more than {_PROCESSOR_SECONDS} s of a processor")
         raise InputError(f"it is damaged: the library that reads it crashed ({name})")
     if done.returncode:
         last = done.stderr.decode("utf-8", "replace").strip().rpartition("\n")[2]
@@ -56,14 +61,17 @@ def guarded(reader: str, path: Path, seconds: float = _SECONDS) -> Tree:
 
 def give(reader: str, path: str) -> None:
     """Write the tree that a reader gives to standard output: what the other process does."""
+    module, _, name = reader.partition(":")
+    read = getattr(importlib.import_module(module), name)
     with contextlib.suppress(ImportError, OSError, ValueError):  # not every system has such limits
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    module, _, name = reader.partition(":")
+        until = math.ceil(time.process_time()) + _PROCESSOR_SECONDS
+        resource.setrlimit(resource.RLIMIT_CPU, (until, until + 1))
     try:
-        image = to_bytes(getattr(importlib.import_module(module), name)(Path(path)), 0)
+        image = to_bytes(read(Path(path)), 0)
     except InputError as error:
         print(error, file=sys.stderr)
         sys.exit(_REFUSED)

@@ -26,6 +26,10 @@ def crash(path):
 def hang(path):
     time.sleep(60)
 
+def spin(path):
+    while True:
+        pass
+
 def fill(path):
     return {"numbers": np.ones(2**31)}
 
@@ -60,6 +64,7 @@ def test_what_the_reader_gives_comes_back(reader):
     [
         ("refuse", "^it is no such file$"),
         ("crash", r"^it is damaged: the library that reads it crashed \(SIGSEGV\)$"),
+        ("spin", r"^it is damaged: reading it takes more than 3 s of a processor$"),
         ("fill", "^it is damaged .*(Memory|allocate)"),
         ("fail", r"^it is damaged \(byte 7\)$"),
     ],
