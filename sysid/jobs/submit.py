@@ -123,17 +123,16 @@ def _strategy(strategy: str, changes: Sequence[Change | None], others: bool) -> 
 
 def _sources(recipes: list[Recipe], drawn: bool, out: Path | None) -> Iterator[str]:
     """SHA-256 of what each recipe's problem is made from; building it first tells what is wrong before any job runs."""
-    texts: dict[str, list[tuple[str, str]]] = {}
+    texts: dict[Recipe, list[tuple[str, str]]] = {}
     of_data = functools.cache(functools.partial(_data, out=out))
     for recipe in recipes:
         bare = replace(recipe, start=None)
-        which = str(bare.to_tree())  # 1 and True are equal as parameters
-        if which not in texts:
+        if bare not in texts:
             problem, files = catalogue.built(bare)
             if drawn:
                 check_drawable(problem)
-            texts[which] = sorted((str(file), _sha256(file)) for file in files if file.is_file())
-        yield hashlib.sha256(repr((texts[which], of_data(recipe.data))).encode()).hexdigest()
+            texts[bare] = sorted((str(file), _sha256(file)) for file in files if file.is_file())
+        yield hashlib.sha256(repr((texts[bare], of_data(recipe.data))).encode()).hexdigest()
 
 
 def _data(path: str | None, out: Path | None) -> str | list[tuple[str, int, int]]:

@@ -56,7 +56,7 @@ class Recipe:
 
     def __post_init__(self) -> None:
         text("Recipe: module", self.module)
-        whole_number("Recipe: rng", self.rng, at_least=0)
+        object.__setattr__(self, "rng", whole_number("Recipe: rng", self.rng, at_least=0))
         if self.data is not None:
             text("Recipe: data", self.data)
         if not isinstance(self.parameters, Mapping) or not all(isinstance(name, str) for name in self.parameters):
@@ -70,8 +70,17 @@ class Recipe:
             if not _is_plain(value):
                 raise InputError(f"parameter {name} = {value!r}: give a number, a text, or a list of them")
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Recipe) and self._key == other._key
+
     def __hash__(self) -> int:
-        return hash((self.module, self.data, self.rng, frozenset(self.parameters)))  # values may be lists
+        return hash(self._key)
+
+    @property
+    def _key(self) -> tuple[object, ...]:
+        # As texts: 1, 1.0 and True are equal in Python, and may make different problems.
+        parameters = frozenset((name, repr(value)) for name, value in self.parameters.items())
+        return self.module, self.data, self.rng, parameters, self.start
 
     @property
     def title(self) -> str:

@@ -67,6 +67,11 @@ def test_equal_recipes_have_one_hash_and_come_back_from_their_tree():
     assert hash(one) == hash(other)
     assert len({one, other, Recipe("mast", parameters={"a": [2], "b": "x"})}) == 2
     assert Recipe.from_tree(one.to_tree()) == one
+    assert len({Recipe("mast", parameters={"a": value}) for value in (1, 1.0, True)}) == 3
+
+
+def test_a_whole_number_given_as_a_float_is_a_seed_that_comes_back():
+    assert Recipe.from_tree(Recipe("mast", rng=4.0).to_tree()).rng == 4
 
 
 @pytest.mark.parametrize("value", [1j, b"x", {1, 2}, float("nan"), io, [float("inf")]])

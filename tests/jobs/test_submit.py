@@ -87,6 +87,12 @@ def test_a_recipe_that_comes_again_is_built_once_whatever_its_start(recipe, monk
     assert built == [replace(recipe, start=None), replace(other, start=None)]
 
 
+def test_one_and_true_make_two_problems_in_one_worker(recipe, tmp_path):
+    (tmp_path / "floors.py").write_text(MODULE.replace("5, second]", "5, 1.5e5 if second is True else 2e5]"))
+    found = list(submit([replace(recipe, parameters={"second": value}) for value in (1, True)]))
+    np.testing.assert_allclose([result.x[1] for result in found], [2e5, 1.5e5], rtol=1e-6)
+
+
 def test_a_job_without_a_structure_to_start_from_says_so(recipe):
     result = next(submit(replace(recipe, start=[1.0, 2.0, 3.0])))
     assert not result.success and result.x.size == 0 and np.isnan(result.residual)
