@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import difflib
 import dis
+import hashlib
 import importlib
 import importlib.machinery
 import importlib.util
@@ -13,7 +14,7 @@ import os
 import sys
 import traceback
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -135,6 +136,27 @@ def built(recipe: Recipe, *, check: bool = True) -> tuple[Problem, frozenset[Pat
     if check:
         problem.check()
     return problem, frozenset({path.absolute(), *imported})
+
+
+def digest(files: Collection[Path]) -> str:
+    """SHA-256 of some files, by what stands in them and their places beside each other, wherever their folder is.
+
+    Raises
+    ------
+    InputError
+        Where one cannot be read.
+    """
+    home = os.path.commonpath([file.parent for file in files])
+    texts = sorted((str(file.relative_to(home)), _sha256(file)) for file in files if file.is_file())
+    return hashlib.sha256(repr(texts).encode()).hexdigest()
+
+
+def _sha256(file: Path) -> str:
+    try:
+        with file.open("rb") as content:
+            return hashlib.file_digest(content, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{file} cannot be read: {error.strerror or error}") from error
 
 
 def parameters_in_words(problem: str) -> str:

@@ -152,8 +152,8 @@ def _run(options: argparse.Namespace, out: Output) -> int:
 
     search, folder = unfinished.begun(options, out)
     recipe = search.recipe
-    problem = catalogue.build(recipe, check=options.max_time is None)  # with a limit under the search's clock
-    checkpoint = Checkpoint(folder / UNFINISHED, search)
+    problem, files = catalogue.built(recipe, check=options.max_time is None)  # with a limit under the search's clock
+    checkpoint = Checkpoint(folder / UNFINISHED, unfinished.with_source(search, files, folder))
     if options.fresh:
         checkpoint.remove()
     test = problem.measurement

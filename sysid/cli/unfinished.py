@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
 
 from sysid import catalogue
@@ -32,6 +34,23 @@ def begun(options: argparse.Namespace, out: Output) -> tuple[Begun, Path]:
             "--fresh begins anew, --out DIR writes elsewhere"
         )
     return search, folder
+
+
+def with_source(search: Begun, files: Collection[Path], folder: Path) -> Begun:
+    """The search with the digest of the files that its problem was made from.
+
+    Raises
+    ------
+    InputError
+        Where it was begun with other ones.
+    """
+    source = catalogue.digest(files)
+    if search.source not in ("", source):
+        raise InputError(
+            f"{folder} holds an unfinished run of {search}, and since it began its module or what this imports from "
+            f"beside itself was edited: give the problem with --out {folder} --fresh to begin anew, or undo the edit"
+        )
+    return replace(search, source=source)
 
 
 def _resumed(options: argparse.Namespace, out: Output) -> tuple[Begun, Path]:

@@ -123,7 +123,7 @@ def _strategy(strategy: str, changes: Sequence[Change | None], others: bool) -> 
 
 def _sources(recipes: list[Recipe], drawn: bool, out: Path | None) -> Iterator[str]:
     """SHA-256 of what each recipe's problem is made from; building it first tells what is wrong before any job runs."""
-    texts: dict[Recipe, list[tuple[str, str]]] = {}
+    texts: dict[Recipe, str] = {}
     of_data = functools.cache(functools.partial(_data, out=out))
     for recipe in recipes:
         bare = replace(recipe, start=None)
@@ -131,7 +131,7 @@ def _sources(recipes: list[Recipe], drawn: bool, out: Path | None) -> Iterator[s
             problem, files = catalogue.built(bare)
             if drawn:
                 check_drawable(problem)
-            texts[bare] = sorted((str(file), _sha256(file)) for file in files if file.is_file())
+            texts[bare] = catalogue.digest(files)
         yield hashlib.sha256(repr((texts[bare], of_data(recipe.data))).encode()).hexdigest()
 
 
@@ -141,18 +141,10 @@ def _data(path: str | None, out: Path | None) -> str | list[tuple[str, int, int]
         return ""
     place = Path(path).resolve()
     if place.is_file():
-        return _sha256(place)
+        return catalogue.digest([place])
     apart = None if out is None else out.resolve()
     files = [file for file in sorted(place.rglob("*")) if file.is_file() and apart not in file.parents]
     return [(str(file.relative_to(place)), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
-
-
-def _sha256(file: Path) -> str:
-    try:
-        with file.open("rb") as content:
-            return hashlib.file_digest(content, "sha256").hexdigest()
-    except OSError as error:
-        raise InputError(f"{file} cannot be read: {error.strerror or error}") from error
 
 
 def _rooted(recipe: Recipe) -> Recipe:

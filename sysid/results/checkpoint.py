@@ -39,11 +39,14 @@ class Begun:
     strategy : str
     seed : int
         Of the search.
+    source : str
+        Digest of the files that the problem was made from: a user's own model is code, which no problem holds.
     """
 
     recipe: Recipe
     strategy: str
     seed: int
+    source: str = field(default="", compare=False)
 
     def __str__(self) -> str:
         recipe = self.recipe
@@ -53,12 +56,14 @@ class Begun:
 
     def to_tree(self) -> Tree:
         """Give the fields by their names; `from_tree` takes them back."""
-        return {"recipe": self.recipe.to_tree(), "strategy": self.strategy, "seed": str(self.seed)}
+        own = {"strategy": self.strategy, "seed": str(self.seed), "source": self.source}
+        return {"recipe": self.recipe.to_tree(), **own}
 
     @classmethod
     def from_tree(cls, tree: Tree) -> Begun:
-        """Give what `to_tree` made a tree of."""
-        return cls(Recipe.from_tree(tree["recipe"]), tree["strategy"], int(tree["seed"]))
+        """Give what `to_tree` made a tree of; earlier ones have no source."""
+        recipe = Recipe.from_tree(tree["recipe"])
+        return cls(recipe, tree["strategy"], int(tree["seed"]), tree.get("source", ""))
 
 
 @dataclass(frozen=True)
@@ -160,7 +165,7 @@ def identity(
     problem: Problem, strategy: str | Strategy, seed: int, start: ArrayLike | Structure | None,
     max_evaluations: int | None,
 ) -> str:  # fmt: skip
-    """A text that tells one search from another: a digest of all that its bits depend on.
+    """A text that tells one search from another: a digest of all that its bits depend on but the code of own models.
 
     Raises
     ------

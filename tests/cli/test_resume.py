@@ -84,9 +84,49 @@ def test_the_problem_may_be_said_again_and_must_be_the_same(stopped, complaint):
 
 
 def test_a_module_that_was_changed_gives_no_mixture(stopped, complaint, here):
+    state = (stopped / FILE_NAME).read_bytes()
     (here / "pair.py").write_text((here / "pair.py").read_text().replace("[0.01, 0.02]", "[0.01, 0.03]"))
     assert cli.main(["run", "--resume", "out"]) == 2
-    assert "is of another search: the problem, its records" in complaint()
+    error = complaint()
+    assert "out holds an unfinished run of pair.py, strategy swarm, seed 0, and since it began its module or" in error
+    assert "with --out out --fresh to begin anew" in error
+    assert (stopped / FILE_NAME).read_bytes() == state
+    assert cli.main([*RUN, "--fresh"]) == 0
+
+
+OWN = """import sysid
+
+
+class Light(sysid.ModalDamping):
+    def ratios(self, geometry, y, omega):
+        return y
+"""
+
+
+class TestAModelOfTheUsersOwn:
+    """Its code stands in no record: only the text of the file beside the module tells an edit."""
+
+    @pytest.fixture
+    def module(self, module, tmp_path):
+        (tmp_path / "own.py").write_text(OWN)
+        return module.replace("import sysid\n", "import sysid\nfrom own import Light\n", 1).replace(
+            "goal=1e-6", "damping=Light(), goal=1e-6"
+        )
+
+    def test_its_edit_is_told_and_undone_the_run_goes_on(self, stopped, complaint, here, capsys):
+        (here / "own.py").write_text(OWN.replace("return y", "return 2 * y"))
+        assert cli.main(["run", "--resume", "out"]) == 2
+        assert "its module or what this imports from beside itself was edited" in complaint()
+        (here / "own.py").write_text(OWN)
+        assert cli.main(["run", "--resume", "out"]) == 0
+        assert capsys.readouterr().out.startswith("going on with pair.py")
+
+    def test_a_folder_that_was_moved_as_a_whole_goes_on(self, stopped, here, capsys, monkeypatch, tmp_path_factory):
+        place = tmp_path_factory.mktemp("elsewhere") / "moved"
+        here.rename(place)
+        monkeypatch.chdir(place)
+        assert cli.main(["run", "--resume", "out"]) == 0
+        assert capsys.readouterr().out.startswith("going on with pair.py")
 
 
 @pytest.mark.parametrize(
