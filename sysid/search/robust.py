@@ -43,21 +43,21 @@ def settled(problem: Problem, end: Outcome, strategy: Strategy, session: Session
     for number in range(1, _ROUNDS + 1):
         try:
             again = _fitted(fitted, end, strategy, session)
-            if again.stopped is None and end.strategy != Modal.name:
+            if again.stopped is not None:
+                raise again.stopped
+            if end.strategy != Modal.name:
                 again = _farther(problem, end, again)
             fitted = problem.pseudo_values(again.structure, again.x)
         except (Stop, KeyboardInterrupt) as stop:
             return _cut_short(end, str(stop) or "interrupted", stop)
         except (InputError, SolverError) as error:
             return _cut_short(end, f"round {number} of Huber's loss came to nothing: {error}")
-        if again.stopped is not None:
-            return _cut_short(end, str(again.stopped) or "interrupted", again.stopped)
         moved = _moved(fitted, end, again)
         session.log(f"round {number} of Huber's loss: {again.message}; the unknowns move by {moved:.2g} deviations")
         end = _with_round(problem.screened, end, again, session)
         if moved < _SETTLED:
             return replace(end, remarks=(*end.remarks, f"Huber's loss settled after {number} rounds"))
-        if session.max_time is not None and session.seconds > session.max_time:
+        if session.is_over:
             break
     told = f"Huber's loss did not settle in {number} rounds: the last moved by {moved:.2g} deviations"
     return replace(end, remarks=(*end.remarks, told)) if moved < _NEAR else _cut_short(end, told)

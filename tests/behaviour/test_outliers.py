@@ -144,6 +144,25 @@ def test_a_wrong_model_is_doubted_as_it_is_by_squares():
     assert any("misses" in sentence for sentence in result.undetermined), result.undetermined
 
 
+@pytest.mark.parametrize(("raised", "told"), [(StopIteration, "stopped the search"), (ZeroDivisionError, None)])
+def test_a_callback_stops_a_round_of_the_loss_and_its_mistakes_are_not_swallowed(raised, told):
+    at = []
+
+    def in_a_round(progress):
+        again = bool(at) and progress.phase == at[-1][0] == "local phase" and progress.iteration <= at[-1][1]
+        at.append((progress.phase, progress.iteration))
+        if again:
+            raise raised
+
+    problem = two_floors(measured(np.random.default_rng(3)), loss="huber")
+    if told is None:
+        with pytest.raises(raised):
+            sysid.identify(problem, strategy=ONE_START, rng=0, callback=in_a_round)
+    else:
+        result = sysid.identify(problem, strategy=ONE_START, rng=0, callback=in_a_round)
+        assert told in result.message and not result.success and not result.interrupted
+
+
 def test_what_cannot_be_is_refused():
     test = measured(np.random.default_rng(0))
     with pytest.raises(sysid.InputError, match="loss = 'l1' is unknown; give one of 'squares', 'huber'"):
