@@ -10,11 +10,11 @@ from scipy.optimize import linear_sum_assignment
 
 from sysid.assessment.sensitivity import sensitivity
 from sysid.jobs.quantities import FREQUENCY, RATIO, label, labelled, quantities
+from sysid.measurement.noise import raised
 from sysid.nlp import EXACT
 from sysid.results.identification import Identification
 from sysid.structure.structure import Array, ComplexArray
 
-_FLOOR = 1e-6  # of the median stated deviation: smaller ones are raised to it, as in the fit
 _LEAST = 0.01  # least variance of a step, as a share of the part's own
 _SAME = 0.1  # relative distance of frequencies up to which a mode is looked for
 
@@ -219,10 +219,8 @@ def _weighted_misfits(result: Identification) -> Iterator[tuple[ComplexArray, fl
 
 
 def _over(misfit: ComplexArray, std: Array | None) -> tuple[ComplexArray, float]:
-    if std is None or not np.any(std > 0):
-        return misfit.ravel(), 0.0
-    raised = np.maximum(std, _FLOOR * np.median(std[std > 0]))
-    return np.ravel(misfit / raised), float(np.sum(np.log(raised)))
+    floored = raised(std)
+    return (misfit.ravel(), 0.0) if floored is None else (np.ravel(misfit / floored), float(np.sum(np.log(floored))))
 
 
 def _parameters(result: Identification) -> int:

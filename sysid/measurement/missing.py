@@ -33,8 +33,7 @@ def present(given: dict[str, Any]) -> dict[str, Any]:
     if not np.any(keep):
         told = ", ".join(f"{name} at {np.count_nonzero(hole)}" for name, hole in holes.items() if np.any(hole))
         raise InputError(f"missing='drop' leaves no line: of {lines}, NaN stands in {told}")
-    wide = {name for name in holes if arrays[name].ndim and arrays[name].shape[-1] == lines}
-    return given | {name: array[..., keep] if name in wide else array for name, array in arrays.items()}
+    return given | {name: a[..., keep] if a.shape[-1:] == (lines,) else a for name, a in arrays.items()}
 
 
 def complete(name: str, value: ArrayLike, kind: type = float) -> NDArray[Any]:

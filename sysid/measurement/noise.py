@@ -23,8 +23,16 @@ def separable(std: Array | None, shape: tuple[int, int, int]) -> tuple[Array, Ar
     shape : (runs, channels, n_freq)
     """
     runs, channels, lines = shape
-    if std is None or not np.any(std > 0):
+    floored = raised(std)
+    if floored is None:
         return np.ones(channels), np.ones((runs, lines))
-    weight = -np.log(np.maximum(std, _LEAST * np.median(std[std > 0])))
+    weight = -np.log(floored)
     channel = weight.mean(axis=(0, 2))
     return np.exp(channel), np.exp((weight - channel[:, None]).mean(axis=1))
+
+
+def raised(std: Array | None) -> Array | None:
+    """Stated deviations as fits weigh by them, the smallest raised; None where none is stated, or none above zero."""
+    if std is None or not np.any(std > 0):
+        return None
+    return np.maximum(std, _LEAST * np.median(std[std > 0]))
