@@ -83,7 +83,7 @@ def short_name(problem: str) -> str:
     return problem.rpartition(".")[2]
 
 
-def build(recipe: Recipe, *, check: bool = True) -> Problem:
+def build(recipe: Recipe) -> Problem:
     """Load a problem module and call its ``problem()``.
 
     Parameters
@@ -92,8 +92,6 @@ def build(recipe: Recipe, *, check: bool = True) -> Problem:
         ``module`` is a path to a module (it ends in .py or holds a separator), else a module in
         ``./problems``, else a bundled problem, else a dotted module that Python can import.
         ``data`` reaches ``problem()`` as a `pathlib.Path`, or as None, ``parameters`` each by its name.
-    check : bool
-        Whether to refuse a problem that cannot be searched, for which poles may be looked for: `identify` does it too.
 
     Raises
     ------
@@ -101,13 +99,14 @@ def build(recipe: Recipe, *, check: bool = True) -> Problem:
         Whatever is wrong with the module, its data or what it gives, a problem that cannot be searched too; an
         InputError from inside the module passes as it is, any other exception is told with its line of the module.
     """
-    return built(recipe, check=check)[0]
+    return built(recipe)[0]
 
 
 def built(recipe: Recipe, *, check: bool = True) -> tuple[Problem, frozenset[Path]]:
     """What `build` gives, and the files it was made from: the module, and what that imported from beside itself.
 
-    Of a dotted module, which Python imports, the module alone.
+    Of a dotted module, which Python imports, the module alone. Without `check` a problem that cannot be searched is not
+    refused, for which poles may be looked for: `identify` does it too.
     """
     data = None if recipe.data is None else Path(recipe.data)
     if recipe.data is not None and not os.path.exists(recipe.data):  # noqa: PTH110 - a path may be "", or too long

@@ -8,13 +8,12 @@ from pathlib import Path
 from sysid import catalogue
 from sysid.cli import parameters
 from sysid.cli.display import Output, complain
-from sysid.cli.files import results_folder, strict_json
+from sysid.cli.files import png, results_folder, strict_json, write_files
 from sysid.cli.status import INTERRUPTED, NOT_REACHED, SUCCESS
 from sysid.compare import peers, table
 from sysid.compare.comparison import Comparison, compare
 from sysid.compare.method_result import MethodResult
 from sysid.results.identification import Recipe
-from sysid.results.storage import atomically
 from sysid.results.version import __version__
 
 PICTURE = "comparison.png"
@@ -48,18 +47,13 @@ def run(options: argparse.Namespace, out: Output) -> int:
 
 def _write(compared: Comparison, recipe: Recipe, folder: Path, out: Output, *, rows: bool) -> None:
     """Write the picture, and the rows of the table as CSV and JSON where they are wanted."""
-    from sysid.plot.canvas import own_style, to_png
     from sysid.plot.comparison import comparison
 
     files = {}
     if any(result.ran for result in compared.results):
-        with own_style():
-            files[PICTURE] = to_png(comparison(compared, recipe.title), dpi=130)
+        files[PICTURE] = png(comparison, compared, recipe.title)
     if rows:
         head = {"problem": recipe.module, "parameters": recipe.parameters, "version": __version__}
         files["comparison.csv"] = table.as_csv(compared).encode()
         files["comparison.json"] = strict_json({**head, **compared.to_dict()}).encode()
-    for name, content in files.items():
-        with atomically(folder / name) as temporary:
-            temporary.write_bytes(content)
-        out.write(f"{folder / name}\n")
+    write_files(folder, files, out)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from sysid.cli.display import Output
-from sysid.cli.files import table_as_csv, write_files
+from sysid.cli.files import png, table_as_csv, write_files
 from sysid.jobs.job import JobResult
 from sysid.jobs.spread import Spread, spreads
 from sysid.results.identification import Identification, Recipe
@@ -16,13 +16,12 @@ from sysid.results.identification import Identification, Recipe
 
 def tell(folder: Path, result: Identification, recipe: Recipe, ends: list[JobResult], out: Output) -> None:
     """Write all draws; where two of them or more are fits, print their spreads and write these and the picture."""
-    from sysid.plot.canvas import own_style, to_png
     from sysid.plot.draws import draws as picture
 
     each: list[Sequence[object]] = [
         ("draw", "seed", "success", "residual", "message", *result.problem.formulation.labels)
     ]
-    for end in sorted(ends, key=lambda one: one.index):
+    for end in ends:
         left = repr(end.residual) if end.has_result else ""
         each.append((end.index, end.seed, end.success, left, end.message, *map(repr, end.x.tolist())))
     files, count = {"draws.csv": table_as_csv(each)}, sum(end.success for end in ends)
@@ -35,8 +34,7 @@ def tell(folder: Path, result: Identification, recipe: Recipe, ends: list[JobRes
         of_all += [(s.name, repr(s.value), repr(s.std), repr(s.drawn), repr(s.inside)) for s in found]
         files["spreads.csv"] = table_as_csv(of_all)
         if any(np.isfinite(spread.ratio) for spread in found):
-            with own_style():
-                files["draws.png"] = to_png(picture(found, count, recipe.title), dpi=130)
+            files["draws.png"] = png(picture, found, count, recipe.title)
     write_files(folder, files, out)
 
 

@@ -6,8 +6,9 @@ import csv
 import io
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from sysid.cli.display import Output
 from sysid.errors import InputError
@@ -41,6 +42,14 @@ def table_as_csv(rows: Sequence[Sequence[object]]) -> bytes:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue().encode()
+
+
+def png(picture: Callable[..., Any], *given: Any, **named: Any) -> bytes:
+    """A picture of what is given, in the package's own style."""
+    from sysid.plot.canvas import own_style, to_png
+
+    with own_style():
+        return to_png(picture(*given, **named), dpi=130)
 
 
 def write_files(folder: Path, files: dict[str, bytes], out: Output) -> None:

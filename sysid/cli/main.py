@@ -404,18 +404,14 @@ def _orders(text: str) -> tuple[int, int]:
     return int(low), int(high)
 
 
-def _count(text: str) -> int:
+def _whole(least: int, text: str) -> int:
     with contextlib.suppress(ValueError):
-        if (count := int(text)) >= 1:
-            return count
-    raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1")
+        if (given := int(text)) >= least:
+            return given
+    raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least}")
 
 
-def _seed(text: str) -> int:
-    with contextlib.suppress(ValueError):
-        if (seed := int(text)) >= 0:
-            return seed
-    raise argparse.ArgumentTypeError(f"{text!r} is not a nonnegative integer")
+_count, _seed = functools.partial(_whole, 1), functools.partial(_whole, 0)
 
 
 def _seconds(text: str) -> float:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sysid.cli import draws, sweeps
 from sysid.cli.display import Output, complain
-from sysid.cli.files import results_folder, table_as_csv, write_files
+from sysid.cli.files import png, results_folder, table_as_csv, write_files
 from sysid.cli.status import INTERRUPTED, NOT_REACHED, SUCCESS
 from sysid.errors import InputError
 from sysid.jobs.engine import cluster, processes
@@ -72,8 +72,9 @@ def _numbered(word: str, count: int) -> tuple[str, ...]:
 
 
 def _ends(jobs: Iterator[JobResult], titles: Sequence[str], out: Output) -> tuple[list[JobResult], bool]:
-    """Tell the ends of jobs as they come; whether Ctrl-C ended that."""
+    """Tell the ends of jobs as they come, and give them by index; whether Ctrl-C ended that."""
     ends: list[JobResult] = []
+    interrupted = False
     try:
         for end in jobs:
             ends.append(end)
@@ -81,8 +82,8 @@ def _ends(jobs: Iterator[JobResult], titles: Sequence[str], out: Output) -> tupl
             out.write(f"{len(ends):4d} of {len(titles)}  {titles[end.index]}  {left}  {end.message}\n")
             out.flush()
     except KeyboardInterrupt:
-        return ends, True
-    return ends, False
+        interrupted = True
+    return sorted(ends, key=lambda one: one.index), interrupted
 
 
 def table(minima: list[Minimum], starts: int) -> str:
@@ -134,22 +135,15 @@ def _write(
     folder: Path, recipe: Recipe, ends: list[JobResult], minima: list[Minimum], problem: Problem, out: Output
 ) -> None:
     """Write the ends of all starts as CSV, and the picture."""
-    from sysid.plot.canvas import own_style, to_png
     from sysid.plot.minima import minima as picture
 
     of = {end.index: i + 1 for i, minimum in enumerate(minima) for end in minimum.results}
-    rows: list[Sequence[object]] = [
-        ("start", "seed", "success", "residual", "minimum", "message", *problem.formulation.labels)
-    ]
-    rows += [
-        (
-            end.index, end.seed, end.success, repr(end.residual) if end.has_result else "", of.get(end.index, ""),
-            end.message, *map(repr, end.x.tolist()),
-        )
-        for end in sorted(ends, key=lambda one: one.index)
-    ]  # fmt: skip
+    names = ("start", "seed", "success", "residual", "minimum", "message", *problem.formulation.labels)
+    rows: list[Sequence[object]] = [names]
+    for end in ends:
+        left, minimum = repr(end.residual) if end.has_result else "", of.get(end.index, "")
+        rows.append((end.index, end.seed, end.success, left, minimum, end.message, *map(repr, end.x.tolist())))
     files = {"starts.csv": table_as_csv(rows)}
     if minima:
-        with own_style():
-            files["minima.png"] = to_png(picture(minima, recipe.title, goal=problem.goal), dpi=130)
+        files["minima.png"] = png(picture, minima, recipe.title, goal=problem.goal)
     write_files(folder, files, out)

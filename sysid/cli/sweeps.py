@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 import textwrap
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from sysid import catalogue
 from sysid.cli.display import Output
-from sysid.cli.files import table_as_csv, write_files
+from sysid.cli.files import png, table_as_csv, write_files
 from sysid.errors import InputError
 from sysid.jobs.changes import Band, Change, Modes, WithoutRun, WithoutSensor
 from sysid.jobs.job import JobResult
@@ -78,7 +78,7 @@ def sweep_of(options: argparse.Namespace, result: Identification, recipe: Recipe
         return None
     if options.leave_out:
         changes[0].of(result.problem)  # tells at once where nothing can be left out
-    _check_records(result, catalogue.build(replace(recipe, start=None)), recipe)
+    _check_records(result, catalogue.build(recipe), recipe)
     return Sweep(name, told, tuple(change.title for change in changes), (recipe,), changes)
 
 
@@ -101,13 +101,12 @@ def tell(
     folder: Path, result: Identification, recipe: Recipe, sweep: Sweep, ends: Sequence[JobResult], out: Output
 ) -> None:
     """Print the table of all identifications, and write it, all moves and the picture."""
-    from sysid.plot.canvas import own_style, to_png
     from sysid.plot.sweep import sweep as picture
 
     part = sweep.of_parts
     own = scored(result, np.nan if part else None)
     rows = [Compared(recipe.title, result.success, result.residual, result.message, own)]
-    for end in sorted(ends, key=lambda one: one.index):
+    for end in ends:
         if end.score is not None:
             moved = moves(own, end.score, part=part)
             title = sweep.titles[end.index]
@@ -116,8 +115,7 @@ def tell(
     without = [(sweep.titles[end.index], end.message) for end in ends if end.score is None]
     files = {f"{sweep.name}.csv": _as_csv(rows, without, part), f"{sweep.name}_moves.csv": _moves_as_csv(rows)}
     if len(rows) > 1:
-        with own_style():
-            files[f"{sweep.name}.png"] = to_png(picture(rows, recipe.title, part=part), dpi=130)
+        files[f"{sweep.name}.png"] = png(picture, rows, recipe.title, part=part)
     write_files(folder, files, out)
 
 
@@ -159,13 +157,11 @@ def criteria(rows: Sequence[Compared]) -> dict[str, list[float]]:
 def _farthest(steps: Sequence[Move]) -> str:
     known = [step for step in steps if np.isfinite(step.deviations)]
     relative = [step for step in steps if np.isfinite(step.relative)]
-    if known:
-        step = max(known, key=lambda one: abs(one.deviations))
-        return f"{step.name}: {100 * step.relative:+.2g} %, {abs(step.deviations):.1f} std"
-    if relative:
-        step = max(relative, key=lambda one: abs(one.relative))
-        return f"{step.name}: {100 * step.relative:+.2g} %"
-    return ""
+    if not (known or relative):
+        return ""
+    step = max(known or relative, key=lambda one: abs(one.deviations if known else one.relative))
+    told = f"{step.name}: {100 * step.relative:+.2g} %"
+    return f"{told}, {abs(step.deviations):.1f} std" if known else told
 
 
 def _notes(rows: Sequence[Compared], part: bool) -> Iterator[str]:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from typing import Any, TypeVar, cast
 
-from sysid.errors import InputError
+from sysid.errors import InputError, whole_number
 
 Task = TypeVar("Task")
 Answer = TypeVar("Answer")
@@ -35,9 +35,7 @@ def processes(workers: int | None = None) -> Callable[[], Executor]:
     InputError
         Where it is not a positive whole number.
     """
-    count = workers if workers is not None else _processors()
-    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise InputError(f"workers = {workers!r}: a whole number from 1 is needed")
+    count = _processors() if workers is None else whole_number("workers", workers, at_least=1)
 
     def make() -> Executor:
         # A fork would copy locks of threads that do not exist in the child.

@@ -57,14 +57,11 @@ def spreads(result: Identification, ends: Sequence[JobResult]) -> list[Spread]:
         raise InputError(f"{len(found)} of {len(ends)} draws have a result; two are needed for a spread")
     u = result.uncertainty
     stds = labelled(u.natural_frequencies, u.damping_ratios, u.variables)
-    identified, draws = quantities(result), [quantities(_moved(result, end)) for end in found]
+    structures = [result.problem.structure(end.x) for end in found]
+    draws = [quantities(replace(result, x=end.x, structure=s)) for end, s in zip(found, structures, strict=True)]
     made = []
-    for name, value in identified.items():
+    for name, value in quantities(result).items():
         off, std = np.array([draw[name] for draw in draws]) - value, stds.get(name, np.nan)
         inside = float(np.mean(np.abs(off) <= _LINEAR * std)) if np.isfinite(std) else np.nan
         made.append(Spread(name, value, std, float(np.sqrt(np.mean(off**2))), inside))
     return made
-
-
-def _moved(result: Identification, end: JobResult) -> Identification:
-    return replace(result, x=end.x, structure=result.problem.structure(end.x))

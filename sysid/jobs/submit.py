@@ -82,9 +82,7 @@ def submit(
                 f"submit takes recipes, not a {type(one).__name__}: a job is rebuilt where it runs, so save the "
                 "problem as a module, problem.py, and give sysid.Recipe('problem.py')"
             )
-    if isinstance(starts, bool) or not isinstance(starts, int) or starts < 1:
-        raise InputError(f"starts = {starts!r}: a whole number from 1 is needed")
-    whole_number("draws", draws, at_least=0)
+    starts, draws = whole_number("starts", starts, at_least=1), whole_number("draws", draws, at_least=0)
     if draws and (starts > 1 or any(one.start is None for one in recipes)):
         raise InputError("draws need Recipe.start, the unknowns that were identified, and exclude starts")
     if changes != ():

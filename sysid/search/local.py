@@ -93,7 +93,7 @@ def solve_or_read(problem: Problem, x: Array, session: Session, **settings: Any)
         return LocalResult(**part.found)
     result = solve(problem, x, max_time=session.left, **settings)
     if not result.curve.size:
-        session.leave_out()
+        session.left_out = True
     if result.stopped is None and not session.cut_short:
         part.ended(lambda: {name: value for name, value in vars(result).items() if name != "stopped"})
     return result

@@ -141,7 +141,7 @@ class Session:
         self.begun = time.perf_counter()
         self.lines: list[str] = []
         self.stop_asked: Stop | None = None  # by a callback, before there was anything to keep
-        self._left_out = False  # a part of the search, for want of time
+        self.left_out = False  # a part of the search, for want of time
 
     @property
     def seconds(self) -> float:
@@ -161,11 +161,7 @@ class Session:
     @property
     def cut_short(self) -> bool:
         """Whether the time is over, or did not suffice for a part of the search: with more it may end elsewhere."""
-        return self.is_over or self._left_out
-
-    def leave_out(self) -> None:
-        """Note that a part of the search is left out for want of time."""
-        self._left_out = True
+        return self.is_over or self.left_out
 
     def allows(self, seconds: float) -> bool:
         """Whether work that cannot be stopped, and takes about so many seconds of a processor, may begin."""
@@ -210,7 +206,7 @@ class Session:
             self.report("poles", iteration, 0, objective)
         except Stop as stop:
             self.stop_asked = stop
-        if self.max_time is not None and self.seconds > self.max_time:
+        if self.is_over:
             raise Stop("the time was over before the poles of the records were found")
 
 

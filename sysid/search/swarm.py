@@ -395,7 +395,7 @@ class _Search:
                 f"(closed form {closed:.4e})"
             )
         else:
-            session.leave_out()
+            session.left_out = True
             session.log(f"{told}: in closed form alone, as IPOPT takes some {seconds:.1g} s to set up: too little time")
         objective, self.x, chosen = ends[1] if solved.success and other < closed else ends[0]
         self.history = replace(self.history, refinement=objective, refinement_error=chosen.error)

@@ -145,7 +145,7 @@ def test_the_session_counts_what_is_left():
     assert not session(10.0, 4.0).allows(2.3)
     late = session(10.0, 4.0)
     assert not late.cut_short
-    late.leave_out()
+    late.left_out = True
     assert late.cut_short
 
 

@@ -270,7 +270,7 @@ ON_THE_LINE = {
     "missing module of a folder": (["run", "some/where"], "No such file"),
     "missing data": (["run", "pair.py", "--data", "nowhere"], "'nowhere': there is no such file or folder"),
     "negative seed": (["run", "pair.py", "--seed", "-1"], "--seed"),
-    "seed that is no integer": (["run", "pair.py", "--seed", "1.5"], "'1.5' is not a nonnegative integer"),
+    "seed that is no integer": (["run", "pair.py", "--seed", "1.5"], "'1.5' is not a whole number from 0"),
     "no time": (["run", "pair.py", "--max-time", "0"], "'0' is not a positive number of seconds"),
     "time that is no number": (["run", "pair.py", "--max-time", "nan"], "--max-time"),
     "results in a file": (["run", "pair.py", "--out", "pair.py/out"], "pair.py is not a folder"),

@@ -281,7 +281,7 @@ def test_the_command_prints_it_and_a_mistake_is_one_line(tmp_path, monkeypatch, 
     assert re.search(r"^      mass share [+-]1 %$", out, re.M)  # a share of all is a share of none
     for arguments, message in (
         (["nowhere.py"], "cannot be read"), (["shear_building", "--data", "no"], "no such file"),
-        (["shear_building", "--seed", "x"], "not a nonnegative integer"), ([], "PROBLEM"),
+        (["shear_building", "--seed", "x"], "not a whole number from 0"), ([], "PROBLEM"),
     ):  # fmt: skip
         assert cli.main(["show", *arguments]) == 2
         error = capsys.readouterr().err

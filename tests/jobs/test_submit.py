@@ -104,7 +104,7 @@ def test_a_job_without_a_structure_to_start_from_says_so(recipe):
     [
         (dict(recipe=3), "a int: a job is rebuilt where it runs, so save the problem as a module"),
         (dict(recipe=[]), "no recipe"),
-        (dict(starts=0), "starts = 0"),
+        (dict(starts=0), "starts is 0; give 1 or above"),
         (dict(executor=4), "executor is a int"),
         (dict(recipe=sysid.Recipe("nowhere.py")), "nowhere.py cannot be read"),
     ],
@@ -119,7 +119,7 @@ def test_threads_are_refused(recipe):
         submit(recipe, executor=threads)
     with pytest.raises(sysid.InputError, match="IPOPT bears none"):
         list(submit(recipe, executor=lambda: ThreadPoolExecutor(1)))
-    with pytest.raises(sysid.InputError, match="workers = 0"):
+    with pytest.raises(sysid.InputError, match="workers is 0; give 1 or above"):
         processes(0)
 
 
