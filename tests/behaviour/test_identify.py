@@ -286,14 +286,8 @@ class TestGoal:
             assert not result.determined
 
 
+@pytest.mark.usefixtures("ctrl_c")
 class TestStopping:
-    @pytest.fixture(autouse=True)
-    def interruptible(self):
-        """Python's own answer to Ctrl-C, which a suite that runs in the background has not."""
-        before = signal.signal(signal.SIGINT, signal.default_int_handler)
-        yield
-        signal.signal(signal.SIGINT, before)
-
     @staticmethod
     def stop_at(phase, iteration, error):
         seen = []

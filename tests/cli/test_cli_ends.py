@@ -202,9 +202,10 @@ def test_the_signal_while_python_imports_is_one_line_of_the_command_alone(here, 
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-def test_a_third_ctrl_c_acts_at_once_and_what_it_breaks_is_no_error_of_ours(here, complaint, files, monkeypatch):
+def test_a_third_ctrl_c_acts_at_once_and_what_it_breaks_is_no_error_of_ours(
+    here, complaint, files, monkeypatch, ctrl_c
+):
     """As CasADi does it, the interrupt comes out as another exception."""
-    original = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def judge(self, particles):
         for _ in range(2):  # they wait for the next report
@@ -215,11 +216,8 @@ def test_a_third_ctrl_c_acts_at_once_and_what_it_breaks_is_no_error_of_ours(here
             raise SystemError("returned a result with an exception set") from error
 
     monkeypatch.setattr(SwarmObjective, "__call__", judge)
-    try:
-        assert cli.main(["run", "pair.py", "--strategy", "swarm"]) == 130
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    finally:
-        signal.signal(signal.SIGINT, original)
+    assert cli.main(["run", "pair.py", "--strategy", "swarm"]) == 130
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     assert complaint() == "sysid: interrupted; nothing was saved\n"
     assert files(here) == {"pair.py"}
 
@@ -227,10 +225,10 @@ def test_a_third_ctrl_c_acts_at_once_and_what_it_breaks_is_no_error_of_ours(here
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 @pytest.mark.parametrize("times", [1, 5])
 @pytest.mark.parametrize("place", ["search", "save", "report"])
-def test_ctrl_c_after_the_search_loses_nothing(here, complaint, files, monkeypatch, no_pictures, place, times):
+def test_ctrl_c_after_the_search_loses_nothing(here, complaint, files, monkeypatch, no_pictures, place, times, ctrl_c):
     """As the search is done, while the result is written, and while the page is made (a third one ends that)."""
     owner, name = {"search": (cli, "identify"), "save": (storage, "write"), "report": (report, "write")}[place]
-    original, before = getattr(owner, name), signal.signal(signal.SIGINT, signal.default_int_handler)
+    original = getattr(owner, name)
 
     def struck(*arguments, **options):
         if place == "search":
@@ -240,10 +238,7 @@ def test_ctrl_c_after_the_search_loses_nothing(here, complaint, files, monkeypat
         return found if place == "search" else original(*arguments, **options)
 
     monkeypatch.setattr(owner, name, struck)
-    try:
-        assert cli.main(["run", "pair.py"]) == 130
-    finally:
-        signal.signal(signal.SIGINT, before)
+    assert cli.main(["run", "pair.py"]) == 130
     ended = place == "report" and times > 2
     assert ("not every file" if ended else "the result is in results/pair") in complaint()
     written = files(here / "results/pair")
@@ -252,16 +247,12 @@ def test_ctrl_c_after_the_search_loses_nothing(here, complaint, files, monkeypat
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-def test_a_ctrl_c_that_one_holds_is_known_to_another_within_it():
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with DeferredInterrupt(patience=None) as outer:
-            signal.raise_signal(signal.SIGINT)
-            with DeferredInterrupt() as inner, pytest.raises(KeyboardInterrupt):
-                inner.check()
-            assert outer.count == 1
-    finally:
-        signal.signal(signal.SIGINT, before)
+def test_a_ctrl_c_that_one_holds_is_known_to_another_within_it(ctrl_c):
+    with DeferredInterrupt(patience=None) as outer:
+        signal.raise_signal(signal.SIGINT)
+        with DeferredInterrupt() as inner, pytest.raises(KeyboardInterrupt):
+            inner.check()
+        assert outer.count == 1
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
@@ -280,20 +271,17 @@ def test_a_time_limit_outlives_what_swallows_it_once():
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-def test_a_run_that_was_told_to_ignore_ctrl_c_ignores_it(here, monkeypatch, no_pictures):
+def test_a_run_that_was_told_to_ignore_ctrl_c_ignores_it(here, monkeypatch, no_pictures, ctrl_c):
     original = sysid.identify
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def identify(*arguments, **options):
         signal.raise_signal(signal.SIGINT)
         return original(*arguments, **options)
 
     monkeypatch.setattr(cli, "identify", identify)
-    try:
-        assert cli.main(["run", "pair.py"]) == 0
-        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGINT, before)
+    assert cli.main(["run", "pair.py"]) == 0
+    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
 
 @pytest.mark.skipif(os.name != "posix", reason="limits of POSIX")
