@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -69,7 +69,7 @@ class Answer:
     undetermined: tuple[str, ...]
     remarks: tuple[str, ...] = ()
     interrupted: bool = False
-    hurried: bool = False
+    hurried: bool = field(default=False, kw_only=True)
 
     @property
     def measurement(self) -> Measurement:
