@@ -138,24 +138,15 @@ def built(recipe: Recipe, *, check: bool = True) -> tuple[Problem, frozenset[Pat
 
 
 def digest(files: Collection[Path]) -> str:
-    """SHA-256 of some files, by what stands in them and their places beside each other, wherever their folder is.
-
-    Raises
-    ------
-    InputError
-        Where one cannot be read.
-    """
-    home = os.path.commonpath([file.parent for file in files])
-    texts = sorted((str(file.relative_to(home)), _sha256(file)) for file in files if file.is_file())
-    return hashlib.sha256(repr(texts).encode()).hexdigest()
-
-
-def _sha256(file: Path) -> str:
+    """SHA-256 of some files, by what stands in them and their places beside each other, wherever their folder is."""
+    home, texts = os.path.commonpath([file.parent for file in files]), []
     try:
-        with file.open("rb") as content:
-            return hashlib.file_digest(content, "sha256").hexdigest()
+        for file in sorted(file for file in files if file.is_file()):
+            with file.open("rb") as content:
+                texts.append((str(file.relative_to(home)), hashlib.file_digest(content, "sha256").hexdigest()))
     except OSError as error:
-        raise InputError(f"{file} cannot be read: {error.strerror or error}") from error
+        raise InputError(f"{error.filename} cannot be read: {error.strerror or error}") from error
+    return hashlib.sha256(repr(texts).encode()).hexdigest()
 
 
 def parameters_in_words(problem: str) -> str:

@@ -16,8 +16,6 @@ from sysid.compare.method_result import MethodResult
 from sysid.results.identification import Recipe
 from sysid.results.version import __version__
 
-PICTURE = "comparison.png"
-
 
 def run(options: argparse.Namespace, out: Output) -> int:
     """Compare, tell each method's end in a line, and write table and picture."""
@@ -51,7 +49,7 @@ def _write(compared: Comparison, recipe: Recipe, folder: Path, out: Output, *, r
 
     files = {}
     if any(result.ran for result in compared.results):
-        files[PICTURE] = png(comparison, compared, recipe.title)
+        files["comparison.png"] = png(comparison, compared, recipe.title)
     if rows:
         head = {"problem": recipe.module, "parameters": recipe.parameters, "version": __version__}
         files["comparison.csv"] = table.as_csv(compared).encode()

@@ -37,13 +37,7 @@ def begun(options: argparse.Namespace, out: Output) -> tuple[Begun, Path]:
 
 
 def with_source(search: Begun, files: Collection[Path], folder: Path) -> Begun:
-    """The search with the digest of the files that its problem was made from.
-
-    Raises
-    ------
-    InputError
-        Where it was begun with other ones.
-    """
+    """The search with the digest of the files that its problem was made from; refused where it began with others."""
     source = catalogue.digest(files)
     if search.source not in ("", source):
         raise InputError(

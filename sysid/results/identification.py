@@ -51,8 +51,10 @@ class Recipe:
     module: str
     data: str | None = None
     rng: int = 0
-    parameters: dict[str, Any] = field(default_factory=dict)
+    parameters: dict[str, Any] = field(default_factory=dict, compare=False)
     start: tuple[float, ...] | None = None
+    # Recipes are compared by their parameters as texts: 1, 1.0 and True are equal in Python.
+    _texts: frozenset[tuple[str, str]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         text("Recipe: module", self.module)
@@ -62,6 +64,7 @@ class Recipe:
         if not isinstance(self.parameters, Mapping) or not all(isinstance(name, str) for name in self.parameters):
             raise InputError("Recipe: parameters is a dictionary from names to values: parameters={'floors': 3}")
         object.__setattr__(self, "parameters", dict(self.parameters))
+        object.__setattr__(self, "_texts", frozenset((name, repr(value)) for name, value in self.parameters.items()))
         if self.start is not None:
             object.__setattr__(self, "start", tuple(finite_array("Recipe: start", self.start).ravel().tolist()))
         for name, value in self.parameters.items():
@@ -69,18 +72,6 @@ class Recipe:
                 raise InputError(f"parameter {name!r} is a field of the recipe itself")
             if not _is_plain(value):
                 raise InputError(f"parameter {name} = {value!r}: give a number, a text, or a list of them")
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Recipe) and self._key == other._key
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-    @property
-    def _key(self) -> tuple[object, ...]:
-        # As texts: 1, 1.0 and True are equal in Python, and may make different problems.
-        parameters = frozenset((name, repr(value)) for name, value in self.parameters.items())
-        return self.module, self.data, self.rng, parameters, self.start
 
     @property
     def title(self) -> str:
