@@ -66,6 +66,16 @@ def test_repeated_least_squares_of_pseudo_values_end_where_hubers_loss_is_least(
     assert off == pytest.approx(1 - 4 / 240, rel=0.02)
 
 
+def test_stated_deviations_are_not_lowered_where_the_records_scatter_less():
+    """Noise a third of what is stated: no number is far out, and the deviations are as stated, as by squares."""
+    y = 0.1 / 3 * circular(np.random.default_rng(0), 1, 2, 60)
+    stated = sysid.Measurement(np.arange(1.0, 61), np.ones((1, 1, 60)), y, rigid_body=np.zeros((2, 1)), response_std=0.1)
+    inferred = dataclasses.replace(stated, response_std=None)
+    for test, wanted, within in ((stated, 0.1, 1e-12), (inferred, 0.1 / 3 / np.sqrt(0.95), 0.15)):
+        (other,) = pseudo_values([(test, [np.zeros_like(y)])], 4)
+        np.testing.assert_allclose(other.response_std, wanted, rtol=within)
+
+
 def test_weights_fall_with_the_distance_beyond_the_constant():
     u = np.array([0.0, 0.5, -1.0j, 3.0 + 4.0j])
     np.testing.assert_allclose(weight(u), [1, 1, 1, TUNING / 5])
