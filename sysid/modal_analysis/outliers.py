@@ -61,6 +61,7 @@ _MEDIAN = 0.4549  # of the square of a standard normal number
 _LEAST_LINES = 5  # with fewer, no number has neighbours enough
 _UNDAMPED, _TINY = 1e-9, np.finfo(float).tiny
 _ROUNDS, _BOUNDED = 8, 3
+_HALVINGS = 60  # of the error of a scale's logarithm, at least
 
 Flags = NDArray[np.bool_]
 
@@ -126,6 +127,20 @@ def loss(u: ComplexArray) -> float:
     """Huber's, summed over whitened numbers."""
     size = np.abs(u)
     return float(np.sum(np.where(size > TUNING, 2 * TUNING * size - TUNING**2, size**2)))
+
+
+def deviance(misfit: ComplexArray) -> float:
+    """-2 log likelihood of complex misfits by the density that Huber's loss is of, its scale s the likeliest.
+
+    It is ``exp(-rho(e / s)) / (pi k s²)`` with ``k = 1 + exp(-c²) / 2c²``. Left out is ``2 N (1 + log pi)``, without
+    which that of N normal misfits is ``2 N log(mean |e|²)``.
+    """
+    size = np.abs(misfit)
+    scale = float(np.sqrt(np.mean(size**2)))
+    for _ in range(_HALVINGS):
+        scale = float(np.sqrt(np.mean(np.minimum(size, TUNING * scale) * size)))
+    of_scale = 2 * np.log(scale) + np.log1p(np.exp(-(TUNING**2)) / (2 * TUNING**2))
+    return float(2 * (loss(misfit / scale) + size.size * (of_scale - 1)))
 
 
 def pseudo_values(fits: Sequence[tuple[Measurement, list[ComplexArray]]], unknowns: int) -> list[Measurement]:

@@ -184,6 +184,26 @@ def test_the_deviance_is_that_of_normal_noise_of_one_size(result):
     assert scores[0].bic - scores[0].deviance == pytest.approx(5 * np.log(480))
 
 
+@pytest.mark.parametrize("stated", [True, False])
+def test_spikes_hardly_change_the_figures_of_hubers_loss(result, stated):
+    """One number of 60 is off by 30 deviations: a spring that is 3 % off stays clearly worse, the noise that of most.
+
+    The mean square of the misfit is 1 + 900 / 60 = 16 times as large, which takes over half of the deviance's step.
+    """
+    test, made = result.measurement, []
+    for spikes in (0, 30):
+        response = test.response.copy()
+        response[:, :, 10] += spikes * test.response_std[:, :, 10]
+        records = replace(test, response=response, response_std=test.response_std if stated else None)
+        given = replace(result.problem, measurement=records, loss="huber")
+        ends = [(x, given.structure(x)) for x in (result.x, result.x * [1.03, 1, 1, 1])]
+        own, off = (scored(replace(result, problem=given, x=x, structure=structure)) for x, structure in ends)
+        made.append((off.deviance - own.deviance, own.noise))
+    (step, noise), (spoiled_step, spoiled_noise) = made
+    assert spoiled_step > 0.7 * step > 300
+    assert spoiled_noise == pytest.approx(noise, rel=0.15)
+
+
 @pytest.mark.parametrize(
     ("force", "total", "expected"),
     [
