@@ -4,6 +4,7 @@ import contextlib
 import os
 import signal
 import sqlite3
+from argparse import Namespace
 from dataclasses import asdict, replace
 from itertools import combinations
 
@@ -13,6 +14,7 @@ import pytest
 from scipy.stats import norm
 
 import sysid
+from sysid.cli.sweeps import sweep_of
 from sysid.errors import InputError, SolverError
 from sysid.jobs import Band, Modes, Score, WithoutRun, WithoutSensor, moves, scored, submit
 from sysid.jobs.ledger import FILE_NAME
@@ -131,6 +133,41 @@ def test_what_is_predicted_is_the_residual_of_what_was_left_out(result):
         expected = np.linalg.norm(left[part]) / np.linalg.norm(size[part])
         assert change.predicted(whole, result) == pytest.approx(expected, rel=1e-12)
     assert np.isnan(Band(0.0, 20.0).predicted(whole, result))  # nothing is outside
+
+
+def spoiled(*, data=None, rng=0):
+    """The problem with spikes of 50 times the noise in its second run."""
+    given = problem()
+    test, response = given.measurement, given.measurement.response.copy()
+    response[1, :, ::15] += 50 * test.response_std[1, :, ::15]
+    return replace(given, measurement=replace(test, response=response), loss="huber")
+
+
+def with_further_test(*, data=None, rng=0, loss="huber"):
+    """The same, fitted twice."""
+    given = spoiled()
+    again = sysid.FurtherTest(
+        given.measurement, mass=MASS, stiffness=STRETCH.T @ np.diag(SPRINGS) @ STRETCH, damping=np.eye(2)
+    )
+    return replace(given, residuals=[again], loss=loss)
+
+
+def test_spikes_are_not_to_be_predicted_under_hubers_loss(result, tmp_path):
+    """The run that was left out is predicted as well as without its spikes."""
+    file = tmp_path / "spikes.py"
+    file.write_text(MODULE.format(folder=__file__.rpartition("/")[0]).replace("problem", "spoiled as problem"))
+    (end,) = submit(sysid.Recipe(str(file), start=tuple(result.x)), changes=[WithoutRun(1)])
+    assert end.score.predicted == pytest.approx(WithoutRun(1).predicted(problem(), result), rel=0.05)
+
+
+def test_a_variant_with_hubers_loss_has_the_same_further_tests(result, tmp_path):
+    """Spikes and all, though it is fitted to others; without them it would be another test."""
+    file = tmp_path / "twice.py"
+    named = MODULE.format(folder=__file__.rpartition("/")[0]).replace("problem", "with_further_test as problem")
+    file.write_text(named)
+    own = replace(result, problem=with_further_test(loss="squares"))
+    sweep = sweep_of(Namespace(variants=[str(file)]), own, sysid.Recipe(str(file)))
+    assert sweep.titles == (str(file),)
 
 
 def test_full_matrices_are_those_of_the_other_sensors_and_do_not_predict_the_one_left_out():
