@@ -18,6 +18,7 @@ from sysid.jobs.changes import Band, Change, Modes, WithoutRun, WithoutSensor
 from sysid.jobs.job import JobResult
 from sysid.jobs.score import Compared, Move, moves, scored
 from sysid.problem.problem import Problem
+from sysid.problem.terms import FurtherTest
 from sysid.results.identification import Identification, Recipe
 
 _FAR = 3.0  # standard deviations of a step, beyond which it counts as far
@@ -85,7 +86,7 @@ def sweep_of(options: argparse.Namespace, result: Identification, recipe: Recipe
 def _check_records(result: Identification, other: Problem, recipe: Recipe) -> None:
     """Refuse a problem of other records than the result's."""
     own, its = (
-        [problem.measurement, *(term.test for term in problem.formulation.further_tests)]
+        [problem.measurement, *(one.measurement for one in problem.residuals if isinstance(one, FurtherTest))]
         for problem in (result.problem, other)
     )
     names = ("freq", "base", "response", "force")

@@ -155,7 +155,7 @@ def _predicted(problem: Problem, result: Identification, change: Change) -> floa
         if part < whole:
             return np.nan
     try:
-        return change.predicted(problem, result)
+        return change.predicted(problem.screened, result)  # whose residual is of such records too
     except InputError:  # such as a base that does not move outside a band
         return np.nan
 

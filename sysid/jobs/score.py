@@ -11,6 +11,7 @@ from scipy.optimize import linear_sum_assignment
 from sysid.assessment.sensitivity import sensitivity
 from sysid.jobs.quantities import FREQUENCY, RATIO, label, labelled, quantities
 from sysid.measurement.noise import raised
+from sysid.modal_analysis import outliers
 from sysid.nlp import EXACT
 from sysid.results.identification import Identification
 from sysid.structure.structure import Array, ComplexArray
@@ -34,8 +35,9 @@ class Score:
         Real numbers of the records that were fitted.
     deviance : float
         -2 log likelihood of normal noise of the stated deviations, its scale as the misfit has it (where noise is not
-        stated: of one size in the accelerations, and in the force, of each test); but for a constant that is the same
-        for all models of the same records. NaN of an exact fit, and where the problem states a misfit of its own.
+        stated: of one size in the accelerations, and in the force, of each test); under Huber's loss of noise with the
+        tails that it supposes. But for a constant that is the same for all models of the same records. NaN of an exact
+        fit, and where the problem states a misfit of its own.
     predicted : float
         Relative residual of what was not fitted: what a change left out, else the problem's validation tests together;
         NaN where there is none, or where the rest does not tell its motion.
@@ -133,18 +135,15 @@ def scored(result: Identification, predicted: float | None = None) -> Score:
         predicted = _norm(wrong) / _norm([test.relative for test in tests]) if tests else np.nan
     noises = list(_weighted_misfits(result))
     exact = result.residual < EXACT
+    of_loss = outliers.deviance if problem.loss == "huber" else _normal_deviance
     deviance = np.nan
     if not exact and problem.formulation.fits_records:
-        # Of 2 N real numbers whose variances are e^(2 log_std) times one that the misfit tells.
-        logs = [e.size * float(np.log(np.mean(np.abs(e) ** 2))) + 2 * log_std for e, log_std in noises]
-        deviance = 2 * sum(logs)
+        deviance = sum(of_loss(e) + 4 * log_std for e, log_std in noises)
     u = None if exact else result.quick_uncertainty
     stds, noise = dict[str, float](), np.nan
     if u is not None:
         stds = labelled(u.natural_frequencies, u.damping_ratios, u.variables)
-        stated = problem.measurement.response_std is not None
-        misfit = noises[0][0][: problem.measurement.response.size]
-        noise = u.inflation**2 * (1.0 if stated else float(np.mean(np.abs(misfit) ** 2)))
+        noise = u.inflation**2 * _noise(result)
     return Score(
         determined=result.determined,
         parameters=_parameters(result) + len(noises),
@@ -207,7 +206,10 @@ def _nearest(own: Array, other: Array) -> list[tuple[int, int]]:
 
 def _weighted_misfits(result: Identification) -> Iterator[tuple[ComplexArray, float]]:
     """Misfits over the stated deviations, and the sum of the logarithms of these; those of one array share a scale."""
-    for test, structure in ((result.measurement, result.structure), *result.further_tests):
+    problem = result.problem
+    fits = problem.fits(result.structure, result.x)  # of the records as they are given
+    own = [] if problem.formulation.fits_records else [(result.measurement, result.structure)]
+    for test, structure in own + fits:
         parts = [(test.relative - test.predict(structure), test.response_std)]
         if test.force is not None:
             parts.append((test.force - test.predict_force(structure), test.force_std))
@@ -216,6 +218,23 @@ def _weighted_misfits(result: Identification) -> Iterator[tuple[ComplexArray, fl
             yield np.concatenate([e for e, _ in weighed]), sum(log_std for _, log_std in weighed)
         else:
             yield from weighed
+
+
+def _normal_deviance(misfit: ComplexArray) -> float:
+    """That of normal misfits whose one variance is their own mean square."""
+    return 2 * misfit.size * float(np.log(np.mean(np.abs(misfit) ** 2)))
+
+
+def _noise(result: Identification) -> float:
+    """Variance of the accelerations' noise that the uncertainty supposes, over the stated one where one is stated."""
+    problem, test = result.problem, result.measurement
+    if problem.loss == "huber":
+        counted = problem.pseudo_values(result.structure, result.x).measurement.response_std
+        assert counted is not None
+        return float(np.mean(counted**2) / (1.0 if test.response_std is None else np.mean(test.response_std**2)))
+    if test.response_std is not None:
+        return 1.0
+    return float(np.mean(np.abs(test.relative - test.predict(result.structure)) ** 2))
 
 
 def _over(misfit: ComplexArray, std: Array | None) -> tuple[ComplexArray, float]:

@@ -16,7 +16,7 @@ are repeated from their last answer :math:`x_0` until it stays. There :math:`J' 
 :math:`J' W \sigma \psi = 0`, as where the loss is least; a step is Newton's with the mean slope in place of each
 number's own; and the covariance of least squares, with the scatter of :math:`y^* - f` for noise, is Huber's:
 :math:`(J'J)^{-1} \sigma^2 \overline{|\psi|^2} / b^2`. Beyond c the slope is 0 along u and :math:`c/|u|` across it: on
-average :math:`c / 2|u|`.
+average :math:`c / 2|u|`. Where deviations are stated, noise that scatters less is not taken for smaller.
 
 What an outlier may do is bounded by its pull, not by its place: one at a line that alone decides something, such as the
 highest of a peak narrower than two lines, moves that by up to three deviations.
@@ -61,6 +61,7 @@ _MEDIAN = 0.4549  # of the square of a standard normal number
 _LEAST_LINES = 5  # with fewer, no number has neighbours enough
 _UNDAMPED, _TINY = 1e-9, np.finfo(float).tiny
 _ROUNDS, _BOUNDED = 8, 3
+_HALVINGS = 60  # of the error of a scale's logarithm, at least
 
 Flags = NDArray[np.bool_]
 
@@ -128,6 +129,20 @@ def loss(u: ComplexArray) -> float:
     return float(np.sum(np.where(size > TUNING, 2 * TUNING * size - TUNING**2, size**2)))
 
 
+def deviance(misfit: ComplexArray) -> float:
+    """-2 log likelihood of complex misfits by the density that Huber's loss is of, its scale s the likeliest.
+
+    It is ``exp(-rho(e / s)) / (pi k s²)`` with ``k = 1 + exp(-c²) / 2c²``. Left out is ``2 N (1 + log pi)``, without
+    which that of N normal misfits is ``2 N log(mean |e|²)``.
+    """
+    size = np.abs(misfit)
+    scale = float(np.sqrt(np.mean(size**2)))
+    for _ in range(_HALVINGS):
+        scale = float(np.sqrt(np.mean(np.minimum(size, TUNING * scale) * size)))
+    of_scale = 2 * np.log(scale) + np.log1p(np.exp(-(TUNING**2)) / (2 * TUNING**2))
+    return float(2 * (loss(misfit / scale) + size.size * (of_scale - 1)))
+
+
 def pseudo_values(fits: Sequence[tuple[Measurement, list[ComplexArray]]], unknowns: int) -> list[Measurement]:
     """Tests with pseudo-values about what a model makes of each in the place of their records, and these deviations.
 
@@ -144,7 +159,11 @@ def pseudo_values(fits: Sequence[tuple[Measurement, list[ComplexArray]]], unknow
     changed = []
     for test, made, parts in every:
         values = [f + part.std * weight(part.u) * part.u / slope for f, part in zip(made, parts, strict=True)]
-        stds = [spread * part.std for part in parts]
+        # As in squares, what is stated is raised where the records show more, and is never lowered.
+        stated = test.response_std, test.force_std
+        stds = [
+            part.std * (spread if own is None else max(spread, 1.0)) for part, own in zip(parts, stated, strict=False)
+        ]
         other = replace(test, response=test.response - test.relative + values[0], response_std=stds[0])
         changed.append(other if test.force is None else replace(other, force=values[1], force_std=stds[1]))
     return changed

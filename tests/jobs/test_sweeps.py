@@ -2,6 +2,7 @@
 
 import os
 import signal
+from argparse import Namespace
 from dataclasses import asdict, replace
 from itertools import combinations
 
@@ -11,6 +12,7 @@ import pytest
 from scipy.stats import norm
 
 import sysid
+from sysid.cli.sweeps import sweep_of
 from sysid.errors import InputError, SolverError
 from sysid.jobs import Band, Modes, Score, WithoutRun, WithoutSensor, moves, scored, submit
 from sysid.modal_analysis.residues import linear_residues
@@ -130,6 +132,41 @@ def test_what_is_predicted_is_the_residual_of_what_was_left_out(result):
     assert np.isnan(Band(0.0, 20.0).predicted(whole, result))  # nothing is outside
 
 
+def spoiled(*, data=None, rng=0):
+    """The problem with spikes of 50 times the noise in its second run."""
+    given = problem()
+    test, response = given.measurement, given.measurement.response.copy()
+    response[1, :, ::15] += 50 * test.response_std[1, :, ::15]
+    return replace(given, measurement=replace(test, response=response), loss="huber")
+
+
+def with_further_test(*, data=None, rng=0, loss="huber"):
+    """The same, fitted twice."""
+    given = spoiled()
+    again = sysid.FurtherTest(
+        given.measurement, mass=MASS, stiffness=STRETCH.T @ np.diag(SPRINGS) @ STRETCH, damping=np.eye(2)
+    )
+    return replace(given, residuals=[again], loss=loss)
+
+
+def test_spikes_are_not_to_be_predicted_under_hubers_loss(result, tmp_path):
+    """The run that was left out is predicted as well as without its spikes."""
+    file = tmp_path / "spikes.py"
+    file.write_text(MODULE.format(folder=__file__.rpartition("/")[0]).replace("problem", "spoiled as problem"))
+    (end,) = submit(sysid.Recipe(str(file), start=tuple(result.x)), changes=[WithoutRun(1)])
+    assert end.score.predicted == pytest.approx(WithoutRun(1).predicted(problem(), result), rel=0.05)
+
+
+def test_a_variant_with_hubers_loss_has_the_same_further_tests(result, tmp_path):
+    """Spikes and all, though it is fitted to others; without them it would be another test."""
+    file = tmp_path / "twice.py"
+    named = MODULE.format(folder=__file__.rpartition("/")[0]).replace("problem", "with_further_test as problem")
+    file.write_text(named)
+    own = replace(result, problem=with_further_test(loss="squares"))
+    sweep = sweep_of(Namespace(variants=[str(file)]), own, sysid.Recipe(str(file)))
+    assert sweep.titles == (str(file),)
+
+
 def test_full_matrices_are_those_of_the_other_sensors_and_do_not_predict_the_one_left_out():
     whole = problem(full=True)
     result = sysid.identify(WithoutSensor(0).of(whole), rng=0)
@@ -179,6 +216,26 @@ def test_the_deviance_is_that_of_normal_noise_of_one_size(result):
     assert scores[0].numbers == 2 * 2 * 2 * FREQ.size
     assert scores[0].aic - scores[0].deviance == 10
     assert scores[0].bic - scores[0].deviance == pytest.approx(5 * np.log(480))
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_spikes_hardly_change_the_figures_of_hubers_loss(result, stated):
+    """One number of 60 is off by 30 deviations: a spring that is 3 % off stays clearly worse, the noise that of most.
+
+    The mean square of the misfit is 1 + 900 / 60 = 16 times as large, which takes over half of the deviance's step.
+    """
+    test, made = result.measurement, []
+    for spikes in (0, 30):
+        response = test.response.copy()
+        response[:, :, 10] += spikes * test.response_std[:, :, 10]
+        records = replace(test, response=response, response_std=test.response_std if stated else None)
+        given = replace(result.problem, measurement=records, loss="huber")
+        ends = [(x, given.structure(x)) for x in (result.x, result.x * [1.03, 1, 1, 1])]
+        own, off = (scored(replace(result, problem=given, x=x, structure=structure)) for x, structure in ends)
+        made.append((off.deviance - own.deviance, own.noise))
+    (step, noise), (spoiled_step, spoiled_noise) = made
+    assert spoiled_step > 0.7 * step > 300
+    assert spoiled_noise == pytest.approx(noise, rel=0.15)
 
 
 @pytest.mark.parametrize(

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize_scalar
 
 import sysid
-from sysid.modal_analysis.outliers import TUNING, one_line, outliers, pseudo_values, screened, weight
+from sysid.modal_analysis.outliers import TUNING, deviance, one_line, outliers, pseudo_values, screened, weight
 
 FREQ = np.linspace(3.0, 16.0, 160)
 
@@ -64,6 +64,34 @@ def test_repeated_least_squares_of_pseudo_values_end_where_hubers_loss_is_least(
     # The stated scatter is that of the pseudo-values, raised by what four unknowns take of 120 numbers.
     off = np.mean(np.abs((other.response.ravel() - X @ beta) / other.response_std.ravel()) ** 2)
     assert off == pytest.approx(1 - 4 / 240, rel=0.02)
+
+
+def test_stated_deviations_are_not_lowered_where_the_records_scatter_less():
+    """Noise a third of what is stated: no number is far out, and the deviations are as stated, as by squares."""
+    y = 0.1 / 3 * circular(np.random.default_rng(0), 1, 2, 60)
+    still, lines = np.zeros((2, 1)), np.arange(1.0, 61)
+    stated = sysid.Measurement(lines, np.ones((1, 1, 60)), y, rigid_body=still, response_std=0.1)
+    inferred = dataclasses.replace(stated, response_std=None)
+    for test, wanted, within in ((stated, 0.1, 1e-12), (inferred, 0.1 / 3 / np.sqrt(0.95), 0.15)):
+        (other,) = pseudo_values([(test, [np.zeros_like(y)])], 4)
+        np.testing.assert_allclose(other.response_std, wanted, rtol=within)
+
+
+def test_the_deviance_is_that_of_the_density_of_the_loss_at_its_likeliest_scale():
+    """The density by integration, its scale by SciPy; without the constant that normal misfits have too."""
+    rng, c = np.random.default_rng(0), TUNING
+    e = 0.3 * circular(rng, 400)
+    e[::50] *= 30
+    size = np.abs(e)
+    inside = quad(lambda r: r * np.exp(-(r**2)), 0, c)[0]
+    area = 2 * np.pi * (inside + quad(lambda r: r * np.exp(c**2 - 2 * c * r), c, 40)[0])
+
+    def twice(log_scale):
+        u = size / np.exp(log_scale)
+        return 2 * np.sum(np.where(u > c, 2 * c * u - c**2, u**2) + 2 * log_scale + np.log(area))
+
+    wanted = minimize_scalar(twice, bracket=(-3, 0)).fun - 2 * size.size * (1 + np.log(np.pi))
+    assert deviance(e) == pytest.approx(wanted, abs=1e-6)
 
 
 def test_weights_fall_with_the_distance_beyond_the_constant():
