@@ -12,15 +12,15 @@ from sysid.cli.files import png, table_as_csv, write_files
 from sysid.jobs.job import JobResult
 from sysid.jobs.spread import Spread, spreads
 from sysid.results.identification import Identification, Recipe
+from sysid.results.summary import counted
 
 
 def tell(folder: Path, result: Identification, recipe: Recipe, ends: list[JobResult], out: Output) -> None:
     """Write all draws; where two of them or more are fits, print their spreads and write these and the picture."""
     from sysid.plot.draws import draws as picture
 
-    each: list[Sequence[object]] = [
-        ("draw", "seed", "success", "residual", "message", *result.problem.formulation.labels)
-    ]
+    names = ("draw", "seed", "success", "residual", "message", *result.problem.formulation.labels)
+    each: list[Sequence[object]] = [names]
     for end in ends:
         left = repr(end.residual) if end.has_result else ""
         each.append((end.index, end.seed, end.success, left, end.message, *map(repr, end.x.tolist())))
@@ -52,4 +52,6 @@ def table(found: Sequence[Spread], count: int, asked: int) -> str:
         f"{100 / np.sqrt(2 * count):.0f} %; within: draws",
         "in the linear interval, which should hold 95 %",
     ]
-    return "\n".join(lines + ([f"{asked - count} draws have no fit and do not count"] if count < asked else []))
+    if count < asked:
+        lines.append(f"{counted(asked - count, 'draw')} without a fit: not counted")
+    return "\n".join(lines)

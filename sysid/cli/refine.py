@@ -21,6 +21,7 @@ from sysid.jobs.submit import submit
 from sysid.nlp import EXACT
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification, Recipe, load
+from sysid.results.summary import counted
 
 _SHOWN = 12  # minima in the table
 _STARTS = 16
@@ -35,16 +36,16 @@ def run(options: argparse.Namespace, out: Output) -> int:
     executor = _executor(options)
     sweep = sweeps.sweep_of(options, result, recipe)
     if sweep is not None:
-        titles, told = sweep.titles, sweep.told
+        titles, told = [*sweep.titles], sweep.told
         jobs = submit(sweep.recipes, changes=sweep.changes, strategy="auto", executor=executor, out=folder)
     elif options.draws is not None:
         if result.residual < EXACT:
             raise InputError(f"{source} fits its records exactly: without noise there is nothing to draw")
-        titles, told = _numbered("draw", options.draws), "draws of noise, each fitted from the result"
+        titles, told = [f"draw {i:4d}" for i in range(options.draws)], "draws of noise, each fitted from the result"
         jobs = submit(_started(recipe, source), draws=options.draws, executor=executor, out=folder)
     else:
         count = options.starts or _STARTS
-        titles, told = _numbered("start", count), "starts, the first at the result"
+        titles, told = [f"start {i:4d}" for i in range(count)], "starts, the first at the result"
         jobs = submit(_started(recipe, source), starts=count, executor=executor, out=folder)
     out.write(f"{recipe.title}: {len(titles)} {told}\n")
     ends, interrupted = _ends(jobs, titles, out)
@@ -65,10 +66,6 @@ def run(options: argparse.Namespace, out: Output) -> int:
         complain(f"interrupted after {len(ends)} of {len(titles)} jobs; the same command goes on from there")
         return INTERRUPTED
     return SUCCESS if any(end.success for end in ends) else NOT_REACHED
-
-
-def _numbered(word: str, count: int) -> tuple[str, ...]:
-    return tuple(f"{word} {i:4d}" for i in range(count))
 
 
 def _ends(jobs: Iterator[JobResult], titles: Sequence[str], out: Output) -> tuple[list[JobResult], bool]:
@@ -95,7 +92,7 @@ def table(minima: list[Minimum], starts: int) -> str:
     if len(minima) > _SHOWN:
         lines.append(f"and {len(minima) - _SHOWN} more")
     without = starts - sum(len(minimum.results) for minimum in minima)
-    lines += [f"{without} starts have no result"] if without else []
+    lines += [f"{counted(without, 'start')} without a result"] if without else []
     alike = len(as_good(minima))
     if alike > 1:
         lines.append(f"{alike} minima with different unknowns fit alike: the data and the model do not tell them apart")

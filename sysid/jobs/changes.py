@@ -149,7 +149,7 @@ class Modes:
 
     @property
     def title(self) -> str:
-        """Of its row in a table."""
+        """Name of its row in tables."""
         return f"{self.count} mode{'s' * (self.count > 1)}"
 
     def of(self, problem: Problem) -> Problem:
