@@ -98,7 +98,7 @@ def table(minima: list[Minimum], starts: int) -> str:
     lines += [f"{without} starts have no result"] if without else []
     alike = len(as_good(minima))
     if alike > 1:
-        lines.append(f"{alike} minima with different unknowns fit alike: the data and the model do not tell them apart")
+        lines.append(f"{alike} minima with different matrices or unknowns fit alike: the data and the model do not tell them apart")
     elif minima:
         lines.append(f"the best minimum was reached from {len(minima[0].results)} of {starts} starts")
     return "\n".join(lines)
