@@ -143,8 +143,12 @@ def _identified(job: Job, session: Session) -> JobResult:
         if result.interrupted:
             raise KeyboardInterrupt
     score = scored(result, None if job.change is None else _predicted(problem, result, job.change))
+    success, message = result.success, result.message
+    if score.numbers <= score.parameters:
+        success = False
+        message = f"{message}; {score.numbers} numbers of the records do not suffice for {score.parameters} parameters"
     x = np.zeros(0) if result.x is None else result.x
-    return JobResult(job.index, job.seed, result.success, result.message, x, result.residual, score)
+    return JobResult(job.index, job.seed, success, message, x, result.residual, score)
 
 
 def _predicted(problem: Problem, result: Identification, change: Change) -> float | None:
