@@ -175,8 +175,8 @@ def moves(own: Score, other: Score, *, part: bool) -> tuple[Move, ...]:
     own, other : Score
     part : bool
         Whether the other is the same model on a part of the records. A step is then told in the standard deviation that
-        it has by noise alone, see `_variance`; else in the larger of both results', for noise of the size that the better
-        fit leaves: what a model lacks is in its own deviations too, and would hide its steps.
+        it has by noise alone, see `_variance`; else in the larger of both results', for noise of the size that the
+        better fit leaves: what a model lacks is in its own deviations too, and would hide its steps.
     """
     of_modes = {label(i, what) for i in range(own.modes) for what in (FREQUENCY, RATIO)}
     pairs = [(name, name) for name in own.values if name not in of_modes and name in other.values]

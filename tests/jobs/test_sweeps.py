@@ -333,7 +333,9 @@ def test_without_the_one_run_along_an_axis_its_modes_cannot_be_found():
     full = problem(full=True)
     assert WithoutRun(0).of(full).measurement.n_runs == 1
     tower = sysid.catalogue.build(sysid.Recipe("cantilever_tower", parameters={"elements": 2, "noise": 0.01}))
-    with pytest.raises(InputError, match="without run 2 the base does not move in every direction: modes that this run"):
+    with pytest.raises(
+        InputError, match="without run 2 the base does not move in every direction: modes that this run"
+    ):
         WithoutRun(1).of(tower)
 
 
