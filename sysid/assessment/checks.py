@@ -247,4 +247,12 @@ def _twins(test: Measurement, structure: Structure) -> Iterator[str]:
         bound = _ALIKE * np.hypot(misfit[i], misfit[j]) + 1e-9 * max(size[i], size[j])
         apart = min(np.linalg.norm(relative[i] - relative[j]), np.linalg.norm(relative[i] + relative[j]))
         if size[i] > bound and apart <= bound:
-            yield f"sensors {names[j]} and {names[i]} record one motion and are one degree of freedom: leave one out"
+            told = f"sensors {names[j]} and {names[i]} record one motion"
+            if structure.n < test.n_sensors:
+                # A fit of fewer modes than there are leaves all that would tell its sensors apart.
+                yield (
+                    f"{told} within the misfit: they are one degree of freedom (leave one out), or modes are missing: "
+                    f"{structure.n} tell no more than {structure.n} of {test.n_sensors} sensors apart"
+                )
+            else:
+                yield f"{told} and are one degree of freedom: leave one out"

@@ -24,7 +24,8 @@ def tell(folder: Path, result: Identification, recipe: Recipe, ends: list[JobRes
     for end in ends:
         left = repr(end.residual) if end.has_result else ""
         each.append((end.index, end.seed, end.success, left, end.message, *map(repr, end.x.tolist())))
-    files, count = {"draws.csv": table_as_csv(each)}, sum(end.success for end in ends)
+    count = sum(end.success for end in ends)
+    files: dict[str, bytes | None] = {"draws.csv": table_as_csv(each), "spreads.csv": None, "draws.png": None}
     if count < 2:
         out.write(f"\n{count} of {len(ends)} draws ended in a fit; two are needed for a spread\n\n")
     else:

@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,9 +52,12 @@ def png(picture: Callable[..., Any], *given: Any, **named: Any) -> bytes:
         return to_png(picture(*given, **named), dpi=130)
 
 
-def write_files(folder: Path, files: dict[str, bytes], out: Output) -> None:
-    """Write files by their names, each whole or not at all, and tell their paths."""
+def write_files(folder: Path, files: Mapping[str, bytes | None], out: Output) -> None:
+    """Write files by their names, each whole or not at all, and tell their paths; None removes an earlier one."""
     for name, content in files.items():
+        if content is None:
+            (folder / name).unlink(missing_ok=True)
+            continue
         with atomically(folder / name) as temporary:
             temporary.write_bytes(content)
         out.write(f"{folder / name}\n")

@@ -292,7 +292,8 @@ def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
         choices=("auto", *NAMED),
         metavar="S",
         help="modal: modes from the data, without a search; continuation: gradients through widened peaks, for "
-        "structured models and variables of your own; swarm: the particle swarm and its refinement; auto, by default: "
+        "structured models and variables of your own; swarm: the particle swarm and its refinement; hpso-ls: the "
+        "published swarm, eigenvalue refinement and IPOPT in Cholesky coordinates; auto, by default: "
         "modal where the models of the problem allow it, continuation where they have a form of their own, else swarm",
     )
     run.add_argument("--out", metavar="DIR", help="folder of the results, results/NAME by default")
@@ -349,7 +350,7 @@ def _add_refine(command: Callable[..., argparse.ArgumentParser]) -> None:
     )
     kinds.add_argument(
         "--draws",
-        type=_count,
+        type=functools.partial(_whole, 2),
         metavar="N",
         help="fits of N sets of records that the result would have given, with noise drawn anew: their spread beside "
         "the linear uncertainty",

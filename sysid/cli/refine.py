@@ -34,6 +34,7 @@ def run(options: argparse.Namespace, out: Output) -> int:
     recipe = _recipe(result, source)
     folder = results_folder(options.out, (source if source.is_dir() else source.parent) / "refine")
     executor = _executor(options)
+    sweeps.check_own_records(result, recipe)
     sweep = sweeps.sweep_of(options, result, recipe)
     if sweep is not None:
         titles, told = [*sweep.titles], sweep.told
@@ -41,13 +42,13 @@ def run(options: argparse.Namespace, out: Output) -> int:
     elif options.draws is not None:
         if result.residual < EXACT:
             raise InputError(f"{source} fits its records exactly: without noise there is nothing to draw")
-        titles, told = [f"draw {i:4d}" for i in range(options.draws)], "draws of noise, each fitted from the result"
+        titles, told = [f"draw {i:4d}" for i in range(options.draws)], "draw{s} of noise, each fitted from the result"
         jobs = submit(_started(recipe, source), draws=options.draws, executor=executor, out=folder)
     else:
         count = options.starts or _STARTS
-        titles, told = [f"start {i:4d}" for i in range(count)], "starts, the first at the result"
+        titles, told = [f"start {i:4d}" for i in range(count)], "start{s}, the first at the result"
         jobs = submit(_started(recipe, source), starts=count, executor=executor, out=folder)
-    out.write(f"{recipe.title}: {len(titles)} {told}\n")
+    out.write(f"{recipe.title}: {len(titles)} {told.format(s='' if len(titles) == 1 else 's')}\n")
     ends, interrupted = _ends(jobs, titles, out)
     try:
         if sweep is not None:
@@ -95,7 +96,9 @@ def table(minima: list[Minimum], starts: int) -> str:
     lines += [f"{counted(without, 'start')} without a result"] if without else []
     alike = len(as_good(minima))
     if alike > 1:
-        lines.append(f"{alike} minima with different unknowns fit alike: the data and the model do not tell them apart")
+        lines.append(
+            f"{alike} minima with different matrices or unknowns fit alike: data and model do not tell them apart"
+        )
     elif minima:
         lines.append(f"the best minimum was reached from {len(minima[0].results)} of {starts} starts")
     return "\n".join(lines)
@@ -140,7 +143,5 @@ def _write(
     for end in ends:
         left, minimum = repr(end.residual) if end.has_result else "", of.get(end.index, "")
         rows.append((end.index, end.seed, end.success, left, minimum, end.message, *map(repr, end.x.tolist())))
-    files = {"starts.csv": table_as_csv(rows)}
-    if minima:
-        files["minima.png"] = png(picture, minima, recipe.title, goal=problem.goal)
-    write_files(folder, files, out)
+    drawn = png(picture, minima, recipe.title, goal=problem.goal) if minima else None
+    write_files(folder, {"starts.csv": table_as_csv(rows), "minima.png": drawn}, out)

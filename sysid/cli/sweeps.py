@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import textwrap
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +20,11 @@ from sysid.jobs.score import Compared, Move, moves, scored
 from sysid.problem.problem import Problem
 from sysid.problem.terms import FurtherTest
 from sysid.results.identification import Identification, Recipe
+from sysid.results.judgement import NO_FIT
+from sysid.search.modal import poles_of
 
 _FAR = 3.0  # standard deviations of a step, beyond which it counts as far
+_DECISIVE = 10.0  # difference of AIC or BIC
 _WIDTH = 120
 
 
@@ -34,7 +37,7 @@ class Sweep:
     name : str
         Of its files.
     told : str
-        Kind of the jobs, for the first line.
+        Kind of the jobs, for the first line; "{s}" is to be put in for the plural.
     titles : tuple of str
         Of the jobs, in their order.
     recipes : tuple of Recipe
@@ -59,43 +62,72 @@ def sweep_of(options: argparse.Namespace, result: Identification, recipe: Recipe
     if options.variants:
         recipes = tuple(Recipe(module, recipe.data, recipe.rng) for module in options.variants)
         for one in recipes:
-            _check_records(result, catalogue.build(one), one)
-        return Sweep("variants", "other models of the same records", tuple(one.title for one in recipes), recipes)
+            if not _same_records(result, catalogue.build(one)):
+                raise InputError(
+                    f"{one.title} has other records than the result: all have to read the same test (a variant is "
+                    "built with the result's data, and with its own parameters as they are by default)"
+                )
+        return Sweep("variants", "other model{s} of the same records", tuple(one.title for one in recipes), recipes)
     changes: tuple[Change, ...] = ()
     name = told = ""
     if options.leave_out == "run":
         changes = tuple(WithoutRun(i) for i in range(result.measurement.n_runs))
-        name, told = "without_run", "identifications, each without one run"
+        name, told = "without_run", "identification{s}, each without one run"
     elif options.leave_out == "sensor":
         changes = tuple(WithoutSensor(i, sensor) for i, sensor in enumerate(result.measurement.sensor_names))
-        name, told = "without_sensor", "identifications, each without one sensor"
+        name, told = "without_sensor", "identification{s}, each without one sensor"
     elif options.bands:
         changes = tuple(Band(low, high) for low, high in options.bands)
-        name, told = "bands", "identifications, each of one band"
+        name, told = "bands", "identification{s}, each of one band"
     elif options.orders:
-        changes = tuple(Modes(count) for count in range(options.orders[0], options.orders[1] + 1))
-        name, told = "orders", "identifications, each of so many modes"
+        name, (changes, told) = "orders", _orders(options.orders[0], options.orders[1], result.problem)
     if not changes:
         return None
-    if options.leave_out:
-        changes[0].of(result.problem)  # tells at once where nothing can be left out
-    _check_records(result, catalogue.build(recipe), recipe)
+    _check_possible(changes, result.problem)
     return Sweep(name, told, tuple(change.title for change in changes), (recipe,), changes)
 
 
-def _check_records(result: Identification, other: Problem, recipe: Recipe) -> None:
-    """Refuse a problem of other records than the result's."""
+def _orders(low: int, high: int, problem: Problem) -> tuple[tuple[Change, ...], str]:
+    """Numbers of modes up to those that stand out of the noise, and what the jobs are."""
+    changes, told = tuple(Modes(count) for count in range(low, high + 1)), "identification{s}, each of so many modes"
+    _check_possible(changes, problem)
+    found = poles_of(problem.screened).omega.size
+    if low > found:
+        raise InputError(f"{found} modes stand out of the noise, fewer than the {low} asked for")
+    return changes[: found + 1 - low], told if high <= found else f"{told}: no more than {found} stand out of the noise"
+
+
+def _check_possible(changes: Sequence[Change], problem: Problem) -> None:
+    """Tell at once where none of the changes can be made."""
+    refusals = []
+    for change in changes:
+        try:
+            change.of(problem)
+        except InputError as error:
+            refusals.append(error)
+        else:
+            return
+    raise refusals[0]
+
+
+def check_own_records(result: Identification, recipe: Recipe) -> None:
+    """Refuse to compare a result with jobs of other records, as its module makes them now."""
+    if not _same_records(result, catalogue.build(replace(recipe, start=None))):
+        raise InputError(
+            f"{recipe.title} now gives other records than those of the result, as the module, its data or what it "
+            "reads has changed: identify them anew by 'sysid run'"
+        )
+
+
+def _same_records(result: Identification, other: Problem) -> bool:
+    """Whether a problem is of the result's records."""
     own, its = (
         [problem.measurement, *(one.measurement for one in problem.residuals if isinstance(one, FurtherTest))]
         for problem in (result.problem, other)
     )
     names = ("freq", "base", "response", "force")
     pairs = [(getattr(mine, name), getattr(one, name)) for mine, one in zip(own, its, strict=False) for name in names]
-    if len(own) != len(its) or not all(np.array_equal(mine, one) for mine, one in pairs):
-        raise InputError(
-            f"{recipe.title} has other records than the result: all have to read the same test (a variant is built "
-            "with the result's data, and with its own parameters as they are by default)"
-        )
+    return len(own) == len(its) and all(np.array_equal(mine, one) for mine, one in pairs)
 
 
 def tell(
@@ -114,17 +146,16 @@ def tell(
             rows.append(Compared(title, end.success, end.residual, end.message, end.score, moved))
     out.write(f"\n{table(rows, part)}\n\n")
     without = [(sweep.titles[end.index], end.message) for end in ends if end.score is None]
-    files = {f"{sweep.name}.csv": _as_csv(rows, without, part), f"{sweep.name}_moves.csv": _moves_as_csv(rows)}
-    if len(rows) > 1:
-        files[f"{sweep.name}.png"] = png(picture, rows, recipe.title, part=part)
-    write_files(folder, files, out)
+    drawn = png(picture, rows, recipe.title, part=part) if len(rows) > 1 else None
+    tables = {f"{sweep.name}.csv": _as_csv(rows, without, part), f"{sweep.name}_moves.csv": _moves_as_csv(rows)}
+    write_files(folder, {**tables, f"{sweep.name}.png": drawn}, out)
 
 
 def table(rows: Sequence[Compared], part: bool) -> str:
     """A line an identification, the result's own first; `part` where they are of parts of the records."""
     columns = [
         ("", [row.title for row in rows]),
-        ("a fit", ["yes" if row.success else "no" for row in rows]),
+        ("a fit", _fits(rows, part)),
         ("determined", ["yes" if row.score.determined else "no" for row in rows]),
         ("residual", [f"{row.residual:.3e}" for row in rows]),
     ]
@@ -143,6 +174,14 @@ def table(rows: Sequence[Compared], part: bool) -> str:
         middle = "  ".join(f"{cell:>{width}}" for cell, width in zip(others, widths[1:-1], strict=True))
         lines.append(f"{first:{widths[0]}}  {middle}  {last}".rstrip())
     return "\n".join([*lines, *_notes(rows, part)])
+
+
+def _fits(rows: Sequence[Compared], part: bool) -> list[str]:
+    """Whether each is a fit; of models of the same records "worse" where another fits better, decisively."""
+    figures = np.array([(row.score.deviance, row.score.aic, row.score.bic) for row in rows])
+    fits = [row.success for row in rows]
+    beaten = [not part and np.any(np.all(figures[fits] + _DECISIVE <= own, axis=1)) for own in figures]
+    return ["no" if not fit else "worse" if worse else "yes" for fit, worse in zip(fits, beaten, strict=True)]
 
 
 def criteria(rows: Sequence[Compared]) -> dict[str, list[float]]:
@@ -167,20 +206,22 @@ def _farthest(steps: Sequence[Move]) -> str:
 
 def _notes(rows: Sequence[Compared], part: bool) -> Iterator[str]:
     """What the columns are, and what all rows say together."""
+    notes = [f"a fit: the search ended well, with a residual within the goal, or {NO_FIT} where none is stated"]
+    predicted = int(np.any(np.isfinite([row.score.predicted for row in rows])))
     if part:
-        notes = [
-            "predicted: relative residual of what was left out, where the rest tells its motion",
+        notes += ["predicted: relative residual of what was left out, where the rest tells its motion"] * predicted
+        notes += [
             "farthest: of frequencies, damping ratios and unknowns, the step from the first row that is largest in the "
             "standard deviations (std) that it has by noise alone",
         ]
     else:
-        notes = [
-            "AIC, BIC: above the least; 10 and more is decisive",
+        notes[0] += "; worse: another one fits better, by AIC and BIC decisively"
+        notes += ["predicted: relative residual of the validation tests"] * predicted
+        notes += [
+            f"AIC, BIC: above the least; {_DECISIVE:g} and more is decisive",
             "farthest: of frequencies, damping ratios and unknowns of one name, the step from the first row that is "
-            "largest in standard deviations (std), the larger ones of both rows",
+            "largest in standard deviations (std), the larger of both rows at the noise that the better fit leaves",
         ]
-        if np.any(np.isfinite([row.score.predicted for row in rows])):
-            notes.insert(0, "predicted: relative residual of the validation tests")
     for note in notes:
         yield from textwrap.wrap(note, _WIDTH)
     steps = [step for row in rows if row.success for step in row.moves if np.isfinite(step.deviations)]

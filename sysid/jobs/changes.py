@@ -74,16 +74,20 @@ class WithoutRun:
         return f"without run {self.run + 1}"
 
     def of(self, problem: Problem) -> Problem:
-        """The problem with the other runs."""
+        """The problem with the other runs; refused where they do not excite all that free matrices' modes need."""
         test = problem.measurement
-        return _on(problem, _runs(test, _all_but(self.run, test.n_runs, "run")))
+        kept = _all_but(self.run, test.n_runs, "run")
+        if problem.free_modes and independent(test.base[kept]).shape[1] < independent(test.base).shape[1]:
+            raise InputError(
+                f"without run {self.run + 1} the base does not move in every direction: modes that this run alone "
+                "excites cannot be found from the others"
+            )
+        return _on(problem, _runs(test, kept))
 
     def predicted(self, problem: Problem, result: Identification) -> float:
-        """Relative residual of the run that was left out; NaN where the others do not tell free matrices' motion."""
-        test, kept = problem.measurement, _all_but(self.run, problem.measurement.n_runs, "run")
-        if problem.free_modes and independent(test.base[kept]).shape[1] < independent(test.base).shape[1]:
-            return np.nan
-        return _runs(test, ~kept).residual(result.structure)
+        """Relative residual of the run that was left out."""
+        test = problem.measurement
+        return _runs(test, ~_all_but(self.run, test.n_runs, "run")).residual(result.structure)
 
 
 @dataclass(frozen=True)

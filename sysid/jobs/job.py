@@ -81,7 +81,8 @@ class JobResult:
     seed : int
         Of the start, where it was a fresh point, of the noise that was drawn, or of a whole identification.
     success : bool
-        The solver's status is good and the residual meets the problem's goal, or is a fit at all where none is given.
+        The solver's status is good, the residual meets the problem's goal, or is a fit at all where none is given, and
+        a whole identification is of more numbers than parameters.
     message : str
         The solver's status, or why there is no result.
     x : (n_variables,)
@@ -143,8 +144,12 @@ def _identified(job: Job, session: Session) -> JobResult:
         if result.interrupted:
             raise KeyboardInterrupt
     score = scored(result, None if job.change is None else _predicted(problem, result, job.change))
+    success, message = result.success, result.message
+    if score.numbers <= score.parameters:
+        success = False
+        message = f"{message}; {score.numbers} numbers of the records do not suffice for {score.parameters} parameters"
     x = np.zeros(0) if result.x is None else result.x
-    return JobResult(job.index, job.seed, result.success, result.message, x, result.residual, score)
+    return JobResult(job.index, job.seed, success, message, x, result.residual, score)
 
 
 def _predicted(problem: Problem, result: Identification, change: Change) -> float | None:

@@ -7,12 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sysid.assessment.sensitivity import meaningful
 from sysid.jobs.job import JobResult
 from sysid.nlp import EXACT
 from sysid.problem.problem import Problem
 from sysid.search.continuation import apart
+from sysid.structure.structure import Structure
 
-_ONE = 1e-3  # of an unknown's size: ends nearer to each other are one minimum
+_ONE = 1e-3  # of an unknown's or a matrix's size: ends nearer to each other are one minimum
+_ROUND_OFF = 1e-6  # relative difference of residuals of one minimum that says nothing
 _ALIKE = 1e-3  # relative difference of residuals up to which minima fit alike
 
 
@@ -30,8 +33,9 @@ class Minimum:
 
     @property
     def best(self) -> JobResult:
-        """The end with the least residual."""
-        return min(self.results, key=lambda result: result.residual)
+        """The end with the least residual; among those that differ by round-off the first by index."""
+        least = max((1 + _ROUND_OFF) * min(result.residual for result in self.results), EXACT)
+        return next(result for result in self.results if result.residual <= least)
 
     @property
     def residual(self) -> float:
@@ -40,17 +44,35 @@ class Minimum:
 
 
 def distinct(problem: Problem, results: Iterable[JobResult]) -> list[Minimum]:
-    """Minima that the jobs of one problem ended in, the least residual first; jobs without a result are left out."""
-    groups: list[list[JobResult]] = []
+    """Minima that the jobs of one problem ended in, the least residual first; jobs without a result are left out.
+
+    Ends are of one minimum where the matrices agree, and all unknowns that mean something by themselves: of shares of a
+    total only the ratios count.
+    """
+    groups: list[tuple[Structure, list[JobResult]]] = []
+    named = meaningful(problem.formulation)
     ended = (result for result in results if result.x.size)
-    for result in sorted(ended, key=lambda one: (one.residual, one.index)):
-        for group in groups:
-            if apart(problem, result.x, group[0].x) < _ONE:
+    for result in sorted(ended, key=lambda one: (max(one.residual, EXACT), one.index)):
+        structure = problem.structure(result.x)
+        for first, group in groups:
+            x = np.where(named, result.x, group[0].x)
+            if apart(problem, x, group[0].x) < _ONE and _matrices_apart(structure, first) < _ONE:
                 group.append(result)
                 break
         else:
-            groups.append([result])
-    return [Minimum(tuple(sorted(group, key=lambda one: one.index))) for group in groups]
+            groups.append((structure, [result]))
+    return [Minimum(tuple(sorted(group, key=lambda one: one.index))) for _, group in groups]
+
+
+def _matrices_apart(one: Structure, other: Structure) -> float:
+    """Largest difference of entries of M, K and C, each over the root of the two diagonal entries."""
+    most = 0.0
+    for name in ("mass", "stiffness", "damping"):
+        a, b = getattr(one, name), getattr(other, name)
+        size = np.sqrt(np.maximum(np.abs(np.diag(a)), np.abs(np.diag(b))))
+        size[size == 0] = size.max() or 1.0  # a base without mass
+        most = max(most, float(np.max(np.abs(a - b) / np.outer(size, size))))
+    return most
 
 
 def as_good(minima: list[Minimum]) -> list[Minimum]:

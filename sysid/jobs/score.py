@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -12,12 +12,15 @@ from sysid.assessment.sensitivity import sensitivity
 from sysid.jobs.quantities import FREQUENCY, RATIO, label, labelled, quantities
 from sysid.measurement.noise import raised
 from sysid.modal_analysis import outliers
+from sysid.modal_analysis.residues import unit_columns
 from sysid.nlp import EXACT
 from sysid.results.identification import Identification
 from sysid.structure.structure import Array, ComplexArray
 
 _LEAST = 0.01  # least variance of a step, as a share of the part's own
 _SAME = 0.1  # relative distance of frequencies up to which a mode is looked for
+_ALIKE = 0.4  # least MAC of one mode; two that turn in their plane, as a symmetric tower's may, keep half
+_NONE = 2.0  # costs of a pair that is none, above those of any that is one
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,8 @@ class Score:
     values, stds : dict of str to float
         Frequencies in Hz, damping ratios, and unknowns that mean something by themselves, by label; their standard
         deviations, where they are known. None of an exact fit.
+    shapes : list of list of float
+        Mode shapes at the sensors, (n_sensors, modes).
 
     Notes
     -----
@@ -63,6 +68,7 @@ class Score:
     modes: int
     values: dict[str, float]
     stds: dict[str, float]
+    shapes: list[list[float]] = field(default_factory=list)
 
     @property
     def frequencies(self) -> Array:
@@ -154,31 +160,37 @@ def scored(result: Identification, predicted: float | None = None) -> Score:
         modes=s.natural_frequencies.size,
         values=quantities(result),
         stds=stds,
+        shapes=s.mode_shapes.tolist(),
     )
 
 
 def moves(own: Score, other: Score, *, part: bool) -> tuple[Move, ...]:
     """How far frequencies, damping ratios and unknowns went from one result to another.
 
-    Modes go to those that are nearest together, within 10 %.
+    Modes go to those that are nearest together, within 10 % in frequency; where both have as many sensors, to those
+    whose shapes are alike (MAC).
 
     Parameters
     ----------
     own, other : Score
     part : bool
         Whether the other is the same model on a part of the records. A step is then told in the standard deviation that
-        it has by noise alone, see `_variance`; else in the larger of both results'.
+        it has by noise alone, see `_variance`; else in the larger of both results', for noise of the size that the
+        better fit leaves: what a model lacks is in its own deviations too, and would hide its steps.
     """
     of_modes = {label(i, what) for i in range(own.modes) for what in (FREQUENCY, RATIO)}
     pairs = [(name, name) for name in own.values if name not in of_modes and name in other.values]
-    for i, j in _nearest(own.frequencies, other.frequencies):
+    for i, j in _nearest(own, other):
         pairs += [(label(i, what), label(j, what)) for what in (FREQUENCY, RATIO)]
     made = []
     for here, there in pairs:
         was, step = own.values[here], other.values[there] - own.values[here]
         whole, of_other = own.stds.get(here, np.nan) ** 2, other.stds.get(there, np.nan) ** 2
         noise = other.noise / own.noise
-        variance = _variance(whole, of_other, noise) if part else float(np.maximum(whole, of_other))
+        if part:
+            variance = _variance(whole, of_other, noise)
+        else:
+            variance = float(np.maximum(whole * min(noise, 1.0), of_other / max(noise, 1.0)))
         known = float(np.sqrt(variance)) if variance > 0 else np.nan
         made.append(Move(here, other.values[there], step / abs(was) if was else np.nan, step / known))
     return tuple(made)
@@ -198,10 +210,15 @@ def _variance(whole: float, part: float, noise: float) -> float:
     return max(whole + part * (1 - 2 * share), _LEAST * part)
 
 
-def _nearest(own: Array, other: Array) -> list[tuple[int, int]]:
-    apart = np.abs(np.log(own[:, None] / other))
-    rows, columns = linear_sum_assignment(np.minimum(apart, _SAME) ** 2)
-    return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if apart[i, j] < _SAME]
+def _nearest(own: Score, other: Score) -> list[tuple[int, int]]:
+    """Modes of both that are one, by their frequencies and shapes."""
+    apart = np.abs(np.log(own.frequencies[:, None] / other.frequencies)) / _SAME
+    mac = np.ones(apart.shape)
+    if own.shapes and len(own.shapes) == len(other.shapes):
+        one, two = (unit_columns(np.array(score.shapes))[0] for score in (own, other))
+        mac = (one.T @ two) ** 2
+    cost = np.where((apart < 1) & (mac >= _ALIKE), apart**2 + 1 - mac, _NONE)
+    return [(int(i), int(j)) for i, j in zip(*linear_sum_assignment(cost), strict=True) if cost[i, j] < _NONE]
 
 
 def _weighted_misfits(result: Identification) -> Iterator[tuple[ComplexArray, float]]:

@@ -45,5 +45,5 @@ def draws(found: Sequence[Spread], count: int, title: str = "") -> Figure:
     ax.set_ylim(len(shown) - 0.5, -0.5)
     ax.set_xlim(0.0, max(2.0, 1.1 * max(ratios, default=0.0)))
     dress(ax, title, "standard deviation of the draws / linear one [–]", "")
-    ax.legend(frameon=False, fontsize="small", loc="upper right")
+    figure.legend(loc="outside lower center", frameon=False, fontsize="small")
     return figure

@@ -1,4 +1,4 @@
-"""Picture of many starts: the residual that each left, in order, and which ended in one minimum."""
+"""Picture of many starts: the residual that each left, minimum by minimum."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sysid.jobs.minima import Minimum
-from sysid.plot.canvas import COLOURS, FAINT, dress, new_figure
+from sysid.plot.canvas import COLOURS, FAINT, dress, new_figure, plain_log
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -17,7 +17,7 @@ _LEAST = 1e-16  # what is below is drawn there
 
 
 def minima(found: Sequence[Minimum], title: str = "", *, goal: float | None = None) -> Figure:
-    """The residual of each start, the best first; starts that ended in one minimum have one colour.
+    """The residual of each start, those that ended in one minimum side by side and in one colour.
 
     Parameters
     ----------
@@ -40,14 +40,19 @@ def minima(found: Sequence[Minimum], title: str = "", *, goal: float | None = No
         left = np.maximum(sorted(result.residual for result in minimum.results), _LEAST)
         named = i < len(COLOURS)
         times = f"reached {len(left)} time{'s' if len(left) > 1 else ''}"
-        label = f"{minimum.residual:.3g}, {times}" if named else "others" if i == len(COLOURS) else None
+        label = f"{i + 1}: {minimum.residual:.4e}, {times}" if named else "others" if i == len(COLOURS) else None
         colour = COLOURS[i] if named else FAINT
         ax.plot(begun + 1 + np.arange(len(left)), left, "o", color=colour, markersize=5, label=label)
         begun += len(left)
     if goal is not None:
         ax.axhline(goal, color=FAINT, linewidth=0.9, linestyle="--", label=f"goal {goal:.3g}")
     ax.set_yscale("log")
+    # Over round-off alone the ticks would all be one number.
+    lowest, highest = ax.dataLim.intervaly
+    ax.set_ylim(lowest / 2, 2 * highest)
+    if highest < 25 * lowest:
+        plain_log(ax.yaxis)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    dress(ax, title, "starts, the best first", "relative residual [–]")
-    ax.legend(frameon=False, fontsize="small", title="residual of the minimum", title_fontsize="small")
+    dress(ax, title, "starts, by minimum", "relative residual [–]")
+    ax.legend(frameon=False, fontsize="small", title="minimum and its residual", title_fontsize="small")
     return figure

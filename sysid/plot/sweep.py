@@ -44,6 +44,8 @@ def sweep(rows: Sequence[Compared], title: str = "", *, part: bool) -> Figure:
         left.plot(predicted, at, "D", color=COLOURS[5], fillstyle="none", label="predicted")
     left.set_xscale("log")
     lowest, highest = left.get_xlim()
+    if highest < 1.5 * lowest:
+        left.set_xlim(lowest / 2, 2 * highest)
     if highest < 100 * lowest:
         plain_log(left.xaxis)
     left.set_yticks(at, [row.title for row in rows])
@@ -76,7 +78,12 @@ def _draw_moves(ax: Any, steps: Sequence[Sequence[Move]]) -> None:
         ax.xaxis.set_minor_locator(NullLocator())
         ax.set_xlim(-1.3 * max(*sizes, _TICKS[0]), 1.3 * max(*sizes, _TICKS[0]))
     ax.axvline(0.0, color=FAINT, linewidth=0.9)
-    dress(ax, "steps from the first row", "standard deviations of a step" if known else "per cent", "")
+    dress(
+        ax,
+        "steps from the first row",
+        f"standard deviations of a step, logarithmic beyond {_TICKS[0]:g}" if known else "per cent",
+        "",
+    )
 
 
 def _draw_criteria(ax: Any, scores: Sequence[Score]) -> None:
@@ -88,4 +95,4 @@ def _draw_criteria(ax: Any, scores: Sequence[Score]) -> None:
             ax.plot(values - np.nanmin(values), at, marker, color=colour, fillstyle="none", label=name.upper())
     ax.axvspan(0, _DECISIVE, color=FAINT, alpha=0.25, linewidth=0, label="no decisive difference")
     ax.set_xscale("symlog", linthresh=_DECISIVE)
-    dress(ax, "AIC and BIC above the least", "difference [–]", "")
+    dress(ax, "AIC and BIC above the least", f"difference, logarithmic beyond {_DECISIVE:g} [–]", "")

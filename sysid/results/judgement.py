@@ -24,7 +24,7 @@ from sysid.search.strategy import Outcome
 _KNOWN = 0.1  # of the root of two diagonal entries; an entry with a larger standard deviation is not known
 _LARGE = 4000  # entries of the mode shapes, beyond which the covariance takes minutes and gigabytes
 _OUTLIERS = "for spikes and drop-outs state Problem(..., loss='huber'), or leave these lines out"
-_NO_FIT = 0.5  # relative residual above which nothing is explained
+NO_FIT = 0.5  # relative residual above which nothing is explained
 
 
 def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session) -> Identification:
@@ -75,7 +75,7 @@ def succeeded(problem: Problem, end: Outcome, *, cut_short: bool = False) -> tup
         wrong.append("a constraint does not hold")
     if goal is not None and residual > goal:
         wrong.append(f"the residual {residual:.3g} is above the goal {goal:.3g}")
-    if goal is None and residual > _NO_FIT and end.stopped is None and (end.success or not cut_short):
+    if goal is None and residual > NO_FIT and end.stopped is None and (end.success or not cut_short):
         wrong.append(
             f"the residual {residual:.3g} is no fit: are the frequencies in Hz, the responses absolute and complex "
             "with exp(+iwt), the axes and signs of rigid_body right, the bounds wide enough?"

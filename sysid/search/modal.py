@@ -88,7 +88,7 @@ class Modal:
         if refusal:
             raise DoesNotApplyError(
                 "strategy 'modal' needs a free stiffness (SpectralStiffness) and ModalDamping, and "
-                f"{refusal}; use 'swarm' for this problem"
+                f"{refusal}; 'auto' chooses another strategy"
             )
         return run_modal(problem, self, session)
 
@@ -292,7 +292,7 @@ def modal_structure(
         Where the base force has the wrong sign, or stated sensors do not tell the modes apart.
     """
     test, mass = problem.measurement, problem.formulation.mass
-    poles = problem.poles or _stated_poles(problem)
+    poles = poles_of(problem)
     fit = ModeFit(test, poles, np.sqrt(problem.totals), monitor, options.max_iterations)
     end = fit.best() if options.modes is None else fit.of_strongest(options.modes)
     held = held_to_totals(problem, end, monitor, options.max_iterations)
@@ -347,8 +347,10 @@ def held_by_model(problem: Problem, structure: Structure) -> Array:
     return x
 
 
-def _stated_poles(problem: Problem) -> Poles:
-    """Poles for the stated frequencies; with others looked for where the model is said to have more."""
+def poles_of(problem: Problem) -> Poles:
+    """Poles of the data; for stated frequencies theirs, with others looked for where the model is said to have more."""
+    if problem.poles is not None:
+        return problem.poles
     stated, test = problem.formulation.stiffness.spectrum, problem.measurement
     assert stated is not None
     if stated.size == test.n_sensors:

@@ -2,12 +2,17 @@
 
 import csv
 import re
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import sysid
+from sysid.cli import draws
 from sysid.cli import main as cli
+from sysid.cli.display import Output
+from sysid.jobs import JobResult
 
 README = Path(__file__).resolve().parents[2] / "README.md"
 PNG = b"\x89PNG"
@@ -118,6 +123,7 @@ def test_a_band_without_lines_is_a_line_without_a_result(floors, capsys):
     assert cli.main(["refine", str(floors), "--bands", "0.5-8", "20-30", "--workers", "1"]) == 0
     out = capsys.readouterr().out
     assert "20 to 30 Hz  no result  no line between 20 and 30 Hz" in out
+    assert "predicted:" in out
     rows = list(csv.DictReader((floors / "refine" / "bands.csv").read_text().splitlines()))
     assert [(row["identification"], row["success"]) for row in rows] == [
         ("two.py", "True"), ("0.5 to 8 Hz", "True"), ("20 to 30 Hz", "False"),
@@ -132,11 +138,43 @@ def test_a_model_that_is_too_simple_loses_by_aic_and_bic(floors, capsys):
     assert rows["one.py"][4] == "2" and min(map(float, rows["one.py"][5:7])) > 100
 
 
-def test_one_draw_has_no_spread_and_is_written(capsys, tmp_path):
-    assert cli.main(["run", "shear_building", "--set", "noise=0.02", "--out", str(tmp_path)]) == 0
-    assert cli.main(["refine", str(tmp_path), "--draws", "1", "--workers", "1"]) == 0
-    assert "1 of 1 draws ended in a fit; two are needed for a spread" in capsys.readouterr().out
-    assert sorted(path.name for path in (tmp_path / "refine").iterdir()) == ["draws.csv", "jobs.sqlite"]
+def test_draws_without_a_spread_leave_no_picture_of_earlier_ones(floors, capsys, tmp_path):
+    for name in ("spreads.csv", "draws.png"):
+        (tmp_path / name).write_text("of earlier draws")
+    result = sysid.load(floors)
+    ends = [JobResult(0, 0, True, "", result.x, 0.02), JobResult(1, 0, False, "lost", result.x[:0], np.nan)]
+    draws.tell(tmp_path, result, result.recipe, ends, Output(sys.stdout))
+    assert "1 of 2 draws ended in a fit; two are needed for a spread" in capsys.readouterr().out
+    assert [path.name for path in tmp_path.iterdir()] == ["draws.csv"]
+
+
+def test_a_module_that_gives_other_records_than_the_results_is_told(floors, capsys):
+    module = Path("two.py")
+    text = module.read_text()
+    module.write_text(text.replace("noise=0.02", "noise=0.04"))
+    try:
+        for kind in (["--starts", "2"], ["--draws", "2"], ["--leave-out", "sensor"]):
+            assert cli.main(["refine", str(floors), *kind]) == 2
+            out, error = capsys.readouterr()
+            assert out == "" and error.count("\n") == 1
+            assert "two.py now gives other records than those of the result" in error
+    finally:
+        module.write_text(text)
+
+
+def test_more_modes_than_stand_out_are_told_in_one_line(capsys, tmp_path):
+    assert (
+        cli.main(["run", "cantilever_tower", "--set", "noise=0.01", "--set", "elements=2", "--out", str(tmp_path)]) == 0
+    )
+    capsys.readouterr()
+    assert cli.main(["refine", str(tmp_path), "--orders", "3-30", "--workers", "1"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].endswith(": 2 identifications, each of so many modes: no more than 4 stand out of the noise")
+    rows = {line[:7]: line for line in lines if line.startswith(("3 modes", "4 modes"))}
+    assert "  worse  " in rows["3 modes"] and "  yes  " in rows["4 modes"]
+    assert not any("leave one out" in line and "modes are missing" not in line for line in lines)
+    assert cli.main(["refine", str(tmp_path), "--orders", "5-6", "--workers", "1"]) == 2
+    assert capsys.readouterr().err == "sysid: 4 modes stand out of the noise, fewer than the 5 asked for\n"
 
 
 @pytest.mark.parametrize("last", ["distinct", "write_files"])
@@ -176,6 +214,9 @@ def test_the_example_of_the_readme_refines_that_result():
         (["results/physical_damping", "--leave-out", "run"], "the test has one run; without it nothing is left"),
         (["results/physical_damping", "--bands", "5-1"], "'5-1' is no band: write its ends in Hz, such as 0.5-20"),
         (["results/physical_damping", "--variants", "shear_building"], "shear_building has other records than"),
+        (["results/physical_damping", "--bands", "100-200"], "no line between 100 and 200 Hz"),
+        (["results/physical_damping", "--orders", "2-4"], "open only where mass and stiffness are free"),
+        (["results/physical_damping", "--draws", "1"], "not a whole number from 2"),
         (["results/physical_damping", "--workers", "2", "--scheduler", "tcp://host:1"], "exclude each other"),
         (["results/physical_damping", "--out", "results/physical_damping/result.h5"], "is not a folder"),
     ],

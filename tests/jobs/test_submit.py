@@ -359,6 +359,34 @@ def test_an_unknown_that_is_zero_but_for_round_off_makes_no_further_minimum(reci
     assert apart([0.0, 10.0], [0.0, 10.1])
 
 
+def test_shares_of_one_mass_by_any_scale_are_one_minimum():
+    """Only the ratios of shares make the masses; the lowest start is named among those that differ by round-off."""
+    K = 1e3 * np.array([[2.0, -1, -1], [-1, 1, 0], [-1, 0, 1]])
+    truth = sysid.Structure(np.diag([3.0, 2, 0]), K, [0.01, 0.01], n_base=1)
+    test = sysid.simulate(truth, np.linspace(1, 10, 20))
+    problem = sysid.Problem(test, mass=sysid.LumpedMass(5.0), stiffness=sysid.ChainStiffness(1e2, 1e4))
+    # Two shares, two springs, two damping ratios.
+    shares = ([0.6, 0.4], [0.3, 0.2], [0.3, 0.3])
+    residuals = (3e-12, 1e-12, 2e-12)
+    ends = [
+        JobResult(i, 0, True, "", np.array([*share, 1e3, 1e3, 0.01, 0.01]), residual)
+        for i, (share, residual) in enumerate(zip(shares, residuals, strict=True))
+    ]
+    first, second = distinct(problem, ends)
+    assert ([end.index for end in first.results], first.best.index) == ([0, 1], 0)
+    assert [end.index for end in second.results] == [2]
+
+
+def test_the_picture_of_starts_that_agree_has_ticks_that_differ(recipe):
+    ends = [JobResult(i, 0, True, "", np.array(SPRINGS), 0.01234 * (1 + 1e-9 * i)) for i in range(3)]
+    problem = sysid.catalogue.build(replace(recipe, start=None))
+    ax = sysid.plot.minima(distinct(problem, ends)).axes[0]
+    low, high = ax.get_ylim()
+    shown = [tick for tick in ax.get_yticks() if low <= tick <= high]
+    assert len({ax.yaxis.get_major_formatter()(tick) for tick in shown}) == len(shown) > 0
+    assert low < 0.01 and high > 0.02
+
+
 def test_a_cluster_gives_the_same_bits(recipe):
     distributed = pytest.importorskip("distributed", reason="needs the extra 'dask'")
     from sysid.jobs import cluster

@@ -311,6 +311,48 @@ def test_modes_that_share_a_frequency_go_to_one_each():
     ]  # fmt: skip
 
 
+def test_modes_of_two_directions_that_cross_are_told_by_their_shapes():
+    """And a mode that the records do not show is none, however near its frequency."""
+    own = replace(_score((1.0, 1.02), (0.1, 0.1)), shapes=[[1.0, 0.0], [0.0, 2.0]])
+    crossed = replace(_score((1.01, 1.03), (0.1, 0.1)), shapes=[[0.1, 3.0], [-1.0, 0.1]])
+    assert [step.value for step in moves(own, crossed, part=False)[::2]] == [1.03, 1.01]
+    unseen = replace(crossed, shapes=[[0.1, 0.2], [-1.0, 1.0]])
+    assert [(step.name, step.value) for step in moves(own, unseen, part=False)[::2]] == [
+        ("mode 2: frequency, Hz", 1.01),
+    ]  # fmt: skip
+
+
+def test_a_bad_model_does_not_hide_its_steps_behind_its_own_misfit():
+    """Twenty times the misfit makes twenty times the deviations; of the noise of the better fit it has as few."""
+    good, bad = _score((1.0,), (0.01,), noise=1.0), _score((1.06,), (0.2,), noise=400.0)
+    assert moves(good, bad, part=False)[0].deviations == pytest.approx(6.0)
+    assert moves(bad, good, part=False)[0].deviations == pytest.approx(-6.0)
+
+
+def test_without_the_one_run_along_an_axis_its_modes_cannot_be_found():
+    full = problem(full=True)
+    assert WithoutRun(0).of(full).measurement.n_runs == 1
+    tower = sysid.catalogue.build(sysid.Recipe("cantilever_tower", parameters={"elements": 2, "noise": 0.01}))
+    with pytest.raises(
+        InputError, match="without run 2 the base does not move in every direction: modes that this run"
+    ):
+        WithoutRun(1).of(tower)
+
+
+def one_run(*, data=None, rng=0):
+    """The problem with its first run."""
+    return WithoutRun(1).of(problem())
+
+
+def test_a_line_of_as_many_numbers_as_unknowns_is_no_fit(result, tmp_path):
+    """Two sensors give four numbers at a line, for two springs and two dampers and the scale of the noise."""
+    file = tmp_path / "one_run.py"
+    file.write_text(MODULE.format(folder=__file__.rpartition("/")[0]).replace("problem", "one_run as problem"))
+    (end,) = submit(sysid.Recipe(str(file), start=tuple(result.x)), changes=[Band(0.5, 0.51)])
+    assert not end.success and end.has_result
+    assert "4 numbers of the records do not suffice for 5 parameters" in end.message
+
+
 def test_steps_of_exact_records_have_no_deviations():
     exact = sysid.identify(problem(noise=0.0), rng=0)
     steps = moves(scored(exact), scored(exact), part=True)
