@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Executor
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,9 +50,11 @@ def run(options: argparse.Namespace, out: Output) -> int:
         titles, told = [f"start {i:4d}" for i in range(count)], "start{s}, the first at the result"
         jobs = submit(_started(recipe, source), starts=count, executor=executor, out=folder)
     out.write(f"{recipe.title}: {len(titles)} {told.format(s='' if len(titles) == 1 else 's')}\n")
-    ends, interrupted = _ends(jobs, titles, out)
     try:
-        if sweep is not None:
+        ends, interrupted = _ends(jobs, titles, out)
+        if interrupted and not ends:
+            pass  # there is nothing to tell
+        elif sweep is not None:
             sweeps.tell(folder, result, recipe, sweep, ends, out)
         elif options.draws is not None:
             draws.tell(folder, result, recipe, ends, out)
@@ -69,16 +72,17 @@ def run(options: argparse.Namespace, out: Output) -> int:
     return SUCCESS if any(end.success for end in ends) else NOT_REACHED
 
 
-def _ends(jobs: Iterator[JobResult], titles: Sequence[str], out: Output) -> tuple[list[JobResult], bool]:
+def _ends(jobs: Generator[JobResult, None, None], titles: Sequence[str], out: Output) -> tuple[list[JobResult], bool]:
     """Tell the ends of jobs as they come, and give them by index; whether Ctrl-C ended that."""
     ends: list[JobResult] = []
     interrupted = False
     try:
-        for end in jobs:
-            ends.append(end)
-            left = f"residual {end.residual:.4e}" if end.has_result else "no result"
-            out.write(f"{len(ends):4d} of {len(titles)}  {titles[end.index]}  {left}  {end.message}\n")
-            out.flush()
+        with closing(jobs):  # also where Ctrl-C strikes while an end is told
+            for end in jobs:
+                ends.append(end)
+                left = f"residual {end.residual:.4e}" if end.has_result else "no result"
+                out.write(f"{len(ends):4d} of {len(titles)}  {titles[end.index]}  {left}  {end.message}\n")
+                out.flush()
     except KeyboardInterrupt:
         interrupted = True
     return sorted(ends, key=lambda one: one.index), interrupted

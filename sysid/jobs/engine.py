@@ -9,9 +9,11 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
 from typing import Any, TypeVar, cast
 
 from sysid.errors import InputError, whole_number
+from sysid.search.session import DeferredInterrupt
 
 Task = TypeVar("Task")
 Answer = TypeVar("Answer")
@@ -39,9 +41,45 @@ def processes(workers: int | None = None) -> Callable[[], Executor]:
 
     def make() -> Executor:
         # A fork would copy locks of threads that do not exist in the child.
-        return ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), initializer=_end_at_interrupt)
+        return _Processes(count, multiprocessing.get_context("spawn"), initializer=_end_at_interrupt)
 
     return make
+
+
+class _Processes(ProcessPoolExecutor):
+    """Processes that Ctrl-C ends without a word, while they still import too."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Hand over a task; a process that is started for it has Ctrl-C blocked until `_end_at_interrupt`."""
+        with _ctrl_c_held():
+            return super().submit(fn, *args, **kwargs)
+
+    def end(self) -> None:
+        """Give up what is not done, and end the processes at once."""
+        with _ctrl_c_held():
+            workers = list(self._processes.values())
+            self.shutdown(wait=False, cancel_futures=True)
+            for worker in workers:
+                worker.terminate()
+
+
+@contextmanager
+def _ctrl_c_held() -> Iterator[None]:
+    """Hold Ctrl-C back until the end, and have it blocked in processes that are started meanwhile.
+
+    Blocking alone does not hold it back: a thread of a library may take the signal. Windows knows no blocking.
+    """
+    held = DeferredInterrupt(patience=None)
+    try:
+        with held:
+            before = set() if sys.platform == "win32" else signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            try:
+                yield
+            finally:
+                if sys.platform != "win32":
+                    signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    finally:
+        held.check()
 
 
 def cluster(address: str) -> Callable[[], Executor]:
@@ -115,8 +153,11 @@ def _processors() -> int:
 
 
 def _end_at_interrupt() -> None:
-    """Let Ctrl-C end a worker without a word: the submitting process tells the user."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    """Let Ctrl-C end a worker without a word, from now on: the submitting process tells the user."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else the submitting process ignores it
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if sys.platform != "win32":
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
 def each(
@@ -162,14 +203,15 @@ def _rebuilding(
         tasks = left[:1] if in_vain else left
         left = left[len(tasks) :]
         executor, unfinished = checked(make()), list[Task]()
+        ours = executor if isinstance(executor, _Processes) else None
         try:
-            for task, future in _submitted(function, tasks, executor):
+            for task, future in _submitted(function, tasks, executor, cancel=ours is None):
                 if isinstance(_error(future), BrokenExecutor):
                     unfinished.append(task)
                 else:
                     yield _answer(task, future, lost)
         finally:
-            executor.shutdown(wait=False)
+            executor.shutdown(wait=False) if ours is None else ours.end()
         in_vain = in_vain + 1 if len(unfinished) == len(tasks) else 0
         if in_vain > _IN_VAIN:
             yield lost(unfinished.pop(), f"its worker died, {_IN_VAIN} times in a row: {_WHY}")
@@ -178,9 +220,13 @@ def _rebuilding(
 
 
 def _submitted(
-    function: Callable[[Task], Answer], tasks: Sequence[Task], executor: Executor
+    function: Callable[[Task], Answer], tasks: Sequence[Task], executor: Executor, cancel: bool = True
 ) -> Iterator[tuple[Task, Future[Answer]]]:
-    """Tasks with their futures as these end."""
+    """Tasks with their futures as these end.
+
+    With `cancel` those that are left at the end are cancelled. A pool of processes that breaks does not bear that: its
+    thread sets them to an error, which a cancelled one refuses. The pool's own shutdown cancels them in that thread.
+    """
     futures: dict[Future[Answer], Task] = {}
     broken: list[tuple[Task, Future[Answer]]] = []
     for task in tasks:
@@ -195,7 +241,7 @@ def _submitted(
             yield futures[future], future
         yield from broken
     finally:
-        for future in futures:
+        for future in futures if cancel else ():
             future.cancel()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import nullcontext
 from dataclasses import replace
@@ -31,7 +31,7 @@ def submit(
     strategy: str = "",
     executor: Executor | Callable[[], Executor] | None = None,
     out: str | Path | None = None,
-) -> Iterator[JobResult]:
+) -> Generator[JobResult, None, None]:
     """Refine each recipe's problem from several starts, by gradients, or identify it whole.
 
     Parameters
@@ -63,9 +63,9 @@ def submit(
 
     Returns
     -------
-    iterator of JobResult
+    generator of JobResult
         As they come; jobs are numbered recipe by recipe, start by start (or draw, or change). The result of a job does
-        not depend on where it runs, nor on how many run beside it.
+        not depend on where it runs, nor on how many run beside it. Its ``close()`` gives up what is left.
 
     Raises
     ------
@@ -156,7 +156,7 @@ def _rooted(recipe: Recipe) -> Recipe:
 
 def _results(
     jobs: list[Job], executor: Executor | Callable[[], Executor] | None, ledger: Ledger | None
-) -> Iterator[JobResult]:
+) -> Generator[JobResult, None, None]:
     with ledger or nullcontext():
         known = {} if ledger is None else ledger.results()
         yield from known.values()

@@ -1,8 +1,11 @@
 """``sysid refine``: the distinct minima of many starts, told, written, and gone on with."""
 
 import csv
+import os
 import re
+import signal
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -190,6 +193,37 @@ def test_ctrl_c_while_saving_tells_where_the_results_are(last, capsys, tmp_path,
     assert capsys.readouterr().err == f"sysid: interrupted while saving; {told}"
     assert cli.main(command) == 0
     assert (tmp_path / "starts.csv").is_file()
+
+
+AT_WORK = """
+
+import multiprocessing
+import time
+
+if multiprocessing.parent_process():
+    print("at work", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+@pytest.mark.parametrize("place", ["imports", "jobs"])
+def test_ctrl_c_of_a_terminal_is_one_line_whatever_the_workers_are_at(place, floors, tmp_path, interruptible):
+    """It reaches all processes at once: as soon as the first has been started, or when one has taken a job."""
+    (tmp_path / "two.py").write_text(Path("two.py").read_text() + AT_WORK)
+    command = ["-u", "-m", "sysid", "refine", str(floors.absolute()), "--workers", "2", "--out", "refine"]
+    with interruptible(*command, cwd=tmp_path, start_new_session=True) as running:
+        assert running.stdout.readline() == "two.py: 16 starts, the first at the result\n"
+        if place == "jobs":
+            assert running.stdout.readline() == "at work\n"
+        else:
+            time.sleep(0.2)
+        os.killpg(running.pid, signal.SIGINT)
+        out, error = running.communicate(timeout=30)
+    assert error == "sysid: interrupted after 0 of 16 jobs; the same command goes on from there\n"
+    assert running.returncode == 130
+    assert [line for line in out.splitlines() if line != "at work"] == [str(Path("refine/jobs.sqlite"))]
+    assert [path.name for path in (tmp_path / "refine").iterdir()] == ["jobs.sqlite"]
 
 
 def test_without_noise_there_is_nothing_to_draw(capsys):
