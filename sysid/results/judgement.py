@@ -11,6 +11,7 @@ import numpy as np
 from sysid.assessment.checks import doubts
 from sysid.assessment.determination import determine
 from sysid.assessment.sensitivity import blocks_of
+from sysid.assessment.uncertainty import LARGE
 from sysid.modal_analysis.outliers import outliers
 from sysid.nlp import EXACT
 from sysid.problem.problem import Problem
@@ -22,7 +23,6 @@ from sysid.search.session import Session
 from sysid.search.strategy import Outcome
 
 _KNOWN = 0.1  # of the root of two diagonal entries; an entry with a larger standard deviation is not known
-_LARGE = 4000  # entries of the mode shapes, beyond which the covariance takes minutes and gigabytes
 _OUTLIERS = "for spikes and drop-outs state Problem(..., loss='huber'), or leave these lines out"
 _NO_FIT = 0.5  # relative residual above which nothing is explained
 
@@ -133,7 +133,7 @@ def _as_certain(it: Identification) -> Identification:
         exact = exact and not it.problem.formulation.priors and it.problem.objective(it.x) < EXACT
     if not it.determined or exact:
         return it
-    if it.structure.mode_shapes.size > _LARGE:
+    if it.structure.mode_shapes.size > LARGE:
         told = "whether noise leaves each entry known was not judged, as that takes minutes: see uncertainty"
         return replace(it, remarks=(*it.remarks, told))
     u, open_ = it.uncertainty, []

@@ -164,7 +164,8 @@ class _Run:
         )
         session.log(f"continuation over {problem.n_variables} unknowns in {len(self.steps)} steps{floor}")
         first = problem.formulation.guess if start is None else as_unknowns(problem, start)
-        for x in (first, *random_starts(problem, starts - 1, session.random)):
+        points = (first, *random_starts(problem, starts - 1, session.random))
+        for tried, x in enumerate(points, start=1):
             self._from(x)
             if self.stopped is not None or (self.ends and not session.time_for_more):
                 break
@@ -179,6 +180,12 @@ class _Run:
         if self.stopped is not None:
             success, message = False, str(self.stopped) or "interrupted"
         begun = _objective_at(problem, first)
+        skipped, remarks = len(points) - tried, ()
+        if skipped and self.stopped is None:
+            remarks = (
+                f"{skipped} of {len(points)} starts were left out for want of time: whether these would have found another "
+                "structure that explains the data as well is not known",
+            )
         phases = (
             *((Phase("start", begun, first, self.begun, 1),) if np.isfinite(begun) else ()),
             Phase("local phase", objective, best.x, session.seconds, best.curve.size),
@@ -187,7 +194,7 @@ class _Run:
             structure, best.x, Continuation.name, success, message,
             History(start=begun, local=objective, local_curve=best.curve, phases=phases), self.stopped,
             alternatives=tuple(_alternatives(problem, best.x, objective, self.ends)) if success else (),
-            good=self._good(objective, best),
+            remarks=remarks, good=self._good(objective, best),
         )  # fmt: skip
 
     def _from(self, x: Array) -> None:
