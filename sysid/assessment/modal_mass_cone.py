@@ -357,8 +357,8 @@ def _unseen(problem: Problem, structure: Structure, misfit: float, responses: _R
         elif share < responses.level:
             yield (
                 f"{_mode(structure, k)} makes {100 * share:.2g} % of the response, and what the fit misses of it "
-                f"({100 * responses.misfit:.2g} %) can look like a mode of up to {100 * responses.level:.2g} %: its mass "
-                "is not known"
+                f"({100 * responses.misfit:.2g} %) can look like a mode of up to {100 * responses.level:.2g} %: its "
+                "mass is not known"
             )
         elif not test.freq[0] <= f <= test.freq[-1]:
             yield (

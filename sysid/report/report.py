@@ -48,6 +48,7 @@ _WIDENED = (
     "Dashed: the swarm's objective of responses with widened peaks, which does not compare with that of the records "
     "themselves; what the phases leave of these stands below."
 )
+_MOST_OUTLIERS = 10  # that are told one by one
 _MANY_PANELS = 40  # beyond which the pictures are drawn with fewer pixels
 
 
@@ -111,6 +112,7 @@ def render(identification: Identification) -> str:
             ("Rigid-body mass", _rigid_body_mass(it)),
             ("Measured against identified", _responses(it, it.measurement)),
             ("Base force", _base_force(it, it.measurement)),
+            ("Outliers", _outliers(it)),
             ("Further tests", _further(it)),
             ("Validation", _validation(it)),
             ("Poles in the data", _poles(it)),
@@ -266,6 +268,17 @@ def _base_force(it: Identification, test: Measurement) -> str:
         alt = f"measured and identified base force, {name}"
         parts.append(picture(plot.base_forces(it, r, measurement=test, band=band), alt))
     return "\n".join(parts)
+
+
+def _outliers(it: Identification) -> str:
+    """The numbers that are farthest from the fit."""
+    found = it.outliers
+    rows = [(o.test, o.run, o.channel, number(o.freq, 6), number(o.size, 3)) for o in found[:_MOST_OUTLIERS]]
+    more = len(found) - len(rows)
+    all_of_them = "summary.json and Identification.outliers hold all of them"
+    caption = "Numbers of the records that are farthest from the fit; test 1 is the problem's own."
+    head = ("test", "run", "channel", "frequency [Hz]", "deviations from the fit")
+    return table(head, rows, caption) + (paragraph(f"And {more} more: {all_of_them}.", "soft") if more else "")
 
 
 def _further(it: Identification) -> str:

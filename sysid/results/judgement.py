@@ -12,7 +12,6 @@ from sysid.assessment.checks import doubts
 from sysid.assessment.determination import determine
 from sysid.assessment.sensitivity import blocks_of
 from sysid.assessment.uncertainty import LARGE
-from sysid.modal_analysis.outliers import outliers
 from sysid.nlp import EXACT
 from sysid.problem.problem import Problem
 from sysid.results.answer import NOT_JUDGED
@@ -20,7 +19,7 @@ from sysid.results.identification import Identification
 from sysid.results.unknowns_table import ON_BOUND
 from sysid.search.deadline import TimeIsOver, within
 from sysid.search.session import Session
-from sysid.search.strategy import Outcome
+from sysid.search.strategy import HUBER, Outcome
 
 _KNOWN = 0.1  # of the root of two diagonal entries; an entry with a larger standard deviation is not known
 _OUTLIERS = "for spikes and drop-outs state Problem(..., loss='huber'), or leave these lines out"
@@ -102,23 +101,26 @@ def _remarks(problem: Problem, end: Outcome) -> Iterator[str]:
 
 def _outliers(problem: Problem, end: Outcome) -> Iterator[str]:
     """Which numbers of the records are far from the fit: all where they count little, else those that stand alone."""
-    huber, fits = problem.loss == "huber", problem.fits(end.structure, end.x)
-    for i, (test, structure) in enumerate(fits, start=1):
-        found = outliers(test, structure, problem.n_variables, alone=not huber)
-        if not found:
-            continue
+    every = problem.outliers(end.structure, end.x)
+    if problem.loss == "squares":
+        what = f", and the lines beside them are not: {_OUTLIERS}"
+    elif any(phase.name == HUBER for phase in end.history.phases):
+        what = ": they count little, by Huber's loss"
+    else:
+        what = (
+            ": the search ended before Huber's loss, so that they count by their squares, but for those that stand "
+            "alone, which were taken out before it"
+        )
+    tests = sorted({one.test for one in every})
+    fits = {i: test for i, (test, _) in enumerate(problem.fits(end.structure, end.x), start=problem.first_test)}
+    for i in tests:
+        found, test = [one for one in every if one.test == i], fits[i]
         which = "the records" if len(fits) == 1 else f"test {i}"
         numbers = test.response.size + (0 if test.force is None else test.force.size)
         channels = ", ".join(f"{name} {count}" for name, count in Counter(one.channel for one in found).most_common(4))
-        far = max(found, key=lambda one: one.size)
-        told = (
-            f"{len(found)} of {numbers} numbers of {which} are up to {far.size:.3g} deviations from the fit "
-            f"({far.channel} at {far.freq:.5g} Hz; by channel {channels})"
-        )
         yield (
-            f"{told}: they count little, by Huber's loss"
-            if huber
-            else f"{told}, and the lines beside them are not: {_OUTLIERS}"
+            f"{len(found)} of {numbers} numbers of {which} are up to {found[0].size:.3g} deviations from the fit "
+            f"({found[0].channel} at {found[0].freq:.5g} Hz; by channel {channels}){what}"
         )
 
 

@@ -29,6 +29,10 @@ _NEAR = 1.1  # times the misfit of free residues at the poles of the data: what 
 _CHANCE = 1e-3  # that noise alone makes the misfit of one of two answers so much larger
 _APART = 0.01  # of an unknown's size, from which two solutions are two ...
 _TOGETHER = 1e-3  # ... and up to which two ways are one
+_LEFT_OUT = (
+    "{} of {} starts were left out for want of time: whether they end at another structure that explains the data as "
+    "well is not known"
+)
 _SMALL = 1e-3  # of its range: the least size of an unknown that may be zero
 
 
@@ -165,9 +169,13 @@ class _Run:
         session.log(f"continuation over {problem.n_variables} unknowns in {len(self.steps)} steps{floor}")
         first = problem.formulation.guess if start is None else as_unknowns(problem, start)
         points = (first, *random_starts(problem, starts - 1, session.random))
-        for tried, x in enumerate(points, start=1):
+        remarks: tuple[str, ...] = ()
+        for left, x in zip(reversed(range(len(points))), points, strict=True):
             self._from(x)
-            if self.stopped is not None or (self.ends and not session.time_for_more):
+            if self.stopped is not None:
+                break
+            if self.ends and not session.time_for_more:
+                remarks = (_LEFT_OUT.format(left, len(points)),) if left else ()
                 break
         if self.stopped is not None and not isinstance(self.stopped, Stop | KeyboardInterrupt):
             raise self.stopped
@@ -180,12 +188,6 @@ class _Run:
         if self.stopped is not None:
             success, message = False, str(self.stopped) or "interrupted"
         begun = _objective_at(problem, first)
-        skipped, remarks = len(points) - tried, ()
-        if skipped and self.stopped is None:
-            remarks = (
-                f"{skipped} of {len(points)} starts were left out for want of time: whether these would have found another "
-                "structure that explains the data as well is not known",
-            )
         phases = (
             *((Phase("start", begun, first, self.begun, 1),) if np.isfinite(begun) else ()),
             Phase("local phase", objective, best.x, session.seconds, best.curve.size),
