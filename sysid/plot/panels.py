@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -13,6 +13,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.plot.canvas import (
     FAINT,
     IDENTIFIED,
+    INK,
     MEASURED,
     RESIDUAL,
     dress,
@@ -31,6 +32,10 @@ if TYPE_CHECKING:
 
 _BAND: dict[str, Any] = {
     "color": IDENTIFIED["color"], "alpha": 0.25, "linewidth": 0, "label": "95 % band", "zorder": 1.5,
+}  # fmt: skip
+_OUTLIER: dict[str, Any] = {
+    "color": INK, "linestyle": "none", "marker": "x", "markersize": 4, "markeredgewidth": 0.9, "label": "outlier",
+    "zorder": 4,
 }  # fmt: skip
 _VISIBLE = 2e-3  # of the magnitude: a narrower band hides behind the curve
 _ROUND_OFF = 1e-10  # of the largest channel: below it a response is arithmetic, not motion
@@ -51,6 +56,7 @@ class Channel(NamedTuple):
     phase: str
     negligible: bool
     std: Array  # of the identified spectrum
+    outliers: Array  # Hz
 
 
 def run_names(test: Measurement) -> tuple[str, ...]:
@@ -68,7 +74,8 @@ def response_channel(
     unit = "–" if test.translational[run % test.n_base] else "m"
     words = test.sensor_names[sensor], f"transmissibility [{unit}]", "acceleration spectrum\n[m/s², own scale]"
     std = _std(test, run, _band_of(test, band, test.n_sensors)[sensor])
-    return _channel(test, test.response[run, sensor], predicted, run, words, np.abs(test.response).max(), std)
+    drawn = _channel(test, test.response[run, sensor], predicted, run, words, np.abs(test.response).max(), std)
+    return drawn._replace(outliers=_outliers(identification, test, test.sensor_names[sensor], run))
 
 
 def force_channel(
@@ -87,7 +94,14 @@ def force_channel(
     )
     std = _std(test, run, _band_of(test, band, test.n_base)[direction])
     largest = np.abs(test.force[:, direction]).max()
-    return _channel(test, test.force[run, direction], predicted, run, words, largest, std)
+    drawn = _channel(test, test.force[run, direction], predicted, run, words, largest, std)
+    return drawn._replace(outliers=_outliers(identification, test, f"force {test.base_axes[direction]}", run))
+
+
+def _outliers(identification: Identification, test: Measurement, channel: str, run: int) -> Array:
+    """Lines of a record that are outliers, Hz; none of a test that was not fitted."""
+    found = identification.outliers if test is identification.measurement else ()
+    return np.array([one.freq for one in found if one[:3] == (1, run + 1, channel)])
 
 
 def _band_of(test: Measurement, band: ArrayLike | None, rows: int) -> Array:
@@ -115,12 +129,13 @@ def _channel(
     negligible = bool(np.abs(measured).max() <= _ROUND_OFF * largest)
     if test.has_unit_runs:
         ones = np.ones_like(measured)
-        return Channel(test.freq, measured, predicted, ones, title, per_base, "phase [°]", negligible, std)
+        return Channel(test.freq, measured, predicted, ones, title, per_base, "phase [°]", negligible, std, np.zeros(0))
     moved = int(np.argmax(np.linalg.norm(test.base[run], axis=-1)))
     assert test.base_axes is not None
     phase = f"phase to\nbase {test.base_axes[moved]} [°]"
     # The scale of a spectrum (a line, per Hz, one-sided) is the record's own affair.
-    return Channel(test.freq, measured, predicted, test.base[run, moved], title, spectrum, phase, negligible, std)
+    against = test.base[run, moved]
+    return Channel(test.freq, measured, predicted, against, title, spectrum, phase, negligible, std, np.zeros(0))
 
 
 def place(ax: Axes | Sequence[Axes] | None, channel: Channel) -> Any:
@@ -152,15 +167,17 @@ def panels(channels: Sequence[Channel], *, alone: float = 6.4) -> Figure:
         for ax, same in zip(axes, (channel.quantity == before.quantity, channel.phase == before.phase), strict=True):
             if at % columns and same:  # what is shared along a row is said once
                 ax.set_ylabel("")
-    figure.legend(handles=key(axes[0]), loc="lower center", ncols=4, frameon=False, fontsize="small")
+    figure.legend(handles=key(figure.axes), loc="lower center", ncols=5, frameon=False, fontsize="small")
     return figure
 
 
-def key(magnitude: Axes) -> list[Any]:
-    """The entries of a legend, in their order."""
-    handles, labels = magnitude.get_legend_handles_labels()
-    entries = dict(zip(labels, handles, strict=True))
-    told = (style["label"] for style in (MEASURED, IDENTIFIED, _BAND, RESIDUAL))
+def key(axes: Iterable[Axes]) -> list[Any]:
+    """The entries of a legend of all these axes, in their order."""
+    entries: dict[str, Any] = {}
+    for ax in axes:
+        handles, labels = ax.get_legend_handles_labels()
+        entries |= dict(zip(labels, handles, strict=True))
+    told = (style["label"] for style in (MEASURED, IDENTIFIED, _BAND, RESIDUAL, _OUTLIER))
     return [entries[label] for label in told if label in entries]
 
 
@@ -175,6 +192,9 @@ def draw(axes: Any, channel: Channel) -> None:
     magnitude.plot(freq, positive(error), **RESIDUAL)
     magnitude.plot(freq, positive(size), **shown)
     magnitude.plot(freq, positive(modelled), **answered)
+    off = np.isin(freq, channel.outliers)
+    if np.any(off):
+        magnitude.plot(freq[off], positive(size[off]), **_OUTLIER)
     reach = DEVIATES * channel.std
     if np.any(reach > _VISIBLE * modelled):
         # The magnitude strays no further than the complex value; to zero, a logarithmic axis cannot follow.

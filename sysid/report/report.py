@@ -141,6 +141,7 @@ def _verdict(it: Identification) -> str:
     )
     word = "Interrupted: the best until then" if it.interrupted else "Success" if it.success else "No success"
     all_records = "over the relative accelerations of all runs, sensors and lines, unweighted"
+    all_records += "; outliers that stand alone are left out" * (it.problem.loss == "huber")
     of = all_records if it.residuals else "of the misfit that the problem states"
     lines = [
         it.message,
@@ -248,8 +249,12 @@ def _responses(it: Identification, test: Measurement) -> str:
         band = u.transmissibility(test.freq)
         words += " The shade around the identified curve, where it is wide enough to be seen, is its 95 % interval."
     dpi = 130 if test.n_sensors * test.n_runs <= _MANY_PANELS else 92
+    own = _as_fitted(it, test)
+    words += " Relative residuals leave out the outliers that stand alone, as that of the whole test does." * (
+        own is not test
+    )
     parts = [paragraph(words, "soft")]
-    for s, (name, score) in enumerate(zip(test.sensor_names, scores(it.structure, test).relative, strict=True)):
+    for s, (name, score) in enumerate(zip(test.sensor_names, scores(it.structure, own).relative, strict=True)):
         alt = f"{name}: measured and identified response, {', '.join(run_names(test))}"
         drawn = picture(plot.responses(it, s, measurement=test, band=band), alt, dpi=dpi)
         heading = f"{name}: relative residual {number(1 - score, 3)}" if np.isfinite(score) else name
@@ -257,11 +262,18 @@ def _responses(it: Identification, test: Measurement) -> str:
     return "\n".join(parts)
 
 
+def _as_fitted(it: Identification, test: Measurement) -> Measurement:
+    """The test with the records whose residual is told: of the one that was fitted, without what stands alone."""
+    return it.problem.screened.measurement if test is it.measurement else test
+
+
 def _base_force(it: Identification, test: Measurement) -> str:
     if test.force is None:
         return ""
-    residual = number(test.force_residual(it.structure))
-    parts = [paragraph(f"Force of the base on the structure. Relative residual over all of it: {residual}.", "soft")]
+    own = _as_fitted(it, test)
+    aside = ", outliers that stand alone left out" * (own is not test)
+    residual = f"Relative residual over all of it{aside}: {number(own.force_residual(it.structure))}"
+    parts = [paragraph(f"Force of the base on the structure. {residual}.", "soft")]
     u = it.quick_uncertainty
     band = None if u is None else u.base_force(test.freq)
     for r, name in enumerate(run_names(test)):
@@ -311,7 +323,9 @@ def _validation(it: Identification) -> str:
             _base_force(it, test),
         ]
     if parts:
-        parts.append("<h3>The test that was fitted, for comparison</h3>" + _score_table(it, it.measurement))
+        parts.append(
+            "<h3>The test that was fitted, for comparison</h3>" + _score_table(it, _as_fitted(it, it.measurement))
+        )
     return "\n".join(parts)
 
 
@@ -333,7 +347,8 @@ def _poles(it: Identification) -> str:
     if diagram.axes[0].texts:
         left = "the largest singular value; why it is without poles stands in the picture"
     right = "all singular values; two that peak at one line are two modes there"
-    return paragraph(f"What the records show without the model. Left: {left}. Right: {right}.", "soft") + beside(
+    aside = ", outliers that stand alone left out" * (it.problem.loss == "huber")
+    return paragraph(f"What the records show without the model{aside}. Left: {left}. Right: {right}.", "soft") + beside(
         picture(diagram, "stabilisation diagram"), picture(plot.cmif(it), "complex mode indicator function")
     )
 

@@ -75,6 +75,14 @@ def test_outliers_are_listed_by_test_run_channel_and_line(tmp_path):
     listed = result.to_dict()["outliers"]
     assert [tuple(one.values()) for one in listed] == [tuple(one) for one in result.outliers]
     assert list(listed[0]) == ["test", "run", "channel", "frequency_hz", "deviations"]
+    figure = sysid.plot.responses(result, "sensor 2")
+    (marked,) = (line for line in figure.axes[0].lines if line.get_label() == "outlier")
+    np.testing.assert_array_equal(marked.get_xydata(), [[FREQ[20], np.abs(tests[0].response[0, 1, 20])]])
+    assert "outlier" in [text.get_text() for text in figure.legends[0].get_texts()]
+    rounds = result.history.phases[-1].evaluations
+    curves = {line.get_label()[:6]: line.get_ydata() for line in sysid.plot.convergence(result).axes[0].lines}
+    assert curves["rounds"].size == rounds
+    assert curves["local "].size == result.history.local_curve.size - rounds
     page = write(result, tmp_path).read_text(encoding="utf-8")
     table = page[page.index("farthest from the fit") :]
     assert table.index(f"{FREQ[100]:.6g}") < table.index(f"{FREQ[20]:.6g}") < table.index(f"{FREQ[90]:.6g}")
