@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
@@ -57,6 +57,7 @@ class Channel(NamedTuple):
     negligible: bool
     std: Array  # of the identified spectrum
     outliers: Array  # Hz
+    gaps: NDArray[np.intp]  # lines before which others are left out
 
 
 def run_names(test: Measurement) -> tuple[str, ...]:
@@ -129,13 +130,17 @@ def _channel(
     negligible = bool(np.abs(measured).max() <= _ROUND_OFF * largest)
     if test.has_unit_runs:
         ones = np.ones_like(measured)
-        return Channel(test.freq, measured, predicted, ones, title, per_base, "phase [°]", negligible, std, np.zeros(0))
+        return Channel(
+            test.freq, measured, predicted, ones, title, per_base, "phase [°]", negligible, std, np.zeros(0), test.gaps
+        )
     moved = int(np.argmax(np.linalg.norm(test.base[run], axis=-1)))
     assert test.base_axes is not None
     phase = f"phase to\nbase {test.base_axes[moved]} [°]"
     # The scale of a spectrum (a line, per Hz, one-sided) is the record's own affair.
     against = test.base[run, moved]
-    return Channel(test.freq, measured, predicted, against, title, spectrum, phase, negligible, std, np.zeros(0))
+    return Channel(
+        test.freq, measured, predicted, against, title, spectrum, phase, negligible, std, np.zeros(0), test.gaps
+    )
 
 
 def place(ax: Axes | Sequence[Axes] | None, channel: Channel) -> Any:
@@ -189,16 +194,17 @@ def draw(axes: Any, channel: Channel) -> None:
     thin = {"linewidth": 0.7} if freq.size > _DENSE else {}
     shown, answered = MEASURED | thin, IDENTIFIED | thin
     size, modelled, error = np.abs(measured), np.abs(identified), np.abs(identified - measured)
-    magnitude.plot(freq, positive(error), **RESIDUAL)
-    magnitude.plot(freq, positive(size), **shown)
-    magnitude.plot(freq, positive(modelled), **answered)
+    lines = broken(freq, channel.gaps)
+    for curve, style in ((error, RESIDUAL), (size, shown), (modelled, answered)):
+        magnitude.plot(lines, broken(positive(curve), channel.gaps), **style)
     off = np.isin(freq, channel.outliers)
     if np.any(off):
         magnitude.plot(freq[off], positive(size[off]), **_OUTLIER)
     reach = DEVIATES * channel.std
     if np.any(reach > _VISIBLE * modelled):
         # The magnitude strays no further than the complex value; to zero, a logarithmic axis cannot follow.
-        magnitude.fill_between(freq, np.maximum(modelled - reach, 1e-3 * modelled), modelled + reach, **_BAND)
+        ends = np.maximum(modelled - reach, 1e-3 * modelled), modelled + reach
+        magnitude.fill_between(lines, *(broken(end, channel.gaps) for end in ends), **_BAND)
     lowest, highest = _span(np.append(size, modelled), error)
     if highest > 0:
         magnitude.set_yscale("log")
@@ -215,7 +221,8 @@ def draw(axes: Any, channel: Channel) -> None:
         magnitude.set_xlabel("")
         magnitude.tick_params(which="both", labelbottom=False)
         for record, style in ((measured, shown), (identified, answered)):
-            phase.plot(*_wrapped(freq, np.angle(record * np.conj(channel.against), deg=True)), **style)
+            angle = np.angle(record * np.conj(channel.against), deg=True)
+            phase.plot(*_wrapped(freq, angle, channel.gaps), **style)
         phase.set_ylim(-190, 190)
         phase.set_yticks([-180, -90, 0, 90, 180], ["−180", "", "0", "", "180"])
         dress(phase, "", "frequency [Hz]", channel.phase)
@@ -230,10 +237,15 @@ def _span(sizes: Array, error: Array) -> tuple[float, float]:
     return max(0.5 * lowest, 1e-5 * top), 1.8 * top
 
 
-def _wrapped(freq: Array, degrees: Array) -> tuple[Array, Array]:
-    """Break a phase curve where it wraps, rather than draw a line across the picture."""
-    jumps = np.flatnonzero(np.abs(np.diff(degrees)) > 180) + 1
-    return np.insert(freq, jumps, np.nan), np.insert(degrees, jumps, np.nan)
+def broken(values: Array, gaps: NDArray[np.intp]) -> Array:
+    """Values along lines, with NaN, where no curve is joined, before those that come after a gap."""
+    return np.insert(values, gaps, np.nan, axis=-1)
+
+
+def _wrapped(freq: Array, degrees: Array, gaps: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Break a phase curve at gaps, and where it wraps, rather than draw a line across the picture."""
+    jumps = np.union1d(np.flatnonzero(np.abs(np.diff(degrees)) > 180) + 1, gaps)
+    return broken(freq, jumps), broken(degrees, jumps)
 
 
 def index_of(what: str, value: int | str, names: Sequence[str]) -> int:

@@ -12,6 +12,7 @@ from sysid.assessment.checks import doubts
 from sysid.assessment.determination import determine
 from sysid.assessment.sensitivity import blocks_of
 from sysid.assessment.uncertainty import LARGE
+from sysid.measurement.missing import in_words
 from sysid.nlp import EXACT
 from sysid.problem.problem import Problem
 from sysid.results.answer import NOT_JUDGED
@@ -91,9 +92,12 @@ def _remarks(problem: Problem, end: Outcome) -> Iterator[str]:
         names = [label for label, on in zip(formulation.labels, at, strict=True) if on]
         if names:
             yield f"on a bound of the search space, beyond which the truth may lie: {', '.join(names)}"
-    dropped = sum(term.test.dropped for term in formulation.tests)
-    if dropped:
-        yield f"{dropped} lines at which a record holds NaN are left out"
+    tests = [term.test for term in formulation.tests]
+    for i, test in enumerate(tests, start=problem.first_test):
+        if test.dropped:
+            where = f" ({in_words(test.holes, test.freq)})" if test.holes else ""
+            which = "" if len(tests) == 1 else f" of test {i}"
+            yield f"{test.dropped} lines at which a record holds NaN are left out{which} for all channels alike{where}"
     yield from _outliers(problem, end)
     if not formulation.fits_records:
         yield "the problem states a misfit of its own; pictures and scores compare with the records as they are"
