@@ -110,6 +110,8 @@ def identify(
         try:
             outcome, why = _run(chosen, why, problem.screened, session, start, follow=strategy == "auto")
             outcome = settled(problem, outcome, chosen, session)
+        except Stop as stop:  # before there was any structure
+            raise SolverError(f"{stop}: nothing is identified") from None
         except (InputError, SolverError):
             if max_time is None:  # it has ended by itself, and would end so again
                 journal.entries.clear()

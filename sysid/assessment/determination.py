@@ -23,6 +23,7 @@ from sysid.assessment.sensitivity import (
     sensitivity,
     with_totals,
 )  # fmt: skip
+from sysid.assessment.uncertainty import LARGE, uncertainty
 from sysid.errors import InputError
 from sysid.models.unknowns import scales_of, split
 from sysid.nlp import EXACT
@@ -34,6 +35,7 @@ from sysid.structure.structure import Array, Structure
 _LOOSE = 1e-2  # of an unknown, by which what is left of exact records may move it
 _MOVED = 1e-6  # of the root of two diagonals, by which an unseen step of order one must change an entry to count
 _OTHER = 1e-3  # of an unknown, or of the root of two diagonals: what differs by less is the same
+_BEYOND = 5.0  # standard deviations by which an entry of another structure must differ: noise hardly moves one so far
 _TOLD = 4  # unknowns of another answer, told
 _SAME_MATRICES = "mass, stiffness and damping stay the same all the same"
 BY_CONE = "judged by the modal-mass cone, which holds all models that explain the data"
@@ -234,18 +236,33 @@ def _others(problem: Problem, structure: Structure, x: Array | None, rivals: Seq
         off = np.where(named, np.abs(other - x) / unit, 0.0)
         far = [j for j in np.argsort(-off, kind="stable")[:_TOLD] if off[j] > _OTHER]
         told = ", ".join(f"{labels[j]} = {other[j]:.4g} in place of {x[j]:.4g}" for j in sorted(far))
-        if _other_matrices(problem, structure, other):
+        if _other_matrices(problem, structure, x, other):
             yield ": ".join(filter(None, ("another structure explains the data as well", told)))
 
 
-def _other_matrices(problem: Problem, mine: Structure, other: Array) -> bool:
-    """Whether other unknowns stand for other matrices, and not for the same in another way."""
+def _other_matrices(problem: Problem, mine: Structure, x: Array, other: Array) -> bool:
+    """Whether other unknowns stand for other matrices, beyond what noise leaves open, and not for the same ones."""
     try:
         its = problem.structure(other)
     except InputError:  # of no structure
         return False
     sizes = [np.sqrt(np.abs(np.diag(a))) + np.finfo(float).tiny for a in blocks_of(mine)]
+    pairs = list(zip(blocks_of(mine), blocks_of(its), sizes, strict=True))
+    if all(np.all(np.abs(a - b) <= _OTHER * np.outer(size, size)) for a, b, size in pairs):
+        return False
+    stds = _stds(problem, mine, x)
     return any(
-        np.any(np.abs(a - b) > _OTHER * np.outer(size, size))
-        for a, b, size in zip(blocks_of(mine), blocks_of(its), sizes, strict=True)
+        np.any(np.abs(a - b) > np.fmax(_OTHER * np.outer(size, size), _BEYOND * std))  # NaN where something is open
+        for (a, b, size), std in zip(pairs, stds, strict=True)
     )
+
+
+def _stds(problem: Problem, structure: Structure, x: Array) -> tuple[Array, ...]:
+    """Standard deviations of M_SS, K_SS and C by the noise; zeros where they take minutes or nothing tells them."""
+    try:
+        if structure.mode_shapes.size <= LARGE:
+            u = uncertainty(problem, structure, x)
+            return u.mass, u.stiffness, u.damping
+    except InputError:
+        pass
+    return tuple(np.zeros_like(a) for a in blocks_of(structure))

@@ -356,8 +356,9 @@ def _unseen(problem: Problem, structure: Structure, misfit: float, responses: _R
             yield f"{_mode(structure, k)} is not moved by the base: nothing in these data tells its mass"
         elif share < responses.level:
             yield (
-                f"{_mode(structure, k)} makes {100 * share:.2g} % of the response, which does not stand out of the "
-                f"misfit of {100 * responses.misfit:.2g} %: its mass is not known"
+                f"{_mode(structure, k)} makes {100 * share:.2g} % of the response, and what the fit misses of it "
+                f"({100 * responses.misfit:.2g} %) can look like a mode of up to {100 * responses.level:.2g} %: its "
+                "mass is not known"
             )
         elif not test.freq[0] <= f <= test.freq[-1]:
             yield (
@@ -365,7 +366,12 @@ def _unseen(problem: Problem, structure: Structure, misfit: float, responses: _R
                 f"answers for all modes there{_like_rigid(test, structure, k)}"
             )
         elif forces and _shares(test, structure, k, push.T, push, forces)[0] < forces.level:
-            yield f"{_mode(structure, k)} does not stand out of the misfit of the base force: its mass is not weighed"
+            (own,) = _shares(test, structure, k, push.T, push, forces)
+            yield (
+                f"{_mode(structure, k)} makes {100 * own:.2g} % of the base force, and what the fit misses of it "
+                f"({100 * forces.misfit:.2g} %) can look like a mode of up to {100 * forces.level:.2g} %: its mass is "
+                "not weighed"
+            )
 
 
 def _clusters(structure: Structure, misfit: float) -> list[list[int]]:

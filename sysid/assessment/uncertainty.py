@@ -36,6 +36,7 @@ from sysid.problem.problem import Problem
 from sysid.problem.slopes import slopes_of
 from sysid.structure.structure import Array, Structure, check_frequencies
 
+LARGE = 4000  # entries of the mode shapes, beyond which the covariance takes minutes and gigabytes
 _SAME = 1e-6  # relative distance that is put between repeated frequencies
 _LEAST_RATIO = 1e-8  # a damping ratio of zero has no logarithm
 

@@ -14,6 +14,11 @@ from sysid.jobs.spread import Spread, spreads
 from sysid.results.identification import Identification, Recipe
 from sysid.results.summary import counted
 
+_LARGER = (
+    "draws have the noise under which least squares scatter as Huber's loss does on the records: it is some per cent\n"
+    "larger than theirs, and so are the residuals"
+)
+
 
 def tell(folder: Path, result: Identification, recipe: Recipe, ends: list[JobResult], out: Output) -> None:
     """Write all draws; where two of them or more are fits, print their spreads and write these and the picture."""
@@ -31,6 +36,8 @@ def tell(folder: Path, result: Identification, recipe: Recipe, ends: list[JobRes
     else:
         found = spreads(result, ends)
         out.write(f"\n{table(found, count, len(ends))}\n\n")
+        if result.problem.loss == "huber":
+            out.write(f"{_LARGER}\n\n")
         of_all: list[Sequence[object]] = [("quantity", "value", "linear_std", "draws_std", "inside_share")]
         of_all += [(s.name, repr(s.value), repr(s.std), repr(s.drawn), repr(s.inside)) for s in found]
         files["spreads.csv"] = table_as_csv(of_all)

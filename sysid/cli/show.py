@@ -61,8 +61,8 @@ def show(problem: Problem, name: str) -> str:
         Where the problem cannot be searched, or the Jacobian is finite at no point that was looked at.
     """
     problem.check()
-    point = _point(problem)
-    blocks = (_test(problem, name), _variables(problem), _unknowns(problem), _at(problem, point))
+    judged = problem.screened  # as a search judges them
+    blocks = (_test(problem, name), _variables(problem), _unknowns(problem), _at(judged, _point(judged)))
     return "\n\n".join("\n".join(_folded(line) for line in block) for block in blocks)
 
 
@@ -313,12 +313,12 @@ def _unseen(problem: Problem, point: _Point) -> Iterator[str]:
     own, base = _moved_matrices(point)
     left = len(words) - own - base
     kinds = (
-        (own, f"mass, stiffness or damping change along {own}"),
-        (base, f"only mass and coupling of the base along {base}"),
-        (left, f"no matrix (the same structure, written otherwise) along {left}"),
+        (own, f"along {own} mass, stiffness or damping change"),
+        (base, f"along {base} only mass and coupling of the base change"),
+        (left, f"along {left} nothing changes, as other values of the unknowns make the same structure there"),
     )
-    changed = ", ".join(sentence for number, sentence in kinds if number)
-    yield f"  - no record sees {counted(len(words), 'direction')}; of these {changed}"
+    changed = "; ".join(sentence for number, sentence in kinds if number)
+    yield f"  - no record sees {counted(len(words), 'direction')}: {changed}"
     more = f" (the {_SHORTEST} shortest of {len(words)})" if len(words) > _SHORTEST else ""
     yield f"  - unseen{more}:"
     yield from (f"      {word}" for word in words[:_SHORTEST])
@@ -372,7 +372,7 @@ def _moves(problem: Problem, point: _Point) -> Array:
         replace(r, measurement=_with_noise(r.measurement)) if isinstance(r, FurtherTest) else r
         for r in problem.residuals
     ]
-    noisy = replace(problem, measurement=_with_noise(problem.measurement), residuals=residuals, loss="squares")
+    noisy = replace(problem, measurement=_with_noise(problem.measurement), residuals=residuals)
     return sensitivity(noisy.formulation, point.x, point.slopes, as_stated=True).normals
 
 

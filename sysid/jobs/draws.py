@@ -19,7 +19,9 @@ def drawn(problem: Problem, x: Array, random: np.random.SeedSequence) -> Problem
 
     Their noise has the stated standard deviations, raised as the linear uncertainty is where the misfit is larger, else
     the size of the misfit that `x` leaves; values known to some accuracy are drawn too (parametric bootstrap: B. Efron
-    and R. Tibshirani, An Introduction to the Bootstrap, 1993).
+    and R. Tibshirani, An Introduction to the Bootstrap, 1993). With pseudo-values for records, as under Huber's loss,
+    it is the noise under which squares scatter as that loss does: larger than that of the records by 1 / sqrt(0.95)
+    without outliers, and by more with them, and so are the residuals of the draws.
 
     Raises
     ------

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError, choice, finite_array, flag, instance, number, random_generator, refuse, sequence
 from sysid.measurement import spectra
-from sysid.measurement.missing import Missing, complete, present
+from sysid.measurement.missing import Missing, complete, named, present
 from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
 from sysid.structure.sensor import Sensor, checked_sensors, sensors_from_tree, sensors_to_tree
 from sysid.structure.structure import Array, ComplexArray, Structure, check_frequencies
@@ -94,7 +94,9 @@ class Measurement:
     missing : {"refuse", "drop"}
         What is done with NaN in the records or their deviations: "drop" leaves out every line that holds any.
     dropped : int
-        How many lines were left out so.
+        How many lines were left out so, of all records.
+    holes : tuple of (str, ndarray)
+        What held NaN there, a sensor's name or that of another record, and at which lines, Hz.
 
     Notes
     -----
@@ -113,13 +115,16 @@ class Measurement:
     base_axes: tuple[str, ...] | None = field(default=None, kw_only=True)
     missing: InitVar[Missing] = field(default="refuse", kw_only=True)
     dropped: int = field(default=0, kw_only=True)
+    holes: tuple[tuple[str, Array], ...] = field(default=(), kw_only=True)
 
     def __post_init__(self, missing: Missing) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 - a frozen class fills itself
         choice("missing", missing, ("refuse", "drop"))
         put("freq", check_frequencies(self.freq))
+        lines: Array = self.freq
+        holes: dict[str, NDArray[np.bool_]] = {}
         if missing == "drop":
-            there = present({name: getattr(self, name) for name in _RECORDS})
+            there, holes = present({name: getattr(self, name) for name in _RECORDS})
             put("dropped", self.dropped + self.freq.size - there["freq"].size)
             for name, record in there.items():
                 put(name, record)
@@ -146,6 +151,7 @@ class Measurement:
             ),
         )
         put("base_axes", self._check_base_axes(d))
+        put("holes", (*self.holes, *named(holes, lines, self.sensor_names, 1)))
         put("response_std", _std("response_std", self.response_std, self.response))
         put("force_std", _std("force_std", self.force_std, self.force))
 
@@ -185,13 +191,16 @@ class Measurement:
             "freq": self.freq, "base": self.base, "response": self.response, "rigid_body": self.rigid_body,
             "force": self.force, "sensors": sensors_to_tree(self.sensors), "response_std": self.response_std,
             "force_std": self.force_std, "base_axes": self.base_axes,
-            **({"dropped": self.dropped} if self.dropped else {}),  # so that an older sysid reads all others
+            # So that an older sysid reads all others.
+            **({"dropped": self.dropped} if self.dropped else {}),
+            **({"holes": [{"name": name, "freq": freq} for name, freq in self.holes]} if self.holes else {}),
         }  # fmt: skip
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Measurement:
         """Give the measurement of a tree that `to_tree` made."""
-        return cls(**{**tree, "sensors": sensors_from_tree(tree["sensors"])})
+        holes = tuple((hole["name"], hole["freq"]) for hole in tree.get("holes", ()))  # earlier files have none
+        return cls(**{**tree, "sensors": sensors_from_tree(tree["sensors"]), "holes": holes})
 
     @property
     def translational(self) -> NDArray[np.bool_]:
@@ -209,6 +218,12 @@ class Measurement:
         """How many lines there are, from where to where, and how many were left out for what was missing."""
         dropped = f" ({self.dropped} more hold NaN and are left out)" if self.dropped else ""
         return f"{self.freq.size} lines from {self.freq[0]:.4g} to {self.freq[-1]:.4g} Hz{dropped}"
+
+    @property
+    def gaps(self) -> NDArray[np.intp]:
+        """Lines before which others were left out, at which no curve is joined."""
+        before = np.searchsorted(self.freq, np.concatenate([freq for _, freq in self.holes] or [self.freq[:0]]))
+        return np.unique(before[(before > 0) & (before < self.freq.size)])
 
     @property
     def n_runs(self) -> int:
@@ -325,8 +340,10 @@ class Measurement:
             "response_std": response_std,
             "force_std": force_std,
         }
+        holes: dict[str, NDArray[np.bool_]] = {}
+        every = lines
         if missing == "drop":
-            given = present(given)
+            given, holes = present(given)
         dropped, lines = lines.size - given["freq"].size, given["freq"]
         force, response_std, force_std = (given[name] for name in ("force", "response_std", "force_std"))
         H = complete("frf", given["frf"], complex)
@@ -340,12 +357,13 @@ class Measurement:
             raise InputError(f"force is {F.shape}; with {d} base directions it is {wanted}")
         # The base direction comes first: it becomes the run.
         by_run: Any = lambda record: None if record is None else np.moveaxis(record, 1, 0)  # noqa: E731
-        named: Any = {"rigid_body": rigid_body, "sensors": sensors, "base_axes": base_axes, "dropped": dropped}
-        return cls(
+        options: Any = {"rigid_body": rigid_body, "sensors": sensors, "base_axes": base_axes, "dropped": dropped}
+        test = cls(
             lines, unit_runs(d, lines.size), by_run(H), force=by_run(F),
             response_std=by_run(_std("response_std", response_std, H)),
-            force_std=by_run(_std("force_std", force_std, F)), **named,
+            force_std=by_run(_std("force_std", force_std, F)), **options,
         )  # fmt: skip
+        return replace(test, holes=named(holes, every, test.sensor_names, 0)) if holes else test
 
     @classmethod
     def from_time(
@@ -438,10 +456,10 @@ def simulate(
     base_force = force_std = None
     if flag("force", force):
         base_force, force_std = _with_noise(np.moveaxis(structure.base_force(lines), 1, 0), noise, random)
-    named: Any = {"sensors": structure.sensors, "base_axes": base_axes}
+    options: Any = {"sensors": structure.sensors, "base_axes": base_axes}
     return Measurement(
         lines, unit_runs(structure.n_base, lines.size), response, rigid_body=structure.rigid_body,
-        force=base_force, response_std=response_std, force_std=force_std, **named,
+        force=base_force, response_std=response_std, force_std=force_std, **options,
     )  # fmt: skip
 
 

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError, finite_array, numbers
+from sysid.structure.structure import Array
+
+_RANGES = 4  # of lines that are told
 
 Missing = Literal["refuse", "drop"]
 
 
-def present(given: dict[str, Any]) -> dict[str, Any]:
-    """Records and deviations, by name, without the lines at which any of them is NaN; infinite numbers stay.
+def present(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, NDArray[np.bool_]]]:
+    """Records and deviations, by name, without the lines at which any of them is NaN; and where they are.
+
+    Infinite numbers stay.
 
     Raises
     ------
@@ -33,7 +39,33 @@ def present(given: dict[str, Any]) -> dict[str, Any]:
     if not np.any(keep):
         told = ", ".join(f"{name} at {np.count_nonzero(hole)}" for name, hole in holes.items() if np.any(hole))
         raise InputError(f"missing='drop' leaves no line: of {lines}, NaN stands in {told}")
-    return given | {name: a[..., keep] if a.shape[-1:] == (lines,) else a for name, a in arrays.items()}
+    kept = {name: a[..., keep] if a.shape[-1:] == (lines,) else a for name, a in arrays.items()}
+    return given | kept, {name: np.isnan(arrays[name]) for name, hole in holes.items() if np.any(hole)}
+
+
+def named(
+    holes: dict[str, NDArray[np.bool_]], freq: Array, sensors: Sequence[str], axis: int
+) -> tuple[tuple[str, Array], ...]:
+    """What holds NaN, and where, Hz: sensors by name, their `axis` being that of three; other records by their own."""
+    found: list[tuple[str, Array]] = []
+    for name, hole in holes.items():
+        rows, names = hole.reshape(1, -1, hole.shape[-1]), [name]
+        if name in ("response", "frf"):
+            first = np.moveaxis(hole, axis if hole.ndim == 3 else 0, 0)
+            rows, names = first.reshape(len(first), -1, freq.size), list(sensors)
+        found += [(one, freq[np.any(row, axis=0)]) for one, row in zip(names, rows, strict=True) if np.any(row)]
+    return tuple(found)
+
+
+def in_words(holes: tuple[tuple[str, Array], ...], freq: Array) -> str:
+    """Which channels hold NaN and from where to where; what no line of `freq` parts is one range."""
+    told = []
+    for name, at in holes:
+        parts = np.split(at, np.flatnonzero(np.diff(np.searchsorted(freq, at))) + 1)
+        ranges = [f"{p[0]:.5g}" if p.size == 1 else f"{p[0]:.5g} to {p[-1]:.5g}" for p in parts[:_RANGES]]
+        more = f" and {len(parts) - _RANGES} more ranges" if len(parts) > _RANGES else ""
+        told.append(f"{name} at {', '.join(ranges)} Hz{more}")
+    return "; ".join(told)
 
 
 def complete(name: str, value: ArrayLike, kind: type = float) -> NDArray[Any]:

@@ -74,8 +74,13 @@ class Whitened(NamedTuple):
 
 
 class Outlier(NamedTuple):
-    """A number of the records: its channel, its line in Hz, its distance from the fit in deviations."""
+    """A number of the records: its test and run, both from 1, its channel, its line in Hz, its deviations from the fit.
 
+    Test 1 is the problem's own, further ones follow. The channel is a sensor's name, or "force x".
+    """
+
+    test: int
+    run: int
     channel: str
     freq: float
     size: float
@@ -278,8 +283,10 @@ def _heights(freq: Array, omega: Array, ratios: Array) -> Array:
     return size
 
 
-def outliers(test: Measurement, structure: Structure, unknowns: int, *, alone: bool = True) -> list[Outlier]:
-    """Numbers of the records that are far from what a structure makes of them.
+def outliers(
+    test: Measurement, structure: Structure, unknowns: int, *, alone: bool = True, number: int = 1
+) -> list[Outlier]:
+    """Numbers of the records that are far from what a structure makes of them, the test's own `number` beside each.
 
     Only those that stand `alone`, or all.
     """
@@ -288,8 +295,8 @@ def outliers(test: Measurement, structure: Structure, unknowns: int, *, alone: b
     first, found = 0, []
     for part in whitened(test, predicted(test, structure), unknowns):
         far = stand_alone(part.u, test.freq, omega, ratios, times=_CERTAIN) if alone else np.abs(part.u) > _FAR
-        for run, channel, line in np.argwhere(far):
+        for run, channel, line in np.argwhere(far).tolist():
             size = float(np.abs(part.u[run, channel, line]))
-            found.append(Outlier(names[first + channel], float(test.freq[line]), size))
+            found.append(Outlier(number, run + 1, names[first + channel], float(test.freq[line]), size))
         first += part.u.shape[1]
     return found

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -131,10 +131,10 @@ def positive(values: Array) -> Array:
     return np.where(values > 0, values, np.nan)
 
 
-def plain_log(axis: Any) -> None:
-    """Ticks of a short logarithmic axis at 1, 2, 5, in plain numbers."""
+def plain_log(axis: Any, at: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
+    """Ticks of a short logarithmic axis at such multiples of powers of ten, in plain numbers."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_locator(LogLocator(subs=at))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_locator(NullLocator())

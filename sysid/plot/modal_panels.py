@@ -12,6 +12,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.stabilisation import LEVELS, relative_frf, singular_values, stabilisation
 from sysid.modal_analysis.vector_fitting import find_poles
 from sysid.plot.canvas import COLOURS, FAINT, IDENTIFIED, INK, MEASURED, dress, frequency_axis, positive
+from sysid.plot.panels import broken
 from sysid.results.identification import Identification
 from sysid.structure.structure import Array
 
@@ -42,7 +43,7 @@ def draw_stabilisation(ax: Axes, subject: Identification | Measurement) -> None:
     test, modes, label = _modes_of(subject)
     values, _, unit = _indicator(test)
     behind: Any = ax.twinx()
-    behind.plot(test.freq, positive(values[0]), color=FAINT, linewidth=0.8)
+    behind.plot(broken(test.freq, test.gaps), broken(positive(values[0]), test.gaps), color=FAINT, linewidth=0.8)
     ax.set_zorder(behind.get_zorder() + 1)
     ax.patch.set_visible(False)
     frequency_axis(ax, test.freq)
@@ -76,7 +77,7 @@ def draw_cmif(ax: Axes, subject: Identification | Measurement) -> None:
     test, modes, label = _modes_of(subject)
     values, reason, unit = _indicator(test)
     for curve, style in zip(values, _CURVES, strict=False):
-        ax.plot(test.freq, positive(curve), zorder=3, **style)
+        ax.plot(broken(test.freq, test.gaps), broken(positive(curve), test.gaps), zorder=3, **style)
     frequency_axis(ax, test.freq)
     _mode_lines(ax, modes, label)
     _log_magnitude(ax, values, room=bool(reason))
@@ -89,7 +90,7 @@ def draw_cmif(ax: Axes, subject: Identification | Measurement) -> None:
 def _modes_of(subject: Identification | Measurement) -> tuple[Measurement, Array, str]:
     """Test, the modes to compare with (Hz), and whose they are: the result's, else those that vector fitting finds."""
     if isinstance(subject, Identification):
-        return subject.measurement, subject.structure.natural_frequencies, "identified mode"
+        return subject.problem.screened.measurement, subject.structure.natural_frequencies, "identified mode"
     try:
         return subject, find_poles(subject).omega / (2 * np.pi), "vector fitting"
     except InputError:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.plot.canvas import (
     FAINT,
     IDENTIFIED,
+    INK,
     MEASURED,
     RESIDUAL,
     dress,
@@ -31,6 +32,10 @@ if TYPE_CHECKING:
 
 _BAND: dict[str, Any] = {
     "color": IDENTIFIED["color"], "alpha": 0.25, "linewidth": 0, "label": "95 % band", "zorder": 1.5,
+}  # fmt: skip
+_OUTLIER: dict[str, Any] = {
+    "color": INK, "linestyle": "none", "marker": "x", "markersize": 4, "markeredgewidth": 0.9, "label": "outlier",
+    "zorder": 4,
 }  # fmt: skip
 _VISIBLE = 2e-3  # of the magnitude: a narrower band hides behind the curve
 _ROUND_OFF = 1e-10  # of the largest channel: below it a response is arithmetic, not motion
@@ -51,6 +56,8 @@ class Channel(NamedTuple):
     phase: str
     negligible: bool
     std: Array  # of the identified spectrum
+    outliers: Array  # Hz
+    gaps: NDArray[np.intp]  # lines before which others are left out
 
 
 def run_names(test: Measurement) -> tuple[str, ...]:
@@ -68,7 +75,8 @@ def response_channel(
     unit = "–" if test.translational[run % test.n_base] else "m"
     words = test.sensor_names[sensor], f"transmissibility [{unit}]", "acceleration spectrum\n[m/s², own scale]"
     std = _std(test, run, _band_of(test, band, test.n_sensors)[sensor])
-    return _channel(test, test.response[run, sensor], predicted, run, words, np.abs(test.response).max(), std)
+    drawn = _channel(test, test.response[run, sensor], predicted, run, words, np.abs(test.response).max(), std)
+    return drawn._replace(outliers=_outliers(identification, test, test.sensor_names[sensor], run))
 
 
 def force_channel(
@@ -87,7 +95,14 @@ def force_channel(
     )
     std = _std(test, run, _band_of(test, band, test.n_base)[direction])
     largest = np.abs(test.force[:, direction]).max()
-    return _channel(test, test.force[run, direction], predicted, run, words, largest, std)
+    drawn = _channel(test, test.force[run, direction], predicted, run, words, largest, std)
+    return drawn._replace(outliers=_outliers(identification, test, f"force {test.base_axes[direction]}", run))
+
+
+def _outliers(identification: Identification, test: Measurement, channel: str, run: int) -> Array:
+    """Lines of a record that are outliers, Hz; none of a test that was not fitted."""
+    found = identification.outliers if test is identification.measurement else ()
+    return np.array([one.freq for one in found if one[:3] == (1, run + 1, channel)])
 
 
 def _band_of(test: Measurement, band: ArrayLike | None, rows: int) -> Array:
@@ -115,12 +130,17 @@ def _channel(
     negligible = bool(np.abs(measured).max() <= _ROUND_OFF * largest)
     if test.has_unit_runs:
         ones = np.ones_like(measured)
-        return Channel(test.freq, measured, predicted, ones, title, per_base, "phase [°]", negligible, std)
+        return Channel(
+            test.freq, measured, predicted, ones, title, per_base, "phase [°]", negligible, std, np.zeros(0), test.gaps
+        )
     moved = int(np.argmax(np.linalg.norm(test.base[run], axis=-1)))
     assert test.base_axes is not None
     phase = f"phase to\nbase {test.base_axes[moved]} [°]"
     # The scale of a spectrum (a line, per Hz, one-sided) is the record's own affair.
-    return Channel(test.freq, measured, predicted, test.base[run, moved], title, spectrum, phase, negligible, std)
+    against = test.base[run, moved]
+    return Channel(
+        test.freq, measured, predicted, against, title, spectrum, phase, negligible, std, np.zeros(0), test.gaps
+    )
 
 
 def place(ax: Axes | Sequence[Axes] | None, channel: Channel) -> Any:
@@ -152,15 +172,17 @@ def panels(channels: Sequence[Channel], *, alone: float = 6.4) -> Figure:
         for ax, same in zip(axes, (channel.quantity == before.quantity, channel.phase == before.phase), strict=True):
             if at % columns and same:  # what is shared along a row is said once
                 ax.set_ylabel("")
-    figure.legend(handles=key(axes[0]), loc="lower center", ncols=4, frameon=False, fontsize="small")
+    figure.legend(handles=key(figure.axes), loc="lower center", ncols=5, frameon=False, fontsize="small")
     return figure
 
 
-def key(magnitude: Axes) -> list[Any]:
-    """The entries of a legend, in their order."""
-    handles, labels = magnitude.get_legend_handles_labels()
-    entries = dict(zip(labels, handles, strict=True))
-    told = (style["label"] for style in (MEASURED, IDENTIFIED, _BAND, RESIDUAL))
+def key(axes: Iterable[Axes]) -> list[Any]:
+    """The entries of a legend of all these axes, in their order."""
+    entries: dict[str, Any] = {}
+    for ax in axes:
+        handles, labels = ax.get_legend_handles_labels()
+        entries |= dict(zip(labels, handles, strict=True))
+    told = (style["label"] for style in (MEASURED, IDENTIFIED, _BAND, RESIDUAL, _OUTLIER))
     return [entries[label] for label in told if label in entries]
 
 
@@ -172,13 +194,17 @@ def draw(axes: Any, channel: Channel) -> None:
     thin = {"linewidth": 0.7} if freq.size > _DENSE else {}
     shown, answered = MEASURED | thin, IDENTIFIED | thin
     size, modelled, error = np.abs(measured), np.abs(identified), np.abs(identified - measured)
-    magnitude.plot(freq, positive(error), **RESIDUAL)
-    magnitude.plot(freq, positive(size), **shown)
-    magnitude.plot(freq, positive(modelled), **answered)
+    lines = broken(freq, channel.gaps)
+    for curve, style in ((error, RESIDUAL), (size, shown), (modelled, answered)):
+        magnitude.plot(lines, broken(positive(curve), channel.gaps), **style)
+    off = np.isin(freq, channel.outliers)
+    if np.any(off):
+        magnitude.plot(freq[off], positive(size[off]), **_OUTLIER)
     reach = DEVIATES * channel.std
     if np.any(reach > _VISIBLE * modelled):
         # The magnitude strays no further than the complex value; to zero, a logarithmic axis cannot follow.
-        magnitude.fill_between(freq, np.maximum(modelled - reach, 1e-3 * modelled), modelled + reach, **_BAND)
+        ends = np.maximum(modelled - reach, 1e-3 * modelled), modelled + reach
+        magnitude.fill_between(lines, *(broken(end, channel.gaps) for end in ends), **_BAND)
     lowest, highest = _span(np.append(size, modelled), error)
     if highest > 0:
         magnitude.set_yscale("log")
@@ -195,7 +221,8 @@ def draw(axes: Any, channel: Channel) -> None:
         magnitude.set_xlabel("")
         magnitude.tick_params(which="both", labelbottom=False)
         for record, style in ((measured, shown), (identified, answered)):
-            phase.plot(*_wrapped(freq, np.angle(record * np.conj(channel.against), deg=True)), **style)
+            angle = np.angle(record * np.conj(channel.against), deg=True)
+            phase.plot(*_wrapped(freq, angle, channel.gaps), **style)
         phase.set_ylim(-190, 190)
         phase.set_yticks([-180, -90, 0, 90, 180], ["−180", "", "0", "", "180"])
         dress(phase, "", "frequency [Hz]", channel.phase)
@@ -210,10 +237,15 @@ def _span(sizes: Array, error: Array) -> tuple[float, float]:
     return max(0.5 * lowest, 1e-5 * top), 1.8 * top
 
 
-def _wrapped(freq: Array, degrees: Array) -> tuple[Array, Array]:
-    """Break a phase curve where it wraps, rather than draw a line across the picture."""
-    jumps = np.flatnonzero(np.abs(np.diff(degrees)) > 180) + 1
-    return np.insert(freq, jumps, np.nan), np.insert(degrees, jumps, np.nan)
+def broken(values: Array, gaps: NDArray[np.intp]) -> Array:
+    """Values along lines, with NaN, where no curve is joined, before those that come after a gap."""
+    return np.insert(values, gaps, np.nan, axis=-1)
+
+
+def _wrapped(freq: Array, degrees: Array, gaps: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Break a phase curve at gaps, and where it wraps, rather than draw a line across the picture."""
+    jumps = np.union1d(np.flatnonzero(np.abs(np.diff(degrees)) > 180) + 1, gaps)
+    return broken(freq, jumps), broken(degrees, jumps)
 
 
 def index_of(what: str, value: int | str, names: Sequence[str]) -> int:

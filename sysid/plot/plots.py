@@ -40,6 +40,7 @@ from sysid.plot.panels import (
     with_force,
 )  # fmt: skip
 from sysid.results.identification import Identification
+from sysid.search.strategy import HUBER
 from sysid.structure.structure import Array
 
 if TYPE_CHECKING:
@@ -161,6 +162,7 @@ def base_forces(
 def convergence(identification: Identification, ax: Axes | None = None) -> Any:
     """Objective through the phases that ran: the swarm's best, the refinement, each iterate of the local phase.
 
+    Each round of Huber's loss weighs its records anew, so that the curve may step up from one to the next.
     Fits with widened peaks on the way are left out; a swarm's curve of such responses is dashed, and says so.
     It is the root of the sum of squares of all that is fitted, so it may differ from the residual, which is of
     accelerations alone and unweighted.
@@ -168,7 +170,9 @@ def convergence(identification: Identification, ax: Axes | None = None) -> Any:
     shown, ax = new_axes(ax, 6.0, 3.6)
     history = identification.history
     swarm, local = positive(history.swarm_curve), positive(history.local_curve)
-    _draw_curves(ax, swarm, local, history.refinement, widened=bool(swarm.size) and bool(np.isnan(history.start)))
+    rounds = sum(phase.evaluations for phase in history.phases if phase.name == HUBER)
+    widened = bool(swarm.size) and bool(np.isnan(history.start))
+    _draw_curves(ax, swarm, local, history.refinement, rounds=rounds, widened=widened)
     values = np.concatenate([swarm, local, [history.refinement]])
     values = values[values > 0]
     if values.size:
@@ -176,7 +180,9 @@ def convergence(identification: Identification, ax: Axes | None = None) -> Any:
         ax.set_yscale("log")
         # A curve that hardly falls is shown as flat as it is.
         ax.set_ylim(min(low / (high / low) ** 0.08, 0.6 * low), max(high * (high / low) ** 0.08, 1.6 * high))
-        if high < 30 * low:
+        if high < 3 * low:
+            plain_log(ax.yaxis, range(1, 10))
+        elif high < 30 * low:
             plain_log(ax.yaxis)
     if ax.get_legend_handles_labels()[0]:
         ax.legend(frameon=False, fontsize="small")
@@ -187,8 +193,11 @@ def convergence(identification: Identification, ax: Axes | None = None) -> Any:
     return shown
 
 
-def _draw_curves(ax: Axes, swarm: Array, local: Array, refinement: float, *, widened: bool) -> None:
-    """Best of the swarm, what the refinement made of it, and after them the iterates of the local phase."""
+def _draw_curves(ax: Axes, swarm: Array, local: Array, refinement: float, *, rounds: int, widened: bool) -> None:
+    """Best of the swarm, what the refinement made of it, and after them the iterates of the local phase.
+
+    The last of these are of the `rounds` of Huber's loss.
+    """
     from matplotlib.ticker import MaxNLocator
 
     end = max(swarm.size - 1, 0)
@@ -202,7 +211,13 @@ def _draw_curves(ax: Axes, swarm: Array, local: Array, refinement: float, *, wid
         # Without a swarm the iterates are few; a single one is no line.
         marker = None if swarm.size and local.size > 1 else "o"
         iterate, ended = end + np.arange(local.size), "local phase, of the records" if widened else "local phase"
-        ax.plot(iterate, local, color=COLOURS[5], linewidth=1.6, marker=marker, markersize=3.5, label=ended)
+        drawn: Any = {"linewidth": 1.6, "marker": marker, "markersize": 3.5}
+        first = max(local.size - rounds, 0)
+        if first:
+            ax.plot(iterate[:first], local[:first], color=COLOURS[5], label=ended, **drawn)
+        if rounds:
+            told = "rounds of Huber's loss, each with its own weights"
+            ax.plot(iterate[first:], local[first:], color=COLOURS[1], label=told, **drawn)
     if swarm.size and local.size:
         ax.axvline(end, color=FAINT, linewidth=0.8, linestyle=":")
     if refinement > 0:
@@ -348,7 +363,8 @@ def stabilisation(subject: Identification | Measurement, ax: Axes | None = None)
 
     A mode is a column of poles that stay where they are; behind them stands the largest singular value of the FRFs of
     relative acceleration. Dashed lines are the modes of the result or, for a measurement alone, those that vector
-    fitting finds. Where no FRF follows from the runs, the spectra and the modes are shown without poles, and why.
+    fitting finds. Where no FRF follows from the runs, the spectra and the modes are shown without poles, and why. With
+    Huber's loss the records are shown without outliers that stand alone.
 
     See Also
     --------
@@ -397,7 +413,7 @@ def overview(identification: Identification, *, title: str | None = None) -> Fig
         draw(above[:, column], channel)
     for ax in above[:, 1:].ravel():
         ax.set_ylabel("")
-    above[0, 0].legend(handles=key(above[0, 0]), frameon=False, fontsize="small")
+    above[0, 0].legend(handles=key(above[0]), frameon=False, fontsize="small")
     below = bottom.subplots(1, 3, width_ratios=[1.15, 1, 1.25])
     search = convergence if identification.history.swarm_curve.size else stabilisation
     search(identification, below[0])

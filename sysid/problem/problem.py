@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, choice, instance, number, refuse
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.outliers import predicted, pseudo_values, screened
+from sysid.modal_analysis.outliers import Outlier, outliers, predicted, pseudo_values, screened
 from sysid.modal_analysis.response import columns, weighed_mass
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.damping import ModalDamping
@@ -66,9 +66,9 @@ class Problem:
     goal : float, optional
         `residual` at which the identification counts as a success.
     loss : {"squares", "huber"}
-        "huber" makes numbers of the records count little that are far from the fit (`sysid.modal_analysis.outliers`):
-        for spikes and drop-outs at some lines of some channels. What else is fitted counts by its squares. A mode must
-        show at more than one line. `objective` and `residual` are of the records as `screened`.
+        "huber" makes numbers of the records count little that are far from the fit: for spikes and drop-outs at some
+        lines of some channels, which `Identification.outliers` then lists. What else is fitted counts by its squares.
+        A mode must show at more than one line. `objective` and `residual` are of the records as `screened`.
 
     The constructor checks types, shapes and what is written. Poles, weights and feasibility are found when they are
     first asked for, once; `check` refuses what cannot be searched.
@@ -211,6 +211,17 @@ class Problem:
         further = [r.measurement for r in self.residuals if isinstance(r, FurtherTest) and x is not None]
         terms = zip(further, self.formulation.further_tests, strict=False)
         return own + [(test, term.matrices.structure(x, test)) for test, term in terms if x is not None]
+
+    @property
+    def first_test(self) -> int:
+        """Number of the first fitted test: 1 is the problem's own, 2 a further one beside a misfit of one's own."""
+        return 1 if self.formulation.fits_records else 2
+
+    def outliers(self, structure: Structure, x: Array | None) -> list[Outlier]:
+        """Numbers of the fitted records that are far from an answer: see `Identification.outliers`."""
+        alone, fits = self.loss != "huber", enumerate(self.fits(structure, x), start=self.first_test)
+        found = [outliers(test, its, self.n_variables, alone=alone, number=i) for i, (test, its) in fits]
+        return sorted((one for of_test in found for one in of_test), key=lambda one: -one.size)
 
     def pseudo_values(self, structure: Structure, x: Array | None) -> Problem:
         """The problem in squares, with pseudo-values about an answer in the place of its records.

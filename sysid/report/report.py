@@ -48,6 +48,7 @@ _WIDENED = (
     "Dashed: the swarm's objective of responses with widened peaks, which does not compare with that of the records "
     "themselves; what the phases leave of these stands below."
 )
+_MOST_OUTLIERS = 10  # that are told one by one
 _MANY_PANELS = 40  # beyond which the pictures are drawn with fewer pixels
 
 
@@ -111,6 +112,7 @@ def render(identification: Identification) -> str:
             ("Rigid-body mass", _rigid_body_mass(it)),
             ("Measured against identified", _responses(it, it.measurement)),
             ("Base force", _base_force(it, it.measurement)),
+            ("Outliers", _outliers(it)),
             ("Further tests", _further(it)),
             ("Validation", _validation(it)),
             ("Poles in the data", _poles(it)),
@@ -139,6 +141,7 @@ def _verdict(it: Identification) -> str:
     )
     word = "Interrupted: the best until then" if it.interrupted else "Success" if it.success else "No success"
     all_records = "over the relative accelerations of all runs, sensors and lines, unweighted"
+    all_records += "; outliers that stand alone are left out" * (it.problem.loss == "huber")
     of = all_records if it.residuals else "of the misfit that the problem states"
     lines = [
         it.message,
@@ -246,8 +249,12 @@ def _responses(it: Identification, test: Measurement) -> str:
         band = u.transmissibility(test.freq)
         words += " The shade around the identified curve, where it is wide enough to be seen, is its 95 % interval."
     dpi = 130 if test.n_sensors * test.n_runs <= _MANY_PANELS else 92
+    own = _as_fitted(it, test)
+    words += " Relative residuals leave out the outliers that stand alone, as that of the whole test does." * (
+        own is not test
+    )
     parts = [paragraph(words, "soft")]
-    for s, (name, score) in enumerate(zip(test.sensor_names, scores(it.structure, test).relative, strict=True)):
+    for s, (name, score) in enumerate(zip(test.sensor_names, scores(it.structure, own).relative, strict=True)):
         alt = f"{name}: measured and identified response, {', '.join(run_names(test))}"
         drawn = picture(plot.responses(it, s, measurement=test, band=band), alt, dpi=dpi)
         heading = f"{name}: relative residual {number(1 - score, 3)}" if np.isfinite(score) else name
@@ -255,17 +262,35 @@ def _responses(it: Identification, test: Measurement) -> str:
     return "\n".join(parts)
 
 
+def _as_fitted(it: Identification, test: Measurement) -> Measurement:
+    """The test with the records whose residual is told: of the one that was fitted, without what stands alone."""
+    return it.problem.screened.measurement if test is it.measurement else test
+
+
 def _base_force(it: Identification, test: Measurement) -> str:
     if test.force is None:
         return ""
-    residual = number(test.force_residual(it.structure))
-    parts = [paragraph(f"Force of the base on the structure. Relative residual over all of it: {residual}.", "soft")]
+    own = _as_fitted(it, test)
+    aside = ", outliers that stand alone left out" * (own is not test)
+    residual = f"Relative residual over all of it{aside}: {number(own.force_residual(it.structure))}"
+    parts = [paragraph(f"Force of the base on the structure. {residual}.", "soft")]
     u = it.quick_uncertainty
     band = None if u is None else u.base_force(test.freq)
     for r, name in enumerate(run_names(test)):
         alt = f"measured and identified base force, {name}"
         parts.append(picture(plot.base_forces(it, r, measurement=test, band=band), alt))
     return "\n".join(parts)
+
+
+def _outliers(it: Identification) -> str:
+    """The numbers that are farthest from the fit."""
+    found = it.outliers
+    rows = [(o.test, o.run, o.channel, number(o.freq, 6), number(o.size, 3)) for o in found[:_MOST_OUTLIERS]]
+    more = len(found) - len(rows)
+    all_of_them = "summary.json and Identification.outliers hold all of them"
+    caption = "Numbers of the records that are farthest from the fit; test 1 is the problem's own."
+    head = ("test", "run", "channel", "frequency [Hz]", "deviations from the fit")
+    return table(head, rows, caption) + (paragraph(f"And {more} more: {all_of_them}.", "soft") if more else "")
 
 
 def _further(it: Identification) -> str:
@@ -298,7 +323,9 @@ def _validation(it: Identification) -> str:
             _base_force(it, test),
         ]
     if parts:
-        parts.append("<h3>The test that was fitted, for comparison</h3>" + _score_table(it, it.measurement))
+        parts.append(
+            "<h3>The test that was fitted, for comparison</h3>" + _score_table(it, _as_fitted(it, it.measurement))
+        )
     return "\n".join(parts)
 
 
@@ -320,7 +347,8 @@ def _poles(it: Identification) -> str:
     if diagram.axes[0].texts:
         left = "the largest singular value; why it is without poles stands in the picture"
     right = "all singular values; two that peak at one line are two modes there"
-    return paragraph(f"What the records show without the model. Left: {left}. Right: {right}.", "soft") + beside(
+    aside = ", outliers that stand alone left out" * (it.problem.loss == "huber")
+    return paragraph(f"What the records show without the model{aside}. Left: {left}. Right: {right}.", "soft") + beside(
         picture(diagram, "stabilisation diagram"), picture(plot.cmif(it), "complex mode indicator function")
     )
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.outliers import Outlier
 from sysid.modal_analysis.response import weighted_error
 from sysid.models.unknowns import Unknown, by_name
 from sysid.problem.problem import Problem
@@ -153,6 +154,16 @@ class Answer:
         huber = self.problem.loss == "huber"
         fitted = self.problem.pseudo_values(self.structure, self.x) if huber else self.problem
         return uncertainty(fitted, self.structure, self.x)
+
+    @cached_property
+    def outliers(self) -> tuple[Outlier, ...]:
+        """Numbers of the fitted records that are far from the fit, the farthest first.
+
+        With ``loss="huber"`` all beyond five deviations, which count little; else those that stand alone, beside lines
+        that fit: spikes and drop-outs. Each tells its `test` and `run` (from 1; test 1 is the problem's own, further
+        ones follow), its `channel` (a sensor's name, or "force x"), `freq` in Hz, and `size` in deviations.
+        """
+        return tuple(self.problem.outliers(self.structure, self.x))
 
     @property
     def covariance(self) -> Array:

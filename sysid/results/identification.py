@@ -142,6 +142,10 @@ class Identification(Answer):
             "closed_by": list(self.closed_by),
             "undetermined": list(self.undetermined),
             "remarks": list(self.remarks),
+            "outliers": [
+                {"test": o.test, "run": o.run, "channel": o.channel, "frequency_hz": o.freq, "deviations": o.size}
+                for o in self.outliers
+            ],
             "evaluations": int(self.history.evaluations),
             "wall_time_s": float(self.history.wall_time),
             "version": __version__,

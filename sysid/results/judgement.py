@@ -11,7 +11,8 @@ import numpy as np
 from sysid.assessment.checks import doubts
 from sysid.assessment.determination import determine
 from sysid.assessment.sensitivity import blocks_of
-from sysid.modal_analysis.outliers import outliers
+from sysid.assessment.uncertainty import LARGE
+from sysid.measurement.missing import in_words
 from sysid.nlp import EXACT
 from sysid.problem.problem import Problem
 from sysid.results.answer import NOT_JUDGED
@@ -19,10 +20,9 @@ from sysid.results.identification import Identification
 from sysid.results.unknowns_table import ON_BOUND
 from sysid.search.deadline import TimeIsOver, within
 from sysid.search.session import Session
-from sysid.search.strategy import Outcome
+from sysid.search.strategy import HUBER, Outcome
 
 _KNOWN = 0.1  # of the root of two diagonal entries; an entry with a larger standard deviation is not known
-_LARGE = 4000  # entries of the mode shapes, beyond which the covariance takes minutes and gigabytes
 _OUTLIERS = "for spikes and drop-outs state Problem(..., loss='huber'), or leave these lines out"
 NO_FIT = 0.5  # relative residual above which nothing is explained
 
@@ -92,9 +92,12 @@ def _remarks(problem: Problem, end: Outcome) -> Iterator[str]:
         names = [label for label, on in zip(formulation.labels, at, strict=True) if on]
         if names:
             yield f"on a bound of the search space, beyond which the truth may lie: {', '.join(names)}"
-    dropped = sum(term.test.dropped for term in formulation.tests)
-    if dropped:
-        yield f"{dropped} lines at which a record holds NaN are left out"
+    tests = [term.test for term in formulation.tests]
+    for i, test in enumerate(tests, start=problem.first_test):
+        if test.dropped:
+            where = f" ({in_words(test.holes, test.freq)})" if test.holes else ""
+            which = "" if len(tests) == 1 else f" of test {i}"
+            yield f"{test.dropped} lines at which a record holds NaN are left out{which} for all channels alike{where}"
     yield from _outliers(problem, end)
     if not formulation.fits_records:
         yield "the problem states a misfit of its own; pictures and scores compare with the records as they are"
@@ -102,23 +105,26 @@ def _remarks(problem: Problem, end: Outcome) -> Iterator[str]:
 
 def _outliers(problem: Problem, end: Outcome) -> Iterator[str]:
     """Which numbers of the records are far from the fit: all where they count little, else those that stand alone."""
-    huber, fits = problem.loss == "huber", problem.fits(end.structure, end.x)
-    for i, (test, structure) in enumerate(fits, start=1):
-        found = outliers(test, structure, problem.n_variables, alone=not huber)
-        if not found:
-            continue
+    every = problem.outliers(end.structure, end.x)
+    if problem.loss == "squares":
+        what = f", and the lines beside them are not: {_OUTLIERS}"
+    elif any(phase.name == HUBER for phase in end.history.phases):
+        what = ": they count little, by Huber's loss"
+    else:
+        what = (
+            ": the search ended before Huber's loss, so that they count by their squares, but for those that stand "
+            "alone, which were taken out before it"
+        )
+    tests = sorted({one.test for one in every})
+    fits = {i: test for i, (test, _) in enumerate(problem.fits(end.structure, end.x), start=problem.first_test)}
+    for i in tests:
+        found, test = [one for one in every if one.test == i], fits[i]
         which = "the records" if len(fits) == 1 else f"test {i}"
         numbers = test.response.size + (0 if test.force is None else test.force.size)
         channels = ", ".join(f"{name} {count}" for name, count in Counter(one.channel for one in found).most_common(4))
-        far = max(found, key=lambda one: one.size)
-        told = (
-            f"{len(found)} of {numbers} numbers of {which} are up to {far.size:.3g} deviations from the fit "
-            f"({far.channel} at {far.freq:.5g} Hz; by channel {channels})"
-        )
         yield (
-            f"{told}: they count little, by Huber's loss"
-            if huber
-            else f"{told}, and the lines beside them are not: {_OUTLIERS}"
+            f"{len(found)} of {numbers} numbers of {which} are up to {found[0].size:.3g} deviations from the fit "
+            f"({found[0].channel} at {found[0].freq:.5g} Hz; by channel {channels}){what}"
         )
 
 
@@ -133,7 +139,7 @@ def _as_certain(it: Identification) -> Identification:
         exact = exact and not it.problem.formulation.priors and it.problem.objective(it.x) < EXACT
     if not it.determined or exact:
         return it
-    if it.structure.mode_shapes.size > _LARGE:
+    if it.structure.mode_shapes.size > LARGE:
         told = "whether noise leaves each entry known was not judged, as that takes minutes: see uncertainty"
         return replace(it, remarks=(*it.remarks, told))
     u, open_ = it.uncertainty, []

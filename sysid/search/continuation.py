@@ -29,6 +29,10 @@ _NEAR = 1.1  # times the misfit of free residues at the poles of the data: what 
 _CHANCE = 1e-3  # that noise alone makes the misfit of one of two answers so much larger
 _APART = 0.01  # of an unknown's size, from which two solutions are two ...
 _TOGETHER = 1e-3  # ... and up to which two ways are one
+_LEFT_OUT = (
+    "{} of {} starts were left out for want of time: whether they end at another structure that explains the data as "
+    "well is not known"
+)
 _SMALL = 1e-3  # of its range: the least size of an unknown that may be zero
 
 
@@ -164,9 +168,14 @@ class _Run:
         )
         session.log(f"continuation over {problem.n_variables} unknowns in {len(self.steps)} steps{floor}")
         first = problem.formulation.guess if start is None else as_unknowns(problem, start)
-        for x in (first, *random_starts(problem, starts - 1, session.random)):
+        points = (first, *random_starts(problem, starts - 1, session.random))
+        remarks: tuple[str, ...] = ()
+        for left, x in zip(reversed(range(len(points))), points, strict=True):
             self._from(x)
-            if self.stopped is not None or (self.ends and not session.time_for_more):
+            if self.stopped is not None:
+                break
+            if self.ends and not session.time_for_more:
+                remarks = (_LEFT_OUT.format(left, len(points)),) if left else ()
                 break
         if self.stopped is not None and not isinstance(self.stopped, Stop | KeyboardInterrupt):
             raise self.stopped
@@ -187,7 +196,7 @@ class _Run:
             structure, best.x, Continuation.name, success, message,
             History(start=begun, local=objective, local_curve=best.curve, phases=phases), self.stopped,
             alternatives=tuple(_alternatives(problem, best.x, objective, self.ends)) if success else (),
-            good=self._good(objective, best),
+            remarks=remarks, good=self._good(objective, best),
         )  # fmt: skip
 
     def _from(self, x: Array) -> None:

@@ -12,11 +12,10 @@ from sysid.problem.problem import Problem
 from sysid.search.local import solve
 from sysid.search.modal import Modal, objective_of
 from sysid.search.session import Session, Stop
-from sysid.search.strategy import History, Outcome, Phase, Strategy
+from sysid.search.strategy import HUBER, History, Outcome, Phase, Strategy
 from sysid.search.swarm import Swarm
 from sysid.structure.structure import Array, Structure
 
-_PHASE = "Huber's loss"
 _ROUNDS = 40
 _SETTLED, _NEAR = 2e-3, 0.05  # standard deviations of the unknowns, root mean square: is settled, is as good
 _FARTHEST = 64.0  # times a step
@@ -79,9 +78,10 @@ def _with_round(problem: Problem, end: Outcome, again: Outcome, session: Session
     """A round's answer, with all that ran before it in its history; objectives are of the screened records."""
     left = objective_of(problem, again.structure, again.x)
     curve = np.concatenate([end.history.local_curve, again.history.local_curve])
-    phases = [phase for phase in end.history.phases if phase.name != _PHASE]
-    if again.x is not None:
-        phases.append(Phase(_PHASE, left, again.x, session.seconds, again.history.local_curve.size))
+    phases = [phase for phase in end.history.phases if phase.name != HUBER]
+    before = sum(phase.evaluations for phase in end.history.phases if phase.name == HUBER)
+    x = np.zeros(0) if again.x is None else again.x
+    phases.append(Phase(HUBER, left, x, session.seconds, before + again.history.local_curve.size))
     history = replace(end.history, local=left, local_curve=curve, phases=tuple(phases))
     return replace(again, remarks=end.remarks, history=history)
 

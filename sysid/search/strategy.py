@@ -13,6 +13,8 @@ from sysid.problem.problem import Problem
 from sysid.search.session import Session
 from sysid.structure.structure import Array, Structure
 
+HUBER = "Huber's loss"  # the phase of its rounds
+
 
 @dataclass(frozen=True, eq=False)
 class Phase:

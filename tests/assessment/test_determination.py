@@ -157,6 +157,17 @@ class TestOtherAnswers:
         assert told.undetermined == ("another structure explains the data as well: k[0] = 3e+04 in place of 2e+04",)
         assert determine(problem, truth, x, [x]).determined
 
+    def test_one_that_noise_does_not_tell_apart_is_the_same(self, truth):
+        """The other spring is off by a part of its deviation, and by so many that no noise explains it."""
+        problem, x = by_hand(truth, 6.0, noise=0.2), np.concatenate([MASSES, SPRINGS, [ALPHA, BETA]])
+        std = uncertainty(problem, problem.structure(x), x).variables["k"][0]
+        assert std > 2e-3 * SPRINGS[0]  # so that the two structures are not the same to a thousandth
+        for times, same in ((1, True), (100, False)):
+            other = x.copy()
+            other[3] += times * std
+            told = determine(problem, problem.structure(x), x, [other])
+            assert told.determined is same, told
+
     def test_models_tell_it_too(self, truth):
         problem = by_models(truth, 6.0)
         x = problem.values(truth)

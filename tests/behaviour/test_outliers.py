@@ -9,6 +9,7 @@ from scipy.optimize import least_squares
 
 import sysid
 from sysid.modal_analysis.outliers import TUNING
+from sysid.report.report import write
 
 FREQ = np.linspace(2.0, 20.0, 150)
 W = 2 * np.pi * FREQ
@@ -58,6 +59,33 @@ def by_scipy(*tests):
 
     found = least_squares(rows, np.ones(4), xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale="jac").x
     return found * np.concatenate([SPRINGS, DAMPERS])
+
+
+def test_outliers_are_listed_by_test_run_channel_and_line(tmp_path):
+    """Those that were put in, of two tests: in Python, in summary.json and in the report."""
+    tests = [sysid.simulate(TRUTH, FREQ, noise=0.01, rng=rng) for rng in (1, 2)]
+    put = {(2, 1, "sensor 1", FREQ[100]): 80, (1, 1, "sensor 2", FREQ[20]): 60, (1, 1, "sensor 1", FREQ[90]): 40}
+    for number, _, name, freq in put:
+        test = tests[number - 1]
+        at = 0, int(name[-1]) - 1, int(np.flatnonzero(freq == FREQ)[0])
+        test.response[at] += put[number, 1, name, freq] * test.response_std[at]
+    result = sysid.identify(two_floors(tests[0], tests[1:], loss="huber"), strategy=ONE_START, rng=0)
+    assert [one[:4] for one in result.outliers] == list(put)
+    np.testing.assert_allclose([one.size for one in result.outliers], list(put.values()), atol=5)  # of normal noise
+    listed = result.to_dict()["outliers"]
+    assert [tuple(one.values()) for one in listed] == [tuple(one) for one in result.outliers]
+    assert list(listed[0]) == ["test", "run", "channel", "frequency_hz", "deviations"]
+    figure = sysid.plot.responses(result, "sensor 2")
+    (marked,) = (line for line in figure.axes[0].lines if line.get_label() == "outlier")
+    np.testing.assert_array_equal(marked.get_xydata(), [[FREQ[20], np.abs(tests[0].response[0, 1, 20])]])
+    assert "outlier" in [text.get_text() for text in figure.legends[0].get_texts()]
+    rounds = result.history.phases[-1].evaluations
+    curves = {line.get_label()[:6]: line.get_ydata() for line in sysid.plot.convergence(result).axes[0].lines}
+    assert curves["rounds"].size == rounds
+    assert curves["local "].size == result.history.local_curve.size - rounds
+    page = write(result, tmp_path).read_text(encoding="utf-8")
+    table = page[page.index("farthest from the fit") :]
+    assert table.index(f"{FREQ[100]:.6g}") < table.index(f"{FREQ[20]:.6g}") < table.index(f"{FREQ[90]:.6g}")
 
 
 @pytest.mark.parametrize("strategy", [ONE_START, sysid.Swarm(max_iterations=8, restarts=0)], ids=["start", "swarm"])
@@ -161,6 +189,7 @@ def test_a_callback_stops_a_round_of_the_loss_and_its_mistakes_are_not_swallowed
     else:
         result = sysid.identify(problem, strategy=ONE_START, rng=0, callback=in_a_round)
         assert told in result.message and not result.success and not result.interrupted
+        assert any("the search ended before Huber's loss" in remark for remark in result.remarks)
 
 
 def test_what_cannot_be_is_refused():

@@ -7,6 +7,7 @@ import pytest
 
 import sysid
 from sysid import InputError, Measurement
+from sysid.measurement.missing import in_words
 from sysid.modal_analysis.residues import line_correlation
 
 LINES = 8
@@ -44,7 +45,12 @@ def test_lines_with_any_hole_are_left_out_and_all_others_stay_as_they_are(record
     assert (found.dropped, wanted.dropped) == (4, 0)
     assert "4 lines from 2 to 7 Hz (4 more hold NaN and are left out)" in repr(found)
     assert found.in_band(2, 6).dropped == dataclasses.replace(found).dropped == 4
-    assert Measurement.from_tree(found.to_tree()).dropped == 4
+    again = Measurement.from_tree(found.to_tree())
+    assert again.dropped == 4
+    told = [("base", [1.0]), ("sensor 2", [4.0]), ("sensor 3", [4.0]), ("force", [6.0]), ("force_std", [8.0])]
+    for test in (found, again):
+        assert {name: freq.tolist() for name, freq in test.holes} == dict(told)
+    np.testing.assert_array_equal(found.gaps, [2, 3])  # before 5 Hz and 7 Hz, of 2, 3, 5 and 7 Hz
 
 
 def test_frequency_response_functions_with_holes(records):
@@ -56,6 +62,10 @@ def test_frequency_response_functions_with_holes(records):
     np.testing.assert_array_equal(found.response, H[..., kept].swapaxes(0, 1))
     np.testing.assert_array_equal(found.force, force[..., kept].swapaxes(0, 1))
     assert (found.freq.size, found.dropped) == (6, 2)
+    assert in_words(found.holes, found.freq) == "sensor 2 at 3 Hz; force at 7 Hz"
+    H[1, 0, 3:5] = np.nan
+    test = Measurement.from_frf(records["freq"], H, **given, missing="drop")
+    assert in_words(test.holes, test.freq) == "sensor 2 at 3 to 5 Hz; force at 7 Hz"
     with pytest.raises(InputError, match=r"frf holds NaN .*index \(1, 0, 2\)\); missing='drop' leaves out the lines"):
         Measurement.from_frf(records["freq"], H, **given)
 

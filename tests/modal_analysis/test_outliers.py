@@ -148,7 +148,7 @@ def test_outliers_are_told_by_channel_line_and_size(noisy):
     response[0, 1, 40] += 30 * test.response_std[0, 1, 40]
     force[0, 0, 7] -= 50j * test.force_std[0, 0, 7]
     found = outliers(dataclasses.replace(test, response=response, force=force), truth, 20)
-    assert [(one.channel, one.freq) for one in found] == [("sensor 2", FREQ[40]), ("force x", FREQ[7])]
+    assert [one[:4] for one in found] == [(1, 1, "sensor 2", FREQ[40]), (1, 1, "force x", FREQ[7])]
     assert [one.size for one in found] == pytest.approx([30, 50], abs=4)
 
 

@@ -303,7 +303,7 @@ def test_a_band_is_the_interval_of_the_identified_magnitude(unit, runs):
             low, high = np.sort(edges[edges[:, 0] == line, 1])[[0, -1]]
             assert high == pytest.approx(middle + reach)
             assert low == pytest.approx(max(middle - reach, 1e-3 * middle))
-        assert [entry.get_label() for entry in key(ax)] == ["measured", "identified", "95 % band", "difference"]
+        assert [entry.get_label() for entry in key([ax])] == ["measured", "identified", "95 % band", "difference"]
 
 
 def test_every_picture_of_responses_takes_a_band(unit):

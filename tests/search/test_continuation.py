@@ -113,3 +113,26 @@ def test_a_second_structure_that_explains_the_data_exactly_is_told(sensors):
     assert not result.determined
     (told,) = (sentence for sentence in result.undetermined if "another structure explains" in sentence)
     assert f"coupling = {-found:.4g} in place of {found:.4g}" in told
+
+
+def test_starts_left_out_for_want_of_time_are_told(monkeypatch):
+    """Whether another structure explains the data is a part of the verdict."""
+    monkeypatch.setattr("sysid.search.session.Session.time_for_more", False)
+    _, _, K, C = springs_and_dampers()
+    problem = sysid.Problem(measured(noise=0.01), mass=np.diag(MASS), stiffness=K, damping=C)
+    result = sysid.identify(problem, strategy=sysid.Continuation(starts=4), rng=0)
+    assert result.success
+    assert any(told.startswith("3 of 4 starts were left out for want of time") for told in result.remarks)
+
+
+def test_time_over_before_there_is_any_structure_is_an_error_of_the_search(monkeypatch):
+    from sysid.search.session import Stop
+
+    def over(problem, monitor):
+        raise Stop("the time was over")
+
+    monkeypatch.setattr("sysid.search.continuation.smoothed_tests", over)
+    _, _, K, C = springs_and_dampers()
+    problem = sysid.Problem(measured(noise=0.01), mass=np.diag(MASS), stiffness=K, damping=C)
+    with pytest.raises(sysid.SolverError, match="the time was over: nothing is identified"):
+        sysid.identify(problem, strategy="continuation", rng=0)
