@@ -311,7 +311,7 @@ def _was_raised(interrupt: KeyboardInterrupt, file: str) -> bool:
 
 def _unknown(name: str) -> InputError:
     names = [entry.name for entry in entries()]
-    if Path(f"{name}.py").is_file():
+    if os.path.isfile(f"{name}.py"):  # noqa: PTH113 - a name may be too long for a path
         return InputError(f"problem {name!r} is unknown, but there is a {name}.py here: sysid run {name}.py")
     close = difflib.get_close_matches(name, names, n=1)
     hint = "".join(f"did you mean {near!r}? " for near in close)

@@ -324,6 +324,7 @@ def test_a_file_that_is_not_there_or_not_a_file(here):
     (here / "folder.py").mkdir()
     assert refused("folder.py") == "problem folder.py is not a file"
     assert "cannot be read" in refused("x" * 5000 + ".py")
+    assert "unknown" in refused("x" * 5000)
 
 
 def test_data_that_is_not_there_is_refused_before_the_module_runs(here):

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 KINDS = ("flipped", "cut", "appended", "zeroed", "moved", "noise")
+_ATTEMPTS = 20
 
 
 def damaged(data: bytes, kind: str, rng: np.random.Generator) -> bytes:
     """Other bytes: bits flipped, an end missing or too much, a block of zeros, of noise or from elsewhere."""
-    broken = bytearray(data)
-    while bytes(broken) == data:
+    for _ in range(_ATTEMPTS):
+        broken = bytearray(data)
         start = int(rng.integers(len(data)))
         size = min(int(rng.integers(1, 2000)), len(data) - start)
         if kind == "flipped":
@@ -27,4 +28,6 @@ def damaged(data: bytes, kind: str, rng: np.random.Generator) -> bytes:
             broken[start : start + size] = data[other : other + size]
         else:
             broken[start : start + size] = rng.bytes(size)
-    return bytes(broken)
+        if broken != data:
+            return bytes(broken)
+    return data + b"0"  # such as zeros, which zeroes do not change

@@ -56,7 +56,7 @@ class Ledger:
         sound = {index: text for index, (text, digest) in wanted.items() if _digest(text) == digest}
         if len(sound) < len(wanted):
             damaged = len(wanted) - len(sound)
-            warnings.warn(f"{damaged} results in {self.path} are damaged and are computed again", stacklevel=3)
+            warnings.warn(f"{damaged} of {len(wanted)} results in {self.path} are damaged: computed again", stacklevel=3)
         return {index: self._result(index, *json.loads(text)) for index, text in sound.items()}
 
     def _result(

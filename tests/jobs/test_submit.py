@@ -292,7 +292,7 @@ class TestLedger:
         with sqlite3.connect(tmp_path / "jobs.sqlite") as file:
             file.execute(f"UPDATE results SET {damage} WHERE rowid = 2")
         file.close()
-        with pytest.warns(UserWarning, match=r"1 results in .* are damaged and are computed again"):
+        with pytest.warns(UserWarning, match=r"1 of 2 results in .* are damaged: computed again"):
             assert [result.message for result in submit(recipe, starts=2, out=tmp_path)] == ["ran", "ran"]
         assert len(ran) == 3
         assert len(list(submit(recipe, starts=2, out=tmp_path))) == 2 and len(ran) == 3
