@@ -55,8 +55,8 @@ class Ledger:
         wanted = {index: rows[key] for index, key in self._keys.items() if key in rows}
         sound = {index: text for index, (text, digest) in wanted.items() if _digest(text) == digest}
         if len(sound) < len(wanted):
-            damaged = len(wanted) - len(sound)
-            warnings.warn(f"{damaged} of {len(wanted)} results in {self.path} are damaged: computed again", stacklevel=3)
+            share = f"{len(wanted) - len(sound)} of {len(wanted)}"
+            warnings.warn(f"{share} results in {self.path} are damaged: computed again", stacklevel=3)
         return {index: self._result(index, *json.loads(text)) for index, text in sound.items()}
 
     def _result(
