@@ -365,8 +365,7 @@ def _unseen(problem: Problem, structure: Structure, misfit: float, responses: _R
                 f"{_mode(structure, k)} lies outside the lines ({test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz) and "
                 f"answers for all modes there{_like_rigid(test, structure, k)}"
             )
-        elif forces and _shares(test, structure, k, push.T, push, forces)[0] < forces.level:
-            (own,) = _shares(test, structure, k, push.T, push, forces)
+        elif forces and (own := _shares(test, structure, k, push.T, push, forces)[0]) < forces.level:
             yield (
                 f"{_mode(structure, k)} makes {100 * own:.2g} % of the base force, and what the fit misses of it "
                 f"({100 * forces.misfit:.2g} %) can look like a mode of up to {100 * forces.level:.2g} %: its mass is "
