@@ -9,7 +9,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -98,17 +98,41 @@ def _kill_now_and_then(stop: threading.Event, every: float, killed: list[int]) -
 
 
 def _overhead(recipe: sysid.Recipe, count: int) -> tuple[float, float]:
-    """Median time of a job here, s, and what one worker takes more for each, ms."""
+    """Median of a job's own time, s, and what one worker takes beside it for each, ms.
+
+    Both are of the same jobs on the same worker: its speed on a shared machine is another one every minute.
+    """
     with tempfile.TemporaryDirectory() as folder, jobs.processes(1)() as pool:
         list(jobs.submit(recipe, executor=pool))  # its worker has built the problem
-        list(jobs.submit(recipe))
-        alone, taken = list[float](), list[float]()
+        own, beside = list[float](), list[float]()
         for i in range(3):
-            own = _timed(lambda: list(jobs.submit(recipe, starts=count)))
-            there = _timed(lambda i=i: list(jobs.submit(recipe, starts=count, executor=pool, out=f"{folder}/{i}")))
-            alone.append(own / count)
-            taken.append(1e3 * (there - own) / count)
-    return float(np.median(alone)), float(np.median(taken))
+            clock = Path(folder) / f"{i}.txt"
+            run = lambda i=i, clock=clock: list(  # noqa: E731
+                jobs.submit(recipe, starts=count, executor=_Clocked(pool, clock), out=f"{folder}/{i}")
+            )
+            taken = _timed(run)
+            times = [float(line) for line in clock.read_text().split()]
+            own += times
+            beside.append(1e3 * (taken - sum(times)) / count)
+    return float(np.median(own)), float(np.median(beside))
+
+
+class _Clocked(Executor):
+    """Another executor, whose calls write what they take by themselves to a file."""
+
+    def __init__(self, pool: Executor, clock: Path) -> None:
+        self.pool, self.clock = pool, clock
+
+    def submit(self, call: Callable[..., object], /, *given: object, **options: object) -> Future[object]:
+        return self.pool.submit(_clocked, self.clock, call, *given, **options)
+
+
+def _clocked(clock: Path, call: Callable[..., object], *given: object, **options: object) -> object:
+    begun = time.perf_counter()
+    result = call(*given, **options)
+    with clock.open("a") as file:
+        file.write(f"{time.perf_counter() - begun}\n")
+    return result
 
 
 def _gain(recipe: sysid.Recipe) -> Iterator[Line]:
