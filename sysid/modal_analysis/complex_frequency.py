@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.residues import Records, force_residues
@@ -91,6 +92,13 @@ class PolesAndResidues:
             return relative, None
         functions = [np.ones((1, freq.size)), *gains_with_velocity(freq, self.omega, self.ratios, shift)]
         return relative, np.einsum("ked,kf,rdf->ref", self.force, np.concatenate(functions), base, optimize=True)
+
+    def shown(self, base: ComplexArray, modes: NDArray[np.intp]) -> ComplexArray:
+        """How modes show in accelerations and force at base motion (runs, d), (modes, runs, n_sensors [+ d])."""
+        parts = [self.residues[modes] + 1j * self.quadrature[modes]]
+        if self.force is not None:
+            parts.append(self.force[1 + modes] + 1j * self.force[1 + self.omega.size + modes])
+        return np.einsum("ksd,rd->krs", np.concatenate(parts, axis=1), base)
 
     def smoothed(self, test: Measurement, share: float) -> Smoothed:
         """The test with a shift of this share of its mean frequency, one run for each independent base motion."""

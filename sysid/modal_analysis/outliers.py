@@ -45,7 +45,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.residues import Records, beyond_chance
 from sysid.modal_analysis.response import gains
-from sysid.modal_analysis.vector_fitting import Monitor, poles_of_any_damping
+from sysid.modal_analysis.vector_fitting import Monitor, poles_from, poles_of_any_damping
 from sysid.structure.structure import Array, ComplexArray, Structure
 
 TUNING = 1.06147  # c, in units of sqrt(E|e|²): 95 % efficient where the noise is normal
@@ -60,7 +60,12 @@ _SUSPECT = 1.2  # times the variance that is stated, up to which the noise may b
 _MEDIAN = 0.4549  # of the square of a standard normal number
 _LEAST_LINES = 5  # with fewer, no number has neighbours enough
 _UNDAMPED, _TINY = 1e-9, np.finfo(float).tiny
-_ROUNDS, _BOUNDED = 8, 3
+_ROUNDS, _BOUNDED, _FREED = 8, 3, 8
+_BEHIND = 2.0  # times the numbers beside it, from which a number need not pull: it may be what moved those
+_PASSES, _STEPS = 4, 12  # after absorbed outliers; of weights
+_DECIDES = 0.18  # leverage of a line, of at most 1
+_NEAR_TOP = 0.3  # of a mode's height, from which it is missed at a line
+_OTHERS = 3  # numbers more than modes, at least, to compare with
 _HALVINGS = 60  # of the error of a scale's logarithm, at least
 
 Flags = NDArray[np.bool_]
@@ -184,21 +189,35 @@ def stand_alone(
     A misfit that a model leaves is smooth, and no outlier. Lines beside a pole that is narrower than their distance are
     not judged: its misfit stands alone too.
     """
+    flags: Flags = _beyond_neighbours(u, times=times, known=known) & ~_in_doubt(freq, omega, ratios)
+    return flags
+
+
+def _beyond_neighbours(u: ComplexArray, *, times: float, known: Flags | None = None) -> Flags:
+    """Which whitened numbers (..., n_freq) are far out, and so many `times` those at the lines beside them."""
     size = np.abs(u)
-    if freq.size < _LEAST_LINES:
+    n_freq = size.shape[-1]
+    if n_freq < _LEAST_LINES:
         return np.zeros(size.shape, dtype=bool)
     others = size if known is None else np.where(known, 0.0, size)
-    here = np.arange(freq.size)
-    first = np.clip(here - 2, 0, freq.size - 5)
+    here = np.arange(n_freq)
+    first = np.clip(here - 2, 0, n_freq - 5)
     near_by = others[..., first[:, None] + np.arange(5)]
     near_by[..., here, here - first] = np.inf
     beside = np.sort(near_by, axis=-1)[..., 2]  # of four the last but one: another outlier may be among them
+    flags: Flags = (size > _FAR) & (size > times * beside)
+    return flags
+
+
+def _in_doubt(freq: Array, omega: Array, ratios: Array) -> Flags:
+    """Which lines (n_freq,) are beside a pole so narrow that its misfit would stand alone."""
+    if freq.size < _LEAST_LINES:
+        return np.ones(freq.size, dtype=bool)
     lines = 2 * np.pi * freq
     distance = np.interp(omega, lines, np.gradient(lines))
     narrow = ratios * omega < _NARROW * distance
-    judged = ~np.any(np.abs(lines - omega[narrow, None]) < 1.5 * distance[narrow, None], axis=0)
-    flags: Flags = (size > _FAR) & (size > times * beside) & judged
-    return flags
+    doubted: Flags = np.any(np.abs(lines - omega[narrow, None]) < 1.5 * distance[narrow, None], axis=0)
+    return doubted
 
 
 def one_line(freq: Array, omega: Array, ratios: Array) -> Flags:
@@ -214,36 +233,132 @@ def screened(test: Measurement, *, monitor: Monitor | None = None) -> Measuremen
     """The test with what the poles of its records make of it in the place of numbers that stand alone.
 
     No model is asked, so that what a model misses stays as it is. Poles that answer for one line only are none.
+    Numbers at the lines that decide a pole or a residue are compared with what all other lines make of them.
     The monitor is called as by `find_poles`.
     """
+    for _ in range(_PASSES):
+        clean, fit = _screened(test, monitor)
+        more = None if fit is None else _without_absorbed(test, clean, fit, monitor)
+        if more is None:
+            break
+        test = more
+    return clean
+
+
+def _screened(test: Measurement, monitor: Monitor | None) -> tuple[Measurement, PolesAndResidues | None]:
+    """The test without numbers that stand alone beside the poles of the rest, and these poles."""
     clean, flags = test, [np.zeros(record.shape, dtype=bool) for record in (test.response, test.base)]
     for _ in range(_ROUNDS):
         fit = _poles(clean, monitor)
         if fit is None:
-            return clean
+            break
         made = _bounded_fit(test, fit)
         parts, before = whitened(test, made, 2 * fit.omega.size), flags
         flags = [
             stand_alone(part.u, test.freq, fit.omega, fit.ratios, known=known)
             for part, known in zip(parts, before, strict=False)
         ]
-        if not any(np.any(now) for now in flags):
+        clean = _replaced(test, made, flags)
+        if clean is test or all(np.array_equal(now, then) for now, then in zip(flags, before, strict=False)):
             break
-        clean = replace(test, response=np.where(flags[0], made[0] + test.response - test.relative, test.response))
-        if test.force is not None:
-            clean = replace(clean, force=np.where(flags[1], made[1], test.force))
-        if all(np.array_equal(now, then) for now, then in zip(flags, before, strict=False)):
+    return clean, fit
+
+
+def _without_absorbed(
+    test: Measurement, clean: Measurement, fit: PolesAndResidues, monitor: Monitor | None
+) -> Measurement | None:
+    """The test with others in the place of outliers that poles or residues of their own explain; None without any.
+
+    Each line that decides a residue is left out, and predicted by poles of what is left of the `clean` records. What
+    they miss there is alike in all channels and runs, a multiple of how each mode shows in them, but for outliers.
+    """
+    made = [part for part in fit.records(test.freq, test.base) if part is not None]
+    stds = np.concatenate([part.std for part in whitened(clean, made, 2 * fit.omega.size)], axis=1)
+    recorded = clean.relative if clean.force is None else np.concatenate([clean.relative, clean.force], axis=1)
+    off = np.zeros_like(recorded)
+    here = np.arange(test.freq.size)
+    decide = Records(clean).leverage(fit.omega, fit.ratios) > _DECIDES
+    for line in np.flatnonzero(decide | _in_doubt(test.freq, fit.omega, fit.ratios)).tolist():
+        rest = clean.at(here != line)
+        records = Records(rest)
+        omega, ratios = poles_from(records, fit.omega, fit.ratios, monitor=monitor)
+        if omega.size == 0:
+            continue
+        other = PolesAndResidues.at(rest, records, omega, ratios)
+        base, std = test.base[:, :, [line]], stds[:, :, line]
+        parts = [part for part in other.records(test.freq[[line]], base) if part is not None]
+        misfit = (recorded[:, :, line] - np.concatenate(parts, axis=1)[:, :, 0]) / std
+        heights = _heights(test.freq, omega, ratios)
+        near = np.flatnonzero(heights[:, line] > _NEAR_TOP * heights.max(axis=1))
+        shown = other.shown(base[:, :, 0], near) / std
+        flags, left = _unlike_others(misfit.ravel(), shown.reshape(near.size, std.size).T)
+        off[:, :, line] = np.where(flags, left, 0.0).reshape(std.shape)
+    # An outlier spoils what is made of the lines beside it: one in each record at a time.
+    size = np.abs(off)
+    flags = (size > 0) & (size == size.max(axis=2, keepdims=True))
+    if not np.any(flags):
+        return None
+    values, n = recorded - off * stds, test.n_sensors
+    return _replaced(test, [values[:, :n], values[:, n:]], [flags[:, :n], flags[:, n:]])
+
+
+def _replaced(test: Measurement, values: Sequence[ComplexArray], flags: Sequence[Flags]) -> Measurement:
+    """The test with values in the place of flagged numbers of accelerations and force; itself where there are none."""
+    if not any(np.any(of_record) for of_record in flags):
+        return test
+    changed = replace(test, response=np.where(flags[0], values[0] + test.response - test.relative, test.response))
+    return changed if test.force is None else replace(changed, force=np.where(flags[1], values[1], test.force))
+
+
+def _unlike_others(misfit: ComplexArray, shown: ComplexArray) -> tuple[Flags, ComplexArray]:
+    """Which of the whitened misfits (N,) at a line are no multiple of modes `shown` (N, k), and what that leaves (N,).
+
+    Each is compared with what all others suggest by Huber's loss, the farthest first.
+    """
+    flags: Flags = np.zeros(misfit.size, dtype=bool)
+    left = misfit
+    while np.count_nonzero(~flags) > shown.shape[1] + _OTHERS:
+        farthest, size, left_by = -1, _CERTAIN, left
+        for j in np.flatnonzero(~flags):
+            others = ~flags
+            others[j] = False
+            now = misfit - shown @ _robust(shown[others], misfit[others])
+            scale = max(1.0, float(np.median(np.abs(now[others]))) / np.sqrt(np.log(2)))
+            spread = np.linalg.lstsq(shown[others].T, shown[j], rcond=None)[0]
+            its = float(np.abs(now[j])) / (scale * float(np.hypot(1.0, np.linalg.norm(spread))))
+            if its > size:
+                farthest, size, left_by = int(j), its, now
+        if farthest < 0:
             break
-    return clean
+        flags[farthest], left = True, left_by
+    return flags, left
+
+
+def _robust(shown: ComplexArray, misfit: ComplexArray) -> ComplexArray:
+    """Multiples (k,) of the columns whose sum is nearest to a misfit by the sum of sizes."""
+    root = np.ones(misfit.size)
+    for _ in range(_STEPS):
+        many: ComplexArray = np.linalg.lstsq(shown * root[:, None], misfit * root, rcond=None)[0]
+        root = 1 / np.sqrt(np.maximum(np.abs(misfit - shown @ many), 1.0))
+    return many
 
 
 def _bounded_fit(test: Measurement, fit: PolesAndResidues) -> list[ComplexArray]:
-    """What poles make of a test with residues that outliers hardly pull: those of pseudo-values, from a first `fit`."""
-    for step in range(1 + _BOUNDED):
+    """What poles make of a test with residues that outliers do not pull, from a first `fit`.
+
+    First their pull is bounded, by pseudo-values. Then numbers that stay far beyond those beside them do not pull at
+    all: at the lines that decide a residue even a bounded pull moves all that is near.
+    """
+    for step in range(1 + _BOUNDED + _FREED):
         made = [part for part in fit.records(test.freq, test.base) if part is not None]
         if step < _BOUNDED:
             other = pseudo_values([(test, made)], 2 * fit.omega.size)[0]
-            fit = PolesAndResidues.at(other, Records(other), fit.omega, fit.ratios)
+        else:
+            parts = whitened(test, made, 2 * fit.omega.size)
+            other = _replaced(test, made, [_beyond_neighbours(part.u, times=_BEHIND) for part in parts])
+        if step == _BOUNDED + _FREED or other is test:
+            break
+        fit = PolesAndResidues.at(other, Records(other), fit.omega, fit.ratios)
     return made
 
 

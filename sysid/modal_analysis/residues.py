@@ -161,6 +161,12 @@ class Records:
         """Best real residues of `functions`."""
         return _least_squares(self.functions(omega, ratios, velocity=velocity), self.data, omega.size, self.size)
 
+    def leverage(self, omega: Array, ratios: Array) -> Array:
+        """Share of each line's own part in what poles and free residues of both kinds make of it, (n_freq,)."""
+        Q = np.linalg.qr(unit_columns(self.functions(omega, ratios, velocity=True))[0])[0]
+        own: Array = np.sum(Q**2, axis=1).reshape(2, -1, self.freq.size).mean(axis=0).max(axis=0)
+        return own
+
     def noise(self, left: Array, unknowns: int, *, least: float = ROUND_OFF) -> float:
         """Variance of a real number of the records about a fit of so many unknowns, as it affects smooth functions."""
         power = float(np.sum(left**2))

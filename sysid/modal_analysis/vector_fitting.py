@@ -188,6 +188,14 @@ def poles_of_any_damping(records: Records, *, monitor: Monitor | None = None) ->
     return np.empty(0), np.empty(0)
 
 
+def poles_from(records: Records, omega: Array, ratios: Array, *, monitor: Monitor | None = None) -> tuple[Array, Array]:
+    """The same as `poles_of_any_damping` from poles close by, ascending."""
+    with one_thread():
+        omega, ratios = _settled(records, omega, ratios, _Progress(monitor, records), velocity=True)
+    order = np.argsort(omega)
+    return omega[order], ratios[order]
+
+
 def _lines_suffice(records: Records, count: int) -> bool:
     return 2 * int(np.count_nonzero(records.freq)) >= 4 * count + 2
 

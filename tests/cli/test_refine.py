@@ -198,10 +198,11 @@ def test_ctrl_c_while_saving_tells_where_the_results_are(last, capsys, tmp_path,
 AT_WORK = """
 
 import multiprocessing
+import os
 import time
 
 if multiprocessing.parent_process():
-    print("at work", flush=True)
+    os.write(1, b"at work\\n")  # whole: another worker writes beside it
     time.sleep(60)
 """
 

@@ -166,3 +166,31 @@ def test_a_single_mode_of_one_line_stays_where_it_shows_beside_it(random_structu
     two = np.concatenate([test.response, test.response], axis=1)
     both = sysid.Measurement(FREQ, test.base, two, rigid_body=np.repeat(test.rigid_body, 2, axis=0))
     assert screened(both) is both
+
+
+def test_an_outlier_on_the_highest_line_of_a_narrow_peak_is_found(random_structure):
+    """A peak as wide as two lines are apart, with a line at its top: other poles and residues would absorb it."""
+    ratios = np.array([0.02, 0.5 * (FREQ[1] - FREQ[0]) / FREQ[70], 0.02])
+    frequencies = [6.0, FREQ[70], 12.0]
+    truth = random_structure(np.random.default_rng(4), n=3, d=2, frequencies=frequencies, ratios=ratios)
+    test = sysid.simulate(truth, FREQ, noise=0.003, force=True, rng=1)
+    response = test.response.copy()
+    response[0, 1, 70] += 60j * test.response_std[0, 1, 70]
+    clean = screened(dataclasses.replace(test, response=response))
+    np.testing.assert_array_equal(np.argwhere(clean.response != response), [[0, 1, 70]])
+    np.testing.assert_array_equal(clean.force, test.force)
+
+
+@pytest.mark.parametrize("width, lines", [(6.0, [70, 71]), (2.0, [70]), (0.3, [69])])
+def test_outliers_that_bend_a_peak_or_stand_beside_a_narrow_one_are_found(random_structure, width, lines):
+    """Two neighbours at the top of a peak move all that is near; a misfit of a peak within a line stands alone too."""
+    ratios = np.array([0.02, 0.5 * width * (FREQ[1] - FREQ[0]) / FREQ[70], 0.02])
+    frequencies = [6.0, FREQ[70] + 0.2 * (FREQ[1] - FREQ[0]), 12.0]
+    truth = random_structure(np.random.default_rng(4), n=3, d=2, frequencies=frequencies, ratios=ratios)
+    test = sysid.simulate(truth, FREQ, noise=0.003, force=True, rng=1)
+    response = test.response.copy()
+    for line in lines:
+        response[0, 1, line] += 60j * test.response_std[0, 1, line]
+    clean = screened(dataclasses.replace(test, response=response))
+    np.testing.assert_array_equal(np.argwhere(clean.response != response), [[0, 1, line] for line in lines])
+    np.testing.assert_array_equal(clean.force, test.force)
