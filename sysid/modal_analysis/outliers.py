@@ -238,8 +238,8 @@ def screened(test: Measurement, *, monitor: Monitor | None = None) -> Measuremen
     """
     for _ in range(_PASSES):
         clean, fit = _screened(test, monitor)
-        more = None if fit is None else _without_absorbed(test, clean, fit, monitor)
-        if more is None:
+        more = test if fit is None else _without_absorbed(test, clean, fit, monitor)
+        if more is test:
             break
         test = more
     return clean
@@ -266,14 +266,14 @@ def _screened(test: Measurement, monitor: Monitor | None) -> tuple[Measurement, 
 
 def _without_absorbed(
     test: Measurement, clean: Measurement, fit: PolesAndResidues, monitor: Monitor | None
-) -> Measurement | None:
-    """The test with others in the place of outliers that poles or residues of their own explain; None without any.
+) -> Measurement:
+    """The test with others in the place of outliers that poles or residues of their own explain; itself without any.
 
     Each line that decides a residue is left out, and predicted by poles of what is left of the `clean` records. What
     they miss there is alike in all channels and runs, a multiple of how each mode shows in them, but for outliers.
     """
-    made = [part for part in fit.records(test.freq, test.base) if part is not None]
-    stds = np.concatenate([part.std for part in whitened(clean, made, 2 * fit.omega.size)], axis=1)
+    parts = whitened(clean, _made(fit, test.freq, test.base), 2 * fit.omega.size)
+    stds = np.concatenate([part.std for part in parts], axis=1)
     recorded = clean.relative if clean.force is None else np.concatenate([clean.relative, clean.force], axis=1)
     off = np.zeros_like(recorded)
     here = np.arange(test.freq.size)
@@ -286,8 +286,8 @@ def _without_absorbed(
             continue
         other = PolesAndResidues.at(rest, records, omega, ratios)
         base, std = test.base[:, :, [line]], stds[:, :, line]
-        parts = [part for part in other.records(test.freq[[line]], base) if part is not None]
-        misfit = (recorded[:, :, line] - np.concatenate(parts, axis=1)[:, :, 0]) / std
+        made = np.concatenate(_made(other, test.freq[[line]], base), axis=1)
+        misfit = (recorded[:, :, line] - made[:, :, 0]) / std
         heights = _heights(test.freq, omega, ratios)
         near = np.flatnonzero(heights[:, line] > _NEAR_TOP * heights.max(axis=1))
         shown = other.shown(base[:, :, 0], near) / std
@@ -296,8 +296,6 @@ def _without_absorbed(
     # An outlier spoils what is made of the lines beside it: one in each record at a time.
     size = np.abs(off)
     flags = (size > 0) & (size == size.max(axis=2, keepdims=True))
-    if not np.any(flags):
-        return None
     values, n = recorded - off * stds, test.n_sensors
     return _replaced(test, [values[:, :n], values[:, n:]], [flags[:, :n], flags[:, n:]])
 
@@ -335,7 +333,7 @@ def _unlike_others(misfit: ComplexArray, shown: ComplexArray) -> tuple[Flags, Co
 
 
 def _robust(shown: ComplexArray, misfit: ComplexArray) -> ComplexArray:
-    """Multiples (k,) of the columns whose sum is nearest to a misfit by the sum of sizes."""
+    """Multiples (k,) of the columns that are nearest to a misfit by Huber's loss, with 1 in the place of `TUNING`."""
     root = np.ones(misfit.size)
     for _ in range(_STEPS):
         many: ComplexArray = np.linalg.lstsq(shown * root[:, None], misfit * root, rcond=None)[0]
@@ -349,17 +347,22 @@ def _bounded_fit(test: Measurement, fit: PolesAndResidues) -> list[ComplexArray]
     First their pull is bounded, by pseudo-values. Then numbers that stay far beyond those beside them do not pull at
     all: at the lines that decide a residue even a bounded pull moves all that is near.
     """
-    for step in range(1 + _BOUNDED + _FREED):
-        made = [part for part in fit.records(test.freq, test.base) if part is not None]
+    for step in range(_BOUNDED + _FREED):
+        made = _made(fit, test.freq, test.base)
         if step < _BOUNDED:
             other = pseudo_values([(test, made)], 2 * fit.omega.size)[0]
         else:
             parts = whitened(test, made, 2 * fit.omega.size)
             other = _replaced(test, made, [_beyond_neighbours(part.u, times=_BEHIND) for part in parts])
-        if step == _BOUNDED + _FREED or other is test:
-            break
+            if other is test:
+                return made
         fit = PolesAndResidues.at(other, Records(other), fit.omega, fit.ratios)
-    return made
+    return _made(fit, test.freq, test.base)
+
+
+def _made(fit: PolesAndResidues, freq: Array, base: ComplexArray) -> list[ComplexArray]:
+    """What poles and residues make of relative accelerations and, where it was measured, of the force."""
+    return [part for part in fit.records(freq, base) if part is not None]
 
 
 def _poles(test: Measurement, monitor: Monitor | None) -> PolesAndResidues | None:
