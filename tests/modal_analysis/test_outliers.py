@@ -168,24 +168,27 @@ def test_a_single_mode_of_one_line_stays_where_it_shows_beside_it(random_structu
     assert screened(both) is both
 
 
-def test_an_outlier_on_the_highest_line_of_a_narrow_peak_is_found(random_structure):
-    """A peak as wide as two lines are apart, with a line at its top: other poles and residues would absorb it."""
-    ratios = np.array([0.02, 0.5 * (FREQ[1] - FREQ[0]) / FREQ[70], 0.02])
-    frequencies = [6.0, FREQ[70], 12.0]
-    truth = random_structure(np.random.default_rng(4), n=3, d=2, frequencies=frequencies, ratios=ratios)
-    test = sysid.simulate(truth, FREQ, noise=0.003, force=True, rng=1)
-    response = test.response.copy()
-    response[0, 1, 70] += 60j * test.response_std[0, 1, 70]
-    clean = screened(dataclasses.replace(test, response=response))
-    np.testing.assert_array_equal(np.argwhere(clean.response != response), [[0, 1, 70]])
-    np.testing.assert_array_equal(clean.force, test.force)
+BESIDE_THE_TOP = pytest.mark.xfail(strict=True, reason="the top line of so narrow a peak is replaced with it")
 
 
-@pytest.mark.parametrize("width, lines", [(6.0, [70, 71]), (2.0, [70]), (0.3, [69])])
-def test_outliers_that_bend_a_peak_or_stand_beside_a_narrow_one_are_found(random_structure, width, lines):
-    """Two neighbours at the top of a peak move all that is near; a misfit of a peak within a line stands alone too."""
-    ratios = np.array([0.02, 0.5 * width * (FREQ[1] - FREQ[0]) / FREQ[70], 0.02])
-    frequencies = [6.0, FREQ[70] + 0.2 * (FREQ[1] - FREQ[0]), 12.0]
+@pytest.mark.parametrize(
+    ("width", "off", "lines"),
+    [
+        (1.0, 0.0, [70]),
+        (6.0, 0.2, [70, 71]),
+        (2.0, 0.2, [70]),
+        (0.3, 0.2, [69]),
+        pytest.param(0.3, 0.2, [71], marks=BESIDE_THE_TOP),
+    ],
+)
+def test_outliers_that_residues_or_peaks_follow_are_found(random_structure, width, off, lines):
+    """At the top of a peak they move its residue and all near it; beside one within a line misfits stand alone too.
+
+    The width of the peak, and how far it is from line 70, are in distances of lines.
+    """
+    distance = FREQ[1] - FREQ[0]
+    ratios = np.array([0.02, 0.5 * width * distance / FREQ[70], 0.02])
+    frequencies = [6.0, FREQ[70] + off * distance, 12.0]
     truth = random_structure(np.random.default_rng(4), n=3, d=2, frequencies=frequencies, ratios=ratios)
     test = sysid.simulate(truth, FREQ, noise=0.003, force=True, rng=1)
     response = test.response.copy()
