@@ -136,6 +136,8 @@ class NonlinearProgram:
                 "print_time": False,
                 "show_eval_warnings": False,  # a step too long is IPOPT's to shorten
                 "iteration_callback": call,
+                "no_nlp_grad": True,  # nobody asks for multipliers of parameters; its expressions take a sixth of a fit
+                "calc_lam_p": False,
                 "ipopt": {
                     "print_level": 0, "sb": "yes", "tol": tolerance, "acceptable_tol": acceptable * tolerance,
                     "acceptable_iter": 5, "constr_viol_tol": 1e-11, "mu_strategy": barrier, **limits,
