@@ -34,10 +34,16 @@ def not_begun(seconds: float) -> str:
     return f"not begun, as its derivatives take some {seconds:.1g} s to set up: too little time"
 
 
-def quiet_options(max_iterations: int) -> dict[str, Any]:
-    """Options of a small run of IPOPT that prints nothing."""
-    ipopt = {"print_level": 0, "sb": "yes", "max_iter": max_iterations}
-    return {"print_time": False, "show_eval_warnings": False, "ipopt": ipopt}
+def quiet_options(max_iterations: int, **ipopt: float | str) -> dict[str, Any]:
+    """Options of a run of IPOPT that prints nothing, with further ones of IPOPT's own."""
+    return {
+        "print_time": False,
+        "show_eval_warnings": False,  # a step too long is IPOPT's to shorten
+        # Nobody asks for multipliers of parameters; their expressions take a seventh of a fit.
+        "no_nlp_grad": True,
+        "calc_lam_p": False,
+        "ipopt": {"print_level": 0, "sb": "yes", "max_iter": max_iterations, **ipopt},
+    }
 
 
 class _BlasOfIpopt(OpenBLASController):
@@ -129,21 +135,12 @@ class NonlinearProgram:
         call = monitor.callback(start, constraints.numel())
 
         def run(at: Array, tolerance: float) -> tuple[str, Array]:
-            limits: dict[str, float] = {"max_iter": max_iterations}
-            if np.isfinite(monitor.left):
-                limits["max_wall_time"] = max(monitor.left, 0.1)
-            options = {
-                "print_time": False,
-                "show_eval_warnings": False,  # a step too long is IPOPT's to shorten
-                "iteration_callback": call,
-                "no_nlp_grad": True,  # nobody asks for multipliers of parameters; its expressions take a sixth of a fit
-                "calc_lam_p": False,
-                "ipopt": {
-                    "print_level": 0, "sb": "yes", "tol": tolerance, "acceptable_tol": acceptable * tolerance,
-                    "acceptable_iter": 5, "constr_viol_tol": 1e-11, "mu_strategy": barrier, **limits,
-                },
-                **(derivatives or {}),
-            }  # fmt: skip
+            limits = {"max_wall_time": max(monitor.left, 0.1)} if np.isfinite(monitor.left) else {}
+            quiet = quiet_options(
+                max_iterations, tol=tolerance, acceptable_tol=acceptable * tolerance, acceptable_iter=5,
+                constr_viol_tol=1e-11, mu_strategy=barrier, **limits,
+            )  # fmt: skip
+            options = {**quiet, "iteration_callback": call, **(derivatives or {})}
             solver = ca.nlpsol("local", "ipopt", nlp, options)
             answer = solver(x0=at, lbx=lower, ubx=upper, lbg=bounds_below, ubg=bounds_above)
             status = solver.stats()["return_status"]

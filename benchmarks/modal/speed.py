@@ -38,7 +38,8 @@ def lines(reduced: bool) -> Iterator[Line]:
             taken, beside = list[list[list[float]]](), list[float]()
             for _ in range(rounds):
                 taken.append([[_seconds(test) for test in group] for group in tests.values()])
-                beside.append(_peer())
+                if reduced:
+                    beside.append(_peer())
         medians = np.median(np.min(taken, axis=0), axis=1)
         shown = "; ".join(f"{kind} {value:.2f}" for kind, value in zip(tests, medians, strict=True))
         what = f"largest median over {count} structures, least of {rounds}, processor s"
