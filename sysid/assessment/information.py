@@ -18,32 +18,11 @@ import scipy.linalg
 import scipy.sparse
 
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.modal_fit import Modes
+from sysid.modal_analysis.modal_fit import Index, Modes
 from sysid.modal_analysis.response import columns, gain_slopes, gains
 from sysid.structure.structure import Array, ComplexArray
 
 _UNSEEN = 1e-10  # of the strongest parameter's part in the records: below it there is round-off only
-
-
-class Index:
-    """Where the modal parameters stand in theta."""
-
-    def __init__(self, s: int, m: int, d: int) -> None:
-        self.shapes = ((s, m), (m, d), (m,), (m,))
-        ends = np.cumsum([np.prod(shape) for shape in self.shapes]).tolist()
-        self.phi, self.gamma, self.log_omega, self.log_ratios = map(slice, [0, *ends], ends)
-        self.pairs = [(i, j) for i in range(d) for j in range(i, d)]  # of M_rb, which is symmetric
-        self.size = ends[-1] + len(self.pairs)
-        self.rigid = np.arange(ends[-1], self.size)
-
-    def split(self, theta: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """Phi, Gamma, log w, log zeta and M_rb of columns of theta, (..., columns)."""
-        d = self.shapes[1][1]
-        rigid = np.empty((d, d, theta.shape[1]))
-        for (i, j), row in zip(self.pairs, theta[self.rigid], strict=True):
-            rigid[i, j] = rigid[j, i] = row
-        phi, gamma = theta[self.phi].reshape(*self.shapes[0], -1), theta[self.gamma].reshape(*self.shapes[1], -1)
-        return phi, gamma, theta[self.log_omega], theta[self.log_ratios], rigid
 
 
 def gains_of(freq: Array, modes: Modes) -> tuple[ComplexArray, ComplexArray]:

@@ -8,8 +8,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from sysid.assessment.information import Index, Parametrisation
-from sysid.modal_analysis.modal_fit import Modes
+from sysid.assessment.information import Parametrisation
+from sysid.modal_analysis.modal_fit import Index, Modes
 from sysid.models.unknowns import scales_of
 from sysid.problem.problem import Problem
 from sysid.structure.structure import Array, Structure

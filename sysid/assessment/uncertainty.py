@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.assessment.information import Index, information, spectra_of, spread
+from sysid.assessment.information import information, spectra_of, spread
 from sysid.assessment.modal_mass_cone import open_modes
 from sysid.assessment.parametrisation import held_by_entries, parametrisation
 from sysid.assessment.perturbations import DirectSpectra, ModalSpectra, Perturbations, matrices_of_modes, std_of
@@ -29,7 +29,7 @@ from sysid.assessment.sensitivity import (
 )  # fmt: skip
 from sysid.errors import InputError
 from sysid.modal_analysis.misfit import inflation_of, records_of
-from sysid.modal_analysis.modal_fit import Modes
+from sysid.modal_analysis.modal_fit import Index, Modes
 from sysid.models.unknowns import by_name, split
 from sysid.problem.formulation import Formulation
 from sysid.problem.problem import Problem

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from sysid.errors import InputError, choice, finite_array, flag, instance, number, random_generator, refuse, sequence
 from sysid.measurement import spectra
 from sysid.measurement.missing import Missing, complete, named, present
+from sysid.measurement.whole import NoiseLevels, WholeRecords, per_run
 from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
 from sysid.structure.sensor import Sensor, checked_sensors, sensors_from_tree, sensors_to_tree
 from sysid.structure.structure import Array, ComplexArray, Structure, check_frequencies
@@ -97,6 +98,8 @@ class Measurement:
         How many lines were left out so, of all records.
     holes : tuple of (str, ndarray)
         What held NaN there, a sensor's name or that of another record, and at which lines, Hz.
+    whole : WholeRecords, optional
+        Of spectra of whole records, which neither begin nor end at rest: see `from_time`.
 
     Notes
     -----
@@ -116,6 +119,7 @@ class Measurement:
     missing: InitVar[Missing] = field(default="refuse", kw_only=True)
     dropped: int = field(default=0, kw_only=True)
     holes: tuple[tuple[str, Array], ...] = field(default=(), kw_only=True)
+    whole: WholeRecords | None = field(default=None, kw_only=True)
 
     def __post_init__(self, missing: Missing) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 - a frozen class fills itself
@@ -194,13 +198,15 @@ class Measurement:
             # So that an older sysid reads all others.
             **({"dropped": self.dropped} if self.dropped else {}),
             **({"holes": [{"name": name, "freq": freq} for name, freq in self.holes]} if self.holes else {}),
+            **({} if self.whole is None else {"whole": self.whole.to_tree()}),
         }  # fmt: skip
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Measurement:
         """Give the measurement of a tree that `to_tree` made."""
         holes = tuple((hole["name"], hole["freq"]) for hole in tree.get("holes", ()))  # earlier files have none
-        return cls(**{**tree, "sensors": sensors_from_tree(tree["sensors"]), "holes": holes})
+        whole = WholeRecords.from_tree(tree.get("whole"))
+        return cls(**{**tree, "sensors": sensors_from_tree(tree["sensors"]), "holes": holes, "whole": whole})
 
     @property
     def translational(self) -> NDArray[np.bool_]:
@@ -239,6 +245,19 @@ class Measurement:
     def n_sensors(self) -> int:
         """Number of sensor axes."""
         return int(self.response.shape[1])
+
+    @property
+    def inputs(self) -> ComplexArray:
+        """What sets the structure in motion: the base, then of whole records the motion at the ends of each run.
+
+        (runs, d + 2 r, n_freq) for r runs that are not stated to be at rest at both ends.
+        """
+        if self.whole is None or not self.whole.moving:
+            return self.base
+        ends = np.zeros((self.n_runs, 2 * len(self.whole.moving), self.freq.size), complex)
+        for at, run in enumerate(self.whole.moving):
+            ends[run, 2 * at : 2 * at + 2] = self.whole.transients(self.freq, run)
+        return np.concatenate([self.base, ends], axis=1)
 
     @property
     def has_unit_runs(self) -> bool:
@@ -372,7 +391,9 @@ class Measurement:
         sample_rate: float,
         *,
         rigid_body: ArrayLike,
-        estimator: Literal["spectra", "h1", "h2"] = "spectra",
+        estimator: Literal["records", "spectra", "h1", "h2"] = "records",
+        at_rest: bool | Sequence[bool] = False,
+        noise: NoiseLevels | None = None,
         segment: int | None = None,
         band: tuple[float, float] | None = None,
         sensors: Sequence[Sensor] | None = None,
@@ -402,12 +423,16 @@ class Measurement:
         base_axes : str or sequence of str, optional
         """
         G = np.atleast_2d(finite_array("rigid_body", rigid_body))
-        choice("estimator", estimator, ("spectra", "h1", "h2"))
+        choice("estimator", estimator, ("records", "spectra", "h1", "h2"))
         records = spectra.check_runs(runs, sample_rate, G.shape)
         given: Any = {"rigid_body": G, "sensors": sensors, "base_axes": base_axes}
-        if estimator == "spectra":
+        if estimator in ("records", "spectra"):
             freq, base, response, force = spectra.whole_record(records, sample_rate)
-            test = cls(freq, base, response, force=force, **given)
+            whole = None
+            if estimator == "records":
+                samples = tuple(run.base.shape[1] for run in records)
+                whole = WholeRecords(samples, float(sample_rate), per_run("at_rest", at_rest, len(records)), noise)
+            test = cls(freq, base, response, force=force, whole=whole, **given)
         else:
             estimate = spectra.averaged(records, sample_rate, kind=estimator, segment=segment)
             test = cls.from_frf(

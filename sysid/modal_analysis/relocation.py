@@ -16,7 +16,7 @@ from sysid.structure.structure import Array, ComplexArray
 _SHARE = 1e-8  # of noise in squares, below which they have not eight digits of it
 _FEW = 60  # channels, for which factors take no longer than squares that round-off may refuse
 
-Blocks = list[tuple[ComplexArray, ComplexArray]]  # base (inputs, n_freq) and channels (c, n_freq) of each
+Blocks = list[tuple[ComplexArray, ComplexArray, ComplexArray]]  # of each: `Records.principal`
 
 
 def relocate(
@@ -34,11 +34,12 @@ def relocate(
         partial = np.where(w > 0, (omega[:, None] / w) ** 2 * g, 1.0)  # w_k² over the same denominator
     sigma = np.concatenate([np.ones((1, w.size)), partial, 1j * w / omega[:, None] * partial])
     bases = []
-    for base, _ in blocks:
+    for base, ends, _ in blocks:
         tell()
-        basis, _ = unit_columns(stacked((numerators[:, None] * base).reshape(-1, w.size)))
+        made = [(numerators[:, None] * base).reshape(-1, w.size), (g[:, None] * ends).reshape(-1, w.size)]
+        basis, _ = unit_columns(stacked(np.concatenate(made)))
         bases.append(np.linalg.qr(basis)[0])
-    few = sum(len(channels) for _, channels in blocks) <= _FEW
+    few = sum(len(channels) for *_, channels in blocks) <= _FEW
     rows = None if few else _rows_by_squares(blocks, bases, sigma, tell)
     if rows is None:
         rows = _rows_by_factors(blocks, bases, sigma, tell)
@@ -55,7 +56,7 @@ def relocate(
 def _rows_by_factors(blocks: Blocks, bases: list[Array], sigma: ComplexArray, tell: Callable[[], object]) -> Array:
     """Triangle of the equations for sigma of all channels: what the numerators cannot fit of ``sigma a``."""
     triangle = np.empty((0, len(sigma)))
-    for (_, channels), Q in zip(blocks, bases, strict=True):
+    for (*_, channels), Q in zip(blocks, bases, strict=True):
         for record in channels:
             tell()
             product = stacked(record * sigma)
@@ -72,12 +73,12 @@ def _rows_by_squares(
     In functions U for which the sum over channels of ``|U a|²`` is one, the matrix of the equations is one less what
     the numerators fit. Its least eigenvalue is the share of noise in ``|sigma a|²``, however close the poles.
     """
-    size = np.sqrt(sum(np.sum(np.abs(channels) ** 2, axis=0) for _, channels in blocks))
+    size = np.sqrt(sum(np.sum(np.abs(channels) ** 2, axis=0) for *_, channels in blocks))
     U, triangle = np.linalg.qr(stacked(size * sigma))
     G = np.eye(len(triangle))
     real, imaginary = np.split(U, 2)
     share = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
-    for (_, channels), Q in zip(blocks, bases, strict=True):
+    for (*_, channels), Q in zip(blocks, bases, strict=True):
         for record in channels:
             tell()
             a, b = (share * record).real[:, None], (share * record).imag[:, None]

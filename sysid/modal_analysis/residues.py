@@ -111,18 +111,19 @@ class Records:
         self.freq = test.freq
         record, std = (test.force, test.force_std) if force else (test.relative, test.response_std)
         assert record is not None
-        self.n_sensors, self.n_base = record.shape[1], test.n_base
+        self.n_sensors, self.n_base = record.shape[1], test.inputs.shape[1]
         channel, line = separable(std, record.shape)
         relative = record * channel[:, None]
-        self.unit = test.has_unit_runs
+        self.unit = test.whole is None and test.has_unit_runs
         if self.unit:
             size = np.exp(np.log(line).mean(axis=1, keepdims=True))  # of each run
             shared = np.exp(np.log(line / size).mean(axis=0))
+            self.driven = 1
             blocks = [(shared[None].astype(complex), (relative * size[:, None] * shared).reshape(-1, test.freq.size))]
             self.channel = (size * channel).ravel()
         else:
-            self.moving = independent(test.base)
-            base = np.einsum("di,rdf->rif", self.moving, test.base * line[:, None])
+            self.moving, self.driven = independent_inputs(test)
+            base = np.einsum("di,rdf->rif", self.moving, test.inputs * line[:, None])
             blocks = list(zip(base, relative * line[:, None], strict=True))
             self.channel = channel
         self.blocks = blocks
@@ -130,9 +131,9 @@ class Records:
         self.data = stacked(np.concatenate([records for _, records in blocks], axis=1))
         self.size = float(np.sum(self.data**2))
 
-    def basis(self, gains: ComplexArray) -> Array:
-        """Columns of gains (k, n_freq) times base motions, (rows, k * inputs)."""
-        block = np.tile(gains, len(self.blocks))[:, None] * self.base[None]
+    def basis(self, gains: ComplexArray, inputs: int | None = None) -> Array:
+        """Columns of gains (k, n_freq) times the first so many inputs, all by default, (rows, k * inputs)."""
+        block = np.tile(gains, len(self.blocks))[:, None] * self.base[None, :inputs]
         return stacked(block.reshape(-1, self.base.shape[1]))
 
     @cached_property
@@ -140,22 +141,30 @@ class Records:
         """Singular values (k,) of all records as a matrix of rows by channels, and its right vectors (k, channels)."""
         return _singular(self.data)
 
-    def principal(self, count: int) -> list[tuple[ComplexArray, ComplexArray]]:
-        """Base (inputs, n_freq) and at most so many principal channels (c, n_freq) of each block."""
+    def principal(self, count: int) -> list[tuple[ComplexArray, ComplexArray, ComplexArray]]:
+        """Base (inputs, n_freq), motion at the ends, and at most so many principal channels (c, n_freq) of each block."""
         out = []
-        for base, channels in self.blocks:
+        for inputs, channels in self.blocks:
+            base, ends = inputs[: self.driven], inputs[self.driven :]
             moving = independent(base[None]).T @ base  # a run moves the base in fewer directions than all together
             sizes, right = self.singular if len(self.blocks) == 1 else _singular(stacked(channels))
             keep = np.flatnonzero(sizes > 1e-14 * sizes[0])[:count]
-            out.append((moving, right[keep] @ channels))
+            out.append((moving, ends[np.any(ends, axis=1)], right[keep] @ channels))
         return out
 
     def functions(self, omega: Array, ratios: Array, *, velocity: bool = False) -> Array:
         """Columns of ``g`` for each input; with `velocity` those of ``i w / w_k g`` too, as further inputs."""
-        if velocity:
-            both = gains_with_velocity(self.freq, omega, ratios)
-            return self.basis(both.swapaxes(0, 1).reshape(-1, self.freq.size))
-        return self.basis(gains(self.freq, omega, ratios))
+        every = gains_with_velocity(self.freq, omega, ratios) if velocity else [gains(self.freq, omega, ratios)]
+        return self.of_poles(list(every))
+
+    def of_poles(self, functions: list[ComplexArray]) -> Array:
+        """Columns of functions of poles, (m, n_freq) each, the first for all inputs and a further one for the base's.
+
+        Velocities of the motion at the ends are combinations of what is there already.
+        """
+        parts = [self.basis(f, None if i == 0 else self.driven) for i, f in enumerate(functions)]
+        by_pole = [part.reshape(len(part), len(functions[0]), -1) for part in parts]
+        return np.concatenate(by_pole, axis=2).reshape(len(parts[0]), -1)
 
     def fit(self, omega: Array, ratios: Array, *, velocity: bool = False) -> ResidueFit:
         """Best real residues of `functions`."""
@@ -305,6 +314,16 @@ def independent(base: ComplexArray) -> Array:
     flat, size = unit_columns(stacked(columns(base)))
     left, s, _ = np.linalg.svd(flat.T, full_matrices=False)
     return left[:, s > _DEPENDENT * s[0]] / size[:, None]
+
+
+def independent_inputs(test: Measurement) -> tuple[Array, int]:
+    """Combinations D (inputs, r) of a test's inputs, and how many of them are of the base; the others stand alone."""
+    base, d = independent(test.base), test.n_base
+    ends = np.linalg.norm(test.inputs[:, d:], axis=(0, 2))
+    both = np.zeros((d + ends.size, base.shape[1] + ends.size))
+    both[:d, : base.shape[1]] = base
+    both[d:, base.shape[1] :] = np.diag(1 / ends)
+    return both, base.shape[1]
 
 
 def _singular(matrix: Array) -> tuple[Array, Array]:

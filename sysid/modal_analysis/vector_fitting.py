@@ -381,7 +381,7 @@ def _projected(records: Records, p: Array, velocity: bool) -> tuple[float, Array
         turn = 2j * np.pi * records.freq / np.tile(omega, 2)[:, None]
         moved = np.concatenate([gains(records.freq, omega, ratios), np.zeros((m, records.freq.size))])
         by_pole = np.concatenate([by_pole, (turn * (by_pole[:, 0] - moved))[:, None]], axis=1)
-    slopes = records.basis(by_pole.reshape(-1, records.freq.size))
+    slopes = records.of_poles([by_pole[:, i] for i in range(by_pole.shape[1])])
     slopes = slopes - fit.Q @ (fit.Q.T @ slopes)
     residues = np.concatenate([fit.residues, fit.residues]).reshape(slopes.shape[1], -1)
     d = slopes.shape[1] // (2 * m)

@@ -1,0 +1,119 @@
+"""Whole records: what their spectra hold beside the response to the base, and the noise of every channel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sysid.errors import InputError, finite_array
+from sysid.structure.structure import Array, ComplexArray
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseLevels:
+    """Standard deviations of the noise of a sample in time, were it white up to half the sample rate.
+
+    Attributes
+    ----------
+    response : (n_sensors,)
+        m/s².
+    base : (d,)
+        m/s² (rad/s² for a rotation).
+    force : (d,) or None
+        N (N m); None where no force was measured.
+    """
+
+    response: Array
+    base: Array
+    force: Array | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("response", "base", "force"):
+            value = getattr(self, name)
+            if value is not None:
+                array = np.atleast_1d(finite_array(f"noise of the {name}", value))
+                if array.ndim != 1 or np.any(array < 0):
+                    raise InputError(f"noise of the {name}: one standard deviation >= 0 a channel is needed")
+                object.__setattr__(self, name, array)
+
+    @property
+    def outputs(self) -> Array:
+        """Of responses and, below them, forces, (n_sensors [+ d],)."""
+        return self.response if self.force is None else np.concatenate([self.response, self.force])
+
+    def to_tree(self) -> dict[str, Any]:
+        """Give the levels as a dictionary of arrays; ``NoiseLevels(**tree)`` takes it back."""
+        return {"response": self.response, "base": self.base, "force": self.force}
+
+
+@dataclass(frozen=True, eq=False)
+class WholeRecords:
+    """What the spectra of whole records need beside them; one entry a run.
+
+    A record of N samples neither starts nor ends at rest: its finite Fourier transform is the response to the base,
+    and two real numbers a mode, by which the motion at its end differs from that at its start.
+
+    Attributes
+    ----------
+    samples : tuple of int
+        N of each run; lines are multiples of ``sample_rate / N``.
+    sample_rate : float
+        Hz.
+    at_rest : tuple of bool
+        Runs that are stated to begin and end at rest, and have no such numbers.
+    noise : NoiseLevels or None
+        Stated; None where they are estimated with the fit.
+    """
+
+    samples: tuple[int, ...]
+    sample_rate: float
+    at_rest: tuple[bool, ...]
+    noise: NoiseLevels | None = field(default=None)
+
+    @property
+    def moving(self) -> tuple[int, ...]:
+        """Runs that are not stated to begin and end at rest."""
+        return tuple(run for run, rest in enumerate(self.at_rest) if not rest)
+
+    @property
+    def density(self) -> Array:
+        """Variance of a spectral line's noise over that of a sample in time, of each run, s²."""
+        return np.array(self.samples) / self.sample_rate**2
+
+    def transients(self, freq: Array, run: int) -> ComplexArray:
+        """Motion at the ends of a run as further inputs at lines in Hz: a change of velocity, of displacement; (2, n).
+
+        ``g_k (a / w² + i b / w)`` is what ``(a + i w b) / (w_k² - w² + 2 i zeta_k w_k w)`` is.
+        """
+        w = 2 * np.pi * freq
+        return np.stack([1 / w**2, 1j / w])
+
+    def to_tree(self) -> dict[str, Any]:
+        """Give it as dictionaries and arrays; `from_tree` takes it back."""
+        return {
+            "samples": np.array(self.samples),
+            "sample_rate": self.sample_rate,
+            "at_rest": np.array(self.at_rest),
+            "noise": None if self.noise is None else self.noise.to_tree(),
+        }
+
+    @classmethod
+    def from_tree(cls, tree: dict[str, Any] | None) -> WholeRecords | None:
+        """Give what a tree of `to_tree` stands for; None for None."""
+        if tree is None:
+            return None
+        noise = None if tree["noise"] is None else NoiseLevels(**tree["noise"])
+        samples, rest = tuple(map(int, tree["samples"])), tuple(map(bool, tree["at_rest"]))
+        return cls(samples, float(tree["sample_rate"]), rest, noise)
+
+
+def per_run(name: str, value: Any, runs: int) -> tuple[bool, ...]:
+    """One bool, or one a run, as one a run."""
+    given: ArrayLike = [value] * runs if isinstance(value, bool | np.bool_) else value
+    array = np.asarray(given)
+    if array.shape != (runs,) or array.dtype != bool:
+        raise InputError(f"{name} = {value!r}: give True or False, or one of them for each of the {runs} runs")
+    return tuple(bool(one) for one in array)

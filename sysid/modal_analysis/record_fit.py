@@ -1,0 +1,240 @@
+"""Fit of a modal model with transients to whole records, with the noise of all channels, base included.
+
+True maximum likelihood with the base's motion unknown: errors weigh by their full covariance at each line, and every
+derivative is taken at the base's motion as all channels make it likely. Levels of the noise that are not stated are
+estimated in turn with the fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from sysid.errors import InputError
+from sysid.measurement.measurement import Measurement
+from sysid.measurement.whole import NoiseLevels
+from sysid.modal_analysis.modal_fit import Modes
+from sysid.modal_analysis.record_model import TRACES, Parameters, RecordModel
+from sysid.modal_analysis.record_noise import floors, likeliest_levels
+from sysid.modal_analysis.residues import Records
+from sysid.modal_analysis.response import gains
+from sysid.structure.structure import Array
+
+_ROUNDS = 12  # of modes and levels in turn
+_STEPS = 60
+_SETTLED = 1e-3  # fall of the sum of squares, in units of the noise, at which the fit stands still
+_SAME_LEVELS = 0.003  # relative change of a standard deviation at which levels stand still
+_WORTH = 25.0  # in units of ``e' S^-1 e``: a mode whose absence raises it by less is noise (chi-squared of 50)
+
+Monitor = Callable[[int, float], object]
+
+
+@dataclass(frozen=True, eq=False)
+class RecordFit:
+    """Modes of whole records, their transients, and the noise of all channels.
+
+    Attributes
+    ----------
+    test : Measurement
+        As given.
+    parameters : Parameters
+    levels : (c + d,)
+        Variances of a sample in time, of responses, forces and base.
+    chi2 : float
+        ``sum e' S^-1 e``: half a chi-squared of `freedom` degrees where the model is right.
+    settled : bool
+        Whether the fit came to its end.
+    """
+
+    test: Measurement
+    parameters: Parameters
+    levels: Array
+    chi2: float
+    settled: bool
+
+    @property
+    def model(self) -> RecordModel:
+        """The model that was fitted."""
+        return RecordModel(self.test, self.parameters.modes.omega.size)
+
+    @property
+    def unknowns(self) -> int:
+        """Numbers that the records determine: without a force the scale of each mode is none."""
+        model = self.model
+        return model.size - (0 if model.force else model.m)
+
+    @property
+    def freedom(self) -> int:
+        """Real numbers of the records less those of the fit."""
+        return self.model.numbers - self.unknowns
+
+    @property
+    def reduced(self) -> float:
+        """Chi-squared over its degrees of freedom: one where the model is right and levels are the noise's."""
+        return 2 * self.chi2 / self.freedom
+
+    @property
+    def noise(self) -> NoiseLevels:
+        """The levels, stated or found, as standard deviations."""
+        root, n, d = np.sqrt(self.levels), self.test.n_sensors, self.test.n_base
+        force = root[n : n + d] if self.test.force is not None else None
+        return NoiseLevels(root[:n], root[-d:], force)
+
+
+def record_modes(test: Measurement, omega: Array, ratios: Array, *, monitor: Monitor | None = None) -> RecordFit:
+    """Fit modes to whole records, from poles close by.
+
+    Parameters
+    ----------
+    test : Measurement
+        Of whole records.
+    omega, ratios : (m,)
+        Circular frequencies, rad/s, and damping ratios.
+    monitor : callable, optional
+        ``monitor(iterations, residual)``, the latter ``sqrt(chi2 / numbers)``; what it raises passes through.
+    """
+    model = RecordModel(test, omega.size)
+    return _fit(model, _first(test, omega, ratios), None, monitor or (lambda i, r: None))
+
+
+def _fit(model: RecordModel, p: Parameters, levels: Array | None, monitor: Monitor) -> RecordFit:
+    """Modes and levels in turn."""
+    test = model.test
+    assert test.whole is not None
+    stated, least = test.whole.noise, floors(model)
+    if stated is not None:
+        levels = np.maximum(np.concatenate([stated.outputs, stated.base]) ** 2, least)
+    elif levels is None:
+        levels = _rough_levels(model, p)
+    unknowns = model.size - (0 if model.force else model.m)
+    settled, chi2 = False, np.inf
+    for round_ in range(_ROUNDS):
+        p, chi2, done = _minimise(model, p, levels, monitor, 10 * round_)
+        if stated is not None:
+            settled = done
+            break
+        before, levels = levels, likeliest_levels(model, p, levels, unknowns)
+        if done and np.all(np.abs(np.log(levels / before)) < 2 * _SAME_LEVELS):
+            settled = True
+            chi2 = model.chi2(p, levels)
+            break
+    return RecordFit(test, p, levels, chi2, settled)
+
+
+def _minimise(
+    model: RecordModel, p: Parameters, levels: Array, monitor: Monitor, count: int
+) -> tuple[Parameters, float, bool]:
+    """Levenberg-Marquardt steps at given levels."""
+    x, damping = model.pack(p), 1e-6
+    here = model.normal_equations(p, levels)
+    for i in range(_STEPS):
+        monitor(count + i, float(np.sqrt(2 * here.chi2 / model.numbers)))
+        size = np.sqrt(np.maximum(np.diag(here.normal), 1e-300))
+        scaled = here.normal / np.outer(size, size)
+        while True:
+            factor = scipy.linalg.cho_factor(scaled + damping * np.eye(size.size), check_finite=False)
+            step = scipy.linalg.cho_solve(factor, here.gradient / size) / size
+            promised = float(here.gradient @ step)
+            trial = model.unpack(x + step)
+            after = _chi2(model, trial, levels)
+            if after <= here.chi2 or promised < _SETTLED:
+                break
+            damping = max(10 * damping, 1e-6)
+            if damping > 1e6:
+                return model.unpack(x), here.chi2, False
+        if after <= here.chi2:
+            x = x + step
+            damping = max(damping / 10, 1e-12)
+            if promised < _SETTLED:
+                return model.unpack(x), after, True
+            here = model.normal_equations(model.unpack(x), levels)
+        else:
+            return model.unpack(x), here.chi2, True
+    return model.unpack(x), here.chi2, False
+
+
+def _chi2(model: RecordModel, p: Parameters, levels: Array) -> float:
+    """The sum of squares; infinite where a step went beyond all measure."""
+    good = np.all(np.isfinite(p.modes.omega)) and np.all(p.modes.ratios < 1.0)
+    value = model.chi2(p, levels) if good else np.inf
+    return value if np.isfinite(value) else np.inf
+
+
+def _first(test: Measurement, omega: Array, ratios: Array) -> Parameters:
+    """Rank-one modes nearest to free residues at given poles; with a force, its own masses."""
+    records = Records(test)
+    d = test.n_base
+    residues = records.by_sensor(records.fit(omega, ratios).residues)  # (m, n, d + 2 r)
+    size = np.linalg.norm(np.concatenate(list(test.inputs), axis=-1), axis=1)
+    u, s, vt = np.linalg.svd(residues * size)
+    strength = np.sqrt(s[:, 0] / size[:d].max())
+    phi, push = u[:, :, 0].T * strength, vt[:, 0] * (s[:, 0] / strength)[:, None] / size
+    modes, ends, rigid = Modes(phi, push[:, :d], omega, ratios), push[:, d:], np.zeros((d, d))
+    if test.force is not None:
+        t, rigid = _masses(test, modes, ends)
+        scale = np.sqrt(t)
+        modes = modes._replace(phi=modes.phi / scale, gamma=modes.gamma * scale[:, None])
+        ends = ends * scale[:, None]
+    channels = test.n_sensors + (0 if test.force is None else d)
+    return Parameters(modes, rigid, ends, np.zeros((test.n_runs, channels, TRACES)))
+
+
+def _masses(test: Measurement, modes: Modes, ends: Array) -> tuple[Array, Array]:
+    """Modal masses (m,) > 0 and rigid-body mass (d, d) by the base force, which is linear in both."""
+    from scipy.optimize import lsq_linear
+
+    assert test.force is not None
+    d, m = test.n_base, modes.omega.size
+    pairs = [(i, j) for i in range(d) for j in range(i, d)]
+    inputs, base = np.concatenate(list(test.inputs), axis=-1), np.concatenate(list(test.base), axis=-1)
+    force = np.concatenate(list(test.force), axis=-1)
+    q = np.tile(gains(test.freq, modes.omega, modes.ratios), test.n_runs) * (np.hstack([modes.gamma, ends]) @ inputs)
+    parts = [np.outer(modes.gamma[k], q[k]) for k in range(m)]
+    for i, j in pairs:
+        unit = np.zeros((d, d))
+        unit[i, j] = unit[j, i] = 1.0
+        parts.append(unit @ base)
+    size = np.linalg.norm(force, axis=1, keepdims=True)
+    design = np.array([(part / size).ravel() for part in parts]).T
+    wanted = (force / size).ravel()
+    rows, target = np.vstack([design.real, design.imag]), np.concatenate([wanted.real, wanted.imag])
+    scale = np.linalg.norm(rows, axis=0)
+    Q, R = np.linalg.qr(rows / scale)
+    free = np.linalg.lstsq(R, Q.T @ target, rcond=None)[0]
+    strength = np.abs(free[:m])
+    if np.sum(free[:m] * strength) < -0.5 * np.sum(strength**2):
+        raise InputError(
+            "the base force answers to the modes with negative masses: check its sign (it is the base's on the "
+            "structure, in phase with the base acceleration at low frequency)"
+        )
+    lower = np.concatenate([np.zeros(m), np.full(len(pairs), -np.inf)])
+    answer = (free if np.all(free[:m] > 0) else lsq_linear(R, Q.T @ target, (lower, np.inf), tol=1e-14).x) / scale
+    rigid = np.zeros((d, d))
+    for (i, j), mass in zip(pairs, answer[m:], strict=True):
+        rigid[i, j] = rigid[j, i] = mass
+    t = answer[:m]
+    return np.maximum(t, 1e-3 * t.max()), rigid
+
+
+def _rough_levels(model: RecordModel, p: Parameters) -> Array:
+    """Variances to begin with: what the first model leaves of the outputs, and the same share of the base."""
+    left, power, base = np.zeros(model.channels), np.zeros(model.channels), np.zeros(model.d)
+    for chunk in model.chunks(p):
+        left += np.sum(np.abs(chunk.error) ** 2, axis=1) / chunk.run.density
+        power += np.sum(np.abs(chunk.run.outputs) ** 2, axis=1) / chunk.run.density
+        base += np.sum(np.abs(chunk.run.base) ** 2, axis=1) / chunk.run.density
+    lines = sum(run.w.size for run in model.runs)
+    share = np.median(left / np.where(power > 0, power, np.inf))
+    return np.maximum(np.concatenate([left, share * base]) / lines, floors(model))
+
+
+def without(fit: RecordFit, k: int) -> Parameters:
+    """Parameters of a fit without mode k."""
+    p = fit.parameters
+    keep = np.arange(p.modes.omega.size) != k
+    modes = Modes(p.modes.phi[:, keep], p.modes.gamma[keep], p.modes.omega[keep], p.modes.ratios[keep])
+    return replace(p, modes=modes, ends=p.ends[keep])
