@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from sysid.errors import InputError, choice, finite_array, flag, instance, number, random_generator, refuse, sequence
 from sysid.measurement import spectra
 from sysid.measurement.missing import Missing, complete, named, present
-from sysid.measurement.whole import NoiseLevels, WholeRecords, per_run
+from sysid.measurement.whole import ModalEstimate, NoiseLevels, WholeRecords, per_run
 from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
 from sysid.structure.sensor import Sensor, checked_sensors, sensors_from_tree, sensors_to_tree
 from sysid.structure.structure import Array, ComplexArray, Structure, check_frequencies
@@ -100,6 +100,8 @@ class Measurement:
         What held NaN there, a sensor's name or that of another record, and at which lines, Hz.
     whole : WholeRecords, optional
         Of spectra of whole records, which neither begin nor end at rest: see `from_time`.
+    modal : ModalEstimate, optional
+        Of whole records whose transients were taken off: what they tell of the modes, with the noise of all channels.
 
     Notes
     -----
@@ -120,6 +122,7 @@ class Measurement:
     dropped: int = field(default=0, kw_only=True)
     holes: tuple[tuple[str, Array], ...] = field(default=(), kw_only=True)
     whole: WholeRecords | None = field(default=None, kw_only=True)
+    modal: ModalEstimate | None = field(default=None, kw_only=True)
 
     def __post_init__(self, missing: Missing) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 - a frozen class fills itself

@@ -110,6 +110,38 @@ class WholeRecords:
         return cls(samples, float(tree["sample_rate"]), rest, noise)
 
 
+@dataclass(frozen=True, eq=False)
+class ModalEstimate:
+    """What whole records tell of the modes: the likeliest ones, and how exactly they are known.
+
+    Attributes
+    ----------
+    phi : (n_sensors, m)
+    gamma : (m, d)
+        Shapes at the sensors and participations; without a force only their products mean something.
+    omega, ratios : (m,)
+        rad/s; damping ratios.
+    rigid : (d, d)
+        Rigid-body mass; of no meaning where no force was measured.
+    information : (p, p)
+        ``Re J' S^-1 J`` over phi, gamma, log omega, log ratios and the upper triangle of the rigid-body mass, with what
+        the transients take away of it: half the inverse of the covariance. Zero for the mass without a force.
+    noise : NoiseLevels
+        Stated, or found with the fit.
+    reduced : float
+        Chi-squared over its degrees of freedom.
+    """
+
+    phi: Array
+    gamma: Array
+    omega: Array
+    ratios: Array
+    rigid: Array
+    information: Array
+    noise: NoiseLevels
+    reduced: float
+
+
 def per_run(name: str, value: Any, runs: int) -> tuple[bool, ...]:
     """One bool, or one a run, as one a run."""
     given: ArrayLike = [value] * runs if isinstance(value, bool | np.bool_) else value

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
@@ -28,7 +27,6 @@ _ROUNDS = 12  # of modes and levels in turn
 _STEPS = 60
 _SETTLED = 1e-3  # fall of the sum of squares, in units of the noise, at which the fit stands still
 _SAME_LEVELS = 0.003  # relative change of a standard deviation at which levels stand still
-_WORTH = 25.0  # in units of ``e' S^-1 e``: a mode whose absence raises it by less is noise (chi-squared of 50)
 
 Monitor = Callable[[int, float], object]
 
@@ -78,6 +76,32 @@ class RecordFit:
         return 2 * self.chi2 / self.freedom
 
     @property
+    def likelihood(self) -> float:
+        """Logarithm of the likelihood less half of Schwarz's price of the unknowns: the larger, the better."""
+        model, c = self.model, self.model.channels
+        spread = 0.0
+        for chunk in model.chunks(self.parameters):
+            T = chunk.H
+            inner = np.einsum("cil,cjl,c->lij", T.conj(), T, 1 / self.levels[:c]) * self.levels[c:]
+            spread += float(np.sum(np.linalg.slogdet(inner + np.eye(inner.shape[1]))[1]))
+            spread += T.shape[-1] * float(np.sum(np.log(self.levels[:c] * chunk.run.density)))
+        return -spread - self.chi2 - self.unknowns * float(np.log(model.numbers)) / 2
+
+    def information(self) -> Array:
+        """``Re J' S^-1 J`` over the unknowns of `Index`, less what transients and traces explain of it; (p, p)."""
+        model = self.model
+        N = model.normal_equations(self.parameters, self.levels).normal
+        kept, size = model.kept, np.sqrt(np.maximum(np.diag(N), 1e-300))
+        scaled = N / np.outer(size, size)
+        inner, cross = scaled[kept:, kept:], scaled[kept:, :kept]
+        lam, V = np.linalg.eigh(inner)
+        seen = lam > 1e-12 * lam.max(initial=0.0)
+        turned = (V[:, seen] / np.sqrt(lam[seen])).T @ cross
+        A = np.zeros((model.index.size, model.index.size))
+        A[:kept, :kept] = (scaled[:kept, :kept] - turned.T @ turned) * np.outer(size[:kept], size[:kept])
+        return A
+
+    @property
     def noise(self) -> NoiseLevels:
         """The levels, stated or found, as standard deviations."""
         root, n, d = np.sqrt(self.levels), self.test.n_sensors, self.test.n_base
@@ -99,6 +123,12 @@ def record_modes(test: Measurement, omega: Array, ratios: Array, *, monitor: Mon
     """
     model = RecordModel(test, omega.size)
     return _fit(model, _first(test, omega, ratios), None, monitor or (lambda i, r: None))
+
+
+def refitted(fit: RecordFit, p: Parameters, *, monitor: Monitor | None = None) -> RecordFit:
+    """The fit from other parameters, and from its levels of noise."""
+    model = RecordModel(fit.test, p.modes.omega.size)
+    return _fit(model, p, fit.levels, monitor or (lambda i, r: None))
 
 
 def _fit(model: RecordModel, p: Parameters, levels: Array | None, monitor: Monitor) -> RecordFit:
@@ -238,3 +268,27 @@ def without(fit: RecordFit, k: int) -> Parameters:
     keep = np.arange(p.modes.omega.size) != k
     modes = Modes(p.modes.phi[:, keep], p.modes.gamma[keep], p.modes.omega[keep], p.modes.ratios[keep])
     return replace(p, modes=modes, ends=p.ends[keep])
+
+
+def worth(fit: RecordFit) -> Array:
+    """What ``e' S^-1 e`` would about rise by without each mode, (m,): all else moves as far as it is free."""
+    model, p = fit.model, fit.parameters
+    N = model.normal_equations(p, fit.levels).normal
+    size = np.sqrt(np.maximum(np.diag(N), 1e-300))
+    scaled = N / np.outer(size, size)
+    m, n, index = model.m, model.n, model.index
+    out = np.zeros(m)
+    for k in range(m):
+        own = index.phi.start + np.arange(n) * m + k
+        # With its shape at zero neither participation, pole nor transient of a mode show.
+        gone = np.concatenate([
+            index.gamma.start + k * model.d + np.arange(model.d), [index.log_omega.start + k, index.log_ratios.start + k],
+            model.kept + k * (model.n_ends // m) + np.arange(model.n_ends // m),
+        ])  # fmt: skip
+        others = np.setdiff1d(np.arange(model.size), np.concatenate([own, gone]))
+        inner = scaled[np.ix_(others, others)] + 1e-10 * np.eye(others.size)
+        cross = scaled[np.ix_(others, own)]
+        left = scaled[np.ix_(own, own)] - cross.T @ np.linalg.solve(inner, cross)
+        phi = p.modes.phi[:, k] * size[own]
+        out[k] = phi @ left @ phi
+    return out

@@ -1,0 +1,104 @@
+"""Whole records without their transients, and what they tell of the modes: poles, fit, noise, one step after the other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sysid.measurement.measurement import Measurement
+from sysid.measurement.whole import ModalEstimate
+from sysid.modal_analysis.record_fit import Monitor, RecordFit, record_modes, refitted, without, worth
+from sysid.modal_analysis.record_poles import rough_deviations
+from sysid.modal_analysis.vector_fitting import find_poles
+from sysid.structure.structure import Array, ComplexArray
+
+_WORTH = 25.0  # in units of ``e' S^-1 e``: a mode whose absence raises it by less is noise (chi-squared of 50)
+_DAMPED = 0.5  # a pole with more damping than this is no mode of a structure
+
+
+def whole_fit(test: Measurement, *, monitor: Monitor | None = None) -> RecordFit:
+    """Modes, transients and noise of whole records.
+
+    Poles are looked for twice: with rough weights, and with the noise that a first fit found.
+
+    Raises
+    ------
+    InputError
+        As `find_poles` does.
+    """
+    poles = find_poles(replace(test, response_std=rough_deviations(test)), monitor=monitor)
+    fit = _kept(record_modes(test, poles.omega, poles.ratios, monitor=monitor), monitor)
+    again = find_poles(replace(test, response_std=deviations(fit)[0]), monitor=monitor)
+    if again.omega.size != fit.parameters.modes.omega.size:
+        other = _kept(record_modes(test, again.omega, again.ratios, monitor=monitor), monitor)
+        fit = max(fit, other, key=lambda one: one.likelihood)
+    return fit
+
+
+def _kept(fit: RecordFit, monitor: Monitor | None) -> RecordFit:
+    """The fit without modes that noise explains."""
+    while fit.parameters.modes.omega.size > 1:
+        value = np.where(fit.parameters.modes.ratios < _DAMPED, worth(fit), 0.0)
+        least = int(np.argmin(value))
+        if value[least] >= _WORTH:
+            break
+        fit = refitted(fit, without(fit, least), monitor=monitor)
+    return fit
+
+
+def deviations(fit: RecordFit) -> tuple[Array, Array | None]:
+    """Standard deviations ``sqrt(E|e|²)`` of responses and force at each line: their own noise and the base's."""
+    test, model = fit.test, fit.model
+    parts: list[list[Array]] = [[] for _ in range(test.n_runs)]
+    c = model.channels
+    for chunk in model.chunks(fit.parameters):
+        power = fit.levels[:c, None] + np.einsum("cdl,d->cl", np.abs(chunk.H) ** 2, fit.levels[c:])
+        parts[chunk.run.number].append(np.sqrt(chunk.run.density * power))
+    std = np.array([np.concatenate(run, axis=1) for run in parts])
+    n = test.n_sensors
+    return std[:, :n], std[:, n:] if model.force else None
+
+
+def without_transients(test: Measurement, *, monitor: Monitor | None = None) -> Measurement:
+    """The records as they would be at rest at both ends, their noise stated, and what they tell of the modes.
+
+    Parameters
+    ----------
+    test : Measurement
+        Of whole records; any other is given back as it is.
+    monitor : callable, optional
+        As in `find_poles`.
+    """
+    if test.whole is None:
+        return test
+    fit = whole_fit(test, monitor=monitor)
+    model, p = fit.model, fit.parameters
+    free: list[list[ComplexArray]] = [[] for _ in range(test.n_runs)]
+    for chunk in model.chunks(p):
+        predicted = np.einsum("cdl,dl->cl", chunk.H, chunk.run.base)
+        free[chunk.run.number].append(chunk.run.outputs - chunk.error - predicted)
+    taken = np.array([np.concatenate(run, axis=1) for run in free])
+    n = test.n_sensors
+    std, force_std = deviations(fit)
+    return replace(
+        test, whole=None, modal=estimate(fit), response=test.response - taken[:, :n], response_std=std,
+        force=None if test.force is None else test.force - taken[:, n:], force_std=force_std,
+    )  # fmt: skip
+
+
+def estimate(fit: RecordFit) -> ModalEstimate:
+    """Modes in ascending order, with their information."""
+    modes, p, index = fit.parameters.modes, fit.parameters, fit.model.index
+    order = np.argsort(modes.omega, kind="stable")
+    A = fit.information()
+    m, (n, d) = order.size, (fit.test.n_sensors, fit.test.n_base)
+    at = np.concatenate([
+        (np.arange(n)[:, None] * m + order).ravel(),
+        (index.gamma.start + order[:, None] * d + np.arange(d)).ravel(),
+        index.log_omega.start + order, index.log_ratios.start + order, index.rigid,
+    ])  # fmt: skip
+    return ModalEstimate(
+        modes.phi[:, order], modes.gamma[order], modes.omega[order], modes.ratios[order], p.rigid,
+        A[np.ix_(at, at)], fit.noise, fit.reduced,
+    )  # fmt: skip
