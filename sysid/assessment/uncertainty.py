@@ -29,6 +29,7 @@ from sysid.assessment.sensitivity import (
 )  # fmt: skip
 from sysid.errors import InputError
 from sysid.modal_analysis.misfit import inflation_of, records_of
+from sysid.modal_analysis.modal_estimate import information_about
 from sysid.modal_analysis.modal_fit import Index, Modes
 from sysid.models.unknowns import by_name, split
 from sysid.problem.formulation import Formulation
@@ -202,11 +203,14 @@ def _by_modes(problem: Problem, structure: Structure, x: Array | None) -> Uncert
     index = Index(structure.n_sensors, structure.n, structure.n_base)
     path = parametrisation(problem, structure, modes, index)
     unknowns = path.unit.size - path.gauge.shape[1]
-    records, spectra = records_of(test, structure, unknowns), spectra_of(test, modes)
-    A = information(modes, index, [record.grams(spectra) for record in records])
-    B = None
-    if not all(record.shared for record in records):
-        B = information(modes, index, [record.sandwich_grams(spectra) for record in records])
+    records, B = records_of(test, structure, unknowns), None
+    if test.modal is not None:
+        A = information_about(test.modal, modes)
+    else:
+        spectra = spectra_of(test, modes)
+        A = information(modes, index, [record.grams(spectra) for record in records])
+        if not all(record.shared for record in records):
+            B = information(modes, index, [record.sandwich_grams(spectra) for record in records])
     steps = spread(A, B, path)
     normals, unseen = (held_by_entries(problem, structure, modes, index, path, part) for part in steps)
     inflation = inflation_of(test, records, unknowns)

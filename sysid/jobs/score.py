@@ -136,7 +136,7 @@ def scored(result: Identification, predicted: float | None = None) -> Score:
     """Figures of a result; `predicted` where a change left something out of its problem."""
     s, problem = result.structure, result.problem
     if predicted is None:
-        tests = problem.validation
+        tests = result.validation
         wrong = [test.relative - test.predict(s) for test in tests]
         predicted = _norm(wrong) / _norm([test.relative for test in tests]) if tests else np.nan
     noises = list(_weighted_misfits(result))

@@ -80,6 +80,10 @@ class Geometry:
     @cached_property
     def poles(self) -> Poles:
         """Poles that stand out of the records."""
+        modal = self.test.modal
+        if modal is not None:
+            left = float(np.sqrt(modal.reduced * np.mean(self.test.response_std**2) / np.mean(abs(self.test.relative) ** 2)))
+            return Poles(modal.omega, modal.ratios, left)
         return find_poles(self.test, monitor=self.monitor)
 
     @property

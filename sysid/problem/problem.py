@@ -15,6 +15,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.outliers import Outlier, outliers, predicted, pseudo_values, screened
 from sysid.modal_analysis.response import columns, weighed_mass
 from sysid.modal_analysis.vector_fitting import Poles
+from sysid.modal_analysis.whole_records import without_transients
 from sysid.models.damping import ModalDamping
 from sysid.models.geometry import Geometry
 from sysid.models.model import MatrixModel
@@ -170,7 +171,7 @@ class Problem:
         return {
             "measurement": self.measurement.to_tree(),
             "given": stored.to_tree(vars(self)),
-            "poles": None if self.loss == "huber" else self.geometry.found,  # those of what is screened
+            "poles": self.geometry.found if self.screened is self else None,  # those of what is screened
             "reference": None if self.reference is None else self.reference.to_tree(),
             "validation": [test.to_tree() for test in self.validation],
             "goal": self.goal,
@@ -201,14 +202,26 @@ class Problem:
         return problem
 
     @cached_property
+    def at_rest(self) -> Problem:
+        """The problem with the transients of whole records taken off; itself where no record is whole."""
+        return self._at_rest(None)
+
+    def _at_rest(self, monitor: Callable[[int, float], object] | None) -> Problem:
+        tests = [self.measurement, *(r.measurement for r in self.residuals if isinstance(r, FurtherTest))]
+        if all(test.whole is None for test in tests):
+            return self
+        return self._with_tests(lambda test: without_transients(test, monitor=monitor), self.loss)
+
+    @cached_property
     def screened(self) -> Problem:
-        """The problem in squares, its records without numbers that stand alone; with ``loss="squares"`` itself."""
-        return self if self.loss == "squares" else self._with_tests(screened)
+        """The problem in squares, its records without transients and, but with squares, numbers that stand alone."""
+        return self.at_rest if self.loss == "squares" else self.at_rest._with_tests(screened)
 
     def fits(self, structure: Structure, x: Array | None) -> list[tuple[Measurement, Structure]]:
         """Each test that is fitted, as it was given, and what the structure was in it at an answer."""
-        own = [(self.measurement, structure)] if self.formulation.fits_records else []
-        further = [r.measurement for r in self.residuals if isinstance(r, FurtherTest) and x is not None]
+        problem = self.at_rest
+        own = [(problem.measurement, structure)] if self.formulation.fits_records else []
+        further = [r.measurement for r in problem.residuals if isinstance(r, FurtherTest) and x is not None]
         terms = zip(further, self.formulation.further_tests, strict=False)
         return own + [(test, term.matrices.structure(x, test)) for test, term in terms if x is not None]
 
@@ -230,18 +243,20 @@ class Problem:
         """
         fits = [(test, predicted(test, its)) for test, its in self.fits(structure, x)]
         made = iter(pseudo_values(fits, self.n_variables))
-        other = self._with_tests(lambda test: next(made))
+        other = self._with_tests(lambda test: next(made))  # whole records too: what they tell of the modes is gone
         other.geometry.found = self.geometry.found
         return other
 
-    def _with_tests(self, change: Callable[[Measurement], Measurement]) -> Problem:
-        """The same in squares, with other records of all tests that are fitted."""
+    def _with_tests(
+        self, change: Callable[[Measurement], Measurement], loss: Literal["squares", "huber"] = "squares"
+    ) -> Problem:
+        """The same, in squares unless stated, with other records of all tests that are fitted."""
         own = change(self.measurement)
         residuals = [
             replace(given, measurement=change(given.measurement)) if isinstance(given, FurtherTest) else given
             for given in self.residuals
         ]
-        return replace(self, measurement=own, residuals=residuals, loss="squares")
+        return replace(self, measurement=own, residuals=residuals, loss=loss)
 
     @property
     def geometry(self) -> Geometry:
@@ -257,7 +272,7 @@ class Problem:
     @cached_property
     def formulation(self) -> Formulation:
         """Matrices, terms and constraints as CasADi functions of the unknowns."""
-        return self.formulate(self.geometry) if self.loss == "squares" else self.screened.formulation
+        return self.formulate(self.geometry) if self.screened is self else self.screened.formulation
 
     @property
     def models(self) -> tuple[MatrixModel, MatrixModel, MatrixModel]:
@@ -278,8 +293,10 @@ class Problem:
         monitor : callable, optional
             Called with (iteration, relative residual) while poles are looked for; what it raises passes through.
         """
+        if "at_rest" not in vars(self):
+            vars(self)["at_rest"] = self._at_rest(monitor)
         if self.loss == "huber" and "screened" not in vars(self):
-            vars(self)["screened"] = self._with_tests(lambda test: screened(test, monitor=monitor))
+            vars(self)["screened"] = self.at_rest._with_tests(lambda test: screened(test, monitor=monitor))
         geometry, formulation = self.geometry, self.formulation
         geometry.monitor = formulation.monitor = monitor
         try:

@@ -14,6 +14,8 @@ import numpy as np
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.misfit import inflation_of, records_of
+from sysid.modal_analysis.modal_estimate import factor_of, index_of, matched, theta_of
+from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.response import weights_of_test
 from sysid.problem.matrices import Matrices
 from sysid.structure.structure import Array, ComplexArray, Structure
@@ -140,6 +142,10 @@ def rows_of_test(
     Noise that is larger than stated, or shared by neighbouring lines, counts as the misfit shows it; with `as_stated`
     it is not, as where a test is planned.
     """
+    if test.modal is not None and s.structure.modal_damping:
+        rows = _rows_of_modes(test, s, unknowns, share=share, as_stated=as_stated)
+        if rows is not None:
+            return rows
     X, dX = response_slopes(s, test.freq)
     R, u = s.structure.recovery, test.base  # (runs, d, n_freq)
     d_a = np.einsum("si,fidc,rdf->srfc", R, dX, u, optimize=True)
@@ -159,6 +165,45 @@ def rows_of_test(
         left, std = (-weights * record.misfit).ravel(), inflation * (weights * record.std).ravel() / np.sqrt(2)
         rows.append(Rows(_real(left), _real(flat), np.concatenate([std, std])))
     return rows
+
+
+def _rows_of_modes(
+    test: Measurement, s: Slopes, unknowns: int, *, share: float, as_stated: bool
+) -> list[Rows] | None:
+    """Rows of whole records, which are those of their modes; None where the structure has fewer modes."""
+    estimate, structure = test.modal, s.structure
+    assert estimate is not None
+    chosen = matched(estimate, 2 * np.pi * structure.natural_frequencies)
+    if chosen is None:
+        return None
+    index, d = index_of(estimate), structure.n_base
+    phi, gamma = structure.mode_shapes[:, chosen], structure.participation[chosen]
+    d_phi = np.einsum("si,ikc->skc", structure.recovery, s.d_shapes[:, chosen])
+    d_gamma = s.d_participation[chosen]
+    size = np.sum(estimate.gamma**2, axis=1)
+    scale = np.sum(gamma * estimate.gamma, axis=1) / size
+    d_scale = np.einsum("kdc,kd->kc", d_gamma, estimate.gamma) / size[:, None]
+    if test.force is not None:
+        scale, d_scale = np.sign(scale), np.zeros_like(d_scale)
+    # In the scale of the estimate, which accelerations leave open.
+    d_phi = d_phi * scale[:, None] + phi[:, :, None] * d_scale
+    d_gamma = (d_gamma - gamma[:, :, None] * (d_scale / scale[:, None])[:, None]) / scale[:, None, None]
+    modes = Modes(
+        phi * scale, gamma / scale[:, None], 2 * np.pi * structure.natural_frequencies[chosen],
+        structure.damping_ratios[chosen],
+    )  # fmt: skip
+    corner = np.array([s.d_rigid[i, j] for i, j in index.pairs])
+    slope = np.concatenate([
+        d_phi.reshape(-1, d_phi.shape[-1]), d_gamma.reshape(-1, d_phi.shape[-1]), s.d_log_omega[chosen],
+        s.d_log_ratios[chosen], corner,
+    ])  # fmt: skip
+    own = Modes(estimate.phi, estimate.gamma, estimate.omega, estimate.ratios)
+    off = theta_of(modes, structure.rigid_body_mass, index) - theta_of(own, estimate.rigid, index)
+    factor = share / weights_of_test(test, weighted=True)[0][1] * factor_of(estimate)
+    inflation = 1.0 if as_stated else inflation_of(test, records_of(test, structure, unknowns), unknowns)
+    std = np.full(len(factor), inflation * share / weights_of_test(test, weighted=True)[0][1] / np.sqrt(2))
+    assert d == gamma.shape[1]
+    return [Rows(factor @ off, factor @ slope, std)]
 
 
 def _real(z: ComplexArray) -> Array:

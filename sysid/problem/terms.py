@@ -16,7 +16,8 @@ import numpy as np
 
 from sysid.errors import InputError, finite_array, instance
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.response import residual
+from sysid.modal_analysis.modal_estimate import misfit_rows
+from sysid.modal_analysis.response import residual, weights_of_test
 from sysid.models.expressions import as_matrix, at_point, check_finite, written_in
 from sysid.models.geometry import Geometry
 from sysid.models.unknowns import user_site, variable_of
@@ -99,6 +100,12 @@ class TestTerm:
         phi, omega = modes
         ratios = self.matrices.ratio_function(x, omega)
         shapes = ca.DM(motion.recovery) @ phi
+        if self.test.modal is not None and self.test.modal.omega.size == omega.numel():
+            gamma, size = phi.T @ motion.push, weights_of_test(self.test, weighted=True)[0][1]
+            weighed = self.test.force is not None
+            return self.weight / size * misfit_rows(
+                self.test.modal, shapes, gamma, omega, ratios, motion.rigid_body_mass, weighed=weighed
+            )
         miss = residual(
             self.test, shapes, phi.T @ motion.push, omega, ratios, motion.rigid_body_mass, weighted=True,
             shift=self.shift,

@@ -314,7 +314,7 @@ def _residual(test: Measurement, structure: Structure) -> str:
 
 def _validation(it: Identification) -> str:
     parts = []
-    for i, test in enumerate(it.problem.validation, start=1):
+    for i, test in enumerate(it.validation, start=1):
         parts += [
             f"<h3>Test {i} of {len(it.problem.validation)}: predicted, never fitted</h3>",
             paragraph(f"{_residual(test, it.structure)}."),

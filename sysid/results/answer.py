@@ -10,8 +10,10 @@ import numpy as np
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
+from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.outliers import Outlier
 from sysid.modal_analysis.response import weighted_error
+from sysid.modal_analysis.transients import without_transients_of
 from sysid.models.unknowns import Unknown, by_name
 from sysid.problem.problem import Problem
 from sysid.search.strategy import History
@@ -74,8 +76,19 @@ class Answer:
 
     @property
     def measurement(self) -> Measurement:
-        """The test that was fitted."""
-        return self.problem.measurement
+        """The test that was fitted; of whole records without their transients."""
+        return self.problem.at_rest.measurement
+
+    @property
+    def noise(self) -> NoiseLevels | None:
+        """Noise of all channels of whole records, stated or found with the fit; None for other records."""
+        modal = self.measurement.modal
+        return None if modal is None else modal.noise
+
+    @cached_property
+    def validation(self) -> tuple[Measurement, ...]:
+        """The problem's validation tests; of whole records without the transients that this structure makes of them."""
+        return tuple(without_transients_of(test, self.structure) for test in self.problem.validation)
 
     @property
     def _in_modes(self) -> bool:
@@ -152,7 +165,7 @@ class Answer:
         from sysid.assessment.uncertainty import uncertainty
 
         huber = self.problem.loss == "huber"
-        fitted = self.problem.pseudo_values(self.structure, self.x) if huber else self.problem
+        fitted = self.problem.pseudo_values(self.structure, self.x) if huber else self.problem.at_rest
         return uncertainty(fitted, self.structure, self.x)
 
     @cached_property

@@ -44,7 +44,7 @@ def summary(it: Answer) -> str:
             f"further test {i} of {len(further)}: relative residual {test.residual(structure):.3e}, natural "
             f"frequencies {frequencies} Hz"
         )
-    for i, test in enumerate(problem.validation, start=1):
+    for i, test in enumerate(it.validation, start=1):
         lines.append(f"test {i} of {len(problem.validation)} never fitted: relative residual {test.residual(s):.3e}")
     lines.append(f"{verdict(it)}.")
     lines += [f"  - {sentence}" for sentence in it.closed_by + it.undetermined]

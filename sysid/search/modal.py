@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, SolverError, sequence, whole_number
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.modal_estimate import above_modes
 from sysid.modal_analysis.modal_fit import ModalFit, Modes
 from sysid.modal_analysis.residues import ROUND_OFF, beyond_chance, line_correlation
 from sysid.modal_analysis.response import columns, gains, stacked, weighted_error, weights_of
@@ -293,8 +294,7 @@ def modal_structure(
     """
     test, mass = problem.measurement, problem.formulation.mass
     poles = poles_of(problem)
-    fit = ModeFit(test, poles, np.sqrt(problem.totals), monitor, options.max_iterations)
-    end = fit.best() if options.modes is None else fit.of_strongest(options.modes)
+    end = _of_whole_records(problem, options) or _fitted(problem, poles, options, monitor)
     held = held_to_totals(problem, end, monitor, options.max_iterations)
     end = held or end
     chosen = degrees_of_freedom(problem, end.modes, options.sensors)
@@ -312,6 +312,32 @@ def modal_structure(
             "the modes found are too much alike at the sensors, as where a sign, gain or axis in rigid_body is "
             f"wrong, or the responses are not absolute accelerations ({error})"
         ) from None
+
+
+def _fitted(problem: Problem, poles: Poles, options: Modal, monitor: IterationMonitor) -> ModalFit:
+    """Modes fitted to the lines, from poles close by."""
+    fit = ModeFit(problem.measurement, poles, np.sqrt(problem.totals), monitor, options.max_iterations)
+    return fit.best() if options.modes is None else fit.of_strongest(options.modes)
+
+
+def _of_whole_records(problem: Problem, options: Modal) -> ModalFit | None:
+    """The modes that were fitted with the transients of whole records; None for other records."""
+    test = problem.measurement
+    if test.modal is None:
+        return None
+    if options.modes not in (None, test.modal.omega.size):
+        raise InputError(
+            f"{test.modal.omega.size} modes stand out of the whole records, not the {options.modes} asked for: narrow "
+            "the band, or take estimator='h1'"
+        )
+    modes, rigid = Modes(test.modal.phi, test.modal.gamma, test.modal.omega, test.modal.ratios), test.modal.rigid
+    if test.force is not None:
+        modes, rigid = above_modes(test.modal)
+    q = gains(test.freq, modes.omega, modes.ratios) * np.einsum("md,rdf->rmf", modes.gamma, test.base)
+    weight, size = weights_of(test.relative, test.response_std)
+    left = weight * columns(test.relative - np.einsum("nm,rmf->rnf", modes.phi, q))
+    residual = float(np.linalg.norm(left)) / size
+    return ModalFit(modes, rigid, residual, residual, "Solve_Succeeded", "")
 
 
 def _modal_masses(problem: Problem, modes: Modes, chosen: DegreesOfFreedom) -> Array:

@@ -1,0 +1,128 @@
+"""Modes of whole records as statistics: what a structure's modes miss them by, in units of the noise."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from sysid.measurement.whole import ModalEstimate
+from sysid.modal_analysis.modal_fit import Index, Modes
+from sysid.structure.structure import Array
+
+_UNSEEN = 1e-12  # of the largest eigenvalue of the scaled information: round-off
+_STEPS = 30
+_BELOW = 1e-12  # relative; a mass so little negative is none
+
+
+class Scaled(NamedTuple):
+    """Information about the modes in the scale of others: `factor` times a move of them is in units of the noise."""
+
+    index: Index
+    factor: Array
+
+
+def index_of(estimate: ModalEstimate) -> Index:
+    """Where the modal parameters stand."""
+    return Index(*estimate.phi.shape, estimate.gamma.shape[1])
+
+
+def factor_of(estimate: ModalEstimate) -> Array:
+    """R (rank, p) with ``R' R`` the information: ``R (theta - estimate)`` has variance one half each."""
+    A = estimate.information
+    size = np.sqrt(np.maximum(np.diag(A), 0.0))
+    seen = size > 0
+    lam, V = np.linalg.eigh(A[np.ix_(seen, seen)] / np.outer(size[seen], size[seen]))
+    known = lam > _UNSEEN * lam[-1]
+    factor = np.zeros((int(known.sum()), size.size))
+    factor[:, seen] = (V[:, known] * np.sqrt(lam[known])).T * size[seen]
+    return factor
+
+
+def theta_of(modes: Modes, rigid: Array, index: Index) -> Array:
+    """Modal parameters as one column."""
+    corner = np.array([rigid[i, j] for i, j in index.pairs])
+    return np.concatenate([modes.phi.ravel(), modes.gamma.ravel(), np.log(modes.omega), np.log(modes.ratios), corner])
+
+
+def information_about(estimate: ModalEstimate, modes: Modes) -> Array:
+    """The information over modal parameters in the scale and sign of `modes`, which are nearly the estimate's."""
+    index = index_of(estimate)
+    scale = np.sum(modes.gamma * estimate.gamma, axis=1) / np.sum(estimate.gamma**2, axis=1)
+    factor = np.ones(index.size)
+    factor[index.phi] = np.tile(scale, estimate.phi.shape[0])
+    factor[index.gamma] = np.repeat(1 / scale, estimate.gamma.shape[1])
+    return estimate.information * np.outer(factor, factor)
+
+
+def misfit_rows(
+    estimate: ModalEstimate, phi: ca.MX, gamma: ca.MX, omega: ca.MX, ratios: ca.MX, rigid: ca.MX, *, weighed: bool
+) -> ca.MX:
+    """``R (theta - estimate)`` as an expression, a column whose sum of squares is what ``e' S^-1 e`` rises by.
+
+    Parameters
+    ----------
+    phi, gamma, omega, ratios, rigid :
+        Of as many modes as the estimate's, in ascending order.
+    weighed : bool
+        Whether a force was measured; without one each mode is brought to the scale of the estimate.
+    """
+    index, (n, m), d = index_of(estimate), estimate.phi.shape, estimate.gamma.shape[1]
+    at = ca.DM(estimate.gamma)
+    scale = ca.sum2(gamma * at) / ca.sum2(at * at)
+    if weighed:
+        scale = ca.sign(scale)
+    phi, gamma = phi * ca.repmat(scale.T, n, 1), gamma / ca.repmat(scale, 1, d)
+    corner = ca.vertcat(*(rigid[i, j] for i, j in index.pairs))
+    theta = ca.vertcat(ca.vec(phi.T), ca.vec(gamma.T), ca.log(omega), ca.log(ratios), corner)
+    own = theta_of(Modes(estimate.phi, estimate.gamma, estimate.omega, estimate.ratios), estimate.rigid, index)
+    assert theta.numel() == own.size and phi.shape == (n, m)
+    return ca.DM(factor_of(estimate)) @ (theta - ca.DM(own))
+
+
+def matched(estimate: ModalEstimate, omega: Array) -> NDArray[np.intp] | None:
+    """For each mode of the estimate the nearest of a structure's, each once; None where it has fewer."""
+    from scipy.optimize import linear_sum_assignment
+
+    if omega.size < estimate.omega.size:
+        return None
+    apart = np.abs(np.log(omega[None] / estimate.omega[:, None]))
+    return np.asarray(linear_sum_assignment(apart)[1])
+
+
+def above_modes(estimate: ModalEstimate) -> tuple[Modes, Array]:
+    """The likeliest modes and rigid-body mass whose remainder, what no mode carries, is no negative mass.
+
+    Steps on the directions in which it is negative, each an equality, by weighted least squares.
+    """
+    index = index_of(estimate)
+    modes, rigid = Modes(estimate.phi, estimate.gamma, estimate.omega, estimate.ratios), estimate.rigid
+    size = np.sqrt(np.maximum(np.diag(rigid), np.finfo(float).tiny))
+    own = theta_of(modes, rigid, index)
+    covariance = np.linalg.pinv(estimate.information, rcond=1e-14, hermitian=True)
+    theta, d = own.copy(), size.size
+    for _ in range(_STEPS):
+        parts = index.split(theta[:, None])
+        gamma, rigid = parts[1][..., 0], parts[4][..., 0]
+        lam, V = np.linalg.eigh((rigid - gamma.T @ gamma) / np.outer(size, size))
+        if lam[0] >= -_BELOW:
+            break
+        rows = []
+        for v in V[:, lam < 0].T:
+            row = np.zeros(index.size)
+            scaled = v / size
+            row[index.gamma] = (-2 * (gamma @ scaled)[:, None] * scaled).ravel()
+            row[index.rigid] = [scaled[i] * scaled[j] * (1 if i == j else 2) for i, j in index.pairs]
+            rows.append(row)
+        C, short = np.array(rows), lam[lam < 0]
+        # Of all with these masses at zero the nearest to the estimate, to first order about here.
+        wanted = C @ theta - short - C @ own
+        theta = own + covariance @ C.T @ np.linalg.solve(C @ covariance @ C.T, wanted)
+    parts = index.split(theta[:, None])
+    phi, gamma, log_omega, log_ratios, rigid = (part[..., 0] for part in parts)
+    lam, V = np.linalg.eigh((rigid - gamma.T @ gamma) / np.outer(size, size))
+    remainder = (V * np.maximum(lam, 0.0)) @ V.T * np.outer(size, size)
+    assert d == len(remainder)
+    return Modes(phi, gamma, np.exp(log_omega), np.exp(log_ratios)), gamma.T @ gamma + remainder
