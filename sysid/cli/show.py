@@ -393,7 +393,7 @@ def _with_noise(test: Measurement) -> Measurement:
         return np.array(_NOISE * np.sqrt(np.mean(np.abs(record) ** 2))) if stated is None else stated
 
     force_std = None if test.force is None else std(test.force, test.force_std)
-    return replace(test, response_std=std(test.response, test.response_std), force_std=force_std)
+    return replace(test, response_std=std(test.response, test.response_std), force_std=force_std, modal=None)
 
 
 # -- lines --------------------------------------------------------------------------------------

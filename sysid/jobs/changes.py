@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sysid.errors import InputError, number, whole_number
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.residues import independent
+from sysid.modal_analysis.transients import without_transients_of
 from sysid.models.stiffness import SpectralStiffness
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification
@@ -50,7 +51,7 @@ class Band:
         outside = (test.freq < self.low) | (test.freq > self.high)
         if problem.free_modes or not np.any(outside):
             return np.nan
-        return test.at(outside).residual(result.structure)
+        return without_transients_of(test.at(outside), result.structure).residual(result.structure)
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,8 @@ class WithoutRun:
     def predicted(self, problem: Problem, result: Identification) -> float:
         """Relative residual of the run that was left out."""
         test = problem.measurement
-        return _runs(test, ~_all_but(self.run, test.n_runs, "run")).residual(result.structure)
+        left_out = _runs(test, ~_all_but(self.run, test.n_runs, "run"))
+        return without_transients_of(left_out, result.structure).residual(result.structure)
 
 
 @dataclass(frozen=True)
@@ -132,7 +134,7 @@ class WithoutSensor:
         """Relative residual of the sensor that was left out; NaN where the structure does not tell its motion."""
         if problem.free_modes or result.x is None:
             return np.nan
-        test = problem.measurement
+        test = without_transients_of(problem.measurement, problem.structure(result.x))
         left, measured = test.relative - test.predict(problem.structure(result.x)), test.relative
         return float(np.linalg.norm(left[:, self.sensor]) / np.linalg.norm(measured[:, self.sensor]))
 
@@ -197,7 +199,9 @@ def _runs(test: Measurement, kept: NDArray[np.bool_]) -> Measurement:
     """The runs where `kept` is true."""
     names = ("base", "response", "force", "response_std", "force_std")
     given = {name: getattr(test, name) for name in names}
-    return replace(test, **{name: record[kept] for name, record in given.items() if record is not None})
+    whole = None if test.whole is None else test.whole.of_runs(kept)
+    some = replace(test, whole=whole, **{name: record[kept] for name, record in given.items() if record is not None})
+    return some.at(np.any(some.own_lines, axis=0))
 
 
 def _sensors(test: Measurement, kept: NDArray[np.bool_]) -> Measurement:
@@ -208,5 +212,6 @@ def _sensors(test: Measurement, kept: NDArray[np.bool_]) -> Measurement:
         response=test.response[:, kept],
         rigid_body=test.rigid_body[kept],
         response_std=None if std is None else std[:, kept],
+        whole=None if test.whole is None else test.whole.of_sensors(kept),
         sensors=None if described is None else tuple(one for one, keep in zip(described, kept, strict=True) if keep),
     )

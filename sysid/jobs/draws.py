@@ -43,7 +43,11 @@ def drawn(problem: Problem, x: Array, random: np.random.SeedSequence) -> Problem
             at = value + std * next(priors).numbers(x)
             again = replace(given, value=at + std * rng.standard_normal(at.size))
         residuals.append(again)
-    test = _again(problem.measurement, problem.structure(x), problem.n_variables, rng)
+    structure, test = problem.structure(x), problem.measurement
+    if test.whole is None:
+        test = _again(test, structure, problem.n_variables, rng)
+    else:
+        test = _whole_again(test, problem.at_rest.measurement, structure, rng)
     return replace(problem, measurement=test, residuals=residuals, validation=(), reference=None)
 
 
@@ -62,8 +66,26 @@ def _again(test: Measurement, structure: Structure, unknowns: int, rng: np.rando
     inflation = inflation_of(test, records_of(test, structure, unknowns), unknowns)
     more = inflation if np.isfinite(inflation) else 1.0
     response, *force = [_noise(more * std, rng) - misfit for misfit, std in misfits_of(test, structure, unknowns)]
-    other = replace(test, response=test.response + response)
+    other = replace(test, response=test.response + response, modal=None)
     return other if test.force is None else replace(other, force=test.force + force[0])
+
+
+def _whole_again(
+    test: Measurement, at_rest: Measurement, structure: Structure, rng: np.random.Generator
+) -> Measurement:
+    """Whole records that the structure makes with the same transients, and noise of the same levels in all channels."""
+    assert test.whole is not None and at_rest.modal is not None
+    noise = at_rest.modal.noise
+
+    def drawn(record: ComplexArray, levels: Array) -> ComplexArray:
+        std = np.sqrt(test.whole.density)[:, None, None] * levels[:, None]  # type: ignore[union-attr]
+        return np.where(test.own_lines[:, None], _noise(np.broadcast_to(std, record.shape), rng), 0.0)
+
+    response = test.response - (at_rest.relative - at_rest.predict(structure)) + drawn(test.response, noise.response)
+    force = None
+    if test.force is not None and at_rest.force is not None and noise.force is not None:
+        force = test.force - (at_rest.force - at_rest.predict_force(structure)) + drawn(test.force, noise.force)
+    return replace(test, base=test.base + drawn(test.base, noise.base), response=response, force=force)
 
 
 def _noise(std: Array, rng: np.random.Generator) -> ComplexArray:

@@ -259,8 +259,13 @@ class Measurement:
             return self.base
         ends = np.zeros((self.n_runs, 2 * len(self.whole.moving), self.freq.size), complex)
         for at, run in enumerate(self.whole.moving):
-            ends[run, 2 * at : 2 * at + 2] = self.whole.transients(self.freq, run)
+            ends[run, 2 * at : 2 * at + 2] = self.own_lines[run] * self.whole.transients(self.freq)
         return np.concatenate([self.base, ends], axis=1)
+
+    @property
+    def own_lines(self) -> NDArray[np.bool_]:
+        """Which lines are a run's own, (runs, n_freq): whole records of other lengths have zeros at the others."""
+        return np.any(self.base != 0, axis=1)
 
     @property
     def has_unit_runs(self) -> bool:
@@ -316,7 +321,8 @@ class Measurement:
     def at(self, keep: NDArray[np.bool_]) -> Measurement:
         """The lines where `keep`, (n_freq,), is true."""
         given = {name: getattr(self, name) for name in _RECORDS}
-        return replace(self, **{name: record[..., keep] for name, record in given.items() if record is not None})
+        lines: Any = {name: record[..., keep] for name, record in given.items() if record is not None}
+        return replace(self, **lines, modal=None)
 
     @classmethod
     def from_frf(

@@ -77,21 +77,28 @@ def whole_record(
 ) -> tuple[Array, ComplexArray, ComplexArray, ComplexArray | None]:
     """Fourier transforms of whole records, without the zero line; m/s² s.
 
+    Where runs differ in length the lines are those of all, and a run has zeros at the lines of others.
+
     Returns
     -------
     freq (n_freq,), base (runs, d, n_freq), response (runs, n_sensors, n_freq), force or None
     """
-    lengths = {run.base.shape[1] for run in runs}
-    if len(lengths) > 1:
-        raise InputError(f"whole-record spectra need equally long runs; these have {sorted(lengths)} samples")
-    n = lengths.pop()
-    freq = np.fft.rfftfreq(n, 1 / sample_rate)[1:]
-    if freq.size == 0:
-        raise InputError(f"a record of {n} samples has no spectral line above zero")
-    transform = lambda records: np.fft.rfft(np.array(records), axis=-1)[..., 1:] / sample_rate  # noqa: E731
+    lengths = sorted({run.base.shape[1] for run in runs})
+    own = {n: np.arange(1, n // 2 + 1) / n for n in lengths}  # in cycles a sample
+    if lengths[0] < 2:
+        raise InputError(f"a record of {lengths[0]} samples has no spectral line above zero")
+    lines = np.unique(np.round(np.concatenate(list(own.values())), 14))
+    at = {n: np.searchsorted(lines, np.round(freq, 14)) for n, freq in own.items()}
+
+    def transform(records: list[Array]) -> ComplexArray:
+        out = np.zeros((len(records), len(records[0]), lines.size), complex)
+        for spectrum, record in zip(out, records, strict=True):
+            spectrum[:, at[record.shape[1]]] = np.fft.rfft(record, axis=-1)[:, 1:] / sample_rate
+        return out
+
     forces = [run.force for run in runs if run.force is not None]
     return (
-        freq,
+        lines * sample_rate,
         transform([run.base for run in runs]),
         transform([run.response for run in runs]),
         transform(forces) if forces else None,

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 
 from sysid.errors import InputError, finite_array
 from sysid.structure.structure import Array, ComplexArray
@@ -83,7 +83,19 @@ class WholeRecords:
         """Variance of a spectral line's noise over that of a sample in time, of each run, s²."""
         return np.array(self.samples) / self.sample_rate**2
 
-    def transients(self, freq: Array, run: int) -> ComplexArray:
+    def of_runs(self, kept: NDArray[np.bool_]) -> WholeRecords:
+        """That of some runs."""
+        chosen = np.flatnonzero(kept).tolist()
+        return replace(
+            self, samples=tuple(self.samples[i] for i in chosen), at_rest=tuple(self.at_rest[i] for i in chosen)
+        )
+
+    def of_sensors(self, kept: NDArray[np.bool_]) -> WholeRecords:
+        """That of some sensors."""
+        noise = self.noise
+        return replace(self, noise=None if noise is None else replace(noise, response=noise.response[kept]))
+
+    def transients(self, freq: Array) -> ComplexArray:
         """Motion at the ends of a run as further inputs at lines in Hz: a change of velocity, of displacement; (2, n).
 
         ``g_k (a / w² + i b / w)`` is what ``(a + i w b) / (w_k² - w² + 2 i zeta_k w_k w)`` is.
@@ -144,8 +156,7 @@ class ModalEstimate:
 
 def per_run(name: str, value: Any, runs: int) -> tuple[bool, ...]:
     """One bool, or one a run, as one a run."""
-    given: ArrayLike = [value] * runs if isinstance(value, bool | np.bool_) else value
-    array = np.asarray(given)
+    array = np.asarray([value] * runs if isinstance(value, bool | np.bool_) else value)
     if array.shape != (runs,) or array.dtype != bool:
         raise InputError(f"{name} = {value!r}: give True or False, or one of them for each of the {runs} runs")
     return tuple(bool(one) for one in array)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import ModalEstimate
 from sysid.modal_analysis.modal_fit import Index, Modes
+from sysid.modal_analysis.response import columns, gains, weights_of
 from sysid.structure.structure import Array
 
 _UNSEEN = 1e-12  # of the largest eigenvalue of the scaled information: round-off
@@ -17,16 +17,20 @@ _STEPS = 30
 _BELOW = 1e-12  # relative; a mass so little negative is none
 
 
-class Scaled(NamedTuple):
-    """Information about the modes in the scale of others: `factor` times a move of them is in units of the noise."""
-
-    index: Index
-    factor: Array
+def residual_of(test: Measurement) -> float:
+    """Relative, weighted residual of the accelerations that the modes of whole records leave."""
+    modal = test.modal
+    assert modal is not None
+    q = gains(test.freq, modal.omega, modal.ratios) * np.einsum("md,rdf->rmf", modal.gamma, test.base)
+    weight, size = weights_of(test.relative, test.response_std)
+    left = weight * columns(test.relative - np.einsum("nm,rmf->rnf", modal.phi, q))
+    return float(np.linalg.norm(left)) / size
 
 
 def index_of(estimate: ModalEstimate) -> Index:
     """Where the modal parameters stand."""
-    return Index(*estimate.phi.shape, estimate.gamma.shape[1])
+    n, m = estimate.phi.shape
+    return Index(n, m, estimate.gamma.shape[1])
 
 
 def factor_of(estimate: ModalEstimate) -> Array:

@@ -159,7 +159,8 @@ def _minimise(
     model: RecordModel, p: Parameters, levels: Array, monitor: Monitor, count: int
 ) -> tuple[Parameters, float, bool]:
     """Levenberg-Marquardt steps at given levels."""
-    x, damping = model.pack(p), 1e-6
+    x: Array = model.pack(p)
+    damping = 1e-6
     here = model.normal_equations(p, levels)
     for i in range(_STEPS):
         monitor(count + i, float(np.sqrt(2 * here.chi2 / model.numbers)))
@@ -177,7 +178,7 @@ def _minimise(
             if damping > 1e6:
                 return model.unpack(x), here.chi2, False
         if after <= here.chi2:
-            x = x + step
+            x = np.asarray(x + step)
             damping = max(damping / 10, 1e-12)
             if promised < _SETTLED:
                 return model.unpack(x), after, True
@@ -203,7 +204,8 @@ def _first(test: Measurement, omega: Array, ratios: Array) -> Parameters:
     u, s, vt = np.linalg.svd(residues * size)
     strength = np.sqrt(s[:, 0] / size[:d].max())
     phi, push = u[:, :, 0].T * strength, vt[:, 0] * (s[:, 0] / strength)[:, None] / size
-    modes, ends, rigid = Modes(phi, push[:, :d], omega, ratios), push[:, d:], np.zeros((d, d))
+    modes, ends = Modes(phi, push[:, :d], omega, ratios), push[:, d:]
+    rigid: Array = np.zeros((d, d))
     if test.force is not None:
         t, rigid = _masses(test, modes, ends)
         scale = np.sqrt(t)
@@ -282,7 +284,8 @@ def worth(fit: RecordFit) -> Array:
         own = index.phi.start + np.arange(n) * m + k
         # With its shape at zero neither participation, pole nor transient of a mode show.
         gone = np.concatenate([
-            index.gamma.start + k * model.d + np.arange(model.d), [index.log_omega.start + k, index.log_ratios.start + k],
+            index.gamma.start + k * model.d + np.arange(model.d),
+            [index.log_omega.start + k, index.log_ratios.start + k],
             model.kept + k * (model.n_ends // m) + np.arange(model.n_ends // m),
         ])  # fmt: skip
         others = np.setdiff1d(np.arange(model.size), np.concatenate([own, gone]))

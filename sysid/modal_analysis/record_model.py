@@ -5,19 +5,20 @@ A run of a test is, at its lines,
 .. math:: a = \sum_k \phi_k g_k (\gamma_k u + \alpha_k / w^2 + i \beta_k / w), \quad y = G u + a + p, \quad
           f = M_{rb} u + \sum_k \gamma_k' g_k (\ldots) + p,
 
-with two real numbers alpha, beta a mode and run for its motion at the ends, and p the traces of sampling and detrending:
-real multiples of 1, i w and 1 / (i w), a channel and run. Each column of the Jacobian is a few real numbers times a few
-spectra, so that normal equations come from products of spectra, and no Jacobian of all lines is kept.
+with two real numbers alpha, beta a mode and run for its motion at the ends, and p the traces of sampling and
+detrending: real multiples of 1, i w and 1 / (i w), a channel and run. Each column of the Jacobian is a few real numbers
+times a few spectra, so that normal equations come from products of spectra, and no Jacobian of all lines is kept.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse
+from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Index, Modes
@@ -82,15 +83,10 @@ class RecordModel:
         self.kept = self.index.size if self.force else int(self.index.rigid[0])
         self.moving = {run: at for at, run in enumerate(self.whole.moving)}
         self.n_ends = m * 2 * len(self.moving)
+        outputs = test.response if test.force is None else np.concatenate([test.response, test.force], axis=1)
         self.runs = [
-            Run(
-                2 * np.pi * test.freq,
-                test.base[r],
-                test.response[r] if test.force is None else np.vstack([test.response[r], test.force[r]]),
-                float(self.whole.density[r]),
-                r,
-            )
-            for r in range(test.n_runs)
+            Run(2 * np.pi * test.freq[own], test.base[r][:, own], outputs[r][:, own], float(self.whole.density[r]), r)
+            for r, own in enumerate(test.own_lines)
         ]
         self.size = self.kept + self.n_ends + test.n_runs * self.channels * TRACES
         self.numbers = 2 * sum(run.outputs.size for run in self.runs)
@@ -162,7 +158,7 @@ class Chunk:
         self.H = np.einsum("ck,kl,kd->cdl", self.shown, self.g, modes.gamma, optimize=True) + direct[:, :, None]
         at = model.moving.get(run.number)
         self.at_ends = None if at is None else slice(2 * at, 2 * at + 2)
-        self.transients = model.whole.transients(freq, run.number)
+        self.transients = model.whole.transients(freq)
         self.pushed_by_ends = 0.0 if at is None else p.ends[:, self.at_ends] @ self.transients  # (m, L)
         unit = freq / model.test.freq[-1]
         self.trace_spectra = np.stack([np.ones_like(run.w) + 0j, 1j * unit, -1j / unit])
@@ -214,13 +210,13 @@ class Chunk:
 
     def coefficients(self, channel: int) -> scipy.sparse.csr_array:
         """How the columns of a channel's Jacobian are made of the spectra, (p, spectra)."""
-        model, modes = self.model, self.p.modes
+        model = self.model
         n, m, d, index = model.n, model.m, model.d, model.index
         k = np.arange(m)
         shown = self.shown[channel]
         rows, cols, values = [], [], []
 
-        def put(row: Array, col: Array, value: Array) -> None:
+        def put(row: NDArray[Any], col: NDArray[Any], value: Array) -> None:
             rows.append(np.ravel(row))
             cols.append(np.ravel(col))
             values.append(np.broadcast_to(value, np.shape(row)).ravel())

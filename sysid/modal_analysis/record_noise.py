@@ -1,7 +1,7 @@
 """Levels of the noise of all channels of whole records by maximum likelihood, at given modes.
 
-At a line the errors of the outputs have the covariance ``S = diag(v_y) + T diag(v_u) T'`` with T from base to outputs.
-The variances maximise ``-sum(log det S + e' S^-1 e)``: a few numbers over thousands of lines, by Fisher scoring of their
+At a line the errors of the outputs have the covariance ``S = diag(v_y) + T diag(v_u) T'``, T from base to outputs. The
+variances maximise ``-sum(log det S + e' S^-1 e)``: a few numbers over thousands of lines, by Fisher scoring of their
 logarithms.
 """
 

@@ -1,12 +1,10 @@
-"""Poles of whole records: noise of the base makes errors largest at the peaks, so that lines weigh by what they may hold.
+"""Rough weights of whole records: noise of the base makes errors largest at the peaks.
 
 Weights need no modes: the motion of a sensor over that of the base, smoothed over some lines, is what passes the noise
 of the base on.
 """
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 
@@ -24,14 +22,10 @@ def rough_deviations(test: Measurement) -> Array:
     power = lambda record: np.abs(record) ** 2  # noqa: E731
     mean = lambda record: np.mean(power(record), axis=(0, 2))  # noqa: E731
     base, response = _smooth(power(test.base)), _smooth(power(test.response))
-    gain = response / np.sum(base, axis=1, keepdims=True)
+    base = np.sum(base, axis=1, keepdims=True)
+    gain = response / np.where(base > 0, base, np.inf)
     own = mean(test.response)[:, None]
     return np.sqrt(own + gain * np.sum(mean(test.base)))
-
-
-def weighed(test: Measurement) -> Measurement:
-    """The test with such deviations in the place of stated ones."""
-    return replace(test, response_std=rough_deviations(test))
 
 
 def _smooth(power: Array) -> Array:

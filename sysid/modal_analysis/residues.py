@@ -142,7 +142,7 @@ class Records:
         return _singular(self.data)
 
     def principal(self, count: int) -> list[tuple[ComplexArray, ComplexArray, ComplexArray]]:
-        """Base (inputs, n_freq), motion at the ends, and at most so many principal channels (c, n_freq) of each block."""
+        """Base (inputs, n_freq), motion at the ends, and so many principal channels (c, n_freq) of each block."""
         out = []
         for inputs, channels in self.blocks:
             base, ends = inputs[: self.driven], inputs[self.driven :]

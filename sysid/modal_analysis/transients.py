@@ -20,7 +20,7 @@ def without_transients_of(test: Measurement, structure: Structure) -> Measuremen
     """
     if test.whole is None:
         return test
-    n, d = structure.n, structure.n_base
+    n = structure.n
     w = 2 * np.pi * test.freq
     M, K = structure.mass[:n, :n], structure.stiffness[:n, :n]
     square, once = (w**2)[:, None, None], w[:, None, None]
@@ -35,7 +35,8 @@ def without_transients_of(test: Measurement, structure: Structure) -> Measuremen
         left = np.concatenate([left, test.force - test.predict_force(structure)], axis=1)
     taken = np.zeros_like(left)
     for run in test.whole.moving:
-        taken[run] = _fitted(left[run], np.moveaxis(shown, 0, -1), w / w[-1])
+        own = test.own_lines[run]
+        taken[run][:, own] = _fitted(left[run][:, own], np.moveaxis(shown, 0, -1)[..., own], w[own] / w[-1])
     s = test.n_sensors
     force = None if test.force is None else test.force - taken[:, s:]
     return replace(test, whole=None, response=test.response - taken[:, :s], force=force)
@@ -43,7 +44,7 @@ def without_transients_of(test: Measurement, structure: Structure) -> Measuremen
 
 def _fitted(left: ComplexArray, shown: ComplexArray, unit: Array) -> ComplexArray:
     """The part of what is left (c, L) that transients (c, p, L) and traces of each channel explain."""
-    c, p, lines = shown.shape
+    _, p, lines = shown.shape
     traces = stacked(np.stack([np.ones(lines) + 0j, 1j * unit, -1j / unit]))  # (2 L, 3)
     Q = np.linalg.qr(traces)[0]
     size = np.linalg.norm(left, axis=1)

@@ -1,10 +1,12 @@
-"""Whole records without their transients, and what they tell of the modes: poles, fit, noise, one step after the other."""
+"""Whole records without their transients, and what they tell of the modes: poles, fit and noise."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import ModalEstimate
@@ -55,9 +57,20 @@ def deviations(fit: RecordFit) -> tuple[Array, Array | None]:
     for chunk in model.chunks(fit.parameters):
         power = fit.levels[:c, None] + np.einsum("cdl,d->cl", np.abs(chunk.H) ** 2, fit.levels[c:])
         parts[chunk.run.number].append(np.sqrt(chunk.run.density * power))
-    std = np.array([np.concatenate(run, axis=1) for run in parts])
+    std = _at_lines(test, parts)
+    for run, own in zip(std, test.own_lines, strict=True):  # where a run has no line its weight is of no meaning
+        run[:, ~own] = np.median(run[:, own], axis=1, keepdims=True)
     n = test.n_sensors
     return std[:, :n], std[:, n:] if model.force else None
+
+
+def _at_lines(test: Measurement, parts: list[list[NDArray[Any]]]) -> NDArray[Any]:
+    """Chunks of each run's own lines as (runs, channels, n_freq), zero at the lines of others."""
+    joined = [np.concatenate(run, axis=1) for run in parts]
+    out = np.zeros((test.n_runs, joined[0].shape[0], test.freq.size), joined[0].dtype)
+    for at, own, run in zip(out, test.own_lines, joined, strict=True):
+        at[:, own] = run
+    return out
 
 
 def without_transients(test: Measurement, *, monitor: Monitor | None = None) -> Measurement:
@@ -78,7 +91,7 @@ def without_transients(test: Measurement, *, monitor: Monitor | None = None) -> 
     for chunk in model.chunks(p):
         predicted = np.einsum("cdl,dl->cl", chunk.H, chunk.run.base)
         free[chunk.run.number].append(chunk.run.outputs - chunk.error - predicted)
-    taken = np.array([np.concatenate(run, axis=1) for run in free])
+    taken = _at_lines(test, free)
     n = test.n_sensors
     std, force_std = deviations(fit)
     return replace(

@@ -82,8 +82,7 @@ class Geometry:
         """Poles that stand out of the records."""
         modal = self.test.modal
         if modal is not None:
-            left = float(np.sqrt(modal.reduced * np.mean(self.test.response_std**2) / np.mean(abs(self.test.relative) ** 2)))
-            return Poles(modal.omega, modal.ratios, left)
+            return Poles(modal.omega, modal.ratios, residual_of(self.test))
         return find_poles(self.test, monitor=self.monitor)
 
     @property

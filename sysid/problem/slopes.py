@@ -143,9 +143,9 @@ def rows_of_test(
     it is not, as where a test is planned.
     """
     if test.modal is not None and s.structure.modal_damping:
-        rows = _rows_of_modes(test, s, unknowns, share=share, as_stated=as_stated)
-        if rows is not None:
-            return rows
+        of_modes = _rows_of_modes(test, s, unknowns, share=share, as_stated=as_stated)
+        if of_modes is not None:
+            return of_modes
     X, dX = response_slopes(s, test.freq)
     R, u = s.structure.recovery, test.base  # (runs, d, n_freq)
     d_a = np.einsum("si,fidc,rdf->srfc", R, dX, u, optimize=True)
@@ -167,9 +167,7 @@ def rows_of_test(
     return rows
 
 
-def _rows_of_modes(
-    test: Measurement, s: Slopes, unknowns: int, *, share: float, as_stated: bool
-) -> list[Rows] | None:
+def _rows_of_modes(test: Measurement, s: Slopes, unknowns: int, *, share: float, as_stated: bool) -> list[Rows] | None:
     """Rows of whole records, which are those of their modes; None where the structure has fewer modes."""
     estimate, structure = test.modal, s.structure
     assert estimate is not None

@@ -103,8 +103,10 @@ class TestTerm:
         if self.test.modal is not None and self.test.modal.omega.size == omega.numel():
             gamma, size = phi.T @ motion.push, weights_of_test(self.test, weighted=True)[0][1]
             weighed = self.test.force is not None
-            return self.weight / size * misfit_rows(
-                self.test.modal, shapes, gamma, omega, ratios, motion.rigid_body_mass, weighed=weighed
+            return (
+                self.weight
+                / size
+                * misfit_rows(self.test.modal, shapes, gamma, omega, ratios, motion.rigid_body_mass, weighed=weighed)
             )
         miss = residual(
             self.test, shapes, phi.T @ motion.push, omega, ratios, motion.rigid_body_mass, weighted=True,

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, SolverError, sequence, whole_number
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.modal_estimate import above_modes
+from sysid.modal_analysis.modal_estimate import above_modes, residual_of
 from sysid.modal_analysis.modal_fit import ModalFit, Modes
 from sysid.modal_analysis.residues import ROUND_OFF, beyond_chance, line_correlation
 from sysid.modal_analysis.response import columns, gains, stacked, weighted_error, weights_of
@@ -333,10 +333,7 @@ def _of_whole_records(problem: Problem, options: Modal) -> ModalFit | None:
     modes, rigid = Modes(test.modal.phi, test.modal.gamma, test.modal.omega, test.modal.ratios), test.modal.rigid
     if test.force is not None:
         modes, rigid = above_modes(test.modal)
-    q = gains(test.freq, modes.omega, modes.ratios) * np.einsum("md,rdf->rmf", modes.gamma, test.base)
-    weight, size = weights_of(test.relative, test.response_std)
-    left = weight * columns(test.relative - np.einsum("nm,rmf->rnf", modes.phi, q))
-    residual = float(np.linalg.norm(left)) / size
+    residual = residual_of(test)
     return ModalFit(modes, rigid, residual, residual, "Solve_Succeeded", "")
 
 

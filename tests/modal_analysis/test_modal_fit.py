@@ -295,7 +295,8 @@ def test_modes_that_share_a_pole_are_fitted_in_a_gauge_of_their_own(random_struc
     assert end.status in SOLVED
     summed, whole = ([r[0], r[1] + r[2], r[3], r[4]] for r in (residues(end.modes), residues(truth)))
     if noise == 0:
-        assert end.residual < 1e-11
+        # Within IPOPT's tolerance, in squares: how far below it the last step ends differs between machines.
+        assert end.residual < 1e-9
         np.testing.assert_allclose(summed, whole, atol=1e-8 * np.abs(whole).max())
         if force:
             block = truth.gamma[1:3].T @ truth.gamma[1:3]

@@ -230,9 +230,9 @@ def test_a_step_of_vector_fitting_ends_at_the_zeros_of_the_function_that_all_unk
     s = 2j * np.pi * records.freq
     sigma = np.concatenate([np.ones((1, s.size)), functions(s)])
     rows = []
-    channels = sum(len(channels) for _, channels in blocks)
+    channels = sum(len(channels) for *_, channels in blocks)
     at = 0
-    for base, records_of_run in blocks:
+    for base, _, records_of_run in blocks:
         for record in records_of_run:
             answer = np.zeros((s.size, channels, 6), complex)
             answer[:, at] = (-(s**2) * functions(s) * base[0]).T
