@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, finite_array, refuse, shown
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.modal_estimate import residual_of
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.models.unknowns import Unknown
 from sysid.structure.structure import Array
