@@ -8,8 +8,10 @@ import casadi as _casadi
 from sysid import jobs, plot
 from sysid.errors import InputError, SolverError, SysidError
 from sysid.identify import identify
-from sysid.measurement.measurement import Measurement, Sensor, rigid_body, simulate
+from sysid.measurement.measurement import Measurement, Sensor, rigid_body
+from sysid.measurement.simulation import simulate
 from sysid.measurement.spectra import resample
+from sysid.measurement.whole import NoiseLevels
 from sysid.models.damping import ModalDamping, ProportionalDamping
 from sysid.models.mass import FullMass, KnownMass, LumpedMass
 from sysid.models.model import MassBlocks, MatrixModel, Stated, StiffnessBlocks, Totals
@@ -33,7 +35,7 @@ if hasattr(_casadi.GlobalOptions, "setNumpyMode"):
 
 __all__ = [
     "ChainStiffness", "Continuation", "FullMass", "FurtherTest", "History", "Identification", "InputError",
-    "KnownMass", "LumpedMass", "MassBlocks", "MatrixModel", "Measurement", "Modal", "ModalDamping", "Prior", "Problem",
+    "KnownMass", "LumpedMass", "MassBlocks", "MatrixModel", "Measurement", "Modal", "ModalDamping", "NoiseLevels", "Prior", "Problem",
     "Progress", "ProportionalDamping", "Recipe", "Sensor", "SolverError", "SpectralStiffness", "Stated",
     "StiffnessBlocks", "Structure", "Swarm", "SwarmSettings", "SysidError", "Totals", "Unknown", "Variable",
     "__version__", "identify", "jobs", "load", "minimize_swarm", "plot", "resample", "rigid_body", "simulate",

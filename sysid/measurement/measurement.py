@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError, choice, finite_array, flag, instance, number, random_generator, refuse, sequence
+from sysid.errors import InputError, choice, finite_array, number, refuse, sequence
 from sysid.measurement import spectra
 from sysid.measurement.missing import Missing, complete, named, present
 from sysid.measurement.whole import ModalEstimate, NoiseLevels, WholeRecords, per_run
@@ -417,11 +417,17 @@ class Measurement:
         sample_rate : float
             Hz.
         rigid_body : array_like, shape (n_sensors, d)
-        estimator : {"spectra", "h1", "h2"}
-            "spectra" is the Fourier transform of each whole record (all runs equally long), right
-            for transients that start and end at rest. "h1" (noise on the responses) and "h2" (noise
+        estimator : {"records", "spectra", "h1", "h2"}
+            "records" takes each run whole, of any length and cut anywhere, in motion too: its transients, two numbers a
+            mode and run, and the noise of all channels, base and force included, are found with the modes. "spectra" is
+            the Fourier transform of each whole record without them, right
+            for motion that starts and ends at rest. "h1" (noise on the responses) and "h2" (noise
             on the base) average over segments and runs by Welch's method and give d unit runs;
             "h1" solves for several base directions at once and gives standard deviations from the coherence.
+        at_rest : bool or sequence of bool
+            Of "records": whether all runs, or each, begin and end at rest, and so have no transients.
+        noise : NoiseLevels, optional
+            Of "records": standard deviations of the noise of a sample of each channel; found where none are stated.
         segment : int, optional
             Samples a segment of "h1" and "h2"; a quarter of the shortest record by default. Its lines must be
             several times closer than the narrowest resonance is wide (rate / segment well below 2 zeta f), else
@@ -451,63 +457,9 @@ class Measurement:
         return test if band is None else test.in_band(*sequence("band", band, "(low, high) in Hz", 2))
 
 
-def simulate(
-    structure: Structure,
-    freq: ArrayLike,
-    *,
-    noise: float = 0.0,
-    force: bool = False,
-    rng: int | np.random.Generator | None = None,
-    base_axes: str | Sequence[str] | None = None,
-) -> Measurement:
-    """The virtual test: d runs of unit base motion, noise on the responses (and force) only.
-
-    Parameters
-    ----------
-    structure : Structure
-    freq : array_like, shape (n_freq,)
-        Hz.
-    noise : float
-        Circular complex noise with ``E|e|² = noise² mean|record|²``, the mean taken over all runs,
-        channels and lines; responses and force apart.
-    force : bool
-        Record the base force too.
-    rng : int, numpy Generator or None
-    base_axes : str or sequence of str, optional
-        Names of the base directions, as in `Measurement`.
-
-    Returns
-    -------
-    Measurement
-        Its standard deviations are set where `noise` is not zero. The *noise floor* of a draw is
-        ``measurement.residual(structure)``.
-    """
-    instance("structure", structure, Structure)
-    noise = number("noise", noise, "a finite fraction >= 0", at_least=0)
-    lines = check_frequencies(freq)
-    random = random_generator(rng)
-    response, response_std = _with_noise(np.moveaxis(structure.transmissibility(lines), 1, 0), noise, random)
-    base_force = force_std = None
-    if flag("force", force):
-        base_force, force_std = _with_noise(np.moveaxis(structure.base_force(lines), 1, 0), noise, random)
-    options: Any = {"sensors": structure.sensors, "base_axes": base_axes}
-    return Measurement(
-        lines, unit_runs(structure.n_base, lines.size), response, rigid_body=structure.rigid_body,
-        force=base_force, response_std=response_std, force_std=force_std, **options,
-    )  # fmt: skip
-
-
 def unit_runs(d: int, n_freq: int) -> ComplexArray:
     """Base spectra of d runs, each of unit acceleration in its own direction, (d, d, n_freq)."""
     return np.repeat(np.eye(d, dtype=complex)[:, :, None], n_freq, axis=2)
-
-
-def _with_noise(record: ComplexArray, noise: float, random: np.random.Generator) -> tuple[ComplexArray, Array | None]:
-    if noise == 0:
-        return record, None
-    std = noise * np.sqrt(np.mean(np.abs(record) ** 2))
-    error = random.standard_normal(record.shape) + 1j * random.standard_normal(record.shape)
-    return record + error * std / np.sqrt(2), np.array(std)
 
 
 def _records(name: str, value: ArrayLike, n_freq: int) -> ComplexArray:

@@ -53,6 +53,15 @@ def is_numeric(values):
         return False
 
 
+def assert_stored(actual, stored):
+    """All that was stored, to the bit, and C, which follows from it: processors round that in their own ways."""
+    structure = dict(stored["structure"])
+    damping = structure.pop("damping", None)
+    assert_same(actual, stored | {"structure": structure}, "result")
+    if damping is not None:
+        assert_same(actual.structure.damping, damping, "result.structure.damping", rtol=1e-12, atol=1e-12)
+
+
 def test_the_files_have_the_old_formats(pair):
     _, expected = pair
     name = next(name for name in NAMES if EXPECTED[name] is expected)
@@ -62,7 +71,7 @@ def test_the_files_have_the_old_formats(pair):
 
 def test_all_that_was_stored_is_the_same_bit_for_bit(pair):
     it, expected = pair
-    assert_same(it, expected["stored"], "result")
+    assert_stored(it, expected["stored"])
     for name, kind in expected["models"].items():
         assert type(getattr(it.problem, name)).__name__ == kind
 
@@ -148,4 +157,4 @@ def test_healing_still_acts():
 @pytest.mark.parametrize("name", NAMES)
 def test_saved_anew_it_is_read_the_same(name, tmp_path):
     again = sysid.load(sysid.load(STORED / f"{name}.h5").save(tmp_path))
-    assert_same(again, EXPECTED[name]["stored"], "result")
+    assert_stored(again, EXPECTED[name]["stored"])
