@@ -262,7 +262,7 @@ class _Record(NamedTuple):
 
     Attributes
     ----------
-    weight : (channels,)
+    weight : (channels, 1), or (runs, channels, n_freq) where the noise of each line is known
     size : float
         Norm of the weighted record.
     misfit : float
@@ -297,21 +297,33 @@ def _record(record: ComplexArray, predicted: ComplexArray, std: Array | None, ti
     Where the misfit is no more than the stated noise, all lines together tell an amplitude, and `_RESOLVED` of
     its standard deviations will do.
     """
-    rms = lambda x: np.sqrt(np.mean(np.abs(x) ** 2, axis=(0, 2)))  # noqa: E731
+    rms = lambda x: np.sqrt(np.mean(np.abs(x) ** 2, axis=(0, 2)))[:, None]  # noqa: E731
     noise = rms(record - predicted) if std is None else rms(std)
     own = rms(record)
     weight = 1 / np.maximum(noise, _QUIET * np.where(own > 0, own, own.max()))
-    by_channel = weight[:, None]
-    size = float(np.linalg.norm(record * by_channel))
-    misfit = float(np.linalg.norm((record - predicted) * by_channel)) / size
+    size = float(np.linalg.norm(record * weight))
+    misfit = float(np.linalg.norm((record - predicted) * weight)) / size
     level = times * misfit
-    if std is not None and misfit <= _AS_STATED * np.linalg.norm(std * by_channel) / size:
+    if std is not None and misfit <= _AS_STATED * np.linalg.norm(std * weight) / size:
         level = float(_RESOLVED * misfit / np.sqrt(2 * record.size))
     return _Record(weight, size, misfit, level)
 
 
+def _record_a_line(record: ComplexArray, predicted: ComplexArray, std: Array) -> _Record:
+    """Weigh a record whose noise is known at each line: an amplitude counts by the noise at its own lines.
+
+    Where the misfit is larger than that noise, so is what may look like a mode.
+    """
+    weight = 1 / std
+    size, left = (float(np.linalg.norm(part * weight)) for part in (record, record - predicted))
+    more = max(1.0, left / np.sqrt(record.size) / _AS_STATED)
+    return _Record(weight, size, left / size, float(_RESOLVED * more / np.sqrt(2) / size))
+
+
 def _responses(test: Measurement, structure: Structure) -> _Record:
     """The relative accelerations."""
+    if test.modal is not None and test.response_std is not None:
+        return _record_a_line(test.relative, test.predict(structure), test.response_std)
     return _record(test.relative, test.predict(structure), test.response_std, _CLEAR)
 
 
@@ -319,14 +331,20 @@ def _forces(test: Measurement, structure: Structure) -> _Record | None:
     """The base force, where it was measured."""
     if test.force is None:
         return None
+    if test.modal is not None and test.force_std is not None:
+        return _record_a_line(test.force, test.predict_force(structure), test.force_std)
     return _record(test.force, test.predict_force(structure), test.force_std, 1.0)
 
 
 def _shares(test: Measurement, structure: Structure, k: int, rows: Array, push: Array, record: _Record) -> Array:
     """Relative size of what motions `rows` (channels, w) at mode k's pole make of a record, pushed by `push` (w, d)."""
     g = gains(test.freq, 2 * np.pi * structure.natural_frequencies[[k]], structure.damping_ratios[[k]])
-    moved = np.linalg.norm(np.einsum("wd,rdf->wrf", push, test.base) * g, axis=(1, 2))
-    return moved * np.linalg.norm(record.weight[:, None] * rows, axis=0) / record.size
+    moved = np.einsum("wd,rdf->wrf", push, test.base) * g
+    if record.weight.ndim == 3:
+        seen = [np.linalg.norm(record.weight * np.outer(row, one).reshape(len(row), *one.shape).swapaxes(0, 1))
+                for row, one in zip(rows.T, moved, strict=True)]  # fmt: skip
+        return np.array(seen) / record.size
+    return np.linalg.norm(moved, axis=(1, 2)) * np.linalg.norm(record.weight * rows, axis=0) / record.size
 
 
 def _seen(test: Measurement, structure: Structure, cluster: list[int], rows: Array, record: _Record) -> Array:
@@ -342,7 +360,9 @@ def _unseen(problem: Problem, structure: Structure, misfit: float, responses: _R
     base = columns(test.base)
     sizes = np.linalg.norm(base, axis=1, keepdims=True)
     spread = np.linalg.svd(base / np.where(sizes > 0, sizes, 1.0), compute_uv=False)
-    rank = int(np.count_nonzero(spread > max(1e-9, min(misfit, 0.5)) * spread[0]))
+    # With the noise of the base known, a direction is not moved where that noise makes most of its motion.
+    chance = min(misfit, 0.5) if test.modal is None else _base_noise(test, sizes.ravel()) / spread[0]
+    rank = int(np.count_nonzero(spread > max(1e-9, chance) * spread[0]))
     if rank < test.n_base:
         yield f"the base moves in only {rank} of {test.n_base} independent directions: responses to the others are open"
     count = int(np.count_nonzero(~problem.formulation.outside))
@@ -371,6 +391,13 @@ def _unseen(problem: Problem, structure: Structure, misfit: float, responses: _R
                 f"({100 * forces.misfit:.2g} %) can look like a mode of up to {100 * forces.level:.2g} %: its mass is "
                 "not weighed"
             )
+
+
+def _base_noise(test: Measurement, sizes: Array) -> float:
+    """Largest noise of a base direction over all lines, its record's size being 1."""
+    assert test.modal is not None
+    lines = np.sqrt(np.sum(test.modal.density * np.count_nonzero(test.own_lines, axis=1)))
+    return float(np.max(test.modal.noise.base * lines / np.where(sizes > 0, sizes, np.inf)))
 
 
 def _clusters(structure: Structure, misfit: float) -> list[list[int]]:

@@ -142,6 +142,8 @@ class ModalEstimate:
         Stated, or found with the fit.
     reduced : float
         Chi-squared over its degrees of freedom.
+    density : (runs,)
+        Of `WholeRecords`.
     """
 
     phi: Array
@@ -152,6 +154,7 @@ class ModalEstimate:
     information: Array
     noise: NoiseLevels
     reduced: float
+    density: Array
 
 
 def per_run(name: str, value: Any, runs: int) -> tuple[bool, ...]:

@@ -15,6 +15,7 @@ from sysid.structure.structure import Array, ComplexArray, Structure
 
 _EXACT = 1e-14  # of a record's rms: what counts as noise where there is none
 _SUSPECT = 1.2  # reduced chi-squared above which the stated noise does not explain the misfit, unless chance does:
+_FAR_BELOW = 0.1  # reduced chi-squared of a misfit, as of round-off, that tells nothing of the noise
 _DEVIATIONS = 4.0  # its least excess above one, in standard deviations of the chi-squared law
 
 
@@ -79,6 +80,8 @@ def inflation_of(test: Measurement, records: list[Record], unknowns: int) -> flo
         stated = test.response_std is not None and (test.force is None or test.force_std is not None)
         return 1.0 if stated else np.nan
     reduced = 2 * sum(np.sum(np.abs(record.misfit / record.std) ** 2) for record in records) / freedom
+    if reduced < _FAR_BELOW:
+        return 1.0
     beyond = reduced if reduced > max(_SUSPECT, 1 + _DEVIATIONS * np.sqrt(2 / freedom)) else 1.0
     shared = line_correlation(
         np.concatenate([(r.misfit / r.std).reshape(-1, test.n_runs, test.freq.size) for r in records])

@@ -113,5 +113,5 @@ def estimate(fit: RecordFit) -> ModalEstimate:
     ])  # fmt: skip
     return ModalEstimate(
         modes.phi[:, order], modes.gamma[order], modes.omega[order], modes.ratios[order], p.rigid,
-        A[np.ix_(at, at)], fit.noise, fit.reduced,
+        A[np.ix_(at, at)], fit.noise, fit.reduced, fit.model.whole.density,
     )  # fmt: skip
