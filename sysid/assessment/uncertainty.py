@@ -205,7 +205,7 @@ def _by_modes(problem: Problem, structure: Structure, x: Array | None) -> Uncert
     unknowns = path.unit.size - path.gauge.shape[1]
     records, B = records_of(test, structure, unknowns), None
     if test.modal is not None:
-        A = information_about(test.modal, modes)
+        A, B = information_about(test.modal, modes)
     else:
         spectra = spectra_of(test, modes)
         A = information(modes, index, [record.grams(spectra) for record in records])

@@ -83,6 +83,11 @@ class WholeRecords:
         """Variance of a spectral line's noise over that of a sample in time, of each run, s²."""
         return np.array(self.samples) / self.sample_rate**2
 
+    @property
+    def spacing(self) -> Array:
+        """Distance of the lines of each run, Hz."""
+        return self.sample_rate / np.array(self.samples)
+
     def of_runs(self, kept: NDArray[np.bool_]) -> WholeRecords:
         """That of some runs."""
         chosen = np.flatnonzero(kept).tolist()
@@ -144,6 +149,8 @@ class ModalEstimate:
         Chi-squared over its degrees of freedom.
     density : (runs,)
         Of `WholeRecords`.
+    scatter : (p, p) or None
+        B, where what is left is no white noise and the covariance is ``A^-1 B A^-1 / 2``, A the information.
     """
 
     phi: Array
@@ -155,6 +162,7 @@ class ModalEstimate:
     noise: NoiseLevels
     reduced: float
     density: Array
+    scatter: Array | None = None
 
 
 def per_run(name: str, value: Any, runs: int) -> tuple[bool, ...]:

@@ -45,20 +45,32 @@ def factor_of(estimate: ModalEstimate) -> Array:
     return factor
 
 
+def independent_rows(estimate: ModalEstimate) -> tuple[Array, Array]:
+    """`factor_of` turned so that its rows have independent errors, and their standard deviations, (rank,)."""
+    factor = factor_of(estimate)
+    if estimate.scatter is None:
+        return factor, np.full(len(factor), np.sqrt(0.5))
+    inverse = np.linalg.pinv(factor)  # moves that each row makes
+    lam, V = np.linalg.eigh(inverse.T @ estimate.scatter @ inverse)
+    return V.T @ factor, np.sqrt(np.maximum(lam, 0.0) / 2)
+
+
 def theta_of(modes: Modes, rigid: Array, index: Index) -> Array:
     """Modal parameters as one column."""
     corner = np.array([rigid[i, j] for i, j in index.pairs])
     return np.concatenate([modes.phi.ravel(), modes.gamma.ravel(), np.log(modes.omega), np.log(modes.ratios), corner])
 
 
-def information_about(estimate: ModalEstimate, modes: Modes) -> Array:
-    """The information over modal parameters in the scale and sign of `modes`, which are nearly the estimate's."""
+def information_about(estimate: ModalEstimate, modes: Modes) -> tuple[Array, Array | None]:
+    """Information, and scatter, over modal parameters in the scale and sign of `modes`, nearly the estimate's."""
     index = index_of(estimate)
     scale = np.sum(modes.gamma * estimate.gamma, axis=1) / np.sum(estimate.gamma**2, axis=1)
     factor = np.ones(index.size)
     factor[index.phi] = np.tile(scale, estimate.phi.shape[0])
     factor[index.gamma] = np.repeat(1 / scale, estimate.gamma.shape[1])
-    return estimate.information * np.outer(factor, factor)
+    scale_of = np.outer(factor, factor)
+    B = estimate.scatter
+    return estimate.information * scale_of, None if B is None else B * scale_of
 
 
 def misfit_rows(

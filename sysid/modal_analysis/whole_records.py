@@ -12,10 +12,12 @@ from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import ModalEstimate
 from sysid.modal_analysis.record_fit import Monitor, RecordFit, record_modes, refitted, without, worth
 from sysid.modal_analysis.record_poles import rough_deviations
+from sysid.modal_analysis.record_spread import scatter
 from sysid.modal_analysis.vector_fitting import find_poles
 from sysid.structure.structure import Array, ComplexArray
 
 _WORTH = 25.0  # in units of ``e' S^-1 e``: a mode whose absence raises it by less is noise (chi-squared of 50)
+_RAZOR = 0.02  # of the distance of lines; half the width of a peak that answers for one bad line, not for a mode
 _DAMPED = 0.5  # a pole with more damping than this is no mode of a structure
 
 
@@ -41,7 +43,9 @@ def whole_fit(test: Measurement, *, monitor: Monitor | None = None) -> RecordFit
 def _kept(fit: RecordFit, monitor: Monitor | None) -> RecordFit:
     """The fit without modes that noise explains."""
     while fit.parameters.modes.omega.size > 1:
-        value = np.where(fit.parameters.modes.ratios < _DAMPED, worth(fit), 0.0)
+        modes = fit.parameters.modes
+        narrow = modes.ratios * modes.omega < _RAZOR * 2 * np.pi * np.min(fit.model.whole.spacing)
+        value = np.where((modes.ratios < _DAMPED) & ~narrow, worth(fit), 0.0)
         least = int(np.argmin(value))
         if value[least] >= _WORTH:
             break
@@ -104,7 +108,7 @@ def estimate(fit: RecordFit) -> ModalEstimate:
     """Modes in ascending order, with their information."""
     modes, p, index = fit.parameters.modes, fit.parameters, fit.model.index
     order = np.argsort(modes.omega, kind="stable")
-    A = fit.information()
+    A, B = fit.information(), scatter(fit)
     m, (n, d) = order.size, (fit.test.n_sensors, fit.test.n_base)
     at = np.concatenate([
         (np.arange(n)[:, None] * m + order).ravel(),
@@ -114,4 +118,5 @@ def estimate(fit: RecordFit) -> ModalEstimate:
     return ModalEstimate(
         modes.phi[:, order], modes.gamma[order], modes.omega[order], modes.ratios[order], p.rigid,
         A[np.ix_(at, at)], fit.noise, fit.reduced, fit.model.whole.density,
+        None if B is None else B[np.ix_(at, at)],
     )  # fmt: skip

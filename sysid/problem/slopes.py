@@ -14,7 +14,7 @@ import numpy as np
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.misfit import inflation_of, records_of
-from sysid.modal_analysis.modal_estimate import factor_of, index_of, matched, theta_of
+from sysid.modal_analysis.modal_estimate import independent_rows, index_of, matched, theta_of
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.response import weights_of_test
 from sysid.problem.matrices import Matrices
@@ -197,9 +197,11 @@ def _rows_of_modes(test: Measurement, s: Slopes, unknowns: int, *, share: float,
     ])  # fmt: skip
     own = Modes(estimate.phi, estimate.gamma, estimate.omega, estimate.ratios)
     off = theta_of(modes, structure.rigid_body_mass, index) - theta_of(own, estimate.rigid, index)
-    factor = share / weights_of_test(test, weighted=True)[0][1] * factor_of(estimate)
+    weight = share / weights_of_test(test, weighted=True)[0][1]
+    factor, std = independent_rows(estimate)
+    factor = weight * factor
     inflation = 1.0 if as_stated else inflation_of(test, records_of(test, structure, unknowns), unknowns)
-    std = np.full(len(factor), inflation * share / weights_of_test(test, weighted=True)[0][1] / np.sqrt(2))
+    std = weight * inflation * std
     assert d == gamma.shape[1]
     return [Rows(factor @ off, factor @ slope, std)]
 

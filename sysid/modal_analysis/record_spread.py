@@ -1,0 +1,81 @@
+"""Scatter of the modes of whole records where what is left is no white noise: sums over blocks of neighbouring lines.
+
+Model error sits at the peaks. Each block of lines, some half-power widths long, then tells its own error: the scores of
+the blocks, each enlarged for the share of its error that the fit takes away, make the covariance (White 1982; MacKinnon
+and White 1985, HC2, a block in the place of a number).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sysid.modal_analysis.record_fit import RecordFit
+from sysid.modal_analysis.record_model import Chunk, Run
+from sysid.structure.structure import Array
+
+_WIDTHS = 3.0  # half-power widths that a block is long
+_LEAST = 4  # lines of a block
+_SHIFTS = 4  # partitions, each begun a part of a block later: where blocks begin must not matter
+_CHANCE = 5.0  # standard deviations by which the power of what is left may differ between blocks
+_TAKEN = 0.98  # share of a block's error, at most, that the fit is corrected for having taken away
+
+
+def blocks_of(run: Run, fit: RecordFit, shift: float) -> list[NDArray[np.intp]]:
+    """Lines of a run in blocks."""
+    modes = fit.parameters.modes
+    order = np.argsort(modes.omega)
+    width = np.interp(run.w, modes.omega[order], 2 * _WIDTHS * (modes.ratios * modes.omega)[order])
+    spacing = np.gradient(run.w)
+    at = np.cumsum(spacing / np.maximum(width, _LEAST * spacing)) + shift
+    cuts = np.flatnonzero(np.diff(np.floor(at))) + 1
+    return np.split(np.arange(run.w.size), cuts)
+
+
+def scatter(fit: RecordFit) -> Array | None:
+    """Twice the covariance of the score over the unknowns of `Index`, (p, p); None where what is left is white.
+
+    With A, the information of the fit, the covariance of the modes is ``A^-1 B A^-1 / 2``; for white noise B is A.
+    """
+    model, p = fit.model, fit.parameters
+    if not uneven(fit):
+        return None
+    N = model.normal_equations(p, fit.levels).normal
+    size = np.sqrt(np.maximum(np.diag(N), 1e-300))
+    N = N / np.outer(size, size)
+    lam, V = np.linalg.eigh(N)
+    seen = lam > 1e-12 * lam[-1]
+    half = V[:, seen] / np.sqrt(lam[seen])  # half half' is the inverse of N
+    meat = np.zeros((half.shape[1],) * 2)
+    for shift in np.arange(_SHIFTS) / _SHIFTS:
+        for run in model.runs:
+            for lines in blocks_of(run, fit, shift):
+                own = run._replace(w=run.w[lines], base=run.base[:, lines], outputs=run.outputs[:, lines])
+                made = Chunk(model, p, own).products(fit.levels)
+                score = half.T @ (made.gradient / size)
+                taken, turn = np.linalg.eigh(half.T @ (made.normal / np.outer(size, size)) @ half)
+                grown = turn @ ((turn.T @ score) / np.sqrt(1 - np.clip(taken, 0.0, _TAKEN)))
+                meat += np.outer(grown, grown) / _SHIFTS
+    # In moves of all unknowns, of which those of `Index` are kept: A^-1 B A^-1 is that of the moves.
+    kept = model.kept
+    moved = (half @ meat @ half.T)[:kept, :kept] / np.outer(size[:kept], size[:kept])
+    A = fit.information()
+    B = np.zeros_like(A)
+    B[:kept, :kept] = 2 * A[:kept, :kept] @ moved @ A[:kept, :kept]
+    return B
+
+
+def uneven(fit: RecordFit) -> bool:
+    """Whether the power of what is left differs between blocks of lines by more than chance."""
+    model, c = fit.model, fit.model.channels
+    off = []
+    for run in model.runs:
+        error = np.concatenate(
+            [chunk.whitened(fit.levels)[0] for chunk in model.chunks(fit.parameters) if chunk.run.number == run.number],
+            axis=1,
+        )
+        power = np.sum(np.abs(error) ** 2, axis=0)
+        for lines in blocks_of(run, fit, 0.0):
+            off.append((np.sum(power[lines]) - c * lines.size) / np.sqrt(c * lines.size))
+    z = np.array(off)
+    return bool(np.sum(z**2) > z.size + _CHANCE * np.sqrt(2 * z.size) or np.max(z) > 2 * _CHANCE)
