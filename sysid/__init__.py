@@ -10,6 +10,7 @@ from sysid.errors import InputError, SolverError, SysidError
 from sysid.identify import identify
 from sysid.measurement.measurement import Measurement, Sensor, rigid_body, simulate
 from sysid.measurement.spectra import resample
+from sysid.measurement.time_scores import TimeScores, time_scores
 from sysid.models.damping import ModalDamping, ProportionalDamping
 from sysid.models.mass import FullMass, KnownMass, LumpedMass
 from sysid.models.model import MassBlocks, MatrixModel, Stated, StiffnessBlocks, Totals
@@ -35,6 +36,7 @@ __all__ = [
     "ChainStiffness", "Continuation", "FullMass", "FurtherTest", "History", "Identification", "InputError",
     "KnownMass", "LumpedMass", "MassBlocks", "MatrixModel", "Measurement", "Modal", "ModalDamping", "Prior", "Problem",
     "Progress", "ProportionalDamping", "Recipe", "Sensor", "SolverError", "SpectralStiffness", "Stated",
-    "StiffnessBlocks", "Structure", "Swarm", "SwarmSettings", "SysidError", "Totals", "Unknown", "Variable",
-    "__version__", "identify", "jobs", "load", "minimize_swarm", "plot", "resample", "rigid_body", "simulate",
+    "StiffnessBlocks", "Structure", "Swarm", "SwarmSettings", "SysidError", "TimeScores", "Totals", "Unknown",
+    "Variable", "__version__", "identify", "jobs", "load", "minimize_swarm", "plot", "resample", "rigid_body",
+    "simulate", "time_scores",
 ]  # fmt: skip
