@@ -104,9 +104,9 @@ class Motion:
 
 def random_motion(
     rng: np.random.Generator, duration: float, sample_rate: float, band: tuple[float, float], *,
-    correlation: np.ndarray | None = None, power: float = 0.0,
+    correlation: np.ndarray | None = None, power: float = 0.0, rms: float = 1.0,
 ) -> Motion:  # fmt: skip
-    """Gaussian base motion of unit rms in each direction.
+    """Gaussian base motion of one rms in each direction.
 
     Parameters
     ----------
@@ -118,6 +118,8 @@ def random_motion(
         Of the base directions; one direction by default.
     power : float
         Exponent of the power spectrum: 0 for white motion, -2 for one whose power falls as 1/f².
+    rms : float
+        m/s².
     """
     assert 0 < band[0] < band[1] < sample_rate / 2
     samples = round(duration * sample_rate)
@@ -130,7 +132,7 @@ def random_motion(
     size[inside] = freq[inside] ** (power / 2)
     correlation = np.eye(1) if correlation is None else np.asarray(correlation)
     drawn = rng.standard_normal((2, len(correlation), freq.size))
-    amplitudes = np.linalg.cholesky(correlation) @ (drawn[0] + 1j * drawn[1]) * (size / np.linalg.norm(size))
+    amplitudes = np.linalg.cholesky(correlation) @ (drawn[0] + 1j * drawn[1]) * (rms * size / np.linalg.norm(size))
     return Motion(amplitudes, period, samples, sample_rate)
 
 
@@ -152,10 +154,6 @@ class Records:
     response: np.ndarray
     force: np.ndarray
     sample_rate: float
-
-    def scaled(self, factor: float) -> Records:
-        """The same motion, stronger or weaker."""
-        return Records(factor * self.base, factor * self.response, factor * self.force, self.sample_rate)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,63 +179,77 @@ def with_noise(
     return Records(**noisy, sample_rate=records.sample_rate), Levels(**std)
 
 
-def ringing(modes: Modes, motion: Motion, rng: np.random.Generator) -> np.ndarray:
-    """Free vibration at the first sample, (n,) complex, as large as the steady state: modal displacements."""
-    steady = _steady_state(modes, motion)
-    rms = np.sqrt(np.sum(np.abs(steady) ** 2, axis=1) / 2)
-    return rms * (rng.standard_normal(rms.size) + 1j * rng.standard_normal(rms.size))
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A structure in motion: base motion, and free vibration beside the steady state that it makes.
 
+    Attributes
+    ----------
+    modes : Modes
+    motion : Motion
+    free : (n,), complex
+        Modal displacements ``Re(free exp(lambda t))``.
+    """
 
-def closed_form(modes: Modes, motion: Motion, free: np.ndarray | None = None) -> Records:
-    """Records whose steady state is summed line by line, and free vibration ``Re(free exp(lambda t))`` beside it."""
-    acceleration = motion.in_time(-(motion.omega**2) * _steady_state(modes, motion))
-    if free is not None:
+    modes: Modes
+    motion: Motion
+    free: np.ndarray
+
+    @classmethod
+    def ringing(cls, modes: Modes, motion: Motion, rng: np.random.Generator) -> Run:
+        """With free vibration at the first sample that is as large as the steady state."""
+        run = cls(modes, motion, np.zeros(modes.omega.size, dtype=complex))
+        rms = np.sqrt(np.sum(np.abs(run.steady_state) ** 2, axis=1) / 2)
+        return cls(modes, motion, rms * (rng.standard_normal(rms.size) + 1j * rng.standard_normal(rms.size)))
+
+    @property
+    def steady_state(self) -> np.ndarray:
+        """Modal displacements at each cosine, (n, lines), complex."""
+        w, wk = self.motion.omega, self.modes.omega[:, None]
+        answer = 1 / (wk**2 - w**2 + 2j * self.modes.zeta[:, None] * wk * w)
+        return -(self.modes.gamma @ self.motion.amplitudes) * answer
+
+    def state(self, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Modal displacement and velocity, (n,) each, at a time after the first sample, s."""
+        steady = self.steady_state * np.exp(1j * self.motion.omega * time)
+        free = self.free * np.exp(self.modes.poles * time)
+        displacement = np.sum(steady.real, axis=1) + free.real
+        return displacement, np.sum((1j * self.motion.omega * steady).real, axis=1) + (self.modes.poles * free).real
+
+    def records(self) -> Records:
+        """In closed form: the steady state summed line by line, and the free vibration."""
+        motion, poles = self.motion, self.modes.poles
         time = np.arange(motion.samples) / motion.sample_rate
-        poles = modes.poles
-        acceleration = acceleration + ((free * poles**2)[:, None] * np.exp(np.outer(poles, time))).real
-    return _records(modes, motion.in_time(motion.amplitudes), acceleration, motion.sample_rate)
+        acceleration = motion.in_time(-(motion.omega**2) * self.steady_state)
+        acceleration = acceleration + ((self.free * poles**2)[:, None] * np.exp(np.outer(poles, time))).real
+        return self._records(motion.in_time(motion.amplitudes), acceleration)
 
+    def records_by_recursion(self, factor: int = FACTOR) -> Records:
+        """By a recursion at `factor` times the rate, exact for what is linear between its samples."""
+        modes, step = self.modes, 1 / (factor * self.motion.sample_rate)
+        base = self.motion.in_time(self.motion.amplitudes, factor)
+        displacement, velocity = self.state(0.0)
+        acceleration = np.empty((modes.omega.size, self.motion.samples))
+        for k, pole in enumerate(modes.poles):
+            load = -modes.gamma[k] @ base
+            # z(t + h) = E z(t) + h (phi_1 - phi_2) f(t) + h phi_2 f(t + h); the exponential holds E, phi_1 and phi_2.
+            E, first, second = scipy.linalg.expm(np.array([[pole * step, 1, 0], [0, 0, 1], [0, 0, 0]]))[0]
+            # q = Im z / w_d and q' = Im(lambda z) / w_d at the first sample
+            initial = velocity[k] - pole.real * displacement[k] + 1j * pole.imag * displacement[k]
+            driven = step * ((first - second) * load[:-1] + second * load[1:])
+            later = scipy.signal.lfilter([1.0], [1.0, -E], driven, zi=np.array([E * initial]))[0]
+            z = np.concatenate([[initial], later])
+            acceleration[k] = ((pole**2 * z).imag / pole.imag + load)[::factor]
+        return self._records(base[:, ::factor], acceleration)
 
-def by_recursion(modes: Modes, motion: Motion, free: np.ndarray | None = None, factor: int = FACTOR) -> Records:
-    """The same records by a recursion at `factor` times the rate, exact for what is linear between its samples."""
-    step = 1 / (factor * motion.sample_rate)
-    base = motion.in_time(motion.amplitudes, factor)
-    displacement, velocity = start(modes, motion, free)
-    acceleration = np.empty((modes.omega.size, motion.samples))
-    for k, pole in enumerate(modes.poles):
-        load = -modes.gamma[k] @ base
-        # z(t + h) = E z(t) + h (phi_1 - phi_2) f(t) + h phi_2 f(t + h); the exponential holds E, phi_1 and phi_2.
-        E, first, second = scipy.linalg.expm(np.array([[pole * step, 1, 0], [0, 0, 1], [0, 0, 0]]))[0]
-        # q = Im z / w_d and q' = Im(lambda z) / w_d at the first sample
-        initial = velocity[k] - pole.real * displacement[k] + 1j * pole.imag * displacement[k]
-        driven = step * ((first - second) * load[:-1] + second * load[1:])
-        later = scipy.signal.lfilter([1.0], [1.0, -E], driven, zi=np.array([E * initial]))[0]
-        z = np.concatenate([[initial], later])
-        acceleration[k] = ((pole**2 * z).imag / pole.imag + load)[::factor]
-    return _records(modes, base[:, ::factor], acceleration, motion.sample_rate)
-
-
-def start(modes: Modes, motion: Motion, free: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Modal displacement and velocity at the first sample, (n,) each."""
-    steady = _steady_state(modes, motion)
-    free = np.zeros(modes.omega.size) if free is None else free
-    displacement = np.sum(steady.real, axis=1) + free.real
-    return displacement, np.sum((1j * motion.omega * steady).real, axis=1) + (modes.poles * free).real
-
-
-def _steady_state(modes: Modes, motion: Motion) -> np.ndarray:
-    """Modal displacements at each cosine, (n, lines), complex."""
-    w, wk = motion.omega, modes.omega[:, None]
-    return -(modes.gamma @ motion.amplitudes) / (wk**2 - w**2 + 2j * modes.zeta[:, None] * wk * w)
-
-
-def _records(modes: Modes, base: np.ndarray, acceleration: np.ndarray, sample_rate: float) -> Records:
-    return Records(
-        base,
-        modes.shapes @ acceleration + modes.rigid_body @ base,
-        modes.gamma.T @ acceleration + modes.rigid_body_mass @ base,
-        sample_rate,
-    )
+    def _records(self, base: np.ndarray, acceleration: np.ndarray) -> Records:
+        modes = self.modes
+        return Records(
+            base,
+            modes.shapes @ acceleration + modes.rigid_body @ base,
+            modes.gamma.T @ acceleration + modes.rigid_body_mass @ base,
+            self.motion.sample_rate,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,18 +283,18 @@ class Setting:
     noise: float = 0.01
     base_noise: float = 0.01
 
-    def records(self, rng: np.random.Generator, duration: float | None = None) -> Records:
-        """Records without noise, cut in motion at both ends."""
+    def run(self, rng: np.random.Generator, duration: float | None = None, strength: float = 1.0) -> Run:
+        """One draw of the motion, cut at both ends; of another duration or rms where they are given."""
         modes = Modes.of(self.structure)
         motion = random_motion(
             rng, duration or self.duration, self.sample_rate, self.motion,
-            correlation=self.correlation, power=self.power,
+            correlation=self.correlation, power=self.power, rms=strength,
         )  # fmt: skip
-        return closed_form(modes, motion, ringing(modes, motion, rng))
+        return Run.ringing(modes, motion, rng)
 
-    def noisy(self, rng: np.random.Generator) -> tuple[Records, Levels]:
-        """Records of one draw of motion and noise, and the levels of its noise."""
-        return with_noise(self.records(rng), rng, self.noise, self.base_noise)
+    def with_noise(self, records: Records, rng: np.random.Generator) -> tuple[Records, Levels]:
+        """Records with noise of this setting, and its levels."""
+        return with_noise(records, rng, self.noise, self.base_noise)
 
 
 STOREY_MASSES = (560.0, 500.0, 460.0, 420.0)  # kg, from the ground

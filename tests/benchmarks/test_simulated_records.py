@@ -25,7 +25,7 @@ def _case(simulated, duration, seed=3):
     motion = simulated.random_motion(
         rng, duration(setting), setting.sample_rate, setting.motion, correlation=setting.correlation, power=-2.0
     )
-    return setting, modes, motion, simulated.ringing(modes, motion, rng)
+    return setting, simulated.Run.ringing(modes, motion, rng)
 
 
 def _distance(a, b):
@@ -34,25 +34,24 @@ def _distance(a, b):
 
 def test_closed_form_and_recursion_agree_as_far_as_the_hold_does(simulated):
     """First-order hold turns a cosine's amplitude down by sinc², so it errs by a quarter at twice the rate."""
-    _, modes, motion, free = _case(simulated, lambda s: 30 / s.structure.natural_frequencies[0])
-    exact = simulated.closed_form(modes, motion, free)
+    _, run = _case(simulated, lambda s: 30 / s.structure.natural_frequencies[0])
+    exact = run.records()
     error = {}
     for factor in (25, 50):
-        other = simulated.by_recursion(modes, motion, free, factor)
+        other = run.records_by_recursion(factor)
         np.testing.assert_allclose(other.base, exact.base, atol=1e-12)
         error[factor] = max(_distance(other.response, exact.response), _distance(other.force, exact.force))
-    assert error[50] < (np.pi * motion.omega[np.any(motion.amplitudes, axis=0)].max() / 2 / np.pi / 50) ** 2
     assert error[50] < 2e-4
     assert error[25] / error[50] == pytest.approx(4, rel=0.05)
 
 
 def test_closed_form_solves_the_equations_of_motion_of_the_matrices(simulated):
     """Against a Runge-Kutta integration of M v'' + C v' + K v = -B u'', and the force of the base on all masses."""
-    setting, modes, motion, free = _case(simulated, lambda s: 3 / s.structure.natural_frequencies[0])
-    s, exact = setting.structure, simulated.closed_form(modes, motion, free)
+    setting, run = _case(simulated, lambda s: 3 / s.structure.natural_frequencies[0])
+    s, motion, exact = setting.structure, run.motion, run.records()
     n, G = s.n, s.rigid_body_dofs
     M, K = s.mass[:n, :n], s.stiffness[:n, :n]
-    q, velocity = simulated.start(modes, motion, free)
+    q, velocity = run.state(0.0)
 
     def base(t):
         return (motion.amplitudes @ np.exp(1j * motion.omega * t)).real
@@ -60,7 +59,7 @@ def test_closed_form_solves_the_equations_of_motion_of_the_matrices(simulated):
     def acceleration(t, v, rate):
         return np.linalg.solve(M, -s.damping @ rate - K @ v - (M @ G + s.mass[:n, n:]) @ base(t))
 
-    shapes = modes.shapes  # the sensors are the degrees of freedom
+    shapes = run.modes.shapes  # the sensors are the degrees of freedom
     time = np.arange(motion.samples) / motion.sample_rate
     solved = scipy.integrate.solve_ivp(
         lambda t, y: np.concatenate([y[n:], acceleration(t, y[:n], y[n:])]), time[[0, -1]],
@@ -80,8 +79,9 @@ def test_records_are_cut_in_motion_with_noise_of_the_stated_size(simulated):
     setting = simulated.four_storeys()
     frequencies = setting.structure.natural_frequencies
     assert frequencies[[0, -1]] == pytest.approx([2.7, 12.8], abs=0.1)
-    clean = setting.records(np.random.default_rng(1))
-    noisy, levels = setting.noisy(np.random.default_rng(1))
+    rng = np.random.default_rng(1)
+    clean = setting.run(rng).records()
+    noisy, levels = setting.with_noise(clean, rng)
     assert clean.base.shape == (1, 24_000)
     assert np.sqrt(np.mean(clean.base**2)) == pytest.approx(1, rel=0.05)
     for name in ("base", "response", "force"):
