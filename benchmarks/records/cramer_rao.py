@@ -42,7 +42,7 @@ class Bound:
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """What is unknown beside the damping ratios: matrices are linear in it, base columns of one follow from M_S0.
+    """What is unknown beside the damping ratios; the matrices are linear in it.
 
     Attributes
     ----------
@@ -52,11 +52,14 @@ class Unknowns:
         Of M_S0.
     stiffness : (r, n, n)
         Of K_SS.
+    base : (s, d, d)
+        Of M_00, which counts only where the base force is measured.
     """
 
     mass: np.ndarray
     coupling: np.ndarray
     stiffness: np.ndarray
+    base: np.ndarray
 
 
 def symmetric(n: int, entries: list[tuple[int, int]] | None = None) -> np.ndarray:
@@ -70,20 +73,23 @@ def symmetric(n: int, entries: list[tuple[int, int]] | None = None) -> np.ndarra
 
 def all_entries(n: int, d: int) -> Unknowns:
     """Nothing is stated."""
-    return Unknowns(symmetric(n), np.eye(n * d).reshape(n * d, n, d), symmetric(n))
+    return Unknowns(symmetric(n), np.eye(n * d).reshape(n * d, n, d), symmetric(n), symmetric(d))
 
 
 def bound(
     structure: sysid.Structure, tests: list[tuple[Run, Levels]], band: tuple[float, float], unknowns: Unknowns, *,
     force: bool,
 ) -> Bound:  # fmt: skip
-    """Bound of runs of one structure, whose degrees of freedom are the sensors; M_00 is unknown where force counts."""
+    """Bound of runs of one structure, whose degrees of freedom are the sensors.
+
+    What records and statement leave open has no bound: of it the figures mean nothing.
+    """
     modes = Modes.of(structure)
     known = information(modes, tests, band, force=force)
-    T, slopes = _slopes(structure, modes, unknowns, rigid=force)
-    fisher = T.T @ known[: len(T), : len(T)] @ T
+    T, slopes = _slopes(structure, modes, unknowns, weighed=force)
+    fisher = T.T @ known @ T
     scale = np.sqrt(np.diag(fisher))
-    covariance = np.linalg.inv(fisher / np.outer(scale, scale)) / np.outer(scale, scale)
+    covariance = np.linalg.pinv(fisher / np.outer(scale, scale), rcond=1e-12, hermitian=True) / np.outer(scale, scale)
 
     def std(name: str) -> np.ndarray:
         jacobian = slopes[name]
@@ -172,7 +178,7 @@ def _size(modes: Modes) -> int:
 
 
 def _slopes(
-    structure: sysid.Structure, modes: Modes, unknowns: Unknowns, *, rigid: bool
+    structure: sysid.Structure, modes: Modes, unknowns: Unknowns, *, weighed: bool
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Derivatives of theta, (p, unknowns), and of the quantities of `Bound`, by all unknowns.
 
@@ -182,14 +188,12 @@ def _slopes(
     phi, squares, c = modes.shapes, modes.omega**2, 2 * modes.zeta * modes.omega
     M, G = structure.mass[:n, :n], modes.rigid_body
     B = M @ G + structure.mass[:n, n:]
-    counts = [len(unknowns.mass), len(unknowns.coupling), len(unknowns.stiffness), n, d * (d + 1) // 2 if rigid else 0]
-    ends = np.cumsum(counts)
-    total = int(ends[-1])
-    dM, dK, dB = np.zeros((total, n, n)), np.zeros((total, n, n)), np.zeros((total, n, d))
-    dM[: ends[0]], dK[ends[1] : ends[2]] = unknowns.mass, unknowns.stiffness
-    dB[: ends[0]], dB[ends[0] : ends[1]] = unknowns.mass @ G, unknowns.coupling
-    log_zeta = np.zeros((total, n))
-    log_zeta[ends[2] : ends[3]] = np.eye(n)
+    base = unknowns.base if weighed else unknowns.base[:0]
+    groups = (unknowns.mass, unknowns.coupling, unknowns.stiffness, base, np.eye(n))
+    dM, dS, dK, d_base, log_zeta = _side_by_side(groups)
+    total = len(dM)
+    dB = dM @ G + dS
+    d_rigid = G.T @ dB + np.swapaxes(dS, 1, 2) @ G + d_base
 
     mass, stiffness = phi.T @ dM @ phi, phi.T @ dK @ phi
     driven = stiffness - mass * squares  # [unknown, l, k]
@@ -202,10 +206,18 @@ def _slopes(
     half = (dQ * c) @ Q.T
     dC = half + np.swapaxes(half, 1, 2) + (Q * (c * (log_omega + log_zeta))[:, None]) @ Q.T
     theta = [d_phi.reshape(total, -1), d_gamma.reshape(total, -1), log_omega, log_zeta]
-    if rigid:
-        theta.append(np.eye(total)[:, ends[3] :])
+    theta.append(d_rigid[:, *np.triu_indices(d)])
     slopes = {
         "natural_frequencies": log_omega * modes.omega / (2 * np.pi), "damping_ratios": log_zeta * modes.zeta,
         "mass": dM, "stiffness": dK, "damping": dC,
     }  # fmt: skip
     return np.hstack(theta).T, {name: np.moveaxis(slope, 0, -1) for name, slope in slopes.items()}
+
+
+def _side_by_side(groups: tuple[np.ndarray, ...]) -> list[np.ndarray]:
+    """Each group of changes as one of all unknowns: zero where another group changes."""
+    ends = np.cumsum([len(group) for group in groups])
+    spread = [np.zeros((int(ends[-1]), *group.shape[1:])) for group in groups]
+    for whole, group, end in zip(spread, groups, ends, strict=True):
+        whole[end - len(group) : end] = group
+    return spread

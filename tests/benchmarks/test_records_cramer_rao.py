@@ -66,21 +66,23 @@ def test_its_information_is_that_of_differences_of_records_in_time(modules, case
         cramer_rao.symmetric(n, [(0, 0), (0, 1)]),
         np.eye(n * d).reshape(n * d, n, d)[:1],
         cramer_rao.symmetric(n, [(1, 1)]),
+        np.zeros((0, d, d)),
     )
-    T, _ = cramer_rao._slopes(s, run.modes, unknowns, rigid=False)
+    T, _ = cramer_rao._slopes(s, run.modes, unknowns, weighed=force)
     info = cramer_rao.information(run.modes, [(run, levels)], setting.lines, force=force)
-    told = T.T @ info[: len(T), : len(T)] @ T
+    told = T.T @ info @ T
 
     def changed(step):
-        """Spectra of a structure with changed matrices, M_rb as it was."""
-        M, K, B = s.mass[:n, :n], s.stiffness[:n, :n], s.mass[:n, :n] @ s.rigid_body_dofs + s.mass[:n, n:]
-        dM = np.einsum("p,pij->ij", step[:2], unknowns.mass)
-        M, K = M + dM, K + step[3] * unknowns.stiffness[0]
-        B = B + dM @ s.rigid_body_dofs + step[2] * unknowns.coupling[0]
-        squares, phi = scipy.linalg.eigh(K, M)
+        """Spectra of a structure with changed matrices."""
+        M, G = s.mass.copy(), s.rigid_body_dofs
+        M[:n, :n] += np.einsum("p,pij->ij", step[:2], unknowns.mass)
+        M[:n, n:] += step[2] * unknowns.coupling[0]
+        M[n:, :n] = M[:n, n:].T
+        K, rigid = s.stiffness[:n, :n] + step[3] * unknowns.stiffness[0], np.vstack([G, np.eye(d)])
+        squares, phi = scipy.linalg.eigh(K, M[:n, :n])
         modes = simulated.Modes(
-            np.sqrt(squares), run.modes.zeta * np.exp(step[4:]), phi.T @ B, phi, run.modes.rigid_body,
-            run.modes.rigid_body_mass,
+            np.sqrt(squares), run.modes.zeta * np.exp(step[4:]), phi.T @ (M[:n] @ rigid), phi, G,
+            rigid.T @ M @ rigid,
         )  # fmt: skip
         records = simulated.Run(modes, run.motion, run.free).records()
         channels = [records.response, records.force] if force else [records.response]
@@ -101,3 +103,43 @@ def test_its_information_is_that_of_differences_of_records_in_time(modules, case
     moves = moves - tangent @ np.linalg.lstsq(tangent, moves, rcond=1e-14)[0]
     scale = np.sqrt(np.diag(told))
     np.testing.assert_allclose(2 * moves.T @ moves / np.outer(scale, scale), told / np.outer(scale, scale), atol=0.02)
+
+
+def test_one_step_from_the_truth_errs_by_the_bound(modules):
+    """Records with noise, their spectra and levels: chi² is its degrees of freedom, errors have the bound's size.
+
+    One Gauss-Newton step of all unknowns, transients and what folds back, over draws of four storeys.
+    """
+    simulated, cramer_rao = modules
+    setting = simulated.four_storeys()
+    s, n, band = setting.structure, setting.structure.n, setting.lines
+    unknowns = cramer_rao.all_entries(n, 1)
+    quotients, chi_square = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        run = setting.run(rng)
+        noisy, levels = setting.with_noise(run.records(), rng)
+        modes = run.modes
+        w, A, U, den = cramer_rao.modal_spectra(modes, run, band)
+        g = w**2 * modes.gamma / den
+        out, rigid = np.vstack([modes.shapes, modes.gamma.T]), np.vstack([modes.rigid_body, modes.rigid_body_mass])
+        u = _spectra(noisy.base, run, band)
+        e = np.vstack([_spectra(noisy.response, run, band), _spectra(noisy.force, run, band)])
+        e = (e - rigid * u - out @ (A - g * U + g * u)).T  # with the base as it was measured
+        factor = np.linalg.cholesky(cramer_rao._noise(modes, run, levels, w, den))
+        J, _ = cramer_rao.whitened(modes, run, levels, band, force=True)
+        T, slopes = cramer_rao._slopes(s, modes, unknowns, weighed=True)
+        folded = [(1j * w[:, None] / w[-1]) ** p * unit for p in range(4) for unit in np.eye(n + 1)]
+        folded = np.linalg.solve(factor, np.stack(folded, -1)).reshape(len(J), -1)
+        columns = np.hstack([J[:, : len(T)] @ T, J[:, len(T) :], folded])
+        columns, errors = np.vstack([columns.real, columns.imag]), np.linalg.solve(factor, e[..., None]).ravel()
+        errors = np.concatenate([errors.real, errors.imag])
+        scale = np.linalg.norm(columns, axis=0)
+        step = np.linalg.lstsq(columns / scale, errors)[0] / scale
+        chi_square.append(2 * np.sum((errors - columns @ step) ** 2) / (errors.size - step.size))
+        bound = cramer_rao.bound(s, [(run, levels)], band, unknowns, force=True)
+        for name, slope in slopes.items():
+            std, error = getattr(bound, name), slope @ step[: slope.shape[-1]]
+            quotients.append((error / std)[np.tril_indices(n)] if std.ndim == 2 else error / std)
+    assert np.mean(chi_square) == pytest.approx(1, abs=0.01)
+    assert np.sqrt(np.mean(np.concatenate(quotients) ** 2)) == pytest.approx(1, abs=0.2)
