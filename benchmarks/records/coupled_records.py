@@ -12,13 +12,15 @@ import sysid
 from benchmarks.line import Line, above, below
 from benchmarks.modal.spread import spread
 from benchmarks.records import trial
-from benchmarks.records.cramer_rao import all_entries, bound, whitened
+from benchmarks.records.cramer_rao import Bound, all_entries, bound, whitened
 from benchmarks.records.simulated import Levels, Run, Setting, coupled
 from benchmarks.records.trial import Trial
 
 STANDS_OUT = 50.0  # rise of chi² without a mode, beyond which it must be found
 SHARE = 0.95
 ACCUSATIONS = 1  # in 300 runs
+MATRICES = ("mass", "stiffness", "damping")
+KNOWN = 0.1  # of the root of two diagonal entries: intervals of what is known less well are not compared
 NEAR = (6.0, 0.5)  # a mode is found within so many deviations of the bound, or half widths of its peak
 
 
@@ -94,8 +96,9 @@ def _draw(group: str, seed: int, number: int) -> Found:
     half_width = truth.damping_ratios * truth.natural_frequencies
     near = np.maximum(NEAR[0] * least.natural_frequencies, NEAR[1] * half_width)
     pairs = matched(truth.natural_frequencies, found.natural_frequencies, near)
-    if not judged.held:
-        judged = replace(judged, held=_held(result, truth, pairs))
+    matrices = judged.held if _all_known(truth, least) else {}
+    held = {name: matrices[name] for name in MATRICES if name in matrices}
+    judged = replace(judged, held={**held, **_held(result, truth, pairs)})
     rises = chi_square_rises(setting, run, levels)
     mine = {i for i, _ in pairs}
     its = {j for _, j in pairs}
@@ -136,6 +139,15 @@ def chi_square_rises(setting: Setting, run: Run, levels: Levels) -> np.ndarray:
         explained = across @ np.linalg.pinv(inner, rcond=1e-12, hermitian=True) @ across
         rises[k] = gram[p + k, p + k] - explained
     return rises
+
+
+def _all_known(truth: sysid.Structure, least: Bound) -> bool:
+    """Whether the records can tell each entry of M, K and C well enough for errors to be in proportion to the noise."""
+    for name in MATRICES:
+        size = np.sqrt(np.diag(getattr(truth, name))[: truth.n])
+        if np.max(getattr(least, name) / np.outer(size, size)) > KNOWN:
+            return False
+    return True
 
 
 def _held(result: sysid.Identification, truth: sysid.Structure, pairs: list[tuple[int, int]]) -> dict[str, list[bool]]:

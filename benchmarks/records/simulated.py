@@ -318,6 +318,7 @@ RATIOS = (0.005, 0.03)
 PERIODS = (20, 200)  # of the first mode
 NOISES = (0.003, 0.05)
 SAMPLES = (5.0, 12.0)  # a period of the highest mode
+WEAK, WEAKER = 0.1, (0.5, 2.5)  # share of modes that the base moves less, and by how many decades
 
 
 def coupled(seed: int) -> Setting:
@@ -325,7 +326,8 @@ def coupled(seed: int) -> Setting:
     rng = np.random.default_rng((seed, 8))
     n, d = int(rng.integers(4, 11)), int(rng.integers(1, 4))
     f = 10 ** rng.uniform(-0.3, 0.9) * np.cumprod([1.0, *np.exp(rng.uniform(*np.log(NEIGHBOURS), n - 1))])
-    structure = coupled_structure(rng, n, d, f)
+    weak = 10 ** -np.where(rng.random(n) < WEAK, rng.uniform(*WEAKER, n), 0.0)
+    structure = coupled_structure(rng, n, d, f, weak)
     rate = float(rng.uniform(*SAMPLES) * f[-1])
     mixing = rng.standard_normal((d, d)) + 1.5 * np.eye(d)
     covariance = mixing @ mixing.T
@@ -344,14 +346,22 @@ def coupled(seed: int) -> Setting:
     )
 
 
-def coupled_structure(rng: np.random.Generator, n: int, d: int, frequencies: np.ndarray) -> sysid.Structure:
-    """A structure with full matrices and natural frequencies (n,), Hz; some modes may hardly move with the base."""
+def coupled_structure(
+    rng: np.random.Generator, n: int, d: int, frequencies: np.ndarray, weak: np.ndarray | None = None
+) -> sysid.Structure:
+    """A structure with full matrices and natural frequencies (n,), Hz; `weak` multiplies participations, (n,)."""
     Q = _orthogonal(rng, n + d)
     M = (Q * 10 ** rng.uniform(1.0, 2.0, n + d)) @ Q.T
     # At least one sensor a direction, in any order.
     G = np.eye(d)[rng.permutation(np.concatenate([np.arange(d), rng.integers(d, size=n - d)]))]
     half = np.linalg.cholesky(M[:n, :n]) @ _orthogonal(rng, n)
     K = (half * (2 * np.pi * frequencies) ** 2) @ half.T
+    if weak is not None:
+        left = M[n:, n:] - M[n:, :n] @ np.linalg.solve(M[:n, :n], M[:n, n:])
+        gamma = np.linalg.solve(half, M[:n, :n] @ G + M[:n, n:])
+        M[:n, n:] = half @ (weak[:, None] * gamma) - M[:n, :n] @ G
+        M[n:, :n] = M[:n, n:].T
+        M[n:, n:] = left + M[n:, :n] @ np.linalg.solve(M[:n, :n], M[:n, n:])  # which keeps M positive definite
     K = np.block([[K, -K @ G], [-(K @ G).T, G.T @ K @ G]])
     return sysid.Structure((M + M.T) / 2, (K + K.T) / 2, rng.uniform(*RATIOS, n), n_base=d)
 

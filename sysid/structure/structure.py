@@ -256,7 +256,8 @@ class Structure:
             Hz.
         initial : array_like, shape (2, n), optional
             Modal displacements and velocities at the first sample (kg^1/2 m, kg^1/2 m/s), as `initial_state` finds
-            them: ``normal_modes.T @ M_SS @ [v, v'].T`` of the relative motion v; at rest where not given.
+            them; of a known relative motion v they are ``normal_modes.T @ M_SS @ v``. Where not given, the structure
+            is at rest relative to the base.
 
         Returns
         -------
