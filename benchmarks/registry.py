@@ -84,6 +84,11 @@ BENCHMARKS = (
     Benchmark("hostile.corruptions", "damaged result files: an error or the same numbers", "2 s", "1 s"),
     Benchmark("hostile.fuzz", "every reader and the command line, given what chance makes", "50 min", "100 s"),
     Benchmark("hostile.extreme_structures", "silent wrong answers at the ends of what occurs", "5 min", "15 s"),
+    Benchmark("records.four_storeys", "one record cut in motion: verdicts, intervals, errors, levels", "5 min", "25 s"),
+    Benchmark("records.coupled_records", "coupled structures: modes, intervals, accusations", "10 min", "20 s"),
+    Benchmark("records.two_runs", "errors of two unequal runs over those of one", "3 min", "20 s"),
+    Benchmark("records.record_speed", "seconds and memory from records in time to a judged result", "1 min", "10 s"),
+    Benchmark("records.measured_records", "measured records: stated deviations against a jackknife", "1 min", "30 s"),
     Benchmark("house", "imports one way, tests of types, branches, sizes of functions and files", "2 s", "2 s"),
 )
 

@@ -11,6 +11,7 @@ from sysid.identify import identify
 from sysid.measurement.measurement import Measurement, Sensor, rigid_body
 from sysid.measurement.simulation import simulate
 from sysid.measurement.spectra import resample
+from sysid.measurement.time_scores import TimeScores, time_scores
 from sysid.measurement.whole import NoiseLevels
 from sysid.models.damping import ModalDamping, ProportionalDamping
 from sysid.models.mass import FullMass, KnownMass, LumpedMass
@@ -37,6 +38,7 @@ __all__ = [
     "ChainStiffness", "Continuation", "FullMass", "FurtherTest", "History", "Identification", "InputError",
     "KnownMass", "LumpedMass", "MassBlocks", "MatrixModel", "Measurement", "Modal", "ModalDamping", "NoiseLevels",
     "Prior", "Problem", "Progress", "ProportionalDamping", "Recipe", "Sensor", "SolverError", "SpectralStiffness",
-    "Stated", "StiffnessBlocks", "Structure", "Swarm", "SwarmSettings", "SysidError", "Totals", "Unknown", "Variable",
-    "__version__", "identify", "jobs", "load", "minimize_swarm", "plot", "resample", "rigid_body", "simulate",
+    "Stated", "StiffnessBlocks", "Structure", "Swarm", "SwarmSettings", "SysidError", "TimeScores", "Totals", "Unknown",
+    "Variable", "__version__", "identify", "jobs", "load", "minimize_swarm", "plot", "resample", "rigid_body",
+    "simulate", "time_scores",
 ]  # fmt: skip

@@ -10,8 +10,9 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError, finite_array, whole_number
+from sysid.errors import InputError, finite_array, number, refuse, whole_number
 from sysid.structure.sensor import checked_sensors, sensors_from_tree, sensors_to_tree
+from sysid.structure.simulation import ModalModel, fitted_state, modal_accelerations
 
 if TYPE_CHECKING:
     from scipy.signal import StateSpace
@@ -243,6 +244,90 @@ class Structure:
         """
         elastic = np.einsum("nd,nef->def", self._coupling, self._relative(freq), optimize=True)
         return elastic + self.rigid_body_mass[:, :, None]
+
+    def simulate(self, base: ArrayLike, sample_rate: float, *, initial: ArrayLike | None = None) -> Array:
+        """Absolute accelerations of the sensors in time, under a base acceleration given by samples.
+
+        Parameters
+        ----------
+        base : array_like, shape (d, n_samples)
+            Base acceleration, m/s².
+        sample_rate : float
+            Hz.
+        initial : array_like, shape (2, n), optional
+            Modal displacements and velocities at the first sample (kg^1/2 m, kg^1/2 m/s), as `initial_state` finds
+            them; of a known relative motion v they are ``normal_modes.T @ M_SS @ v``. Where not given, the structure
+            is at rest relative to the base.
+
+        Returns
+        -------
+        ndarray, shape (n_sensors, n_samples)
+
+        Raises
+        ------
+        InputError
+            Where shapes disagree or there are fewer than two samples.
+
+        Notes
+        -----
+        Exact for a base acceleration that is a cubic spline through its samples, for any damping matrix. What is
+        band-limited loses ``1 - sinc(x)^4 / sum_k sinc(x - k)^4`` of its amplitude, x = frequency / sample rate: 0.5 %
+        at 5 samples a period, 0.024 % at 10, 0.0014 % at 20 (straight lines between samples: 12, 3 and 0.8 %), and the
+        spline is less exact at either end. Resample a record with fewer samples a period to a higher rate first.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> K = 800.0 * np.array([[1, -1], [-1, 1]])
+        >>> one = Structure(np.diag([2.0, 0.0]), K, [0.5], n_base=1)
+        >>> rising = np.ones((1, 200))  # after a step of the base acceleration the mass follows
+        >>> bool(np.isclose(one.simulate(rising, 50.0)[0, -1], 1.0))
+        True
+        """
+        motion, modal = self._in_time(base, sample_rate, initial)
+        return self.mode_shapes @ modal + self.rigid_body @ motion
+
+    def simulate_force(self, base: ArrayLike, sample_rate: float, *, initial: ArrayLike | None = None) -> Array:
+        """Force of the base on the structure in time, (d, n_samples), N; see `simulate`."""
+        motion, modal = self._in_time(base, sample_rate, initial)
+        return self.participation.T @ modal + self.rigid_body_mass @ motion
+
+    def initial_state(self, base: ArrayLike, response: ArrayLike, sample_rate: float) -> Array:
+        """Modal displacements and velocities at the first sample that explain records best, in least squares.
+
+        Parameters
+        ----------
+        base : array_like, shape (d, n_samples)
+            Base acceleration, m/s².
+        response : array_like, shape (n_sensors, n_samples)
+            Absolute accelerations of the sensors, m/s².
+        sample_rate : float
+            Hz.
+
+        Returns
+        -------
+        ndarray, shape (2, n)
+            `initial` of `simulate`. A mode that no sensor sees is at rest.
+        """
+        samples = np.shape(base)[-1] if np.ndim(base) else 0
+        measured = shaped_array("response", response, self.n_sensors, samples)
+        left = measured - self.simulate(base, sample_rate)
+        return fitted_state(self._modal_model, self.mode_shapes, left, sample_rate)
+
+    @property
+    def _modal_model(self) -> ModalModel:
+        return ModalModel(self._omega, self._modal_damping_matrix, self.participation)
+
+    def _in_time(self, base: ArrayLike, sample_rate: float, initial: ArrayLike | None) -> tuple[Array, Array]:
+        """Base acceleration and modal accelerations, (n, n_samples)."""
+        motion = shaped_array("base", base, self.n_base, "n_samples")
+        rate = number("sample_rate", sample_rate)
+        refuse(
+            (motion.shape[1] < 2, f"base has {motion.shape[1]} samples; at least two are needed"),
+            (rate <= 0, f"sample_rate = {rate:g} Hz; it must be positive"),
+        )
+        state = np.zeros((2, self.n)) if initial is None else shaped_array("initial", initial, 2, self.n)
+        return motion, modal_accelerations(self._modal_model, motion, rate, state)
 
     def to_state_space(self) -> StateSpace:
         """Continuous-time state space from base accelerations to absolute sensor accelerations.
