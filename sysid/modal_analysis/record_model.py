@@ -26,6 +26,7 @@ from sysid.modal_analysis.response import gain_slopes, gains
 from sysid.structure.structure import Array, ComplexArray
 
 _AT_ONCE = 4096  # lines whose derivatives are held in memory together
+_FAR = 30.0  # logarithms of frequencies and damping ratios
 TRACES = 3  # real numbers a channel and run: of 1, i w and 1 / (i w)
 
 
@@ -113,7 +114,9 @@ class RecordModel:
         theta = np.zeros((index.size, 1))
         theta[: self.kept, 0] = x[: self.kept]
         phi, gamma, log_omega, log_ratios, rigid = (part[..., 0] for part in index.split(theta))
-        modes = Modes(phi, gamma, np.exp(log_omega), np.exp(log_ratios))
+        # No step of use leads beyond these.
+        omega, ratios = np.exp(np.clip(log_omega, -_FAR, _FAR)), np.exp(np.clip(log_ratios, -_FAR, _FAR))
+        modes = Modes(phi, gamma, omega, ratios)
         ends, traces = np.split(x[self.kept :], [self.n_ends])
         shape = (len(self.whole.samples), self.channels, TRACES)
         return Parameters(modes, rigid, ends.reshape(self.m, -1), traces.reshape(shape))
