@@ -21,7 +21,7 @@ from sysid.modal_analysis.response import gain_slopes
 from sysid.structure.structure import Array, Structure
 
 _CHANCE = 1e-3  # that any sensor of a right test is accused
-_SUSPECT = 2.0  # standard deviations, beyond which an error of a gain counts among what is not known
+_SUSPECT = 1.8  # deviations of the noise, beyond which an error of a gain counts among what is not known
 _LEAST = 2e-3  # of a gain; smaller errors are usual
 _MIMICKED = 1e-2  # of a constant; less of it is left where a mode far below the lines answers like one
 _EXACT = 1e-8  # of the records: what counts as noise where there is none
@@ -33,7 +33,7 @@ _DEPENDENT = 1e-10  # of the largest eigenvalue: changes of poles that do not sh
 _BLOCKS = (8, 16, 32, 64)  # of lines, within which they may share their error
 _LINES = 2  # times the free residues: fewer numbers than these tell nothing beside noise
 
-Estimate = tuple[Array, Array]
+Estimate = tuple[Array, Array, Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,14 +94,14 @@ def gain_errors(test: Measurement, structure: Structure) -> GainErrors:
     rise = (test.freq / test.freq[-1]) ** 2
     ones, rising = (records.basis(part[None] + 0j) for part in (np.ones_like(rise), rise))
     slopes = records.basis(gain_slopes(test.freq, *poles)[: 0 if velocity else None])
-    plain, plain_std = _estimate(test, records, free, free.Q, ones, slopes)
+    plain, plain_std, least = _estimate(test, records, free, free.Q, ones, slopes)
     both = np.linalg.qr(np.hstack([free.Q, rising]))[0]
-    error, std = _estimate(test, records, free, both, ones, slopes)
-    possible = np.where(np.abs(plain) > _SUSPECT * plain_std, np.abs(plain), 0.0)
+    error, std, least_beside = _estimate(test, records, free, both, ones, slopes)
+    pairs = ((np.abs(plain), least), (np.abs(error), least_beside))
+    possible = np.max([np.where(size > _SUSPECT * noise, size, 0.0) for size, noise in pairs], axis=0)
     plain_std = np.hypot(plain_std, plain - error)
     better = plain_std < std
     error, std = np.where(better, plain, error), np.where(better, plain_std, std)
-    possible = np.maximum(possible, np.where(np.abs(error) > _SUSPECT * std, np.abs(error), 0.0))
     freedom = (len(records.data) - free.Q.shape[1] - rising.shape[1]) * (records.data.shape[1] // test.n_sensors)
     return GainErrors(error, std, possible, freedom)
 
@@ -131,7 +131,7 @@ def told(test: Measurement, errors: GainErrors) -> Iterator[str]:
 
 
 def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, ones: Array, slopes: Array) -> Estimate:
-    """Errors of the gains, (n_sensors,), and their standard deviations, beside functions Q (rows, columns).
+    """Errors of the gains beside functions Q (rows, columns), their deviations, and these by the noise alone.
 
     The poles of `slopes` (rows, 2 m inputs) move with them, in a Gauss-Newton step: they were fitted without them.
     """
@@ -164,8 +164,8 @@ def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, o
         stated = 0.5  # half of a complex number's variance, in units of what is stated
         # What a model misses is no noise, and pulls constants along: beyond the stated noise it counts twice.
         noise, variance = np.maximum(noise, stated), variance * np.maximum(noise / stated, 1.0)
-    std = np.sqrt(np.maximum(variance, noise) * np.diag(normal))
-    return np.where(shown, error, np.nan), np.where(shown, std, np.nan)
+    std, least = (np.sqrt(part * np.diag(normal)) for part in (np.maximum(variance, noise), noise))
+    return np.where(shown, error, np.nan), np.where(shown, std, np.nan), np.where(shown, least, np.nan)
 
 
 def _less(Q: Array, columns: Array) -> Array:

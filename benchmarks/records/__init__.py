@@ -1,0 +1,1 @@
+"""Benchmarks of records as a laboratory makes them."""
