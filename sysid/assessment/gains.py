@@ -18,6 +18,7 @@ from scipy.special import stdtr
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.residues import Records, ResidueFit
 from sysid.modal_analysis.response import gain_slopes
+from sysid.problem.problem import Problem
 from sysid.structure.structure import Array, Structure
 
 _CHANCE = 1e-3  # that any sensor of a right test is accused
@@ -128,6 +129,21 @@ def told(test: Measurement, errors: GainErrors) -> Iterator[str]:
         "the transmissibility differs from the row of rigid_body, and M_SS, K_SS and C are wrong in these rows and "
         "columns; calibrate the sensor and divide its record by its gain, or correct rigid_body"
     )
+
+
+def assumed(problem: Problem) -> Iterator[str]:
+    """Gains on which masses rest and that no record can show to be wrong, in sentences."""
+    test, mass = problem.measurement, problem.formulation.mass
+    if mass.entries is not None and np.all(np.isfinite(mass.entries)):
+        return
+    still = [name for name, row in zip(test.sensor_names, test.rigid_body, strict=True) if not np.any(row)]
+    if still:
+        yield (
+            f"the gain of {', '.join(still)} is assumed to be right: the row of rigid_body is zero, so that no record "
+            "shows an error of it, and 1 % makes 2 % in the diagonal of M_SS, K_SS and C there"
+        )
+    if test.force is not None and mass.totals is None:
+        yield "the gain of the base force is assumed to be right: it is the scale of M, K and C, which no record shows"
 
 
 def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, ones: Array, slopes: Array) -> Estimate:

@@ -119,3 +119,26 @@ class TestAnswer:
         assert np.all(np.abs(off) < 3 * std)
         if not noise:  # where the move is all of the deviation
             np.testing.assert_allclose(np.abs(off[1]) / std[1], 1.0, atol=0.15)
+
+
+class TestAssumptions:
+    @pytest.fixture
+    def across(self):
+        """Two masses on a base that moves along x alone; the second, coupled to the first, moves along y only."""
+        M = np.array([[4.0, 1.0, 0.0], [1.0, 3.0, 0.0], [0.0, 0.0, 0.0]])
+        K = np.array([[5e3, 1e3, -5e3], [1e3, 9e3, -1e3], [-5e3, -1e3, 5e3]])
+        return Structure(M, K, [0.01, 0.02], n_base=1)
+
+    def test_a_gain_that_nothing_shows_is_named_where_masses_rest_on_it(self, across):
+        assert across.rigid_body[:, 0] == pytest.approx([1.0, 0.0], abs=1e-12)
+        test = dataclasses.replace(simulate(across, lines(across), force=True), rigid_body=[[1.0], [0.0]])
+        result = sysid.identify(Problem(test, mass=FullMass()), rng=0)
+        assert result.determined
+        assert [remark.split(" is assumed")[0] for remark in result.remarks if "assumed" in remark] == [
+            "the gain of sensor 2", "the gain of the base force",
+        ]  # fmt: skip
+
+    def test_none_where_all_masses_are_stated(self, across):
+        test = dataclasses.replace(simulate(across, lines(across), force=True), rigid_body=[[1.0], [0.0]])
+        result = sysid.identify(Problem(test, mass=sysid.KnownMass(across.mass)), rng=0)
+        assert not any("assumed" in remark for remark in result.remarks)
