@@ -84,7 +84,7 @@ BENCHMARKS = (
     Benchmark("hostile.corruptions", "damaged result files: an error or the same numbers", "2 s", "1 s"),
     Benchmark("hostile.fuzz", "every reader and the command line, given what chance makes", "50 min", "100 s"),
     Benchmark("hostile.extreme_structures", "silent wrong answers at the ends of what occurs", "5 min", "15 s"),
-    Benchmark("records.gain_errors", "a sensor 2 % wrong: silent cases, and right ones accused", "4 min", "15 s"),
+    Benchmark("records.gain_errors", "a sensor 2 % wrong: silent cases, and right ones accused", "3 min", "10 s"),
     Benchmark("house", "imports one way, tests of types, branches, sizes of functions and files", "2 s", "2 s"),
 )
 
