@@ -164,7 +164,7 @@ def _run(
     try:
         outcome = chosen.run(problem, session, start)
     except DoesNotApplyError as error:
-        if not follow:
+        if not follow or isinstance(chosen, STRATEGIES[-1]):  # after which there is nothing else
             raise
         return _instead(chosen, error, problem, session, start)
     after = _after(chosen, problem, start) if follow and not outcome.good else None

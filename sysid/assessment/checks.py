@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtri
 
+from sysid.assessment.gains import distinct_poles, gain_errors, told
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.residues import Records, ResidueFit, beyond_chance, force_residual_left
@@ -18,7 +19,6 @@ from sysid.problem.problem import Problem
 from sysid.structure.structure import Array, Structure
 
 _ROUND_OFF = 1e-8  # of the records: what counts as noise where there is none
-_SAME_POLE = 1e-6  # relative distance of poles that count as one
 _ALIKE = 3.0  # misfits by which two records must differ to be of two sensors
 _MISFIT = 1.5  # times what free residues leave, beyond which a record is not what the modes make of it
 _LINES = 2  # times the free residues: fewer numbers than these tell nothing beside noise
@@ -57,15 +57,16 @@ def doubts(problem: Problem, structure: Structure, x: Array | None) -> tuple[str
 
 def _of_records(formulation: Formulation, test: Measurement, structure: Structure) -> list[str]:
     """Signs in the records of one test that a structure is not theirs, in sentences."""
-    records, poles = Records(test), _poles(structure)
+    records, poles = Records(test), distinct_poles(structure)
     velocity = not structure.modal_damping
     if records.data.shape[0] <= _LINES * poles[0].size * records.n_base * (2 if velocity else 1):
         return []
     free = records.fit(*poles, velocity=velocity)
     misses, rigid = list(_misfit(formulation, test, structure, records, free)), list(_rigid(test, records, free))
-    found = [*misses, *_force(formulation, test, structure), *rigid]
+    gains = [] if rigid else list(told(test, gain_errors(test, structure)))
+    found = [*misses, *_force(formulation, test, structure), *rigid, *gains]
     # Beside what those say, quadrature and likeness mean nothing.
-    if structure.modal_damping and not rigid:
+    if structure.modal_damping and not (rigid or gains):
         found += _damping(records, poles, free)
     if not (misses or rigid):
         found += _twins(test, structure)
@@ -112,21 +113,13 @@ def _misfit(
         )
 
 
-def _poles(structure: Structure) -> tuple[Array, Array]:
-    """Distinct poles, rad/s and ratios."""
-    omega = 2 * np.pi * structure.natural_frequencies
-    poles = omega * (1 + 1j * structure.damping_ratios)
-    first = np.concatenate([[True], np.abs(np.diff(poles)) > _SAME_POLE * omega[1:]])
-    return omega[first], structure.damping_ratios[first]
-
-
 def _stated_mass(problem: Problem, structure: Structure) -> Iterator[str]:
     """What the base force weighs, where a stated mass says otherwise."""
     test, stated = problem.measurement, problem.formulation.mass
     whole = stated.totals is not None or np.all(np.isfinite(problem.known_mass))
     if test.force is None or not whole or not structure.modal_damping:
         return
-    poles = _poles(structure)
+    poles = distinct_poles(structure)
     weighed, own = np.diag(weighed_mass(test, *poles)), np.diag(structure.rigid_body_mass)
     if np.any(np.abs(weighed / own - 1) >= max(0.01, 3 * force_residual_left(test, *poles) / np.sqrt(test.freq.size))):
         given, told = (", ".join(f"{m:.4g}" for m in masses) for masses in (own, weighed))
@@ -188,7 +181,7 @@ def _force(formulation: Formulation, test: Measurement, structure: Structure) ->
     # Both misfits in units of the stated noise: what is left at a noisy peak speaks against nothing.
     left = replace(test, force=test.force - test.predict_force(structure))
     misfit = float(np.sqrt(Records(left, force=True).size / Records(test, force=True).size))
-    possible = max(force_residual_left(test, *_poles(structure)), _ROUND_OFF)
+    possible = max(force_residual_left(test, *distinct_poles(structure)), _ROUND_OFF)
     if misfit > max(_MISFIT * possible, 1e-6):
         yield (
             f"the base force misses what the modes of the accelerations make of it by {100 * misfit:.3g} % "

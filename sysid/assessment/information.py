@@ -64,6 +64,22 @@ def information(modes: Modes, index: Index, grams: list[Iterator[Array]]) -> Arr
     return A
 
 
+def gain_gradients(modes: Modes, index: Index, rigid_body: Array, grams: Iterator[Array]) -> Array:
+    """``Re J' W y`` over theta, y the motion ``G u + a`` of one sensor alone, (size of theta, n_sensors).
+
+    So far the fit is pulled by a relative error of that sensor's gain; parameters as in `information`.
+    """
+    phi, gamma = modes.phi, modes.gamma
+    (s, m), d = phi.shape, gamma.shape[1]
+    pulls = np.zeros((index.size, s))
+    common = np.arange(index.gamma.start, index.log_ratios.stop)
+    for i, gram in enumerate(grams):
+        at = np.concatenate([np.arange(i * m, (i + 1) * m), common])
+        factor = np.concatenate([np.ones(m), np.repeat(phi[i], d), phi[i], phi[i]])
+        pulls[at, i] = factor * (gram[: at.size, :m] @ phi[i] + gram[: at.size, -d:] @ rigid_body[i])
+    return pulls
+
+
 class Parametrisation(NamedTuple):
     """How theta moves with a problem's unknowns.
 

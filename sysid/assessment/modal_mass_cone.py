@@ -30,7 +30,7 @@ _UNRESOLVED = 20.0  # misfits, in parts of the half-power half-width, by which r
 _CLEAR = 3.0  # misfits above which a mode's share of the responses is seen
 _AS_STATED = 1.2  # times the stated noise, to which a misfit may be noise alone
 _RESOLVED = 10.0  # standard deviations of a mode's amplitude at which it is known, to a tenth
-_GAIN = 0.02  # of the base's motion; a smaller error of a sensor's gain is not told from a mode below the lines
+_GAIN = 5e-3  # of the base's motion; a smaller error of a sensor's gain is not told from a mode below the lines
 _QUIET = 1e-9  # of a channel's own size: noise below it is round-off
 _INVISIBLE = 1e-6  # of the strongest mode's participation
 _NOTHING = 5e-7  # of an entry's range: ends below it are zero
@@ -396,8 +396,9 @@ def _unseen(problem: Problem, structure: Structure, misfit: float, responses: _R
 def _base_noise(test: Measurement, sizes: Array) -> float:
     """Largest noise of a base direction over all lines, its record's size being 1."""
     assert test.modal is not None
-    lines = np.sqrt(np.sum(test.modal.density * np.count_nonzero(test.own_lines, axis=1)))
-    return float(np.max(test.modal.noise.base * lines / np.where(sizes > 0, sizes, np.inf)))
+    lines = test.modal.density * np.count_nonzero(test.own_lines, axis=1)
+    noise = np.sqrt(np.sum(test.modal.noise.base**2 * lines[:, None], axis=0))
+    return float(np.max(noise / np.where(sizes > 0, sizes, np.inf)))
 
 
 def _clusters(structure: Structure, misfit: float) -> list[list[int]]:

@@ -14,7 +14,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.assessment.information import information, spectra_of, spread
+from sysid.assessment.gains import gain_errors
+from sysid.assessment.information import gain_gradients, information, spectra_of, spread
 from sysid.assessment.modal_mass_cone import open_modes
 from sysid.assessment.parametrisation import held_by_entries, parametrisation
 from sysid.assessment.perturbations import DirectSpectra, ModalSpectra, Perturbations, matrices_of_modes, std_of
@@ -31,10 +32,11 @@ from sysid.errors import InputError
 from sysid.modal_analysis.misfit import inflation_of, records_of
 from sysid.modal_analysis.modal_estimate import information_about
 from sysid.modal_analysis.modal_fit import Index, Modes
+from sysid.modal_analysis.response import columns, weights_of_test
 from sysid.models.unknowns import by_name, split
 from sysid.problem.formulation import Formulation
 from sysid.problem.problem import Problem
-from sysid.problem.slopes import slopes_of
+from sysid.problem.slopes import Slopes, rows_of_test, slopes_of
 from sysid.structure.structure import Array, Structure, check_frequencies
 
 LARGE = 4000  # entries of the mode shapes, beyond which the covariance takes minutes and gigabytes
@@ -203,7 +205,7 @@ def _by_modes(problem: Problem, structure: Structure, x: Array | None) -> Uncert
     index = Index(structure.n_sensors, structure.n, structure.n_base)
     path = parametrisation(problem, structure, modes, index)
     unknowns = path.unit.size - path.gauge.shape[1]
-    records, B = records_of(test, structure, unknowns), None
+    records, B, spectra = records_of(test, structure, unknowns), None, None
     if test.modal is not None:
         A, B = information_about(test.modal, modes)
     else:
@@ -211,10 +213,18 @@ def _by_modes(problem: Problem, structure: Structure, x: Array | None) -> Uncert
         A = information(modes, index, [record.grams(spectra) for record in records])
         if not all(record.shared for record in records):
             B = information(modes, index, [record.sandwich_grams(spectra) for record in records])
-    steps = spread(A, B, path)
-    normals, unseen = (held_by_entries(problem, structure, modes, index, path, part) for part in steps)
+    normals, unseen = spread(A, B, path)
+    wrong = np.zeros((index.size, 0))
+    possible = np.zeros(0) if spectra is None else gain_errors(test, structure).possible
+    if spectra is not None and np.any(possible):
+        pulls = gain_gradients(modes, index, test.rigid_body, records[0].grams(spectra))
+        plain = normals if B is None else spread(A, None, path)[0]
+        wrong = 2 * plain @ (plain.T @ (pulls * possible)[:, possible > 0])  # half the inverse of the information
+    steps = (held_by_entries(problem, structure, modes, index, path, part) for part in (normals, wrong, unseen))
+    normals, wrong, unseen = steps
     inflation = inflation_of(test, records, unknowns)
-    moves = Perturbations(normals.shape[1], *index.split(np.hstack([inflation * normals, unseen])))
+    moved = np.hstack([inflation * normals, wrong, unseen])
+    moves = Perturbations(normals.shape[1] + wrong.shape[1], *index.split(moved))
     matrices = matrices_of_modes(structure, modes, moves)
     if test.force is None and open_modes(problem, structure):
         open_ = np.full((structure.n, structure.n), np.nan)
@@ -234,19 +244,40 @@ def _by_unknowns(problem: Problem, structure: Structure, x: Array) -> Uncertaint
     formulation, x = with_totals(problem, structure, x)
     slopes = slopes_of(formulation.matrices, x, test, modes.omega)
     known = sensitivity(formulation, x, slopes)
-    steps = known.steps
+    if formulation.fits_records:
+        known = _with_gains(formulation, x, slopes, known)
+    steps, count = known.steps, known.normals.shape[1]
     inflation = inflation_of(test, records_of(test, structure, x.size), x.size) if formulation.fits_records else 1.0
     shapes = np.einsum("si,ikc->skc", structure.recovery, slopes.d_shapes)
     parts = (shapes, slopes.d_participation, slopes.d_log_omega, slopes.d_log_ratios, slopes.d_rigid)
-    moves = Perturbations(known.rank, *(part @ steps for part in parts))
+    moves = Perturbations(count, *(part @ steps for part in parts))
     matrices = []
     for matrix, slope in blocks_and_slopes(structure, slopes):
         size = np.sqrt(np.abs(np.diag(matrix)))
-        matrices.append(std_of(slope @ steps, known.rank, np.outer(size, size)))
+        matrices.append(std_of(slope @ steps, count, np.outer(size, size)))
     found = _quantities(problem, structure, modes, moves, inflation, matrices)
     if not structure.modal_damping:
-        found = replace(found, _spectra=DirectSpectra(slopes, steps, known.rank))
+        found = replace(found, _spectra=DirectSpectra(slopes, steps, count))
     return _with_unknowns(found, problem, formulation, x, known)
+
+
+def _with_gains(formulation: Formulation, x: Array, slopes: Slopes, known: Sensitivity) -> Sensitivity:
+    """Add to the moves of x those that make up for an error that a sensor's gain may have (`GainErrors.possible`)."""
+    own, structure = formulation.own_test, slopes.structure
+    test = own.test
+    if test.modal is not None:
+        return known
+    possible = gain_errors(test, structure).possible
+    if not np.any(possible):
+        return known
+    rows = rows_of_test(test, slopes, x.size, share=own.weight)[0]
+    weight, scale = weights_of_test(test, weighted=True)[0]
+    whole = columns(test.predict(structure) + test.response - test.relative)  # G u + a
+    size = own.weight * possible[:, None] * weight / scale * whole
+    pulls = rows.jacobian.reshape(2, *size.shape, -1)
+    pull = np.einsum("slc,sl->cs", pulls[0], size.real) + np.einsum("slc,sl->cs", pulls[1], size.imag)
+    inverse = known.unit[:, None] * known.seen / known.singular_values[: known.rank]
+    return replace(known, normals=np.hstack([known.normals, inverse @ (inverse.T @ pull[:, possible > 0])]))
 
 
 def _with_unknowns(
@@ -254,7 +285,7 @@ def _with_unknowns(
 ) -> Uncertainty:
     """Add the unknowns that mean something by themselves, and their covariance where all do."""
     unknowns, names = formulation.unknowns, {unknown.name for unknown in problem.variables}
-    std = std_of(known.steps, known.rank, known.unit)
+    std = std_of(known.steps, known.normals.shape[1], known.unit)
     of_unknowns = zip(unknowns, split(unknowns, meaningful(formulation)), strict=True)
     told = [unknown.name for unknown, part in of_unknowns if np.all(part) and unknown.name in names]
     values, variables = ({name: by_name(unknowns, every)[name] for name in told} for every in (x, std))

@@ -78,7 +78,7 @@ def _whole_again(
     noise = at_rest.modal.noise
 
     def drawn(record: ComplexArray, levels: Array) -> ComplexArray:
-        std = np.sqrt(test.whole.density)[:, None, None] * levels[:, None]  # type: ignore[union-attr]
+        std = np.sqrt(test.whole.density)[:, None, None] * levels[..., None]  # type: ignore[union-attr]
         return np.where(test.own_lines[:, None], _noise(np.broadcast_to(std, record.shape), rng), 0.0)
 
     response = test.response - (at_rest.relative - at_rest.predict(structure)) + drawn(test.response, noise.response)

@@ -18,11 +18,11 @@ class NoiseLevels:
 
     Attributes
     ----------
-    response : (n_sensors,)
-        m/s².
-    base : (d,)
+    response : (n_sensors,) or (runs, n_sensors)
+        m/s²; a row a run where they were found in several.
+    base : (d,) or (runs, d)
         m/s² (rad/s² for a rotation).
-    force : (d,) or None
+    force : (d,), (runs, d) or None
         N (N m); None where no force was measured.
     """
 
@@ -35,14 +35,14 @@ class NoiseLevels:
             value = getattr(self, name)
             if value is not None:
                 array = np.atleast_1d(finite_array(f"noise of the {name}", value))
-                if array.ndim != 1 or np.any(array < 0):
-                    raise InputError(f"noise of the {name}: one standard deviation >= 0 a channel is needed")
+                if array.ndim > 2 or np.any(array < 0):
+                    raise InputError(f"noise of the {name}: one standard deviation >= 0 a channel, or run and channel")
                 object.__setattr__(self, name, array)
 
     @property
     def outputs(self) -> Array:
-        """Of responses and, below them, forces, (n_sensors [+ d],)."""
-        return self.response if self.force is None else np.concatenate([self.response, self.force])
+        """Of responses and, behind them, forces, (n_sensors [+ d],) or a row of them a run."""
+        return self.response if self.force is None else np.concatenate([self.response, self.force], axis=-1)
 
     def to_tree(self) -> dict[str, Any]:
         """Give the levels as a dictionary of arrays; ``NoiseLevels(**tree)`` takes it back."""
@@ -90,15 +90,16 @@ class WholeRecords:
 
     def of_runs(self, kept: NDArray[np.bool_]) -> WholeRecords:
         """That of some runs."""
-        chosen = np.flatnonzero(kept).tolist()
-        return replace(
-            self, samples=tuple(self.samples[i] for i in chosen), at_rest=tuple(self.at_rest[i] for i in chosen)
-        )
+        samples, rest = (tuple(np.array(part)[kept].tolist()) for part in (self.samples, self.at_rest))
+        noise = self.noise
+        if noise is not None and noise.base.ndim == 2:
+            noise = NoiseLevels(**{name: part[kept] for name, part in vars(noise).items() if part is not None})
+        return replace(self, samples=samples, at_rest=rest, noise=noise)
 
     def of_sensors(self, kept: NDArray[np.bool_]) -> WholeRecords:
         """That of some sensors."""
         noise = self.noise
-        return replace(self, noise=None if noise is None else replace(noise, response=noise.response[kept]))
+        return replace(self, noise=None if noise is None else replace(noise, response=noise.response[..., kept]))
 
     def transients(self, freq: Array) -> ComplexArray:
         """Motion at the ends of a run as further inputs at lines in Hz: a change of velocity, of displacement; (2, n).
@@ -128,6 +129,15 @@ class WholeRecords:
 
 
 @dataclass(frozen=True, eq=False)
+class Gains:
+    """Relative errors of the sensors' gains that whole records show, (n_sensors,), and their deviations."""
+
+    error: Array
+    std: Array
+    freedom: int
+
+
+@dataclass(frozen=True, eq=False)
 class ModalEstimate:
     """What whole records tell of the modes: the likeliest ones, and how exactly they are known.
 
@@ -149,6 +159,7 @@ class ModalEstimate:
         Chi-squared over its degrees of freedom.
     density : (runs,)
         Of `WholeRecords`.
+    gain : Gains
     scatter : (p, p) or None
         B, where what is left is no white noise and the covariance is ``A^-1 B A^-1 / 2``, A the information.
     """
@@ -162,6 +173,7 @@ class ModalEstimate:
     noise: NoiseLevels
     reduced: float
     density: Array
+    gain: Gains
     scatter: Array | None = None
 
 

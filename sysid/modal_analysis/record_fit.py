@@ -40,7 +40,7 @@ class RecordFit:
     test : Measurement
         As given.
     parameters : Parameters
-    levels : (c + d,)
+    levels : (runs, c + d)
         Variances of a sample in time, of responses, forces and base.
     chi2 : float
         ``sum e' S^-1 e``: half a chi-squared of `freedom` degrees where the model is right.
@@ -82,9 +82,10 @@ class RecordFit:
         spread = 0.0
         for chunk in model.chunks(self.parameters):
             T = chunk.H
-            inner = np.einsum("cil,cjl,c->lij", T.conj(), T, 1 / self.levels[:c]) * self.levels[c:]
+            own = self.levels[chunk.run.number]
+            inner = np.einsum("cil,cjl,c->lij", T.conj(), T, 1 / own[:c]) * own[c:]
             spread += float(np.sum(np.linalg.slogdet(inner + np.eye(inner.shape[1]))[1]))
-            spread += T.shape[-1] * float(np.sum(np.log(self.levels[:c] * chunk.run.density)))
+            spread += T.shape[-1] * float(np.sum(np.log(own[:c] * chunk.run.density)))
         return -spread - self.chi2 - self.unknowns * float(np.log(model.numbers)) / 2
 
     def information(self) -> Array:
@@ -105,8 +106,10 @@ class RecordFit:
     def noise(self) -> NoiseLevels:
         """The levels, stated or found, as standard deviations."""
         root, n, d = np.sqrt(self.levels), self.test.n_sensors, self.test.n_base
-        force = root[n : n + d] if self.test.force is not None else None
-        return NoiseLevels(root[:n], root[-d:], force)
+        if len(root) == 1:
+            root = root[0]
+        force = root[..., n : n + d] if self.test.force is not None else None
+        return NoiseLevels(root[..., :n], root[..., -d:], force)
 
 
 def record_modes(test: Measurement, omega: Array, ratios: Array, *, monitor: Monitor | None = None) -> RecordFit:
@@ -137,7 +140,7 @@ def _fit(model: RecordModel, p: Parameters, levels: Array | None, monitor: Monit
     assert test.whole is not None
     stated, least = test.whole.noise, floors(model)
     if stated is not None:
-        levels = np.maximum(np.concatenate([stated.outputs, stated.base]) ** 2, least)
+        levels = np.maximum(np.concatenate([stated.outputs, stated.base], axis=-1) ** 2, least)
     elif levels is None:
         levels = _rough_levels(model, p)
     unknowns = model.size - (0 if model.force else model.m)
@@ -254,14 +257,16 @@ def _masses(test: Measurement, modes: Modes, ends: Array) -> tuple[Array, Array]
 
 def _rough_levels(model: RecordModel, p: Parameters) -> Array:
     """Variances to begin with: what the first model leaves of the outputs, and the same share of the base."""
-    left, power, base = np.zeros(model.channels), np.zeros(model.channels), np.zeros(model.d)
+    power = np.zeros((3, len(model.runs), model.channels + model.d))  # of errors and records; numbers of lines
     for chunk in model.chunks(p):
-        left += np.sum(np.abs(chunk.error) ** 2, axis=1) / chunk.run.density
-        power += np.sum(np.abs(chunk.run.outputs) ** 2, axis=1) / chunk.run.density
-        base += np.sum(np.abs(chunk.run.base) ** 2, axis=1) / chunk.run.density
-    lines = sum(run.w.size for run in model.runs)
-    share = np.median(left / np.where(power > 0, power, np.inf))
-    return np.maximum(np.concatenate([left, share * base]) / lines, floors(model))
+        run = chunk.run
+        for at, part in enumerate((np.vstack([chunk.error, run.base]), np.vstack([run.outputs, run.base]))):
+            power[at, run.number] += np.sum(np.abs(part) ** 2, axis=1) / run.density
+        power[2, run.number] += run.w.size
+    left, whole, lines = power
+    share = np.median(left[:, : model.channels] / np.where(whole > 0, whole, np.inf)[:, : model.channels])
+    left[:, model.channels :] *= share
+    return np.maximum(left / lines, floors(model))
 
 
 def without(fit: RecordFit, k: int) -> Parameters:

@@ -73,9 +73,12 @@ class RecordModel:
 
     The unknowns are those of `Index`, then ``ends`` and ``traces``, each in the order of its entries; without a force
     the rigid-body mass is left out.
+
+    With `gains` there are further columns, to be asked of at an end: an error of each sensor's gain, which shows beside
+    its modes as ``G u``, and what modes above the lines make of each sensor, as ``w² u``.
     """
 
-    def __init__(self, test: Measurement, m: int) -> None:
+    def __init__(self, test: Measurement, m: int, *, gains: bool = False) -> None:
         assert test.whole is not None
         self.test, self.whole, self.m = test, test.whole, m
         self.n, self.d, self.force = test.n_sensors, test.n_base, test.force is not None
@@ -89,7 +92,9 @@ class RecordModel:
             Run(2 * np.pi * test.freq[own], test.base[r][:, own], outputs[r][:, own], float(self.whole.density[r]), r)
             for r, own in enumerate(test.own_lines)
         ]
-        self.size = self.kept + self.n_ends + test.n_runs * self.channels * TRACES
+        self.n_fit = self.kept + self.n_ends + test.n_runs * self.channels * TRACES
+        self.gains = gains
+        self.size = self.n_fit + gains * self.n * (1 + self.d)
         self.numbers = 2 * sum(run.outputs.size for run in self.runs)
 
     def thinned(self, step: int) -> RecordModel:
@@ -131,7 +136,7 @@ class RecordModel:
     def normal_equations(self, p: Parameters, levels: Array) -> Shift:
         """Products with the base as the records of all channels make it likely, for noise of these levels.
 
-        `levels` are variances of a sample in time, of the outputs and then of the base, (c + d,).
+        `levels` are variances of a sample in time, of the outputs and then of the base, (runs, c + d).
         """
         size = self.size
         normal, gradient, chi2 = np.zeros((size, size)), np.zeros(size), 0.0
@@ -168,15 +173,18 @@ class Chunk:
         free = self.shown @ (self.g * self.pushed_by_ends) + p.traces[run.number] @ self.trace_spectra
         self.error = run.outputs - np.einsum("cdl,dl->cl", self.H, run.base) - free
 
+    def deviations(self, levels: Array) -> tuple[Array, Array]:
+        """Inverse deviations of the outputs' own noise at a line, (c,), and deviations of the base's, (d,)."""
+        own, c = levels[self.run.number] * self.run.density, self.model.channels
+        return 1 / np.sqrt(own[:c]), np.sqrt(own[c:])
+
     def whitened(self, levels: Array) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
         """Errors of unit variance (c, L), W (c, d, L) with ``S^-1 = D (I - W W') D``, and the likeliest base (d, L).
 
         D are the inverse roots of the outputs' own variances. A column of the errors is ``F D e`` with ``F F' = I - W
         W'`` nowhere formed: what is given is ``D e`` and what products with S^-1 need.
         """
-        c = self.model.channels
-        scale = 1 / np.sqrt(levels[:c] * self.run.density)
-        root = np.sqrt(levels[c:] * self.run.density)
+        scale, root = self.deviations(levels)
         B = scale[:, None, None] * self.H * root[:, None]  # (c, d, L)
         d = B.shape[1]
         BB = np.einsum("cil,cjl->lij", B.conj(), B) + np.eye(d)
@@ -209,7 +217,10 @@ class Chunk:
         ]
         if self.at_ends is not None:
             parts.append((g[:, None] * self.transients).reshape(-1, base.shape[1]))
-        return np.concatenate([*parts, self.trace_spectra])
+        parts.append(self.trace_spectra)
+        if self.model.gains:
+            parts.append((freq / self.model.test.freq[-1]) ** 2 * base)
+        return np.concatenate(parts)
 
     def coefficients(self, channel: int) -> scipy.sparse.csr_array:
         """How the columns of a channel's Jacobian are made of the spectra, (p, spectra)."""
@@ -244,7 +255,14 @@ class Chunk:
             last = last + 2 * m
         own = model.kept + model.n_ends + (self.run.number * model.channels + channel) * TRACES
         put(own + np.arange(TRACES), last + np.arange(TRACES), np.ones(TRACES))
-        shape = (model.size, int(last + TRACES))
+        last = last + TRACES
+        if model.gains:
+            beside = np.arange(d)
+            if channel < n:
+                put(np.full(d, model.n_fit + channel), first[3] + beside, model.test.rigid_body[channel])
+                put(model.n_fit + n + channel * d + beside, last + beside, np.ones(d))
+            last = last + d
+        shape = (model.size, int(last))
         data = (np.concatenate(values), (np.concatenate(rows), np.concatenate(cols)))
         return scipy.sparse.csr_array(scipy.sparse.coo_array(data, shape=shape))
 
@@ -252,7 +270,7 @@ class Chunk:
         """Products of the Jacobian of these lines."""
         model, c = self.model, self.model.channels
         error, W, base = self.whitened(levels)
-        scale = 1 / np.sqrt(levels[:c] * self.run.density)
+        scale = self.deviations(levels)[0]
         spectra = self.spectra(base)
         gram = (spectra @ spectra.conj().T).real
         # S^-1 e, in the same units: D (I - W W') D e.

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from sysid.modal_analysis.record_model import Parameters, RecordModel
-from sysid.structure.structure import Array
+from sysid.structure.structure import Array, ComplexArray
 
 _ENOUGH = 8000  # lines, of all runs together: more of them tell a level no better than the fit needs
 _STEPS = 30
@@ -19,16 +19,14 @@ VANISHING = 1e-7  # of a channel's rms: what counts as noise where there is none
 
 
 def floors(model: RecordModel) -> Array:
-    """Least variance of a sample of each output and base direction, (c + d,)."""
-    power = np.zeros(model.channels + model.d)
-    for run in model.runs:
-        both = np.vstack([run.outputs, run.base])
-        power = np.maximum(power, np.mean(np.abs(both) ** 2, axis=1) / run.density)
+    """Least variance of a sample of each run's outputs and base directions, (runs, c + d)."""
+    spectra = (np.vstack([run.outputs, run.base]) / np.sqrt(run.density) for run in model.runs)
+    power = np.array([np.mean(np.abs(both) ** 2, axis=1) for both in spectra])
     return VANISHING**2 * np.where(power > 0, power, power.max())
 
 
 def likeliest_levels(model: RecordModel, p: Parameters, levels: Array, unknowns: int) -> Array:
-    """Variances of a sample in time of each output and base direction, (c + d,), from those to begin with.
+    """Variances of a sample in time of each run's outputs and base directions, (runs, c + d), from first ones.
 
     Parameters
     ----------
@@ -38,7 +36,16 @@ def likeliest_levels(model: RecordModel, p: Parameters, levels: Array, unknowns:
     lines = sum(run.w.size for run in model.runs)
     thin = model.thinned(max(1, -(-lines // _ENOUGH)))
     least = floors(model)
-    parts = [(chunk.error, chunk.H, chunk.run.density) for chunk in thin.chunks(p)]
+    chunks = list(thin.chunks(p))
+    found = np.array([
+        _of_run([(part.error, part.H, part.run.density) for part in chunks if part.run.number == run], own, floor)
+        for run, (own, floor) in enumerate(zip(levels, least, strict=True))
+    ])  # fmt: skip
+    return found * model.numbers / max(model.numbers - unknowns, model.numbers / 4)
+
+
+def _of_run(parts: list[tuple[ComplexArray, ComplexArray, float]], levels: Array, least: Array) -> Array:
+    """Variances of one run, (c + d,)."""
     log = np.log(np.maximum(levels, least))
     value, score, fisher = _likelihood(parts, log)
     for _ in range(_STEPS):
@@ -56,10 +63,10 @@ def likeliest_levels(model: RecordModel, p: Parameters, levels: Array, unknowns:
             log, (value, score, fisher) = trial, new
         if moved < _SETTLED:
             break
-    return np.exp(log) * model.numbers / max(model.numbers - unknowns, model.numbers / 4)
+    return np.asarray(np.exp(log))
 
 
-def _likelihood(parts: list[tuple[Array, Array, float]], log: Array) -> tuple[float, Array, Array]:
+def _likelihood(parts: list[tuple[ComplexArray, ComplexArray, float]], log: Array) -> tuple[float, Array, Array]:
     """Log-likelihood, and its score and Fisher information by the logarithms of the variances."""
     value, score, fisher = 0.0, np.zeros(log.size), np.zeros((log.size, log.size))
     v = np.exp(log)

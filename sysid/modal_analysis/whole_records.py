@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import ModalEstimate
 from sysid.modal_analysis.record_fit import Monitor, RecordFit, record_modes, refitted, without, worth
+from sysid.modal_analysis.record_gains import gain_errors_of
 from sysid.modal_analysis.record_poles import rough_deviations
 from sysid.modal_analysis.record_spread import scatter
 from sysid.modal_analysis.vector_fitting import find_poles
@@ -59,7 +60,8 @@ def deviations(fit: RecordFit) -> tuple[Array, Array | None]:
     parts: list[list[Array]] = [[] for _ in range(test.n_runs)]
     c = model.channels
     for chunk in model.chunks(fit.parameters):
-        power = fit.levels[:c, None] + np.einsum("cdl,d->cl", np.abs(chunk.H) ** 2, fit.levels[c:])
+        own = fit.levels[chunk.run.number]
+        power = own[:c, None] + np.einsum("cdl,d->cl", np.abs(chunk.H) ** 2, own[c:])
         parts[chunk.run.number].append(np.sqrt(chunk.run.density * power))
     std = _at_lines(test, parts)
     for run, own in zip(std, test.own_lines, strict=True):  # where a run has no line its weight is of no meaning
@@ -117,6 +119,6 @@ def estimate(fit: RecordFit) -> ModalEstimate:
     ])  # fmt: skip
     return ModalEstimate(
         modes.phi[:, order], modes.gamma[order], modes.omega[order], modes.ratios[order], p.rigid,
-        A[np.ix_(at, at)], fit.noise, fit.reduced, fit.model.whole.density,
+        A[np.ix_(at, at)], fit.noise, fit.reduced, fit.model.whole.density, gain_errors_of(fit),
         None if B is None else B[np.ix_(at, at)],
     )  # fmt: skip

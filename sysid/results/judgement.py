@@ -10,6 +10,7 @@ import numpy as np
 
 from sysid.assessment.checks import doubts
 from sysid.assessment.determination import determine
+from sysid.assessment.gains import assumed
 from sysid.assessment.sensitivity import blocks_of
 from sysid.assessment.uncertainty import LARGE
 from sysid.measurement.missing import in_words
@@ -57,7 +58,7 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
         determined=not open_,
         closed_by=() if open_ else closed_by,
         undetermined=open_,
-        remarks=(why, *end.remarks, *_remarks(problem, end)),
+        remarks=(why, *end.remarks, *_remarks(problem, end), *(() if open_ else assumed(problem))),
         interrupted=isinstance(end.stopped, KeyboardInterrupt),
     )
     try:

@@ -10,6 +10,7 @@ import pytest
 
 import sysid
 from sysid import FullMass, Identification, InputError, Problem, Swarm, identify
+from sysid.search.strategy import DoesNotApplyError
 
 QUICK = Swarm(max_iterations=8, n_particles=20)
 SWARM_ONLY = Swarm(max_iterations=8, n_particles=20, local=None)
@@ -154,6 +155,16 @@ class TestAuto:
         assert result.strategy == "swarm"
         assert f"{given[2]:.5g} Hz does not stand out" in result.remarks[0]
         assert "of the stated natural frequencies" in result.remarks[0]
+
+    def test_where_none_applies_one_error_tells_of_each(self, problem, monkeypatch):
+        def run(strategy, *_):
+            raise DoesNotApplyError(f"{strategy.name} is refused")
+
+        for kind in (sysid.Modal, sysid.Continuation, Swarm):
+            monkeypatch.setattr(kind, "run", run)
+        with pytest.raises(InputError, match="modal is refused; nor does the swarm: swarm is refused") as caught:
+            identify(problem, rng=0)
+        assert not isinstance(caught.value, DoesNotApplyError)
 
     @pytest.mark.parametrize("asked", ["modal", "swarm", sysid.Modal(), QUICK])
     def test_what_was_asked_is_said_to_be_so(self, problem, asked):

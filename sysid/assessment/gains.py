@@ -1,0 +1,216 @@
+r"""Errors of single sensors' gains, as the constant term of the transmissibility shows them.
+
+A sensor that reads ``1 + eps`` times its motion records ``(1 + eps) (G u + a)``. Its mode shapes take the factor, and
+its masses with them; ``eps G u`` is left beside all modes. Modes above the lines leave a part ``w² E u`` that grows
+with frequency, so that a constant is told apart. Modes below them answer by a constant too, and where one is fitted,
+nothing is told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtr
+
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.residues import Records, ResidueFit
+from sysid.modal_analysis.response import gain_slopes
+from sysid.problem.problem import Problem
+from sysid.structure.structure import Array, Structure
+
+_CHANCE = 1e-3  # that any sensor of a right test is accused
+_SUSPECT = 1.8  # deviations of the noise, beyond which an error of a gain counts among what is not known
+_LEAST = 2e-3  # of a gain; smaller errors are usual
+_MIMICKED = 1e-2  # of a constant; less of it is left where a mode far below the lines answers like one
+_EXACT = 1e-8  # of the records: what counts as noise where there is none
+_BESIDE = 0.1  # of the largest error: what it leaves of itself on other sensors, as poles follow it
+_ALIKE = 3.0  # standard deviations by which errors of gains may differ and still be the base's one
+_TOLD = 3  # sensors
+_SAME_POLE = 1e-6  # relative distance of poles that count as one
+_DEPENDENT = 1e-10  # of the largest eigenvalue: changes of poles that do not show
+_BLOCKS = (8, 16, 32, 64)  # of lines, within which they may share their error
+_LINES = 2  # times the free residues: fewer numbers than these tell nothing beside noise
+
+Estimate = tuple[Array, Array, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class GainErrors:
+    """Relative errors of the sensors' gains, and what chance makes of them.
+
+    Attributes
+    ----------
+    error, std : (n_sensors,)
+        Of the gain, as a fraction, and its standard deviation; NaN where the records cannot show it: the sensor's
+        row of G is zero, or modes answer like a constant.
+    possible : (n_sensors,)
+        Error that the gain may well have, though it may be chance; zero where nothing speaks for one.
+    freedom : int
+        Degrees of freedom of the standard deviations.
+    """
+
+    error: Array
+    std: Array
+    possible: Array
+    freedom: int
+
+    @property
+    def wrong(self) -> NDArray[np.intp]:
+        """Sensors whose gain is wrong beyond chance and by more than is usual, the worst first."""
+        shown = np.isfinite(self.error)
+        off = np.where(shown, np.abs(self.error) / np.where(shown, self.std, 1.0), 0.0)
+        chance = 2 * stdtr(self.freedom, -off) * np.count_nonzero(shown)
+        size = np.abs(np.nan_to_num(self.error))
+        found = np.flatnonzero((chance < _CHANCE) & (size > max(_LEAST, _BESIDE * size.max())))
+        return found[np.argsort(-off[found])]
+
+    @property
+    def of_base(self) -> float | None:
+        """The one error that explains those of all sensors, where three or more show one: then it is the base's."""
+        shown = np.isfinite(self.error)
+        if np.count_nonzero(shown) < _TOLD or not self.wrong.size:
+            return None
+        error, std = self.error[shown], self.std[shown]
+        one = float(np.average(error, weights=std**-2))
+        return one if np.all(np.abs(error - one) < _ALIKE * std) else None
+
+
+def gain_errors(test: Measurement, structure: Structure) -> GainErrors:
+    """What the constant terms of a test say of its sensors' gains, at the poles of the structure that was fitted to it.
+
+    Each is estimated twice, beside the modes alone and beside a part that grows as w² too. The first is the more
+    exact, but right only where no mode lies above the lines: by how much the two differ counts among its errors. The
+    one that is then known better is taken. A record's own misfit is its noise, line by line, and lines that share it
+    are counted as such; noise that is stated larger counts as stated.
+    """
+    records, poles, velocity = Records(test), distinct_poles(structure), not structure.modal_damping
+    if test.modal is not None:
+        gain = test.modal.gain
+        error = np.where(np.any(test.rigid_body, axis=1), gain.error, np.nan)
+        return GainErrors(error, gain.std, np.zeros(test.n_sensors), gain.freedom)
+    count = poles[0].size * test.n_base * (2 if velocity else 1)
+    if records.data.shape[0] <= _LINES * (count + 2 * test.n_base):
+        unknown = np.full(test.n_sensors, np.nan)
+        return GainErrors(unknown, unknown, np.zeros(test.n_sensors), 1)
+    free = records.fit(*poles, velocity=velocity)
+    rise = (test.freq / test.freq[-1]) ** 2
+    ones, rising = (records.basis(part[None] + 0j) for part in (np.ones_like(rise), rise))
+    slopes = records.basis(gain_slopes(test.freq, *poles)[: 0 if velocity else None])
+    plain, plain_std, least = _estimate(test, records, free, free.Q, ones, slopes)
+    both = np.linalg.qr(np.hstack([free.Q, rising]))[0]
+    error, std, least_beside = _estimate(test, records, free, both, ones, slopes)
+    pairs = ((np.abs(plain), least), (np.abs(error), least_beside))
+    possible = np.max([np.where(size > _SUSPECT * noise, size, 0.0) for size, noise in pairs], axis=0)
+    plain_std = np.hypot(plain_std, plain - error)
+    better = plain_std < std
+    error, std = np.where(better, plain, error), np.where(better, plain_std, std)
+    freedom = (len(records.data) - free.Q.shape[1] - rising.shape[1]) * (records.data.shape[1] // test.n_sensors)
+    return GainErrors(error, std, possible, freedom)
+
+
+def distinct_poles(structure: Structure) -> tuple[Array, Array]:
+    """Distinct poles, rad/s and ratios."""
+    omega = 2 * np.pi * structure.natural_frequencies
+    poles = omega * (1 + 1j * structure.damping_ratios)
+    first = np.concatenate([[True], np.abs(np.diff(poles)) > _SAME_POLE * omega[1:]])
+    return omega[first], structure.damping_ratios[first]
+
+
+def told(test: Measurement, errors: GainErrors) -> Iterator[str]:
+    """Gains that are wrong, with their deviations and the remedy, in a sentence."""
+    if not errors.wrong.size:
+        return
+    name = lambda i: (  # noqa: E731
+        f"{test.sensor_names[i]} by {100 * errors.error[i]:+.2g} % (standard deviation {100 * errors.std[i]:.1g} %)"
+    )
+    base = errors.of_base
+    alike = "" if base is None else f", or that of the base by {-100 * base:+.2g} %, as all sensors show the same error"
+    yield (
+        f"the gain is wrong of {', '.join(map(name, errors.wrong[:_TOLD]))}{alike}: by so much the constant term of "
+        "the transmissibility differs from the row of rigid_body, and M_SS, K_SS and C are wrong in these rows and "
+        "columns; calibrate the sensor and divide its record by its gain, or correct rigid_body"
+    )
+
+
+def assumed(problem: Problem) -> Iterator[str]:
+    """Gains on which masses rest and that no record can show to be wrong, in sentences."""
+    test, mass = problem.measurement, problem.formulation.mass
+    if mass.entries is not None and np.all(np.isfinite(mass.entries)):
+        return
+    still = [name for name, row in zip(test.sensor_names, test.rigid_body, strict=True) if not np.any(row)]
+    if still:
+        yield (
+            f"the gain of {', '.join(still)} is assumed to be right: the row of rigid_body is zero, so that no record "
+            "shows an error of it, and 1 % makes 2 % in the diagonal of M_SS, K_SS and C there"
+        )
+    if test.force is not None and mass.totals is None:
+        yield "the gain of the base force is assumed to be right: it is the scale of M, K and C, which no record shows"
+
+
+def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, ones: Array, slopes: Array) -> Estimate:
+    """Errors of the gains beside functions Q (rows, columns), their deviations, and these by the noise alone.
+
+    The poles of `slopes` (rows, 2 m inputs) move with them, in a Gauss-Newton step: they were fitted without them.
+    """
+    each, lines = records.data.shape[1] // test.n_sensors, test.freq.size
+    by_sensor = lambda x: np.sum(x, axis=-2).reshape(*x.shape[:-2], each, test.n_sensors).sum(axis=-2)  # noqa: E731
+    rigid, beside = _rigid_motion(test, records), _less(Q, free.left)
+    extra, slopes = _less(Q, ones), _less(Q, slopes)
+    column = extra @ rigid
+    size = by_sensor(column**2)
+    shown = size > _MIMICKED**2 * by_sensor((ones @ rigid) ** 2)
+    column *= np.tile(shown, each)
+    size[~shown] = 1.0
+    moved = np.tile(free.residues, (2, 1, 1))[: slopes.shape[1] // ones.shape[1]]  # (2 m, inputs, channels)
+    by = lambda x: x.reshape(*moved.shape[:2], x.shape[-1])  # noqa: E731
+    across = by_sensor(moved * by(slopes.T @ column))
+    products = (slopes.T @ slopes).reshape(*moved.shape[:2] * 2)
+    together = np.einsum("kic,kilj,ljc->kl", moved, products, moved, optimize=True)
+    inverse = np.linalg.pinv(together, rcond=_DEPENDENT, hermitian=True)
+    pull = np.einsum("kic,kic->k", moved, by(slopes.T @ beside))
+    normal = np.linalg.inv(np.diag(size) - across.T @ inverse @ across)
+    error = normal @ (by_sensor(column * beside) - across.T @ (inverse @ pull))
+    steps = inverse @ (pull - across @ error)
+    along = (steps[:, None, None] * moved).reshape(slopes.shape[1], moved.shape[-1])
+    left = beside - column * np.tile(error, each) - slopes @ along
+    by_line = by_sensor((left * column).reshape(2, -1, lines, left.shape[1]).sum(axis=0)[..., None, :])
+    variance = np.array([_variance(own) for own in np.moveaxis(by_line, -1, 0)]) / size
+    noise = by_sensor(left**2) / max((len(left) - Q.shape[1]) * each - 1, 1)
+    noise = np.maximum(noise, _EXACT**2 * records.size / left.size)
+    if test.response_std is not None and np.any(test.response_std > 0):
+        stated = 0.5  # half of a complex number's variance, in units of what is stated
+        # What a model misses is no noise, and pulls constants along: beyond the stated noise it counts twice.
+        noise, variance = np.maximum(noise, stated), variance * np.maximum(noise / stated, 1.0)
+    std, least = (np.sqrt(part * np.diag(normal)) for part in (np.maximum(variance, noise), noise))
+    return np.where(shown, error, np.nan), np.where(shown, std, np.nan), np.where(shown, least, np.nan)
+
+
+def _less(Q: Array, columns: Array) -> Array:
+    """Columns less their part along orthonormal ones, twice, as the first time leaves round-off of what it takes."""
+    columns = columns - Q @ (Q.T @ columns)
+    return columns - Q @ (Q.T @ columns)
+
+
+def _rigid_motion(test: Measurement, records: Records) -> Array:
+    """The weighted records of sensors that move as G says, by the inputs of `records`, (inputs, channels)."""
+    if records.unit:
+        return test.rigid_body.T.reshape(1, -1) * records.channel
+    return np.linalg.pinv(records.moving) @ test.rigid_body.T * records.channel
+
+
+def _variance(products: Array) -> float:
+    """Variance of the sum of products (runs, n_freq) of which lines in a run may share their error.
+
+    The largest of what single lines and blocks of them show: noise has no blocks, what a model misses has.
+    """
+    runs, lines = products.shape
+    found = [float(np.sum(products**2))]
+    for count in _BLOCKS:
+        blocks = max(count // runs, 1)
+        if lines >= 2 * blocks and blocks * runs > 2:
+            sums = np.add.reduceat(products, np.arange(blocks) * lines // blocks, axis=1)
+            found.append(float(np.sum(sums**2)) * sums.size / (sums.size - 1))
+    return max(found)

@@ -1,0 +1,40 @@
+"""Errors of the sensors' gains that whole records show, beside all that was fitted."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sysid.measurement.whole import Gains
+from sysid.modal_analysis.record_fit import RecordFit
+from sysid.modal_analysis.record_model import RecordModel
+from sysid.structure.structure import Array
+
+_SEEN = 1e-10  # of the largest eigenvalue of the scaled information; less is round-off
+
+
+def gain_errors_of(fit: RecordFit) -> Gains:
+    """A step of all unknowns from the end of a fit, the gains and what modes above the lines make among them.
+
+    Once with that part and once without it: by how much the two differ counts among the errors of the second, and the
+    better known of both is taken.
+    """
+    model = RecordModel(fit.test, fit.parameters.modes.omega.size, gains=True)
+    made = model.normal_equations(fit.parameters, fit.levels)
+    size = np.sqrt(np.maximum(np.diag(made.normal), 1e-300))
+    normal, gradient = made.normal / np.outer(size, size), made.gradient / size
+    n, at = model.n, model.n_fit
+    beyond = max(fit.reduced, 1.0)
+
+    def estimate(count: int) -> tuple[Array, Array]:
+        part = slice(0, count)
+        lam, V = np.linalg.eigh(normal[part, part])
+        seen = lam > _SEEN * lam[-1]
+        half = V[:, seen] / np.sqrt(lam[seen])
+        step = half @ (half.T @ gradient[part])
+        std = np.sqrt(beyond / 2) * np.linalg.norm(half, axis=1)
+        return step[at : at + n] / size[at : at + n], std[at : at + n] / size[at : at + n]
+
+    (plain, plain_std), (error, std) = estimate(at + n), estimate(model.size)
+    plain_std = np.hypot(plain_std, plain - error)
+    better = plain_std < std
+    return Gains(np.where(better, plain, error), np.where(better, plain_std, std), fit.freedom)

@@ -1,0 +1,144 @@
+"""A sensor's gain that is wrong is told with its size, and counts among what is not known; right ones are not told."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import sysid
+from sysid import FullMass, LumpedMass, Measurement, Problem, Structure, simulate
+from sysid.assessment.gains import gain_errors
+
+ERROR = 0.02
+
+
+def lines(truth, count=300):
+    f = truth.natural_frequencies
+    return np.geomspace(0.5 * f[0], 1.3 * f[-1], count)
+
+
+def misread(test, sensor, error=ERROR):
+    """The same test with the record of one sensor read too large."""
+    response = test.response.copy()
+    response[:, sensor] *= 1 + error
+    return dataclasses.replace(test, response=response)
+
+
+def storeys(matrix=False):
+    """Three storeys on a base without mass, 1 to 2 % damping, as ratios or as a matrix that is not modal."""
+    K = 5000.0 * np.array([[2.0, -1, 0, -1], [-1, 2, -1, 0], [0, -1, 1, 0], [-1, 0, 0, 1]])
+    M = np.diag([4.0, 3.0, 5.0, 0.0])
+    if not matrix:
+        return Structure(M, K, [0.01, 0.015, 0.02], n_base=1)
+    return Structure(M, K, n_base=1, damping_matrix=1e-3 * K[:3, :3] + np.diag([0.0, 0.0, 3.0]))
+
+
+def shaken(structure, rng, runs=3):
+    """Noise-free runs of random base motion in all directions at once."""
+    freq = lines(structure)
+    base = rng.normal(size=(2, runs, structure.n_base, freq.size))
+    base = base[0] + 1j * base[1]
+    response = np.einsum("sdf,rdf->rsf", structure.transmissibility(freq), base)
+    return Measurement(freq, base, response, rigid_body=structure.rigid_body)
+
+
+class TestEstimate:
+    @pytest.mark.parametrize("unit", [True, False])
+    @pytest.mark.parametrize("sensor", range(4))
+    def test_is_the_error_that_was_made(self, random_structure, sensor, unit):
+        rng = np.random.default_rng(sensor)
+        truth = random_structure(rng, n=4, d=2)
+        test = simulate(truth, lines(truth)) if unit else shaken(truth, rng)
+        expected = np.where(np.arange(4) == sensor, ERROR, 0.0)
+        found = gain_errors(misread(test, sensor), truth)
+        np.testing.assert_allclose(found.error, expected, atol=1e-9)
+        assert found.wrong.tolist() == [sensor]
+
+    def test_of_a_damping_matrix_too(self):
+        truth = storeys(matrix=True)
+        assert not truth.modal_damping
+        found = gain_errors(misread(simulate(truth, lines(truth)), 1), truth)
+        # Poles are taken from modal ratios, which are not quite those of such a matrix.
+        np.testing.assert_allclose(found.error, [0.0, ERROR, 0.0], atol=5e-4)
+        assert found.wrong.tolist() == [1]
+
+    def test_its_deviation_is_the_scatter_of_draws(self):
+        """The sum of squares of 300 errors over their deviations is chi-squared, within 4 of its deviations."""
+        truth = storeys()
+        rng = np.random.default_rng(0)
+        draws = [gain_errors(simulate(truth, lines(truth), noise=0.01, rng=rng), truth) for _ in range(100)]
+        squares = np.sum([(draw.error / draw.std) ** 2 for draw in draws])
+        # Blocks of lines count where they scatter more than lines, so that deviations are rather too large.
+        assert 0.75 * 300 < squares < 300 + 4 * np.sqrt(2 * 300)
+
+    def test_nothing_shows_where_the_base_does_not_move_the_sensor(self, random_structure):
+        truth = random_structure(np.random.default_rng(0), n=3, d=1)
+        still = dataclasses.replace(simulate(truth, lines(truth)), rigid_body=truth.rigid_body * [[1.0], [0.0], [1.0]])
+        assert np.isnan(gain_errors(still, truth).error).tolist() == [False, True, False]
+
+    @pytest.mark.parametrize("noise", [0.0, 0.003])
+    def test_modes_above_the_lines_are_no_gain(self, noise):
+        """Lines up to two thirds of the way to the third mode, of which the model knows nothing."""
+        truth = storeys()
+        f = truth.natural_frequencies
+        freq = np.linspace(0.3 * f[0], f[1] + 0.5 * (f[2] - f[1]), 300)
+        test = simulate(truth, freq, noise=noise, rng=0)
+        two = sysid.identify(Problem(test, mass=FullMass()), strategy=sysid.Modal(modes=2), rng=0).structure
+        assert two.n == 2
+        assert gain_errors(test, two).wrong.size == 0
+        assert gain_errors(misread(test, 0, 0.1), two).error[0] == pytest.approx(0.1, abs=0.03)
+
+    def test_one_error_of_all_is_the_bases(self):
+        truth = storeys()
+        test = simulate(truth, lines(truth), noise=0.003, rng=0)
+        found = gain_errors(dataclasses.replace(test, response=test.response / (1 + ERROR)), truth)
+        assert found.of_base == pytest.approx(-ERROR, abs=4e-3)
+        assert gain_errors(misread(test, 0), truth).of_base is None
+
+
+@pytest.mark.parametrize("mass", [FullMass(), LumpedMass()], ids=["full", "lumped"])
+@pytest.mark.parametrize("noise", [0.0, 0.003])
+class TestAnswer:
+    @pytest.fixture
+    def answer(self, mass, noise):
+        truth = storeys()
+        test = simulate(truth, lines(truth), noise=noise, force=True, rng=0)
+        return truth, sysid.identify(Problem(misread(test, 1), mass=mass), rng=0)
+
+    def test_tells_sensor_gain_and_remedy(self, answer):
+        _, result = answer
+        (told,) = [sentence for sentence in result.undetermined if "gain" in sentence]
+        assert "sensor 2 by +" in told and "standard deviation" in told and "calibrate" in told
+        assert float(told.split("sensor 2 by +")[1].split(" %")[0]) == pytest.approx(100 * ERROR, abs=0.4)
+        assert not result.determined and told in result.message
+
+    def test_its_intervals_hold_the_mass_all_the_same(self, answer, noise):
+        truth, result = answer
+        off = np.diag(result.structure.mass)[:3] - np.diag(truth.mass)[:3]
+        std = np.diag(result.uncertainty.mass)
+        assert np.all(np.abs(off) < 3 * std)
+        if not noise:  # where the move is all of the deviation
+            np.testing.assert_allclose(np.abs(off[1]) / std[1], 1.0, atol=0.15)
+
+
+class TestAssumptions:
+    @pytest.fixture
+    def across(self):
+        """Two masses on a base that moves along x alone; the second, coupled to the first, moves along y only."""
+        M = np.array([[4.0, 1.0, 0.0], [1.0, 3.0, 0.0], [0.0, 0.0, 0.0]])
+        K = np.array([[5e3, 1e3, -5e3], [1e3, 9e3, -1e3], [-5e3, -1e3, 5e3]])
+        return Structure(M, K, [0.01, 0.02], n_base=1)
+
+    def test_a_gain_that_nothing_shows_is_named_where_masses_rest_on_it(self, across):
+        assert across.rigid_body[:, 0] == pytest.approx([1.0, 0.0], abs=1e-12)
+        test = dataclasses.replace(simulate(across, lines(across), force=True), rigid_body=[[1.0], [0.0]])
+        result = sysid.identify(Problem(test, mass=FullMass()), rng=0)
+        assert result.determined
+        assert [remark.split(" is assumed")[0] for remark in result.remarks if "assumed" in remark] == [
+            "the gain of sensor 2", "the gain of the base force",
+        ]  # fmt: skip
+
+    def test_none_where_all_masses_are_stated(self, across):
+        test = dataclasses.replace(simulate(across, lines(across), force=True), rigid_body=[[1.0], [0.0]])
+        result = sysid.identify(Problem(test, mass=sysid.KnownMass(across.mass)), rng=0)
+        assert not any("assumed" in remark for remark in result.remarks)
