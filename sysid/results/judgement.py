@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from sysid.assessment.checks import doubts
-from sysid.assessment.determination import determine
+from sysid.assessment.determination import BY_RANK, determine
 from sysid.assessment.gains import assumed
 from sysid.assessment.sensitivity import blocks_of
 from sysid.assessment.uncertainty import LARGE
@@ -20,6 +20,7 @@ from sysid.results.answer import NOT_JUDGED
 from sysid.results.identification import Identification
 from sysid.results.unknowns_table import ON_BOUND
 from sysid.search.deadline import TimeIsOver, within
+from sysid.search.other_answers import with_other_answers
 from sysid.search.session import Session
 from sysid.search.strategy import HUBER, Outcome
 
@@ -42,6 +43,11 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
             known = determine(records, end.structure, end.x, end.alternatives)
             doubtful = doubts(records, end.structure, end.x) if judged else ()
             open_, closed_by = (*doubtful, *known.undetermined), known.closed_by
+        if success and known.judged_by == BY_RANK and not open_:
+            end, unknown = with_other_answers(problem, end, session)
+            with within(session.left):
+                others = determine(records, end.structure, end.x, end.alternatives).undetermined
+            open_ = (*unknown, *others)
     except TimeIsOver:
         open_ = (NOT_JUDGED,)
     if not success:

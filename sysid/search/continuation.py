@@ -282,17 +282,23 @@ def _objective_at(problem: Problem, x: Array) -> float:
 
 def _alternatives(problem: Problem, x: Array, objective: float, ends: list[tuple[float, LocalResult]]) -> list[Array]:
     """Other ends that explain the data as well."""
+    most = as_good_as(problem, objective)
+    found: list[Array] = []
+    for other, answer in ends:
+        good = np.isfinite(other) and other <= most
+        if good and all(apart(problem, answer.x, known) > _APART for known in (x, *found)):
+            found.append(answer.x)
+    return found
+
+
+def as_good_as(problem: Problem, objective: float) -> float:
+    """The most that another answer leaves where it explains the data as well as one that leaves `objective`."""
     from scipy.stats import chi2
 
     tests = [term.test for term in problem.formulation.tests]
     numbers = 2 * sum(test.response.size + (0 if test.force is None else test.force.size) for test in tests)
-    as_good = objective * np.sqrt(1 + chi2.isf(_CHANCE, x.size) / max(numbers - x.size, 1))
-    found: list[Array] = []
-    for other, answer in ends:
-        good = np.isfinite(other) and other <= max(as_good, EXACT)
-        if good and all(apart(problem, answer.x, known) > _APART for known in (x, *found)):
-            found.append(answer.x)
-    return found
+    size = problem.n_variables
+    return max(objective * float(np.sqrt(1 + chi2.isf(_CHANCE, size) / max(numbers - size, 1))), EXACT)
 
 
 def apart(problem: Problem, x: Array, other: Array) -> float:

@@ -1,0 +1,182 @@
+"""Other answers, far from the one found, that explain the records as well: told where there are, and only there.
+
+In a chain of two known masses whose roof alone is measured, the stretches k1 and k2 (springs and dampers alike) do what
+k2 (m1 + m2) / m2 and k1 m2 / (m1 + m2) do: their product is the same, and so is (m1 + m2) k2 + m2 k1.
+"""
+
+import os
+import signal
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import sysid
+from sysid.search import other_answers
+from sysid.search.batch_least_squares import LeastSquares
+from sysid.search.same_response import SameResponse
+
+STRETCH = np.array([[1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]])
+MASS, SPRINGS, DAMPERS = np.array([5.0, 4.0]), np.array([2e4, 1.5e4]), np.array([9.0, 6.0])
+EXCHANGE = MASS.sum() / MASS[1]
+SEEDS_MISSED_BEFORE = (2, 4)  # continuation alone comes to one answer only
+TOLD = "another structure explains the data as well"
+
+
+def problem(floors=(1,), *, noise=0.01, rng=0, lower=1e3, ratios=False):
+    """The chain with sensors on some floors."""
+    K, C = (STRETCH.T @ np.diag(values) @ STRETCH for values in (SPRINGS, DAMPERS))
+    recovery = np.eye(2)[list(floors)]
+    truth = sysid.Structure(
+        np.diag([*MASS, 0.0]), K, [0.01, 0.02] if ratios else None, n_base=1, recovery=recovery,
+        rigid_body=np.ones((len(floors), 1)), damping_matrix=None if ratios else C[:2, :2],
+    )  # fmt: skip
+    test = sysid.simulate(truth, np.linspace(2.0, 20.0, 200), noise=noise, rng=rng)
+    k = sysid.Variable("spring", 2, lower=lower, upper=1e6, log=True, unit="N/m")
+    c = sysid.Variable("damper", 2, lower=0.1, upper=500.0, log=True, unit="N s/m")
+    zeta = sysid.Variable("ratio", 2, lower=1e-3, upper=0.2, log=True)
+    return sysid.Problem(
+        test, mass=np.diag([*MASS, 0.0]), stiffness=STRETCH.T @ ca.diag(k) @ STRETCH,
+        damping=zeta if ratios else STRETCH.T @ ca.diag(c) @ STRETCH, recovery=recovery,
+    )  # fmt: skip
+
+
+def exchanged(x):
+    """The other answer's unknowns: springs, then dampers."""
+    k, c = x[:2], x[2:]
+    return np.array([k[1] * EXCHANGE, k[0] / EXCHANGE, c[1] * EXCHANGE, c[0] / EXCHANGE])
+
+
+X = np.concatenate([SPRINGS, DAMPERS])
+
+
+def test_the_exchange_gives_the_same_transmissibility():
+    posed = problem()
+    freq = np.linspace(0.5, 40.0, 300)
+    one, other = (posed.structure(x).transmissibility(freq) for x in (X, exchanged(X)))
+    np.testing.assert_allclose(one, other, rtol=1e-10)
+
+
+def test_differences_at_complex_frequencies_vanish_there_and_nowhere_about():
+    same = SameResponse(problem(), X)
+    at, off = same(np.array([exchanged(X), 1.01 * X]))
+    assert np.abs(at).max() < 1e-12
+    assert np.abs(off).max() > 1e-4
+
+
+def test_responses_are_those_of_direct_solves_also_with_ratios():
+    """Against modes, by hand: sum of phi gamma s² / (s² + 2 zeta w s + w²), less its sign."""
+    posed = problem(ratios=True)
+    x, moved = np.array([*SPRINGS, 0.01, 0.02]), np.array([2.2e4, 1.4e4, 0.013, 0.017])
+    same = SameResponse(posed, x)
+    (term,) = same.terms
+    records = []
+    for at in (x, moved):
+        it = posed.structure(at)
+        w, s = 2 * np.pi * it.natural_frequencies, term.s[:, None]
+        gamma = it.normal_modes.T @ it.mass[:2, :2] @ np.ones(2)
+        modes = -(s**2) / (s**2 + 2 * it.damping_ratios * w * s + w**2)
+        records.append(modes @ (it.recovery @ it.normal_modes * gamma)[0])
+    expected = (records[1] - records[0]) / np.linalg.norm(records[0])
+    (made,) = same(moved[None])
+    direction = term.inputs.item()
+    np.testing.assert_allclose(made[: expected.size] + 1j * made[expected.size :], direction * expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", SEEDS_MISSED_BEFORE)
+def test_a_second_answer_is_told_with_its_values(seed):
+    result = sysid.identify(problem(rng=seed), rng=seed)
+    assert result.success
+    assert not result.determined
+    (told,) = result.undetermined
+    other = exchanged(result.x)
+    assert told.startswith(f"{TOLD}: spring[0] = ")
+    values = [float(part.split(" in place")[0].split("= ")[1]) for part in told.split(", ")]
+    np.testing.assert_allclose(values, other, rtol=2e-3)
+
+
+def test_nobody_accuses_unique_answers():
+    """Both floors; the roof alone with bounds that leave the other answer out: k2 of the other is 8889 N/m."""
+    start = np.array([2.1e4, 1.45e4, 8.0, 7.0])
+    for posed in (problem((0, 1), rng=2), problem(rng=2, lower=1e4)):
+        result = sysid.identify(posed, rng=2, start=start)
+        assert result.determined, result.undetermined
+        assert not any("looked for" in told for told in result.remarks)
+
+
+def test_no_time_is_lost_where_the_equations_are_linear(monkeypatch):
+    assert other_answers.is_unique_if_rank_is_full(problem((0, 1)))
+    assert other_answers.is_unique_if_rank_is_full(problem((0, 1), ratios=True))
+    assert not other_answers.is_unique_if_rank_is_full(problem((1,)))
+    monkeypatch.setattr(other_answers, "SameResponse", None)
+    assert sysid.identify(problem((0, 1)), rng=0).determined
+
+
+def test_the_same_seed_finds_the_same_bits():
+    one, two = (sysid.identify(problem(rng=2), rng=2, start=X) for _ in range(2))
+    assert one.undetermined == two.undetermined
+    np.testing.assert_array_equal(one.x, two.x)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_ctrl_c_during_the_look_keeps_the_answer_and_says_so(ctrl_c):
+    def interrupt(progress):
+        if progress.phase == "other answers":
+            os.kill(os.getpid(), signal.SIGINT)
+
+    result = sysid.identify(problem(rng=2), rng=2, callback=interrupt)
+    assert result.interrupted
+    assert result.success
+    assert not result.determined
+    np.testing.assert_allclose(result.values["spring"], SPRINGS, rtol=0.01)
+    assert result.undetermined == (other_answers.NOT_LOOKED_FOR.format("interrupted"),)
+
+
+def test_a_callback_may_stop_it():
+    def stop(progress):
+        if progress.phase == "other answers":
+            raise StopIteration
+
+    result = sysid.identify(problem(rng=2), rng=2, callback=stop)
+    assert not result.determined
+    assert result.undetermined == (other_answers.NOT_LOOKED_FOR.format("the callback stopped the search"),)
+
+
+def test_the_time_limit_ends_it(monkeypatch):
+    from sysid.search.session import Session
+
+    inner = other_answers.with_other_answers
+
+    def late(posed, end, session):
+        monkeypatch.setattr(Session, "is_over", True)
+        return inner(posed, end, session)
+
+    monkeypatch.setattr("sysid.results.judgement.with_other_answers", late)
+    result = sysid.identify(problem(rng=2), rng=2)
+    assert result.undetermined == (other_answers.NOT_LOOKED_FOR.format("the time was over"),)
+
+
+def test_too_many_unknowns_are_a_remark(monkeypatch):
+    monkeypatch.setattr(other_answers, "_FEWEST_STARTS", 65)
+    result = sysid.identify(problem(rng=2), rng=2)
+    assert any("no other structure that explains the data as well was looked for" in told for told in result.remarks)
+
+
+def test_least_squares_from_many_starts_finds_every_root_and_keeps_to_the_box():
+    """(10 u - 2)(10 u - 7) = 0 has two roots; v = 1.3 lies outside, where the nearest is v = 1."""
+
+    def rows(points):
+        u, v = 10 * points.T
+        return np.stack([(u - 2) * (u - 7), v - 13], axis=1)
+
+    points = np.random.default_rng(0).random((40, 2))
+    search = LeastSquares(rows, points.copy())
+    begun = search.left.copy()
+    for _ in range(60):
+        search.step()
+    assert np.all(search.left <= begun)
+    u, v = search.points.T
+    np.testing.assert_allclose(v, 1.0)
+    nearest = np.where(np.abs(u - 0.2) < np.abs(u - 0.7), 0.2, 0.7)
+    np.testing.assert_allclose(u, nearest, atol=1e-6)
+    assert {0.2, 0.7} == set(nearest)
