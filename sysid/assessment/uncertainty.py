@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from sysid.assessment.information import Index, information, spectra_of, spread
 from sysid.assessment.modal_mass_cone import open_modes
-from sysid.assessment.parametrisation import held_by_entries, parametrisation
+from sysid.assessment.parametrisation import parametrisation
 from sysid.assessment.perturbations import DirectSpectra, ModalSpectra, Perturbations, matrices_of_modes, std_of
 from sysid.assessment.sensitivity import (
     Sensitivity,
@@ -27,6 +27,7 @@ from sysid.assessment.sensitivity import (
     sensitivity,
     with_totals,
 )  # fmt: skip
+from sysid.assessment.statements import conditioned
 from sysid.errors import InputError
 from sysid.modal_analysis.misfit import inflation_of, records_of
 from sysid.modal_analysis.modal_fit import Modes
@@ -198,19 +199,10 @@ def uncertainty(problem: Problem, structure: Structure, x: Array | None) -> Unce
 
 def _by_modes(problem: Problem, structure: Structure, x: Array | None) -> Uncertainty:
     """Standard deviations where the modal parameters are free, from their Fisher information."""
-    test, modes = problem.measurement, modes_of(structure)
-    index = Index(structure.n_sensors, structure.n, structure.n_base)
-    path = parametrisation(problem, structure, modes, index)
-    unknowns = path.unit.size - path.gauge.shape[1]
-    records, spectra = records_of(test, structure, unknowns), spectra_of(test, modes)
-    A = information(modes, index, [record.grams(spectra) for record in records])
-    B = None
-    if not all(record.shared for record in records):
-        B = information(modes, index, [record.sandwich_grams(spectra) for record in records])
-    steps = spread(A, B, path)
-    normals, unseen = (held_by_entries(problem, structure, modes, index, path, part) for part in steps)
-    inflation = inflation_of(test, records, unknowns)
-    moves = Perturbations(normals.shape[1], *index.split(np.hstack([inflation * normals, unseen])))
+    test, (modes, index, inflation, normals, unseen) = problem.measurement, moves_by_records(problem, structure)
+    normals, unseen = conditioned(problem, structure, modes, index, normals, unseen)
+    normals = normals if np.isfinite(inflation) else np.full_like(normals, np.nan)
+    moves = Perturbations(normals.shape[1], *index.split(np.hstack([normals, unseen])))
     matrices = matrices_of_modes(structure, modes, moves)
     if test.force is None and open_modes(problem, structure):
         open_ = np.full((structure.n, structure.n), np.nan)
@@ -222,6 +214,22 @@ def _by_modes(problem: Problem, structure: Structure, x: Array | None) -> Uncert
     known = of_outside(problem.formulation, x)
     std = std_of(known.steps, known.rank, known.unit)
     return replace(found, values=by_name(variables, at), variables=by_name(variables, std))
+
+
+def moves_by_records(problem: Problem, structure: Structure) -> tuple[Modes, Index, float, Array, Array]:
+    """Modes, index, inflation, and moves of theta that the records leave: of a standard normal each, and unseen."""
+    test, modes = problem.measurement, modes_of(structure)
+    index = Index(structure.n_sensors, structure.n, structure.n_base)
+    path = parametrisation(problem, structure, modes, index)
+    unknowns = path.unit.size - path.gauge.shape[1]
+    records, spectra = records_of(test, structure, unknowns), spectra_of(test, modes)
+    A = information(modes, index, [record.grams(spectra) for record in records])
+    B = None
+    if not all(record.shared for record in records):
+        B = information(modes, index, [record.sandwich_grams(spectra) for record in records])
+    normals, unseen = spread(A, B, path)
+    inflation = inflation_of(test, records, unknowns)
+    return modes, index, inflation, (1.0 if np.isnan(inflation) else inflation) * normals, unseen
 
 
 def _by_unknowns(problem: Problem, structure: Structure, x: Array) -> Uncertainty:
