@@ -1,0 +1,1 @@
+"""Records in time of base-shake tests, as a laboratory makes them."""
