@@ -112,8 +112,25 @@ def _contradictions(
         explained.sort(key=lambda one: -one[0])
         near = [words for off, words in explained if off**2 > explained[0][0] ** 2 - _ALIKE**2]
         yield f"{told}: {'; or '.join(near[:_TOLD])}"
-    else:
-        yield f"{told}; no single one of them explains it"
+        return
+    factor = _common_factor(problem, stated, theta, index, normals)
+    if factor > 0:
+        scaled = stated._replace(values=factor * stated.values, std=factor * stated.std)
+        if _chance(adjust(problem, scaled, theta, index, normals), numbers) >= _CHANCE:
+            yield f"{told}; all of them would be met {factor:.4g} times as large: is a unit or the force's gain wrong?"
+            return
+    yield f"{told}; no single one of them explains it"
+
+
+def _common_factor(problem: Problem, stated: Statements, theta: Array, index: Index, normals: Array) -> float:
+    """By what all statements would be wrong in common, by what a base force weighs; zero where none was measured."""
+    if problem.measurement.force is None:
+        return 0.0
+    values, slopes = made(problem, stated, theta, index)
+    noise = slopes @ normals
+    weight = np.linalg.pinv(noise @ noise.T, hermitian=True)
+    given = stated.values / stated.scale
+    return float(given @ weight @ values / (given @ weight @ given))
 
 
 def _in_words(problem: Problem, stated: Statements, row: int, value: float, off: float) -> str:

@@ -103,6 +103,15 @@ def test_a_wrong_entry_is_named_with_its_factor():
     assert factor == pytest.approx(25 / 35, rel=0.01)
 
 
+def test_masses_in_another_unit_are_told_with_their_common_factor():
+    test = simulate(TRUTH, FREQ, noise=0.01, rng=3, force=True)
+    pounds = M_SS / 0.45359237
+    result = identify(Problem(test, mass=FullMass(known=pounds, known_std=0.2)), strategy="modal")
+    (told,) = (sentence for sentence in result.undetermined if "cannot all be met" in sentence)
+    factor = float(told.split(" times as large")[0].rsplit(" ", 1)[1])
+    assert factor == pytest.approx(0.45359237, rel=0.01)
+
+
 def test_a_wrong_total_is_told_against_the_force():
     test = simulate(TRUTH, FREQ, noise=0.01, rng=3, force=True)
     total = TRUTH.rigid_body_mass[0, 0]
