@@ -35,8 +35,8 @@ if hasattr(_casadi.GlobalOptions, "setNumpyMode"):
 
 __all__ = [
     "ChainStiffness", "Continuation", "FullMass", "FurtherTest", "History", "Identification", "InputError",
-    "KnownMass", "LumpedMass", "MassBlocks", "MatrixModel", "Measurement", "Modal", "ModalDamping", "NoiseLevels", "Prior", "Problem",
-    "Progress", "ProportionalDamping", "Recipe", "Sensor", "SolverError", "SpectralStiffness", "Stated",
-    "StiffnessBlocks", "Structure", "Swarm", "SwarmSettings", "SysidError", "Totals", "Unknown", "Variable",
+    "KnownMass", "LumpedMass", "MassBlocks", "MatrixModel", "Measurement", "Modal", "ModalDamping", "NoiseLevels",
+    "Prior", "Problem", "Progress", "ProportionalDamping", "Recipe", "Sensor", "SolverError", "SpectralStiffness",
+    "Stated", "StiffnessBlocks", "Structure", "Swarm", "SwarmSettings", "SysidError", "Totals", "Unknown", "Variable",
     "__version__", "identify", "jobs", "load", "minimize_swarm", "plot", "resample", "rigid_body", "simulate",
 ]  # fmt: skip

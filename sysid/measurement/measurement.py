@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError, choice, finite_array, number, refuse, sequence
 from sysid.measurement import spectra
+from sysid.measurement.cuts import check_cuts
 from sysid.measurement.missing import Missing, complete, named, present
 from sysid.measurement.whole import ModalEstimate, NoiseLevels, WholeRecords, per_run
 from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
@@ -446,7 +447,9 @@ class Measurement:
             whole = None
             if estimator == "records":
                 samples = tuple(run.base.shape[1] for run in records)
-                whole = WholeRecords(samples, float(sample_rate), per_run("at_rest", at_rest, len(records)), noise)
+                rest = per_run("at_rest", at_rest, len(records))
+                check_cuts(records, rest, G)
+                whole = WholeRecords(samples, float(sample_rate), rest, noise)
             test = cls(freq, base, response, force=force, whole=whole, **given)
         else:
             estimate = spectra.averaged(records, sample_rate, kind=estimator, segment=segment)
