@@ -13,6 +13,7 @@ from sysid.errors import InputError, choice, finite_array, number, refuse, seque
 from sysid.measurement import spectra
 from sysid.measurement.cuts import check_cuts
 from sysid.measurement.missing import Missing, complete, named, present
+from sysid.measurement.noise import levels_at_rest
 from sysid.measurement.whole import ModalEstimate, NoiseLevels, WholeRecords, per_run
 from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
 from sysid.structure.sensor import Sensor, checked_sensors, sensors_from_tree, sensors_to_tree
@@ -458,6 +459,8 @@ class Measurement:
                 force_std=estimate.force_std, **given,
             )  # fmt: skip
         return test if band is None else test.in_band(*sequence("band", band, "(low, high) in Hz", 2))
+
+    noise_from_rest = staticmethod(levels_at_rest)
 
 
 def unit_runs(d: int, n_freq: int) -> ComplexArray:
