@@ -11,7 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError, choice, finite_array, number, refuse, sequence
 from sysid.measurement import spectra
+from sysid.measurement.cuts import check_cuts
 from sysid.measurement.missing import Missing, complete, named, present
+from sysid.measurement.noise import levels_at_rest
 from sysid.measurement.whole import ModalEstimate, NoiseLevels, WholeRecords, per_run
 from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
 from sysid.structure.sensor import Sensor, checked_sensors, sensors_from_tree, sensors_to_tree
@@ -446,7 +448,9 @@ class Measurement:
             whole = None
             if estimator == "records":
                 samples = tuple(run.base.shape[1] for run in records)
-                whole = WholeRecords(samples, float(sample_rate), per_run("at_rest", at_rest, len(records)), noise)
+                rest = per_run("at_rest", at_rest, len(records))
+                check_cuts(records, rest, G)
+                whole = WholeRecords(samples, float(sample_rate), rest, noise)
             test = cls(freq, base, response, force=force, whole=whole, **given)
         else:
             estimate = spectra.averaged(records, sample_rate, kind=estimator, segment=segment)
@@ -455,6 +459,8 @@ class Measurement:
                 force_std=estimate.force_std, **given,
             )  # fmt: skip
         return test if band is None else test.in_band(*sequence("band", band, "(low, high) in Hz", 2))
+
+    noise_from_rest = staticmethod(levels_at_rest)
 
 
 def unit_runs(d: int, n_freq: int) -> ComplexArray:

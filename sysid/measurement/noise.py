@@ -1,12 +1,75 @@
-"""Weights of a fit from stated standard deviations: a factor for each channel times one for each line of each run."""
+"""Stated noise: weights of a fit from standard deviations, and levels from stretches in which nothing moves."""
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sysid.errors import InputError, finite_array, sequence
+from sysid.measurement.spectra import Run, check_runs
+from sysid.measurement.whole import NoiseLevels
 from sysid.structure.structure import Array
 
+_FEWEST_LINES = 50  # a deviation known to 7 %
 _LEAST = 1e-6  # of the median standard deviation; smaller ones are raised to it, so that no sample dominates
+
+
+def levels_at_rest(
+    runs: Sequence[tuple[ArrayLike, ArrayLike, ArrayLike | None]],
+    sample_rate: float,
+    *,
+    band: tuple[float, float] | None = None,
+) -> NoiseLevels:
+    """Noise of each channel from stretches in which nothing moves, for ``from_time(noise=)``.
+
+    Deviations of a sample in time, were the noise white as it is in the band. A mean and a straight line are taken off
+    each record; the lowest line, which that touches, is left out.
+
+    Parameters
+    ----------
+    runs : sequence of (base, response, force or None)
+        Records at rest, as in `Measurement.from_time`.
+    sample_rate : float
+        Hz.
+    band : (low, high), optional
+        Hz, both ends included: that of the test; noise that is not white has another level elsewhere.
+
+    Raises
+    ------
+    InputError
+        Records that do not fit each other, or are too short for a level.
+    """
+    given = sequence("runs", runs, "a list of (base, response, force or None)")
+    base, response, _ = sequence("run 0", given[0], "(base, response, force or None)", 3)
+    shape = tuple(np.atleast_2d(finite_array("run 0", record)).shape[0] for record in (response, base))
+    records = check_runs(given, sample_rate, shape)
+    low, high = (0.0, np.inf) if band is None else sequence("band", band, "(low, high) in Hz", 2)
+    level = _levels(records, sample_rate, low, high)
+    n, d = shape
+    return NoiseLevels(level[:n], level[n : n + d], None if records[0].force is None else level[n + d :])
+
+
+def _levels(runs: Sequence[Run], sample_rate: float, low: float, high: float) -> Array:
+    """Deviations of a sample of responses, base and force, (channels,), by the lines from `low` to `high` Hz."""
+    power, lines = np.zeros(0), 0
+    for run in runs:
+        records = np.vstack([run.response, run.base, *([] if run.force is None else [run.force])])
+        n = records.shape[1]
+        freq = np.fft.rfftfreq(n, 1 / sample_rate)
+        keep = (np.arange(freq.size) > 1) & (freq < sample_rate / 2) & (freq >= low) & (freq <= high)
+        unit = np.vander(np.linspace(-1.0, 1.0, n), 2)
+        slopes = np.linalg.lstsq(unit, records.T, rcond=None)[0]
+        spectra = np.fft.rfft(records - (unit @ slopes).T, axis=1)[:, keep]
+        own = np.sum(np.abs(spectra) ** 2, axis=1) / n
+        power, lines = (own if not power.size else power + own), lines + int(keep.sum())
+    if lines < _FEWEST_LINES:
+        raise InputError(
+            f"the stretch at rest has {lines} lines in the band, too few for a level (at least {_FEWEST_LINES}): "
+            "give a longer stretch, or a wider band"
+        )
+    return np.sqrt(power / lines)
 
 
 def separable(std: Array | None, shape: tuple[int, int, int]) -> tuple[Array, Array]:

@@ -18,6 +18,7 @@ from sysid.problem.problem import Problem
 from sysid.report.html import Cell, beside, bullets, fold, matrix, number, page, paragraph, picture, table, text
 from sysid.report.matrices import CHOSEN, ONE_OF_MANY, SAME, Lines, half_widths, matrices, stated
 from sysid.results.identification import Identification
+from sysid.results.noise_table import noise_of_channels
 from sysid.results.phases import COLUMNS, rows_of_phases
 from sysid.results.storage import atomically, file_or_folder
 from sysid.results.summary import (
@@ -27,6 +28,7 @@ from sysid.results.summary import (
     known_half_width,
     mass_percent_std,
     next_steps,
+    noise_source,
     residual_in_words,
     tilde,
     verdict,
@@ -112,6 +114,7 @@ def render(identification: Identification) -> str:
             ("Rigid-body mass", _rigid_body_mass(it)),
             ("Measured against identified", _responses(it, it.measurement)),
             ("Base force", _base_force(it, it.measurement)),
+            ("Noise", _noise(it)),
             ("Outliers", _outliers(it)),
             ("Further tests", _further(it)),
             ("Validation", _validation(it)),
@@ -280,6 +283,13 @@ def _base_force(it: Identification, test: Measurement) -> str:
         alt = f"measured and identified base force, {name}"
         parts.append(picture(plot.base_forces(it, r, measurement=test, band=band), alt))
     return "\n".join(parts)
+
+
+def _noise(it: Identification) -> str:
+    """The noise of each channel of whole records."""
+    rows = [(one.channel, number(one.level, 3), one.unit, number(one.percent, 3)) for one in noise_of_channels(it)]
+    caption = f"Noise of each channel, {noise_source(it)}: standard deviation of a sample in time."
+    return table(("channel", "of a sample", "unit", "% of its rms"), rows, caption) if rows else ""
 
 
 def _outliers(it: Identification) -> str:

@@ -15,6 +15,7 @@ from sysid.errors import InputError, finite_array, text, whole_number
 from sysid.problem.problem import Problem
 from sysid.results import storage
 from sysid.results.answer import Answer, reported_unknowns
+from sysid.results.noise_table import noise_of_channels
 from sysid.results.summary import summary
 from sysid.results.version import __version__
 from sysid.search.strategy import History
@@ -145,6 +146,10 @@ class Identification(Answer):
             "outliers": [
                 {"test": o.test, "run": o.run, "channel": o.channel, "frequency_hz": o.freq, "deviations": o.size}
                 for o in self.outliers
+            ],
+            "noise": [
+                {"channel": c.channel, "level": c.level, "unit": c.unit, "percent_of_rms": c.percent}
+                for c in noise_of_channels(self)
             ],
             "evaluations": int(self.history.evaluations),
             "wall_time_s": float(self.history.wall_time),

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from sysid.assessment.sensitivity import blocks_of
 from sysid.results.answer import NOT_JUDGED, Answer
+from sysid.results.noise_table import noise_of_channels
 from sysid.results.phases import COLUMNS, rows_of_phases
 from sysid.results.unknowns_table import MANY, rows_of, stated_values
 from sysid.structure.structure import Array
@@ -46,6 +47,7 @@ def summary(it: Answer) -> str:
         )
     for i, test in enumerate(it.validation, start=1):
         lines.append(f"test {i} of {len(problem.validation)} never fitted: relative residual {test.residual(s):.3e}")
+    lines += _noise(it)
     lines.append(f"{verdict(it)}.")
     lines += [f"  - {sentence}" for sentence in it.closed_by + it.undetermined]
     if not (it.determined or it.hurried) and it.open_masses:
@@ -59,6 +61,19 @@ def _phases(it: Answer) -> list[str]:
     """Table of what each phase left, where there was more than one."""
     rows = rows_of_phases(it)
     return _aligned([list(column) for column in zip(COLUMNS, *rows, strict=True)]) if len(rows) > 1 else []
+
+
+def _noise(it: Answer) -> list[str]:
+    """Table of the noise of each channel, where whole records were fitted."""
+    rows = [(one.channel, f"{one.level:.3g}", one.unit, f"{one.percent:.3g}") for one in noise_of_channels(it)]
+    head = (f"noise {noise_source(it)}", "of a sample", "unit", "% of rms")
+    return _aligned([list(column) for column in zip(head, *rows, strict=True)]) if 0 < len(rows) <= MANY else []
+
+
+def noise_source(it: Answer) -> str:
+    """Whether levels of noise were stated or found."""
+    whole = it.problem.measurement.whole
+    return "as stated" if whole is not None and whole.noise is not None else "found with the fit"
 
 
 def residual_in_words(it: Answer) -> str:

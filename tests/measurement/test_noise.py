@@ -1,8 +1,9 @@
-"""Weights of a fit: 1/std where noise is a channel's times a line's, and the nearest such product elsewhere."""
+"""Weights of a fit: 1/std where noise is a channel's times a line's, else the nearest such product; levels at rest."""
 
 import numpy as np
 import pytest
 
+import sysid
 from sysid.measurement.noise import separable
 
 SHAPE = (2, 3, 7)
@@ -46,3 +47,29 @@ def test_no_sample_weighs_a_million_times_more_than_the_middle_one():
     weight = product(std)
     np.testing.assert_allclose(weight[:, 1], 1e6, rtol=1e-9)
     np.testing.assert_allclose(weight[:, [0, 2]], 1.0, rtol=1e-9)
+
+
+class TestNoiseFromRest:
+    def test_levels_are_those_of_the_noise_beside_offset_and_drift(self):
+        rng, rate, n = np.random.default_rng(5), 100.0, 20_000
+        true = np.array([0.02, 0.03, 0.01, 5.0])  # two sensors, base, force
+        noise = true[:, None] * rng.standard_normal((4, n)) + np.linspace(1.0, 1.5, n)
+        runs = [(noise[2:3, a:b], noise[:2, a:b], noise[3:, a:b]) for a, b in ((0, 12_000), (12_000, n))]
+        levels = sysid.Measurement.noise_from_rest(runs, rate)
+        found = np.concatenate([levels.response, levels.base, levels.force])
+        np.testing.assert_allclose(found, true, rtol=4 / np.sqrt(2 * n))
+
+    def test_coloured_noise_has_the_level_of_the_band(self):
+        rng, rate, n = np.random.default_rng(6), 100.0, 50_000
+        white = rng.standard_normal((2, n + 1))
+        rising = white[:, 1:] - white[:, :-1]  # its spectrum is 2 |sin(pi f / rate)| times the white one's
+        low, high = 10.0, 12.0
+        levels = sysid.Measurement.noise_from_rest([(rising[:1], rising[1:], None)], rate, band=(low, high))
+        f = np.linspace(low, high, 1001)
+        wanted = np.sqrt(np.mean(4 * np.sin(np.pi * f / rate) ** 2))
+        np.testing.assert_allclose([levels.base[0], levels.response[0]], wanted, rtol=4 / np.sqrt(2 * n * 0.04))
+
+    def test_a_stretch_that_is_too_short_is_refused(self):
+        rest = np.random.default_rng(7).standard_normal((1, 60))
+        with pytest.raises(sysid.InputError, match="has 28 lines in the band, too few for a level"):
+            sysid.Measurement.noise_from_rest([(rest, rest, None)], 10.0)

@@ -1,0 +1,45 @@
+"""The noise of each channel of whole records, for summary, summary.json and report."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sysid.results.answer import Answer
+
+
+class ChannelNoise(NamedTuple):
+    """Noise of a channel, of all runs together: deviation of a sample; in per cent of the channel's rms over the lines."""
+
+    channel: str
+    level: float
+    unit: str
+    percent: float
+
+
+def noise_of_channels(it: Answer) -> tuple[ChannelNoise, ...]:
+    """Noise of sensors, base and force of whole records; none for other records.
+
+    Per cent are of what the channel records over the lines of the test, noise and all, so that a band makes both alike.
+    """
+    levels, test = it.noise, it.problem.measurement
+    if levels is None or test.whole is None:
+        return ()
+    axes = test.base_axes or ()
+    turns = ["r" in axis for axis in axes]
+    names = [(name, "m/s²") for name in test.sensor_names]
+    names += [(f"base {axis}", "rad/s²" if turn else "m/s²") for axis, turn in zip(axes, turns, strict=True)]
+    spectra, level = [test.response, test.base], [levels.response, levels.base]
+    if test.force is not None and levels.force is not None:
+        names += [(f"force {axis}", "N m" if turn else "N") for axis, turn in zip(axes, turns, strict=True)]
+        spectra, level = [*spectra, test.force], [*level, levels.force]
+    power = np.sum(np.abs(np.concatenate(spectra, axis=1)) ** 2, axis=(0, 2))
+    lines = test.whole.density * test.own_lines.sum(axis=1)  # of each run
+    found = np.concatenate([np.broadcast_to(part, (test.n_runs, part.shape[-1])) for part in level], axis=1)
+    rms, std = np.sqrt(power / lines.sum()), np.sqrt(lines @ found**2 / lines.sum())
+    percent = 100 * std / np.where(rms > 0, rms, np.inf)
+    return tuple(
+        ChannelNoise(name, float(own), unit, float(share))
+        for (name, unit), own, share in zip(names, std, percent, strict=True)
+    )
