@@ -10,7 +10,7 @@ from sysid.results.answer import Answer
 
 
 class ChannelNoise(NamedTuple):
-    """Noise of a channel, of all runs together: deviation of a sample; in per cent of the channel's rms over the lines."""
+    """Noise of a channel, of all runs together: deviation of a sample, and in per cent of the rms over the lines."""
 
     channel: str
     level: float
