@@ -147,6 +147,14 @@ class RecordModel:
         other.numbers = 2 * sum(run.outputs.size for run in other.runs)
         return other
 
+    def weighed_as_all(self) -> RecordModel:
+        """The same, each line of a coarse test standing for those around it that were left out."""
+        other = RecordModel(self.test, self.m)
+        other.runs = [
+            run._replace(weight=np.gradient(run.w) / (2 * np.pi * self.whole.spacing[run.number])) for run in self.runs
+        ]
+        return other
+
     def pack(self, p: Parameters) -> Array:
         """The unknowns as one column."""
         modes, index = p.modes, self.index
@@ -250,9 +258,8 @@ class Chunk:
     def covered(self, levels: Array) -> ComplexArray:
         """V (d, c, L) with ``S^-1 = D² - V V'``: what the noise of the base hides."""
         B, inverse = self._base_noise(levels)
-        return np.moveaxis(self.deviations(levels)[0][:, None] * (B @ np.linalg.cholesky(inverse)), 0, -1).swapaxes(
-            0, 1
-        )
+        V = self.deviations(levels)[0][:, None] * np.matmul(B, np.linalg.cholesky(inverse), dtype=complex)
+        return V.transpose(2, 1, 0)
 
     def spectra(self, base: ComplexArray) -> ComplexArray:
         """What all columns of the Jacobian are made of, (spectra, L)."""

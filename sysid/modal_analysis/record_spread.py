@@ -40,7 +40,7 @@ def scatter(fit: RecordFit) -> Array | None:
     model, p = fit.model, fit.parameters
     if not uneven(fit):
         return None
-    N = model.normal_equations(p, fit.levels).normal
+    N = fit.normal
     size = np.sqrt(np.maximum(np.diag(N), 1e-300))
     N = N / np.outer(size, size)
     lam, V = np.linalg.eigh(N)
