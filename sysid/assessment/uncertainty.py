@@ -136,13 +136,13 @@ class Uncertainty:
         InputError
             For another name, or a level that is no probability.
         """
-        from scipy.stats import norm
+        from scipy.special import ndtri
 
         if name not in (*_QUANTITIES, *self.variables):
             raise InputError(f"no uncertainty of {name!r}; give one of {', '.join((*_QUANTITIES, *self.variables))}")
         if not 0 < level < 1:
             raise InputError(f"level = {level}: a probability between 0 and 1 is needed")
-        z = float(norm.ppf((1 + level) / 2))
+        z = float(ndtri((1 + level) / 2))
         if name in self.variables:
             value, std = self.values[name], self.variables[name]
             return np.stack([value - z * std, value + z * std])

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -17,18 +19,26 @@ from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.modal_analysis.record_model import TRACES, Parameters, RecordModel
+from sysid.modal_analysis.record_model import TRACES, Parameters, RecordModel, Shift
 from sysid.modal_analysis.record_noise import floors, likeliest_levels
 from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.response import gains
 from sysid.structure.structure import Array
 
-_ROUNDS = 12  # of modes and levels in turn
-_STEPS = 60
 _SETTLED = 1e-3  # fall of the sum of squares, in units of the noise, at which the fit stands still
 _SAME_LEVELS = 0.003  # relative change of a standard deviation at which levels stand still
 
 Monitor = Callable[[int, float], object]
+
+
+class Limits(NamedTuple):
+    """How far a fit goes at most: rounds of modes and levels in turn, steps of each round."""
+
+    rounds: int
+    steps: int
+
+
+_WHOLE, _ROUGH = Limits(12, 60), Limits(3, 4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,10 +64,22 @@ class RecordFit:
     chi2: float
     settled: bool
 
-    @property
+    @cached_property
     def model(self) -> RecordModel:
         """The model that was fitted."""
         return RecordModel(self.test, self.parameters.modes.omega.size)
+
+    @cached_property
+    def equations(self) -> Shift:
+        """Normal equations at the end of the fit, with the columns of gains, which come last."""
+        model = RecordModel(self.test, self.parameters.modes.omega.size, gains=True)
+        return model.normal_equations(self.parameters, self.levels)
+
+    @property
+    def normal(self) -> Array:
+        """``Re J' S^-1 J`` over all unknowns of the fit."""
+        size = self.model.size
+        return self.equations.normal[:size, :size]
 
     @property
     def unknowns(self) -> int:
@@ -90,8 +112,7 @@ class RecordFit:
 
     def information(self) -> Array:
         """``Re J' S^-1 J`` over the unknowns of `Index`, less what transients and traces explain of it; (p, p)."""
-        model = self.model
-        N = model.normal_equations(self.parameters, self.levels).normal
+        model, N = self.model, self.normal
         kept, size = model.kept, np.sqrt(np.maximum(np.diag(N), 1e-300))
         scaled = N / np.outer(size, size)
         inner, cross = scaled[kept:, kept:], scaled[kept:, :kept]
@@ -113,7 +134,7 @@ class RecordFit:
 
 
 def record_modes(test: Measurement, omega: Array, ratios: Array, *, monitor: Monitor | None = None) -> RecordFit:
-    """Fit modes to whole records, from poles close by.
+    """Fit modes to whole records, roughly, from poles close by: a few steps, for `refitted` to go on from.
 
     Parameters
     ----------
@@ -125,16 +146,32 @@ def record_modes(test: Measurement, omega: Array, ratios: Array, *, monitor: Mon
         ``monitor(iterations, residual)``, the latter ``sqrt(chi2 / numbers)``; what it raises passes through.
     """
     model = RecordModel(test, omega.size)
-    return _fit(model, _first(test, omega, ratios), None, monitor or (lambda i, r: None))
+    return _fit(model, _first(test, omega, ratios), None, monitor or (lambda i, r: None), _ROUGH)
 
 
-def refitted(fit: RecordFit, p: Parameters, *, monitor: Monitor | None = None) -> RecordFit:
-    """The fit from other parameters, and from its levels of noise."""
+def refitted(fit: RecordFit, p: Parameters, *, rough: bool = False, monitor: Monitor | None = None) -> RecordFit:
+    """The fit from other parameters, and from its levels of noise; with `rough` a few steps of it."""
     model = RecordModel(fit.test, p.modes.omega.size)
-    return _fit(model, p, fit.levels, monitor or (lambda i, r: None))
+    return _fit(model, p, fit.levels, monitor or (lambda i, r: None), _ROUGH if rough else _WHOLE)
 
 
-def _fit(model: RecordModel, p: Parameters, levels: Array | None, monitor: Monitor) -> RecordFit:
+def on_all_lines(fit: RecordFit, test: Measurement, *, monitor: Monitor | None = None) -> RecordFit:
+    """The fit of a test from that of some of its lines, which still give the normal matrix of each step.
+
+    Gradients and what is left are those of all lines, so that the end is theirs.
+    """
+    model = RecordModel(test, fit.parameters.modes.omega.size)
+    return _fit(model, fit.parameters, fit.levels, monitor or (lambda i, r: None), _WHOLE, fit.model.weighed_as_all())
+
+
+def _fit(
+    model: RecordModel,
+    p: Parameters,
+    levels: Array | None,
+    monitor: Monitor,
+    limits: Limits,
+    coarse: RecordModel | None = None,
+) -> RecordFit:
     """Modes and levels in turn."""
     test = model.test
     assert test.whole is not None
@@ -145,8 +182,8 @@ def _fit(model: RecordModel, p: Parameters, levels: Array | None, monitor: Monit
         levels = _rough_levels(model, p)
     unknowns = model.size - (0 if model.force else model.m)
     settled, chi2 = False, np.inf
-    for round_ in range(_ROUNDS):
-        p, chi2, done = _minimise(model, p, levels, monitor, 10 * round_)
+    for round_ in range(limits.rounds):
+        p, chi2, done = _minimise(model, p, levels, monitor, (10 * round_, limits.steps), coarse)
         if stated is not None:
             settled = done
             break
@@ -159,14 +196,20 @@ def _fit(model: RecordModel, p: Parameters, levels: Array | None, monitor: Monit
 
 
 def _minimise(
-    model: RecordModel, p: Parameters, levels: Array, monitor: Monitor, count: int
+    model: RecordModel,
+    p: Parameters,
+    levels: Array,
+    monitor: Monitor,
+    counts: tuple[int, int],
+    coarse: RecordModel | None,
 ) -> tuple[Parameters, float, bool]:
-    """Levenberg-Marquardt steps at given levels."""
+    """Levenberg-Marquardt steps at given levels; `counts` of iterations so far, and of steps at most."""
     x: Array = model.pack(p)
     damping = 1e-6
-    here = model.normal_equations(p, levels)
-    for i in range(_STEPS):
-        monitor(count + i, float(np.sqrt(2 * here.chi2 / model.numbers)))
+    here = _equations(model, coarse, p, levels)
+    done, most = counts
+    for i in range(most):
+        monitor(done + i, float(np.sqrt(2 * here.chi2 / model.numbers)))
         size = np.sqrt(np.maximum(np.diag(here.normal), 1e-300))
         scaled = here.normal / np.outer(size, size)
         while True:
@@ -184,7 +227,7 @@ def _minimise(
             damping = max(damping / 10, 1e-12)
             if promised < _SETTLED:
                 return model.unpack(x), after, True
-            here = model.normal_equations(model.unpack(x), levels)
+            here = _equations(model, coarse, model.unpack(x), levels)
         else:
             return model.unpack(x), here.chi2, True
     return model.unpack(x), here.chi2, False
@@ -199,6 +242,13 @@ def _step(scaled: Array, damping: float, gradient: Array) -> Array:
             damping = max(10 * damping, 1e-12)
             continue
         return np.asarray(scipy.linalg.cho_solve(factor, gradient))
+
+
+def _equations(model: RecordModel, coarse: RecordModel | None, p: Parameters, levels: Array) -> Shift:
+    """Normal equations, their matrix from a coarser model where there is one."""
+    if coarse is None:
+        return model.normal_equations(p, levels)
+    return model.gradient(p, levels)._replace(normal=coarse.normal_equations(p, levels).normal)
 
 
 def _chi2(model: RecordModel, p: Parameters, levels: Array) -> float:
@@ -289,8 +339,7 @@ def without(fit: RecordFit, k: int) -> Parameters:
 
 def worth(fit: RecordFit) -> Array:
     """What ``e' S^-1 e`` would about rise by without each mode, (m,): all else moves as far as it is free."""
-    model, p = fit.model, fit.parameters
-    N = model.normal_equations(p, fit.levels).normal
+    model, p, N = fit.model, fit.parameters, fit.normal
     size = np.sqrt(np.maximum(np.diag(N), 1e-300))
     scaled = N / np.outer(size, size)
     m, n, index = model.m, model.n, model.index

@@ -19,7 +19,7 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     better known of both is taken.
     """
     model = RecordModel(fit.test, fit.parameters.modes.omega.size, gains=True)
-    made = model.normal_equations(fit.parameters, fit.levels)
+    made = fit.equations
     size = np.sqrt(np.maximum(np.diag(made.normal), 1e-300))
     normal, gradient = made.normal / np.outer(size, size), made.gradient / size
     n, at = model.n, model.n_fit

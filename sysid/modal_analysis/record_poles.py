@@ -7,11 +7,28 @@ of the base on.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.structure.structure import Array
 
 _WIDTH = 5  # lines over which powers are smoothed
+_A_WIDTH = 6  # lines kept in a half-power width ..
+_DAMPING = 0.005  # .. of this damping ratio
+
+
+def few_lines(test: Measurement) -> NDArray[np.bool_]:
+    """Lines that tell the modes where there are many: `_A_WIDTH` in a half-power width, the last too, (n_freq,).
+
+    All of them where that would not save half.
+    """
+    keep = np.zeros(test.freq.size, bool)
+    for own in test.own_lines:
+        lines = np.flatnonzero(own)
+        step = np.gradient(test.freq[lines]) / test.freq[lines] * _A_WIDTH / (2 * _DAMPING)
+        at = np.floor(np.cumsum(np.minimum(step, 1.0)))
+        keep[lines[np.append(np.flatnonzero(np.diff(at, prepend=-1.0) > 0), -1)]] = True
+    return keep if 2 * np.count_nonzero(keep) < keep.size else np.ones_like(keep)
 
 
 def rough_deviations(test: Measurement) -> Array:

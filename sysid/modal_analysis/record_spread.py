@@ -40,20 +40,22 @@ def scatter(fit: RecordFit) -> Array | None:
     model, p = fit.model, fit.parameters
     if not uneven(fit):
         return None
-    N = model.normal_equations(p, fit.levels).normal
+    N = fit.normal
     size = np.sqrt(np.maximum(np.diag(N), 1e-300))
     N = N / np.outer(size, size)
     lam, V = np.linalg.eigh(N)
     seen = lam > 1e-12 * lam[-1]
     half = V[:, seen] / np.sqrt(lam[seen])  # half half' is the inverse of N
     meat = np.zeros((half.shape[1],) * 2)
+    columns = [Chunk(model, p, run.at(slice(0, 1))).columns() for run in model.runs]
     for shift in np.arange(_SHIFTS) / _SHIFTS:
-        for run in model.runs:
+        for run, own in zip(model.runs, columns, strict=True):
+            at = size[own.unknowns]
             for lines in blocks_of(run, fit, shift):
-                own = run._replace(w=run.w[lines], base=run.base[:, lines], outputs=run.outputs[:, lines])
-                made = Chunk(model, p, own).products(fit.levels)
-                score = half.T @ (made.gradient / size)
-                taken, turn = np.linalg.eigh(half.T @ (made.normal / np.outer(size, size)) @ half)
+                made = Chunk(model, p, run.at(lines)).products(fit.levels, own)
+                score = half[own.unknowns].T @ (made.gradient / at)
+                inner = half[own.unknowns].T @ (made.normal / np.outer(at, at)) @ half[own.unknowns]
+                taken, turn = np.linalg.eigh(inner)
                 grown = turn @ ((turn.T @ score) / np.sqrt(1 - np.clip(taken, 0.0, _TAKEN)))
                 meat += np.outer(grown, grown) / _SHIFTS
     # In moves of all unknowns, of which those of `Index` are kept: A^-1 B A^-1 is that of the moves.
@@ -70,11 +72,8 @@ def uneven(fit: RecordFit) -> bool:
     model, c = fit.model, fit.model.channels
     off = []
     for run in model.runs:
-        error = np.concatenate(
-            [chunk.whitened(fit.levels)[0] for chunk in model.chunks(fit.parameters) if chunk.run.number == run.number],
-            axis=1,
-        )
-        power = np.sum(np.abs(error) ** 2, axis=0)
+        chunks = [chunk for chunk in model.chunks(fit.parameters) if chunk.run.number == run.number]
+        power = np.concatenate([chunk.weighed(fit.levels).power for chunk in chunks])
         for lines in blocks_of(run, fit, 0.0):
             off.append((np.sum(power[lines]) - c * lines.size) / np.sqrt(c * lines.size))
     z = np.array(off)

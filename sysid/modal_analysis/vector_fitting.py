@@ -197,7 +197,9 @@ def poles_from(records: Records, omega: Array, ratios: Array, *, monitor: Monito
 
 
 def _lines_suffice(records: Records, count: int) -> bool:
-    return 2 * int(np.count_nonzero(records.freq)) >= 4 * count + 2
+    """Whether the lines determine so many poles, and the records residues of both kinds beside the motion at ends."""
+    inputs = len(records.base) + records.driven
+    return 2 * int(np.count_nonzero(records.freq)) >= 4 * count + 2 and len(records.data) > inputs * count
 
 
 def _relocated(records: Records, count: int, progress: _Progress) -> tuple[Array, Array]:

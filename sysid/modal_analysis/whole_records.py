@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import ModalEstimate
-from sysid.modal_analysis.record_fit import Monitor, RecordFit, record_modes, refitted, without, worth
+from sysid.modal_analysis.record_fit import Monitor, RecordFit, on_all_lines, record_modes, refitted, without, worth
 from sysid.modal_analysis.record_gains import gain_errors_of
 from sysid.modal_analysis.record_more import WORTH, with_further_modes
-from sysid.modal_analysis.record_poles import rough_deviations
+from sysid.modal_analysis.record_poles import few_lines, rough_deviations
 from sysid.modal_analysis.record_spread import scatter
 from sysid.modal_analysis.vector_fitting import find_poles
 from sysid.structure.structure import Array, ComplexArray
@@ -25,13 +25,17 @@ _DAMPED = 0.5  # a pole with more damping than this is no mode of a structure
 def whole_fit(test: Measurement, *, monitor: Monitor | None = None) -> RecordFit:
     """Modes, transients and noise of whole records.
 
-    Poles are looked for twice: with rough weights, and with the noise that a first fit found.
+    Poles are looked for twice: with rough weights, and with the noise that a first fit found; where lines are many, on
+    some of them, from which the fit of all begins.
 
     Raises
     ------
     InputError
         As `find_poles` does.
     """
+    lines = few_lines(test)
+    if not np.all(lines):
+        return on_all_lines(whole_fit(test.at(lines), monitor=monitor), test, monitor=monitor)
     poles = find_poles(replace(test, response_std=rough_deviations(test)), monitor=monitor)
     fit = _kept(record_modes(test, poles.omega, poles.ratios, monitor=monitor), monitor)
     again = find_poles(replace(test, response_std=deviations(fit)[0]), monitor=monitor)
@@ -42,16 +46,24 @@ def whole_fit(test: Measurement, *, monitor: Monitor | None = None) -> RecordFit
 
 
 def _kept(fit: RecordFit, monitor: Monitor | None) -> RecordFit:
-    """The fit without modes that noise explains."""
-    while fit.parameters.modes.omega.size > 1:
-        modes = fit.parameters.modes
-        narrow = modes.ratios * modes.omega < _RAZOR * 2 * np.pi * np.min(fit.model.whole.spacing)
-        value = np.where((modes.ratios < _DAMPED) & ~narrow, worth(fit), 0.0)
-        least = int(np.argmin(value))
-        if value[least] >= WORTH:
-            break
-        fit = refitted(fit, without(fit, least), monitor=monitor)
+    """A rough fit without modes that noise explains, settled, and without those that it explains then."""
+    for rough in (True, False):
+        if not rough:
+            fit = refitted(fit, fit.parameters, monitor=monitor)
+        while (least := _least(fit)) is not None:
+            fit = refitted(fit, without(fit, least), rough=rough, monitor=monitor)
     return fit
+
+
+def _least(fit: RecordFit) -> int | None:
+    """The mode that explains least, if no more than noise."""
+    modes = fit.parameters.modes
+    if modes.omega.size == 1:
+        return None
+    narrow = modes.ratios * modes.omega < _RAZOR * 2 * np.pi * np.min(fit.model.whole.spacing)
+    value = np.where((modes.ratios < _DAMPED) & ~narrow, worth(fit), 0.0)
+    least = int(np.argmin(value))
+    return least if value[least] < WORTH else None
 
 
 def deviations(fit: RecordFit) -> tuple[Array, Array | None]:

@@ -11,6 +11,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.nlp import quiet_options
 from sysid.problem.formulation import Formulation
 from sysid.structure.structure import Array
+from sysid.swarm import sampling
 
 _POINTS = 128  # of the search space, looked at
 _STARTS = 8  # of the search for a point that satisfies the constraints
@@ -25,13 +26,11 @@ def points_of(formulation: Formulation) -> Array:
 
 def latin_hypercube(formulation: Formulation, count: int, rng: np.random.Generator) -> list[Array]:
     """Points spread over the search space as the swarm's are."""
-    from scipy.stats import qmc
-
-    unit = qmc.LatinHypercube(formulation.size, rng=rng).random(count)
+    unit = sampling.latin_hypercube(count, formulation.size, rng)
     rows = formulation.lower + unit * (formulation.upper - formulation.lower)
     s = ca.MX.sym("s", formulation.size)
-    sampling = ca.Function("sampling", [s], [formulation.from_sampling(s)])
-    return [np.asarray(sampling(row)).ravel() for row in rows]
+    unknowns = ca.Function("unknowns", [s], [formulation.from_sampling(s)])
+    return [np.asarray(unknowns(row)).ravel() for row in rows]
 
 
 def check_matrices(formulation: Formulation, points: Array, test: Measurement, site: str) -> None:

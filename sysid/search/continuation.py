@@ -293,12 +293,12 @@ def _alternatives(problem: Problem, x: Array, objective: float, ends: list[tuple
 
 def as_good_as(problem: Problem, objective: float) -> float:
     """The most that another answer leaves where it explains the data as well as one that leaves `objective`."""
-    from scipy.stats import chi2
+    from scipy.special import gammainccinv
 
     tests = [term.test for term in problem.formulation.tests]
     numbers = 2 * sum(test.response.size + (0 if test.force is None else test.force.size) for test in tests)
     size = problem.n_variables
-    return max(objective * float(np.sqrt(1 + chi2.isf(_CHANCE, size) / max(numbers - size, 1))), EXACT)
+    return max(objective * float(np.sqrt(1 + 2 * gammainccinv(size / 2, _CHANCE) / max(numbers - size, 1))), EXACT)
 
 
 def apart(problem: Problem, x: Array, other: Array) -> float:

@@ -25,6 +25,7 @@ from sysid.search.same_response import LINES, SameResponse
 from sysid.search.session import Session, Stop
 from sysid.search.strategy import Outcome
 from sysid.structure.structure import Array, Structure
+from sysid.swarm.sampling import latin_hypercube
 
 _MOST_STARTS, _FEWEST_STARTS = 64, 4
 _STEPS = 60
@@ -136,10 +137,8 @@ class _Box:
 
     def starts(self, session: Session, count: int) -> Array:
         """A Latin hypercube."""
-        from scipy.stats import qmc
-
         source = np.random.SeedSequence(session.random.entropy, spawn_key=(*session.random.spawn_key, _SEED))
-        return qmc.LatinHypercube(self.lower.size, rng=np.random.default_rng(source)).random(count)
+        return latin_hypercube(count, self.lower.size, np.random.default_rng(source))
 
 
 def _fit(problem: Problem, x: Array, session: Session) -> Array:

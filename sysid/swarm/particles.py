@@ -15,6 +15,7 @@ from . import adaptation
 from .adaptation import EvolutionaryState
 from .box import Box
 from .checks import checked_costs, checked_rows
+from .sampling import latin_hypercube
 from .settings import SwarmSettings
 
 FloatArray = NDArray[np.float64]
@@ -309,12 +310,10 @@ class ParticleSwarm:
 
     def _sample(self) -> FloatArray:
         """Latin hypercube in the unit cube (n_particles, n_free): one particle in each of n_particles slices."""
-        from scipy.stats import qmc
-
         if self.box.n_free == 0:
             return np.zeros((self.n_particles, 0))
-        sampler = qmc.LatinHypercube(self.box.n_free, rng=int(self._rng.integers(2**63)))
-        return sampler.random(self.n_particles)
+        rng = np.random.default_rng(int(self._rng.integers(2**63)))
+        return latin_hypercube(self.n_particles, self.box.n_free, rng)
 
     def _advance(self) -> None:
         if np.isinf(self.best_cost):
