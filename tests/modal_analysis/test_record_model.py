@@ -62,13 +62,13 @@ def _model(force: bool, d: int) -> tuple[RecordModel, Parameters, Array]:
     modes = Modes(r.normal(size=(n, m)), r.normal(size=(m, d)), np.array([15.0, 35.0]), np.array([0.06, 0.1]))
     traces = r.normal(size=(2, model.channels, 3))
     p = Parameters(modes, rigid, r.normal(size=(m, 2)), traces)
-    return model, p, r.uniform(0.3, 2.0, model.channels + d)
+    return model, p, r.uniform(0.3, 2.0, (2, model.channels + d))
 
 
 def _dense(chunk: Chunk, levels: Array) -> ComplexArray:
     """S of each line, (L, c, c)."""
-    c, T = chunk.model.channels, np.moveaxis(chunk.H, -1, 0)
-    return chunk.run.density * (np.diag(levels[:c]) + T @ np.diag(levels[c:]) @ T.conj().swapaxes(1, 2))
+    c, T, own = chunk.model.channels, np.moveaxis(chunk.H, -1, 0), levels[chunk.run.number]
+    return chunk.run.density * (np.diag(own[:c]) + T @ np.diag(own[c:]) @ T.conj().swapaxes(1, 2))
 
 
 def _dense_chi2(model: RecordModel, p: Parameters, levels: Array) -> float:
@@ -111,7 +111,7 @@ def test_normal_matrix_is_that_of_derivatives_at_the_likeliest_base(force: bool,
         here = Chunk(model, p, run)
         S, T = _dense(here, levels), np.moveaxis(here.H, -1, 0)
         pulled = np.einsum("lcd,lc->ld", T.conj(), np.linalg.solve(S, here.error.T[..., None])[..., 0])
-        likely = run._replace(base=run.base + (run.density * levels[model.channels :] * pulled).T)
+        likely = run._replace(base=run.base + (run.density * levels[run.number, model.channels :] * pulled).T)
         J = np.array([
             (Chunk(model, model.unpack(x - h * u), likely).error - Chunk(model, model.unpack(x + h * u), likely).error)
             / (2 * h)
