@@ -113,6 +113,12 @@ print(full.summary())
 assert full.determined
 
 # %% [markdown]
+# The roof in the second run, with its transients taken off, and what the model answers to the base motion:
+
+# %%
+sysid.plot.transmissibility(full, sensor="floor 4", run=1)
+
+# %% [markdown]
 # `result.noise` holds the noise that was found with the fit: the standard deviation of a sample of each channel, a row
 # a run. Nobody stated it. All intervals come from it.
 
