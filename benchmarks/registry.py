@@ -73,6 +73,9 @@ BENCHMARKS = (
     Benchmark("modal.six_axis_spacecraft", "errors of predictions and rigid-body mass, 20 modes", "1 min", "10 s"),
     Benchmark("modal.large_tests", "seconds and memory for 50 and 100 modes", "2 min", "15 s"),
     Benchmark("modal.unsound_tests", "whether results say what a test cannot tell", "10 s", "10 s"),
+    Benchmark(
+        "records.stated_values", "stated masses: whether true ones help and wrong ones are told", "4 min", "15 s"
+    ),
     Benchmark("variants.six_springs", "errors of springs and dampers at four levels of noise", "9 min", "25 s"),
     Benchmark("variants.five_storeys", "errors of storey stiffnesses at 5 % noise", "6 min", "20 s"),
     Benchmark("variants.modules_from_readme", "whether modules written from the README alone run", "3 min", "3 min"),

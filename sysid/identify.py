@@ -16,6 +16,7 @@ from sysid.problem.problem import Problem
 from sysid.results.checkpoint import Checkpoint, identity
 from sysid.results.identification import Identification
 from sysid.results.judgement import judge
+from sysid.results.stated_masses import with_stated_masses
 from sysid.search.continuation import Continuation
 from sysid.search.journal import Journal
 from sysid.search.modal import Modal
@@ -110,6 +111,7 @@ def identify(
         try:
             outcome, why = _run(chosen, why, problem.screened, session, start, follow=strategy == "auto")
             outcome = settled(problem, outcome, chosen, session)
+            outcome = with_stated_masses(problem.screened, outcome, session)
         except Stop as stop:  # before there was any structure
             raise SolverError(f"{stop}: nothing is identified") from None
         except (InputError, SolverError):

@@ -15,7 +15,7 @@ from benchmarks.swarm.shake_table import DATA
 
 EVENTS = ("sine_1p5", "sine_2p0")
 WITHIN = 1.5
-BLOCKS = 160  # some tenths of a Hz each, several widths of a peak
+BLOCKS = 40  # some half a Hz each
 
 
 def lines(reduced: bool) -> Iterator[Line]:
@@ -29,7 +29,7 @@ def lines(reduced: bool) -> Iterator[Line]:
         return
     event = load_module("mini_shake_table").event
     for name in EVENTS[: 1 if reduced else None]:
-        yield _jackknife(name, event(data / name), BLOCKS)
+        yield _jackknife(name, event(data / name, "records"), BLOCKS)
 
 
 def _jackknife(name: str, test: sysid.Measurement, blocks: int) -> Line:

@@ -10,6 +10,7 @@ import numpy as np
 
 from sysid.assessment.information import Parametrisation
 from sysid.modal_analysis.modal_fit import Index, Modes
+from sysid.models.geometry import Geometry
 from sysid.models.unknowns import scales_of
 from sysid.problem.problem import Problem
 from sysid.structure.structure import Array, Structure
@@ -18,7 +19,7 @@ from sysid.structure.structure import Array, Structure
 def parametrisation(problem: Problem, structure: Structure, modes: Modes, index: Index) -> Parametrisation:
     """Theta itself, less what the damping model and stated totals tie."""
     test, (phi, gamma, _, _) = problem.measurement, modes
-    m, d = gamma.shape
+    d = gamma.shape[1]
     slope, unit, keep = np.eye(index.size), np.ones(index.size), np.ones(index.size, bool)
     strength = np.linalg.norm(phi, axis=0)
     unit[index.phi] = np.tile(strength, len(phi))
@@ -26,11 +27,9 @@ def parametrisation(problem: Problem, structure: Structure, modes: Modes, index:
     unit[index.gamma] = np.repeat(np.max(strength * np.linalg.norm(gamma, axis=1)) / strength, d)
     weight = np.sqrt(problem.totals)
     unit[index.rigid] = [weight[i] * weight[j] for i, j in index.pairs]
-    gauge, of_mode = np.zeros((index.size, 0)), np.eye(m)
+    gauge = np.zeros((index.size, 0))
     if test.force is None:
-        gauge = np.zeros((index.size, m))
-        gauge[index.phi] = -(phi[:, :, None] * of_mode).reshape(-1, m)
-        gauge[index.gamma] = (gamma[:, :, None] * of_mode[:, None]).reshape(-1, m)
+        gauge = gauge_of(phi, gamma, index)
     else:
         for entry, row in _tied_masses(problem, modes, index):
             slope[entry], keep[entry] = row, False
@@ -64,7 +63,7 @@ def _with_ratios_tied(
 def _tied_masses(problem: Problem, modes: Modes, index: Index) -> Iterator[tuple[int, Array]]:
     """Entries of M_rb that a stated total mass ties, and how they follow theta, (size of theta,)."""
     totals, geometry, (phi, gamma, _, _) = problem.formulation.mass.totals, problem.geometry, modes
-    if totals is None:
+    if totals is None or problem.formulation.mass.weighs:  # there they are statistics
         return
     for at, (i, j) in zip(index.rigid.tolist(), index.pairs, strict=True):
         if i != j and problem.rigid_total is None:  # its diagonal alone is stated
@@ -72,42 +71,29 @@ def _tied_masses(problem: Problem, modes: Modes, index: Index) -> Iterator[tuple
         row = np.zeros(index.size)
         # With other degrees of freedom than the sensors the fit ties M_rb itself.
         if totals.kind == "trace" and phi.shape[0] == phi.shape[1]:
-            # M_rb,ii = total - sum of the sensors' M_jj - (delta' delta)_ii + (Gamma' Gamma)_ii, delta = Gamma - P G
-            P, own = np.linalg.inv(phi), geometry.directions[: geometry.n] == i
-            drawn = P @ geometry.rigid_body[:, i]
-            delta = gamma[:, i] - drawn
-            by_phi = 2 * (P.T @ P)[:, own] @ P[:, own].T - 2 * np.outer(P.T @ delta, drawn)
-            row[index.phi] = by_phi.ravel()
-            row[index.gamma].reshape(gamma.shape)[:, i] = 2 * (gamma[:, i] - delta)
+            row = slope_of_drawn_mass(geometry, phi, gamma, index, i)
         yield at, row
 
 
-def held_by_entries(
-    problem: Problem, structure: Structure, modes: Modes, index: Index, path: Parametrisation, moves: Array
-) -> Array:
-    """Moves of theta (size of theta, moves) with the scale of each mode moved so that known entries of the mass stay.
+def gauge_of(phi: Array, gamma: Array, index: Index) -> Array:
+    """Moves of theta, (size, m), that change the scale of one mode each: no acceleration shows them."""
+    m = len(gamma)
+    gauge, of_mode = np.zeros((index.size, m)), np.eye(m)
+    gauge[index.phi] = -(phi[:, :, None] * of_mode).reshape(-1, m)
+    gauge[index.gamma] = (gamma[:, :, None] * of_mode[:, None]).reshape(-1, m)
+    return gauge
 
-    So it is where these, not a force, set the scale of the modes. With P the inverse of Phi the entries are those of
-    ``M_SS = P' P`` and ``M_S0 = P' (Gamma - P G)``.
+
+def slope_of_drawn_mass(geometry: Geometry, phi: Array, gamma: Array, index: Index, i: int) -> Array:
+    """Slope (size of theta,) of what M_rb,ii is less by than the trace of M over direction i.
+
+    ``M_rb,ii = trace - sum of the sensors' M_jj - (delta' delta)_ii + (Gamma' Gamma)_ii``, ``delta = Gamma - P G``.
     """
-    G, known = problem.geometry.rigid_body, problem.known_mass
-    if problem.measurement.force is not None or not structure.at_sensors or not np.any(np.isfinite(known)):
-        return moves
-    phi, gamma, _, _ = modes
-    n, d = gamma.shape
-    P = np.linalg.inv(phi)
-    M, push, steps = P.T @ P, P.T @ gamma, np.hstack([-np.eye(n), G])
-    size = np.sqrt(np.diag(M))
-    scale = np.outer(size, np.concatenate([size, np.full(d, size.max())]))
-    rows = []
-    for i, j in np.argwhere(np.isfinite(known)):
-        row = np.zeros(index.size)
-        # Of -M_ij, or of the second part of M_S0 = P' Gamma - M G.
-        by_phi = np.outer(M[i], P @ steps[:, j]) + np.outer(M @ steps[:, j], P[:, i])
-        if j >= n:
-            by_phi -= np.outer(push[:, j - n], P[:, i])
-            row[index.gamma].reshape(gamma.shape)[:, j - n] = P[:, i]
-        row[index.phi] = by_phi.ravel()
-        rows.append(row / scale[i, j])
-    C, gauge = np.array(rows), path.slope @ path.gauge
-    return moves - gauge @ (np.linalg.pinv(C @ gauge, rcond=1e-9) @ (C @ moves))
+    row = np.zeros(index.size)
+    P, own = np.linalg.inv(phi), geometry.directions[: geometry.n] == i
+    drawn = P @ geometry.rigid_body[:, i]
+    delta = gamma[:, i] - drawn
+    by_phi = 2 * (P.T @ P)[:, own] @ P[:, own].T - 2 * np.outer(P.T @ delta, drawn)
+    row[index.phi] = by_phi.ravel()
+    row[index.gamma].reshape(gamma.shape)[:, i] = 2 * (gamma[:, i] - delta)
+    return row

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from sysid.assessment.gains import gain_errors
 from sysid.assessment.information import gain_gradients, information, spectra_of, spread
 from sysid.assessment.modal_mass_cone import open_modes
-from sysid.assessment.parametrisation import held_by_entries, parametrisation
+from sysid.assessment.parametrisation import parametrisation
 from sysid.assessment.perturbations import DirectSpectra, ModalSpectra, Perturbations, matrices_of_modes, std_of
 from sysid.assessment.sensitivity import (
     Sensitivity,
@@ -28,6 +28,7 @@ from sysid.assessment.sensitivity import (
     sensitivity,
     with_totals,
 )  # fmt: skip
+from sysid.assessment.statements import conditioned
 from sysid.errors import InputError
 from sysid.modal_analysis.misfit import inflation_of, records_of
 from sysid.modal_analysis.modal_estimate import information_about
@@ -201,6 +202,25 @@ def uncertainty(problem: Problem, structure: Structure, x: Array | None) -> Unce
 
 def _by_modes(problem: Problem, structure: Structure, x: Array | None) -> Uncertainty:
     """Standard deviations where the modal parameters are free, from their Fisher information."""
+    test, (modes, index, inflation, normals, unseen) = problem.measurement, moves_by_records(problem, structure)
+    normals, unseen = conditioned(problem, structure, modes, index, normals, unseen)
+    normals = normals if np.isfinite(inflation) else np.full_like(normals, np.nan)
+    moves = Perturbations(normals.shape[1], *index.split(np.hstack([normals, unseen])))
+    matrices = matrices_of_modes(structure, modes, moves)
+    if test.force is None and open_modes(problem, structure):
+        open_ = np.full((structure.n, structure.n), np.nan)
+        matrices = open_, open_, open_  # zeros that a decoupled structure keeps included
+    found = _quantities(problem, structure, modes, moves, inflation, matrices)
+    if x is None or not np.any(problem.formulation.outside):
+        return found
+    variables, at = outside_variables(problem.formulation), x[problem.formulation.outside]
+    known = of_outside(problem.formulation, x)
+    std = std_of(known.steps, known.rank, known.unit)
+    return replace(found, values=by_name(variables, at), variables=by_name(variables, std))
+
+
+def moves_by_records(problem: Problem, structure: Structure) -> tuple[Modes, Index, float, Array, Array]:
+    """Modes, index, inflation, and moves of theta that the records leave: of a standard normal each, and unseen."""
     test, modes = problem.measurement, modes_of(structure)
     index = Index(structure.n_sensors, structure.n, structure.n_base)
     path = parametrisation(problem, structure, modes, index)
@@ -214,28 +234,14 @@ def _by_modes(problem: Problem, structure: Structure, x: Array | None) -> Uncert
         if not all(record.shared for record in records):
             B = information(modes, index, [record.sandwich_grams(spectra) for record in records])
     normals, unseen = spread(A, B, path)
-    wrong = np.zeros((index.size, 0))
+    inflation = inflation_of(test, records, unknowns)
+    moves = [(1.0 if np.isnan(inflation) else inflation) * normals]
     possible = np.zeros(0) if spectra is None else gain_errors(test, structure).possible
     if spectra is not None and np.any(possible):
         pulls = gain_gradients(modes, index, test.rigid_body, records[0].grams(spectra))
         plain = normals if B is None else spread(A, None, path)[0]
-        wrong = 2 * plain @ (plain.T @ (pulls * possible)[:, possible > 0])  # half the inverse of the information
-    steps = (held_by_entries(problem, structure, modes, index, path, part) for part in (normals, wrong, unseen))
-    normals, wrong, unseen = steps
-    inflation = inflation_of(test, records, unknowns)
-    moved = np.hstack([inflation * normals, wrong, unseen])
-    moves = Perturbations(normals.shape[1] + wrong.shape[1], *index.split(moved))
-    matrices = matrices_of_modes(structure, modes, moves)
-    if test.force is None and open_modes(problem, structure):
-        open_ = np.full((structure.n, structure.n), np.nan)
-        matrices = open_, open_, open_  # zeros that a decoupled structure keeps included
-    found = _quantities(problem, structure, modes, moves, inflation, matrices)
-    if x is None or not np.any(problem.formulation.outside):
-        return found
-    variables, at = outside_variables(problem.formulation), x[problem.formulation.outside]
-    known = of_outside(problem.formulation, x)
-    std = std_of(known.steps, known.rank, known.unit)
-    return replace(found, values=by_name(variables, at), variables=by_name(variables, std))
+        moves.append(2 * plain @ (plain.T @ (pulls * possible)[:, possible > 0]))  # half the inverse of the information
+    return modes, index, inflation, np.hstack(moves), unseen
 
 
 def _by_unknowns(problem: Problem, structure: Structure, x: Array) -> Uncertainty:

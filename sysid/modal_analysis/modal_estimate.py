@@ -13,8 +13,8 @@ from sysid.modal_analysis.response import columns, gains, weights_of
 from sysid.structure.structure import Array
 
 _UNSEEN = 1e-12  # of the largest eigenvalue of the scaled information: round-off
-_STEPS = 30
-_BELOW = 1e-12  # relative; a mass so little negative is none
+_STEPS = 200
+_BELOW = 1e-3  # of the rigid-body mass; the least remainder to begin with, as a factor of zero has no slope
 
 
 def residual_of(test: Measurement) -> float:
@@ -111,34 +111,59 @@ def matched(estimate: ModalEstimate, omega: Array) -> NDArray[np.intp] | None:
 def above_modes(estimate: ModalEstimate) -> tuple[Modes, Array]:
     """The likeliest modes and rigid-body mass whose remainder, what no mode carries, is no negative mass.
 
-    Steps on the directions in which it is negative, each an equality, by weighted least squares.
+    Least squares over participations and a factor L of the remainder ``L L'``; all else follows them linearly.
     """
+    from scipy.optimize import least_squares
+
     index = index_of(estimate)
     modes, rigid = Modes(estimate.phi, estimate.gamma, estimate.omega, estimate.ratios), estimate.rigid
     size = np.sqrt(np.maximum(np.diag(rigid), np.finfo(float).tiny))
+    scaled = lambda gamma: (rigid - gamma.T @ gamma) / np.outer(size, size)  # noqa: E731
+    lam, V = np.linalg.eigh(scaled(modes.gamma))
+    if lam[0] >= 0:
+        return modes, rigid
     own = theta_of(modes, rigid, index)
-    covariance = np.linalg.pinv(estimate.information, rcond=1e-14, hermitian=True)
-    theta, d = own.copy(), size.size
-    for _ in range(_STEPS):
-        parts = index.split(theta[:, None])
-        gamma, rigid = parts[1][..., 0], parts[4][..., 0]
-        lam, V = np.linalg.eigh((rigid - gamma.T @ gamma) / np.outer(size, size))
-        if lam[0] >= -_BELOW:
-            break
-        rows = []
-        for v in V[:, lam < 0].T:
-            row = np.zeros(index.size)
-            scaled = v / size
-            row[index.gamma] = (-2 * (gamma @ scaled)[:, None] * scaled).ravel()
-            row[index.rigid] = [scaled[i] * scaled[j] * (1 if i == j else 2) for i, j in index.pairs]
-            rows.append(row)
-        C, short = np.array(rows), lam[lam < 0]
-        # Of all with these masses at zero the nearest to the estimate, to first order about here.
-        wanted = C @ theta - short - C @ own
-        theta = own + covariance @ C.T @ np.linalg.solve(C @ covariance @ C.T, wanted)
-    parts = index.split(theta[:, None])
-    phi, gamma, log_omega, log_ratios, rigid = (part[..., 0] for part in parts)
-    lam, V = np.linalg.eigh((rigid - gamma.T @ gamma) / np.outer(size, size))
-    remainder = (V * np.maximum(lam, 0.0)) @ V.T * np.outer(size, size)
-    assert d == len(remainder)
-    return Modes(phi, gamma, np.exp(log_omega), np.exp(log_ratios)), gamma.T @ gamma + remainder
+    mass = np.concatenate([np.arange(index.gamma.start, index.gamma.stop), index.rigid])
+    others = np.setdiff1d(np.arange(index.size), mass)
+    A = estimate.information
+    inverse = np.linalg.pinv(A[np.ix_(others, others)], rcond=_UNSEEN, hermitian=True)
+    follow = -inverse @ A[np.ix_(others, mass)]
+    unit = np.concatenate([np.tile(size, len(modes.gamma)), [size[i] * size[j] for i, j in index.pairs]])
+    inner = (A[np.ix_(mass, mass)] + A[np.ix_(mass, others)] @ follow) * np.outer(unit, unit)
+    values, turn = np.linalg.eigh((inner + inner.T) / 2)
+    R = np.sqrt(np.maximum(values, 0.0))[:, None] * turn.T
+    (m, d), lower = modes.gamma.shape, np.tril_indices(len(size))
+
+    def parts(z: Array) -> tuple[Array, Array]:
+        L = np.zeros((d, d))
+        L[lower] = z[m * d :]
+        return z[: m * d].reshape(m, d), L
+
+    def moved(z: Array) -> Array:
+        gamma, L = parts(z)
+        whole = gamma.T @ gamma + L @ L.T  # in units of `size`
+        corner = np.array([whole[i, j] for i, j in index.pairs])
+        return np.concatenate([gamma.ravel(), corner]) - own[mass] / unit
+
+    def slope(z: Array) -> Array:
+        gamma, L = parts(z)
+        J = np.zeros((m * d + len(index.pairs), z.size))
+        J[: m * d, : m * d] = np.eye(m * d)
+        for row, (i, j) in enumerate(index.pairs, start=m * d):
+            by_gamma = np.zeros((m, d))
+            by_gamma[:, i] += gamma[:, j]
+            by_gamma[:, j] += gamma[:, i]
+            by_L = np.zeros((d, d))
+            by_L[i] += L[j]
+            by_L[j] += L[i]
+            J[row] = np.concatenate([by_gamma.ravel(), by_L[lower]])
+        return R @ J
+
+    root = np.linalg.cholesky((V * np.maximum(lam, _BELOW * max(lam[-1], 1.0))) @ V.T)
+    start = np.concatenate([(modes.gamma / size).ravel(), root[lower]])
+    end = least_squares(lambda z: R @ moved(z), start, slope, xtol=1e-14, ftol=1e-14, gtol=1e-14, max_nfev=_STEPS)
+    theta, step = own.copy(), moved(end.x) * unit
+    theta[mass] += step
+    theta[others] += follow @ step
+    phi, gamma, log_omega, log_ratios, rigid = (part[..., 0] for part in index.split(theta[:, None]))
+    return Modes(phi, gamma, np.exp(log_omega), np.exp(log_ratios)), rigid

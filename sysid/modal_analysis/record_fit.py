@@ -170,8 +170,7 @@ def _minimise(
         size = np.sqrt(np.maximum(np.diag(here.normal), 1e-300))
         scaled = here.normal / np.outer(size, size)
         while True:
-            factor = scipy.linalg.cho_factor(scaled + damping * np.eye(size.size), check_finite=False)
-            step = scipy.linalg.cho_solve(factor, here.gradient / size) / size
+            step = _step(scaled, damping, here.gradient / size) / size
             promised = float(here.gradient @ step)
             trial = model.unpack(x + step)
             after = _chi2(model, trial, levels)
@@ -189,6 +188,17 @@ def _minimise(
         else:
             return model.unpack(x), here.chi2, True
     return model.unpack(x), here.chi2, False
+
+
+def _step(scaled: Array, damping: float, gradient: Array) -> Array:
+    """A damped step; with more damping where round-off has made the normal matrix indefinite."""
+    while True:
+        try:
+            factor = scipy.linalg.cho_factor(scaled + damping * np.eye(gradient.size), check_finite=False)
+        except np.linalg.LinAlgError:
+            damping = max(10 * damping, 1e-12)
+            continue
+        return np.asarray(scipy.linalg.cho_solve(factor, gradient))
 
 
 def _chi2(model: RecordModel, p: Parameters, levels: Array) -> float:

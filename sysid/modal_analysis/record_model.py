@@ -204,6 +204,18 @@ class Chunk:
         pulled = np.einsum("lij,lj,lkj,kl->il", V, shrink, V.conj(), Wh, optimize=True)
         return e - np.einsum("cjl,jl->cl", W, pulled), W, base
 
+    def weighed_errors(self, levels: Array) -> tuple[Array, ComplexArray, ComplexArray, ComplexArray]:
+        """Lines (L,), rad/s, likeliest inputs (d + 2 r, L), ``S^-1 e`` (c, L) and ``S^-1`` (c, c, L)."""
+        _, W, base = self.whitened(levels)
+        scale = self.deviations(levels)[0]
+        inverse = -np.einsum("cjl,ejl->cel", W, W.conj()) * scale[:, None, None] * scale[:, None]
+        c = np.arange(len(scale))
+        inverse[c, c] += scale[:, None] ** 2
+        ends = np.zeros((2 * len(self.model.moving), base.shape[1]), complex)
+        if self.at_ends is not None:
+            ends[self.at_ends] = self.transients
+        return self.run.w, np.concatenate([base, ends]), np.einsum("cel,el->cl", inverse, self.error), inverse
+
     def spectra(self, base: ComplexArray) -> ComplexArray:
         """What all columns of the Jacobian are made of, (spectra, L)."""
         modes, g = self.p.modes, self.g

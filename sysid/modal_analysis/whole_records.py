@@ -12,12 +12,12 @@ from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import ModalEstimate
 from sysid.modal_analysis.record_fit import Monitor, RecordFit, record_modes, refitted, without, worth
 from sysid.modal_analysis.record_gains import gain_errors_of
+from sysid.modal_analysis.record_more import WORTH, with_further_modes
 from sysid.modal_analysis.record_poles import rough_deviations
 from sysid.modal_analysis.record_spread import scatter
 from sysid.modal_analysis.vector_fitting import find_poles
 from sysid.structure.structure import Array, ComplexArray
 
-_WORTH = 25.0  # in units of ``e' S^-1 e``: a mode whose absence raises it by less is noise (chi-squared of 50)
 _RAZOR = 0.02  # of the distance of lines; half the width of a peak that answers for one bad line, not for a mode
 _DAMPED = 0.5  # a pole with more damping than this is no mode of a structure
 
@@ -38,7 +38,7 @@ def whole_fit(test: Measurement, *, monitor: Monitor | None = None) -> RecordFit
     if again.omega.size != fit.parameters.modes.omega.size:
         other = _kept(record_modes(test, again.omega, again.ratios, monitor=monitor), monitor)
         fit = max(fit, other, key=lambda one: one.likelihood)
-    return fit
+    return with_further_modes(fit, monitor=monitor)
 
 
 def _kept(fit: RecordFit, monitor: Monitor | None) -> RecordFit:
@@ -48,7 +48,7 @@ def _kept(fit: RecordFit, monitor: Monitor | None) -> RecordFit:
         narrow = modes.ratios * modes.omega < _RAZOR * 2 * np.pi * np.min(fit.model.whole.spacing)
         value = np.where((modes.ratios < _DAMPED) & ~narrow, worth(fit), 0.0)
         least = int(np.argmin(value))
-        if value[least] >= _WORTH:
+        if value[least] >= WORTH:
             break
         fit = refitted(fit, without(fit, least), monitor=monitor)
     return fit

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, choice, finite_array, numbers, refuse
+from sysid.errors import InputError, choice, finite_array, numbers, refuse, shown
 from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import FACTOR_FLOOR, Geometry, check_sane, check_total_mass
 from sysid.models.model import MassBlocks, Stated, Totals, Written, constant
@@ -65,9 +65,15 @@ class FullMass(FieldTree):
         physical ``M_rb[i, i]``; the only one for a matrix.
     known : array_like (n, n) or (n, n + d), optional
         Entries of ``M_SS``, or of ``[M_SS, M_S0]``, that are known, NaN where they are not: weighed parts, zeros
-        between what cannot be coupled. The modal strategy holds them, or checks them where a base force was
-        measured, and the result says what they close; the swarm cannot. More entries than the data
-        leave open are met in the least-squares sense. They need one mode a sensor.
+        between what cannot be coupled. They are adjusted together with the records, by weighted least squares, and
+        the result says what they close, and which of them contradict the rest. The modal strategy can do it, the swarm
+        cannot. They need one mode a sensor.
+    known_std : float or array_like, optional
+        Standard deviations of the known entries, kg, in the shape of `known` or one for all; 0, as without it, where
+        an entry is exact.
+    total_std : float or array_like, optional
+        Standard deviations of `total_mass`, in its shape or one for all. With a measured base force they weigh the
+        total beside the records; without one a total only bounds masses.
 
     References
     ----------
@@ -77,6 +83,8 @@ class FullMass(FieldTree):
     total_mass: ArrayLike | None = None
     healing: Literal["trace", "rigid_body"] = "trace"
     known: ArrayLike | None = None
+    known_std: ArrayLike | None = None
+    total_std: ArrayLike | None = None
 
     def __post_init__(self) -> None:
         choice("FullMass: healing", self.healing, ("trace", "rigid_body"))
@@ -92,6 +100,8 @@ class FullMass(FieldTree):
             check_sane("FullMass: known", np.diag(given))
         if self.total_mass is not None and np.ndim(self.total_mass) == 2 and self.healing != "rigid_body":
             raise InputError("a matrix of total mass is the rigid-body mass: state healing='rigid_body' with it")
+        _deviations("FullMass: known_std", self.known_std, "known", self.known)
+        _deviations("FullMass: total_std", self.total_std, "total_mass", self.total_mass)
 
     def known_entries(self, geometry: Geometry) -> Array:
         """What is known of ``[M_SS, M_S0]``, (n, n + d); NaN where nothing is."""
@@ -182,13 +192,27 @@ class FullMass(FieldTree):
         count = np.count_nonzero(np.triu(np.isfinite(known[:, : geometry.n])))
         count += np.count_nonzero(np.isfinite(known[:, geometry.n :]))
         sentence = f"{count} {'entry' if count == 1 else 'entries'} of the mass matrix stated to be known"
-        return Stated(free=True, entries=known, totals=self._stated_totals(geometry), sentence=sentence)
+        return Stated(
+            True, known, self._stated_totals(geometry), sentence=sentence, entries_std=self._entries_std(known)
+        )
+
+    def _entries_std(self, known: Array) -> Array | None:
+        """Deviations of the known entries (n, n + d); the larger of two that are given for one entry."""
+        std = _deviations("FullMass: known_std", self.known_std, "known", self.known)
+        if std is None:
+            return None
+        n, whole = len(known), np.zeros_like(known)
+        whole[:, : std.shape[1]] = np.nan_to_num(std)
+        whole[:, :n] = np.maximum(whole[:, :n], whole[:, :n].T)
+        return whole
 
     def _stated_totals(self, geometry: Geometry) -> Totals | None:
         if self.total_mass is None:
             return None
         whole = geometry.rigid_total(self.total_mass)
-        return Totals(geometry.totals(self.total_mass) if whole is None else whole, self.healing)
+        totals = geometry.totals(self.total_mass) if whole is None else whole
+        std = _deviations("FullMass: total_std", self.total_std, "total_mass", self.total_mass)
+        return Totals(totals, self.healing, None if std is None else np.broadcast_to(std, totals.shape))
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,6 +331,28 @@ class WrittenMass(Written):
     def blocks(self, geometry: Geometry, y: ca.MX) -> ca.MX:
         """The expression; no coupling and no base mass where it has no base rows."""
         return self.whole(geometry)
+
+
+def _deviations(name: str, std: ArrayLike | None, of: str, values: ArrayLike | None) -> Array | None:
+    """Standard deviations in the shape of the values; None where all are exact.
+
+    Raises
+    ------
+    InputError
+        Where they are negative, not finite beside a value, of another shape, or there are no values.
+    """
+    if std is None:
+        return None
+    if values is None:
+        raise InputError(f"{name} is given without {of}: state what it is the deviation of")
+    value, given = numbers(f"{name}'s {of}", values), numbers(name, std)
+    if given.shape not in ((), value.shape):
+        raise InputError(f"{name} is {given.shape}; one number or {value.shape}, the shape of {of}, is needed")
+    given = np.broadcast_to(given, value.shape)
+    wrong = np.isfinite(value) & ~((given >= 0) & (given < np.inf))
+    if np.any(wrong):
+        raise InputError(f"{name} = {shown(given[wrong].tolist())}: deviations of 0 or above are needed")
+    return np.array(given)
 
 
 def _spread(geometry: Geometry) -> tuple[Array, Array]:

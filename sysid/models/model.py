@@ -31,15 +31,25 @@ class Totals:
     kind : {"trace", "rigid_body", "sensors"}
         What is summed: the diagonal over the direction's sensors and its base row; ``M_rb``; or the diagonal over the
         sensors alone.
+    std : (d,) or (d, d) or None
+        Standard deviations; None where all are exact.
     """
 
     values: Array
     kind: Literal["trace", "rigid_body", "sensors"]
+    std: Array | None = None
 
     @property
     def by_direction(self) -> Array:
         """One total a base direction, (d,)."""
         return np.diag(self.values) if self.values.ndim == 2 else self.values
+
+    @property
+    def std_by_direction(self) -> Array:
+        """Their standard deviations, (d,)."""
+        if self.std is None:
+            return np.zeros(len(self.values))
+        return np.diag(self.std) if self.std.ndim == 2 else self.std
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +71,8 @@ class Stated:
         Weights W of sums ``sum(W * matrix)`` that are never negative, such as the springs of a chain.
     sentence : str
         "the mass is stated to be lumped on the sensors"; empty where nothing is stated.
+    entries_std : (n, n + d) or None
+        Standard deviations of the entries, 0 where one is exact; None where all are.
     """
 
     free: bool = False
@@ -69,6 +81,13 @@ class Stated:
     spectrum: Array | None = None
     positive: Array | None = None
     sentence: str = ""
+    entries_std: Array | None = None
+
+    @property
+    def weighs(self) -> bool:
+        """Whether entries or totals of a free mass are adjusted together with the records."""
+        with_std = self.totals is not None and self.totals.std is not None
+        return self.free and (self.entries is not None or with_std)
 
     @property
     def rigid_total(self) -> Array | None:

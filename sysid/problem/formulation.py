@@ -112,7 +112,7 @@ class Formulation:
         """
         _check_names([*(unknown for group in self.of_models for unknown in group), *self.variables])
         _check_healing(self.healed, self.unknowns)
-        known = self.mass.entries is not None or self.mass.rigid_total is not None
+        known = self.mass.weighs or self.mass.rigid_total is not None
         refuse(
             (not self.unknowns, "this problem has no unknowns: nothing is to be identified"),
             (
@@ -120,9 +120,10 @@ class Formulation:
                 "Prior beside a misfit of your own: put it into that misfit, in the units of its rows",
             ),
             (
-                self.mass.free and known and not self.free_modes,
-                "known entries of a FullMass, and a total_mass that is a matrix, go with the modal strategy only, and "
-                "that with SpectralStiffness and damping ratios alone: write them as constraints",
+                self.mass.free and known and not (self.free_modes and self.damping.free),
+                "known entries of a FullMass, a total_std, and a total_mass that is a matrix, go with the modal "
+                "strategy only, and that with SpectralStiffness and ModalDamping alone: write them as constraints, or "
+                "as Prior",
             ),
         )
 

@@ -41,7 +41,7 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
     try:
         with within(session.left):
             known = determine(records, end.structure, end.x, end.alternatives)
-            doubtful = doubts(records, end.structure, end.x) if judged else ()
+            doubtful = (*end.doubts, *doubts(records, end.structure, end.x)) if judged else ()
             open_, closed_by = (*doubtful, *known.undetermined), known.closed_by
         if success and known.judged_by == BY_RANK and not open_:
             end, unknown = with_other_answers(problem, end, session)

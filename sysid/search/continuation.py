@@ -61,7 +61,7 @@ class Continuation:
     def refusal(self, problem: Problem, start: ArrayLike | Structure | None) -> str | None:
         """Why "auto" does not take it: poles and residues make the matrices, or entries of a free mass are stated."""
         formulation = problem.formulation
-        if formulation.mass.free and (formulation.mass.entries is not None or problem.rigid_total is not None):
+        if formulation.mass.weighs or (formulation.mass.free and problem.rigid_total is not None):
             return "it cannot hold known entries of a free mass or a whole rigid-body mass"
         described = formulation.mass.free or formulation.mass.entries is not None
         if formulation.test_alone and formulation.geometry.at_sensors and formulation.stiffness.free and described:

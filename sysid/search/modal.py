@@ -295,7 +295,9 @@ def modal_structure(
     test, mass = problem.measurement, problem.formulation.mass
     poles = poles_of(problem)
     end = _of_whole_records(problem, options) or _fitted(problem, poles, options, monitor)
-    held = held_to_totals(problem, end, monitor, options.max_iterations)
+    # With all modes at the sensors totals are adjusted together with the other statements, afterwards.
+    later = mass.weighs and end.modes.omega.size == test.n_sensors
+    held = None if later else held_to_totals(problem, end, monitor, options.max_iterations)
     end = held or end
     chosen = degrees_of_freedom(problem, end.modes, options.sensors)
     modes, remainder = end.modes, end.rigid - end.modes.gamma.T @ end.modes.gamma
@@ -304,7 +306,7 @@ def modal_structure(
         modes = modes._replace(phi=modes.phi / np.sqrt(t), gamma=modes.gamma * np.sqrt(t)[:, None])
         remainder = np.diag(problem.totals)
     # A stated total is kept, even where the base force weighs another.
-    unmet = mass.free and (test.force is None or (mass.totals is not None and held is None))
+    unmet = mass.free and (test.force is None or (mass.totals is not None and held is None and not later))
     try:
         return build(problem, modes, remainder, chosen, to_totals=unmet), end, chosen, poles
     except InputError as error:

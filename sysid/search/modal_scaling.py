@@ -161,7 +161,8 @@ def nearest_lumped(
     coupling = np.einsum("ki,kj->ijk", P, delta).reshape(-1, m)
     entries, values = _entries(P, delta, np.full((m, m + G.shape[1]), np.nan) if known is None else known)
     scaled = np.flatnonzero(values)
-    if scaled.size and np.linalg.matrix_rank(entries / np.linalg.norm(entries, axis=1, keepdims=True), 1e-9) == m:
+    lengths = np.linalg.norm(entries, axis=1, keepdims=True)  # zero where no modal mass makes an entry
+    if scaled.size and np.linalg.matrix_rank(entries / np.where(lengths > 0, lengths, 1.0), 1e-9) == m:
         unit = np.linalg.norm(entries, axis=0)
         weights = 1 / np.where(values == 0, np.abs(values).max(), np.abs(values))[:, None]
         t = lsq_linear(entries * weights / unit, values * weights[:, 0], (0.0, np.inf), tol=1e-14).x

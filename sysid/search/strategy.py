@@ -125,6 +125,8 @@ class Outcome:
         Other unknowns that explain the data as well.
     good : bool
         The fit is as good as the data let it be, as far as the strategy can tell: no other needs to follow.
+    doubts : tuple of str
+        Stated values that contradict the records.
     """
 
     structure: Structure
@@ -137,6 +139,7 @@ class Outcome:
     remarks: tuple[str, ...] = ()
     alternatives: tuple[Array, ...] = ()
     good: bool = True
+    doubts: tuple[str, ...] = ()
 
 
 class Strategy(Protocol):

@@ -139,7 +139,7 @@ class Swarm:
     def refusal(self, problem: Problem, start: ArrayLike | Structure | None) -> str | None:
         """Why it cannot search a problem: what healing cannot meet, or more modes than degrees of freedom."""
         mass = problem.formulation.mass
-        if mass.free and (mass.entries is not None or problem.rigid_total is not None):
+        if mass.weighs or (mass.free and problem.rigid_total is not None):
             return (
                 "the swarm cannot hold known entries of the mass or a whole rigid-body mass: state their diagonals as "
                 "total_mass only, or take strategy 'modal'"

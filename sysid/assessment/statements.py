@@ -1,0 +1,222 @@
+r"""Stated masses as statistics beside the records: adjustment of the modal parameters to both.
+
+The records give an estimate of the modal parameters, ``theta + N a`` with a standard normal a, and leave the scale of
+each mode open where no force was measured. A statement is a function ``s(theta) = v - D e``, D its deviation, zero
+where it is exact. The likeliest theta makes ``|a|² + |e|²`` least, the scales being free: weighted least squares of
+records and statements together. What is left is chi-squared at as many degrees of freedom as there are statements
+that do not set scales.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sysid.assessment.information import Index
+from sysid.assessment.parametrisation import gauge_of, slope_of_drawn_mass
+from sysid.modal_analysis.modal_fit import Modes
+from sysid.problem.problem import Problem
+from sysid.structure.structure import Array, Structure
+
+_STEPS = 40
+_LONGEST = 0.5  # of a step: of the logarithm of a mode's scale, or of a shape's length
+_SETTLED = 1e-11  # relative, of a step
+_MET = 1e-8  # relative: an exact statement that holds so far does
+_WIDE = 5.0  # standard deviation of the logarithm of a mode's scale that nothing sets
+_DEPENDENT = 1e-13  # of the largest singular value
+_OPEN = 1e-9  # of the largest effect of a scale: what statements feel less, they leave open
+
+
+class Statements(NamedTuple):
+    """What is stated of masses, one row each.
+
+    ``entries`` (e, 2) of ``[M_SS, M_S0]``; ``totals`` (t, 2) of the rigid-body mass, or of the traces where ``kind`` is
+    "trace"; ``values``, ``std`` and ``scale`` (e + t,): kg, the last what is a large change.
+    """
+
+    entries: NDArray[np.intp]
+    totals: NDArray[np.intp]
+    kind: str
+    values: Array
+    std: Array
+    scale: Array
+
+    def without(self, row: int) -> Statements:
+        """All but one."""
+        kept = np.arange(self.values.size) != row
+        e = len(self.entries)
+        return Statements(self.entries[kept[:e]], self.totals[kept[e:]], self.kind, *(a[kept] for a in self[3:]))
+
+
+def statements_of(problem: Problem, structure: Structure) -> Statements | None:
+    """The statements that are adjusted together with the records; None where there are none."""
+    mass, geometry, test = problem.formulation.mass, problem.geometry, problem.measurement
+    if not (mass.weighs and problem.free_modes and structure.at_sensors):
+        return None
+    n, d = geometry.n, geometry.d
+    known = problem.known_mass
+    i, j = np.nonzero(np.isfinite(known))
+    once = j >= i
+    entries = np.column_stack([i[once], j[once]])
+    std = np.zeros((n, n + d)) if mass.entries_std is None else mass.entries_std
+    values, stds = known[i[once], j[once]], std[i[once], j[once]]
+    size = np.sqrt(np.diag(structure.mass))
+    size = np.where(size > 0, size, size.max())
+    scale = size[entries[:, 0]] * size[entries[:, 1]]
+    totals, kind = np.zeros((0, 2), dtype=int), ""
+    if mass.totals is not None and test.force is not None:
+        kind, given = mass.totals.kind, mass.totals.values
+        pairs = [(i, j) for i in range(d) for j in range(i, d if given.ndim == 2 else i + 1)]
+        totals = np.array(pairs)
+        deviations = np.zeros_like(given) if mass.totals.std is None else mass.totals.std
+        at = tuple(totals.T) if given.ndim == 2 else totals[:, 0]
+        values, stds = np.concatenate([values, given[at]]), np.concatenate([stds, deviations[at]])
+        rigid = np.sqrt(mass.totals.by_direction)
+        scale = np.concatenate([scale, rigid[totals[:, 0]] * rigid[totals[:, 1]]])
+    return Statements(entries, totals, kind, values, stds, scale)
+
+
+def made(problem: Problem, stated: Statements, theta: Array, index: Index) -> tuple[Array, Array]:
+    """What modal parameters make of the statements, (r,), and its slopes, (r, size of theta); in units of `scale`.
+
+    With P the inverse of Phi the entries are those of ``M_SS = P' P`` and ``M_S0 = P' (Gamma - P G)``.
+    """
+    G, geometry = problem.geometry.rigid_body, problem.geometry
+    phi, gamma, _, _, rigid = (part[..., 0] for part in index.split(theta[:, None]))
+    n = len(phi)
+    P = np.linalg.inv(phi)
+    M, push = P.T @ P, P.T @ gamma
+    whole, steps = np.hstack([M, push - M @ G]), np.hstack([-np.eye(n), G])
+    values, slopes = np.zeros(stated.values.size), np.zeros((stated.values.size, index.size))
+    for at, (i, j) in enumerate(stated.entries):
+        values[at], row = whole[i, j], slopes[at]
+        by_phi = np.outer(M[i], P @ steps[:, j]) + np.outer(M @ steps[:, j], P[:, i])
+        if j >= n:
+            by_phi -= np.outer(push[:, j - n], P[:, i])
+            row[index.gamma].reshape(gamma.shape)[:, j - n] = P[:, i]
+        row[index.phi] = by_phi.ravel()
+    for at, (i, j) in enumerate(stated.totals, start=len(stated.entries)):
+        values[at] = rigid[i, j]
+        if stated.kind == "trace":
+            delta, own = gamma[:, i] - P @ G[:, i], geometry.directions[:n] == i
+            values[at] += np.diag(M)[own].sum() - gamma[:, i] @ gamma[:, i] + delta @ delta
+            slopes[at] = -slope_of_drawn_mass(geometry, phi, gamma, index, i)
+        slopes[at, index.rigid[index.pairs.index((i, j))]] += 1.0
+    return values / stated.scale, slopes / stated.scale[:, None]
+
+
+class Adjusted(NamedTuple):
+    """Modal parameters that records and statements make likeliest.
+
+    ``theta`` (size,); ``misfit``, chi-squared; ``freedom`` of it; ``holds``: exact statements are met.
+    """
+
+    theta: Array
+    misfit: float
+    freedom: int
+    holds: bool
+
+
+def adjust(problem: Problem, stated: Statements, theta: Array, index: Index, normals: Array) -> Adjusted:
+    """Adjust modal parameters to statements by Gauss-Newton steps.
+
+    Parameters
+    ----------
+    theta : (size,)
+        What the records alone make likeliest; without a force at any scale of the modes.
+    normals : (size, k)
+        What one standard normal each makes of it.
+    """
+    k, weighed = normals.shape[1], problem.measurement.force is not None
+    m = index.shapes[1][0]
+    wanted, std = stated.values / stated.scale, stated.std / stated.scale
+    if not wanted.size:
+        return Adjusted(theta, 0.0, 0, holds=True)
+    at, a, b = theta, np.zeros(k), np.zeros(0 if weighed else m)
+    for step in range(_STEPS):
+        values, slopes = made(problem, stated, at, index)
+        F, U = slopes @ _rescaled(normals, b, index), slopes @ _gauge(at, index, weighed)
+        system = np.hstack([F, _WIDE * U, np.diag(std)])
+        # Shapes of modes that almost share a pole turn too easily for steps to settle: then these only meet what is
+        # exact.
+        settling = step >= _STEPS // 2
+        gap = np.where(std > 0, 0.0, wanted - values) if settling else wanted - values + F @ a + U @ b
+        y = np.linalg.lstsq(system, gap, rcond=_DEPENDENT)[0]
+        step_a, step_b = y[:k], _WIDE * y[k : k + b.size]
+        if not settling:
+            step_a, step_b = step_a - a, step_b - b
+        shapes = (normals[index.phi] @ step_a).reshape(index.shapes[0])
+        size = np.linalg.norm(theta[index.phi].reshape(index.shapes[0]), axis=0)
+        long = max(np.max(np.linalg.norm(shapes, axis=0) / size), np.abs(step_b).max(initial=0.0))
+        part = min(1.0, _LONGEST / long) if long > 0 else 1.0
+        a, b = a + part * step_a, b + part * step_b
+        at = _rescaled((theta + normals @ a)[:, None], b, index)[:, 0]
+        if long < _SETTLED:
+            break
+    left = wanted - made(problem, stated, at, index)[0]
+    e = np.where(std > 0, left / np.where(std > 0, std, 1.0), 0.0)
+    spread = np.linalg.svd(_whitened(F, std) @ U, compute_uv=False) if U.size else np.zeros(0)
+    freedom = wanted.size - int(np.count_nonzero(spread > 1.0))
+    return Adjusted(at, float(a @ a + e @ e), freedom, bool(np.all(np.abs(left[std == 0]) < _MET)))
+
+
+def conditioned(
+    problem: Problem, structure: Structure, modes: Modes, index: Index, normals: Array, unseen: Array
+) -> tuple[Array, Array]:
+    """Moves of theta that records and statements together leave: of a standard normal each, and unseen.
+
+    Parameters
+    ----------
+    normals, unseen : (size, k), (size, q)
+        Those that the records alone leave.
+    """
+    stated = statements_of(problem, structure)
+    if stated is None:
+        return normals, unseen
+    theta = theta_of(modes, structure.rigid_body_mass, index)
+    std = stated.std / stated.scale
+    _, C = made(problem, stated, theta, index)
+    gauge = _gauge(theta, index, problem.measurement.force is not None)
+    U = C @ gauge
+    F = np.hstack([C @ normals, np.diag(std)[:, std > 0]])
+    left, s, _ = np.linalg.svd(U) if U.size else (np.eye(std.size), np.zeros(0), None)
+    rank = int(np.count_nonzero(s > _OPEN * s.max(initial=0.0)))
+    checks = left[:, rank:].T @ F  # statements that no scale can meet
+    back = np.linalg.pinv(U, rcond=_OPEN) if U.size else np.zeros((0, std.size))
+    own = np.hstack([normals, np.zeros((index.size, F.shape[1] - normals.shape[1]))]) - gauge @ (back @ F)
+    _, s, vt = np.linalg.svd(checks, full_matrices=False)
+    known = vt[s > _DEPENDENT * s.max(initial=0.0)]
+    own = own - (own @ known.T) @ known
+    return own, unseen - gauge @ (back @ (C @ unseen))
+
+
+def theta_of(modes: Modes, rigid: Array, index: Index) -> Array:
+    """Modal parameters as one column."""
+    corner = np.array([rigid[i, j] for i, j in index.pairs])
+    return np.concatenate([modes.phi.ravel(), modes.gamma.ravel(), np.log(modes.omega), np.log(modes.ratios), corner])
+
+
+def _gauge(theta: Array, index: Index, weighed: bool) -> Array:
+    """What the logarithm of each mode's scale moves, (size, m); nothing where a force sets it."""
+    if weighed:
+        return np.zeros((index.size, 0))
+    phi, gamma, *_ = (part[..., 0] for part in index.split(theta[:, None]))
+    return gauge_of(phi, gamma, index)
+
+
+def _rescaled(theta: Array, scale: Array, index: Index) -> Array:
+    """Columns of theta with the shape of each mode divided, its participation multiplied by exp(scale)."""
+    if not scale.size:
+        return theta
+    theta, s, d = theta.copy(), index.shapes[0][0], index.shapes[1][1]
+    theta[index.phi] *= np.tile(np.exp(-scale), s)[:, None]
+    theta[index.gamma] *= np.repeat(np.exp(scale), d)[:, None]
+    return theta
+
+
+def _whitened(F: Array, std: Array) -> Array:
+    """Inverse square root of the covariance of statements less what the records make of them."""
+    lam, V = np.linalg.eigh(F @ F.T + np.diag(std**2))
+    return (V / np.sqrt(np.maximum(lam, _DEPENDENT**2 * max(lam[-1], np.finfo(float).tiny)))).T

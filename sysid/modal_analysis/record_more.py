@@ -1,0 +1,92 @@
+"""Further modes of whole records: what the errors of a fit hold of them, weighed by their full covariance.
+
+The noise of the base shows in all channels at once, along what the structure makes of it. A weak mode whose shape is
+another stands out of these errors, though in no channel by itself.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sysid.modal_analysis.modal_fit import Modes
+from sysid.modal_analysis.record_fit import Monitor, RecordFit, refitted, worth
+from sysid.modal_analysis.record_model import Parameters
+from sysid.modal_analysis.response import gains
+from sysid.structure.structure import Array
+
+WORTH = 25.0  # in units of ``e' S^-1 e``: a mode whose absence raises it by less is noise (chi-squared of 50)
+_RATIOS = (0.004, 0.012, 0.036)  # damping ratios that are tried
+_STEP = 1.0  # of a candidate's damping ratio, from one frequency to the next
+_REACH = 15.0  # half-power widths about a candidate, of lines that are looked at
+_DAMPED = 0.5  # a pole with more damping than this is no mode of a structure
+_CHANCE = 8.0  # by which the best of many candidates exceeds what noise makes of one
+
+
+def with_further_modes(fit: RecordFit, *, monitor: Monitor | None = None) -> RecordFit:
+    """The fit with further modes, one after the other, as long as each is worth more than noise."""
+    while True:
+        p = _candidate(fit)
+        if p is None:
+            return fit
+        more = refitted(fit, p, monitor=monitor)
+        damped = np.any(more.parameters.modes.ratios > _DAMPED)
+        if damped or more.likelihood <= fit.likelihood or np.min(worth(more)) < WORTH:
+            return fit
+        fit = more
+
+
+def _candidate(fit: RecordFit) -> Parameters | None:
+    """The parameters with one more mode, where its likeliest residue of rank one is beyond chance."""
+    model, p = fit.model, fit.parameters
+    c, inputs = model.channels, model.d + 2 * len(model.moving)
+    chance = (np.sqrt(c) + np.sqrt(inputs)) ** 2 / 2 + _CHANCE
+    best, found = chance, None
+    errors = [chunk.weighed_errors(fit.levels) for chunk in model.chunks(p)]
+    for ratio in _RATIOS:
+        ends = 2 * np.pi * fit.test.freq[[0, -1]]
+        count = int(np.log(ends[1] / ends[0]) / (_STEP * ratio)) + 2
+        for omega in np.geomspace(ends[0], ends[1], count):
+            gradient, S, U, power = np.zeros((c, inputs)), np.zeros((c, c)), np.zeros((inputs, inputs)), 0.0
+            for w, inputs_there, seen, inverse in errors:
+                near = slice(*np.searchsorted(w, omega * (1 + np.array([-1, 1]) * 2 * _REACH * ratio)))
+                g = gains(w[near] / (2 * np.pi), np.array([omega]), np.array([ratio]))[0]
+                moved = g * inputs_there[:, near]
+                gradient += (seen[:, near] @ moved.conj().T).real
+                S += np.einsum("cel,l->ce", inverse[:, :, near], np.abs(g) ** 2).real
+                U += (moved @ moved.conj().T).real
+                power += float(np.sum(np.abs(g) ** 2))
+            used = np.diag(U) > 0
+            if power == 0 or not np.any(used):
+                continue
+            # The normal matrix of residues is nearly that of the inputs times the mean inverse covariance.
+            left, right = _inverse_root(S / power), _inverse_root(U[np.ix_(used, used)])
+            u, s, vt = np.linalg.svd(left @ gradient[:, used] @ right)
+            if s[0] ** 2 > best:
+                push = np.zeros(inputs)
+                push[used] = right @ vt[0]
+                best, found = float(s[0] ** 2), (float(omega), ratio, left @ u[:, 0] * s[0], push)
+    return None if found is None else _with(fit, *found)
+
+
+def _with(fit: RecordFit, omega: float, ratio: float, shape: Array, push: Array) -> Parameters:
+    """Parameters with one more mode."""
+    p, model = fit.parameters, fit.model
+    n, d = model.n, model.d
+    phi, gamma = shape[:n], push[:d]
+    if model.force and np.linalg.norm(gamma) > 0:
+        # The force weighs the mode: what it answers by is the participation times the same.
+        weighed = float(shape[n:] @ gamma / (gamma @ gamma))
+        scale = np.sqrt(max(weighed, 1e-3 * float(np.linalg.norm(shape[n:]) / np.linalg.norm(gamma)), 1e-300))
+        phi, gamma, push = phi / scale, gamma * scale, push * scale
+    modes = p.modes
+    more = Modes(
+        np.column_stack([modes.phi, phi]), np.vstack([modes.gamma, gamma]), np.append(modes.omega, omega),
+        np.append(modes.ratios, ratio),
+    )  # fmt: skip
+    return Parameters(more, p.rigid, np.vstack([p.ends, push[d:]]), p.traces)
+
+
+def _inverse_root(matrix: Array) -> Array:
+    lam, V = np.linalg.eigh(matrix)
+    some = lam > 1e-10 * lam[-1]
+    return (V[:, some] / np.sqrt(lam[some])) @ V[:, some].T

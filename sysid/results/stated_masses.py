@@ -1,0 +1,170 @@
+"""Adjustment of a fit to what is stated of masses, and what contradicts it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from sysid.assessment.information import Index
+from sysid.assessment.statements import Adjusted, Statements, adjust, made, statements_of, theta_of
+from sysid.assessment.uncertainty import moves_by_records
+from sysid.errors import InputError
+from sysid.modal_analysis.modal_fit import Modes
+from sysid.problem.matrices import assemble
+from sysid.problem.problem import Problem
+from sysid.search.deadline import TimeIsOver, within
+from sysid.search.modal import objective_of
+from sysid.search.modal_scaling import to_stated_totals
+from sysid.search.session import Session
+from sysid.search.strategy import Outcome
+from sysid.structure.structure import Array, Structure
+
+_CHANCE = 1e-3  # that statements that are right are called contradictory
+_ALIKE = 2.0  # deviations, by which statements that explain it as well as the best are told
+_TOLD = 4
+_ROUND_OFF = 1e-8  # of the records: what counts as noise where there is none
+
+
+def with_stated_masses(problem: Problem, end: Outcome, session: Session) -> Outcome:
+    """The fit adjusted to records and statements together, and sentences on statements that contradict the rest."""
+    if end.stopped is not None or statements_of(problem, end.structure) is None:
+        return end
+    try:
+        with within(session.left):
+            return _adjusted(problem, end)
+    except TimeIsOver:
+        late = "the time was over before stated masses were adjusted together with the records"
+        return replace(end, success=False, message=f"{end.message}; {late}")
+
+
+def _adjusted(problem: Problem, end: Outcome) -> Outcome:
+    first = end.structure
+    stated = statements_of(problem, first)
+    assert stated is not None
+    modes, index, _, normals, _ = moves_by_records(problem, first)
+    if problem.measurement.response_std is None:
+        least = _ROUND_OFF / max(problem.measurement.residual(first), np.finfo(float).eps)
+        normals = normals * max(1.0, least)
+    theta = theta_of(modes, first.rigid_body_mass, index)
+    best = adjust(problem, stated, theta, index, normals)
+    said = tuple(_contradictions(problem, stated, best, theta, index, normals))
+    try:
+        structure = _structure(problem, first, theta, best.theta, index)
+    except (InputError, np.linalg.LinAlgError):
+        structure = None
+    if structure is None or not best.holds:
+        said = said or ("the stated masses cannot all be met together with the records",)
+        return replace(end, doubts=said)
+    x = problem.values(structure)
+    if end.x is not None:
+        at = problem.formulation.parts.damping
+        x[at] = np.clip(x[at], problem.lower[at], problem.upper[at])
+        x[at.stop :] = end.x[at.stop :]
+    history = replace(end.history, local=objective_of(problem, structure, x))
+    return replace(end, structure=structure, x=x, history=history, doubts=said)
+
+
+def _structure(problem: Problem, first: Structure, before: Array, after: Array, index: Index) -> Structure:
+    """The structure of adjusted modal parameters; what was repeated in the first stays so."""
+    phi, gamma, log_omega, log_ratios, rigid = (part[..., 0] for part in index.split(after[:, None]))
+    _, _, own_omega, own_ratios, _ = (part[..., 0] for part in index.split(before[:, None]))
+    omega = 2 * np.pi * first.natural_frequencies * np.exp(log_omega - own_omega)
+    ratios = first.damping_ratios * np.exp(log_ratios - own_ratios)
+    order = np.argsort(omega, kind="stable")
+    end = Modes(phi[:, order], gamma[order], omega[order], ratios[order])
+    geometry, P, G = problem.geometry, np.linalg.inv(end.phi), problem.geometry.rigid_body
+    if problem.measurement.force is None:
+        groups = geometry.directions[: geometry.n]
+        remainder = np.diag(problem.totals)
+        _, left = to_stated_totals(problem, P, end.gamma, G, groups, remainder, scaled=True)
+    else:
+        left = rigid - end.gamma.T @ end.gamma
+        size = np.sqrt(np.diag(rigid))
+        lam, V = np.linalg.eigh(left / np.outer(size, size))
+        left = (V * np.maximum(lam, 0.0)) @ V.T * np.outer(size, size)
+    M_SS = P.T @ P
+    delta = end.gamma - P @ G
+    return assemble(
+        M_SS, P.T @ end.gamma - M_SS @ G, delta.T @ delta + left, (P.T * end.omega**2) @ P, G, ratios=end.ratios,
+        test=problem.measurement,
+    )  # fmt: skip
+
+
+def _contradictions(
+    problem: Problem, stated: Statements, best: Adjusted, theta: Array, index: Index, normals: Array
+) -> Iterator[str]:
+    """Whether statements and records disagree beyond chance, and which statements explain it."""
+    numbers = _numbers(problem, index)
+    if _chance(best, numbers) >= _CHANCE:
+        return
+    told = f"the stated masses cannot all be met together with the records (chance {_chance(best, numbers):.1g})"
+    explained: list[tuple[float, str]] = []
+    for row in range(stated.values.size):
+        without = adjust(problem, stated.without(row), theta, index, normals)
+        if without.freedom == best.freedom or _chance(without, numbers) < _CHANCE:
+            continue
+        value = (made(problem, stated, without.theta, index)[0] * stated.scale)[row]
+        off = np.sqrt(max(best.misfit - without.misfit, 0.0))
+        explained.append((off, _in_words(problem, stated, row, value, off)))
+    if explained:
+        explained.sort(key=lambda one: -one[0])
+        near = [words for off, words in explained if off**2 > explained[0][0] ** 2 - _ALIKE**2]
+        yield f"{told}: {'; or '.join(near[:_TOLD])}"
+        return
+    factor = _common_factor(problem, stated, theta, index, normals)
+    if factor > 0:
+        scaled = stated._replace(values=factor * stated.values, std=factor * stated.std)
+        if _chance(adjust(problem, scaled, theta, index, normals), numbers) >= _CHANCE:
+            yield f"{told}; all of them would be met {factor:.4g} times as large: is a unit or the force's gain wrong?"
+            return
+    yield f"{told}; no single one of them explains it"
+
+
+def _common_factor(problem: Problem, stated: Statements, theta: Array, index: Index, normals: Array) -> float:
+    """By what all statements would be wrong in common, by what a base force weighs; zero where none was measured."""
+    if problem.measurement.force is None:
+        return 0.0
+    values, slopes = made(problem, stated, theta, index)
+    noise = slopes @ normals
+    weight = np.linalg.pinv(noise @ noise.T, hermitian=True)
+    given = stated.values / stated.scale
+    return float(given @ weight @ values / (given @ weight @ given))
+
+
+def _in_words(problem: Problem, stated: Statements, row: int, value: float, off: float) -> str:
+    test, n = problem.measurement, problem.geometry.n
+    axes = test.base_axes or [f"base direction {i + 1}" for i in range(test.n_base)]
+    given = stated.values[row]
+    factor = f", {value / given:.4g} times as much" if given else ""
+    if row < len(stated.entries):
+        i, j = stated.entries[row]
+        column = test.sensor_names[j] if j < n else f"base {axes[j - n]}"
+        name = f"row {test.sensor_names[i]}, column {column}"
+    else:
+        i, j = stated.totals[row - len(stated.entries)]
+        name = f"the total in {axes[i]}" if i == j else f"the rigid-body mass between {axes[i]} and {axes[j]}"
+    return (
+        f"{name} is stated as {given:.4g}, and the records with all other statements make it {value:.4g}{factor} "
+        f"({off:.2g} deviations off)"
+    )
+
+
+def _numbers(problem: Problem, index: Index) -> float:
+    """Degrees of freedom of the records' own noise; infinite where it is stated."""
+    test = problem.measurement
+    if test.response_std is not None and (test.force is None or test.force_std is not None):
+        return np.inf
+    return float(max(2 * (test.response.size + (0 if test.force is None else test.force.size)) - index.size, 1))
+
+
+def _chance(found: Adjusted, numbers: float) -> float:
+    """Probability of a misfit so large where all statements are right."""
+    from scipy.special import chdtrc, fdtrc
+
+    if found.freedom <= 0:
+        return 1.0
+    if np.isinf(numbers):
+        return float(chdtrc(found.freedom, found.misfit))
+    return float(fdtrc(found.freedom, numbers, found.misfit / found.freedom))

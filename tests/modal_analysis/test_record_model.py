@@ -1,0 +1,137 @@
+"""Whole records as a model: transients in closed form, and derivatives and weights against dense references."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sysid.measurement.measurement import Measurement
+from sysid.measurement.whole import WholeRecords
+from sysid.modal_analysis.modal_fit import Modes
+from sysid.modal_analysis.record_model import Chunk, Parameters, RecordModel
+from sysid.modal_analysis.response import gains
+from sysid.structure.structure import Array, ComplexArray
+
+OMEGA, RATIO, RATE, SAMPLES = 2 * np.pi * 3.1, 0.02, 40.0, 700
+FORCED = 2j * np.pi * 2.2345  # between two lines
+
+
+def _motion() -> tuple[list[tuple[complex, complex]], list[tuple[complex, complex]]]:
+    """Base and displacement of an oscillator as sums of ``Re c exp(s t)``: forced off the lines, and free."""
+    c, pole = 1.3 - 0.4j, OMEGA * (-RATIO + 1j * np.sqrt(1 - RATIO**2))
+    forced = -c / (FORCED**2 + 2 * RATIO * OMEGA * FORCED + OMEGA**2)
+    return [(c, FORCED)], [(forced, FORCED), (0.003 + 0.002j, pole)]
+
+
+def _transform(parts: list[tuple[complex, complex]], w: Array, derivative: int) -> ComplexArray:
+    T = SAMPLES / RATE
+    terms = [(a * s**derivative / 2, s) for a, s in parts]
+    both = [*terms, *((np.conj(a), np.conj(s)) for a, s in terms)]
+    return np.sum([a * (np.exp(s * T) - 1) / (s - 1j * w) for a, s in both], axis=0)
+
+
+def _change(parts: list[tuple[complex, complex]], derivative: int) -> float:
+    return float(sum((a * s**derivative * (np.exp(s * SAMPLES / RATE) - 1)).real for a, s in parts))
+
+
+def test_transform_of_a_moving_record_is_the_response_and_two_numbers() -> None:
+    base, motion = _motion()
+    freq = np.arange(10, 300) * RATE / SAMPLES
+    w = 2 * np.pi * freq
+    dq, dv = _change(motion, 0), _change(motion, 1)
+    ends = np.array([OMEGA**2 * dv, OMEGA**2 * dq + 2 * RATIO * OMEGA * dv])
+    g = gains(freq, np.array([OMEGA]), np.array([RATIO]))[0]
+    inputs = ends @ WholeRecords((SAMPLES,), RATE, (False,)).transients(freq)
+    exact = _transform(motion, w, 2)
+    model = g * (_transform(base, w, 0) + inputs)
+    assert np.linalg.norm(model - exact) < 1e-9 * np.linalg.norm(exact)
+    assert np.linalg.norm(g * inputs) > 0.1 * np.linalg.norm(exact)  # the numbers matter
+
+
+def _model(force: bool, d: int) -> tuple[RecordModel, Parameters, Array]:
+    """Two runs of unequal length, one at rest; data and parameters at random, so that no error is small."""
+    r = np.random.default_rng(3)
+    n, m, rate = 3, 2, 20.0
+    runs = [(r.normal(size=(d, N)), r.normal(size=(n, N)), r.normal(size=(d, N)) if force else None) for N in (64, 50)]
+    test = Measurement.from_time(
+        runs, rate, rigid_body=r.normal(size=(n, d)) / 4, band=(1.0, 9.0), at_rest=[False, True],
+        base_axes="xyz"[:d],
+    )  # fmt: skip
+    model = RecordModel(test, m)
+    rigid = (2.0 * np.eye(d) + 0.1) if force else np.zeros((d, d))
+    modes = Modes(r.normal(size=(n, m)), r.normal(size=(m, d)), np.array([15.0, 35.0]), np.array([0.06, 0.1]))
+    traces = r.normal(size=(2, model.channels, 3))
+    p = Parameters(modes, rigid, r.normal(size=(m, 2)), traces)
+    return model, p, r.uniform(0.3, 2.0, model.channels + d)
+
+
+def _dense(chunk: Chunk, levels: Array) -> ComplexArray:
+    """S of each line, (L, c, c)."""
+    c, T = chunk.model.channels, np.moveaxis(chunk.H, -1, 0)
+    return chunk.run.density * (np.diag(levels[:c]) + T @ np.diag(levels[c:]) @ T.conj().swapaxes(1, 2))
+
+
+def _dense_chi2(model: RecordModel, p: Parameters, levels: Array) -> float:
+    total = 0.0
+    for chunk in model.chunks(p):
+        for S, e in zip(_dense(chunk, levels), chunk.error.T, strict=True):
+            total += (e.conj() @ np.linalg.solve(S, e)).real
+    return total
+
+
+CASES = pytest.mark.parametrize(("force", "d"), [(True, 1), (False, 1), (True, 2), (False, 2)])
+
+
+@CASES
+def test_whitened_errors_sum_to_those_of_the_dense_covariance(force: bool, d: int) -> None:
+    model, p, levels = _model(force, d)
+    assert model.chi2(p, levels) == pytest.approx(_dense_chi2(model, p, levels), rel=1e-10)
+
+
+@CASES
+def test_gradient_is_that_of_the_sum_with_covariance_varying(force: bool, d: int) -> None:
+    model, p, levels = _model(force, d)
+    made, x = model.normal_equations(p, levels), model.pack(p)
+    h = 1e-5
+    slope = [
+        (_dense_chi2(model, model.unpack(x + h * u), levels) - _dense_chi2(model, model.unpack(x - h * u), levels))
+        / (2 * h)
+        for u in np.eye(x.size)
+    ]
+    np.testing.assert_allclose(-2 * made.gradient, slope, atol=1e-6 * np.abs(slope).max())
+    assert made.chi2 == pytest.approx(_dense_chi2(model, p, levels), rel=1e-10)
+
+
+@CASES
+def test_normal_matrix_is_that_of_derivatives_at_the_likeliest_base(force: bool, d: int) -> None:
+    model, p, levels = _model(force, d)
+    made, x, h = model.normal_equations(p, levels), model.pack(p), 1e-5
+    dense = np.zeros_like(made.normal)
+    for run in model.runs:
+        here = Chunk(model, p, run)
+        S, T = _dense(here, levels), np.moveaxis(here.H, -1, 0)
+        pulled = np.einsum("lcd,lc->ld", T.conj(), np.linalg.solve(S, here.error.T[..., None])[..., 0])
+        likely = run._replace(base=run.base + (run.density * levels[model.channels :] * pulled).T)
+        J = np.array([
+            (Chunk(model, model.unpack(x - h * u), likely).error - Chunk(model, model.unpack(x + h * u), likely).error)
+            / (2 * h)
+            for u in np.eye(x.size)
+        ])  # fmt: skip
+        J = np.moveaxis(J, -1, 0)  # (L, p, c)
+        dense += np.einsum("lpc,lcq->pq", J.conj(), np.linalg.solve(S, J.swapaxes(1, 2))).real
+    np.testing.assert_allclose(made.normal, dense, atol=1e-7 * np.abs(dense).max())
+
+
+def test_lines_of_unequal_runs_are_their_own_transforms() -> None:
+    r = np.random.default_rng(0)
+    runs = [(r.normal(size=(1, N)), r.normal(size=(2, N)), None) for N in (60, 84)]
+    test = Measurement.from_time(runs, 12.0, rigid_body=[[1.0], [1.0]])
+    for run, own, (base, response, _) in zip(RecordModel(test, 1).runs, test.own_lines, runs, strict=True):
+        N = base.shape[1]
+        lines = np.rint(test.freq[own] * N / 12.0).astype(int)
+        np.testing.assert_allclose(test.freq[own], lines * 12.0 / N, rtol=1e-12)
+        scale = (run.base[0] / np.fft.rfft(base[0])[lines])[0]
+        np.testing.assert_allclose(run.base, scale * np.fft.rfft(base)[:, lines], rtol=1e-9)
+        np.testing.assert_allclose(run.outputs, scale * np.fft.rfft(response)[:, lines], rtol=1e-9)
+        assert scale == pytest.approx(1 / 12.0)
+        assert not np.any(test.response[run.number][:, ~own])
