@@ -83,8 +83,9 @@ plt.show()
 # ## From records to a measurement
 #
 # The events start and end (nearly) at rest, so the Fourier transform of each whole record will do
-# (`estimator="spectra"`). A long stationary random test would take `estimator="h1"` and a segment length. The band
-# leaves out the drift of the offsets below, and the noise of the units above.
+# (`estimator="spectra"`). The default, `estimator="records"` (notebook 6), would weigh every line by the noise of the
+# units; here what a linear model misses is many times larger than that noise, so all lines count alike. The band leaves
+# out the drift of the offsets below, and the noise of the units above.
 
 # %%
 SENSORS = [sysid.Sensor(f"floor {i}", (0.0, 0.0, float(i)), "x") for i in (1, 2, 3)]

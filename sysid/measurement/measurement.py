@@ -421,11 +421,12 @@ class Measurement:
         rigid_body : array_like, shape (n_sensors, d)
         estimator : {"records", "spectra", "h1", "h2"}
             "records" takes each run whole, of any length and cut anywhere, in motion too: its transients, two numbers a
-            mode and run, and the noise of all channels, base and force included, are found with the modes. "spectra" is
-            the Fourier transform of each whole record without them, right
-            for motion that starts and ends at rest. "h1" (noise on the responses) and "h2" (noise
-            on the base) average over segments and runs by Welch's method and give d unit runs;
-            "h1" solves for several base directions at once and gives standard deviations from the coherence.
+            mode and run, and the noise of all channels, base and force included, are found with the modes. Runs may
+            differ in length and strength. "spectra" is the Fourier transform of each whole record without them, right
+            for motion that starts and ends at rest where the model misses more than noise, as of a structure that is
+            not quite linear. "h1" (noise on the responses) and "h2" (noise on the base) average over segments and runs
+            by Welch's method and give d unit runs; "h1" solves for several base directions at once and gives standard
+            deviations from the coherence.
         at_rest : bool or sequence of bool
             Of "records": whether all runs, or each, begin and end at rest, and so have no transients.
         noise : NoiseLevels, optional
@@ -438,6 +439,15 @@ class Measurement:
             Hz, both ends included; all lines but zero by default.
         sensors : sequence of Sensor, optional
         base_axes : str or sequence of str, optional
+
+        Examples
+        --------
+        Two runs of 4 and 3 s at 100 Hz, the second at rest at both ends:
+
+        >>> rng = np.random.default_rng(0)
+        >>> runs = [(rng.standard_normal((1, n)), rng.standard_normal((2, n)), None) for n in (400, 300)]
+        >>> Measurement.from_time(runs, 100.0, rigid_body=[[1.0], [1.0]], at_rest=[False, True], band=(1.0, 10.0))
+        <Measurement: 2 sensors, base x, 2 runs, 55 lines from 1 to 10 Hz>
         """
         G = np.atleast_2d(finite_array("rigid_body", rigid_body))
         choice("estimator", estimator, ("records", "spectra", "h1", "h2"))

@@ -24,6 +24,13 @@ class NoiseLevels:
         m/s² (rad/s² for a rotation).
     force : (d,), (runs, d) or None
         N (N m); None where no force was measured.
+
+    Examples
+    --------
+    Two sensors, one base direction, no force:
+
+    >>> NoiseLevels(response=[0.02, 0.03], base=[0.01]).outputs
+    array([0.02, 0.03])
     """
 
     response: Array

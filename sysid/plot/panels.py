@@ -138,9 +138,12 @@ def _channel(
     phase = f"phase to\nbase {test.base_axes[moved]} [°]"
     # The scale of a spectrum (a line, per Hz, one-sided) is the record's own affair.
     against = test.base[run, moved]
+    own = test.own_lines[run]  # whole records of other lengths have zeros at the others
+    gaps = np.concatenate([[0], np.cumsum(own)])[test.gaps]
     return Channel(
-        test.freq, measured, predicted, against, title, spectrum, phase, negligible, std, np.zeros(0), test.gaps
-    )
+        test.freq[own], measured[own], predicted[own], against[own], title, spectrum, phase, negligible, std[own],
+        np.zeros(0), gaps,
+    )  # fmt: skip
 
 
 def place(ax: Axes | Sequence[Axes] | None, channel: Channel) -> Any:

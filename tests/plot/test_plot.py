@@ -306,6 +306,17 @@ def test_a_band_is_the_interval_of_the_identified_magnitude(unit, runs):
         assert [entry.get_label() for entry in key([ax])] == ["measured", "identified", "95 % band", "difference"]
 
 
+def test_a_run_of_another_length_shows_its_own_lines_only(runs):
+    """Two records of 400 and 300 samples at 100 Hz: lines of the second are 1/3 Hz apart, zeros stand between."""
+    rng = np.random.default_rng(0)
+    records = [(rng.standard_normal((2, n)), rng.standard_normal((3, n)), None) for n in (400, 300)]
+    test = sysid.Measurement.from_time(records, 100.0, rigid_body=runs.measurement.rigid_body, band=(1.0, 10.0))
+    channel = response_channel(runs, test, 1, 1)
+    np.testing.assert_allclose(channel.freq, np.arange(3, 31) / 3)
+    assert test.freq.size > channel.freq.size == channel.measured.size == channel.identified.size == channel.std.size
+    assert np.all(channel.measured != 0) and np.all(channel.identified != 0)
+
+
 def test_every_picture_of_responses_takes_a_band(unit):
     u = unit.uncertainty
     of_responses, of_force = u.transmissibility(FREQ), u.base_force(FREQ)
