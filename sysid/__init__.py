@@ -8,7 +8,8 @@ import casadi as _casadi
 from sysid import jobs, plot
 from sysid.errors import InputError, SolverError, SysidError
 from sysid.identify import identify
-from sysid.measurement.measurement import Measurement, Sensor, rigid_body
+from sysid.measurement.measurement import Measurement, Sensor
+from sysid.measurement.rigid_body import rigid_body
 from sysid.measurement.simulation import simulate
 from sysid.measurement.spectra import resample
 from sysid.measurement.time_scores import TimeScores, time_scores

@@ -22,7 +22,7 @@ from sysid.problem.problem import Problem
 from sysid.structure.structure import Array, Structure
 
 _CHANCE = 1e-3  # that any sensor of a right test is accused
-_SUSPECT = 1.8  # deviations of the noise, beyond which an error of a gain counts among what is not known
+_SUSPECT = 2.5  # deviations of the noise, beyond which an error of a gain counts among what is not known
 _LEAST = 2e-3  # of a gain; smaller errors are usual
 _MIMICKED = 1e-2  # of a constant; less of it is left where a mode far below the lines answers like one
 _EXACT = 1e-8  # of the records: what counts as noise where there is none

@@ -14,62 +14,14 @@ from sysid.measurement import spectra
 from sysid.measurement.cuts import check_cuts
 from sysid.measurement.missing import Missing, complete, named, present
 from sysid.measurement.noise import levels_at_rest
+from sysid.measurement.rigid_body import axis_vector
 from sysid.measurement.whole import ModalEstimate, NoiseLevels, WholeRecords, per_run
-from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
+from sysid.structure.axes import BASE_AXES, base_columns
 from sysid.structure.sensor import Sensor, checked_sensors, sensors_from_tree, sensors_to_tree
 from sysid.structure.structure import Array, ComplexArray, Structure, check_frequencies
 
+_FOLDED = 0.4  # of the sample rate; whole records are fitted up to it
 _RECORDS = ("freq", "base", "response", "force", "response_std", "force_std")  # what has lines
-
-
-def rigid_body(
-    positions: ArrayLike,
-    axes: Sequence[str | Sequence[float]],
-    *,
-    base_axes: str | Sequence[str] = "xyz",
-    origin: Sequence[float] = (0.0, 0.0, 0.0),
-) -> Array:
-    """Motion of each sensor for unit rigid motion of the base (method of eq. 4 of Cerini et al. 2024).
-
-    A sensor along the unit vector e at r from `origin` has the row ``[e', (r x e)']``.
-
-    Parameters
-    ----------
-    positions : array_like, shape (n_sensors, 3)
-        m.
-    axes : sequence of n_sensors strings ("x", "-y", ...) or direction vectors
-    base_axes : str or sequence of str
-        Of x y z rx ry rz; a string such as "xy" is short for its letters, "x rz" names two.
-    origin : sequence of float, shape (3,)
-        The base point, m. Rotations of the base are in rad/s² about it.
-
-    Returns
-    -------
-    ndarray, shape (n_sensors, d)
-
-    Examples
-    --------
-    >>> rigid_body([[0, 0, 2.0]], ["x"], base_axes=["x", "ry"])
-    array([[1., 2.]])
-    """
-    points = np.atleast_2d(finite_array("positions", positions))
-    given = sequence("axes", axes, "a list with one axis a sensor, such as ['x', '-y']")
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) != len(given):
-        raise InputError(f"positions {points.shape} and {len(given)} axes disagree; both have one row a sensor")
-    columns = base_columns(base_axes)
-    motion = rigid_motion(points, origin).reshape(len(points), 6, 6)
-    rows = [axis_vector(axis, f"sensor {i}") @ motion[i, :3] for i, axis in enumerate(given)]
-    return np.array(rows)[:, columns]
-
-
-def axis_vector(axis: str | Sequence[float], label: str = "a sensor") -> Array:
-    """Unit vector of "x", "-y", ... or of a direction vector."""
-    row = sensor_row(axis, label)
-    if np.any(row[3:]):
-        raise InputError(
-            f"the axis of {label} is the rotation {axis!r}; an accelerometer measures x, y or z, or a vector"
-        )
-    return row[:3]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -421,12 +373,10 @@ class Measurement:
         rigid_body : array_like, shape (n_sensors, d)
         estimator : {"records", "spectra", "h1", "h2"}
             "records" takes each run whole, of any length and cut anywhere, in motion too: its transients, two numbers a
-            mode and run, and the noise of all channels, base and force included, are found with the modes. Runs may
-            differ in length and strength. "spectra" is the Fourier transform of each whole record without them, right
-            for motion that starts and ends at rest where the model misses more than noise, as of a structure that is
-            not quite linear. "h1" (noise on the responses) and "h2" (noise on the base) average over segments and runs
-            by Welch's method and give d unit runs; "h1" solves for several base directions at once and gives standard
-            deviations from the coherence.
+            mode and run, and the noise of all channels, base and force included, are found with the modes. "spectra" is
+            the Fourier transform of each whole record without them, right for motion that starts and ends at rest where
+            the model misses more than noise. "h1" (noise on the responses) and "h2" (noise on the base) average over
+            segments and runs by Welch's method and give d unit runs; "h1" solves for several base directions at once.
         at_rest : bool or sequence of bool
             Of "records": whether all runs, or each, begin and end at rest, and so have no transients.
         noise : NoiseLevels, optional
@@ -436,7 +386,8 @@ class Measurement:
             several times closer than the narrowest resonance is wide (rate / segment well below 2 zeta f), else
             leakage flattens the peak, and damping and masses come out wrong.
         band : (low, high), optional
-            Hz, both ends included; all lines but zero by default.
+            Hz, both ends included; by default all lines but zero, of "records" up to 0.4 of the sample rate, as motion
+            that sampling folds back is largest above.
         sensors : sequence of Sensor, optional
         base_axes : str or sequence of str, optional
 
@@ -468,6 +419,8 @@ class Measurement:
                 estimate.freq, estimate.frf, force=estimate.force, response_std=estimate.frf_std,
                 force_std=estimate.force_std, **given,
             )  # fmt: skip
+        if band is None and estimator == "records":
+            band = test.freq[0], max(_FOLDED * sample_rate, test.freq[0])
         return test if band is None else test.in_band(*sequence("band", band, "(low, high) in Hz", 2))
 
     noise_from_rest = staticmethod(levels_at_rest)

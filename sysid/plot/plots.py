@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError
-from sysid.measurement.measurement import Measurement, axis_vector
+from sysid.measurement.measurement import Measurement
+from sysid.measurement.rigid_body import axis_vector
 from sysid.plot.canvas import (
     COLOURS,
     FAINT,

@@ -1,0 +1,62 @@
+"""Motion of sensors with a rigid base, from their positions and axes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sysid.errors import InputError, finite_array, sequence
+from sysid.structure.axes import base_columns, rigid_motion, sensor_row
+from sysid.structure.structure import Array
+
+
+def rigid_body(
+    positions: ArrayLike,
+    axes: Sequence[str | Sequence[float]],
+    *,
+    base_axes: str | Sequence[str] = "xyz",
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
+) -> Array:
+    """Motion of each sensor for unit rigid motion of the base (method of eq. 4 of Cerini et al. 2024).
+
+    A sensor along the unit vector e at r from `origin` has the row ``[e', (r x e)']``.
+
+    Parameters
+    ----------
+    positions : array_like, shape (n_sensors, 3)
+        m.
+    axes : sequence of n_sensors strings ("x", "-y", ...) or direction vectors
+    base_axes : str or sequence of str
+        Of x y z rx ry rz; a string such as "xy" is short for its letters, "x rz" names two.
+    origin : sequence of float, shape (3,)
+        The base point, m. Rotations of the base are in rad/s² about it.
+
+    Returns
+    -------
+    ndarray, shape (n_sensors, d)
+
+    Examples
+    --------
+    >>> rigid_body([[0, 0, 2.0]], ["x"], base_axes=["x", "ry"])
+    array([[1., 2.]])
+    """
+    points = np.atleast_2d(finite_array("positions", positions))
+    given = sequence("axes", axes, "a list with one axis a sensor, such as ['x', '-y']")
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) != len(given):
+        raise InputError(f"positions {points.shape} and {len(given)} axes disagree; both have one row a sensor")
+    columns = base_columns(base_axes)
+    motion = rigid_motion(points, origin).reshape(len(points), 6, 6)
+    rows = [axis_vector(axis, f"sensor {i}") @ motion[i, :3] for i, axis in enumerate(given)]
+    return np.array(rows)[:, columns]
+
+
+def axis_vector(axis: str | Sequence[float], label: str = "a sensor") -> Array:
+    """Unit vector of "x", "-y", ... or of a direction vector."""
+    row = sensor_row(axis, label)
+    if np.any(row[3:]):
+        raise InputError(
+            f"the axis of {label} is the rotation {axis!r}; an accelerometer measures x, y or z, or a vector"
+        )
+    return row[:3]
