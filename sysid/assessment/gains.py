@@ -22,7 +22,7 @@ from sysid.problem.problem import Problem
 from sysid.structure.structure import Array, Structure
 
 _CHANCE = 1e-3  # that any sensor of a right test is accused
-_SUSPECT = 2.5  # deviations of the noise, beyond which an error of a gain counts among what is not known
+_SUSPECT = 2.5  # deviations of the noise, beyond which what a gain is off by counts among what is not known
 _LEAST = 2e-3  # of a gain; smaller errors are usual
 _MIMICKED = 1e-2  # of a constant; less of it is left where a mode far below the lines answers like one
 _EXACT = 1e-8  # of the records: what counts as noise where there is none
@@ -103,7 +103,8 @@ def gain_errors(test: Measurement, structure: Structure) -> GainErrors:
     both = np.linalg.qr(np.hstack([free.Q, rising]))[0]
     error, std, least_beside = _estimate(test, records, free, both, ones, slopes)
     pairs = ((np.abs(plain), least), (np.abs(error), least_beside))
-    possible = np.max([np.where(size > _SUSPECT * noise, size, 0.0) for size, noise in pairs], axis=0)
+    beyond = [np.sqrt(np.maximum(size**2 - (_SUSPECT * noise) ** 2, 0.0)) for size, noise in pairs]
+    possible = np.max(np.nan_to_num(beyond), axis=0)
     plain_std = np.hypot(plain_std, plain - error)
     better = plain_std < std
     error, std = np.where(better, plain, error), np.where(better, plain_std, std)

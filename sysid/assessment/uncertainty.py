@@ -202,7 +202,9 @@ def uncertainty(problem: Problem, structure: Structure, x: Array | None) -> Unce
 
 def _by_modes(problem: Problem, structure: Structure, x: Array | None) -> Uncertainty:
     """Standard deviations where the modal parameters are free, from their Fisher information."""
-    test, (modes, index, inflation, normals, unseen) = problem.measurement, moves_by_records(problem, structure)
+    test, (modes, index, inflation, normals, unseen) = (
+        problem.measurement, moves_by_records(problem, structure, gains=True)
+    )  # fmt: skip
     normals, unseen = conditioned(problem, structure, modes, index, normals, unseen)
     normals = normals if np.isfinite(inflation) else np.full_like(normals, np.nan)
     moves = Perturbations(normals.shape[1], *index.split(np.hstack([normals, unseen])))
@@ -219,8 +221,13 @@ def _by_modes(problem: Problem, structure: Structure, x: Array | None) -> Uncert
     return replace(found, values=by_name(variables, at), variables=by_name(variables, std))
 
 
-def moves_by_records(problem: Problem, structure: Structure) -> tuple[Modes, Index, float, Array, Array]:
-    """Modes, index, inflation, and moves of theta that the records leave: of a standard normal each, and unseen."""
+def moves_by_records(
+    problem: Problem, structure: Structure, *, gains: bool = False
+) -> tuple[Modes, Index, float, Array, Array]:
+    """Modes, index, inflation, and moves of theta that the records leave: of a standard normal each, and unseen.
+
+    With `gains` also those that make up for errors that gains of sensors may have.
+    """
     test, modes = problem.measurement, modes_of(structure)
     index = Index(structure.n_sensors, structure.n, structure.n_base)
     path = parametrisation(problem, structure, modes, index)
@@ -236,6 +243,8 @@ def moves_by_records(problem: Problem, structure: Structure) -> tuple[Modes, Ind
     normals, unseen = spread(A, B, path)
     inflation = inflation_of(test, records, unknowns)
     moves = [(1.0 if np.isnan(inflation) else inflation) * normals]
+    if not gains:
+        return modes, index, inflation, moves[0], unseen
     possible = np.zeros(0) if spectra is None else gain_errors(test, structure).possible
     if spectra is not None and np.any(possible):
         pulls = gain_gradients(modes, index, test.rigid_body, records[0].grams(spectra))
