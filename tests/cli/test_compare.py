@@ -59,7 +59,7 @@ def test_a_folder_takes_the_rows_too(here, capsys):
         (["pair.py", "--max-time", "0"], "not a positive number"),
         (["pair.py", "--set", "goal=1"], "parameters of this module: none"),
         (["pair.py", "--out", "pair.py"], "not a folder"),
-        (["known.py"], "no strategy applies: modal: "),
+        (["known.py"], "known entries of a FullMass"),
     ],
 )
 def test_a_mistake_is_one_line(here, capsys, arguments, told):

@@ -5,11 +5,11 @@ import time
 import casadi as ca
 import numpy as np
 import pytest
-import scipy.stats.qmc
 
 import sysid
 from sysid.models import geometry
 from sysid.problem import formulation, problem
+from sysid.swarm import sampling
 
 SPRINGS = np.array([2e4, 1.5e4, 1e4])
 FREQ = np.linspace(1.0, 30.0, 60)
@@ -71,7 +71,7 @@ def calls(monkeypatch):
     counted(formulation, "noise_level")
     counted(problem, "weighed_mass")
     counted(ca, "nlpsol")
-    counted(scipy.stats.qmc, "LatinHypercube")
+    counted(sampling, "latin_hypercube")
     return ran
 
 
@@ -88,14 +88,14 @@ def test_nothing_is_searched(calls, which):
     ("which", "searches"),
     [
         ("full mass", {"find_poles"}),
-        ("frequencies stated", {"LatinHypercube"}),
-        ("a limit of frequencies that is low", {"find_poles", "LatinHypercube"}),
+        ("frequencies stated", {"latin_hypercube"}),
+        ("a limit of frequencies that is low", {"find_poles", "latin_hypercube"}),
         ("weighed by the base force", {"find_poles", "weighed_mass"}),
-        ("written", {"LatinHypercube"}),
-        ("a further test", {"LatinHypercube"}),
-        ("a prior", {"find_poles", "LatinHypercube"}),
-        ("a constraint and healing", {"nlpsol", "LatinHypercube"}),
-        ("a misfit", {"find_poles", "LatinHypercube"}),
+        ("written", {"latin_hypercube"}),
+        ("a further test", {"latin_hypercube"}),
+        ("a prior", {"find_poles", "latin_hypercube"}),
+        ("a constraint and healing", {"nlpsol", "latin_hypercube"}),
+        ("a misfit", {"find_poles", "latin_hypercube"}),
     ],
 )
 def test_what_is_needed_is_searched_by_the_check_and_once(calls, which, searches):

@@ -26,7 +26,7 @@ def answer():
         levels.append(share * np.std(clean))
         records.append((clean + levels[-1] * rng.standard_normal(n))[None])
     noise = sysid.NoiseLevels(levels[1:2], levels[:1], levels[2:])
-    test = sysid.Measurement.from_time([tuple(records)], rate, rigid_body=[[1.0]], noise=noise)
+    test = sysid.Measurement.from_time([tuple(records)], rate, rigid_body=[[1.0]], noise=noise, band=(0.0, rate / 2))
     return sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), rng=1)
 
 
