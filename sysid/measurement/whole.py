@@ -169,6 +169,8 @@ class ModalEstimate:
     gain : Gains
     scatter : (p, p) or None
         B, where what is left is no white noise and the covariance is ``A^-1 B A^-1 / 2``, A the information.
+    settled : bool
+        Whether modes and levels of noise stood still at the end of the fit.
     """
 
     phi: Array
@@ -182,6 +184,7 @@ class ModalEstimate:
     density: Array
     gain: Gains
     scatter: Array | None = None
+    settled: bool = True
 
 
 def per_run(name: str, value: Any, runs: int) -> tuple[bool, ...]:

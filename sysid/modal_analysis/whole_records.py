@@ -132,5 +132,5 @@ def estimate(fit: RecordFit) -> ModalEstimate:
     return ModalEstimate(
         modes.phi[:, order], modes.gamma[order], modes.omega[order], modes.ratios[order], p.rigid,
         A[np.ix_(at, at)], fit.noise, fit.reduced, fit.model.whole.density, gain_errors_of(fit),
-        None if B is None else B[np.ix_(at, at)],
+        None if B is None else B[np.ix_(at, at)], fit.settled,
     )  # fmt: skip

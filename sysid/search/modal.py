@@ -219,6 +219,10 @@ def run_modal(problem: Problem, options: Modal, session: Session) -> Outcome:
         + f" Hz (free residues fit within {poles.residual:.2e})"
     )
     success, message = end.status in SOLVED or end.residual <= EXACT, f"IPOPT: {end.status}"
+    modal = problem.measurement.modal
+    if modal is not None:  # fitted with the transients, before
+        success = modal.settled
+        message = f"the fit of whole records {'settled' if success else 'did not settle: modes or noise still moved'}"
     if monitor.is_over and end.residual > EXACT:
         success, message = False, f"{message}; the time was over before every further fit was tried"
     answer = LocalResult(np.zeros(0), success, message, np.array(monitor.curve), monitor.stopped)
