@@ -341,8 +341,8 @@ def _shares(test: Measurement, structure: Structure, k: int, rows: Array, push: 
     g = gains(test.freq, 2 * np.pi * structure.natural_frequencies[[k]], structure.damping_ratios[[k]])
     moved = np.einsum("wd,rdf->wrf", push, test.base) * g
     if record.weight.ndim == 3:
-        seen = [np.linalg.norm(record.weight * np.outer(row, one).reshape(len(row), *one.shape).swapaxes(0, 1))
-                for row, one in zip(rows.T, moved, strict=True)]  # fmt: skip
+        pairs = zip(rows.T, moved, strict=True)
+        seen = [np.linalg.norm(record.weight * row[:, None] * one[:, None]) for row, one in pairs]
         return np.array(seen) / record.size
     return np.linalg.norm(moved, axis=(1, 2)) * np.linalg.norm(record.weight * rows, axis=0) / record.size
 

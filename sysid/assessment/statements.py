@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from sysid.assessment.information import Index
 from sysid.assessment.parametrisation import gauge_of, slope_of_drawn_mass
+from sysid.modal_analysis.modal_estimate import theta_of
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.problem.problem import Problem
 from sysid.structure.structure import Array, Structure
@@ -190,12 +191,6 @@ def conditioned(
     known = vt[s > _DEPENDENT * s.max(initial=0.0)]
     own = own - (own @ known.T) @ known
     return own, unseen - gauge @ (back @ (C @ unseen))
-
-
-def theta_of(modes: Modes, rigid: Array, index: Index) -> Array:
-    """Modal parameters as one column."""
-    corner = np.array([rigid[i, j] for i, j in index.pairs])
-    return np.concatenate([modes.phi.ravel(), modes.gamma.ravel(), np.log(modes.omega), np.log(modes.ratios), corner])
 
 
 def _gauge(theta: Array, index: Index, weighed: bool) -> Array:

@@ -6,7 +6,6 @@ import numpy as np
 
 from sysid.measurement.whole import Gains
 from sysid.modal_analysis.record_fit import RecordFit
-from sysid.modal_analysis.record_model import RecordModel
 from sysid.structure.structure import Array
 
 _SEEN = 1e-10  # of the largest eigenvalue of the scaled information; less is round-off
@@ -18,11 +17,10 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     Once with that part and once without it: by how much the two differ counts among the errors of the second, and the
     better known of both is taken.
     """
-    model = RecordModel(fit.test, fit.parameters.modes.omega.size, gains=True)
     made = fit.equations
     size = np.sqrt(np.maximum(np.diag(made.normal), 1e-300))
     normal, gradient = made.normal / np.outer(size, size), made.gradient / size
-    n, at = model.n, model.n_fit
+    n, at = fit.model.n, fit.model.size  # gains come behind all that was fitted
     beyond = max(fit.reduced, 1.0)
 
     def estimate(count: int) -> tuple[Array, Array]:
@@ -34,7 +32,7 @@ def gain_errors_of(fit: RecordFit) -> Gains:
         std = np.sqrt(beyond / 2) * np.linalg.norm(half, axis=1)
         return step[at : at + n] / size[at : at + n], std[at : at + n] / size[at : at + n]
 
-    (plain, plain_std), (error, std) = estimate(at + n), estimate(model.size)
+    (plain, plain_std), (error, std) = estimate(at + n), estimate(size.size)
     plain_std = np.hypot(plain_std, plain - error)
     better = plain_std < std
     return Gains(np.where(better, plain, error), np.where(better, plain_std, std), fit.freedom)

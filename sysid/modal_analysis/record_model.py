@@ -13,11 +13,11 @@ times a few spectra, so that normal equations come from products of spectra, and
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from copy import copy
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
@@ -142,14 +142,14 @@ class RecordModel:
 
     def thinned(self, step: int) -> RecordModel:
         """The same with every `step`-th line, for steps that need not be exact."""
-        other = RecordModel(self.test, self.m)
+        other = copy(self)
         other.runs = [run.at(slice(None, None, step)) for run in self.runs]
         other.numbers = 2 * sum(run.outputs.size for run in other.runs)
         return other
 
     def weighed_as_all(self) -> RecordModel:
         """The same, each line of a coarse test standing for those around it that were left out."""
-        other = RecordModel(self.test, self.m)
+        other = copy(self)
         other.runs = [
             run._replace(weight=np.gradient(run.w) / (2 * np.pi * self.whole.spacing[run.number])) for run in self.runs
         ]
@@ -293,23 +293,22 @@ class Chunk:
 
     def columns(self) -> Columns:
         """How the columns of all channels are made of the spectra."""
-        every = np.array([self.coefficients(channel).toarray() for channel in range(self.model.channels)])
+        every = np.array([self.coefficients(channel) for channel in range(self.model.channels)])
         row, spectrum = np.nonzero(np.any(every != 0, axis=0))
         unknowns, starts = np.unique(row, return_index=True)
         return Columns(unknowns, starts, spectrum, every[:, row, spectrum].T.copy())
 
-    def coefficients(self, channel: int) -> scipy.sparse.csr_array:
+    def coefficients(self, channel: int) -> Array:
         """How the columns of a channel's Jacobian are made of the spectra, (p, spectra)."""
         model = self.model
         n, m, d, index = model.n, model.m, model.d, model.index
         k = np.arange(m)
         shown = self.shown[channel]
-        rows, cols, values = [], [], []
+        spectra = m + m * d + 2 * m + d + 2 * m * (self.at_ends is not None) + TRACES + d * model.gains
+        C = np.zeros((model.size, spectra))
 
         def put(row: NDArray[Any], col: NDArray[Any], value: Array) -> None:
-            rows.append(np.ravel(row))
-            cols.append(np.ravel(col))
-            values.append(np.broadcast_to(value, np.shape(row)).ravel())
+            C[row, col] += value
 
         first = np.cumsum([0, m, m * d, 2 * m, d])  # of q, g u, slopes, u; then transients, traces
         if channel < n:
@@ -337,10 +336,7 @@ class Chunk:
             if channel < n:
                 put(np.full(d, model.n_fit + channel), first[3] + beside, model.test.rigid_body[channel])
                 put(model.n_fit + n + channel * d + beside, last + beside, np.ones(d))
-            last = last + d
-        shape = (model.size, int(last))
-        data = (np.concatenate(values), (np.concatenate(rows), np.concatenate(cols)))
-        return scipy.sparse.csr_array(scipy.sparse.coo_array(data, shape=shape))
+        return C
 
     def gradient(self, levels: Array, columns: Columns) -> Shift:
         """Products of the Jacobian of these lines with the errors; unknowns as in `columns`."""

@@ -71,9 +71,11 @@ def uneven(fit: RecordFit) -> bool:
     """Whether the power of what is left differs between blocks of lines by more than chance."""
     model, c = fit.model, fit.model.channels
     off = []
-    for run in model.runs:
-        chunks = [chunk for chunk in model.chunks(fit.parameters) if chunk.run.number == run.number]
-        power = np.concatenate([chunk.weighed(fit.levels).power for chunk in chunks])
+    powers: list[list[Array]] = [[] for _ in model.runs]
+    for chunk in model.chunks(fit.parameters):
+        powers[chunk.run.number].append(chunk.weighed(fit.levels).power)
+    for run, parts in zip(model.runs, powers, strict=True):
+        power = np.concatenate(parts)
         for lines in blocks_of(run, fit, 0.0):
             off.append((np.sum(power[lines]) - c * lines.size) / np.sqrt(c * lines.size))
     z = np.array(off)

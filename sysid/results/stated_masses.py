@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from sysid.assessment.information import Index
-from sysid.assessment.statements import Adjusted, Statements, adjust, made, statements_of, theta_of
+from sysid.assessment.statements import Adjusted, Statements, adjust, made, statements_of
 from sysid.assessment.uncertainty import moves_by_records
 from sysid.errors import InputError
+from sysid.modal_analysis.modal_estimate import theta_of
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.problem.matrices import assemble
 from sysid.problem.problem import Problem
