@@ -15,17 +15,17 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.modal_fit import Modes
+from sysid.modal_analysis.modal_masses import weigh
 from sysid.modal_analysis.record_model import TRACES, Parameters, RecordModel, Shift
 from sysid.modal_analysis.record_noise import floors, likeliest_levels
 from sysid.modal_analysis.residues import Records
-from sysid.modal_analysis.response import gains
 from sysid.structure.structure import Array
 
 _SETTLED = 1e-3  # fall of the sum of squares, in units of the noise, at which the fit stands still
+_LEAST_MASS = 1e-3  # of the largest modal mass, that a mode begins with
 _SAME_LEVELS = 0.003  # relative change of a standard deviation at which levels stand still
 
 Monitor = Callable[[int, float], object]
@@ -270,49 +270,12 @@ def _first(test: Measurement, omega: Array, ratios: Array) -> Parameters:
     modes, ends = Modes(phi, push[:, :d], omega, ratios), push[:, d:]
     rigid: Array = np.zeros((d, d))
     if test.force is not None:
-        t, rigid = _masses(test, modes, ends)
-        scale = np.sqrt(t)
+        t, rigid = weigh(test, modes, ends)
+        scale = np.sqrt(np.maximum(t, _LEAST_MASS * t.max()))
         modes = modes._replace(phi=modes.phi / scale, gamma=modes.gamma * scale[:, None])
         ends = ends * scale[:, None]
     channels = test.n_sensors + (0 if test.force is None else d)
     return Parameters(modes, rigid, ends, np.zeros((test.n_runs, channels, TRACES)))
-
-
-def _masses(test: Measurement, modes: Modes, ends: Array) -> tuple[Array, Array]:
-    """Modal masses (m,) > 0 and rigid-body mass (d, d) by the base force, which is linear in both."""
-    from scipy.optimize import lsq_linear
-
-    assert test.force is not None
-    d, m = test.n_base, modes.omega.size
-    pairs = [(i, j) for i in range(d) for j in range(i, d)]
-    inputs, base = np.concatenate(list(test.inputs), axis=-1), np.concatenate(list(test.base), axis=-1)
-    force = np.concatenate(list(test.force), axis=-1)
-    q = np.tile(gains(test.freq, modes.omega, modes.ratios), test.n_runs) * (np.hstack([modes.gamma, ends]) @ inputs)
-    parts = [np.outer(modes.gamma[k], q[k]) for k in range(m)]
-    for i, j in pairs:
-        unit = np.zeros((d, d))
-        unit[i, j] = unit[j, i] = 1.0
-        parts.append(unit @ base)
-    size = np.linalg.norm(force, axis=1, keepdims=True)
-    design = np.array([(part / size).ravel() for part in parts]).T
-    wanted = (force / size).ravel()
-    rows, target = np.vstack([design.real, design.imag]), np.concatenate([wanted.real, wanted.imag])
-    scale = np.linalg.norm(rows, axis=0)
-    Q, R = np.linalg.qr(rows / scale)
-    free = np.linalg.lstsq(R, Q.T @ target, rcond=None)[0]
-    strength = np.abs(free[:m])
-    if np.sum(free[:m] * strength) < -0.5 * np.sum(strength**2):
-        raise InputError(
-            "the base force answers to the modes with negative masses: check its sign (it is the base's on the "
-            "structure, in phase with the base acceleration at low frequency)"
-        )
-    lower = np.concatenate([np.zeros(m), np.full(len(pairs), -np.inf)])
-    answer = (free if np.all(free[:m] > 0) else lsq_linear(R, Q.T @ target, (lower, np.inf), tol=1e-14).x) / scale
-    rigid = np.zeros((d, d))
-    for (i, j), mass in zip(pairs, answer[m:], strict=True):
-        rigid[i, j] = rigid[j, i] = mass
-    t = answer[:m]
-    return np.maximum(t, 1e-3 * t.max()), rigid
 
 
 def _rough_levels(model: RecordModel, p: Parameters) -> Array:

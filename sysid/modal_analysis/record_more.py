@@ -12,13 +12,13 @@ from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.record_fit import Monitor, RecordFit, refitted, worth
 from sysid.modal_analysis.record_model import Parameters
 from sysid.modal_analysis.response import gains
+from sysid.modal_analysis.vector_fitting import DAMPED
 from sysid.structure.structure import Array
 
 WORTH = 25.0  # in units of ``e' S^-1 e``: a mode whose absence raises it by less is noise (chi-squared of 50)
 _RATIOS = (0.004, 0.012, 0.036)  # damping ratios that are tried
 _STEP = 1.0  # of a candidate's damping ratio, from one frequency to the next
 _REACH = 15.0  # half-power widths about a candidate, of lines that are looked at
-_DAMPED = 0.5  # a pole with more damping than this is no mode of a structure
 _CHANCE = 8.0  # by which the best of many candidates exceeds what noise makes of one
 
 
@@ -29,7 +29,7 @@ def with_further_modes(fit: RecordFit, *, monitor: Monitor | None = None) -> Rec
         if p is None:
             return fit
         more = refitted(fit, p, monitor=monitor)
-        damped = np.any(more.parameters.modes.ratios > _DAMPED)
+        damped = np.any(more.parameters.modes.ratios > DAMPED)
         if damped or more.likelihood <= fit.likelihood or np.min(worth(more)) < WORTH:
             return fit
         fit = more

@@ -30,8 +30,8 @@ _SETTLED = 1e-6  # fall of the squared error, relative, at which poles are polis
 _EXACT = 1e-13  # relative residual that no further step betters
 _FAR = 100.0  # times the error that may be, from which moving other poles too does not save a pole less
 _GUESS = 0.01  # damping ratio to begin with
-_RAZOR = 0.02  # of the distance of lines; half the width of a peak that answers for one bad line, not for a mode
-_DAMPED = 0.5  # a pole with more damping than this is no mode of a structure
+RAZOR = 0.02  # of the distance of lines; half the width of a peak that answers for one bad line, not for a mode
+DAMPED = 0.5  # a pole with more damping than this is no mode of a structure
 _EDGE = 10.0  # times their ends, how far outside the lines a mode may lie: it answers for all that are there
 _BESIDE = 0.1  # how far outside the lines a mode alone may lie, as a fraction of their ends
 
@@ -328,8 +328,8 @@ def _prune(
 ) -> tuple[Array, Array]:
     """Remove poles, the least useful first, until each that stays lowers the error by far more than noise would."""
     lines = 2 * np.pi * records.freq[records.freq > 0]
-    inside = (omega > lines[0] / _EDGE) & (omega < _EDGE * lines[-1]) & (ratios < _DAMPED)
-    inside &= ratios * omega > _RAZOR * np.interp(omega, lines, np.gradient(lines))
+    inside = (omega > lines[0] / _EDGE) & (omega < _EDGE * lines[-1]) & (ratios < DAMPED)
+    inside &= ratios * omega > RAZOR * np.interp(omega, lines, np.gradient(lines))
     kept = np.flatnonzero(inside)  # what is no mode goes first, whatever it explains
     subsets = None
     while kept.size:

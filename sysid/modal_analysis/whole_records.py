@@ -15,11 +15,8 @@ from sysid.modal_analysis.record_gains import gain_errors_of
 from sysid.modal_analysis.record_more import WORTH, with_further_modes
 from sysid.modal_analysis.record_poles import few_lines, rough_deviations
 from sysid.modal_analysis.record_spread import scatter
-from sysid.modal_analysis.vector_fitting import find_poles
+from sysid.modal_analysis.vector_fitting import DAMPED, RAZOR, find_poles
 from sysid.structure.structure import Array, ComplexArray
-
-_RAZOR = 0.02  # of the distance of lines; half the width of a peak that answers for one bad line, not for a mode
-_DAMPED = 0.5  # a pole with more damping than this is no mode of a structure
 
 
 def whole_fit(test: Measurement, *, monitor: Monitor | None = None) -> RecordFit:
@@ -60,8 +57,8 @@ def _least(fit: RecordFit) -> int | None:
     modes = fit.parameters.modes
     if modes.omega.size == 1:
         return None
-    narrow = modes.ratios * modes.omega < _RAZOR * 2 * np.pi * np.min(fit.model.whole.spacing)
-    value = np.where((modes.ratios < _DAMPED) & ~narrow, worth(fit), 0.0)
+    narrow = modes.ratios * modes.omega < RAZOR * 2 * np.pi * np.min(fit.model.whole.spacing)
+    value = np.where((modes.ratios < DAMPED) & ~narrow, worth(fit), 0.0)
     least = int(np.argmin(value))
     return least if value[least] < WORTH else None
 

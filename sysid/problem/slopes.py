@@ -174,7 +174,7 @@ def _rows_of_modes(test: Measurement, s: Slopes, unknowns: int, *, share: float,
     chosen = matched(estimate, 2 * np.pi * structure.natural_frequencies)
     if chosen is None:
         return None
-    index, d = index_of(estimate), structure.n_base
+    index = index_of(estimate)
     phi, gamma = structure.mode_shapes[:, chosen], structure.participation[chosen]
     d_phi = np.einsum("si,ikc->skc", structure.recovery, s.d_shapes[:, chosen])
     d_gamma = s.d_participation[chosen]
@@ -202,7 +202,6 @@ def _rows_of_modes(test: Measurement, s: Slopes, unknowns: int, *, share: float,
     factor = weight * factor
     inflation = 1.0 if as_stated else inflation_of(test, records_of(test, structure, unknowns), unknowns)
     std = weight * inflation * std
-    assert d == gamma.shape[1]
     return [Rows(factor @ off, factor @ slope, std)]
 
 

@@ -11,10 +11,7 @@ import casadi as ca
 import numpy as np
 import scipy.linalg
 
-from sysid.errors import InputError
-from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.modal_fit import Modes, Ties
-from sysid.modal_analysis.response import columns, gains
+from sysid.modal_analysis.modal_fit import Ties
 from sysid.problem.problem import Problem
 from sysid.structure.structure import Array
 from sysid.structure.triangular import lower_entries
@@ -23,55 +20,6 @@ _HELD = 1e5  # weight of known entries beside what is only likely
 _SPARE = 1e-3  # least share of a total mass that is left to the base
 _SHARE = 1e-3  # of the largest share of a mode in a total; a smaller one would make its modal mass beyond measure
 _LEAST = 0.5  # of an equal share of the mass, that each mode keeps where nothing tells modal masses
-
-
-def weigh(test: Measurement, modes: Modes) -> tuple[Array, Array]:
-    """Modal masses t (m,) > 0 and rigid-body mass (d, d): the base force is linear in both.
-
-    Raises
-    ------
-    InputError
-        Where the force wants negative masses: a wrong sign.
-    """
-    from scipy.optimize import lsq_linear
-
-    d, m = test.n_base, modes.omega.size
-    assert test.force is not None
-    base, force = columns(test.base), columns(test.force)
-    g = np.tile(gains(test.freq, modes.omega, modes.ratios), test.n_runs)
-    pairs = [(i, j) for i in range(d) for j in range(i, d)]
-    pushes = (modes.gamma @ base) * g
-    parts = [np.outer(modes.gamma[k], pushes[k]) for k in range(m)]
-    for i, j in pairs:
-        unit = np.zeros((d, d))
-        unit[i, j] = unit[j, i] = 1.0
-        parts.append(unit @ base)
-    # Moments and forces count in units of their own records.
-    size = np.linalg.norm(force, axis=1, keepdims=True)
-    size[size == 0] = 1.0
-    design = np.array([(part / size).ravel() for part in parts]).T
-    wanted = (force / size).ravel()
-    scale = np.linalg.norm(design, axis=0)
-    scale[scale == 0] = 1.0
-    stacked = np.vstack([design.real, design.imag]) / scale
-    target = np.concatenate([wanted.real, wanted.imag])
-    lower = np.concatenate([np.zeros(m), np.full(len(pairs), -np.inf)])
-    # The triangular factor stands for all lines.
-    Q, R = np.linalg.qr(stacked)
-    plain = Q.T @ target
-    free = np.linalg.lstsq(R, plain, rcond=None)[0]
-    strength = np.abs(free[:m])
-    if np.sum(free[:m] * strength) < -0.5 * np.sum(strength**2):
-        raise InputError(
-            "the base force answers to the modes with negative masses: check its sign (it is the base's on the "
-            "structure, in phase with the base acceleration at low frequency)"
-        )
-    answer = (free if np.all(free[:m] > 0) else lsq_linear(R, plain, (lower, np.inf), tol=1e-14).x) / scale
-    rigid = np.zeros((d, d))
-    for (i, j), mass in zip(pairs, answer[m:], strict=True):
-        rigid[i, j] = rigid[j, i] = mass
-    t = answer[:m]
-    return np.maximum(t, 1e-9 * t.max()), rigid
 
 
 def stated_totals(problem: Problem) -> Ties | None:

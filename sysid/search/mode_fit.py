@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sysid.errors import InputError, SolverError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, Spectrum, fit_modes
+from sysid.modal_analysis.modal_masses import weigh
 from sysid.modal_analysis.residues import (
     Records,
     ResidueFit,
@@ -24,7 +25,7 @@ from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.spectrum import SOLVED
 from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram
 from sysid.problem.problem import Problem
-from sysid.search.modal_scaling import stated_totals, weigh
+from sysid.search.modal_scaling import stated_totals
 from sysid.search.strategy import DoesNotApplyError
 from sysid.structure.structure import Array
 

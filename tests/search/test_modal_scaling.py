@@ -7,7 +7,8 @@ import pytest
 import sysid
 from sysid import FullMass, InputError, KnownMass, LumpedMass, Measurement, Problem, Structure, simulate
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.search.modal_scaling import nearest_lumped, of_known_mass, stated_totals, to_stated_totals, weigh
+from sysid.modal_analysis.modal_masses import weigh
+from sysid.search.modal_scaling import nearest_lumped, of_known_mass, stated_totals, to_stated_totals
 
 
 def lines(truth, count=200):
