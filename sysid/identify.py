@@ -186,10 +186,7 @@ def _instead(
     chosen: Strategy, error: DoesNotApplyError, problem: Problem, session: Session, start: ArrayLike | Structure | None
 ) -> tuple[Outcome, str]:
     """Run what comes after a strategy that turned out not to apply."""
-    last = STRATEGIES[-1]
-    if isinstance(chosen, last):
-        raise error
-    after = _after(chosen, problem, start) or last()
+    after = _after(chosen, problem, start) or STRATEGIES[-1]()
     why = f"strategy {after.name!r}: the {chosen.name} one does not apply ({error})"
     try:
         return _run(after, why, problem, session, start, follow=True)

@@ -6,9 +6,7 @@
 from __future__ import annotations
 
 import json
-import os
 import resource
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -19,7 +17,7 @@ import sysid
 from benchmarks.line import Line, below
 from benchmarks.modal.identification import identify_records, matrix_distance
 from benchmarks.modal.random_structures import frequency_lines, random_structure
-from benchmarks.problem_modules import ROOT
+from benchmarks.own_process import figures_of
 
 SIZES = ((50, 3, 1000, 10.0), (100, 3, 2000, 90.0))  # n, d, lines, s
 MEMORY = 4.0  # GiB
@@ -30,7 +28,7 @@ def lines(reduced: bool) -> Iterator[Line]:
     """Noise-free tests with base force; the reduced form takes the smaller one."""
     for n, d, count, seconds in SIZES[: 1 if reduced else None]:
         what = f"no noise, base force, n = {n}, d = {d}, {count} lines: "
-        figures = _in_own_process(n, d, count, PATIENCE * seconds)
+        figures = figures_of("benchmarks.modal.large_tests", [str(n), str(d), str(count)], PATIENCE * seconds)
         if "said" in figures:
             yield Line(what + figures["said"], "no result", f"<= {seconds:g} s", False)
             continue
@@ -41,22 +39,6 @@ def lines(reduced: bool) -> Iterator[Line]:
             what + "residual, residual of the force, relative distance of M_SS, K_SS and C, modes found",
             f"{shown}, {figures['found']}",
         )
-
-
-def _in_own_process(n: int, d: int, count: int, patience: float) -> dict:
-    command = [sys.executable, "-m", "benchmarks.modal.large_tests", str(n), str(d), str(count)]
-    paths = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
-    environment = {**os.environ, "PYTHONPATH": paths}
-    try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, check=False, cwd=ROOT, env=environment, timeout=patience
-        )
-    except subprocess.TimeoutExpired:
-        return {"said": f"not done after {patience:g} s"}
-    if done.returncode:
-        return {"said": (done.stderr.strip().splitlines() or ["no output"])[-1]}
-    figures: dict = json.loads(done.stdout.strip().splitlines()[-1])
-    return figures
 
 
 def main() -> None:

@@ -6,9 +6,7 @@
 from __future__ import annotations
 
 import json
-import os
 import resource
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -17,7 +15,7 @@ import numpy as np
 
 import sysid
 from benchmarks.line import Line, below
-from benchmarks.problem_modules import ROOT
+from benchmarks.own_process import figures_of
 from benchmarks.records import trial
 from benchmarks.records.simulated import Setting, coupled_structure, four_storeys
 
@@ -41,29 +39,13 @@ def lines(reduced: bool) -> Iterator[Line]:
     """Full mass, with force, 1 % noise; the reduced form leaves out the ten minutes."""
     for name in list(CASES)[: 1 if reduced else None]:
         _, seconds, memory = CASES[name]
-        figures = _in_own_process(name, PATIENCE * seconds)
+        figures = figures_of("benchmarks.records.record_speed", [name], PATIENCE * seconds)
         if "said" in figures:
             yield Line(f"{name}: {figures['said']}", "no result", f"<= {seconds:g} s", False)
             continue
         yield below(f"{name}: seconds", figures["seconds"], seconds)
         yield below(f"{name}: peak memory, GiB", figures["memory"], memory)
         yield Line(f"{name}: modes found, residual", f"{figures['found']}, {figures['residual']:.3g}")
-
-
-def _in_own_process(name: str, patience: float) -> dict:
-    command = [sys.executable, "-m", "benchmarks.records.record_speed", name]
-    paths = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
-    try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, check=False, cwd=ROOT,
-            env={**os.environ, "PYTHONPATH": paths}, timeout=patience,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired:
-        return {"said": f"not done after {patience:g} s"}
-    if done.returncode:
-        return {"said": (done.stderr.strip().splitlines() or ["no output"])[-1]}
-    figures: dict = json.loads(done.stdout.strip().splitlines()[-1])
-    return figures
 
 
 def main() -> None:
