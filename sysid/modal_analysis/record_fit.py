@@ -98,8 +98,13 @@ class RecordFit:
         return 2 * self.chi2 / self.freedom
 
     @property
+    def schwarz(self) -> float:
+        """The log-likelihood less half of Schwarz's price of the unknowns: the larger, the better."""
+        return self.likelihood - self.unknowns * float(np.log(self.model.numbers)) / 2
+
+    @cached_property
     def likelihood(self) -> float:
-        """Logarithm of the likelihood less half of Schwarz's price of the unknowns: the larger, the better."""
+        """Logarithm of the records' likelihood, up to a constant."""
         model, c = self.model, self.model.channels
         spread = 0.0
         for chunk in model.chunks(self.parameters):
@@ -108,7 +113,7 @@ class RecordFit:
             inner = np.einsum("cil,cjl,c->lij", T.conj(), T, 1 / own[:c]) * own[c:]
             spread += float(np.sum(np.linalg.slogdet(inner + np.eye(inner.shape[1]))[1]))
             spread += T.shape[-1] * float(np.sum(np.log(own[:c] * chunk.run.density)))
-        return -spread - self.chi2 - self.unknowns * float(np.log(model.numbers)) / 2
+        return -spread - self.chi2
 
     def information(self) -> Array:
         """``Re J' S^-1 J`` over the unknowns of `Index`, less what transients and traces explain of it; (p, p)."""

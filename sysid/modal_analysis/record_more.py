@@ -10,37 +10,43 @@ import numpy as np
 
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.record_fit import Monitor, RecordFit, refitted, worth
-from sysid.modal_analysis.record_model import Parameters
+from sysid.modal_analysis.record_model import Parameters, RecordModel
 from sysid.modal_analysis.response import gains
 from sysid.modal_analysis.vector_fitting import DAMPED
 from sysid.structure.structure import Array
 
-WORTH = 25.0  # in units of ``e' S^-1 e``: a mode whose absence raises it by less is noise (chi-squared of 50)
+_WORTH = 25.0  # in units of ``e' S^-1 e``: a mode whose absence raises it by less is noise (chi-squared of 50)
 _RATIOS = (0.004, 0.012, 0.036)  # damping ratios that are tried
 _STEP = 1.0  # of a candidate's damping ratio, from one frequency to the next
 _REACH = 15.0  # half-power widths about a candidate, of lines that are looked at
-_CHANCE = 8.0  # by which the best of many candidates exceeds what noise makes of one
+_CHANCE = 12.0  # by which the best of many candidates exceeds what noise makes of one
 
 
 def with_further_modes(fit: RecordFit, *, monitor: Monitor | None = None) -> RecordFit:
     """The fit with further modes, one after the other, as long as each is worth more than noise."""
     while True:
-        p = _candidate(fit)
+        least = least_worth(fit.model)
+        p = _candidate(fit, least)
         if p is None:
             return fit
         more = refitted(fit, p, monitor=monitor)
         damped = np.any(more.parameters.modes.ratios > DAMPED)
-        if damped or more.likelihood <= fit.likelihood or np.min(worth(more)) < WORTH:
+        if damped or more.likelihood - fit.likelihood < least or np.min(worth(more)) < least:
             return fit
         fit = more
 
 
-def _candidate(fit: RecordFit) -> Parameters | None:
-    """The parameters with one more mode, where its likeliest residue of rank one is beyond chance."""
+def least_worth(model: RecordModel) -> float:
+    """What a mode must lower ``e' S^-1 e`` by: more than noise makes of the likeliest residue of rank one."""
+    inputs = model.d + 2 * len(model.moving)
+    return max(_WORTH, float((np.sqrt(model.channels) + np.sqrt(inputs)) ** 2 / 2 + _CHANCE))
+
+
+def _candidate(fit: RecordFit, least: float) -> Parameters | None:
+    """The parameters with one more mode, where its likeliest residue of rank one is worth more than `least`."""
     model, p = fit.model, fit.parameters
     c, inputs = model.channels, model.d + 2 * len(model.moving)
-    chance = (np.sqrt(c) + np.sqrt(inputs)) ** 2 / 2 + _CHANCE
-    best, found = chance, None
+    best, found = least, None
     errors = [chunk.weighed_errors(fit.levels) for chunk in model.chunks(p)]
     for ratio in _RATIOS:
         ends = 2 * np.pi * fit.test.freq[[0, -1]]

@@ -16,6 +16,7 @@ _ENOUGH = 8000  # lines, of all runs together: more of them tell a level no bett
 _STEPS = 30
 _SETTLED = 1e-4  # of a level's logarithm
 VANISHING = 1e-7  # of a channel's rms: what counts as noise where there is none
+_LEAST_SHARE = 0.01  # of the median share of noise: with few lines one channel could come out exact, infinitely likely
 
 
 def floors(model: RecordModel) -> Array:
@@ -36,6 +37,8 @@ def likeliest_levels(model: RecordModel, p: Parameters, levels: Array, unknowns:
     lines = sum(run.w.size for run in model.runs)
     thin = model.thinned(max(1, -(-lines // _ENOUGH)))
     least = floors(model)
+    share = np.median(levels / least, axis=1, keepdims=True)
+    least = least * np.maximum(1.0, _LEAST_SHARE**2 * share)
     chunks = list(thin.chunks(p))
     found = np.array([
         _of_run([(part.error, part.H, part.run.density) for part in chunks if part.run.number == run], own, floor)

@@ -102,10 +102,12 @@ def find_poles(test: Measurement, *, monitor: Monitor | None = None) -> Poles:
 
 
 def _find(records: Records, progress: _Progress) -> Poles:
-    count = _count(records, progress)
-    while _lines_suffice(records, count):
+    wanted, most = _count(records, progress), _most_poles(records)
+    # Where lines are few a spare pole or two must do.
+    count = min(wanted, most) if most > wanted - _SPARE else wanted
+    while count <= most:
         omega, ratios = _search(records, count, progress)
-        if omega.size <= count - _SPARE // 2:
+        if omega.size <= count - (_SPARE // 2 if count >= wanted else 1):
             break
         count += max(count // 2, _SPARE)  # too few were spare
     else:
@@ -180,7 +182,7 @@ def poles_of_any_damping(records: Records, *, monitor: Monitor | None = None) ->
     progress = _Progress(monitor, records)
     with one_thread():
         count = _count(records, progress)
-        while _lines_suffice(records, count):
+        while count <= _most_poles(records):
             omega, ratios = _settled(records, *_relocated(records, count, progress), progress, velocity=True)
             if omega.size <= count - _SPARE // 2 or count >= records.n_sensors + _SPARE:
                 return omega, ratios
@@ -196,10 +198,10 @@ def poles_from(records: Records, omega: Array, ratios: Array, *, monitor: Monito
     return omega[order], ratios[order]
 
 
-def _lines_suffice(records: Records, count: int) -> bool:
-    """Whether the lines determine so many poles, and the records residues of both kinds beside the motion at ends."""
+def _most_poles(records: Records) -> int:
+    """How many poles the lines determine, and the records residues of both kinds beside the motion at ends."""
     inputs = len(records.base) + records.driven
-    return 2 * int(np.count_nonzero(records.freq)) >= 4 * count + 2 and len(records.data) > inputs * count
+    return min((int(np.count_nonzero(records.freq)) - 1) // 2, (len(records.data) - 1) // inputs)
 
 
 def _relocated(records: Records, count: int, progress: _Progress) -> tuple[Array, Array]:

@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import ModalEstimate
+from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.record_fit import Monitor, RecordFit, on_all_lines, record_modes, refitted, without, worth
 from sysid.modal_analysis.record_gains import gain_errors_of
-from sysid.modal_analysis.record_more import WORTH, with_further_modes
+from sysid.modal_analysis.record_more import least_worth, with_further_modes
 from sysid.modal_analysis.record_poles import few_lines, rough_deviations
 from sysid.modal_analysis.record_spread import scatter
-from sysid.modal_analysis.vector_fitting import DAMPED, RAZOR, find_poles
+from sysid.modal_analysis.vector_fitting import DAMPED, RAZOR, Poles, find_poles
 from sysid.structure.structure import Array, ComplexArray
 
 
@@ -36,10 +37,16 @@ def whole_fit(test: Measurement, *, monitor: Monitor | None = None) -> RecordFit
     poles = find_poles(replace(test, response_std=rough_deviations(test)), monitor=monitor)
     fit = _kept(record_modes(test, poles.omega, poles.ratios, monitor=monitor), monitor)
     again = find_poles(replace(test, response_std=deviations(fit)[0]), monitor=monitor)
-    if again.omega.size != fit.parameters.modes.omega.size:
+    if not _same_modes(fit.parameters.modes, again):
         other = _kept(record_modes(test, again.omega, again.ratios, monitor=monitor), monitor)
-        fit = max(fit, other, key=lambda one: one.likelihood)
+        fit = max(fit, other, key=lambda one: one.schwarz)
     return with_further_modes(fit, monitor=monitor)
+
+
+def _same_modes(modes: Modes, poles: Poles) -> bool:
+    """Whether each pole lies within the half-power width of a mode, and each mode of a pole."""
+    apart = np.abs(np.log(poles.omega / modes.omega[:, None])) / (2 * modes.ratios[:, None])
+    return bool(np.all(apart.min(axis=0) < 1) and np.all(apart.min(axis=1) < 1))
 
 
 def _kept(fit: RecordFit, monitor: Monitor | None) -> RecordFit:
@@ -60,7 +67,7 @@ def _least(fit: RecordFit) -> int | None:
     narrow = modes.ratios * modes.omega < RAZOR * 2 * np.pi * np.min(fit.model.whole.spacing)
     value = np.where((modes.ratios < DAMPED) & ~narrow, worth(fit), 0.0)
     least = int(np.argmin(value))
-    return least if value[least] < WORTH else None
+    return least if value[least] < least_worth(fit.model) else None
 
 
 def deviations(fit: RecordFit) -> tuple[Array, Array | None]:

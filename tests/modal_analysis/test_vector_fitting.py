@@ -95,7 +95,13 @@ def test_a_band_without_a_mode_is_refused():
 def test_too_few_lines_are_refused():
     truth = structure(np.random.default_rng(5), 4, 1)
     with pytest.raises(InputError, match="too few"):
-        find_poles(simulate(truth, np.linspace(1, 60, 12)))
+        find_poles(simulate(truth, np.linspace(1, 60, 8)))
+
+
+def test_where_lines_are_few_so_are_spare_poles():
+    truth = structure(np.random.default_rng(5), 4, 1)
+    found = find_poles(simulate(truth, np.linspace(1, 60, 12)))  # which determine 5 poles, not the usual 10
+    np.testing.assert_allclose(found.omega, 2 * np.pi * truth.natural_frequencies, rtol=1e-9)
 
 
 def building(dashpot):
