@@ -1,0 +1,51 @@
+"""Modes found in whole records: cases in which the search once missed one, found one too many, or failed."""
+
+import importlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sysid.modal_analysis.whole_records import whole_fit
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def records():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT))
+        names = ("simulated", "trial", "two_runs")
+        yield [importlib.import_module(f"benchmarks.records.{name}") for name in names]
+
+
+def _coupled(records, seed, draw):
+    simulated, trial, _ = records
+    setting, rng = simulated.coupled(seed), np.random.default_rng((seed, draw, 5))
+    noisy, levels = setting.with_noise(setting.run(rng).records(), rng)
+    return setting.structure, levels, whole_fit(trial.measurement([noisy], setting, force=True))
+
+
+def _assert_the_modes(fit, truth):
+    modes = fit.parameters.modes
+    assert modes.omega.size == truth.n
+    assert np.all(np.abs(np.sort(modes.omega) / (2 * np.pi) / truth.natural_frequencies - 1) < truth.damping_ratios)
+
+
+def test_few_lines_make_no_channel_exact(records):
+    truth, levels, fit = _coupled(records, seed=33, draw=3)  # 22 lines, seven channels, four modes
+    _assert_the_modes(fit, truth)
+    true = np.concatenate([levels.response, levels.force, levels.base])
+    assert np.all(np.sqrt(fit.levels[0]) > 0.1 * true)
+
+
+def test_a_mode_that_is_worth_less_than_the_price_of_its_unknowns_is_found(records):
+    truth, _, fit = _coupled(records, seed=12, draw=3)  # its sixth mode raises chi² by 57, its unknowns cost 53
+    _assert_the_modes(fit, truth)
+
+
+def test_two_poles_about_one_mode_are_left_for_those_of_the_second_search(records):
+    simulated, trial, two_runs = records
+    setting = simulated.four_storeys()
+    fit = whole_fit(trial.measurement(two_runs._runs("two runs", 8)[1], setting, force=True))
+    _assert_the_modes(fit, setting.structure)
