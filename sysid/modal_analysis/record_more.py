@@ -7,18 +7,20 @@ another stands out of these errors, though in no channel by itself.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.record_fit import Monitor, RecordFit, refitted, worth
 from sysid.modal_analysis.record_model import Parameters, RecordModel
 from sysid.modal_analysis.response import gains
-from sysid.modal_analysis.vector_fitting import DAMPED
+from sysid.modal_analysis.vector_fitting import DAMPED, RAZOR
 from sysid.structure.structure import Array
 
 _WORTH = 25.0  # in units of ``e' S^-1 e``: a mode whose absence raises it by less is noise (chi-squared of 50)
 _RATIOS = (0.004, 0.012, 0.036)  # damping ratios that are tried
 _STEP = 1.0  # of a candidate's damping ratio, from one frequency to the next
 _REACH = 15.0  # half-power widths about a candidate, of lines that are looked at
+_PROMISING = 0.7  # of what a mode must be worth, that a few steps show
 _CHANCE = 12.0  # by which the best of many candidates exceeds what noise makes of one
 
 
@@ -29,11 +31,20 @@ def with_further_modes(fit: RecordFit, *, monitor: Monitor | None = None) -> Rec
         p = _candidate(fit, least)
         if p is None:
             return fit
-        more = refitted(fit, p, monitor=monitor)
-        damped = np.any(more.parameters.modes.ratios > DAMPED)
-        if damped or more.likelihood - fit.likelihood < least or np.min(worth(more)) < least:
+        more = refitted(fit, p, rough=True, monitor=monitor)
+        if more.likelihood - fit.likelihood < _PROMISING * least or np.any(no_modes(more)):
+            return fit
+        more = refitted(more, more.parameters, monitor=monitor)
+        if more.likelihood - fit.likelihood < least or np.any(no_modes(more)) or np.min(worth(more)) < least:
             return fit
         fit = more
+
+
+def no_modes(fit: RecordFit) -> NDArray[np.bool_]:
+    """Whether each mode is none of a structure, whatever it explains, (m,): too damped, or far narrower than a line."""
+    modes = fit.parameters.modes
+    narrow = modes.ratios * modes.omega < RAZOR * 2 * np.pi * np.min(fit.model.whole.spacing)
+    return np.asarray((modes.ratios >= DAMPED) | narrow)
 
 
 def least_worth(model: RecordModel) -> float:

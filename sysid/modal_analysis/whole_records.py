@@ -13,10 +13,10 @@ from sysid.measurement.whole import ModalEstimate
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.record_fit import Monitor, RecordFit, on_all_lines, record_modes, refitted, without, worth
 from sysid.modal_analysis.record_gains import gain_errors_of
-from sysid.modal_analysis.record_more import least_worth, with_further_modes
+from sysid.modal_analysis.record_more import least_worth, no_modes, with_further_modes
 from sysid.modal_analysis.record_poles import few_lines, rough_deviations
 from sysid.modal_analysis.record_spread import scatter
-from sysid.modal_analysis.vector_fitting import DAMPED, RAZOR, Poles, find_poles
+from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.structure.structure import Array, ComplexArray
 
 
@@ -61,11 +61,9 @@ def _kept(fit: RecordFit, monitor: Monitor | None) -> RecordFit:
 
 def _least(fit: RecordFit) -> int | None:
     """The mode that explains least, if no more than noise."""
-    modes = fit.parameters.modes
-    if modes.omega.size == 1:
+    if fit.parameters.modes.omega.size == 1:
         return None
-    narrow = modes.ratios * modes.omega < RAZOR * 2 * np.pi * np.min(fit.model.whole.spacing)
-    value = np.where((modes.ratios < DAMPED) & ~narrow, worth(fit), 0.0)
+    value = np.where(no_modes(fit), 0.0, worth(fit))
     least = int(np.argmin(value))
     return least if value[least] < least_worth(fit.model) else None
 
