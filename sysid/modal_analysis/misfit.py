@@ -83,9 +83,8 @@ def inflation_of(test: Measurement, records: list[Record], unknowns: int) -> flo
     if reduced < _FAR_BELOW:
         return 1.0
     beyond = reduced if reduced > max(_SUSPECT, 1 + _DEVIATIONS * np.sqrt(2 / freedom)) else 1.0
-    shared = line_correlation(
-        np.concatenate([(r.misfit / r.std).reshape(-1, test.n_runs, test.freq.size) for r in records])
-    )
+    error = np.concatenate([(r.misfit / r.std).reshape(-1, test.n_runs, test.freq.size) for r in records])
+    shared = line_correlation(error, unknowns)
     return float(np.sqrt(beyond * shared))
 
 

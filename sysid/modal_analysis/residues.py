@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.noise import separable
@@ -18,8 +19,8 @@ from sysid.structure.structure import Array, ComplexArray
 _DEVIATIONS = 12.0  # of the chi-squared law, by which a squared error must fall to mean something
 ROUND_OFF = 1e-11  # of the records: what counts as noise where there is none
 _LARGE = 1e-6  # of the squared records: a squared error so large follows to ten digits as the difference of two squares
-_LAGS = range(1, 4)  # distances of lines that may share their noise
-_CHANCE = 5.0  # standard deviations of the correlation of white noise
+_LAGS = range(4)  # distances of lines that may share their noise; none: their power
+_CHANCE = 3e-7  # that white noise is taken for noise that neighbouring lines share
 _DEPENDENT = 1e-9  # of the largest singular value of the base records
 
 
@@ -178,26 +179,19 @@ class Records:
 
     def noise(self, left: Array, unknowns: int, *, least: float = ROUND_OFF) -> float:
         """Variance of a real number of the records about a fit of so many unknowns, as it affects smooth functions."""
-        power = float(np.sum(left**2))
-        shared = (float(np.sum(left * self.neighbours(left, lag))) for lag in _LAGS)
-        return self.variance(self.correlation_factor(power, shared) * power, unknowns, least=least)
+        factor = line_correlation(self.in_runs(left).transpose(2, 0, 1), unknowns)
+        return self.variance(factor * float(np.sum(left**2)), unknowns, least=least)
 
     def variance(self, squared_error: float, unknowns: int, *, least: float = ROUND_OFF) -> float:
         """Share of one real number of the records in a squared error that a fit of so many unknowns leaves."""
         freedom = max(self.data.size - unknowns, 1)
         return max(squared_error / freedom, least**2 * self.size / self.data.size)
 
-    def correlation_factor(self, power: float, shared: Iterable[float]) -> float:
-        """`line_correlation` from the sum of squares of an error, and of its products with neighbours at each lag."""
-        return _correlation_factor(power, shared, self.data.size // 2, self.freq.size)
-
-    def neighbours(self, rows: Array, lag: int) -> Array:
-        """Mean of what stands `lag` lines before and after, within each run, (rows, columns); zero beyond the ends."""
-        own = rows.reshape(-1, self.freq.size, rows.shape[1])
-        out = np.zeros_like(own)
-        out[:, lag:] += own[:, :-lag] / 2
-        out[:, :-lag] += own[:, lag:] / 2
-        return out.reshape(rows.shape)
+    def in_runs(self, rows: Array) -> ComplexArray:
+        """Rows of the records, real parts above imaginary ones, as complex lines (runs, n_freq, columns)."""
+        real, imaginary = rows.reshape(2, -1, self.freq.size, rows.shape[1])
+        whole: ComplexArray = real + 1j * imaginary
+        return whole
 
     def by_sensor(self, residues: Array) -> Array:
         """Residues (m, inputs, channels) of `fit` in the test's own units, (m, n_sensors, d).
@@ -242,11 +236,11 @@ class SubsetFits:
         left = records.data - Q @ self._answered
         self._size = float(np.vdot(self._answered, self._answered))
         self._outside = float(np.sum(left**2))
-        # Products of an error `left + Q z` with its neighbours: constant, linear and quadratic in z, for each lag.
-        shifted = [records.neighbours(Q, lag).T for lag in _LAGS]
-        self._constant = [float(np.sum(left * records.neighbours(left, lag))) for lag in _LAGS]
-        self._linear = [2 * lagged @ left for lagged in shifted]
-        self._quadratic = [lagged @ Q for lagged in shifted]
+        # Products of errors `left + Q z` with their neighbours in each run: constant, linear, quadratic in z; by lag.
+        ours, basis = records.in_runs(left), records.in_runs(Q)
+        self._constant = _own_products(ours)
+        self._linear = _lagged(lambda lag: _products(basis, ours, lag) + _products(ours, basis, lag).swapaxes(1, 2))
+        self._quadratic = _lagged(lambda lag: _products(basis, basis, lag))
 
     def worth(self, kept: NDArray[np.intp]) -> tuple[Array, float]:
         """What the squared error of the poles `kept` would rise by without each, over the noise, (len(kept),).
@@ -263,10 +257,32 @@ class SubsetFits:
         z = fit.left
         squares = z @ z.T
         squared_error = self._outside + float(np.trace(squares))
-        terms = zip(self._constant, self._linear, self._quadratic, strict=True)
-        shared = (c + float(np.sum(linear * z)) + float(np.sum(quadratic * squares)) for c, linear, quadratic in terms)
-        factor = self.records.correlation_factor(squared_error, shared)
-        return fit.gain / self.records.variance(factor * squared_error, kept.size * self.per_pole), squared_error
+        linear = np.einsum("lrkc,kc->lr", self._linear, z)
+        products = self._constant + linear + np.einsum("lrij,ij->lr", self._quadratic, squares)
+        unknowns, records = kept.size * self.per_pole, self.records
+        factor = _correlation_factor(products, records.data.shape[1], records.freq.size, unknowns)
+        return fit.gain / records.variance(factor * squared_error, unknowns), squared_error
+
+
+def _lagged(products: Callable[[int], ComplexArray]) -> ComplexArray:
+    """Products at each lag, (lags, ...)."""
+    return np.stack([products(lag) for lag in _LAGS])
+
+
+def _neighbours(first: ComplexArray, second: ComplexArray, lag: int) -> tuple[ComplexArray, ComplexArray]:
+    """Lines (runs, n_freq, columns) and, conjugate, those that stand `lag` lines before them in the same run."""
+    return first[:, lag:], second[:, : max(second.shape[1] - lag, 0)].conj()
+
+
+def _own_products(error: ComplexArray) -> ComplexArray:
+    """Sums of products of errors (runs, n_freq, channels) with their neighbours, (lags, runs)."""
+    return _lagged(lambda lag: np.einsum("rfc,rfc->r", *_neighbours(error, error, lag)))
+
+
+def _products(first: ComplexArray, second: ComplexArray, lag: int) -> ComplexArray:
+    """Sums over the lines of each run of products with `_neighbours`, (runs, columns of first, of second)."""
+    late, early = _neighbours(first, second, lag)
+    return late.swapaxes(1, 2) @ early
 
 
 def _least_squares(X: Array, data: Array, m: int, size: float) -> ResidueFit:
@@ -285,23 +301,41 @@ def beyond_chance(freedom: float) -> float:
     return float(freedom + _DEVIATIONS * np.sqrt(2 * freedom))
 
 
-def line_correlation(error: ComplexArray) -> float:
-    """Factor by which errors (..., n_freq) weigh more on smooth functions as neighbouring lines share them.
+def line_correlation(error: ComplexArray, unknowns: int = 0) -> float:
+    """Factor by which errors weigh more on smooth functions of frequency as neighbouring lines share them.
 
     One for white noise. Windows of averaged spectra smear each error over some lines: of H1 with Hann's it is 1.9.
+    Products of neighbours have the phase ``exp(2 pi i f tau)`` of a lag f, tau the time at which the error sits in its
+    run; sums over the lines of a run, which share it, count by their modulus.
+
+    Parameters
+    ----------
+    error : (channels, runs, n_freq) complex
+    unknowns : int
+        Real numbers of the fit that leaves it.
     """
-    shared = (float(np.sum(error[..., lag:] * error[..., :-lag].conj()).real) for lag in _LAGS)
-    return _correlation_factor(float(np.sum(np.abs(error) ** 2)), shared, error.size, error.shape[-1])
+    return _correlation_factor(_own_products(error.transpose(1, 2, 0)), error.shape[0], error.shape[-1], unknowns)
 
 
-def _correlation_factor(power: float, shared: Iterable[float], size: int, lines: int) -> float:
-    """One, and twice the correlation of `size` complex errors at each lag up to the first that may be chance."""
+def _correlation_factor(products: ComplexArray, channels: int, lines: int, unknowns: int) -> float:
+    """One, and twice the correlation of errors at each lag up to the first that may be chance.
+
+    `products` are sums over channels and lines, (lags, runs). White noise of power p over N complex numbers makes sums
+    of variance ``p^2 / N``, whose squared moduli over it are exponential; they are taken off. A fit of white noise
+    leaves errors ``I - H``, whose sums are at most those of ``trace(H)``, half the unknowns, over N.
+    """
+    power = products[0].real
+    moved = power > 0
+    if lines <= 2 * len(_LAGS) - 2 or not np.any(moved):
+        return 1.0
+    share = unknowns / max(2 * channels * lines * moved.sum() - unknowns, 1)
+    chance = chdtri(2 * moved.sum(), _CHANCE) / 2
     factor = 1.0
-    if lines > 2 * len(_LAGS):
-        for products in shared:
-            if products <= _CHANCE / np.sqrt(2 * size) * power:
-                break
-            factor += 2 * products / power
+    for lag, sums in enumerate(np.abs(products[1:, moved]) / power[moved], start=1):
+        level = channels * (lines - lag) / (channels * lines) ** 2
+        if np.sum(np.maximum(sums - share, 0) ** 2) <= chance * level:
+            break
+        factor += 2 * float(np.sqrt(np.maximum(sums**2 - level, 0)) @ power[moved] / np.sum(power))
     return factor
 
 

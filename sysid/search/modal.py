@@ -146,7 +146,8 @@ def _independent_sensors(test: Measurement, modes: Modes) -> int:
     error = weight * columns(test.relative - motion) / size
     unknowns = modes.phi.size + modes.gamma.size + modes.omega.size
     variance = float(np.sum(np.abs(error) ** 2)) / max(2 * error.size - unknowns, 1)
-    variance = max(variance * line_correlation(error.reshape(len(error), -1, test.freq.size)), ROUND_OFF**2)
+    shared = line_correlation(error.reshape(len(error), -1, test.freq.size), unknowns)
+    variance = max(variance * shared, ROUND_OFF**2)
     s = np.linalg.svd(stacked(weight * columns(motion) / size), compute_uv=False)[: min(n, m)]
     beyond = np.cumsum(s[::-1] ** 2)[::-1]
     chance = np.array([beyond_chance((n - r) * (m - r)) for r in range(s.size)])

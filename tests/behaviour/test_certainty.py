@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import block_diag
 
 from sysid import FullMass, InputError, LumpedMass, Measurement, Problem, Structure, identify, simulate
-from sysid.modal_analysis.residues import line_correlation
+from sysid.modal_analysis.residues import Records, line_correlation
 
 FREQ = np.linspace(2.0, 30.0, 500)
 
@@ -122,9 +122,36 @@ def test_relative_accelerations_are_told_from_absolute_ones(random_structure, se
 
 
 class TestLineCorrelation:
-    def test_white_noise_shares_nothing(self):
+    @pytest.mark.parametrize("lines", [50, 200, 2000])
+    @pytest.mark.parametrize("channels", [1, 6])
+    def test_white_noise_shares_nothing(self, lines, channels):
         rng = np.random.default_rng(0)
-        assert line_correlation(rng.normal(size=(6, 500)) + 1j * rng.normal(size=(6, 500))) == 1.0
+        drawn = rng.normal(size=(100, 2, channels, 3, lines))
+        found = [line_correlation(real + 1j * imaginary) for real, imaginary in drawn]
+        assert found == [1.0] * 100
+
+    @pytest.mark.parametrize(("lines", "poles"), [(50, 8), (400, 20)])
+    def test_nor_does_what_a_fit_leaves_of_it(self, lines, poles):
+        """Free residues of both kinds take a sixth and a tenth of all numbers, of neighbouring lines together."""
+        rng, freq = np.random.default_rng(0), np.linspace(1.0, lines / 10, lines)
+        omega, ratios = 2 * np.pi * np.linspace(2.0, freq[-1], poles), np.full(poles, 0.02)
+        for _ in range(10):
+            noise = rng.normal(size=(1, 12, lines)) + 1j * rng.normal(size=(1, 12, lines))
+            records = Records(Measurement(freq, np.ones((1, 1, lines)), 1 + noise, rigid_body=np.ones((12, 1))))
+            fit = records.fit(omega, ratios, velocity=True)
+            left = records.in_runs(fit.left).transpose(2, 0, 1)
+            assert line_correlation(left, fit.residues.size) == 1.0
+
+    @pytest.mark.parametrize("tau", [0.0, 0.25, 0.5, 0.77])
+    def test_zero_padding_to_twice_the_length_is_found_wherever_the_record_stands(self, tau):
+        """White noise within half of a period: neighbours correlate by sin(pi/2)/(pi/2), those after them by nothing.
+
+        The runs stand in their periods at times of their own.
+        """
+        white = np.random.default_rng(0).normal(size=(4, 2, 4000))
+        at = np.array([tau, 0.1])[:, None] * np.arange(4001)
+        padded = np.fft.rfft(white, n=8000) * np.exp(2j * np.pi * at)
+        assert line_correlation(padded) == pytest.approx(1 + 4 / np.pi, rel=0.02)
 
     def test_a_hann_window_smears_over_its_main_lobe(self):
         """Its lines are (-1, 2, -1)/4 of those without a window: neighbours correlate by -2/3 and 1/6.
@@ -134,9 +161,10 @@ class TestLineCorrelation:
         rng = np.random.default_rng(0)
 
         def windowed():
-            white = rng.normal(size=(20, 4002)) + 1j * rng.normal(size=(20, 4002))
-            return 2 * white[:, 1:-1] - white[:, 2:] - white[:, :-2]
+            white = rng.normal(size=(20, 1, 4002)) + 1j * rng.normal(size=(20, 1, 4002))
+            return 2 * white[..., 1:-1] - white[..., 2:] - white[..., :-2]
 
+        assert line_correlation(windowed()) == pytest.approx(1 + 2 * (2 / 3 + 1 / 6), rel=0.03)
         assert line_correlation(windowed().conj() * windowed()) == pytest.approx(1 + 2 * (4 / 9 + 1 / 36), rel=0.03)
 
     def test_h1_of_long_records_has_it(self):
@@ -151,3 +179,18 @@ class TestLineCorrelation:
             segment=1000,
         )
         assert line_correlation(test.relative) == pytest.approx(1.94, rel=0.2)
+
+    @pytest.mark.parametrize("begins", [0.0, -50.0, 7.3])
+    def test_deviations_hold_where_lines_share_their_noise_wherever_records_begin(self, begins):
+        """Residues of two known poles; noise of records of 50 s that are zero-padded to 100 s."""
+        freq, rng, off = np.fft.rfftfreq(6000, 1 / 60.0)[150:1500], np.random.default_rng(1), []
+        omega, ratios, later = 2 * np.pi * np.array([5.0, 11.0]), np.full(2, 0.02), np.exp(2j * np.pi * freq * begins)
+        for _ in range(60):
+            noise = np.fft.rfft(rng.normal(size=(1, 4, 3000)), n=6000)[..., 150:1500]
+            test = Measurement(freq, later[None, None], (1.0 + noise) * later, rigid_body=np.ones((4, 1)))
+            records = Records(test)
+            fit = records.fit(omega, ratios)
+            std = np.sqrt(records.noise(fit.left, fit.residues.size) * np.einsum("kir,kir->ki", fit.spread, fit.spread))
+            off.append(fit.residues / std[..., None])
+        # 480 standard normal numbers; those of white noise would be off by the root of 2.
+        assert 0.87 < np.sqrt(np.mean(np.square(off))) < 1.1
