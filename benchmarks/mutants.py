@@ -180,7 +180,7 @@ NOTICED = (
         "test_certainty"),
     Mutant("C08", "upper ends of the masses 1 % too high", "np.maximum(values[1], own[i, j])",
         "np.maximum(values[1], own[i, j]) * 1.01", "test_intervals"),
-    Mutant("C09", "twin sensors never told", "if size[i] > bound and apart <= bound:", "if False:", "test_checks"),
+    Mutant("C09", "twin sensors never told", "if apart <= most and np.mean(", "if False and np.mean(", "test_checks"),
     Mutant("C10", "a stated mass that the force contradicts never told", "max(0.01, 3 * force_residual_left",
         "max(np.inf, 3 * force_residual_left", "test_checks"),
     Mutant("C11", "sensors that move with the base never told", "if wrong.size:", "if False:",

@@ -303,9 +303,12 @@ STOREY_RATIOS = (0.012, 0.014, 0.017, 0.020)
 TABLE_MASS = 300.0  # kg, above the load cells and below the first storey
 
 
-def four_storeys(table: float = TABLE_MASS) -> Setting:
-    """A chain of four storeys, all floors measured, on a table, kg: 120 s at 200 Hz, 1 % noise on every channel."""
-    k = np.array(STOREY_STIFFNESSES)
+def four_storeys(table: float = TABLE_MASS, top: float = STOREY_STIFFNESSES[-1]) -> Setting:
+    """A chain of four storeys, all floors measured, on a table, kg: 120 s at 200 Hz, 1 % noise on every channel.
+
+    `top` is the stiffness of the uppermost storey, N/m.
+    """
+    k = np.array([*STOREY_STIFFNESSES[:-1], top])
     K = np.zeros((5, 5))
     for i, below in enumerate([4, 0, 1, 2]):  # what each storey stands on; the table comes last
         K[np.ix_([below, i], [below, i])] += k[i] * np.array([[1, -1], [-1, 1]])

@@ -19,7 +19,10 @@ from sysid.problem.problem import Problem
 from sysid.structure.structure import Array, Structure
 
 _ROUND_OFF = 1e-8  # of the records: what counts as noise where there is none
-_ALIKE = 3.0  # misfits by which two records must differ to be of two sensors
+_ALIKE = 0.5  # of the power of a motion; another that differs by more, noise included, is not the same
+_NEIGHBOURS = 11  # lines that tell the noise about one, where it is not stated
+_SEEN = 3.0  # times the noise, the least motion that two sensors can share
+_EQUAL = 1e-9  # of a sensor's motion: what counts as noise where there is none
 _MISFIT = 1.5  # times what free residues leave, beyond which a record is not what the modes make of it
 _LINES = 2  # times the free residues: fewer numbers than these tell nothing beside noise
 _MIMICKED = 1e-2  # of a constant; less of it is left where a mode far below the lines answers like one
@@ -222,20 +225,47 @@ def _damping(records: Records, poles: tuple[Array, Array], free: ResidueFit) -> 
 
 
 def _twins(test: Measurement, structure: Structure) -> Iterator[str]:
-    """Sensors that record one motion."""
-    relative = columns(test.relative)
-    misfit = np.linalg.norm(columns(test.predict(structure)) - relative, axis=1)
-    size, names = np.linalg.norm(relative, axis=1), test.sensor_names
+    """Sensors whose motions differ by no more than noise does, line by line."""
+    lines, names = np.concatenate(test.own_lines), test.sensor_names
+    moves, noise = columns(test.relative)[:, lines], _own_noise(test)
+    left = moves - columns(test.predict(structure))[:, lines]
+    gram = (moves @ moves.conj().T).real
+    size, most = np.diag(gram), beyond_chance(2 * moves.shape[1]) / (2 * moves.shape[1])
     for i, j in zip(*np.tril_indices(test.n_sensors, -1), strict=True):
-        bound = _ALIKE * np.hypot(misfit[i], misfit[j]) + 1e-9 * max(size[i], size[j])
-        apart = min(np.linalg.norm(relative[i] - relative[j]), np.linalg.norm(relative[i] + relative[j]))
-        if size[i] > bound and apart <= bound:
-            told = f"sensors {names[j]} and {names[i]} record one motion"
+        sign, smaller = np.sign(gram[i, j]), min(size[i], size[j])
+        if size[i] + size[j] - 2 * abs(gram[i, j]) > _ALIKE * smaller or smaller == 0:
+            continue
+        each = _smooth(np.abs(left[i] - sign * left[j]) ** 2) if noise is None else (noise[i] + noise[j])[lines]
+        both = each + (_EQUAL**2 * (size[i] + size[j])) / lines.sum()
+        apart = np.mean(np.abs(moves[i] - sign * moves[j]) ** 2 / both)
+        if apart <= most and np.mean(np.abs(moves[[i, j]]) ** 2 / both, axis=1).min() > _SEEN**2:
+            told = f"sensors {names[j]} and {names[i]} record one motion but for noise"
             if structure.n < test.n_sensors:
                 # A fit of fewer modes than there are leaves all that would tell its sensors apart.
                 yield (
-                    f"{told} within the misfit: they are one degree of freedom (leave one out), or modes are missing: "
+                    f"{told}: they are one degree of freedom (leave one out), or modes are missing: "
                     f"{structure.n} tell no more than {structure.n} of {test.n_sensors} sensors apart"
                 )
             else:
                 yield f"{told} and are one degree of freedom: leave one out"
+
+
+def _own_noise(test: Measurement) -> Array | None:
+    """Variance of the sensors' own noise, (n_sensors, runs * n_freq); None where it is neither stated nor found.
+
+    Of whole records without the base's noise, which sensors in one motion share.
+    """
+    if test.modal is not None:
+        levels = np.broadcast_to(test.modal.noise.response, (test.n_runs, test.n_sensors))
+        by_run = max(test.modal.reduced, 1.0) * test.modal.density[:, None] * levels**2
+        return np.repeat(by_run.T, test.freq.size, axis=1)
+    if test.response_std is not None:
+        return columns(np.broadcast_to(test.response_std, test.response.shape) + 0j).real ** 2
+    return None
+
+
+def _smooth(power: Array) -> Array:
+    """Mean of each line's power and that of its neighbours."""
+    from scipy.ndimage import uniform_filter1d
+
+    return np.asarray(uniform_filter1d(power, _NEIGHBOURS, mode="nearest"))

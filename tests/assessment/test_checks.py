@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import sysid
+from benchmarks.records.simulated import four_storeys
 from sysid import FullMass, KnownMass, LumpedMass, Measurement, Problem, Structure, simulate
 from sysid.assessment.checks import doubts
 
@@ -150,7 +151,7 @@ class TestTwins:
         test, structure = self.with_twin(sign, noise)
         twins = [s for s in said(test, structure) if "record one motion" in s]
         assert twins == [
-            "sensors sensor 3 and sensor 4 record one motion within the misfit: they are one degree of freedom (leave "
+            "sensors sensor 3 and sensor 4 record one motion but for noise: they are one degree of freedom (leave "
             "one out), or modes are missing: 3 tell no more than 3 of 4 sensors apart"
         ]
 
@@ -158,6 +159,38 @@ class TestTwins:
     def test_neighbours_are_not(self, noise):
         test, structure = self.with_twin(1, noise, apart=0.2)
         assert not [s for s in said(test, structure) if "record one motion" in s]
+
+    @pytest.mark.parametrize("stated", [True, False])
+    @pytest.mark.parametrize(("times", "count"), [(3.0, 0), (30.0, 0), (0.1, 1)])
+    def test_nor_are_floors_on_a_stiff_storey_that_differ_by_more_than_noise(self, times, count, stated):
+        """By so many times the noise in the upper third of the lines, and hardly below."""
+        k, stiff = 5000.0, 400_000.0
+        K = np.array([[2 * k, -k, 0], [-k, k + stiff, -stiff], [0, -stiff, stiff]])
+        full = np.block([[K, -K.sum(axis=1, keepdims=True)], [-K.sum(axis=1)[None], K.sum(keepdims=True)]])
+        truth = Structure(np.diag([4.0, 4.0, 4.0, 1.0]), full, np.full(3, 0.01), n_base=1)
+        freq = np.linspace(2.0, 12.0, 300)
+        clean = simulate(truth, freq)
+        apart = clean.response[0, 2] - clean.response[0, 1]
+        std = np.sqrt(np.mean(np.abs(apart[200:]) ** 2) / 2) / times  # two sensors
+        rng = np.random.default_rng(0)
+        noise = std * np.sqrt(0.5) * (rng.normal(size=(1, 3, 300)) + 1j * rng.normal(size=(1, 3, 300)))
+        test = changed(clean, response=clean.response + noise, response_std=std if stated else None)
+        found = [s for s in said(test, truth) if "record one motion" in s]
+        assert len(found) == count
+        assert all("sensor 2 and sensor 3" in s for s in found)
+
+    @pytest.mark.parametrize(("top", "count"), [(1e7, 0), (1e9, 1)])
+    def test_whole_records_judge_by_the_noise_that_they_show(self, top, count):
+        """Floors 3 and 4 of four storeys, 40 s cut in motion: the storey between them moves 1e7/top times as much."""
+        setting = four_storeys(top=top)
+        rng = np.random.default_rng(0)
+        noisy, _ = setting.with_noise(setting.run(rng, 40.0).records(), rng)
+        test = Measurement.from_time(
+            [(noisy.base, noisy.response, noisy.force)], noisy.sample_rate, rigid_body=np.ones((4, 1)), band=(1.0, 20.0)
+        )
+        found = sysid.identify(Problem(test, mass=FullMass()), rng=0)
+        assert found.structure.n == 3
+        assert len([s for s in found.undetermined if "sensors sensor 3 and sensor 4 record one motion" in s]) == count
 
     def test_nor_are_sensors_that_both_record_nothing_but_noise(self):
         test, structure = self.with_twin(1, 0.001)
