@@ -161,9 +161,9 @@ class TestTwins:
         assert not [s for s in said(test, structure) if "record one motion" in s]
 
     @pytest.mark.parametrize("stated", [True, False])
-    @pytest.mark.parametrize(("times", "count"), [(3.0, 0), (30.0, 0), (0.1, 1)])
+    @pytest.mark.parametrize(("times", "count"), [(2.5, 0), (30.0, 0), (0.1, 1)])
     def test_nor_are_floors_on_a_stiff_storey_that_differ_by_more_than_noise(self, times, count, stated):
-        """By so many times the noise in the upper third of the lines, and hardly below."""
+        """By so many times the noise, in the mean over the lines."""
         k, stiff = 5000.0, 400_000.0
         K = np.array([[2 * k, -k, 0], [-k, k + stiff, -stiff], [0, -stiff, stiff]])
         full = np.block([[K, -K.sum(axis=1, keepdims=True)], [-K.sum(axis=1)[None], K.sum(keepdims=True)]])
@@ -171,7 +171,7 @@ class TestTwins:
         freq = np.linspace(2.0, 12.0, 300)
         clean = simulate(truth, freq)
         apart = clean.response[0, 2] - clean.response[0, 1]
-        std = np.sqrt(np.mean(np.abs(apart[200:]) ** 2) / 2) / times  # two sensors
+        std = np.sqrt(np.mean(np.abs(apart) ** 2) / 2) / times  # two sensors
         rng = np.random.default_rng(0)
         noise = std * np.sqrt(0.5) * (rng.normal(size=(1, 3, 300)) + 1j * rng.normal(size=(1, 3, 300)))
         test = changed(clean, response=clean.response + noise, response_std=std if stated else None)
@@ -179,9 +179,9 @@ class TestTwins:
         assert len(found) == count
         assert all("sensor 2 and sensor 3" in s for s in found)
 
-    @pytest.mark.parametrize(("top", "count"), [(1e7, 0), (1e9, 1)])
+    @pytest.mark.parametrize(("top", "count"), [(3e7, 0), (1e9, 1)])
     def test_whole_records_judge_by_the_noise_that_they_show(self, top, count):
-        """Floors 3 and 4 of four storeys, 40 s cut in motion: the storey between them moves 1e7/top times as much."""
+        """Floors 3 and 4 of four storeys, 40 s cut in motion: 50 and 1,700 times as stiff between them as the usual ones."""
         setting = four_storeys(top=top)
         rng = np.random.default_rng(0)
         noisy, _ = setting.with_noise(setting.run(rng, 40.0).records(), rng)
