@@ -117,7 +117,8 @@ def above_modes(estimate: ModalEstimate) -> tuple[Modes, Array]:
 
     index = index_of(estimate)
     modes, rigid = Modes(estimate.phi, estimate.gamma, estimate.omega, estimate.ratios), estimate.rigid
-    size = np.sqrt(np.maximum(np.diag(rigid), np.finfo(float).tiny))
+    size = np.sqrt(np.maximum(np.diag(rigid), np.diag(modes.gamma.T @ modes.gamma)))
+    size[size == 0] = 1.0
     scaled = lambda gamma: (rigid - gamma.T @ gamma) / np.outer(size, size)  # noqa: E731
     lam, V = np.linalg.eigh(scaled(modes.gamma))
     if lam[0] >= 0:

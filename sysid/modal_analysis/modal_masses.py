@@ -7,8 +7,10 @@ import numpy as np
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.modal_analysis.response import columns, gains
-from sysid.structure.structure import Array
+from sysid.modal_analysis.response import columns, gains, stacked
+from sysid.structure.structure import Array, ComplexArray
+
+_MOST = 0.5  # of the power of a base force, the least that a fit must explain to tell its sign
 
 
 def weigh(test: Measurement, modes: Modes, ends: Array | None = None) -> tuple[Array, Array]:
@@ -46,22 +48,43 @@ def weigh(test: Measurement, modes: Modes, ends: Array | None = None) -> tuple[A
     wanted = (force / size).ravel()
     scale = np.linalg.norm(design, axis=0)
     scale[scale == 0] = 1.0
-    stacked = np.vstack([design.real, design.imag]) / scale
+    rows = np.vstack([design.real, design.imag]) / scale
     target = np.concatenate([wanted.real, wanted.imag])
     lower = np.concatenate([np.zeros(m), np.full(len(pairs), -np.inf)])
     # The triangular factor stands for all lines.
-    Q, R = np.linalg.qr(stacked)
+    Q, R = np.linalg.qr(rows)
     plain = Q.T @ target
     free = np.linalg.lstsq(R, plain, rcond=None)[0]
-    strength = np.abs(free[:m])
-    if np.sum(free[:m] * strength) < -0.5 * np.sum(strength**2):
-        raise InputError(
-            "the base force answers to the modes with negative masses: check its sign (it is the base's on the "
-            "structure, in phase with the base acceleration at low frequency)"
-        )
+    together = np.sum(free[:m] * np.abs(free[:m])) < -0.5 * np.sum(free[:m] ** 2)
+    _check_signs(test, modes.gamma, pushes, force / size, bool(together))
     answer = (free if np.all(free[:m] > 0) else lsq_linear(R, plain, (lower, np.inf), tol=1e-14).x) / scale
     rigid = np.zeros((d, d))
     for (i, j), mass in zip(pairs, answer[m:], strict=True):
         rigid[i, j] = rigid[j, i] = mass
     t = answer[:m]
     return np.maximum(t, 1e-9 * t.max()), rigid
+
+
+def _check_signs(test: Measurement, gamma: Array, pushes: ComplexArray, force: ComplexArray, together: bool) -> None:
+    """Refuse a base force (d, lines) that wants negative masses, `together` or in one direction taken by itself.
+
+    In each direction the modes, by the squares of their shares, and the rigid-body mass must be negative in a fit that
+    explains most of the force: what is hardly moved says nothing.
+    """
+    base, wrong = columns(test.base), []
+    for i in range(test.n_base):
+        design = np.vstack([gamma[:, i, None] * pushes, base])
+        scale = np.linalg.norm(design, axis=1)
+        scale[scale == 0] = 1.0
+        X, wanted = stacked(design / scale[:, None]), stacked(force[i : i + 1])[:, 0]
+        found = np.linalg.lstsq(X, wanted, rcond=None)[0]
+        masses, rigid = found[: len(gamma)], found[len(gamma) + i]
+        explained = np.sum((X @ found) ** 2) > _MOST * np.sum(wanted**2)
+        if explained and rigid < 0 and np.sum(masses * np.abs(masses)) < -0.5 * np.sum(masses**2):
+            wrong.append(test.base_axes[i] if test.base_axes else f"base direction {i + 1}")
+    if together or wrong:
+        where = f" in {' and '.join(wrong)}" if 0 < len(wrong) < test.n_base else ""
+        raise InputError(
+            f"the base force{where} answers to the modes with negative masses: check its sign (it is the base's on the "
+            "structure, in phase with the base acceleration at low frequency)"
+        )

@@ -181,7 +181,7 @@ class TestTwins:
 
     @pytest.mark.parametrize(("top", "count"), [(3e7, 0), (1e9, 1)])
     def test_whole_records_judge_by_the_noise_that_they_show(self, top, count):
-        """Floors 3 and 4 of four storeys, 40 s cut in motion: 50 and 1,700 times as stiff between them as the usual ones."""
+        """Floors 3 and 4 of four storeys, 40 s cut in motion, 50 and 1,700 times as stiff between as usual."""
         setting = four_storeys(top=top)
         rng = np.random.default_rng(0)
         noisy, _ = setting.with_noise(setting.run(rng, 40.0).records(), rng)

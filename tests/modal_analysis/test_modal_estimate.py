@@ -41,6 +41,12 @@ def test_modes_that_leave_positive_mass_stay(d: int) -> None:
     np.testing.assert_allclose(theta_of(modes, rigid, index_of(estimate)), _own(estimate), rtol=1e-10)
 
 
+@pytest.mark.parametrize("d", [1, 3])
+def test_a_force_that_weighs_less_than_nothing_still_ends_in_a_positive_mass(d: int) -> None:
+    modes, rigid = above_modes(_estimate(d, -0.5))
+    assert np.linalg.eigvalsh(rigid - modes.gamma.T @ modes.gamma)[0] > -1e-9 * np.trace(rigid)
+
+
 @pytest.mark.parametrize("d", [1, 2, 3])
 def test_modes_that_carry_too_much_move_as_little_as_they_must(d: int) -> None:
     estimate = _estimate(d, 0.97)

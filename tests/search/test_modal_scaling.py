@@ -65,6 +65,19 @@ class TestWeigh:
         with pytest.raises(InputError, match="negative masses: check its sign"):
             weigh(wrong, rescaled(truth, np.ones(4)))
 
+    def test_so_is_that_of_one_load_cell_by_its_direction(self, random_structure, seed, d, general):
+        rng = np.random.default_rng([seed, d])
+        truth = random_structure(rng, n=4, d=d)
+        test = general_test(rng, truth) if general else simulate(truth, lines(truth), force=True, noise=0.02, rng=rng)
+        for i in range(d):
+            flipped = test.force * np.where(np.arange(d) == i, -1.0, 1.0)[:, None]
+            wrong = Measurement(test.freq, test.base, test.response, rigid_body=test.rigid_body, force=flipped)
+            named = (
+                "force" if d == 1 else f"force in {'xyz'[i]}" if wrong.base_axes else f"force in base direction {i + 1}"
+            )
+            with pytest.raises(InputError, match=f"{named} answers to the modes with negative masses: check its sign"):
+                weigh(wrong, rescaled(truth, np.ones(4)))
+
 
 def test_forces_and_moments_count_in_units_of_their_own(random_structure):
     """A moment in N mm weighs no less: with noise, the modal masses do not depend on the unit of length."""
