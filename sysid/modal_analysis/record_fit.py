@@ -154,19 +154,28 @@ def record_modes(test: Measurement, omega: Array, ratios: Array, *, monitor: Mon
     return _fit(model, _first(test, omega, ratios), None, monitor or (lambda i, r: None), _ROUGH)
 
 
-def refitted(fit: RecordFit, p: Parameters, *, rough: bool = False, monitor: Monitor | None = None) -> RecordFit:
-    """The fit from other parameters, and from its levels of noise; with `rough` a few steps of it."""
-    model = RecordModel(fit.test, p.modes.omega.size)
-    return _fit(model, p, fit.levels, monitor or (lambda i, r: None), _ROUGH if rough else _WHOLE)
+def refitted(
+    fit: RecordFit,
+    p: Parameters,
+    *,
+    rough: bool = False,
+    some: Measurement | None = None,
+    monitor: Monitor | None = None,
+) -> RecordFit:
+    """The fit from other parameters, and from its levels of noise; with `rough` a few steps of it.
+
+    Where lines are many, `some` is the test at a few of them, which give the normal matrix of each step. Gradients and
+    what is left are those of all lines, so that the end is theirs.
+    """
+    m = p.modes.omega.size
+    coarse = None if some is None else RecordModel(some, m).weighed_as_all()
+    limits = _ROUGH if rough else _WHOLE
+    return _fit(RecordModel(fit.test, m), p, fit.levels, monitor or (lambda i, r: None), limits, coarse)
 
 
 def on_all_lines(fit: RecordFit, test: Measurement, *, monitor: Monitor | None = None) -> RecordFit:
-    """The fit of a test from that of some of its lines, which still give the normal matrix of each step.
-
-    Gradients and what is left are those of all lines, so that the end is theirs.
-    """
-    model = RecordModel(test, fit.parameters.modes.omega.size)
-    return _fit(model, fit.parameters, fit.levels, monitor or (lambda i, r: None), _WHOLE, fit.model.weighed_as_all())
+    """The fit of a test from that of some of its lines."""
+    return refitted(replace(fit, test=test), fit.parameters, some=fit.test, monitor=monitor)
 
 
 def _fit(

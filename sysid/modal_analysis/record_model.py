@@ -48,28 +48,61 @@ class Run(NamedTuple):
         )
 
 
-class Columns(NamedTuple):
-    """How the columns of a run's Jacobian are made of its spectra: ``sum of values[:, channel] * spectra[spectrum]``.
+class Layer(NamedTuple):
+    """One entry of each of some columns of a Jacobian: ``values[:, channel] * spectra[spectrum]``, (k,) and (k, c)."""
 
-    `unknowns` (k,) are those that show in this run; the entries of each begin at `starts` (k,) and name their spectrum
-    (entries,) and what each channel takes of it, (entries, c).
-    """
-
-    unknowns: NDArray[np.intp]
-    starts: NDArray[np.intp]
+    column: NDArray[np.intp]
     spectrum: NDArray[np.intp]
     values: Array
 
-    def of_channel(self, channel: int, spectra: int) -> Array:
-        """The same as a matrix, (k, spectra)."""
-        matrix = np.zeros((self.unknowns.size, spectra))
-        row = np.repeat(np.arange(self.starts.size), np.diff(self.starts, append=self.spectrum.size))
-        matrix[row, self.spectrum] = self.values[:, channel]
-        return matrix
 
-    def summed(self, spectra: ComplexArray, weight: ComplexArray) -> ComplexArray:
+class Columns(NamedTuple):
+    """How the columns of a run's Jacobian are made of its spectra, each the sum of its entries in all layers.
+
+    `unknowns` (k,) are those that show in this run. The first layer has an entry of each.
+    """
+
+    unknowns: NDArray[np.intp]
+    layers: list[Layer]
+
+    def seen(self, weights: ComplexArray, spectra: ComplexArray) -> ComplexArray:
         """Sums of all columns (k, L) over the channels, with weights (c, L)."""
-        return np.add.reduceat((self.values @ weight) * spectra[self.spectrum], self.starts, axis=0)
+        first, *others = self.layers
+        out = _times(first.values, weights)
+        out *= spectra[first.spectrum]
+        for column, spectrum, values in others:
+            out[column] += _times(values, weights) * spectra[spectrum]
+        return out
+
+    def products(self, sums: Sums, scale: Array) -> Shift:
+        """Products of the Jacobian from those of its spectra, for outputs of these inverse deviations, (c,)."""
+        normal, gradient = -sums.hidden, np.zeros(self.unknowns.size)
+        for column, spectrum, values in self.layers:
+            gradient[column] += np.sum(values * sums.cross[spectrum], axis=1)
+            if normal.size == 0:
+                continue
+            for other, beside, theirs in self.layers:
+                normal[np.ix_(column, other)] += (scale**2 * values) @ theirs.T * sums.gram[np.ix_(spectrum, beside)]
+        return Shift(normal, gradient, sums.chi2)
+
+
+class Sums(NamedTuple):
+    """Products over some lines of a run, of which those of the Jacobian are made.
+
+    Of its spectra (s, s), of these with errors by their covariance (s, c), of what the noise of the base hides of the
+    columns (k, k), and ``e' S^-1 e``; the first and the third are empty where only a gradient is asked for.
+    """
+
+    gram: Array
+    cross: Array
+    hidden: Array
+    chi2: float
+
+    def plus(self, other: Sums) -> Sums:
+        """Those of the lines of both."""
+        return Sums(
+            self.gram + other.gram, self.cross + other.cross, self.hidden + other.hidden, self.chi2 + other.chi2
+        )  # fmt: skip
 
 
 class Weighed(NamedTuple):
@@ -186,20 +219,25 @@ class RecordModel:
 
         `levels` are variances of a sample in time, of the outputs and then of the base, (runs, c + d).
         """
-        return self._products(p, lambda chunk, columns: chunk.products(levels, columns))
+        return self._products(p, levels, Chunk.sums)
 
     def gradient(self, p: Parameters, levels: Array) -> Shift:
         """The same without the normal matrix, which stays zero: several times as fast."""
-        return self._products(p, lambda chunk, columns: chunk.gradient(levels, columns))
+        return self._products(p, levels, Chunk.sums_of_errors)
 
-    def _products(self, p: Parameters, of_chunk: Callable[[Chunk, Columns], Shift]) -> Shift:
+    def _products(self, p: Parameters, levels: Array, of_chunk: Callable[[Chunk, Array, Columns], Sums]) -> Shift:
         normal, gradient, chi2 = np.zeros((self.size, self.size)), np.zeros(self.size), 0.0
-        columns: dict[int, Columns] = {}
+        found: dict[int, tuple[Columns, Array, Sums]] = {}
         for chunk in self.chunks(p):
-            number = chunk.run.number
-            if number not in columns:
-                columns[number] = chunk.columns()
-            made, at = of_chunk(chunk, columns[number]), columns[number].unknowns
+            run = chunk.run.number
+            if run in found:
+                columns, scale, before = found[run]
+                found[run] = columns, scale, before.plus(of_chunk(chunk, levels, columns))
+            else:
+                columns = chunk.columns()
+                found[run] = columns, chunk.deviations(levels)[0], of_chunk(chunk, levels, columns)
+        for columns, scale, sums in found.values():
+            made, at = columns.products(sums, scale), columns.unknowns
             if made.normal.size:
                 normal[np.ix_(at, at)] += made.normal
             gradient[at] += made.gradient
@@ -222,15 +260,17 @@ class Chunk:
         self.shown = modes.phi if not model.force else np.vstack([modes.phi, modes.gamma.T])  # (c, m)
         direct = model.test.rigid_body if not model.force else np.vstack([model.test.rigid_body, p.rigid])
         # From base to outputs, (c, d, L).
-        self.H = np.einsum("ck,kl,kd->cdl", self.shown, self.g, modes.gamma, optimize=True) + direct[:, :, None]
+        pushed = (self.g[:, None] * modes.gamma[:, :, None]).reshape(len(self.g), -1)
+        self.H = _times(self.shown, pushed).reshape(len(direct), -1, run.w.size) + direct[:, :, None]
         at = model.moving.get(run.number)
         self.at_ends = None if at is None else slice(2 * at, 2 * at + 2)
         self.transients = model.whole.transients(freq)
-        self.pushed_by_ends = 0.0 if at is None else p.ends[:, self.at_ends] @ self.transients  # (m, L)
+        self.pushed_by_ends = 0.0 if at is None else _times(p.ends[:, self.at_ends], self.transients)  # (m, L)
         unit = freq / model.test.freq[-1]
         self.trace_spectra = np.stack([np.ones_like(run.w) + 0j, 1j * unit, -1j / unit])
-        free = self.shown @ (self.g * self.pushed_by_ends) + p.traces[run.number] @ self.trace_spectra
-        self.error = run.outputs - np.einsum("cdl,dl->cl", self.H, run.base) - free
+        moved = self.g * (_times(modes.gamma, run.base) + self.pushed_by_ends)
+        made = _times(self.shown, moved) + _times(direct, run.base) + _times(p.traces[run.number], self.trace_spectra)
+        self.error = run.outputs - made
 
     def deviations(self, levels: Array) -> tuple[Array, Array]:
         """Inverse deviations of the outputs' own noise at a line, (c,), and deviations of the base's, (d,)."""
@@ -238,28 +278,49 @@ class Chunk:
         return 1 / np.sqrt(own[:c]), np.sqrt(own[c:])
 
     def _base_noise(self, levels: Array) -> tuple[ComplexArray, ComplexArray]:
-        """``B = D T sqrt(v_u)`` (L, c, d), D the inverse deviations of the outputs, and ``(I + B' B)^-1`` (L, d, d)."""
+        """What the noise of the base hides in units of the outputs' own, and its factor.
+
+        With ``B = D H sqrt(v_u)``, D the inverse deviations of the outputs, and ``L L' = I + B' B``: ``B L'^-1``
+        (d, c, L) and L (d, d, L), a line of vectors at a time as d is at most a few.
+        """
         scale, root = self.deviations(levels)
-        B = np.moveaxis(scale[:, None, None] * self.H * root[:, None], -1, 0)
-        return B, np.linalg.inv(B.conj().transpose(0, 2, 1) @ B + np.eye(B.shape[2]))
+        B = np.asarray(scale[:, None] * self.H.transpose(1, 0, 2) * root[:, None, None], dtype=complex)
+        d = len(B)
+        factor = np.zeros((d, d, B.shape[2]), dtype=complex)
+        for j in range(d):
+            for i in range(j + 1):
+                product = np.sum(B[j].conj() * B[i], axis=0) + (i == j)  # of the rows of B' B + I
+                for k in range(i):
+                    product -= factor[j, k] * factor[i, k].conj()
+                # Never less than one on the diagonal, round-off aside.
+                factor[j, i] = np.sqrt(np.maximum(product.real, 1.0)) if i == j else product / factor[i, i].real
+        for j in range(d):
+            for i in range(j):
+                B[j] -= B[i] * factor[j, i].conj()
+            B[j] /= factor[j, j].real
+        return B, factor
 
     def weighed(self, levels: Array) -> Weighed:
         """Errors weighed by their full covariance."""
         scale, root = self.deviations(levels)
-        B, inverse = self._base_noise(levels)
-        e = (scale[:, None] * self.error).T[..., None]
+        V, factor = self._base_noise(levels)
+        e = scale[:, None] * self.error
         # What is likeliest of the base's noise, in its own units; what it makes of the errors is taken off them.
-        noise = inverse @ (B.conj().transpose(0, 2, 1) @ e)
-        left = (e - B @ noise)[..., 0].T
-        noise = noise[..., 0].T
-        power = np.sum(np.abs(left) ** 2, axis=0) + np.sum(np.abs(noise) ** 2, axis=0)
-        return Weighed(scale[:, None] * left, power, self.run.base + root[:, None] * noise)
+        noise = np.array([np.sum(part.conj() * e, axis=0) for part in V])
+        for part, own in zip(V, noise, strict=True):
+            e -= part * own
+        for j in reversed(range(len(V))):
+            for i in range(j + 1, len(V)):
+                noise[j] -= factor[i, j].conj() * noise[i]
+            noise[j] /= factor[j, j].real
+        power = _power(e) + _power(noise)
+        return Weighed(scale[:, None] * e, power, self.run.base + root[:, None] * noise)
 
     def covered(self, levels: Array) -> ComplexArray:
         """V (d, c, L) with ``S^-1 = D² - V V'``: what the noise of the base hides."""
-        B, inverse = self._base_noise(levels)
-        V = self.deviations(levels)[0][:, None] * np.matmul(B, np.linalg.cholesky(inverse), dtype=complex)
-        return V.transpose(2, 1, 0)
+        V = self._base_noise(levels)[0]
+        V *= self.deviations(levels)[0][:, None]
+        return V
 
     def weighed_errors(self, levels: Array) -> tuple[Array, ComplexArray, ComplexArray, ComplexArray]:
         """Lines (L,), rad/s, likeliest inputs (d + 2 r, L), ``S^-1 e`` (c, L) and ``S^-1`` (c, c, L)."""
@@ -277,7 +338,7 @@ class Chunk:
         """What all columns of the Jacobian are made of, (spectra, L)."""
         modes, g = self.p.modes, self.g
         freq = self.run.w / (2 * np.pi)
-        push = modes.gamma @ base + self.pushed_by_ends
+        push = _times(modes.gamma, base) + self.pushed_by_ends
         parts = [
             g * push,
             (g[:, None] * base).reshape(-1, base.shape[1]),
@@ -295,8 +356,13 @@ class Chunk:
         """How the columns of all channels are made of the spectra."""
         every = np.array([self.coefficients(channel) for channel in range(self.model.channels)])
         row, spectrum = np.nonzero(np.any(every != 0, axis=0))
-        unknowns, starts = np.unique(row, return_index=True)
-        return Columns(unknowns, starts, spectrum, every[:, row, spectrum].T.copy())
+        unknowns, starts, count = np.unique(row, return_index=True, return_counts=True)
+        layers = []
+        for depth in range(count.max()):
+            column = np.flatnonzero(count > depth)
+            entry = starts[column] + depth
+            layers.append(Layer(column, spectrum[entry], every[:, row[entry], spectrum[entry]].T.copy()))
+        return Columns(unknowns, layers)
 
     def coefficients(self, channel: int) -> Array:
         """How the columns of a channel's Jacobian are made of the spectra, (p, spectra)."""
@@ -338,31 +404,40 @@ class Chunk:
                 put(model.n_fit + n + channel * d + beside, last + beside, np.ones(d))
         return C
 
-    def gradient(self, levels: Array, columns: Columns) -> Shift:
-        """Products of the Jacobian of these lines with the errors; unknowns as in `columns`."""
+    def sums_of_errors(self, levels: Array, columns: Columns) -> Sums:
+        """Products of the spectra of these lines with the errors alone."""
         weighed = self.weighed(levels)
-        return Shift(np.zeros((0, 0)), self._gradient(weighed, columns), float(self.run.weight @ weighed.power))
+        cross = _dots(self.spectra(weighed.base), self.run.weight * weighed.seen)
+        return Sums(np.zeros((0, 0)), cross, np.zeros((0, 0)), float(self.run.weight @ weighed.power))
 
-    def _gradient(self, weighed: Weighed, columns: Columns) -> Array:
-        spectra = self.spectra(weighed.base)
-        cross = (spectra.conj() @ (self.run.weight * weighed.seen).T).real  # (spectra, c)
-        return np.add.reduceat(np.sum(columns.values * cross[columns.spectrum], axis=1), columns.starts)
+    def sums(self, levels: Array, columns: Columns) -> Sums:
+        """All products of these lines; unknowns as in `columns`."""
+        weighed, root = self.weighed(levels), np.sqrt(self.run.weight)
+        spectra = root * self.spectra(weighed.base)
+        hidden = np.zeros((columns.unknowns.size,) * 2)
+        for part in self.covered(levels):
+            seen = columns.seen(part.conj(), spectra)
+            hidden += _dots(seen, seen)
+        cross = _dots(spectra, root * weighed.seen)
+        return Sums(_dots(spectra, spectra), cross, hidden, float(self.run.weight @ weighed.power))
 
     def products(self, levels: Array, columns: Columns) -> Shift:
         """Products of the Jacobian of these lines; unknowns as in `columns`."""
-        weighed = self.weighed(levels)
-        spectra = np.sqrt(self.run.weight) * self.spectra(weighed.base)
-        gram = _squares(spectra)
-        normal = np.zeros((columns.unknowns.size,) * 2)
-        for i, scale in enumerate(self.deviations(levels)[0]):
-            C = columns.of_channel(i, len(spectra))
-            normal += scale**2 * (C @ gram @ C.T)
-        for part in self.covered(levels):
-            normal -= _squares(columns.summed(spectra, part.conj()))
-        return Shift(normal, self._gradient(weighed, columns), float(self.run.weight @ weighed.power))
+        return columns.products(self.sums(levels, columns), self.deviations(levels)[0])
 
 
-def _squares(rows: ComplexArray) -> Array:
-    """``Re X X'`` of rows (k, L)."""
-    flat = np.ascontiguousarray(rows).view(float)
-    return flat @ flat.T
+def _times(matrix: Array, rows: ComplexArray) -> ComplexArray:
+    """A real matrix times rows (k, L) in real arithmetic: half of what a complex product would take."""
+    return np.asarray((np.ascontiguousarray(matrix) @ np.ascontiguousarray(rows).view(float)).view(complex))
+
+
+def _power(rows: ComplexArray) -> Array:
+    """Sums of squares of the moduli over the rows, (L,)."""
+    return np.asarray(np.sum(rows.real**2 + rows.imag**2, axis=0))
+
+
+def _dots(rows: ComplexArray, others: ComplexArray) -> Array:
+    """``Re X Y'`` of rows (k, L), (l, L)."""
+    one = np.ascontiguousarray(rows).view(float)
+    two = one if others is rows else np.ascontiguousarray(others).view(float)
+    return np.asarray(one @ two.T)

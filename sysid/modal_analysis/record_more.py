@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.record_fit import Monitor, RecordFit, refitted, worth
 from sysid.modal_analysis.record_model import Parameters, RecordModel
@@ -21,20 +22,24 @@ _RATIOS = (0.004, 0.012, 0.036)  # damping ratios that are tried
 _STEP = 1.0  # of a candidate's damping ratio, from one frequency to the next
 _REACH = 15.0  # half-power widths about a candidate, of lines that are looked at
 _PROMISING = 0.7  # of what a mode must be worth, that a few steps show
+_FINE = 16  # lines in a half-power width that tell the mean covariance there
 _CHANCE = 12.0  # by which the best of many candidates exceeds what noise makes of one
 
 
-def with_further_modes(fit: RecordFit, *, monitor: Monitor | None = None) -> RecordFit:
-    """The fit with further modes, one after the other, as long as each is worth more than noise."""
+def with_further_modes(fit: RecordFit, *, some: Measurement | None = None, monitor: Monitor | None = None) -> RecordFit:
+    """The fit with further modes, one after the other, as long as each is worth more than noise.
+
+    Where lines are many, `some` is the test at a few of them, as in `refitted`.
+    """
     while True:
         least = least_worth(fit.model)
         p = _candidate(fit, least)
         if p is None:
             return fit
-        more = refitted(fit, p, rough=True, monitor=monitor)
+        more = refitted(fit, p, rough=True, some=some, monitor=monitor)
         if more.likelihood - fit.likelihood < _PROMISING * least or np.any(no_modes(more)):
             return fit
-        more = refitted(more, more.parameters, monitor=monitor)
+        more = refitted(more, more.parameters, some=some, monitor=monitor)
         if more.likelihood - fit.likelihood < least or np.any(no_modes(more)) or np.min(worth(more)) < least:
             return fit
         fit = more
@@ -66,12 +71,16 @@ def _candidate(fit: RecordFit, least: float) -> Parameters | None:
             gradient, S, U, power = np.zeros((c, inputs)), np.zeros((c, c)), np.zeros((inputs, inputs)), 0.0
             for w, inputs_there, seen, inverse in errors:
                 near = slice(*np.searchsorted(w, omega * (1 + np.array([-1, 1]) * 2 * _REACH * ratio)))
+                if near.start == near.stop:
+                    continue
                 g = gains(w[near] / (2 * np.pi), np.array([omega]), np.array([ratio]))[0]
                 moved = g * inputs_there[:, near]
                 gradient += (seen[:, near] @ moved.conj().T).real
-                S += np.einsum("cel,l->ce", inverse[:, :, near], np.abs(g) ** 2).real
+                step = max(1, (near.stop - near.start) // int(2 * _REACH * _FINE))
+                strength = step * np.abs(g[::step]) ** 2
+                S += np.einsum("cel,l->ce", inverse[:, :, near][:, :, ::step], strength).real
                 U += (moved @ moved.conj().T).real
-                power += float(np.sum(np.abs(g) ** 2))
+                power += float(np.sum(strength))
             used = np.diag(U) > 0
             if power == 0 or not np.any(used):
                 continue

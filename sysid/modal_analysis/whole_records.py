@@ -33,7 +33,9 @@ def whole_fit(test: Measurement, *, monitor: Monitor | None = None) -> RecordFit
     """
     lines = few_lines(test)
     if not np.all(lines):
-        return on_all_lines(whole_fit(test.at(lines), monitor=monitor), test, monitor=monitor)
+        some = test.at(lines)
+        fit = on_all_lines(whole_fit(some, monitor=monitor), test, monitor=monitor)
+        return with_further_modes(fit, some=some, monitor=monitor)  # weak ones show on all lines only
     poles = find_poles(replace(test, response_std=rough_deviations(test)), monitor=monitor)
     fit = _kept(record_modes(test, poles.omega, poles.ratios, monitor=monitor), monitor)
     again = find_poles(replace(test, response_std=deviations(fit)[0]), monitor=monitor)

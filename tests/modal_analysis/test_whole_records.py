@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sysid.modal_analysis.record_poles import few_lines
 from sysid.modal_analysis.whole_records import whole_fit
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -49,3 +50,15 @@ def test_two_poles_about_one_mode_are_left_for_those_of_the_second_search(record
     setting = simulated.four_storeys()
     fit = whole_fit(trial.measurement(two_runs._runs("two runs", 8)[1], setting, force=True))
     _assert_the_modes(fit, setting.structure)
+
+
+def test_a_weak_mode_that_only_all_lines_of_a_long_record_show_is_found(records):
+    simulated, trial, _ = records
+    weak = np.array([1.0, 1.0, 3e-4])
+    structure = simulated.coupled_structure(np.random.default_rng(1), 3, 1, np.array([2.0, 8.0, 30.0]), weak)
+    setting = simulated.Setting(structure, 120.0, 200.0, (1.0, 40.0), (0.5, 60.0), np.eye(1))
+    rng = np.random.default_rng(2)
+    noisy, _ = setting.with_noise(setting.run(rng).records(), rng)
+    test = trial.measurement([noisy], setting, force=True)
+    assert whole_fit(test.at(few_lines(test))).parameters.modes.omega.size == 2
+    _assert_the_modes(whole_fit(test), structure)
