@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,6 +144,16 @@ class Gains:
     freedom: int
 
 
+class Excess(NamedTuple):
+    """A band, Hz, where a fit leaves `factor` times the noise level of a channel (of sensors, forces, base) of a run."""
+
+    channel: int
+    run: int
+    low: float
+    high: float
+    factor: float
+
+
 @dataclass(frozen=True, eq=False)
 class ModalEstimate:
     """What whole records tell of the modes: the likeliest ones, and how exactly they are known.
@@ -171,6 +181,8 @@ class ModalEstimate:
         B, where what is left is no white noise and the covariance is ``A^-1 B A^-1 / 2``, A the information.
     settled : bool
         Whether modes and levels of noise stood still at the end of the fit.
+    excess : tuple of Excess
+        Where the fit leaves more than the noise; empty where what it leaves is white.
     """
 
     phi: Array
@@ -185,6 +197,7 @@ class ModalEstimate:
     gain: Gains
     scatter: Array | None = None
     settled: bool = True
+    excess: tuple[Excess, ...] = ()
 
 
 def per_run(name: str, value: Any, runs: int) -> tuple[bool, ...]:

@@ -16,6 +16,7 @@ from sysid.modal_analysis.record_gains import gain_errors_of
 from sysid.modal_analysis.record_more import least_worth, no_modes, with_further_modes
 from sysid.modal_analysis.record_poles import few_lines, rough_deviations
 from sysid.modal_analysis.record_spread import scatter
+from sysid.modal_analysis.record_whiteness import excess_of
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.structure.structure import Array, ComplexArray
 
@@ -135,4 +136,5 @@ def estimate(fit: RecordFit) -> ModalEstimate:
         modes.phi[:, order], modes.gamma[order], modes.omega[order], modes.ratios[order], p.rigid,
         A[np.ix_(at, at)], fit.noise, fit.reduced, fit.model.whole.density, gain_errors_of(fit),
         None if B is None else B[np.ix_(at, at)], fit.settled,
+        excess_of(fit),
     )  # fmt: skip

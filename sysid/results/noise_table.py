@@ -1,12 +1,16 @@
-"""The noise of each channel of whole records, for summary, summary.json and report."""
+"""The noise of each channel of whole records, for summary, summary.json and report, and where fits leave more."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 
+from sysid.measurement.measurement import Measurement
 from sysid.results.answer import Answer
+
+_TOLD = 3  # channels
 
 
 class ChannelNoise(NamedTuple):
@@ -42,4 +46,27 @@ def noise_of_channels(it: Answer) -> tuple[ChannelNoise, ...]:
     return tuple(
         ChannelNoise(name, float(own), unit, float(share))
         for (name, unit), own, share in zip(names, std, percent, strict=True)
+    )
+
+
+def excess_in_words(test: Measurement) -> Iterator[str]:
+    """What the modes of whole records, their transients taken off, leave beyond the noise, in a sentence."""
+    modal = test.modal
+    if modal is None or not modal.excess:
+        return
+    axes = test.base_axes or ()
+    names = [*test.sensor_names]
+    names += [f"force {axis}" for axis in axes] if test.force is not None else []
+    names += [f"base {axis}" for axis in axes]
+    told = [
+        f"in {names[one.channel]}{f' of run {one.run}' if test.n_runs > 1 else ''} is {one.factor:.2g} times the noise "
+        f"level between {one.low:.3g} and {one.high:.3g} Hz"
+        for one in modal.excess[:_TOLD]
+    ]
+    more = len(modal.excess) - len(told)
+    others = f", and so in {more} more" if more else ""
+    source = "intervals are by its scatter" if modal.scatter is not None else "intervals are as if it were white"
+    yield (
+        f"what the fit leaves {', '.join(told)}{others}: the noise there is not white, or the model misses something; "
+        f"{source}"
     )
