@@ -73,12 +73,15 @@ class WholeRecords:
         Runs that are stated to begin and end at rest, and have no such numbers.
     noise : NoiseLevels or None
         Stated; None where they are estimated with the fit.
+    varying : (runs, channels) of bool, or None
+        Sensors, forces and base directions whose level is found to vary over the lines; set by the fit, in no file.
     """
 
     samples: tuple[int, ...]
     sample_rate: float
     at_rest: tuple[bool, ...]
     noise: NoiseLevels | None = field(default=None)
+    varying: NDArray[np.bool_] | None = field(default=None)
 
     @property
     def moving(self) -> tuple[int, ...]:
@@ -145,13 +148,22 @@ class Gains:
 
 
 class Excess(NamedTuple):
-    """A band, Hz, where a fit leaves `factor` times the noise level of a channel (of sensors, forces, base) of a run."""
+    """A band, Hz, where a fit leaves `factor` times the noise of a channel (of sensors, forces, base) of a run."""
 
     channel: int
     run: int
     low: float
     high: float
     factor: float
+
+
+class VaryingLevel(NamedTuple):
+    """Noise of a channel of a run, numbered as in `Excess`, that varies over the lines: least and largest deviation."""
+
+    channel: int
+    run: int
+    least: float
+    largest: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,6 +195,8 @@ class ModalEstimate:
         Whether modes and levels of noise stood still at the end of the fit.
     excess : tuple of Excess
         Where the fit leaves more than the noise; empty where what it leaves is white.
+    varying : tuple of VaryingLevel
+        Levels that were let vary smoothly over the lines; `noise` holds their means.
     """
 
     phi: Array
@@ -198,6 +212,7 @@ class ModalEstimate:
     scatter: Array | None = None
     settled: bool = True
     excess: tuple[Excess, ...] = ()
+    varying: tuple[VaryingLevel, ...] = ()
 
 
 def per_run(name: str, value: Any, runs: int) -> tuple[bool, ...]:

@@ -28,23 +28,25 @@ def excess_of(fit: RecordFit) -> tuple[Excess, ...]:
     model, test = fit.model, fit.test
     bands = sum(_count(power.shape[1]) * len(power) for power in powers)
     found: list[tuple[float, Excess]] = []
-    for run, own, power in zip(model.runs, test.own_lines, powers, strict=True):
-        freq = test.freq[own]
-        size = np.sqrt(np.mean(np.abs(np.vstack([run.outputs, run.base])) ** 2, axis=1) / run.density)
-        for channel in np.flatnonzero(np.sqrt(fit.levels[run.number]) > _TRACE * size):
+    levels = np.sqrt(fit.levels_of_runs)
+    for number, (own, power) in enumerate(zip(test.own_lines, powers, strict=True)):
+        freq, runs = test.freq[own], [run for run in model.runs if run.number == number]
+        both = np.concatenate([np.vstack([run.outputs, run.base]) for run in runs], axis=1)
+        size = np.sqrt(np.mean(np.abs(both) ** 2, axis=1) / runs[0].density)
+        for channel in np.flatnonzero(levels[number] > _TRACE * size):
             best = most_unlikely(power[channel], bands)
             if best is not None:
                 first, last, weight = best
                 factor = float(np.sqrt(np.mean(power[channel, first:last])))
                 found.append((weight, Excess(
-                    int(channel), run.number, float(freq[first]), float(freq[last - 1]), factor
+                    int(channel), number, float(freq[first]), float(freq[last - 1]), factor
                 )))  # fmt: skip
     return tuple(one for _, one in sorted(found, key=lambda pair: -pair[0]))
 
 
 def noise_powers(fit: RecordFit) -> list[Array]:
     """Squares of the noise of each channel as all errors tell it, over their variances, (c + d, lines) a run."""
-    parts: list[list[Array]] = [[] for _ in fit.model.runs]
+    parts: list[list[Array]] = [[] for _ in range(fit.test.n_runs)]
     for chunk in fit.model.chunks(fit.parameters):
         _, _, seen, inverse = chunk.weighed_errors(fit.levels)
         own = np.einsum("ccl->cl", inverse).real

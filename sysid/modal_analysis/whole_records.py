@@ -16,25 +16,32 @@ from sysid.modal_analysis.record_gains import gain_errors_of
 from sysid.modal_analysis.record_more import least_worth, no_modes, with_further_modes
 from sysid.modal_analysis.record_poles import few_lines, rough_deviations
 from sysid.modal_analysis.record_spread import scatter
+from sysid.modal_analysis.record_varying import varying_levels, with_varying_levels
 from sysid.modal_analysis.record_whiteness import excess_of
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.structure.structure import Array, ComplexArray
 
 
 def whole_fit(test: Measurement, *, monitor: Monitor | None = None) -> RecordFit:
-    """Modes, transients and noise of whole records.
-
-    Poles are looked for twice: with rough weights, and with the noise that a first fit found; where lines are many, on
-    some of them, from which the fit of all begins.
+    """Modes, transients and noise of whole records, its levels smooth over the lines where they are no constants.
 
     Raises
     ------
     InputError
         As `find_poles` does.
     """
+    return with_varying_levels(_white_fit(test, monitor), monitor=monitor)
+
+
+def _white_fit(test: Measurement, monitor: Monitor | None) -> RecordFit:
+    """The fit with one level of noise a channel and run.
+
+    Poles are looked for twice: with rough weights, and with the noise that a first fit found; where lines are many, on
+    some of them, from which the fit of all begins.
+    """
     lines = few_lines(test)
     if not np.all(lines):
-        return on_all_lines(whole_fit(test.at(lines), monitor=monitor), test, monitor=monitor)
+        return on_all_lines(_white_fit(test.at(lines), monitor), test, monitor=monitor)
     poles = find_poles(replace(test, response_std=rough_deviations(test)), monitor=monitor)
     fit = _kept(record_modes(test, poles.omega, poles.ratios, monitor=monitor), monitor)
     again = find_poles(replace(test, response_std=deviations(fit)[0]), monitor=monitor)
@@ -75,7 +82,7 @@ def deviations(fit: RecordFit) -> tuple[Array, Array | None]:
     parts: list[list[Array]] = [[] for _ in range(test.n_runs)]
     c = model.channels
     for chunk in model.chunks(fit.parameters):
-        own = fit.levels[chunk.run.number]
+        own = fit.levels[chunk.run.piece]
         power = own[:c, None] + np.einsum("cdl,d->cl", np.abs(chunk.H) ** 2, own[c:])
         parts[chunk.run.number].append(np.sqrt(chunk.run.density * power))
     std = _at_lines(test, parts)
@@ -136,5 +143,5 @@ def estimate(fit: RecordFit) -> ModalEstimate:
         modes.phi[:, order], modes.gamma[order], modes.omega[order], modes.ratios[order], p.rigid,
         A[np.ix_(at, at)], fit.noise, fit.reduced, fit.model.whole.density, gain_errors_of(fit),
         None if B is None else B[np.ix_(at, at)], fit.settled,
-        excess_of(fit),
+        excess_of(fit), varying_levels(fit),
     )  # fmt: skip

@@ -49,24 +49,28 @@ def noise_of_channels(it: Answer) -> tuple[ChannelNoise, ...]:
     )
 
 
-def excess_in_words(test: Measurement) -> Iterator[str]:
-    """What the modes of whole records, their transients taken off, leave beyond the noise, in a sentence."""
+def noise_in_words(test: Measurement) -> Iterator[str]:
+    """Where the noise of whole records, their transients taken off, is not white, and what the fit leaves beside it."""
     modal = test.modal
-    if modal is None or not modal.excess:
+    if modal is None:
         return
     axes = test.base_axes or ()
     names = [*test.sensor_names]
     names += [f"force {axis}" for axis in axes] if test.force is not None else []
     names += [f"base {axis}" for axis in axes]
+    name = lambda one: names[one.channel] + (f" of run {one.run}" if test.n_runs > 1 else "")  # noqa: E731
+    if modal.varying:
+        told = [f"{name(one)} {one.largest / one.least:.2g} times" for one in modal.varying]
+        yield f"the noise is not white: levels vary smoothly over the lines, from least to largest of {', '.join(told)}"
     told = [
-        f"in {names[one.channel]}{f' of run {one.run}' if test.n_runs > 1 else ''} is {one.factor:.2g} times the noise "
-        f"level between {one.low:.3g} and {one.high:.3g} Hz"
+        f"in {name(one)} is {one.factor:.2g} times the noise level between {one.low:.3g} and {one.high:.3g} Hz"
         for one in modal.excess[:_TOLD]
     ]
-    more = len(modal.excess) - len(told)
-    others = f", and so in {more} more" if more else ""
-    source = "intervals are by its scatter" if modal.scatter is not None else "intervals are as if it were white"
-    yield (
-        f"what the fit leaves {', '.join(told)}{others}: the noise there is not white, or the model misses something; "
-        f"{source}"
-    )
+    if told:
+        more = len(modal.excess) - len(told)
+        others = f", and so in {more} more" if more else ""
+        source = "intervals are by its scatter" if modal.scatter is not None else "intervals are as if it were white"
+        yield (
+            f"what the fit leaves {', '.join(told)}{others}: the noise there is not white, or the model misses "
+            f"something; {source}"
+        )
