@@ -66,7 +66,7 @@ def _of_records(formulation: Formulation, test: Measurement, structure: Structur
     free = records.fit(*poles, velocity=velocity)
     misses, rigid = list(_misfit(formulation, test, structure, records, free)), list(_rigid(test, records, free))
     gains = [] if rigid else list(told(test, gain_errors(test, structure)))
-    found = [*leaks, *misses, *_force(formulation, test, structure), *rigid, *gains]
+    found = [*_at_rest(test), *leaks, *misses, *_force(formulation, test, structure), *rigid, *gains]
     # Beside what those say, quadrature and likeness mean nothing.
     if structure.modal_damping and not (leaks or rigid or gains):
         found += _damping(records, poles, free)
@@ -75,6 +75,16 @@ def _of_records(formulation: Formulation, test: Measurement, structure: Structur
     if not (leaks or misses or rigid):
         found += _twins(test, structure)
     return found
+
+
+def _at_rest(test: Measurement) -> Iterator[str]:
+    """Whether runs of whole records are at rest at both ends where it is stated."""
+    for run in () if test.modal is None else test.modal.in_motion:
+        yield (
+            f"run {run} is stated to begin and end at rest (at_rest), but its records show the free vibration of a "
+            "structure that was in motion at one end: leave the statement out for this run, so that its transients are "
+            "fitted"
+        )
 
 
 def _priors(formulation: Formulation, x: Array) -> Iterator[str]:

@@ -197,6 +197,8 @@ class ModalEstimate:
         Where the fit leaves more than the noise; empty where what it leaves is white.
     varying : tuple of VaryingLevel
         Levels that were let vary smoothly over the lines; `noise` holds their means.
+    in_motion : tuple of int
+        Runs stated to be at rest at both ends that the records show were not.
     """
 
     phi: Array
@@ -213,6 +215,7 @@ class ModalEstimate:
     settled: bool = True
     excess: tuple[Excess, ...] = ()
     varying: tuple[VaryingLevel, ...] = ()
+    in_motion: tuple[int, ...] = ()
 
 
 def per_run(name: str, value: Any, runs: int) -> tuple[bool, ...]:

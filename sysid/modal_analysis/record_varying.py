@@ -5,37 +5,44 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sysid.measurement.whole import VaryingLevel
 from sysid.modal_analysis.record_fit import Monitor, RecordFit, refitted
+from sysid.modal_analysis.record_noise import likeliest_levels
 from sysid.modal_analysis.record_whiteness import excess_of
-
-_ROUNDS = 3  # in each of which the channels that still stand out are joined to those whose level varies
 
 
 def with_varying_levels(fit: RecordFit, *, monitor: Monitor | None = None) -> RecordFit:
     """The fit with levels that vary, for the channels where the noise is not white; as it is where none is.
 
-    Also as it is where smooth levels do not explain what is left: that is the error of a model, at its peaks, or hum.
+    Also as it is where smooth levels do not explain what is left, which is the error of a model, at its peaks, or hum:
+    the levels are tried beside the modes as they are, and only then fitted with them.
     """
     assert fit.test.whole is not None
     if fit.test.whole.noise is not None:
         return fit
-    found = excess_of(fit)
-    trial, varying = fit, np.zeros((fit.test.n_runs, fit.levels.shape[1]), bool)
-    for _ in range(_ROUNDS):
-        if not found:
-            return trial if trial.schwarz > fit.schwarz else fit
+    found, trial = excess_of(fit), fit
+    varying = np.zeros((fit.test.n_runs, fit.levels.shape[1]), bool)
+    while found:
         before = varying.copy()
         varying[[one.run for one in found], [one.channel for one in found]] = True
         if np.array_equal(varying, before):
             return fit
-        test = replace(fit.test, whole=replace(fit.test.whole, varying=varying.copy()))
-        start = replace(fit, test=test)
-        rows = [run.number for run in start.model.runs]
-        trial = refitted(replace(start, levels=fit.levels_of_runs[rows]), fit.parameters, monitor=monitor)
+        trial = _levels_alone(fit, varying.copy())
         found = excess_of(trial)
-    return fit
+    if trial is fit:
+        return fit
+    trial = refitted(trial, fit.parameters, monitor=monitor)
+    return fit if excess_of(trial) or trial.schwarz < fit.schwarz else trial
+
+
+def _levels_alone(fit: RecordFit, varying: NDArray[np.bool_]) -> RecordFit:
+    """The fit with some levels that vary, and the modes as they are."""
+    assert fit.test.whole is not None
+    trial = replace(fit, test=replace(fit.test, whole=replace(fit.test.whole, varying=varying)))
+    levels = fit.levels_of_runs[[run.number for run in trial.model.runs]]
+    return replace(trial, levels=likeliest_levels(trial.model, fit.parameters, levels, fit.unknowns))
 
 
 def varying_levels(fit: RecordFit) -> tuple[VaryingLevel, ...]:

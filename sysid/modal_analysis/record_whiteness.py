@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import gammaincc
 
 from sysid.measurement.whole import Excess
@@ -62,7 +63,7 @@ def _sizes(lines: int) -> Sequence[int]:
     return [*(_FEWEST * 2**i for i in range(64) if _FEWEST * 2**i < lines), lines] if lines >= _FEWEST else []
 
 
-def _starts(size: int, lines: int) -> Array:
+def _starts(size: int, lines: int) -> NDArray[np.intp]:
     """First lines of bands of one size."""
     return np.arange(0, lines - size + 1, max(size // 2, 1))
 

@@ -15,6 +15,7 @@ from sysid.modal_analysis.record_fit import Monitor, RecordFit, on_all_lines, re
 from sysid.modal_analysis.record_gains import gain_errors_of
 from sysid.modal_analysis.record_more import least_worth, no_modes, with_further_modes
 from sysid.modal_analysis.record_poles import few_lines, rough_deviations
+from sysid.modal_analysis.record_rest import runs_in_motion
 from sysid.modal_analysis.record_spread import scatter
 from sysid.modal_analysis.record_varying import varying_levels, with_varying_levels
 from sysid.modal_analysis.record_whiteness import excess_of
@@ -143,5 +144,5 @@ def estimate(fit: RecordFit) -> ModalEstimate:
         modes.phi[:, order], modes.gamma[order], modes.omega[order], modes.ratios[order], p.rigid,
         A[np.ix_(at, at)], fit.noise, fit.reduced, fit.model.whole.density, gain_errors_of(fit),
         None if B is None else B[np.ix_(at, at)], fit.settled,
-        excess_of(fit), varying_levels(fit),
+        excess_of(fit), varying_levels(fit), runs_in_motion(fit),
     )  # fmt: skip
