@@ -197,6 +197,8 @@ class ModalEstimate:
         Where the fit leaves more than the noise; empty where what it leaves is white.
     varying : tuple of VaryingLevel
         Levels that were let vary smoothly over the lines; `noise` holds their means.
+    untold : tuple of (run, channel)
+        Levels of `noise` that the records do not determine.
     in_motion : tuple of int
         Runs stated to be at rest at both ends that the records show were not.
     """
@@ -216,6 +218,7 @@ class ModalEstimate:
     excess: tuple[Excess, ...] = ()
     varying: tuple[VaryingLevel, ...] = ()
     in_motion: tuple[int, ...] = ()
+    untold: tuple[tuple[int, int], ...] = ()
 
 
 def per_run(name: str, value: Any, runs: int) -> tuple[bool, ...]:

@@ -17,6 +17,7 @@ from sysid.structure.structure import Array, ComplexArray
 
 _ENOUGH = 8000  # lines, of all runs together: more of them tell a level no better than the fit needs
 _STEPS = 30
+_VAGUE = 1e-6  # information on a logarithm that counts as none
 _SETTLED = 1e-4  # of a level's logarithm
 VANISHING = 1e-7  # of a channel's rms: what counts as noise where there is none
 _LEAST_SHARE = 0.01  # of the median share of noise: with few lines one channel could come out exact, infinitely likely
@@ -39,19 +40,48 @@ def likeliest_levels(model: RecordModel, p: Parameters, levels: Array, unknowns:
     """
     lines = sum(run.w.size for run in model.runs)
     thin = model.thinned(max(1, -(-lines // _ENOUGH)))
+    parts = _parts(thin, p)
     least = floors(model)
     share = np.median(levels / least, axis=1, keepdims=True)
     least = least * np.maximum(1.0, _LEAST_SHARE**2 * share)
-    parts = [Part(chunk.error, chunk.H, chunk.run.density, chunk.run.piece) for chunk in thin.chunks(p)]
     found = np.zeros_like(levels)
     for number in range(len(model.whole.samples)):
-        runs = [run for run in model.runs if run.number == number]
-        rows = [run.piece for run in runs]
-        varies = np.zeros(levels.shape[1], bool) if model.whole.varying is None else model.whole.varying[number]
-        ends = float(runs[0].w[0]), float(runs[-1].w[-1])
-        D = dict(zip(rows, designs(np.array([np.mean(run.w) for run in runs]), ends, varies), strict=True))
+        D = _designs(model, number, levels.shape[1])
+        rows = list(D)
         found[rows] = _of_run([part for part in parts if part.piece in D], D, levels[rows], least[rows])
     return found * model.numbers / max(model.numbers - unknowns, model.numbers / 4)
+
+
+def level_deviations(model: RecordModel, p: Parameters, levels: Array) -> Array:
+    """Standard deviations of the logarithms of levels found, as deviations of a sample, (runs, c + d).
+
+    Large where the records do not tell a level, or not apart from others: of a nearly rigid structure with one sensor
+    only the sum of its noise and the base's shows.
+    """
+    parts, out = _parts(model, p), []
+    for number in range(len(model.whole.samples)):
+        D = _designs(model, number, levels.shape[1])
+        rows, every = list(D), np.concatenate(list(D.values()))
+        x = np.linalg.lstsq(every, np.log(levels[rows]).ravel(), rcond=None)[0]
+        fisher = _likelihood([part for part in parts if part.piece in D], D, x)[2]
+        inverse = np.linalg.inv(fisher + _VAGUE * np.eye(x.size))
+        mean = np.mean(list(D.values()), axis=0)
+        out.append(np.sqrt(np.einsum("ci,ij,cj->c", mean, inverse, mean)) / 2)
+    return np.array(out)
+
+
+def _parts(model: RecordModel, p: Parameters) -> list[Part]:
+    return [Part(chunk.error, chunk.H, chunk.run.density, chunk.run.piece) for chunk in model.chunks(p)]
+
+
+def _designs(model: RecordModel, number: int, channels: int) -> dict[int, Array]:
+    """What the numbers of a run's levels make of their logarithms, piece by piece."""
+    runs = [run for run in model.runs if run.number == number]
+    varying = model.whole.varying
+    varies = np.zeros(channels, bool) if varying is None else varying[number]
+    ends = float(runs[0].w[0]), float(runs[-1].w[-1])
+    made = designs(np.array([np.mean(run.w) for run in runs]), ends, varies)
+    return {run.piece: one for run, one in zip(runs, made, strict=True)}
 
 
 class Part(NamedTuple):

@@ -62,6 +62,14 @@ def noise_in_words(test: Measurement) -> Iterator[str]:
     if modal.varying:
         told = [f"{name(one)} {one.largest / one.least:.2g} times" for one in modal.varying]
         yield f"the noise is not white: levels vary smoothly over the lines, from least to largest of {', '.join(told)}"
+    if modal.untold:
+        untold = ", ".join(
+            names[channel] + (f" of run {run}" if test.n_runs > 1 else "") for run, channel in modal.untold
+        )
+        yield (
+            f"the records do not tell the noise level of {untold}, as it is small beside that of other channels or "
+            "shows as theirs does: the level given is one of many that explain them as well"
+        )
     told = [
         f"in {name(one)} is {one.factor:.2g} times the noise level between {one.low:.3g} and {one.high:.3g} Hz"
         for one in modal.excess[:_TOLD]
