@@ -9,6 +9,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from sysid.assessment.gains import distinct_poles, gain_errors, told
+from sysid.assessment.leakage import leakage
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.residues import Records, ResidueFit, beyond_chance, force_residual_left
@@ -61,19 +62,32 @@ def doubts(problem: Problem, structure: Structure, x: Array | None) -> tuple[str
 def _of_records(formulation: Formulation, test: Measurement, structure: Structure) -> list[str]:
     """Signs in the records of one test that a structure is not theirs, in sentences."""
     records, poles = Records(test), distinct_poles(structure)
+    leaks = list(leakage(test, structure)) if test.averaged else []
     velocity = not structure.modal_damping
     if records.data.shape[0] <= _LINES * poles[0].size * records.n_base * (2 if velocity else 1):
-        return []
+        return leaks
     free = records.fit(*poles, velocity=velocity)
     misses, rigid = list(_misfit(formulation, test, structure, records, free)), list(_rigid(test, records, free))
     gains = [] if rigid else list(told(test, gain_errors(test, structure)))
-    found = [*misses, *_force(formulation, test, structure), *rigid, *gains]
+    found = [*_at_rest(test), *leaks, *misses, *_force(formulation, test, structure), *rigid, *gains]
     # Beside what those say, quadrature and likeness mean nothing.
-    if structure.modal_damping and not (rigid or gains):
+    if structure.modal_damping and not (leaks or rigid or gains):
         found += _damping(records, poles, free)
-    if not (misses or rigid):
+    if not found:  # spectra of unknown origin, whose misfit nothing else explains
+        found = leaks = list(leakage(test, structure))
+    if not (leaks or misses or rigid):
         found += _twins(test, structure)
     return found
+
+
+def _at_rest(test: Measurement) -> Iterator[str]:
+    """Whether runs of whole records are at rest at both ends where it is stated."""
+    for run in () if test.modal is None else test.modal.in_motion:
+        yield (
+            f"run {run} is stated to begin and end at rest (at_rest), but its records show the free vibration of a "
+            "structure that was in motion at one end: leave the statement out for this run, so that its transients are "
+            "fitted"
+        )
 
 
 def _priors(formulation: Formulation, x: Array) -> Iterator[str]:

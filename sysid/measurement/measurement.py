@@ -52,6 +52,8 @@ class Measurement:
         How many lines were left out so, of all records.
     holes : tuple of (str, ndarray)
         What held NaN there, a sensor's name or that of another record, and at which lines, Hz.
+    averaged : bool
+        Averages over segments, as "h1" and "h2" of `from_time` give: their window flattens narrow peaks.
     whole : WholeRecords, optional
         Of spectra of whole records, which neither begin nor end at rest: see `from_time`.
     modal : ModalEstimate, optional
@@ -75,6 +77,7 @@ class Measurement:
     missing: InitVar[Missing] = field(default="refuse", kw_only=True)
     dropped: int = field(default=0, kw_only=True)
     holes: tuple[tuple[str, Array], ...] = field(default=(), kw_only=True)
+    averaged: bool = field(default=False, kw_only=True)
     whole: WholeRecords | None = field(default=None, kw_only=True)
     modal: ModalEstimate | None = field(default=None, kw_only=True)
 
@@ -155,6 +158,7 @@ class Measurement:
             # So that an older sysid reads all others.
             **({"dropped": self.dropped} if self.dropped else {}),
             **({"holes": [{"name": name, "freq": freq} for name, freq in self.holes]} if self.holes else {}),
+            **({"averaged": True} if self.averaged else {}),
             **({} if self.whole is None else {"whole": self.whole.to_tree()}),
         }  # fmt: skip
 
@@ -419,6 +423,7 @@ class Measurement:
                 estimate.freq, estimate.frf, force=estimate.force, response_std=estimate.frf_std,
                 force_std=estimate.force_std, **given,
             )  # fmt: skip
+            test = replace(test, averaged=True)
         if band is None and estimator == "records":
             band = test.freq[0], max(_FOLDED * sample_rate, test.freq[0])
         return test if band is None else test.in_band(*sequence("band", band, "(low, high) in Hz", 2))

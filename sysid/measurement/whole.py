@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,12 +73,15 @@ class WholeRecords:
         Runs that are stated to begin and end at rest, and have no such numbers.
     noise : NoiseLevels or None
         Stated; None where they are estimated with the fit.
+    varying : (runs, channels) of bool, or None
+        Sensors, forces and base directions whose level is found to vary over the lines; set by the fit, in no file.
     """
 
     samples: tuple[int, ...]
     sample_rate: float
     at_rest: tuple[bool, ...]
     noise: NoiseLevels | None = field(default=None)
+    varying: NDArray[np.bool_] | None = field(default=None)
 
     @property
     def moving(self) -> tuple[int, ...]:
@@ -144,6 +147,25 @@ class Gains:
     freedom: int
 
 
+class Excess(NamedTuple):
+    """A band, Hz, where a fit leaves `factor` times the noise of a channel (of sensors, forces, base) of a run."""
+
+    channel: int
+    run: int
+    low: float
+    high: float
+    factor: float
+
+
+class VaryingLevel(NamedTuple):
+    """Noise of a channel of a run, numbered as in `Excess`, that varies over the lines: least and largest deviation."""
+
+    channel: int
+    run: int
+    least: float
+    largest: float
+
+
 @dataclass(frozen=True, eq=False)
 class ModalEstimate:
     """What whole records tell of the modes: the likeliest ones, and how exactly they are known.
@@ -171,6 +193,14 @@ class ModalEstimate:
         B, where what is left is no white noise and the covariance is ``A^-1 B A^-1 / 2``, A the information.
     settled : bool
         Whether modes and levels of noise stood still at the end of the fit.
+    excess : tuple of Excess
+        Where the fit leaves more than the noise; empty where what it leaves is white.
+    varying : tuple of VaryingLevel
+        Levels that were let vary smoothly over the lines; `noise` holds their means.
+    untold : tuple of (run, channel)
+        Levels of `noise` that the records do not determine.
+    in_motion : tuple of int
+        Runs stated to be at rest at both ends that the records show were not.
     """
 
     phi: Array
@@ -185,6 +215,10 @@ class ModalEstimate:
     gain: Gains
     scatter: Array | None = None
     settled: bool = True
+    excess: tuple[Excess, ...] = ()
+    varying: tuple[VaryingLevel, ...] = ()
+    in_motion: tuple[int, ...] = ()
+    untold: tuple[tuple[int, int], ...] = ()
 
 
 def per_run(name: str, value: Any, runs: int) -> tuple[bool, ...]:

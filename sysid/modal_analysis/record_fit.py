@@ -19,6 +19,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_masses import weigh
+from sysid.modal_analysis.record_colour import extra_numbers
 from sysid.modal_analysis.record_model import TRACES, Parameters, RecordModel, Shift
 from sysid.modal_analysis.record_noise import floors, likeliest_levels
 from sysid.modal_analysis.residues import Records
@@ -50,8 +51,8 @@ class RecordFit:
     test : Measurement
         As given.
     parameters : Parameters
-    levels : (runs, c + d)
-        Variances of a sample in time, of responses, forces and base.
+    levels : (pieces, c + d)
+        Variances of a sample in time, of responses, forces and base; a row a run, or a stretch of a run's lines.
     chi2 : float
         ``sum e' S^-1 e``: half a chi-squared of `freedom` degrees where the model is right.
     settled : bool
@@ -100,7 +101,8 @@ class RecordFit:
     @property
     def schwarz(self) -> float:
         """The log-likelihood less half of Schwarz's price of the unknowns: the larger, the better."""
-        return self.likelihood - self.unknowns * float(np.log(self.model.numbers)) / 2
+        unknowns = self.unknowns + extra_numbers(self.model.whole.varying)
+        return self.likelihood - unknowns * float(np.log(self.model.numbers)) / 2
 
     @cached_property
     def likelihood(self) -> float:
@@ -109,7 +111,7 @@ class RecordFit:
         spread = 0.0
         for chunk in model.chunks(self.parameters):
             T = chunk.H
-            own = self.levels[chunk.run.number]
+            own = self.levels[chunk.run.piece]
             inner = np.einsum("cil,cjl,c->lij", T.conj(), T, 1 / own[:c]) * own[c:]
             spread += float(np.sum(np.linalg.slogdet(inner + np.eye(inner.shape[1]))[1]))
             spread += T.shape[-1] * float(np.sum(np.log(own[:c] * chunk.run.density)))
@@ -129,9 +131,18 @@ class RecordFit:
         return A
 
     @property
+    def levels_of_runs(self) -> Array:
+        """Mean variances over the lines of each run, (runs, c + d)."""
+        mean, lines = np.zeros((self.test.n_runs, self.levels.shape[1])), np.zeros((self.test.n_runs, 1))
+        for run in self.model.runs:
+            mean[run.number] += run.w.size * self.levels[run.piece]
+            lines[run.number] += run.w.size
+        return mean / lines
+
+    @property
     def noise(self) -> NoiseLevels:
         """The levels, stated or found, as standard deviations."""
-        root, n, d = np.sqrt(self.levels), self.test.n_sensors, self.test.n_base
+        root, n, d = np.sqrt(self.levels_of_runs), self.test.n_sensors, self.test.n_base
         if len(root) == 1:
             root = root[0]
         force = root[..., n : n + d] if self.test.force is not None else None

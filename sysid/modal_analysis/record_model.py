@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Index, Modes
+from sysid.modal_analysis.record_colour import pieces
 from sysid.modal_analysis.response import gain_slopes, gains
 from sysid.structure.structure import Array, ComplexArray
 
@@ -40,6 +41,8 @@ class Run(NamedTuple):
     number: int
     weight: Array
     """(L,): of how many lines each stands for."""
+    piece: int
+    """Row of the levels of noise: runs are cut where levels vary over the lines."""
 
     def at(self, lines: Any) -> Run:
         """Some of its lines."""
@@ -164,10 +167,13 @@ class RecordModel:
         self.runs = [
             Run(
                 2 * np.pi * test.freq[own], test.base[r][:, own], outputs[r][:, own], float(self.whole.density[r]), r,
-                np.ones(np.count_nonzero(own)),
+                np.ones(np.count_nonzero(own)), r,
             )
             for r, own in enumerate(test.own_lines)
         ]  # fmt: skip
+        if self.whole.varying is not None:
+            cut = [run.at(lines) for run in self.runs for lines in pieces(run.w)]
+            self.runs = [run._replace(piece=piece) for piece, run in enumerate(cut)]
         self.n_fit = self.kept + self.n_ends + test.n_runs * self.channels * TRACES
         self.gains = gains
         self.size = self.n_fit + gains * self.n * (1 + self.d)
@@ -217,7 +223,7 @@ class RecordModel:
     def normal_equations(self, p: Parameters, levels: Array) -> Shift:
         """Products with the base as the records of all channels make it likely, for noise of these levels.
 
-        `levels` are variances of a sample in time, of the outputs and then of the base, (runs, c + d).
+        `levels` are variances of a sample in time, of the outputs and then of the base, (pieces, c + d).
         """
         return self._products(p, levels, Chunk.sums)
 
@@ -274,7 +280,7 @@ class Chunk:
 
     def deviations(self, levels: Array) -> tuple[Array, Array]:
         """Inverse deviations of the outputs' own noise at a line, (c,), and deviations of the base's, (d,)."""
-        own, c = levels[self.run.number] * self.run.density, self.model.channels
+        own, c = levels[self.run.piece] * self.run.density, self.model.channels
         return 1 / np.sqrt(own[:c]), np.sqrt(own[c:])
 
     def _base_noise(self, levels: Array) -> tuple[ComplexArray, ComplexArray]:

@@ -7,27 +7,31 @@ logarithms.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
+from sysid.modal_analysis.record_colour import designs
 from sysid.modal_analysis.record_model import Parameters, RecordModel
 from sysid.structure.structure import Array, ComplexArray
 
 _ENOUGH = 8000  # lines, of all runs together: more of them tell a level no better than the fit needs
 _STEPS = 30
+_VAGUE = 1e-6  # information on a logarithm that counts as none
 _SETTLED = 1e-4  # of a level's logarithm
 VANISHING = 1e-7  # of a channel's rms: what counts as noise where there is none
 _LEAST_SHARE = 0.01  # of the median share of noise: with few lines one channel could come out exact, infinitely likely
 
 
 def floors(model: RecordModel) -> Array:
-    """Least variance of a sample of each run's outputs and base directions, (runs, c + d)."""
+    """Least variance of a sample of outputs and base directions, (pieces, c + d)."""
     spectra = (np.vstack([run.outputs, run.base]) / np.sqrt(run.density) for run in model.runs)
     power = np.array([np.mean(np.abs(both) ** 2, axis=1) for both in spectra])
     return VANISHING**2 * np.where(power > 0, power, power.max())
 
 
 def likeliest_levels(model: RecordModel, p: Parameters, levels: Array, unknowns: int) -> Array:
-    """Variances of a sample in time of each run's outputs and base directions, (runs, c + d), from first ones.
+    """Variances of a sample in time of outputs and base directions, (pieces, c + d), from first ones.
 
     Parameters
     ----------
@@ -36,45 +40,90 @@ def likeliest_levels(model: RecordModel, p: Parameters, levels: Array, unknowns:
     """
     lines = sum(run.w.size for run in model.runs)
     thin = model.thinned(max(1, -(-lines // _ENOUGH)))
+    parts = _parts(thin, p)
     least = floors(model)
     share = np.median(levels / least, axis=1, keepdims=True)
     least = least * np.maximum(1.0, _LEAST_SHARE**2 * share)
-    chunks = list(thin.chunks(p))
-    found = np.array([
-        _of_run([(part.error, part.H, part.run.density) for part in chunks if part.run.number == run], own, floor)
-        for run, (own, floor) in enumerate(zip(levels, least, strict=True))
-    ])  # fmt: skip
+    found = np.zeros_like(levels)
+    for number in range(len(model.whole.samples)):
+        D = _designs(model, number, levels.shape[1])
+        rows = list(D)
+        found[rows] = _of_run([part for part in parts if part.piece in D], D, levels[rows], least[rows])
     return found * model.numbers / max(model.numbers - unknowns, model.numbers / 4)
 
 
-def _of_run(parts: list[tuple[ComplexArray, ComplexArray, float]], levels: Array, least: Array) -> Array:
-    """Variances of one run, (c + d,)."""
-    log = np.log(np.maximum(levels, least))
-    value, score, fisher = _likelihood(parts, log)
+def level_deviations(model: RecordModel, p: Parameters, levels: Array) -> Array:
+    """Standard deviations of the logarithms of levels found, as deviations of a sample, (runs, c + d).
+
+    Large where the records do not tell a level, or not apart from others: of a nearly rigid structure with one sensor
+    only the sum of its noise and the base's shows.
+    """
+    parts, out = _parts(model, p), []
+    for number in range(len(model.whole.samples)):
+        D = _designs(model, number, levels.shape[1])
+        rows, every = list(D), np.concatenate(list(D.values()))
+        x = np.linalg.lstsq(every, np.log(levels[rows]).ravel(), rcond=None)[0]
+        fisher = _likelihood([part for part in parts if part.piece in D], D, x)[2]
+        inverse = np.linalg.inv(fisher + _VAGUE * np.eye(x.size))
+        mean = np.mean(list(D.values()), axis=0)
+        out.append(np.sqrt(np.einsum("ci,ij,cj->c", mean, inverse, mean)) / 2)
+    return np.array(out)
+
+
+def _parts(model: RecordModel, p: Parameters) -> list[Part]:
+    return [Part(chunk.error, chunk.H, chunk.run.density, chunk.run.piece) for chunk in model.chunks(p)]
+
+
+def _designs(model: RecordModel, number: int, channels: int) -> dict[int, Array]:
+    """What the numbers of a run's levels make of their logarithms, piece by piece."""
+    runs = [run for run in model.runs if run.number == number]
+    varying = model.whole.varying
+    varies = np.zeros(channels, bool) if varying is None else varying[number]
+    ends = float(runs[0].w[0]), float(runs[-1].w[-1])
+    made = designs(np.array([np.mean(run.w) for run in runs]), ends, varies)
+    return {run.piece: one for run, one in zip(runs, made, strict=True)}
+
+
+class Part(NamedTuple):
+    """Some lines: errors (c, L), what passes the base on (c, d, L), density and piece of `Run`."""
+
+    error: ComplexArray
+    H: ComplexArray
+    density: float
+    piece: int
+
+
+def _of_run(parts: list[Part], D: dict[int, Array], levels: Array, least: Array) -> Array:
+    """Variances of the pieces of one run, (pieces, c + d), with logarithms ``D x`` of a few numbers x."""
+    every = np.concatenate(list(D.values()))
+    x = np.linalg.lstsq(every, np.log(np.maximum(levels, least)).ravel(), rcond=None)[0]
+    # A number stands for a channel's lowest level at most.
+    lowest = np.min(np.where(every > 0, np.log(least).ravel()[:, None], np.inf), axis=0)
+    x = np.maximum(x, lowest)
+    value, score, fisher = _likelihood(parts, D, x)
     for _ in range(_STEPS):
         size = np.sqrt(np.diag(fisher))
         step = np.linalg.solve(fisher / np.outer(size, size) + 1e-6 * np.eye(size.size), score / size) / size
         step = np.clip(step, -2.0, 2.0)
         while True:
-            trial = np.maximum(log + step, np.log(least))
-            new = _likelihood(parts, trial)
+            trial = np.maximum(x + step, lowest)
+            new = _likelihood(parts, D, trial)
             if new[0] >= value or np.abs(step).max() < _SETTLED:
                 break
             step = step / 2
-        moved = np.abs(trial - log).max()
+        moved = np.abs(trial - x).max()
         if new[0] >= value:
-            log, (value, score, fisher) = trial, new
+            x, (value, score, fisher) = trial, new
         if moved < _SETTLED:
             break
-    return np.asarray(np.exp(log))
+    return np.asarray(np.exp(every @ x)).reshape(levels.shape)
 
 
-def _likelihood(parts: list[tuple[ComplexArray, ComplexArray, float]], log: Array) -> tuple[float, Array, Array]:
-    """Log-likelihood, and its score and Fisher information by the logarithms of the variances."""
-    value, score, fisher = 0.0, np.zeros(log.size), np.zeros((log.size, log.size))
-    v = np.exp(log)
-    for error, H, density in parts:
-        c = error.shape[0]
+def _likelihood(parts: list[Part], D: dict[int, Array], x: Array) -> tuple[float, Array, Array]:
+    """Log-likelihood, and its score and Fisher information by the numbers of which variances are made."""
+    value, score, fisher = 0.0, np.zeros(x.size), np.zeros((x.size, x.size))
+    for error, H, density, piece in parts:
+        c, v = error.shape[0], np.exp(D[piece] @ x)
         T, e = np.moveaxis(H, -1, 0), error.T
         S = np.einsum("lcd,d,led->lce", T, density * v[c:], T.conj(), optimize=True)
         S[:, np.arange(c), np.arange(c)] += density * v[:c]
@@ -85,8 +134,8 @@ def _likelihood(parts: list[tuple[ComplexArray, ComplexArray, float]], log: Arra
         value -= float(np.sum(np.linalg.slogdet(S)[1]) + np.sum(np.einsum("lc,lc->l", e.conj(), Ge).real))
         own = np.concatenate([np.abs(Ge) ** 2 - np.einsum("lcc->lc", G).real,
                               np.abs(TGe) ** 2 - np.einsum("ldd->ld", TGT).real], axis=1)  # fmt: skip
-        score += density * v * own.sum(axis=0)
+        score += D[piece].T @ (density * v * own.sum(axis=0))
         between = np.sum(np.abs(GT) ** 2, axis=0)
         pairs = np.block([[np.sum(np.abs(G) ** 2, axis=0), between], [between.T, np.sum(np.abs(TGT) ** 2, axis=0)]])
-        fisher += density**2 * np.outer(v, v) * pairs
+        fisher += D[piece].T @ (density**2 * np.outer(v, v) * pairs) @ D[piece]
     return value, score, fisher

@@ -73,7 +73,7 @@ def uneven(fit: RecordFit) -> bool:
     off = []
     powers: list[list[Array]] = [[] for _ in model.runs]
     for chunk in model.chunks(fit.parameters):
-        powers[chunk.run.number].append(chunk.weighed(fit.levels).power)
+        powers[chunk.run.piece].append(chunk.weighed(fit.levels).power)
     for run, parts in zip(model.runs, powers, strict=True):
         power = np.concatenate(parts)
         for lines in blocks_of(run, fit, 0.0):

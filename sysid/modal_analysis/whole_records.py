@@ -8,33 +8,54 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import ModalEstimate
+from sysid.modal_analysis.excitation import steady_sine
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.record_fit import Monitor, RecordFit, on_all_lines, record_modes, refitted, without, worth
 from sysid.modal_analysis.record_gains import gain_errors_of
 from sysid.modal_analysis.record_more import least_worth, no_modes, with_further_modes
 from sysid.modal_analysis.record_poles import few_lines, rough_deviations
+from sysid.modal_analysis.record_rest import runs_in_motion
 from sysid.modal_analysis.record_spread import scatter
+from sysid.modal_analysis.record_varying import untold_levels, varying_levels, with_varying_levels
+from sysid.modal_analysis.record_whiteness import excess_of
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.structure.structure import Array, ComplexArray
 
 
 def whole_fit(test: Measurement, *, monitor: Monitor | None = None) -> RecordFit:
-    """Modes, transients and noise of whole records.
-
-    Poles are looked for twice: with rough weights, and with the noise that a first fit found; where lines are many, on
-    some of them, from which the fit of all begins.
+    """Modes, transients and noise of whole records, its levels smooth over the lines where they are no constants.
 
     Raises
     ------
     InputError
-        As `find_poles` does.
+        As `find_poles` does, or where the base moved in a steady sine.
+    """
+    try:
+        fit = _white_fit(test, monitor)
+    except (InputError, np.linalg.LinAlgError) as error:
+        told = steady_sine(test)
+        if told is None:
+            raise
+        raise InputError(told) from error
+    fit = with_varying_levels(fit, monitor=monitor)
+    if fit.model.whole.varying is not None:  # where the level was too low, noise passed for modes
+        fit = _pruned(fit, monitor)
+    return fit
+
+
+def _white_fit(test: Measurement, monitor: Monitor | None) -> RecordFit:
+    """The fit with one level of noise a channel and run.
+
+    Poles are looked for twice: with rough weights, and with the noise that a first fit found; where lines are many, on
+    some of them, from which the fit of all begins.
     """
     lines = few_lines(test)
     if not np.all(lines):
         some = test.at(lines)
-        fit = on_all_lines(whole_fit(some, monitor=monitor), test, monitor=monitor)
+        fit = on_all_lines(_white_fit(some, monitor), test, monitor=monitor)
         return with_further_modes(fit, some=some, monitor=monitor)  # weak ones show on all lines only
     poles = find_poles(replace(test, response_std=rough_deviations(test)), monitor=monitor)
     fit = _kept(record_modes(test, poles.omega, poles.ratios, monitor=monitor), monitor)
@@ -56,8 +77,14 @@ def _kept(fit: RecordFit, monitor: Monitor | None) -> RecordFit:
     for rough in (True, False):
         if not rough:
             fit = refitted(fit, fit.parameters, monitor=monitor)
-        while (least := _least(fit)) is not None:
-            fit = refitted(fit, without(fit, least), rough=rough, monitor=monitor)
+        fit = _pruned(fit, monitor, rough=rough)
+    return fit
+
+
+def _pruned(fit: RecordFit, monitor: Monitor | None, *, rough: bool = False) -> RecordFit:
+    """The fit without modes that noise explains, one after the other."""
+    while (least := _least(fit)) is not None:
+        fit = refitted(fit, without(fit, least), rough=rough, monitor=monitor)
     return fit
 
 
@@ -76,7 +103,7 @@ def deviations(fit: RecordFit) -> tuple[Array, Array | None]:
     parts: list[list[Array]] = [[] for _ in range(test.n_runs)]
     c = model.channels
     for chunk in model.chunks(fit.parameters):
-        own = fit.levels[chunk.run.number]
+        own = fit.levels[chunk.run.piece]
         power = own[:c, None] + np.einsum("cdl,d->cl", np.abs(chunk.H) ** 2, own[c:])
         parts[chunk.run.number].append(np.sqrt(chunk.run.density * power))
     std = _at_lines(test, parts)
@@ -137,4 +164,5 @@ def estimate(fit: RecordFit) -> ModalEstimate:
         modes.phi[:, order], modes.gamma[order], modes.omega[order], modes.ratios[order], p.rigid,
         A[np.ix_(at, at)], fit.noise, fit.reduced, fit.model.whole.density, gain_errors_of(fit),
         None if B is None else B[np.ix_(at, at)], fit.settled,
+        excess_of(fit), varying_levels(fit), runs_in_motion(fit), untold_levels(fit),
     )  # fmt: skip

@@ -18,6 +18,7 @@ from sysid.nlp import EXACT
 from sysid.problem.problem import Problem
 from sysid.results.answer import NOT_JUDGED
 from sysid.results.identification import Identification
+from sysid.results.noise_table import noise_in_words
 from sysid.results.unknowns_table import ON_BOUND
 from sysid.search.deadline import TimeIsOver, within
 from sysid.search.other_answers import with_other_answers
@@ -105,6 +106,8 @@ def _remarks(problem: Problem, end: Outcome) -> Iterator[str]:
             where = f" ({in_words(test.holes, test.freq)})" if test.holes else ""
             which = "" if len(tests) == 1 else f" of test {i}"
             yield f"{test.dropped} lines at which a record holds NaN are left out{which} for all channels alike{where}"
+    for test, _ in problem.fits(end.structure, end.x):
+        yield from noise_in_words(test)
     yield from _outliers(problem, end)
     if not formulation.fits_records:
         yield "the problem states a misfit of its own; pictures and scores compare with the records as they are"

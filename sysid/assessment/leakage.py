@@ -1,0 +1,108 @@
+"""Spectra averaged over segments: peaks that are too narrow for their lines, and modes that leakage doubles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sysid.measurement.measurement import Measurement
+from sysid.structure.structure import Array, Structure
+
+_FEWEST = 8.0  # lines in a half-power width; a Hann window then takes 2 % off a peak, and more with fewer
+_TWICE = 2.0  # distances of lines, within which a peak that was smeared over them is taken for two modes
+_SAME_SHAPE = 0.95  # modal assurance criterion
+_MISSED = 3.0  # times the relative misfit elsewhere, beyond which spectra of unknown origin show a peak flattened
+_NEAR = 1.5  # half-power widths about a peak ..
+_AT_LEAST = 1.5  # .. or distances of lines
+
+
+class Peaks(NamedTuple):
+    """Modes within the lines: numbers as users count them, Hz, half-power widths and distances of lines there, Hz."""
+
+    number: NDArray[np.intp]
+    frequency: Array
+    width: Array
+    spacing: Array
+
+
+def leakage(test: Measurement, structure: Structure) -> Iterator[str]:
+    """Whether lines are too coarse for the modes that were found, and which modes may be none, in sentences.
+
+    Averages over segments (`Measurement.averaged`) are judged by their lines alone. Frequency response functions of
+    unknown origin may be exact at any lines, so that they must miss more at the peak than elsewhere. Spectra of whole
+    records are no averages, and never judged.
+    """
+    if test.freq.size < 2 or not (test.averaged or test.has_unit_runs):
+        return
+    peaks = _peaks(test, structure)
+    coarse = peaks.spacing * _FEWEST > peaks.width
+    averaged = "" if test.averaged else "if these spectra are averages over segments, "
+    groups = _found_twice(peaks, coarse, structure)
+    if groups:
+        of_groups = ", ".join(" and ".join(f"{f:.4g}" for f in peaks.frequency[group]) for group in groups)
+        most = np.max(peaks.spacing[[group[0] for group in groups]])
+        yield (
+            f"modes at {of_groups} Hz have the same shape, and lines are up to {most:.2g} Hz apart: {averaged}one mode "
+            "found twice is leakage of segments that are too short, no second mode"
+        )
+    if not np.any(coarse):
+        return
+    k = int(np.argmax(np.where(coarse, peaks.spacing / peaks.width, 0.0)))
+    missed = "" if test.averaged else _missed(test, structure, float(peaks.frequency[k]), float(peaks.width[k]))
+    if missed is None:
+        return
+    yield (
+        f"lines are {peaks.spacing[k]:.2g} Hz apart, mode {peaks.number[k]} is {peaks.width[k]:.2g} Hz wide{missed}: "
+        f"{averaged}their window flattens its peak, and damping and masses come out wrong; take whole records "
+        f"(from_time with estimator='records'), or segments of {_FEWEST / peaks.width[k]:.3g} s or longer"
+    )
+
+
+def _peaks(test: Measurement, structure: Structure) -> Peaks:
+    """Modes within the lines."""
+    freq, f = test.freq, structure.natural_frequencies
+    inside = np.flatnonzero((f >= freq[0]) & (f <= freq[-1]))
+    width = 2 * structure.damping_ratios[inside] * f[inside]
+    return Peaks(inside + 1, f[inside], width, np.interp(f[inside], freq, np.gradient(freq)))
+
+
+def _found_twice(peaks: Peaks, coarse: NDArray[np.bool_], structure: Structure) -> list[list[int]]:
+    """Groups of modes of one shape, each within two distances of lines from the next."""
+    groups: list[list[int]] = []
+    for i, j in pairwise(range(peaks.number.size)):
+        near = peaks.frequency[j] - peaks.frequency[i] < _TWICE * peaks.spacing[i]
+        if not (near and coarse[i] and coarse[j] and _mac(structure, *peaks.number[[i, j]] - 1) > _SAME_SHAPE):
+            continue
+        if groups and groups[-1][-1] == i:
+            groups[-1].append(j)
+        else:
+            groups.append([i, j])
+    return groups
+
+
+def _mac(structure: Structure, i: int, j: int) -> float:
+    """Modal assurance criterion of two modes at the sensors, 0 to 1."""
+    a, b = (structure.mode_shapes[:, [i, j]]).T
+    return float((a @ b) ** 2 / max((a @ a) * (b @ b), np.finfo(float).tiny))
+
+
+def _missed(test: Measurement, structure: Structure, frequency: float, width: float) -> str | None:
+    """What a fit misses about a peak, in words; None where that is no more than elsewhere.
+
+    Noise as large at all lines is less of the response at a peak, noise in proportion to it the same: only a peak
+    itself that is not what modes make of it stands out.
+    """
+    distance = np.gradient(test.freq)
+    near = np.abs(test.freq - frequency) < np.maximum(_NEAR * width, _AT_LEAST * distance)
+    if not np.any(near) or np.all(near):
+        return None
+    left = test.relative - test.predict(structure)
+    share = lambda at: float(np.linalg.norm(left[..., at]) / np.linalg.norm(test.relative[..., at]))  # noqa: E731
+    there, elsewhere = share(near), share(~near)
+    if there < _MISSED * elsewhere or there < 1e-6:
+        return None
+    return f", and the fit misses {100 * there:.2g} % of the response there ({100 * elsewhere:.2g} % elsewhere)"

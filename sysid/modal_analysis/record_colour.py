@@ -1,0 +1,59 @@
+"""Noise whose level varies smoothly over the lines: few numbers a channel, the logarithm linear between them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sysid.structure.structure import Array
+
+KNOTS = 5  # frequencies at which a level is a number of its own, evenly in the root of frequency
+_PIECES = 20  # stretches of lines with one level each, that of the straight line in their middle
+_LEAST = 4  # lines of a stretch
+
+
+def pieces(w: Array) -> list[slice]:
+    """Stretches of the lines of a run, (L,), rad/s."""
+    root = np.sqrt(w)
+    bounds = np.unique(np.searchsorted(root, np.linspace(root[0], root[-1], _PIECES + 1)[1:-1]))
+    cuts = [0]
+    for bound in bounds:
+        if bound - cuts[-1] >= _LEAST and w.size - bound >= _LEAST:
+            cuts.append(int(bound))
+    return [slice(a, b) for a, b in zip(cuts, [*cuts[1:], w.size], strict=True)]
+
+
+def hats(middles: Array, first: float, last: float) -> Array:
+    """What each of `KNOTS` numbers makes of the logarithm of a level in the middle of each stretch, (pieces, knots)."""
+    at = np.linspace(np.sqrt(first), np.sqrt(last), KNOTS)
+    return np.array([np.interp(np.sqrt(middles), at, one) for one in np.eye(KNOTS)]).T
+
+
+def designs(middles: Array, ends: tuple[float, float], varies: NDArray[np.bool_]) -> list[Array]:
+    """What the numbers of a run make of the logarithms of all levels, (channels, numbers) a stretch.
+
+    Parameters
+    ----------
+    middles : (pieces,)
+        Middles of stretches, rad/s.
+    ends : (first, last)
+        Lines of the run, rad/s.
+    varies : (channels,) of bool
+        Channels whose levels vary; others have one number.
+    """
+    if not np.any(varies):
+        return [np.eye(varies.size)] * middles.size
+    shape = hats(middles, *ends)
+    first = np.concatenate([[0], np.cumsum(np.where(varies, KNOTS, 1))])
+    made = []
+    for row in shape:
+        D = np.zeros((varies.size, first[-1]))
+        for channel, own in enumerate(varies):
+            D[channel, first[channel] : first[channel + 1]] = row if own else 1.0
+        made.append(D)
+    return made
+
+
+def extra_numbers(varying: NDArray[np.bool_] | None) -> int:
+    """Numbers that varying levels take more than constant ones."""
+    return 0 if varying is None else (KNOTS - 1) * int(np.count_nonzero(varying))

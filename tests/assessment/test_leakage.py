@@ -1,0 +1,96 @@
+"""Lines too coarse for the modes, and modes that leakage doubles, are told; exact spectra are not accused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import sysid
+from benchmarks.records.simulated import four_storeys
+from sysid import Measurement, Structure, simulate
+from sysid.assessment.leakage import leakage
+
+SETTING = four_storeys()
+TRUTH = SETTING.structure
+RATE = SETTING.sample_rate
+WIDTH = 2 * TRUTH.damping_ratios[0] * TRUTH.natural_frequencies[0]
+
+
+def records(seed):
+    rng = np.random.default_rng(seed)
+    made, _ = SETTING.with_noise(SETTING.run(rng).records(), rng)
+    return [(made.base, made.response, None)]
+
+
+def h1(segment, seed=0):
+    return Measurement.from_time(
+        records(seed), RATE, rigid_body=np.ones((4, 1)), estimator="h1", segment=segment, band=(1.0, 20.0)
+    )
+
+
+def frf(test):
+    return Measurement.from_frf(test.freq, test.response[0], rigid_body=test.rigid_body)
+
+
+def test_an_average_over_short_segments_is_told_its_lines_and_the_width_of_its_narrowest_mode():
+    result = sysid.identify(sysid.Problem(h1(4000), mass=sysid.FullMass()), rng=0)
+    (told,) = [sentence for sentence in result.undetermined if "lines are" in sentence]
+    assert told.startswith(f"lines are {RATE / 4000:.2g} Hz apart, mode 1 is ")
+    assert float(told.split("mode 1 is ")[1].split()[0]) == pytest.approx(WIDTH, rel=0.1)
+    assert float(told.split("segments of ")[1].split()[0]) == pytest.approx(8 / WIDTH, rel=0.1)
+    assert not any("one motion" in sentence for sentence in result.undetermined)
+
+
+def test_nothing_is_told_of_lines_that_are_fine_enough_or_of_whole_records():
+    fine = replace(simulate(TRUTH, np.arange(1.0, 20.0, WIDTH / 8.1)), averaged=True)
+    assert list(leakage(fine, TRUTH)) == []
+    coarse = replace(simulate(TRUTH, np.arange(1.0, 20.0, WIDTH / 7.9)), averaged=True)
+    assert len(list(leakage(coarse, TRUTH))) == 1
+    assert list(leakage(replace(coarse, averaged=False, base=2 * coarse.base), TRUTH)) == []  # no unit runs
+
+
+@pytest.mark.parametrize("noise", ["none", "white", "in proportion"])
+def test_exact_response_functions_on_coarse_lines_have_no_leakage(noise):
+    rng = np.random.default_rng(1)
+    test = simulate(TRUTH, np.arange(1.0, 20.0, 2 * WIDTH), noise=0.02 if noise == "white" else 0.0, rng=rng)
+    if noise == "in proportion":
+        error = rng.standard_normal((2, *test.response.shape))
+        test = replace(test, response=test.response * (1 + 0.02 * (error[0] + 1j * error[1])))
+    assert list(leakage(test, TRUTH)) == []
+
+
+def test_an_analysers_averages_are_told_where_the_fit_misses_their_peak():
+    test = frf(h1(4000))
+    assert not test.averaged
+    (told,) = leakage(test, TRUTH)
+    assert "if these spectra are averages over segments" in told
+    assert "the fit misses" in told
+
+
+def test_a_frequency_found_twice_within_two_lines_is_leakage():
+    test = h1(2000, seed=1)
+    result = sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), rng=0)
+    f = result.structure.natural_frequencies
+    assert np.diff(f).min() < 2 * RATE / 2000  # the first mode of four
+    (told,) = [sentence for sentence in result.undetermined if "same shape" in sentence]
+    assert told.startswith(f"modes at {f[0]:.4g} and {f[1]:.4g} Hz have the same shape")
+    assert "no second mode" in told
+
+
+def test_two_modes_as_close_with_other_shapes_are_two():
+    f = TRUTH.natural_frequencies.copy()
+    M, n = TRUTH.mass, TRUTH.n
+    phi = TRUTH.mode_shapes
+    f[1] = f[0] + WIDTH / 2
+    half = M[:n, :n] @ phi
+    K = half @ np.diag((2 * np.pi * f) ** 2) @ half.T
+    G = TRUTH.rigid_body
+    close = Structure(M, np.block([[K, -K @ G], [-(K @ G).T, G.T @ K @ G]]), TRUTH.damping_ratios, n_base=1)
+    test = replace(simulate(close, np.arange(1.0, 20.0, WIDTH)), averaged=True)
+    assert not any("same shape" in sentence for sentence in leakage(test, close))
+
+
+def test_averages_stay_averages_in_files():
+    test = h1(4000)
+    assert Measurement.from_tree(test.to_tree()).averaged
+    assert not Measurement.from_tree(frf(test).to_tree()).averaged

@@ -1,0 +1,58 @@
+"""What a fit of whole records leaves is told where it is more than noise, by channel, band and factor."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import sysid
+from benchmarks.records.simulated import Records, four_storeys
+from sysid.modal_analysis.record_whiteness import LEVEL, most_unlikely
+
+SETTING = four_storeys()
+
+
+def made(seed: int, duration: float = 20.0) -> Records:
+    rng = np.random.default_rng(seed)
+    records, _ = SETTING.with_noise(SETTING.run(rng, duration).records(), rng)
+    return records
+
+
+def fitted(records: Records) -> sysid.Identification:
+    test = sysid.Measurement.from_time(
+        [(records.base, records.response, None)], SETTING.sample_rate, rigid_body=np.ones((4, 1)), band=SETTING.lines
+    )
+    return sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), rng=0)
+
+
+def test_one_in_a_thousand_white_draws_is_accused() -> None:
+    """Of 6 channels of 400 lines: a Poisson variable of at most 1; 7 or more are as unlikely as 1e-4."""
+    rng = np.random.default_rng(3)
+    bands = 6 * sum(400 // (size // 2) - 1 for size in (8, 16, 32, 64, 128, 256)) + 6
+    alarms = sum(any(most_unlikely(row, bands) for row in rng.exponential(size=(6, 400))) for _ in range(1000))
+    assert LEVEL == 1e-3
+    assert alarms < 7
+
+
+def test_white_noise_is_not_told() -> None:
+    for seed in range(2):
+        assert not any("what the fit leaves" in remark for remark in fitted(made(seed)).remarks)
+
+
+def test_a_band_of_one_sensor_with_three_times_the_noise_is_told() -> None:
+    records = made(5)
+    rng = np.random.default_rng(8)
+    response = records.response.copy()
+    freq = np.fft.rfftfreq(response.shape[1], 1 / SETTING.sample_rate)
+    more = np.fft.rfft(rng.standard_normal(response.shape[1])) * ((freq > 4) & (freq < 6))
+    # White noise of this sensor has 1 % of its rms; sqrt(8) times that beside it makes three times the level.
+    response[1] += np.sqrt(8) * 0.01 * np.sqrt(np.mean(response[1] ** 2)) * np.fft.irfft(more, response.shape[1])
+    result = fitted(Records(records.base, response, records.force, records.sample_rate))
+    assert result.measurement.modal is not None
+    worst = result.measurement.modal.excess[0]
+    assert (worst.channel, worst.run) == (1, 0)
+    assert 3.8 < worst.low < worst.high < 6.3
+    assert worst.factor == pytest.approx(3.0 / np.sqrt(1 + 8 * 2 / 19), rel=0.2)  # of its level over all 19 Hz
+    (told,) = [remark for remark in result.remarks if "what the fit leaves" in remark]
+    assert told.startswith(f"what the fit leaves in sensor 2 is {worst.factor:.2g} times the noise level between ")
+    assert told.replace("\n", " ")[:60] in result.summary().replace("\n  ", " ")
