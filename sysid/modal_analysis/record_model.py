@@ -12,7 +12,7 @@ times a few spectra, so that normal equations come from products of spectra, and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -155,6 +155,12 @@ class RecordModel:
         ]
         return other
 
+    def weighed_by(self, weights: Sequence[Array]) -> RecordModel:
+        """The same, each line of each run standing for so many."""
+        other = copy(self)
+        other.runs = [run._replace(weight=weight) for run, weight in zip(self.runs, weights, strict=True)]
+        return other
+
     def pack(self, p: Parameters) -> Array:
         """The unknowns as one column."""
         modes, index = p.modes, self.index
@@ -243,11 +249,11 @@ class Chunk:
         B = np.moveaxis(scale[:, None, None] * self.H * root[:, None], -1, 0)
         return B, np.linalg.inv(B.conj().transpose(0, 2, 1) @ B + np.eye(B.shape[2]))
 
-    def weighed(self, levels: Array) -> Weighed:
-        """Errors weighed by their full covariance."""
+    def weighed(self, levels: Array, error: ComplexArray | None = None) -> Weighed:
+        """Errors, or other spectra (c, L), weighed by their full covariance."""
         scale, root = self.deviations(levels)
         B, inverse = self._base_noise(levels)
-        e = (scale[:, None] * self.error).T[..., None]
+        e = (scale[:, None] * (self.error if error is None else error)).T[..., None]
         # What is likeliest of the base's noise, in its own units; what it makes of the errors is taken off them.
         noise = inverse @ (B.conj().transpose(0, 2, 1) @ e)
         left = (e - B @ noise)[..., 0].T

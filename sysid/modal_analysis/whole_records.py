@@ -16,6 +16,7 @@ from sysid.modal_analysis.record_gains import gain_errors_of
 from sysid.modal_analysis.record_more import least_worth, with_further_modes
 from sysid.modal_analysis.record_poles import few_lines, rough_deviations
 from sysid.modal_analysis.record_spread import scatter
+from sysid.modal_analysis.record_spurious import without_spurious_modes
 from sysid.modal_analysis.vector_fitting import DAMPED, RAZOR, Poles, find_poles
 from sysid.structure.structure import Array, ComplexArray
 
@@ -40,7 +41,7 @@ def whole_fit(test: Measurement, *, monitor: Monitor | None = None) -> RecordFit
     if not _same_modes(fit.parameters.modes, again):
         other = _kept(record_modes(test, again.omega, again.ratios, monitor=monitor), monitor)
         fit = max(fit, other, key=lambda one: one.schwarz)
-    return with_further_modes(fit, monitor=monitor)
+    return without_spurious_modes(with_further_modes(fit, monitor=monitor), monitor=monitor)
 
 
 def _same_modes(modes: Modes, poles: Poles) -> bool:
