@@ -235,10 +235,10 @@ def _minimise(
     done, most = counts
     for i in range(most):
         monitor(done + i, float(np.sqrt(2 * here.chi2 / model.numbers)))
-        size = np.sqrt(np.maximum(np.diag(here.normal), 1e-300))
-        scaled = here.normal / np.outer(size, size)
+        unit = _units(here.normal)
+        scaled = here.normal * np.outer(unit, unit)
         while True:
-            step = _step(scaled, damping, here.gradient / size) / size
+            step = _step(scaled, damping, here.gradient * unit) * unit
             promised = float(here.gradient @ step)
             trial = model.unpack(x + step)
             after = _chi2(model, trial, levels)
@@ -256,6 +256,12 @@ def _minimise(
         else:
             return model.unpack(x), here.chi2, True
     return model.unpack(x), here.chi2, False
+
+
+def _units(normal: Array) -> Array:
+    """What each unknown moves by to show as much as the noise; zero for one that shows nowhere, but for round-off."""
+    known = np.diag(normal)
+    return np.where(known > np.finfo(float).tiny, 1 / np.sqrt(np.maximum(known, np.finfo(float).tiny)), 0.0)
 
 
 def _step(scaled: Array, damping: float, gradient: Array) -> Array:
@@ -325,11 +331,14 @@ def without(fit: RecordFit, k: int) -> Parameters:
     return replace(p, modes=modes, ends=p.ends[keep])
 
 
-def worth(fit: RecordFit) -> Array:
-    """What ``e' S^-1 e`` would about rise by without each mode, (m,): all else moves as far as it is free."""
-    model, p, N = fit.model, fit.parameters, fit.normal
-    size = np.sqrt(np.maximum(np.diag(N), 1e-300))
-    scaled = N / np.outer(size, size)
+def worth(fit: RecordFit, normal: Array | None = None) -> Array:
+    """What ``e' S^-1 e`` would about rise by without each mode, (m,): all else moves as far as it is free.
+
+    With `normal` in place of the fit's ``Re J' S^-1 J``, as of lines that count for less.
+    """
+    model, p, N = fit.model, fit.parameters, fit.normal if normal is None else normal
+    unit = _units(N)
+    scaled = N * np.outer(unit, unit)
     m, n, index = model.m, model.n, model.index
     out = np.zeros(m)
     for k in range(m):
@@ -344,6 +353,6 @@ def worth(fit: RecordFit) -> Array:
         inner = scaled[np.ix_(others, others)] + 1e-10 * np.eye(others.size)
         cross = scaled[np.ix_(others, own)]
         left = scaled[np.ix_(own, own)] - cross.T @ np.linalg.solve(inner, cross)
-        phi = p.modes.phi[:, k] * size[own]
+        phi = np.divide(p.modes.phi[:, k], unit[own], out=np.zeros(n), where=unit[own] > 0)
         out[k] = phi @ left @ phi
     return out

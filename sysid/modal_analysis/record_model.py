@@ -12,7 +12,7 @@ times a few spectra, so that normal equations come from products of spectra, and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -194,6 +194,12 @@ class RecordModel:
         ]
         return other
 
+    def weighed_by(self, weights: Sequence[Array]) -> RecordModel:
+        """The same, each line of each run standing for so many."""
+        other = copy(self)
+        other.runs = [run._replace(weight=weight) for run, weight in zip(self.runs, weights, strict=True)]
+        return other
+
     def pack(self, p: Parameters) -> Array:
         """The unknowns as one column."""
         modes, index = p.modes, self.index
@@ -306,11 +312,11 @@ class Chunk:
             B[j] /= factor[j, j].real
         return B, factor
 
-    def weighed(self, levels: Array) -> Weighed:
-        """Errors weighed by their full covariance."""
+    def weighed(self, levels: Array, error: ComplexArray | None = None) -> Weighed:
+        """Errors, or other spectra (c, L), weighed by their full covariance."""
         scale, root = self.deviations(levels)
         V, factor = self._base_noise(levels)
-        e = scale[:, None] * self.error
+        e = scale[:, None] * (self.error if error is None else error)
         # What is likeliest of the base's noise, in its own units; what it makes of the errors is taken off them.
         noise = np.array([np.sum(part.conj() * e, axis=0) for part in V])
         for part, own in zip(V, noise, strict=True):

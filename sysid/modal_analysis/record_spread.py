@@ -1,8 +1,9 @@
-"""Scatter of the modes of whole records where what is left is no white noise: sums over blocks of neighbouring lines.
+"""Scatter of the modes of whole records where what is left is no white noise: a jackknife over blocks of lines.
 
-Model error sits at the peaks. Each block of lines, some half-power widths long, then tells its own error: the scores of
-the blocks, each enlarged for the share of its error that the fit takes away, make the covariance (White 1982; MacKinnon
-and White 1985, HC2, a block in the place of a number).
+Model error sits at the peaks. Each block of lines, some half-power widths long, then tells its own error: what the
+modes would move by without it. One linear step from the end of the fit gives these moves, the score of the block
+divided by the share of the information that is left without it, and their squares make the covariance (White 1982;
+MacKinnon and White 1985, HC3, a block in the place of a number).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ _WIDTHS = 3.0  # half-power widths that a block is long
 _LEAST = 4  # lines of a block
 _SHIFTS = 4  # partitions, each begun a part of a block later: where blocks begin must not matter
 _CHANCE = 5.0  # standard deviations by which the power of what is left may differ between blocks
-_TAKEN = 0.98  # share of a block's error, at most, that the fit is corrected for having taken away
+_TAKEN = 0.98  # share of the information, at most, that is taken to be a block's
 
 
 def blocks_of(run: Run, fit: RecordFit, shift: float) -> list[NDArray[np.intp]]:
@@ -56,7 +57,7 @@ def scatter(fit: RecordFit) -> Array | None:
                 score = half[own.unknowns].T @ (made.gradient / at)
                 inner = half[own.unknowns].T @ (made.normal / np.outer(at, at)) @ half[own.unknowns]
                 taken, turn = np.linalg.eigh(inner)
-                grown = turn @ ((turn.T @ score) / np.sqrt(1 - np.clip(taken, 0.0, _TAKEN)))
+                grown = turn @ ((turn.T @ score) / (1 - np.clip(taken, 0.0, _TAKEN)))
                 meat += np.outer(grown, grown) / _SHIFTS
     # In moves of all unknowns, of which those of `Index` are kept: A^-1 B A^-1 is that of the moves.
     kept = model.kept

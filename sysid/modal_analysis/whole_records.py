@@ -19,6 +19,7 @@ from sysid.modal_analysis.record_more import least_worth, no_modes, with_further
 from sysid.modal_analysis.record_poles import few_lines, rough_deviations
 from sysid.modal_analysis.record_rest import runs_in_motion
 from sysid.modal_analysis.record_spread import scatter
+from sysid.modal_analysis.record_spurious import without_spurious_modes
 from sysid.modal_analysis.record_varying import untold_levels, varying_levels, with_varying_levels
 from sysid.modal_analysis.record_whiteness import excess_of
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
@@ -63,7 +64,7 @@ def _white_fit(test: Measurement, monitor: Monitor | None) -> RecordFit:
     if not _same_modes(fit.parameters.modes, again):
         other = _kept(record_modes(test, again.omega, again.ratios, monitor=monitor), monitor)
         fit = max(fit, other, key=lambda one: one.schwarz)
-    return with_further_modes(fit, monitor=monitor)
+    return without_spurious_modes(with_further_modes(fit, monitor=monitor), monitor=monitor)
 
 
 def _same_modes(modes: Modes, poles: Poles) -> bool:

@@ -1,0 +1,68 @@
+"""Spurious modes of whole records: what the modes miss of their own motion, explained by one more mode.
+
+A frame that softens with amplitude, under a steady sine, leaves errors at the lines of the sine and of its harmonics
+that are far beyond the noise, and a further mode near by explains them. Where what is left is no white noise, such
+lines count for less, and the one block of lines where a mode shows most is no evidence for it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sysid.modal_analysis.record_fit import Monitor, RecordFit, record_modes, refitted, without, worth
+from sysid.modal_analysis.record_model import Chunk
+from sysid.modal_analysis.record_more import least_worth
+from sysid.modal_analysis.record_spread import blocks_of, uneven
+from sysid.structure.structure import Array
+
+_MORE = 4.0  # times what a mode must be worth where noise alone is left
+
+
+def without_spurious_modes(fit: RecordFit, *, monitor: Monitor | None = None) -> RecordFit:
+    """The fit without spurious modes, one after the other; as it is where what is left is white noise."""
+    while fit.parameters.modes.omega.size > 1 and uneven(fit):
+        value = worth_beyond_misfit(fit)
+        least = int(np.argmin(value))
+        if value[least] > _MORE * least_worth(fit.model):
+            break
+        # From new residues: two modes close together may have cancelled each other.
+        modes = without(fit, least).modes
+        fit = record_modes(fit.test, modes.omega, modes.ratios, monitor=monitor)
+        fit = refitted(fit, fit.parameters, monitor=monitor)
+    return fit
+
+
+def worth_beyond_misfit(fit: RecordFit) -> Array:
+    """`worth` of each mode, (m,), in lines that count for less where the model misses more, but for one block of them.
+
+    At a line the model misses what is left in its block, and the share of the modes' motion there that it misses of all
+    lines together.
+    """
+    model, p, c = fit.model, fit.parameters, fit.model.channels
+    left, moved, parts = [], [], []
+    for run in model.runs:
+        chunk = Chunk(model, p, run)
+        each = chunk.shown[:, :, None] * chunk.g * (p.modes.gamma @ run.base + chunk.pushed_by_ends)  # (c, m, L)
+        left.append(chunk.weighed(fit.levels).power)
+        moved.append(chunk.weighed(fit.levels, each.sum(axis=1)).power)
+        parts.append([chunk.weighed(fit.levels, mode).power for mode in each.swapaxes(0, 1)])
+    share = sum(map(np.sum, left)) / sum(map(np.sum, moved))
+    blocks = [blocks_of(run, fit, 0.0) for run in model.runs]
+    weights = [
+        1 / (_by_block(lines, power, c) + share * motion / c)
+        for lines, power, motion in zip(blocks, left, moved, strict=True)
+    ]
+    value = worth(fit, model.weighed_by(weights).normal_equations(p, fit.levels).normal)
+    told = np.hstack(
+        [
+            [[np.sum((weight * mode)[part]) for part in lines] for mode in modes]
+            for lines, weight, modes in zip(blocks, weights, parts, strict=True)
+        ]
+    )  # (m, blocks)
+    return np.asarray(value * (1 - told.max(axis=1) / told.sum(axis=1)))
+
+
+def _by_block(blocks: list[NDArray[np.intp]], power: Array, channels: int) -> Array:
+    """What is left of a line in its block, in units of the noise, one at least, (L,)."""
+    return np.concatenate([np.full(lines.size, max(1.0, power[lines].mean() / channels)) for lines in blocks])

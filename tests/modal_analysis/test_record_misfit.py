@@ -1,0 +1,87 @@
+"""Whole records that a modal model misses by more than white noise: spurious modes, and deviations by blocks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.signal
+
+import sysid
+from sysid.modal_analysis.modal_estimate import factor_of
+from sysid.modal_analysis.record_fit import RecordFit, record_modes, refitted
+from sysid.modal_analysis.record_more import with_further_modes
+from sysid.modal_analysis.record_spread import blocks_of
+from sysid.modal_analysis.record_spurious import without_spurious_modes
+from sysid.modal_analysis.whole_records import estimate
+from sysid.structure.structure import Array
+
+RATE, SAMPLES, FINE, STEADY = 50.0, 3000, 8, 30.0  # Hz, of records; samples; finer steps; s of a steady sine
+FREQUENCIES, RATIOS = np.array([3.1, 7.3]), np.array([0.01, 0.012])
+SHAPES, PARTICIPATIONS, DRIVEN = np.array([[0.5, 0.8], [0.9, -0.6]]), np.array([1.2, 0.5]), 5.02  # Hz
+
+
+def _records(rng: np.random.Generator, missed: float) -> tuple[Array, Array]:
+    """Base and two floors under random motion and half a minute of a sine; to it, floors answer by more than modes do.
+
+    Exact for a base that is linear between fine steps: ``z' = pole z + load``, the modal displacement ``Im z / w_d``.
+    """
+    time = np.arange(SAMPLES * FINE) / (RATE * FINE)
+    base = scipy.signal.resample(0.3 * rng.standard_normal(SAMPLES), SAMPLES * FINE)
+    base += np.where(time < STEADY, np.sin(2 * np.pi * DRIVEN * time), 0.0)
+    moved = []
+    for f, ratio, participation in zip(FREQUENCIES, RATIOS, PARTICIPATIONS, strict=True):
+        pole = 2 * np.pi * f * (-ratio + 1j * np.sqrt(1 - ratio**2))
+        load, x = -participation * base, pole / (RATE * FINE)
+        first, second = np.expm1(x) / x, (np.expm1(x) - x) / x**2
+        steps = ((first - second) * load[:-1] + second * load[1:]) / (RATE * FINE)
+        z = np.append(0.0, scipy.signal.lfilter([1.0], [1.0, -np.exp(x)], steps))
+        moved.append((pole**2 * z).imag / pole.imag + load)
+    relative = SHAPES @ np.array(moved)[:, ::FINE]
+    base, time = base[::FINE], time[::FINE]
+    sine = np.where((time > 3) & (time < STEADY), np.sin(2 * np.pi * DRIVEN * time + 0.7), 0.0)
+    error = missed * np.std(relative) * np.outer([1.0, -0.7], sine)
+    noise = 0.01 * rng.standard_normal((3, SAMPLES))
+    return base[None] + noise[:1], relative + base + error + noise[1:]
+
+
+def _fitted(base: Array, response: Array) -> RecordFit:
+    test = sysid.Measurement.from_time([(base, response, None)], RATE, rigid_body=np.ones((2, 1)), band=(1.0, 10.0))
+    fit = record_modes(test, 2 * np.pi * FREQUENCIES, RATIOS)
+    return refitted(fit, fit.parameters)
+
+
+def test_what_modes_miss_of_a_steady_sine_is_no_mode() -> None:
+    fit = _fitted(*_records(np.random.default_rng(0), missed=0.05))
+    more = with_further_modes(fit)
+    assert more.parameters.modes.omega.size > 2
+    found = np.sort(without_spurious_modes(more).parameters.modes.omega) / (2 * np.pi)
+    assert found == pytest.approx(FREQUENCIES, rel=3e-3)
+
+
+def test_where_noise_alone_is_left_every_mode_stays() -> None:
+    fit = _fitted(*_records(np.random.default_rng(1), missed=0.0))
+    assert without_spurious_modes(fit) is fit
+
+
+def test_stated_deviations_are_those_of_refits_without_a_block() -> None:
+    """Noise five times as large about the second mode; the jackknife refits all lines but those of a block."""
+    rng = np.random.default_rng(2)
+    base, response = _records(rng, missed=0.0)
+    band = scipy.signal.butter(4, [6.3, 8.3], "bandpass", fs=RATE, output="sos")
+    fit = _fitted(base, response + scipy.signal.sosfilt(band, 0.05 * rng.standard_normal(response.shape), axis=1))
+    found = estimate(fit)
+    assert found.scatter is not None
+    moves = np.linalg.pinv(factor_of(found))
+    covariance = moves @ moves.T @ found.scatter @ moves @ moves.T / 2
+    stated = np.sqrt(np.diag(covariance)[fit.model.index.log_omega])
+    variances = []
+    for shift in (0.0, 0.25, 0.5, 0.75):
+        blocks = blocks_of(fit.model.runs[0], fit, shift)
+        left = []
+        for block in blocks:
+            part = replace(fit, test=fit.test.at(np.delete(np.arange(fit.test.freq.size), block)))
+            left.append(np.log(np.sort(refitted(part, fit.parameters).parameters.modes.omega)))
+        variances.append((len(blocks) - 1) * np.var(left, axis=0))
+    assert stated == pytest.approx(np.sqrt(np.mean(variances, axis=0)), rel=0.1)
