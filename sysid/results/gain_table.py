@@ -14,8 +14,7 @@ _EXACT = 1e-8  # deviation of a gain: round-off
 class SensorGain(NamedTuple):
     """Gain of a sensor against the base's, its standard deviation, and what 1 % of it does to M_SS.
 
-    `worth` is in stated deviations of the diagonal entry that moves by most of them; NaN where it was not computed or
-    there is no noise.
+    `worth` is in stated deviations of the diagonal entry that moves by most of them; NaN where there is no noise.
     """
 
     sensor: str
@@ -25,13 +24,12 @@ class SensorGain(NamedTuple):
 
 
 def gains_of_sensors(it: Answer) -> tuple[SensorGain, ...]:
-    """Gains of the sensors that the records of a fit show; of none where time was over or nothing was fitted."""
-    if it.hurried or not it.success or not it.problem.formulation.fits_records:
+    """Gains of the sensors that the records of a fit show; of none where deviations take long or nothing was fitted."""
+    if it.quick_uncertainty is None or not it.success or not it.problem.formulation.fits_records:
         return ()
     found, names = it.gains, it.measurement.sensor_names
     shown = np.isfinite(found.error)
-    worth = np.full(shown.size, np.nan) if it.quick_uncertainty is None else it.gain_worth
-    worth = np.where(np.nan_to_num(found.std) > _EXACT, worth, np.nan)  # noise-free records state no deviation of M
+    worth = np.where(np.nan_to_num(found.std) > _EXACT, it.gain_worth, np.nan)  # without noise M has no deviation
     return tuple(
         SensorGain(names[i], 1 + float(found.error[i]), float(found.std[i]), float(worth[i]))
         for i in np.flatnonzero(shown)
