@@ -23,6 +23,9 @@ from sysid.structure.structure import Array, Structure
 
 _CHANCE = 1e-3  # that any sensor of a right test is accused
 _SUSPECT = 2.5  # deviations of the noise, beyond which what a gain is off by counts among what is not known
+_UNSHOWN = 2.0  # %: the error that a gain may have where no record shows it
+_WITHIN = 2.0  # deviations of a gain: what the records leave open
+_MOVED = 3.0  # stated deviations of M_SS, from which an assumption is told
 _LEAST = 2e-3  # of a gain; smaller errors are usual
 _MIMICKED = 1e-2  # of a constant; less of it is left where a mode far below the lines answers like one
 _EXACT = 1e-8  # of the records: what counts as noise where there is none
@@ -89,8 +92,9 @@ def gain_errors(test: Measurement, structure: Structure) -> GainErrors:
     records, poles, velocity = Records(test), distinct_poles(structure), not structure.modal_damping
     if test.modal is not None:
         gain = test.modal.gain
-        error = np.where(np.any(test.rigid_body, axis=1), gain.error, np.nan)
-        return GainErrors(error, gain.std, np.zeros(test.n_sensors), gain.freedom)
+        moved = np.any(test.rigid_body, axis=1)
+        error, std = np.where(moved, gain.error, np.nan), np.where(moved, gain.std, np.nan)
+        return GainErrors(error, std, np.nan_to_num(_beyond(error, std)), gain.freedom)
     count = poles[0].size * test.n_base * (2 if velocity else 1)
     if records.data.shape[0] <= _LINES * (count + 2 * test.n_base):
         unknown = np.full(test.n_sensors, np.nan)
@@ -102,14 +106,17 @@ def gain_errors(test: Measurement, structure: Structure) -> GainErrors:
     plain, plain_std, least = _estimate(test, records, free, free.Q, ones, slopes)
     both = np.linalg.qr(np.hstack([free.Q, rising]))[0]
     error, std, least_beside = _estimate(test, records, free, both, ones, slopes)
-    pairs = ((np.abs(plain), least), (np.abs(error), least_beside))
-    beyond = [np.sqrt(np.maximum(size**2 - (_SUSPECT * noise) ** 2, 0.0)) for size, noise in pairs]
-    possible = np.max(np.nan_to_num(beyond), axis=0)
+    possible = np.max(np.nan_to_num([_beyond(plain, least), _beyond(error, least_beside)]), axis=0)
     plain_std = np.hypot(plain_std, plain - error)
     better = plain_std < std
     error, std = np.where(better, plain, error), np.where(better, plain_std, std)
     freedom = (len(records.data) - free.Q.shape[1] - rising.shape[1]) * (records.data.shape[1] // test.n_sensors)
     return GainErrors(error, std, possible, freedom)
+
+
+def _beyond(error: Array, std: Array) -> Array:
+    """What chance does not explain of errors with these deviations."""
+    return np.sqrt(np.maximum(error**2 - (_SUSPECT * std) ** 2, 0.0))
 
 
 def distinct_poles(structure: Structure) -> tuple[Array, Array]:
@@ -149,6 +156,45 @@ def assumed(problem: Problem) -> Iterator[str]:
         )
     if test.force is not None and mass.totals is None:
         yield "the gain of the base force is assumed to be right: it is the scale of M, K and C, which no record shows"
+
+
+def worth_of(by_gain: Array, mass_std: Array) -> Array:
+    """By how many of its deviations the diagonal of M_SS moves at most where it moves by `by_gain`, (n_sensors,).
+
+    Parameters
+    ----------
+    by_gain : (n_sensors, m)
+        Moves of the diagonal that an error of each sensor's gain makes.
+    mass_std : (m, m)
+        What is stated exactly does not move.
+    """
+    std = np.diag(mass_std)
+    known = std > 0
+    return np.max(by_gain[:, known] / std[known], axis=1, initial=0.0)
+
+
+def rests_on(test: Measurement, errors: GainErrors, worth: Array) -> Iterator[str]:
+    """Gains that M_SS rests on more closely than the records show them, in a sentence that accuses none.
+
+    `worth` (n_sensors,): deviations that an error of 1 % moves M_SS by. The records leave a gain open to its estimate
+    and two deviations on either side. Where an error within that would move M_SS by more than `_MOVED` of its stated
+    deviations, which hold for right gains, that the gain is right is an assumption that matters.
+    """
+    found = []
+    for i in np.flatnonzero(np.any(test.rigid_body, axis=1)):
+        size, open_ = 100 * abs(errors.error[i]), 100 * _WITHIN * errors.std[i]
+        reach = size + open_ if np.isfinite(errors.error[i]) else _UNSHOWN
+        if worth[i] * reach > _MOVED:
+            shown = f"{1 + errors.error[i]:.4f} +- {open_ / 100:.1g}" if np.isfinite(errors.error[i]) else "not shown"
+            found.append(
+                f"{test.sensor_names[i]} ({shown}; an error of {reach:.2g} % moves M_SS by {worth[i] * reach:.2g})"
+            )
+    if found:
+        yield (
+            "the stated deviations of M_SS hold where gains are right, which these records show less exactly, by no "
+            f"more than chance off 1: gain of {', '.join(found)} of its deviations; calibrate these sensors where that "
+            "matters"
+        )
 
 
 def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, ones: Array, slopes: Array) -> Estimate:

@@ -164,18 +164,21 @@ def adjust(problem: Problem, stated: Statements, theta: Array, index: Index, nor
 
 
 def conditioned(
-    problem: Problem, structure: Structure, modes: Modes, index: Index, normals: Array, unseen: Array
-) -> tuple[Array, Array]:
-    """Moves of theta that records and statements together leave: of a standard normal each, and unseen.
+    problem: Problem, structure: Structure, modes: Modes, index: Index, normals: Array, unseen: Array,
+    shifts: Array,
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Moves of theta that records and statements together leave: of a standard normal each, unseen, and shifts.
 
     Parameters
     ----------
     normals, unseen : (size, k), (size, q)
         Those that the records alone leave.
+    shifts : (size, r)
+        What errors that are no noise make of theta where the records alone are fitted.
     """
     stated = statements_of(problem, structure)
     if stated is None:
-        return normals, unseen
+        return normals, unseen, shifts
     theta = theta_of(modes, structure.rigid_body_mass, index)
     std = stated.std / stated.scale
     _, C = made(problem, stated, theta, index)
@@ -187,10 +190,14 @@ def conditioned(
     checks = left[:, rank:].T @ F  # statements that no scale can meet
     back = np.linalg.pinv(U, rcond=_OPEN) if U.size else np.zeros((0, std.size))
     own = np.hstack([normals, np.zeros((index.size, F.shape[1] - normals.shape[1]))]) - gauge @ (back @ F)
-    _, s, vt = np.linalg.svd(checks, full_matrices=False)
-    known = vt[s > _DEPENDENT * s.max(initial=0.0)]
+    turn, s, vt = np.linalg.svd(checks, full_matrices=False)
+    seen = s > _DEPENDENT * s.max(initial=0.0)
+    known = vt[seen]
+    # A shift is taken for noise as far as noise explains by how much the statements are missed.
+    missed = (turn[:, seen] / s[seen]).T @ (left[:, rank:].T @ (C @ shifts))
+    shifts = shifts - gauge @ (back @ (C @ shifts)) - (own @ known.T) @ missed
     own = own - (own @ known.T) @ known
-    return own, unseen - gauge @ (back @ (C @ unseen))
+    return own, unseen - gauge @ (back @ (C @ unseen)), shifts
 
 
 def _gauge(theta: Array, index: Index, weighed: bool) -> Array:

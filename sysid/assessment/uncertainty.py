@@ -31,7 +31,7 @@ from sysid.assessment.sensitivity import (
 from sysid.assessment.statements import conditioned
 from sysid.errors import InputError
 from sysid.modal_analysis.misfit import inflation_of, records_of
-from sysid.modal_analysis.modal_estimate import information_about
+from sysid.modal_analysis.modal_estimate import independent_rows, information_about, shifts_about
 from sysid.modal_analysis.modal_fit import Index, Modes
 from sysid.modal_analysis.response import columns, weights_of_test
 from sysid.models.unknowns import by_name, split
@@ -77,6 +77,8 @@ class Uncertainty:
     inflation : float
         Factor by which all standard deviations were raised because the misfit is larger than the stated noise
         explains; 1 otherwise, NaN where the lines are too few to tell a noise that is not stated.
+    mass_by_gain : (n_sensors, m)
+        By how much an error of one, 100 %, of each sensor's gain moves the diagonal of M_SS, to first order, kg.
     values, variables : dict of str to ndarray
         Values, and their standard deviations, of the unknowns that mean something by themselves: variables, springs,
         damping ratios; not the entries of factors of a matrix, nor shares of a total. By name, in their shapes.
@@ -106,6 +108,7 @@ class Uncertainty:
     covariance: Array
     inflation: float
     _spectra: ModalSpectra | DirectSpectra = field(repr=False)
+    mass_by_gain: Array
     values: dict[str, Array] = field(default_factory=dict)
     variables: dict[str, Array] = field(default_factory=dict)
 
@@ -202,10 +205,12 @@ def uncertainty(problem: Problem, structure: Structure, x: Array | None) -> Unce
 
 def _by_modes(problem: Problem, structure: Structure, x: Array | None) -> Uncertainty:
     """Standard deviations where the modal parameters are free, from their Fisher information."""
-    test, (modes, index, inflation, normals, unseen) = (
-        problem.measurement, moves_by_records(problem, structure, gains=True)
-    )  # fmt: skip
-    normals, unseen = conditioned(problem, structure, modes, index, normals, unseen)
+    test = problem.measurement
+    modes, index, inflation, normals, unseen, shifts = moves_by_records(problem, structure, gains=True)
+    possible = gain_errors(test, structure).possible
+    # What makes up for an error that a gain may have counts beside the noise.
+    normals = np.hstack([normals, (shifts * possible)[:, possible > 0]])
+    normals, unseen, shifts = conditioned(problem, structure, modes, index, normals, unseen, shifts)
     normals = normals if np.isfinite(inflation) else np.full_like(normals, np.nan)
     moves = Perturbations(normals.shape[1], *index.split(np.hstack([normals, unseen])))
     matrices = matrices_of_modes(structure, modes, moves)
@@ -213,6 +218,9 @@ def _by_modes(problem: Problem, structure: Structure, x: Array | None) -> Uncert
         open_ = np.full((structure.n, structure.n), np.nan)
         matrices = open_, open_, open_  # zeros that a decoupled structure keeps included
     found = _quantities(problem, structure, modes, moves, inflation, matrices)
+    each = [Perturbations(1, *index.split(shift[:, None])) for shift in shifts.T]
+    by_gain = np.array([np.diag(matrices_of_modes(structure, modes, own)[0]) for own in each])
+    found = replace(found, mass_by_gain=by_gain)
     if x is None or not np.any(problem.formulation.outside):
         return found
     variables, at = outside_variables(problem.formulation), x[problem.formulation.outside]
@@ -223,10 +231,10 @@ def _by_modes(problem: Problem, structure: Structure, x: Array | None) -> Uncert
 
 def moves_by_records(
     problem: Problem, structure: Structure, *, gains: bool = False
-) -> tuple[Modes, Index, float, Array, Array]:
+) -> tuple[Modes, Index, float, Array, Array, Array]:
     """Modes, index, inflation, and moves of theta that the records leave: of a standard normal each, and unseen.
 
-    With `gains` also those that make up for errors that gains of sensors may have.
+    With `gains` also what an error of one of each sensor's gain makes of theta, in columns; none without it.
     """
     test, modes = problem.measurement, modes_of(structure)
     index = Index(structure.n_sensors, structure.n, structure.n_base)
@@ -242,15 +250,16 @@ def moves_by_records(
             B = information(modes, index, [record.sandwich_grams(spectra) for record in records])
     normals, unseen = spread(A, B, path)
     inflation = inflation_of(test, records, unknowns)
-    moves = [(1.0 if np.isnan(inflation) else inflation) * normals]
-    if not gains:
-        return modes, index, inflation, moves[0], unseen
-    possible = np.zeros(0) if spectra is None else gain_errors(test, structure).possible
-    if spectra is not None and np.any(possible):
-        pulls = gain_gradients(modes, index, test.rigid_body, records[0].grams(spectra))
+    shifts = np.zeros((index.size, 0))
+    if gains:
+        if spectra is not None:
+            pulls = gain_gradients(modes, index, test.rigid_body, records[0].grams(spectra))
+        else:
+            assert test.modal is not None
+            pulls = A @ shifts_about(test.modal, modes)
         plain = normals if B is None else spread(A, None, path)[0]
-        moves.append(2 * plain @ (plain.T @ (pulls * possible)[:, possible > 0]))  # half the inverse of the information
-    return modes, index, inflation, np.hstack(moves), unseen
+        shifts = 2 * plain @ (plain.T @ pulls)  # these make half the inverse of the information
+    return modes, index, inflation, (1.0 if np.isnan(inflation) else inflation) * normals, unseen, shifts
 
 
 def _by_unknowns(problem: Problem, structure: Structure, x: Array) -> Uncertainty:
@@ -259,8 +268,9 @@ def _by_unknowns(problem: Problem, structure: Structure, x: Array) -> Uncertaint
     formulation, x = with_totals(problem, structure, x)
     slopes = slopes_of(formulation.matrices, x, test, modes.omega)
     known = sensitivity(formulation, x, slopes)
+    shifts: Array = np.zeros((x.size, test.n_sensors))
     if formulation.fits_records:
-        known = _with_gains(formulation, x, slopes, known)
+        known, shifts = _with_gains(formulation, x, slopes, known)
     steps, count = known.steps, known.normals.shape[1]
     inflation = inflation_of(test, records_of(test, structure, x.size), x.size) if formulation.fits_records else 1.0
     shapes = np.einsum("si,ikc->skc", structure.recovery, slopes.d_shapes)
@@ -271,28 +281,34 @@ def _by_unknowns(problem: Problem, structure: Structure, x: Array) -> Uncertaint
         size = np.sqrt(np.abs(np.diag(matrix)))
         matrices.append(std_of(slope @ steps, count, np.outer(size, size)))
     found = _quantities(problem, structure, modes, moves, inflation, matrices)
+    found = replace(found, mass_by_gain=np.abs(np.einsum("iic,cs->si", slopes.mass, shifts)))
     if not structure.modal_damping:
         found = replace(found, _spectra=DirectSpectra(slopes, steps, count))
     return _with_unknowns(found, problem, formulation, x, known)
 
 
-def _with_gains(formulation: Formulation, x: Array, slopes: Slopes, known: Sensitivity) -> Sensitivity:
-    """Add to the moves of x those that make up for an error that a sensor's gain may have (`GainErrors.possible`)."""
+def _with_gains(formulation: Formulation, x: Array, slopes: Slopes, known: Sensitivity) -> tuple[Sensitivity, Array]:
+    """Add to the moves of x those that make up for an error that a sensor's gain may have (`GainErrors.possible`).
+
+    And what an error of one of each gain makes of x, (size of x, n_sensors).
+    """
     own, structure = formulation.own_test, slopes.structure
     test = own.test
-    if test.modal is not None:
-        return known
     possible = gain_errors(test, structure).possible
-    if not np.any(possible):
-        return known
     rows = rows_of_test(test, slopes, x.size, share=own.weight)[0]
     weight, scale = weights_of_test(test, weighted=True)[0]
     whole = columns(test.predict(structure) + test.response - test.relative)  # G u + a
-    size = own.weight * possible[:, None] * weight / scale * whole
-    pulls = rows.jacobian.reshape(2, *size.shape, -1)
-    pull = np.einsum("slc,sl->cs", pulls[0], size.real) + np.einsum("slc,sl->cs", pulls[1], size.imag)
+    size = own.weight * weight / scale * whole
+    if test.modal is not None and len(rows.jacobian) != 2 * size.size:  # rows of modes in place of those of lines
+        factor = own.weight / scale * independent_rows(test.modal)[0]
+        pull = rows.jacobian.T @ (factor @ test.modal.gain.moves)
+    else:
+        pulls = rows.jacobian.reshape(2, *size.shape, -1)
+        pull = np.einsum("slc,sl->cs", pulls[0], size.real) + np.einsum("slc,sl->cs", pulls[1], size.imag)
     inverse = known.unit[:, None] * known.seen / known.singular_values[: known.rank]
-    return replace(known, normals=np.hstack([known.normals, inverse @ (inverse.T @ pull[:, possible > 0])]))
+    shifts = inverse @ (inverse.T @ pull)
+    normals = np.hstack([known.normals, (shifts * possible)[:, possible > 0]])
+    return replace(known, normals=normals), shifts
 
 
 def _with_unknowns(
@@ -372,4 +388,5 @@ def _quantities(
         covariance=covariance,
         inflation=inflation,
         _spectra=ModalSpectra(modes, moves, structure.rigid_body_mass),
+        mass_by_gain=np.zeros((structure.n_sensors, n)),
     )

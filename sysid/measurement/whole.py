@@ -140,11 +140,15 @@ class WholeRecords:
 
 @dataclass(frozen=True, eq=False)
 class Gains:
-    """Relative errors of the sensors' gains that whole records show, (n_sensors,), and their deviations."""
+    """Relative errors of the sensors' gains that whole records show, (n_sensors,), and their deviations.
+
+    `moves` (p, n_sensors) is what an error of one of each gain makes of the fitted modal parameters, to first order.
+    """
 
     error: Array
     std: Array
     freedom: int
+    moves: Array
 
 
 class Excess(NamedTuple):

@@ -63,14 +63,25 @@ def theta_of(modes: Modes, rigid: Array, index: Index) -> Array:
 
 def information_about(estimate: ModalEstimate, modes: Modes) -> tuple[Array, Array | None]:
     """Information, and scatter, over modal parameters in the scale and sign of `modes`, nearly the estimate's."""
+    factor = _scale_of(estimate, modes)
+    scale_of = np.outer(factor, factor)
+    B = estimate.scatter
+    return estimate.information * scale_of, None if B is None else B * scale_of
+
+
+def shifts_about(estimate: ModalEstimate, modes: Modes) -> Array:
+    """What an error of one of each sensor's gain makes of the parameters, in the scale and sign of `modes`."""
+    return estimate.gain.moves / _scale_of(estimate, modes)[:, None]
+
+
+def _scale_of(estimate: ModalEstimate, modes: Modes) -> Array:
+    """The estimate's parameters over those of nearly the same modes in another scale, (p,)."""
     index = index_of(estimate)
     scale = np.sum(modes.gamma * estimate.gamma, axis=1) / np.sum(estimate.gamma**2, axis=1)
     factor = np.ones(index.size)
     factor[index.phi] = np.tile(scale, estimate.phi.shape[0])
     factor[index.gamma] = np.repeat(1 / scale, estimate.gamma.shape[1])
-    scale_of = np.outer(factor, factor)
-    B = estimate.scatter
-    return estimate.information * scale_of, None if B is None else B * scale_of
+    return factor
 
 
 def misfit_rows(

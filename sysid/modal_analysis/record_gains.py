@@ -35,4 +35,14 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     (plain, plain_std), (error, std) = estimate(at + n), estimate(size.size)
     plain_std = np.hypot(plain_std, plain - error)
     better = plain_std < std
-    return Gains(np.where(better, plain, error), np.where(better, plain_std, std), fit.freedom)
+    # A sensor that reads too much records `1 + error` times all its motion, transients included: its rows of what is
+    # linear in it take the factor, and G u beside them pulls the fit.
+    lam, V = np.linalg.eigh(normal[:at, :at])
+    seen = lam > _SEEN * lam[-1]
+    half = V[:, seen] / np.sqrt(lam[seen])
+    pulled = half @ (half.T @ normal[:at, at : at + n]) / size[:at, None] * size[at : at + n]
+    moves = np.zeros((fit.model.index.size, n))
+    moves[: fit.model.kept] = pulled[: fit.model.kept]
+    by_sensor = moves[fit.model.index.phi].reshape(n, -1, n)
+    by_sensor[np.arange(n), :, np.arange(n)] += fit.parameters.modes.phi
+    return Gains(np.where(better, plain, error), np.where(better, plain_std, std), fit.freedom, moves)

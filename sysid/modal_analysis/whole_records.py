@@ -154,7 +154,7 @@ def estimate(fit: RecordFit) -> ModalEstimate:
     """Modes in ascending order, with their information."""
     modes, p, index = fit.parameters.modes, fit.parameters, fit.model.index
     order = np.argsort(modes.omega, kind="stable")
-    A, B = fit.information(), scatter(fit)
+    A, B, gain = fit.information(), scatter(fit), gain_errors_of(fit)
     m, (n, d) = order.size, (fit.test.n_sensors, fit.test.n_base)
     at = np.concatenate([
         (np.arange(n)[:, None] * m + order).ravel(),
@@ -163,7 +163,7 @@ def estimate(fit: RecordFit) -> ModalEstimate:
     ])  # fmt: skip
     return ModalEstimate(
         modes.phi[:, order], modes.gamma[order], modes.omega[order], modes.ratios[order], p.rigid,
-        A[np.ix_(at, at)], fit.noise, fit.reduced, fit.model.whole.density, gain_errors_of(fit),
+        A[np.ix_(at, at)], fit.noise, fit.reduced, fit.model.whole.density, replace(gain, moves=gain.moves[at]),
         None if B is None else B[np.ix_(at, at)], fit.settled,
         excess_of(fit), varying_levels(fit), runs_in_motion(fit), untold_levels(fit),
     )  # fmt: skip

@@ -17,6 +17,7 @@ from sysid.problem.formulation import MATRICES
 from sysid.problem.problem import Problem
 from sysid.report.html import Cell, beside, bullets, fold, matrix, number, page, paragraph, picture, table, text
 from sysid.report.matrices import CHOSEN, ONE_OF_MANY, SAME, Lines, half_widths, matrices, stated
+from sysid.results.gain_table import gains_of_sensors
 from sysid.results.identification import Identification
 from sysid.results.noise_table import noise_of_channels
 from sysid.results.phases import COLUMNS, rows_of_phases
@@ -115,6 +116,7 @@ def render(identification: Identification) -> str:
             ("Measured against identified", _responses(it, it.measurement)),
             ("Base force", _base_force(it, it.measurement)),
             ("Noise", _noise(it)),
+            ("Gains", _gains(it)),
             ("Outliers", _outliers(it)),
             ("Further tests", _further(it)),
             ("Validation", _validation(it)),
@@ -290,6 +292,19 @@ def _noise(it: Identification) -> str:
     rows = [(one.channel, number(one.level, 3), one.unit, number(one.percent, 3)) for one in noise_of_channels(it)]
     caption = f"Noise of each channel, {noise_source(it)}: standard deviation of a sample in time."
     return table(("channel", "of a sample", "unit", "% of its rms"), rows, caption) if rows else ""
+
+
+def _gains(it: Identification) -> str:
+    """The gain of each sensor as the records show it."""
+    rows = [
+        (g.sensor, f"{g.gain:.4f}", half_width(g.std, g.gain), "" if np.isnan(g.worth) else number(g.worth, 2))
+        for g in gains_of_sensors(it)
+    ]
+    caption = (
+        "Gain of each sensor against the base, as the constant term of the transmissibility shows it; masses assume 1. "
+        "The last column: by how many of its stated deviations M_SS is off where a gain is 1 % off."
+    )
+    return table(("sensor", "gain", "± (95 %)", "1 % moves M_SS by, deviations"), rows, caption) if rows else ""
 
 
 def _outliers(it: Identification) -> str:

@@ -21,6 +21,7 @@ from sysid.structure.structure import Array, ComplexArray, Structure
 
 if TYPE_CHECKING:
     from sysid.assessment.determination import Intervals
+    from sysid.assessment.gains import GainErrors
     from sysid.assessment.uncertainty import Uncertainty
 
 NOT_JUDGED = "what data and model determine, and how far noise leaves it known, was not judged: the time was over"
@@ -84,6 +85,23 @@ class Answer:
         """Noise of all channels of whole records, stated or found with the fit; None for other records."""
         modal = self.measurement.modal
         return None if modal is None else modal.noise
+
+    @cached_property
+    def gains(self) -> GainErrors:
+        """By how much each sensor's gain differs from the base's, as the records show it, and how exactly they do."""
+        from sysid.assessment.gains import gain_errors
+
+        return gain_errors(self.problem.screened.measurement, self.structure)
+
+    @property
+    def gain_worth(self) -> Array:
+        """By how many stated deviations an error of 1 % of each sensor's gain moves the diagonal of M_SS, (n_sensors,).
+
+        Of the entry that moves by most of them.
+        """
+        from sysid.assessment.gains import worth_of
+
+        return worth_of(0.01 * self.uncertainty.mass_by_gain, self.uncertainty.mass)
 
     @cached_property
     def validation(self) -> tuple[Measurement, ...]:

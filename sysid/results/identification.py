@@ -15,6 +15,7 @@ from sysid.errors import InputError, finite_array, text, whole_number
 from sysid.problem.problem import Problem
 from sysid.results import storage
 from sysid.results.answer import Answer, reported_unknowns
+from sysid.results.gain_table import gains_of_sensors
 from sysid.results.noise_table import noise_of_channels
 from sysid.results.summary import summary
 from sysid.results.version import __version__
@@ -150,6 +151,15 @@ class Identification(Answer):
             "noise": [
                 {"channel": c.channel, "level": c.level, "unit": c.unit, "percent_of_rms": c.percent}
                 for c in noise_of_channels(self)
+            ],
+            "gains": [
+                {
+                    "sensor": g.sensor,
+                    "gain": g.gain,
+                    "std": g.std,
+                    "deviations_per_percent": _plain(np.array(g.worth)),
+                }
+                for g in gains_of_sensors(self)
             ],
             "evaluations": int(self.history.evaluations),
             "wall_time_s": float(self.history.wall_time),

@@ -10,7 +10,7 @@ import numpy as np
 
 from sysid.assessment.checks import doubts
 from sysid.assessment.determination import BY_RANK, determine
-from sysid.assessment.gains import assumed
+from sysid.assessment.gains import assumed, rests_on
 from sysid.assessment.sensitivity import blocks_of
 from sysid.assessment.uncertainty import LARGE
 from sysid.measurement.missing import in_words
@@ -162,4 +162,12 @@ def _as_certain(it: Identification) -> Identification:
             open_.append(f"noise leaves entries of {name} open")
         elif largest > _KNOWN:
             open_.append(f"noise leaves entries of {name} with standard deviations up to {100 * largest:.2g} %")
-    return replace(it, determined=False, closed_by=(), undetermined=tuple(open_)) if open_ else it
+    return replace(it, determined=False, closed_by=(), undetermined=tuple(open_)) if open_ else _with_gains(it)
+
+
+def _with_gains(it: Identification) -> Identification:
+    """Add the gains that what is determined rests on more closely than the records show them."""
+    if not it.problem.formulation.fits_records:
+        return it
+    told = rests_on(it.problem.screened.measurement, it.gains, it.gain_worth)
+    return replace(it, remarks=(*it.remarks, *told))

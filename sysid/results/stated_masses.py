@@ -44,7 +44,7 @@ def _adjusted(problem: Problem, end: Outcome) -> Outcome:
     first = end.structure
     stated = statements_of(problem, first)
     assert stated is not None
-    modes, index, _, normals, _ = moves_by_records(problem, first)
+    modes, index, _, normals, *_ = moves_by_records(problem, first)
     if problem.measurement.response_std is None:
         least = _ROUND_OFF / max(problem.measurement.residual(first), np.finfo(float).eps)
         normals = normals * max(1.0, least)

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from sysid.assessment.sensitivity import blocks_of
 from sysid.results.answer import NOT_JUDGED, Answer
+from sysid.results.gain_table import gains_of_sensors
 from sysid.results.noise_table import noise_of_channels
 from sysid.results.phases import COLUMNS, rows_of_phases
 from sysid.results.unknowns_table import MANY, rows_of, stated_values
@@ -47,7 +48,7 @@ def summary(it: Answer) -> str:
         )
     for i, test in enumerate(it.validation, start=1):
         lines.append(f"test {i} of {len(problem.validation)} never fitted: relative residual {test.residual(s):.3e}")
-    lines += _noise(it)
+    lines += [*_noise(it), *_gains(it)]
     lines.append(f"{verdict(it)}.")
     lines += [f"  - {sentence}" for sentence in it.closed_by + it.undetermined]
     if not (it.determined or it.hurried) and it.open_masses:
@@ -67,6 +68,16 @@ def _noise(it: Answer) -> list[str]:
     """Table of the noise of each channel, where whole records were fitted."""
     rows = [(one.channel, f"{one.level:.3g}", one.unit, f"{one.percent:.3g}") for one in noise_of_channels(it)]
     head = (f"noise {noise_source(it)}", "of a sample", "unit", "% of rms")
+    return _aligned([list(column) for column in zip(head, *rows, strict=True)]) if 0 < len(rows) <= MANY else []
+
+
+def _gains(it: Answer) -> list[str]:
+    """Table of each sensor's gain as the records show it."""
+    rows = [
+        (g.sensor, f"{g.gain:.4f}", half_width(g.std, g.gain), "-" if np.isnan(g.worth) else f"{g.worth:.2g}")
+        for g in gains_of_sensors(it)
+    ]
+    head = ("gain against the base (M assumes 1)", "by the records", "+- (95 %)", "1 % moves M_SS by, deviations")
     return _aligned([list(column) for column in zip(head, *rows, strict=True)]) if 0 < len(rows) <= MANY else []
 
 

@@ -140,8 +140,9 @@ def no_pictures(monkeypatch):
 def test_the_report_has_every_part_in_order(complete, page):
     page = Page(page)
     assert page.headings == [
-        "Modes", "Rigid-body mass", "Measured against identified", "Base force", "Validation", "Poles in the data",
-        "Convergence", "Modal assurance criterion", "Effective masses", "Mode shapes", "Matrices", "What ran",
+        "Modes", "Rigid-body mass", "Measured against identified", "Base force", "Gains", "Validation",
+        "Poles in the data", "Convergence", "Modal assurance criterion", "Effective masses", "Mode shapes", "Matrices",
+        "What ran",
     ]  # fmt: skip
     for words in ("Solve_Succeeded; damping_ratio[1] ends on its bound", "Strategy 'swarm', as asked."):
         assert page.text.index(words) < page.text.index("Modes")
