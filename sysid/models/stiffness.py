@@ -71,7 +71,7 @@ class SpectralStiffness(FieldTree):
     def targets(self, geometry: Geometry) -> Array:
         """Circular frequencies that are stated, else those that stand out of the data, rad/s, ascending, at most n."""
         if self.natural_frequencies is None:
-            return geometry.poles.omega[: geometry.n]
+            return geometry.natural_frequencies
         given, n = np.atleast_1d(np.array(self.natural_frequencies, dtype=float)), geometry.n
         if given.size > n:
             raise InputError(f"{given.size} natural frequencies are given for {n} sensors; at most {n} fit")
