@@ -160,10 +160,13 @@ class ChainStiffness(FieldTree):
         Search space of the spring stiffnesses, N/m, positive; searched on a logarithmic scale.
     """
 
-    lower: ArrayLike
-    upper: ArrayLike
+    lower: ArrayLike = math.nan
+    upper: ArrayLike = math.nan
 
     def __post_init__(self) -> None:
+        for name in ("lower", "upper"):
+            if getattr(self, name) is math.nan:
+                raise InputError(f"ChainStiffness: {name} is missing; give bounds of the springs, lower and upper, N/m")
         low, high = (finite_array("ChainStiffness: bounds", bound) for bound in (self.lower, self.upper))
         alike = low.ndim < 2 and high.ndim < 2 and (low.shape == high.shape or 1 in (low.size, high.size))
         if not (alike and np.all(low > 0) and np.all(low < high)):
