@@ -142,8 +142,7 @@ def random_generator(rng: RandomSource) -> np.random.Generator:
 def numbers(name: str, value: ArrayLike, kind: type = float) -> NDArray[Any]:
     """A new array of numbers, float or complex, which may be NaN or infinite; texts and masked entries are none."""
     words = {float: "real numbers", complex: "numbers"}[kind]
-    parts = value if isinstance(value, list | tuple) else [value]
-    if any(isinstance(part, np.ma.MaskedArray) and np.ma.is_masked(part) for part in parts):
+    if _is_masked(value):
         raise InputError(f"{name} has masked entries: drop those lines, or fill them with numbers (numpy.ma.filled)")
     try:
         given = np.array(value)
@@ -157,6 +156,13 @@ def numbers(name: str, value: ArrayLike, kind: type = float) -> NDArray[Any]:
         raise InputError(f"{name} is not an array of {words}: {shown(value)}")
     refuse((kind is float and code == "c", f"{name} is complex; real numbers are needed"))
     return array
+
+
+def _is_masked(value: Any) -> bool:
+    """Whether an array, or one in lists of arrays, has masked entries."""
+    if isinstance(value, list | tuple):
+        return any(_is_masked(part) for part in value)
+    return isinstance(value, np.ma.MaskedArray) and bool(np.ma.is_masked(value))
 
 
 def finite_array(name: str, value: ArrayLike, kind: type = float) -> NDArray[Any]:

@@ -38,6 +38,10 @@ _OTHER = 1e-3  # of an unknown, or of the root of two diagonals: what differs by
 _BEYOND = 5.0  # standard deviations by which an entry of another structure must differ: noise hardly moves one so far
 _TOLD = 4  # unknowns of another answer, told
 _SAME_MATRICES = "mass, stiffness and damping stay the same all the same"
+_NO_SCALE = (
+    "without a base force or a known mass the scale of mass, stiffness and damping is not determined: give the force, "
+    "or state one mass in kg"
+)
 BY_CONE = "judged by the modal-mass cone, which holds all models that explain the data"
 BY_RANK = "judged by the rank of the Jacobian, to first order about this answer"
 
@@ -161,6 +165,8 @@ def _by_rank(problem: Problem, structure: Structure, x: Array | None) -> tuple[t
         factors = _moving(pairs, known.unit, factors)
         open_.append(f"{seen} {'; nor of '.join([*words, *_factors_in_words(formulation, factors)])}")
         open_ += [modal_mass_cone.UNIT_MASS] if problem.unit_mass else []
+        if problem.measurement.force is None and not problem.unit_mass and _scale_is_open(pairs, known):
+            open_.append(_NO_SCALE)
     misfit = formulation.objective(x)
     if rank and misfit < EXACT and misfit > _LOOSE * known.singular_values[rank - 1]:
         (weakest,) = directions_in_words(formulation.unknowns, x, known.unit, known.seen[:, -1:])
@@ -204,6 +210,18 @@ def _factors_in_words(formulation: Formulation, directions: Array) -> Iterator[s
         moved = split(formulation.unknowns, np.abs(directions).max(axis=1) > _MOVED)
         titles = [unknown.title for unknown, part in zip(formulation.unknowns, moved, strict=True) if np.any(part)]
         yield f"{', '.join(titles)} together, in {count} {'way' if count == 1 else 'ways'}"
+
+
+def _scale_is_open(pairs: list[tuple[Array, Array]], known: Sensitivity) -> bool:
+    """Whether one factor for mass, stiffness and damping together is among what nothing sees."""
+    sizes = [max(np.abs(matrix).max(), np.finfo(float).tiny) for matrix, _ in pairs]
+    common = np.concatenate([matrix.ravel() / size for (matrix, _), size in zip(pairs, sizes, strict=True)])
+    steps = known.unit[:, None] * known.unseen
+    moved = np.concatenate([
+        (slope @ steps).reshape(-1, steps.shape[1]) / size for (_, slope), size in zip(pairs, sizes, strict=True)
+    ])  # fmt: skip
+    left = common - moved @ np.linalg.lstsq(moved, common)[0]
+    return bool(np.linalg.norm(left) < _MOVED * np.linalg.norm(common))
 
 
 def _open_entries(matrix: Array, slope: Array, known: Sensitivity) -> Array:

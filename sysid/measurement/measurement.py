@@ -9,13 +9,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError, choice, finite_array, number, refuse, sequence
+from sysid.errors import InputError, choice, finite_array, number, refuse, sequence, whole_number
 from sysid.measurement import spectra
 from sysid.measurement.cuts import check_cuts
 from sysid.measurement.missing import Missing, complete, named, present
 from sysid.measurement.noise import levels_at_rest
-from sysid.measurement.rigid_body import axis_vector
-from sysid.measurement.whole import ModalEstimate, NoiseLevels, WholeRecords, per_run
+from sysid.measurement.rigid_body import axis_vector, check_axes
+from sysid.measurement.whole import ModalEstimate, NoiseLevels, WholeRecords, check_options, per_run
 from sysid.structure.axes import BASE_AXES, base_columns
 from sysid.structure.sensor import Sensor, checked_sensors, sensors_from_tree, sensors_to_tree
 from sysid.structure.structure import Array, ComplexArray, Structure, check_frequencies
@@ -85,6 +85,7 @@ class Measurement:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 - a frozen class fills itself
         choice("missing", missing, ("refuse", "drop"))
         put("freq", check_frequencies(self.freq))
+        whole_number("dropped", self.dropped, at_least=0)
         lines: Array = self.freq
         holes: dict[str, NDArray[np.bool_]] = {}
         if missing == "drop":
@@ -109,12 +110,14 @@ class Measurement:
                 f"({sensors}, {d}) is needed",
             ),
             (not np.any(self.base), "base is zero everywhere: there is no excitation to identify from"),
+            (not np.any(self.response), "response is zero everywhere: there is no motion to identify from"),
             (
                 self.sensors is not None and len(self.sensors) != sensors,
                 f"{len(self.sensors or ())} sensors are described but response has {sensors}",
             ),
         )
         put("base_axes", self._check_base_axes(d))
+        check_axes(self.sensors or (), self.rigid_body, self.base_axes or ())
         put("holes", (*self.holes, *named(holes, lines, self.sensor_names, 1)))
         put("response_std", _std("response_std", self.response_std, self.response))
         put("force_std", _std("force_std", self.force_std, self.force))
@@ -406,6 +409,7 @@ class Measurement:
         """
         G = np.atleast_2d(finite_array("rigid_body", rigid_body))
         choice("estimator", estimator, ("records", "spectra", "h1", "h2"))
+        check_options(estimator, at_rest=at_rest, noise=noise, segment=segment)
         records = spectra.check_runs(runs, sample_rate, G.shape)
         given: Any = {"rigid_body": G, "sensors": sensors, "base_axes": base_axes}
         if estimator in ("records", "spectra"):

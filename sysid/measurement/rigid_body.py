@@ -8,8 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, finite_array, sequence
-from sysid.structure.axes import base_columns, rigid_motion, sensor_row
+from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
+from sysid.structure.sensor import Sensor
 from sysid.structure.structure import Array
+
+_ASKEW = 0.02  # by which a sensor's axis, a unit vector, may differ from its row: about one degree
 
 
 def rigid_body(
@@ -60,3 +63,27 @@ def axis_vector(axis: str | Sequence[float], label: str = "a sensor") -> Array:
             f"the axis of {label} is the rotation {axis!r}; an accelerometer measures x, y or z, or a vector"
         )
     return row[:3]
+
+
+def check_axes(sensors: Sequence[Sensor], rigid_body: Array, base_axes: Sequence[str]) -> None:
+    """Refuse sensors whose axes are not what their rows of `rigid_body` (n_sensors, d) say.
+
+    For unit translation of the base a sensor has its axis's part in that direction, wherever it is. A base that moves
+    askew to the axes has no name: its direction may be any that all rows agree on.
+    """
+    moves = [i for i, name in enumerate(base_axes) if name in BASE_AXES[:3]]
+    if not sensors or not moves:
+        return
+    names = [base_axes[i] for i in moves]
+    axes = np.array([sensor_row(sensor.axis, f"sensor {sensor.name!r}")[:3] for sensor in sensors])
+    rows, wanted = rigid_body[:, moves], axes[:, base_columns(names)]
+    off = np.abs(rows - wanted)
+    directions = np.linalg.lstsq(axes, rows)[0]
+    askew = np.any(np.abs(directions).max(axis=0) < 1 - _ASKEW) and np.all(np.abs(axes @ directions - rows) < _ASKEW)
+    if np.any(off > _ASKEW) and not askew:
+        i, j = map(int, np.unravel_index(int(np.argmax(off)), off.shape))
+        raise InputError(
+            f"sensors: {sensors[i].name!r} has the axis {sensors[i].axis!r}, but by its row of rigid_body it moves by "
+            f"{rows[i, j]:.3g} for unit {names[j]} of the base, in place of {wanted[i, j]:.3g}: correct axis, row or "
+            "base_axes"
+        )

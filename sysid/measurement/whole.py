@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.errors import InputError, finite_array
+from sysid.errors import InputError, finite_array, instance, refuse
 from sysid.structure.structure import Array, ComplexArray
 
 
@@ -223,6 +223,19 @@ class ModalEstimate:
     varying: tuple[VaryingLevel, ...] = ()
     in_motion: tuple[int, ...] = ()
     untold: tuple[tuple[int, int], ...] = ()
+
+
+def check_options(estimator: str, *, at_rest: Any, noise: Any, segment: Any) -> None:
+    """Refuse options of `Measurement.from_time` that its estimator does not read."""
+    whole, averaged = estimator == "records", estimator in ("h1", "h2")
+    rests = np.any(np.asarray(at_rest, dtype=object) != False)  # noqa: E712 - entry by entry
+    if noise is not None:
+        instance("noise", noise, NoiseLevels)
+    refuse(
+        (not whole and rests, f"at_rest goes with estimator='records', not {estimator!r}: leave it out"),
+        (not whole and noise is not None, f"noise goes with estimator='records', not {estimator!r}: leave it out"),
+        (not averaged and segment is not None, f"segment goes with 'h1' and 'h2', not {estimator!r}: leave it out"),
+    )
 
 
 def per_run(name: str, value: Any, runs: int) -> tuple[bool, ...]:

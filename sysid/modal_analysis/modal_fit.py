@@ -18,6 +18,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from sysid.errors import SolverError
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.noise import separable
 from sysid.modal_analysis.residues import force_residual_left, linear_residues
@@ -125,6 +126,11 @@ def fit_modes(
     ties : callable, optional
         Equalities between shapes, participations and rigid-body mass.
 
+    Raises
+    ------
+    SolverError
+        Where the modes' motions are linearly dependent.
+
     References
     ----------
     G. H. Golub, V. Pereyra, SIAM J. Numer. Anal. 10 (1973) 413-432; L. Kaufman, BIT 15 (1975) 49-57.
@@ -150,9 +156,12 @@ def fit_modes(
             z.constrain(tie)
     best, status = z.minimize(error.value, monitor, max_iterations, _derivatives(z, error, gamma, omega, ratios, rigid))
     end = ca.Function("end", [z.z], [error.phi, gamma, omega, ratios, rigid, error.value, ca.norm_fro(error.left)])
-    values = [np.asarray(v) for v in end(best)]
-    if not all(np.all(np.isfinite(v)) for v in values):
-        values = [np.asarray(v) for v in end(np.concatenate(z.start))]
+    try:
+        values = [np.asarray(v) for v in end(best)]
+        if not all(np.all(np.isfinite(v)) for v in values):
+            values = [np.asarray(v) for v in end(np.concatenate(z.start))]
+    except RuntimeError:  # of CasADi: the normal equations are singular
+        raise SolverError(f"{m} modes move so much alike that no shapes can be told apart") from None
     modes = Modes(values[0], values[1], values[2].ravel(), values[3].ravel())
     left = float(np.sqrt(values[5].item())), float(values[6].item())
     return ModalFit(modes, values[4], *left, status, z.on_bounds(best))

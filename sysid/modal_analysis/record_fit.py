@@ -152,6 +152,8 @@ class RecordFit:
 def record_modes(test: Measurement, omega: Array, ratios: Array, *, monitor: Monitor | None = None) -> RecordFit:
     """Fit modes to whole records, roughly, from poles close by: a few steps, for `refitted` to go on from.
 
+    At each pole there are as many modes as its residue has rank.
+
     Parameters
     ----------
     test : Measurement
@@ -161,8 +163,9 @@ def record_modes(test: Measurement, omega: Array, ratios: Array, *, monitor: Mon
     monitor : callable, optional
         ``monitor(iterations, residual)``, the latter ``sqrt(chi2 / numbers)``; what it raises passes through.
     """
-    model = RecordModel(test, omega.size)
-    return _fit(model, _first(test, omega, ratios), None, monitor or (lambda i, r: None), _ROUGH)
+    first = _first(test, omega, ratios)
+    model = RecordModel(test, first.modes.omega.size)
+    return _fit(model, first, None, monitor or (lambda i, r: None), _ROUGH)
 
 
 def refitted(
@@ -290,15 +293,18 @@ def _chi2(model: RecordModel, p: Parameters, levels: Array) -> float:
 
 
 def _first(test: Measurement, omega: Array, ratios: Array) -> Parameters:
-    """Rank-one modes nearest to free residues at given poles; with a force, its own masses."""
+    """Rank-one modes nearest to free residues at given poles, several where it needs them; with a force, its masses."""
     records = Records(test)
-    d = test.n_base
-    residues = records.by_sensor(records.fit(omega, ratios).residues)  # (m, n, d + 2 r)
+    d, free = test.n_base, records.fit(omega, ratios)
+    residues = records.by_sensor(free.residues)  # (m, n, d + 2 r)
     size = np.linalg.norm(np.concatenate(list(test.inputs), axis=-1), axis=1)
     u, s, vt = np.linalg.svd(residues * size)
-    strength = np.sqrt(s[:, 0] / size[:d].max())
-    phi, push = u[:, :, 0].T * strength, vt[:, 0] * (s[:, 0] / strength)[:, None] / size
-    modes, ends = Modes(phi, push[:, :d], omega, ratios), push[:, d:]
+    ranks = free.ranks(records.noise(free.left, free.residues.size), test.n_sensors, d)
+    pole = np.repeat(np.arange(omega.size), ranks)
+    at = np.concatenate([np.arange(rank) for rank in ranks])
+    strength = np.sqrt(s[pole, at] / size[:d].max())
+    phi, push = u[pole, :, at].T * strength, vt[pole, at] * (s[pole, at] / strength)[:, None] / size
+    modes, ends = Modes(phi, push[:, :d], omega[pole], ratios[pole]), push[:, d:]
     rigid: Array = np.zeros((d, d))
     if test.force is not None:
         t, rigid = weigh(test, modes, ends)

@@ -99,6 +99,16 @@ class ResidueFit:
         kept = len(both) - self.residues.shape[1]
         return float(np.sum(np.linalg.svd(both, compute_uv=False)[kept:] ** 2))
 
+    def ranks(self, noise: float, n_sensors: int, n_base: int) -> NDArray[np.intp]:
+        """Number of modes at each pole, (m,): singular values of its residue that stand out of noise of this variance.
+
+        At least one, and no more than sensors or base directions.
+        """
+        s = np.linalg.svd(self.whitened.reshape(len(self.whitened), -1, n_sensors), compute_uv=False)
+        # Unknowns of a further mode, at most.
+        needed = np.count_nonzero(s**2 > noise * beyond_chance(n_sensors + n_base), axis=1)
+        return np.clip(needed, 1, min(n_sensors, n_base))
+
 
 class Records:
     """Weighted relative accelerations of a test, or its base force; real parts above imaginary ones.

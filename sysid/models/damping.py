@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +17,8 @@ from sysid.models.geometry import Geometry
 from sysid.models.model import MassBlocks, Stated, StiffnessBlocks, Written
 from sysid.models.unknowns import Unknown, lower_of, upper_of
 from sysid.structure.structure import Array, Structure
+
+_MISSING = (math.nan, math.nan)  # no default
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,11 +68,13 @@ class ProportionalDamping(FieldTree):
     beta : (lower, upper), s
     """
 
-    alpha: tuple[float, float]
-    beta: tuple[float, float]
+    alpha: tuple[float, float] = _MISSING
+    beta: tuple[float, float] = _MISSING
 
     def __post_init__(self) -> None:
-        for name in ("alpha", "beta"):
+        for name, unit in (("alpha", "1/s"), ("beta", "s")):
+            if getattr(self, name) is _MISSING:
+                raise InputError(f"ProportionalDamping: {name} is missing; give its bounds (lower, upper), {unit}")
             pair = finite_array(f"ProportionalDamping: {name}", getattr(self, name))
             if pair.shape != (2,) or not 0 <= pair[0] < pair[1]:
                 raise InputError(f"ProportionalDamping: {name} needs 0 <= lower < upper, not {shown(pair.tolist())}")

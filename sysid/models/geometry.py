@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from sysid.errors import InputError, finite_array, refuse, shown
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import residual_of
+from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.models.unknowns import Unknown
 from sysid.structure.structure import Array
@@ -85,6 +86,20 @@ class Geometry:
         if modal is not None:
             return Poles(modal.omega, modal.ratios, residual_of(self.test))
         return find_poles(self.test, monitor=self.monitor)
+
+    @cached_property
+    def natural_frequencies(self) -> Array:
+        """Circular frequencies of the modes that stand out of the records, rad/s, ascending, at most n.
+
+        A pole counts as often as its residue has rank, where the model has room for all.
+        """
+        omega, test = self.poles.omega, self.test
+        if omega.size < self.n and test.n_base > 1 and test.modal is None:
+            records = Records(test)
+            free = records.fit(omega, self.poles.ratios)
+            ranks = free.ranks(records.noise(free.left, free.residues.size), test.n_sensors, test.n_base)
+            omega = np.repeat(omega, ranks) if ranks.sum() <= self.n else omega
+        return omega[: self.n]
 
     @property
     def found(self) -> dict[str, Any] | None:

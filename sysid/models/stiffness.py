@@ -71,7 +71,7 @@ class SpectralStiffness(FieldTree):
     def targets(self, geometry: Geometry) -> Array:
         """Circular frequencies that are stated, else those that stand out of the data, rad/s, ascending, at most n."""
         if self.natural_frequencies is None:
-            return geometry.poles.omega[: geometry.n]
+            return geometry.natural_frequencies
         given, n = np.atleast_1d(np.array(self.natural_frequencies, dtype=float)), geometry.n
         if given.size > n:
             raise InputError(f"{given.size} natural frequencies are given for {n} sensors; at most {n} fit")
@@ -160,10 +160,13 @@ class ChainStiffness(FieldTree):
         Search space of the spring stiffnesses, N/m, positive; searched on a logarithmic scale.
     """
 
-    lower: ArrayLike
-    upper: ArrayLike
+    lower: ArrayLike = math.nan
+    upper: ArrayLike = math.nan
 
     def __post_init__(self) -> None:
+        for name in ("lower", "upper"):
+            if getattr(self, name) is math.nan:
+                raise InputError(f"ChainStiffness: {name} is missing; give bounds of the springs, lower and upper, N/m")
         low, high = (finite_array("ChainStiffness: bounds", bound) for bound in (self.lower, self.upper))
         alike = low.ndim < 2 and high.ndim < 2 and (low.shape == high.shape or 1 in (low.size, high.size))
         if not (alike and np.all(low > 0) and np.all(low < high)):

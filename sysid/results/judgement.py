@@ -84,10 +84,15 @@ def succeeded(problem: Problem, end: Outcome, *, cut_short: bool = False) -> tup
     if goal is not None and residual > goal:
         wrong.append(f"the residual {residual:.3g} is above the goal {goal:.3g}")
     if goal is None and residual > NO_FIT and end.stopped is None and (end.success or not cut_short):
-        wrong.append(
-            f"the residual {residual:.3g} is no fit: are the frequencies in Hz, the responses absolute and complex "
-            "with exp(+iwt), the axes and signs of rigid_body right, the bounds wide enough?"
-        )
+        doubt = "are the frequencies in Hz, the responses absolute and complex with exp(+iwt), the axes and signs of "
+        doubt += "rigid_body right, the bounds wide enough?"
+        if problem.unit_mass and not problem.formulation.stiffness.free:
+            doubt = (
+                "without a base force or a mass in kg their scale is not determined, and masses are normalised to 1 kg "
+                "in each base direction, which the bounds of the stiffness may exclude: state total_mass, or give the "
+                "base force"
+            )
+        wrong.append(f"the residual {residual:.3g} is no fit: {doubt}")
     return end.success and not wrong, "; ".join((end.message, *wrong))
 
 

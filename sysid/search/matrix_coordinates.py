@@ -44,14 +44,15 @@ def fit_in_matrices(
     # The modes themselves stand for a free stiffness; of free modes only the plain entries are asked for here.
     apart = modal and formulation.stiffness.free and not problem.free_modes
     held = formulation.parts.stiffness if apart else slice(0, 0)
-    x = np.clip(x, formulation.lower, formulation.upper)
-    unknowns = add_unknowns(z, formulation.unknowns, x, held)
+    start = np.clip(x, formulation.lower, formulation.upper)
+    start[held] = x[held]
+    unknowns = add_unknowns(z, formulation.unknowns, start, held)
     _add_constraints(problem, unknowns, z)
-    modes = _add_modes(problem, unknowns, problem.structure(x), z, tied=not apart) if modal else None
+    modes = _add_modes(problem, unknowns, problem.structure(start), z, tied=not apart) if modal else None
     rows = ca.vertcat(*(term.rows(unknowns, modes) for term in terms_with(formulation, smoothed)))
     seconds = _SECONDS * (problem.geometry.n / 12) ** _POWER if modal else _JACOBIAN * rows.numel() * z.z.numel() ** 2
     if not monitor.allows(seconds):
-        return End(x, np.inf, not_begun(seconds), "")
+        return End(start, np.inf, not_begun(seconds), "")
     derivatives = None if modal else {"hess_lag": _gauss_newton(z, rows)}
     # Beside noise the objective's round-off stops the line search first: the gradient is then small, not at tolerance.
     best, status = z.minimize(ca.sumsqr(rows), monitor, max_iterations, derivatives, acceptable=1e2 if modal else 1e3)
@@ -63,8 +64,9 @@ def fit_in_matrices(
     ended = ended.ravel()
     if modes is not None:
         ended = _in_order(problem, ended, shapes, omega.ravel(), tied=not apart)
-    ended = np.clip(ended, formulation.lower, formulation.upper)
-    return End(ended, float(objective.item()), status, z.on_bounds(best))
+    inside = np.clip(ended, formulation.lower, formulation.upper)
+    inside[held] = ended[held]  # of the modes, which have no box
+    return End(inside, float(objective.item()), status, z.on_bounds(best))
 
 
 def terms_with(formulation: Formulation, smoothed: Sequence[TestTerm]) -> list[Term]:

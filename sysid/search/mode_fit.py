@@ -73,15 +73,18 @@ class ModeFit:
         self._check()
         test, records, poles = self.test, self.records, self.poles
         m, n, d = poles.omega.size, test.n_sensors, test.n_base
-        best = self._grown(np.ones(m, dtype=int))
+        single = np.ones(m, dtype=int)
+        best = self._grown(self._with(single), single)
         # Modes of rank one may have dragged poles away from where several modes share one.
         free = records.fit(poles.omega, poles.ratios)
         noise = records.noise(free.left, free.residues.size)
         excess = best.of_accelerations**2 * records.size - free.squared_error
-        ranks = _ranks(free, noise, n, d)
-        wanting = excess > noise * beyond_chance(m * (n - 1) * (d - 1)) or ranks.sum() < best.modes.omega.size
-        if self._goes_on and wanting and np.any(ranks > 1):
-            other = self._grown(ranks)
+        ranks = free.ranks(noise, n, d)
+        # An exact fit lacks nothing; round-off in residues of poles that nearly coincide would ask for more modes.
+        lacks = best.of_accelerations > EXACT and excess > noise * beyond_chance(m * (n - 1) * (d - 1))
+        wanting = lacks or ranks.sum() < best.modes.omega.size
+        if self._goes_on and wanting and np.any(ranks > 1) and (first := self._tried(ranks)) is not None:
+            other = self._grown(first, ranks)
             more = other.modes.omega.size - best.modes.omega.size
             gained = (best.of_accelerations**2 - other.of_accelerations**2) * records.size / noise
             if gained > np.sign(more) * beyond_chance(abs(more) * (n + d)):
@@ -142,13 +145,13 @@ class ModeFit:
                 "add lines or runs"
             )
 
-    def _grown(self, multiplicity: Integers) -> ModalFit:
-        """Fit with so many modes at each pole, and with more where their free residues call for it."""
-        best = self._with(multiplicity)
+    def _grown(self, best: ModalFit, multiplicity: Integers) -> ModalFit:
+        """The fit of so many modes at each pole, or one with more where their free residues call for it."""
         while self._goes_on and (lacking := self._lacking_rank(best, multiplicity)) is not None:
             more = multiplicity.copy()
             more[lacking] += 1
-            again = self._with(more)
+            if (again := self._tried(more)) is None:
+                break
             gained = (best.of_accelerations**2 - again.of_accelerations**2) * self.records.size
             noise = self._free(again, more)[1]
             if gained < beyond_chance(self.test.n_sensors + self.test.n_base) * noise:
@@ -193,10 +196,20 @@ class ModeFit:
             modes = modes._replace(phi=modes.phi / np.sqrt(t), gamma=modes.gamma * np.sqrt(t)[:, None])
         lam, vectors = np.linalg.eigh((rigid - modes.gamma.T @ modes.gamma) / np.outer(unit, unit))
         remainder = (vectors * np.maximum(lam, 0.0)) @ vectors.T * np.outer(unit, unit)
-        return fit_modes(
-            test, modes, _free_spectrum(poles.omega, poles.ratios, pole), unit=unit, remainder=remainder,
-            monitor=self.monitor, max_iterations=self.max_iterations,
-        )  # fmt: skip
+        try:
+            return fit_modes(
+                test, modes, _free_spectrum(poles.omega, poles.ratios, pole), unit=unit, remainder=remainder,
+                monitor=self.monitor, max_iterations=self.max_iterations,
+            )  # fmt: skip
+        except SolverError as error:
+            raise DoesNotApplyError(f"{error}: use fewer modes, Modal(modes=), or narrow the band") from None
+
+    def _tried(self, multiplicity: Integers) -> ModalFit | None:
+        """The same; None where the modes cannot be told apart."""
+        try:
+            return self._with(multiplicity)
+        except DoesNotApplyError:
+            return None
 
 
 def _ascending(fit: ModalFit) -> ModalFit:
@@ -204,13 +217,6 @@ def _ascending(fit: ModalFit) -> ModalFit:
     end = fit.modes
     order = np.argsort(end.omega, kind="stable")
     return replace(fit, modes=Modes(end.phi[:, order], end.gamma[order], end.omega[order], end.ratios[order]))
-
-
-def _ranks(free: ResidueFit, noise: float, n: int, d: int) -> Integers:
-    """Number of modes at each pole: singular values of its free residue that stand out of the noise."""
-    s = np.linalg.svd(free.whitened.reshape(len(free.whitened), -1, n), compute_uv=False)
-    needed = np.count_nonzero(s**2 > noise * beyond_chance(n + d), axis=1)  # unknowns of a further mode, at most
-    return np.clip(needed, 1, min(n, d))
 
 
 def held_to_totals(problem: Problem, end: ModalFit, monitor: IterationMonitor, max_iterations: int) -> ModalFit | None:
@@ -239,7 +245,8 @@ def _free_spectrum(omega: Array, ratios: Array, pole: Integers) -> Spectrum:
         shift = _within(z.variable("frequency", np.zeros(omega.size)) * ca.DM(ratios), 1.0)
         loss = _within(z.variable("damping ratio", np.zeros(omega.size)), 10.0)
         moved, lossy = ca.DM(omega) * ca.exp(shift), ca.DM(ratios) * ca.exp(loss)
-        return moved[pole.tolist()], lossy[pole.tolist()]
+        # Entries of a scalar are a row.
+        return ca.vec(moved[pole.tolist()]), ca.vec(lossy[pole.tolist()])
 
     return spectrum
 

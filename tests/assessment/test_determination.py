@@ -277,3 +277,18 @@ class TestMassesThatNobodyWeighed:
         assert told.closed_by == ("the data and the written model fix mass, stiffness and damping",)
         assert np.all(np.isfinite(intervals(problem, problem.structure(x), x).stiffness))
         assert np.all(np.isfinite(uncertainty(problem, problem.structure(x), x).variables["k"]))
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_written_chain_without_force_is_told_that_its_scale_is_open(force):
+    m, k = sysid.Variable("m", 2, lower=0.1, upper=9.0), sysid.Variable("k", 2, lower=1e2, upper=1e4)
+    truth = sysid.Structure(
+        np.diag([2.0, 1.0, 0.0]), 1e3 * np.array([[2.0, -1, -1], [-1, 1, 0], [-1, 0, 1]]), [0.01, 0.02], n_base=1
+    )
+    test = sysid.simulate(truth, np.linspace(1.0, 9.0, 60), force=force)
+    stiffness = ca.blockcat([[k[0] + k[1], -k[1]], [-k[1], k[1]]])
+    problem = sysid.Problem(test, mass=ca.diagcat(m[0], m[1]), stiffness=stiffness)
+    order = {"m": [2.0, 1.0], "k": [1e3, 1e3], "damping_ratio": [0.01, 0.02]}
+    x = np.concatenate([order[unknown.name] for unknown in problem.formulation.unknowns])
+    open_ = determine(problem, truth, x).undetermined
+    assert any("the scale of mass, stiffness and damping is not determined" in told for told in open_) != force

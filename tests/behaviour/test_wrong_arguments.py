@@ -220,6 +220,60 @@ def check(name, make, right, argument, wrong):
         assert len(said) < 400, said
 
 
+TWO_WAYS = sysid.Measurement(FREQ, np.repeat(np.eye(2)[:, :, None], 40, 2), np.ones((2, 2, 40)), rigid_body=np.eye(2))
+STORED = {"freq": FREQ, "base": TWO_WAYS.base, "response": TWO_WAYS.response, "rigid_body": np.eye(2)}
+MASKED = np.ma.masked_array(np.ones((2, 40)), np.arange(80).reshape(2, 40) == 3)
+LEVELS = sysid.NoiseLevels([0.1, 0.1], [0.1])
+
+
+def in_directions(*axes, **arguments):
+    sensors = [sysid.Sensor(f"s{i}", (0, 0, i), axis) for i, axis in enumerate(axes)]
+    return sysid.Measurement(**(STORED | {"sensors": sensors} | arguments))
+
+
+def from_time(**arguments):
+    return sysid.Measurement.from_time(SHAKEN, 10.0, rigid_body=TEST.rigid_body, **arguments)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: in_directions("-x", "y", base_axes="xy"), "'s0' has the axis '-x', but by its row"),
+        (lambda: in_directions("x", "z", base_axes="xy"), "'s1' has the axis 'z'"),
+        (lambda: in_directions("x", "x"), "'s1' has the axis 'x'|'s0' has the axis 'x'"),
+        (lambda: sysid.Measurement(**(STORED | {"response": [list(MASKED)] * 2})), "response has masked entries"),
+        (lambda: sysid.Measurement(**(STORED | {"response": np.zeros((2, 2, 40))})), "response is zero everywhere"),
+        (lambda: sysid.Measurement(**STORED, dropped=-1), "dropped is -1"),
+        (lambda: from_time(segment=16), "segment goes with 'h1' and 'h2'"),
+        (lambda: from_time(estimator="h1", at_rest=True), "at_rest goes with estimator='records'"),
+        (lambda: from_time(estimator="spectra", noise=LEVELS), "noise goes with estimator='records'"),
+        (lambda: from_time(noise=0.1), "noise is a float, not a sysid.NoiseLevels"),
+        (lambda: sysid.ProportionalDamping(), "alpha is missing; give its bounds"),
+        (lambda: sysid.ProportionalDamping((0.0, 1.0)), "beta is missing; give its bounds"),
+        (lambda: sysid.ChainStiffness(1e3), "upper is missing; give bounds"),
+        (lambda: sysid.ChainStiffness(1e5, 1e3), "0 < lower < upper"),
+        (lambda: sysid.Structure(TRUTH.mass, TRUTH.stiffness, [0.01, 0.02], n_base=1.9), "n_base is 1.9"),
+        (lambda: sysid.Sensor("tip", (0, 0, np.nan), "x"), "the position of sensor 'tip' holds NaN"),
+        (lambda: sysid.Sensor("tip", (0, 0, 1), (0, np.inf, 1)), "the axis of sensor 'tip' holds NaN or infinite"),
+        (
+            lambda: sysid.Problem(
+                TEST, mass=sysid.FullMass(known=np.eye(2)), stiffness=sysid.ChainStiffness(1.0, 1e5)
+            ).check(),
+            "known entries of a FullMass.* go with the modal strategy only",
+        ),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_right_is_refused(make, said):
+    with pytest.raises(sysid.InputError, match=said):
+        make()
+
+
+def test_sensors_along_their_rows_are_taken_whatever_the_direction_of_the_base():
+    assert in_directions("x", (0.0, 2.0, 0.0), base_axes="xy").base_axes == ("x", "y")
+    askew = in_directions("x", "y", base=TWO_WAYS.base[:, :1], rigid_body=[[0.6], [0.8]])
+    assert askew.in_band(1.0, 3.0).n_base == 1
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_the_right_arguments_are_right(name):
     make, right = CASES[name]

@@ -110,9 +110,11 @@ class TestRecords:
         np.testing.assert_array_equal(test.force_std, np.full((3, 2, 5), 0.25))
 
     def test_in_band_keeps_the_lines_between_both_ends(self, records):
+        G = records["rigid_body"]
+        axes = np.column_stack([G[:, 1], G[:, 0], np.sqrt(1 - np.sum(G**2, axis=1))])
         test = Measurement(
             **records, response_std=np.ones(5), force_std=np.arange(5.0), base_axes="yx",
-            sensors=[Sensor(str(i), (0, 0, i), "x") for i in range(4)],
+            sensors=[Sensor(str(i), (0, 0, i), axis) for i, axis in enumerate(axes.tolist())],
         )  # fmt: skip
         cut = test.in_band(2.0, 5.0)
         np.testing.assert_array_equal(cut.freq, [2, 4, 5])
@@ -124,7 +126,8 @@ class TestRecords:
 
     def test_names_of_sensors(self, records):
         assert Measurement(**records).sensor_names == ("sensor 1", "sensor 2", "sensor 3", "sensor 4")
-        named = Measurement(**records, sensors=[Sensor(name, (0, 0, 0), "x") for name in "abcd"])
+        alike = records | {"rigid_body": np.eye(2)[[0, 0, 0, 0]]}
+        named = Measurement(**alike, sensors=[Sensor(name, (0, 0, 0), "x") for name in "abcd"])
         assert named.sensor_names == tuple("abcd")
 
     def test_predictions_are_the_structure_under_this_base_motion(self, records, random_structure):

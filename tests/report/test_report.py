@@ -75,7 +75,8 @@ def complete(truth):
     random = np.random.default_rng(4)
     guess = sysid.Structure(truth.mass, 1.02 * truth.stiffness, truth.damping_ratios, n_base=2)
     names = ("low", HOSTILE, "tip")
-    sensors = [sysid.Sensor(name, (0, 0, float(i)), "x") for i, name in enumerate(names)]
+    axes = ("x", (0.6, 0.8, 0.0), "y")
+    sensors = [sysid.Sensor(name, (0, 0, i), axis) for i, (name, axis) in enumerate(zip(names, axes, strict=True))]
     test = dataclasses.replace(sysid.simulate(truth, FREQ, noise=0.01, force=True, rng=3), sensors=sensors)
     base = random.standard_normal((2, 2, FREQ.size)) + 1j * random.standard_normal((2, 2, FREQ.size))
     response = np.einsum("sdf,rdf->rsf", truth.transmissibility(FREQ), base)
@@ -365,7 +366,7 @@ def test_matrices_carry_the_names_of_their_degrees_of_freedom(modal, truth, no_p
     two = [0, 2]
     it = modal(
         force=True, response=test.response[:, two], rigid_body=test.rigid_body[two], response_std=None,
-        sensors=[sysid.Sensor(name, (0, 0, 1), "x") for name in ("low", "tip")],
+        sensors=[sysid.Sensor("low", (0, 0, 1), "x"), sysid.Sensor("tip", (0, 0, 1), "y")],
     )  # fmt: skip
     assert it.structure.n == 3
     page = Page(report.render(it))

@@ -19,14 +19,14 @@ def building(damping_matrix: bool = False, sensors: bool = True, skew: bool = Tr
     n, d = 3, 2
     root = random.standard_normal((n + d, n + d))
     mass = root @ root.T + 5 * np.eye(n + d)
-    G = np.array([[1.0, 0.0], [0.6, 0.8] if skew else [1.0, 0.0], [0.0, 1.0]])
+    G = np.array([[1.0, 0.0], [0.6, 0.8] if skew else [1.0, 0.0], [0.0, -1.0]])
     spring = random.standard_normal((n, n))
     K = 4e4 * (spring @ spring.T + np.eye(n))
     stiffness = np.block([[K, -K @ G], [-G.T @ K, G.T @ K @ G]])
     described = (
-        sysid.Sensor("top, +x", (0.0, 0.0, 3.0), "x"),
-        sysid.Sensor("Stütze 2 – schräg", (0.1, 0.2, 2.0), (0.6, 0.8, 0.0) if skew else (1.0, 0.0, 0.0)),
-        sysid.Sensor("tip", (0.0, 0.0, 1.0), "-y"),
+        sysid.Sensor("top, +x", (0.0, 0.0, 3.0), "y"),
+        sysid.Sensor("Stütze 2 – schräg", (0.1, 0.2, 2.0), (0.8, 0.6, 0.0) if skew else (0.0, 1.0, 0.0)),
+        sysid.Sensor("tip", (0.0, 0.0, 1.0), "-x"),
     )
     return sysid.Structure(
         mass,

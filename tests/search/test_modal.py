@@ -119,10 +119,11 @@ def test_fewer_modes_than_sensors_are_recovered_from_the_sensors_chosen(chosen):
     """Eight sensors on a structure whose motion three modes make: the five others follow exactly."""
     truth, rng = structure(3, 3, 2), np.random.default_rng(0)
     recovery = np.vstack([np.eye(3), rng.normal(size=(5, 3))])
+    G = np.clip(recovery @ truth.rigid_body, -0.7, 0.7)
+    axes = np.column_stack([G, np.sqrt(1 - np.sum(G**2, axis=1))])
     wide = sysid.Structure(
-        truth.mass, truth.stiffness, truth.damping_ratios, n_base=2, recovery=recovery,
-        rigid_body=np.clip(recovery @ truth.rigid_body, -0.7, 0.7),
-        sensors=[sysid.Sensor(f"s{i}", (0, 0, float(i)), "x") for i in range(8)],
+        truth.mass, truth.stiffness, truth.damping_ratios, n_base=2, recovery=recovery, rigid_body=G,
+        sensors=[sysid.Sensor(f"s{i}", (0, 0, float(i)), axis) for i, axis in enumerate(axes.tolist())],
     )  # fmt: skip
     test = sysid.simulate(wide, lines(truth), force=True)
     strategy = sysid.Modal(sensors=chosen)
