@@ -241,13 +241,13 @@ class RecordModel:
         normal, gradient, chi2 = np.zeros((self.size, self.size)), np.zeros(self.size), 0.0
         found: dict[int, tuple[Columns, Array, Sums]] = {}
         for chunk in self.chunks(p):
-            run = chunk.run.number
-            if run in found:
-                columns, scale, before = found[run]
-                found[run] = columns, scale, before.plus(of_chunk(chunk, levels, columns))
+            piece = chunk.run.piece
+            if piece in found:
+                columns, scale, before = found[piece]
+                found[piece] = columns, scale, before.plus(of_chunk(chunk, levels, columns))
             else:
                 columns = chunk.columns()
-                found[run] = columns, chunk.deviations(levels)[0], of_chunk(chunk, levels, columns)
+                found[piece] = columns, chunk.deviations(levels)[0], of_chunk(chunk, levels, columns)
         for columns, scale, sums in found.values():
             made, at = columns.products(sums, scale), columns.unknowns
             if made.normal.size:
