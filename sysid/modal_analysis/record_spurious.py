@@ -21,16 +21,23 @@ _MORE = 4.0  # times what a mode must be worth where noise alone is left
 
 def without_spurious_modes(fit: RecordFit, *, monitor: Monitor | None = None) -> RecordFit:
     """The fit without spurious modes, one after the other; as it is where what is left is white noise."""
-    while fit.parameters.modes.omega.size > 1 and uneven(fit):
-        value = worth_beyond_misfit(fit)
-        least = int(np.argmin(value))
-        if value[least] > _MORE * least_worth(fit.model):
-            break
-        # From new residues: two modes close together may have cancelled each other.
+    begun = fit
+    while (least := _spurious(fit)) is not None:
+        # From new residues, a few steps: two modes close together may have cancelled each other.
         modes = without(fit, least).modes
         fit = record_modes(fit.test, modes.omega, modes.ratios, monitor=monitor)
-        fit = refitted(fit, fit.parameters, monitor=monitor)
-    return fit
+    if fit is begun:
+        return fit
+    return without_spurious_modes(refitted(fit, fit.parameters, monitor=monitor), monitor=monitor)
+
+
+def _spurious(fit: RecordFit) -> int | None:
+    """The mode that is worth least beyond what the model misses, if too little."""
+    if fit.parameters.modes.omega.size == 1 or not uneven(fit):
+        return None
+    value = worth_beyond_misfit(fit)
+    least = int(np.argmin(value))
+    return least if value[least] < _MORE * least_worth(fit.model) else None
 
 
 def worth_beyond_misfit(fit: RecordFit) -> Array:
