@@ -198,20 +198,17 @@ def _force(formulation: Formulation, test: Measurement, structure: Structure) ->
 
 def _rigid(test: Measurement, records: Records, free: ResidueFit) -> Iterator[str]:
     """Whether sensors move in a constant proportion to the base beside their modes: then rigid_body is wrong."""
-    ones = records.basis(np.ones((1, test.freq.size), dtype=complex))
-    extra = ones - free.Q @ (free.Q.T @ ones)
-    if np.linalg.norm(extra) < _MIMICKED * np.linalg.norm(ones):
-        return
-    Q, R = np.linalg.qr(extra)
-    along = Q.T @ free.left
-    left = free.left - Q @ along
-    gained = np.sum(along**2, axis=0).reshape(-1, test.n_sensors).sum(axis=0)
-    noise = records.noise(left, free.residues.size + along.size, least=_ROUND_OFF)
-    moved = records.by_sensor(np.linalg.solve(R, along)[None])[0]
+    if test.modal is not None:  # beside the noise of the base, which biases what follows
+        moved, chi2 = test.modal.gain.rigid.copy(), test.modal.gain.rigid_chi2
+    else:
+        found = _along_the_base(test, records, free)
+        if found is None:
+            return
+        moved, chi2 = found
     reach = np.abs(test.rigid_body).max(axis=0)
     moved /= np.where(reach > 0, reach, np.inf)
     most, size = np.abs(moved).argmax(axis=1), np.abs(moved).max(axis=1)
-    wrong = np.flatnonzero((gained > noise * beyond_chance(test.n_base)) & (size > _GAIN))
+    wrong = np.flatnonzero((chi2 > beyond_chance(test.n_base)) & (size > _GAIN))
     if wrong.size:
         told = ", ".join(
             f"{test.sensor_names[i]} by {moved[i, most[i]]:.2g} times base direction {most[i] + 1}"
@@ -221,6 +218,23 @@ def _rigid(test: Measurement, records: Records, free: ResidueFit) -> Iterator[st
             f"{wrong.size} of {test.n_sensors} sensors move with the base beside their modes and what rigid_body says "
             f"({told}): their sign, gain or axis is wrong, or their accelerations are not absolute"
         )
+
+
+def _along_the_base(test: Measurement, records: Records, free: ResidueFit) -> tuple[Array, Array] | None:
+    """Share of the base's motion in what each sensor's modes leave, (n_sensors, d), and its chi-squared.
+
+    None where modes answer for all of it.
+    """
+    ones = records.basis(np.ones((1, test.freq.size), dtype=complex))
+    extra = ones - free.Q @ (free.Q.T @ ones)
+    if np.linalg.norm(extra) < _MIMICKED * np.linalg.norm(ones):
+        return None
+    Q, R = np.linalg.qr(extra)
+    along = Q.T @ free.left
+    left = free.left - Q @ along
+    gained = np.sum(along**2, axis=0).reshape(-1, test.n_sensors).sum(axis=0)
+    noise = records.noise(left, free.residues.size + along.size, least=_ROUND_OFF)
+    return records.by_sensor(np.linalg.solve(R, along)[None])[0], gained / noise
 
 
 def _damping(records: Records, poles: tuple[Array, Array], free: ResidueFit) -> Iterator[str]:

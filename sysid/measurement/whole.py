@@ -142,13 +142,17 @@ class WholeRecords:
 class Gains:
     """Relative errors of the sensors' gains that whole records show, (n_sensors,), and their deviations.
 
-    `moves` (p, n_sensors) is what an error of one of each gain makes of the fitted modal parameters, to first order.
+    `moves` (p, n_sensors) is what an error of one of each gain makes of the fitted modal parameters, to first order;
+    `rigid` (n_sensors, d) the share of the base's motion in each sensor beside what its row of G says, as a wrong sign,
+    axis or gain makes it, and `rigid_chi2` (n_sensors,) how far it stands out, with d degrees of freedom.
     """
 
     error: Array
     std: Array
     freedom: int
     moves: Array
+    rigid: Array
+    rigid_chi2: Array
 
 
 class Excess(NamedTuple):

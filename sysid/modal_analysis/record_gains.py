@@ -1,8 +1,9 @@
-"""Errors of the sensors' gains that whole records show, beside all that was fitted."""
+"""Errors of the sensors' gains and axes that whole records show, beside all that was fitted."""
 
 from __future__ import annotations
 
 import numpy as np
+import scipy.linalg
 
 from sysid.measurement.whole import Gains
 from sysid.modal_analysis.record_fit import RecordFit
@@ -15,20 +16,17 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     """A step of all unknowns from the end of a fit, the gains and what modes above the lines make among them.
 
     Once with that part and once without it: by how much the two differ counts among the errors of the second, and the
-    better known of both is taken.
+    better known of both is taken. Motion with the base in any of its directions is asked for without it.
     """
-    made = fit.equations
-    size = np.sqrt(np.maximum(np.diag(made.normal), 1e-300))
-    normal, gradient = made.normal / np.outer(size, size), made.gradient / size
-    n, at = fit.model.n, fit.model.size  # gains come behind all that was fitted
+    made, G = fit.equations, fit.test.rigid_body
+    (n, d), at = G.shape, fit.model.size  # what is asked for comes behind all that was fitted
     beyond = max(fit.reduced, 1.0)
+    along = scipy.linalg.block_diag(np.eye(at), scipy.linalg.block_diag(*G[:, :, None]), np.eye(n * d))
+    normal, gradient, size = _scaled(along.T @ made.normal @ along, along.T @ made.gradient)
 
     def estimate(count: int) -> tuple[Array, Array]:
-        part = slice(0, count)
-        lam, V = np.linalg.eigh(normal[part, part])
-        seen = lam > _SEEN * lam[-1]
-        half = V[:, seen] / np.sqrt(lam[seen])
-        step = half @ (half.T @ gradient[part])
+        half = _half_inverse(normal[:count, :count])
+        step = half @ (half.T @ gradient[:count])
         std = np.sqrt(beyond / 2) * np.linalg.norm(half, axis=1)
         return step[at : at + n] / size[at : at + n], std[at : at + n] / size[at : at + n]
 
@@ -37,12 +35,39 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     better = plain_std < std
     # A sensor that reads too much records `1 + error` times all its motion, transients included: its rows of what is
     # linear in it take the factor, and G u beside them pulls the fit.
-    lam, V = np.linalg.eigh(normal[:at, :at])
-    seen = lam > _SEEN * lam[-1]
-    half = V[:, seen] / np.sqrt(lam[seen])
+    half = _half_inverse(normal[:at, :at])
     pulled = half @ (half.T @ normal[:at, at : at + n]) / size[:at, None] * size[at : at + n]
     moves = np.zeros((fit.model.index.size, n))
     moves[: fit.model.kept] = pulled[: fit.model.kept]
     by_sensor = moves[fit.model.index.phi].reshape(n, -1, n)
     by_sensor[np.arange(n), :, np.arange(n)] += fit.parameters.modes.phi
-    return Gains(np.where(better, plain, error), np.where(better, plain_std, std), fit.freedom, moves)
+    rigid, chi2 = _rigid(fit, beyond)
+    return Gains(
+        np.where(better, plain, error), np.where(better, plain_std, std), fit.freedom, moves, rigid, chi2
+    )  # fmt: skip
+
+
+def _rigid(fit: RecordFit, beyond: float) -> tuple[Array, Array]:
+    """Share of the base's motion in each sensor beside what G says, (n_sensors, d), and its chi-squared of each."""
+    made, (n, d), at = fit.equations, fit.test.rigid_body.shape, fit.model.size
+    count = at + n * d
+    normal, gradient, size = _scaled(made.normal[:count, :count], made.gradient[:count])
+    half = _half_inverse(normal)
+    step = (half @ (half.T @ gradient))[at:].reshape(n, d)
+    own = half[at:].reshape(n, d, -1)
+    covariance = beyond / 2 * own @ own.swapaxes(1, 2)
+    chi2 = np.einsum("ni,nij,nj->n", step, np.linalg.pinv(covariance, rcond=_SEEN, hermitian=True), step)
+    return step / size[at:].reshape(n, d), chi2
+
+
+def _scaled(normal: Array, gradient: Array) -> tuple[Array, Array, Array]:
+    """Normal equations in unknowns of like size, and the factors of these."""
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    return normal / np.outer(size, size), gradient / size, size
+
+
+def _half_inverse(normal: Array) -> Array:
+    """``H`` with ``H H'`` the inverse of scaled normal equations, but for what shows nowhere."""
+    lam, V = np.linalg.eigh(normal)
+    seen = lam > _SEEN * lam[-1]
+    return np.asarray(V[:, seen] / np.sqrt(lam[seen]))

@@ -150,8 +150,9 @@ class RecordModel:
     The unknowns are those of `Index`, then ``ends`` and ``traces``, each in the order of its entries; without a force
     the rigid-body mass is left out.
 
-    With `gains` there are further columns, to be asked of at an end: an error of each sensor's gain, which shows beside
-    its modes as ``G u``, and what modes above the lines make of each sensor, as ``w² u``.
+    With `gains` there are further columns, to be asked of at an end, (n_sensors, d) of each kind: a constant share of
+    the base's motion ``u`` in each sensor, which a wrong gain makes as ``G u``, and what modes above the lines make,
+    ``w² u``.
     """
 
     def __init__(self, test: Measurement, m: int, *, gains: bool = False) -> None:
@@ -176,7 +177,7 @@ class RecordModel:
             self.runs = [run._replace(piece=piece) for piece, run in enumerate(cut)]
         self.n_fit = self.kept + self.n_ends + test.n_runs * self.channels * TRACES
         self.gains = gains
-        self.size = self.n_fit + gains * self.n * (1 + self.d)
+        self.size = self.n_fit + gains * 2 * self.n * self.d
         self.numbers = 2 * sum(run.outputs.size for run in self.runs)
 
     def thinned(self, step: int) -> RecordModel:
@@ -412,8 +413,8 @@ class Chunk:
         if model.gains:
             beside = np.arange(d)
             if channel < n:
-                put(np.full(d, model.n_fit + channel), first[3] + beside, model.test.rigid_body[channel])
-                put(model.n_fit + n + channel * d + beside, last + beside, np.ones(d))
+                put(model.n_fit + channel * d + beside, first[3] + beside, np.ones(d))
+                put(model.n_fit + (n + channel) * d + beside, last + beside, np.ones(d))
         return C
 
     def sums_of_errors(self, levels: Array, columns: Columns) -> Sums:

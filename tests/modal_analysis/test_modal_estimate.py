@@ -25,7 +25,7 @@ def _estimate(d: int, share: float, seed: int = 1) -> ModalEstimate:
     return ModalEstimate(
         r.normal(size=(n, m)), gamma, np.array([10.0, 25.0, 40.0]), np.array([0.01, 0.02, 0.03]),
         share * gamma.T @ gamma, 1e3 * root.T @ root, NoiseLevels(np.ones(n), np.ones(d), np.ones(d)), 1.0,
-        np.ones(1), Gains(np.zeros(n), np.ones(n), 1000, np.zeros((size, n))),
+        np.ones(1), Gains(np.zeros(n), np.ones(n), 1000, np.zeros((size, n)), np.zeros((n, d)), np.zeros(n)),
     )  # fmt: skip
 
 

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.record_gains import gain_errors_of
 from sysid.modal_analysis.record_poles import few_lines
 from sysid.modal_analysis.whole_records import whole_fit
 
@@ -62,3 +64,26 @@ def test_a_weak_mode_that_only_all_lines_of_a_long_record_show_is_found(records)
     test = trial.measurement([noisy], setting, force=True)
     assert whole_fit(test.at(few_lines(test))).parameters.modes.omega.size == 2
     _assert_the_modes(whole_fit(test), structure)
+
+
+@pytest.mark.parametrize("gain", [1.0, 1.2])
+def test_motion_with_the_base_is_judged_beside_its_noise(records, gain):
+    # Base directions nearly dependent: a hundredth of the base's power is noise, much more of its least direction.
+    simulated, _, _ = records
+    rng = np.random.default_rng(5)
+    truth = simulated.coupled_structure(rng, 4, 3, np.array([2.1, 3.4, 5.2, 9.0]))
+    mixing = np.array([[1.0, 0.3, 0.2], [0.3, 1.0, 0.1], [0.98, 0.35, 0.2]])
+    size = np.linalg.norm(mixing, axis=1)
+    motion = simulated.random_motion(
+        rng, 120.0, 40.0, (0.5, 15.0), correlation=mixing @ mixing.T / np.outer(size, size)
+    )
+    run = simulated.Run.ringing(simulated.Modes.of(truth), motion, rng)
+    noisy, _ = simulated.with_noise(run.records(), rng, 0.01)
+    response = noisy.response.copy()
+    response[0] *= gain
+    test = Measurement.from_time(
+        [(noisy.base, response, noisy.force)], 40.0, rigid_body=truth.rigid_body, band=(1.0, 15.0)
+    )
+    chi2 = gain_errors_of(whole_fit(test)).rigid_chi2
+    assert np.all(chi2[1:] < 30)  # of three degrees of freedom
+    assert chi2[0] > 1000 if gain != 1 else chi2[0] < 30
