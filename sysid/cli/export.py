@@ -27,9 +27,11 @@ def add(command: Callable[..., argparse.ArgumentParser]) -> None:
         "export",
         help="write the identified structure for another program",
         description="Write the identified structure for another program, in the format that the ending of FILE tells: "
-        ".csv, M, K and C with deviations (exact); .mat, MATLAB (exact). The file says what the data leave open.",
+        ".csv, M, K and C with deviations (exact); .mat, MATLAB (exact); .op4, Nastran OUTPUT4 "
+        "with the Craig-Bampton superelement (exact); .bdf or .dmig, the superelement as Nastran's DMIG (10 digits); "
+        ".unv or .uff, mode shapes as dataset 55 (6 digits). The file says what the data leave open.",
         epilog="Examples: sysid export results/cantilever_tower tower.csv; "
-        "sysid export results/cantilever_tower tower.mat",
+        "sysid export results/cantilever_tower tower.bdf",
     )
     parser.add_argument("result", metavar="RESULT", help="a result.h5, or the folder that holds it")
     parser.add_argument("file", metavar="FILE", help="the file to write")

@@ -24,6 +24,11 @@ class Format:
 FORMATS = {
     ".csv": Format("text_table", "table of M, K and C with deviations"),
     ".mat": Format("matlab", "MATLAB file"),
+    ".op4": Format("op4", "Nastran OUTPUT4 file", "pyyeti", "nastran"),
+    ".dmig": Format("dmig", "Nastran DMIG superelement"),
+    ".bdf": Format("dmig", "Nastran DMIG superelement"),
+    ".unv": Format("uff55", "universal file of mode shapes"),
+    ".uff": Format("uff55", "universal file of mode shapes"),
 }
 
 
@@ -41,6 +46,9 @@ def export(identification: Identification, path: str | Path) -> Path:
         ==========  ============================================================  =====================
         ``.csv``    M, K and C with deviations, one entry a row                   exact
         ``.mat``    M, K, C with deviations, modes, state space, for MATLAB       exact
+        ``.op4``    M, K, C, Craig-Bampton superelement (extra ``nastran``)       exact
+        ``.bdf``    the superelement as Nastran's DMIG; ``.dmig`` too             10 digits
+        ``.unv``    mode shapes, universal file dataset 55; ``.uff`` too          6 digits
         ==========  ============================================================  =====================
 
     Returns

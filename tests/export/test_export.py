@@ -11,33 +11,23 @@ from sysid.cli.main import main
 from sysid.export.content import damping_of
 
 
-@pytest.fixture(scope="module")
-def result() -> sysid.Identification:
-    """Three masses on springs with a base that moves in x, with force and noise."""
-    K = 1e5 * np.array([[2.0, -1, 0], [-1, 2, -1], [0, -1, 1]])
-    G = np.ones((3, 1))
-    full = np.block([[K, -K @ G], [-G.T @ K, G.T @ K @ G]])
-    truth = sysid.Structure(np.diag([20.0, 15.0, 10.0, 5.0]), full, [0.01, 0.012, 0.015], n_base=1)
-    freq = np.linspace(2.0, 40.0, 150)
-    sensors = [sysid.Sensor(f"floor {k}", (0.0, 0.0, float(k)), "x") for k in (1, 2, 3)]
-    test = sysid.Measurement.from_frf(
-        freq, truth.transmissibility(freq), force=truth.base_force(freq), rigid_body=G, base_axes="x", sensors=sensors
-    )
-    return sysid.identify(
-        sysid.Problem(test, mass=sysid.FullMass(), stiffness=sysid.SpectralStiffness(), damping=sysid.ModalDamping())
-    )
-
-
 def test_a_table_keeps_every_number_and_tells_units_and_judgement(result, tmp_path):
     lines = sysid.export(result, tmp_path / "new" / "m.csv").read_text(encoding="utf-8").splitlines()
     rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
     s = result.structure
     for letter, matrix in (("M", s.mass), ("K", s.stiffness), ("C", damping_of(s))):
-        read = np.zeros((4, 4))
+        read = np.zeros((5, 5))
         for row in (r for r in rows if r["matrix"] == letter):
             read[int(row["row"]) - 1, int(row["column"]) - 1] = float(row["value"])
         assert np.array_equal(read, matrix)
-    assert {r["unit"] for r in rows} == {"kg", "N/m", "N s/m"}
+    assert {r["unit"] for r in rows} == {f"{u}{m}" for u in ("kg",) for m in ("", " m", " m2")} | {
+        "N/m",
+        "N",
+        "N m",
+        "N s/m",
+        "N s",
+        "N s m",
+    }
     assert rows[3]["column_name"] == "base x" and rows[3]["row_name"] == "floor 1"
     head = "\n".join(line for line in lines if line.startswith("#"))
     assert "judgement: " in head and "units: " in head and sysid.__version__ in head
@@ -49,13 +39,13 @@ def test_a_matlab_file_keeps_every_number(result, tmp_path):
     s, system = result.structure, result.structure.to_state_space()
     for name, value in {"M": s.mass, "K": s.stiffness, "Phi": s.mode_shapes, "G": s.rigid_body, "A": system.A}.items():
         assert np.array_equal(read[name], value), name
-    assert [str(cell[0]) for cell in read["dof_names"][:, 0]] == ["floor 1", "floor 2", "floor 3", "base x"]
+    assert [str(cell[0]) for cell in read["dof_names"][:, 0]] == ["floor 1", "floor 2", "floor 3", "base x", "base ry"]
     assert any(str(cell[0]).startswith("judgement: ") for cell in read["about"][:, 0])
 
 
 def test_damping_on_all_degrees_of_freedom_is_still_in_a_rigid_motion(result):
     s = result.structure
-    rigid = np.vstack([s.rigid_body_dofs, np.eye(1)])
+    rigid = np.vstack([s.rigid_body_dofs, np.eye(2)])
     assert np.abs(damping_of(s) @ rigid).max() < 1e-10 * np.abs(s.damping).max()
     assert np.array_equal(damping_of(s)[:3, :3], s.damping)
 
