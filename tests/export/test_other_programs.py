@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import sysid
+from sysid.export.state_space import control_system
 
 FREQ = np.linspace(2.0, 40.0, 300)
 
@@ -57,3 +58,13 @@ def test_a_universal_file_keeps_modes_to_1e_5(result, tmp_path):
     np.testing.assert_allclose([mode["modal_damp_vis"] for mode in modes], s.damping_ratios, rtol=1e-5)
     np.testing.assert_allclose(np.transpose([mode["r1"] for mode in modes]), s.mode_shapes, rtol=1e-5)
     assert modes[0]["id1"].startswith("determined")
+
+
+def test_python_control_answers_as_identified(result):
+    pytest.importorskip("control")
+    system = control_system(result)
+    answer = system(2j * np.pi * FREQ)
+    right = result.structure.transmissibility(FREQ)
+    assert np.abs(answer - right).max() < 1e-10 * np.abs(right).max()
+    assert system.input_labels == ["base x", "base ry"]
+    assert system.output_labels == ["floor 1", "floor 2", "floor 3"]
