@@ -1,4 +1,4 @@
-"""The command line: ``sysid list``, ``new``, ``show``, ``run``, ``compare``, ``refine`` and ``report``.
+"""The command line: ``sysid list``, ``new``, ``show``, ``run``, ``compare``, ``refine``, ``report``, ``export``.
 
 Exit status: 0 success; 1 the search did not reach its goal; 2 a mistake in what was given, told in
 one line; 130 interrupted, with the best so far saved; 70 an error of sysid itself, told in one line
@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import IO, Any, NoReturn, cast
 
 from sysid import catalogue
-from sysid.cli import parameters, starting, unfinished
+from sysid.cli import export, parameters, starting, unfinished
 from sysid.cli.display import Output, collected_warnings, complain, display_on
 from sysid.cli.files import strict_json
 from sysid.cli.status import BUG, INTERRUPTED, MISTAKE, NOT_REACHED, SUCCESS
@@ -270,6 +270,8 @@ def _parser() -> argparse.ArgumentParser:
     report = command("report", help="write report.html again, beside a result")
     report.add_argument("result", metavar="RESULT", help="a result.h5, or the folder that holds it")
     report.set_defaults(command=_report)
+
+    export.add(command)
     return parser
 
 

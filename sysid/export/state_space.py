@@ -1,0 +1,42 @@
+"""The state space of an identified structure as an object of python-control."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from sysid.errors import InputError
+from sysid.results.identification import Identification
+
+if TYPE_CHECKING:
+    from control import StateSpace
+
+
+def control_system(identification: Identification) -> StateSpace:
+    """`Structure.to_state_space` for python-control (extra ``control``), with names; exact, double precision.
+
+    Returns
+    -------
+    control.StateSpace
+        2n states ``[v, v']`` (the relative motion of the degrees of freedom), d inputs (base accelerations, "base x"
+        and so on), n_sensors outputs (absolute accelerations, by the sensors' names).
+
+    Raises
+    ------
+    InputError
+        Where python-control is not installed.
+    """
+    try:
+        import control
+    except ImportError:
+        raise InputError("control_system needs the package control: pip install 'structural-sysid[control]'") from None
+    system = identification.structure.to_state_space()
+    test = identification.measurement
+    return control.ss(
+        system.A, system.B, system.C, system.D,
+        inputs=[f"base {axis}" for axis in test.base_axes or ()], outputs=_plain(test.sensor_names),
+    )  # fmt: skip
+
+
+def _plain(names: tuple[str, ...]) -> list[str]:
+    """Names without ".", by which python-control separates systems from signals."""
+    return [name.replace(".", "_") for name in names]

@@ -1,0 +1,70 @@
+"""What other programs read of exported files, and how they answer to a moving base."""
+
+import numpy as np
+import pytest
+
+import sysid
+from sysid.export.state_space import control_system
+
+FREQ = np.linspace(2.0, 40.0, 300)
+
+
+def base_driven(mass, damping, stiffness, recovery, base):
+    """pyYeti's answer to unit accelerations of the base: transmissibility and apparent mass."""
+    cb = pytest.importorskip("pyyeti.cb")
+    driven = [cb.cbtf(mass, damping, stiffness, unit, FREQ, np.arange(base)) for unit in np.eye(base)]
+    sensors = np.stack([recovery @ answer.a for answer in driven], axis=1)
+    return sensors, np.stack([answer.frc for answer in driven], axis=1)
+
+
+def assert_answers_alike(structure, driven, tolerance):
+    for found, right in zip(driven, (structure.transmissibility(FREQ), structure.base_force(FREQ)), strict=True):
+        assert np.abs(found - right).max() < tolerance * np.abs(right).max()
+
+
+def test_an_op4_file_keeps_every_number_and_its_superelement_answers_as_identified(result, tmp_path):
+    op4 = pytest.importorskip("pyyeti.nastran.op4")
+    read = op4.read(str(sysid.export(result, tmp_path / "m.op4")))
+    s = result.structure
+    assert np.array_equal(read["m"], s.mass) and np.array_equal(read["k"], s.stiffness)
+    assert_answers_alike(s, base_driven(read["mcb"], read["ccb"], read["kcb"], read["rcb"], 2), 1e-10)
+    assert read["determnd"][0, 0] == result.determined
+    note = ["".join(map(chr, row.astype(int))).rstrip() for row in read["note"]]
+    assert any(line.startswith("judgement: determined") for line in note)
+
+
+def test_a_dmig_deck_keeps_ten_digits_and_answers_as_identified(result, tmp_path):
+    bulk = pytest.importorskip("pyyeti.nastran.bulk")
+    path = sysid.export(result, tmp_path / "m.bdf")
+    read = bulk.rddmig(str(path))
+    points = [(1, 1), (1, 5), (1001, 0), (1002, 0), (1003, 0)]
+    form = result.structure.to_craig_bampton()
+    order = np.ix_([3, 4, 0, 1, 2], [3, 4, 0, 1, 2])
+    K, M, C = (read[name].reindex(index=points, columns=points).fillna(0).to_numpy() for name in ("kcb", "mcb", "bcb"))
+    R = read["rcb"].reindex(columns=points).to_numpy()
+    for found, right in ((M, form.mass), (K, form.stiffness), (C, form.damping)):
+        np.testing.assert_allclose(found, right[order], rtol=5.1e-10, atol=1e-90)
+    assert_answers_alike(result.structure, base_driven(M, C, K, R, 2), 1e-6)
+    text = path.read_text()
+    assert "$ judgement: determined" in text and max(map(len, text.splitlines())) <= 80
+
+
+def test_a_universal_file_keeps_modes_to_1e_5(result, tmp_path):
+    pyuff = pytest.importorskip("pyuff")
+    file = pyuff.UFF(str(sysid.export(result, tmp_path / "m.unv")))
+    modes = [file.read_sets(int(k)) for k in np.flatnonzero(file.get_set_types() == 55)]
+    s = result.structure
+    np.testing.assert_allclose([mode["freq"] for mode in modes], s.natural_frequencies, rtol=1e-5)
+    np.testing.assert_allclose([mode["modal_damp_vis"] for mode in modes], s.damping_ratios, rtol=1e-5)
+    np.testing.assert_allclose(np.transpose([mode["r1"] for mode in modes]), s.mode_shapes, rtol=1e-5)
+    assert modes[0]["id1"].startswith("determined")
+
+
+def test_python_control_answers_as_identified(result):
+    pytest.importorskip("control")
+    system = control_system(result)
+    answer = system(2j * np.pi * FREQ)
+    right = result.structure.transmissibility(FREQ)
+    assert np.abs(answer - right).max() < 1e-10 * np.abs(right).max()
+    assert system.input_labels == ["base x", "base ry"]
+    assert system.output_labels == ["floor 1", "floor 2", "floor 3"]
