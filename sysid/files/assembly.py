@@ -116,7 +116,8 @@ def _time_column(recording: Recording, said: Description) -> Column | None:
 
 def _records(recording: Recording, said: Description) -> tuple[list[Array], list[Row]]:
     """The record of each channel in SI units, and its row of the table."""
-    records, rows = [], []
+    records: list[Array] = []
+    rows: list[Row] = []
     for channel in said.channels:
         column = recording.column(channel.column)
         check_finite(column, recording.path)

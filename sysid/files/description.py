@@ -139,11 +139,11 @@ def _channel(entry: Any, place: str) -> Channel:
         raise InputError(f"{place}: {shown(entry)} is no table of column, role, axis, position, unit")
     for name in entry:
         refuse((name not in _FIELDS, f"{place}: {name!r} is unknown; known are {', '.join(_FIELDS)}"))
-    column = entry.get("column")
+    column: Any = entry.get("column")
     refuse((not isinstance(column, str | int) or column == "", f"{place}: column is missing (its name, or its number)"))
     place = f"{place} (column {column})"
     choice(f"{place}: role", entry.get("role"), ROLES)
-    axis = entry.get("axis")
+    axis: Any = entry.get("axis")
     refuse((axis is None, f"{place}: axis is missing: x, y, z, a sign before it where it points back, or a vector"))
     sensor_row(axis, place)
     where = vector3(entry.get("position", (0.0, 0.0, 0.0)), f"{place}: position").tolist()

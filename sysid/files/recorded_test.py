@@ -5,7 +5,6 @@ Records in time stay records, so that whoever identifies from them chooses the e
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -93,8 +92,9 @@ class RecordedTest:
         band = options.pop("band", None)
         if options:
             raise InputError(f"{', '.join(options)}: only records in time take it, and these are spectra")
-        base, response, force = (None if part[0] is None else np.stack(part) for part in zip(*self.runs, strict=True))
-        test = Measurement(self.freq, base, response, force=force, **given)
+        parts: Any = zip(*self.runs, strict=True)
+        base, response, force = (None if part[0] is None else np.stack(part) for part in parts)
+        test = Measurement(self.freq, base, response, force=force, **given)  # type: ignore[arg-type]
         return test if band is None else test.in_band(*band)
 
     def in_words(self) -> str:
@@ -141,12 +141,8 @@ class RecordedTest:
         table = tuple(Row(**row) for row in tree["table"])
         return cls(
             runs, sensors_from_tree(tree["sensors"]) or (), tuple(tree["base_axes"]), tuple(tree["origin"].tolist()),
-            tree["sample_rate"], tree["freq"], table, tuple(_listed(tree["remarks"])),
+            tree["sample_rate"], tree["freq"], table, tuple(tree["remarks"]),
         )  # fmt: skip
-
-
-def _listed(remarks: Sequence[str]) -> Sequence[str]:
-    return list(remarks)
 
 
 def load(path: str | Path) -> RecordedTest:

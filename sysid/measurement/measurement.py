@@ -68,7 +68,7 @@ class Measurement:
     freq: Array
     base: ComplexArray
     response: ComplexArray
-    rigid_body: Array = field(default=None, kw_only=True)  # type: ignore[assignment] # filled from the sensors
+    rigid_body: Array = field(default=None, kw_only=True)  # type: ignore[arg-type] # filled below
     force: ComplexArray | None = field(default=None, kw_only=True)
     sensors: tuple[Sensor, ...] | None = field(default=None, kw_only=True)
     response_std: Array | None = field(default=None, kw_only=True)

@@ -55,6 +55,7 @@ def rigid_body(
         raise InputError("rigid_body needs positions and axes, or sensors, which have both")
     if described is not None:
         positions, axes = [sensor.position for sensor in described], [sensor.axis for sensor in described]
+    assert positions is not None
     points = np.atleast_2d(finite_array("positions", positions))
     given = sequence("axes", axes, "a list with one axis a sensor, such as ['x', '-y']")
     if points.ndim != 2 or points.shape[1] != 3 or len(points) != len(given):
