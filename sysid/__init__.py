@@ -8,6 +8,7 @@ import casadi as _casadi
 from sysid import jobs, plot
 from sysid.errors import InputError, SolverError, SysidError
 from sysid.export.export import export
+from sysid.files.reading import read
 from sysid.identify import identify
 from sysid.measurement.measurement import Measurement, Sensor
 from sysid.measurement.rigid_body import rigid_body
@@ -41,6 +42,6 @@ __all__ = [
     "KnownMass", "LumpedMass", "MassBlocks", "MatrixModel", "Measurement", "Modal", "ModalDamping", "NoiseLevels",
     "Prior", "Problem", "Progress", "ProportionalDamping", "Recipe", "Sensor", "SolverError", "SpectralStiffness",
     "Stated", "StiffnessBlocks", "Structure", "Swarm", "SwarmSettings", "SysidError", "TimeScores", "Totals", "Unknown",
-    "Variable", "__version__", "export", "identify", "jobs", "load", "minimize_swarm", "plot", "resample", "rigid_body",
-    "simulate", "time_scores",
+    "Variable", "__version__", "export", "identify", "jobs", "load", "minimize_swarm", "plot", "read", "resample",
+    "rigid_body", "simulate", "time_scores",
 ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""The command line: ``sysid list``, ``new``, ``show``, ``run``, ``compare``, ``refine``, ``report``, ``export``.
+"""Commands: ``sysid list``, ``new``, ``read``, ``show``, ``run``, ``compare``, ``refine``, ``report``, ``export``.
 
 Exit status: 0 success; 1 the search did not reach its goal; 2 a mistake in what was given, told in
 one line; 130 interrupted, with the best so far saved; 70 an error of sysid itself, told in one line
@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import IO, Any, NoReturn, cast
 
 from sysid import catalogue
-from sysid.cli import export, parameters, starting, unfinished
+from sysid.cli import export, parameters, read, starting, unfinished
 from sysid.cli.display import Output, collected_warnings, complain, display_on
 from sysid.cli.files import strict_json
 from sysid.cli.status import BUG, INTERRUPTED, MISTAKE, NOT_REACHED, SUCCESS
@@ -125,9 +125,9 @@ def _list(options: argparse.Namespace, out: Output) -> int:
 def _new(options: argparse.Namespace, out: Output) -> int:
     from sysid.cli import new
 
-    module, test = new.write(options.name)
+    module, test = new.write(options.name, data=options.data)
     out.write(
-        f"{module} and {test} are written. Try them, then change the five steps of {module} into your own:\n"
+        f"{module} and {test} are written. Try them, then change the steps of {module} into your own:\n"
         f"  sysid show {module}    what is unknown, and what the data determine\n"
         f"  sysid run {module}     identify, and write results/{module.stem}/report.html\n"
         f"  python -m pytest {test}\n"
@@ -249,6 +249,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Write NAME.py, a commented problem that runs at once, and test_NAME.py; never over a file.",
     )
     new.add_argument("name", metavar="NAME", help="a name that Python can import: letters, digits, underscores")
+    new.add_argument("--data", metavar="TEST.h5", help="a test that 'sysid read' wrote: a module that identifies it")
     new.set_defaults(command=_new)
 
     show = command(
@@ -263,6 +264,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     show.set_defaults(command=_show)
 
+    read.add(command)
     _add_run(command)
     _add_compare(command)
     _add_refine(command)
@@ -279,9 +281,11 @@ def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
     run = command(
         "run",
         help="identify the structure of a problem",
-        description="Identify the structure of a problem. Writes result.h5, summary.json and report.html.",
+        description="Identify the structure of a problem, or of a test that 'sysid read' wrote (sysid run test.h5). "
+        "Writes result.h5, summary.json and report.html.",
     )
     parameters.add_arguments(run, optional=True)
+    read.add_masses(run)
     run.add_argument(
         "--seed",
         type=_seed,

@@ -11,10 +11,11 @@ import sys
 from pathlib import Path
 
 from sysid.errors import InputError, refuse
+from sysid.files import recorded_test
 from sysid.results.storage import atomically
 
 
-def write(name: str, folder: Path | None = None) -> tuple[Path, Path]:
+def write(name: str, folder: Path | None = None, *, data: str | None = None) -> tuple[Path, Path]:
     """Write ``NAME.py`` and ``test_NAME.py``, both whole or neither, and never over what is there.
 
     Parameters
@@ -23,6 +24,8 @@ def write(name: str, folder: Path | None = None) -> tuple[Path, Path]:
         A Python identifier: the test imports the module by it.
     folder : Path, optional
         Where to; the current folder by default.
+    data : str, optional
+        A test that ``sysid read`` wrote: the module identifies it, in the place of a simulated one.
 
     Returns
     -------
@@ -36,14 +39,15 @@ def write(name: str, folder: Path | None = None) -> tuple[Path, Path]:
     """
     _check(name)
     folder = folder or Path()
+    texts = (_MODULE, _TEST) if data is None else _of_data(data)
     module, test = folder / f"{name}.py", folder / f"test_{name}.py"
     for path in (module, test):
         if os.path.lexists(path):
             raise InputError(f"{path} exists already, so nothing was written: choose another name, or move it away")
     try:
         with atomically(module) as module_text, atomically(test) as test_text:
-            module_text.write_text(_MODULE.replace("NAME", name), encoding="utf-8")
-            test_text.write_text(_TEST.replace("NAME", name), encoding="utf-8")
+            module_text.write_text(texts[0].replace("NAME", name), encoding="utf-8")
+            test_text.write_text(texts[1].replace("NAME", name), encoding="utf-8")
     except BaseException:
         with contextlib.suppress(OSError):
             test.unlink(missing_ok=True)  # the first to take its place; it was not there before
@@ -74,6 +78,17 @@ def _check(name: str) -> None:
             f"sysid new my_{name}",
         ),
     )
+
+
+def _of_data(data: str) -> tuple[str, str]:
+    """Texts of a module and its test for a test file."""
+    test = recorded_test.load(data)
+    sensors = "\n".join(f"#   {sensor.name}: {sensor.axis} at {sensor.position} m" for sensor in test.sensors)
+    told = {"PATH": repr(str(Path(data))), "SENSORS": sensors, "AXES": " ".join(test.base_axes)}
+    module = _DATA_MODULE
+    for word, value in told.items():
+        module = module.replace(word, value)
+    return module, _DATA_TEST
 
 
 def _is_taken(name: str) -> bool:
@@ -168,4 +183,40 @@ def test_each_unknown_is_found_within_its_uncertainty(result, name):
 
 def test_the_total_mass_is_held(result):
     assert result.values["mass"].sum() == pytest.approx(module.TOTAL, rel=1e-6)
+'''
+
+_DATA_MODULE = '''"""NAME: a structure, identified from a recorded test.
+
+Say here what the structure is and how it was tested, then change the three steps below into your own.
+"""
+
+from pathlib import Path
+
+import sysid
+from sysid.files import recorded_test
+
+TEST = Path(__file__).parent / PATH
+# Sensors of the test; its base moves along AXES:
+SENSORS
+
+
+def problem(*, data=None, rng=0):
+    # 1. The test: its records whole; band=(low, high) in Hz takes some of the lines, estimator="h1" averages them.
+    test = recorded_test.load(data or TEST).measurement()
+
+    # 2. What is known of the masses: their total, if no base force was measured: sysid.FullMass(1450.0, ...);
+    #    masses at the sensors alone: sysid.LumpedMass(1450.0).
+    mass = sysid.FullMass(healing="rigid_body")
+
+    # 3. The problem. The stiffness is found by its modes, with one damping ratio for each.
+    return sysid.Problem(test, mass=mass, stiffness=sysid.SpectralStiffness(), damping=sysid.ModalDamping())
+'''
+
+_DATA_TEST = '''"""NAME: the recorded test is read, and its problem can be searched."""
+
+import NAME as module
+
+
+def test_the_problem_can_be_searched():
+    module.problem().check()
 '''

@@ -8,11 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from sysid import catalogue
-from sysid.cli import parameters
+from sysid.cli import parameters, read
 from sysid.cli.display import Output
 from sysid.cli.files import results_folder
 from sysid.errors import InputError
 from sysid.results.checkpoint import FILE_NAME, Begun, Checkpoint
+from sysid.results.identification import Recipe
 
 
 def begun(options: argparse.Namespace, out: Output) -> tuple[Begun, Path]:
@@ -26,7 +27,7 @@ def begun(options: argparse.Namespace, out: Output) -> tuple[Begun, Path]:
     if options.resume is not None:
         return _resumed(options, out)
     search = _asked(options)
-    folder = results_folder(options.out, Path("results") / catalogue.short_name(search.recipe.module))
+    folder = results_folder(options.out, Path("results") / _name(search.recipe))
     checkpoint = Checkpoint(folder / FILE_NAME)
     if checkpoint.exists and not options.fresh:
         raise InputError(
@@ -73,10 +74,17 @@ def _resumed(options: argparse.Namespace, out: Output) -> tuple[Begun, Path]:
     return search, folder
 
 
+def _name(recipe: Recipe) -> str:
+    """Name for the folder of results: the module's, of a test that is run without one the test's."""
+    own = recipe.module == read.MODULE and recipe.data is not None
+    return Path(recipe.data or "").stem if own else catalogue.short_name(recipe.module)
+
+
 def _asked(options: argparse.Namespace) -> Begun:
     if options.problem is None:
         raise InputError("PROBLEM is missing (see 'sysid run --help')")
-    return Begun(parameters.recipe_of(options), options.strategy or "auto", options.seed or 0)
+    recipe = read.recipe(options, parameters.recipe_of(options))
+    return Begun(recipe, options.strategy or "auto", options.seed or 0)
 
 
 def _in_words(checkpoint: Checkpoint, search: Begun) -> str:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from sysid.errors import InputError, refuse
+from sysid.files.recording import Column, Recording
+from sysid.measurement.spectra import resample
 from sysid.structure.structure import Array
 
 _TIME = "SampleTimeFine"
@@ -75,3 +78,27 @@ def read(path: str | Path) -> UnitRecord:
     if np.any(falls):
         raise InputError(f"{file}: {_TIME} does not rise at row {int(np.argmax(falls)) + 2}")
     return UnitRecord(time, acceleration, rotation)
+
+
+def is_export(path: Path) -> bool:
+    """Whether a text file begins like an export of a unit."""
+    try:
+        with path.open("rb") as file:
+            return f"{_TIME},".encode() in file.read(4000)
+    except OSError:
+        return False
+
+
+def together(paths: Sequence[Path]) -> Recording:
+    """The units of one run, a file each, on one clock: columns such as ``ground.Acc_X``, without their means."""
+    records = [read(path) for path in paths]
+    time, found = resample([(record.time, record.acceleration) for record in records])
+    columns = tuple(
+        Column(f"{path.stem}.{name}", values - values.mean(), "m/s²", f"{path.stem}.{name}")
+        for path, unit in zip(paths, found, strict=True)
+        for name, values in zip(_ACCELERATION, unit, strict=True)
+    )
+    remarks = (
+        f"{len(paths)} units are brought to one clock; gravity and offsets are taken off: the mean of each channel",
+    )
+    return Recording(paths[0], columns, float(1 / (time[1] - time[0])), remarks=remarks)

@@ -14,7 +14,7 @@ from sysid.measurement import spectra
 from sysid.measurement.cuts import check_cuts
 from sysid.measurement.missing import Missing, complete, named, present
 from sysid.measurement.noise import levels_at_rest
-from sysid.measurement.rigid_body import axis_vector, check_axes
+from sysid.measurement.rigid_body import axis_vector, check_axes, told_by
 from sysid.measurement.whole import ModalEstimate, NoiseLevels, WholeRecords, check_options, per_run
 from sysid.structure.axes import BASE_AXES, base_columns
 from sysid.structure.sensor import Sensor, checked_sensors, sensors_from_tree, sensors_to_tree
@@ -36,8 +36,8 @@ class Measurement:
         Base acceleration, m/s² (rad/s² for a rotation). One run may be given without its axis.
     response : array_like, complex, shape (runs, n_sensors, n_freq)
         *Absolute* acceleration of the sensors, m/s².
-    rigid_body : array_like, shape (n_sensors, d)
-        Motion of the sensors for unit base motion (`sysid.rigid_body`).
+    rigid_body : array_like, shape (n_sensors, d), optional
+        Motion of the sensors for unit base motion (`sysid.rigid_body`); by default what `sensors` and `base_axes` tell.
     force : array_like, complex, shape (runs, d, n_freq), optional
         Force of the base on the structure, N (N m): it tends to ``+M_rb u0''`` at low frequency.
     sensors : sequence of Sensor, optional
@@ -68,7 +68,7 @@ class Measurement:
     freq: Array
     base: ComplexArray
     response: ComplexArray
-    rigid_body: Array = field(kw_only=True)
+    rigid_body: Array = field(default=None, kw_only=True)  # type: ignore[arg-type] # filled below
     force: ComplexArray | None = field(default=None, kw_only=True)
     sensors: tuple[Sensor, ...] | None = field(default=None, kw_only=True)
     response_std: Array | None = field(default=None, kw_only=True)
@@ -95,7 +95,7 @@ class Measurement:
                 put(name, record)
         put("base", _records("base", self.base, self.freq.size))
         put("response", _records("response", self.response, self.freq.size))
-        put("rigid_body", np.atleast_2d(finite_array("rigid_body", self.rigid_body)))
+        put("rigid_body", _motion(self.rigid_body, self.sensors, self.base_axes, self.base.shape[1]))
         (runs, d, _), (response_runs, sensors, _) = self.base.shape, self.response.shape
         if self.force is not None:
             put("force", _records("force", self.force, self.freq.size))
@@ -291,7 +291,7 @@ class Measurement:
         freq: ArrayLike,
         frf: ArrayLike,
         *,
-        rigid_body: ArrayLike,
+        rigid_body: ArrayLike | None = None,
         force: ArrayLike | None = None,
         sensors: Sequence[Sensor] | None = None,
         response_std: ArrayLike | None = None,
@@ -308,7 +308,7 @@ class Measurement:
         frf : array_like, complex, shape (n_sensors, d, n_freq)
             Transmissibility: absolute acceleration per unit base acceleration. With one base
             direction (n_sensors, n_freq) will do.
-        rigid_body : array_like, shape (n_sensors, d)
+        rigid_body : array_like, shape (n_sensors, d), optional
         force : array_like, complex, shape (d, d, n_freq), optional
             Apparent mass, kg: [force direction, base direction] per unit base acceleration.
         sensors : sequence of Sensor, optional
@@ -360,7 +360,7 @@ class Measurement:
         runs: Sequence[tuple[ArrayLike, ArrayLike, ArrayLike | None]],
         sample_rate: float,
         *,
-        rigid_body: ArrayLike,
+        rigid_body: ArrayLike | None = None,
         estimator: Literal["records", "spectra", "h1", "h2"] = "records",
         at_rest: bool | Sequence[bool] = False,
         noise: NoiseLevels | None = None,
@@ -377,7 +377,8 @@ class Measurement:
             Records (d, n_samples), (n_sensors, n_samples) and (d, n_samples); responses absolute.
         sample_rate : float
             Hz.
-        rigid_body : array_like, shape (n_sensors, d)
+        rigid_body : array_like, shape (n_sensors, d), optional
+            By default what `sensors` and `base_axes` tell.
         estimator : {"records", "spectra", "h1", "h2"}
             "records" takes each run whole, of any length and cut anywhere, in motion too: its transients, two numbers a
             mode and run, and the noise of all channels, base and force included, are found with the modes. "spectra" is
@@ -407,9 +408,9 @@ class Measurement:
         >>> Measurement.from_time(runs, 100.0, rigid_body=[[1.0], [1.0]], at_rest=[False, True], band=(1.0, 10.0))
         <Measurement: 2 sensors, base x, 2 runs, 55 lines from 1 to 10 Hz>
         """
-        G = np.atleast_2d(finite_array("rigid_body", rigid_body))
         choice("estimator", estimator, ("records", "spectra", "h1", "h2"))
         check_options(estimator, at_rest=at_rest, noise=noise, segment=segment)
+        G = _motion(rigid_body, sensors, base_axes, spectra.directions(runs))
         records = spectra.check_runs(runs, sample_rate, G.shape)
         given: Any = {"rigid_body": G, "sensors": sensors, "base_axes": base_axes}
         if estimator in ("records", "spectra"):
@@ -433,6 +434,16 @@ class Measurement:
         return test if band is None else test.in_band(*sequence("band", band, "(low, high) in Hz", 2))
 
     noise_from_rest = staticmethod(levels_at_rest)
+
+
+def _motion(given: ArrayLike | None, sensors: Any, base_axes: Any, d: int) -> Array:
+    """Motion of the sensors with the base, as given or told by the sensors' descriptions."""
+    if given is not None:
+        return np.atleast_2d(finite_array("rigid_body", given))
+    described = checked_sensors(sensors)
+    if described is None:
+        raise InputError("rigid_body is missing: give it (sysid.rigid_body), or sensors=[sysid.Sensor(...), ...]")
+    return told_by(described, base_axes, d)
 
 
 def unit_runs(d: int, n_freq: int) -> ComplexArray:

@@ -9,16 +9,17 @@ from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, finite_array, sequence
 from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
-from sysid.structure.sensor import Sensor
+from sysid.structure.sensor import Sensor, checked_sensors
 from sysid.structure.structure import Array
 
 _ASKEW = 0.02  # by which a sensor's axis, a unit vector, may differ from its row: about one degree
 
 
 def rigid_body(
-    positions: ArrayLike,
-    axes: Sequence[str | Sequence[float]],
+    positions: ArrayLike | None = None,
+    axes: Sequence[str | Sequence[float]] | None = None,
     *,
+    sensors: Sequence[Sensor] | None = None,
     base_axes: str | Sequence[str] = "xyz",
     origin: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Array:
@@ -31,6 +32,8 @@ def rigid_body(
     positions : array_like, shape (n_sensors, 3)
         m.
     axes : sequence of n_sensors strings ("x", "-y", ...) or direction vectors
+    sensors : sequence of Sensor
+        In the place of `positions` and `axes`: they have them.
     base_axes : str or sequence of str
         Of x y z rx ry rz; a string such as "xy" is short for its letters, "x rz" names two.
     origin : sequence of float, shape (3,)
@@ -44,7 +47,15 @@ def rigid_body(
     --------
     >>> rigid_body([[0, 0, 2.0]], ["x"], base_axes=["x", "ry"])
     array([[1., 2.]])
+    >>> rigid_body(sensors=[Sensor("top", (0, 0, 2.0), "x")], base_axes=["x", "ry"])
+    array([[1., 2.]])
     """
+    described = checked_sensors(sensors)
+    if (described is None) == (positions is None) or (positions is None) != (axes is None):
+        raise InputError("rigid_body needs positions and axes, or sensors, which have both")
+    if described is not None:
+        positions, axes = [sensor.position for sensor in described], [sensor.axis for sensor in described]
+    assert positions is not None
     points = np.atleast_2d(finite_array("positions", positions))
     given = sequence("axes", axes, "a list with one axis a sensor, such as ['x', '-y']")
     if points.ndim != 2 or points.shape[1] != 3 or len(points) != len(given):
@@ -87,3 +98,20 @@ def check_axes(sensors: Sequence[Sensor], rigid_body: Array, base_axes: Sequence
             f"{rows[i, j]:.3g} for unit {names[j]} of the base, in place of {wanted[i, j]:.3g}: correct axis, row or "
             "base_axes"
         )
+
+
+def told_by(sensors: Sequence[Sensor], base_axes: str | Sequence[str] | None, d: int) -> Array:
+    """Motion of described sensors with a base that moves in d directions; these are told where they are in doubt.
+
+    Three directions are x y z, one that of the sensors, all along one axis.
+    """
+    if base_axes is None:
+        along = {sensor.axis.lstrip("+-") for sensor in sensors if isinstance(sensor.axis, str)}
+        whole = len(along) == 1 and all(isinstance(sensor.axis, str) for sensor in sensors)
+        if d != 3 and not (d == 1 and whole):
+            raise InputError(
+                f"the sensors do not tell along which {d} of x y z rx ry rz the base moves: state base_axes, such as "
+                "['x'], or rigid_body"
+            )
+        base_axes = "xyz" if d == 3 else along.pop()
+    return rigid_body(sensors=sensors, base_axes=base_axes)

@@ -72,6 +72,14 @@ def check_runs(
     return records
 
 
+def directions(runs: Any) -> int:
+    """How many directions the base has in the first run, as far as it can be told; `check_runs` looks closer."""
+    try:
+        return int(np.atleast_2d(np.asarray(runs[0][0])).shape[0])
+    except (TypeError, IndexError, KeyError, ValueError):
+        return 1
+
+
 def whole_record(
     runs: Sequence[Run], sample_rate: float
 ) -> tuple[Array, ComplexArray, ComplexArray, ComplexArray | None]:

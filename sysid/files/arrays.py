@@ -1,0 +1,128 @@
+"""Named arrays: MATLAB files (scipy; version 7.3 by h5py), HDF5 and NPZ."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sysid.errors import InputError
+from sysid.files import units
+from sysid.files.recording import Column, Recording
+
+_RATES = ("fs", "sample_rate", "samplerate", "sampling_rate", "srate")
+_FREQUENCIES = ("freq", "frequency", "frequencies", "f", "freq_hz")
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+
+
+def read_npz(path: Path) -> Recording:
+    """Arrays of an NPZ file; nothing pickled is loaded."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            named = {name: (file[name], "") for name in file.files}
+    except Exception as error:  # zipfile and NumPy raise many
+        raise InputError(
+            f"{path} is no NPZ, or is damaged ({error}): write it with numpy.savez, of numbers alone"
+        ) from None
+    return recording(path, named)
+
+
+def read_mat(path: Path) -> Recording:
+    """Arrays of a MATLAB file of any version."""
+    from scipy.io import loadmat
+
+    try:
+        if path.read_bytes()[:8] == _HDF5 or _is_hdf5(path):
+            return read_hdf5(path)
+        found = loadmat(path, simplify_cells=True)
+    except InputError:
+        raise
+    except Exception as error:  # scipy raises many
+        raise InputError(f"{path} is no MATLAB file, or is damaged ({error}): save it again") from None
+    return recording(path, dict(_flat({name: one for name, one in found.items() if not name.startswith("__")})))
+
+
+def read_hdf5(path: Path) -> Recording:
+    """Datasets of an HDF5 file, by their paths in it; an attribute ``unit`` or ``units`` is their unit."""
+    import h5py
+
+    named: dict[str, tuple[Any, str]] = {}
+
+    def visit(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and not name.startswith("#") and item.dtype.kind in "buif" + "cV":
+            unit = item.attrs.get("unit", item.attrs.get("units", ""))
+            named[name.replace("/", ".")] = (_values(item[()]), unit.decode() if isinstance(unit, bytes) else str(unit))
+
+    try:
+        with h5py.File(path, "r") as file:
+            file.visititems(visit)
+            matlab = any("MATLAB_class" in item.attrs for item in file.values())
+    except Exception as error:  # h5py raises many
+        raise InputError(f"{path} is no HDF5, or is damaged ({error}): write it again") from None
+    # MATLAB stores its arrays column by column.
+    return recording(path, {name: (one.T if matlab else one, unit) for name, (one, unit) in named.items()})
+
+
+def _is_hdf5(path: Path) -> bool:
+    """Whether an HDF5 file begins behind the 512 bytes of text of a MATLAB file of version 7.3."""
+    with path.open("rb") as file:
+        file.seek(512)
+        return file.read(8) == _HDF5
+
+
+def _values(array: Any) -> Any:
+    """Complex numbers as MATLAB 7.3 stores them, of fields real and imag, as complex numbers."""
+    names = getattr(getattr(array, "dtype", None), "names", None)
+    return array["real"] + 1j * array["imag"] if names and {"real", "imag"} <= set(names) else np.asarray(array)
+
+
+def _flat(tree: dict[str, Any], above: str = "") -> Iterator[tuple[str, tuple[Any, str]]]:
+    """Numbers in a structure of structures, by their dotted names."""
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{above}{name}.")
+        elif np.asarray(value).dtype.kind in "buifc":
+            yield above + name, (np.asarray(value), "")
+
+
+def recording(path: Path, named: dict[str, tuple[Any, str]]) -> Recording:
+    """Columns of arrays: a vector is one, a matrix one a row or column along the longer side, ``name[1]`` and so on.
+
+    Raises
+    ------
+    InputError
+        Where there are no vectors, of the length that most have.
+    """
+    scalars = {name: float(one) for name, (one, _) in named.items() if one.size == 1 and one.dtype.kind != "c"}
+    vectors: dict[str, tuple[Any, str]] = {}
+    for name, (one, unit) in named.items():
+        if one.size > 1:
+            vectors |= _vectors(name, np.squeeze(one), unit)
+    lengths = [one.size for one, _ in vectors.values()]
+    if not lengths:
+        raise InputError(f"{path} holds no arrays of records: a vector of samples a channel is needed, or a matrix")
+    length = max(lengths)
+    other = [name for name, (one, _) in vectors.items() if one.size != length]
+    real = [name for name, (one, _) in vectors.items() if name not in other and one.dtype.kind != "c"]
+    frequencies = next((name for known in _FREQUENCIES for name in real if name == known), None)
+    rate = next((value for name, value in scalars.items() if name.rpartition(".")[2].lower() in _RATES), None)
+    columns = tuple(
+        Column(name, one, unit, f"array {name!r}")
+        for name, (one, unit) in vectors.items()
+        if name not in other and name != frequencies
+    )
+    remarks = (f"arrays of another length than {length} are left out: {', '.join(other[:8])}",) if other else ()
+    freq = None if frequencies is None else np.asarray(vectors[frequencies][0], float)
+    if freq is not None:
+        freq = freq * (units.unit(vectors[frequencies or ""][1] or "Hz", "frequency").factor)
+    return Recording(path, columns, rate, freq, remarks)
+
+
+def _vectors(name: str, array: Any, unit: str) -> dict[str, tuple[Any, str]]:
+    if array.ndim == 1:
+        return {name: (array, unit)}
+    # A record is longer than there are channels.
+    lines = np.moveaxis(array, int(np.argmax(array.shape)), -1).reshape(-1, max(array.shape))
+    return {f"{name}[{at}]": (line, unit) for at, line in enumerate(lines, 1)}

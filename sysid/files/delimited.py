@@ -1,0 +1,147 @@
+"""Text tables as loggers write them: preamble, header, units, decimal points or commas, any usual delimiter."""
+
+from __future__ import annotations
+
+import codecs
+import re
+from collections import Counter
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from sysid.errors import InputError, shown
+from sysid.files import units
+from sysid.files.recording import Column, Recording
+from sysid.structure.structure import Array
+
+_LOOKED_AT = 200  # lines from which the delimiter is told
+_IN_BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\[\]]*)[\])]\s*$")
+_BLANKS = re.compile(r"[ \t]+")
+
+
+@dataclass(frozen=True)
+class _Form:
+    """How numbers stand in a line."""
+
+    delimiter: str
+    comma: bool  # decimal comma
+
+    def fields(self, line: str) -> list[str]:
+        parts = _BLANKS.split(line.strip()) if self.delimiter == " " else line.split(self.delimiter)
+        return [part.strip().strip('"').strip() for part in parts]
+
+    def numbers(self, fields: list[str]) -> list[float] | None:
+        """The numbers of the fields, NaN where one is empty; None where one is no number."""
+        try:
+            return [float((field.replace(",", ".") if self.comma else field) or "nan") for field in fields]
+        except ValueError:
+            return None
+
+
+def read(path: Path) -> Recording:
+    """Columns of a text table; a last line that was cut short is left out, and said.
+
+    Raises
+    ------
+    InputError
+        A file without a table, a line in the middle with another number of fields or a word, a second table.
+    """
+    lines = _text(path).splitlines()
+    form, width = _form(lines, path)
+    rows = [(number, form.fields(line)) for number, line in enumerate(lines, 1) if line.strip(" \t\r\x1a\0")]
+    first = next(
+        at for at, (_, row) in enumerate(rows) if len(row) == width and any(row) and form.numbers(row) is not None
+    )
+    body, remarks = _whole(rows[first:], form, width)
+    table = _numbers(body, form, width, path)
+    names, given = _header([row for _, row in rows[:first]], width)
+    kept = [at for at in range(width) if not (names[at] == "" and np.all(np.isnan(table[:, at])))]
+    columns = tuple(
+        Column(names[at] or f"column {at + 1}", table[:, at], given[at], f"column {at + 1} ({names[at] or 'no name'})")
+        for at in kept
+    )
+    return Recording(path, columns, remarks=remarks)
+
+
+def _text(path: Path) -> str:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
+    if not content.strip():
+        raise InputError(f"{path} is empty")
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return content.decode("utf-16", "replace")
+    head = content[:4000]
+    if head.count(0) > len(head) // 4:  # Latin letters in UTF-16 without its mark: every other byte is zero
+        return content.decode("utf-16-le" if head[1::2].count(0) > head[::2].count(0) else "utf-16-be", "replace")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
+
+
+def _form(lines: list[str], path: Path) -> tuple[_Form, int]:
+    """Delimiter, decimal sign and number of fields by which most lines from the middle on are numbers."""
+    filled = [line for line in lines if line.strip()]
+    middle = filled[len(filled) // 3 :][:_LOOKED_AT]
+    best, score = None, (0, 0)
+    for delimiter, comma in product(";\t,| ", (False, True)):
+        if comma and delimiter == ",":
+            continue
+        form = _Form(delimiter, comma)
+        rows = [form.fields(line) for line in middle]
+        widths = Counter(len(row) for row in rows if form.numbers(row) is not None and any(row))
+        if widths:
+            width, count = widths.most_common(1)[0]
+            if (count, width) > score:
+                best, score = (form, width), (count, width)
+    if best is None:
+        raise InputError(f"{path} holds no table of numbers: {shown(middle[0] if middle else '')} stands in its middle")
+    return best
+
+
+def _whole(
+    body: list[tuple[int, list[str]]], form: _Form, width: int
+) -> tuple[list[tuple[int, list[str]]], tuple[str, ...]]:
+    """The rows without a last one that was cut short."""
+    number, last = body[-1]
+    if len(body) > 1 and (len(last) < width or form.numbers(last) is None):
+        return body[:-1], (f"line {number}, the last, is cut short and left out",)
+    return body, ()
+
+
+def _numbers(body: list[tuple[int, list[str]]], form: _Form, width: int, path: Path) -> Array:
+    table = []
+    for number, row in body:
+        values = form.numbers(row) if len(row) == width else None
+        if values is None:
+            wrong = next((field for field in row if form.numbers([field]) is None), None)
+            fault = f"holds {shown(wrong)}" if wrong is not None else f"has {len(row)} fields where {width} are needed"
+            raise InputError(
+                f"{path}, line {number}: {fault}, where a table of numbers goes on: mend or delete the line; where a "
+                "second test begins, write it to a file of its own"
+            )
+        table.append(values)
+    return np.array(table)
+
+
+def _header(rows: list[list[str]], width: int) -> tuple[list[str], list[str]]:
+    """Names and units of the columns from the lines above the numbers, those next to them first."""
+    names, given = [""] * width, [""] * width
+    for row in reversed(rows):
+        # A trailing delimiter may stand under the header and not under the numbers.
+        fields = row[:width] if not any(row[width:]) else row
+        if len(fields) != width or not any(fields):
+            break
+        bare = [field.strip("[]() ") for field in fields]
+        if sum(units.find(field) is not None for field in bare) > sum(bool(field) for field in bare) / 2:
+            given = bare
+            continue
+        found = [_IN_BRACKETS.match(field) for field in fields]
+        names = [match[1] if match else field for match, field in zip(found, fields, strict=True)]
+        given = [(match[2].strip() if match else "") or old for match, old in zip(found, given, strict=True)]
+        break
+    return names, given

@@ -1,0 +1,173 @@
+"""Which column is which sensor: from a TOML file, from the command line, or from dictionaries."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from sysid.errors import InputError, choice, number, path_of, refuse, sequence, shown, text
+from sysid.structure.axes import base_columns, sensor_row, vector3
+
+ROLES = ("base", "response", "force")
+_FIELDS = ("column", "name", "role", "position", "axis", "unit", "reference")
+_TOP = ("sensor", "sample_rate", "time", "frequency", "base_axes", "origin", "frf", "convention", "layout")
+CONVENTIONS = ("exp(+iwt)", "exp(-iwt)")
+
+EXAMPLE = """\
+time = "Time"                  # or: sample_rate = 200.0
+[[sensor]]
+column = "CH1"                 # its name in the file, or its number from 1
+role = "base"                  # base, response or force
+axis = "x"                     # x, -y, ..., or a direction such as [0.7, 0.7, 0]
+unit = "g"                     # where the file does not state it
+[[sensor]]
+column = "CH2"
+name = "floor 1"
+role = "response"
+axis = "x"
+position = [0.0, 0.0, 3.0]     # m
+"""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """What is said of one column."""
+
+    column: str | int
+    role: str
+    axis: Any
+    name: str
+    position: tuple[float, float, float]
+    unit: str
+    reference: str
+
+
+@dataclass(frozen=True)
+class Description:
+    """What is said of a test's files.
+
+    Attributes
+    ----------
+    channels : tuple of Channel
+    sample_rate : float or None
+        Hz.
+    time, frequency : str or int or None
+        The columns of time or frequency.
+    base_axes : str or None
+        Of which the base moves; those of the base channels by default.
+    origin : tuple of float
+        The base point, m.
+    frf, convention : str
+        Of frequency responses, see `sysid.files.responses`; "" where they are to be recognised.
+    """
+
+    channels: tuple[Channel, ...] = ()
+    sample_rate: float | None = None
+    time: str | int | None = None
+    frequency: str | int | None = None
+    base_axes: str | None = None
+    origin: tuple[float, ...] = (0.0, 0.0, 0.0)
+    frf: str = ""
+    convention: str = ""
+    place: str = field(default="the description")
+
+
+def from_toml(path: Path) -> dict[str, Any]:
+    """The dictionary that a TOML file stands for."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is no TOML: {error}") from None
+
+
+def from_words(words: Sequence[str]) -> dict[str, Any]:
+    """One sensor from the words of a command line: ``COLUMN role=response axis=x position=0,0,3 unit=g``."""
+    entry: dict[str, Any] = {"column": words[0]}
+    for word in words[1:]:
+        name, equals, value = word.partition("=")
+        if not equals or name not in _FIELDS[1:]:
+            raise InputError(
+                f"--sensor {words[0]}: {word!r} is none of {', '.join(f'{one}=' for one in _FIELDS[1:])}; such as "
+                "--sensor CH2 role=response axis=x position=0,0,3 unit=g"
+            )
+        listed = name == "position" or (name == "axis" and "," in value)
+        try:
+            entry[name] = [float(part) for part in value.split(",")] if listed else value
+        except ValueError:
+            raise InputError(f"--sensor {words[0]}: {word!r} needs numbers, such as {name}=0,0,3") from None
+    return entry
+
+
+def description(given: Mapping[str, Any], place: str = "the description") -> Description:
+    """Check what is said of a test.
+
+    Raises
+    ------
+    InputError
+        A word that is not known, a role, an axis or a position that is none.
+    """
+    for name in given:
+        refuse((name not in _TOP, f"{place}: {name!r} is unknown; known are {', '.join(_TOP)}"))
+    listed = given.get("sensor", ())
+    channels = tuple(
+        _channel(entry, f"{place}, sensor {at}")
+        for at, entry in enumerate(listed and sequence(f"{place}: sensor", listed, "a list of sensors"), 1)
+    )
+    columns = [channel.column for channel in channels if not channel.reference]
+    twice = next((one for one in columns if columns.count(one) > 1), None)
+    refuse((twice is not None, f"{place}: column {twice!r} is given to two sensors"))
+    rate, axes, convention = given.get("sample_rate"), given.get("base_axes"), given.get("convention", "")
+    if axes is not None:
+        base_columns(axes)
+    choice(f"{place}: convention", convention, ("", *CONVENTIONS))
+    return Description(
+        channels,
+        None if rate is None else number(f"{place}: sample_rate", rate, "a positive number in Hz", above=0),
+        given.get("time"), given.get("frequency"), axes if axes is None or isinstance(axes, str) else " ".join(axes),
+        tuple(vector3(given.get("origin", (0.0, 0.0, 0.0)), f"{place}: origin").tolist()),
+        given.get("frf", ""), convention, place,
+    )  # fmt: skip
+
+
+def _channel(entry: Any, place: str) -> Channel:
+    if not isinstance(entry, Mapping):
+        raise InputError(f"{place}: {shown(entry)} is no table of column, role, axis, position, unit")
+    for name in entry:
+        refuse((name not in _FIELDS, f"{place}: {name!r} is unknown; known are {', '.join(_FIELDS)}"))
+    column: Any = entry.get("column")
+    refuse((not isinstance(column, str | int) or column == "", f"{place}: column is missing (its name, or its number)"))
+    place = f"{place} (column {column})"
+    choice(f"{place}: role", entry.get("role"), ROLES)
+    axis: Any = entry.get("axis")
+    refuse((axis is None, f"{place}: axis is missing: x, y, z, a sign before it where it points back, or a vector"))
+    sensor_row(axis, place)
+    where = vector3(entry.get("position", (0.0, 0.0, 0.0)), f"{place}: position").tolist()
+    name = text(f"{place}: name", entry.get("name", str(column)))
+    axis = axis if isinstance(axis, str) else tuple(map(float, axis))
+    return Channel(
+        column, entry["role"], axis, name, (where[0], where[1], where[2]), str(entry.get("unit", "")),
+        str(entry.get("reference", "")),
+    )  # fmt: skip
+
+
+def beside(path: Path) -> Path | None:
+    """A TOML file that stands beside a file: of its name, or ``sensors.toml`` in its folder."""
+    for near in (path.with_suffix(".toml"), path.parent / "sensors.toml"):
+        if near.is_file():
+            return near
+    return None
+
+
+def asked(given: Any, paths: Sequence[Path]) -> Description:
+    """The description from what was given: a path of a TOML, a mapping, or None for the one beside the files."""
+    if isinstance(given, Description):
+        return given
+    if isinstance(given, Mapping):
+        return description(given)
+    file = beside(paths[0]) if given is None else path_of("sensors", given)
+    return Description() if file is None else description(from_toml(file), str(file))

@@ -1,0 +1,171 @@
+"""A test as it was recorded, in SI units and with its sensors: what ``test.h5`` holds.
+
+Records in time stay records, so that whoever identifies from them chooses the estimator and the band.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sysid.errors import InputError
+from sysid.files.tree import Tree, from_bytes, is_tree, to_bytes
+from sysid.measurement.measurement import Measurement
+from sysid.measurement.rigid_body import rigid_body
+from sysid.structure.sensor import Sensor, sensors_from_tree, sensors_to_tree
+from sysid.structure.structure import Array
+
+_FORMAT = 1
+_CONTENT = "recorded test"
+
+Run = tuple[Array, Array, Array | None]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One channel in the table of what was read.
+
+    Attributes
+    ----------
+    column, sensor, role, axis, unit : str
+        `unit` is the file's.
+    factor : float
+        By which its numbers were multiplied to be in SI units.
+    rms : float
+        In SI units, without the mean of a record in time.
+    source : str
+        File.
+    """
+
+    column: str
+    sensor: str
+    role: str
+    axis: str
+    unit: str
+    factor: float
+    rms: float
+    source: str
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedTest:
+    """Runs of a base-shake test.
+
+    Attributes
+    ----------
+    runs : tuple of (base, response, force or None)
+        (d, n), (n_sensors, n), (d, n): m/s² and N in time, or complex spectra.
+    sensors : tuple of Sensor
+        Of the responses.
+    base_axes : tuple of str
+    origin : tuple of float
+        The base point, m.
+    sample_rate : float or None
+        Hz, of records in time.
+    freq : (n,) or None
+        Hz, of spectra.
+    table : tuple of Row
+        Of all channels, file by file.
+    remarks : tuple of str
+        What was left out, recognised or mended.
+    """
+
+    runs: tuple[Run, ...]
+    sensors: tuple[Sensor, ...]
+    base_axes: tuple[str, ...]
+    origin: tuple[float, ...]
+    sample_rate: float | None
+    freq: Array | None
+    table: tuple[Row, ...]
+    remarks: tuple[str, ...] = ()
+
+    def measurement(self, **options: Any) -> Measurement:
+        """The measurement; `options` are those of `Measurement.from_time`, of spectra ``band`` alone."""
+        G = rigid_body(sensors=self.sensors, base_axes=self.base_axes, origin=self.origin)
+        given: Any = {"rigid_body": G, "sensors": self.sensors, "base_axes": self.base_axes}
+        if self.freq is None:
+            assert self.sample_rate is not None
+            return Measurement.from_time(self.runs, self.sample_rate, **given, **options)
+        band = options.pop("band", None)
+        if options:
+            raise InputError(f"{', '.join(options)}: only records in time take it, and these are spectra")
+        parts: Any = zip(*self.runs, strict=True)
+        base, response, force = (None if part[0] is None else np.stack(part) for part in parts)
+        test = Measurement(self.freq, base, response, force=force, **given)  # type: ignore[arg-type]
+        return test if band is None else test.in_band(*band)
+
+    def in_words(self) -> str:
+        """The table of channels, and what there is of them."""
+        heads = ("column", "sensor", "role", "axis", "unit", "factor to SI", "rms (SI)", "file")
+        rows = [
+            (row.column, row.sensor, row.role, row.axis, row.unit, f"{row.factor:.6g}", f"{row.rms:.4g}", row.source)
+            for row in self.table
+        ]
+        widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
+        lines = ["  ".join(f"{word:{size}}" for word, size in zip(row, widths, strict=True)) for row in (heads, *rows)]
+        return "\n".join([*(line.rstrip() for line in lines), "", *self.remarks, self._size()])
+
+    def _size(self) -> str:
+        runs = f"{len(self.runs)} run{'s' if len(self.runs) > 1 else ''}"
+        force = "with base force" if self.runs[0][2] is not None else "without base force"
+        parts = f"{len(self.sensors)} sensors, base moving along {' '.join(self.base_axes)}, {force}"
+        if self.freq is not None:
+            return f"{runs} of spectra: {parts}, {self.freq.size} lines from {self.freq[0]:g} to {self.freq[-1]:g} Hz"
+        lengths = ", ".join(f"{run[0].shape[1] / (self.sample_rate or 1):.4g}" for run in self.runs[:5])
+        return f"{runs} in time: {parts}, {lengths}{', ...' if len(self.runs) > 5 else ''} s at {self.sample_rate:g} Hz"
+
+    def to_bytes(self) -> bytes:
+        """The file ``test.h5``."""
+        return to_bytes(
+            {
+                "content": _CONTENT,
+                "runs": [{"base": base, "response": response, "force": force} for base, response, force in self.runs],
+                "sensors": sensors_to_tree(self.sensors),
+                "base_axes": self.base_axes,
+                "origin": np.array(self.origin),
+                "sample_rate": self.sample_rate,
+                "freq": self.freq,
+                "table": [vars(row) for row in self.table],
+                "remarks": list(self.remarks),
+            },
+            _FORMAT,
+        )
+
+    @classmethod
+    def from_tree(cls, tree: Tree) -> RecordedTest:
+        """The test of the tree that a file holds."""
+        runs = tuple((run["base"], run["response"], run["force"]) for run in tree["runs"])
+        table = tuple(Row(**row) for row in tree["table"])
+        return cls(
+            runs, sensors_from_tree(tree["sensors"]) or (), tuple(tree["base_axes"]), tuple(tree["origin"].tolist()),
+            tree["sample_rate"], tree["freq"], table, tuple(tree["remarks"]),
+        )  # fmt: skip
+
+
+def load(path: str | Path) -> RecordedTest:
+    """Read a ``test.h5`` again.
+
+    Raises
+    ------
+    InputError
+        Where it is missing, damaged, or something else.
+    """
+    file = Path(path)
+    try:
+        image = file.read_bytes()
+    except OSError as error:
+        raise InputError(f"{file} cannot be read: {error.strerror or error}") from None
+    if not is_tree(image):
+        raise InputError(
+            f"{file} is not a test that sysid wrote: 'sysid read {file} --sensors SENSORS.toml --out test.h5' makes one"
+        )
+    try:
+        tree, _ = from_bytes(image)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from None
+    if tree.get("content") != _CONTENT:
+        raise InputError(f"{file} holds a {tree.get('content', 'result')}, not a test: give what 'sysid read' wrote")
+    return RecordedTest.from_tree(tree)

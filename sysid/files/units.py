@@ -1,0 +1,72 @@
+"""Units of channels: what quantity a unit is of, and its factor to SI."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from sysid.errors import InputError, shown
+
+STANDARD_GRAVITY = 9.80665  # m/s²
+POUND = 4.4482216152605  # N
+INCH = 0.0254  # m
+
+
+class Unit(NamedTuple):
+    """A quantity, and the factor that takes a number in this unit to SI."""
+
+    quantity: str
+    factor: float
+
+
+SI = {
+    "acceleration": "m/s²", "velocity": "m/s", "displacement": "m", "force": "N", "moment": "N m",
+    "angular acceleration": "rad/s²", "time": "s", "frequency": "Hz",
+}  # fmt: skip
+
+_LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": INCH, "ft": 12 * INCH}
+_FORCES = {"N": 1.0, "mN": 1e-3, "kN": 1e3, "MN": 1e6, "lbf": POUND, "kip": 1e3 * POUND}
+_DEGREE = 3.141592653589793 / 180
+
+UNITS: dict[str, Unit] = {
+    **{name: Unit("displacement", size) for name, size in _LENGTHS.items()},
+    **{f"{name}/s": Unit("velocity", size) for name, size in _LENGTHS.items()},
+    **{f"{name}/s2": Unit("acceleration", size) for name, size in _LENGTHS.items()},
+    "g": Unit("acceleration", STANDARD_GRAVITY),
+    "mg": Unit("acceleration", 1e-3 * STANDARD_GRAVITY),
+    "ug": Unit("acceleration", 1e-6 * STANDARD_GRAVITY),
+    "gal": Unit("acceleration", 1e-2),
+    **{name: Unit("force", size) for name, size in _FORCES.items()},
+    **{f"{name}m": Unit("moment", size) for name, size in _FORCES.items() if name.endswith("N")},
+    "rad/s2": Unit("angular acceleration", 1.0),
+    "deg/s2": Unit("angular acceleration", _DEGREE),
+    "s": Unit("time", 1.0),
+    "ms": Unit("time", 1e-3),
+    "us": Unit("time", 1e-6),
+    "Hz": Unit("frequency", 1.0),
+    "kHz": Unit("frequency", 1e3),
+    "rad/s": Unit("frequency", 1 / (2 * 3.141592653589793)),
+}
+_OTHER_WORDS = {
+    "m/s/s": "m/s2", "mm/s/s": "mm/s2", "ms-2": "m/s2", "gn": "g", "gs": "g", "lb": "lbf", "newton": "N", "sec": "s",
+    "seconds": "s", "second": "s", "hz": "Hz", "kn": "kN", "n": "N", "G": "g", "g's": "g",
+}  # fmt: skip
+
+
+def find(text: str) -> Unit | None:
+    """The unit that a text names, such as "m/s²", "mm/s^2", "g" or "kN"; None where it names none."""
+    plain = text.strip().replace("²", "2").replace("µ", "u").replace("μ", "u").replace("°", "deg")
+    for sign in (" ", "^", "*", "·"):
+        plain = plain.replace(sign, "")
+    plain = plain.replace("sec2", "s2").replace("(", "").replace(")", "")
+    return UNITS.get(_OTHER_WORDS.get(plain, plain)) or UNITS.get(_OTHER_WORDS.get(plain.lower(), plain.lower()))
+
+
+def unit(text: str, of: str) -> Unit:
+    """The unit that a text names, or an InputError that says of what it is none."""
+    known = find(text)
+    if known is None:
+        raise InputError(
+            f"the unit {shown(text)} of {of} is not known: m/s², mm/s², g, N, kN, lbf and their like are; state it "
+            "with unit= in the description of the sensor"
+        )
+    return known

@@ -1,0 +1,154 @@
+"""Universal files: functions at nodal degrees of freedom (58, 58b) with the geometry of 15 or 2411 and units of 164.
+
+Read with pyuff, an extra. Of the geometry sets 82 (trace lines) and 151 (header) nothing is needed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sysid.errors import InputError
+from sysid.files import units
+from sysid.files.recording import Column, Recording, rate_of
+
+_FUNCTIONS = {0: "general", 1: "time response", 2: "auto spectrum", 3: "cross spectrum", 4: "frequency response",
+              6: "coherence", 12: "spectrum"}  # fmt: skip
+_READ = (1, 4, 12)
+_DIRECTIONS = {1: "x", 2: "y", 3: "z", 4: "rx", 5: "ry", 6: "rz"}
+_SPECIFIC = {8: "m", 9: "N", 11: "m/s", 12: "m/s²", 13: "N"}  # data types whose unit is SI where no label says another
+_MARK = re.compile(rb"^    -1[ \t]*\r?$", re.MULTILINE)
+_NO_LABEL = ("", "NONE")
+
+
+def read(path: Path) -> list[Recording]:
+    """The recordings of a universal file: its time records, or its spectra, run by run.
+
+    A load case is a run; a function without reference is told by its node and direction, as in ``12+X``.
+
+    Raises
+    ------
+    InputError
+        Without pyuff; a file cut short, of another type, without sets 58; lengths that differ.
+    """
+    sets = _sets(path)
+    lengths = _scale(sets)
+    points = _points(sets, lengths)
+    functions = [(at, one) for at, one in enumerate(sets, 1) if one.get("type") == 58]
+    kinds = {_FUNCTIONS.get(one["func_type"], str(one["func_type"])) for _, one in functions}
+    used = [(at, one) for at, one in functions if one["func_type"] in _READ]
+    if not used:
+        found = ", ".join(sorted({str(one.get("type")) for one in sets})) or "none"
+        raise InputError(
+            f"{path} holds no time records or frequency responses: sets {found}"
+            f"{', functions ' + ', '.join(sorted(kinds)) if kinds else ''}; export functions as sets 58 or 58b"
+        )
+    if len({one["func_type"] == 1 for _, one in used}) > 1:
+        raise InputError(f"{path} holds time records and frequency responses: export one kind into a file of its own")
+    runs: dict[int, list[tuple[int, dict[str, Any]]]] = {}
+    for at, one in used:
+        runs.setdefault(one["load_case_id"] if one["func_type"] != 4 else 0, []).append((at, one))
+    return [_recording(path, run, points) for run in runs.values()]
+
+
+def _sets(path: Path) -> list[dict[str, Any]]:
+    try:
+        import pyuff
+    except ImportError:
+        raise InputError(f"{path}: universal files need pyuff: pip install 'structural-sysid[uff]'") from None
+    try:
+        marks = len(_MARK.findall(path.read_bytes()))
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
+    if not marks:
+        raise InputError(f"{path} is no universal file: it has no line '    -1', by which a set begins and ends")
+    if marks % 2:
+        raise InputError(f"{path} is cut short: its last set, number {marks // 2 + 1}, does not end; export it again")
+    file, sets = pyuff.UFF(str(path)), []
+    for at, kind in enumerate(file.get_set_types()):
+        try:
+            sets.append(file.read_sets(at))
+        except Exception as error:  # pyuff raises Exception itself
+            raise InputError(
+                f"{path}, set {at + 1} of {len(file.get_set_types())} (type {kind}): {error}; is it damaged, or "
+                "another type than it says? Export it again"
+            ) from None
+    return sets
+
+
+def _scale(sets: Sequence[dict[str, Any]]) -> float:
+    """Length of the file's unit of length in m, from its set 164; 1 without one."""
+    return next((1 / one["length"] for one in sets if one.get("type") == 164 and one.get("length")), 1.0)
+
+
+def _points(sets: Sequence[dict[str, Any]], length: float) -> dict[int, tuple[float, ...]]:
+    """Positions of the nodes, m."""
+    return {
+        int(node): tuple(float(part) * length for part in place)
+        for one in sets
+        if one.get("type") in (15, 2411)
+        for node, *place in zip(one["node_nums"], one["x"], one["y"], one["z"], strict=True)
+    }
+
+
+def _recording(path: Path, run: Sequence[tuple[int, dict[str, Any]]], points: dict[int, Any]) -> Recording:
+    columns = tuple(_column(path, at, one, points) for at, one in run)
+    first, lengths = run[0][1], {column.values.size for column in columns}
+    other = next(((at, one) for at, one in run if not _same_abscissa(one, first)), None)
+    if len(lengths) > 1 or other is not None:
+        at = other[0] if other else next(at for at, one in run if np.size(one["data"]) != columns[0].values.size)
+        raise InputError(
+            f"{path}, set {at}: it has other times or frequencies than set {run[0][0]}, with which it forms a run; "
+            "export tests of another length or rate with another load case, or into a file of their own"
+        )
+    x = np.asarray(first["x"], float)[: columns[0].values.size]
+    if first["func_type"] == 1:
+        if not first["abscissa_spacing"]:
+            return Recording(path, columns, sample_rate=rate_of(x, path, f"set {run[0][0]}"))
+        return Recording(path, columns, sample_rate=1 / first["abscissa_inc"])
+    return Recording(path, columns, freq=x)
+
+
+def _same_abscissa(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    a, b = np.asarray(one["x"], float), np.asarray(other["x"], float)
+    return a.shape == b.shape and bool(np.allclose(a, b, rtol=1e-6, atol=0))
+
+
+def _column(path: Path, at: int, one: dict[str, Any], points: dict[int, Any]) -> Column:
+    name, values = dof(one["rsp_node"], one["rsp_dir"]), np.asarray(one["data"])
+    if values.size < one["num_pts"]:
+        raise InputError(
+            f"{path}, set {at} ({name}): {values.size} of {one['num_pts']} values are there: it is cut short, or not "
+            "of the precision that it says; export it again"
+        )
+    spectrum = one["func_type"] == 4
+    upper = _unit(one, "ordinate")
+    lower = _unit(one, "orddenom") if spectrum else ""
+    direction = int(one["rsp_dir"])
+    axis = ("-" if direction < 0 else "") + _DIRECTIONS.get(abs(direction), "")
+    return Column(
+        name, values[: one["num_pts"]], f"{upper} / {lower}" if upper and lower else upper, f"set {at} ({name})",
+        dof(one["ref_node"], one["ref_dir"]) if spectrum else "", position=points.get(int(one["rsp_node"])), axis=axis,
+    )  # fmt: skip
+
+
+def dof(node: int, direction: int) -> str:
+    """A node and direction as test engineers write it: ``12+X``, ``3-RZ``."""
+    name = _DIRECTIONS.get(abs(int(direction)), "").upper()
+    return f"{int(node)}{'-' if int(direction) < 0 else '+'}{name}"
+
+
+def _unit(one: dict[str, Any], side: str) -> str:
+    """Unit of an axis: its label where that names a unit, else the SI unit of its data type, else ""."""
+    for key in (f"{side}_axis_units_lab", f"{side}_axis_lab"):
+        label = str(one.get(key, "")).strip().strip("[]()")
+        if label not in _NO_LABEL and units.find(label) is not None:
+            return label
+    label = str(one.get(f"{side}_axis_units_lab", "")).strip()
+    if label not in _NO_LABEL:
+        return label  # unknown: whoever takes the channel says so
+    return _SPECIFIC.get(int(one[f"{side}_spec_data_type"]), "")

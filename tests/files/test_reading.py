@@ -1,0 +1,230 @@
+"""A laboratory's files are read right, or told in one line that names file, place and remedy."""
+
+import re
+from itertools import chain
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+
+import sysid
+from sysid.cli import main as cli
+from sysid.files import reading, recorded_test
+
+G = 9.80665
+FREQ = np.arange(1, 401) * 0.05
+STRETCH = np.array([[1.0, 0, 0, -1], [-1, 1, 0, 0], [0, -1, 1, 0]])
+TRUTH = sysid.Structure(
+    np.diag([4.0, 3.0, 2.0, 0.0]), STRETCH.T @ np.diag([9e3, 7e3, 5e3]) @ STRETCH, [0.02] * 3, n_base=1
+)
+H = TRUTH.relative_acceleration(FREQ)[:, 0] + 1
+F = TRUTH.base_force(FREQ)[0, 0]
+SENSORS = {
+    "sensor": [
+        {"column": "table", "role": "base", "axis": "x"},
+        {"column": "top", "role": "response", "axis": "x", "position": [0, 0, 3]},
+        {"column": "force", "role": "force", "axis": "x"},
+    ]
+}
+MATRIX = {
+    "frf": "transmissibility",
+    "base_axes": "x",
+    "sensor": [
+        *({"column": f"H[{i}]", "role": "response", "axis": "x", "position": [0, 0, i]} for i in (1, 2, 3)),
+        {"column": "F", "role": "force", "axis": "x", "unit": "N / m/s²"},
+    ],
+}
+
+
+def records(n=400):
+    """Time at 200 Hz, table in g, top in mm/s², force in kN; and the same in SI units."""
+    si = np.random.default_rng(0).standard_normal((3, n))
+    return np.arange(n) / 200, si / [[G], [1e-3], [1e3]], si
+
+
+def table(delimiter=";", comma=True, heads=("Zeit", "table", "top", "force"), units=("s", "g", "mm/s²", "kN")):
+    time, values, _ = records()
+    rows = ["Logger", "Operator: Müller", delimiter.join(heads)]
+    if units:
+        rows.append(delimiter.join(units))
+    for row in np.vstack([time, values]).T:
+        line = delimiter.join(f"{value:.12g}" for value in row)
+        rows.append(line.replace(".", ",") if comma else line)
+    return rows
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
+@pytest.mark.parametrize("delimiter, comma", [(";", True), ("\t", True), (",", False), ("\t", False)])
+def test_a_table_is_read_with_any_encoding_delimiter_and_decimal_sign(tmp_path, encoding, delimiter, comma):
+    (tmp_path / "run.csv").write_text("\r\n".join(table(delimiter, comma)), encoding=encoding)
+    test = reading.gather(tmp_path / "run.csv", SENSORS)
+    (base, response, force), si = test.runs[0], records()[2]
+    np.testing.assert_allclose(np.vstack([base, response, force]), si, rtol=1e-10)
+    assert test.sample_rate == 200
+    assert [row.factor for row in test.table] == pytest.approx([G, 1e-3, 1e3])
+
+
+def test_units_in_brackets_and_a_cut_last_row(tmp_path):
+    heads = ("Time [s]", "table (g)", "top [mm/s^2]", "force [kN]")
+    rows = [*table(",", False, heads, None), "2.0,0.1"]
+    (tmp_path / "run.csv").write_text("\n".join(rows))
+    test = reading.gather(tmp_path / "run.csv", SENSORS)
+    np.testing.assert_allclose(test.runs[0][0][0], records()[2][0], rtol=1e-10)
+    assert "the last, is cut short" in test.remarks[0]
+
+
+@pytest.mark.parametrize(
+    "change, said, words",
+    [
+        (lambda rows: [*rows[:50], "x;y;z;w", *rows[50:]], SENSORS, "line 51: holds 'x'.*mend or delete"),
+        (lambda rows: rows + rows[2:], SENSORS, "line 405: holds 'Zeit'.*second test"),
+        (lambda rows: rows + rows[4:], SENSORS, "time does not rise at sample 401.*two tests"),
+        (lambda rows: rows[:100] + rows[140:], SENSORS, "uneven, most at sample 97"),
+        (lambda rows: rows[:2], SENSORS, "no table of numbers"),
+        (lambda rows: [], SENSORS, "is empty"),
+        (lambda rows: rows, {}, "which column is which sensor is not said.*'table'.*--sensor"),
+        (lambda rows: [rows[2], *rows[4:]], SENSORS, "no unit is stated: add unit"),
+        (lambda rows: [row.replace("kN", "mm") for row in rows], SENSORS, "'mm' is a displacement"),
+        (lambda rows: [row.replace("kN", "bananas") for row in rows], SENSORS, "'bananas' of .* is not known"),
+        (lambda rows: [row.replace("top", "roof") for row in rows], SENSORS, "no column 'top': it has 4 columns"),
+        (lambda rows: [row.replace("Zeit", "n") for row in rows], SENSORS, "no column of time.*sample_rate"),
+        (lambda rows: rows, {"sensor": [{"column": "top", "role": "response"}]}, "sensor 1 .*axis is missing"),
+    ],
+)
+def test_a_broken_table_is_told_in_words(tmp_path, change, said, words):
+    path = tmp_path / "run.csv"
+    path.write_text("\n".join(change(table())))
+    with pytest.raises(sysid.InputError, match=words) as told:
+        reading.gather(path, said)
+    assert re.search(r"run\.csv|the description", str(told.value))
+
+
+def test_a_thousand_channels_are_read(tmp_path):
+    values = np.random.default_rng(1).standard_normal((50, 1000))
+    heads = ",".join(f"A{i} [g]" for i in range(1000))
+    np.savetxt(tmp_path / "run.csv", values, delimiter=",", header=heads, comments="")
+    roles = ["base", *["response"] * 999]
+    sensors = [{"column": f"A{i}", "role": role, "axis": "x"} for i, role in enumerate(roles)]
+    test = reading.gather(tmp_path / "run.csv", {"sample_rate": 100, "sensor": sensors})
+    np.testing.assert_allclose(test.runs[0][1], G * values.T[1:], rtol=1e-12)
+
+
+@pytest.mark.parametrize("ending", ["mat", "npz", "h5"])
+def test_arrays_keep_every_bit(tmp_path, ending):
+    path, named = tmp_path / f"a.{ending}", {"freq": FREQ, "H": H, "F": F}
+    if ending == "mat":
+        scipy.io.savemat(path, named)
+    elif ending == "npz":
+        np.savez(path, **named)
+    else:
+        with h5py.File(path, "w") as file:
+            file.update(named)
+    test = sysid.read(path, MATRIX)
+    assert np.array_equal(test.response[0], H) and np.array_equal(test.force[0, 0], F)
+    assert np.array_equal(test.freq, FREQ)
+    np.testing.assert_array_equal(test.rigid_body, np.ones((3, 1)))
+
+
+@pytest.mark.parametrize("ending", ["mat", "npz", "h5", "uff"])
+def test_a_file_of_another_kind_or_cut_short_is_told(tmp_path, ending):
+    if ending == "uff":
+        pytest.importorskip("pyuff")
+    path = tmp_path / f"a.{ending}"
+    path.write_bytes(b"nothing of the kind")
+    with pytest.raises(sysid.InputError, match=rf"a\.{ending} is no"):
+        sysid.read(path, MATRIX)
+
+
+def test_the_test_file_gives_back_what_was_read(tmp_path):
+    (tmp_path / "run.csv").write_text("\n".join(table()))
+    test = reading.gather(tmp_path / "run.csv", SENSORS)
+    (tmp_path / "test.h5").write_bytes(test.to_bytes())
+    again = recorded_test.load(tmp_path / "test.h5")
+    assert all(np.array_equal(a, b) for a, b in zip(test.runs[0], again.runs[0], strict=True))
+    assert (again.sensors, again.table, again.sample_rate) == (test.sensors, test.table, test.sample_rate)
+
+
+def functions(binary, conjugated=False):
+    """Sets 58 of the three sensors, the second in g, and of the force, behind the positions of their nodes."""
+    pyuff = pytest.importorskip("pyuff")
+    none, zero = np.zeros(4, int), np.zeros(4)
+    # pyuff writes the header of a binary set wrongly where it is the first in a file.
+    sets = [
+        pyuff.prepare_2411(node_nums=none + range(1, 5), def_cs=none, disp_cs=none, color=none, x=zero, y=zero, z=zero)
+    ]
+    for node, (values, unit) in enumerate([(H[0], "m/s^2"), (H[1] / G, "g"), (H[2], "m/s^2"), (F, "N")], 1):
+        sets.append(
+            pyuff.prepare_58(
+                binary=binary, func_type=4, rsp_node=node, rsp_dir=1, ref_node=100, ref_dir=1, x=FREQ, num_pts=400,
+                data=np.conj(values) if conjugated else values, id1="", id2="", id3="", id4="", id5="", load_case_id=0,
+                rsp_ent_name="s", ref_ent_name="r", abscissa_spacing=1, abscissa_inc=0.05, abscissa_min=0.05,
+                ord_data_type=6, ordinate_spec_data_type=12, orddenom_spec_data_type=12, abscissa_spec_data_type=18,
+                ordinate_axis_units_lab=unit, orddenom_axis_units_lab="m/s^2",
+            )
+        )  # fmt: skip
+    return sets
+
+
+UNIVERSAL = {
+    "base_axes": "x",
+    "sensor": [
+        *({"column": f"{i}+X", "role": "response", "axis": "x", "position": [0, 0, i]} for i in (1, 2, 3)),
+        {"column": "4+X", "role": "force", "axis": "x"},
+    ],
+}
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")  # of pyuff
+@pytest.mark.parametrize("binary, exact", [(0, 1e-11), (1, 4e-16)])
+@pytest.mark.parametrize("conjugated", [False, True])
+def test_universal_files_keep_their_numbers_and_show_their_convention(tmp_path, binary, exact, conjugated):
+    pyuff = pytest.importorskip("pyuff")
+    pyuff.UFF(str(tmp_path / "a.uff")).write_sets(functions(binary, conjugated), "overwrite")
+    test = reading.gather(tmp_path / "a.uff", UNIVERSAL)
+    base, response, force = test.runs[0]
+    np.testing.assert_allclose(response, H, rtol=exact)
+    np.testing.assert_allclose(force[0], F, rtol=exact)
+    np.testing.assert_allclose(test.freq, FREQ, rtol=1e-5)
+    assert np.array_equal(base, np.ones((1, FREQ.size)))
+    assert ("exp(-iwt)" if conjugated else "exp(+iwt)") in test.remarks[-1]
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (lambda text: text[: len(text) // 2], "is cut short: its last set"),
+        (lambda text: text.replace("    58     ", "    55     "), r"set 2 of 2 \(type 55\).*another type"),
+        (lambda text: "    -1\n    -1\n", "holds no time records"),
+    ],
+)
+def test_a_broken_universal_file_is_told_in_words(tmp_path, change, words):
+    pyuff = pytest.importorskip("pyuff")
+    path = tmp_path / "a.uff"
+    pyuff.UFF(str(path)).write_sets(functions(0)[:2], "overwrite")
+    path.write_text(change(path.read_text()))
+    with pytest.raises(sysid.InputError, match=words) as told:
+        reading.gather(path, UNIVERSAL)
+    assert "a.uff" in str(told.value)
+
+
+def test_functions_of_no_stated_form_are_asked_for(tmp_path):
+    np.savez(tmp_path / "a.npz", freq=FREQ, H=H, F=F)
+    with pytest.raises(sysid.InputError, match=r"a.npz.*receptance, mobility, accelerance or transmissibility"):
+        sysid.read(tmp_path / "a.npz", {**MATRIX, "frf": ""})
+
+
+def test_three_commands_from_a_table_to_a_result(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    np.savez("a.npz", freq=FREQ, H=H, F=F)
+    words = [f"--sensor H[{i}] role=response axis=x position=0,0,{i}".split() for i in (1, 2, 3)]
+    force = ["--sensor", "F", "role=force", "axis=x", "unit=N / m/s²"]
+    given = ["read", "a.npz", "--base-axes", "x", "--frf", "transmissibility", *chain(*words), *force]
+    assert cli.main(given) == 0
+    assert "factor to SI" in capsys.readouterr().out
+    monkeypatch.setattr("sysid.report.report.render", lambda result: "report")
+    assert cli.main(["run", "test.h5"]) == 0
+    mass = sysid.load("results/test").structure.mass
+    np.testing.assert_allclose(np.diag(mass)[:3], [4, 3, 2], rtol=1e-6)
+    assert cli.main(["new", "mine", "--data", "test.h5"]) == 0
+    assert cli.main(["show", "mine.py"]) == 0
