@@ -83,10 +83,11 @@ def inflation_of(test: Measurement, records: list[Record], unknowns: int) -> flo
     if reduced < _FAR_BELOW:
         return 1.0
     beyond = reduced if reduced > max(_SUSPECT, 1 + _DEVIATIONS * np.sqrt(2 / freedom)) else 1.0
-    if test.modal is not None and test.modal.scatter is not None:
-        return float(np.sqrt(beyond))  # scatter over blocks of lines holds what these share
     error = np.concatenate([(r.misfit / r.std).reshape(-1, test.n_runs, test.freq.size) for r in records])
-    return float(np.sqrt(beyond * line_correlation(error, unknowns)))
+    # Scatter over blocks of lines holds what these share.
+    scattered = test.modal is not None and test.modal.scatter is not None
+    shared = 1.0 if scattered else line_correlation(error, unknowns)
+    return float(np.sqrt(beyond * shared))
 
 
 def _gram(vectors: ComplexArray) -> Array:
