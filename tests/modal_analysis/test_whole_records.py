@@ -90,6 +90,13 @@ def test_a_second_pole_within_the_width_of_a_mode_is_left_where_the_second_searc
     _assert_the_modes(whole_fit(trial.measurement([noisy], setting, force=True)), setting.structure)
 
 
+def test_records_without_noise_have_the_modes_of_the_structure(records):
+    simulated, trial, _ = records
+    setting, rng = simulated.four_storeys(), np.random.default_rng(1)
+    run = setting.run(rng).records()  # what folds back of the transients shows at some 1e-6 of the records
+    _assert_the_modes(whole_fit(trial.measurement([run], setting, force=True)), setting.structure)
+
+
 @pytest.mark.parametrize("gain", [1.0, 1.2])
 def test_motion_with_the_base_is_judged_beside_its_noise(records, gain):
     # Base directions nearly dependent: a hundredth of the base's power is noise, much more of its least direction.
