@@ -23,6 +23,7 @@ from sysid.models.stiffness import ChainStiffness, SpectralStiffness
 from sysid.models.unknowns import Unknown, Variable
 from sysid.problem.problem import Problem
 from sysid.problem.terms import FurtherTest, Prior
+from sysid.report.report import write as write_report
 from sysid.results.identification import Identification, Recipe, load
 from sysid.results.version import __version__
 from sysid.search.continuation import Continuation
@@ -43,5 +44,5 @@ __all__ = [
     "Prior", "Problem", "Progress", "ProportionalDamping", "Recipe", "Sensor", "SolverError", "SpectralStiffness",
     "Stated", "StiffnessBlocks", "Structure", "Swarm", "SwarmSettings", "SysidError", "TimeScores", "Totals", "Unknown",
     "Variable", "__version__", "export", "identify", "jobs", "load", "minimize_swarm", "plot", "read", "resample",
-    "rigid_body", "simulate", "time_scores",
+    "rigid_body", "simulate", "time_scores", "write_report",
 ]  # fmt: skip

@@ -317,7 +317,7 @@ def mode_shapes(identification: Identification, modes: Sequence[int] | None = No
     InputError
         Where the sensors have no positions, or all the same.
     """
-    points, motion, sticks = _geometry(identification)
+    points, motion, sticks = stick_model(identification.measurement)
     structure = identification.structure
     chosen = range(1, min(structure.n, _MAX_SHAPES) + 1) if modes is None else modes
     if any(not 1 <= k <= structure.n for k in chosen):
@@ -437,12 +437,22 @@ def normalised(matrix: Array) -> Array:
     return np.divide(matrix, outer, out=np.zeros_like(outer), where=outer > 0)
 
 
-def _geometry(identification: Identification) -> tuple[Array, Array, list[tuple[int, int]]]:
-    """Points (p, 3); each sensor's share in their motion (p, 3, n_sensors); pairs of points that a stick joins."""
+def stick_model(
+    test: Measurement, further: Sequence[ArrayLike] | Array = ()
+) -> tuple[Array, Array, list[tuple[int, int]]]:
+    """Points of the sensors (p, 3), their motion by each sensor (p, 3, n_sensors), and pairs that a stick joins.
+
+    In the pairs `further` points (q, 3) count first.
+
+    Raises
+    ------
+    InputError
+        Where the sensors have no positions, or all the same.
+    """
     from scipy.sparse.csgraph import minimum_spanning_tree
     from scipy.spatial.distance import pdist, squareform
 
-    sensors = identification.measurement.sensors
+    sensors = test.sensors
     if sensors is None:
         raise InputError("mode_shapes: the sensors are not described; give the measurement sysid.Sensor objects")
     points, owner = np.unique(np.array([s.position for s in sensors], float).round(9), axis=0, return_inverse=True)
@@ -451,5 +461,6 @@ def _geometry(identification: Identification) -> tuple[Array, Array, list[tuple[
     motion = np.zeros((len(points), 3, len(sensors)))
     for s, (sensor, p) in enumerate(zip(sensors, np.ravel(owner), strict=True)):
         motion[p, :, s] = axis_vector(sensor.axis)
-    tree = minimum_spanning_tree(squareform(pdist(points))).tocoo()
+    every = np.vstack([*further, points])
+    tree = minimum_spanning_tree(squareform(pdist(every))).tocoo()
     return points, motion, list(zip(tree.row.tolist(), tree.col.tolist(), strict=True))

@@ -1,8 +1,9 @@
-"""A static page from pieces: text, tables, pictures; nothing that runs, nothing from elsewhere."""
+"""A page from pieces: text, tables, pictures, one script of its own; nothing from elsewhere."""
 
 from __future__ import annotations
 
 import base64
+import hashlib
 import html
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
@@ -20,41 +21,76 @@ ROUND_OFF = 1e-12
 _WIDE = 11  # columns beyond which a table is printed smaller
 
 STYLE = """
-:root { --ink: #1f2430; --soft: #5a6472; --line: #dde2e7; --good: #0a7d5a; --warn: #b36b00; --bad: #b3261e; }
+:root { color-scheme: light dark; --paper: #fff; --ink: #1f2430; --soft: #5a6472; --line: #dde2e7; --fill: #f1f4f6;
+  --link: #0b5c96; --good: #0a7d5a; --warn: #a35f00; --bad: #b3261e; --found: #0068a8; --left: #a34a00; }
+@media screen and (prefers-color-scheme: dark) { :root { --paper: #14181d; --ink: #e6eaee; --soft: #a9b3be;
+  --line: #39424c; --fill: #20272e; --link: #86bfee; --good: #3cc296; --warn: #e5a94b; --bad: #f47f77;
+  --found: #62b6f0; --left: #f0995a; } }
 * { box-sizing: border-box; }
-body { margin: 0 auto; padding: 2rem 1.5rem 4rem; max-width: 1120px; color: var(--ink); background: #fff;
+body { margin: 0 auto; padding: 1.2rem 1.5rem 4rem; max-width: 1120px; color: var(--ink); background: var(--paper);
   font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", "DejaVu Sans", sans-serif; }
-h1 { font-size: 1.7rem; margin: 0 0 .2rem; overflow-wrap: anywhere; }
-h2 { font-size: 1.25rem; margin: 2.6rem 0 .6rem; padding-bottom: .25rem; border-bottom: 1px solid var(--line); }
+h1 { font-size: 1.5rem; line-height: 1.25; margin: 0 0 .2rem; overflow-wrap: anywhere; }
+h2 { font-size: 1.25rem; margin: 2.4rem 0 .6rem; padding-bottom: .25rem; border-bottom: 1px solid var(--line); }
 h3 { font-size: 1rem; margin: 1.4rem 0 .4rem; }
-p { margin: .5rem 0; max-width: 72ch; } ul { margin: .3rem 0; padding-left: 1.3rem; max-width: 72ch; }
+p { margin: .5rem 0; max-width: 76ch; overflow-wrap: anywhere; }
+ul { margin: .3rem 0; padding-left: 1.3rem; max-width: 76ch; overflow-wrap: anywhere; }
 .pair { display: flex; flex-wrap: wrap; gap: 0 1.5rem; align-items: flex-start; }
 .pair figure { flex: 1 1 420px; min-width: 0; }
-.mark { border: 1px solid #c6ccd3; border-radius: 3px; padding: 0 .4em; margin-right: .5em; color: var(--soft);
-  background: #f1f3f5; font-size: .8rem; white-space: nowrap; }
+.mark { border: 1px solid var(--line); border-radius: 3px; padding: 0 .4em; margin-right: .5em; color: var(--soft);
+  background: var(--fill); font-size: .8rem; white-space: nowrap; }
 td small { display: block; color: var(--soft); font-size: .82em; line-height: 1.25; }
-details { border-bottom: 1px solid var(--line); } summary { cursor: pointer; padding: .35rem 0; }
 .soft, figcaption { color: var(--soft); font-size: .9rem; }
-.verdict { border: 1px solid var(--line); border-left: 6px solid var(--soft); border-radius: 4px; padding: .7rem 1rem;
-  margin: 1rem 0; overflow-wrap: anywhere; }
+.verdict { border: 1px solid var(--line); border-left: 6px solid var(--soft); border-radius: 4px; padding: .5rem 1rem;
+  margin: .6rem 0; }
 .verdict strong { font-size: 1.1rem; }
+.verdict p { margin: .25rem 0; }
 .good { border-left-color: var(--good); } .warn { border-left-color: var(--warn); }
 .bad { border-left-color: var(--bad); }
-.scroll { overflow-x: auto; margin: .6rem 0 1rem; break-inside: auto; }
+.good strong { color: var(--good); } .warn strong { color: var(--warn); } .bad strong { color: var(--bad); }
+.scroll { overflow-x: auto; margin: .6rem 0 1rem; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .88rem; }
 th, td { padding: .2rem .65rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
 thead th { border-bottom: 1.5px solid var(--soft); vertical-align: bottom; font-weight: 600;
   white-space: normal; max-width: 9em; }
-.words td, .words th { text-align: left; }
+.words td, .words th { text-align: left; white-space: normal; vertical-align: top; }
 th:first-child, td:first-child { text-align: left; font-weight: 500; }
-figure { margin: .8rem 0 1.2rem; break-inside: avoid; } img { max-width: 100%; height: auto; display: block; }
-pre { background: #f5f7f9; padding: .8rem 1rem; overflow-x: auto; font-size: .82rem; line-height: 1.45; }
-nav { margin: .8rem 0; font-size: .9rem; } nav a { color: #0b5c96; margin-right: 1rem; white-space: nowrap; }
-@media print { body { max-width: none; padding: 0; font-size: 10pt; } nav { display: none; }
-  details::details-content { content-visibility: visible; block-size: auto; }
+.words td:first-child { white-space: nowrap; }
+figure { margin: .8rem 0 1.2rem; break-inside: avoid; }
+img { max-width: 100%; height: auto; display: block; background: #fff; }
+pre { background: var(--fill); padding: .8rem 1rem; overflow-x: auto; font-size: .82rem; line-height: 1.45; }
+nav { margin: .8rem 0; font-size: .9rem; }
+nav a { color: var(--link); margin-right: 1rem; display: inline-block; }
+.controls { display: flex; flex-wrap: wrap; gap: .4rem .9rem; align-items: center; font-size: .9rem; }
+.controls select, .controls button { font: inherit; color: var(--ink); background: var(--fill);
+  border: 1px solid var(--soft); border-radius: 4px; padding: .15rem .5rem; max-width: 100%; }
+.controls label { max-width: 100%; }
+.area { touch-action: pan-y; user-select: none; margin-top: .4rem; }
+.shapes { display: flex; flex-wrap: wrap; gap: .5rem; } .shapes svg { flex: 0 0 auto; }
+.told { min-height: 3em; font-variant-numeric: tabular-nums; font-size: .9rem; }
+svg { display: block; max-width: 100%; height: auto; } svg text { fill: var(--soft); font-size: 11px; }
+svg .title { fill: var(--ink); font-size: 12px; }
+svg path, svg line { fill: none; stroke-width: 1.6; vector-effect: non-scaling-stroke; }
+svg .grid { stroke: var(--line); stroke-width: 1; } svg .cursor { stroke: var(--soft); stroke-width: 1; }
+svg .zoom { fill: var(--soft); opacity: .2; }
+svg .measured { stroke: var(--ink); opacity: .75; } svg .identified { stroke: var(--found); }
+svg .recorded, svg .rest { stroke: var(--soft); opacity: .6; stroke-width: 1; } svg .left { stroke: var(--left); }
+svg .noise { stroke: var(--soft); stroke-dasharray: 5 3; } svg .band { stroke: var(--found); stroke-dasharray: 2 3; }
+svg .dot { fill: var(--found); } svg .base { fill: var(--soft); }
+.key { border-top: 3px solid var(--soft); font-size: .85rem; } .key.measured { border-color: var(--ink); }
+.key.identified { border-color: var(--found); } .key.left { border-color: var(--left); }
+.key.noise { border-top-style: dashed; } .key.band { border-top: 3px dotted var(--found); }
+[hidden] { display: none !important; } .paper { display: none; }
+@media (max-width: 600px) { body { padding: .8rem .8rem 3rem; font-size: 14px; } th, td { padding: .2rem .4rem; }
+  h1 { font-size: 1.25rem; } }
+@media print { body { max-width: none; padding: 0; font-size: 10pt; }
+  nav, .controls, .area, .told { display: none; } .modes { break-inside: auto; }
+  .paper { display: block; } .sheet, .shapes svg { break-inside: avoid; } .shapes { display: block; }
+  .shapes svg { display: inline-block; }
   .scroll { overflow: visible; } table { font-size: 7.5pt; } .wide { font-size: 5.5pt; }
-  th, td { padding: .1rem .3rem; }
-  h2 { break-after: avoid; } pre { white-space: pre-wrap; } }
+  th, td { padding: .1rem .3rem; } tr { break-inside: avoid; }
+  h2, h3, figcaption { break-after: avoid; } h2 + *, h3 + *, .soft + * { break-before: avoid; }
+  .soft { break-after: avoid; }
+  pre { white-space: pre-wrap; } }
 """
 
 
@@ -82,15 +118,15 @@ def paragraph(value: object, kind: str = "") -> str:
     return f"<p{_class(kind)}>{text(value)}</p>"
 
 
+def sentence(words: str) -> str:
+    """Begin with a capital, end with a stop."""
+    return words[:1].upper() + words[1:] + ("" if words.endswith((".", "!")) else ".")
+
+
 def bullets(sentences: Iterable[object]) -> str:
     """Set a list of plain sentences; nothing where there are none."""
     items = "".join(f"<li>{text(s)}</li>" for s in sentences)
     return f"<ul>{items}</ul>" if items else ""
-
-
-def fold(heading: object, content: str, *, opened: bool = False) -> str:
-    """Set content that its heading unfolds."""
-    return f"<details{' open' if opened else ''}><summary>{text(heading)}</summary>\n{content}\n</details>"
 
 
 def beside(*parts: str) -> str:
@@ -155,20 +191,25 @@ def picture(
     return f"<figure>{image}{_caption(caption, label)}</figure>"
 
 
-def page(title: object, head: str, sections: Iterable[tuple[str, str]]) -> str:
-    """Join the sections, (heading, content), to a page with links to each; empty ones are left out."""
+def page(title: object, head: str, sections: Iterable[tuple[str, str]], script: str = "") -> str:
+    """Join the sections, (heading, content), to a page with links to each; empty ones are left out.
+
+    Nothing runs in it but `script`, as the page says to the browser.
+    """
     kept = [(name, content) for name, content in sections if content]
     links = " ".join(f'<a href="#s{i}">{text(name)}</a>' for i, (name, _) in enumerate(kept))
     body = "\n".join(
         f'<section><h2 id="s{i}">{text(name)}</h2>\n{content}\n</section>' for i, (name, content) in enumerate(kept)
     )
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta http-equiv="Content-Security-Policy" '
-        "content=\"default-src 'none'; img-src data:; style-src 'unsafe-inline'\">\n"
+        f"content=\"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'\">\n"
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{text(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
-        f"<h1>{text(title)}</h1>\n{head}\n<nav>{links}</nav>\n{body}\n</body>\n</html>\n"
+        f"<h1>{text(title)}</h1>\n{head}\n<nav>{links}</nav>\n{body}\n<script>{script}</script>\n"
+        "</body>\n</html>\n"
     )
 
 

@@ -9,14 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid import plot
-from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.plot.canvas import own_style
-from sysid.plot.panels import run_names
 from sysid.problem.formulation import MATRICES
 from sysid.problem.problem import Problem
-from sysid.report.html import Cell, beside, bullets, fold, matrix, number, page, paragraph, picture, table, text
+from sysid.report.curves import curves, mode_shapes, script
+from sysid.report.html import Cell, beside, bullets, matrix, number, page, paragraph, picture, sentence, table, text
 from sysid.report.matrices import CHOSEN, ONE_OF_MANY, SAME, Lines, half_widths, matrices, stated
+from sysid.report.opening import opening, trust
 from sysid.results.gain_table import gains_of_sensors
 from sysid.results.identification import Identification
 from sysid.results.noise_table import noise_of_channels
@@ -28,11 +28,9 @@ from sysid.results.summary import (
     is_one_of_many,
     known_half_width,
     mass_percent_std,
-    next_steps,
     noise_source,
     residual_in_words,
     tilde,
-    verdict,
 )  # fmt: skip
 from sysid.results.unknowns_table import rows_of, stated_values
 from sysid.results.version import __version__
@@ -108,71 +106,31 @@ def render(identification: Identification) -> str:
     it = identification
     return page(
         _title(it),
-        _verdict(it),
+        opening(it),
         [
-            ("Unknowns", _unknowns(it)),
+            ("How far to trust it", trust(it)),
             ("Modes", _modes(it)),
-            ("Rigid-body mass", _rigid_body_mass(it)),
+            ("Mode shapes", mode_shapes(it)),
+            ("Total mass", _rigid_body_mass(it)),
+            ("Unknowns", _unknowns(it)),
+            ("Matrices", matrices(it)),
             ("Measured against identified", _responses(it, it.measurement)),
-            ("Base force", _base_force(it, it.measurement)),
+            ("Validation", _validation(it)),
+            ("Further tests", _further(it)),
             ("Noise", _noise(it)),
             ("Gains", _gains(it)),
             ("Outliers", _outliers(it)),
-            ("Further tests", _further(it)),
-            ("Validation", _validation(it)),
             ("Poles in the data", _poles(it)),
-            ("Convergence", _convergence(it)),
             ("Modal assurance criterion", _mac(it)),
             ("Effective masses", _effective_masses(it)),
-            ("Mode shapes", _mode_shapes(it)),
-            ("Matrices", matrices(it)),
-            ("What ran", _what_ran(it)),
+            ("How it was found", _how(it) + _convergence(it) + _what_ran(it)),
         ],
+        script(),
     )
 
 
 def _title(it: Identification) -> str:
     return f"Identification of {PurePath(it.recipe.module).stem}" if it.recipe else "Identification"
-
-
-def _verdict(it: Identification) -> str:
-    test, n, d = it.measurement, it.structure.n, it.structure.n_base
-    sensors = f" seen by {test.n_sensors} sensors" * (n != test.n_sensors)
-    head = paragraph(
-        f"{n} degrees of freedom{sensors}, {counted(d, 'base direction')} "
-        f"({', '.join(test.base_axes or ())}), {counted(test.n_runs, 'run')}, "
-        f"{test.lines_in_words}",
-        "soft",
-    )
-    word = "Interrupted: the best until then" if it.interrupted else "Success" if it.success else "No success"
-    all_records = "over the relative accelerations of all runs, sensors and lines, unweighted"
-    all_records += "; outliers that stand alone are left out" * (it.problem.loss == "huber")
-    of = all_records if it.residuals else "of the misfit that the problem states"
-    lines = [
-        it.message,
-        f"Relative residual {residual_in_words(it)}, {of}.",
-        f"Objective {it.objective:.3e}: all that is fitted, each record weighted by its noise.",
-    ]
-    if it.force_residual is not None:
-        lines.append(f"Of the base force: {it.force_residual:.3e}.")
-    head += _framed("good" if it.success else "bad", word, "".join(map(paragraph, lines)))
-    steps, lines = next_steps(it), []
-    if it.closed_by:
-        lines.append("What fixes it:")
-    if steps:
-        lines.append(
-            "Frequencies, damping ratios and the responses to base motion hold for all of them; the mass, "
-            "stiffness and damping matrices below are one choice. What is open:"
-        )
-    told = bullets(map(_sentence, it.closed_by + it.undetermined))
-    content = "".join(map(paragraph, lines)) + told + "".join(paragraph(_sentence(step)) for step in steps)
-    head += _framed("good" if it.determined else "warn", verdict(it), content)
-    return head + "".join(paragraph(_sentence(remark), "soft") for remark in it.remarks)
-
-
-def _framed(kind: str, heading: str, content: str) -> str:
-    """A box with a coloured edge: "good", "warn" or "bad"."""
-    return f'<div class="verdict {kind}"><strong>{text(heading)}</strong>{content}</div>'
 
 
 def _unknowns(it: Identification) -> str:
@@ -186,7 +144,7 @@ def _unknowns(it: Identification) -> str:
     if not rows:
         return ""
     head = ("unknown", "value", "±", "unit", "lower", "upper", "")
-    told = bullets(_sentence(s) for s in stated_values(it))
+    told = bullets(sentence(s) for s in stated_values(it))
     return table(head, rows, "± is half of the 95 % interval that noise leaves; open: the data do not tell.") + told
 
 
@@ -248,43 +206,20 @@ def _rigid_body_mass(it: Identification) -> str:
 
 
 def _responses(it: Identification, test: Measurement) -> str:
-    words = (_PER_UNIT if test.has_unit_runs else _AS_MOVED) + " The difference of the two is drawn faint."
-    u, band = it.quick_uncertainty, None
-    if u is not None:
-        band = u.transmissibility(test.freq)
-        words += " The shade around the identified curve, where it is wide enough to be seen, is its 95 % interval."
-    dpi = 130 if test.n_sensors * test.n_runs <= _MANY_PANELS else 92
+    words = _PER_UNIT if test.has_unit_runs else _AS_MOVED
     own = _as_fitted(it, test)
-    words += " Relative residuals leave out the outliers that stand alone, as that of the whole test does." * (
-        own is not test
-    )
-    parts = [paragraph(words, "soft")]
-    for s, (name, score) in enumerate(zip(test.sensor_names, scores(it.structure, own).relative, strict=True)):
-        alt = f"{name}: measured and identified response, {', '.join(run_names(test))}"
-        drawn = picture(plot.responses(it, s, measurement=test, band=band), alt, dpi=dpi)
-        heading = f"{name}: relative residual {number(1 - score, 3)}" if np.isfinite(score) else name
-        parts.append(fold(heading, drawn, opened=s == 0))
-    return "\n".join(parts)
+    scored = zip(test.sensor_names, scores(it.structure, own).relative, strict=True)
+    rows = [(name, number(1 - score, 3)) for name, score in scored]
+    left_out = " Outliers that stand alone are left out." * (own is not test)
+    caption = f"‖predicted - measured‖ / ‖measured‖ of the accelerations relative to the base.{left_out}"
+    if test.force is not None:
+        rows.append(("base force", number(own.force_residual(it.structure), 3)))
+    return paragraph(words, "soft") + curves(it, test) + table(("channel", "relative residual"), rows, caption)
 
 
 def _as_fitted(it: Identification, test: Measurement) -> Measurement:
     """The test with the records whose residual is told: of the one that was fitted, without what stands alone."""
     return it.problem.screened.measurement if test is it.measurement else test
-
-
-def _base_force(it: Identification, test: Measurement) -> str:
-    if test.force is None:
-        return ""
-    own = _as_fitted(it, test)
-    aside = ", outliers that stand alone left out" * (own is not test)
-    residual = f"Relative residual over all of it{aside}: {number(own.force_residual(it.structure))}"
-    parts = [paragraph(f"Force of the base on the structure. {residual}.", "soft")]
-    u = it.quick_uncertainty
-    band = None if u is None else u.base_force(test.freq)
-    for r, name in enumerate(run_names(test)):
-        alt = f"measured and identified base force, {name}"
-        parts.append(picture(plot.base_forces(it, r, measurement=test, band=band), alt))
-    return "\n".join(parts)
 
 
 def _noise(it: Identification) -> str:
@@ -345,7 +280,6 @@ def _validation(it: Identification) -> str:
             paragraph(f"{_residual(test, it.structure)}."),
             _score_table(it, test),
             _responses(it, test),
-            _base_force(it, test),
         ]
     if parts:
         parts.append(
@@ -380,6 +314,8 @@ def _poles(it: Identification) -> str:
 
 def _convergence(it: Identification) -> str:
     history = it.history
+    if not rows_of_phases(it):
+        return ""
     steps = max(history.local_curve.size - 1, 0)
     refined = "eigenvalues replaced by those given"
     if np.isfinite(history.refinement_error):
@@ -420,12 +356,20 @@ def _effective_masses(it: Identification) -> str:
     return paragraph(words, "soft") + picture(plot.effective_masses(it), alt, caption, label=label)
 
 
-def _mode_shapes(it: Identification) -> str:
-    try:
-        figure = plot.mode_shapes(it)
-    except InputError:  # no positions: no picture
-        return ""
-    return picture(figure, "mode shapes", "Sticks join neighbouring sensors; grey: at rest.")
+def _how(it: Identification) -> str:
+    """What was minimised and how it ended, in the words of the search."""
+    all_records = "over the relative accelerations of all runs, sensors and lines, unweighted"
+    all_records += "; outliers that stand alone are left out" * (it.problem.loss == "huber")
+    of = all_records if it.residuals else "of the misfit that the problem states"
+    lines = [
+        f"{'Success' if it.success else 'No success'}: {it.message}.",
+        *map(sentence, it.remarks[:1]),
+        f"Relative residual {residual_in_words(it)}, {of}.",
+        f"Objective {it.objective:.3e}: all that is fitted, each record weighted by its noise.",
+    ]
+    if it.force_residual is not None:
+        lines.append(f"Of the base force: {it.force_residual:.3e}.")
+    return "".join(map(paragraph, lines))
 
 
 def _what_ran(it: Identification) -> str:
@@ -460,11 +404,6 @@ def _difference(value: float, reference: float) -> str:
         return "–"
     share = value / reference - 1
     return f"{100 * share:+.2g}" if abs(share) > SAME else "0"
-
-
-def _sentence(words: str) -> str:
-    """Begin with a capital, end with a stop."""
-    return words[:1].upper() + words[1:] + ("" if words.endswith((".", "!")) else ".")
 
 
 def _models(problem: Problem) -> list[list[object]]:

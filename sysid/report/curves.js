@@ -1,0 +1,349 @@
+// Draws the curves and mode shapes of the page from the numbers that stand beside them.
+"use strict";
+
+const SVG = "http://www.w3.org/2000/svg";
+const MARGIN = { left: 62, right: 12, top: 20, bottom: 30 };
+const LEAST = 5; // lines that remain when zooming in
+
+function element(parent, name, attributes = {}, words = "") {
+  const made = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  made.textContent = words;
+  parent.append(made);
+  return made;
+}
+
+function drawn(parent, name, attributes = {}, words = "") {
+  const made = document.createElementNS(SVG, name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  if (words) made.textContent = words;
+  parent.append(made);
+  return made;
+}
+
+function numbers(packed) {
+  return new Float32Array(Uint8Array.from(atob(packed), (letter) => letter.charCodeAt(0)).buffer);
+}
+
+function choice(parent, label, names) {
+  const box = element(parent, "label", {}, label + " ");
+  const select = element(box, "select");
+  names.forEach((name, at) => element(select, "option", { value: at }, name));
+  box.hidden = names.length < 2;
+  return select;
+}
+
+function button(parent, words, action) {
+  const made = element(parent, "button", { type: "button" }, words);
+  made.addEventListener("click", action);
+  return made;
+}
+
+const significant = (value) => (Number.isFinite(value) ? Number(value.toPrecision(4)).toString() : "–");
+
+// --- axes -----------------------------------------------------------------------------------------------------------
+
+function ticksOf(low, high, count) {
+  const rough = (high - low) / count;
+  const power = 10 ** Math.floor(Math.log10(rough));
+  const step = [1, 2, 5, 10].map((k) => k * power).find((one) => one >= rough);
+  const ticks = [];
+  for (let at = Math.ceil(low / step - 1e-9) * step; at <= high + 1e-9 * step; at += step) ticks.push(at);
+  return ticks;
+}
+
+function logTicks(low, high) {
+  const found = [];
+  const many = high / low > 1e4;
+  for (let power = Math.floor(Math.log10(low)); power <= Math.ceil(Math.log10(high)); power += 1) {
+    for (const k of high / low > 30 ? [1] : [1, 2, 5]) {
+      const tick = k * 10 ** power;
+      if (tick >= low && tick <= high && (!many || power % 2 === 0)) found.push(tick);
+    }
+  }
+  return found.length > 1 ? found : ticksOf(low, high, 4);
+}
+
+function scale(low, high, from, to, log) {
+  const [a, b] = log ? [Math.log(low), Math.log(high)] : [low, high];
+  const along = (value) => from + (((log ? Math.log(value) : value) - a) / (b - a)) * (to - from);
+  along.back = (pixel) => {
+    const value = a + ((pixel - from) / (to - from)) * (b - a);
+    return log ? Math.exp(value) : value;
+  };
+  along.ticks = log ? logTicks(low, high) : ticksOf(low, high, 4);
+  return along;
+}
+
+function line(x, y, freq, values, first, last) {
+  let path = "";
+  let pen = "M";
+  for (let at = first; at <= last; at += 1) {
+    if (Number.isFinite(values[at]) && Number.isFinite(y(values[at]))) {
+      path += `${pen}${x(freq[at]).toFixed(1)} ${y(values[at]).toFixed(1)}`;
+      pen = "L";
+    } else pen = "M";
+  }
+  return path;
+}
+
+// One panel of curves: an array of {kind, values}, over the lines from `first` to `last`.
+function panel(svg, top, height, width, x, freq, [first, last], curves, title, options) {
+  const inner = [top + MARGIN.top, top + height - MARGIN.bottom];
+  let [low, high] = [Infinity, -Infinity];
+  for (const { values } of curves) {
+    for (let at = first; at <= last; at += 1) {
+      if (Number.isFinite(values[at]) && (!options.log || values[at] > 0)) {
+        low = Math.min(low, values[at]);
+        high = Math.max(high, values[at]);
+      }
+    }
+  }
+  if (options.range) [low, high] = options.range;
+  if (!(high > low)) [low, high] = options.log ? [(low || 1) / 2, (high || 1) * 2] : [low - 1, high + 1];
+  if (options.log) [low, high] = [Math.max(low, high * 1e-9) / 1.3, high * 1.3];
+  const y = scale(low, high, inner[1], inner[0], options.log);
+  const ticks = options.ticks || y.ticks;
+  for (const tick of ticks) {
+    drawn(svg, "line", { x1: MARGIN.left, x2: width - MARGIN.right, y1: y(tick), y2: y(tick), class: "grid" });
+    drawn(svg, "text", { x: MARGIN.left - 6, y: y(tick) + 4, "text-anchor": "end" }, significant(tick));
+  }
+  for (const tick of x.ticks) {
+    drawn(svg, "line", { x1: x(tick), x2: x(tick), y1: inner[0], y2: inner[1], class: "grid" });
+    if (options.bottom) drawn(svg, "text", { x: x(tick), y: inner[1] + 16, "text-anchor": "middle" }, significant(tick));
+  }
+  drawn(svg, "text", { x: MARGIN.left, y: top + 13, class: "title" }, title);
+  if (options.bottom) {
+    drawn(svg, "text", { x: width - MARGIN.right, y: top + height - 2, "text-anchor": "end" }, "frequency, Hz");
+  }
+  for (const { kind, values } of curves) drawn(svg, "path", { d: line(x, y, freq, values, first, last), class: kind });
+}
+
+// --- responses ------------------------------------------------------------------------------------------------------
+
+function spectra(data, channel, run) {
+  const of = ([re, im]) => [numbers(re), numbers(im)];
+  const size = ([re, im]) => re.map((value, at) => Math.hypot(value, im[at]));
+  const turn = ([re, im]) => re.map((value, at) => (Math.atan2(im[at], value) * 180) / Math.PI);
+  const [measured, identified] = [of(channel.measured[run]), of(channel.identified[run])];
+  const left = [measured[0].map((v, at) => v - identified[0][at]), measured[1].map((v, at) => v - identified[1][at])];
+  return {
+    measured: size(measured), identified: size(identified), phase: turn(measured), phaseIdentified: turn(identified),
+    left: size(left), noise: channel.noise && numbers(channel.noise[run]),
+    recorded: channel.recorded && numbers(channel.recorded[run]), band: channel.band && numbers(channel.band[run]),
+  };
+}
+
+function drawCurves(parent, freq, channel, values, [first, last], width, heights, recorded = false) {
+  const total = heights.reduce((sum, one) => sum + one, 0);
+  const svg = drawn(parent, "svg", { viewBox: `0 0 ${width} ${total}`, width, height: total, role: "img" });
+  drawn(svg, "title", {}, `${channel.name}: measured and identified ${channel.words}`);
+  const x = scale(freq[first], freq[last], MARGIN.left, width - MARGIN.right, freq[last] > 8 * freq[first] && freq[first] > 0);
+  const amplitude = [{ kind: "measured", values: values.measured }, { kind: "identified", values: values.identified }];
+  if (recorded) amplitude.unshift({ kind: "recorded", values: values.recorded });
+  const phase = [{ kind: "measured", values: values.phase }, { kind: "identified", values: values.phaseIdentified }];
+  const left = [{ kind: "left", values: values.left }];
+  for (const kind of ["noise", "band"]) if (values[kind]) left.push({ kind, values: values[kind] });
+  panel(svg, 0, heights[0], width, x, freq, [first, last], amplitude, `${channel.name}: ${channel.words}`, { log: true });
+  const turns = { range: [-185, 185], ticks: [-180, -90, 0, 90, 180] };
+  panel(svg, heights[0], heights[1], width, x, freq, [first, last], phase, "phase, degrees", turns);
+  const below = { log: true, bottom: true };
+  panel(svg, heights[0] + heights[1], heights[2], width, x, freq, [first, last], left, "what the fit leaves", below);
+  return { svg, x, total };
+}
+
+function startCurves(figure) {
+  const data = JSON.parse(figure.querySelector("script").textContent);
+  const freq = numbers(data.freq);
+  const bar = element(figure, "div", { class: "controls" });
+  const channels = choice(bar, "Channel", data.channels.map((one) => one.name));
+  const runs = choice(bar, "Run", data.runs);
+  const withTransients = element(bar, "label", {}, "");
+  const tick = element(withTransients, "input", { type: "checkbox" });
+  withTransients.append(" as recorded, with transients");
+  let range = [0, freq.length - 1];
+  const zoomed = (factor) => () => {
+    const middle = cursor === null ? (range[0] + range[1]) / 2 : cursor;
+    const half = Math.max((factor * (range[1] - range[0])) / 2, LEAST / 2);
+    range = [Math.max(0, Math.floor(middle - half)), Math.min(freq.length - 1, Math.ceil(middle + half))];
+    redraw();
+  };
+  button(bar, "Zoom in", zoomed(0.5));
+  button(bar, "Zoom out", zoomed(2));
+  button(bar, "All lines", () => {
+    range = [0, freq.length - 1];
+    redraw();
+  });
+  element(bar, "span", { class: "key measured" }, "measured");
+  element(bar, "span", { class: "key identified" }, "identified");
+  element(bar, "span", { class: "key left" }, "their difference");
+  element(bar, "span", { class: "key noise" }, "noise (standard deviation)");
+  element(bar, "span", { class: "key band" }, "95 % interval of the identified");
+  const area = element(figure, "div", { class: "area", tabindex: 0 });
+  area.setAttribute("aria-label", "Curves: arrow keys move the cursor from line to line");
+  const told = element(figure, "p", { class: "told", role: "status" });
+  let [cursor, view, values, held] = [null, null, null, null];
+
+  function tell() {
+    if (cursor === null || cursor < range[0] || cursor > range[1]) cursor = null;
+    view.mark?.remove();
+    if (cursor === null) {
+      told.textContent = "Point at the curves for values; drag across them to zoom, double click for all lines.";
+      return;
+    }
+    const at = view.x(freq[cursor]);
+    view.mark = drawn(view.svg, "line", { x1: at, x2: at, y1: MARGIN.top, y2: view.total - MARGIN.bottom, class: "cursor" });
+    const noise = values.noise ? `, noise ${significant(values.noise[cursor])}` : "";
+    const band = values.band ? `, 95 % interval ± ${significant(values.band[cursor])}` : "";
+    told.textContent =
+      `${significant(freq[cursor])} Hz: measured ${significant(values.measured[cursor])} at ` +
+      `${values.phase[cursor].toFixed(0)}°, identified ${significant(values.identified[cursor])} at ` +
+      `${values.phaseIdentified[cursor].toFixed(0)}°, difference ${significant(values.left[cursor])}${noise}${band}`;
+  }
+
+  function redraw() {
+    const channel = data.channels[channels.value];
+    values = spectra(data, channel, runs.value);
+    withTransients.hidden = !values.recorded;
+    for (const kind of ["noise", "band"]) bar.querySelector(`.${kind}`).hidden = !values[kind];
+    area.replaceChildren();
+    const width = Math.max(300, Math.min(1072, area.clientWidth));
+    view = drawCurves(area, freq, channel, values, range, width, [230, 120, 150], tick.checked && values.recorded);
+    tell();
+  }
+
+  function lineAt(event) {
+    const box = view.svg.getBoundingClientRect();
+    const wanted = view.x.back(((event.clientX - box.left) / box.width) * view.svg.viewBox.baseVal.width);
+    let best = range[0];
+    for (let at = range[0]; at <= range[1]; at += 1) if (Math.abs(freq[at] - wanted) < Math.abs(freq[best] - wanted)) best = at;
+    return best;
+  }
+
+  area.addEventListener("pointermove", (event) => {
+    cursor = lineAt(event);
+    tell();
+    view.zoom?.remove();
+    if (held === null) return;
+    const ends = [view.x(freq[held]), view.x(freq[cursor])].sort((a, b) => a - b);
+    view.zoom = drawn(view.svg, "rect", { x: ends[0], width: ends[1] - ends[0], y: 0, height: view.total, class: "zoom" });
+  });
+  area.addEventListener("pointerdown", (event) => {
+    if (event.pointerType !== "touch") held = lineAt(event);
+  });
+  window.addEventListener("pointerup", (event) => {
+    if (held === null) return;
+    const ends = [held, lineAt(event)].sort((a, b) => a - b);
+    held = null;
+    if (ends[1] - ends[0] >= LEAST) range = ends;
+    redraw();
+  });
+  area.addEventListener("dblclick", () => {
+    range = [0, freq.length - 1];
+    redraw();
+  });
+  area.addEventListener("keydown", (event) => {
+    const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+    if (!step) return;
+    event.preventDefault();
+    cursor = Math.max(range[0], Math.min(range[1], (cursor ?? range[0] - step) + step));
+    tell();
+  });
+  for (const control of [channels, runs, tick]) control.addEventListener("change", redraw);
+  window.addEventListener("resize", redraw);
+  redraw();
+  return () => {
+    const paper = element(figure, "div", { class: "paper" });
+    for (const channel of data.channels) {
+      data.runs.forEach((name, run) => {
+        const part = element(paper, "div", { class: "sheet" });
+        if (data.runs.length > 1) element(part, "p", {}, name);
+        drawCurves(part, freq, channel, spectra(data, channel, run), [0, freq.length - 1], 680, [170, 90, 110]);
+      });
+    }
+    return paper;
+  };
+}
+
+// --- mode shapes ----------------------------------------------------------------------------------------------------
+
+// What the eye sees of a point from an angle about the vertical, slightly from above: to the right, and down.
+function seen([x, y, z], angle) {
+  const [c, s] = [Math.cos(angle), Math.sin(angle)];
+  return [c * x - s * y, -0.95 * z + 0.3 * (s * x + c * y)];
+}
+
+function middleOf(data) {
+  return [0, 1, 2].map((i) => {
+    const own = data.points.map((point) => point[i]);
+    return (Math.min(...own) + Math.max(...own)) / 2;
+  });
+}
+
+function drawMode(parent, data, mode, width, height) {
+  const svg = drawn(parent, "svg", { viewBox: `0 0 ${width} ${height}`, width, height, role: "img" });
+  drawn(svg, "title", {}, data.names[mode]);
+  const middle = middleOf(data);
+  const from = (point) => point.map((v, i) => v - middle[i]);
+  const every = data.shapes.flatMap((shape) => data.points.map((point, p) => from(point).map((v, i) => Math.abs(v) + Math.abs(shape[p][i]))));
+  const wide = Math.max(...every.map(([x, y]) => Math.hypot(x, y)));
+  const high = Math.max(...every.map((point) => point[2]));
+  const size = Math.min((width - 40) / (2 * wide || 1), (height - 60) / (1.9 * high + 0.6 * wide || 1));
+  const place = (point, angle) => {
+    const [x, y] = seen(from(point), angle);
+    return [width / 2 + size * x, (height + 30) / 2 + size * y];
+  };
+  const stick = (kind) => data.sticks.map(() => drawn(svg, "line", { class: kind }));
+  const [rest, moved] = [stick("rest"), stick("identified")];
+  const dots = data.points.map((_, p) => drawn(svg, "circle", { r: p ? 3 : 0, class: "dot" }));
+  const base = drawn(svg, "rect", { width: 44, height: 6, class: "base" });
+  const named = drawn(svg, "text", {}, "base");
+  data.names[mode].split(", ").forEach((words, at) => {
+    drawn(svg, "text", { x: width / 2, y: 13 + 14 * at, "text-anchor": "middle", class: at ? "" : "title" }, words);
+  });
+  const put = (one, values) => Object.entries(values).forEach(([key, value]) => one.setAttribute(key, value));
+  const join = (lines, places) => lines.forEach((one, at) => {
+    const [start, end] = data.sticks[at].map((p) => places[p]);
+    put(one, { x1: start[0], y1: start[1], x2: end[0], y2: end[1] });
+  });
+  return (share, angle) => {
+    join(rest, data.points.map((point) => place(point, angle)));
+    const places = data.points.map((point, p) => place(point.map((v, i) => v + share * data.shapes[mode][p][i]), angle));
+    join(moved, places);
+    dots.forEach((dot, p) => put(dot, { cx: places[p][0], cy: places[p][1] }));
+    const [x, y] = place(data.points[0], angle);
+    put(base, { x: x - 22, y: y - 3 });
+    put(named, { x: x + 26, y: y + 5 });
+  };
+}
+
+function startModes(figure) {
+  const data = JSON.parse(figure.querySelector("script").textContent);
+  const bar = element(figure, "div", { class: "controls" });
+  const area = element(figure, "div", { class: "shapes" });
+  const moves = data.names.map((_, mode) => drawMode(area, data, mode, 210, 260));
+  let [running, begun] = [false, 0];
+  const play = button(bar, "Move", () => {
+    running = !running;
+    play.textContent = running ? "Stop" : "Move";
+    begun = performance.now();
+    if (running) requestAnimationFrame(step);
+    else draw(1);
+  });
+  const turn = element(element(bar, "label", {}, "View from "), "input", { type: "range", min: 0, max: 360, value: 30 });
+  const draw = (share) => moves.forEach((move) => move(share, (turn.value * Math.PI) / 180));
+  turn.addEventListener("input", () => running || draw(1));
+  function step(now) {
+    if (!running) return;
+    draw(Math.cos((now - begun) / 250));
+    requestAnimationFrame(step);
+  }
+  draw(1);
+}
+
+document.querySelectorAll("figure.modes").forEach(startModes);
+// On paper every channel stands, in place of the one that is chosen.
+const sheets = [...document.querySelectorAll("figure.curves")].map(startCurves);
+let papers = [];
+window.addEventListener("beforeprint", () => { papers = sheets.map((sheet) => sheet()); });
+window.addEventListener("afterprint", () => papers.forEach((paper) => paper.remove()));
