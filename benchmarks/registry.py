@@ -94,6 +94,9 @@ BENCHMARKS = (
     Benchmark("records.record_speed", "seconds and memory from records in time to a judged result", "1 min", "10 s"),
     Benchmark("records.measured_records", "measured records: stated deviations against a jackknife", "1 min", "30 s"),
     Benchmark("records.gain_errors", "a sensor 2 % wrong: silent cases, and right ones accused", "3 min", "10 s"),
+    Benchmark(
+        "files.read_files", "one test as CSV, MAT, UFF 58 and 58b: masses after read, run and export", "40 s", "12 s"
+    ),
     Benchmark("files.exported_files", "exported files read by other programs: what they keep", "20 s", "10 s"),
     Benchmark("house", "imports one way, tests of types, branches, sizes of functions and files", "2 s", "2 s"),
 )

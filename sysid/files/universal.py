@@ -22,6 +22,8 @@ _READ = (1, 4, 12)
 _DIRECTIONS = {1: "x", 2: "y", 3: "z", 4: "rx", 5: "ry", 6: "rz"}
 _SPECIFIC = {8: "m", 9: "N", 11: "m/s", 12: "m/s²", 13: "N"}  # data types whose unit is SI where no label says another
 _MARK = re.compile(rb"^    -1[ \t]*\r?$", re.MULTILINE)
+_BINARY = re.compile(rb"\s*58b\s+\d+\s+\d+\s+(\d+)\s+(\d+)[^\n]*\n")  # lines of text and bytes that follow
+_AFTER_BYTES = re.compile(rb"\s*    -1")
 _NO_LABEL = ("", "NONE")
 
 
@@ -61,13 +63,13 @@ def _sets(path: Path) -> list[dict[str, Any]]:
     except ImportError:
         raise InputError(f"{path}: universal files need pyuff: pip install 'structural-sysid[uff]'") from None
     try:
-        marks = len(_MARK.findall(path.read_bytes()))
+        whole, ends = _counted(path.read_bytes())
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
-    if not marks:
+    if not whole and ends:
         raise InputError(f"{path} is no universal file: it has no line '    -1', by which a set begins and ends")
-    if marks % 2:
-        raise InputError(f"{path} is cut short: its last set, number {marks // 2 + 1}, does not end; export it again")
+    if not ends:
+        raise InputError(f"{path} is cut short: its last set, number {whole + 1}, does not end; export it again")
     file, sets = pyuff.UFF(str(path)), []
     for at, kind in enumerate(file.get_set_types()):
         try:
@@ -78,6 +80,27 @@ def _sets(path: Path) -> list[dict[str, Any]]:
                 "another type than it says? Export it again"
             ) from None
     return sets
+
+
+def _counted(content: bytes) -> tuple[int, bool]:
+    """How many sets are whole, and whether the last one ends.
+
+    The bytes of a binary set, in which a mark may stand, are stepped over.
+    """
+    at, whole = 0, 0
+    while (begun := _MARK.search(content, at)) is not None:
+        at, binary = begun.end(), _BINARY.match(content, begun.end())
+        if binary is None:
+            end = _MARK.search(content, at)
+        else:
+            at = binary.end()
+            for _ in range(int(binary[1])):
+                at = content.find(b"\n", at) + 1 or len(content)
+            end = _AFTER_BYTES.match(content, at + int(binary[2]))
+        if end is None:
+            return whole, False
+        at, whole = end.end(), whole + 1
+    return whole, True
 
 
 def _scale(sets: Sequence[dict[str, Any]]) -> float:

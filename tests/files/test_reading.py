@@ -10,7 +10,7 @@ import scipy.io
 
 import sysid
 from sysid.cli import main as cli
-from sysid.files import reading, recorded_test
+from sysid.files import reading, recorded_test, universal
 
 G = 9.80665
 FREQ = np.arange(1, 401) * 0.05
@@ -228,3 +228,13 @@ def test_three_commands_from_a_table_to_a_result(tmp_path, monkeypatch, capsys):
     np.testing.assert_allclose(np.diag(mass)[:3], [4, 3, 2], rtol=1e-6)
     assert cli.main(["new", "mine", "--data", "test.h5"]) == 0
     assert cli.main(["show", "mine.py"]) == 0
+
+
+@pytest.mark.parametrize("cut", [0, 3, 40])
+def test_the_bytes_of_a_binary_set_are_no_marks(cut):
+    data = b"\n    -1\n" + bytes(8)
+    head = f"    -1\n    58b     1     2          11{len(data):12d}     0     0           0           0\n"
+    one = head.encode() + b"text\n" * 11 + data + b"    -1\n"
+    text = b"    -1\n   151\nheader\n    -1\n"
+    content = text + one + one
+    assert universal._counted(content[: len(content) - cut]) == ((3, True) if cut == 0 else (2, False))
