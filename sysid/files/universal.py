@@ -23,7 +23,8 @@ _DIRECTIONS = {1: "x", 2: "y", 3: "z", 4: "rx", 5: "ry", 6: "rz"}
 _SPECIFIC = {8: "m", 9: "N", 11: "m/s", 12: "m/s²", 13: "N"}  # data types whose unit is SI where no label says another
 _MARK = re.compile(rb"^    -1[ \t]*\r?$", re.MULTILINE)
 _BINARY = re.compile(rb"\s*58b\s+\d+\s+\d+\s+(\d+)\s+(\d+)[^\n]*\n")  # lines of text and bytes that follow
-_AFTER_BYTES = re.compile(rb"\s*    -1")
+_AFTER_BYTES = re.compile(rb"\s*    -1[ \t]*\r?$", re.MULTILINE)
+_LAST_OR_BETWEEN = re.compile(rb"    -1[ \t]*\r?\n?(?=    -1[ \t]*\r?\n|\s*\Z)")
 _NO_LABEL = ("", "NONE")
 
 
@@ -96,7 +97,8 @@ def _counted(content: bytes) -> tuple[int, bool]:
             at = binary.end()
             for _ in range(int(binary[1])):
                 at = content.find(b"\n", at) + 1 or len(content)
-            end = _AFTER_BYTES.match(content, at + int(binary[2]))
+            # pyuff counts half of the bytes of complex numbers.
+            end = _AFTER_BYTES.match(content, at + int(binary[2])) or _LAST_OR_BETWEEN.search(content, at)
         if end is None:
             return whole, False
         at, whole = end.end(), whole + 1
