@@ -10,7 +10,7 @@ import numpy as np
 from sysid.export.content import deviations_of, matrices_of, names_of, rotations_of, statements, unit
 from sysid.results.identification import Identification
 
-PRECISION = "exact, 17 digits"
+PRECISION = "exact: each number has the up to 17 digits that give the same double-precision number when read"
 COLUMNS = ("matrix", "row", "column", "value", "deviation", "unit", "row_name", "column_name")
 _EMPTY = "an empty deviation: the entry is open, belongs to the base, or its deviation was not computed"
 

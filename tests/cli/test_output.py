@@ -4,6 +4,7 @@ import importlib.metadata
 import json
 import os
 import re
+import sys
 
 import numpy as np
 import pytest
@@ -118,3 +119,20 @@ def test_doctor_tells_what_is_missing_with_the_command_that_installs_it(capsys, 
     monkeypatch.setattr(doctor, "linear_solvers", list)
     assert cli.main(["doctor"]) == 2
     assert "IPOPT does not work" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "package", "extra"),
+    [
+        (["export", "FINISHED", "m.op4"], "pyyeti", "nastran"),
+        (["read", "shake.unv"], "pyuff", "uff"),
+        (["refine", "FINISHED", "--scheduler", "tcp://host:8786"], "distributed", "dask"),
+    ],
+)
+def test_a_missing_extra_is_one_line_with_the_command_that_installs_it(
+    here, complaint, finished, monkeypatch, words, package, extra
+):
+    (here / "shake.unv").write_text("    -1\n    58\n    -1\n")
+    monkeypatch.setitem(sys.modules, package, None)
+    assert cli.main([str(finished) if word == "FINISHED" else word for word in words]) == 2
+    assert complaint().endswith(f"needs the package {package}: python -m pip install 'structural-sysid[{extra}]'\n")

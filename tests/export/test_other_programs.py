@@ -31,6 +31,18 @@ def test_an_op4_file_keeps_every_number_and_its_superelement_answers_as_identifi
     assert read["determnd"][0, 0] == result.determined
     note = ["".join(map(chr, row.astype(int))).rstrip() for row in read["note"]]
     assert any(line.startswith("judgement: determined") for line in note)
+    rigid = np.r_[s.rigid_body[:, 0], 1.0, 0.0]  # 1 m/s² in x: no elastic force, 20 + 15 + 10 + 5 kg
+    assert np.abs(read["k"] @ rigid).max() < 1e-10 * np.abs(read["k"]).max()
+    assert rigid @ read["m"] @ rigid == pytest.approx(50.0, rel=1e-6)
+    assert np.array_equal(read["kcb"][:2], np.zeros((2, 5))) and read["mcb"][0, 0] == pytest.approx(50.0, rel=1e-6)
+
+
+def test_an_op4_file_notes_what_the_data_leave_open(noisy, tmp_path):
+    op4 = pytest.importorskip("pyyeti.nastran.op4")
+    read = op4.read(str(sysid.export(noisy[2], tmp_path / "m.op4")))
+    note = "\n".join("".join(map(chr, row.astype(int))).rstrip() for row in read["note"])
+    assert read["determnd"][0, 0] == 0
+    assert "judgement: NOT DETERMINED" in note and "open: all modal masses are open" in note
 
 
 def test_a_dmig_deck_keeps_ten_digits_and_answers_as_identified(result, tmp_path):
