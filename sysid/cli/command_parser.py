@@ -21,6 +21,12 @@ class Parser(argparse.ArgumentParser):
         raise InputError(f"{message} (see '{self.prog} --help')")
 
 
+def epilog(examples: tuple[str, ...], more: str = "") -> str:
+    """The end of a help: examples, a line each, then text that keeps its lines."""
+    shown = "\n".join(f"  {example}" for example in examples)
+    return f"examples:\n{shown}\n" + (f"\n{more}" if more else "")
+
+
 def adder(parser: argparse.ArgumentParser) -> Callable[..., argparse.ArgumentParser]:
     """A function that adds a command to a parser.
 
@@ -32,12 +38,11 @@ def adder(parser: argparse.ArgumentParser) -> Callable[..., argparse.ArgumentPar
     def add(
         name: str, *, summary: str, examples: tuple[str, ...], description: str = "", more: str = ""
     ) -> argparse.ArgumentParser:
-        shown = "\n".join(f"  {example}" for example in examples)
         command: Any = commands.add_parser(
             name,
             help=summary,
             description=textwrap.fill(description or f"{summary[0].upper()}{summary[1:]}.", _WIDTH),
-            epilog=f"examples:\n{shown}\n{more}",
+            epilog=epilog(examples, more),
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )

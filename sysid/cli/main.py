@@ -24,7 +24,7 @@ from typing import IO, Any, NoReturn, cast
 from sysid import catalogue
 from sysid.cli import doctor, export, parameters, read, starting, unfinished
 from sysid.cli.argument_types import band, count, orders, seconds, seed, whole
-from sysid.cli.command_parser import JSON, QUIET, Parser, adder
+from sysid.cli.command_parser import JSON, QUIET, Parser, adder, epilog
 from sysid.cli.display import display_on
 from sysid.cli.output import Output, collected_warnings, keep_for_document, strict_json
 from sysid.cli.status import BUG, INTERRUPTED, MISTAKE, NOT_REACHED, SUCCESS
@@ -229,10 +229,15 @@ def _parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog="sysid",
         description="Mass, stiffness and damping matrices of a structure from shaker-table tests.",
-        epilog="Exit status: 0 success, 1 the search did not reach its goal, 2 a mistake in what was given, "
-        "130 interrupted (the best so far is saved), 70 an error of sysid itself.",
+        epilog=epilog(
+            ("sysid run cantilever_tower", "sysid read sine.csv --sensors sensors.toml --out test.h5",
+             "sysid run test.h5 --mass 1450", "sysid export results/test test.bdf", "sysid run --help"),
+            "Exit status: 0 success, 1 the search did not reach its goal, 2 a mistake in what was\n"
+            "given, 130 interrupted (the best so far is saved), 70 an error of sysid itself.",
+        ),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
-    )
+    )  # fmt: skip
     parser.add_argument("--version", action="version", version=f"sysid {__version__}")
     command = adder(parser)
 
@@ -335,7 +340,7 @@ def _add_compare(command: Callable[..., argparse.ArgumentParser]) -> None:
         description="Run every strategy that applies and, where the extra 'benchmark' is installed, optimisers of "
         "pymoo, cma and SciPy on the objective of the swarm, with its number of evaluations and the same local phase. "
         "Prints one table and writes one picture, comparison.png.",
-        examples=("sysid compare shear_building --max-time 5 --out side_by_side",),
+        examples=("sysid compare shear_building --max-time 1 --out side_by_side",),
     )
     parameters.add_arguments(compare)
     compare.add_argument("--seed", type=seed, default=0, metavar="N", help="of all methods, 0 by default")
@@ -356,8 +361,8 @@ def _add_refine(command: Callable[..., argparse.ArgumentParser]) -> None:
         "from fresh points of the search space, or one of the other kinds below. Prints one table, and writes it and a "
         "picture. Results are kept as they come: the same command goes on where it was interrupted.",
         examples=(
-            "sysid refine results/my_building --starts 4",
-            "sysid refine results/my_building --draws 8 --workers 1",
+            "sysid refine results/noisy --starts 4",
+            "sysid refine results/noisy --draws 8 --workers 1",
             "sysid refine results/noisy --leave-out sensor --json",
         ),
     )

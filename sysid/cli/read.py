@@ -32,7 +32,7 @@ def add(command: Callable[..., argparse.ArgumentParser]) -> None:
         "Which column is which sensor is said in a TOML file or by --sensor; a TOML file of the name of the first "
         "file, or sensors.toml beside it, is found by itself.",
         examples=_EXAMPLES,
-        more=f"\nsensors.toml:\n{description.EXAMPLE}",
+        more=f"sensors.toml:\n{description.EXAMPLE}",
     )
     read.add_argument("files", metavar="FILE", nargs="+", help="of any known format; each is a run")
     read.add_argument("--out", metavar="TEST.h5", help="file to write, test.h5 by default")
