@@ -29,6 +29,13 @@ def document(capsys):
     return run
 
 
+@pytest.fixture
+def pair(here, no_pictures, capsys):
+    """The folder of a result."""
+    assert cli.main(["run", "pair.py", "--quiet"]) == 0
+    return here / "results/pair"
+
+
 def test_a_run_as_a_document_is_the_summary_with_its_files(here, document, no_pictures):
     status, told, error = document("run", "pair.py")
     assert status == 0
@@ -45,7 +52,7 @@ def test_nothing_that_is_printed_beside_it_gets_into_the_document(here, process,
     assert b"of Python" in done.stderr and b"of C" in done.stderr
 
 
-def test_every_command_that_tells_has_a_document(here, document, finished):
+def test_every_command_that_tells_has_a_document(pair, document):
     _, told, _ = document("list")
     assert "shear_building" in [one["name"] for one in told["problems"]]
     _, told, _ = document("show", "shear_building")
@@ -53,8 +60,8 @@ def test_every_command_that_tells_has_a_document(here, document, finished):
     assert (told["unknowns"], told["rank"], told["directions"]) == (8, 7, 8)
     assert {one["name"] for one in told["variables"] if one["unseen"]} == {"mass share"}
     assert document("new", "mine")[1]["files"] == ["mine.py", "test_mine.py"]
-    assert document("report", finished)[1]["files"] == [str(finished / "report.html")]
-    _, told, _ = document("export", finished, "pair.csv")
+    assert document("report", pair)[1]["files"] == [str(pair / "report.html")]
+    _, told, _ = document("export", pair, "pair.csv")
     assert told["files"] == ["pair.csv"] and told["precision"].startswith("exact")
 
 
@@ -124,15 +131,15 @@ def test_doctor_tells_what_is_missing_with_the_command_that_installs_it(capsys, 
 @pytest.mark.parametrize(
     ("words", "package", "extra"),
     [
-        (["export", "FINISHED", "m.op4"], "pyyeti", "nastran"),
+        (["export", "RESULT", "m.op4"], "pyyeti", "nastran"),
         (["read", "shake.unv"], "pyuff", "uff"),
-        (["refine", "FINISHED", "--scheduler", "tcp://host:8786"], "distributed", "dask"),
+        (["refine", "RESULT", "--scheduler", "tcp://host:8786"], "distributed", "dask"),
     ],
 )
 def test_a_missing_extra_is_one_line_with_the_command_that_installs_it(
-    here, complaint, finished, monkeypatch, words, package, extra
+    here, complaint, pair, monkeypatch, words, package, extra
 ):
     (here / "shake.unv").write_text("    -1\n    58\n    -1\n")
     monkeypatch.setitem(sys.modules, package, None)
-    assert cli.main([str(finished) if word == "FINISHED" else word for word in words]) == 2
+    assert cli.main([str(pair) if word == "RESULT" else word for word in words]) == 2
     assert complaint().endswith(f"needs the package {package}: python -m pip install 'structural-sysid[{extra}]'\n")
