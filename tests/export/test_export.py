@@ -10,7 +10,7 @@ from scipy.io import loadmat
 
 import sysid
 from sysid.cli.main import main
-from sysid.export.content import damping_of
+from sysid.export.content import damping_of, rotations_of, unit
 from sysid.export.state_space import control_system
 
 
@@ -77,6 +77,16 @@ def test_entries_that_the_data_leave_open_have_no_deviation(noisy, tmp_path):
     assert all(np.isnan(std).all() for std in (*deviations.values(), mat["M_std"], mat["K_std"], mat["C_std"]))
     about = [str(cell[0]) for cell in mat["about"][:, 0]]
     assert any(line.startswith("open: all modal masses are open") for line in about) and not mat["determined"][0, 0]
+
+
+def test_a_coordinate_that_no_sensor_records_has_no_unit(result):
+    s = result.structure
+    between = [[1, 0, 0], [0, 1, 0], [0, 0.5, 0.5]]  # the third sensor sees two coordinates
+    other = sysid.Structure(s.mass, s.stiffness, s.damping_ratios, n_base=2, recovery=between)
+    kinds = rotations_of(replace(result, structure=other))
+    assert kinds == (False, False, None, False, True)
+    assert [unit("M", kinds[0], kinds[j]) for j in range(5)] == ["kg", "kg", "", "kg", "kg m"]
+    assert unit("K", True, True) == "N m" and unit("C", True, None) == ""
 
 
 NEEDS = {"m.op4": ("pyyeti", "nastran"), "system": ("control", "control")}
