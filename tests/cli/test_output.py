@@ -128,6 +128,16 @@ def test_doctor_tells_what_is_missing_with_the_command_that_installs_it(capsys, 
     assert "IPOPT does not work" in capsys.readouterr().err
 
 
+def test_doctor_says_where_it_cannot_know_what_is_needed(capsys, monkeypatch):
+    def requires(name):
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "requires", requires)
+    monkeypatch.setattr(doctor, "linear_solvers", lambda: ["mumps"])
+    assert cli.main(["doctor"]) == 0
+    assert "imported from its folder, not installed" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "package", "extra"),
     [
