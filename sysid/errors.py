@@ -14,6 +14,7 @@ asked for, or raises an ``InputError``.
 
 from __future__ import annotations
 
+import importlib
 import math
 import operator
 from collections.abc import Sequence
@@ -37,6 +38,19 @@ class InputError(SysidError, ValueError):
 
 class SolverError(SysidError):
     """A numerical solver ended without a usable answer; the message has its status."""
+
+
+def how_to_install(extra: str) -> str:
+    """The command for an extra of the package, which works wherever it is installed."""
+    return f"python -m pip install 'structural-sysid[{extra}]'"
+
+
+def needed(package: str, extra: str, what: str) -> None:
+    """Refuse `what` where a package of an extra is not installed, with the command for it."""
+    try:
+        importlib.import_module(package)
+    except ImportError:
+        raise InputError(f"{what} needs the package {package}: {how_to_install(extra)}") from None
 
 
 def refuse(*mistakes: tuple[Any, str]) -> None:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import csv
 import importlib.util
+import os
+import subprocess
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -34,6 +36,7 @@ def lines(reduced: bool) -> Iterator[Line]:
             dmig = [_dmig(it, where) for it in results]
             yield below("DMIG: largest relative difference of an entry", max(m for m, _ in dmig), 5.1e-10)
             yield below("DMIG: transmissibility and base force by pyyeti", max(a for _, a in dmig), 1e-6)
+        yield from _by_pynastran(results[0], where)
         if importlib.util.find_spec("pyuff") is None:
             yield Line("UFF 55", "pyuff is not installed")
         else:
@@ -101,6 +104,30 @@ def _dmig(it: sysid.Identification, where: Path) -> tuple[float, float]:
     form, order = it.structure.to_craig_bampton(), [n, n + 1, *range(n)]
     right = form.mass[np.ix_(order, order)], form.stiffness[np.ix_(order, order)], form.recovery[:, order]
     return max(map(_difference, (M, K, R), right)), _answers(it, M, C, K, R)
+
+
+def _by_pynastran(it: sysid.Identification, where: Path) -> Iterator[Line]:
+    """What pyNastran reads, in the environment whose Python SYSID_PYNASTRAN names."""
+    python = os.environ.get("SYSID_PYNASTRAN")
+    if not python or importlib.util.find_spec("pyyeti") is None:
+        yield Line("OP4 and DMIG by pyNastran", "SYSID_PYNASTRAN names no Python with it, or pyyeti is missing")
+        return
+    for name in ("m.op4", "m.bdf"):
+        sysid.export(it, where / name)
+    alone = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    script = Path(__file__).with_name("read_by_pynastran.py")
+    subprocess.run([python, str(script), str(where)], check=True, env=alone, stdout=subprocess.DEVNULL)
+    with np.load(where / "read.npz") as read:
+        kept = max(_difference(read["M"], it.structure.mass), _difference(read["K"], it.structure.stiffness))
+        yield below("OP4 by pyNastran: largest relative difference of M and K", kept, 0)
+        digits = 0.0
+        for bulk, op4 in (("mcb", "MCB"), ("kcb", "KCB"), ("bcb", "CCB")):
+            # Points without an entry, such as the base in the stiffness, are not in what it gives.
+            at = [
+                (1, 5).index(component) if point == 1 else point - 999 for point, component in read[f"{bulk}_columns"]
+            ]
+            digits = max(digits, _difference(read[bulk], read[op4][np.ix_(at, at)]))
+        yield below("DMIG by pyNastran: largest relative difference of an entry", digits, 5.1e-10)
 
 
 def _answers(it: sysid.Identification, M: np.ndarray, C: np.ndarray, K: np.ndarray, R: np.ndarray) -> float:

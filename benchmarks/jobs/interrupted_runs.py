@@ -83,7 +83,7 @@ def _interrupted(folder: Path, when: float, times: int, apart: float) -> tuple[s
     if status not in (0, 130):
         return NOTHING, f"status {status}: {error.strip()}"
     if "result.h5" not in there:
-        swarm = "swarm  " in out
+        swarm = "swarm  " in error
         return NOTHING, f"nothing was saved, but there was a candidate: {error}" if swarm or there or not status else ""
     result = sysid.load(folder)
     if status == 0 or not result.interrupted:

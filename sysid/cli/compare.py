@@ -7,8 +7,8 @@ from pathlib import Path
 
 from sysid import catalogue
 from sysid.cli import parameters
-from sysid.cli.display import Output, complain
-from sysid.cli.files import png, results_folder, strict_json, write_files
+from sysid.cli.files import png, results_folder, write_files
+from sysid.cli.output import Output, strict_json
 from sysid.cli.status import INTERRUPTED, NOT_REACHED, SUCCESS
 from sysid.compare import peers, table
 from sysid.compare.comparison import Comparison, compare
@@ -29,16 +29,16 @@ def run(options: argparse.Namespace, out: Output) -> int:
         out.write("the problem has no reference, so errors of M, K and C are not known\n")
 
     def tell(result: MethodResult) -> None:
-        out.write(f"{table.line(result)}\n")
-        out.flush()
+        out.progress(f"{table.line(result)}\n")
 
     compared = compare(problem, rng=options.seed, max_time=options.max_time, listener=tell)
     if not compared.results:
         raise KeyboardInterrupt
     out.write(f"\n{table.text(compared)}\n\n")
+    out.answer(comparison={"problem": recipe.module, "parameters": recipe.parameters, **compared.to_dict()})
     _write(compared, recipe, folder, out, rows=options.out is not None)
     if compared.interrupted:
-        complain("interrupted; the table holds what there was until then")
+        out.complain("interrupted; the table holds what there was until then")
         return INTERRUPTED
     return SUCCESS if compared.success else NOT_REACHED
 

@@ -1,92 +1,29 @@
-"""What the commands print: output that takes any character, one line for a mistake, progress."""
+"""Progress of a search on standard error: a table that updates in a terminal, elsewhere lines."""
 
 from __future__ import annotations
 
-import contextlib
-import errno
-import io
 import math
-import sys
 import time
-import warnings
-from collections.abc import Callable, Iterator
-from typing import IO, TYPE_CHECKING, Any, cast
+from typing import IO, TYPE_CHECKING, cast
 
+from sysid.cli.output import Output
 from sysid.search.session import Progress
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-_CLOSED = OSError(errno.EBADF, "it is closed")
 _PLAIN_EVERY = 5.0  # s between lines where the display is no terminal
-
-
-class Output:
-    """A text stream that takes any character and never raises.
-
-    A closed pipe or a full disk must not end a search whose result goes elsewhere; `failed` keeps
-    the first such error. None is a stream that was closed before the process began.
-    """
-
-    def __init__(self, stream: IO[str] | None) -> None:
-        self._stream = io.StringIO() if stream is None else stream
-        self.encoding = getattr(stream, "encoding", None) or "utf-8"
-        self.failed = _CLOSED if stream is None else None
-
-    def write(self, text: str) -> int:
-        """Write what the stream can show of a text; its length."""
-        self._try(self._stream.write, text.encode(self.encoding, "replace").decode(self.encoding))
-        return len(text)
-
-    def flush(self) -> None:
-        """Flush the stream."""
-        self._try(self._stream.flush)
-
-    def close(self) -> None:
-        """Leave the stream open: it is not a problem module's to close."""
-
-    def _try(self, do: Callable[..., object], *arguments: str) -> None:
-        if self.failed is None:
-            try:
-                do(*arguments)
-            except OSError as error:
-                self.failed = error
-            except ValueError:  # a closed file
-                self.failed = _CLOSED
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
-
-
-def complain(message: object) -> None:
-    """One line on standard error, whatever the message holds; nothing where that is closed."""
-    if sys.stderr is None:
-        return
-    with contextlib.suppress(OSError, ValueError):
-        print("sysid:", " ".join(str(message).split()), file=sys.stderr, flush=True)
-
-
-@contextlib.contextmanager
-def collected_warnings() -> Iterator[list[str]]:
-    """Keep warnings for the end: they would tear the live display, or stand beside the one line of a mistake."""
-    lines: list[str] = []
-    with warnings.catch_warnings():
-        # An assignment, and not record=True: warnings that are errors stay so.
-        warnings.showwarning = lambda message, category, filename, lineno, file=None, line=None: lines.append(
-            f"{filename}:{lineno}: {category.__name__}: {message}"
-        )
-        yield lines
 
 
 def display_on(out: Output) -> _LiveTable | _Lines:
     """Display of progress: a table that updates in a terminal, elsewhere a line at times."""
     from rich.console import Console
 
-    terminal = out.isatty()
+    terminal = out.stderr.isatty() and not out.quiet
     # No markup, and no control codes unless it is a terminal, whatever the environment asks.
     console = Console(
-        file=cast(IO[str], out), force_terminal=terminal, force_jupyter=False, markup=False, emoji=False,
+        file=cast(IO[str], out.stderr), force_terminal=terminal, force_jupyter=False, markup=False, emoji=False,
         highlight=False,
     )  # fmt: skip
     return _LiveTable(console) if console.is_terminal and not console.is_dumb_terminal else _Lines(out)
@@ -119,8 +56,7 @@ class _Lines:
     def _print(self) -> None:
         if self._pending is not None:
             self._printed = self._pending.seconds
-            self._out.write(f"{self._pending}\n")
-            self._out.flush()
+            self._out.progress(f"{self._pending}\n")
         self._pending = None
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sysid.cli.display import Output
 from sysid.cli.files import png, table_as_csv, write_files
+from sysid.cli.output import Output
 from sysid.jobs.job import JobResult
 from sysid.jobs.spread import Spread, spreads
 from sysid.results.identification import Identification, Recipe
@@ -38,6 +38,7 @@ def tell(folder: Path, result: Identification, recipe: Recipe, ends: list[JobRes
         out.write(f"\n{table(found, count, len(ends))}\n\n")
         if result.problem.loss == "huber":
             out.write(f"{_LARGER}\n\n")
+        out.answer(spreads=[vars(spread) for spread in found])
         of_all: list[Sequence[object]] = [("quantity", "value", "linear_std", "draws_std", "inside_share")]
         of_all += [(s.name, repr(s.value), repr(s.std), repr(s.drawn), repr(s.inside)) for s in found]
         files["spreads.csv"] = table_as_csv(of_all)

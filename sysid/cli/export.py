@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
-from sysid.cli.display import Output
+from sysid.cli.output import Output
 from sysid.cli.status import SUCCESS
 from sysid.export.export import export, format_of, precision
 from sysid.results.identification import load
@@ -17,7 +17,9 @@ def run(options: argparse.Namespace, out: Output) -> int:
     target = Path(options.file)
     form = format_of(target)  # a wrong ending is told before the result is read
     written = export(load(options.result), target)
-    out.write(f"{written}: {form.name}; precision: {precision(target)}\n")
+    out.wrote(written)
+    out.write(f"{form.name}; precision: {precision(target)}\n")
+    out.answer(format=form.name, precision=precision(target))
     return SUCCESS
 
 
@@ -25,13 +27,14 @@ def add(command: Callable[..., argparse.ArgumentParser]) -> None:
     """Add the command and its arguments."""
     parser = command(
         "export",
-        help="write the identified structure for another program",
+        summary="write the identified structure for another program",
         description="Write the identified structure for another program, in the format that the ending of FILE tells: "
         ".csv, M, K and C with deviations (exact); .mat, MATLAB (exact); .op4, Nastran OUTPUT4 "
         "with the Craig-Bampton superelement (exact); .bdf or .dmig, the superelement as Nastran's DMIG (10 digits); "
         ".unv or .uff, mode shapes as dataset 55 (6 digits). The file says what the data leave open.",
-        epilog="Examples: sysid export results/cantilever_tower tower.csv; "
-        "sysid export results/cantilever_tower tower.bdf",
+        examples=tuple(
+            f"sysid export results/cantilever_tower tower.{ending}" for ending in ("csv", "mat", "op4", "bdf", "unv")
+        ),
     )
     parser.add_argument("result", metavar="RESULT", help="a result.h5, or the folder that holds it")
     parser.add_argument("file", metavar="FILE", help="the file to write")

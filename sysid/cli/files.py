@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sysid.cli.display import Output
+from sysid.cli.output import Output
 from sysid.errors import InputError
 from sysid.results.storage import atomically
 
@@ -29,12 +28,6 @@ def results_folder(given: str | None, default: Path) -> Path:
     if not os.access(place, os.W_OK | os.X_OK):
         raise InputError(f"folder of results {folder}: {place} cannot be written")
     return folder
-
-
-def strict_json(value: object) -> str:
-    """JSON with null for what is not a number."""
-    finite = json.loads(json.dumps(value), parse_constant=lambda _: None)
-    return json.dumps(finite, indent=2, allow_nan=False) + "\n"
 
 
 def table_as_csv(rows: Sequence[Sequence[object]]) -> bytes:
@@ -60,4 +53,4 @@ def write_files(folder: Path, files: Mapping[str, bytes | None], out: Output) ->
             continue
         with atomically(folder / name) as temporary:
             temporary.write_bytes(content)
-        out.write(f"{folder / name}\n")
+        out.wrote(folder / name)

@@ -1,6 +1,7 @@
 """Commands: ``sysid list``, ``new``, ``read``, ``show``, ``run``, ``compare``, ``refine``, ``report``, ``export``.
 
-Exit status: 0 success; 1 the search did not reach its goal; 2 a mistake in what was given, told in
+What they say is words, or with ``--json`` one document, on standard output; progress, warnings and mistakes are on
+standard error. Exit status: 0 success; 1 the search did not reach its goal; 2 a mistake in what was given, told in
 one line; 130 interrupted, with the best so far saved; 70 an error of sysid itself, told in one line
 with the traceback in a log file.
 """
@@ -10,8 +11,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
-import math
-import os
 import signal
 import sys
 import tempfile
@@ -23,9 +22,11 @@ from pathlib import Path
 from typing import IO, Any, NoReturn, cast
 
 from sysid import catalogue
-from sysid.cli import export, parameters, read, starting, unfinished
-from sysid.cli.display import Output, collected_warnings, complain, display_on
-from sysid.cli.files import strict_json
+from sysid.cli import doctor, export, parameters, read, starting, unfinished
+from sysid.cli.argument_types import band, count, orders, seconds, seed, whole
+from sysid.cli.command_parser import JSON, QUIET, Parser, adder, epilog
+from sysid.cli.display import display_on
+from sysid.cli.output import Output, collected_warnings, keep_for_document, strict_json
 from sysid.cli.status import BUG, INTERRUPTED, MISTAKE, NOT_REACHED, SUCCESS
 from sysid.errors import InputError, SolverError
 from sysid.identify import NAMED, identify
@@ -55,24 +56,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     int
         Exit status.
     """
-    out = Output(sys.stdout)
-    # Whatever argparse, a problem module or CasADi prints passes through it too.
-    with contextlib.redirect_stdout(cast(IO[str], out)):
-        status = _run_command(argv, out)
-    out.flush()
-    if out.failed is not None:
-        # What is left in the interpreter's own buffer would fail once more at exit.
-        with contextlib.suppress(OSError, ValueError, AttributeError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if not isinstance(out.failed, BrokenPipeError):  # a reader that has seen enough is no mistake
-            complain(f"standard output cannot be written: {out.failed.strerror}")
-            status = status or MISTAKE
-    return status
+    given = sys.argv[1:] if argv is None else argv
+    out = Output(json=JSON in given, quiet=QUIET in given)  # known before arguments are parsed, for what is wrong there
+    with contextlib.redirect_stdout(cast(IO[str], out.prints)):
+        status = _run_command(given, out)
+    return out.end(status)
 
 
 def command() -> NoReturn:
     """Run the command line and end the process, which no Ctrl-C breaks any more once its status is known."""
     try:
+        if JSON in sys.argv:
+            keep_for_document()
         status = main()
     except KeyboardInterrupt:  # one more, while the first one was told
         status = INTERRUPTED
@@ -81,7 +76,7 @@ def command() -> NoReturn:
     sys.exit(status)
 
 
-def _run_command(argv: Sequence[str] | None, out: Output) -> int:
+def _run_command(argv: Sequence[str], out: Output) -> int:
     """Parse and run; every exception becomes one line and a status."""
     try:
         starting.is_over()
@@ -89,22 +84,22 @@ def _run_command(argv: Sequence[str] | None, out: Output) -> int:
         with collected_warnings() as remarks:
             status = int(options.command(options, out))
         for remark in remarks:
-            complain(f"warning: {remark}")
+            out.warn(remark)
         return status
     except SystemExit as end:  # argparse, after --help or --version
         return int(end.code or 0)
     except InputError as error:
-        complain(error)
+        out.complain(error)
         return MISTAKE
     except SolverError as error:
-        complain(error)
+        out.complain(error)
         return NOT_REACHED
     except KeyboardInterrupt:
-        complain(starting.NOTHING_SAVED)
+        out.complain(starting.NOTHING_SAVED)
         return INTERRUPTED
     except Exception as error:
         log = _write_log()
-        complain(f"an error of sysid itself ({type(error).__name__}: {error}); {log}")
+        out.complain(f"an error of sysid itself ({type(error).__name__}: {error}); {log}")
         return BUG
 
 
@@ -119,6 +114,7 @@ def _list(options: argparse.Namespace, out: Output) -> int:
         out.write(f"{entry.name:{width}}  {entry.description}{own}\n")
     if not entries:
         out.write("no problems found; a path to a module does as well: sysid run PATH\n")
+    out.answer(problems=[{**vars(entry), "path": str(entry.path)} for entry in entries])
     return SUCCESS
 
 
@@ -126,8 +122,10 @@ def _new(options: argparse.Namespace, out: Output) -> int:
     from sysid.cli import new
 
     module, test = new.write(options.name, data=options.data)
+    out.wrote(module)
+    out.wrote(test)
     out.write(
-        f"{module} and {test} are written. Try them, then change the steps of {module} into your own:\n"
+        f"Try them, then change the steps of {module} into your own:\n"
         f"  sysid show {module}    what is unknown, and what the data determine\n"
         f"  sysid run {module}     identify, and write results/{module.stem}/report.html\n"
         f"  python -m pytest {test}\n"
@@ -136,10 +134,14 @@ def _new(options: argparse.Namespace, out: Output) -> int:
 
 
 def _show(options: argparse.Namespace, out: Output) -> int:
-    from sysid.cli.show import show
+    from sysid.cli.show import figures, show
 
     recipe = parameters.recipe_of(options, options.seed)
-    out.write(f"{show(catalogue.build(recipe), recipe.title)}\n")
+    problem = catalogue.build(recipe)
+    if out.json:
+        out.answer(**figures(problem, recipe.title))
+    else:
+        out.write(f"{show(problem, recipe.title)}\n")
     return SUCCESS
 
 
@@ -164,6 +166,7 @@ def _run(options: argparse.Namespace, out: Output) -> int:
         f"{test.freq.size} lines from {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz, "
         f"{unknowns} unknowns, seed {search.seed}\n"
     )
+    out.flush()
     failed: InputError | None = None
     # From the search's end until the result is on the disk Ctrl-C waits, however often.
     with DeferredInterrupt(patience=None) as late:
@@ -180,6 +183,7 @@ def _run(options: argparse.Namespace, out: Output) -> int:
     try:
         words, figures = _told(result, left(LEAST))
         out.write(f"\n{words}\n\n")
+        out.answer(result=figures)
         out.flush()
         if failed is not None:
             raise failed
@@ -187,11 +191,11 @@ def _run(options: argparse.Namespace, out: Output) -> int:
         with DeferredInterrupt() as writing:
             _write_pages(result, figures, folder, out, left(0.0))
     except KeyboardInterrupt:
-        complain(f"interrupted while saving; the result is there, but not every file is in {folder}")
+        out.complain(f"interrupted while saving; the result is there, but not every file is in {folder}")
         return INTERRUPTED
     if late.asked or writing.asked or result.interrupted:
         on = f"; 'sysid run --resume {folder}' goes on" if checkpoint.exists else ""
-        complain(f"interrupted; the {'best so far' if result.interrupted else 'result'} is in {folder}{on}")
+        out.complain(f"interrupted; the {'best so far' if result.interrupted else 'result'} is in {folder}{on}")
         return INTERRUPTED
     return SUCCESS if result.success else NOT_REACHED
 
@@ -214,39 +218,37 @@ def _report(options: argparse.Namespace, out: Output) -> int:
     source = Path(options.result)
     result = load(source)
     folder = source if source.is_dir() else source.parent
-    out.write(f"{report.write(result, folder / report.FILE_NAME)}\n")
+    out.wrote(report.write(result, folder / report.FILE_NAME))
     return SUCCESS
 
 
 # -- arguments ----------------------------------------------------------------------------------
 
 
-class _Parser(argparse.ArgumentParser):
-    """Mistakes become an InputError, so that they are one line like all others."""
-
-    def error(self, message: str) -> NoReturn:
-        raise InputError(f"{message} (see '{self.prog} --help')")
-
-
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+    parser = Parser(
         prog="sysid",
         description="Mass, stiffness and damping matrices of a structure from shaker-table tests.",
-        epilog="Exit status: 0 success, 1 the search did not reach its goal, 2 a mistake in what was given, "
-        "130 interrupted (the best so far is saved), 70 an error of sysid itself.",
+        epilog=epilog(
+            ("sysid run cantilever_tower", "sysid read sine.csv --sensors sensors.toml --out test.h5",
+             "sysid run test.h5 --mass 1450", "sysid export results/test test.bdf", "sysid run --help"),
+            "Exit status: 0 success, 1 the search did not reach its goal, 2 a mistake in what was\n"
+            "given, 130 interrupted (the best so far is saved), 70 an error of sysid itself.",
+        ),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
-    )
+    )  # fmt: skip
     parser.add_argument("--version", action="version", version=f"sysid {__version__}")
-    commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    command = functools.partial(commands.add_parser, allow_abbrev=False)
+    command = adder(parser)
 
-    lister = command("list", help="list the problems that can be run by name")
+    lister = command("list", summary="list the problems that can be run by name", examples=("sysid list",))
     lister.set_defaults(command=_list)
 
     new = command(
         "new",
-        help="write a commented problem module and its test here",
+        summary="write a commented problem module and its test here",
         description="Write NAME.py, a commented problem that runs at once, and test_NAME.py; never over a file.",
+        examples=("sysid new my_building", "sysid new my_tower --data test.h5"),
     )
     new.add_argument("name", metavar="NAME", help="a name that Python can import: letters, digits, underscores")
     new.add_argument("--data", metavar="TEST.h5", help="a test that 'sysid read' wrote: a module that identifies it")
@@ -254,13 +256,14 @@ def _parser() -> argparse.ArgumentParser:
 
     show = command(
         "show",
-        help="tell the unknowns of a problem and what its data determine, without a search",
+        summary="tell the unknowns of a problem and what its data determine, without a search",
         description="Tell the unknowns of a problem, their bounds and scaling, and what the data determine: rank and "
         "unseen directions of the exact Jacobian at the reference, where it is known, or at a guess.",
+        examples=("sysid show shear_building", "sysid show my_building.py"),
     )
     parameters.add_arguments(show)
     show.add_argument(
-        "--seed", type=_seed, metavar="N", help="reaches problem() as rng: of simulated noise; 0 by default"
+        "--seed", type=seed, metavar="N", help="reaches problem() as rng: of simulated noise; 0 by default"
     )
     show.set_defaults(command=_show)
 
@@ -269,26 +272,37 @@ def _parser() -> argparse.ArgumentParser:
     _add_compare(command)
     _add_refine(command)
 
-    report = command("report", help="write report.html again, beside a result")
+    report = command(
+        "report",
+        summary="write report.html again, beside a result",
+        examples=("sysid report results/cantilever_tower", "sysid report results/cantilever_tower/result.h5"),
+    )
     report.add_argument("result", metavar="RESULT", help="a result.h5, or the folder that holds it")
     report.set_defaults(command=_report)
 
     export.add(command)
+    doctor.add(command)
     return parser
 
 
 def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
     run = command(
         "run",
-        help="identify the structure of a problem",
+        summary="identify the structure of a problem",
         description="Identify the structure of a problem, or of a test that 'sysid read' wrote (sysid run test.h5). "
         "Writes result.h5, summary.json and report.html.",
+        examples=(
+            "sysid run cantilever_tower",
+            "sysid run cantilever_tower --set elements=3 --set noise=0.01 --out results/noisy",
+            "sysid run my_building.py --max-time 60 --quiet",
+            "sysid run test.h5 --mass 1450",
+        ),
     )
     parameters.add_arguments(run, optional=True)
     read.add_masses(run)
     run.add_argument(
         "--seed",
-        type=_seed,
+        type=seed,
         metavar="N",
         help="of the search, 0 by default: the same seed gives the same result. The simulated noise of a problem is "
         "part of the problem and does not change with it",
@@ -305,7 +319,7 @@ def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
     run.add_argument("--out", metavar="DIR", help="folder of the results, results/NAME by default")
     run.add_argument(
         "--max-time",
-        type=_seconds,
+        type=seconds,
         metavar="S",
         help="end after about so many seconds; a report that they do not suffice for is left to 'sysid report'",
     )
@@ -322,41 +336,47 @@ def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
 def _add_compare(command: Callable[..., argparse.ArgumentParser]) -> None:
     compare = command(
         "compare",
-        help="run all strategies on a problem, and other optimisers, side by side",
+        summary="run all strategies on a problem, and other optimisers, side by side",
         description="Run every strategy that applies and, where the extra 'benchmark' is installed, optimisers of "
         "pymoo, cma and SciPy on the objective of the swarm, with its number of evaluations and the same local phase. "
         "Prints one table and writes one picture, comparison.png.",
+        examples=("sysid compare shear_building --max-time 1 --out side_by_side",),
     )
     parameters.add_arguments(compare)
-    compare.add_argument("--seed", type=_seed, default=0, metavar="N", help="of all methods, 0 by default")
+    compare.add_argument("--seed", type=seed, default=0, metavar="N", help="of all methods, 0 by default")
     compare.add_argument(
         "--out",
         metavar="DIR",
         help="folder of the picture, results/NAME by default; the table goes there too (CSV, JSON)",
     )
-    compare.add_argument("--max-time", type=_seconds, metavar="S", help="end each method after about so many seconds")
+    compare.add_argument("--max-time", type=seconds, metavar="S", help="end each method after about so many seconds")
     compare.set_defaults(command=_compare)
 
 
 def _add_refine(command: Callable[..., argparse.ArgumentParser]) -> None:
     refine = command(
         "refine",
-        help="jobs about a result: many starts, draws of noise, parts of its test, other models",
+        summary="jobs about a result: many starts, draws of noise, parts of its test, other models",
         description="Run many jobs about a result, on all processors or a cluster: the local phase from the result and "
         "from fresh points of the search space, or one of the other kinds below. Prints one table, and writes it and a "
         "picture. Results are kept as they come: the same command goes on where it was interrupted.",
+        examples=(
+            "sysid refine results/noisy --starts 4",
+            "sysid refine results/noisy --draws 8 --workers 1",
+            "sysid refine results/noisy --leave-out sensor --json",
+        ),
     )
     refine.add_argument("result", metavar="RESULT", help="a result.h5 that 'sysid run' wrote, or its folder")
     kinds = refine.add_mutually_exclusive_group()
     kinds.add_argument(
         "--starts",
-        type=_count,
+        type=count,
         metavar="N",
         help="16 by default; the first is the result. Tells the distinct minima, and how often each was reached",
     )
     kinds.add_argument(
         "--draws",
-        type=functools.partial(_whole, 2),
+        type=functools.partial(whole, 2),
         metavar="N",
         help="fits of N sets of records that the result would have given, with noise drawn anew: their spread beside "
         "the linear uncertainty",
@@ -369,14 +389,14 @@ def _add_refine(command: Callable[..., argparse.ArgumentParser]) -> None:
     )
     kinds.add_argument(
         "--bands",
-        type=_band,
+        type=band,
         nargs="+",
         metavar="LOW-HIGH",
         help="identify from the lines of each band, in Hz: how far the answer moves with the band",
     )
     kinds.add_argument(
         "--orders",
-        type=_orders,
+        type=orders,
         metavar="A-B",
         help="identify with A to B modes of those that stand out of the noise, where mass and stiffness are free: AIC, "
         "BIC and the residual of the validation tests",
@@ -387,45 +407,10 @@ def _add_refine(command: Callable[..., argparse.ArgumentParser]) -> None:
         metavar="MODULE",
         help="identify by other problem modules from the same data: AIC, BIC and the residual of the validation tests",
     )
-    refine.add_argument("--workers", type=_count, metavar="N", help="processes, as many as processors by default")
+    refine.add_argument("--workers", type=count, metavar="N", help="processes, as many as processors by default")
     refine.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster, such as tcp://host:8786")
     refine.add_argument("--out", metavar="DIR", help="folder, RESULT's folder/refine by default")
     refine.set_defaults(command=_refine)
-
-
-def _band(text: str) -> tuple[float, float]:
-    low, _, high = text.rpartition("-")  # at the last dash, as 1e-3 has one too
-    try:
-        ends = float(low), float(high)
-    except ValueError:
-        ends = 0.0, 0.0
-    if not 0 <= ends[0] < ends[1] < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is no band: write its ends in Hz, such as 0.5-20")
-    return ends
-
-
-def _orders(text: str) -> tuple[int, int]:
-    low, _, high = text.partition("-")
-    if not (low.isdecimal() and high.isdecimal() and 1 <= int(low) <= int(high)):
-        raise argparse.ArgumentTypeError(f"{text!r} is no range of numbers of modes: write 3-8")
-    return int(low), int(high)
-
-
-def _whole(least: int, text: str) -> int:
-    with contextlib.suppress(ValueError):
-        if (given := int(text)) >= least:
-            return given
-    raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least}")
-
-
-_count, _seed = functools.partial(_whole, 1), functools.partial(_whole, 0)
-
-
-def _seconds(text: str) -> float:
-    with contextlib.suppress(ValueError):
-        if 0 < (seconds := float(text)) < math.inf:
-            return seconds
-    raise argparse.ArgumentTypeError(f"{text!r} is not a positive number of seconds")
 
 
 # -- files --------------------------------------------------------------------------------------
@@ -467,14 +452,14 @@ def _write_pages(
     """
     from sysid.report import report
 
-    out.write(f"result   {folder / RESULT}\n")
+    out.wrote(folder / RESULT, "result   ")
     summary = folder / _SUMMARY
     with atomically(summary) as temporary:
         temporary.write_text(strict_json(figures), encoding="utf-8")
-    out.write(f"summary  {summary}\n")
+    out.wrote(summary, "summary  ")
     try:
         with within(left):
-            out.write(f"report   {report.write(result, folder / report.FILE_NAME)}\n")
+            out.wrote(report.write(result, folder / report.FILE_NAME), "report   ")
     except TimeIsOver:
         out.write(f"no report, as the time is over: 'sysid report {folder}' writes it\n")
 

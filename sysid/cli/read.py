@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sysid.cli.display import Output
+from sysid.cli.output import Output
 from sysid.cli.status import SUCCESS
 from sysid.errors import InputError, refuse
 from sysid.files import description, recorded_test
@@ -15,15 +15,11 @@ from sysid.files.reading import gather
 from sysid.results.identification import Recipe
 from sysid.results.storage import atomically
 
-_EXAMPLES = """\
-examples:
-  sysid read sine.csv --sensors sensors.toml --out test.h5
-  sysid read run1.csv run2.csv --rate 200 --sensor CH1 role=base axis=x unit=g \\
-      --sensor CH2 role=response name=top axis=x position=0,0,3 unit=g --out test.h5
-  sysid run test.h5 --mass 1450
-
-sensors.toml:
-"""
+_EXAMPLES = (
+    "sysid read sine.csv --sensors sensors.toml --out test.h5",
+    "sysid read run1.csv run2.csv --time Time --sensor CH1 role=base axis=x unit=g \\\n"
+    "      --sensor CH2 role=response name=top axis=x position=0,0,3 unit=g --out test.h5",
+)
 MODULE = "recorded_test"  # the bundled problem that takes what this command writes
 
 
@@ -31,12 +27,12 @@ def add(command: Callable[..., argparse.ArgumentParser]) -> None:
     """Add the command to the parser."""
     read = command(
         "read",
-        help="read the files of a logger as a test that 'sysid run' takes",
+        summary="read the files of a logger as a test that 'sysid run' takes",
         description="Read the files of a test, convert its channels to SI units, print a table of them, and write it. "
         "Which column is which sensor is said in a TOML file or by --sensor; a TOML file of the name of the first "
         "file, or sensors.toml beside it, is found by itself.",
-        epilog=_EXAMPLES + description.EXAMPLE,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        examples=_EXAMPLES,
+        more=f"sensors.toml:\n{description.EXAMPLE}",
     )
     read.add_argument("files", metavar="FILE", nargs="+", help="of any known format; each is a run")
     read.add_argument("--out", metavar="TEST.h5", help="file to write, test.h5 by default")
@@ -71,7 +67,10 @@ def run(options: argparse.Namespace, out: Output) -> int:
     test = gather(options.files, _said(options))
     with atomically(target) as temporary:
         temporary.write_bytes(test.to_bytes())
-    out.write(f"{test.in_words()}\n{target} is written: 'sysid run {target}' identifies it\n")
+    out.write(f"{test.in_words()}\n")
+    out.wrote(target)
+    out.write(f"'sysid run {target}' identifies it\n")
+    out.answer(channels=[vars(row) for row in test.table], remarks=list(test.remarks), runs=len(test.runs))
     return SUCCESS
 
 

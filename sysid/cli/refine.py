@@ -8,10 +8,11 @@ from concurrent.futures import Executor
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from sysid.cli import draws, sweeps
-from sysid.cli.display import Output, complain
 from sysid.cli.files import png, results_folder, table_as_csv, write_files
+from sysid.cli.output import Output
 from sysid.cli.status import INTERRUPTED, NOT_REACHED, SUCCESS
 from sysid.errors import InputError
 from sysid.jobs.engine import cluster, processes
@@ -50,6 +51,7 @@ def run(options: argparse.Namespace, out: Output) -> int:
         titles, told = [f"start {i:4d}" for i in range(count)], "start{s}, the first at the result"
         jobs = submit(_started(recipe, source), starts=count, executor=executor, out=folder)
     out.write(f"{recipe.title}: {len(titles)} {told.format(s='' if len(titles) == 1 else 's')}\n")
+    out.flush()
     try:
         ends, interrupted = _ends(jobs, titles, out)
         if interrupted and not ends:
@@ -61,13 +63,14 @@ def run(options: argparse.Namespace, out: Output) -> int:
         else:
             minima = distinct(result.problem, ends)
             out.write(f"\n{table(minima, len(ends))}\n\n")
+            out.answer(minima=[_figures(minimum) for minimum in minima])
             _write(folder, recipe, ends, minima, result.problem, out)
-        out.write(f"{folder / LEDGER}\n")
+        out.wrote(folder / LEDGER)
     except KeyboardInterrupt:
-        complain(f"interrupted while saving; results are in {folder / LEDGER}: the same command writes the files")
+        out.complain(f"interrupted while saving; results are in {folder / LEDGER}: the same command writes the files")
         return INTERRUPTED
     if interrupted:
-        complain(f"interrupted after {len(ends)} of {len(titles)} jobs; the same command goes on from there")
+        out.complain(f"interrupted after {len(ends)} of {len(titles)} jobs; the same command goes on from there")
         return INTERRUPTED
     return SUCCESS if any(end.success for end in ends) else NOT_REACHED
 
@@ -81,8 +84,7 @@ def _ends(jobs: Generator[JobResult, None, None], titles: Sequence[str], out: Ou
             for end in jobs:
                 ends.append(end)
                 left = f"residual {end.residual:.4e}" if end.has_result else "no result"
-                out.write(f"{len(ends):4d} of {len(titles)}  {titles[end.index]}  {left}  {end.message}\n")
-                out.flush()
+                out.progress(f"{len(ends):4d} of {len(titles)}  {titles[end.index]}  {left}  {end.message}\n")
     except KeyboardInterrupt:
         interrupted = True
     return sorted(ends, key=lambda one: one.index), interrupted
@@ -106,6 +108,15 @@ def table(minima: list[Minimum], starts: int) -> str:
     elif minima:
         lines.append(f"the best minimum was reached from {len(minima[0].results)} of {starts} starts")
     return "\n".join(lines)
+
+
+def _figures(minimum: Minimum) -> dict[str, Any]:
+    """A minimum for the JSON document."""
+    best = minimum.best
+    return {
+        "residual": best.residual, "reached": len(minimum.results), "success": best.success, "best_start": best.index,
+        "unknowns": best.x.tolist(),
+    }  # fmt: skip
 
 
 def _recipe(result: Identification, source: Path) -> Recipe:

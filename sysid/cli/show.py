@@ -10,6 +10,7 @@ import contextlib
 import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -64,6 +65,31 @@ def show(problem: Problem, name: str) -> str:
     judged = problem.screened  # as a search judges them
     blocks = (_test(problem, name), _variables(problem), _unknowns(problem), _at(judged, _point(judged)))
     return "\n\n".join("\n".join(_folded(line) for line in block) for block in blocks)
+
+
+def figures(problem: Problem, name: str) -> dict[str, Any]:
+    """What `show` tells, for scripts: numbers, texts, and lists and dictionaries of them; errors as there."""
+    problem.check()
+    test, point = problem.measurement, _point(problem.screened)
+    known = point.known
+    members = zip(problem.variables, slices_of(problem.variables), strict=True)
+    return {
+        "problem": name,
+        "sensors": list(test.sensor_names),
+        "base_axes": list(test.base_axes or ()),
+        "strategy": choose("auto", problem, None)[0].name,
+        "degrees_of_freedom": problem.geometry.n,
+        "unknowns": problem.n_variables,
+        "variables": [
+            {"name": v.title, "unit": v.unit, "lower": np.min(v.lower), "upper": np.max(v.upper),
+             "values": point.x[part].tolist(), "unseen": bool(np.any(np.abs(known.unseen[part]) > _TOUCHED))}
+            for v, part in members
+        ],
+        "point": point.where,
+        "rank": known.rank,
+        "directions": known.free.shape[1],
+        "sentences": list(point.sentences),
+    }  # fmt: skip
 
 
 # -- what is given ------------------------------------------------------------------------------

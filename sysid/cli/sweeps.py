@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 import textwrap
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from sysid import catalogue
-from sysid.cli.display import Output
 from sysid.cli.files import png, table_as_csv, write_files
+from sysid.cli.output import Output
 from sysid.errors import InputError
 from sysid.jobs.changes import Band, Change, Modes, WithoutRun, WithoutSensor
 from sysid.jobs.job import JobResult
@@ -145,6 +145,7 @@ def tell(
             title = sweep.titles[end.index]
             rows.append(Compared(title, end.success, end.residual, end.message, end.score, moved))
     out.write(f"\n{table(rows, part)}\n\n")
+    out.answer(identifications=[asdict(row) for row in rows])
     without = [(sweep.titles[end.index], end.message) for end in ends if end.score is None]
     drawn = png(picture, rows, recipe.title, part=part) if len(rows) > 1 else None
     tables = {f"{sweep.name}.csv": _as_csv(rows, without, part), f"{sweep.name}_moves.csv": _moves_as_csv(rows)}

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from sysid import catalogue
 from sysid.cli import parameters, read
-from sysid.cli.display import Output
 from sysid.cli.files import results_folder
+from sysid.cli.output import Output
 from sysid.errors import InputError
 from sysid.results.checkpoint import FILE_NAME, Begun, Checkpoint
 from sysid.results.identification import Recipe

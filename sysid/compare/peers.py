@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.compare.method_result import MethodResult, Recorder, Status, errors_of, status_of
-from sysid.errors import InputError, SolverError
+from sysid.errors import InputError, SolverError, how_to_install
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.results.judgement import succeeded
@@ -24,7 +24,7 @@ from sysid.search.swarm_objective import SwarmObjective
 from sysid.structure.structure import Array
 
 PACKAGES = ("pymoo", "cma")  # of the extra "benchmark"
-HOW_TO_INSTALL = 'python -m pip install ".[benchmark]"'
+HOW_TO_INSTALL = how_to_install("benchmark")
 
 _SHARE = 2 / 3  # of the time, that a search may take before its local phase: as the swarm's
 _WORST = 1e30  # an objective in the place of what is not a number: above that of any broken constraint

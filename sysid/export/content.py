@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from datetime import datetime
 
@@ -41,17 +40,22 @@ def names_of(it: Identification) -> tuple[str, ...]:
     return (*it.degrees_of_freedom, *(f"base {axis}" for axis in it.measurement.base_axes or ()))
 
 
-def unit(letter: str, rotations: int) -> str:
-    """Unit of an entry of M, K or C of which so many of row and column are rotations."""
-    return _UNITS[letter][rotations]
+def unit(letter: str, row: bool | None, column: bool | None) -> str:
+    """Unit of an entry of M, K or C by whether row and column are rotations; "" where one is not known."""
+    return "" if row is None or column is None else _UNITS[letter][row + column]
 
 
-def rotations_of(it: Identification) -> tuple[bool, ...]:
-    """Which rows of the matrices are rotations."""
-    sensors, at = it.measurement.sensors, it.structure.dof_sensors
-    axes = [sensors[j].axis if sensors is not None and j >= 0 else "" for j in at]
-    turned = (isinstance(axis, str) and re.search("r", axis) is not None for axis in axes)
+def rotations_of(it: Identification) -> tuple[bool | None, ...]:
+    """Which rows of the matrices are rotations; None for a coordinate that no sensor records, which may be anything."""
+    turned = (None if j < 0 else _records_rotation(it, j) for j in it.structure.dof_sensors)
     return (*turned, *(axis.startswith("r") for axis in it.measurement.base_axes or ()))
+
+
+def _records_rotation(it: Identification, sensor: int) -> bool:
+    """Whether a sensor is described as one of rotation."""
+    sensors = it.measurement.sensors
+    axis = "" if sensors is None else sensors[sensor].axis
+    return isinstance(axis, str) and "r" in axis
 
 
 JUDGED = {

@@ -11,7 +11,7 @@ from sysid.results.identification import Identification
 from sysid.structure.axes import BASE_AXES
 from sysid.structure.structure import Array
 
-PRECISION = "10 significant digits"
+PRECISION = "10 significant digits: what 16 characters, the widest field of bulk data, hold beside sign and exponent"
 BASE, FIRST_MODE, FIRST_SENSOR = 1, 1_001, 100_001  # identification numbers of points
 _LEAST = 1e-90  # a larger negative exponent has no room in a field
 _SYMMETRIC, _RECTANGULAR = 6, 2

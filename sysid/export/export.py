@@ -6,7 +6,7 @@ import importlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from sysid.errors import InputError, instance, path_of
+from sysid.errors import InputError, instance, needed, path_of
 from sysid.results.identification import Identification
 from sysid.results.storage import atomically
 
@@ -70,7 +70,7 @@ def export(identification: Identification, path: str | Path) -> Path:
     target = path_of("path", path)
     chosen = format_of(target)
     if chosen.needs:
-        _check_installed(chosen, target)
+        needed(chosen.needs, chosen.extra, f"{target}: a {chosen.name}")
     module = importlib.import_module(f"sysid.export.{chosen.module}")
     with atomically(target) as temporary:
         module.write(identification, temporary)
@@ -90,13 +90,3 @@ def precision(path: str | Path) -> str:
     """What a file of this ending keeps of the numbers, in words."""
     found = importlib.import_module(f"sysid.export.{format_of(Path(path)).module}")
     return str(found.PRECISION)
-
-
-def _check_installed(chosen: Format, target: Path) -> None:
-    try:
-        importlib.import_module(chosen.needs)
-    except ImportError:
-        raise InputError(
-            f"{target}: a {chosen.name} needs the package {chosen.needs}: "
-            f"pip install 'structural-sysid[{chosen.extra}]'"
-        ) from None

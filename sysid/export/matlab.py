@@ -10,7 +10,7 @@ from scipy.io import savemat
 from sysid.export.content import deviations_of, matrices_of, names_of, statements
 from sysid.results.identification import Identification
 
-PRECISION = "exact, double precision"
+PRECISION = "exact: the file holds the 8 bytes of each double-precision number"
 
 
 def write(it: Identification, path: Path) -> None:

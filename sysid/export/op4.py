@@ -12,7 +12,7 @@ from sysid.export.superelement import superelement_of
 from sysid.results.identification import Identification
 from sysid.structure.structure import Array
 
-PRECISION = "exact, double precision"
+PRECISION = "exact: the file holds the 8 bytes of each double-precision number"
 _WIDTH = 72
 
 

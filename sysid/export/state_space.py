@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sysid.errors import InputError
+from sysid.errors import needed
 from sysid.results.identification import Identification
 
 if TYPE_CHECKING:
@@ -25,10 +25,9 @@ def control_system(identification: Identification) -> StateSpace:
     InputError
         Where python-control is not installed.
     """
-    try:
-        import control
-    except ImportError:
-        raise InputError("control_system needs the package control: pip install 'structural-sysid[control]'") from None
+    needed("control", "control", "control_system")
+    import control
+
     system = identification.structure.to_state_space()
     test = identification.measurement
     return control.ss(

@@ -10,9 +10,12 @@ import numpy as np
 from sysid.export.content import deviations_of, matrices_of, names_of, rotations_of, statements, unit
 from sysid.results.identification import Identification
 
-PRECISION = "exact, 17 digits"
+PRECISION = "exact: each number has the up to 17 digits that give the same double-precision number when read"
 COLUMNS = ("matrix", "row", "column", "value", "deviation", "unit", "row_name", "column_name")
-_EMPTY = "an empty deviation: the entry is open, belongs to the base, or its deviation was not computed"
+_EMPTY = (
+    "an empty deviation: the entry is open, belongs to the base, or its deviation was not computed",
+    "an empty unit: row or column is a coordinate that no sensor records, in the unit that the model gives it",
+)
 
 
 def write(it: Identification, path: Path) -> None:
@@ -22,12 +25,12 @@ def write(it: Identification, path: Path) -> None:
     """
     names, turned, deviations = names_of(it), rotations_of(it), deviations_of(it)
     with path.open("w", newline="", encoding="utf-8") as file:
-        file.writelines(f"# {text}\n" for text in (*statements(it, PRECISION), _EMPTY))
+        file.writelines(f"# {text}\n" for text in (*statements(it, PRECISION), *_EMPTY))
         table = csv.writer(file, lineterminator="\n")
         table.writerow(COLUMNS)
         for letter, matrix in matrices_of(it.structure).items():
             for (i, j), value in np.ndenumerate(matrix):
                 std = deviations[letter][i, j]
                 known = repr(float(std)) if np.isfinite(std) else ""
-                described = unit(letter, turned[i] + turned[j]), names[i], names[j]
+                described = unit(letter, turned[i], turned[j]), names[i], names[j]
                 table.writerow((letter, i + 1, j + 1, repr(float(value)), known, *described))

@@ -13,7 +13,7 @@ from sysid.structure.axes import sensor_row
 from sysid.structure.sensor import Sensor
 from sysid.structure.structure import Array
 
-PRECISION = "6 significant digits, the format's own"
+PRECISION = "6 significant digits: dataset 55 prescribes the number format E13.5"
 _SI = f"{1.0:25.17E}".replace("E", "D") * 3
 _NORMAL_MODE, _STRUCTURAL, _DISPLACEMENT, _REAL = 2, 1, 8, 2
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import multiprocessing
 import os
 import signal
@@ -12,7 +11,7 @@ from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExec
 from contextlib import contextmanager
 from typing import Any, TypeVar, cast
 
-from sysid.errors import InputError, whole_number
+from sysid.errors import InputError, needed, whole_number
 from sysid.search.session import DeferredInterrupt
 
 Task = TypeVar("Task")
@@ -95,8 +94,7 @@ def cluster(address: str) -> Callable[[], Executor]:
     InputError
         Where Dask is not installed, no scheduler answers, or a worker has several threads.
     """
-    if importlib.util.find_spec("distributed") is None:
-        raise InputError('a cluster needs Dask: python -m pip install ".[dask]"')
+    needed("distributed", "dask", "a cluster")
 
     def make() -> Executor:
         from distributed import Client

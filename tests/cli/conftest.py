@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import re
 import signal
 import subprocess
 import sys
@@ -50,11 +51,22 @@ def finished(tmp_path_factory, module):
 
 
 @pytest.fixture
-def complaint(capsys):
-    """Give a function that returns the one line on standard error."""
+def beside_progress(capsys):
+    """Give a function that returns what is on standard output, and what is on standard error beside progress."""
 
     def read():
-        error = capsys.readouterr().err
+        out, error = capsys.readouterr()
+        return out, re.sub(r"^[a-z][\w ]+ iteration +\d+ .*\n", "", error, flags=re.MULTILINE)
+
+    return read
+
+
+@pytest.fixture
+def complaint(beside_progress):
+    """Give a function that returns the one line on standard error that is no progress."""
+
+    def read():
+        error = beside_progress()[1]
         assert error.startswith("sysid: ")
         assert error.count("\n") == 1
         assert error.endswith("\n")

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.cli import files as writing
 from sysid.cli import main as cli
+from sysid.cli import output
 from sysid.report import report
 
 FREQUENCIES = "truth.natural_frequencies"
@@ -29,9 +29,9 @@ KEYS = {
 # -- success ------------------------------------------------------------------------------------
 
 
-def test_run_writes_three_files_under_the_name_of_the_module_and_tells_where(here, capsys, files, no_pictures):
+def test_run_writes_three_files_under_the_name_of_the_module_and_tells_where(here, beside_progress, files, no_pictures):
     assert cli.main(["run", "pair.py", "--seed", "3"]) == 0
-    out, error = capsys.readouterr()
+    out, error = beside_progress()
     assert error == ""
     assert files(here) == {"pair.py", "results", "results/pair"} | {
         f"results/pair/{name}" for name in ("result.h5", "summary.json", "report.html")
@@ -114,19 +114,20 @@ def test_plain_output_has_no_control_codes_whatever_the_environment_asks(here, p
     environment = os.environ | {"FORCE_COLOR": "1", "TTY_COMPATIBLE": "1", "PYTHONIOENCODING": "ascii", "COLUMNS": "40"}
     done = process("run", "pair.py", "--strategy", "swarm", env=environment, cwd=here)
     assert done.returncode == 0
-    assert done.stderr == b""
-    assert b"\x1b" not in done.stdout
-    assert b"\r" not in done.stdout.replace(os.linesep.encode(), b"\n")
-    text = done.stdout.decode("ascii")
+    assert b"success: " in done.stdout and b" iteration " not in done.stdout
+    for stream in (done.stdout, done.stderr):
+        assert b"\x1b" not in stream
+        assert b"\r" not in stream.replace(os.linesep.encode(), b"\n")
+    text = done.stderr.decode("ascii")
     for phase in ("swarm", "refinement", "local phase"):
         assert re.search(rf"^{phase} +iteration +\d+ +objective +\S+ +[\d.]+ s$", text, re.M)
 
 
 def test_the_modal_strategy_tells_its_only_phase(here, capsys, no_pictures):
     assert cli.main(["run", "pair.py", "--strategy", "modal"]) == 0
-    out = capsys.readouterr().out
-    assert re.search(r"^local phase +iteration +\d+ +objective +\S+ +[\d.]+ s$", out, re.M)
-    assert not re.search(r"^(swarm|refinement) ", out, re.M)
+    out, error = capsys.readouterr()
+    assert re.search(r"^local phase +iteration +\d+ +objective +\S+ +[\d.]+ s$", error, re.M)
+    assert not re.search(r"^(swarm|refinement) ", error, re.M)
     assert "strategy 'modal', as asked" in out
     assert "nan" not in out
 
@@ -169,7 +170,7 @@ def test_a_closed_pipe_and_a_full_disk_behind_standard_output(here, process, wit
     # The search goes on without a reader: its result is in the files.
     done = process("run", "pair.py", cwd=here, preexec_fn=_closed_standard_output)
     assert done.returncode == 0
-    assert done.stderr == b""
+    assert b"sysid:" not in done.stderr
     assert (here / "results/pair/report.html").exists()
     if Path("/dev/full").exists():
         with Path("/dev/full").open("w") as full:
@@ -206,7 +207,7 @@ def test_warnings_are_told_after_the_run_a_line_each_and_not_beside_a_mistake(he
 def test_what_is_not_a_number_is_null_in_the_summary(finished):
     result = sysid.load(finished)
     history = replace(result.history, wall_time=np.nan)
-    strict = lambda value: json.loads(writing.strict_json(value), parse_constant=pytest.fail)  # noqa: E731
+    strict = lambda value: json.loads(output.strict_json(value), parse_constant=pytest.fail)  # noqa: E731
     assert strict(replace(result, history=history).to_dict())["wall_time_s"] is None
     assert strict({"a": [np.nan, 1.0, (float("inf"), "x")], "b": None, "c": True}) == {
         "a": [None, 1.0, [None, "x"]], "b": None, "c": True,

@@ -28,13 +28,12 @@ def files(folder):
 def test_a_line_a_method_then_one_table_and_one_picture(here, capsys):
     assert cli.main(["compare", "pair.py"]) == 0
     out, error = capsys.readouterr()
-    assert error == ""
     lines = out.splitlines()
     assert lines[0].startswith("pair.py: ")
-    assert 'python -m pip install ".[benchmark]"' in lines[1]
+    assert "python -m pip install 'structural-sysid[benchmark]'" in lines[1]
     assert "no reference" in lines[2]
-    assert [line.partition(":")[0] for line in lines[3:7]] == ["modal", "continuation", "swarm", "hpso-ls"]
-    assert lines[8].split() == ["method", "before", "after", "evaluations", "seconds", "status"]
+    assert [line.partition(":")[0] for line in error.splitlines()] == ["modal", "continuation", "swarm", "hpso-ls"]
+    assert lines[4].split() == ["method", "before", "after", "evaluations", "seconds", "status"]
     assert out.endswith("results/pair/comparison.png\n\n") or out.endswith("results/pair/comparison.png\n")
     assert files(here / "results/pair") == {"comparison.png"}
     assert (here / "results/pair/comparison.png").read_bytes().startswith(PNG)
@@ -85,6 +84,6 @@ def test_ctrl_c_shows_the_table_of_what_is_finished(here, capsys, monkeypatch):
     monkeypatch.setattr(comparison, "identify", identify)
     assert cli.main(["compare", "pair.py", "--out", "side"]) == 130
     out, error = capsys.readouterr()
-    assert error.startswith("sysid: interrupted")
+    assert error.splitlines()[-1].startswith("sysid: interrupted")
     assert "modal " in out
     assert files(here / "side") == {"comparison.png", "comparison.csv", "comparison.json"}

@@ -26,13 +26,13 @@ def test_what_is_written_passes_its_own_test_with_warnings_as_errors(here):
     assert "5 passed" in done.stdout
 
 
-def test_what_is_written_runs_from_the_command_line_in_seconds(here, capsys, no_pictures):
+def test_what_is_written_runs_from_the_command_line_in_seconds(here, capsys, beside_progress, no_pictures):
     assert cli.main(["new", "my_tower"]) == 0
     told = capsys.readouterr().out
     for command in ("sysid show my_tower.py", "sysid run my_tower.py", "python -m pytest test_my_tower.py"):
         assert command in told
     assert cli.main(["run", "my_tower.py"]) == 0
-    out, error = capsys.readouterr()
+    out, error = beside_progress()
     assert error == ""
     assert "Determined" in out
     assert sysid.load(here / "results/my_tower").history.wall_time < 60

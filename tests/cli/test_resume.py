@@ -175,7 +175,7 @@ def test_a_killed_process_goes_on(here, process, without_pictures, interruptible
     (here / "pair.py").write_text(without_pictures.replace("goal=1e-6", "goal=1e-30"))
     running = interruptible("-m", "sysid", "run", "pair.py", "--strategy", "swarm", "--out", "out", cwd=here)
     with running:
-        for line in running.stdout:
+        for line in running.stderr:
             if line.startswith("swarm"):
                 break
         time.sleep(0.2)

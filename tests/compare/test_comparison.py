@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.cli.files import strict_json
+from sysid.cli.output import strict_json
 from sysid.compare import comparison, peers, table
 from sysid.compare.method_result import Status, errors_of
 from sysid.search.modal import Modal

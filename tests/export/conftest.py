@@ -27,3 +27,17 @@ def result() -> sysid.Identification:
     return sysid.identify(
         sysid.Problem(test, mass=sysid.FullMass(), stiffness=sysid.SpectralStiffness(), damping=damping)
     )
+
+
+@pytest.fixture(scope="session")
+def noisy():
+    """Three masses that shake with 1 % noise: the truth, and what is found with and without the force of the base."""
+    K, G = 1e5 * np.array([[2.0, -1, 0], [-1, 2, -1], [0, -1, 1]]), np.ones((3, 1))
+    full = np.block([[K, -K @ G], [-G.T @ K, G.T @ K @ G]])
+    truth = sysid.Structure(np.diag([20.0, 15.0, 10.0, 5.0]), full, [0.01, 0.012, 0.015], n_base=1)
+    found = []
+    for force in (True, False):
+        test = sysid.simulate(truth, np.linspace(2.0, 40.0, 150), noise=0.01, force=force, rng=3)
+        mass = sysid.FullMass() if force else sysid.FullMass(50.0)
+        found.append(sysid.identify(sysid.Problem(test, mass=mass, damping=sysid.ModalDamping())))
+    return truth, *found

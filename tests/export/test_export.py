@@ -1,6 +1,7 @@
 """Exported files keep the numbers, say what is open, and are written whole or not at all."""
 
 import csv
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -9,18 +10,29 @@ from scipy.io import loadmat
 
 import sysid
 from sysid.cli.main import main
-from sysid.export.content import damping_of
+from sysid.export.content import damping_of, rotations_of, unit
+from sysid.export.state_space import control_system
+
+
+def read_table(path):
+    """Rows of a table, and values and deviations by matrix; NaN where there is none."""
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    size = max(int(row["row"]) for row in rows)
+    both = {"value": {}, "deviation": {}}
+    for name, found in both.items():
+        for row in rows:
+            matrix = found.setdefault(row["matrix"], np.full((size, size), np.nan))
+            matrix[int(row["row"]) - 1, int(row["column"]) - 1] = float(row[name] or "nan")
+    return rows, both["value"], both["deviation"]
 
 
 def test_a_table_keeps_every_number_and_tells_units_and_judgement(result, tmp_path):
-    lines = sysid.export(result, tmp_path / "new" / "m.csv").read_text(encoding="utf-8").splitlines()
-    rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
+    path = sysid.export(result, tmp_path / "new" / "m.csv")
+    lines, (rows, values, _) = path.read_text(encoding="utf-8").splitlines(), read_table(path)
     s = result.structure
     for letter, matrix in (("M", s.mass), ("K", s.stiffness), ("C", damping_of(s))):
-        read = np.zeros((5, 5))
-        for row in (r for r in rows if r["matrix"] == letter):
-            read[int(row["row"]) - 1, int(row["column"]) - 1] = float(row["value"])
-        assert np.array_equal(read, matrix)
+        assert np.array_equal(values[letter], matrix)
     assert {r["unit"] for r in rows} == {f"{u}{m}" for u in ("kg",) for m in ("", " m", " m2")} | {
         "N/m",
         "N",
@@ -43,11 +55,61 @@ def test_a_matlab_file_keeps_every_number(result, tmp_path):
     assert any(str(cell[0]).startswith("judgement: ") for cell in read["about"][:, 0])
 
 
-def test_damping_on_all_degrees_of_freedom_is_still_in_a_rigid_motion(result):
+def test_deviations_stand_beside_the_entries_and_hold_the_true_ones(noisy, tmp_path):
+    truth, result, _ = noisy
+    _, values, deviations = read_table(sysid.export(result, tmp_path / "m.csv"))
+    mat = loadmat(sysid.export(result, tmp_path / "m.mat"))
+    blocks = {"M": truth.mass, "K": truth.stiffness, "C": truth.damping}
+    for letter, name in (("M", "mass"), ("K", "stiffness"), ("C", "damping")):
+        std = deviations[letter]
+        assert np.array_equal(std[:3, :3], getattr(result.uncertainty, name))
+        assert np.isnan(std[3:]).all() and np.isnan(std[:, 3:]).all()  # the base has none
+        assert np.array_equal(std, mat[f"{letter}_std"], equal_nan=True)
+        found, std = values[letter][:3, :3], std[:3, :3]
+        assert np.all(np.abs(found - blocks[letter][:3, :3]) < 4 * std)
+        assert np.all(np.diag(std) < 0.15 * np.diag(found))
+
+
+def test_entries_that_the_data_leave_open_have_no_deviation(noisy, tmp_path):
+    _, _, without_force = noisy
+    deviations = read_table(sysid.export(without_force, tmp_path / "m.csv"))[2]
+    mat = loadmat(sysid.export(without_force, tmp_path / "m.mat"))
+    assert all(np.isnan(std).all() for std in (*deviations.values(), mat["M_std"], mat["K_std"], mat["C_std"]))
+    about = [str(cell[0]) for cell in mat["about"][:, 0]]
+    assert any(line.startswith("open: all modal masses are open") for line in about) and not mat["determined"][0, 0]
+
+
+def test_a_coordinate_that_no_sensor_records_has_no_unit(result):
     s = result.structure
-    rigid = np.vstack([s.rigid_body_dofs, np.eye(2)])
-    assert np.abs(damping_of(s) @ rigid).max() < 1e-10 * np.abs(s.damping).max()
-    assert np.array_equal(damping_of(s)[:3, :3], s.damping)
+    between = [[1, 0, 0], [0, 1, 0], [0, 0.5, 0.5]]  # the third sensor sees two coordinates
+    other = sysid.Structure(s.mass, s.stiffness, s.damping_ratios, n_base=2, recovery=between)
+    kinds = rotations_of(replace(result, structure=other))
+    assert kinds == (False, False, None, False, True)
+    assert [unit("M", kinds[0], kinds[j]) for j in range(5)] == ["kg", "kg", "", "kg", "kg m"]
+    assert unit("K", True, True) == "N m" and unit("C", True, None) == ""
+
+
+NEEDS = {"m.op4": ("pyyeti", "nastran"), "system": ("control", "control")}
+
+
+@pytest.mark.parametrize("file", NEEDS)
+def test_a_missing_extra_is_one_line_with_the_remedy(result, tmp_path, monkeypatch, file):
+    package, extra = NEEDS[file]
+    monkeypatch.setitem(sys.modules, package, None)
+    remedy = rf"needs the package {package}: python -m pip install 'structural-sysid\[{extra}\]'$"
+    with pytest.raises(sysid.InputError, match=remedy):
+        control_system(result) if file == "system" else sysid.export(result, tmp_path / file)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_rigid_motion_strains_nothing_and_carries_the_total_mass(result, tmp_path):
+    values = read_table(sysid.export(result, tmp_path / "m.csv"))[1]
+    rigid = np.vstack([result.structure.rigid_body_dofs, np.eye(2)])
+    assert np.abs(values["K"] @ rigid).max() < 1e-10 * np.abs(values["K"]).max()
+    assert np.abs(values["C"] @ rigid).max() < 1e-10 * np.abs(values["C"]).max()
+    # 20, 15 and 10 kg at 1, 2 and 3 m, and 5 kg, 8 kg m² of the base.
+    total = [[20 + 15 + 10 + 5, 20 + 2 * 15 + 3 * 10], [20 + 2 * 15 + 3 * 10, 20 + 4 * 15 + 9 * 10 + 8]]
+    np.testing.assert_allclose(rigid.T @ values["M"] @ rigid, total, rtol=1e-6)
 
 
 @pytest.mark.parametrize("ending", ["csv", "bdf", "unv"])

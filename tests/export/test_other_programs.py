@@ -1,5 +1,7 @@
 """What other programs read of exported files, and how they answer to a moving base."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -31,6 +33,29 @@ def test_an_op4_file_keeps_every_number_and_its_superelement_answers_as_identifi
     assert read["determnd"][0, 0] == result.determined
     note = ["".join(map(chr, row.astype(int))).rstrip() for row in read["note"]]
     assert any(line.startswith("judgement: determined") for line in note)
+    rigid = np.r_[s.rigid_body[:, 0], 1.0, 0.0]  # 1 m/s² in x: no elastic force, 20 + 15 + 10 + 5 kg
+    assert np.abs(read["k"] @ rigid).max() < 1e-10 * np.abs(read["k"]).max()
+    assert rigid @ read["m"] @ rigid == pytest.approx(50.0, rel=1e-6)
+    assert np.array_equal(read["kcb"][:2], np.zeros((2, 5))) and read["mcb"][0, 0] == pytest.approx(50.0, rel=1e-6)
+
+
+def test_an_op4_file_notes_what_the_data_leave_open(noisy, tmp_path):
+    op4 = pytest.importorskip("pyyeti.nastran.op4")
+    read = op4.read(str(sysid.export(noisy[2], tmp_path / "m.op4")))
+    note = "\n".join("".join(map(chr, row.astype(int))).rstrip() for row in read["note"])
+    assert read["determnd"][0, 0] == 0
+    assert "judgement: ONE OF MANY" in note and "open: all modal masses are open" in note
+
+
+def test_a_superelement_with_damping_that_is_not_classical_answers_as_its_structure(result, tmp_path):
+    op4 = pytest.importorskip("pyyeti.nastran.op4")
+    s = result.structure
+    dampers = 30.0 * np.array([[5.0, -1, 0], [-1, 1.5, -0.5], [0, -0.5, 0.5]])
+    damped = sysid.Structure(s.mass, s.stiffness, damping_matrix=dampers, n_base=2)
+    read = op4.read(str(sysid.export(replace(result, structure=damped), tmp_path / "m.op4")))
+    modal = read["ccb"][2:, 2:]
+    assert np.abs(modal - np.diag(np.diag(modal))).max() > 0.1 * np.diag(modal).max()
+    assert_answers_alike(damped, base_driven(read["mcb"], read["ccb"], read["kcb"], read["rcb"], 2), 1e-10)
 
 
 def test_a_dmig_deck_keeps_ten_digits_and_answers_as_identified(result, tmp_path):
@@ -61,8 +86,12 @@ def test_a_universal_file_keeps_modes_to_1e_5(result, tmp_path):
 
 
 def test_python_control_answers_as_identified(result):
-    pytest.importorskip("control")
+    control = pytest.importorskip("control")
     system = control_system(result)
+    frequencies, ratios, _ = control.damp(system, doprint=False)
+    order = np.argsort(frequencies)[::2]
+    np.testing.assert_allclose(frequencies[order], 2 * np.pi * result.structure.natural_frequencies, rtol=1e-10)
+    np.testing.assert_allclose(ratios[order], result.structure.damping_ratios, rtol=1e-8)
     answer = system(2j * np.pi * FREQ)
     right = result.structure.transmissibility(FREQ)
     assert np.abs(answer - right).max() < 1e-10 * np.abs(right).max()

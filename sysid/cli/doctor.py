@@ -1,0 +1,170 @@
+"""``sysid doctor``: what this installation has, what it lacks, and how to get that."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import os
+import platform
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from sysid.cli.output import Output
+from sysid.cli.status import MISTAKE, SUCCESS
+from sysid.errors import how_to_install
+from sysid.results.version import __version__
+
+_PACKAGE = "structural-sysid"
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_USED = "mumps"  # the linear solver of every search
+_LINEAR_SOLVERS = (_USED, "spral", "ma27", "ma57", "ma77", "ma86", "ma97", "pardiso")
+
+# In a process of its own: a library that is found and does not fit ends the process. Names come one by one.
+_TRIAL = """
+import sys
+import casadi
+x = casadi.MX.sym("x")
+for name in sys.argv[1:]:
+    options = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", "linear_solver": name}}
+    try:
+        solver = casadi.nlpsol("trial", "ipopt", {"x": x, "f": (x - 1) ** 2 + x**4}, options)
+        solver(x0=0.0)
+        if solver.stats()["success"]:
+            print("works:", name, flush=True)
+    except RuntimeError:
+        pass
+"""
+
+
+@dataclass(frozen=True)
+class Package:
+    """A package that sysid needs, always or for an extra.
+
+    Attributes
+    ----------
+    name, needed : str
+        `needed` is the least version.
+    extra : str
+        "" where it is always needed.
+    version : str
+        "" where it is not installed.
+    enough : bool
+        Whether it is installed, and late enough.
+    """
+
+    name: str
+    needed: str
+    extra: str
+    version: str
+    enough: bool
+
+
+def run(options: argparse.Namespace, out: Output) -> int:
+    """Tell all of it; a mistake where something is missing that every search needs."""
+    packages, solvers, threads = tuple(_packages()), linear_solvers(), _libraries()
+    required = [package for package in packages if not package.extra]
+    missing = sorted({package.extra for package in packages if package.extra and not package.enough})
+    place = Path(__file__).resolve().parents[1]
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    variables = {name: os.environ[name] for name in _THREADS if name in os.environ}
+    out.answer(
+        sysid=__version__, folder=str(place), python=platform.python_version(), executable=sys.executable,
+        platform=platform.platform(), packages=[asdict(package) for package in packages], linear_solvers=solvers,
+        processors=usable, thread_libraries=threads, environment=variables, matplotlib_backend=_backend(),
+        missing_extras={name: how_to_install(name) for name in missing},
+    )  # fmt: skip
+    out.write(f"sysid {__version__} in {place}\n")
+    out.write(f"Python {platform.python_version()} ({sys.executable}) on {platform.platform()}\n\npackages\n")
+    for package in required:
+        out.write(f"  {package.name:<14} {_version(package)}\n")
+    out.write(f"\nIPOPT {'works' if _USED in solvers else 'does NOT work'} with MUMPS, which every search takes; ")
+    out.write(f"linear solvers found: {', '.join(solvers) or 'none'}\n")
+    out.write(f"\n{usable} processors; linear algebra of a search is held to one thread, jobs run side by side\n")
+    for name, count in threads.items():
+        out.write(f"  {name}: {count} thread{'s' if count > 1 else ''} outside of a search\n")
+    for name, value in variables.items():
+        out.write(f"  {name}={value}\n")
+    out.write(f"\nmatplotlib draws by its backend {_backend()!r}; report.html is written without a browser\n\nextras\n")
+    for extra in sorted({package.extra for package in packages if package.extra}):
+        members = ", ".join(f"{one.name} {_version(one)}" for one in packages if one.extra == extra)
+        out.write(f"  {extra:<10} {members}" + (f": {how_to_install(extra)}\n" if extra in missing else "\n"))
+    return _judged(required, solvers, out)
+
+
+def _judged(required: list[Package], solvers: list[str], out: Output) -> int:
+    """One line where a search cannot work."""
+    lacking = [f"{package.name}>={package.needed}" for package in required if not package.enough]
+    if lacking:
+        out.complain(f"these packages are missing or too old: python -m pip install {' '.join(map(repr, lacking))}")
+    elif _USED not in solvers:
+        out.complain("IPOPT does not work: python -m pip install --force-reinstall casadi")
+    elif not required:
+        out.warn("sysid is imported from its folder, not installed, so that what it needs is not known: pip install it")
+    return MISTAKE if lacking or _USED not in solvers else SUCCESS
+
+
+def _version(package: Package) -> str:
+    old = "" if package.enough else f" (too old: {package.needed} is needed)"
+    return f"{package.version}{old}" if package.version else "missing"
+
+
+def _packages() -> Iterator[Package]:
+    """What the installed package states that it needs; nothing where it is not installed."""
+    try:
+        stated = importlib.metadata.requires(_PACKAGE) or ()
+    except importlib.metadata.PackageNotFoundError:
+        return
+    for line in sorted(stated, key=lambda one: ("extra" in one, one)):
+        found = re.match(r"([\w.-]+)(?:\[.*\])?>=([\d.]+)(?:.*extra == ['\"](\w+)['\"])?", line)
+        if found is None or found[1] == _PACKAGE:
+            continue
+        name, needed, extra = found[1], found[2], found[3] or ""
+        try:
+            version = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            version = ""
+        yield Package(name, needed, extra, version, bool(version) and _numbers(version) >= _numbers(needed))
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    """The leading numbers of a version: (3, 8, 2) of "3.8.2rc1"."""
+    found = re.match(r"\d+(?:\.\d+)*", version)
+    return tuple(map(int, found[0].split("."))) if found else ()
+
+
+def linear_solvers() -> list[str]:
+    """The linear solvers with which IPOPT solves a small program here."""
+    done = subprocess.run(
+        [sys.executable, "-c", _TRIAL, *_LINEAR_SOLVERS], capture_output=True, text=True, timeout=120, check=False
+    )
+    return re.findall(r"^works: (\w+)$", done.stdout, re.MULTILINE)
+
+
+def _libraries() -> dict[str, int]:
+    """Libraries of linear algebra by name and version, and how many threads each takes."""
+    import scipy.linalg  # noqa: F401 - only libraries that are loaded are found
+    from threadpoolctl import threadpool_info
+
+    return {f"{one['prefix']} {one['version']}": one["num_threads"] for one in threadpool_info()}
+
+
+def _backend() -> str:
+    import matplotlib
+
+    return str(matplotlib.get_backend())
+
+
+def add(command: Callable[..., argparse.ArgumentParser]) -> None:
+    """Add the command."""
+    parser = command(
+        "doctor",
+        summary="tell what this installation has, what it lacks, and how to get that",
+        description="Tell versions of Python and packages, the solvers that work here, threads, and which extras are "
+        "installed, with the command for those that are not. Exit status 2 where a search could not work.",
+        examples=("sysid doctor", "sysid doctor --json"),
+    )
+    parser.set_defaults(command=run)

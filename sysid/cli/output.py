@@ -1,0 +1,161 @@
+"""What commands say: words or one JSON document on standard output, progress and complaints on standard error."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import json
+import os
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, Any
+
+from sysid.cli.status import MISTAKE
+
+_CLOSED = OSError(errno.EBADF, "it is closed")
+
+
+class Stream:
+    """A text stream that takes any character and never raises.
+
+    A closed pipe or a full disk must not end a search whose result goes elsewhere; `failed` keeps
+    the first such error. None is a stream that was closed before the process began.
+    """
+
+    def __init__(self, stream: IO[str] | None) -> None:
+        self._stream = io.StringIO() if stream is None else stream
+        self.encoding = getattr(stream, "encoding", None) or "utf-8"
+        self.failed = _CLOSED if stream is None else None
+
+    def write(self, text: str) -> int:
+        """Write what the stream can show of a text; its length."""
+        self._try(self._stream.write, text.encode(self.encoding, "replace").decode(self.encoding))
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush the stream."""
+        self._try(self._stream.flush)
+
+    def close(self) -> None:
+        """Leave the stream open: it is not a problem module's to close."""
+
+    def _try(self, do: Callable[..., object], *arguments: str) -> None:
+        if self.failed is None:
+            try:
+                do(*arguments)
+            except OSError as error:
+                self.failed = error
+            except ValueError:  # a closed file
+                self.failed = _CLOSED
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+class Output:
+    """What one command says.
+
+    Parameters
+    ----------
+    json : bool
+        In the place of words one JSON document, at the end: ``status``, ``files`` that were written, ``warnings``, the
+        command's own figures, and ``error`` where there is one.
+    quiet : bool
+        No words and no progress; complaints, warnings and the document remain.
+    """
+
+    def __init__(self, *, json: bool = False, quiet: bool = False) -> None:
+        self.stdout, self.stderr = Stream(sys.stdout), Stream(sys.stderr)
+        self.json, self.quiet = json, quiet
+        self._document: dict[str, Any] = {"files": [], "warnings": []}
+
+    @property
+    def prints(self) -> Stream:
+        """Where what argparse, a problem module or CasADi prints goes: not into the document."""
+        return self.stderr if self.json or self.quiet else self.stdout
+
+    def write(self, words: str) -> None:
+        """Say words to people."""
+        if not (self.json or self.quiet):
+            self.stdout.write(words)
+
+    def flush(self) -> None:
+        """Flush the words."""
+        self.stdout.flush()
+
+    def progress(self, words: str) -> None:
+        """Say how far the work is."""
+        if not self.quiet:
+            self.stdout.flush()
+            self.stderr.write(words)
+            self.stderr.flush()
+
+    def answer(self, **figures: Any) -> None:
+        """Add to the document: numbers, texts, and lists and dictionaries of them."""
+        self._document.update(figures)
+
+    def wrote(self, path: Path, label: str = "") -> None:
+        """Tell a file that was written."""
+        self._document["files"].append(str(path))
+        self.write(f"{label}{path}\n")
+
+    def complain(self, message: object) -> None:
+        """One line on standard error, whatever the message holds."""
+        line = " ".join(str(message).split())
+        self._document["error"] = line
+        self._complain(line)
+
+    def warn(self, message: object) -> None:
+        """The same for what is no mistake."""
+        line = " ".join(str(message).split())
+        self._document["warnings"].append(line)
+        self._complain(f"warning: {line}")
+
+    def end(self, status: int) -> int:
+        """Write the document, if that was asked for; the exit status, also where standard output cannot be written."""
+        if self.json:
+            self.stdout.write(strict_json({"status": status, **self._document}))
+        self.flush()
+        failed = self.stdout.failed
+        if failed is None:
+            return status
+        # What is left in the interpreter's own buffer would fail once more at exit.
+        with contextlib.suppress(OSError, ValueError, AttributeError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if isinstance(failed, BrokenPipeError):  # a reader that has seen enough is no mistake
+            return status
+        self._complain(f"standard output cannot be written: {failed.strerror}")
+        return status or MISTAKE
+
+    def _complain(self, line: str) -> None:
+        self.stdout.flush()
+        self.stderr.write(f"sysid: {line}\n")
+        self.stderr.flush()
+
+
+def strict_json(value: object) -> str:
+    """JSON with null for what is not a number."""
+    finite = json.loads(json.dumps(value, default=lambda array: array.tolist()), parse_constant=lambda _: None)
+    return json.dumps(finite, indent=2, allow_nan=False) + "\n"
+
+
+def keep_for_document() -> None:
+    """Keep standard output of this process for the document: what else is printed goes to standard error."""
+    with contextlib.suppress(OSError):  # one of them is closed
+        sys.stdout = os.fdopen(os.dup(1), "w", encoding="utf-8")
+        os.dup2(2, 1)
+
+
+@contextlib.contextmanager
+def collected_warnings() -> Iterator[list[str]]:
+    """Keep warnings for the end: they would tear the live display, or stand beside the one line of a mistake."""
+    lines: list[str] = []
+    with warnings.catch_warnings():
+        # An assignment, and not record=True: warnings that are errors stay so.
+        warnings.showwarning = lambda message, category, filename, lineno, file=None, line=None: lines.append(
+            f"{filename}:{lineno}: {category.__name__}: {message}"
+        )
+        yield lines
