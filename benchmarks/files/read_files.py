@@ -142,7 +142,7 @@ def _identified(files: list[str], where: Path) -> np.ndarray:
     exported = where / ("m.op4" if importlib.util.find_spec("pyyeti") else "m.mat")
     for command in (
         ["read", *files, "--out", str(test)],
-        ["run", str(test), "--set", "band=(1.0, 14.0)", "--out", str(out)],
+        ["run", str(test), "--band", "1-14", "--out", str(out)],
         ["export", str(out / "result.h5"), str(exported)],
     ):
         said, wrong = io.StringIO(), io.StringIO()

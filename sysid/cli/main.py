@@ -296,10 +296,11 @@ def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
             "sysid run cantilever_tower --set elements=3 --set noise=0.01 --out results/noisy",
             "sysid run my_building.py --max-time 60 --quiet",
             "sysid run test.h5 --mass 1450",
+            "sysid run test.h5 --band 0.5-20",
         ),
     )
     parameters.add_arguments(run, optional=True)
-    read.add_masses(run)
+    read.add_options(run)
     run.add_argument(
         "--seed",
         type=seed,

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from sysid.cli.argument_types import band
 from sysid.cli.output import Output
 from sysid.cli.status import SUCCESS
 from sysid.errors import InputError, refuse
@@ -99,20 +100,21 @@ def is_test(name: str | None) -> bool:
 def recipe(options: argparse.Namespace, made: Recipe) -> Recipe:
     """The recipe of a run of a test file: the bundled problem, with the test as its data."""
     if not is_test(made.module):
-        refuse(
-            (options.mass is not None or options.lumped, "--mass and --lumped are for a test that 'sysid read' wrote")
-        )
+        asked = options.mass is not None or options.lumped or options.band is not None
+        refuse((asked, "--mass, --lumped and --band are for a test that 'sysid read' wrote"))
         return made
     refuse((made.data is not None, f"--data {made.data}: {made.module} is the data already"))
     recorded_test.load(made.module)  # told before anything is made
     extra: dict[str, Any] = {"lumped": True} if options.lumped else {}
     if options.mass is not None:
         extra["mass"] = options.mass[0] if len(options.mass) == 1 else options.mass
+    if options.band is not None:
+        extra["band"] = options.band
     return Recipe(MODULE, made.module, made.rng, {**made.parameters, **extra})
 
 
-def add_masses(command: argparse.ArgumentParser) -> None:
-    """Add to a command what it may say of the masses of a test file."""
+def add_options(command: argparse.ArgumentParser) -> None:
+    """Add to a command what it may say of a test file: its masses, and the lines that are fitted."""
     command.add_argument(
         "--mass",
         type=_masses,
@@ -120,6 +122,9 @@ def add_masses(command: argparse.ArgumentParser) -> None:
         help="of TEST.h5: mass that moves with the base, kg, a number or one a direction: 1450 or 1450,1450,1450",
     )
     command.add_argument("--lumped", action="store_true", help="of TEST.h5: masses at the sensors alone")
+    command.add_argument(
+        "--band", type=band, metavar="LOW-HIGH", help="of TEST.h5: the lines that are fitted, Hz, such as 0.5-40"
+    )
 
 
 def _masses(text: str) -> list[float]:

@@ -16,7 +16,7 @@ from sysid.cli import main as cli
 from sysid.cli.output import Output
 from sysid.jobs import JobResult
 
-README = Path(__file__).resolve().parents[2] / "README.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "refinement_jobs.md"
 PNG = b"\x89PNG"
 
 
@@ -232,10 +232,10 @@ def test_without_noise_there_is_nothing_to_draw(capsys):
     assert "fits its records exactly: without noise there is nothing to draw" in capsys.readouterr().err
 
 
-@pytest.mark.skipif(not README.exists(), reason="no README beside the tests")
-def test_the_example_of_the_readme_refines_that_result():
+@pytest.mark.skipif(not PAGE.exists(), reason="no docs beside the tests")
+def test_the_example_of_its_page_refines_that_result():
     names = {"sysid": sysid}
-    exec(re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)[0], names)
+    exec(re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[0], names)
     assert [end.index for end in names["ends"]] == [0, 1, 2, 3]
     assert names["ends"][0].residual <= max(names["result"].residual, 1e-12) * (1 + 1e-6)
 
