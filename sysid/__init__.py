@@ -23,7 +23,7 @@ from sysid.models.stiffness import ChainStiffness, SpectralStiffness
 from sysid.models.unknowns import Unknown, Variable
 from sysid.problem.problem import Problem
 from sysid.problem.terms import FurtherTest, Prior
-from sysid.report.report import write as write_report
+from sysid.report.report import write_report
 from sysid.results.identification import Identification, Recipe, load
 from sysid.results.version import __version__
 from sysid.search.continuation import Continuation

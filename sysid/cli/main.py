@@ -218,7 +218,7 @@ def _report(options: argparse.Namespace, out: Output) -> int:
     source = Path(options.result)
     result = load(source)
     folder = source if source.is_dir() else source.parent
-    out.wrote(report.write(result, folder / report.FILE_NAME))
+    out.wrote(report.write_report(result, folder / report.FILE_NAME))
     return SUCCESS
 
 
@@ -460,7 +460,7 @@ def _write_pages(
     out.wrote(summary, "summary  ")
     try:
         with within(left):
-            out.wrote(report.write(result, folder / report.FILE_NAME), "report   ")
+            out.wrote(report.write_report(result, folder / report.FILE_NAME), "report   ")
     except TimeIsOver:
         out.write(f"no report, as the time is over: 'sysid report {folder}' writes it\n")
 

@@ -33,6 +33,9 @@ from sysid.structure.structure import Array, Structure
 class Problem:
     """What to identify, and from what.
 
+    The constructor checks types, shapes and what is written. Poles, weights and feasibility are found when they are
+    first asked for, once; `check` refuses what cannot be searched.
+
     Parameters
     ----------
     measurement : Measurement
@@ -70,9 +73,6 @@ class Problem:
         "huber" makes numbers of the records count little that are far from the fit: for spikes and drop-outs at some
         lines of some channels, which `Identification.outliers` then lists. What else is fitted counts by its squares.
         A mode must show at more than one line. `objective` and `residual` are of the records as `screened`.
-
-    The constructor checks types, shapes and what is written. Poles, weights and feasibility are found when they are
-    first asked for, once; `check` refuses what cannot be searched.
 
     Attributes
     ----------

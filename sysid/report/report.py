@@ -74,7 +74,7 @@ def scores(structure: Structure, test: Measurement) -> Scores:
     return Scores(_score(predicted, test.relative), absolute, rigid)
 
 
-def write(identification: Identification, path: str | Path) -> Path:
+def write_report(identification: Identification, path: str | Path) -> Path:
     """Write the report, whole or not at all.
 
     Parameters

@@ -162,7 +162,7 @@ def test_the_summary_and_the_report_have_their_unknowns(noisy, tmp_path, monkeyp
         monkeypatch.setattr(room, "picture", lambda figure, alt, caption="", **_: f"<p>{caption}</p>")
     result = noisy[0]
     summary = result.summary()
-    page = report.write(result, tmp_path / "report.html").read_text(encoding="utf-8")
+    page = report.write_report(result, tmp_path / "report.html").read_text(encoding="utf-8")
     for line in LINES:
         assert line in summary
         assert line in page

@@ -80,7 +80,7 @@ def test_a_report_that_fails_takes_no_result_away(here, capsys, monkeypatch):
     def write(*arguments, **options):
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr(report, "write", write)
+    monkeypatch.setattr(report, "write_report", write)
     assert cli.main(["run", "pair.py"]) == 70
     assert "result.h5" in capsys.readouterr().out
     assert sysid.load(here / "results/pair").success
@@ -123,7 +123,7 @@ def test_a_report_that_takes_more_time_than_is_left_is_left_out(here, capsys, fi
         while True:
             time.sleep(0.01)
 
-    monkeypatch.setattr(report, "write", write)
+    monkeypatch.setattr(report, "write_report", write)
     assert cli.main(["run", "pair.py", "--max-time", "1.5"]) == 0
     assert "no report, as the time is over: 'sysid report results/pair' writes it" in capsys.readouterr().out
     assert files(here / "results/pair") == {"result.h5", "summary.json"}
@@ -134,7 +134,7 @@ def test_ctrl_c_while_saving_says_that_files_are_missing(here, complaint, files,
     def write(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(report, "write", write)
+    monkeypatch.setattr(report, "write_report", write)
     assert cli.main(["run", "pair.py"]) == 130
     assert "not every file is in results/pair" in complaint()
     assert not [name for name in files(here) if name.endswith(".tmp")]
@@ -228,7 +228,7 @@ def test_a_third_ctrl_c_acts_at_once_and_what_it_breaks_is_no_error_of_ours(
 @pytest.mark.parametrize("place", ["search", "save", "report"])
 def test_ctrl_c_after_the_search_loses_nothing(here, complaint, files, monkeypatch, no_pictures, place, times, ctrl_c):
     """As the search is done, while the result is written, and while the page is made (a third one ends that)."""
-    owner, name = {"search": (cli, "identify"), "save": (storage, "write"), "report": (report, "write")}[place]
+    owner, name = {"search": (cli, "identify"), "save": (storage, "write"), "report": (report, "write_report")}[place]
     original = getattr(owner, name)
 
     def struck(*arguments, **options):

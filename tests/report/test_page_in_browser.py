@@ -138,7 +138,7 @@ def test_every_control_works_and_the_page_is_readable(result, tmp_path, width, d
 
 
 def test_the_page_prints(result, tmp_path):
-    page, pdf = report.write(result, tmp_path), tmp_path / "page.pdf"
+    page, pdf = report.write_report(result, tmp_path), tmp_path / "page.pdf"
     command = [CHROMIUM, *OPTIONS, f"--user-data-dir={tmp_path / 'user'}", f"--print-to-pdf={pdf}", page.as_uri()]
     subprocess.run(command, capture_output=True, timeout=120, check=True)
     content = pdf.read_bytes()

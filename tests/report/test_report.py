@@ -273,8 +273,8 @@ def test_scores_follow_their_definition(complete, truth, page):
 
 def test_write_gives_a_file_named_or_in_a_folder(plain, tmp_path, monkeypatch):
     monkeypatch.setattr(report, "render", lambda it: f"residual {it.residual} – \udcff")
-    assert report.write(plain, tmp_path / "new" / "run.1") == tmp_path / "new" / "run.1" / "report.html"
-    path = report.write(plain, str(tmp_path / "page.html"))
+    assert report.write_report(plain, tmp_path / "new" / "run.1") == tmp_path / "new" / "run.1" / "report.html"
+    path = report.write_report(plain, str(tmp_path / "page.html"))
     assert path.read_text(encoding="utf-8") == f"residual {plain.residual} – ?"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["new", "page.html"]
 
@@ -288,12 +288,12 @@ def test_a_failure_while_writing_leaves_the_old_page(plain, tmp_path, monkeypatc
 
     monkeypatch.setattr(plot, "effective_masses", fail)
     with pytest.raises(failure):
-        report.write(plain, tmp_path)
+        report.write_report(plain, tmp_path)
     monkeypatch.undo()
     monkeypatch.setattr(report, "render", lambda it: "new")
     monkeypatch.setattr("pathlib.Path.write_bytes", fail)
     with pytest.raises(failure):
-        report.write(plain, tmp_path)
+        report.write_report(plain, tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
     assert (tmp_path / "report.html").read_text() == "old"
 
@@ -301,9 +301,9 @@ def test_a_failure_while_writing_leaves_the_old_page(plain, tmp_path, monkeypatc
 def test_a_place_that_cannot_be_written_gets_one_sentence(plain, tmp_path, no_pictures):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(sysid.InputError, match=r"ends in \.html"):
-        report.write(plain, tmp_path / "notes.txt")
+        report.write_report(plain, tmp_path / "notes.txt")
     with pytest.raises(sysid.InputError, match="cannot be written"):
-        report.write(plain, tmp_path / "notes.txt" / "report.html")
+        report.write_report(plain, tmp_path / "notes.txt" / "report.html")
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
@@ -461,7 +461,7 @@ def test_a_page_of_12_panels_stays_below_1_megabyte(random_structure, tmp_path):
     it = sysid.Identification(
         truth, problem, problem.values(truth), "swarm", 0, True, "", sysid.History(), False, (), (), ()
     )
-    assert report.write(it, tmp_path).stat().st_size < 1e6
+    assert report.write_report(it, tmp_path).stat().st_size < 1e6
 
 
 @pytest.fixture
