@@ -97,6 +97,9 @@ BENCHMARKS = (
     Benchmark(
         "files.read_files", "one test as CSV, MAT, UFF 58 and 58b: masses after read, run and export", "40 s", "12 s"
     ),
+    Benchmark(
+        "files.awkward_files", "awkward and broken files: read right, or refused in one clear line", "5 s", "5 s"
+    ),
     Benchmark("files.exported_files", "exported files read by other programs: what they keep", "20 s", "10 s"),
     Benchmark("house", "imports one way, tests of types, branches, sizes of functions and files", "2 s", "2 s"),
 )

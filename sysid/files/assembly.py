@@ -8,7 +8,7 @@ import numpy as np
 
 from sysid.errors import InputError, refuse
 from sysid.files import units
-from sysid.files.description import EXAMPLE, Channel, Description
+from sysid.files.description import Channel, Description
 from sysid.files.recorded_test import RecordedTest, Row, Run
 from sysid.files.recording import Column, Recording, check_finite, rate_of
 from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
@@ -47,9 +47,9 @@ def in_time(recordings: Sequence[Recording], said: Description) -> RecordedTest:
 def undescribed(recording: Recording) -> str:
     """What to say where nothing tells which column is which sensor."""
     return (
-        f"{recording.path}: which column is which sensor is not said; {recording.in_words()}. Say it with --sensors "
-        f"FILE.toml, or with --sensor COLUMN role=response axis=x position=0,0,3 unit=g for each; such a "
-        f"file:\n{EXAMPLE}"
+        f"{recording.path}: which column is which sensor is not said; {recording.in_words()}. Say it in a file "
+        f"sensors.toml beside it ('sysid read --help' shows one), or with --sensor COLUMN role=response axis=x "
+        "position=0,0,3 unit=g for each"
     )
 
 

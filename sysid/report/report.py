@@ -380,7 +380,7 @@ def _what_ran(it: Identification) -> str:
     facts += [
         ["strategy", it.strategy],
         ["seed", "–" if it.seed is None else it.seed],
-        ["wall time", f"{it.history.wall_time:.1f} s"],
+        ["wall time", f"{it.history.wall_time:.2g} s"],
         *_models(problem),
         ["sysid", __version__],
     ]

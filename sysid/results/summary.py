@@ -33,7 +33,7 @@ def summary(it: Answer) -> str:
         "",
         *_unknowns(it),
         f"{'success' if it.success else 'no success'}: {it.message}",
-        f"relative residual {residual_in_words(it)}{force}; seed {it.seed}, {it.history.wall_time:.1f} s",
+        f"relative residual {residual_in_words(it)}{force}; seed {it.seed}, {it.history.wall_time:.2g} s",
         *_phases(it),
         *it.remarks,
         "rigid-body mass " + ", ".join(_rigid_masses(it, axes)),
