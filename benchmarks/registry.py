@@ -101,6 +101,7 @@ BENCHMARKS = (
         "files.awkward_files", "awkward and broken files: read right, or refused in one clear line", "5 s", "5 s"
     ),
     Benchmark("files.exported_files", "exported files read by other programs: what they keep", "20 s", "10 s"),
+    Benchmark("page.report_page", "the report page: size, seconds, and a browser's measure of it", "90 s", "15 s"),
     Benchmark("house", "imports one way, tests of types, branches, sizes of functions and files", "2 s", "2 s"),
 )
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from sysid.errors import InputError
@@ -10,6 +12,7 @@ from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.response import columns, gains, stacked
 from sysid.structure.structure import Array, ComplexArray
 
+_TURNED = 0.25  # of what a base force leaves; of one with a wrong sign less is left when it is turned
 _MOST = 0.5  # of the power of a base force, the least that a fit must explain to tell its sign
 
 
@@ -55,7 +58,8 @@ def weigh(test: Measurement, modes: Modes, ends: Array | None = None) -> tuple[A
     Q, R = np.linalg.qr(rows)
     plain = Q.T @ target
     free = np.linalg.lstsq(R, plain, rcond=None)[0]
-    together = np.sum(free[:m] * np.abs(free[:m])) < -0.5 * np.sum(free[:m] ** 2)
+    negative = np.sum(free[:m] * np.abs(free[:m])) < -0.5 * np.sum(free[:m] ** 2)
+    together = negative and _fits_turned(R, plain, range(m))
     _check_signs(test, modes.gamma, pushes, force / size, bool(together))
     answer = (free if np.all(free[:m] > 0) else lsq_linear(R, plain, (lower, np.inf), tol=1e-14).x) / scale
     rigid = np.zeros((d, d))
@@ -63,6 +67,23 @@ def weigh(test: Measurement, modes: Modes, ends: Array | None = None) -> tuple[A
         rigid[i, j] = rigid[j, i] = mass
     t = answer[:m]
     return np.maximum(t, 1e-9 * t.max()), rigid
+
+
+def _fits_turned(X: Array, wanted: Array, masses: Sequence[int]) -> bool:
+    """Whether a force of the other sign is much better explained by unknowns of which `masses` are not negative.
+
+    Of modes far below all lines free masses cancel each other and the base's, and their signs say nothing.
+    """
+    from scipy.optimize import lsq_linear
+
+    lower = np.full(X.shape[1], -np.inf)
+    lower[list(masses)] = 0.0
+    Q, R = np.linalg.qr(X)
+    left = []
+    for sign in (1.0, -1.0):
+        found = lsq_linear(R, Q.T @ (sign * wanted), (lower, np.inf), method="bvls").x
+        left.append(np.sum((X @ found - sign * wanted) ** 2))
+    return bool(left[1] < _TURNED * left[0])
 
 
 def _check_signs(test: Measurement, gamma: Array, pushes: ComplexArray, force: ComplexArray, together: bool) -> None:
@@ -80,7 +101,8 @@ def _check_signs(test: Measurement, gamma: Array, pushes: ComplexArray, force: C
         found = np.linalg.lstsq(X, wanted, rcond=None)[0]
         masses, rigid = found[: len(gamma)], found[len(gamma) + i]
         explained = np.sum((X @ found) ** 2) > _MOST * np.sum(wanted**2)
-        if explained and rigid < 0 and np.sum(masses * np.abs(masses)) < -0.5 * np.sum(masses**2):
+        negative = rigid < 0 and np.sum(masses * np.abs(masses)) < -0.5 * np.sum(masses**2)
+        if explained and negative and _fits_turned(X, wanted, [*range(len(gamma)), len(gamma) + i]):
             wrong.append(test.base_axes[i] if test.base_axes else f"base direction {i + 1}")
     if together or wrong:
         where = f" in {' and '.join(wrong)}" if 0 < len(wrong) < test.n_base else ""

@@ -1,0 +1,1 @@
+"""The report page, by the browser's own measure."""

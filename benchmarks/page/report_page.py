@@ -1,0 +1,72 @@
+"""The report page: size, time, first screen, controls, contrast and width in a browser, and print."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+import sysid
+from benchmarks.line import Line, below
+from benchmarks.modal.random_structures import frequency_lines, random_structure
+from benchmarks.page import browser
+from sysid.report import report
+
+WIDTHS = ((1280, False), (768, True), (380, False), (380, True))  # pixels; dark
+CONTRAST = 4.5  # of text, WCAG 2.2 AA
+MOST_BYTES = 5 * 2**20
+
+
+def lines(reduced: bool) -> Iterator[Line]:
+    """Of the first command's page, and of one of 20 sensors, three directions and 1,000 lines."""
+    with tempfile.TemporaryDirectory() as folder:
+        where = Path(folder)
+        command = [sys.executable, "-m", "sysid", "run", "cantilever_tower", "--quiet", "--out", str(where / "tower")]
+        seconds = []
+        for _ in range(2 if reduced else 4):
+            begun = time.perf_counter()
+            subprocess.run(command, check=True, cwd=where)
+            seconds.append(time.perf_counter() - begun)
+        yield below("sysid run cantilever_tower with its page, not the first time, s: least", min(seconds[1:]), 4.0)
+        pages = {"tower": (where / "tower" / report.FILE_NAME).read_text(encoding="utf-8")}
+        large = report.write_report(_large(), where / "large")
+        yield below("bytes of the page of 20 sensors, 3 directions, 1,000 lines", large.stat().st_size, MOST_BYTES)
+        if browser.CHROMIUM is None:
+            yield Line("the page in a browser", "no Chromium is installed")
+            return
+        pages["large"] = large.read_text(encoding="utf-8")
+        for name, page in list(pages.items())[: 1 if reduced else 2]:
+            yield from _in_a_browser(name, page, where)
+        sheets = browser.pages_printed(where / "tower" / report.FILE_NAME, where)
+        yield Line("tower: sheets of its print", f"{sheets}", "from 2 on", sheets > 1)
+
+
+def _in_a_browser(name: str, page: str, where: Path) -> Iterator[Line]:
+    for width, dark in WIDTHS:
+        told = browser.measured(page, where, width, dark=dark)
+        what = f"{name}, {width} pixels{', dark' * dark}: "
+        yield below(what + "errors in the console", len(told["errors"]), 0)
+        works = all(told[key] for key in ("zoomed", "whole", "all_lines", "keys", "moved"))
+        yield Line(what + "zoom, keys, choices and moving modes", "all work" if works else str(told), "all work", works)
+        lowest = max(told["first"])
+        yield below(what + "judgement, next step, masses, first mode: lowest edge, pixels", lowest, 800)
+        wide = len(told["over"]) + max(told["sideways"], 0)
+        yield below(what + "elements wider than the page", wide, 0)
+        least = told["contrast"]
+        yield Line(what + "least contrast of text", f"{least:.2f}", f">= {CONTRAST}", least >= CONTRAST)
+
+
+def _large() -> sysid.Identification:
+    truth = random_structure(7, n=20, d=3)
+    freq = frequency_lines(truth, 1000)
+    axes = ["xyz"[k] for k in np.argmax(np.abs(truth.rigid_body), axis=1)]
+    sensors = [sysid.Sensor(f"sensor {k}", (0.1 * (k % 4), 0.1, float(k)), axis) for k, axis in enumerate(axes)]
+    test = sysid.simulate(truth, freq, noise=0.01, force=True, rng=7)
+    problem = sysid.Problem(dataclasses.replace(test, sensors=sensors), mass=sysid.FullMass())
+    return sysid.identify(problem, rng=0)
