@@ -23,6 +23,7 @@ from sysid.modal_analysis.record_spurious import without_spurious_modes
 from sysid.modal_analysis.record_varying import untold_levels, varying_levels, with_varying_levels
 from sysid.modal_analysis.record_whiteness import excess_of
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
+from sysid.nlp import one_thread
 from sysid.structure.structure import Array, ComplexArray
 
 
@@ -149,7 +150,8 @@ def without_transients(test: Measurement, *, monitor: Monitor | None = None) -> 
     """
     if test.whole is None:
         return test
-    fit = whole_fit(test, monitor=monitor)
+    with one_thread():  # the same bits on any number of processors, and many times faster where others use them too
+        fit = whole_fit(test, monitor=monitor)
     model, p = fit.model, fit.parameters
     free: list[list[ComplexArray]] = [[] for _ in range(test.n_runs)]
     for chunk in model.chunks(p):

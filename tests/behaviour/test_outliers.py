@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 
 import sysid
 from sysid.modal_analysis.outliers import TUNING
-from sysid.report.report import write
+from sysid.report.report import write_report
 
 FREQ = np.linspace(2.0, 20.0, 150)
 W = 2 * np.pi * FREQ
@@ -84,7 +84,7 @@ def test_outliers_are_listed_by_test_run_channel_and_line(tmp_path):
     curves = {line.get_label()[:6]: line.get_ydata() for line in sysid.plot.convergence(result).axes[0].lines}
     assert curves["rounds"].size == rounds
     assert curves["local "].size == result.history.local_curve.size - rounds
-    page = write(result, tmp_path).read_text(encoding="utf-8")
+    page = write_report(result, tmp_path).read_text(encoding="utf-8")
     table = page[page.index("farthest from the fit") :]
     assert table.index(f"{FREQ[100]:.6g}") < table.index(f"{FREQ[20]:.6g}") < table.index(f"{FREQ[90]:.6g}")
 
