@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sysid.assessment.mistakes import named_mistakes
 from sysid.errors import InputError, SolverError, finite_array, function, instance, number, path_of, whole_number
 from sysid.nlp import one_thread
 from sysid.problem.problem import Problem
@@ -105,13 +106,15 @@ def identify(
         kept = file.journal(identity(problem, strategy, seed, start, max_evaluations))
     with one_thread(), DeferredInterrupt() as interrupt, kept as journal:
         session = Session(listeners, interrupt, max_time, random, max_evaluations, journal)
+        named = named_mistakes(problem)
         prepare(problem, session)
         chosen, why = choose(strategy, problem, start)
         check(problem, chosen)
         try:
-            outcome, why = _run(chosen, why, problem.screened, session, start, follow=strategy == "auto")
+            outcome, why = _run(chosen, why, problem.screened, session, start, follow=strategy == "auto" and not named)
             outcome = settled(problem, outcome, chosen, session)
             outcome = with_stated_masses(problem.screened, outcome, session)
+            outcome = replace(outcome, mistakes=named)
         except Stop as stop:  # before there was any structure
             raise SolverError(f"{stop}: nothing is identified") from None
         except (InputError, SolverError):
