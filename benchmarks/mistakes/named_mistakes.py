@@ -90,17 +90,17 @@ def _is_in_short(cell: Cell) -> bool:
 
 def end_of(cell: Cell) -> End:
     """What is said of a cell."""
-    begun = time.perf_counter()
+    begun = time.process_time()
     cause = CAUSES.get(cell.cause)
     data = right(cell.kind, force=cell.force, axes=cause.axes if cause else "x", seed=cell.seed)
-    begun = time.perf_counter()
+    begun = time.process_time()
     try:
         result = sysid.identify(problem(cell.form, (cause.made(data) if cause else data).test), rng=0)
         told = (result.message, *result.undetermined)
         first = result.confidence[0] if result.confidence else ""
     except sysid.SysidError as error:
         told, first = (str(error),), str(error)
-    return End(first, " | ".join(told), time.perf_counter() - begun)
+    return End(first, " | ".join(told), time.process_time() - begun)
 
 
 def fit_of_other(cell: Cell) -> float:

@@ -13,11 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.errors import refuse
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.direct_terms import DirectTerms, direct_terms
-from sysid.problem.problem import Problem
-from sysid.problem.terms import FurtherTest
 from sysid.structure.structure import Array
 
 _NO_FIT = 0.3  # relative misfit, from which modes do not explain the records
@@ -30,6 +27,7 @@ _LIKE = 0.04  # by how much a factor may differ from that of two units
 _NONE = 0.1  # of a sensor's rigid-body motion; as good as none
 _CARRIED = 0.5  # of the rigid-body motion, that modes between the lines carry: there is no other below them
 _TURN = 0.03  # rad at the last line; the least delay that is told
+_LARGE_TURN = 0.3  # rad there, from which no fit is worth a search
 _MOST = 1.5  # rad at the last line; the largest one
 _ALIKE = 0.2  # of a delay, by which sensors on one clock may differ
 _NO_WORSE = 1.02  # times the misfit before, that records on one clock may have
@@ -56,45 +54,32 @@ class Mistake:
         What is wrong, by what it shows, and what to do.
     everywhere : bool
         It spoils all channels, so that nothing is worth a search.
+    gross : bool
+        No model with a form of its own fits one channel, so that a search in its unknowns is not worth its time.
     """
 
     sentence: str
     everywhere: bool = False
+    gross: bool = True
 
 
-def named_mistakes(problem: Problem) -> tuple[str, ...]:
-    """Mistakes that the records of a problem's tests show by themselves, in sentences, the worst first.
+def mistakes_of(test: Measurement, terms: DirectTerms | None) -> list[Mistake]:
+    """Mistakes that the records of a test show by themselves, the worst first; none where they cannot tell.
 
-    Raises
-    ------
-    InputError
-        Where one spoils all channels.
+    Parameters
+    ----------
+    test : Measurement
+    terms : DirectTerms or None
+        Of the test, as `direct_terms` gives them.
     """
-    tests = [problem.measurement] if problem.misfit is None else []
-    tests += [given.measurement for given in problem.residuals if isinstance(given, FurtherTest)]
-    told: list[str] = []
-    for i, test in enumerate(tests, start=1):
-        for mistake in mistakes_of(test):
-            sentence = mistake.sentence if len(tests) == 1 else f"test {i}: {mistake.sentence}"
-            refuse((mistake.everywhere, sentence))
-            told.append(sentence)
-    return tuple(told)
-
-
-def mistakes_of(test: Measurement) -> list[Mistake]:
-    """Mistakes that the records of a test show by themselves, the worst first; none where they cannot tell."""
-    try:
-        terms = direct_terms(test)
-        if terms is None:
-            return []
-        if terms.misfit > _NO_FIT:
-            return list(_conjugated(test, terms))
-        if terms.below:
-            return []
-        late, terms = _late(test, terms)
-        return [*late, *_of_motion(test, terms), *_of_force(test, terms)]
-    except np.linalg.LinAlgError:
+    if terms is None:
         return []
+    if terms.misfit > _NO_FIT:
+        return list(_conjugated(test, terms))
+    if terms.below:
+        return []
+    late, terms = _late(test, terms)
+    return [*late, *_of_motion(test, terms), *_of_force(test, terms)]
 
 
 def _conjugated(test: Measurement, terms: DirectTerms) -> Iterator[Mistake]:
@@ -141,7 +126,8 @@ def _late(test: Measurement, terms: DirectTerms) -> tuple[list[Mistake], DirectT
         "with a phase that grows with frequency, as two clocks or a filter on some channels alone make it; bring them "
         "to one clock (sysid.resample), or filter all channels alike"
     )
-    return [Mistake(sentence)], terms
+    turned = abs(delay) * 2 * np.pi * test.freq[-1]
+    return [Mistake(sentence, everywhere=of_all and turned > _LARGE_TURN, gross=turned > _LARGE_TURN)], terms
 
 
 def _delays(test: Measurement, terms: DirectTerms) -> Array | None:
@@ -311,7 +297,7 @@ def _of_sensors(test: Measurement, motion: _Motion, right: NDArray[np.bool_]) ->
             carried = np.sum(motion.modal[i] * motion.stated[i]) / np.sum(motion.stated[i] ** 2)
             sentence = _of_sensor(test.sensor_names[motion.sensors[i]], float(value), float(carried))
             if sentence:
-                yield Mistake(sentence)
+                yield Mistake(sentence, gross="gain" not in sentence)
 
 
 def _of_sensor(name: str, factor: float, carried: float) -> str | None:
