@@ -108,10 +108,10 @@ def identify(
     with one_thread(), DeferredInterrupt() as interrupt, kept as journal:
         session = Session(listeners, interrupt, max_time, random, max_evaluations, journal)
         named = named_mistakes(problem)
-        prepare(problem, session)
-        chosen, why = choose(strategy, problem, start)
-        check(problem, chosen)
         try:
+            prepare(problem, session)
+            chosen, why = choose(strategy, problem, start)
+            check(problem, chosen)
             outcome, why = _run(chosen, why, problem.screened, session, start, follow=strategy == "auto" and not named)
             outcome = settled(problem, outcome, chosen, session)
             outcome = with_stated_masses(problem.screened, outcome, session)
@@ -121,7 +121,7 @@ def identify(
         except (InputError, SolverError) as error:
             if max_time is None:  # it has ended by itself, and would end so again
                 journal.entries.clear()
-            if named:
+            if named and isinstance(error, InputError):
                 raise InputError("; ".join((*named, str(error)))) from error
             raise
         result = judge(problem, outcome, why, seed, session)

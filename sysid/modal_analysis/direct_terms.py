@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.excitation import steady_sine
 from sysid.modal_analysis.record_poles import few_lines, rough_deviations
 from sysid.modal_analysis.relocation import relocate
 from sysid.modal_analysis.residues import Records, beyond_chance, unit_columns
@@ -73,6 +74,8 @@ def direct_terms(test: Measurement) -> DirectTerms | None:
     Noise counts by its deviations where these are stated; a test of whole records is fitted with its transients.
     """
     if test.whole is not None:
+        if steady_sine(test) is not None:
+            return None
         test = test.at(few_lines(test))
         test = replace(test, response_std=rough_deviations(test), force_std=None)
     still = replace(test, rigid_body=np.zeros_like(test.rigid_body), sensors=None)

@@ -42,8 +42,9 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
     try:
         with within(session.left):
             known = determine(records, end.structure, end.x, end.alternatives)
-            # A mistake that is named explains whatever else speaks against the fit.
-            further = doubts(records, end.structure, end.x) if judged and not end.mistakes else ()
+            # A mistake that is named explains whatever else speaks against the fit; short segments have more to tell.
+            more = judged and (not end.mistakes or records.measurement.averaged)
+            further = doubts(records, end.structure, end.x) if more else ()
             doubtful = (*end.doubts, *further) if judged else ()
             open_, closed_by = (*end.mistakes, *doubtful, *known.undetermined), known.closed_by
         if success and known.judged_by == BY_RANK and not open_:
