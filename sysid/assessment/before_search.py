@@ -121,6 +121,13 @@ def _of_frequencies(problem: Problem, declared: Formulation, test: Measurement) 
         low, high = np.min(made, axis=0), np.max(made, axis=0)
         what = "the bounds of the model allow first natural frequencies"
     inside = lambda f: bool(low[0] / _WITHIN < f[0] < high[0] * _WITHIN and f[-1] < high[-1] * _WITHIN)  # noqa: E731
+    if stated is not None and found[0] < low[0] / _BEYOND and inside(2 * np.pi * found):
+        yield Mistake(
+            f"the stated natural frequencies are in rad/s, not Hz: {', '.join(f'{f:.4g}' for f in low[:4])} Hz are "
+            f"stated, the records have modes at {', '.join(f'{f:.4g}' for f in found[:4])} Hz, and a factor of 2 pi = "
+            "6.283 lies between; divide what is stated by 2 pi",
+            everywhere=True,
+        )
     mended = found / (2 * np.pi)
     if found[0] > _BEYOND * high[0] and inside(mended):
         span = f"{low[0]:.4g}" if stated is not None else f"of {low[0]:.4g} to {high[0]:.4g}"

@@ -10,12 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.excitation import steady_sine
 from sysid.modal_analysis.record_poles import few_lines, rough_deviations
 from sysid.modal_analysis.relocation import relocate
 from sysid.modal_analysis.residues import Records, beyond_chance, unit_columns
+from sysid.modal_analysis.vector_fitting import RAZOR
 from sysid.nlp import one_thread
 from sysid.structure.structure import Array, ComplexArray
 
@@ -27,6 +29,9 @@ _MODE = 0.3  # largest damping ratio of a pole that is kept; what has more answe
 _OUTSIDE = 1.5  # times the last line, up to where poles are kept; what lies below the first shows by its tail
 _ROUND_OFF = 1e-9  # of the records: what counts as noise where there is none
 _DEPENDENT = 1e-11  # of the largest singular value of the functions
+_FAR = 6.0  # medians of the errors of a channel, from which a line holds a spike
+_SCREENINGS = 3  # times that lines with spikes are left out
+_FEW = 0.25  # of the lines
 _LINES = 3  # real numbers of a channel for each function, at least
 
 
@@ -49,7 +54,7 @@ class DirectTerms:
     below : bool
         Modes below the lines show, which answer like a constant too: the terms are not the rigid-body motion alone.
     misfit : float
-        Relative residual of the absolute accelerations.
+        Relative residual of the absolute accelerations on all lines; the terms are those without lines far off the fit.
     omega, ratios : (m,)
         rad/s; all poles, spurious ones too.
     """
@@ -80,18 +85,33 @@ def direct_terms(test: Measurement) -> DirectTerms | None:
         test = replace(test, response_std=rough_deviations(test), force_std=None)
     still = replace(test, rigid_body=np.zeros_like(test.rigid_body), sensors=None)
     with one_thread():
-        records = Records(still)
-        if not records.unit and records.driven < test.n_base:
+        found = _of_accelerations(still)
+        if found is None:
             return None
-        poles = _poles(records)
-        if poles is None:
-            return None
-        rigid = _fitted(records, *poles)
+        misfit = found[2].misfit
+        for _ in range(_SCREENINGS):
+            spikes = found[2].spikes
+            if not spikes.any():
+                break
+            still = still.at(~spikes)
+            found = _of_accelerations(still)
+            if found is None:
+                return None
+        *poles, rigid = found
         force = None if test.force is None else _fitted(Records(still, force=True), *poles)
     mass = (None, None, None) if force is None else (force.terms[0], force.std[0], force.modal)
     return DirectTerms(
-        rigid.terms[0], rigid.std[0], rigid.terms[1], rigid.std[1], rigid.modal, *mass, rigid.below, rigid.misfit, *poles
+        rigid.terms[0], rigid.std[0], rigid.terms[1], rigid.std[1], rigid.modal, *mass, rigid.below, misfit, *poles
     )  # fmt: skip
+
+
+def _of_accelerations(still: Measurement) -> tuple[Array, Array, _Fit] | None:
+    """Poles, and the fit on them; None where the base moves in too few directions, or no pole is found."""
+    records = Records(still)
+    if not records.unit and records.driven < still.n_base:
+        return None
+    poles = _poles(records)
+    return None if poles is None else (*poles, _fitted(records, *poles))
 
 
 def _poles(records: Records) -> tuple[Array, Array] | None:
@@ -107,6 +127,7 @@ def _poles(records: Records) -> tuple[Array, Array] | None:
     for _ in range(_STEPS):
         omega, ratios = relocate(records, channels, omega, ratios, lambda: None, direct)
     kept = (omega > lines[0]) & (omega < _OUTSIDE * lines[-1]) & (ratios < _MODE)
+    kept &= ratios * omega > RAZOR * np.interp(omega, lines, np.gradient(lines))  # else it answers for one bad line
     return (omega[kept], ratios[kept]) if np.any(kept) else None
 
 
@@ -118,13 +139,14 @@ def _without_poles(freq: Array) -> ComplexArray:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Coefficients of `_without_poles` (2, channels of the test, d), their deviations, sum of residues, and misfit."""
+    """Coefficients of `_without_poles` (2, channels of the test, d), their deviations, sum of residues, misfit, and lines far off."""
 
     terms: Array
     std: Array
     modal: Array
     below: bool
     misfit: float
+    spikes: NDArray[np.bool_]
 
 
 def _fitted(records: Records, omega: Array, ratios: Array) -> _Fit:
@@ -153,7 +175,16 @@ def _fitted(records: Records, omega: Array, ratios: Array) -> _Fit:
         _by_sensor(records, of_modes.sum(axis=0, keepdims=True))[0],
         gained > noise * beyond_chance(beyond.shape[1] * left.shape[1]),
         float(np.linalg.norm(left) / np.sqrt(records.size)),
+        _spikes(records.in_runs(left)),
     )  # fmt: skip
+
+
+def _spikes(left: ComplexArray) -> NDArray[np.bool_]:
+    """Lines of errors (runs, n_freq, channels) with a number far off its neighbours; none where these are many."""
+    size = np.abs(left)
+    level = np.median(size, axis=1, keepdims=True)
+    far = np.any((size > _FAR * level) & (level > 0), axis=(0, 2))
+    return far if np.count_nonzero(far) < _FEW * far.size else np.zeros_like(far)
 
 
 def _by_sensor(records: Records, terms: Array, *, squares: bool = False) -> Array:
