@@ -95,6 +95,7 @@ BENCHMARKS = (
     Benchmark("records.measured_records", "measured records: stated deviations against a jackknife", "1 min", "30 s"),
     Benchmark("records.gain_errors", "a sensor 2 % wrong: silent cases, and right ones accused", "3 min", "10 s"),
     Benchmark("files.exported_files", "exported files read by other programs: what they keep", "20 s", "10 s"),
+    Benchmark("mistakes.named_mistakes", "one mistake a test: named first, right ones not accused", "6 min", "20 s"),
     Benchmark("house", "imports one way, tests of types, branches, sizes of functions and files", "2 s", "2 s"),
 )
 
