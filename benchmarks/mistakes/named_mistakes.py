@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import product
 from typing import NamedTuple
 
@@ -40,7 +40,7 @@ class Cell(NamedTuple):
 
 
 class End(NamedTuple):
-    """The first sentence, all that is said, and how long it took, s."""
+    """The first sentence, all that speaks against the records, and how long a processor took, s."""
 
     first: str
     said: str
@@ -68,15 +68,15 @@ def lines(reduced: bool) -> Iterator[Line]:
     yield below(f"seconds of the slowest ({slowest})", ends[slowest].seconds, SECONDS)
 
 
-def cells(causes: object) -> list[Cell]:
+def cells(causes: Iterable[str]) -> list[Cell]:
     """All cells of some causes."""
-    every = (Cell(*it) for it in product(causes, FORMS, (SPECTRA, RECORDS), (False, True)))  # type: ignore[call-overload]
+    every = (Cell(*it) for it in product(causes, FORMS, (SPECTRA, RECORDS), (False, True)))
     return [cell for cell in every if cell.cause == RIGHT or _is_possible(cell)]
 
 
 def _is_possible(cell: Cell) -> bool:
     cause = CAUSES[cell.cause]
-    positions = cause.axes != "x" and cell.form in ("lumped", "chain")  # which have no rotational inertia of the base
+    positions = cause.axes != "x" and cell.form == "chain"  # whose sensors move in one base direction each
     return cell.kind in cause.kinds and cause.force in (None, cell.force) and not positions
 
 
@@ -90,7 +90,6 @@ def _is_in_short(cell: Cell) -> bool:
 
 def end_of(cell: Cell) -> End:
     """What is said of a cell."""
-    begun = time.process_time()
     cause = CAUSES.get(cell.cause)
     data = right(cell.kind, force=cell.force, axes=cause.axes if cause else "x", seed=cell.seed)
     begun = time.process_time()

@@ -7,8 +7,8 @@ same records: docs/mistakes.md has the table.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -104,7 +104,8 @@ def problem(form: str, test: sysid.Measurement) -> sysid.Problem:
     if form == "full":
         return sysid.Problem(test, mass=sysid.FullMass())
     if form == "lumped":
-        return sysid.Problem(test, mass=sysid.LumpedMass(total if test.n_base == 1 else [total, np.nan][:1]))
+        moment = float(MASSES @ HEIGHTS**2)
+        return sysid.Problem(test, mass=sysid.LumpedMass(total if test.n_base == 1 else [total, moment]))
     if form == "chain":
         springs = sysid.ChainStiffness(1.5e5, 6e6)
         return sysid.Problem(test, mass=sysid.LumpedMass(total), stiffness=springs)
@@ -159,7 +160,8 @@ def _conjugated(data: Data) -> Data:
     return replace(data, response=data.response.conj(), force=None if data.force is None else data.force.conj())
 
 
-class Cause(NamedTuple):
+@dataclass(frozen=True)
+class Cause:
     """A mistake.
 
     Attributes
@@ -180,7 +182,7 @@ class Cause(NamedTuple):
 
     made: Callable[[Data], Data]
     named: str
-    untold: dict[str, Callable[[sysid.Structure], sysid.Structure]] = {}
+    untold: dict[str, Callable[[sysid.Structure], sysid.Structure]] = field(default_factory=dict)
     kinds: tuple[str, ...] = (SPECTRA, RECORDS)
     force: bool | None = None
     axes: str = "x"

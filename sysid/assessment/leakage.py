@@ -66,7 +66,8 @@ def leakage(test: Measurement, structure: Structure) -> Iterator[str]:
 def unresolved(test: Measurement, omega: Array, ratios: Array) -> Iterator[str]:
     """Whether averages over segments have too few lines in most peaks of poles found in them, in a sentence.
 
-    Where only some are so narrow `leakage` tells it of the structure that was fitted. The window itself makes a narrow peak about one and a half distances of lines wide.
+    Where only some are so narrow `leakage` tells it of the structure that was fitted. The window itself makes a narrow
+    peak about one and a half distances of lines wide.
 
     Parameters
     ----------

@@ -33,15 +33,13 @@ _ALIKE = 0.2  # of a delay, by which sensors on one clock may differ
 _NO_WORSE = 1.02  # times the misfit before, that records on one clock may have
 _ROUNDS = 3  # of taking a delay off
 GRAVITY = 9.80665
-UNITS = (  # factors of two units, in words
-    (GRAVITY, "9.81, that of g and m/s²"),
-    (1000.0, "1,000, that of m/s² and mm/s²"),
-    (1 / GRAVITY, "9.81, that of m/s² and g"),
-    (1 / 1000.0, "1,000, that of mm/s² and m/s²"),
+_UNITS = (  # what sensors over base are multiplied by, in words, and the units with the smaller and the larger numbers
+    (GRAVITY, "9.81", "g", "m/s²"),
+    (1 / GRAVITY, "9.81", "g", "m/s²"),
+    (1000.0, "1,000", "m/s²", "mm/s²"),
+    (1 / 1000.0, "1,000", "m/s²", "mm/s²"),
 )
-
-
-_CLEAR = (-1.0, *(value for value, _ in UNITS))  # factors that no mode makes
+_CLEAR = (-1.0, *(unit[0] for unit in _UNITS))  # factors that no mode makes
 
 
 @dataclass(frozen=True)
@@ -233,11 +231,15 @@ def _of_columns(test: Measurement, motion: _Motion) -> Iterator[Mistake]:
     if alike:
         yield from _of_all(motion, float(np.mean(factor[moved])))
     elif np.all(np.abs(factor[others] - 1) < _GROSS) and np.any(turns):
-        for value, words in ((1e-3, "mm in the place of m"), (1e-2, "cm in the place of m"), (1e3, "km in the place of m")):
+        for value, words in (
+            (1e-3, "mm in the place of m"),
+            (1e-2, "cm in the place of m"),
+            (1e3, "km in the place of m"),
+        ):
             if np.all(np.abs(factor[turns] / value - 1) < _GROSS):
                 yield Mistake(
-                    f"the positions behind rigid_body are in {words}: for a rotation of the base the sensors move "
-                    f"{value:g} times what it says, a factor of {max(value, 1 / value):,.0f}, and for translations as "
+                    f"the positions behind rigid_body are in {words}, not m: for a rotation of the base the sensors "
+                    f"move {value:g} times what it says, a factor of {1 / value:,.0f}, and for translations as "
                     "it says; give positions in m",
                     everywhere=True,
                 )
@@ -245,8 +247,8 @@ def _of_columns(test: Measurement, motion: _Motion) -> Iterator[Mistake]:
     if not alike and reversed_ and np.all(np.abs(np.abs(factor[moved]) - 1) < _GROSS):
         assert test.base_axes is not None
         yield Mistake(
-            f"the sign of the base in {', '.join(test.base_axes[i] for i in reversed_)} is reversed: beside their modes "
-            "all sensors move against it; change the sign of its record, or of its column of rigid_body",
+            f"the sign of the base in {', '.join(test.base_axes[i] for i in reversed_)} is reversed: beside their "
+            "modes all sensors move against it; change the sign of its record, or of its column of rigid_body",
             everywhere=True,
         )
 
@@ -259,16 +261,12 @@ def _of_all(motion: _Motion, factor: float) -> Iterator[Mistake]:
             "change the sign of the base's record",
             everywhere=True,
         )
-    for value, words in UNITS:
+    for value, times, small, large in _UNITS:
         if abs(factor / value - 1) < _LIKE:
-            first, second = ("the base", "the sensors") if value > 1 else ("the sensors", "the base")
-            small, large = ("g", "m/s²") if value in (GRAVITY, 1 / GRAVITY) else ("m/s²", "mm/s²")
-            times = 9.81 if small == "g" else 1000
+            first, second = ("the base is", "the sensors are") if value > 1 else ("the sensors are", "the base is")
             yield Mistake(
-                f"{first} {'is' if first == 'the base' else 'are'} in {small} where {second} "
-                f"{'is' if second == 'the base' else 'are'} in {large}: beside their modes the sensors move "
-                f"{factor:.3g} times as rigid_body says, a factor of {times:,}; multiply "
-                f"{'its record' if first == 'the base' else 'their records'} by {times:,}",
+                f"{first} in {small} where {second} in {large}: beside their modes the sensors move {factor:.3g} times "
+                f"as rigid_body says, a factor of {times}; bring both to m/s²",
                 everywhere=True,
             )
 
@@ -305,11 +303,12 @@ def _of_sensor(name: str, factor: float, carried: float) -> str | None:
     shown = "beside its modes it moves with the base"
     if abs(factor + 1) < _GROSS:
         return f"the sign of {name} is reversed: {shown} by {factor:.3g} times what rigid_body says; change its sign"
-    for value, words in UNITS:
+    for value, times, small, large in _UNITS:
         if abs(factor / value - 1) < _LIKE:
+            own, base = (small, large) if value < 1 else (large, small)
             return (
                 f"{name} is in another unit than the base: {shown} by {factor:.4g} times what rigid_body says, a "
-                f"factor of {words}; bring its record to m/s²"
+                f"factor of {times}, as of a sensor in {own} and a base in {base}; bring both to m/s²"
             )
     if abs(factor) < _NONE:
         return (
@@ -331,11 +330,11 @@ def _of_force(test: Measurement, terms: DirectTerms) -> Iterator[Mistake]:
     if terms.mass is None or terms.mass_std is None or terms.modal_mass is None:
         return
     weighed, std, modal = (np.diag(it) for it in (terms.mass, terms.mass_std, terms.modal_mass))
-    wrong = np.flatnonzero((weighed < -_SURE * std) & (modal < 0))
-    if wrong.size:
+    against = np.flatnonzero((weighed < -_SURE * std) & (modal < 0))
+    if against.size:
         assert test.base_axes is not None
-        masses = ", ".join(f"{weighed[i]:.4g}" for i in wrong)
-        axes = "" if wrong.size == test.n_base else f" in {', '.join(test.base_axes[i] for i in wrong)}"
+        masses = ", ".join(f"{weighed[i]:.4g}" for i in against)
+        axes = "" if against.size == test.n_base else f" in {', '.join(test.base_axes[i] for i in against)}"
         yield Mistake(
             f"the sign of the base force{axes} is reversed: it weighs {masses} (kg, or kg m²); give the force of the "
             "base on the structure, in phase with the base's acceleration at low frequency",

@@ -97,11 +97,12 @@ def direct_terms(test: Measurement) -> DirectTerms | None:
             found = _of_accelerations(still)
             if found is None:
                 return None
-        *poles, rigid = found
-        force = None if test.force is None else _fitted(Records(still, force=True), *poles)
-    mass = (None, None, None) if force is None else (force.terms[0], force.std[0], force.modal)
+        omega, ratios, rigid = found
+        force = None if test.force is None else _fitted(Records(still, force=True), omega, ratios)
+    (own, slope), (own_std, slope_std) = rigid.terms, rigid.std
+    mass, mass_std, modal_mass = (None,) * 3 if force is None else (force.terms[0], force.std[0], force.modal)
     return DirectTerms(
-        rigid.terms[0], rigid.std[0], rigid.terms[1], rigid.std[1], rigid.modal, *mass, rigid.below, misfit, *poles
+        own, own_std, slope, slope_std, rigid.modal, mass, mass_std, modal_mass, rigid.below, misfit, omega, ratios
     )  # fmt: skip
 
 
@@ -139,7 +140,10 @@ def _without_poles(freq: Array) -> ComplexArray:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Coefficients of `_without_poles` (2, channels of the test, d), their deviations, sum of residues, misfit, and lines far off."""
+    """Coefficients of the functions 1 and i w (2, channels, d), their deviations, and the sum of residues.
+
+    Whether modes below the lines show, the relative residual, and lines (n_freq,) that are far off.
+    """
 
     terms: Array
     std: Array

@@ -24,7 +24,9 @@ def test_without_noise_they_are_the_matrices_of_the_structure(seed):
     # Poles are relocated a few times, and then left as they are.
     np.testing.assert_allclose(terms.rigid, truth.rigid_body, atol=1e-6)
     size = np.sqrt(np.diag(truth.rigid_body_mass))
-    np.testing.assert_allclose(terms.mass / np.outer(size, size), truth.rigid_body_mass / np.outer(size, size), atol=1e-6)
+    np.testing.assert_allclose(
+        terms.mass / np.outer(size, size), truth.rigid_body_mass / np.outer(size, size), atol=1e-6
+    )
     np.testing.assert_allclose(2 * np.pi * truth.natural_frequencies[-1] * terms.slope, 0.0, atol=1e-5)
     assert not terms.below
 
