@@ -20,9 +20,11 @@ from sysid.structure.structure import Array
 _NO_FIT = 0.3  # relative misfit, from which modes do not explain the records
 _MENDED = 0.3  # of the misfit; what a mended record may leave
 _GROSS = 0.15  # of a sensor's rigid-body motion: smaller errors of gains are told by what was fitted
+_CHANCE = 3.0  # standard deviations that a factor may be off by
 _ALONE = 0.05  # of the same of the other sensors, where one alone has another gain
 _SURE = 6.0  # standard deviations
-_SHOWN = 0.05  # of a sensor's rigid-body motion; it is not known where the standard deviation is larger
+_ONE_SURE = 10.0  # the same of the delay of one sensor, whose deviation is not known so well
+_SHOWN = 0.1  # of a sensor's rigid-body motion; it is not known where the standard deviation is larger
 _LIKE = 0.04  # by how much a factor may differ from that of two units
 _NONE = 0.1  # of a sensor's rigid-body motion; as good as none
 _CARRIED = 0.5  # of the rigid-body motion, that modes between the lines carry: there is no other below them
@@ -143,7 +145,7 @@ def _delays(test: Measurement, terms: DirectTerms) -> Array | None:
     error = np.maximum(error, np.finfo(float).tiny)
     least = _TURN / (2 * np.pi * test.freq[-1])
     mean = float(np.average(delay, weights=error**-2))
-    off = (np.abs(delay) > _SURE * error) & (np.abs(delay) > least)
+    off = (np.abs(delay) > _ONE_SURE * error) & (np.abs(delay) > least)
     if np.any(np.abs(delay[off]) > _MOST / (2 * np.pi * test.freq[-1])):  # the first terms of a series do not tell it
         return None
     out = np.zeros(test.n_sensors)
@@ -201,8 +203,7 @@ def _of_motion(test: Measurement, terms: DirectTerms) -> Iterator[Mistake]:
         if found:
             yield from found[:1]
             return
-    if 2 * np.count_nonzero(right) >= known.size:
-        yield from _of_sensors(test, motion, right)
+    yield from _swapped(test, motion, right) or _of_sensors(test, motion, right)
 
 
 def _relative(motion: _Motion) -> Iterator[Mistake]:
@@ -221,6 +222,7 @@ def _of_columns(test: Measurement, motion: _Motion) -> Iterator[Mistake]:
     """Whether each base direction has one factor of its own in all sensors."""
     weight = np.sum(motion.stated**2, axis=0)
     moved = weight > 0
+    several = np.count_nonzero(np.abs(motion.stated) > _NONE, axis=0) > 1
     factor = np.ones(weight.size)
     factor[moved] = np.sum(motion.stated * motion.recorded, axis=0)[moved] / weight[moved]
     if not np.all(motion.agree(motion.stated * factor)):
@@ -243,8 +245,9 @@ def _of_columns(test: Measurement, motion: _Motion) -> Iterator[Mistake]:
                     "it says; give positions in m",
                     everywhere=True,
                 )
-    reversed_ = [i for i in np.flatnonzero(moved) if abs(factor[i] + 1) < _GROSS]
-    if not alike and reversed_ and np.all(np.abs(np.abs(factor[moved]) - 1) < _GROSS):
+    reversed_ = [int(i) for i in np.flatnonzero(moved) if abs(factor[i] + 1) < _GROSS]
+    # Where one sensor alone shows a direction, it is told of that sensor.
+    if not alike and reversed_ and np.all(several[reversed_]) and np.all(np.abs(np.abs(factor[moved]) - 1) < _GROSS):
         assert test.base_axes is not None
         yield Mistake(
             f"the sign of the base in {', '.join(test.base_axes[i] for i in reversed_)} is reversed: beside their "
@@ -271,28 +274,40 @@ def _of_all(motion: _Motion, factor: float) -> Iterator[Mistake]:
             )
 
 
-def _of_sensors(test: Measurement, motion: _Motion, right: NDArray[np.bool_]) -> Iterator[Mistake]:
-    """Which few sensors stand in each other's place, or have a sign, a unit or a gain of their own."""
+def _swapped(test: Measurement, motion: _Motion, right: NDArray[np.bool_]) -> list[Mistake]:
+    """Whether two sensors stand in each other's place, and a third is right."""
     wrong = np.flatnonzero(~right)
-    if wrong.size == 2:
-        there = motion.stated.copy()
-        there[wrong] = there[wrong[::-1]]
-        if np.all(motion.agree(there)):
-            yield Mistake(
-                f"{_names(test, motion.sensors[wrong])} are swapped: beside their modes each moves with the base as "
-                "rigid_body says of the other; exchange their records, or their rows of rigid_body"
-            )
-            return
+    if wrong.size != 2 or right.size < 3:
+        return []
+    there = motion.stated.copy()
+    there[wrong] = there[wrong[::-1]]
+    if not np.all(motion.agree(there)):
+        return []
+    return [
+        Mistake(
+            f"{_names(test, motion.sensors[wrong])} are swapped: beside their modes each moves with the base as "
+            "rigid_body says of the other; exchange their records, or their rows of rigid_body"
+        )
+    ]
+
+
+def _of_sensors(test: Measurement, motion: _Motion, right: NDArray[np.bool_]) -> Iterator[Mistake]:
+    """Which few sensors have a sign, a unit or a gain of their own, where most are right."""
+    wrong = np.flatnonzero(~right)
+    if 2 * wrong.size > right.size:
+        return
     stated, recorded = motion.stated[wrong], motion.recorded[wrong]
     factor = np.sum(stated * recorded, axis=1) / np.sum(stated**2, axis=1)
+    error = np.linalg.norm(motion.std[wrong], axis=1) / np.linalg.norm(stated, axis=1)
     scaled = motion.stated.copy()
     scaled[wrong] *= factor[:, None]
     agree = motion.agree(scaled)
-    for i, value in zip(wrong, factor, strict=True):
+    for i, value, std in zip(wrong, factor, error, strict=True):
         # Modes far below the lines move some sensors more than others, but not one alone.
         alone = wrong.size == 1 and np.count_nonzero(motion.agree(motion.stated, _ALONE)) == right.size - 1
         if agree[i] and (alone or any(abs(value / own - 1) < _LIKE for own in _CLEAR)):
             carried = np.sum(motion.modal[i] * motion.stated[i]) / np.sum(motion.stated[i] ** 2)
+            value = next((u[0] for u in _UNITS if abs(value - u[0]) < min(_CHANCE * std, _GROSS * u[0])), value)
             sentence = _of_sensor(test.sensor_names[motion.sensors[i]], float(value), float(carried))
             if sentence:
                 yield Mistake(sentence, gross="gain" not in sentence)

@@ -179,15 +179,15 @@ def _fitted(records: Records, omega: Array, ratios: Array) -> _Fit:
         _by_sensor(records, of_modes.sum(axis=0, keepdims=True))[0],
         gained > noise * beyond_chance(beyond.shape[1] * left.shape[1]),
         float(np.linalg.norm(left) / np.sqrt(records.size)),
-        _spikes(records.in_runs(left)),
+        _spikes(records.in_runs(left), _ROUND_OFF * np.sqrt(records.size / records.data.size)),
     )  # fmt: skip
 
 
-def _spikes(left: ComplexArray) -> NDArray[np.bool_]:
+def _spikes(left: ComplexArray, least: float) -> NDArray[np.bool_]:
     """Lines of errors (runs, n_freq, channels) with a number far off its neighbours; none where these are many."""
     size = np.abs(left)
-    level = np.median(size, axis=1, keepdims=True)
-    far = np.any((size > _FAR * level) & (level > 0), axis=(0, 2))
+    level = np.maximum(np.median(size, axis=1, keepdims=True), least)
+    far = np.any(size > _FAR * level, axis=(0, 2))
     return far if np.count_nonzero(far) < _FEW * far.size else np.zeros_like(far)
 
 
