@@ -211,6 +211,7 @@ CAUSES = {
     "swapped": Cause(
         _swapped, r"storey 2 and storey 3 .*(swapped|exchanged)", {"full": exchanged, "lumped": exchanged}
     ),
+    "swapped, rows of G differ": Cause(_swapped, r"sensor 2 and sensor 3 .*swapped", axes="x ry"),
     "one sensor in g": Cause(lambda it: _scaled(it, sensors=_one(1 / GRAVITY, 2)), r"storey 3.*9\.81"),
     "sensors in g": Cause(lambda it: _scaled(it, sensors=1 / GRAVITY), r"sensors.*9\.81"),
     "base in g": Cause(lambda it: _scaled(it, base=1 / GRAVITY), r"base.*9\.81"),

@@ -24,12 +24,14 @@ _WITHIN = 1.15  # times the same, up to which mended records agree
 _CORNERS = 6  # unknowns whose bounds are combined
 _SURE = 6.0  # standard deviations of a weighed mass
 _MODAL = 0.4  # of the mended mass, that the modes between the lines carry at least
+_LBF = 4.4482216
 _FACTORS = (  # of the weighed mass over the right one, and what they are in words
     (1e-3, "1,000", "the base force is in kN, not N"),
-    (1e3, "1,000", "the base force is in mN, or base and sensors in mm/s² times 1e-3"),
-    (GRAVITY, "9.81", "base and sensors are in g, not m/s²"),
+    (1e3, "1,000", "the base force is in N, and was taken for kN"),
+    (GRAVITY, "9.81", "base and sensors are in g, not m/s² (or the base force is in N, and was taken for kgf)"),
     (1 / GRAVITY, "9.81", "the base force is in kgf, not N"),
-    (1 / 4.4482216, "4.448", "the base force is in lbf, not N"),
+    (1 / _LBF, "4.448", "the base force is in lbf, not N"),
+    (_LBF, "4.448", "the base force is in N, and was taken for lbf"),
 )
 
 
