@@ -52,7 +52,8 @@ def lines(reduced: bool) -> Iterator[Line]:
     wrong = [cell for cell in cells(CAUSES) if not reduced or _is_in_short(cell)]
     tellable, untold = [c for c in wrong if not c.untold], [c for c in wrong if c.untold]
     seeds = range(1 if reduced else 5)
-    sound = [cell._replace(seed=seed) for cell in cells([RIGHT]) for seed in seeds if not reduced or cell.force]
+    some = [cell for cell in cells([RIGHT]) if not reduced or (cell.force and cell.kind == SPECTRA)]
+    sound = [cell._replace(seed=seed) for cell in some for seed in seeds]
     ends = dict(zip([*wrong, *sound], spread(end_of, [*wrong, *sound]), strict=True))
     missed = [cell for cell in tellable if not re.search(CAUSES[cell.cause].named, ends[cell].first)]
     for cell in missed:

@@ -203,6 +203,16 @@ def _of_motion(test: Measurement, terms: DirectTerms) -> Iterator[Mistake]:
         if found:
             yield from found[:1]
             return
+    for factor in (1.0, *_CLEAR):
+        # One mistake in all sensors, and another in a few of them.
+        of_all = replace(motion, stated=factor * motion.stated)
+        right = of_all.agree(of_all.stated)
+        sharp = np.max(np.linalg.norm(motion.std, axis=1)) < _LIKE * abs(factor)
+        if 2 * np.count_nonzero(right) > known.size and (factor == 1.0 or sharp):
+            yield from () if factor == 1.0 else _of_all(motion, factor)
+            yield from _swapped(test, of_all, right) or _of_sensors(test, of_all, right)
+            return
+    right = motion.agree(motion.stated)
     yield from _swapped(test, motion, right) or _of_sensors(test, motion, right)
 
 

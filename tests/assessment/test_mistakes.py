@@ -66,6 +66,12 @@ def test_swapped_sensors_of_two_directions_are_told_without_any_model():
     assert sentence.startswith("sensor 1 and sensor 7 are swapped")
 
 
+def test_a_mistake_in_all_sensors_and_another_in_one_are_both_told():
+    test = random_test(noise=0.002)
+    found = told(with_sensor(replace(test, response=test.response / 9.80665), -1.0))
+    assert re.match(r"the sensors are in g.* \| the sign of sensor 3 is reversed", found)
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_right_records_are_accused_of_nothing(seed):
     truth = random_structure(seed, n=3 + seed % 6, d=1 + seed % 3)
@@ -126,6 +132,6 @@ def test_stated_frequencies_and_lines_in_rad_per_s(factor, words):
 
 def test_sensors_that_are_swapped_in_a_written_model_are_told():
     test = CAUSES["swapped"].made(right(SPECTRA, force=False)).test
-    result = identify(problem("written", test), rng=0)
+    result = identify(problem("written", test), strategy=sysid.Continuation(1), rng=0)
     assert result.confidence[0].startswith("storey 2 and storey 3 are swapped")
     assert not result.determined
