@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sysid.assessment.before_search import named_mistakes
+from sysid.assessment.exchanged import exchanged_sensors
 from sysid.errors import InputError, SolverError, finite_array, function, instance, number, path_of, whole_number
 from sysid.nlp import one_thread
 from sysid.problem.problem import Problem
@@ -105,18 +107,22 @@ def identify(
         kept = file.journal(identity(problem, strategy, seed, start, max_evaluations))
     with one_thread(), DeferredInterrupt() as interrupt, kept as journal:
         session = Session(listeners, interrupt, max_time, random, max_evaluations, journal)
-        prepare(problem, session)
-        chosen, why = choose(strategy, problem, start)
-        check(problem, chosen)
+        named = named_mistakes(problem)
         try:
-            outcome, why = _run(chosen, why, problem.screened, session, start, follow=strategy == "auto")
+            prepare(problem, session)
+            chosen, why = choose(strategy, problem, start)
+            check(problem, chosen)
+            outcome, why = _run(chosen, why, problem.screened, session, start, follow=strategy == "auto" and not named)
             outcome = settled(problem, outcome, chosen, session)
             outcome = with_stated_masses(problem.screened, outcome, session)
+            outcome = replace(outcome, mistakes=(*named, *outcome.mistakes))
         except Stop as stop:  # before there was any structure
             raise SolverError(f"{stop}: nothing is identified") from None
-        except (InputError, SolverError):
+        except (InputError, SolverError) as error:
             if max_time is None:  # it has ended by itself, and would end so again
                 journal.entries.clear()
+            if named and isinstance(error, InputError):
+                raise InputError("; ".join((*named, str(error)))) from error
             raise
         result = judge(problem, outcome, why, seed, session)
     if checkpoint is not None and file is not checkpoint and not result.interrupted:
@@ -169,6 +175,10 @@ def _run(
         if not follow or isinstance(chosen, STRATEGIES[-1]):  # after which there is nothing else
             raise
         return _instead(chosen, error, problem, session, start)
+    if not outcome.good and outcome.stopped is None and session.time_for_more:
+        told = exchanged_sensors(problem, outcome.structure)
+        if told:
+            return replace(outcome, mistakes=told), why
     after = _after(chosen, problem, start) if follow and not outcome.good else None
     if after is None or outcome.stopped is not None or not session.time_for_more:
         return outcome, why

@@ -13,6 +13,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.structure.structure import Array, Structure
 
 _FEWEST = 8.0  # lines in a half-power width; a Hann window then takes 2 % off a peak, and more with fewer
+_RESOLVED = 2.5  # distances of lines; narrower peaks are mostly the window's
 _TWICE = 2.0  # distances of lines, within which a peak that was smeared over them is taken for two modes
 _SAME_SHAPE = 0.95  # modal assurance criterion
 _MISSED = 3.0  # times the relative misfit elsewhere, beyond which spectra of unknown origin show a peak flattened
@@ -60,6 +61,32 @@ def leakage(test: Measurement, structure: Structure) -> Iterator[str]:
         f"{averaged}their window flattens its peak, and damping and masses come out wrong; take whole records "
         f"(from_time with estimator='records'), or segments of {_FEWEST / peaks.width[k]:.3g} s or longer"
     )
+
+
+def unresolved(test: Measurement, omega: Array, ratios: Array) -> Iterator[str]:
+    """Whether averages over segments have too few lines in most peaks of poles found in them, in a sentence.
+
+    Where only some are so narrow `leakage` tells it of the structure that was fitted. The window itself makes a narrow
+    peak about one and a half distances of lines wide.
+
+    Parameters
+    ----------
+    omega, ratios : (m,)
+        rad/s, fractions of critical damping.
+    """
+    f = omega / (2 * np.pi)
+    inside = (f >= test.freq[0]) & (f <= test.freq[-1])
+    if not test.averaged or test.freq.size < 2 or not np.any(inside):
+        return
+    f, width = f[inside], 2 * ratios[inside] * f[inside]
+    spacing = np.interp(f, test.freq, np.gradient(test.freq))
+    k = int(np.argmax(spacing / width))
+    if 2 * np.count_nonzero(width < _RESOLVED * spacing) >= f.size:
+        yield (
+            f"the segments are too short: lines are {spacing[k]:.2g} Hz apart ({1 / spacing[k]:.3g} s a segment), and "
+            f"the peak at {f[k]:.4g} Hz is no wider than their window makes any peak, so that damping and masses are "
+            "the window's; take whole records (from_time with estimator='records'), or segments several times as long"
+        )
 
 
 def _peaks(test: Measurement, structure: Structure) -> Peaks:

@@ -25,11 +25,15 @@ def relocate(
     omega: Array,
     ratios: Array,
     tell: Callable[[], object],
+    direct: ComplexArray | None = None,
 ) -> tuple[Array, Array]:
-    """One step of relaxed vector fitting: the zeros of sigma in ``sigma a = sum of (r_1 + r_2 i w) g``."""
+    """One step of relaxed vector fitting: the zeros of sigma in ``sigma a = sum of (r_1 + r_2 i w) g``.
+
+    With `direct` (k, n_freq) functions that no pole has stand beside the sum.
+    """
     w = 2 * np.pi * records.freq
     g, velocity = gains_with_velocity(records.freq, omega, ratios)
-    numerators = np.concatenate([g, velocity])
+    numerators = np.concatenate([g, velocity] if direct is None else [g, velocity, direct])
     with np.errstate(divide="ignore", invalid="ignore"):
         partial = np.where(w > 0, (omega[:, None] / w) ** 2 * g, 1.0)  # w_k² over the same denominator
     sigma = np.concatenate([np.ones((1, w.size)), partial, 1j * w / omega[:, None] * partial])

@@ -161,7 +161,7 @@ class Problem:
 
     def _check_declarations(self) -> None:
         """Refuse models that do not fit the test, and what is written wrong; nothing is searched for it."""
-        declared = self.formulate(self._geometry.unsearched())
+        declared = self.formulate(self.unsearched)
         for model in declared.models:
             model.stated(declared.geometry)
         declared.check()
@@ -268,6 +268,11 @@ class Problem:
         """That of the records as they are given."""
         weighed = None if self.measurement.force is None else self._weigh
         return geometry_of(self.measurement, self.stiffness, self.recovery, self.rigid_body_dofs, weighed)
+
+    @property
+    def unsearched(self) -> Geometry:
+        """The geometry with made-up poles and weights, for what is asked before the records are searched."""
+        return self._geometry.unsearched()
 
     @cached_property
     def formulation(self) -> Formulation:

@@ -42,8 +42,11 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
     try:
         with within(session.left):
             known = determine(records, end.structure, end.x, end.alternatives)
-            doubtful = (*end.doubts, *doubts(records, end.structure, end.x)) if judged else ()
-            open_, closed_by = (*doubtful, *known.undetermined), known.closed_by
+            # A mistake that is named explains whatever else speaks against the fit; short segments have more to tell.
+            more = judged and (not end.mistakes or records.measurement.averaged)
+            further = doubts(records, end.structure, end.x) if more else ()
+            doubtful = (*end.doubts, *further) if judged else ()
+            open_, closed_by = (*end.mistakes, *doubtful, *known.undetermined), known.closed_by
         if success and known.judged_by == BY_RANK and not open_:
             end, unknown = with_other_answers(problem, end, session)
             with within(session.left):
@@ -51,6 +54,8 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
             open_ = (*unknown, *others)
     except TimeIsOver:
         open_ = (NOT_JUDGED,)
+    if end.mistakes and open_[: len(end.mistakes)] != end.mistakes:
+        open_ = (*end.mistakes, *open_)
     if not success:
         open_ = ("the search did not end in a fit, so this is not yet any structure that explains the data", *open_)
     it = Identification(
@@ -60,7 +65,7 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
         strategy=end.strategy,
         seed=seed,
         success=success,
-        message="; ".join((message, *doubtful)),
+        message="; ".join((*end.mistakes, message, *doubtful)),
         history=replace(end.history, log=tuple(session.lines), wall_time=session.seconds),
         determined=not open_,
         closed_by=() if open_ else closed_by,

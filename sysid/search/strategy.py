@@ -127,6 +127,9 @@ class Outcome:
         The fit is as good as the data let it be, as far as the strategy can tell: no other needs to follow.
     doubts : tuple of str
         Stated values that contradict the records.
+    mistakes : tuple of str
+        What is wrong with the records or with what is stated of them, by name; it explains whatever else speaks against
+        the fit.
     """
 
     structure: Structure
@@ -140,6 +143,7 @@ class Outcome:
     alternatives: tuple[Array, ...] = ()
     good: bool = True
     doubts: tuple[str, ...] = ()
+    mistakes: tuple[str, ...] = ()
 
 
 class Strategy(Protocol):

@@ -167,21 +167,12 @@ def test_sensors_that_move_with_the_base_are_refused():
         sysid.Problem(test, mass=sysid.FullMass(1.0), stiffness=sysid.SpectralStiffness([2.0, 3.0]))
 
 
-@pytest.mark.parametrize("mistake", ["rad/s", "conjugated", "flipped sensor"])
-def test_a_solver_that_converged_to_no_fit_is_no_success(mistake):
+def test_a_solver_that_converged_to_no_fit_is_no_success():
     """Without a goal the solver's good status alone must not read as a result; the message names the usual causes."""
     truth = chain([3.0, 4.0], [4000.0, 3000.0], [0.01, 0.012])
     test = sysid.simulate(truth, np.linspace(1.0, 10.0, 120))
-    given, response = truth.natural_frequencies, test.response.copy()
-    if mistake == "rad/s":
-        given = given * 2 * np.pi
-    elif mistake == "conjugated":
-        response = response.conj()
-    else:
-        response[:, 0] *= -1
-    wrong = sysid.Measurement(test.freq, test.base, response, rigid_body=test.rigid_body)
-    problem = sysid.Problem(wrong, mass=sysid.LumpedMass(7.0), stiffness=sysid.SpectralStiffness(given))
-    result = sysid.identify(problem, rng=0, strategy=QUICK)
+    stiffness = sysid.SpectralStiffness(2.5 * truth.natural_frequencies)
+    result = sysid.identify(sysid.Problem(test, mass=sysid.LumpedMass(7.0), stiffness=stiffness), rng=0, strategy=QUICK)
     assert not result.success
     assert not result.determined
     assert "is no fit" in result.message

@@ -1,0 +1,1 @@
+"""Tests with one mistake in them, and whether results name it."""

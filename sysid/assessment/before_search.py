@@ -1,0 +1,158 @@
+"""What is wrong with records, or between them and what is stated, as it is told before a search."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+
+import numpy as np
+
+from sysid.assessment.leakage import unresolved
+from sysid.assessment.mistakes import GRAVITY, Mistake, mistakes_of
+from sysid.errors import InputError, refuse
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.direct_terms import DirectTerms, direct_terms
+from sysid.modal_analysis.poles_of_test import poles_of_test
+from sysid.problem.feasibility import points_of
+from sysid.problem.formulation import Formulation
+from sysid.problem.problem import Problem
+from sysid.problem.terms import FurtherTest
+from sysid.structure.structure import Array, Structure
+
+_BEYOND = 1.5  # times what the model allows, from which records contradict it
+_WITHIN = 1.15  # times the same, up to which mended records agree
+_CORNERS = 6  # unknowns whose bounds are combined
+_SURE = 6.0  # standard deviations of a weighed mass
+_MODAL = 0.4  # of the mended mass, that the modes between the lines carry at least
+_LBF = 4.4482216
+_FACTORS = (  # of the weighed mass over the right one, and what they are in words
+    (1e-3, "1,000", "the base force is in kN, not N"),
+    (1e3, "1,000", "the base force is in N, and was taken for kN"),
+    (GRAVITY, "9.81", "base and sensors are in g, not m/s² (or the base force is in N, and was taken for kgf)"),
+    (1 / GRAVITY, "9.81", "the base force is in kgf, not N"),
+    (1 / _LBF, "4.448", "the base force is in lbf, not N"),
+    (_LBF, "4.448", "the base force is in N, and was taken for lbf"),
+)
+
+
+def named_mistakes(problem: Problem) -> tuple[str, ...]:
+    """Mistakes that the tests of a problem show before a search, in sentences, the worst first.
+
+    Raises
+    ------
+    InputError
+        Where one spoils all channels, or a channel of a problem whose model has a form of its own, so that a search
+        would be in vain.
+    """
+    declared = problem.formulate(problem.unsearched)
+    tests = [problem.measurement] if problem.misfit is None else []
+    tests += [given.measurement for given in problem.residuals if isinstance(given, FurtherTest)]
+    told: list[str] = []
+    for i, test in enumerate(tests):
+        for mistake in _of_test(problem, declared, test, own=test is problem.measurement):
+            sentence = mistake.sentence if len(tests) == 1 else f"test {i + 1}: {mistake.sentence}"
+            refuse((mistake.everywhere or (mistake.gross and not declared.free_modes), sentence))
+            told.append(sentence)
+    return tuple(told)
+
+
+def _of_test(problem: Problem, declared: Formulation, test: Measurement, *, own: bool) -> list[Mistake]:
+    try:
+        terms = direct_terms(test)
+        found = mistakes_of(test, terms)
+        if own and not found and terms is not None:
+            found = [*_of_mass(declared, test, terms), *_of_frequencies(problem, declared, test)]
+        if not found and test.averaged:
+            found = [Mistake(sentence, gross=False) for sentence in unresolved(test, *poles_of_test(test))]
+    except (np.linalg.LinAlgError, InputError):  # records that tell nothing; the search says so
+        return []
+    return found
+
+
+def _of_mass(declared: Formulation, test: Measurement, terms: DirectTerms) -> Iterator[Mistake]:
+    """Whether the base force weighs what is stated by a factor of two units."""
+    allowed = None if terms.mass is None or terms.below else _masses(declared)
+    if allowed is None or terms.mass is None or terms.modal_mass is None or terms.mass_std is None:
+        return
+    low, high = (part[test.translational] for part in allowed)
+    weighed, std, modal = (np.diag(it)[test.translational] for it in (terms.mass, terms.mass_std, terms.modal_mass))
+    known = (weighed > _SURE * std) & np.isfinite(low) & (high > 0)
+    if not np.any(known):
+        return
+    low, high, weighed, modal = low[known], high[known], weighed[known], modal[known]
+    if np.any((weighed > low / _BEYOND) & (weighed < high * _BEYOND)):
+        return
+    for factor, told, words in _FACTORS:
+        # What no mode carries may be a fixture, of whatever mass.
+        mended, of_modes = weighed / factor, modal / factor
+        agree = (mended > low / _WITHIN) & (mended < high * _WITHIN) & (of_modes > _MODAL * low)
+        if np.all(agree):
+            masses = ", ".join(f"{m:.4g}" for m in weighed)
+            stated = ", ".join(f"{a:.4g}" if a == b else f"{a:.4g} to {b:.4g}" for a, b in zip(low, high, strict=True))
+            yield Mistake(
+                f"the base force weighs {masses} kg where {stated} kg are stated, a factor of {told}: {words}",
+                everywhere=True,
+            )
+            return
+
+
+def _masses(declared: Formulation) -> tuple[Array, Array] | None:
+    """Least and largest mass that what is stated lets move in each base direction, (d,) each; None where it is open."""
+    totals = declared.mass.totals
+    if totals is not None:
+        return totals.by_direction, totals.by_direction
+    if declared.mass.free or declared.stiffness.free:
+        return None
+    found = [np.diag(s.rigid_body_mass) for s in _structures(declared)]
+    return (np.min(found, axis=0), np.max(found, axis=0)) if found else None
+
+
+def _of_frequencies(problem: Problem, declared: Formulation, test: Measurement) -> Iterator[Mistake]:
+    """Whether lines are in rad/s, as frequencies that are stated, or that the bounds allow, show."""
+    stated = getattr(problem.stiffness, "natural_frequencies", None)
+    if declared.stiffness.free and stated is None:
+        return
+    found = poles_of_test(test)[0] / (2 * np.pi)
+    if stated is not None:
+        low = high = np.atleast_1d(np.array(stated, dtype=float))
+        what = "the stated natural frequencies are"
+    else:
+        made = [s.natural_frequencies for s in _structures(declared)]
+        if not made:
+            return
+        low, high = np.min(made, axis=0), np.max(made, axis=0)
+        what = "the bounds of the model allow first natural frequencies"
+    inside = lambda f: bool(low[0] / _WITHIN < f[0] < high[0] * _WITHIN and f[-1] < high[-1] * _WITHIN)  # noqa: E731
+    if stated is not None and found[0] < low[0] / _BEYOND and inside(2 * np.pi * found):
+        yield Mistake(
+            f"the stated natural frequencies are in rad/s, not Hz: {', '.join(f'{f:.4g}' for f in low[:4])} Hz are "
+            f"stated, the records have modes at {', '.join(f'{f:.4g}' for f in found[:4])} Hz, and a factor of 2 pi = "
+            "6.283 lies between; divide what is stated by 2 pi",
+            everywhere=True,
+        )
+    mended = found / (2 * np.pi)
+    if found[0] > _BEYOND * high[0] and inside(mended):
+        span = f"{low[0]:.4g}" if stated is not None else f"of {low[0]:.4g} to {high[0]:.4g}"
+        yield Mistake(
+            f"the lines are in rad/s, not Hz: the records have modes at {', '.join(f'{f:.4g}' for f in found[:4])} Hz "
+            f"as they are given, {what} {span} Hz, and a factor of 2 pi = 6.283 lies between; divide the frequencies "
+            "by 2 pi",
+            everywhere=True,
+        )
+
+
+def _structures(declared: Formulation) -> list[Structure]:
+    """Structures over the search space, its corners among them."""
+    unknowns, lower, upper = declared.unknowns, declared.lower, declared.upper
+    ends = np.cumsum([unknown.size for unknown in unknowns])
+    points = list(points_of(declared))
+    if len(unknowns) <= _CORNERS:
+        for choice in product((False, True), repeat=len(unknowns)):
+            points.append(np.where(np.repeat(choice, np.diff(ends, prepend=0)), upper, lower))
+    made = []
+    for x in points:
+        try:
+            made.append(declared.matrices.structure(x, declared.measurement))
+        except InputError:  # no structure there
+            continue
+    return made

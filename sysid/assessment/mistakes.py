@@ -1,0 +1,367 @@
+"""Mistakes in the records of a test, named by what they leave beside all modes, before anything is fitted to a model.
+
+What each sensor moves with the base beside its modes is its row of rigid_body, whatever mass and stiffness are (see
+`sysid.modal_analysis.direct_terms`). Records that differ from it by a sign, a unit, a gain, a delay, or because two
+sensors stand in each other's place, tell so. docs/mistakes.md has the table of what can be told, and what cannot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.direct_terms import DirectTerms, direct_terms
+from sysid.structure.structure import Array
+
+_NO_FIT = 0.3  # relative misfit, from which modes do not explain the records
+_MENDED = 0.3  # of the misfit; what a mended record may leave
+_GROSS = 0.15  # of a sensor's rigid-body motion: smaller errors of gains are told by what was fitted
+_CHANCE = 3.0  # standard deviations that a factor may be off by
+_ALONE = 0.05  # of the same of the other sensors, where one alone has another gain
+_SURE = 6.0  # standard deviations
+_ONE_SURE = 10.0  # the same of the delay of one sensor, whose deviation is not known so well
+_SHOWN = 0.1  # of a sensor's rigid-body motion; it is not known where the standard deviation is larger
+_LIKE = 0.04  # by how much a factor may differ from that of two units
+_NONE = 0.1  # of a sensor's rigid-body motion; as good as none
+_CARRIED = 0.5  # of the rigid-body motion, that modes between the lines carry: there is no other below them
+_TURN = 0.03  # rad at the last line; the least delay that is told
+_LARGE_TURN = 0.3  # rad there, from which no fit is worth a search
+_MOST = 1.5  # rad at the last line; the largest one
+_ALIKE = 0.2  # of a delay, by which sensors on one clock may differ
+_NO_WORSE = 1.02  # times the misfit before, that records on one clock may have
+_ROUNDS = 3  # of taking a delay off
+GRAVITY = 9.80665
+_UNITS = (  # what sensors over base are multiplied by, in words, and the units with the smaller and the larger numbers
+    (GRAVITY, "9.81", "g", "m/s²"),
+    (1 / GRAVITY, "9.81", "g", "m/s²"),
+    (1000.0, "1,000", "m/s²", "mm/s²"),
+    (1 / 1000.0, "1,000", "m/s²", "mm/s²"),
+)
+_CLEAR = (-1.0, *(unit[0] for unit in _UNITS))  # factors that no mode makes
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """A mistake that the records show.
+
+    Attributes
+    ----------
+    sentence : str
+        What is wrong, by what it shows, and what to do.
+    everywhere : bool
+        It spoils all channels, so that nothing is worth a search.
+    gross : bool
+        No model with a form of its own fits one channel, so that a search in its unknowns is not worth its time.
+    """
+
+    sentence: str
+    everywhere: bool = False
+    gross: bool = True
+
+
+def mistakes_of(test: Measurement, terms: DirectTerms | None) -> list[Mistake]:
+    """Mistakes that the records of a test show by themselves, the worst first; none where they cannot tell.
+
+    Parameters
+    ----------
+    test : Measurement
+    terms : DirectTerms or None
+        Of the test, as `direct_terms` gives them.
+    """
+    if terms is None:
+        return []
+    if terms.misfit > _NO_FIT:
+        return list(_conjugated(test, terms))
+    if terms.below:
+        return []
+    late, terms = _late(test, terms)
+    return [*late, *_of_motion(test, terms), *_of_force(test, terms)]
+
+
+def _conjugated(test: Measurement, terms: DirectTerms) -> Iterator[Mistake]:
+    """Whether the conjugates of the spectra are those of modes, and the spectra are not."""
+    if test.whole is not None:
+        return
+    force = None if test.force is None else test.force.conj()
+    other = direct_terms(replace(test, base=test.base.conj(), response=test.response.conj(), force=force))
+    if other is not None and other.misfit < _MENDED * terms.misfit:
+        yield Mistake(
+            "the spectra follow exp(-i w t): modes that decay leave "
+            f"{100 * terms.misfit:.2g} % of the responses, and {100 * other.misfit:.2g} % of their conjugates: take "
+            "the complex conjugate of response and force (numpy.conj)",
+            everywhere=True,
+        )
+
+
+def _late(test: Measurement, terms: DirectTerms) -> tuple[list[Mistake], DirectTerms]:
+    """Sensors whose records are late against the base's, and the terms of the records without that delay."""
+    total = np.zeros(test.n_sensors)
+    first: Array | None = None
+    for _ in range(_ROUNDS):
+        found = _delays(test, terms)
+        if found is None:
+            break
+        first = found if first is None else first
+        total += found
+        if test.whole is not None:  # a record turned by its spectrum begins with its end
+            break
+        turn = np.exp(2j * np.pi * total[:, None] * test.freq)
+        mended = direct_terms(replace(test, response=test.response * turn))
+        if mended is None or mended.misfit > _NO_WORSE * terms.misfit:
+            return [], terms
+        terms = mended
+    if first is None:
+        return [], terms
+    which = np.flatnonzero(total)
+    of_all = which.size == np.count_nonzero(np.any(test.rigid_body, axis=1)) and which.size > 1
+    who = "the records of all sensors are" if of_all else f"the record of {_names(test, which)} is"
+    delay = float(np.mean(total[which]))
+    word = "late" if delay > 0 else "early"
+    sentence = (
+        f"{who} {1e3 * abs(delay):.3g} ms {word} against the base's: beside their modes the sensors follow the base "
+        "with a phase that grows with frequency, as two clocks or a filter on some channels alone make it; bring them "
+        "to one clock (sysid.resample), or filter all channels alike"
+    )
+    turned = abs(delay) * 2 * np.pi * test.freq[-1]
+    return [Mistake(sentence, everywhere=of_all and turned > _LARGE_TURN, gross=turned > _LARGE_TURN)], terms
+
+
+def _delays(test: Measurement, terms: DirectTerms) -> Array | None:
+    """Delay of each sensor beyond chance, s, one for all or that of one alone; None where there is none."""
+    reach = _reach(test)
+    c, slope, std = terms.rigid / reach, terms.slope / reach, terms.slope_std / reach
+    size = np.sum(c**2, axis=1)
+    stated = np.sum((test.rigid_body / reach) ** 2, axis=1)
+    told = np.sum((terms.rigid_std / reach) ** 2, axis=1) < _SHOWN**2 * np.maximum(size, stated)
+    known = np.flatnonzero((stated > 0) & (size > _NONE**2 * stated) & told)
+    if not known.size:
+        return None
+    delay = -np.sum(slope * c, axis=1)[known] / size[known]
+    error = np.sqrt(np.sum((std * c) ** 2, axis=1))[known] / size[known]
+    error = np.maximum(error, np.finfo(float).tiny)
+    least = _TURN / (2 * np.pi * test.freq[-1])
+    mean = float(np.average(delay, weights=error**-2))
+    off = (np.abs(delay) > _ONE_SURE * error) & (np.abs(delay) > least)
+    if np.any(np.abs(delay[off]) > _MOST / (2 * np.pi * test.freq[-1])):  # the first terms of a series do not tell it
+        return None
+    out = np.zeros(test.n_sensors)
+    if np.all(np.abs(delay - mean) < np.maximum(_SURE * error, _ALIKE * abs(mean))):
+        if abs(mean) < max(_SURE / np.sqrt(np.sum(error**-2)), least):
+            return None
+        out[known] = mean
+    elif np.count_nonzero(off) == 1 and known.size > 2:
+        out[known[off]] = delay[off]
+    else:
+        return None
+    return out
+
+
+def _reach(test: Measurement) -> Array:
+    """Largest motion of any sensor for unit base motion, by direction, (d,)."""
+    reach = np.abs(test.rigid_body).max(axis=0)
+    return np.asarray(np.where(reach > 0, reach, 1.0))
+
+
+def _names(test: Measurement, which: NDArray[np.intp]) -> str:
+    return " and ".join(test.sensor_names[i] for i in which)
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """Rigid-body motion of the sensors whose own is known: as stated, as recorded, its error; in units of `_reach`."""
+
+    sensors: NDArray[np.intp]
+    stated: Array
+    recorded: Array
+    std: Array
+    modal: Array
+
+    def agree(self, stated: Array, within: float = _GROSS) -> NDArray[np.bool_]:
+        """Which rows are recorded as these say, but for what is usual and for chance."""
+        size = np.linalg.norm(stated, axis=1, keepdims=True)
+        off = np.abs(self.recorded - stated)
+        return np.asarray(np.all(off < np.maximum(within * size, _SURE * self.std), axis=1))
+
+
+def _of_motion(test: Measurement, terms: DirectTerms) -> Iterator[Mistake]:
+    """What the recorded rigid-body motion differs by from what is stated, the simplest explanation of all of it."""
+    reach = _reach(test)
+    G, c, std = test.rigid_body / reach, terms.rigid / reach, terms.rigid_std / reach
+    size = np.linalg.norm(G, axis=1)
+    gain = np.maximum(np.linalg.norm(c, axis=1) / np.where(size > 0, size, 1.0), 1.0)
+    known = np.flatnonzero((size > 0) & (np.linalg.norm(std, axis=1) < _SHOWN * size * gain))
+    motion = _Motion(known, G[known], c[known], std[known], (terms.modal / reach)[known])
+    right = motion.agree(motion.stated)
+    if known.size == 0 or np.all(right):
+        return
+    if known.size > 1:
+        found = [*_relative(motion), *_of_columns(test, motion)]
+        if found:
+            yield from found[:1]
+            return
+    for factor in (1.0, *_CLEAR):
+        # One mistake in all sensors, and another in a few of them.
+        of_all = replace(motion, stated=factor * motion.stated)
+        right = of_all.agree(of_all.stated)
+        sharp = np.max(np.linalg.norm(motion.std, axis=1)) < _LIKE * abs(factor)
+        if 2 * np.count_nonzero(right) > known.size and (factor == 1.0 or sharp):
+            yield from () if factor == 1.0 else _of_all(motion, factor)
+            yield from _swapped(test, of_all, right) or _of_sensors(test, of_all, right)
+            return
+    right = motion.agree(motion.stated)
+    yield from _swapped(test, motion, right) or _of_sensors(test, motion, right)
+
+
+def _relative(motion: _Motion) -> Iterator[Mistake]:
+    """Whether no sensor moves with the base, though their modes carry what moves with it."""
+    size = np.linalg.norm(motion.stated, axis=1)
+    carried = np.sum(motion.modal * motion.stated) / np.sum(motion.stated**2)
+    if np.all(np.linalg.norm(motion.recorded, axis=1) < _NONE * size) and carried > _CARRIED:
+        yield Mistake(
+            "the responses are relative to the base, not absolute: beside their modes the sensors do not move with the "
+            "base at all; add what rigid_body makes of the base's acceleration (response + G base)",
+            everywhere=True,
+        )
+
+
+def _of_columns(test: Measurement, motion: _Motion) -> Iterator[Mistake]:
+    """Whether each base direction has one factor of its own in all sensors."""
+    weight = np.sum(motion.stated**2, axis=0)
+    moved = weight > 0
+    several = np.count_nonzero(np.abs(motion.stated) > _NONE, axis=0) > 1
+    factor = np.ones(weight.size)
+    factor[moved] = np.sum(motion.stated * motion.recorded, axis=0)[moved] / weight[moved]
+    if not np.all(motion.agree(motion.stated * factor)):
+        return
+    turns = ~test.translational & moved
+    others = test.translational & moved
+    alike = np.ptp(factor[moved]) < _LIKE * np.abs(factor[moved]).max()
+    if alike:
+        yield from _of_all(motion, float(np.mean(factor[moved])))
+    elif np.all(np.abs(factor[others] - 1) < _GROSS) and np.any(turns):
+        for value, words in (
+            (1e-3, "mm in the place of m"),
+            (1e-2, "cm in the place of m"),
+            (1e3, "km in the place of m"),
+        ):
+            if np.all(np.abs(factor[turns] / value - 1) < _GROSS):
+                yield Mistake(
+                    f"the positions behind rigid_body are in {words}, not m: for a rotation of the base the sensors "
+                    f"move {value:g} times what it says, a factor of {1 / value:,.0f}, and for translations as "
+                    "it says; give positions in m",
+                    everywhere=True,
+                )
+    reversed_ = [int(i) for i in np.flatnonzero(moved) if abs(factor[i] + 1) < _GROSS]
+    # Where one sensor alone shows a direction, it is told of that sensor.
+    if not alike and reversed_ and np.all(several[reversed_]) and np.all(np.abs(np.abs(factor[moved]) - 1) < _GROSS):
+        assert test.base_axes is not None
+        yield Mistake(
+            f"the sign of the base in {', '.join(test.base_axes[i] for i in reversed_)} is reversed: beside their "
+            "modes all sensors move against it; change the sign of its record, or of its column of rigid_body",
+            everywhere=True,
+        )
+
+
+def _of_all(motion: _Motion, factor: float) -> Iterator[Mistake]:
+    """What one factor in all sensors and directions means."""
+    if abs(factor + 1) < _GROSS:
+        yield Mistake(
+            "the sign of the base is reversed, or that of all sensors: beside their modes all move against the base; "
+            "change the sign of the base's record",
+            everywhere=True,
+        )
+    for value, times, small, large in _UNITS:
+        if abs(factor / value - 1) < _LIKE:
+            first, second = ("the base is", "the sensors are") if value > 1 else ("the sensors are", "the base is")
+            yield Mistake(
+                f"{first} in {small} where {second} in {large}: beside their modes the sensors move {factor:.3g} times "
+                f"as rigid_body says, a factor of {times}; bring both to m/s²",
+                everywhere=True,
+            )
+
+
+def _swapped(test: Measurement, motion: _Motion, right: NDArray[np.bool_]) -> list[Mistake]:
+    """Whether two sensors stand in each other's place, and a third is right."""
+    wrong = np.flatnonzero(~right)
+    if wrong.size != 2 or right.size < 3:
+        return []
+    there = motion.stated.copy()
+    there[wrong] = there[wrong[::-1]]
+    if not np.all(motion.agree(there)):
+        return []
+    return [
+        Mistake(
+            f"{_names(test, motion.sensors[wrong])} are swapped: beside their modes each moves with the base as "
+            "rigid_body says of the other; exchange their records, or their rows of rigid_body"
+        )
+    ]
+
+
+def _of_sensors(test: Measurement, motion: _Motion, right: NDArray[np.bool_]) -> Iterator[Mistake]:
+    """Which few sensors have a sign, a unit or a gain of their own, where most are right."""
+    wrong = np.flatnonzero(~right)
+    if 2 * wrong.size > right.size:
+        return
+    stated, recorded = motion.stated[wrong], motion.recorded[wrong]
+    factor = np.sum(stated * recorded, axis=1) / np.sum(stated**2, axis=1)
+    error = np.linalg.norm(motion.std[wrong], axis=1) / np.linalg.norm(stated, axis=1)
+    scaled = motion.stated.copy()
+    scaled[wrong] *= factor[:, None]
+    agree = motion.agree(scaled)
+    for i, value, std in zip(wrong, factor, error, strict=True):
+        # Modes far below the lines move some sensors more than others, but not one alone.
+        alone = wrong.size == 1 and np.count_nonzero(motion.agree(motion.stated, _ALONE)) == right.size - 1
+        if agree[i] and (alone or any(abs(value / own - 1) < _LIKE for own in _CLEAR)):
+            carried = np.sum(motion.modal[i] * motion.stated[i]) / np.sum(motion.stated[i] ** 2)
+            value = next((u[0] for u in _UNITS if abs(value - u[0]) < min(_CHANCE * std, _GROSS * u[0])), value)
+            sentence = _of_sensor(test.sensor_names[motion.sensors[i]], float(value), float(carried))
+            if sentence:
+                yield Mistake(sentence, gross="gain" not in sentence)
+
+
+def _of_sensor(name: str, factor: float, carried: float) -> str | None:
+    """What a factor of one sensor alone means."""
+    shown = "beside its modes it moves with the base"
+    if abs(factor + 1) < _GROSS:
+        return f"the sign of {name} is reversed: {shown} by {factor:.3g} times what rigid_body says; change its sign"
+    for value, times, small, large in _UNITS:
+        if abs(factor / value - 1) < _LIKE:
+            own, base = (small, large) if value < 1 else (large, small)
+            return (
+                f"{name} is in another unit than the base: {shown} by {factor:.4g} times what rigid_body says, a "
+                f"factor of {times}, as of a sensor in {own} and a base in {base}; bring both to m/s²"
+            )
+    if abs(factor) < _NONE:
+        return (
+            f"{name} is relative to the base, where the other sensors are absolute: {shown} by {factor:.2g} times what "
+            "rigid_body says; add the base's acceleration to its record"
+            if carried > _CARRIED
+            else None
+        )
+    return (
+        f"the gain of {name} is {factor:.3g}: {shown} by so many times what rigid_body says, and the other sensors as "
+        "it says; divide its record by its gain, or correct its row of rigid_body"
+        if factor > 0
+        else None
+    )
+
+
+def _of_force(test: Measurement, terms: DirectTerms) -> Iterator[Mistake]:
+    """Whether the base force weighs a negative mass, at low frequency and by its modes."""
+    if terms.mass is None or terms.mass_std is None or terms.modal_mass is None:
+        return
+    weighed, std, modal = (np.diag(it) for it in (terms.mass, terms.mass_std, terms.modal_mass))
+    against = np.flatnonzero((weighed < -_SURE * std) & (modal < 0))
+    if against.size:
+        assert test.base_axes is not None
+        masses = ", ".join(f"{weighed[i]:.4g}" for i in against)
+        axes = "" if against.size == test.n_base else f" in {', '.join(test.base_axes[i] for i in against)}"
+        yield Mistake(
+            f"the sign of the base force{axes} is reversed: it weighs {masses} (kg, or kg m²); give the force of the "
+            "base on the structure, in phase with the base's acceleration at low frequency",
+            everywhere=True,
+        )

@@ -1,0 +1,202 @@
+"""What the absolute motion of the sensors is beside all modes: their rigid-body motion and their delay, as recorded.
+
+Absolute accelerations are ``(G + sum of R_k g_k) u_0''``. With poles, residues and a term without poles free, that term
+tells what each sensor's row of G would have to be, whatever was stated of it. A record that is late by tau has
+``G (1 - i w tau)`` there, to first order, and no structure has a part that grows as ``i w``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.excitation import steady_sine
+from sysid.modal_analysis.record_poles import few_lines, rough_deviations
+from sysid.modal_analysis.relocation import relocate
+from sysid.modal_analysis.residues import Records, beyond_chance, unit_columns
+from sysid.modal_analysis.vector_fitting import RAZOR
+from sysid.nlp import one_thread
+from sysid.structure.structure import Array, ComplexArray
+
+_SPARE, _MOST = 6, 40  # poles beyond one a sensor; all of them
+_CHANNELS = 12  # principal ones, by which the poles are looked for
+_STEPS = 8
+_GUESS = 0.01  # damping ratio
+_MODE = 0.3  # largest damping ratio of a pole that is kept; what has more answers like a term without poles
+_OUTSIDE = 1.5  # times the last line, up to where poles are kept; what lies below the first shows by its tail
+_ROUND_OFF = 1e-9  # of the records: what counts as noise where there is none
+_DEPENDENT = 1e-11  # of the largest singular value of the functions
+_FAR = 6.0  # medians of the errors of a channel, from which a line holds a spike
+_SCREENINGS = 3  # times that lines with spikes are left out
+_FEW = 0.25  # of the lines
+_LINES = 3  # real numbers of a channel for each function, at least
+
+
+@dataclass(frozen=True, eq=False)
+class DirectTerms:
+    """Terms without poles of a test's accelerations, and of its base force.
+
+    Attributes
+    ----------
+    rigid, rigid_std : (n_sensors, d)
+        What the sensors move with the base beside all modes, and its standard deviation.
+    slope, slope_std : (n_sensors, d), s
+        Its part that grows as ``i w``.
+    modal : (n_sensors, d)
+        Sum of the residues of all modes.
+    mass, mass_std : (d, d), kg, or None
+        The same of the force: the rigid-body mass.
+    modal_mass : (d, d), kg, or None
+        Sum of the force's residues: effective masses.
+    below : bool
+        Modes below the lines show, which answer like a constant too: the terms are not the rigid-body motion alone.
+    misfit : float
+        Relative residual of the absolute accelerations on all lines; the terms are those without lines far off the fit.
+    omega, ratios : (m,)
+        rad/s; all poles, spurious ones too.
+    """
+
+    rigid: Array
+    rigid_std: Array
+    slope: Array
+    slope_std: Array
+    modal: Array
+    mass: Array | None
+    mass_std: Array | None
+    modal_mass: Array | None
+    below: bool
+    misfit: float
+    omega: Array
+    ratios: Array
+
+
+def direct_terms(test: Measurement) -> DirectTerms | None:
+    """Fit poles, residues and terms without poles; None where lines or base motion do not tell them.
+
+    Noise counts by its deviations where these are stated; a test of whole records is fitted with its transients.
+    """
+    if test.whole is not None:
+        if steady_sine(test) is not None:
+            return None
+        test = test.at(few_lines(test))
+        test = replace(test, response_std=rough_deviations(test), force_std=None)
+    still = replace(test, rigid_body=np.zeros_like(test.rigid_body), sensors=None)
+    with one_thread():
+        found = _of_accelerations(still)
+        if found is None:
+            return None
+        misfit = found[2].misfit
+        for _ in range(_SCREENINGS):
+            spikes = found[2].spikes
+            if not spikes.any():
+                break
+            still = still.at(~spikes)
+            found = _of_accelerations(still)
+            if found is None:
+                return None
+        omega, ratios, rigid = found
+        force = None if test.force is None else _fitted(Records(still, force=True), omega, ratios)
+    (own, slope), (own_std, slope_std) = rigid.terms, rigid.std
+    mass, mass_std, modal_mass = (None,) * 3 if force is None else (force.terms[0], force.std[0], force.modal)
+    return DirectTerms(
+        own, own_std, slope, slope_std, rigid.modal, mass, mass_std, modal_mass, rigid.below, misfit, omega, ratios
+    )  # fmt: skip
+
+
+def _of_accelerations(still: Measurement) -> tuple[Array, Array, _Fit] | None:
+    """Poles, and the fit on them; None where the base moves in too few directions, or no pole is found."""
+    records = Records(still)
+    if not records.unit and records.driven < still.n_base:
+        return None
+    poles = _poles(records)
+    return None if poles is None else (*poles, _fitted(records, *poles))
+
+
+def _poles(records: Records) -> tuple[Array, Array] | None:
+    """Poles of the records beside terms without them; none is removed for explaining no more than noise."""
+    lines = 2 * np.pi * records.freq[records.freq > 0]
+    inputs = records.base.shape[0]
+    room = (records.data.shape[0] // _LINES // inputs - 3) // 2
+    count = min(records.n_sensors + _SPARE, _MOST, room)
+    if count < 1:
+        return None
+    omega, ratios = np.geomspace(lines[0], lines[-1], count), np.full(count, _GUESS)
+    channels, direct = records.principal(_CHANNELS), _without_poles(records.freq)
+    for _ in range(_STEPS):
+        omega, ratios = relocate(records, channels, omega, ratios, lambda: None, direct)
+    kept = (omega > lines[0]) & (omega < _OUTSIDE * lines[-1]) & (ratios < _MODE)
+    kept &= ratios * omega > RAZOR * np.interp(omega, lines, np.gradient(lines))  # else it answers for one bad line
+    return (omega[kept], ratios[kept]) if np.any(kept) else None
+
+
+def _without_poles(freq: Array) -> ComplexArray:
+    """The functions 1, i w and w², the latter two one in size at the last line, (3, n_freq)."""
+    x = freq / freq[-1]
+    return np.stack([np.ones_like(x) + 0j, 1j * x, x**2 + 0j])
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Coefficients of the functions 1 and i w (2, channels, d), their deviations, and the sum of residues.
+
+    Whether modes below the lines show, the relative residual, and lines (n_freq,) that are far off.
+    """
+
+    terms: Array
+    std: Array
+    modal: Array
+    below: bool
+    misfit: float
+    spikes: NDArray[np.bool_]
+
+
+def _fitted(records: Records, omega: Array, ratios: Array) -> _Fit:
+    """Linear least squares on given poles; the slopes per rad/s."""
+    direct = records.basis(_without_poles(records.freq), records.driven)
+    functions, size = unit_columns(np.hstack([direct, records.functions(omega, ratios, velocity=True)]))
+    Q, R = np.linalg.qr(functions)
+    answered = Q.T @ records.data
+    left = records.data - Q @ answered
+    inverse = np.linalg.pinv(R, rcond=_DEPENDENT) / size[:, None]
+    beta, known = inverse @ answered, direct.shape[1]
+    freedom = max(len(left) - functions.shape[1], 1)
+    level = np.maximum(np.linalg.norm(left, axis=0), _ROUND_OFF * np.linalg.norm(records.data, axis=0))
+    tail = records.basis((records.freq[0] / records.freq)[None] ** 2 + 0j, records.driven)
+    beyond = np.linalg.qr(tail - Q @ (Q.T @ tail))[0]
+    noise = records.noise(left, functions.shape[1] * left.shape[1], least=_ROUND_OFF)
+    gained = float(np.sum((beyond.T @ left) ** 2))
+    shared = noise / records.variance(float(np.sum(left**2)), functions.shape[1] * left.shape[1], least=_ROUND_OFF)
+    spread = np.linalg.norm(inverse[:known], axis=1)[:, None] * level * np.sqrt(shared / freedom)
+    turn = np.array([1.0, 1 / (2 * np.pi * records.freq[-1])])[:, None, None]
+    of_terms = lambda x: x.reshape(3, records.driven, -1)[:2]  # noqa: E731
+    of_modes = beta[known:].reshape(omega.size, -1, beta.shape[1])[:, : records.driven]
+    return _Fit(
+        turn * _by_sensor(records, of_terms(beta[:known])),
+        turn * np.sqrt(_by_sensor(records, of_terms(spread) ** 2, squares=True)),
+        _by_sensor(records, of_modes.sum(axis=0, keepdims=True))[0],
+        gained > noise * beyond_chance(beyond.shape[1] * left.shape[1]),
+        float(np.linalg.norm(left) / np.sqrt(records.size)),
+        _spikes(records.in_runs(left), _ROUND_OFF * np.sqrt(records.size / records.data.size)),
+    )  # fmt: skip
+
+
+def _spikes(left: ComplexArray, least: float) -> NDArray[np.bool_]:
+    """Lines of errors (runs, n_freq, channels) with a number far off its neighbours; none where these are many."""
+    size = np.abs(left)
+    level = np.maximum(np.median(size, axis=1, keepdims=True), least)
+    far = np.any(size > _FAR * level, axis=(0, 2))
+    return far if np.count_nonzero(far) < _FEW * far.size else np.zeros_like(far)
+
+
+def _by_sensor(records: Records, terms: Array, *, squares: bool = False) -> Array:
+    """Coefficients (k, driven inputs, channels), or their variances, in the test's own units, (k, n_sensors, d)."""
+    power = 2 if squares else 1
+    plain = terms / records.channel**power
+    if records.unit:
+        return plain.reshape(len(terms), -1, records.n_sensors).transpose(0, 2, 1)
+    moving = records.moving[:, : records.driven] ** power
+    d = len(moving) - (records.base.shape[0] - records.driven)
+    return np.einsum("kic,di->kcd", plain, moving[:d])

@@ -1,0 +1,137 @@
+"""Mistakes in records are named, with what they amount to; right records are accused of nothing."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import sysid
+from benchmarks.mistakes.wrong_tests import CAUSES, SPECTRA, problem, right
+from benchmarks.modal.random_structures import frequency_lines, random_structure
+from sysid import FullMass, InputError, LumpedMass, Problem, SpectralStiffness, identify, simulate
+from sysid.assessment.mistakes import mistakes_of
+from sysid.modal_analysis.direct_terms import direct_terms
+
+BY_RECORDS = [name for name, cause in CAUSES.items() if SPECTRA in cause.kinds and not cause.untold]
+
+
+def told(test):
+    return " | ".join(mistake.sentence for mistake in mistakes_of(test, direct_terms(test)))
+
+
+def random_test(seed=3, noise=0.01):
+    """Seven sensors in two directions, a full and coupled mass."""
+    truth = random_structure(seed, n=7, d=2)
+    return simulate(truth, frequency_lines(truth), noise=noise, force=True, rng=seed)
+
+
+def with_sensor(test, factor, sensor=2):
+    response = test.response.copy()
+    response[:, sensor] = response[:, sensor] * factor
+    return replace(test, response=response)
+
+
+@pytest.mark.parametrize("name", BY_RECORDS)
+def test_each_cause_is_named_and_nothing_else(name):
+    cause = CAUSES[name]
+    test = cause.made(right(SPECTRA, force=cause.force is True, axes=cause.axes)).test
+    found = mistakes_of(test, direct_terms(test))
+    assert len(found) == 1
+    assert re.search(cause.named, found[0].sentence)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda t: with_sensor(t, -1.0), "the sign of sensor 3 is reversed"),
+        (lambda t: with_sensor(t, 1000.0), r"sensor 3 is in another unit.*1,000"),
+        (lambda t: with_sensor(t, 0.7), "the gain of sensor 3 is 0.7"),
+        (lambda t: with_sensor(t, np.exp(-2j * np.pi * 1e-3 * t.freq)), "record of sensor 3 is 1.0. ms late"),
+        (lambda t: replace(t, response=1000 * t.response), r"base is in m/s² where the sensors are in mm/s².*1,000"),
+        (lambda t: replace(t, response=-t.response), "sign of the base is reversed, or that of all sensors"),
+        (lambda t: replace(t, rigid_body=t.rigid_body * [1.0, -1.0]), "sign of the base in y is reversed"),
+        (lambda t: replace(t, force=-t.force), "sign of the base force is reversed"),
+    ],
+)  # fmt: skip
+def test_mistakes_of_two_directions(change, sentence):
+    assert re.match(f".*{sentence}", told(change(replace(random_test(noise=0.002), base_axes=("x", "y")))))
+
+
+def test_swapped_sensors_of_two_directions_are_told_without_any_model():
+    test = random_test()
+    order = [6, *range(1, 6), 0]
+    assert abs(test.rigid_body[0] @ test.rigid_body[6]) < 0.1  # along y and along x
+    sentence = told(replace(test, response=test.response[:, order]))
+    assert sentence.startswith("sensor 1 and sensor 7 are swapped")
+
+
+def test_a_mistake_in_all_sensors_and_another_in_one_are_both_told():
+    test = random_test(noise=0.002)
+    found = told(with_sensor(replace(test, response=test.response / 9.80665), -1.0))
+    assert re.match(r"the sensors are in g.* \| the sign of sensor 3 is reversed", found)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_right_records_are_accused_of_nothing(seed):
+    truth = random_structure(seed, n=3 + seed % 6, d=1 + seed % 3)
+    f, noise = truth.natural_frequencies, (0.0, 0.003, 0.03)[seed % 3]
+    assert not told(simulate(truth, frequency_lines(truth), noise=noise, force=True, rng=seed))
+    above = np.geomspace(1.02 * f[0], 1.3 * f[-1], 300)  # a mode below the lines answers like a constant
+    assert not told(simulate(truth, above, noise=noise, force=True, rng=seed))
+
+
+def test_a_building_on_soft_springs_is_not_relative():
+    k, n = np.array([2e4, 1e6, 1e6]), 3  # all of it hardly moves at the lines
+    E = np.eye(n) - np.eye(n, k=-1)
+    K, G = E.T @ np.diag(k) @ E, np.ones((n, 1))
+    full = np.block([[K, -K @ G], [-G.T @ K, G.T @ K @ G]])
+    truth = sysid.Structure(np.diag([500.0, 400.0, 300.0, 0.0]), full, [0.02, 0.02, 0.02], n_base=1)
+    f = truth.natural_frequencies
+    assert not told(simulate(truth, np.geomspace(0.5 * f[1], 1.3 * f[2], 400), noise=0.01, force=True, rng=0))
+
+
+def test_a_sign_is_the_first_sentence_and_refused_where_the_model_has_a_form():
+    test = CAUSES["one sign"].made(right(SPECTRA, force=True)).test
+    result = identify(problem("full", test), rng=0)
+    assert result.confidence[0].startswith("the sign of storey 2 is reversed")
+    assert result.message.startswith("the sign of storey 2 is reversed")
+    assert not result.determined
+    with pytest.raises(InputError, match="the sign of storey 2 is reversed"):
+        identify(problem("chain", test), rng=0)
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"), [(1e-3, "1,000: the base force is in kN"), (1 / 9.80665, "9.81: the base force is in kgf")]
+)
+def test_a_force_in_another_unit_is_told_by_a_stated_total_alone(factor, words):
+    test = random_test()
+    wrong, totals = replace(test, force=factor * test.force), random_structure(3, n=7, d=2).rigid_body_mass.diagonal()
+    with pytest.raises(InputError, match=words):
+        identify(Problem(wrong, mass=FullMass(totals, healing="rigid_body")), rng=0)
+    assert "the base force is in" not in identify(Problem(wrong, mass=FullMass()), rng=0).message
+
+
+def test_a_heavy_fixture_is_no_unit():
+    """Load cells below a table of nine times the mass of what stands on it."""
+    data = right(SPECTRA, force=True)
+    table = 8.80665 * 1940.0 * data.base
+    heavy = replace(data, force=data.force + table).test
+    with pytest.raises(InputError, match="9.81"):
+        identify(problem("lumped", replace(heavy, force=9.80665 * data.test.force)), rng=0)
+    assert "9.81" not in identify(problem("lumped", heavy), rng=0).message
+
+
+@pytest.mark.parametrize(("factor", "words"), [(2 * np.pi, "stated natural"), (1 / (2 * np.pi), "lines")])
+def test_stated_frequencies_and_lines_in_rad_per_s(factor, words):
+    test = right(SPECTRA, force=False).test
+    stated = SpectralStiffness(factor * np.array([2.688, 6.682, 10.054, 12.838]))
+    with pytest.raises(InputError, match=f"{words}.* in rad/s, not Hz: .*2 pi"):
+        identify(Problem(test, mass=LumpedMass(1940.0), stiffness=stated), rng=0)
+
+
+def test_sensors_that_are_swapped_in_a_written_model_are_told():
+    test = CAUSES["swapped"].made(right(SPECTRA, force=False)).test
+    result = identify(problem("written", test), strategy=sysid.Continuation(1), rng=0)
+    assert result.confidence[0].startswith("storey 2 and storey 3 are swapped")
+    assert not result.determined
