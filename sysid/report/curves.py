@@ -72,7 +72,10 @@ def _responses(it: Identification, test: Measurement) -> Iterator[dict[str, Any]
     band = None if u is None else _half_widths(u.transmissibility(test.freq), test)
     raw, words = _recorded(it, test), "transmissibility" if own else "acceleration spectrum, m/s² (own scale)"
     for s, name in enumerate(test.sensor_names):
-        channel = _channel(name, words, test.response[:, s], predicted[:, s], _of(test.response_std, s), _of(band, s))
+        turn = _against_base(test, test.rigid_body[s])
+        channel = _channel(
+            name, words, turn * test.response[:, s], turn * predicted[:, s], _of(test.response_std, s), _of(band, s)
+        )
         if raw is not None:
             channel["recorded"] = [_packed(np.abs(run)) for run in raw.response[:, s]]
         yield channel
@@ -102,6 +105,17 @@ def _channel(
         if values is not None and np.all(np.isfinite(values)):
             found[kind] = [_packed(np.broadcast_to(run, measured.shape[-1:])) for run in values]
     return found
+
+
+def _against_base(test: Measurement, moves: Array) -> ComplexArray:
+    """What turns the phases of each run to those against one base direction, (runs, n_freq).
+
+    That which moves the channel most with it, by `moves`, (d,): a sensor's row of G.
+    """
+    share = np.linalg.norm(test.base, axis=-1) * (np.abs(moves) if np.any(moves) else 1.0)
+    base = test.base[np.arange(test.n_runs), np.argmax(share, axis=1)]
+    size = np.abs(base)
+    return np.asarray(np.divide(base.conj(), size, out=np.ones_like(base), where=size > 0))
 
 
 def _half_widths(std: Array, test: Measurement) -> NDArray[Any]:

@@ -42,7 +42,7 @@ _TOTALS = {"trace": "total of the diagonal", "rigid_body": "rigid-body total", "
 _PER_UNIT = "Absolute acceleration of each sensor per unit base acceleration (transmissibility), magnitude and phase."
 _AS_MOVED = (
     "Spectra of each sensor's absolute acceleration in each run, as the base moved: not transmissibilities. The phase "
-    "is told against the base direction that moved most."
+    "is told against the base direction that moves the sensor most with it."
 )
 _LAST_PHASE = "Only the last phase, of the start that ended best: any fits with widened peaks before it are left out."
 _WIDENED = (
@@ -130,7 +130,11 @@ def render(identification: Identification) -> str:
 
 
 def _title(it: Identification) -> str:
-    return f"Identification of {PurePath(it.recipe.module).stem}" if it.recipe else "Identification"
+    if it.recipe is None:
+        return "Identification"
+    # A test that `sysid read` wrote is called by its file.
+    of_file = it.recipe.module == "recorded_test" and it.recipe.data
+    return f"Identification of {PurePath(it.recipe.data or '').name if of_file else PurePath(it.recipe.module).stem}"
 
 
 def _unknowns(it: Identification) -> str:
