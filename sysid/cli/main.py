@@ -162,7 +162,7 @@ def _run(options: argparse.Namespace, out: Output) -> int:
     out.write(
         f"{recipe.title}: {test.n_sensors} sensors, base moving along {' '.join(test.base_axes or ())}, "
         f"{test.freq.size} lines from {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz, "
-        f"{unknowns} unknowns, seed {search.seed}\n"
+        f"{unknowns} unknowns{'' if recipe.module == read.MODULE else f', seed {search.seed}'}\n"
     )
     failed: InputError | None = None
     # From the search's end until the result is on the disk Ctrl-C waits, however often.

@@ -8,7 +8,7 @@ import numpy as np
 
 from sysid.errors import InputError, refuse
 from sysid.files import units
-from sysid.files.description import EXAMPLE, Channel, Description
+from sysid.files.description import Channel, Description
 from sysid.files.recorded_test import RecordedTest, Row, Run
 from sysid.files.recording import Column, Recording, check_finite, rate_of
 from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
@@ -47,9 +47,9 @@ def in_time(recordings: Sequence[Recording], said: Description) -> RecordedTest:
 def undescribed(recording: Recording) -> str:
     """What to say where nothing tells which column is which sensor."""
     return (
-        f"{recording.path}: which column is which sensor is not said; {recording.in_words()}. Say it with --sensors "
-        f"FILE.toml, or with --sensor COLUMN role=response axis=x position=0,0,3 unit=g for each; such a "
-        f"file:\n{EXAMPLE}"
+        f"{recording.path}: which column is which sensor is not said; {recording.in_words()}. Say it in a TOML file "
+        "(--sensors FILE.toml), or with --sensor COLUMN role=response axis=x position=0,0,3 unit=g for each; 'sysid "
+        "read --help' shows such a file"
     )
 
 
@@ -125,7 +125,9 @@ def _records(recording: Recording, said: Description) -> tuple[list[Array], list
         record = factor * np.real(column.values)
         rms = float(np.std(record))
         if channel.role != "force" and rms == 0.0:
-            raise InputError(f"{recording.path}, {column.place}: the record of {channel.name!r} never moves")
+            raise InputError(
+                f"{recording.path}, {column.place}: the record of {channel.name!r} never moves: is it the right column? Else leave it out"
+            )
         records.append(record)
         rows.append(row_of(column, channel, unit, factor, rms, recording))
     return records, rows

@@ -22,6 +22,9 @@ _READ = (1, 4, 12)
 _DIRECTIONS = {1: "x", 2: "y", 3: "z", 4: "rx", 5: "ry", 6: "rz"}
 _SPECIFIC = {8: "m", 9: "N", 11: "m/s", 12: "m/s²", 13: "N"}  # data types whose unit is SI where no label says another
 _MARK = re.compile(rb"^    -1[ \t]*\r?$", re.MULTILINE)
+# A binary set: its size in bytes in the 32nd to 43rd place of its first line, and 11 lines of text before the numbers.
+_BINARY = re.compile(rb"\s*\n {4}58b.{24}[ ]*(\d+)[^\n]*\n(?:[^\n]*\n){11}")
+_LAST = re.compile(rb"    -1[ \t]*\r?$", re.MULTILINE)
 _NO_LABEL = ("", "NONE")
 
 
@@ -61,13 +64,9 @@ def _sets(path: Path) -> list[dict[str, Any]]:
     except ImportError:
         raise InputError(f"{path}: universal files need pyuff: pip install 'structural-sysid[uff]'") from None
     try:
-        marks = len(_MARK.findall(path.read_bytes()))
+        _check_whole(path, path.read_bytes())
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
-    if not marks:
-        raise InputError(f"{path} is no universal file: it has no line '    -1', by which a set begins and ends")
-    if marks % 2:
-        raise InputError(f"{path} is cut short: its last set, number {marks // 2 + 1}, does not end; export it again")
     file, sets = pyuff.UFF(str(path)), []
     for at, kind in enumerate(file.get_set_types()):
         try:
@@ -78,6 +77,24 @@ def _sets(path: Path) -> list[dict[str, Any]]:
                 "another type than it says? Export it again"
             ) from None
     return sets
+
+
+def _check_whole(path: Path, content: bytes) -> None:
+    """Refuse a file whose last set does not end.
+
+    The numbers of a binary set are stepped over by the size that its first line states, which some programs state too
+    small: its last mark follows them without a line end, and they may look like a mark.
+    """
+    begin, number = _MARK.search(content), 0
+    if begin is None:
+        raise InputError(f"{path} is no universal file: it has no line '    -1', by which a set begins and ends")
+    while begin is not None:
+        number += 1
+        size = _BINARY.match(content, begin.end())
+        end = _MARK.search(content, begin.end()) if size is None else _LAST.search(content, size.end() + int(size[1]))
+        if end is None:
+            raise InputError(f"{path} is cut short: its last set, number {number}, does not end; export it again")
+        begin = _MARK.search(content, end.end())
 
 
 def _scale(sets: Sequence[dict[str, Any]]) -> float:

@@ -24,6 +24,13 @@ _ROUND_OFF = 1e-10  # of a value: what is no noise of an instrument
 _WIDTH = 120
 
 
+def _search(it: Answer) -> str:
+    """Seed and time of a search; modes from the data are drawn from no seed."""
+    seed = "" if it.strategy == "modal" else f"; seed {it.seed}"
+    time = it.history.wall_time
+    return seed + (f"{',' if seed else ';'} {time:.1f} s" if time >= 0.05 else "")
+
+
 def summary(it: Answer) -> str:
     """Table of the result, at most 120 columns wide."""
     s, axes, problem = it.structure, it.measurement.base_axes or (), it.problem
@@ -33,7 +40,7 @@ def summary(it: Answer) -> str:
         "",
         *_unknowns(it),
         f"{'success' if it.success else 'no success'}: {it.message}",
-        f"relative residual {residual_in_words(it)}{force}; seed {it.seed}, {it.history.wall_time:.1f} s",
+        f"relative residual {residual_in_words(it)}{force}{_search(it)}",
         *_phases(it),
         *it.remarks,
         "rigid-body mass " + ", ".join(_rigid_masses(it, axes)),
