@@ -20,7 +20,15 @@ from benchmarks.line import Line, above
 
 INTERRUPTS = 50
 BESIDE = 2
-COMMAND = ["run", "cantilever_tower", "--strategy", "hpso-ls", "--set", "elements=3", "--out"]
+SETTINGS = ("elements=3", "force=False", "noise=0")
+COMMAND = [
+    "run",
+    "cantilever_tower",
+    "--strategy",
+    "hpso-ls",
+    *(word for one in SETTINGS for word in ("--set", one)),
+    "--out",
+]
 FILES = {"result.h5", "summary.json", "report.html"}
 LAST = 1.0  # s at the end of a run, in which a fifth of all interrupts strike
 WROTE_ALL, BEST_SO_FAR, NOTHING = "all was written", "the best so far", "nothing"

@@ -21,7 +21,7 @@ EVERY = 0.05  # s between two states
 def main(case: str, folder: str) -> None:
     """Search, or go on with it, and save the result."""
     if case == "swarm of free modes":
-        recipe = sysid.Recipe("cantilever_tower", parameters={"elements": 3})
+        recipe = sysid.Recipe("cantilever_tower", parameters={"elements": 3, "noise": 0.0, "force": False})
         problem, strategy = catalogue.build(recipe), sysid.Swarm.published()
     else:
         problem = problem_of(STRUCTURED[0], 9400)[0]

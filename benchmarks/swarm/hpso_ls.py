@@ -22,7 +22,7 @@ def lines(reduced: bool) -> Iterator[Line]:
     """Fits, and whether each keeps what it must; seeds, restarts and seconds are told."""
     seeds = SEEDS[:2] if reduced else SEEDS
     for elements in (3,) if reduced else (3, 5):
-        problem = load_module("cantilever_tower").problem(elements=elements)
+        problem = load_module("cantilever_tower").problem(elements=elements, noise=0.0, force=False)
         results = [sysid.identify(problem, strategy="hpso-ls", rng=seed) for seed in seeds]
         what = f"tower, n = {2 * elements}, strategy hpso-ls, no noise, {len(seeds)} seeds: "
         fits = [result for result in results if result.residual <= EXACT]
@@ -59,7 +59,7 @@ def _phases(what: str, results: list[sysid.Identification]) -> Line:
 
 def _hessian() -> float:
     """Largest relative error along random directions, differences of fourth order."""
-    problem = load_module("cantilever_tower").problem(elements=3)
+    problem = load_module("cantilever_tower").problem(elements=3, noise=0.0, force=False)
     error, structure = CholeskyError(problem), problem.reference
     n, rng, h, worst = structure.n, np.random.default_rng(9100), 1e-5, 0.0
     for _ in range(5):

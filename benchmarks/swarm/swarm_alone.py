@@ -81,7 +81,7 @@ def _rival(task: tuple[str, int, int, int]) -> tuple[float, float]:
 
 
 def _landscape(elements: int, session: Session) -> Landscape:
-    return Landscape.of(load_module("cantilever_tower").problem(elements=elements), session)
+    return Landscape.of(load_module("cantilever_tower").problem(elements=elements, noise=0.0, force=False), session)
 
 
 def _random(evaluate: peers.Evaluate, size: int, rng: np.random.Generator) -> None:

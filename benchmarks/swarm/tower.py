@@ -16,7 +16,7 @@ def lines(reduced: bool) -> Iterator[Line]:
     """cantilever_tower without noise."""
     seeds = range(1 if reduced else 5)
     module = load_module("cantilever_tower")
-    problem = module.problem()
+    problem = module.problem(noise=0.0, force=False)
     truth = problem.reference.natural_frequencies
     results = [sysid.identify(problem, strategy="swarm", rng=seed) for seed in seeds]
     figures = []

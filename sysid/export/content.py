@@ -54,13 +54,20 @@ def rotations_of(it: Identification) -> tuple[bool, ...]:
     return (*turned, *(axis.startswith("r") for axis in it.measurement.base_axes or ()))
 
 
+JUDGED = {
+    "no fit": "NO FIT: the search did not succeed, so these matrices do not explain the test",
+    "determined": "determined: data and stated model fix every entry of the matrices",
+    "one of many": "ONE OF MANY: other matrices explain the test as well, or noise leaves entries open: see 'open'",
+}
+
+
 def statements(it: Identification, precision: str) -> tuple[str, ...]:
     """Sentences that go into every file: origin, judgement, what is open, units, order of the rows, precision."""
     structure, base = it.structure, " ".join(it.measurement.base_axes or ())
     found = [
         f"written by sysid {__version__} on {datetime.now().astimezone().isoformat(timespec='seconds')}",
         f"problem: {it.recipe.title if it.recipe else 'of a script'}; strategy {it.strategy}; seed {it.seed}",
-        f"judgement: {judgement(it)}; relative residual {it.residual:.3g}",
+        f"judgement: {JUDGED[it.judgement]}; relative residual {it.residual:.3g}",
         f"search: {it.message}",
         *(f"fixed by: {text}" for text in it.closed_by),
         *(f"open: {text}" for text in it.undetermined),
@@ -74,15 +81,6 @@ def statements(it: Identification, precision: str) -> tuple[str, ...]:
     if it.problem.unit_mass:
         found.append("all masses, stiffness and damping are relative: no mass was stated, and they are scaled to 1 kg")
     return tuple(" ".join(text.split()) for text in found)
-
-
-def judgement(it: Identification) -> str:
-    """Whether the matrices may be taken as they are, in a line."""
-    if not it.success:
-        return "NO FIT: the search did not succeed, so these matrices do not explain the test"
-    if it.determined:
-        return "determined: data and stated model fix every entry of the matrices"
-    return "NOT DETERMINED: other matrices explain the test as well, or noise leaves entries open; see 'open' below"
 
 
 def one_line_each(texts: Sequence[str], width: int, mark: str = "") -> list[str]:

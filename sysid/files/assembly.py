@@ -126,7 +126,8 @@ def _records(recording: Recording, said: Description) -> tuple[list[Array], list
         rms = float(np.std(record))
         if channel.role != "force" and rms == 0.0:
             raise InputError(
-                f"{recording.path}, {column.place}: the record of {channel.name!r} never moves: is it the right column? Else leave it out"
+                f"{recording.path}, {column.place}: the record of {channel.name!r} never moves: is it the right "
+                "column? Else leave it out"
             )
         records.append(record)
         rows.append(row_of(column, channel, unit, factor, rms, recording))

@@ -149,10 +149,12 @@ class RecordFit:
         return NoiseLevels(root[..., :n], root[..., -d:], force)
 
 
-def record_modes(test: Measurement, omega: Array, ratios: Array, *, monitor: Monitor | None = None) -> RecordFit:
+def record_modes(
+    test: Measurement, omega: Array, ratios: Array, *, repeated: bool = False, monitor: Monitor | None = None
+) -> RecordFit:
     """Fit modes to whole records, roughly, from poles close by: a few steps, for `refitted` to go on from.
 
-    At each pole there are as many modes as its residue has rank.
+    At each pole there is one mode, or, with `repeated`, as many as its residue has rank.
 
     Parameters
     ----------
@@ -163,7 +165,7 @@ def record_modes(test: Measurement, omega: Array, ratios: Array, *, monitor: Mon
     monitor : callable, optional
         ``monitor(iterations, residual)``, the latter ``sqrt(chi2 / numbers)``; what it raises passes through.
     """
-    first = _first(test, omega, ratios)
+    first = _first(test, omega, ratios, repeated=repeated)
     model = RecordModel(test, first.modes.omega.size)
     return _fit(model, first, None, monitor or (lambda i, r: None), _ROUGH)
 
@@ -292,14 +294,16 @@ def _chi2(model: RecordModel, p: Parameters, levels: Array) -> float:
     return value if np.isfinite(value) else np.inf
 
 
-def _first(test: Measurement, omega: Array, ratios: Array) -> Parameters:
-    """Rank-one modes nearest to free residues at given poles, several where it needs them; with a force, its masses."""
+def _first(test: Measurement, omega: Array, ratios: Array, *, repeated: bool) -> Parameters:
+    """Rank-one modes nearest to free residues at given poles, one at each or `repeated`; with a force, its masses."""
     records = Records(test)
     d, free = test.n_base, records.fit(omega, ratios)
     residues = records.by_sensor(free.residues)  # (m, n, d + 2 r)
     size = np.linalg.norm(np.concatenate(list(test.inputs), axis=-1), axis=1)
     u, s, vt = np.linalg.svd(residues * size)
-    ranks = free.ranks(records.noise(free.left, free.residues.size), test.n_sensors, d)
+    ranks = np.ones(omega.size, int)
+    if repeated:
+        ranks = free.ranks(records.noise(free.left, free.residues.size), test.n_sensors, d)
     pole = np.repeat(np.arange(omega.size), ranks)
     at = np.concatenate([np.arange(rank) for rank in ranks])
     strength = np.sqrt(s[pole, at] / size[:d].max())

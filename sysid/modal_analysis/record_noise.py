@@ -19,7 +19,7 @@ _ENOUGH = 8000  # lines, of all runs together: more of them tell a level no bett
 _STEPS = 30
 _VAGUE = 1e-6  # information on a logarithm that counts as none
 _SETTLED = 1e-4  # of a level's logarithm
-VANISHING = 1e-7  # of a channel's rms: what counts as noise where there is none
+VANISHING = 1e-5  # of a channel's rms: least noise; what the model leaves of folding can show below it
 _LEAST_SHARE = 0.01  # of the median share of noise: with few lines one channel could come out exact, infinitely likely
 
 

@@ -59,16 +59,30 @@ def _white_fit(test: Measurement, monitor: Monitor | None) -> RecordFit:
         fit = on_all_lines(_white_fit(some, monitor), test, monitor=monitor)
         return with_further_modes(fit, some=some, monitor=monitor)  # weak ones show on all lines only
     poles = find_poles(replace(test, response_std=rough_deviations(test)), monitor=monitor)
-    fit = _kept(record_modes(test, poles.omega, poles.ratios, monitor=monitor), monitor)
+    fit = _fitted(test, poles, monitor)
     again = find_poles(replace(test, response_std=deviations(fit)[0]), monitor=monitor)
     if not _same_modes(fit.parameters.modes, again):
-        other = _kept(record_modes(test, again.omega, again.ratios, monitor=monitor), monitor)
-        fit = max(fit, other, key=lambda one: one.schwarz)
+        fit = max(fit, _fitted(test, again, monitor), key=lambda one: one.schwarz)
     return without_spurious_modes(with_further_modes(fit, monitor=monitor), monitor=monitor)
 
 
+def _fitted(test: Measurement, poles: Poles, monitor: Monitor | None) -> RecordFit:
+    """One mode at each pole, or as many as its residue has rank where each is worth more than noise."""
+    first = record_modes(test, poles.omega, poles.ratios, monitor=monitor)
+    fit = _kept(first, monitor)
+    repeated = record_modes(test, poles.omega, poles.ratios, repeated=True, monitor=monitor)
+    modes = repeated.parameters.modes.omega.size
+    if modes == first.parameters.modes.omega.size:
+        return fit
+    repeated = _kept(repeated, monitor)
+    more = repeated.parameters.modes.omega.size - fit.parameters.modes.omega.size
+    return repeated if repeated.likelihood - fit.likelihood > max(more, 0) * least_worth(fit.model) else fit
+
+
 def _same_modes(modes: Modes, poles: Poles) -> bool:
-    """Whether each pole lies within the half-power width of a mode, and each mode of a pole."""
+    """Whether there are as many, each pole within the half-power width of a mode, and each mode of a pole."""
+    if modes.omega.size != poles.omega.size:
+        return False
     apart = np.abs(np.log(poles.omega / modes.omega[:, None])) / (2 * modes.ratios[:, None])
     return bool(np.all(apart.min(axis=0) < 1) and np.all(apart.min(axis=1) < 1))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -74,6 +74,27 @@ class Answer:
     remarks: tuple[str, ...] = ()
     interrupted: bool = False
     hurried: bool = field(default=False, kw_only=True)
+
+    @property
+    def judgement(self) -> Literal["determined", "one of many", "no fit"]:
+        """What the matrices are worth, in a word.
+
+        "determined" as the field of that name; "one of many" where other matrices explain the records as well, noise
+        leaves entries open, or something speaks against the fit; "no fit" without `success`.
+        """
+        if not self.success:
+            return "no fit"
+        return "determined" if self.determined else "one of many"
+
+    @property
+    def confidence(self) -> tuple[str, ...]:
+        """How far the answer can be trusted, in sentences, the weightiest first.
+
+        Why there is no fit; what speaks against it, and what is open; what fixes the matrices where nothing is; and
+        what else is to be known of records, bounds and sensors.
+        """
+        told = (*self.undetermined, *self.closed_by, *self.remarks[1:])  # the first tells why the strategy was taken
+        return told if self.success else (self.message, *told)
 
     @property
     def measurement(self) -> Measurement:

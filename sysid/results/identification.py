@@ -126,6 +126,8 @@ class Identification(Answer):
             "parameters": self.recipe.parameters if self.recipe else {},
             "strategy": self.strategy,
             "seed": self.seed,
+            "judgement": self.judgement,
+            "confidence": list(self.confidence),
             "success": bool(self.success),
             "message": self.message,
             "residual": self.residual,

@@ -10,6 +10,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.record_gains import gain_errors_of
 from sysid.modal_analysis.record_poles import few_lines
 from sysid.modal_analysis.whole_records import whole_fit
+from sysid.structure.structure import Structure
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -64,6 +65,36 @@ def test_a_weak_mode_that_only_all_lines_of_a_long_record_show_is_found(records)
     test = trial.measurement([noisy], setting, force=True)
     assert whole_fit(test.at(few_lines(test))).parameters.modes.omega.size == 2
     _assert_the_modes(whole_fit(test), structure)
+
+
+def test_modes_at_one_pole_are_as_many_as_its_residue_has_rank(records):
+    simulated, trial, _ = records
+    drawn = simulated.coupled_structure(np.random.default_rng(3), 4, 2, np.array([2.0, 5.0, 5.0, 9.0]))
+    truth = Structure(drawn.mass, drawn.stiffness, np.array([0.01, 0.012, 0.012, 0.02]), n_base=2)
+    setting = simulated.Setting(truth, 60.0, 50.0, (1.0, 15.0), (0.5, 20.0), np.eye(2))
+    rng = np.random.default_rng(4)
+    noisy, _ = setting.with_noise(setting.run(rng).records(), rng)
+    _assert_the_modes(whole_fit(trial.measurement([noisy], setting, force=True)), truth)
+
+
+@pytest.mark.parametrize(("seed", "draw"), [(19, 0), (33, 0)])
+def test_a_pole_is_no_two_modes_where_one_explains_it(records, seed, draw):
+    truth, _, fit = _coupled(records, seed, draw)  # the residue of one pole has rank two, from errors of all poles
+    _assert_the_modes(fit, truth)
+
+
+def test_a_second_pole_within_the_width_of_a_mode_is_left_where_the_second_search_has_one(records):
+    simulated, trial, _ = records
+    setting, rng = simulated.four_storeys(0.0), np.random.default_rng((3, 4))
+    noisy, _ = setting.with_noise(setting.run(rng).records(), rng)
+    _assert_the_modes(whole_fit(trial.measurement([noisy], setting, force=True)), setting.structure)
+
+
+def test_records_without_noise_have_the_modes_of_the_structure(records):
+    simulated, trial, _ = records
+    setting, rng = simulated.four_storeys(), np.random.default_rng(1)
+    run = setting.run(rng).records()  # what folds back of the transients shows at some 1e-6 of the records
+    _assert_the_modes(whole_fit(trial.measurement([run], setting, force=True)), setting.structure)
 
 
 @pytest.mark.parametrize("gain", [1.0, 1.2])

@@ -169,3 +169,18 @@ def test_an_open_scale_of_variables_is_one_of_many(closed):
     assert it.open_masses == ()
     assert ("state one of these unknowns" in it.summary()) is not closed
     assert "over all these models" not in it.summary()  # the rank tells of small changes only
+
+
+def test_judgement_and_confidence_say_first_what_weighs_most():
+    test = measured(force=True)
+    found = stood_for(sysid.Problem(test, mass=sysid.FullMass()), floors(), None)
+    fixed = dataclasses.replace(
+        found, determined=True, undetermined=(), closed_by=("force",), remarks=("why", "a bound")
+    )
+    open_ = dataclasses.replace(fixed, determined=False, undetermined=("mode 2 is open",), closed_by=())
+    failed = dataclasses.replace(open_, success=False, message="no fit: 60 % is left")
+    assert [it.judgement for it in (fixed, open_, failed)] == ["determined", "one of many", "no fit"]
+    assert fixed.confidence == ("force", "a bound")
+    assert open_.confidence == ("mode 2 is open", "a bound")
+    assert failed.confidence == ("no fit: 60 % is left", "mode 2 is open", "a bound")
+    assert failed.to_dict()["judgement"] == "no fit" and failed.to_dict()["confidence"] == list(failed.confidence)
