@@ -1,7 +1,9 @@
 """A laboratory's files are read right, or told in one line that names file, place and remedy."""
 
 import re
+import tomllib
 from itertools import chain
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -10,7 +12,7 @@ import scipy.io
 
 import sysid
 from sysid.cli import main as cli
-from sysid.files import reading, recorded_test
+from sysid.files import description, reading, recorded_test
 
 G = 9.80665
 FREQ = np.arange(1, 401) * 0.05
@@ -265,3 +267,10 @@ def test_what_a_library_raises_of_a_foreign_file_is_one_line(tmp_path, monkeypat
     (tmp_path / "a.npz").write_bytes(b"x")
     with pytest.raises(sysid.InputError, match=r"a\.npz cannot be read \(of a library\).*Export it again"):
         reading.gather(tmp_path / "a.npz", MATRIX)
+
+
+def test_the_toml_of_the_page_on_files_is_read():
+    page = Path(__file__).parents[2] / "docs" / "reading_files.md"
+    found = re.search(r"```toml\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    said = description.description(tomllib.loads(found[1]))
+    assert [(one.role, one.position) for one in said.channels] == [("base", (0, 0, 0)), ("response", (0, 0, 3))]
