@@ -23,8 +23,9 @@ def read_npz(path: Path) -> Recording:
         with np.load(path, allow_pickle=False) as file:
             named = {name: (file[name], "") for name in file.files}
     except Exception as error:  # zipfile and NumPy raise many
+        words = str(error).partition(".")[0]  # NumPy goes on with advice to load pickles
         raise InputError(
-            f"{path} is no NPZ, or is damaged ({error}): write it with numpy.savez, of numbers alone"
+            f"{path} is no NPZ, or is damaged ({words}): write it with numpy.savez, of numbers alone"
         ) from None
     return recording(path, named)
 

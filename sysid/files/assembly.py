@@ -47,9 +47,9 @@ def in_time(recordings: Sequence[Recording], said: Description) -> RecordedTest:
 def undescribed(recording: Recording) -> str:
     """What to say where nothing tells which column is which sensor."""
     return (
-        f"{recording.path}: which column is which sensor is not said; {recording.in_words()}. Say it in a file "
-        f"sensors.toml beside it ('sysid read --help' shows one), or with --sensor COLUMN role=response axis=x "
-        "position=0,0,3 unit=g for each"
+        f"{recording.path}: which column is which sensor is not said; {recording.in_words()}. Say it in a TOML file "
+        "(--sensors FILE.toml), or with --sensor COLUMN role=response axis=x position=0,0,3 unit=g for each; 'sysid "
+        "read --help' shows such a file"
     )
 
 
@@ -125,7 +125,10 @@ def _records(recording: Recording, said: Description) -> tuple[list[Array], list
         record = factor * np.real(column.values)
         rms = float(np.std(record))
         if channel.role != "force" and rms == 0.0:
-            raise InputError(f"{recording.path}, {column.place}: the record of {channel.name!r} never moves")
+            raise InputError(
+                f"{recording.path}, {column.place}: the record of {channel.name!r} never moves: is it the right "
+                "column? Else leave it out"
+            )
         records.append(record)
         rows.append(row_of(column, channel, unit, factor, rms, recording))
     return records, rows

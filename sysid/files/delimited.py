@@ -72,6 +72,8 @@ def _text(path: Path) -> str:
         raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
     if not content.strip():
         raise InputError(f"{path} is empty")
+    if content.startswith((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)):  # begins as UTF-16 does
+        return content.decode("utf-32", "replace")
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return content.decode("utf-16", "replace")
     head = content[:4000]
@@ -99,7 +101,10 @@ def _form(lines: list[str], path: Path) -> tuple[_Form, int]:
             if (count, width) > score:
                 best, score = (form, width), (count, width)
     if best is None:
-        raise InputError(f"{path} holds no table of numbers: {shown(middle[0] if middle else '')} stands in its middle")
+        raise InputError(
+            f"{path} holds no table of numbers: {shown(middle[0] if middle else '')} stands in its middle; "
+            "export it as text, a row a sample"
+        )
     return best
 
 

@@ -59,7 +59,7 @@ def gather(paths: str | Path | Sequence[str | Path], sensors: Any = None) -> Rec
     said = asked(sensors, files)
     if all(xsens_dot.is_export(file) for file in files):
         return assembly.in_time([xsens_dot.together(files)], said)  # a unit is a file
-    recordings = [recording for file in files for recording in _recordings(file)]
+    recordings = [recording for file in files for recording in _read_or_told(file)]
     spectra = {recording.freq is not None for recording in recordings}
     if len(spectra) > 1:
         raise InputError("some files hold records in time and some spectra: read them apart")
@@ -80,3 +80,16 @@ def _recordings(file: Path) -> list[Recording]:
         known = ", ".join((*_TEXT, *_READERS, *_UNIVERSAL))
         raise InputError(f"{file}: the ending {ending!r} is not known; known are {known}")
     return [_READERS[ending](file)]
+
+
+def _read_or_told(file: Path) -> list[Recording]:
+    """The recordings of a file of any kind; what a library raises of a file that it cannot take is one line."""
+    try:
+        return _recordings(file)
+    except InputError:
+        raise
+    except MemoryError:
+        raise InputError(f"{file}: reading it takes more memory than there is: export fewer channels a file") from None
+    except Exception as error:  # foreign files, foreign parsers: any type
+        words = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{file} cannot be read ({words}): is it damaged? Export it again") from None

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.errors import InputError, needed
+from sysid.errors import InputError
 from sysid.files import units
 from sysid.files.recording import Column, Recording, rate_of
 
@@ -22,9 +22,9 @@ _READ = (1, 4, 12)
 _DIRECTIONS = {1: "x", 2: "y", 3: "z", 4: "rx", 5: "ry", 6: "rz"}
 _SPECIFIC = {8: "m", 9: "N", 11: "m/s", 12: "m/s²", 13: "N"}  # data types whose unit is SI where no label says another
 _MARK = re.compile(rb"^    -1[ \t]*\r?$", re.MULTILINE)
-_BINARY = re.compile(rb"\s*58b\s+\d+\s+\d+\s+(\d+)\s+(\d+)[^\n]*\n")  # lines of text and bytes that follow
-_AFTER_BYTES = re.compile(rb"\s*    -1[ \t]*\r?$", re.MULTILINE)
-_LAST_OR_BETWEEN = re.compile(rb"    -1[ \t]*\r?\n?(?=    -1[ \t]*\r?\n|\s*\Z)")
+# A binary set: its size in bytes in the 32nd to 43rd place of its first line, and 11 lines of text before the numbers.
+_BINARY = re.compile(rb"\s*\n {4}58b.{24}[ ]*(\d+)[^\n]*\n(?:[^\n]*\n){11}")
+_LAST = re.compile(rb"    -1[ \t]*\r?$", re.MULTILINE)
 _NO_LABEL = ("", "NONE")
 
 
@@ -59,17 +59,14 @@ def read(path: Path) -> list[Recording]:
 
 
 def _sets(path: Path) -> list[dict[str, Any]]:
-    needed("pyuff", "uff", f"{path}: reading a universal file")
-    import pyuff
-
     try:
-        whole, ends = _counted(path.read_bytes())
+        import pyuff
+    except ImportError:
+        raise InputError(f"{path}: universal files need pyuff: pip install 'structural-sysid[uff]'") from None
+    try:
+        _check_whole(path, path.read_bytes())
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
-    if not whole and ends:
-        raise InputError(f"{path} is no universal file: it has no line '    -1', by which a set begins and ends")
-    if not ends:
-        raise InputError(f"{path} is cut short: its last set, number {whole + 1}, does not end; export it again")
     file, sets = pyuff.UFF(str(path)), []
     for at, kind in enumerate(file.get_set_types()):
         try:
@@ -82,26 +79,22 @@ def _sets(path: Path) -> list[dict[str, Any]]:
     return sets
 
 
-def _counted(content: bytes) -> tuple[int, bool]:
-    """How many sets are whole, and whether the last one ends.
+def _check_whole(path: Path, content: bytes) -> None:
+    """Refuse a file whose last set does not end.
 
-    The bytes of a binary set, in which a mark may stand, are stepped over.
+    The numbers of a binary set are stepped over by the size that its first line states, which some programs state too
+    small: its last mark follows them without a line end, and they may look like a mark.
     """
-    at, whole = 0, 0
-    while (begun := _MARK.search(content, at)) is not None:
-        at, binary = begun.end(), _BINARY.match(content, begun.end())
-        if binary is None:
-            end = _MARK.search(content, at)
-        else:
-            at = binary.end()
-            for _ in range(int(binary[1])):
-                at = content.find(b"\n", at) + 1 or len(content)
-            # pyuff counts half of the bytes of complex numbers.
-            end = _AFTER_BYTES.match(content, at + int(binary[2])) or _LAST_OR_BETWEEN.search(content, at)
+    begin, number = _MARK.search(content), 0
+    if begin is None:
+        raise InputError(f"{path} is no universal file: it has no line '    -1', by which a set begins and ends")
+    while begin is not None:
+        number += 1
+        size = _BINARY.match(content, begin.end())
+        end = _MARK.search(content, begin.end()) if size is None else _LAST.search(content, size.end() + int(size[1]))
         if end is None:
-            return whole, False
-        at, whole = end.end(), whole + 1
-    return whole, True
+            raise InputError(f"{path} is cut short: its last set, number {number}, does not end; export it again")
+        begin = _MARK.search(content, end.end())
 
 
 def _scale(sets: Sequence[dict[str, Any]]) -> float:

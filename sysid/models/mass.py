@@ -29,7 +29,7 @@ def sampling_exponent(k: int, c: float = _ROW_EXPECTATION) -> float:
     It is the root of eq. 19, ``∫_{-1}^{1} y² dx = c / k``: every row of the Cholesky factor then has the
     same expected squared norm.
 
-    >>> round(sampling_exponent(1), 4)
+    >>> round(float(sampling_exponent(1)), 4)
     1.7808
     """
     return (3 * c + np.sqrt(c**2 + 16 * c * k)) / (4 * (2 * k - c))

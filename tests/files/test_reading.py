@@ -10,7 +10,7 @@ import scipy.io
 
 import sysid
 from sysid.cli import main as cli
-from sysid.files import reading, recorded_test, universal
+from sysid.files import reading, recorded_test
 
 G = 9.80665
 FREQ = np.arange(1, 401) * 0.05
@@ -190,6 +190,18 @@ def test_universal_files_keep_their_numbers_and_show_their_convention(tmp_path, 
     assert ("exp(-iwt)" if conjugated else "exp(+iwt)") in test.remarks[-1]
 
 
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")  # of pyuff
+@pytest.mark.parametrize("sensors", [1, 2])
+def test_binary_sets_are_whole_whatever_their_number_or_cut_short(tmp_path, sensors):
+    pyuff, path = pytest.importorskip("pyuff"), tmp_path / "a.uff"
+    pyuff.UFF(str(path)).write_sets(functions(1)[: 1 + sensors], "overwrite")
+    said = {**UNIVERSAL, "sensor": UNIVERSAL["sensor"][:sensors]}
+    np.testing.assert_allclose(reading.gather(path, said).runs[0][1], H[:sensors], rtol=4e-16)
+    path.write_bytes(path.read_bytes()[:-3000])
+    with pytest.raises(sysid.InputError, match=rf"a\.uff is cut short: its last set, number {1 + sensors}"):
+        reading.gather(path, said)
+
+
 @pytest.mark.parametrize(
     "change, words",
     [
@@ -230,11 +242,19 @@ def test_three_commands_from_a_table_to_a_result(tmp_path, monkeypatch, capsys):
     assert cli.main(["show", "mine.py"]) == 0
 
 
-@pytest.mark.parametrize("cut", [0, 3, 40])
-def test_the_bytes_of_a_binary_set_are_no_marks(cut):
-    data = b"\n    -1\n" + bytes(8)
-    head = f"    -1\n    58b     1     2          11{len(data):12d}     0     0           0           0\n"
-    one = head.encode() + b"text\n" * 11 + data + b"    -1\n"
-    text = b"    -1\n   151\nheader\n    -1\n"
-    content = text + one + one
-    assert universal._counted(content[: len(content) - cut]) == ((3, True) if cut == 0 else (2, False))
+def test_a_file_without_sensors_points_to_the_help_in_one_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    np.savez("a.npz", freq=FREQ, H=H, F=F)
+    assert cli.main(["read", "a.npz"]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1 and "sysid read --help" in told and "[[sensor]]" not in told
+
+
+def test_what_a_library_raises_of_a_foreign_file_is_one_line(tmp_path, monkeypatch):
+    def fails(path):
+        raise ZeroDivisionError("of a\nlibrary")
+
+    monkeypatch.setitem(reading._READERS, ".npz", fails)
+    (tmp_path / "a.npz").write_bytes(b"x")
+    with pytest.raises(sysid.InputError, match=r"a\.npz cannot be read \(of a library\).*Export it again"):
+        reading.gather(tmp_path / "a.npz", MATRIX)
