@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.errors import InputError
+from sysid.errors import InputError, needed
 from sysid.files import units
 from sysid.files.recording import Column, Recording, rate_of
 
@@ -59,10 +59,9 @@ def read(path: Path) -> list[Recording]:
 
 
 def _sets(path: Path) -> list[dict[str, Any]]:
-    try:
-        import pyuff
-    except ImportError:
-        raise InputError(f"{path}: universal files need pyuff: pip install 'structural-sysid[uff]'") from None
+    needed("pyuff", "uff", f"{path}: reading a universal file")
+    import pyuff
+
     try:
         _check_whole(path, path.read_bytes())
     except OSError as error:
