@@ -18,6 +18,7 @@ from sysid.results.storage import atomically
 
 _EXAMPLES = (
     "sysid read sine.csv --sensors sensors.toml --out test.h5",
+    "sysid read CH1.csv CH2.csv --join --sensors sensors.toml --out test.h5",
     "sysid read run1.csv run2.csv --time Time --sensor CH1 role=base axis=x unit=g \\\n"
     "      --sensor CH2 role=response name=top axis=x position=0,0,3 unit=g --out test.h5",
 )
@@ -48,6 +49,13 @@ def add(command: Callable[..., argparse.ArgumentParser]) -> None:
     )
     read.add_argument("--rate", type=float, metavar="HZ", help="samples a second, where no column has the time")
     read.add_argument("--time", metavar="COLUMN", help="the column of time")
+    read.add_argument("--frequency", metavar="COLUMN", help="the column of frequencies, of spectra")
+    read.add_argument(
+        "--join",
+        action="store_true",
+        default=None,
+        help="a file a sensor: the files of a folder are one run; columns are called FILE, or FILE.COLUMN of several",
+    )
     read.add_argument("--base-axes", metavar="AXES", help='along which the base moves, such as "x" or "x rz"')
     read.add_argument("--frf", metavar="FORM", help="of frequency responses: transmissibility, accelerance, mobility, "
                       "receptance, apparent mass")  # fmt: skip
@@ -78,8 +86,8 @@ def run(options: argparse.Namespace, out: Output) -> int:
 def _said(options: argparse.Namespace) -> Any:
     """What the options say; over a TOML file where both do."""
     given: dict[str, Any] = {
-        "sample_rate": options.rate, "time": options.time, "base_axes": options.base_axes, "frf": options.frf,
-        "convention": options.convention,
+        "sample_rate": options.rate, "time": options.time, "frequency": options.frequency, "join": options.join,
+        "base_axes": options.base_axes, "frf": options.frf, "convention": options.convention,
     }  # fmt: skip
     given = {name: value for name, value in given.items() if value is not None}
     if options.sensor:

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from zipfile import is_zipfile
 
 import numpy as np
 
 from sysid.errors import InputError
-from sysid.files import units
 from sysid.files.recording import Column, Recording
+from sysid.files.spectral import is_abscissa
 
 _RATES = ("fs", "sample_rate", "samplerate", "sampling_rate", "srate")
-_FREQUENCIES = ("freq", "frequency", "frequencies", "f", "freq_hz")
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
@@ -23,7 +23,8 @@ def read_npz(path: Path) -> Recording:
         with np.load(path, allow_pickle=False) as file:
             named = {name: (file[name], "") for name in file.files}
     except Exception as error:  # zipfile and NumPy raise many
-        words = str(error).partition(".")[0]  # NumPy goes on with advice to load pickles
+        # NumPy takes what is no archive for pickles, and advises to load them.
+        words = str(error).partition(".")[0] if is_zipfile(path) else "it is no zip archive"
         raise InputError(
             f"{path} is no NPZ, or is damaged ({words}): write it with numpy.savez, of numbers alone"
         ) from None
@@ -52,7 +53,9 @@ def read_hdf5(path: Path) -> Recording:
     named: dict[str, tuple[Any, str]] = {}
 
     def visit(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset) and not name.startswith("#") and item.dtype.kind in "buif" + "cV":
+        # MATLAB keeps the sizes of empty arrays, and texts as numbers.
+        text = item.attrs.get("MATLAB_class") in (b"char", b"cell") or "MATLAB_empty" in item.attrs
+        if isinstance(item, h5py.Dataset) and not (name.startswith("#") or text) and item.dtype.kind in "buifcV":
             unit = item.attrs.get("unit", item.attrs.get("units", ""))
             named[name.replace("/", ".")] = (_values(item[()]), unit.decode() if isinstance(unit, bytes) else str(unit))
 
@@ -96,34 +99,33 @@ def recording(path: Path, named: dict[str, tuple[Any, str]]) -> Recording:
     InputError
         Where there are no vectors, of the length that most have.
     """
-    scalars = {name: float(one) for name, (one, _) in named.items() if one.size == 1 and one.dtype.kind != "c"}
+    numbers = {name: (np.squeeze(one), unit) for name, (one, unit) in named.items() if one.dtype.kind in "buifc"}
+    scalars = {name: float(one) for name, (one, _) in numbers.items() if one.ndim == 0 and one.dtype.kind != "c"}
+    flat = {name: one.size for name, (one, _) in numbers.items() if one.ndim == 1}
+    along = {size for name, size in flat.items() if is_abscissa(name)} or set(flat.values())
     vectors: dict[str, tuple[Any, str]] = {}
-    for name, (one, unit) in named.items():
+    remarks = []
+    for name, (one, unit) in numbers.items():
         if one.size > 1:
-            vectors |= _vectors(name, np.squeeze(one), unit)
-    lengths = [one.size for one, _ in vectors.values()]
-    if not lengths:
+            lines = _lines(one, along)
+            vectors |= {f"{name}[{at}]" if one.ndim > 1 else name: (line, unit) for at, line in enumerate(lines, 1)}
+            if one.ndim > 1 and lines.shape[1] not in along:
+                remarks.append(f"array {name!r} is taken as {len(lines)} records of {lines.shape[1]} samples")
+    if not vectors:
         raise InputError(f"{path} holds no arrays of records: a vector of samples a channel is needed, or a matrix")
-    length = max(lengths)
+    told = [size for name, size in flat.items() if is_abscissa(name)]
+    length = max(told or [one.size for one, _ in vectors.values()])
     other = [name for name, (one, _) in vectors.items() if one.size != length]
-    real = [name for name, (one, _) in vectors.items() if name not in other and one.dtype.kind != "c"]
-    frequencies = next((name for known in _FREQUENCIES for name in real if name == known), None)
+    remarks += [f"arrays of another length than {length} are left out: {', '.join(other[:8])}"] * bool(other)
     rate = next((value for name, value in scalars.items() if name.rpartition(".")[2].lower() in _RATES), None)
     columns = tuple(
-        Column(name, one, unit, f"array {name!r}")
-        for name, (one, unit) in vectors.items()
-        if name not in other and name != frequencies
+        Column(name, one, unit, f"array {name!r}") for name, (one, unit) in vectors.items() if name not in other
     )
-    remarks = (f"arrays of another length than {length} are left out: {', '.join(other[:8])}",) if other else ()
-    freq = None if frequencies is None else np.asarray(vectors[frequencies][0], float)
-    if freq is not None:
-        freq = freq * (units.unit(vectors[frequencies or ""][1] or "Hz", "frequency").factor)
-    return Recording(path, columns, rate, freq, remarks)
+    return Recording(path, columns, rate, remarks=tuple(remarks))
 
 
-def _vectors(name: str, array: Any, unit: str) -> dict[str, tuple[Any, str]]:
-    if array.ndim == 1:
-        return {name: (array, unit)}
-    # A record is longer than there are channels.
-    lines = np.moveaxis(array, int(np.argmax(array.shape)), -1).reshape(-1, max(array.shape))
-    return {f"{name}[{at}]": (line, unit) for at, line in enumerate(lines, 1)}
+def _lines(array: Any, along: set[int]) -> Any:
+    """Records of an array, a row each: along a side that is as long as time or frequency, else the longest."""
+    sides = [side for side, size in enumerate(array.shape) if size in along] or range(array.ndim)
+    side = max(sides, key=lambda at: array.shape[at])
+    return np.moveaxis(array, side, -1).reshape(-1, array.shape[side])

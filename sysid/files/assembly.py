@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -11,11 +13,12 @@ from sysid.files import units
 from sysid.files.description import Channel, Description
 from sysid.files.recorded_test import RecordedTest, Row, Run
 from sysid.files.recording import Column, Recording, check_finite, rate_of
+from sysid.files.spectral import TIME_NAMES
 from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
 from sysid.structure.sensor import Sensor
 from sysid.structure.structure import Array
 
-_TIME_NAMES = {"time", "t", "zeit", "temps", "tiempo", "tempo", "time stamp", "timestamp", "elapsed time"}
+_CLEAR_POWER = 0.5  # of the power of all lines, whatever its sign
 _TURNS = {True: ("angular acceleration",), False: ("acceleration",)}
 
 
@@ -28,20 +31,32 @@ def in_time(recordings: Sequence[Recording], said: Description) -> RecordedTest:
         Where roles or axes are not said, a column or a rate is missing, a unit is unknown or of something else.
     """
     refuse((not said.channels, undescribed(recordings[0])))
+    said, remarks = completed(said, recordings[0])
     axes = base_directions(said)
-    runs, table, rates, remarks = [], [], [], []
+    runs, table, rates = [], [], []
     for recording in recordings:
         rates.append(_rate(recording, said))
         records, rows = _records(recording, said)
         table += rows
         remarks += [f"{recording.path}: {remark}" for remark in recording.remarks]
+        plain = [column for column in (_time_column(recording, said),) if column is not None and not column.unit]
+        remarks += [f"{recording.path}, {column.place}: time has no unit, and is taken as s" for column in plain]
         runs.append(_run(records, said, axes, recording))
     if max(rates) - min(rates) > 1e-6 * max(rates):
         raise InputError(
             f"{recordings[int(np.argmax(rates))].path} is sampled at {max(rates):g} Hz and "
             f"{recordings[int(np.argmin(rates))].path} at {min(rates):g} Hz: bring them to one rate, or read them apart"
         )
+    remarks += work_of_force(*_spectra(runs, rates[0]))
     return RecordedTest(tuple(runs), sensors_of(said), axes, said.origin, rates[0], None, tuple(table), tuple(remarks))
+
+
+def _spectra(runs: Sequence[Run], rate: float) -> tuple[list[Any], Array]:
+    """Spectra of base and force over the length of the shortest run, and their lines in Hz, without 0 and the last."""
+    n = min(run[0].shape[1] for run in runs)
+    both = [(base, force) for base, _, force in runs if force is not None]
+    spectra = [[np.fft.rfft(part[:, :n])[:, 1:-1] for part in pair] for pair in both]
+    return [(base, base, force) for base, force in spectra], np.fft.rfftfreq(n, 1 / rate)[1:-1]
 
 
 def undescribed(recording: Recording) -> str:
@@ -53,10 +68,44 @@ def undescribed(recording: Recording) -> str:
     )
 
 
+def completed(said: Description, recording: Recording) -> tuple[Description, list[str]]:
+    """The description with axes and positions that the file tells and it does not, and what is to be told of that.
+
+    Raises
+    ------
+    InputError
+        A column that is missing; an axis that neither tells; a sensor without position on a base that turns.
+    """
+    channels, remarks = [], []
+    for at, channel in enumerate(said.channels, 1):
+        named = [column for column in recording.columns if column.name == str(channel.column)]
+        column = named[0] if named else recording.column(channel.column)
+        axis = channel.axis or column.axis
+        refuse(
+            (
+                not axis,
+                f"{said.place}, sensor {at} (column {channel.column}): axis is missing, and {recording.path} does not "
+                "tell it: x, y, z, a sign before it where it points back, or a vector",
+            )
+        )
+        other = column.axis and isinstance(axis, str) and axis.lstrip("+") != column.axis
+        told = f"the file says axis {column.axis}, the description {axis}, which is taken"
+        remarks += [f"{recording.path}, {column.place}: {told}"] * bool(other)
+        # Of several columns of a name one is told by its number, or by the reference.
+        called = column.name if recording.names.count(column.name) == 1 else channel.column
+        channels.append(replace(channel, column=called, axis=axis, position=channel.position or column.position))
+    turns = "r" in (said.base_axes or "".join(str(one.axis) for one in channels if one.role == "base"))
+    lost = next((one.name for one in channels if turns and one.role == "response" and one.position is None), None)
+    refuse((lost, f"{said.place}: the base turns, and the position of {lost!r} is missing: position, in m"))
+    placed = [replace(one, position=one.position or (0.0, 0.0, 0.0)) for one in channels]
+    return replace(said, channels=tuple(placed)), remarks
+
+
 def sensors_of(said: Description) -> tuple[Sensor, ...]:
     """The sensors of the responses, each once."""
     found = {channel.name: channel for channel in said.channels if channel.role == "response"}
-    return tuple(Sensor(channel.name, channel.position, channel.axis) for channel in found.values())
+    points = {name: channel.position or (0.0, 0.0, 0.0) for name, channel in found.items()}
+    return tuple(Sensor(name, points[name], channel.axis) for name, channel in found.items())
 
 
 def base_directions(said: Description) -> tuple[str, ...]:
@@ -110,7 +159,7 @@ def _time_column(recording: Recording, said: Description) -> Column | None:
     if said.time is not None:
         return recording.column(said.time)
     used = {str(channel.column) for channel in said.channels}
-    found = [column for column in recording.columns if column.name.lower() in _TIME_NAMES and column.name not in used]
+    found = [column for column in recording.columns if column.name.lower() in TIME_NAMES and column.name not in used]
     return found[0] if len(found) == 1 and said.sample_rate is None else None
 
 
@@ -165,28 +214,47 @@ def _factor(recording: Recording, column: Column, channel: Channel) -> tuple[flo
 
 def motions(channels: Sequence[Channel], axes: Sequence[str], origin: Sequence[float]) -> Array:
     """What channels show of unit motions of the base in its directions, (channels, d)."""
-    points = np.array([channel.position for channel in channels])
+    points = np.array([channel.position or (0.0, 0.0, 0.0) for channel in channels])
     rows = rigid_motion(points, origin).reshape(len(points), 6, 6)
     ways = [sensor_row(channel.axis, channel.name) for channel in channels]
     return np.array([way @ row for way, row in zip(ways, rows, strict=True)])[:, base_columns(list(axes))]
 
 
-def base_and_force(
-    said: Description, axes: Sequence[str], base: Array, force: Array | None, place: str
-) -> tuple[Array, Array | None]:
-    """Motion of the base point from its sensors by least squares, and the sum of the load cells, each (d, n)."""
-    seen = motions([channel for channel in said.channels if channel.role == "base"], axes, said.origin)
+def base_motion(
+    channels: Sequence[Channel], said: Description, axes: Sequence[str], base: Array, place: str
+) -> Array:  # fmt: skip
+    """Motion of the base point from its sensors by least squares, (d, n)."""
+    seen = motions([channel for channel in channels if channel.role == "base"], axes, said.origin)
     if np.linalg.matrix_rank(seen) < len(axes):
         raise InputError(
             f"{place}: the base's sensors do not show its motion along {' '.join(axes)}: each direction needs one"
         )
-    moved = base if np.array_equal(seen, np.eye(len(axes))) else np.linalg.pinv(seen) @ base
-    if force is None:
-        return moved, None
-    cells = motions([channel for channel in said.channels if channel.role == "force"], axes, said.origin)
+    return base if np.array_equal(seen, np.eye(len(axes))) else np.linalg.pinv(seen) @ base
+
+
+def total_force(
+    channels: Sequence[Channel], said: Description, axes: Sequence[str], force: Sequence[Array], place: str
+) -> Array | None:
+    """The sum of the load cells along the base's directions, (d, n); None without any."""
+    if not force:
+        return None
+    cells = motions([channel for channel in channels if channel.role == "force"], axes, said.origin)
     unseen = [axis for axis, column in zip(axes, cells.T, strict=True) if not np.any(column)]
     refuse((unseen, f"{place}: no force sensor acts along {' '.join(unseen)}: measure it there too, or give no force"))
-    return moved, cells.T @ force
+    return cells.T @ np.array(force)
+
+
+def work_of_force(runs: Sequence[Run], freq: Array) -> list[str]:
+    """What the sign of the base force seems to be: the table's force gives a damped structure power at every line."""
+    moved = [(base, force) for base, _, force in runs if force is not None]
+    power = [np.sum(np.real(force * np.conj(base / (2j * np.pi * freq))), axis=0) for base, force in moved]
+    share = float(np.sum(power) / max(np.sum(np.abs(power)), np.finfo(float).tiny))
+    right = "the base force gives power to the structure, as the force of the table on it does"
+    reversed_ = (
+        "the base force takes power from the structure: it seems to be the force of the structure on the table; where "
+        'it is, turn the axes of the load cells (axis = "-x" for "x")'
+    )
+    return [right] * (share > _CLEAR_POWER) + [reversed_] * (share < -_CLEAR_POWER)
 
 
 def _run(records: list[Array], said: Description, axes: Sequence[str], recording: Recording) -> Run:
@@ -194,6 +262,6 @@ def _run(records: list[Array], said: Description, axes: Sequence[str], recording
         role: [record for record, channel in zip(records, said.channels, strict=True) if channel.role == role]
         for role in ("base", "response", "force")
     }
-    force = np.array(by_role["force"]) if by_role["force"] else None
-    base, force = base_and_force(said, axes, np.array(by_role["base"]), force, str(recording.path))
-    return base, np.array(by_role["response"]), force
+    place = str(recording.path)
+    base = base_motion(said.channels, said, axes, np.array(by_role["base"]), place)
+    return base, np.array(by_role["response"]), total_force(said.channels, said, axes, by_role["force"], place)

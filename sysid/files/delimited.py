@@ -14,11 +14,15 @@ import numpy as np
 from sysid.errors import InputError, shown
 from sysid.files import units
 from sysid.files.recording import Column, Recording
+from sysid.files.spectral import part_of
 from sysid.structure.structure import Array
 
 _LOOKED_AT = 200  # lines from which the delimiter is told
 _IN_BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\[\]]*)[\])]\s*$")
 _BLANKS = re.compile(r"[ \t]+")
+_DIGITS = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_COMPLEX = re.compile(rf"\(?\s*({_DIGITS})\s*([+-])\s*\+?({_DIGITS})\s*\*?\s*[ij]\s*\)?")
+_CLOCK = re.compile(r"(?:\d{1,4}[-./]\d{1,2}[-./]\d{1,4}[ T]\s*)?(\d{1,2}):(\d{2}):(\d{2}(?:\.\d*)?)Z?")
 
 
 @dataclass(frozen=True)
@@ -32,12 +36,26 @@ class _Form:
         parts = _BLANKS.split(line.strip()) if self.delimiter == " " else line.split(self.delimiter)
         return [part.strip().strip('"').strip() for part in parts]
 
-    def numbers(self, fields: list[str]) -> list[float] | None:
-        """The numbers of the fields, NaN where one is empty; None where one is no number."""
+    def numbers(self, fields: list[str]) -> list[complex] | None:
+        """The numbers of the fields, NaN where one is empty, s where it is a time of day; None where one is none."""
+        plain = [(field.replace(",", ".") if self.comma else field) or "nan" for field in fields]
         try:
-            return [float((field.replace(",", ".") if self.comma else field) or "nan") for field in fields]
+            return [float(field) for field in plain]
         except ValueError:
-            return None
+            found = [_number(field) for field in plain]
+            return None if None in found else [one for one in found if one is not None]
+
+
+def _number(field: str) -> complex | None:
+    """A number, complex such as 1.5-2j too; the seconds of a time of day such as 12:30:01.005, behind a date or not."""
+    try:
+        return float(field)
+    except ValueError:
+        if match := _CLOCK.fullmatch(field):
+            return 3600.0 * int(match[1]) + 60.0 * int(match[2]) + float(match[3])
+        if match := _COMPLEX.fullmatch(field):
+            return complex(float(match[1]), float(match[3]) * (-1 if match[2] == "-" else 1))
+    return None
 
 
 def read(path: Path) -> Recording:
@@ -56,10 +74,11 @@ def read(path: Path) -> Recording:
     )
     body, remarks = _whole(rows[first:], form, width)
     table = _numbers(body, form, width, path)
+    values = [column if np.any(column.imag) else column.real for column in table.T]
     names, given = _header([row for _, row in rows[:first]], width)
-    kept = [at for at in range(width) if not (names[at] == "" and np.all(np.isnan(table[:, at])))]
+    kept = [at for at in range(width) if not (names[at] == "" and np.all(np.isnan(values[at])))]
     columns = tuple(
-        Column(names[at] or f"column {at + 1}", table[:, at], given[at], f"column {at + 1} ({names[at] or 'no name'})")
+        Column(names[at] or f"column {at + 1}", values[at], given[at], f"column {at + 1} ({names[at] or 'no name'})")
         for at in kept
     )
     return Recording(path, columns, remarks=remarks)
@@ -101,10 +120,9 @@ def _form(lines: list[str], path: Path) -> tuple[_Form, int]:
             if (count, width) > score:
                 best, score = (form, width), (count, width)
     if best is None:
-        raise InputError(
-            f"{path} holds no table of numbers: {shown(middle[0] if middle else '')} stands in its middle; "
-            "export it as text, a row a sample"
-        )
+        line = middle[0] if middle else ""
+        found = f"{shown(line)} stands in its middle" if line.isprintable() else "it is no text"
+        raise InputError(f"{path} holds no table of numbers: {found}; export it as text, a row a sample")
     return best
 
 
@@ -145,7 +163,7 @@ def _header(rows: list[list[str]], width: int) -> tuple[list[str], list[str]]:
         if sum(units.find(field) is not None for field in bare) > sum(bool(field) for field in bare) / 2:
             given = bare
             continue
-        found = [_IN_BRACKETS.match(field) for field in fields]
+        found = [None if part_of(field)[1] else _IN_BRACKETS.match(field) for field in fields]
         names = [match[1] if match else field for match, field in zip(found, fields, strict=True)]
         given = [(match[2].strip() if match else "") or old for match, old in zip(found, given, strict=True)]
         break

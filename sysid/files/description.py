@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sysid.errors import InputError, choice, number, path_of, refuse, sequence, shown, text
+from sysid.errors import InputError, choice, flag, number, path_of, refuse, sequence, shown, text
 from sysid.structure.axes import base_columns, sensor_row, vector3
 
 ROLES = ("base", "response", "force")
 _FIELDS = ("column", "name", "role", "position", "axis", "unit", "reference")
-_TOP = ("sensor", "sample_rate", "time", "frequency", "base_axes", "origin", "frf", "convention", "layout")
+_TOP = ("sensor", "sample_rate", "time", "frequency", "base_axes", "origin", "frf", "convention", "join")
 CONVENTIONS = ("exp(+iwt)", "exp(-iwt)")
 
 EXAMPLE = """\
@@ -34,13 +34,13 @@ position = [0.0, 0.0, 3.0]     # m
 
 @dataclass(frozen=True)
 class Channel:
-    """What is said of one column."""
+    """What is said of one column; `axis` and `position` are None where the file has to tell them."""
 
     column: str | int
     role: str
     axis: Any
     name: str
-    position: tuple[float, float, float]
+    position: tuple[float, float, float] | None
     unit: str
     reference: str
 
@@ -62,6 +62,8 @@ class Description:
         The base point, m.
     frf, convention : str
         Of frequency responses, see `sysid.files.responses`; "" where they are to be recognised.
+    join : bool
+        Whether the files of a folder hold the sensors of one run, instead of a run each.
     """
 
     channels: tuple[Channel, ...] = ()
@@ -72,6 +74,7 @@ class Description:
     origin: tuple[float, ...] = (0.0, 0.0, 0.0)
     frf: str = ""
     convention: str = ""
+    join: bool = False
     place: str = field(default="the description")
 
 
@@ -121,16 +124,23 @@ def description(given: Mapping[str, Any], place: str = "the description") -> Des
     columns = [channel.column for channel in channels if not channel.reference]
     twice = next((one for one in columns if columns.count(one) > 1), None)
     refuse((twice is not None, f"{place}: column {twice!r} is given to two sensors"))
+    names = [channel.name for channel in channels if channel.role == "response" and not channel.reference]
+    twice = next((one for one in names if names.count(one) > 1), None)
+    refuse((twice is not None, f"{place}: two sensors of the responses are named {twice!r}: name them apart"))
     rate, axes, convention = given.get("sample_rate"), given.get("base_axes"), given.get("convention", "")
     if axes is not None:
         base_columns(axes)
     choice(f"{place}: convention", convention, ("", *CONVENTIONS))
+    join = flag(f"{place}: join", given.get("join", False))
+    for name in ("time", "frequency"):
+        wrong = given.get(name) is not None and not isinstance(given[name], str | int)
+        refuse((wrong, f"{place}: {name} must be the name or the number of a column, got {shown(given.get(name))}"))
     return Description(
         channels,
         None if rate is None else number(f"{place}: sample_rate", rate, "a positive number in Hz", above=0),
         given.get("time"), given.get("frequency"), axes if axes is None or isinstance(axes, str) else " ".join(axes),
         tuple(vector3(given.get("origin", (0.0, 0.0, 0.0)), f"{place}: origin").tolist()),
-        given.get("frf", ""), convention, place,
+        given.get("frf", ""), convention, join, place,
     )  # fmt: skip
 
 
@@ -143,16 +153,14 @@ def _channel(entry: Any, place: str) -> Channel:
     refuse((not isinstance(column, str | int) or column == "", f"{place}: column is missing (its name, or its number)"))
     place = f"{place} (column {column})"
     choice(f"{place}: role", entry.get("role"), ROLES)
-    axis: Any = entry.get("axis")
-    refuse((axis is None, f"{place}: axis is missing: x, y, z, a sign before it where it points back, or a vector"))
-    sensor_row(axis, place)
-    where = vector3(entry.get("position", (0.0, 0.0, 0.0)), f"{place}: position").tolist()
+    axis, where = entry.get("axis"), entry.get("position")
+    if axis is not None:
+        sensor_row(axis, place)
+        axis = axis if isinstance(axis, str) else tuple(map(float, axis))
+    x, y, z = vector3((0.0, 0.0, 0.0) if where is None else where, f"{place}: position").tolist()
     name = text(f"{place}: name", entry.get("name", str(column)))
-    axis = axis if isinstance(axis, str) else tuple(map(float, axis))
-    return Channel(
-        column, entry["role"], axis, name, (where[0], where[1], where[2]), str(entry.get("unit", "")),
-        str(entry.get("reference", "")),
-    )  # fmt: skip
+    words = [str(entry.get(one, "")) for one in ("unit", "reference")]
+    return Channel(column, entry["role"], axis, name, None if where is None else (x, y, z), *words)
 
 
 def beside(path: Path) -> Path | None:

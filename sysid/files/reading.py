@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sysid.errors import InputError, path_of
-from sysid.files import arrays, assembly, delimited, responses, universal, xsens_dot
-from sysid.files.description import asked
+from sysid.errors import InputError, path_of, refuse
+from sysid.files import arrays, assembly, delimited, joined, responses, spectral, universal, xsens_dot
+from sysid.files.description import Description, asked
 from sysid.files.recorded_test import RecordedTest
 from sysid.files.recording import Recording
 from sysid.measurement.measurement import Measurement
@@ -51,6 +51,15 @@ def read(
     return gather(paths, sensors).measurement(**options)
 
 
+# First bytes of a format, what it is called, and what to do where the ending says something else.
+_BEGINNINGS = (
+    (b"\x89HDF\r\n\x1a\n", "HDF5", ".h5", (".h5", ".hdf5", ".mat")),
+    (b"MATLAB 5.0 MAT-file", "MATLAB", ".mat", (".mat",)),
+    (b"MATLAB 7.3 MAT-file", "MATLAB", ".mat", (".mat", ".h5", ".hdf5")),
+    (b"    -1", "universal file", ".unv", _UNIVERSAL),
+)
+
+
 def gather(paths: str | Path | Sequence[str | Path], sensors: Any = None) -> RecordedTest:
     """The test of some files, with its records whole; arguments as of `read`."""
     files = [path_of("paths", path) for path in ([paths] if isinstance(paths, str | Path) else paths)]
@@ -60,6 +69,11 @@ def gather(paths: str | Path | Sequence[str | Path], sensors: Any = None) -> Rec
     if all(xsens_dot.is_export(file) for file in files):
         return assembly.in_time([xsens_dot.together(files)], said)  # a unit is a file
     recordings = [recording for file in files for recording in _read_or_told(file)]
+    if said.join:
+        recordings = joined.by_folder(recordings, said)
+    else:
+        _check_one_each(recordings, said)
+    recordings = [spectral.recognised(recording, said) for recording in recordings]
     spectra = {recording.freq is not None for recording in recordings}
     if len(spectra) > 1:
         raise InputError("some files hold records in time and some spectra: read them apart")
@@ -72,6 +86,7 @@ def _recordings(file: Path) -> list[Recording]:
     if file.is_dir():
         raise InputError(f"{file} is a folder: name its files")
     ending = file.suffix.lower()
+    _check_ending(file, ending)
     if ending in _UNIVERSAL:
         return universal.read(file)
     if ending in _TEXT:
@@ -80,6 +95,30 @@ def _recordings(file: Path) -> list[Recording]:
         known = ", ".join((*_TEXT, *_READERS, *_UNIVERSAL))
         raise InputError(f"{file}: the ending {ending!r} is not known; known are {known}")
     return [_READERS[ending](file)]
+
+
+def _check_ending(file: Path, ending: str) -> None:
+    """Refuse a file that begins as one of another format than its ending says."""
+    with file.open("rb") as opened:
+        begin = opened.read(20)
+    for first, name, right, endings in _BEGINNINGS:
+        wrong = begin.startswith(first) and ending not in endings
+        refuse((wrong, f"{file} begins as a file of the format {name} does: give it the ending {right}"))
+
+
+def _check_one_each(recordings: Sequence[Recording], said: Description) -> None:
+    """Refuse files that seem to hold one sensor each, where they are read as a run each."""
+    names = set(recordings[0].names)
+    others = {name: other.path for other in recordings[1:] for name in (*other.names, other.path.stem)}
+    elsewhere = [str(channel.column) for channel in said.channels if str(channel.column) not in names]
+    found = next((name for name in elsewhere if name in others), None)
+    refuse(
+        (
+            found is not None,
+            f"{recordings[0].path} has no column {found!r}, which {others.get(str(found))} is or has: does each file "
+            "hold one sensor? Then read them with --join (join = true)",
+        )
+    )
 
 
 def _read_or_told(file: Path) -> list[Recording]:

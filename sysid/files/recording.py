@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.errors import InputError
+from sysid.errors import InputError, refuse
 from sysid.structure.structure import Array
 
 _SHOWN = 12  # columns in a message
@@ -44,7 +44,7 @@ class Column:
     place: str
     reference: str = ""
     form: str = ""
-    position: tuple[float, ...] | None = None
+    position: tuple[float, float, float] | None = None
     axis: str = ""
 
 
@@ -101,7 +101,9 @@ class Recording:
         """How many columns there are, and what they are called."""
         told = ", ".join(map(repr, self.names[:_SHOWN]))
         more = f" and {len(self.names) - _SHOWN} more" if len(self.names) > _SHOWN else ""
-        return f"it has {len(self.names)} columns, {told}{more}"
+        left_out = "".join(f" ({remark})" for remark in self.remarks[:1])
+        plural = "s" * (len(self.names) != 1)
+        return f"it has {len(self.names)} column{plural}, {told}{more}{left_out}"
 
 
 def check_finite(column: Column, path: Path) -> None:
@@ -122,13 +124,17 @@ def rate_of(time: Array, path: Path, place: str) -> float:
     InputError
         Where time does not rise, or its steps are uneven: says at which sample.
     """
-    if time.size < 3:
-        raise InputError(f"{path}: {time.size} samples are no record")
+    refuse((time.size < 3, f"{path}: {time.size} samples are no record: is it the right file, and whole?"))
     falls = np.flatnonzero(np.diff(time) <= 0)
     if falls.size:
+        before, after = time[falls[0]], time[falls[0] + 1]
+        cause = "two tests in one file? Write each to a file of its own"
+        if after == before:
+            cause = "a sample twice, or times that are rounded? State sample_rate in place of time (--rate)"
+        elif falls.size > time.size / 2:
+            cause = "it runs backwards: is it the right column?"
         raise InputError(
-            f"{path}, {place}: time does not rise at sample {falls[0] + 2} ({time[falls[0]]:g}, then "
-            f"{time[falls[0] + 1]:g} s): two tests in one file? Write each to a file of its own"
+            f"{path}, {place}: time does not rise at sample {falls[0] + 2} ({before:g}, then {after:g} s): {cause}"
         )
     step = (time[-1] - time[0]) / (time.size - 1)
     late = np.abs(time - time[0] - step * np.arange(time.size))

@@ -6,14 +6,24 @@ unit of it, where it is a force the base channels tell how the base moved.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sysid.errors import InputError, refuse
+from sysid.errors import InputError, choice, refuse
 from sysid.files import units
-from sysid.files.assembly import base_and_force, base_directions, motions, row_of, sensors_of, undescribed
+from sysid.files.assembly import (
+    base_directions,
+    base_motion,
+    completed,
+    row_of,
+    sensors_of,
+    total_force,
+    undescribed,
+    work_of_force,
+)
 from sysid.files.description import CONVENTIONS, Channel, Description
 from sysid.files.recorded_test import RecordedTest, Row, Run
 from sysid.files.recording import Column, Recording, check_finite
@@ -29,7 +39,10 @@ FORMS = {
     "apparent mass": ("force", "acceleration"),
     "spectrum": ("acceleration", ""),
 }
-_ORDER = {"displacement": 2, "velocity": 1, "acceleration": 0}  # how often to differentiate
+_ORDER = {"displacement": 2, "velocity": 1}  # how often to differentiate
+_OF_ROLE = {"base": "a motion", "response": "a motion", "force": "a force"}
+_MOTIONS = ("acceleration", "velocity", "displacement", "angular acceleration")
+_ENDS_WITH_AXIS = re.compile(r"(?:.*\d)?([+-]?)(r?[xyz])")
 _CLEAR = 0.02  # of the sums by which the convention is told
 
 
@@ -42,28 +55,39 @@ def from_spectra(recordings: Sequence[Recording], said: Description) -> Recorded
         Where form or convention are neither said nor shown, roles or axes are not said, a reference is missing.
     """
     refuse((not said.channels, undescribed(recordings[0])))
-    refuse((said.frf != "" and said.frf not in FORMS, f"{said.place}: frf = {said.frf!r}; one of {', '.join(FORMS)}"))
+    choice(f"{said.place}: frf", said.frf, ("", *FORMS))
     freq = recordings[0].freq
     assert freq is not None
-    axes, runs, table, remarks = base_directions_of(said), [], [], []
+    said, remarks = completed(said, recordings[0])
+    axes = base_directions_of(said)
     for recording in recordings:
         other = recording.freq
         if other is None or other.shape != freq.shape or not np.allclose(other, freq, rtol=1e-6):
             raise InputError(f"{recording.path} has other lines than {recordings[0].path}: read them apart")
-        columns = recording.columns
-        for reference in dict.fromkeys(_reference(column, said) for column in columns if _is_used(column, said)):
-            run, rows = _run(recording, reference, said, axes, freq)
+        remarks += [f"{recording.path}: {remark}" for remark in recording.remarks]
+    runs, table = _runs(recordings, said, axes, freq)
+    sign, how = _convention(runs, said)
+    if sign < 0:  # conjugated as they are in the file: velocities and displacements are differentiated after it
+        runs, table = _runs(recordings, said, axes, freq, conjugated=True)
+    kept = freq > 0
+    freq, runs = freq[kept], [_at(run, kept) for run in runs]
+    remarks += ["the line at 0 Hz is left out"] * (not np.all(kept))
+    remarks += [*work_of_force(runs, freq), how]
+    return RecordedTest(tuple(runs), sensors_of(said), axes, said.origin, None, freq, tuple(table), tuple(remarks))
+
+
+def _runs(
+    recordings: Sequence[Recording], said: Description, axes: Sequence[str], freq: Array, conjugated: bool = False
+) -> tuple[list[Run], list[Row]]:
+    """A run for each reference of each recording."""
+    runs, table = [], []
+    for recording in recordings:
+        found = [_reference(column, said) for column in recording.columns if _is_used(column, said)]
+        for reference in dict.fromkeys(found):
+            run, rows = _run(recording, reference, said, axes, freq, conjugated)
             runs.append(run)
             table += rows
-    kept = freq > 0
-    if not np.all(kept):
-        freq, runs = freq[kept], [_lines(run, kept) for run in runs]
-        remarks.append("the line at 0 Hz is left out")
-    sign, how = _convention(runs, said)
-    remarks.append(how)
-    if sign < 0:
-        runs = [tuple(None if part is None else part.conj() for part in run) for run in runs]
-    return RecordedTest(tuple(runs), sensors_of(said), axes, said.origin, None, freq, tuple(table), tuple(remarks))
+    return runs, table
 
 
 def base_directions_of(said: Description) -> tuple[str, ...]:
@@ -79,7 +103,11 @@ def base_directions_of(said: Description) -> tuple[str, ...]:
 
 
 def _is_used(column: Column, said: Description) -> bool:
-    return any(str(channel.column) == column.name for channel in said.channels)
+    return any(
+        str(channel.column) == column.name
+        and (channel.reference or column.reference) == (column.reference or channel.reference)
+        for channel in said.channels
+    )
 
 
 def _reference(column: Column, said: Description) -> str:
@@ -88,121 +116,168 @@ def _reference(column: Column, said: Description) -> str:
 
 
 def _run(
-    recording: Recording, reference: str, said: Description, axes: Sequence[str], freq: Array
-) -> tuple[Any, list[Row]]:
-    """Base, responses and forces per unit of a reference, in the order of the description."""
+    recording: Recording, reference: str, said: Description, axes: Sequence[str], freq: Array, conjugated: bool
+) -> tuple[Run, list[Row]]:
+    """Base, responses and forces per unit of a reference, in the order of the sensors."""
+    found = [
+        (channel, column)
+        for channel in said.channels
+        if (column := _of_reference(recording, channel, reference, said)) is not None
+    ]
+    forms = [_form(recording, column, channel, said) for channel, column in found]
+    lower = _denominator(forms, reference, recording)
+    parts: dict[str, dict[str, ComplexArray]] = {"base": {}, "response": {}, "force": {}}
     rows: list[Row] = []
-    parts: dict[str, list[ComplexArray]] = {"base": [], "response": [], "force": []}
-    quantity = ""
-    for channel in said.channels:
-        column = _of_reference(recording, channel, reference, said)
-        if column is None:
-            continue
+    for (channel, column), form in zip(found, forms, strict=True):
         check_finite(column, recording.path)
-        factor, upper, quantity, unit = _in_si(recording, column, channel, said)
-        values = np.asarray(column.values, complex) * factor * (2j * np.pi * freq) ** _ORDER.get(upper, 0)
-        parts[channel.role].append(values)
+        values: Any = np.asarray(column.values, complex) * form.factor
+        values = (values.conj() if conjugated else values) * (2j * np.pi * freq) ** _ORDER.get(form.upper or lower, 0)
+        parts[channel.role][channel.name] = values
         rms = float(np.sqrt(np.mean(np.abs(values) ** 2)))
-        rows.append(row_of(column, channel, unit, factor, rms, recording))
-    wanted = sum(channel.role == "response" for channel in said.channels if channel.reference in ("", reference))
-    if len(parts["response"]) < wanted or not parts["response"]:
-        raise InputError(
-            f"{recording.path}: per unit of {reference or 'the reference'} it holds {len(parts['response'])} of "
-            f"{wanted} sensors; each sensor needs a function for each reference; {recording.in_words()}"
-        )
-    return _with_base(parts, quantity, reference, said, axes, recording), rows
+        rows.append(row_of(column, channel, form.unit, form.factor, rms, recording))
+    sensors = [sensor.name for sensor in sensors_of(said)]
+    missing = next((name for name in sensors if name not in parts["response"]), None)
+    refuse(
+        (
+            missing is not None,
+            f"{recording.path}: per unit of {reference or 'the reference'} the function of {missing!r} is missing: "
+            f"each sensor needs one for each reference, under the same name; {recording.in_words()}",
+        ),
+        (
+            not any(np.any(values.imag) for values in parts["response"].values()),
+            f"{recording.path}: its functions are real numbers, magnitudes it seems: export complex ones, or real and "
+            "imaginary part, or magnitude and phase in columns named so",
+        ),
+    )
+    response: Any = np.array([parts["response"][name] for name in sensors])
+    channels = [channel for channel, _ in found]
+    place = str(recording.path)
+    base: Any = np.array(list(parts["base"].values()))
+    force: list[Any] = list(parts["force"].values())
+    if base.size:
+        base = base_motion(channels, said, axes, base, place)
+    else:
+        base = _unit_motion(lower, reference, axes, recording, freq)
+    return (base, response, total_force(channels, said, axes, force, place)), rows
 
 
 def _of_reference(recording: Recording, channel: Channel, reference: str, said: Description) -> Column | None:
     found = [
         column
         for column in recording.columns
-        if column.name == str(channel.column) and _reference(column, said) == reference
+        if column.name == str(channel.column)
+        and reference == _reference(column, said)
+        and channel.reference in ("", reference)
     ]
-    if len(found) > 1:
-        raise InputError(
+    refuse(
+        (
+            len(found) > 1,
             f"{recording.path}: {channel.column!r} stands there {len(found)} times per unit of "
             f"{reference or 'nothing'} ({', '.join(column.place for column in found)}): two tests in "
-            "one file? Export each into its own"
+            "one file? Export each into its own",
         )
-    if not found and not any(column.name == str(channel.column) for column in recording.columns):
+    )
+    if str(channel.column) not in recording.names:
         recording.column(channel.column)  # raises, with what there is
-    return found[0] if found else None
+    return next(iter(found), None)
 
 
-def _in_si(recording: Recording, column: Column, channel: Channel, said: Description) -> tuple[float, str, str, str]:
-    """Factor, quantity of the numerator and of the denominator ("" for none), and the unit in words."""
+class _Form(NamedTuple):
+    """What a function is, by its unit.
+
+    `upper` and `lower` are quantities; both are "" of a number per the same, `lower` is "" of a spectrum, which is per
+    nothing.
+    """
+
+    factor: float
+    upper: str
+    lower: str
+    unit: str
+
+
+def _form(recording: Recording, column: Column, channel: Channel, said: Description) -> _Form:
+    """What a function is, by its unit and by what is stated."""
     place = f"{recording.path}, {column.place}"
     text = channel.unit or column.unit
-    above, _, below = (part.strip() for part in text.partition(" / "))
-    form = FORMS.get(said.frf, ("", ""))
-    if channel.role == "force" and said.frf == "transmissibility":
-        form = FORMS["apparent mass"]
-    if not text and form == ("acceleration", "acceleration"):
-        return 1.0, *form, "1"
-    if not text:
-        raise InputError(
-            f"{place}: neither unit nor form of this function is stated: is it receptance, mobility, accelerance or "
-            'transmissibility? State frf = "..." (--frf) and unit = "m/s² / N" or the like'
+    if not text and said.frf == "transmissibility" and channel.role != "force":
+        return _Form(1.0, "", "", "1")
+    refuse(
+        (
+            not text,
+            f"{place}: of this function no unit{' and no form' * (said.frf == '')} is stated: is it receptance, "
+            'mobility, accelerance or transmissibility? State frf = "..." (--frf) and unit = "m/s² / N" or the like',
         )
-    upper = units.unit(above, place)
-    lower = units.unit(below, place) if below else units.Unit("", 1.0)
-    if said.frf and (upper.quantity, lower.quantity) != form and not _alike(said.frf, upper, lower):
-        raise InputError(
-            f"{place}: a {said.frf} is {' per '.join(filter(None, form))}, but its unit is {text!r}: mend frf, or "
-            "the unit"
+    )
+    upper, lower = units.ratio(text, place)
+    form = _Form(upper.factor / lower.factor, upper.quantity, lower.quantity, text)
+    known = f"frf = {said.frf!r}" * bool(said.frf) or "no frf (transmissibility, of motions)"
+    refuse(
+        (
+            not _fits(form, channel.role, said.frf),
+            f"{place}: the unit {text!r} does not fit: {known} is stated, and a {channel.role} sensor gives "
+            f"{_OF_ROLE[channel.role]} per unit of the reference: mend frf (--frf), or the unit",
         )
-    return upper.factor / lower.factor, upper.quantity, lower.quantity, text
+    )
+    return form
 
 
-def _alike(form: str, upper: units.Unit, lower: units.Unit) -> bool:
-    """Whether the quantities are of the form: any motion over the same is a transmissibility."""
-    return form == "transmissibility" and (upper.quantity == lower.quantity or upper.quantity == "force")
+def _fits(form: _Form, role: str, frf: str) -> bool:
+    """Whether a function can be of a sensor of this role, and is of the form that is stated."""
+    known = FORMS.get(frf, ("", ""))
+    if role == "force":
+        return form.upper in ("force", "moment") and (frf in ("", "transmissibility") or form.lower == known[1])
+    if frf == "transmissibility":
+        return form.upper == form.lower and form.upper in ("", *_MOTIONS)
+    return form.upper in _MOTIONS and (frf in ("", "apparent mass") or (form.upper, form.lower) == known)
 
 
-def _with_base(
-    parts: dict[str, list[ComplexArray]], quantity: str, reference: str, said: Description, axes: Sequence[str],
-    recording: Recording,
-) -> Run:  # fmt: skip
-    response: Any = np.array(parts["response"])
-    force: Any = np.array(parts["force"]) if parts["force"] else None
-    if parts["base"]:
-        return _placed(np.array(parts["base"]), response, force, said, axes, recording)
-    if quantity == "force" or not quantity:
-        raise InputError(
-            f"{recording.path}: its functions are per unit of {quantity or 'nothing'}, so that the base's own motion "
-            'is needed: describe its channels with role = "base"'
+def _denominator(forms: Sequence[_Form], reference: str, recording: Recording) -> str:
+    """What all functions of a reference are per unit of; acceleration for numbers per the same, which are of any."""
+    found = list(dict.fromkeys(form.lower for form in forms if form.upper))
+    plain = any(not form.upper for form in forms)
+    refuse(
+        (
+            len(found) > 1 or (plain and not set(found) <= set(_MOTIONS)),
+            f"{recording.path}: functions per unit of {reference or 'the reference'} have the units "
+            f"{', '.join(dict.fromkeys(repr(form.unit) for form in forms))}: all need one and the same denominator",
         )
-    base: Any = np.zeros((len(axes), response.shape[1]), complex)
-    at = _direction(reference, axes, recording)
-    base[at] = 1.0
-    if quantity in ("velocity", "displacement"):  # same over same: the response was differentiated, the base is not yet
-        base[at] = (2j * np.pi * np.asarray(recording.freq)) ** _ORDER[quantity]
-    cells = [channel for channel in said.channels if channel.role == "force"]
-    if force is not None:
-        force = motions(cells, axes, said.origin).T @ force
-    return base, response, force
+    )
+    return next(iter(found), "acceleration")
 
 
-def _placed(base: Any, response: Any, force: Any, said: Description, axes: Sequence[str], recording: Recording) -> Run:
-    moved, total = base_and_force(said, axes, base, force, str(recording.path))
-    return moved, response, total
+def _unit_motion(
+    lower: str, reference: str, axes: Sequence[str], recording: Recording, freq: Array
+) -> ComplexArray:  # fmt: skip
+    """The base's acceleration that moves by one unit of the reference."""
+    refuse(
+        (
+            lower not in _MOTIONS,
+            f"{recording.path}: functions are per unit of {lower or 'nothing'} ({reference or 'no reference'}), "
+            'so that the base\'s own motion per unit of it is needed: describe its channels with role = "base"',
+        )
+    )
+    at, sign = _direction(reference, axes, recording)
+    base: ComplexArray = np.zeros((len(axes), freq.size), complex)
+    base[at] = sign * (2j * np.pi * freq) ** _ORDER.get(lower, 0)
+    return base
 
 
-def _direction(reference: str, axes: Sequence[str], recording: Recording) -> int:
-    """Which base direction a reference is: that of its name, or the only one."""
-    if len(axes) == 1:
-        return 0
-    name = reference.rpartition("+")[2].lower()
-    if name not in axes:
-        raise InputError(
+def _direction(reference: str, axes: Sequence[str], recording: Recording) -> tuple[int, float]:
+    """Which base direction a reference is, and its sign: that of its name, or the only one where it names none."""
+    match = _ENDS_WITH_AXIS.fullmatch(reference.strip().lower())
+    only = axes[0] if len(axes) == 1 else ""
+    sign, axis = match.groups() if match else ("", only)
+    refuse(
+        (
+            axis not in axes,
             f"{recording.path}: the reference {reference!r} is none of the base's axes {' '.join(axes)}: state "
-            'reference = "x" with each function'
+            'base_axes (--base-axes), or reference = "x" with each function',
         )
-    return list(axes).index(name)
+    )
+    return list(axes).index(axis), float(f"{sign}1")
 
 
-def _lines(run: Run, kept: Any) -> Any:
+def _at(run: Run, kept: Any) -> Any:
     return tuple(None if part is None else part[:, kept] for part in run)
 
 

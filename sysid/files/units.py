@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import NamedTuple
 
 from sysid.errors import InputError, shown
@@ -42,12 +43,15 @@ UNITS: dict[str, Unit] = {
     "s": Unit("time", 1.0),
     "ms": Unit("time", 1e-3),
     "us": Unit("time", 1e-6),
+    "deg": Unit("angle", _DEGREE),
+    "rad": Unit("angle", 1.0),
     "Hz": Unit("frequency", 1.0),
     "kHz": Unit("frequency", 1e3),
     "rad/s": Unit("frequency", 1 / (2 * 3.141592653589793)),
 }
 _OTHER_WORDS = {
     "m/s/s": "m/s2", "mm/s/s": "mm/s2", "ms-2": "m/s2", "gn": "g", "gs": "g", "lb": "lbf", "newton": "N", "sec": "s",
+    "degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad",
     "seconds": "s", "second": "s", "hz": "Hz", "kn": "kN", "n": "N", "G": "g", "g's": "g",
 }  # fmt: skip
 
@@ -59,6 +63,29 @@ def find(text: str) -> Unit | None:
         plain = plain.replace(sign, "")
     plain = plain.replace("sec2", "s2").replace("(", "").replace(")", "")
     return UNITS.get(_OTHER_WORDS.get(plain, plain)) or UNITS.get(_OTHER_WORDS.get(plain.lower(), plain.lower()))
+
+
+_RATIOS = {
+    "kg": (UNITS["N"], UNITS["m/s2"]),
+    "1/kg": (UNITS["m/s2"], UNITS["N"]),
+    **dict.fromkeys(("1", "-", "dimensionless"), (Unit("", 1.0), Unit("", 1.0))),
+}
+
+
+def ratio(text: str, of: str) -> tuple[Unit, Unit]:
+    """Units of what a function is, and of what it is per unit of: of "m/s²/N", "g / N", "kg".
+
+    The quantity of the latter is "" where it is per nothing; of a number per the same, such as "1", that of both is.
+    """
+    plain, nothing = text.strip(), Unit("", 1.0)
+    if plain in _RATIOS:
+        return _RATIOS[plain]
+    cuts = [match.start() for match in re.finditer("/", plain)]
+    pairs = [(find(plain[:cut]), find(plain[cut + 1 :])) for cut in cuts]
+    both = [(above, below) for above, below in pairs if above is not None and below is not None]
+    if find(plain) is None and both:
+        return both[0]
+    return unit(plain, of), nothing
 
 
 def unit(text: str, of: str) -> Unit:

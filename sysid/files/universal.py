@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,11 +21,16 @@ _FUNCTIONS = {0: "general", 1: "time response", 2: "auto spectrum", 3: "cross sp
               6: "coherence", 12: "spectrum"}  # fmt: skip
 _READ = (1, 4, 12)
 _DIRECTIONS = {1: "x", 2: "y", 3: "z", 4: "rx", 5: "ry", 6: "rz"}
-_SPECIFIC = {8: "m", 9: "N", 11: "m/s", 12: "m/s²", 13: "N"}  # data types whose unit is SI where no label says another
+# Data types of functions whose unit no label tells: that of the set 164, and SI without one.
+_SPECIFIC = {8: "{length}", 9: "{force}", 11: "{length}/s", 12: "{length}/s²", 13: "{force}"}
+# Units by how many of them are an SI unit, as a set 164 states it.
+_LENGTHS = {1.0: "m", 100.0: "cm", 1000.0: "mm", 1 / units.INCH: "in", 1 / (12 * units.INCH): "ft"}
+_FORCES = {1.0: "N", 1000.0: "mN", 1e-3: "kN", 1 / units.POUND: "lbf"}
 _MARK = re.compile(rb"^    -1[ \t]*\r?$", re.MULTILINE)
 # A binary set: its size in bytes in the 32nd to 43rd place of its first line, and 11 lines of text before the numbers.
 _BINARY = re.compile(rb"\s*\n {4}58b.{24}[ ]*(\d+)[^\n]*\n(?:[^\n]*\n){11}")
 _LAST = re.compile(rb"    -1[ \t]*\r?$", re.MULTILINE)
+_KNOWN = {"58", "15", "2411", "164", "82", "151"}  # read, or without need
 _NO_LABEL = ("", "NONE")
 
 
@@ -39,8 +45,9 @@ def read(path: Path) -> list[Recording]:
         Without pyuff; a file cut short, of another type, without sets 58; lengths that differ.
     """
     sets = _sets(path)
-    lengths = _scale(sets)
-    points = _points(sets, lengths)
+    stated = next((one for one in sets if one.get("type") == 164), {})
+    points = _points(sets, 1 / (stated.get("length") or 1.0))
+    own = _Units(_of_system(stated, "length", _LENGTHS), _of_system(stated, "force", _FORCES))
     functions = [(at, one) for at, one in enumerate(sets, 1) if one.get("type") == 58]
     kinds = {_FUNCTIONS.get(one["func_type"], str(one["func_type"])) for _, one in functions}
     used = [(at, one) for at, one in functions if one["func_type"] in _READ]
@@ -55,7 +62,9 @@ def read(path: Path) -> list[Recording]:
     runs: dict[int, list[tuple[int, dict[str, Any]]]] = {}
     for at, one in used:
         runs.setdefault(one["load_case_id"] if one["func_type"] != 4 else 0, []).append((at, one))
-    return [_recording(path, run, points) for run in runs.values()]
+    left_out = sorted({str(one.get("type")) for one in sets} - _KNOWN)
+    remarks = (f"sets of type {', '.join(left_out)} are left out",) * bool(left_out)
+    return [replace(_recording(path, run, points, own), remarks=remarks) for run in runs.values()]
 
 
 def _sets(path: Path) -> list[dict[str, Any]]:
@@ -96,9 +105,17 @@ def _check_whole(path: Path, content: bytes) -> None:
         begin = _MARK.search(content, end.end())
 
 
-def _scale(sets: Sequence[dict[str, Any]]) -> float:
-    """Length of the file's unit of length in m, from its set 164; 1 without one."""
-    return next((1 / one["length"] for one in sets if one.get("type") == 164 and one.get("length")), 1.0)
+class _Units(NamedTuple):
+    """The file's units; "" where its set 164 states one that has no name here."""
+
+    length: str
+    force: str
+
+
+def _of_system(stated: dict[str, Any], quantity: str, known: dict[float, str]) -> str:
+    """The unit of a set 164, which states how many of it are an SI unit; the SI unit without such a set."""
+    size = float(stated.get(quantity) or 1.0)
+    return next((name for one, name in known.items() if abs(size / one - 1) < 1e-4), "")
 
 
 def _points(sets: Sequence[dict[str, Any]], length: float) -> dict[int, tuple[float, ...]]:
@@ -111,8 +128,10 @@ def _points(sets: Sequence[dict[str, Any]], length: float) -> dict[int, tuple[fl
     }
 
 
-def _recording(path: Path, run: Sequence[tuple[int, dict[str, Any]]], points: dict[int, Any]) -> Recording:
-    columns = tuple(_column(path, at, one, points) for at, one in run)
+def _recording(
+    path: Path, run: Sequence[tuple[int, dict[str, Any]]], points: dict[int, Any], own: _Units
+) -> Recording:  # fmt: skip
+    columns = tuple(_column(path, at, one, points, own) for at, one in run)
     first, lengths = run[0][1], {column.values.size for column in columns}
     other = next(((at, one) for at, one in run if not _same_abscissa(one, first)), None)
     if len(lengths) > 1 or other is not None:
@@ -134,7 +153,7 @@ def _same_abscissa(one: dict[str, Any], other: dict[str, Any]) -> bool:
     return a.shape == b.shape and bool(np.allclose(a, b, rtol=1e-6, atol=0))
 
 
-def _column(path: Path, at: int, one: dict[str, Any], points: dict[int, Any]) -> Column:
+def _column(path: Path, at: int, one: dict[str, Any], points: dict[int, Any], own: _Units) -> Column:
     name, values = dof(one["rsp_node"], one["rsp_dir"]), np.asarray(one["data"])
     if values.size < one["num_pts"]:
         raise InputError(
@@ -142,8 +161,8 @@ def _column(path: Path, at: int, one: dict[str, Any], points: dict[int, Any]) ->
             "of the precision that it says; export it again"
         )
     spectrum = one["func_type"] == 4
-    upper = _unit(one, "ordinate")
-    lower = _unit(one, "orddenom") if spectrum else ""
+    upper = _unit(one, "ordinate", own)
+    lower = _unit(one, "orddenom", own) if spectrum else ""
     direction = int(one["rsp_dir"])
     axis = ("-" if direction < 0 else "") + _DIRECTIONS.get(abs(direction), "")
     return Column(
@@ -158,8 +177,8 @@ def dof(node: int, direction: int) -> str:
     return f"{int(node)}{'-' if int(direction) < 0 else '+'}{name}"
 
 
-def _unit(one: dict[str, Any], side: str) -> str:
-    """Unit of an axis: its label where that names a unit, else the SI unit of its data type, else ""."""
+def _unit(one: dict[str, Any], side: str, own: _Units) -> str:
+    """Unit of an axis: its label where that names a unit, else the file's unit of its data type, else ""."""
     for key in (f"{side}_axis_units_lab", f"{side}_axis_lab"):
         label = str(one.get(key, "")).strip().strip("[]()")
         if label not in _NO_LABEL and units.find(label) is not None:
@@ -167,4 +186,5 @@ def _unit(one: dict[str, Any], side: str) -> str:
     label = str(one.get(f"{side}_axis_units_lab", "")).strip()
     if label not in _NO_LABEL:
         return label  # unknown: whoever takes the channel says so
-    return _SPECIFIC.get(int(one[f"{side}_spec_data_type"]), "")
+    unit = _SPECIFIC.get(int(one[f"{side}_spec_data_type"]), "").format(**own._asdict())
+    return unit * (units.find(unit) is not None)

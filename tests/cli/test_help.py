@@ -45,6 +45,8 @@ def write_records(folder, sensors):
         both += 1e-3 * both.std() * rng.normal(size=both.shape)
         rows = [f"{k / 50:.2f},{x:.9e},{y:.9e}" for k, (x, y) in enumerate(both.T)]
         (folder / f"{name}.csv").write_text("\n".join(["Time,CH1,CH2 [g]", *rows]) + "\n")
+    for name, row in zip(("CH1", "CH2"), both, strict=True):
+        (folder / f"{name}.csv").write_text("\n".join(["Time,a [g]", *(f"{k / 50},{x}" for k, x in enumerate(row))]))
 
 
 def test_all_examples_run(helps, tmp_path, monkeypatch, capsys, no_pictures):

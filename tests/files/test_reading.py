@@ -258,3 +258,22 @@ def test_what_a_library_raises_of_a_foreign_file_is_one_line(tmp_path, monkeypat
     (tmp_path / "a.npz").write_bytes(b"x")
     with pytest.raises(sysid.InputError, match=r"a\.npz cannot be read \(of a library\).*Export it again"):
         reading.gather(tmp_path / "a.npz", MATRIX)
+
+
+def test_files_of_one_sensor_each_are_joined_to_runs_by_their_folders(tmp_path):
+    time, _, si = records()
+    roles = {"a": "base", "b": "response"}
+    sensors = [{"column": name, "role": role, "axis": "x", "unit": "m/s²"} for name, role in roles.items()]
+    paths = [tmp_path / run / f"{name}.csv" for run in ("first", "second") for name in "ab"]
+    for path, row in zip(paths, [*si[:2], *-si[:2]], strict=True):
+        path.parent.mkdir(exist_ok=True)
+        np.savetxt(path, np.array([time, row]).T, fmt="%.17g", delimiter=";", header="time [s];acc", comments="")
+    test = reading.gather(paths, {"join": True, "sensor": sensors})
+    for (base, response, _), sign in zip(test.runs, (1, -1), strict=True):
+        assert np.array_equal([base[0], response[0]], sign * si[:2])
+    with pytest.raises(sysid.InputError, match=r"a\.csv has no column 'b', which .*b\.csv.*--join"):
+        reading.gather(paths[:2], {"sensor": sensors[1:]})
+    late = (time + 0.5, si[1])
+    np.savetxt(paths[1], np.array(late).T, fmt="%.17g", delimiter=";", header="time [s];acc", comments="")
+    with pytest.raises(sysid.InputError, match=r"b\.csv.*sample 1 is at 0.5 s, that of a\.csv at 0 s.*sysid\.resample"):
+        reading.gather(paths[:2], {"join": True, "sensor": sensors})
