@@ -7,11 +7,13 @@ true ones, 2 with one line that names the file (or its description) and says a w
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import io
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -120,13 +122,97 @@ def _hdf5(folder: Path) -> None:
             file[name].attrs["unit"] = "m/s^2"
 
 
+def _named(name: str) -> Callable[[Path], None]:
+    """An HDF5 file of another name."""
+
+    def done(folder: Path) -> None:
+        _hdf5(folder)
+        (folder / "run.h5").rename(folder / name)
+
+    return done
+
+
+def _matrix(channels: int) -> Callable[[Path], None]:
+    """MATLAB's time and a matrix of which the records of the test are the first two columns."""
+
+    def done(folder: Path) -> None:
+        from scipy.io import savemat
+
+        matrix = np.vstack([_TABLE, _TOP, np.ones((channels - 2, _SAMPLES))]).T
+        savemat(folder / "run.mat", {"x": matrix, "t": np.arange(_SAMPLES) / 100})
+
+    return done
+
+
 def _mat(folder: Path) -> None:
     from scipy.io import savemat
 
     savemat(folder / "run.mat", {"table": _TABLE, "top": _TOP, "fs": 100.0})
 
 
+def _many(content: dict[str, str], toml: str) -> Callable[[Path], None]:
+    """Several text files, and what is said of them."""
+
+    def done(folder: Path) -> None:
+        for name, text in content.items():
+            (folder / name).write_text(text, encoding="utf-8")
+        (folder / "sensors.toml").write_text(toml, encoding="utf-8")
+
+    return done
+
+
+def _with(old: str, new: str) -> list[str]:
+    """The rows with what stands in one cell of the 91st replaced."""
+    rows = _rows()
+    cells = rows[90].split(";")
+    cells[int(old)] = new
+    return [*rows[:90], ";".join(cells), *rows[91:]]
+
+
+def _one_each(shift: float = 0.0, fewer: int = 0) -> dict[str, str]:
+    """A file a sensor; the second begins later, or is shorter."""
+    time = np.arange(_SAMPLES) / 100
+    both = (("run_table", time, _TABLE), ("run_top", (time + shift)[: _SAMPLES - fewer], _TOP))
+    return {
+        f"{name}.csv": "\n".join(["time;a", *(f"{t:.4f};{a:.12g}" for t, a in zip(*pair, strict=False))])
+        for name, *pair in both
+    }
+
+
+def _universal(change: Callable[[str], str] = str, **given: Any) -> Callable[[Path], None]:
+    """Two time records as sets 58, the text changed; nothing where pyuff is not installed."""
+
+    def done(folder: Path) -> None:
+        import pyuff
+
+        sets = [
+            pyuff.prepare_58(
+                **{
+                    "binary": 0, "func_type": 1, "ver_num": 0, "load_case_id": 0, "rsp_ent_name": "NONE",
+                    "rsp_node": node, "rsp_dir": 1, "ref_ent_name": "NONE", "ref_node": 0, "ref_dir": 0,
+                    "ord_data_type": 4, "num_pts": _SAMPLES, "abscissa_spacing": 1, "abscissa_min": 0.0,
+                    "abscissa_inc": 0.01, "abscissa_spec_data_type": 17, "orddenom_spec_data_type": 0,
+                    "z_axis_spec_data_type": 0, "ordinate_spec_data_type": 12, "x": np.arange(_SAMPLES) / 100,
+                    "data": row, "id1": "", "id2": "", "id3": "", "id4": "", "id5": "",
+                }
+                | given
+            )
+            for node, row in ((1, _TABLE), (2, _TOP))
+        ]  # fmt: skip
+        pyuff.UFF(str(folder / "run.uff")).write_sets(sets, "overwrite")
+        path, toml = folder / "run.uff", _TOML.replace('"table"', '"1+X"').replace('"top"', '"2+X"')
+        path.write_text(change(path.read_text()))
+        (folder / "sensors.toml").write_text(toml)
+
+    return done
+
+
 _STATED = _TOML.replace('axis = "x"', 'axis = "x"\nunit = "m/s^2"')
+_MATRIX = _STATED.replace('"table"', '"x[1]"').replace('"top"', '"x[2]"')
+_SECOND = _TOML.partition("[[sensor]]\n")[2].partition("[[sensor]]\n")[2].replace("column", 'name = "top"\ncolumn')
+_SECOND = "[[sensor]]\n" + _SECOND.replace('column = "top"', "column = 2")
+_TURNS = _HEAD.replace("table [m/s^2]", "table [rad/s^2]")
+_EACH = _STATED.replace('"table"', '"run_table"').replace('"top"', '"run_top"')
 _WIDE = ";".join(["time [s]", "table [m/s^2]", "top [m/s^2]", *(f"A{k} [g]" for k in range(998))])
 _CASES: list[Case] = [
     ("as it should be", _text(_rows()), _READ),
@@ -143,6 +229,25 @@ _CASES: list[Case] = [
     ("empty", _text([], ""), "is empty"),
     ("words alone", _text(["one", "two"], "three"), "no table of numbers"),
     ("a bad row in the middle", _text([*_rows()[:90], "x;y;z", *_rows()[90:]]), "line 92"),
+    ("a number that is none", _text(_with("2", "NaN")), "sample 91"),
+    ("an error of a spreadsheet", _text(_with("2", "#N/A")), "line 92"),
+    ("one number cell too many", _text(_with("2", "1;2")), "line 92"),
+    ("only a header", _text([]), "no table of numbers"),
+    ("one row", _text(_rows()[:1]), "no record"),
+    ("time that runs backwards", _text(_rows()[::-1]), "backwards"),
+    ("time that stands still", _text([row[:3] + row[6:] for row in _rows()]), "--rate"),
+    ("time of day", _text([f"01.03.2024 12:00:0{row}" for row in _rows()]), _READ),
+    ("a folder", lambda folder: (folder / "run.csv").mkdir(), "is a folder"),
+    ("line ends of old Macs", _bytes("run.csv", "\r".join([_HEAD, *_rows()]).encode()), _READ),
+    ("zeros behind the end", _bytes("run.csv", "\n".join([_HEAD, *_rows(), "\0" * 99]).encode()), _READ),
+    ("two sensors of one name", _both(_text(_rows()), _TOML + _SECOND), "name them apart"),
+    ("a base that turns", _both(_text(_rows(), _TURNS), _TOML.replace('"x"', '"rx"', 1)), _READ),
+    ("and no position", _both(_text(_rows(), _TURNS), _TOML.replace('"x"', '"rx"', 1).partition("pos")[0]), "turns"),
+    ("a file a sensor", _many(_one_each(), "join = true\n" + _EACH), _READ),
+    ("a file a sensor, not said", _many(_one_each(), _EACH), "--join"),
+    ("a file a sensor, of other times", _many(_one_each(shift=0.5), "join = true\n" + _EACH), "sysid.resample"),
+    ("a file a sensor, one short", _many(_one_each(fewer=90), "join = true\n" + _EACH), "210 samples"),
+    ("a file a sensor, one a sample short", _many(_one_each(fewer=1), "join = true\n" + _EACH), _READ),
     ("a gap in a channel", _text([*_rows()[:90], "0.9000;;1", *_rows()[91:]]), "sample 91"),
     ("overflow of the logger", _text([*_rows()[:90], "0.9000;inf;1", *_rows()[91:]]), "sample 91"),
     ("two tests in one file", _text([*_rows(), *_rows()]), "two tests"),
@@ -169,6 +274,7 @@ _CASES: list[Case] = [
     ("a UFF without sets", _bytes("run.uff", b"    -1\n    -1\n"), "run.uff"),
     ("a UFF with an unknown set", _bytes("run.uff", b"    -1\n  9999\n 1 2 3\n    -1\n"), "run.uff"),
     ("a set 58 cut inside its head", _bytes("run.uff", b"    -1\n    58\nNONE\nNONE\n    -1\n"), "set 1"),
+    ("HDF5 named CSV", _named("run.csv"), "ending .h5"),
     ("NPZ", _both(_npz(table=_TABLE, top=_TOP, fs=np.array(100.0)), _STATED), _READ),
     ("NPZ without a rate", _both(_npz(table=_TABLE, top=_TOP), _STATED), "sample_rate"),
     ("NPZ cut short", _both(_cut(_npz(table=_TABLE, top=_TOP), "run.npz", 0.7), _STATED), "run.npz"),
@@ -176,6 +282,28 @@ _CASES: list[Case] = [
     ("NPZ of single numbers", _both(_npz(a=np.array(1.0)), _STATED), "no arrays"),
     ("MAT", _both(_mat, _STATED), _READ),
     ("MAT cut short", _both(_cut(_mat, "run.mat", 0.6), _STATED), "run.mat"),
+    ("MAT with time along its longer side", _both(_matrix(3), _MATRIX), _READ),
+    ("MAT of more channels than samples", _both(_matrix(1000), _MATRIX), _READ),
+    ("NPZ of complex numbers without frequencies", _both(_npz(table=_TABLE + 1j, top=_TOP), _STATED), "--frequency"),
     ("HDF5", _hdf5, _READ),
     ("HDF5 cut short", _cut(_hdf5, "run.h5", 0.6), "run.h5"),
 ]
+if importlib.util.find_spec("pyuff") is not None:
+    _CASES += [
+        ("UFF", _universal(), _READ),
+        ("UFF cut short", _universal(lambda text: text[: int(0.8 * len(text))]), "cut short"),
+        ("UFF cut inside a number", _universal(lambda text: text[:-40] + "\n    -1\n"), "set 2"),
+        ("UFF of another type", _universal(lambda text: text.replace("    58", "    55", 1)), "run.uff"),
+        ("UFF of a type that is none", _universal(lambda text: text.replace("    58", "  9958", 1)), "run.uff"),
+        ("UFF with words for numbers", _universal(lambda text: text.replace("E", "x", 60)), "run.uff"),
+        ("UFF with the line ends of Windows", _universal(lambda text: text.replace("\n", "\r\n")), _READ),
+        (
+            "UFF with fewer points than it says",
+            _universal(lambda text: text.replace("       300", "       900", 1)),
+            "set 1",
+        ),
+        ("UFF of an unknown unit", _universal(ordinate_axis_units_lab="furlong"), "furlong"),
+        ("UFF of no unit", _universal(ordinate_spec_data_type=0), "unit"),
+        ("UFF of one channel twice", _universal(rsp_node=1), "'2+X'"),
+        ("UFF of coherences", _universal(func_type=6), "coherence"),
+    ]
