@@ -11,6 +11,7 @@ import numpy as np
 
 from sysid.compare.comparison import Comparison
 from sysid.compare.method_result import MATRICES, MethodResult, Status
+from sysid.results.phases import seconds_in_words
 
 _WIDTH = 120
 
@@ -44,7 +45,7 @@ def line(result: MethodResult) -> str:
     if not result.ran:
         return f"{result.name}: {result.status.value}"
     before = f"{_number(result.before, '.2e')} -> " if np.isfinite(result.before) else ""
-    return f"{result.name}: {result.status.value}, {before}{result.after:.2e}, {result.seconds:.1f} s"
+    return f"{result.name}: {result.status.value}, {before}{result.after:.2e}, {seconds_in_words(result.seconds)}"
 
 
 def as_csv(comparison: Comparison) -> str:

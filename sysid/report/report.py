@@ -20,7 +20,7 @@ from sysid.report.opening import opening, trust
 from sysid.results.gain_table import gains_of_sensors
 from sysid.results.identification import Identification
 from sysid.results.noise_table import noise_of_channels
-from sysid.results.phases import COLUMNS, rows_of_phases
+from sysid.results.phases import COLUMNS, rows_of_phases, seconds_in_words
 from sysid.results.storage import atomically, file_or_folder
 from sysid.results.summary import (
     counted,
@@ -384,7 +384,7 @@ def _what_ran(it: Identification) -> str:
     facts += [
         ["strategy", it.strategy],
         ["seed", "–" if it.seed is None else it.seed],
-        ["wall time", f"{it.history.wall_time:.2g} s"],
+        ["wall time", seconds_in_words(it.history.wall_time)],
         *_models(problem),
         ["sysid", __version__],
     ]

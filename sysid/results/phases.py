@@ -15,6 +15,11 @@ from sysid.structure.structure import Array, Structure
 COLUMNS = ("after", "objective", "residual", "frequencies, %", "1 - MAC", "M, %", "K, %", "C, %", "candidates", "s")
 
 
+def seconds_in_words(seconds: float) -> str:
+    """A time with two digits, or whole seconds: "0.031 s", "4.2 s", "123 s"."""
+    return f"{seconds:.2g} s" if not seconds >= 99.5 else f"{seconds:.0f} s"
+
+
 class Searched(Protocol):
     """A result, as far as its phases go."""
 

@@ -12,7 +12,7 @@ from sysid.assessment.sensitivity import blocks_of
 from sysid.results.answer import NOT_JUDGED, Answer
 from sysid.results.gain_table import gains_of_sensors
 from sysid.results.noise_table import noise_of_channels
-from sysid.results.phases import COLUMNS, rows_of_phases
+from sysid.results.phases import COLUMNS, rows_of_phases, seconds_in_words
 from sysid.results.unknowns_table import MANY, rows_of, stated_values
 from sysid.structure.structure import Array
 
@@ -33,7 +33,7 @@ def summary(it: Answer) -> str:
         "",
         *_unknowns(it),
         f"{'success' if it.success else 'no success'}: {it.message}",
-        f"relative residual {residual_in_words(it)}{force}; seed {it.seed}, {it.history.wall_time:.2g} s",
+        f"relative residual {residual_in_words(it)}{force}; seed {it.seed}, {seconds_in_words(it.history.wall_time)}",
         *_phases(it),
         *it.remarks,
         "rigid-body mass " + ", ".join(_rigid_masses(it, axes)),

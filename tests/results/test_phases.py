@@ -8,7 +8,7 @@ import pytest
 import sysid
 from sysid.report.report import render
 from sysid.results.answer import modal_assurance
-from sysid.results.phases import COLUMNS, errors, rows_of_phases
+from sysid.results.phases import COLUMNS, errors, rows_of_phases, seconds_in_words
 
 
 @pytest.fixture(scope="module")
@@ -87,3 +87,8 @@ def test_the_answer_is_told_without_building_it_again(random_case, monkeypatch):
     result = sysid.identify(problem, strategy="modal", rng=0)
     monkeypatch.setattr(type(problem), "structure", lambda *given: pytest.fail("the matrices were built"))
     assert [row[0] for row in rows_of_phases(result)] == ["local phase"]
+
+
+def test_seconds_are_neither_rounded_to_nothing_nor_written_with_a_power():
+    told = {0.0004: "0.0004 s", 0.0312: "0.031 s", 4.21: "4.2 s", 99.4: "99 s", 99.6: "100 s", 1234.5: "1234 s"}
+    assert {seconds: seconds_in_words(seconds) for seconds in told} == told
