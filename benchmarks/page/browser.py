@@ -50,10 +50,9 @@ for (const one of document.querySelectorAll("input[type=range]")) {
   one.value = 200;
   one.dispatchEvent(new Event("input"));
 }
-window.dispatchEvent(new Event("beforeprint"));
-told.sheets = document.querySelectorAll(".paper svg").length;
-window.dispatchEvent(new Event("afterprint"));
-told.left = document.querySelectorAll(".paper").length;
+const sheets = [...document.querySelectorAll(".sheet svg")];
+told.sheets = sheets.length;
+told.stills = sheets.filter((one) => one.getBoundingClientRect().width > 0).length;
 const moving = () => [...document.querySelectorAll(".shapes circle")].map((one) => one.getAttribute("cx")).join();
 told.over = [...document.querySelectorAll("body *")]
   .filter((one) => !one.closest(".scroll, pre, svg, [hidden], noscript"))

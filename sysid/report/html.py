@@ -22,10 +22,11 @@ _WIDE = 11  # columns beyond which a table is printed smaller
 
 STYLE = """
 :root { color-scheme: light dark; --paper: #fff; --ink: #1f2430; --soft: #5a6472; --line: #dde2e7; --fill: #f1f4f6;
-  --link: #0b5c96; --good: #0a7d5a; --warn: #a35f00; --bad: #b3261e; --found: #0068a8; --left: #a34a00; }
+  --link: #0b5c96; --good: #0a7d5a; --warn: #a35f00; --bad: #b3261e; --found: #0068a8; --left: #a34a00;
+  --seen: #a0a5ac; }
 @media screen and (prefers-color-scheme: dark) { :root { --paper: #14181d; --ink: #e6eaee; --soft: #a9b3be;
   --line: #39424c; --fill: #20272e; --link: #86bfee; --good: #3cc296; --warn: #e5a94b; --bad: #f47f77;
-  --found: #62b6f0; --left: #f0995a; } }
+  --found: #62b6f0; --left: #f0995a; --seen: #767f89; } }
 * { box-sizing: border-box; }
 body { margin: 0 auto; padding: 1.2rem 1.5rem 4rem; max-width: 1120px; color: var(--ink); background: var(--paper);
   font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", "DejaVu Sans", sans-serif; }
@@ -72,24 +73,28 @@ svg .title { fill: var(--ink); font-size: 12px; }
 svg path, svg line { fill: none; stroke-width: 1.6; vector-effect: non-scaling-stroke; }
 svg .grid { stroke: var(--line); stroke-width: 1; } svg .cursor { stroke: var(--soft); stroke-width: 1; }
 svg .zoom { fill: var(--soft); opacity: .2; }
-svg .measured { stroke: var(--ink); opacity: .75; } svg .identified { stroke: var(--found); }
+svg .measured { stroke: var(--seen); stroke-width: 3; } svg .identified { stroke: var(--found); }
 svg .recorded, svg .rest { stroke: var(--soft); opacity: .6; stroke-width: 1; } svg .left { stroke: var(--left); }
 svg .noise { stroke: var(--soft); stroke-dasharray: 5 3; } svg .band { stroke: var(--found); stroke-dasharray: 2 3; }
 svg .dot { fill: var(--found); } svg .base { fill: var(--soft); }
-.key { border-top: 3px solid var(--soft); font-size: .85rem; } .key.measured { border-color: var(--ink); }
+.legend { display: flex; flex-wrap: wrap; gap: .3rem .9rem; margin: .6rem 0 0; max-width: none; }
+.key { border-top: 3px solid var(--soft); font-size: .85rem; } .key.measured { border-color: var(--seen); }
 .key.identified { border-color: var(--found); } .key.left { border-color: var(--left); }
 .key.noise { border-top-style: dashed; } .key.band { border-top: 3px dotted var(--found); }
-[hidden] { display: none !important; } .paper { display: none; }
+[hidden] { display: none !important; }
+.sheets { display: flex; flex-wrap: wrap; gap: 0 1rem; } .sheet { flex: 1 1 330px; max-width: 540px; min-width: 0; }
+.sheet p { margin: .6rem 0 0; font-size: .85rem; } .sheet svg { width: 100%; }
+@media screen { .drawn .sheets { display: none; } }
 @media (max-width: 600px) { body { padding: .8rem .8rem 3rem; font-size: 14px; } th, td { padding: .2rem .4rem; }
   h1 { font-size: 1.25rem; } }
 @media print { body { max-width: none; padding: 0; font-size: 10pt; }
-  nav, .controls, .area, .told { display: none; } .modes { break-inside: auto; }
-  .paper { display: block; } .sheet, .shapes svg { break-inside: avoid; } .shapes { display: block; }
-  .shapes svg { display: inline-block; }
+  nav, .controls, .area, .told { display: none; } .modes, .curves { break-inside: auto; }
+  .sheet, .shapes svg { break-inside: avoid; } .shapes, .sheets { display: block; }
+  .sheet { display: inline-block; width: 49%; } .shapes svg { display: inline-block; }
   .scroll { overflow: visible; } table { font-size: 7.5pt; } .wide { font-size: 5.5pt; }
   th, td { padding: .1rem .3rem; } tr { break-inside: avoid; }
-  h2, h3, figcaption { break-after: avoid; } h2 + *, h3 + *, .soft + * { break-before: avoid; }
-  .soft { break-after: avoid; }
+  h2, h3, figcaption, .soft, .legend, .sheet p { break-after: avoid; } p, li { break-inside: avoid; }
+  h2 + *, h3 + *, .soft + *, .legend + * { break-before: avoid; }
   pre { white-space: pre-wrap; } }
 """
 

@@ -29,7 +29,7 @@ def test_every_control_works_and_the_page_is_readable(result, tmp_path, width, d
     assert told["used"]["select"] >= 4 and set(told["used"]) >= {"Zoom in", "Zoom out", "All lines", "Stop"}
     assert "Hz: measured" in told["hover"] and "noise" in told["hover"] and "95 % interval" in told["hover"]
     assert told["zoomed"] and told["whole"] and told["all_lines"] and told["keys"] and told["moved"]
-    assert told["sheets"] == (3 + 2) * 2 and told["left"] == 0  # every channel of both runs, on paper alone
+    assert told["sheets"] == (3 + 2) * 2 and told["stills"] == 0  # every channel of both runs, on paper alone
     assert told["over"] == [] and told["sideways"] <= 0
     assert max(told["first"]) < 800  # judgement, next step, masses and frequencies on the first screen
     assert told["contrast"] >= 4.5

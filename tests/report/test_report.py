@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 import hashlib
+import html
 import json
 import re
 from html.parser import HTMLParser
@@ -192,6 +193,24 @@ def test_every_channel_of_every_test_is_in_its_curves(complete, page):
     assert "noise" in fitted["channels"][0] and "noise" not in unseen["channels"][0]
     assert len(shapes["points"]) == 3 + 1 and len(shapes["shapes"]) == 3  # the sensors' places and the base
     assert shapes["shapes"][0][0] == [0, 0, 0]
+
+
+def test_without_its_script_the_page_shows_all_curves_and_modes(complete, page):
+    """Of each channel in each run; the script is what hides them."""
+    sheets = re.findall(r'<div class="sheet"><p>(.*?)</p>(.*?)</div>', page, re.DOTALL)
+    names = [*complete.measurement.sensor_names, "base force x", "base force y"]
+    assert [html.unescape(name) for name, _ in sheets] == [
+        *(f"{name}, base {axis}" for name in names for axis in "xy"),
+        *(f"{name}, run {run}" for name in names[:3] for run in (1, 2)),
+    ]
+    for k, (_, drawing) in enumerate(sheets):
+        kinds = re.findall(r'<path class="(measured|identified|left|noise|band)" d="M[^"]+"', drawing)
+        fitted = ["noise"] * (k < 10)  # no noise is known of the test that was not fitted
+        assert kinds == ["measured", "identified", "measured", "identified", "left", *fitted, "band"]
+        assert "frequency [Hz]" in drawing and "phase [°]" in drawing
+    (shapes,) = re.findall(r'<div class="shapes">(.*?)</div>', page)
+    assert shapes.count("<svg") == shapes.count('class="base"') == complete.structure.n
+    assert "noscript" not in page
 
 
 def unpacked(text):
