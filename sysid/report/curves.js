@@ -83,19 +83,19 @@ function scale(low, high, from, to, log, wide) {
   return along;
 }
 
-function line(x, y, freq, values, first, last, jump) {
+function line(x, y, freq, gaps, values, first, last, jump) {
   let path = "";
   let before = NaN;
   for (let at = first; at <= last; at += 1) {
     const up = Number.isFinite(values[at]) ? y(values[at]) : NaN;
-    if (Number.isFinite(up)) path += `${Math.abs(up - before) <= jump ? "L" : "M"}${x(freq[at]).toFixed(1)} ${up.toFixed(1)}`;
+    if (Number.isFinite(up)) path += `${Math.abs(up - before) <= jump && !gaps.includes(at) ? "L" : "M"}${x(freq[at]).toFixed(1)} ${up.toFixed(1)}`;
     before = up;
   }
   return path;
 }
 
 // One panel of curves: an array of {kind, values}, over the lines from `first` to `last`.
-function panel(svg, top, height, width, x, freq, [first, last], curves, title, options) {
+function panel(svg, top, height, width, x, { freq, gaps }, [first, last], curves, title, options) {
   const inner = [top + MARGIN.top, top + height - MARGIN.bottom];
   let [low, high] = [Infinity, -Infinity];
   for (const { kind, values } of curves) {
@@ -127,7 +127,7 @@ function panel(svg, top, height, width, x, freq, [first, last], curves, title, o
   const jump = options.range ? Math.abs(inner[1] - inner[0]) / 2 : Infinity;
   for (const { kind, values: all } of curves) {
     const values = kind === "band" ? all.map((value) => (value < low ? NaN : value)) : all;
-    drawn(svg, "path", { d: line(x, y, freq, values, first, last, jump), class: kind });
+    drawn(svg, "path", { d: line(x, y, freq, gaps, values, first, last, jump), class: kind });
   }
 }
 
@@ -152,7 +152,7 @@ function spectra(data, channel, run) {
   };
 }
 
-function drawCurves(parent, freq, channel, values, [first, last], width, heights, recorded = false) {
+function drawCurves(parent, { freq, gaps }, channel, values, [first, last], width, heights, recorded = false) {
   const total = heights.reduce((sum, one) => sum + one, 0);
   const svg = drawn(parent, "svg", { viewBox: `0 0 ${width} ${total}`, width, height: total, role: "img" });
   drawn(svg, "title", {}, `${channel.name}: measured and identified ${channel.words}`);
@@ -163,12 +163,12 @@ function drawCurves(parent, freq, channel, values, [first, last], width, heights
   const left = [{ kind: "left", values: values.left }];
   for (const kind of ["noise", "band"]) if (values[kind]) left.push({ kind, values: values[kind] });
   const title = `${channel.name}: ${channel.words} [${channel.unit}]`;
-  panel(svg, 0, heights[0], width, x, freq, [first, last], amplitude, title, { log: DECADES[0] });
+  panel(svg, 0, heights[0], width, x, { freq, gaps }, [first, last], amplitude, title, { log: DECADES[0] });
   const turns = { range: [LOWEST, HIGHEST], ticks: [-180, -90, 0] };
-  panel(svg, heights[0], heights[1], width, x, freq, [first, last], phase, "phase [°]", turns);
+  panel(svg, heights[0], heights[1], width, x, { freq, gaps }, [first, last], phase, "phase [°]", turns);
   const below = { log: DECADES[2], bottom: true };
   const beside = `difference of measured and identified${values.noise ? ", and noise" : ""} [${channel.unit}]`;
-  panel(svg, heights[0] + heights[1], heights[2], width, x, freq, [first, last], left, beside, below);
+  panel(svg, heights[0] + heights[1], heights[2], width, x, { freq, gaps }, [first, last], left, beside, below);
   return { svg, x, total };
 }
 
@@ -226,7 +226,7 @@ function startCurves(figure) {
     for (const kind of ["noise", "band"]) legend.querySelector(`.${kind}`)?.toggleAttribute("hidden", !values[kind]);
     area.replaceChildren();
     const width = Math.max(300, Math.min(1072, area.clientWidth));
-    view = drawCurves(area, freq, channel, values, range, width, [230, 120, 150], tick.checked && values.recorded);
+    view = drawCurves(area, { freq, gaps: data.gaps }, channel, values, range, width, [230, 120, 150], tick.checked && values.recorded);
     tell();
   }
 

@@ -34,9 +34,14 @@ def script() -> str:
 def curves(it: Identification, test: Measurement) -> str:
     """Element of the responses and the base force of a test: of all, without the script; with it one, to be chosen."""
     channels, runs = [*_responses(it, test), *_forces(it, test)], run_names(test)
-    content = {"freq": _packed(test.freq), "runs": runs, "channels": list(map(_told, channels))}
+    content = {
+        "freq": _packed(test.freq),
+        "gaps": test.gaps.tolist(),
+        "runs": runs,
+        "channels": list(map(_told, channels)),
+    }
     drawn = "".join(
-        curve_sheet(f"{channel.name}, {name}" if len(runs) > 1 else channel.name, test.freq, channel, run)
+        curve_sheet(f"{channel.name}, {name}" if len(runs) > 1 else channel.name, test.freq, channel, run, test.gaps)
         for channel in channels
         for run, name in enumerate(runs)
     )

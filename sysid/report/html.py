@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 ROUND_OFF = 1e-12
 _WIDE = 11  # columns beyond which a table is printed smaller
+_BLOCK = 10  # columns of a matrix that stand beside each other, on paper too
 
 STYLE = """
 :root { color-scheme: light dark; --paper: #fff; --ink: #1f2430; --soft: #5a6472; --line: #dde2e7; --fill: #f1f4f6;
@@ -33,8 +34,8 @@ body { margin: 0 auto; padding: 1.2rem 1.5rem 4rem; max-width: 1120px; color: va
 h1 { font-size: 1.5rem; line-height: 1.25; margin: 0 0 .2rem; overflow-wrap: anywhere; }
 h2 { font-size: 1.25rem; margin: 2.4rem 0 .6rem; padding-bottom: .25rem; border-bottom: 1px solid var(--line); }
 h3 { font-size: 1rem; margin: 1.4rem 0 .4rem; }
-p { margin: .5rem 0; max-width: 76ch; overflow-wrap: anywhere; }
-ul { margin: .3rem 0; padding-left: 1.3rem; max-width: 76ch; overflow-wrap: anywhere; }
+p, figcaption { margin: .5rem 0; max-width: 92ch; overflow-wrap: anywhere; text-wrap: pretty; }
+ul { margin: .3rem 0; padding-left: 1.3rem; max-width: 92ch; overflow-wrap: anywhere; text-wrap: pretty; }
 .pair { display: flex; flex-wrap: wrap; gap: 0 1.5rem; align-items: flex-start; }
 .pair figure { flex: 1 1 420px; min-width: 0; }
 .mark { border: 1px solid var(--line); border-radius: 3px; padding: 0 .4em; margin-right: .5em; color: var(--soft);
@@ -53,6 +54,7 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size
 th, td { padding: .2rem .65rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
 thead th { border-bottom: 1.5px solid var(--soft); vertical-align: bottom; font-weight: 600;
   white-space: normal; max-width: 9em; }
+@media screen { table { width: max-content; } .words { width: auto; } }
 .words td, .words th { text-align: left; white-space: normal; vertical-align: top; }
 th:first-child, td:first-child { text-align: left; font-weight: 500; }
 .words td:first-child { white-space: nowrap; }
@@ -90,7 +92,8 @@ svg .dot { fill: var(--found); } svg .base { fill: var(--soft); }
 @media print { body { max-width: none; padding: 0; font-size: 10pt; }
   nav, .controls, .area, .told { display: none; } .modes, .curves { break-inside: auto; }
   .sheet, .shapes svg { break-inside: avoid; } .shapes, .sheets { display: block; }
-  .sheet { display: inline-block; width: 49%; } .shapes svg { display: inline-block; }
+  .sheet { display: inline-block; width: 49%; } .shapes svg { display: inline-block; width: 24%; }
+  .shapes, .sheets { orphans: 1; widows: 1; }
   .scroll { overflow: visible; } table { font-size: 7.5pt; } .wide { font-size: 5.5pt; }
   th, td { padding: .1rem .3rem; } tr { break-inside: avoid; }
   h2, h3, figcaption, .soft, .legend, .sheet p { break-after: avoid; } p, li { break-inside: avoid; }
@@ -175,10 +178,16 @@ def matrix(
     """
     values = np.where(np.abs(values) > ROUND_OFF * np.abs(values).max(), values, 0.0)
     lines = [
-        [name, *(Cell(number(v), lower) for v, lower in zip(line, under, strict=True))]
-        for name, line, under in zip(rows, values, below or no_lines(values.shape), strict=True)
+        [Cell(number(v), lower) for v, lower in zip(line, under, strict=True)]
+        for line, under in zip(values, below or no_lines(values.shape), strict=True)
     ]
-    return table(["", *columns], lines, caption, label=label)
+    parts, count = [], len(columns)
+    for block in np.array_split(np.arange(count), max(1, -(-count // _BLOCK))):
+        first, last = block[0], block[-1] + 1
+        cells = [[name, *line[first:last]] for name, line in zip(rows, lines, strict=True)]
+        which = f"; columns {first + 1} to {last} of {count}" * (block.size < count)
+        parts.append(table(["", *columns[first:last]], cells, f"{caption}{which}", label=label))
+    return "".join(parts)
 
 
 def no_lines(shape: tuple[int, ...]) -> list[list[tuple[str, ...]]]:

@@ -15,8 +15,8 @@ ONE_OF_MANY, CHOSEN = "one of many", "as the modal masses were chosen"
 SAME = 1e-9  # of a value: a smaller difference is round-off
 _ENDS_ELSEWHERE = " How far the entries may go is in the result's mass_interval and stiffness_interval."
 _ENDS_BELOW = (
-    " Below an entry of M_SS and K_SS: the least … and the … greatest value that it takes in any model that explains "
-    "the data and holds what was stated."
+    " Below an entry of M_SS and K_SS: from where … to where it goes in the models that explain the data and hold what "
+    "was stated."
 )
 
 Lines = list[list[tuple[str, ...]]]  # below each entry of a matrix
@@ -92,6 +92,12 @@ def _ranges(ends: Array, otherwise: Lines) -> Lines:
     """Lines below the entries of a matrix: both ends of their range (2, n, n), or `otherwise` where they are one."""
     lines = [list(line) for line in otherwise]
     for i, j in np.argwhere(~np.isclose(ends[0], ends[1], rtol=SAME, atol=0.0)):
-        least, most = (number(end, 3) if np.isfinite(end) else "unbounded" for end in ends[:, i, j])
-        lines[i][j] = (f"{least} …", f"… {most}")
+        least, most = (number(end, 3) for end in ends[:, i, j])
+        bounded = np.isfinite(ends[:, i, j])
+        told = {
+            (True, True): (f"{least} …", f"… {most}"),
+            (True, False): (f"from {least}",),
+            (False, True): (f"to {most}",),
+        }
+        lines[i][j] = told.get((bool(bounded[0]), bool(bounded[1])), ("any value",))
     return lines

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sysid.report.html import text
 from sysid.structure.structure import Array, ComplexArray
@@ -76,14 +76,17 @@ class _Panel(NamedTuple):
     decades: int
 
 
-def curve_sheet(name: str, freq: Array, channel: Channel, run: int) -> str:
-    """One channel in one run: magnitude, phase, and what is left of it beside its noise."""
+def curve_sheet(name: str, freq: Array, channel: Channel, run: int, gaps: ArrayLike = ()) -> str:
+    """One channel in one run: magnitude, phase, and what is left of it beside its noise.
+
+    No curve is joined at `gaps`, lines before which others were left out.
+    """
     across = _Axis(freq[0], freq[-1], _LEFT, _WIDTH - _RIGHT, bool(freq[0] > 0 and freq[-1] > _WIDE * freq[0]))
     drawn, bottom = [], 0
     for panel, height in zip(_panels(channel, run), _HEIGHTS, strict=True):
         top = bottom + _TITLE
         bottom = top + height
-        drawn.append(_drawn(panel, across, _upward(panel, bottom, top), across(freq)))
+        drawn.append(_drawn(panel, across, _upward(panel, bottom, top), across(freq), gaps))
     for value in across.ticks(_APART):
         drawn.append(f'<text x="{float(across(value)):.1f}" y="{bottom + 14}" text-anchor="middle">{value:g}</text>')
     drawn.append(f'<text x="{_WIDTH - _RIGHT}" y="{bottom + 27}" text-anchor="end">frequency [Hz]</text>')
@@ -167,8 +170,8 @@ def _svg(title: str, width: int, height: int, content: str) -> str:
     )
 
 
-def _drawn(panel: _Panel, across: _Axis, up: _Axis, x: Array) -> str:
-    """Title, grid and curves of a panel; `x` is where the frequencies are."""
+def _drawn(panel: _Panel, across: _Axis, up: _Axis, x: Array, gaps: ArrayLike) -> str:
+    """Title, grid and curves of a panel; `x` is where the frequencies are, `gaps` at which no curve is joined."""
     parts = [f'<text class="title" x="{_LEFT}" y="{up.end - 5:g}">{text(panel.title)}</text>']
     for value in up.ticks(_ABOVE) if panel.decades else [-180.0, -90.0, 0.0]:
         y = float(up(value))
@@ -180,7 +183,7 @@ def _drawn(panel: _Panel, across: _Axis, up: _Axis, x: Array) -> str:
     jump = np.inf if panel.decades else abs(up.start - up.end) / 2
     for kind, values in panel.curves.items():
         seen = np.where(values < up.low, np.nan, values) if kind == "band" else values
-        parts.append(f'<path class="{kind}" d="{_path(x, up(seen), jump)}"/>')
+        parts.append(f'<path class="{kind}" d="{_path(x, up(seen), jump, gaps)}"/>')
     return "".join([*parts, "</g>"])
 
 
@@ -205,10 +208,11 @@ def _log_ticks(low: float, high: float, room: float) -> list[float]:
     return [value for value in numbers if low <= value <= high]
 
 
-def _path(x: Array, y: Array, jump: float) -> str:
+def _path(x: Array, y: Array, jump: float, gaps: ArrayLike) -> str:
     """A curve in whole steps of part of a pixel, left out where it is not finite and where it jumps."""
     kept = np.flatnonzero(np.isfinite(y))
-    breaks = np.flatnonzero((np.diff(kept) > 1) | (np.abs(np.diff(y[kept])) > jump)) + 1
+    apart = (np.diff(kept) > 1) | (np.abs(np.diff(y[kept])) > jump) | np.isin(kept[1:], gaps)
+    breaks = np.flatnonzero(apart) + 1
     return "".join(_segment(x[part], y[part]) for part in np.split(kept, breaks) if part.size)
 
 

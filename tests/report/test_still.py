@@ -97,3 +97,14 @@ def test_what_is_level_or_nothing_has_axes(values):
     drawing = sheet(np.linspace(1.0, 3.0, 30), values)
     assert "nan" not in drawing and "inf" not in drawing
     assert len(re.findall('class="grid"', drawing)) > 10
+
+
+def test_no_curve_is_joined_where_lines_were_left_out():
+    freq = np.linspace(1.0, 20.0, 60)
+    drawing = sheet(freq, oscillator(freq))
+    assert not any(np.isnan(one).any() for one in curves(drawing, "identified"))
+    channel = Channel("tip", "transmissibility", "–", oscillator(freq)[None], oscillator(freq)[None], None, None)
+    size, _ = curves(curve_sheet("tip", freq, channel, 0, [25]), "identified")
+    (gap,) = np.flatnonzero(np.isnan(size[:, 0]))
+    across = scales(drawing)[0]
+    np.testing.assert_allclose(across(size[[gap - 1, gap + 1], 0]), freq[24:26], rtol=0.01)
