@@ -162,12 +162,12 @@ function drawCurves(parent, { freq, gaps }, channel, values, [first, last], widt
   const phase = [{ kind: "measured", values: values.phase }, { kind: "identified", values: values.phaseIdentified }];
   const left = [{ kind: "left", values: values.left }];
   for (const kind of ["noise", "band"]) if (values[kind]) left.push({ kind, values: values[kind] });
-  const title = `${channel.name}: ${channel.words} [${channel.unit}]`;
+  const title = `${width < 600 ? "" : `${channel.name}: `}${channel.words} [${channel.unit}]`;
   panel(svg, 0, heights[0], width, x, { freq, gaps }, [first, last], amplitude, title, { log: DECADES[0] });
   const turns = { range: [LOWEST, HIGHEST], ticks: [-180, -90, 0] };
   panel(svg, heights[0], heights[1], width, x, { freq, gaps }, [first, last], phase, "phase [°]", turns);
   const below = { log: DECADES[2], bottom: true };
-  const beside = `difference of measured and identified${values.noise ? ", and noise" : ""} [${channel.unit}]`;
+  const beside = `difference${values.noise ? " and noise" : ""} [${channel.unit}]`;
   panel(svg, heights[0] + heights[1], heights[2], width, x, { freq, gaps }, [first, last], left, beside, below);
   return { svg, x, total };
 }
@@ -225,7 +225,7 @@ function startCurves(figure) {
     withTransients.hidden = !values.recorded;
     for (const kind of ["noise", "band"]) legend.querySelector(`.${kind}`)?.toggleAttribute("hidden", !values[kind]);
     area.replaceChildren();
-    const width = Math.max(300, Math.min(1072, area.clientWidth));
+    const width = Math.max(300, Math.min(1200, area.clientWidth));
     view = drawCurves(area, { freq, gaps: data.gaps }, channel, values, range, width, [230, 120, 150], tick.checked && values.recorded);
     tell();
   }

@@ -29,7 +29,7 @@ STYLE = """
   --line: #39424c; --fill: #20272e; --link: #86bfee; --good: #3cc296; --warn: #e5a94b; --bad: #f47f77;
   --found: #62b6f0; --left: #f0995a; --seen: #767f89; } }
 * { box-sizing: border-box; }
-body { margin: 0 auto; padding: 1.2rem 1.5rem 4rem; max-width: 1120px; color: var(--ink); background: var(--paper);
+body { margin: 0 auto; padding: 1.2rem 1.5rem 4rem; max-width: 1180px; color: var(--ink); background: var(--paper);
   font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", "DejaVu Sans", sans-serif; }
 h1 { font-size: 1.5rem; line-height: 1.25; margin: 0 0 .2rem; overflow-wrap: anywhere; }
 h2 { font-size: 1.25rem; margin: 2.4rem 0 .6rem; padding-bottom: .25rem; border-bottom: 1px solid var(--line); }
@@ -51,7 +51,7 @@ td small { display: block; color: var(--soft); font-size: .82em; line-height: 1.
 .good strong { color: var(--good); } .warn strong { color: var(--warn); } .bad strong { color: var(--bad); }
 .scroll { overflow-x: auto; margin: .6rem 0 1rem; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .88rem; }
-th, td { padding: .2rem .65rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
+th, td { padding: .2rem .55rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
 thead th { border-bottom: 1.5px solid var(--soft); vertical-align: bottom; font-weight: 600;
   white-space: normal; max-width: 9em; }
 @media screen { table { width: max-content; } .words { width: auto; } }
@@ -59,7 +59,7 @@ thead th { border-bottom: 1.5px solid var(--soft); vertical-align: bottom; font-
 th:first-child, td:first-child { text-align: left; font-weight: 500; }
 .words td:first-child { white-space: nowrap; }
 figure { margin: .8rem 0 1.2rem; break-inside: avoid; }
-img { max-width: 100%; height: auto; display: block; background: #fff; }
+img { max-width: max(100%, 600px); height: auto; display: block; background: #fff; }
 pre { background: var(--fill); padding: .8rem 1rem; overflow-x: auto; font-size: .82rem; line-height: 1.45; }
 nav { margin: .8rem 0; font-size: .9rem; }
 nav a { color: var(--link); margin-right: 1rem; display: inline-block; }
@@ -88,14 +88,17 @@ svg .dot { fill: var(--found); } svg .base { fill: var(--soft); }
 .sheet p { margin: .6rem 0 0; font-size: .85rem; } .sheet svg { width: 100%; }
 @media screen { .drawn .sheets { display: none; } }
 @media (max-width: 600px) { body { padding: .8rem .8rem 3rem; font-size: 14px; } th, td { padding: .2rem .4rem; }
-  h1 { font-size: 1.25rem; } }
+  h1 { font-size: 1.25rem; } .shapes svg { width: calc(50% - .25rem); }
+  .shapes svg text { font-size: 13px; } .shapes svg .title { font-size: 14px; } }
 @media print { body { max-width: none; padding: 0; font-size: 10pt; }
   nav, .controls, .area, .told { display: none; } .modes, .curves { break-inside: auto; }
   .sheet, .shapes svg { break-inside: avoid; } .shapes, .sheets { display: block; }
-  .sheet { display: inline-block; width: 49%; } .shapes svg { display: inline-block; width: 24%; }
+  .sheet { display: inline-block; width: 49%; } .sheet p { margin-top: .2rem; }
+  .shapes svg { display: inline-block; width: 24%; }
   .shapes, .sheets { orphans: 1; widows: 1; }
-  .scroll { overflow: visible; } table { font-size: 7.5pt; } .wide { font-size: 5.5pt; }
-  th, td { padding: .1rem .3rem; } tr { break-inside: avoid; }
+  .scroll { overflow: visible; } img { max-width: 100%; max-height: 3.7in; width: auto; }
+  .pair { flex-wrap: nowrap; } .pair figure { flex-basis: 0; } table { font-size: 7.5pt; } .wide { font-size: 5.5pt; }
+  th, td { padding: .05rem .3rem; line-height: 1.3; } td small { line-height: 1.1; } tr { break-inside: avoid; }
   h2, h3, figcaption, .soft, .legend, .sheet p { break-after: avoid; } p, li { break-inside: avoid; }
   h2 + *, h3 + *, .soft + *, .legend + * { break-before: avoid; }
   pre { white-space: pre-wrap; } }
@@ -202,7 +205,7 @@ def picture(
     width = round(92 * float(figure.get_size_inches()[0]))
     data = base64.b64encode(to_png(figure, dpi=dpi, colours=colours)).decode("ascii")
     image = f'<img width="{width}" alt="{text(alt)}" src="data:image/png;base64,{data}">'
-    return f"<figure>{image}{_caption(caption, label)}</figure>"
+    return f'<figure class="scroll">{image}{_caption(caption, label)}</figure>'
 
 
 def page(title: object, head: str, sections: Iterable[tuple[str, str]], script: str = "") -> str:

@@ -74,10 +74,17 @@ def half_widths(values: Array, std: Array, stated: Array | bool = False) -> Line
         return lines
     size = np.sqrt(np.abs(np.diag(values)))
     for i, j in np.ndindex(*std.shape):
-        width = half_width(float(std[i, j]), float(size[i] * size[j]))
-        told: dict[str, tuple[str, ...]] = {"open": ("open",), "0": ()}
-        lines[i][j] = ("stated",) if stated[i, j] else told.get(width, (f"± {width}",))
+        width = plain(half_width(float(std[i, j]), float(size[i] * size[j])))
+        if stated[i, j] or width == "open":
+            lines[i][j] = ("stated" if stated[i, j] else "open",)
+        elif width != "0":
+            lines[i][j] = (f"± {width}",)
     return lines
+
+
+def plain(width: str) -> str:
+    """A half-width as "110", not "1.1e+02"; words stay."""
+    return width if width == "open" else f"{float(width):.6g}"
 
 
 def stated(it: Identification) -> Array:

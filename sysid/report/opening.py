@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from sysid.report.html import bullets, number, paragraph, sentence, table, text
+from sysid.report.matrices import stated
 from sysid.results.identification import Identification
 from sysid.results.summary import DEVIATES, counted, half_width, next_steps, verdict
 from sysid.results.unknowns_table import rows_of
@@ -100,9 +101,12 @@ def _masses(it: Identification) -> Iterator[tuple[str, str]]:
         yield "total mass", "not determined: no mass is stated and no force was measured (1 kg is taken)"
         return
     masses, std = np.diag(it.structure.rigid_body_mass), np.diag(it.quick_std("rigid_body_mass"))
-    for axis, mass, own in zip(it.measurement.base_axes or (), masses, std, strict=True):
+    by_user = np.diag(stated(it))
+    for axis, mass, deviation, known in zip(it.measurement.base_axes or (), masses, std, by_user, strict=True):
         unit = "kg m²" if axis.startswith("r") else "kg"
-        yield f"total mass, {axis}", _with_interval(mass, own, unit)
+        exact = known and half_width(deviation, mass) in ("open", "0")
+        told = f"{number(mass)} {unit}, as stated" if exact else _with_interval(mass, deviation, unit)
+        yield f"total mass, {axis}", told
 
 
 def _unknowns(it: Identification) -> Iterator[tuple[str, str]]:

@@ -15,7 +15,7 @@ from sysid.problem.formulation import MATRICES
 from sysid.problem.problem import Problem
 from sysid.report.curves import curves, mode_shapes, script
 from sysid.report.html import Cell, beside, bullets, matrix, number, page, paragraph, picture, sentence, table, text
-from sysid.report.matrices import CHOSEN, ONE_OF_MANY, SAME, Lines, half_widths, matrices, stated
+from sysid.report.matrices import CHOSEN, ONE_OF_MANY, SAME, Lines, half_widths, matrices, plain, stated
 from sysid.report.opening import opening, rounded, share_of_noise, trust
 from sysid.results.gain_table import gains_of_sensors
 from sysid.results.identification import Identification
@@ -145,7 +145,7 @@ def _title(it: Identification) -> str:
 def _unknowns(it: Identification) -> str:
     rows = [
         (
-            row.label, number(row.value, 6), half_width(row.std, row.value), row.unit, number(row.lower),
+            row.label, number(row.value, 6), plain(half_width(row.std, row.value)), row.unit, number(row.lower),
             number(row.upper), row.on_bound,
         )
         for row in rows_of(it)
@@ -265,18 +265,13 @@ def _gains(it: Identification) -> str:
     caption = "Gain of each sensor against the base, as the constant term of the transmissibility shows it; masses "
     caption += "assume 1. ±: half of the 95 % interval."
     head, found = ["sensor", "gain", "±"], gains_of_sensors(it)
-    rows = [[g.sensor, *_gain(g.gain, g.std)] for g in found]
+    rows = [[g.sensor, f"{g.gain:.4f}", half_width(g.std, g.gain)] for g in found]
     if it.determined and any(np.isfinite(g.worth) for g in found):  # else M_SS has no deviation
         head.append("1 % moves M_SS by, deviations")
         caption += " The last column: by how many of its stated deviations M_SS is off where a gain is 1 % off."
         for row, gain in zip(rows, found, strict=True):
             row.append(number(gain.worth, 2))
     return table(head, rows, caption) if rows else ""
-
-
-def _gain(gain: float, std: float) -> tuple[str, str]:
-    value, width = rounded(gain, std, 5)
-    return (f"{gain:.4f}", width) if width in ("open", "0") else (value, width)
 
 
 def _outliers(it: Identification) -> str:
@@ -366,7 +361,10 @@ def _convergence(it: Identification) -> str:
     caption = _LAST_PHASE * (it.strategy == "continuation")
     if history.swarm_curve.size and np.isnan(history.start):
         caption = _WIDENED
-    parts = [picture(plot.convergence(it), alt, caption)] * _falls(it) + [table(COLUMNS, ran, f"{told}.", words=True)]
+    parts = [picture(plot.convergence(it), alt, caption)] if _falls(it) else []
+    told_of = [k for k in range(len(COLUMNS)) if any(row[k] != "-" for row in ran)]  # of a reference only where it is
+    rows = [[row[k] for k in told_of] for row in ran]
+    parts.append(table([COLUMNS[k] for k in told_of], rows, f"{told}.", words=True))
     if history.restarts:
         again = f"{counted(history.restarts, 'further swarm')} followed, as the first ended in no good fit"
         parts.append(paragraph(f"{again}; {history.evaluations} candidates are those of all.", "soft"))

@@ -12,7 +12,7 @@ from sysid.report.html import text
 from sysid.structure.structure import Array, ComplexArray
 
 _WIDTH, _LEFT, _RIGHT = 360, 48, 8  # pixels
-_TITLE, _HEIGHTS, _BELOW = 18, (110, 62, 84), 30  # pixels above each panel, of each, and below the last
+_TITLE, _HEIGHTS, _BELOW = 18, (86, 46, 68), 30  # pixels above each panel, of each, and below the last
 _APART, _ABOVE = 34.0, 16.0  # pixels between ticks at least: of frequencies, and of an axis upwards
 _MARGIN = 1.3  # of the largest and smallest value of a logarithmic axis
 _WIDE = 8.0  # last over first line from which frequencies stand on a logarithmic axis

@@ -363,7 +363,7 @@ def modal(truth):
 
 
 def half(std):
-    return f"{norm.ppf(0.975) * std:.2g}"
+    return f"{float(f'{norm.ppf(0.975) * std:.2g}'):.6g}"  # 110, not 1.1e+02
 
 
 def to_two_digits(value, std):
@@ -404,6 +404,8 @@ def test_what_is_not_determined_stands_with_its_range_and_a_mark(modal, truth, n
     assert all(cell.startswith("~") and "±" not in cell for row in modes[1:] for cell in row[5:])
     assert all(float(row[2]) > 0 and float(row[4]) > 0 for row in modes[1:-1])
     assert rigid[1][1:] == [f"{total[0]:.4g}|stated", f"{it.structure.rigid_body_mass[0, 1]:.4g}|open"]
+    opening = dict(page.tables[0])
+    assert [opening[f"total mass, {axis}"] for axis in "xy"] == [f"{mass:.4g} kg, as stated" for mass in total]
     square = [table for table in page.tables if table[0][1:] == list(it.measurement.sensor_names)]
     assert len(square) == 3
     for table, ends in zip(square, (it.mass_interval, it.stiffness_interval), strict=False):
