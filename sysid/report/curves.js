@@ -99,7 +99,7 @@ function panel(svg, top, height, width, x, { freq, gaps }, [first, last], curves
   const inner = [top + MARGIN.top, top + height - MARGIN.bottom];
   let [low, high] = [Infinity, -Infinity];
   for (const { kind, values } of curves) {
-    if (kind === "band") continue; // it may leave the axis below
+    if (kind === "band") continue; // it may leave the axis
     for (let at = first; at <= last; at += 1) {
       if (Number.isFinite(values[at]) && (!options.log || values[at] > 0)) {
         low = Math.min(low, values[at]);
@@ -108,6 +108,9 @@ function panel(svg, top, height, width, x, { freq, gaps }, [first, last], curves
     }
   }
   if (options.range) [low, high] = options.range;
+  if (high === -Infinity) {
+    drawn(svg, "text", { x: (MARGIN.left + width) / 2, y: (inner[0] + inner[1]) / 2, "text-anchor": "middle" }, "0 at all lines");
+  }
   if (!(high >= low)) [low, high] = options.log ? [(low || 1) / 2, (high || 1) * 2] : [low - 1, high + 1];
   if (options.log) [low, high] = [Math.max(low, high / options.log) / 1.3, high * 1.3];
   const y = scale(low, high, inner[1], inner[0], options.log, 18);
@@ -126,7 +129,7 @@ function panel(svg, top, height, width, x, { freq, gaps }, [first, last], curves
   }
   const jump = options.range ? Math.abs(inner[1] - inner[0]) / 2 : Infinity;
   for (const { kind, values: all } of curves) {
-    const values = kind === "band" ? all.map((value) => (value < low ? NaN : value)) : all;
+    const values = kind === "band" ? all.map((value) => (value < low || value > high ? NaN : value)) : all;
     drawn(svg, "path", { d: line(x, y, freq, gaps, values, first, last, jump), class: kind });
   }
 }
@@ -142,13 +145,13 @@ function spectra(data, channel, run) {
   });
   const level = (kind) => {
     const told = channel[kind] && numbers(channel[kind][run]);
-    return told && told.length === 1 ? new Float32Array(left[0].length).fill(told[0]) : told;
+    return told && told.length === 1 ? new Float32Array(left.length).fill(told[0]) : told;
   };
   const [measured, identified] = [of(channel.measured[run]), of(channel.identified[run])];
-  const left = [measured[0].map((v, at) => v - identified[0][at]), measured[1].map((v, at) => v - identified[1][at])];
+  const left = numbers(channel.left[run]);
   return {
     measured: size(measured), identified: size(identified), phase: turn(measured), phaseIdentified: turn(identified),
-    left: size(left), noise: level("noise"), recorded: level("recorded"), band: level("band"),
+    left, noise: level("noise"), recorded: level("recorded"), band: level("band"),
   };
 }
 

@@ -138,6 +138,7 @@ def _told(channel: Channel) -> dict[str, Any]:
     found |= {
         name: [[_packed(run.real), _packed(run.imag)] for run in own[name]] for name in ("measured", "identified")
     }
+    found["left"] = [_packed(np.abs(run)) for run in channel.measured - channel.identified]
     for name in ("noise", "band", "recorded"):
         if own[name] is not None:
             found[name] = [_packed(run[:1] if np.ptp(run) == 0 else run) for run in own[name]]

@@ -44,6 +44,10 @@ _DRAWN_SHAPES = (
     "Motion relative to the base, which stands still, at the places of the sensors along their axes; grey: at rest. "
     "The largest motion is drawn alike in all modes."
 )
+_TOLD_SHAPES = (
+    "Motion of each sensor relative to the base, the largest of each mode 1. Sensors with positions have their mode "
+    "shapes drawn."
+)
 _AS_MOVED = (
     "Spectra of each sensor's absolute acceleration in each run, as the base moved: not transmissibilities. The phase "
     "is told against the base direction that moves the sensor most with it."
@@ -191,7 +195,14 @@ def _modes(it: Identification) -> str:
 
 def _shapes(it: Identification) -> str:
     drawn = mode_shapes(it)
-    return paragraph(_DRAWN_SHAPES, "soft") + drawn if drawn else ""
+    if drawn:
+        return paragraph(_DRAWN_SHAPES, "soft") + drawn
+    shapes = it.structure.mode_shapes
+    largest = np.take_along_axis(shapes, np.abs(shapes).argmax(axis=0)[None], axis=0)
+    shapes = np.divide(shapes, largest, out=np.zeros_like(shapes), where=largest != 0)
+    rows = [*it.measurement.sensor_names, "base"]
+    columns = [f"mode {k}" for k in range(1, it.structure.n + 1)]
+    return matrix(np.vstack([shapes, np.zeros(it.structure.n)]), rows, columns, _TOLD_SHAPES)
 
 
 def _effective_mass_columns(it: Identification, many: Array) -> Iterator[list[object]]:

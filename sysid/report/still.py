@@ -179,16 +179,21 @@ def _drawn(panel: _Panel, across: _Axis, up: _Axis, x: Array, gaps: ArrayLike) -
         parts.append(f'<text x="{_LEFT - 5}" y="{y + 4:.1f}" text-anchor="end">{value:g}</text>')
     for value in across.ticks(_APART):
         parts.append(f'<path class="grid" d="M{float(across(value)):.1f} {up.start}V{up.end}"/>')
-    parts.append(f'<g transform="scale({1 / _FINE:g})">')
     jump = np.inf if panel.decades else abs(up.start - up.end) / 2
+    paths = {}
     for kind, values in panel.curves.items():
-        seen = np.where(values < up.low, np.nan, values) if kind == "band" else values
-        parts.append(f'<path class="{kind}" d="{_path(x, up(seen), jump, gaps)}"/>')
-    return "".join([*parts, "</g>"])
+        seen = np.where((values < up.low) | (values > up.high), np.nan, values) if kind == "band" else values
+        paths[kind] = _path(x, up(seen), jump, gaps)
+    drawn = "".join(f'<path class="{kind}" d="{path}"/>' for kind, path in paths.items())
+    parts.append(f'<g transform="scale({1 / _FINE:g})">{drawn}</g>')
+    if not any(paths.values()):
+        right, down = (across.start + across.end) / 2, (up.start + up.end) / 2
+        parts.append(f'<text x="{right:g}" y="{down:g}" text-anchor="middle">0 at all lines</text>')
+    return "".join(parts)
 
 
 def _upward(panel: _Panel, bottom: float, top: float) -> _Axis:
-    """Axis of phases; or the logarithmic one of all curves but intervals, which may leave it below."""
+    """Axis of phases; or the logarithmic one of all curves but intervals, which may leave it."""
     if not panel.decades:
         return _Axis(_LOWEST, _HIGHEST, bottom, top, False)
     values = np.concatenate([np.ravel(curve) for kind, curve in panel.curves.items() if kind != "band"])

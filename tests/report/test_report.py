@@ -191,6 +191,9 @@ def test_every_channel_of_every_test_is_in_its_curves(complete, page):
             for s, run in np.ndindex(3, 2):
                 re_, im = map(unpacked, shown["channels"][s][kind][run])
                 np.testing.assert_allclose(re_ + 1j * im, expected[run, s], atol=1e-6 * np.abs(expected).max())
+        for s, run in np.ndindex(3, 2):
+            left = np.abs(spectra["measured"] - spectra["identified"])[run, s]
+            np.testing.assert_allclose(unpacked(shown["channels"][s]["left"][run]), left, rtol=1e-6)
     assert "noise" in fitted["channels"][0] and "noise" not in unseen["channels"][0]
     assert len(shapes["points"]) == 3 + 1 and len(shapes["shapes"]) == 3  # the sensors' places and the base
     assert shapes["shapes"][0][0] == [0, 0, 0]
@@ -253,12 +256,22 @@ def test_modes_and_their_reference_are_told(complete, page):
 def test_what_is_absent_leaves_no_section(plain, no_pictures):
     page = Page(report.render(plain))
     assert page.headings == [
-        "How far to trust it", "Modes", "Measured against identified", "Total mass", "Matrices", "Poles in the data",
-        "Modal assurance criterion", "Effective masses", "How it was found",
+        "How far to trust it", "Modes", "Mode shapes", "Measured against identified", "Total mass", "Matrices",
+        "Poles in the data", "Modal assurance criterion", "Effective masses", "How it was found",
     ]  # fmt: skip
     assert "normalised to 1 kg" in page.text and "convergence" not in page.alts
     assert "No fit" in page.text and "The mass matrix is known." in page.text
     assert "Stopped before its end" in page.text and "AutoMAC" not in page.text and "no reference is known" in page.text
+
+
+def test_mode_shapes_without_positions_are_a_table(plain, no_pictures):
+    page = Page(report.render(plain))
+    (shapes,) = [table for table in page.tables if table[0] == ["", "mode 1", "mode 2", "mode 3"]]
+    assert [row[0] for row in shapes[1:]] == [*plain.measurement.sensor_names, "base"]
+    told = np.array([row[1:] for row in shapes[1:]], float)
+    assert not told[-1].any() and np.all(told.max(axis=0) == 1) and np.all(np.abs(told) <= 1)
+    for k, shape in enumerate(plain.structure.mode_shapes.T):
+        np.testing.assert_allclose(told[:-1, k] * shape[np.argmax(told[:-1, k])], shape, rtol=1e-3)
 
 
 def test_captions_tell_what_is_in_the_pictures(complete, plain, page, no_pictures):
