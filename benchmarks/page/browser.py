@@ -41,6 +41,12 @@ point("pointerdown", 0.3); point("pointermove", 0.6); point("pointerup", 0.6);
 told.zoomed = paths() !== all;
 area.dispatchEvent(new MouseEvent("dblclick"));
 told.whole = paths() === all;
+for (const tick of document.querySelectorAll("input[type=checkbox]")) {
+  const recorded = () => document.querySelectorAll("path.recorded").length;
+  const before = recorded();
+  tick.click();
+  if (recorded() > before) count("checkbox");
+}
 for (const button of document.querySelectorAll("button")) { button.click(); count(button.textContent); }
 told.all_lines = paths() === all;
 const keyed = document.querySelector(".told").textContent;
@@ -59,9 +65,9 @@ told.over = [...document.querySelectorAll("body *")]
   .filter((one) => one.getBoundingClientRect().right > innerWidth + 1)
   .map((one) => one.outerHTML.slice(0, 80));
 told.sideways = document.documentElement.scrollWidth - document.documentElement.clientWidth;
-const bottom = (words) => [...document.querySelectorAll("strong, td, b")]
-  .find((one) => one.textContent.startsWith(words)).getBoundingClientRect().bottom;
-told.first = ["Determined", "Next:", "mode 1", "total mass"].map(bottom);
+const bottom = (words) => [...document.querySelectorAll("td, b")].find((one) => one.textContent.startsWith(words));
+told.first = [document.querySelector(".verdict strong"), ...["Next:", "mode 1", "total mass"].map(bottom)]
+  .map((one) => one.getBoundingClientRect().bottom);
 const light = (colour) => {
   const [r, g, b] = colour.match(/[0-9.]+/g).slice(0, 3).map((one) => one / 255)
     .map((v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4));

@@ -226,6 +226,7 @@ function startCurves(figure) {
     const channel = data.channels[channels.value];
     values = spectra(data, channel, runs.value);
     withTransients.hidden = !values.recorded;
+    legend.querySelector(".recorded")?.toggleAttribute("hidden", !(tick.checked && values.recorded));
     for (const kind of ["noise", "band"]) legend.querySelector(`.${kind}`)?.toggleAttribute("hidden", !values[kind]);
     area.replaceChildren();
     const width = Math.max(300, Math.min(1200, area.clientWidth));

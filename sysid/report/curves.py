@@ -57,6 +57,8 @@ def _legend(channels: Sequence[Channel]) -> str:
     if any(channel.band is not None for channel in channels):
         keys["band"] = "half of the 95 % interval of the identified"
     marks = "".join(f'<span class="key {kind}">{words}</span>' for kind, words in keys.items())
+    if any(channel.recorded is not None for channel in channels):
+        marks += '<span class="key recorded" hidden>as recorded</span>'  # until it is asked for
     return f'<p class="legend">{marks}</p>'
 
 

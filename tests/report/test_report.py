@@ -17,7 +17,7 @@ from scipy.stats import norm
 import sysid
 from sysid import plot
 from sysid.report import matrices as _report_matrices
-from sysid.report import report
+from sysid.report import opening, report
 
 FREQ = np.linspace(1.0, 40.0, 30)
 HOSTILE = "</td><script>alert('x')</script> & \"$\\foo$\""
@@ -166,6 +166,25 @@ def test_the_report_opens_with_the_answer_and_ends_with_the_search(complete, pag
     ):  # fmt: skip
         assert words in rest
     assert rest.index("The mass of mode 3 is open.") < rest.index("Solve_Succeeded")
+
+
+def test_what_is_open_and_what_speaks_against_the_answer_stand_apart(complete):
+    """Doubts are told in the message too, what is open is not."""
+    against, left = "the damping is not classical; ratios approximate it", "the mass of mode 3 is open"
+    doubtful = dataclasses.replace(complete, message=f"Solve_Succeeded; {against}", undetermined=(against, left))
+    told = [part.split("</h3>") for part in opening.trust(doubtful).split("<h3>")[1:]]
+    assert [name for name, _ in told] == [
+        "What the data do not determine", "What speaks against it", "What fixes the matrices",
+        "What to measure or to do next",
+    ]  # fmt: skip
+    assert left[1:] in told[0][1] and against[1:] not in told[0][1]
+    assert against[1:] in told[1][1] and left[1:] not in told[1][1]
+    failed = dataclasses.replace(doubtful, success=False, message=f"{against}; the residual is no fit")
+    told = [part.split("</h3>") for part in opening.trust(failed).split("<h3>")[1:]]
+    assert told[0][0] == "What speaks against it"
+    assert re.findall("<li>(.*?)</li>", told[0][1]) == [
+        "The residual is no fit.", f"T{against[1:]}.", f"T{left[1:]}."
+    ]  # fmt: skip
 
 
 def test_every_channel_of_every_test_is_in_its_curves(complete, page):
