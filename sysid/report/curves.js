@@ -161,7 +161,7 @@ function drawCurves(parent, { freq, gaps }, channel, values, [first, last], widt
   drawn(svg, "title", {}, `${channel.name}: measured and identified ${channel.words}`);
   const x = scale(freq[first], freq[last], MARGIN.left, width - MARGIN.right, freq[last] > 8 * freq[first] && freq[first] > 0, 40);
   const amplitude = [{ kind: "measured", values: values.measured }, { kind: "identified", values: values.identified }];
-  if (recorded) amplitude.unshift({ kind: "recorded", values: values.recorded });
+  if (recorded) amplitude.splice(1, 0, { kind: "recorded", values: values.recorded });
   const phase = [{ kind: "measured", values: values.phase }, { kind: "identified", values: values.phaseIdentified }];
   const left = [{ kind: "left", values: values.left }];
   for (const kind of ["noise", "band"]) if (values[kind]) left.push({ kind, values: values[kind] });

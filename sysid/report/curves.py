@@ -107,7 +107,7 @@ def _responses(it: Identification, test: Measurement) -> Iterator[Channel]:
     u = it.quick_uncertainty
     band = None if u is None else _half_widths(u.transmissibility(test.freq), test)
     raw = _recorded(it, test)
-    words, unit = ("transmissibility", "–") if own else ("spectrum of acceleration", "m/s², as recorded")
+    words, unit = ("transmissibility", "–") if own else ("spectrum of acceleration", "m/s², scaled as given")
     for s, name in enumerate(test.sensor_names):
         turn = _against_base(test, test.rigid_body[s])
         yield Channel(
@@ -123,7 +123,7 @@ def _forces(it: Identification, test: Measurement) -> Iterator[Channel]:
     predicted, u = test.predict_force(it.structure), it.quick_uncertainty
     band = None if u is None else _half_widths(u.base_force(test.freq), test)
     for i, axis in enumerate(test.base_axes or ()):
-        words, unit = ("apparent mass", "kg") if test.has_unit_runs else ("spectrum of force", "N, as recorded")
+        words, unit = ("apparent mass", "kg") if test.has_unit_runs else ("spectrum of force", "N, scaled as given")
         if not test.translational.all():
             words, unit = "force or moment of the base", "N or N m" + " per unit of base motion" * test.has_unit_runs
         turn = _against_base(test, np.eye(test.n_base)[i])

@@ -76,12 +76,14 @@ svg path, svg line { fill: none; stroke-width: 1.6; vector-effect: non-scaling-s
 svg .grid { stroke: var(--line); stroke-width: 1; } svg .cursor { stroke: var(--soft); stroke-width: 1; }
 svg .zoom { fill: var(--soft); opacity: .2; }
 svg .measured { stroke: var(--seen); stroke-width: 3; } svg .identified { stroke: var(--found); }
-svg .recorded, svg .rest { stroke: var(--soft); opacity: .6; stroke-width: 1; } svg .left { stroke: var(--left); }
+svg .rest { stroke: var(--soft); opacity: .6; stroke-width: 1; } svg .recorded { stroke: var(--good); }
+svg .left { stroke: var(--left); }
 svg .noise { stroke: var(--soft); stroke-dasharray: 5 3; } svg .band { stroke: var(--found); stroke-dasharray: 2 3; }
 svg .dot { fill: var(--found); } svg .base { fill: var(--soft); }
 .legend { display: flex; flex-wrap: wrap; gap: .3rem .9rem; margin: .6rem 0 0; max-width: none; }
 .key { border-top: 3px solid var(--soft); font-size: .85rem; } .key.measured { border-color: var(--seen); }
 .key.identified { border-color: var(--found); } .key.left { border-color: var(--left); }
+.key.recorded { border-color: var(--good); }
 .key.noise { border-top-style: dashed; } .key.band { border-top: 3px dotted var(--found); }
 [hidden] { display: none !important; }
 .sheets { display: flex; flex-wrap: wrap; gap: 0 1rem; } .sheet { flex: 1 1 330px; max-width: 540px; min-width: 0; }

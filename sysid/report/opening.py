@@ -83,8 +83,8 @@ def _steps(it: Identification) -> list[str]:
     """What to do next, the first thing first."""
     if it.judgement == "no fit":
         return [
-            "Look at the curves, and at what speaks against the fit, below; check units (Hz, m/s², N, kg), the signs "
-            "and axes of the sensors, and that responses are absolute."
+            "Look at the curves and at what speaks against the fit; check units (Hz, m/s², N, kg), the signs and axes "
+            "of the sensors, and that responses are absolute."
         ]
     steps = [sentence(step.removeprefix("to close it: ")) for step in next_steps(it)]
     if steps:
