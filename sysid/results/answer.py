@@ -93,8 +93,7 @@ class Answer:
         Why there is no fit; what speaks against it, and what is open; what fixes the matrices where nothing is; and
         what else is to be known of records, bounds and sensors.
         """
-        told = (*self.undetermined, *self.closed_by, *self.remarks[1:])  # the first tells why the strategy was taken
-        return told if self.success else (self.message, *told)
+        return (*self.undetermined, *self.closed_by, *self.remarks[1:])  # the first tells why the strategy was taken
 
     @property
     def measurement(self) -> Measurement:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from sysid.assessment.checks import doubts
 from sysid.assessment.determination import BY_RANK, determine
 from sysid.assessment.gains import assumed, rests_on
+from sysid.assessment.model_error import Miss, levels_in_words, missed_in_words, misses_of, model_errors
 from sysid.assessment.sensitivity import blocks_of
 from sysid.assessment.uncertainty import LARGE
 from sysid.measurement.missing import in_words
@@ -30,42 +32,65 @@ _OUTLIERS = "for spikes and drop-outs state Problem(..., loss='huber'), or leave
 NO_FIT = 0.5  # relative residual above which nothing is explained
 
 
+class Verdict(NamedTuple):
+    """Whether where a search ended is a fit.
+
+    Attributes
+    ----------
+    fits : bool
+        The solver succeeded, constraints hold, and the residual is within the goal, or of any use without one.
+    wrong : tuple of str
+        Why it is no success, in sentences.
+    message : str
+        These, and what the solver says.
+    misses : list of Miss
+        What the model leaves of each record, in units of its noise.
+    """
+
+    fits: bool
+    wrong: tuple[str, ...]
+    message: str
+    misses: list[Miss]
+
+    @property
+    def success(self) -> bool:
+        """It fits, and, without a goal, within the noise of the records."""
+        return self.fits and not self.wrong
+
+
 def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session) -> Identification:
     """Judge where a search ended: `why` tells why its strategy was taken, the session has its log and clock."""
     cut_short, records = session.cut_short, problem.screened
-    success, message = succeeded(records, end, cut_short=cut_short)
-    session.log(f"done: {message}")
+    verdict = verdict_of(problem, end, cut_short=cut_short)
+    session.log(f"done: {verdict.message}")
     # What was stopped on its way has misfits of another kind.
-    judged = end.stopped is None and (success or (problem.free_modes and not cut_short))
+    judged = end.stopped is None and (end.success or (problem.free_modes and not cut_short))
     closed_by: tuple[str, ...] = ()
-    doubtful: tuple[str, ...] = ()
+    against: tuple[str, ...] = ()
     try:
         with within(session.left):
             known = determine(records, end.structure, end.x, end.alternatives)
-            # A mistake that is named explains whatever else speaks against the fit; short segments have more to tell.
-            more = judged and (not end.mistakes or records.measurement.averaged)
-            further = doubts(records, end.structure, end.x) if more else ()
-            doubtful = (*end.doubts, *further) if judged else ()
-            open_, closed_by = (*end.mistakes, *doubtful, *known.undetermined), known.closed_by
-        if success and known.judged_by == BY_RANK and not open_:
+            against = _against(problem, end, verdict) if judged else ()
+            open_, closed_by = (*end.mistakes, *against, *known.undetermined), known.closed_by
+        if verdict.success and known.judged_by == BY_RANK and not open_:
             end, unknown = with_other_answers(problem, end, session)
             with within(session.left):
                 others = determine(records, end.structure, end.x, end.alternatives).undetermined
             open_ = (*unknown, *others)
     except TimeIsOver:
         open_ = (NOT_JUDGED,)
-    if end.mistakes and open_[: len(end.mistakes)] != end.mistakes:
-        open_ = (*end.mistakes, *open_)
-    if not success:
-        open_ = ("the search did not end in a fit, so this is not yet any structure that explains the data", *open_)
+    if not verdict.fits:
+        told = f"the search did not end in a fit ({end.message}): this is not yet any structure that explains the data"
+        open_ = (told, *open_)
+    open_ = tuple(dict.fromkeys((*end.mistakes, *verdict.wrong, *open_)))
     it = Identification(
         structure=end.structure,
         problem=problem,
         x=end.x,
         strategy=end.strategy,
         seed=seed,
-        success=success,
-        message="; ".join((*end.mistakes, message, *doubtful)),
+        success=verdict.success,
+        message="; ".join(dict.fromkeys((*end.mistakes, *verdict.wrong, *against, end.message))),
         history=replace(end.history, log=tuple(session.lines), wall_time=session.seconds),
         determined=not open_,
         closed_by=() if open_ else closed_by,
@@ -80,11 +105,22 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
         return replace(it, determined=False, closed_by=(), undetermined=(NOT_JUDGED,))
 
 
-def succeeded(problem: Problem, end: Outcome, *, cut_short: bool = False) -> tuple[bool, str]:
-    """Whether where a search ended is a fit, and the message; `cut_short` by its time it is blamed on nothing else."""
-    test, goal, wrong = problem.measurement, problem.goal, []
-    residual = test.residual(end.structure) if end.x is None or problem.free_modes else problem.residual(end.x)
-    if end.x is not None and end.success and not problem.keeps_constraints(end.x):
+def _against(problem: Problem, end: Outcome, verdict: Verdict) -> tuple[str, ...]:
+    """What speaks against an answer, in the order of its weight; a mistake that is named explains what else does."""
+    averaged = problem.screened.measurement.averaged
+    if end.mistakes:
+        return (*end.doubts, *(doubts(problem.screened, end.structure, end.x) if averaged else ()))
+    errors = model_errors(problem, end.structure, verdict.misses)
+    further = doubts(problem.screened, end.structure, end.x, changing=errors.changing)
+    return (*errors.sentences, *end.doubts, *further)
+
+
+def verdict_of(problem: Problem, end: Outcome, *, cut_short: bool = False) -> Verdict:
+    """Whether where a search ended is a fit; `cut_short` by its time it is blamed on nothing else."""
+    records, goal, wrong = problem.screened, problem.goal, []
+    test = records.measurement
+    residual = test.residual(end.structure) if end.x is None or problem.free_modes else records.residual(end.x)
+    if end.x is not None and end.success and not records.keeps_constraints(end.x):
         wrong.append("a constraint does not hold")
     if goal is not None and residual > goal:
         wrong.append(f"the residual {residual:.3g} is above the goal {goal:.3g}")
@@ -98,7 +134,11 @@ def succeeded(problem: Problem, end: Outcome, *, cut_short: bool = False) -> tup
                 "base force"
             )
         wrong.append(f"the residual {residual:.3g} is no fit: {doubt}")
-    return end.success and not wrong, "; ".join((end.message, *wrong))
+    fits = end.success and not wrong
+    misses = misses_of(problem, end.structure, end.x) if end.stopped is None else []
+    if goal is None:
+        wrong += missed_in_words(misses)
+    return Verdict(fits, tuple(wrong), "; ".join((*wrong, end.message)), misses)
 
 
 def _remarks(problem: Problem, end: Outcome) -> Iterator[str]:
@@ -110,6 +150,7 @@ def _remarks(problem: Problem, end: Outcome) -> Iterator[str]:
         names = [label for label, on in zip(formulation.labels, at, strict=True) if on]
         if names:
             yield f"on a bound of the search space, beyond which the truth may lie: {', '.join(names)}"
+    yield from levels_in_words(problem)
     tests = [term.test for term in formulation.tests]
     for i, test in enumerate(tests, start=problem.first_test):
         if test.dropped:
