@@ -69,7 +69,9 @@ def _of_records(formulation: Formulation, test: Measurement, structure: Structur
     if records.data.shape[0] <= _LINES * poles[0].size * records.n_base * (2 if velocity else 1):
         return leaks
     free = records.fit(*poles, velocity=velocity)
-    misses, rigid = list(_misfit(formulation, test, structure, records, free)), list(_rigid(test, records, free))
+    misses, rigid = list(_misfit(formulation, test, structure, records, free)), []
+    if not changing:
+        rigid = list(_rigid(test, records, free))
     gains = [] if rigid or changing else list(told(test, gain_errors(test, structure)))
     found = [*_at_rest(test), *leaks, *misses, *_force(formulation, test, structure), *rigid, *gains]
     # Beside what those say, quadrature and likeness mean nothing.

@@ -15,6 +15,7 @@ from scipy.special import gammaincinv
 
 from sysid.measurement.in_time import peaks, quiet_levels
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.outliers import Outlier
 from sysid.modal_analysis.stretches import Stretch, stretches_of
 from sysid.modal_analysis.transients import without_transients_of
@@ -28,15 +29,18 @@ _BLOCK = 16  # lines of a block ..
 _BLOCKS = 8  # .. of which there are so many at least, that tell the noise by the quietest quarter
 _QUIET = 0.25
 _TRACE = 1e-4  # of the records; smaller ones are no noise of an instrument
-_MOVED = 0.25  # half-power widths, by which the frequency of a mode changes at least
+_MOVED = 0.1  # half-power widths, by which the frequency of a mode changes at least
 _KNOWN = 0.1  # the same, to which it is known at least
 _SURE = 6.0  # standard deviations of a change
 _EXPLAINED = 0.7  # of the squares that constant poles leave, that others leave at most
 _SHOWN = 0.03  # of the largest level of a mode, at which it shows
 _ENOUGH = 5  # stretches that tell a trend
 _TREND = 0.03  # that chance orders frequencies so by level
+_SURE_TREND = 1e-3  # the same, where poles that change explain little, as the level changes within stretches
 _OF_RUNS = 0.3  # of the whole change, within runs, where runs differ
 _LEAST_RATIO = 1e-4
+_CLOSE = 1.06  # ratio of frequencies, within which modes ..
+_ONE_SHAPE = 0.9  # .. of one shape (modal assurance criterion) are one that changes
 _LEVEL = 1.25  # times the fitted levels, beyond which another is outside
 
 
@@ -199,7 +203,7 @@ def model_errors(problem: Problem, structure: Structure, misses: list[Miss]) -> 
     missed = [m for test in unfitted for record in _records(test, test, structure) for m in _miss(record, test, False)]
     scattered = modal is not None and modal.scatter is not None
     beyond = scattered or any(miss.times > BEYOND for miss in (*misses, *missed))
-    drift = tuple(drift_in_words(problem, structure)) if beyond else ()
+    drift = tuple(drift_in_words(problem)) if beyond else ()
     told = (*missed_in_words(misses), *drift, *unpredicted_in_words(unfitted, structure))
     return ModelErrors(told, bool(drift))
 
@@ -214,76 +218,109 @@ class Seen(NamedTuple):
     level: float
 
 
-def drift_in_words(problem: Problem, structure: Structure) -> Iterator[str]:
+def drift_in_words(problem: Problem) -> Iterator[str]:
     """The mode whose frequency changes most between stretches of all records, those never fitted too, in a sentence."""
-    fitted = [problem.measurement] if problem.formulation.fits_records else []
-    tests = [*fitted, *problem.validation]
-    f = structure.natural_frequencies
-    inside = np.flatnonzero([any(test.freq[0] < one < test.freq[-1] for test in tests) for one in f])
-    if inside.size == 0:
+    if not problem.formulation.fits_records:
         return
-    ratios = np.maximum(structure.damping_ratios, _LEAST_RATIO)
-    made = [stretches_of(test, 2 * np.pi * f[inside], ratios[inside]) for test in tests]
-    squares = np.sum([[one.left**2, one.left_by_all**2] for part in made for one in part], axis=0)
-    if not np.any(squares) or squares[0] > _EXPLAINED * squares[1]:
+    tests = [problem.measurement, *problem.validation]
+    modes = _modes(problem.screened.measurement)
+    if not modes:
         return
-    found: list[tuple[float, int, list[Seen]]] = []
-    for k, mode in enumerate(inside):
-        width = float(2 * ratios[mode] * f[mode])
-        seen = [one for i, part in enumerate(made) for one in _seen(part, k, width, i - len(fitted), tests[i])]
+    omega, ratios = np.transpose(modes)
+    made = [stretches_of(test, omega, ratios) for test in tests]
+    every = [one for part in made for one in part]
+    explained = sum(min(one.left, one.left_by_all) ** 2 for one in every) < _EXPLAINED * sum(
+        one.left_by_all**2 for one in every
+    )
+    found: list[tuple[float, float, list[Seen]]] = []
+    for k, mode in enumerate(modes):
+        width = mode.ratio * mode.omega / np.pi
+        seen = [one for i, part in enumerate(made) for one in _seen(part, k, width, i, tests[i])]
         seen = [one for one in seen if one.level > _SHOWN * max(each.level for each in seen)]
         if len(seen) > 1:
             low, high = min(seen, key=lambda one: one.frequency), max(seen, key=lambda one: one.frequency)
             change = high.frequency - low.frequency
-            if change > max(_MOVED * width, _SURE * np.hypot(low.std, high.std)):
-                found.append((change / width, int(mode) + 1, seen))
+            clear = change > max(_MOVED * width, _SURE * np.hypot(low.std, high.std))
+            if clear and (explained or _trend(seen, _SURE_TREND)):
+                found.append((change / width, mode.omega / (2 * np.pi), seen))
     if found:
-        _, number, seen = max(found, key=lambda one: (_trend(one[2]) != 0, one[0]))
-        others = [str(one[1]) for one in found if one[1] != number]
-        also = f" (so do{'es' * (len(others) == 1)} that of mode {', '.join(others)})" if others else ""
-        yield f"the frequency of mode {number}{also} {_how(seen)}"
+        _, frequency, seen = max(found, key=lambda one: (_trend(one[2]) != 0, one[0]))
+        others = ", ".join(f"{one[1]:.3g}" for one in found if one[1] != frequency)
+        also = f" (and of those near {others} Hz)" if others else ""
+        yield f"the frequency of the mode near {frequency:.3g} Hz{also} {_how(seen)}"
 
 
-def _seen(stretches: list[Stretch], k: int, width: float, unseen: int, test: Measurement) -> list[Seen]:
-    """A mode in the stretches of a test in which it is known; `unseen` counts the tests that were never fitted."""
+class Mode(NamedTuple):
+    """A pole that records show: rad/s; damping ratio."""
+
+    omega: float
+    ratio: float
+
+
+def _modes(test: Measurement) -> list[Mode]:
+    """Poles of a test; those close by of one shape, as a fit makes of a mode that changes, are one."""
+    if test.modal is not None:
+        omega, ratios, shapes = test.modal.omega, test.modal.ratios, test.modal.phi
+    else:
+        poles = PolesAndResidues.of(test)
+        if poles is None:
+            return []
+        omega, ratios, shapes = poles.omega, poles.ratios, poles.residues.reshape(poles.omega.size, -1).T
+    shapes = shapes / np.maximum(np.linalg.norm(shapes, axis=0), np.finfo(float).tiny)
+    groups: list[list[int]] = []
+    for k in range(omega.size):
+        near = [group for group in groups if omega[k] < _CLOSE * omega[group[0]] and len(shapes) > 1]
+        like = [group for group in near if (shapes[:, group[0]] @ shapes[:, k]) ** 2 > _ONE_SHAPE]
+        if like:
+            like[-1].append(k)
+        else:
+            groups.append([k])
+    return [Mode(float(omega[group].mean()), max(float(ratios[group].max()), _LEAST_RATIO)) for group in groups]
+
+
+def _seen(stretches: list[Stretch], k: int, width: float, number: int, test: Measurement) -> list[Seen]:
+    """A mode in the stretches of a test in which it is known; test 0 is the one that was fitted."""
     made = []
     for one in stretches:
         run = f"run {one.run}" if test.n_runs > 1 else "the record"
-        record = run if unseen < 0 else f"{run} of unfitted test {unseen + 1}"
-        if one.std[k] < _KNOWN * width:
+        record = run if number == 0 else f"{run} of unfitted test {number}"
+        if one.std[k] < _KNOWN * width and one.left <= one.left_by_all:
             part = f"{one.start:.3g} to {one.end:.3g} s"
             made.append(Seen(record, part, float(one.frequency[k]), float(one.std[k]), float(one.level[k])))
     return made
 
 
-def _trend(seen: list[Seen]) -> float:
-    """Rank correlation of the frequency of a mode with its level; zero where it may be chance."""
+def _trend(seen: list[Seen], chance: float = _TREND) -> float:
+    """Rank correlation of the frequency of a mode with its level; zero where chance may make it."""
     from scipy.stats import spearmanr
 
     if len(seen) < _ENOUGH:
         return 0.0
     found = spearmanr([one.level for one in seen], [one.frequency for one in seen])
-    return float(found.statistic) if found.pvalue < _TREND else 0.0
+    return float(found.statistic) if found.pvalue < chance else 0.0
 
 
 def _how(seen: list[Seen]) -> str:
     """How the frequency of a mode changes, and what to do, in words."""
     trend, frequency = _trend(seen), np.array([one.frequency for one in seen])
+    records = list(dict.fromkeys(one.record for one in seen))
+    own = {record: [one for one in seen if one.record == record] for record in records}
+    within = max(float(np.ptp([one.frequency for one in part])) for part in own.values())
+    if len(records) > 1 and within < _OF_RUNS * np.ptp(frequency):
+        means = [
+            (record, np.mean([(one.frequency, one.level) for one in part], axis=0)) for record, part in own.items()
+        ]
+        told = ", ".join(f"{f:.4g} Hz in {record} at {level:.2g} m/s² rms" for record, (f, level) in means)
+        return f"differs from record to record ({told}): fit them one by one, and find what changed between them"
     if trend != 0.0:
         by_level = sorted(seen, key=lambda one: one.level)
-        ends = (
-            f"{one.frequency:.4g} Hz where it moves a sensor by {one.level:.2g}" for one in by_level[:: len(seen) - 1]
-        )
+        least, most = (f"{one.frequency:.4g} Hz" for one in by_level[:: len(seen) - 1])
         return (
-            f"{'falls' if trend < 0 else 'rises'} as the motion grows, from {' to '.join(ends)} m/s² rms: the "
-            f"structure {'softens' if trend < 0 else 'stiffens'}, and no linear model holds at all levels; fit runs of "
-            "the level of interest"
+            f"{'falls' if trend < 0 else 'rises'} as the motion grows, from {least} where it moves a sensor by "
+            f"{by_level[0].level:.2g} m/s² rms to {most} at {by_level[-1].level:.2g} m/s²: the structure "
+            f"{'softens' if trend < 0 else 'stiffens'}, and no linear model holds at all levels; fit runs of the level "
+            "of interest"
         )
-    records = list(dict.fromkeys(one.record for one in seen))
-    own = {record: [one.frequency for one in seen if one.record == record] for record in records}
-    if len(records) > 1 and max(map(np.ptp, own.values())) < _OF_RUNS * np.ptp(frequency):
-        told = ", ".join(f"{np.mean(values):.4g} Hz in {record}" for record, values in own.items())
-        return f"differs from record to record ({told}): fit them one by one, and find what changed between them"
     low, high = seen[int(np.argmin(frequency))], seen[int(np.argmax(frequency))]
     ends = (f"{one.frequency:.4g} Hz at {one.part} of {one.record}" for one in (low, high))
     return (

@@ -39,7 +39,7 @@ class Limits(NamedTuple):
     steps: int
 
 
-_WHOLE, _ROUGH, _POLES = Limits(12, 60), Limits(3, 4), Limits(4, 8)
+_WHOLE, _ROUGH, _POLES = Limits(12, 60), Limits(3, 4), Limits(1, 20)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,13 +14,14 @@ from sysid.measurement import spectra
 from sysid.measurement.in_time import RunInTime, in_time
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.spectra import Run
-from sysid.measurement.whole import WholeRecords
+from sysid.measurement.whole import NoiseLevels, WholeRecords
 from sysid.modal_analysis.record_fit import RecordFit, record_modes, with_poles_of
 from sysid.structure.structure import Array
 
 _MOST = 12  # stretches of a run
 _PERIODS = 25  # of the lowest mode, that a stretch holds at least
 _EDGE = 2  # lines of a stretch at each end of the band, which what lies beyond it reaches
+_LEAST = 1e-3  # of the sensor that moves most: how much of the motion of one that hardly moves counts in full
 _FEWEST = 8  # lines of a stretch for each mode
 
 
@@ -77,11 +78,17 @@ def stretches_of(test: Measurement, omega: Array, ratios: Array) -> list[Stretch
     if len(pieces) < 2:
         return []
     rate = runs[0].rate
-    cut = _as_test(test, pieces, rate)
+    # Least squares, each sensor by its size: were levels fitted, a change would pass for noise of the base.
+    moved = [run.response - test.rigid_body @ run.base for run in runs]
+    size = np.sqrt(np.mean(np.concatenate(moved, axis=1) ** 2, axis=1))
+    noise = NoiseLevels(np.maximum(size, _LEAST * size.max()), np.zeros(test.n_base))
+    cut = _as_test(test, pieces, rate, noise)
     if cut is None or cut.freq.size < _FEWEST * omega.size:
         return []
     every = record_modes(cut, omega, ratios)
-    return [_stretch(piece, every, one) for piece in pieces if (one := _as_test(test, [piece], rate)) is not None]
+    return [
+        _stretch(piece, every, one) for piece in pieces if (one := _as_test(test, [piece], rate, noise)) is not None
+    ]
 
 
 def _stretch(piece: Piece, every: RecordFit, test: Measurement) -> Stretch:
@@ -91,9 +98,9 @@ def _stretch(piece: Piece, every: RecordFit, test: Measurement) -> Stretch:
     free = np.r_[index.log_omega, index.log_ratios, model.kept : model.size]
     N = own.normal[np.ix_(free, free)]
     unit = 1 / np.sqrt(np.maximum(np.diag(N), np.finfo(float).tiny))
-    inverse = np.linalg.pinv(N * np.outer(unit, unit), hermitian=True)
     m, f = modes.omega.size, modes.omega / (2 * np.pi)
-    std = f * unit[:m] * np.sqrt(np.diag(inverse)[:m] / 2)
+    variance = unit[:m] ** 2 * np.diag(np.linalg.pinv(N * np.outer(unit, unit), hermitian=True))[:m] / 2 * own.reduced
+    std = f * np.sqrt(np.where(variance > 0, variance, np.inf))  # round-off, of a mode that shows nowhere
     return Stretch(piece.number, piece.start, piece.end, f, std, modes.ratios, _levels(own), _left(own), _left(held))
 
 
@@ -125,7 +132,7 @@ def _pieces(runs: list[RunInTime], shortest: float) -> list[Piece]:
     return made
 
 
-def _as_test(test: Measurement, pieces: list[Piece], rate: float) -> Measurement | None:
+def _as_test(test: Measurement, pieces: list[Piece], rate: float, noise: NoiseLevels) -> Measurement | None:
     """Stretches as the runs of a test of whole records, within the band of theirs; None where that holds no line."""
     freq, base, response, _ = spectra.whole_record([piece.records for piece in pieces], rate)
     samples = tuple(piece.records.base.shape[1] for piece in pieces)
@@ -133,6 +140,6 @@ def _as_test(test: Measurement, pieces: list[Piece], rate: float) -> Measurement
     inside = (freq >= test.freq[0] + margin) & (freq <= test.freq[-1] - margin)
     if not np.any(inside):
         return None
-    whole = WholeRecords(samples, rate, (False,) * len(pieces))
+    whole = WholeRecords(samples, rate, (False,) * len(pieces), noise)
     given = (freq[inside], base[..., inside], response[..., inside])
     return Measurement(*given, rigid_body=test.rigid_body, base_axes=test.base_axes, sensors=test.sensors, whole=whole)

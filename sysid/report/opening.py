@@ -28,7 +28,7 @@ def opening(it: Identification) -> str:
 
 def trust(it: Identification) -> str:
     """HTML of what speaks against the answer, what is open, and what fixes it; remarks after these."""
-    parts = [] if it.success else [paragraph(sentence(it.message))]
+    parts = []
     if it.undetermined:
         parts.append(paragraph("Open, or against it:") + bullets(map(sentence, it.undetermined)))
         if it.success:
@@ -61,7 +61,7 @@ def _subject(it: Identification) -> str:
 
 def _meaning(it: Identification) -> str:
     if it.judgement == "no fit":
-        return sentence(f"these matrices do not explain the records: {it.message}")
+        return sentence(f"these matrices do not explain the records: {it.confidence[0]}")
     return sentence(verdict(it).partition(": ")[2] or verdict(it))
 
 

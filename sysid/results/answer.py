@@ -93,7 +93,10 @@ class Answer:
         Why there is no fit; what speaks against it, and what is open; what fixes the matrices where nothing is; and
         what else is to be known of records, bounds and sensors.
         """
-        return (*self.undetermined, *self.closed_by, *self.remarks[1:])  # the first tells why the strategy was taken
+        told = (*self.undetermined, *self.closed_by, *self.remarks[1:])  # the first tells why the strategy was taken
+        if self.success or any(sentence in self.message for sentence in self.undetermined):
+            return told
+        return (self.message, *told)  # of results of older versions, and of searches that were stopped
 
     @property
     def measurement(self) -> Measurement:

@@ -29,7 +29,8 @@ from sysid.search.strategy import HUBER, Outcome
 
 _KNOWN = 0.1  # of the root of two diagonal entries; an entry with a larger standard deviation is not known
 _OUTLIERS = "for spikes and drop-outs state Problem(..., loss='huber'), or leave these lines out"
-NO_FIT = 0.5  # relative residual above which nothing is explained
+_NO_FIT = 0.5  # relative residual above which nothing is explained
+_NO_END = "the search did not end in a fit ({}): this is not yet any structure that explains the data"
 
 
 class Verdict(NamedTuple):
@@ -66,12 +67,12 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
     # What was stopped on its way has misfits of another kind.
     judged = end.stopped is None and (end.success or (problem.free_modes and not cut_short))
     closed_by: tuple[str, ...] = ()
-    against: tuple[str, ...] = ()
+    against = Against(verdict.wrong, ())
     try:
         with within(session.left):
             known = determine(records, end.structure, end.x, end.alternatives)
-            against = _against(problem, end, verdict) if judged else ()
-            open_, closed_by = (*end.mistakes, *against, *known.undetermined), known.closed_by
+            against = _against(problem, end, verdict) if judged else against
+            open_, closed_by = (*end.mistakes, *against.further, *known.undetermined), known.closed_by
         if verdict.success and known.judged_by == BY_RANK and not open_:
             end, unknown = with_other_answers(problem, end, session)
             with within(session.left):
@@ -79,10 +80,8 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
             open_ = (*unknown, *others)
     except TimeIsOver:
         open_ = (NOT_JUDGED,)
-    if not verdict.fits:
-        told = f"the search did not end in a fit ({end.message}): this is not yet any structure that explains the data"
-        open_ = (told, *open_)
-    open_ = tuple(dict.fromkeys((*end.mistakes, *verdict.wrong, *open_)))
+    told = () if verdict.fits else (_NO_END.format(end.message),)
+    open_ = tuple(dict.fromkeys((*end.mistakes, *against.first, *told, *open_)))
     it = Identification(
         structure=end.structure,
         problem=problem,
@@ -90,7 +89,7 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
         strategy=end.strategy,
         seed=seed,
         success=verdict.success,
-        message="; ".join(dict.fromkeys((*end.mistakes, *verdict.wrong, *against, end.message))),
+        message="; ".join(dict.fromkeys(_in_order(end, (*end.mistakes, *against.first, *against.further)))),
         history=replace(end.history, log=tuple(session.lines), wall_time=session.seconds),
         determined=not open_,
         closed_by=() if open_ else closed_by,
@@ -105,14 +104,29 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
         return replace(it, determined=False, closed_by=(), undetermined=(NOT_JUDGED,))
 
 
-def _against(problem: Problem, end: Outcome, verdict: Verdict) -> tuple[str, ...]:
+class Against(NamedTuple):
+    """What speaks against an answer, in sentences: why it is no success, or what explains that; and further signs."""
+
+    first: tuple[str, ...]
+    further: tuple[str, ...]
+
+
+def _against(problem: Problem, end: Outcome, verdict: Verdict) -> Against:
     """What speaks against an answer, in the order of its weight; a mistake that is named explains what else does."""
     averaged = problem.screened.measurement.averaged
     if end.mistakes:
-        return (*end.doubts, *(doubts(problem.screened, end.structure, end.x) if averaged else ()))
+        further = doubts(problem.screened, end.structure, end.x) if averaged else ()
+        return Against(verdict.wrong, (*end.doubts, *further))
     errors = model_errors(problem, end.structure, verdict.misses)
-    further = doubts(problem.screened, end.structure, end.x, changing=errors.changing)
-    return (*errors.sentences, *end.doubts, *further)
+    further = (*end.doubts, *doubts(problem.screened, end.structure, end.x, changing=errors.changing))
+    if errors.changing:
+        return Against((*errors.sentences, *verdict.wrong), further)
+    return Against(verdict.wrong, (*errors.sentences, *further))
+
+
+def _in_order(end: Outcome, told: tuple[str, ...]) -> tuple[str, ...]:
+    """Sentences, and what the solver says: first where it did not succeed, else last."""
+    return (*told, end.message) if end.success else (end.message, *told)
 
 
 def verdict_of(problem: Problem, end: Outcome, *, cut_short: bool = False) -> Verdict:
@@ -124,7 +138,7 @@ def verdict_of(problem: Problem, end: Outcome, *, cut_short: bool = False) -> Ve
         wrong.append("a constraint does not hold")
     if goal is not None and residual > goal:
         wrong.append(f"the residual {residual:.3g} is above the goal {goal:.3g}")
-    if goal is None and residual > NO_FIT and end.stopped is None and (end.success or not cut_short):
+    if goal is None and residual > _NO_FIT and end.stopped is None and (end.success or not cut_short):
         doubt = "are the frequencies in Hz, the responses absolute and complex with exp(+iwt), the axes and signs of "
         doubt += "rigid_body right, the bounds wide enough?"
         if problem.unit_mass and not problem.formulation.stiffness.free:
@@ -138,7 +152,7 @@ def verdict_of(problem: Problem, end: Outcome, *, cut_short: bool = False) -> Ve
     misses = misses_of(problem, end.structure, end.x) if end.stopped is None else []
     if goal is None:
         wrong += missed_in_words(misses)
-    return Verdict(fits, tuple(wrong), "; ".join((*wrong, end.message)), misses)
+    return Verdict(fits, tuple(wrong), "; ".join(_in_order(end, tuple(wrong))), misses)
 
 
 def _remarks(problem: Problem, end: Outcome) -> Iterator[str]:

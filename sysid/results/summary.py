@@ -32,7 +32,7 @@ def summary(it: Answer) -> str:
         *_mode_table(it),
         "",
         *_unknowns(it),
-        f"{'success' if it.success else 'no success'}: {it.message}",
+        f"{'success' if it.success else 'no success'}: {_ending(it)}",
         f"relative residual {residual_in_words(it)}{force}; seed {it.seed}, {seconds_in_words(it.history.wall_time)}",
         *_phases(it),
         *it.remarks,
@@ -56,6 +56,15 @@ def summary(it: Answer) -> str:
     lines += [_NOT_COMPUTED] if it.hurried else []
     lines += [f"  > {sentence}" for sentence in next_steps(it)]
     return "\n".join(_folded(line) for line in lines)
+
+
+def _ending(it: Answer) -> str:
+    """The message, but for sentences that are told again below: of these the first alone."""
+    others = [sentence for sentence in it.undetermined if sentence in it.message][1:]
+    message = it.message
+    for sentence in others:
+        message = message.replace(f"; {sentence}", "").replace(f"{sentence}; ", "")
+    return message
 
 
 def _phases(it: Answer) -> list[str]:
