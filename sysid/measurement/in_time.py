@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.fft import next_fast_len
 
 from sysid.measurement.measurement import Measurement
-from sysid.measurement.whole import NoiseLevels
+from sysid.measurement.whole import NoiseLevels, WholeRecords
 from sysid.structure.structure import Array, ComplexArray
 
 _SAMPLES = 2.5  # a period of the highest line, where the sample rate is not known
@@ -39,11 +40,10 @@ def in_time(test: Measurement) -> list[RunInTime]:
     test : Measurement
         As ``from_time`` gives it with the estimators "records" and "spectra".
     """
-    sampled = _sampling(test)
-    if sampled is None:
+    whole = as_whole(test).whole
+    if whole is None:
         return []
-    rate, samples = sampled
-    made = []
+    rate, samples, made = whole.sample_rate, whole.samples, []
     for run, (own, n) in enumerate(zip(test.own_lines, samples, strict=True)):
         at = np.round(test.freq[own] * n / rate).astype(int)
         base, response, force = (
@@ -82,18 +82,16 @@ def _quietest(run: RunInTime, records: Array) -> Array:
     return np.asarray(np.sqrt(power * records.shape[1] / (2 * run.lines)))
 
 
-def _sampling(test: Measurement) -> tuple[float, tuple[int, ...]] | None:
-    """A sample rate and the samples of each run at it; None where the lines are not those of whole records."""
-    if test.whole is not None:
-        return test.whole.sample_rate, test.whole.samples
-    if test.averaged or test.has_unit_runs or test.freq.size < 2:
-        return None
+def as_whole(test: Measurement) -> Measurement:
+    """Spectra as those of whole records cut in motion; as they are where their lines cannot be such."""
+    if test.whole is not None or test.averaged or test.has_unit_runs or test.freq.size < 2:
+        return test
     spacing = float(np.min(np.diff(test.freq)))
     multiple = test.freq / spacing
     if np.any(np.abs(multiple - np.round(multiple)) > _EVEN * multiple[-1]):
-        return None
-    n = int(next_fast_len(int(np.ceil(_SAMPLES * multiple[-1]))))
-    return n * spacing, (n,) * test.n_runs
+        return test
+    n, runs = int(next_fast_len(int(np.ceil(_SAMPLES * multiple[-1])))), test.n_runs
+    return replace(test, whole=WholeRecords((n,) * runs, n * spacing, (False,) * runs))
 
 
 def _of_lines(lines: ComplexArray, at: Array, n: int) -> Array:

@@ -35,7 +35,8 @@ class Stretch(NamedTuple):
     start, end : float
         s, from the beginning of the run.
     frequency, std : (m,)
-        Hz, and its standard deviation as if what is left were white noise.
+        Hz, and its standard deviation, roughly, from what is left about its peak: too small by some times where a
+        stretch has only a few lines there.
     ratio : (m,)
     level : (m,)
         Root mean square of what each mode makes of the acceleration of the sensor that it moves most, m/s².
@@ -99,9 +100,24 @@ def _stretch(piece: Piece, every: RecordFit, test: Measurement) -> Stretch:
     N = own.normal[np.ix_(free, free)]
     unit = 1 / np.sqrt(np.maximum(np.diag(N), np.finfo(float).tiny))
     m, f = modes.omega.size, modes.omega / (2 * np.pi)
-    variance = unit[:m] ** 2 * np.diag(np.linalg.pinv(N * np.outer(unit, unit), hermitian=True))[:m] / 2 * own.reduced
+    variance = (
+        unit[:m] ** 2 * np.diag(np.linalg.pinv(N * np.outer(unit, unit), hermitian=True))[:m] / 2 * _noise_at_peaks(own)
+    )
     std = f * np.sqrt(np.where(variance > 0, variance, np.inf))  # round-off, of a mode that shows nowhere
     return Stretch(piece.number, piece.start, piece.end, f, std, modes.ratios, _levels(own), _left(own), _left(held))
+
+
+def _noise_at_peaks(fit: RecordFit) -> Array:
+    """What is left about each mode, over the levels, (m,): the noise of the base is larger there than elsewhere.
+
+    Each line counts by what it tells of the frequency of the mode: the power of the response's slope in it.
+    """
+    modes, total, weight = fit.parameters.modes, np.zeros(fit.model.m), np.zeros(fit.model.m)
+    for chunk in fit.model.chunks(fit.parameters):
+        slope = np.abs(chunk.g**2 * (modes.gamma @ chunk.run.base + chunk.pushed_by_ends)) ** 2
+        total += slope @ chunk.weighed(fit.levels).power  # of all sensors alike: the base's noise is in all of them
+        weight += np.sum(slope, axis=1)
+    return np.asarray(total / np.maximum(weight, np.finfo(float).tiny)) * fit.model.numbers / fit.freedom
 
 
 def _left(fit: RecordFit) -> float:

@@ -67,11 +67,6 @@ def _meaning(it: Identification) -> str:
 
 def _next(it: Identification) -> str:
     """The one thing to do next."""
-    if it.judgement == "no fit":
-        return (
-            "look at the curves, and at what speaks against the fit, below; check units (Hz, m/s², N, kg), the signs "
-            "and axes of the sensors, and that responses are absolute."
-        )
     steps = next_steps(it)
     if steps:
         return sentence(steps[0].removeprefix("to close it: "))

@@ -19,6 +19,10 @@ from sysid.structure.structure import Array
 _NOT_COMPUTED = (
     "uncertainty not computed, as the time was over: Identification.uncertainty and 'sysid report' compute it"
 )
+_MEND = (
+    "mend or measure what is named first; where a fit as near as this will do, state the residual that is enough: "
+    "Problem(..., goal=...)"
+)
 DEVIATES = 1.96  # standard deviations on either side of 95 % of a normal law
 _ROUND_OFF = 1e-10  # of a value: what is no noise of an instrument
 _WIDTH = 120
@@ -120,7 +124,13 @@ def verdict(it: Answer) -> str:
 
 def next_steps(it: Answer) -> list[str]:
     """What would close what is open, in sentences."""
-    if it.determined or it.hurried or NOT_JUDGED in it.undetermined or not it.is_one_of_many:
+    if it.determined or it.hurried or NOT_JUDGED in it.undetermined:
+        return []
+    if not it.success:
+        return [
+            _MEND if it.problem.goal is None else "mend what is named first; no model reaches a goal below the noise"
+        ]
+    if not it.is_one_of_many:
         return []
     if not it.open_masses:
         return [
