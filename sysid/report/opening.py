@@ -19,6 +19,7 @@ _HOLDS = (
     "frequencies, damping ratios and responses to base motion hold whichever of these models is taken; mass, stiffness "
     "and damping matrices are one choice"
 )
+_NO_END = "the search did not end"
 _MOST_MODES, _MOST_UNKNOWNS = 4, 5  # whose figures stand in the opening; all of them follow
 
 
@@ -45,16 +46,12 @@ def trust(it: Identification) -> str:
 
 
 def _weighed(it: Identification) -> tuple[list[str], list[str]]:
-    """What speaks against the answer, and what is open: where there is no fit all is of the first kind."""
-    if not it.success:
-        own = it.message
-        for told in it.undetermined:
-            own = own.replace(told, "")
-        ended = "; ".join(part for part in own.split("; ") if part.strip())
-        return [*filter(None, [ended]), *it.undetermined], []
-    against = [told for told in it.undetermined if told in it.message]  # the message tells doubts, not what is open
+    """What speaks against the answer, which its message tells too, and what is open."""
+    against = [told for told in it.undetermined if told in it.message or told.startswith(_NO_END)]
     open_ = [told for told in it.undetermined if told not in against]
-    if it.undetermined and it.is_one_of_many:
+    if not it.success and it.confidence[0] == it.message:
+        against.insert(0, it.message)
+    if open_ and it.success and it.is_one_of_many:
         open_.append(_HOLDS)
     return against, open_
 
@@ -75,17 +72,12 @@ def _subject(it: Identification) -> str:
 
 def _meaning(it: Identification) -> str:
     if it.judgement == "no fit":
-        return sentence(f"these matrices do not explain the records: {it.message}")
+        return sentence(f"these matrices do not explain the records: {it.confidence[0]}")
     return sentence(verdict(it).partition(": ")[2] or verdict(it))
 
 
 def _steps(it: Identification) -> list[str]:
     """What to do next, the first thing first."""
-    if it.judgement == "no fit":
-        return [
-            "Look at the curves and at what speaks against the fit; check units (Hz, m/s², N, kg), the signs and axes "
-            "of the sensors, and that responses are absolute."
-        ]
     steps = [sentence(step.removeprefix("to close it: ")) for step in next_steps(it)]
     if steps:
         return steps
