@@ -106,11 +106,27 @@ def measured(page: str, folder: Path, width: int, height: int = 800, *, dark: bo
         "<pre id=told></pre><script>onmessage = (e) => { told.textContent = e.data; };</script>"
     )
     scheme = f"--blink-settings=preferredColorScheme={0 if dark else 1}"
-    ran = _chromium(folder, scheme, "--window-size=1400,900", "--dump-dom", (folder / "frame.html").as_uri())
-    words = re.findall(r'<pre id="told">(.*?)</pre>', ran.stdout, re.DOTALL)[0]
-    if not words:
-        raise RuntimeError(f"the page's script did not end: {ran.stderr}")
-    found: dict[str, Any] = json.loads(html.unescape(words))
+    return _told(folder, scheme)
+
+
+STILL = """<script>
+onload = () => {
+  const page = document.querySelector("iframe").contentDocument;
+  const wide = (one) => one.getBoundingClientRect().width > 100;
+  const count = (what) => [...page.querySelectorAll(what)].filter(wide).length;
+  const over = page.documentElement.scrollWidth - page.documentElement.clientWidth;
+  document.querySelector("pre").textContent = JSON.stringify(
+    { sheets: count(".sheet svg"), modes: count(".shapes svg"), controls: count("select, button"), sideways: over });
+};
+</script>"""
+
+
+def seen_without_scripts(page: str, folder: Path, width: int, height: int = 800) -> dict[str, int]:
+    """How many curves, mode shapes and controls a browser shows that runs no script, and what is wider than it."""
+    (folder / "page.html").write_text(re.sub(r"script-src '[^']*'", "script-src 'none'", page), encoding="utf-8")
+    frame = f'<iframe src="page.html" style="border:0" width={width} height={height}></iframe><pre id=told></pre>'
+    (folder / "frame.html").write_text(frame + STILL)
+    found: dict[str, int] = _told(folder, "--allow-file-access-from-files")
     return found
 
 
@@ -120,6 +136,15 @@ def pages_printed(page: Path, folder: Path) -> int:
     _chromium(folder, f"--print-to-pdf={pdf}", page.as_uri())
     content = pdf.read_bytes()
     return len(re.findall(rb"/Type\s*/Page\b", content)) if content.startswith(b"%PDF") else 0
+
+
+def _told(folder: Path, option: str) -> Any:
+    """What the script of the frame tells."""
+    ran = _chromium(folder, option, "--window-size=1400,900", "--dump-dom", (folder / "frame.html").as_uri())
+    words = re.findall(r'<pre id="told">(.*?)</pre>', ran.stdout, re.DOTALL)[0]
+    if not words:
+        raise RuntimeError(f"the page's script did not end: {ran.stderr}")
+    return json.loads(html.unescape(words))
 
 
 def _chromium(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:

@@ -43,6 +43,11 @@ def lines(reduced: bool) -> Iterator[Line]:
         pages["large"] = large.read_text(encoding="utf-8")
         for name, page in list(pages.items())[: 1 if reduced else 2]:
             yield from _in_a_browser(name, page, where, WIDTHS[::3] if reduced else WIDTHS)
+        still = browser.seen_without_scripts(pages["tower"], where, 380)
+        shown = still["sheets"], still["modes"], still["sideways"]
+        expected = ((10 + 2) * 2, 10, 0)
+        text = "tower without scripts, 380 pixels: curves, mode shapes, pixels wider than the page"
+        yield Line(text, ", ".join(map(str, shown)), ", ".join(map(str, expected)), shown == expected)
         sheets = browser.pages_printed(where / "tower" / report.FILE_NAME, where)
         yield Line("tower: sheets of its print", f"{sheets}", "from 2 on", sheets > 1)
 

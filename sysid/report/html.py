@@ -100,7 +100,7 @@ svg .dot { fill: var(--found); } svg .base { fill: var(--soft); }
   .shapes, .sheets { orphans: 1; widows: 1; }
   .scroll { overflow: visible; } img { max-width: 100%; max-height: 3.7in; width: auto; }
   .pair { flex-wrap: nowrap; break-inside: avoid; } .pair figure { flex-basis: 0; }
-  table { font-size: 7.5pt; } .wide { font-size: 5.5pt; }
+  table { font-size: 7.5pt; } .words { font-size: 9pt; } .wide { font-size: 5.5pt; }
   th, td { padding: .05rem .3rem; line-height: 1.3; } td small { line-height: 1.1; } tr { break-inside: avoid; }
   h2, h3, figcaption, .soft, .legend, .sheet p { break-after: avoid; } p, li { break-inside: avoid; }
   h2 + *, h3 + *, .soft + *, .legend + * { break-before: avoid; }

@@ -82,7 +82,7 @@ def _steps(it: Identification) -> list[str]:
     if steps:
         return steps
     if it.judgement == "one of many":
-        return ["Mend or measure what is named first below."]
+        return ["Mend or measure what speaks against it, the first thing first: below."]
     if not it.problem.validation:
         return ["Predict a test that was not fitted (validation=[...]): it alone shows what the model leaves out."]
     return ["Take the matrices: sysid export writes them for Nastran, MATLAB and others."]

@@ -36,6 +36,11 @@ def test_every_control_works_and_the_page_is_readable(result, tmp_path, width, d
     assert (sum(map(int, re.findall(r"\d+", told["paper"])[:3])) < 150) == dark
 
 
+def test_without_scripts_all_curves_and_mode_shapes_are_seen(result, tmp_path):
+    told = browser.seen_without_scripts(report.render(result), tmp_path, 380)
+    assert told == {"sheets": (3 + 2) * 2, "modes": 3, "controls": 0, "sideways": 0}
+
+
 def test_the_page_prints(result, tmp_path):
     assert browser.pages_printed(report.write_report(result, tmp_path), tmp_path) > 2
 
