@@ -41,7 +41,7 @@ def gains(omega):
 
 
 def test_equation_of_motion_modal_sum_and_base_force_are_one():
-    """The structure with its base as one system of n + d degrees of freedom, absolute, knows nothing of B, G or modes."""
+    """They agree with structure and base as one system in absolute motion, which needs neither B nor modes."""
     damping = whole(C, G)
     given, force = TRUTH.transmissibility(FREQ), TRUTH.base_force(FREQ)
     for at, w in enumerate(OMEGA):
