@@ -71,7 +71,8 @@ def universal():
 
 def commands():
     """The lines of the page that read files, without their first two words."""
-    return re.findall(r"^sysid read (.*)$", PAGE.read_text(encoding="utf-8"), re.M) if PAGE.exists() else []
+    text = PAGE.read_text(encoding="utf-8").replace("\\\n", "") if PAGE.exists() else ""
+    return re.findall(r"^sysid read (.*)$", text, re.M)
 
 
 @pytest.mark.parametrize("line", commands())
