@@ -40,7 +40,8 @@ def scatter(fit: RecordFit) -> Array | None:
 
     With A, the information of the fit, the covariance of the modes is ``A^-1 B A^-1 / 2``; for white noise B is A.
     """
-    return scatter_over_blocks(fit) if uneven(fit) else None
+    # Levels stated too low or too high are no reason: the power of the misfit counts once, with the information.
+    return scatter_over_blocks(fit) if uneven(fit, 2 * fit.chi2 / fit.model.numbers) else None
 
 
 def scatter_over_blocks(fit: RecordFit) -> Array:
@@ -72,8 +73,8 @@ def scatter_over_blocks(fit: RecordFit) -> Array:
     return B
 
 
-def uneven(fit: RecordFit) -> bool:
-    """Whether the power of what is left differs between blocks of lines by more than chance."""
+def uneven(fit: RecordFit, mean: float = 1.0) -> bool:
+    """Whether the power of what is left differs between blocks of lines, and from its mean, by more than chance."""
     model, c = fit.model, fit.model.channels
     off = []
     powers: list[list[Array]] = [[] for _ in model.runs]
@@ -82,6 +83,6 @@ def uneven(fit: RecordFit) -> bool:
     for run, parts in zip(model.runs, powers, strict=True):
         power = np.concatenate(parts)
         for lines in blocks_of(run, fit, 0.0):
-            off.append((np.sum(power[lines]) - c * lines.size) / np.sqrt(c * lines.size))
+            off.append((np.sum(power[lines]) / mean - c * lines.size) / np.sqrt(c * lines.size))
     z = np.array(off)
     return bool(np.sum(z**2) > z.size + _CHANCE * np.sqrt(2 * z.size) or np.max(z) > 2 * _CHANCE)

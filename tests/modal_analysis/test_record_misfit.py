@@ -45,8 +45,15 @@ def _records(rng: np.random.Generator, missed: float) -> tuple[Array, Array]:
     return base[None] + noise[:1], relative + base + error + noise[1:]
 
 
-def _fitted(base: Array, response: Array) -> RecordFit:
-    test = sysid.Measurement.from_time([(base, response, None)], RATE, rigid_body=np.ones((2, 1)), band=(1.0, 10.0))
+def _measured(base: Array, response: Array, level: float | None = None) -> sysid.Measurement:
+    noise = None if level is None else sysid.NoiseLevels(np.full(2, level), np.full(1, level))
+    return sysid.Measurement.from_time(
+        [(base, response, None)], RATE, rigid_body=np.ones((2, 1)), band=(1.0, 10.0), noise=noise
+    )
+
+
+def _fitted(base: Array, response: Array, level: float | None = None) -> RecordFit:
+    test = _measured(base, response, level)
     fit = record_modes(test, 2 * np.pi * FREQUENCIES, RATIOS)
     return refitted(fit, fit.parameters)
 
@@ -62,6 +69,14 @@ def test_what_modes_miss_of_a_steady_sine_is_no_mode() -> None:
 def test_where_noise_alone_is_left_every_mode_stays() -> None:
     fit = _fitted(*_records(np.random.default_rng(1), missed=0.0))
     assert without_spurious_modes(fit) is fit
+
+
+def _uneven(seed: int) -> tuple[Array, Array]:
+    """Records with noise five times as large about the second mode."""
+    rng = np.random.default_rng(seed)
+    base, response = _records(rng, missed=0.0)
+    band = scipy.signal.butter(4, [6.3, 8.3], "bandpass", fs=RATE, output="sos")
+    return base, response + scipy.signal.sosfilt(band, 0.05 * rng.standard_normal(response.shape), axis=1)
 
 
 def _of_logarithms(fit: RecordFit, scatter: Array | None = None) -> Array:
@@ -81,15 +96,12 @@ def test_scatter_over_blocks_is_the_information_where_noise_alone_is_left() -> N
 
 
 def test_stated_deviations_are_those_of_refits_without_a_block() -> None:
-    """Noise five times as large about the second mode; the jackknife refits all lines but those of a block.
+    """The jackknife refits all lines but those of a block.
 
     What it is too wide by, where noise is white, is taken off: without a block an estimate moves by the difference of
     both variances.
     """
-    rng = np.random.default_rng(2)
-    base, response = _records(rng, missed=0.0)
-    band = scipy.signal.butter(4, [6.3, 8.3], "bandpass", fs=RATE, output="sos")
-    fit = _fitted(base, response + scipy.signal.sosfilt(band, 0.05 * rng.standard_normal(response.shape), axis=1))
+    fit = _fitted(*_uneven(2))
     found = estimate(fit)
     assert found.scatter is not None
     variances, plain = [], []
@@ -105,3 +117,20 @@ def test_stated_deviations_are_those_of_refits_without_a_block() -> None:
     assert np.sqrt(_of_logarithms(fit, found.scatter)) == pytest.approx(
         np.sqrt(np.mean(variances, axis=0) / np.mean(plain, axis=0)), rel=0.2
     )
+
+
+def test_levels_stated_too_low_are_no_reason_for_a_scatter_over_blocks() -> None:
+    records = _records(np.random.default_rng(1), missed=0.0)
+    for level in (0.01, 0.004):
+        assert estimate(_fitted(*records, level)).scatter is None
+
+
+def test_a_scatter_over_blocks_holds_the_misfit_whatever_levels_were_stated() -> None:
+    """Levels are but weights there: of one common factor deviations do not depend."""
+    stated = []
+    for level in (0.01, 0.004):
+        result = sysid.identify(sysid.Problem(_measured(*_uneven(2), level), mass=sysid.FullMass()), rng=0)
+        assert result.measurement.modal is not None
+        assert result.measurement.modal.scatter is not None
+        stated.append(result.uncertainty.natural_frequencies)
+    assert stated[1] == pytest.approx(stated[0], rel=0.02)
