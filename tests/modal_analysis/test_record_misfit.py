@@ -134,3 +134,11 @@ def test_a_scatter_over_blocks_holds_the_misfit_whatever_levels_were_stated() ->
         assert result.measurement.modal.scatter is not None
         stated.append(result.uncertainty.natural_frequencies)
     assert stated[1] == pytest.approx(stated[0], rel=0.02)
+
+
+def test_the_sum_of_squares_is_at_the_levels_found_where_the_fit_does_not_come_to_its_end() -> None:
+    rough = record_modes(
+        _measured(*_records(np.random.default_rng(1), missed=0.0)), 2 * np.pi * 1.05 * FREQUENCIES, RATIOS
+    )
+    assert not rough.settled
+    assert rough.chi2 == pytest.approx(rough.model.chi2(rough.parameters, rough.levels), rel=1e-9)
