@@ -219,8 +219,8 @@ def model_errors(problem: Problem, structure: Structure, misses: list[Miss]) -> 
     modal = problem.screened.measurement.modal
     unfitted = [without_transients_of(test, structure) for test in problem.validation]
     missed = [m for test in unfitted for record in _records(test, test, structure) for m in _miss(record, test, False)]
-    scattered = modal is not None and modal.scatter is not None
-    beyond = scattered or any(miss.times > BEYOND for miss in (*misses, *missed))
+    uneven = modal is not None and bool(modal.scatter is not None or modal.excess)
+    beyond = uneven or any(miss.times > BEYOND for miss in (*misses, *missed))
     drift = tuple(drift_in_words(problem)) if beyond else ()
     told = (*missed_in_words(misses), *drift, *unpredicted_in_words(unfitted, structure))
     return ModelErrors(told, bool(drift))
@@ -256,11 +256,11 @@ def drift_in_words(problem: Problem) -> Iterator[str]:
         seen = [one for i, part in enumerate(made) for one in _seen(part, k, width, i, tests[i])]
         seen = [one for one in seen if one.level > _SHOWN * max(each.level for each in seen)]
         if len(seen) > 1:
-            low, high = min(seen, key=lambda one: one.frequency), max(seen, key=lambda one: one.frequency)
-            change = high.frequency - low.frequency
-            clear = change > max(_MOVED * width, _SURE * np.hypot(low.std, high.std))
+            f, std = (np.array([getattr(one, name) for one in seen]) for name in ("frequency", "std"))
+            change = np.abs(f[:, None] - f)
+            clear = np.any(change > np.maximum(_MOVED * width, _SURE * np.hypot(std[:, None], std)))
             if clear and (explained or _trend(seen, _SURE_TREND)):
-                found.append((change / width, mode.omega / (2 * np.pi), seen))
+                found.append((float(np.ptp(f)) / width, mode.omega / (2 * np.pi), seen))
     if found:
         _, frequency, seen = max(found, key=lambda one: (_trend(one[2]) != 0, one[0]))
         others = ", ".join(f"{one[1]:.3g}" for one in found if one[1] != frequency)
@@ -309,13 +309,15 @@ def _seen(stretches: list[Stretch], k: int, width: float, number: int, test: Mea
 
 
 def _trend(seen: list[Seen], chance: float = _TREND) -> float:
-    """Rank correlation of the frequency of a mode with its level; zero where chance may make it."""
+    """Rank correlation of the frequency of a mode with its level; zero where chance or time make as large a one."""
     from scipy.stats import spearmanr
 
     if len(seen) < _ENOUGH:
         return 0.0
-    found = spearmanr([one.level for one in seen], [one.frequency for one in seen])
-    return float(found.statistic) if found.pvalue < chance else 0.0
+    frequency = [one.frequency for one in seen]
+    found = spearmanr([one.level for one in seen], frequency)
+    in_time = abs(spearmanr(np.arange(len(seen)), frequency).statistic)
+    return float(found.statistic) if found.pvalue < chance and abs(found.statistic) > in_time else 0.0
 
 
 def _how(seen: list[Seen]) -> str:

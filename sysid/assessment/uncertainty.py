@@ -272,7 +272,8 @@ def _by_unknowns(problem: Problem, structure: Structure, x: Array) -> Uncertaint
     if formulation.fits_records:
         known, shifts = _with_gains(formulation, x, slopes, known)
     steps, count = known.steps, known.normals.shape[1]
-    inflation = inflation_of(test, records_of(test, structure, x.size), x.size) if formulation.fits_records else 1.0
+    weighed = test if structure.modal_damping else replace(test, modal=None)  # as `rows_of_test` does
+    inflation = inflation_of(weighed, records_of(test, structure, x.size), x.size) if formulation.fits_records else 1.0
     shapes = np.einsum("si,ikc->skc", structure.recovery, slopes.d_shapes)
     parts = (shapes, slopes.d_participation, slopes.d_log_omega, slopes.d_log_ratios, slopes.d_rigid)
     moves = Perturbations(count, *(part @ steps for part in parts))

@@ -82,12 +82,15 @@ def inflation_of(test: Measurement, records: list[Record], unknowns: int) -> flo
     reduced = 2 * sum(np.sum(np.abs(record.misfit / record.std) ** 2) for record in records) / freedom
     if reduced < _FAR_BELOW:
         return 1.0
+    # Scatter over blocks of lines holds the size of what the modes leave, and what neighbours share of it.
+    scattered = test.modal if test.modal is not None and test.modal.scatter is not None else None
+    if scattered is not None:
+        reduced /= max(scattered.reduced, 1.0)
     beyond = reduced if reduced > max(_SUSPECT, 1 + _DEVIATIONS * np.sqrt(2 / freedom)) else 1.0
+    if scattered is not None:
+        return float(np.sqrt(beyond))
     error = np.concatenate([(r.misfit / r.std).reshape(-1, test.n_runs, test.freq.size) for r in records])
-    # Scatter over blocks of lines holds what these share.
-    scattered = test.modal is not None and test.modal.scatter is not None
-    shared = 1.0 if scattered else line_correlation(error, unknowns)
-    return float(np.sqrt(beyond * shared))
+    return float(np.sqrt(beyond * line_correlation(error, unknowns)))
 
 
 def _gram(vectors: ComplexArray) -> Array:

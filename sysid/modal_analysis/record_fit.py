@@ -230,8 +230,9 @@ def _fit(
         before, levels = levels, likeliest_levels(model, p, levels, unknowns)
         if done and np.all(np.abs(np.log(levels / before)) < 2 * _SAME_LEVELS):
             settled = True
-            chi2 = model.chi2(p, levels)
             break
+    if stated is None:
+        chi2 = model.chi2(p, levels)  # at the last levels
     return RecordFit(test, p, levels, chi2, settled)
 
 

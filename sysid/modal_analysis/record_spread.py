@@ -1,9 +1,11 @@
-"""Scatter of the modes of whole records where what is left is no white noise: a jackknife over blocks of lines.
+"""Scatter of the modes of whole records where what is left is no white noise: a sandwich over blocks of lines.
 
-Model error sits at the peaks. Each block of lines, some half-power widths long, then tells its own error: what the
-modes would move by without it. One linear step from the end of the fit gives these moves, the score of the block
-divided by the share of the information that is left without it, and their squares make the covariance (White 1982;
-MacKinnon and White 1985, HC3, a block in the place of a number).
+Model error sits at the peaks. Each block of lines, some half-power widths long, then tells its own error: what its
+score would move the modes by, in one linear step from the end of the fit. The fit has taken a part of each block's
+errors: of white noise, a block with the share H of the information leaves a score of covariance ``H (I - H)``. The
+score over the root of ``I - H`` has H again, so that the squares of all moves make the covariance without bias (White
+1982; MacKinnon and White 1985, HC2, a block in the place of a number). The whole ``I - H``, HC3, is the jackknife,
+which is too wide: a block may hold most of what tells a mode.
 """
 
 from __future__ import annotations
@@ -38,10 +40,13 @@ def scatter(fit: RecordFit) -> Array | None:
 
     With A, the information of the fit, the covariance of the modes is ``A^-1 B A^-1 / 2``; for white noise B is A.
     """
-    model, p = fit.model, fit.parameters
-    if not uneven(fit):
-        return None
-    N = fit.normal
+    # Levels stated too low or too high are no reason: the power of the misfit counts once, with the information.
+    return scatter_over_blocks(fit) if uneven(fit, 2 * fit.chi2 / fit.model.numbers) else None
+
+
+def scatter_over_blocks(fit: RecordFit) -> Array:
+    """The same, whatever is left."""
+    model, p, N = fit.model, fit.parameters, fit.normal
     size = np.sqrt(np.maximum(np.diag(N), 1e-300))
     N = N / np.outer(size, size)
     lam, V = np.linalg.eigh(N)
@@ -57,7 +62,7 @@ def scatter(fit: RecordFit) -> Array | None:
                 score = half[own.unknowns].T @ (made.gradient / at)
                 inner = half[own.unknowns].T @ (made.normal / np.outer(at, at)) @ half[own.unknowns]
                 taken, turn = np.linalg.eigh(inner)
-                grown = turn @ ((turn.T @ score) / (1 - np.clip(taken, 0.0, _TAKEN)))
+                grown = turn @ ((turn.T @ score) / np.sqrt(1 - np.clip(taken, 0.0, _TAKEN)))
                 meat += np.outer(grown, grown) / _SHIFTS
     # In moves of all unknowns, of which those of `Index` are kept: A^-1 B A^-1 is that of the moves.
     kept = model.kept
@@ -68,8 +73,8 @@ def scatter(fit: RecordFit) -> Array | None:
     return B
 
 
-def uneven(fit: RecordFit) -> bool:
-    """Whether the power of what is left differs between blocks of lines by more than chance."""
+def uneven(fit: RecordFit, mean: float = 1.0) -> bool:
+    """Whether the power of what is left differs between blocks of lines, and from its mean, by more than chance."""
     model, c = fit.model, fit.model.channels
     off = []
     powers: list[list[Array]] = [[] for _ in model.runs]
@@ -78,6 +83,6 @@ def uneven(fit: RecordFit) -> bool:
     for run, parts in zip(model.runs, powers, strict=True):
         power = np.concatenate(parts)
         for lines in blocks_of(run, fit, 0.0):
-            off.append((np.sum(power[lines]) - c * lines.size) / np.sqrt(c * lines.size))
+            off.append((np.sum(power[lines]) / mean - c * lines.size) / np.sqrt(c * lines.size))
     z = np.array(off)
     return bool(np.sum(z**2) > z.size + _CHANCE * np.sqrt(2 * z.size) or np.max(z) > 2 * _CHANCE)

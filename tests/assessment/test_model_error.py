@@ -5,72 +5,14 @@ import re
 
 import numpy as np
 import pytest
-import scipy.linalg
-from scipy.interpolate import CubicSpline
 
 import sysid
+from benchmarks.mistakes.changing import RATE, SECONDS, SPRINGS, frequencies, motion, noisy
+from benchmarks.mistakes.changing import measured as as_test
+from benchmarks.mistakes.changing import response as answer
 from sysid.assessment.model_error import BEYOND, drift_in_words, misses_of
 from sysid.measurement.in_time import in_time, peaks, quiet_levels
 from sysid.modal_analysis.stretches import stretches_of
-
-RATE, SECONDS = 80.0, 100
-MASSES, SPRINGS, DAMPERS = np.array([2.0, 1.0]), np.array([2400.0, 1500.0]), np.array([1.2, 0.8])
-
-
-def frequencies(springs):
-    """Natural frequencies of the two storeys, Hz."""
-    k1, k2 = springs
-    return np.sqrt(scipy.linalg.eigh([[k1 + k2, -k2], [-k2, k2]], np.diag(MASSES), eigvals_only=True)) / (2 * np.pi)
-
-
-def motion(rng, seconds=SECONDS):
-    """Random base motion between 1 and 15 Hz, 1 m/s² rms."""
-    n = int(seconds * RATE)
-    freq = np.fft.rfftfreq(n, 1 / RATE)
-    lines = np.where((freq > 1) & (freq < 15), rng.standard_normal(freq.size) + 1j * rng.standard_normal(freq.size), 0)
-    record = np.fft.irfft(lines, n)
-    return record / record.std()
-
-
-def answer(base, factor=lambda t: 1.0, softening=0.0, steps=2):
-    """Absolute accelerations of both floors, by Runge and Kutta's steps.
-
-    The springs are multiplied by factor(t); the first one's force is ``k d / sqrt(1 + softening d²)``.
-    """
-    h, n = 1 / RATE / steps, base.size
-    u = CubicSpline(np.arange(n), base)(np.arange(2 * steps * (n - 1) + 1) / (2 * steps))
-
-    def rates(state, base, t):
-        x1, x2, v1, v2 = state
-        k1, k2 = factor(t) * SPRINGS
-        f1 = k1 * x1 / np.sqrt(1 + softening * x1 * x1) + DAMPERS[0] * v1
-        f2 = k2 * (x2 - x1) + DAMPERS[1] * (v2 - v1)
-        return np.array([v1, v2, (f2 - f1) / MASSES[0] - base, -f2 / MASSES[1] - base])
-
-    state, out = np.zeros(4), np.empty((2, n))
-    for i in range(n):
-        out[:, i] = rates(state, u[2 * steps * i], i / RATE)[2:] + base[i]
-        for j in range(2 * steps * i, min(2 * steps * (i + 1), 2 * steps * (n - 1)), 2):
-            t = j * h / 2
-            a = rates(state, u[j], t)
-            b = rates(state + h / 2 * a, u[j + 1], t + h / 2)
-            c = rates(state + h / 2 * b, u[j + 1], t + h / 2)
-            d = rates(state + h * c, u[j + 2], t + h)
-            state = state + h / 6 * (a + 2 * b + 2 * c + d)
-    return out
-
-
-def noisy(rng, base, response, share=0.02):
-    std = share * base.std()
-    return base[None] + std * rng.standard_normal((1, base.size)), response + std * rng.standard_normal(response.shape)
-
-
-def as_test(*runs, estimator="records"):
-    sensors = [sysid.Sensor(f"floor {i}", (0.0, 0.0, float(i)), "x") for i in (1, 2)]
-    return sysid.Measurement.from_time(
-        [(base, response, None) for base, response in runs], RATE, sensors=sensors, band=(0.5, 20.0),
-        estimator=estimator,
-    )  # fmt: skip
 
 
 def identified(test, **options):
