@@ -114,6 +114,8 @@ def _responses(it: Identification, test: Measurement) -> Iterator[Channel]:
     band = None if u is None else _half_widths(u.transmissibility(test.freq), test)
     raw, noise = _recorded(it, test), noise_level(test, it.structure).response
     words, unit = ("transmissibility", "–") if own else ("spectrum of acceleration", "m/s², scaled as given")
+    if own and not test.translational.all():
+        unit = "per unit base motion"
     for s, name in enumerate(test.sensor_names):
         turn = _against_base(test, test.rigid_body[s])
         yield Channel(
@@ -132,7 +134,10 @@ def _forces(it: Identification, test: Measurement) -> Iterator[Channel]:
     for i, axis in enumerate(test.base_axes or ()):
         words, unit = ("apparent mass", "kg") if test.has_unit_runs else ("spectrum of force", "N, scaled as given")
         if not test.translational.all():
-            words, unit = "force or moment of the base", "N or N m" + " per unit of base motion" * test.has_unit_runs
+            words, unit = (
+                "force or moment",
+                "per unit base motion" if test.has_unit_runs else "N or N m, scaled as given",
+            )
         turn = _against_base(test, np.eye(test.n_base)[i])
         yield Channel(
             f"base force {axis}", words, unit, turn * test.force[:, i], turn * predicted[:, i],

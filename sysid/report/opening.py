@@ -96,10 +96,10 @@ def _masses(it: Identification) -> Iterator[tuple[str, str]]:
     masses, std = np.diag(it.structure.rigid_body_mass), np.diag(it.quick_std("rigid_body_mass"))
     by_user = np.diag(stated(it))
     for axis, mass, deviation, known in zip(it.measurement.base_axes or (), masses, std, by_user, strict=True):
-        unit = "kg m²" if axis.startswith("r") else "kg"
+        what, unit = ("moment of inertia", "kg m²") if axis.startswith("r") else ("total mass", "kg")
         exact = known and half_width(deviation, mass) in ("open", "0")
         told = f"{number(mass)} {unit}, as stated" if exact else _with_interval(mass, deviation, unit)
-        yield f"total mass, {axis}", told
+        yield f"{what}, {axis}", told
 
 
 def _unknowns(it: Identification) -> Iterator[tuple[str, str]]:
