@@ -21,6 +21,7 @@ from sysid.report import report
 WIDTHS = ((1280, False), (768, True), (380, False), (380, True))  # pixels; dark
 CONTRAST = 4.5  # of text, WCAG 2.2 AA
 MOST_BYTES = 5 * 2**20
+MOST_SECONDS = 4.0
 
 
 def lines(reduced: bool) -> Iterator[Line]:
@@ -29,11 +30,15 @@ def lines(reduced: bool) -> Iterator[Line]:
         where = Path(folder)
         command = [sys.executable, "-m", "sysid", "run", "cantilever_tower", "--quiet", "--out", str(where / "tower")]
         seconds = []
-        for _ in range(2 if reduced else 4):
+        for run in range(4):
             begun = time.perf_counter()
             subprocess.run(command, check=True, cwd=where)
             seconds.append(time.perf_counter() - begun)
-        yield below("sysid run cantilever_tower with its page, not the first time, s: least", min(seconds[1:]), 4.0)
+            if reduced and run and seconds[-1] < MOST_SECONDS:  # else other work may have had the processor
+                break
+        yield below(
+            "sysid run cantilever_tower with its page, not the first time, s: least", min(seconds[1:]), MOST_SECONDS
+        )
         pages = {"tower": (where / "tower" / report.FILE_NAME).read_text(encoding="utf-8")}
         large = report.write_report(_large(), where / "large")
         yield below("bytes of the page of 20 sensors, 3 directions, 1,000 lines", large.stat().st_size, MOST_BYTES)
