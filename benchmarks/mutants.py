@@ -114,9 +114,9 @@ MISSED = (
     Mutant("H02", "elitist learning in every state",
         "if self.state is EvolutionaryState.CONVERGENCE and self.box.n_free > 0:", "if self.box.n_free > 0:",
         "test_moves"),
-    Mutant("H03", "deviations of a problem in expressions never inflated",
+    Mutant("H03", "deviations of free matrices never inflated",
         "inflation = inflation_of(test, records, unknowns)", "inflation = 1.0",
-        "test_stated_noise"),
+        "test_uncertainty::TestNoiseLevel"),
 )  # fmt: skip
 
 NOTICED = (
