@@ -170,6 +170,24 @@ def _quiet(left: ComplexArray, variance: Array, own: NDArray[np.bool_]) -> Array
     return out
 
 
+def noise_at_most(test: Measurement, left: ComplexArray) -> Array | None:
+    """Noise that is not known, at most: what a fit leaves of the quietest quarter of the lines.
+
+    Parameters
+    ----------
+    test : Measurement
+    left : ndarray, shape (runs, channels, n_freq)
+        Measured less predicted.
+
+    Returns
+    -------
+    ndarray, shape (runs, channels, 1), or None
+        Standard deviations; None with few lines, and of transmissibilities, whose noise may be in proportion to them.
+    """
+    quiet = None if test.has_unit_runs else _quiet(left, np.ones(left.shape), test.own_lines)
+    return None if quiet is None else np.asarray(np.sqrt(quiet)[..., None])
+
+
 def missed_in_words(misses: list[Miss]) -> Iterator[str]:
     """Records that the model misses by more than their noise, in one sentence."""
     told = [

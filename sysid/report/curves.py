@@ -17,6 +17,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.plot.panels import run_names
 from sysid.plot.plots import stick_model
 from sysid.report.html import text
+from sysid.report.noise_level import noise_level
 from sysid.report.still import Channel, curve_sheet, mode_still, room_of_modes
 from sysid.results.identification import Identification
 from sysid.results.summary import DEVIATES
@@ -46,14 +47,19 @@ def curves(it: Identification, test: Measurement) -> str:
         for run, name in enumerate(runs)
     )
     words = "Measured and identified spectra, their difference and the noise"
-    return _element("curves", content, words, f'{_legend(channels)}<div class="sheets">{drawn}</div>')
+    return _element(
+        "curves",
+        content,
+        words,
+        f'{_legend(channels, at_most=test.response_std is None)}<div class="sheets">{drawn}</div>',
+    )
 
 
-def _legend(channels: Sequence[Channel]) -> str:
+def _legend(channels: Sequence[Channel], *, at_most: bool) -> str:
     """What each line is, of those that are drawn."""
     keys = {"measured": "measured", "identified": "identified", "left": "their difference"}
     if any(channel.noise is not None for channel in channels):
-        keys["noise"] = "noise (standard deviation)"
+        keys["noise"] = f"noise{' at most, by the quietest lines' * at_most} (standard deviation)"
     if any(channel.band is not None for channel in channels):
         keys["band"] = "half of the 95 % interval of the identified"
     marks = "".join(f'<span class="key {kind}">{words}</span>' for kind, words in keys.items())
@@ -106,13 +112,13 @@ def _responses(it: Identification, test: Measurement) -> Iterator[Channel]:
     predicted = test.predict(it.structure) + np.einsum("sd,rdf->rsf", test.rigid_body, test.base)
     u = it.quick_uncertainty
     band = None if u is None else _half_widths(u.transmissibility(test.freq), test)
-    raw = _recorded(it, test)
+    raw, noise = _recorded(it, test), noise_level(test, it.structure).response
     words, unit = ("transmissibility", "–") if own else ("spectrum of acceleration", "m/s², scaled as given")
     for s, name in enumerate(test.sensor_names):
         turn = _against_base(test, test.rigid_body[s])
         yield Channel(
             name, words, unit, turn * test.response[:, s], turn * predicted[:, s],
-            _levels(test.response_std, s, test), _levels(band, s, test),
+            _levels(noise, s, test), _levels(band, s, test),
             None if raw is None else np.abs(raw.response[:, s]),
         )  # fmt: skip
 
@@ -121,6 +127,7 @@ def _forces(it: Identification, test: Measurement) -> Iterator[Channel]:
     if test.force is None:
         return
     predicted, u = test.predict_force(it.structure), it.quick_uncertainty
+    noise = noise_level(test, it.structure).force
     band = None if u is None else _half_widths(u.base_force(test.freq), test)
     for i, axis in enumerate(test.base_axes or ()):
         words, unit = ("apparent mass", "kg") if test.has_unit_runs else ("spectrum of force", "N, scaled as given")
@@ -129,7 +136,7 @@ def _forces(it: Identification, test: Measurement) -> Iterator[Channel]:
         turn = _against_base(test, np.eye(test.n_base)[i])
         yield Channel(
             f"base force {axis}", words, unit, turn * test.force[:, i], turn * predicted[:, i],
-            _levels(test.force_std, i, test), _levels(band, i, test),
+            _levels(noise, i, test), _levels(band, i, test),
         )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from sysid.report.html import bullets, number, paragraph, sentence, table, text
 from sysid.report.matrices import stated
+from sysid.report.noise_level import NoiseLevel, noise_level
 from sysid.results.identification import Identification
 from sysid.results.summary import DEVIATES, counted, half_width, next_steps, verdict
 from sysid.results.unknowns_table import rows_of
@@ -122,17 +123,20 @@ def _modes(it: Identification) -> Iterator[tuple[str, str]]:
 
 def _fit(it: Identification) -> Iterator[tuple[str, str]]:
     test = it.problem.screened.measurement
+    level = noise_level(test, it.structure)
     left = f"{number(100 * it.residual, 3)} % of the accelerations relative to the base"
-    noise = _share(test.response_std, test.relative)
-    left += f" (noise {number(100 * noise, 3)} %)" if noise else ""
+    left += _beside(_share(level.response, test.relative), level)
     if it.force_residual is not None and test.force is not None:
         left += f", {number(100 * it.force_residual, 3)} % of the base force"
-        noise = _share(test.force_std, test.force)
-        left += f" (noise {number(100 * noise, 3)} %)" if noise else ""
+        left += _beside(_share(level.force, test.force), level)
     yield "the fit leaves", left
     for i, unseen in enumerate(it.validation, start=1):
         missed = number(100 * unseen.residual(it.structure), 3)
         yield f"unfitted test {i}", f"missed by {missed} % of its accelerations relative to the base"
+
+
+def _beside(noise: float, level: NoiseLevel) -> str:
+    return f" (noise{level.bound} {number(100 * noise, 3)} %)" if noise else ""
 
 
 def rounded(value: float, std: float, digits: int = 4) -> tuple[str, str]:
@@ -149,15 +153,6 @@ def _with_interval(value: float, std: float, unit: str) -> str:
     if width == "open":
         return f"{told} {unit}, one of many: these data do not determine it"
     return f"{told} {unit}" if width == "0" else f"{told} ± {width} {unit}"
-
-
-def share_of_noise(std: Array | None, records: ComplexArray) -> Array:
-    """Noise over records, (channels,), as the residual measures them; NaN where it is not known."""
-    if std is None:
-        return np.full(records.shape[1], np.nan)
-    size = np.linalg.norm(records, axis=(0, 2))
-    noise = np.sqrt(np.sum(np.broadcast_to(std, records.shape) ** 2, axis=(0, 2)))
-    return np.divide(noise, size, out=np.full_like(size, np.nan), where=size > 0)
 
 
 def _share(std: Array | None, records: ComplexArray) -> float:

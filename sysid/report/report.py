@@ -16,7 +16,8 @@ from sysid.problem.problem import Problem
 from sysid.report.curves import curves, mode_shapes, script
 from sysid.report.html import Cell, beside, bullets, matrix, number, page, paragraph, picture, sentence, table, text
 from sysid.report.matrices import CHOSEN, ONE_OF_MANY, SAME, Lines, half_widths, matrices, plain, stated
-from sysid.report.opening import opening, rounded, share_of_noise, trust
+from sysid.report.noise_level import noise_level, share_of_noise
+from sysid.report.opening import opening, rounded, trust
 from sysid.results.gain_table import gains_of_sensors
 from sysid.results.identification import Identification
 from sysid.results.noise_table import noise_of_channels
@@ -243,10 +244,11 @@ def _responses(it: Identification, test: Measurement) -> str:
 def _residuals(it: Identification) -> str:
     """What the fit leaves of each channel, beside its noise."""
     test = _as_fitted(it, it.measurement)
+    level = noise_level(test, it.structure)
     left = [1 - score for score in scores(it.structure, test).relative]
-    channels = [*zip(test.sensor_names, left, share_of_noise(test.response_std, test.relative), strict=True)]
+    channels = [*zip(test.sensor_names, left, share_of_noise(level.response, test.relative), strict=True)]
     if test.force is not None:
-        noise = share_of_noise(test.force_std, test.force)
+        noise = share_of_noise(level.force, test.force)
         force = [*zip(test.base_axes or (), _score_of_force(it, test), noise, strict=True)]
         channels += [(f"base force {axis}", 1 - score, own) for axis, score, own in force]
     known = any(np.isfinite(noise) for *_, noise in channels)
@@ -256,7 +258,7 @@ def _residuals(it: Identification) -> str:
     )
     caption += "to the base; and its noise likewise." if known else "to the base."
     caption += " Outliers that stand alone are left out." * (test is not it.measurement)
-    return table(("channel", "left [%]", *["noise [%]"] * known), rows, caption)
+    return table(("channel", "left [%]", *[f"noise{level.bound} [%]"] * known), rows, caption)
 
 
 def _as_fitted(it: Identification, test: Measurement) -> Measurement:
