@@ -20,6 +20,7 @@ _STEPS = 30
 _VAGUE = 1e-6  # information on a logarithm that counts as none
 _SETTLED = 1e-4  # of a level's logarithm
 VANISHING = 1e-5  # of a channel's rms: least noise; what the model leaves of folding can show below it
+NO_NOISE = 2 * VANISHING  # levels at the least, which the fit's own numbers raise a little, are no noise
 _LEAST_SHARE = 0.01  # of the median share of noise: with few lines one channel could come out exact, infinitely likely
 
 

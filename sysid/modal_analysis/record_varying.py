@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 
 from sysid.measurement.whole import VaryingLevel
 from sysid.modal_analysis.record_fit import Monitor, RecordFit, refitted
-from sysid.modal_analysis.record_noise import level_deviations, likeliest_levels
+from sysid.modal_analysis.record_noise import NO_NOISE, level_deviations, likeliest_levels
 from sysid.modal_analysis.record_whiteness import excess_of
 
 _UNTOLD = 0.5  # standard deviation of a level's logarithm, beyond which the records do not determine it
-_TRACE = 1e-5  # of the channels' rms: where all levels are smaller, there is no noise to tell
 
 
 def with_varying_levels(fit: RecordFit, *, monitor: Monitor | None = None) -> RecordFit:
@@ -67,7 +66,7 @@ def untold_levels(fit: RecordFit) -> tuple[tuple[int, int], ...]:
     outputs = fit.test.response if fit.test.force is None else np.concatenate([fit.test.response, fit.test.force], 1)
     power = np.sum(np.abs(np.concatenate([outputs, fit.test.base], axis=1)) ** 2, axis=2)
     rms = np.sqrt(power / (fit.test.own_lines.sum(axis=1) * fit.test.whole.density)[:, None])
-    if fit.test.whole.noise is not None or np.all(np.sqrt(fit.levels_of_runs) <= _TRACE * rms):
+    if fit.test.whole.noise is not None or np.all(np.sqrt(fit.levels_of_runs) <= NO_NOISE * rms):
         return ()
     wide = level_deviations(fit.model, fit.parameters, fit.levels) > _UNTOLD
     return tuple((int(run), int(channel)) for run, channel in np.argwhere(wide))

@@ -16,11 +16,11 @@ from scipy.special import gammaincc
 
 from sysid.measurement.whole import Excess
 from sysid.modal_analysis.record_fit import RecordFit
+from sysid.modal_analysis.record_noise import NO_NOISE
 from sysid.structure.structure import Array
 
 LEVEL = 1e-3  # of false alarms, of all channels, runs and bands together
 _FEWEST = 8  # lines of a band
-_TRACE = 1e-5  # of a channel's rms: smaller levels are what sampling leaves of exact records, no noise
 
 
 def excess_of(fit: RecordFit) -> tuple[Excess, ...]:
@@ -34,7 +34,7 @@ def excess_of(fit: RecordFit) -> tuple[Excess, ...]:
         freq, runs = test.freq[own], [run for run in model.runs if run.number == number]
         both = np.concatenate([np.vstack([run.outputs, run.base]) for run in runs], axis=1)
         size = np.sqrt(np.mean(np.abs(both) ** 2, axis=1) / runs[0].density)
-        for channel in np.flatnonzero(levels[number] > _TRACE * size):
+        for channel in np.flatnonzero(levels[number] > NO_NOISE * size):
             best = most_unlikely(power[channel], bands)
             if best is not None:
                 first, last, weight = best

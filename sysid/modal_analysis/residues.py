@@ -248,7 +248,7 @@ class SubsetFits:
         self._outside = float(np.sum(left**2))
         # Products of errors `left + Q z` with their neighbours in each run: constant, linear, quadratic in z; by lag.
         ours, basis = records.in_runs(left), records.in_runs(Q)
-        self._constant = _own_products(ours)
+        self._constant, self._chance = _own_products(ours)  # chance as in the fit on all poles
         self._linear = _lagged(lambda lag: _products(basis, ours, lag) + _products(ours, basis, lag).swapaxes(1, 2))
         self._quadratic = _lagged(lambda lag: _products(basis, basis, lag))
 
@@ -270,7 +270,7 @@ class SubsetFits:
         linear = np.einsum("lrkc,kc->lr", self._linear, z)
         products = self._constant + linear + np.einsum("lrij,ij->lr", self._quadratic, squares)
         unknowns, records = kept.size * self.per_pole, self.records
-        factor = _correlation_factor(products, records.data.shape[1], records.freq.size, unknowns)
+        factor = _correlation_factor(products, self._chance, records.data.shape[1], records.freq.size, unknowns)
         return fit.gain / records.variance(factor * squared_error, unknowns), squared_error
 
 
@@ -284,9 +284,17 @@ def _neighbours(first: ComplexArray, second: ComplexArray, lag: int) -> tuple[Co
     return first[:, lag:], second[:, : max(second.shape[1] - lag, 0)].conj()
 
 
-def _own_products(error: ComplexArray) -> ComplexArray:
-    """Sums of products of errors (runs, n_freq, channels) with their neighbours, (lags, runs)."""
-    return _lagged(lambda lag: np.einsum("rfc,rfc->r", *_neighbours(error, error, lag)))
+def _own_products(error: ComplexArray) -> tuple[ComplexArray, Array]:
+    """Sums of products of errors (runs, n_freq, channels) with their neighbours, (lags, runs), and chance in them.
+
+    Products at two lines are independent where the noise is white, whatever channels share and however lines differ:
+    the variance of their sum, relative to the squared power of the run, is that of their squares.
+    """
+    each = [np.einsum("rfc,rfc->rf", *_neighbours(error, error, lag)) for lag in _LAGS]
+    sums = np.stack([one.sum(axis=1) for one in each])
+    squares = np.stack([np.sum(np.abs(one) ** 2, axis=1) for one in each])
+    power = sums[0].real ** 2
+    return sums, squares / np.where(power > 0, power, 1.0)
 
 
 def _products(first: ComplexArray, second: ComplexArray, lag: int) -> ComplexArray:
@@ -324,15 +332,16 @@ def line_correlation(error: ComplexArray, unknowns: int = 0) -> float:
     unknowns : int
         Real numbers of the fit that leaves it.
     """
-    return _correlation_factor(_own_products(error.transpose(1, 2, 0)), error.shape[0], error.shape[-1], unknowns)
+    products, chance = _own_products(error.transpose(1, 2, 0))
+    return _correlation_factor(products, chance, error.shape[0], error.shape[-1], unknowns)
 
 
-def _correlation_factor(products: ComplexArray, channels: int, lines: int, unknowns: int) -> float:
+def _correlation_factor(products: ComplexArray, variance: Array, channels: int, lines: int, unknowns: int) -> float:
     """One, and twice the correlation of errors at each lag up to the first that may be chance.
 
-    `products` are sums over channels and lines, (lags, runs). White noise of power p over N complex numbers makes sums
-    of variance ``p^2 / N``, whose squared moduli over it are exponential; they are taken off. A fit of white noise
-    leaves errors ``I - H``, whose sums are at most those of ``trace(H)``, half the unknowns, over N.
+    `products` are sums over channels and lines, (lags, runs), and `variance` that of white noise in them over the
+    squared power of the run: squared moduli over it are exponential; they are taken off. A fit of white noise leaves
+    errors ``I - H``, whose sums are at most those of ``trace(H)``, half the unknowns, over all complex numbers.
     """
     power = products[0].real
     moved = power > 0
@@ -341,9 +350,9 @@ def _correlation_factor(products: ComplexArray, channels: int, lines: int, unkno
     share = unknowns / max(2 * channels * lines * moved.sum() - unknowns, 1)
     chance = chdtri(2 * moved.sum(), _CHANCE) / 2
     factor = 1.0
-    for lag, sums in enumerate(np.abs(products[1:, moved]) / power[moved], start=1):
-        level = channels * (lines - lag) / (channels * lines) ** 2
-        if np.sum(np.maximum(sums - share, 0) ** 2) <= chance * level:
+    for sums, level in zip(np.abs(products[1:, moved]) / power[moved], variance[1:, moved], strict=True):
+        beyond = np.maximum(sums - share, 0) ** 2
+        if np.sum(np.divide(beyond, level, out=np.zeros_like(level), where=level > 0)) <= chance:
             break
         factor += 2 * float(np.sqrt(np.maximum(sums**2 - level, 0)) @ power[moved] / np.sum(power))
     return factor

@@ -16,7 +16,8 @@ def without_transients_of(test: Measurement, structure: Structure) -> Measuremen
 
     Changes of displacement q and velocity v over a run make ``Z^-1 (f + i w g)`` of the degrees of freedom, with Z the
     dynamic stiffness, ``f = K v`` and ``g = K q + C v``: two real numbers a degree of freedom and run, whatever the
-    damping. Traces of sampling and detrending are real multiples of 1, i w and 1 / (i w) a channel and run.
+    damping. Traces of sampling and detrending are real multiples of 1, i w and 1 / (i w) a channel and run,
+    also of one at rest at both ends.
     """
     if test.whole is None:
         return test
@@ -34,9 +35,10 @@ def without_transients_of(test: Measurement, structure: Structure) -> Measuremen
     if test.force is not None:
         left = np.concatenate([left, test.force - test.predict_force(structure)], axis=1)
     taken = np.zeros_like(left)
-    for run in test.whole.moving:
-        own = test.own_lines[run]
-        taken[run][:, own] = _fitted(left[run][:, own], np.moveaxis(shown, 0, -1)[..., own], w[own] / w[-1])
+    shown = np.moveaxis(shown, 0, -1)  # (c, 2 n, L)
+    for run, (own, rest) in enumerate(zip(test.own_lines, test.whole.at_rest, strict=True)):
+        of_ends = shown[:, :0] if rest else shown
+        taken[run][:, own] = _fitted(left[run][:, own], of_ends[..., own], w[own] / w[-1])
     s = test.n_sensors
     force = None if test.force is None else test.force - taken[:, s:]
     return replace(test, whole=None, response=test.response - taken[:, :s], force=force)
@@ -54,7 +56,7 @@ def _fitted(left: ComplexArray, shown: ComplexArray, unit: Array) -> ComplexArra
     plain_rows, plain = rows - Q @ (Q.T @ rows), wanted - (wanted @ Q) @ Q.T
     scale = np.linalg.norm(plain_rows, axis=(0, 1))
     scale[scale == 0] = 1.0
-    x = np.linalg.lstsq((plain_rows / scale).reshape(-1, p), plain.ravel(), rcond=1e-10)[0] / scale
+    x = np.linalg.lstsq((plain_rows / scale).reshape(plain.size, p), plain.ravel(), rcond=1e-10)[0] / scale
     made = rows @ x
     made = (made + (wanted - made) @ Q @ Q.T) * size[:, None]
     return made[:, :lines] + 1j * made[:, lines:]

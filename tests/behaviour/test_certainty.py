@@ -130,6 +130,15 @@ class TestLineCorrelation:
         found = [line_correlation(real + 1j * imaginary) for real, imaginary in drawn]
         assert found == [1.0] * 100
 
+    def test_nor_does_noise_that_channels_share_or_that_few_lines_hold(self):
+        rng = np.random.default_rng(0)
+        white = rng.normal(size=(100, 2, 10, 1, 200))
+        unequal = np.where(np.arange(200) < 10, 3.0, 0.1)
+        for real, imaginary in white:
+            error = real + 1j * imaginary
+            assert line_correlation(error[:1] + 0.3 * error) == 1.0
+            assert line_correlation(unequal * error) == 1.0
+
     @pytest.mark.parametrize(("lines", "poles"), [(50, 8), (400, 20)])
     def test_nor_does_what_a_fit_leaves_of_it(self, lines, poles):
         """Free residues of both kinds take a sixth and a tenth of all numbers, of neighbouring lines together."""

@@ -7,6 +7,9 @@ import pytest
 
 import sysid
 from benchmarks.records.simulated import Records, four_storeys
+from sysid.measurement.whole import WholeRecords
+from sysid.modal_analysis.record_fit import record_modes, refitted
+from sysid.modal_analysis.record_varying import untold_levels
 from sysid.modal_analysis.record_whiteness import LEVEL, most_unlikely
 
 SETTING = four_storeys()
@@ -56,3 +59,18 @@ def test_a_band_of_one_sensor_with_three_times_the_noise_is_told() -> None:
     (told,) = [remark for remark in result.remarks if "what the fit leaves" in remark]
     assert told.startswith(f"what the fit leaves in sensor 2 is {worst.factor:.2g} times the noise level between ")
     assert told.replace("\n", " ")[:60] in result.summary().replace("\n  ", " ")
+
+
+@pytest.mark.parametrize(("noise", "told"), [(0.01, True), (0.0, False)])
+def test_levels_that_the_records_leave_open_are_told_only_where_there_is_noise(noise: float, told: bool) -> None:
+    """One sensor, lines far below its one mode: there the noise of the sensor and of the base look alike."""
+    rng, freq = np.random.default_rng(0), np.arange(20, 101) * 0.05
+    w, wk, ratio = 2 * np.pi * freq, 2 * np.pi * 10.0, 0.05
+    base, *error = rng.standard_normal((3, freq.size)) + 1j * rng.standard_normal((3, freq.size))
+    response = (1 + 1.2 * w**2 / (wk**2 - w**2 + 2j * ratio * wk * w)) * base
+    test = sysid.Measurement(
+        freq, (base + noise * error[0])[None, None], (response + noise * error[1])[None, None],
+        rigid_body=np.ones((1, 1)), whole=WholeRecords((1000,), 50.0, (True,)),
+    )  # fmt: skip
+    fit = record_modes(test, np.array([wk]), np.array([ratio]))
+    assert bool(untold_levels(refitted(fit, fit.parameters))) == told
