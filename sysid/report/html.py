@@ -91,7 +91,7 @@ svg .dot { fill: var(--found); } svg .base { fill: var(--soft); }
 @media screen { .drawn .sheets { display: none; } }
 @media (max-width: 600px) { body { padding: .8rem .8rem 3rem; font-size: 14px; } th, td { padding: .2rem .4rem; }
   td:first-child { white-space: normal; max-width: 9em; }
-  .words td:first-child { white-space: normal; max-width: 7.5em; }
+  .words td:first-child { white-space: normal; min-width: 8em; max-width: 8em; }
   h1 { font-size: 1.25rem; } .shapes svg { width: calc(50% - .25rem); }
   .shapes svg text { font-size: 13px; } .shapes svg .title { font-size: 14px; } }
 @media print { body { max-width: none; padding: 0; font-size: 10pt; }
