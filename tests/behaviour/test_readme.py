@@ -102,6 +102,25 @@ def test_the_examples_of_the_docs_find_their_own_structure(tmp_path, monkeypatch
     _ring_is_identified(names["RingStiffness"]())
 
 
+def test_the_lines_on_records_and_results_run_one_after_the_other():
+    rng, G = np.random.default_rng(1), np.ones((2, 1))
+    K = 2000.0 * np.array([[2, -1, -1], [-1, 1, 0], [-1, 0, 1]])
+    truth = sysid.Structure(np.diag([5.0, 4.0, 0.0]), K, [0.01, 0.015], n_base=1)
+    base = rng.standard_normal((1, 2000))
+    still = truth.simulate(base, 100.0)
+    base, response = base[:, 500:], still[:, 500:] + 0.01 * rng.standard_normal((2, 1500))  # begins in motion
+    names = {"sysid": sysid, "G": G, "base": base, "response": response, "freq": np.linspace(0.5, 8.0, 20)}
+    (records,), (bounds,), (motion,) = map(
+        examples, ("docs/records_and_noise.md", "docs/what_the_data_determine.md", "docs/results.md")
+    )
+    exec(compile(records, "records_and_noise.md", "exec"), names)
+    names["result"] = sysid.identify(sysid.Problem(names["test"], mass=sysid.LumpedMass(total_mass=9.0)), rng=0)
+    exec(compile(bounds, "what_the_data_determine.md", "exec"), names)
+    exec(compile(motion, "results.md", "exec"), names)
+    assert names["scores"].error.max() < 0.03 and names["force"].shape == base.shape
+    np.testing.assert_allclose(names["result"].structure.mass[:2, :2], np.diag([5.0, 4.0]), atol=0.05)
+
+
 def _ring_is_identified(model):
     """The matrix model of the README finds the springs of a ring of sectors that differ in mass."""
     to_base, coupling, G = 2e4, 3e3, np.ones((4, 1))
