@@ -1,11 +1,14 @@
 """The documents: every page is in the site's contents, and the reference has every public name."""
 
+import contextlib
+import io
 import re
 from pathlib import Path
 
 import pytest
 
 import sysid
+from sysid.cli import main as cli
 
 ROOT = Path(__file__).resolve().parents[1]
 pytestmark = pytest.mark.skipif(not (ROOT / "mkdocs.yml").exists(), reason="no documents beside the tests")
@@ -30,3 +33,16 @@ def test_the_reference_has_every_public_name():
 
 def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) < 150
+
+
+def test_every_option_that_the_pages_name_is_there():
+    commands = ("read", "run", "export", "report", "new", "show", "list", "compare", "refine", "doctor")
+    with contextlib.redirect_stdout(io.StringIO()) as told:
+        for command in commands:
+            with contextlib.suppress(SystemExit):
+                cli.main([command, "--help"])
+    known = set(re.findall(r"--[a-z][a-z-]+", told.getvalue()))
+    for name in ("README.md", *(f"docs/{page}.md" for page in ("command_line", "reading_files", "refinement_jobs"))):
+        text = (ROOT / name).read_text(encoding="utf-8")
+        assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", text)) <= known, name
+        assert set(re.findall(r"[`\n]sysid ([a-z]+)\b", text)) <= set(commands), name
