@@ -75,8 +75,8 @@ MISSED = (
     Mutant("B10", "accelerations never adapted", "self.cognitive, self.social = adaptation.next_accelerations(",
         "_ = adaptation.next_accelerations(", "test_moves"),
     Mutant("C05", "inflation of a problem in expressions times 1.5",
-        "inflation = inflation_of(test, records_of(test, structure, x.size), x.size)",
-        "inflation = 1.5 * inflation_of(test, records_of(test, structure, x.size), x.size)", "test_stated_noise"),
+        "inflation = inflation_of(weighed, records_of(test, structure, x.size), x.size)",
+        "inflation = 1.5 * inflation_of(weighed, records_of(test, structure, x.size), x.size)", "test_stated_noise"),
     Mutant("C12", "poles of the data that fit better than the model's never told",
         "possible = max(poles.of_accelerations, _ROUND_OFF)", "possible = np.inf",
         "test_checks::test_a_model_whose_poles_are_not_those_of_the_data_is_told"),
@@ -115,7 +115,7 @@ MISSED = (
         "if self.state is EvolutionaryState.CONVERGENCE and self.box.n_free > 0:", "if self.box.n_free > 0:",
         "test_moves"),
     Mutant("H03", "deviations of a problem in expressions never inflated",
-        "inflation = 1.0 if as_stated else inflation_of(test, records, unknowns)", "inflation = 1.0",
+        "inflation = 1.0 if as_stated else inflation_of(by_lines, records, unknowns)", "inflation = 1.0",
         "test_stated_noise"),
 )  # fmt: skip
 
@@ -173,7 +173,7 @@ NOTICED = (
     Mutant("C02", "intervals 1.2 times too wide", "z = float(ndtri((1 + level) / 2))",
         "z = 1.2 * float(ndtri((1 + level) / 2))", "test_uncertainty"),
     Mutant("C03", "level of intervals one-sided", "ndtri((1 + level) / 2)", "ndtri(level)", "test_uncertainty"),
-    Mutant("C04", "no inflation", "return float(np.sqrt(beyond * shared))", "return 1.0",
+    Mutant("C04", "no inflation", "return float(np.sqrt(beyond * line_correlation(error, unknowns)))", "return 1.0",
         "test_uncertainty::TestNoiseLevel"),
     Mutant("C06", "everything determined", "determined=not open_,", "determined=True,", "test_honesty"),
     Mutant("C07", "matrices that noise leaves open called determined", "if not it.determined or exact:", "if True:",
