@@ -114,9 +114,9 @@ MISSED = (
     Mutant("H02", "elitist learning in every state",
         "if self.state is EvolutionaryState.CONVERGENCE and self.box.n_free > 0:", "if self.box.n_free > 0:",
         "test_moves"),
-    Mutant("H03", "deviations of a problem in expressions never inflated",
-        "inflation = 1.0 if as_stated else inflation_of(by_lines, records, unknowns)", "inflation = 1.0",
-        "test_stated_noise"),
+    Mutant("H03", "deviations of free matrices never inflated",
+        "inflation = inflation_of(test, records, unknowns)", "inflation = 1.0",
+        "test_uncertainty::TestNoiseLevel"),
 )  # fmt: skip
 
 NOTICED = (
@@ -226,8 +226,8 @@ NOTICED = (
     Mutant("F02", "candidates that break constraints not penalised",
         "np.where(broken > 0, _WORST * (1 + broken), np.minimum(objective, _WORST))", "np.minimum(objective, _WORST)",
         "test_swarm_objective"),
-    Mutant("F03", "success above the goal", "end.success and not wrong,",
-        "end.success and not [one for one in wrong if 'above the goal' not in one],", "test_identify"),
+    Mutant("F03", "success above the goal", "return self.fits and not self.wrong",
+        "return self.fits or not [one for one in self.wrong if 'above the goal' not in one]", "test_identify"),
     Mutant("F06", "refinement by IPOPT left out",
         "self.refine(self.spectrum)", "pass", "test_swarm_strategy test_identify"),
     Mutant("F07", "the first best of the swarm kept",

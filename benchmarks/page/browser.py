@@ -41,6 +41,12 @@ point("pointerdown", 0.3); point("pointermove", 0.6); point("pointerup", 0.6);
 told.zoomed = paths() !== all;
 area.dispatchEvent(new MouseEvent("dblclick"));
 told.whole = paths() === all;
+for (const tick of document.querySelectorAll("input[type=checkbox]")) {
+  const recorded = () => document.querySelectorAll("path.recorded").length;
+  const before = recorded();
+  tick.click();
+  if (recorded() > before) count("checkbox");
+}
 for (const button of document.querySelectorAll("button")) { button.click(); count(button.textContent); }
 told.all_lines = paths() === all;
 const keyed = document.querySelector(".told").textContent;
@@ -50,19 +56,18 @@ for (const one of document.querySelectorAll("input[type=range]")) {
   one.value = 200;
   one.dispatchEvent(new Event("input"));
 }
-window.dispatchEvent(new Event("beforeprint"));
-told.sheets = document.querySelectorAll(".paper svg").length;
-window.dispatchEvent(new Event("afterprint"));
-told.left = document.querySelectorAll(".paper").length;
+const sheets = [...document.querySelectorAll(".sheet svg")];
+told.sheets = sheets.length;
+told.stills = sheets.filter((one) => one.getBoundingClientRect().width > 0).length;
 const moving = () => [...document.querySelectorAll(".shapes circle")].map((one) => one.getAttribute("cx")).join();
 told.over = [...document.querySelectorAll("body *")]
   .filter((one) => !one.closest(".scroll, pre, svg, [hidden], noscript"))
   .filter((one) => one.getBoundingClientRect().right > innerWidth + 1)
   .map((one) => one.outerHTML.slice(0, 80));
 told.sideways = document.documentElement.scrollWidth - document.documentElement.clientWidth;
-const bottom = (words) => [...document.querySelectorAll("strong, td, b")]
-  .find((one) => one.textContent.startsWith(words)).getBoundingClientRect().bottom;
-told.first = ["Determined", "Next:", "mode 1", "total mass"].map(bottom);
+const bottom = (words) => [...document.querySelectorAll("td, b")].find((one) => one.textContent.startsWith(words));
+told.first = [document.querySelector(".verdict strong"), ...["Next:", "mode 1", "total mass"].map(bottom)]
+  .map((one) => one.getBoundingClientRect().bottom);
 const light = (colour) => {
   const [r, g, b] = colour.match(/[0-9.]+/g).slice(0, 3).map((one) => one / 255)
     .map((v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4));
@@ -101,11 +106,27 @@ def measured(page: str, folder: Path, width: int, height: int = 800, *, dark: bo
         "<pre id=told></pre><script>onmessage = (e) => { told.textContent = e.data; };</script>"
     )
     scheme = f"--blink-settings=preferredColorScheme={0 if dark else 1}"
-    ran = _chromium(folder, scheme, "--window-size=1400,900", "--dump-dom", (folder / "frame.html").as_uri())
-    words = re.findall(r'<pre id="told">(.*?)</pre>', ran.stdout, re.DOTALL)[0]
-    if not words:
-        raise RuntimeError(f"the page's script did not end: {ran.stderr}")
-    found: dict[str, Any] = json.loads(html.unescape(words))
+    return _told(folder, scheme)
+
+
+STILL = """<script>
+onload = () => {
+  const page = document.querySelector("iframe").contentDocument;
+  const wide = (one) => one.getBoundingClientRect().width > 100;
+  const count = (what) => [...page.querySelectorAll(what)].filter(wide).length;
+  const over = page.documentElement.scrollWidth - page.documentElement.clientWidth;
+  document.querySelector("pre").textContent = JSON.stringify(
+    { sheets: count(".sheet svg"), modes: count(".shapes svg"), controls: count("select, button"), sideways: over });
+};
+</script>"""
+
+
+def seen_without_scripts(page: str, folder: Path, width: int, height: int = 800) -> dict[str, int]:
+    """How many curves, mode shapes and controls a browser shows that runs no script, and what is wider than it."""
+    (folder / "page.html").write_text(re.sub(r"script-src '[^']*'", "script-src 'none'", page), encoding="utf-8")
+    frame = f'<iframe src="page.html" style="border:0" width={width} height={height}></iframe><pre id=told></pre>'
+    (folder / "frame.html").write_text(frame + STILL)
+    found: dict[str, int] = _told(folder, "--allow-file-access-from-files")
     return found
 
 
@@ -115,6 +136,15 @@ def pages_printed(page: Path, folder: Path) -> int:
     _chromium(folder, f"--print-to-pdf={pdf}", page.as_uri())
     content = pdf.read_bytes()
     return len(re.findall(rb"/Type\s*/Page\b", content)) if content.startswith(b"%PDF") else 0
+
+
+def _told(folder: Path, option: str) -> Any:
+    """What the script of the frame tells."""
+    ran = _chromium(folder, option, "--window-size=1400,900", "--dump-dom", (folder / "frame.html").as_uri())
+    words = re.findall(r'<pre id="told">(.*?)</pre>', ran.stdout, re.DOTALL)[0]
+    if not words:
+        raise RuntimeError(f"the page's script did not end: {ran.stderr}")
+    return json.loads(html.unescape(words))
 
 
 def _chromium(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:

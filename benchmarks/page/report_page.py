@@ -7,7 +7,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -42,13 +42,18 @@ def lines(reduced: bool) -> Iterator[Line]:
             return
         pages["large"] = large.read_text(encoding="utf-8")
         for name, page in list(pages.items())[: 1 if reduced else 2]:
-            yield from _in_a_browser(name, page, where)
+            yield from _in_a_browser(name, page, where, WIDTHS[::3] if reduced else WIDTHS)
+        still = browser.seen_without_scripts(pages["tower"], where, 380)
+        shown = still["sheets"], still["modes"], still["sideways"]
+        expected = ((10 + 2) * 2, 10, 0)
+        text = "tower without scripts, 380 pixels: curves, mode shapes, pixels wider than the page"
+        yield Line(text, ", ".join(map(str, shown)), ", ".join(map(str, expected)), shown == expected)
         sheets = browser.pages_printed(where / "tower" / report.FILE_NAME, where)
         yield Line("tower: sheets of its print", f"{sheets}", "from 2 on", sheets > 1)
 
 
-def _in_a_browser(name: str, page: str, where: Path) -> Iterator[Line]:
-    for width, dark in WIDTHS:
+def _in_a_browser(name: str, page: str, where: Path, widths: Sequence[tuple[int, bool]]) -> Iterator[Line]:
+    for width, dark in widths:
         told = browser.measured(page, where, width, dark=dark)
         what = f"{name}, {width} pixels{', dark' * dark}: "
         yield below(what + "errors in the console", len(told["errors"]), 0)

@@ -67,6 +67,8 @@ def _jackknife(name: str, test: sysid.Measurement, shifts: int) -> Iterator[Line
     met = bool(np.all((ratios <= WITHIN) & (ratios >= 1 / WITHIN)))
     text = f"{name}: times that this jackknife is too wide where what is left is white, which are taken off"
     yield Line(text, " / ".join(f"{w:.2f}" for w in wide))
+    text = f"{name}: stated deviations over those of the jackknife as it is"
+    yield Line(text, " / ".join(f"{r:.2f}" for r in ratios / wide))
     text = f"{name}: stated deviations of frequencies over those of a jackknife by blocks of {WIDTH:g} Hz"
     yield Line(text, " / ".join(f"{r:.2f}" for r in ratios), f"{1 / WITHIN:.2f} to {WITHIN:g}", met)
 

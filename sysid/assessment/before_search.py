@@ -8,8 +8,9 @@ from itertools import product
 import numpy as np
 
 from sysid.assessment.leakage import unresolved
-from sysid.assessment.mistakes import GRAVITY, Mistake, mistakes_of
+from sysid.assessment.mistakes import CONJUGATED, GRAVITY, Mistake, mistakes_of
 from sysid.errors import InputError, refuse
+from sysid.measurement.in_time import as_whole
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.direct_terms import DirectTerms, direct_terms
 from sysid.modal_analysis.poles_of_test import poles_of_test
@@ -60,6 +61,10 @@ def _of_test(problem: Problem, declared: Formulation, test: Measurement, *, own:
     try:
         terms = direct_terms(test)
         found = mistakes_of(test, terms)
+        if found and terms is not None and terms.misfit <= CONJUGATED and test.whole is None:
+            # Of records cut in motion, transients that were left in look like delays and gains.
+            test = as_whole(test)
+            found = found if test.whole is None else mistakes_of(test, direct_terms(test))
         if own and not found and terms is not None:
             found = [*_of_mass(declared, test, terms), *_of_frequencies(problem, declared, test)]
         if not found and test.averaged:

@@ -32,7 +32,7 @@ _FAR = 4.0  # standard deviations from a stated value, beyond which it is told b
 _GAIN = 0.03  # of the base's motion; smaller errors of a sensor's gain are usual
 
 
-def doubts(problem: Problem, structure: Structure, x: Array | None) -> tuple[str, ...]:
+def doubts(problem: Problem, structure: Structure, x: Array | None, *, changing: bool = False) -> tuple[str, ...]:
     """What speaks against an answer, in sentences; nothing counts as determined beside one.
 
     Parameters
@@ -42,6 +42,8 @@ def doubts(problem: Problem, structure: Structure, x: Array | None) -> tuple[str
         The answer, with the sensors of the problem's own test.
     x : (n_variables,) or None
         The unknowns that stand for it; None where it has other degrees of freedom than the sensors.
+    changing : bool
+        Frequencies change between stretches of the records, which looks like quadrature and wrong gains too.
     """
     formulation = problem.formulation
     found: list[str] = []
@@ -54,12 +56,12 @@ def doubts(problem: Problem, structure: Structure, x: Array | None) -> tuple[str
             found += check(problem, structure)
         tests.insert(0, (problem.measurement, structure))
     for i, (test, its) in enumerate(tests, start=1):
-        told = _of_records(formulation, test, its)
+        told = _of_records(formulation, test, its, changing)
         found += told if len(tests) == 1 else [f"test {i}: {sentence}" for sentence in told]
     return tuple(found)
 
 
-def _of_records(formulation: Formulation, test: Measurement, structure: Structure) -> list[str]:
+def _of_records(formulation: Formulation, test: Measurement, structure: Structure, changing: bool) -> list[str]:
     """Signs in the records of one test that a structure is not theirs, in sentences."""
     records, poles = Records(test), distinct_poles(structure)
     leaks = list(leakage(test, structure)) if test.averaged else []
@@ -67,11 +69,13 @@ def _of_records(formulation: Formulation, test: Measurement, structure: Structur
     if records.data.shape[0] <= _LINES * poles[0].size * records.n_base * (2 if velocity else 1):
         return leaks
     free = records.fit(*poles, velocity=velocity)
-    misses, rigid = list(_misfit(formulation, test, structure, records, free)), list(_rigid(test, records, free))
-    gains = [] if rigid else list(told(test, gain_errors(test, structure)))
+    misses, rigid = list(_misfit(formulation, test, structure, records, free)), []
+    if not changing:
+        rigid = list(_rigid(test, records, free))
+    gains = [] if rigid or changing else list(told(test, gain_errors(test, structure)))
     found = [*_at_rest(test), *leaks, *misses, *_force(formulation, test, structure), *rigid, *gains]
     # Beside what those say, quadrature and likeness mean nothing.
-    if structure.modal_damping and not (leaks or rigid or gains):
+    if structure.modal_damping and not (leaks or rigid or gains or changing):
         found += _damping(records, poles, free)
     if not found:  # spectra of unknown origin, whose misfit nothing else explains
         found = leaks = list(leakage(test, structure))

@@ -17,7 +17,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.direct_terms import DirectTerms, direct_terms
 from sysid.structure.structure import Array
 
-_NO_FIT = 0.3  # relative misfit, from which modes do not explain the records
+CONJUGATED = 0.3  # relative misfit, from which modes do not explain the records
 _MENDED = 0.3  # of the misfit; what a mended record may leave
 _GROSS = 0.15  # of a sensor's rigid-body motion: smaller errors of gains are told by what was fitted
 _CHANCE = 3.0  # standard deviations that a factor may be off by
@@ -74,7 +74,7 @@ def mistakes_of(test: Measurement, terms: DirectTerms | None) -> list[Mistake]:
     """
     if terms is None:
         return []
-    if terms.misfit > _NO_FIT:
+    if terms.misfit > CONJUGATED:
         return list(_conjugated(test, terms))
     if terms.below:
         return []

@@ -20,7 +20,6 @@ from sysid.jobs.score import Compared, Move, moves, scored
 from sysid.problem.problem import Problem
 from sysid.problem.terms import FurtherTest
 from sysid.results.identification import Identification, Recipe
-from sysid.results.judgement import NO_FIT
 from sysid.search.modal import poles_of
 
 _FAR = 3.0  # standard deviations of a step, beyond which it counts as far
@@ -207,7 +206,7 @@ def _farthest(steps: Sequence[Move]) -> str:
 
 def _notes(rows: Sequence[Compared], part: bool) -> Iterator[str]:
     """What the columns are, and what all rows say together."""
-    notes = [f"a fit: the search ended well, with a residual within the goal, or {NO_FIT} where none is stated"]
+    notes = ["a fit: the search ended well, with a residual within the goal, or the noise where none is stated"]
     predicted = int(np.any(np.isfinite([row.score.predicted for row in rows])))
     if part:
         notes += ["predicted: relative residual of what was left out, where the rest tells its motion"] * predicted

@@ -15,7 +15,7 @@ from sysid.compare.method_result import MethodResult, Recorder, Status, errors_o
 from sysid.errors import InputError, SolverError, how_to_install
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
-from sysid.results.judgement import succeeded
+from sysid.results.judgement import verdict_of
 from sysid.search.continuation import descend
 from sysid.search.session import Session
 from sysid.search.strategy import History, Outcome
@@ -128,11 +128,11 @@ def run(name: str, landscape: Landscape, most: int, session: Session, recorder: 
     except (InputError, SolverError, np.linalg.LinAlgError) as error:  # the best candidate is no structure
         return MethodResult(name, Status.FAILED, str(error), evaluations=evaluator.count, seconds=session.seconds)
     solved = answer is not None and answer.success and x is answer.x
-    success, message = succeeded(problem, Outcome(structure, x, name, solved, words, History(), stopped))
+    verdict = verdict_of(problem, Outcome(structure, x, name, solved, words, History(), stopped))
     return MethodResult(
         name,
-        status_of(success, isinstance(stopped, KeyboardInterrupt) or session.interrupt.asked),
-        message,
+        status_of(verdict.success, isinstance(stopped, KeyboardInterrupt) or session.interrupt.asked),
+        verdict.message,
         problem.objective(start),
         problem.objective(x),
         problem.residual(x),

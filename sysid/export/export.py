@@ -40,16 +40,13 @@ def export(identification: Identification, path: str | Path) -> Path:
     identification : Identification
         What `identify` gives, or `load` reads.
     path : str or Path
-        The file. It is written whole or not at all, over an earlier one; folders are made.
-        ==========  ============================================================  =====================
-        ending      content                                                       precision
-        ==========  ============================================================  =====================
-        ``.csv``    M, K and C with deviations, one entry a row                   exact
-        ``.mat``    M, K, C with deviations, modes, state space, for MATLAB       exact
-        ``.op4``    M, K, C, Craig-Bampton superelement (extra ``nastran``)       exact
-        ``.bdf``    the superelement as Nastran's DMIG; ``.dmig`` too             10 digits
-        ``.unv``    mode shapes, universal file dataset 55; ``.uff`` too          6 digits
-        ==========  ============================================================  =====================
+        The file. It is written whole or not at all, over an earlier one; folders are made. By its ending it holds:
+
+        - ``.csv``: M, K and C with deviations, one entry a row; exact
+        - ``.mat``: M, K, C with deviations, modes, state space, for MATLAB; exact
+        - ``.op4``: M, K, C, Craig-Bampton superelement (extra ``nastran``); exact
+        - ``.bdf`` or ``.dmig``: the superelement as Nastran's DMIG; 10 digits
+        - ``.unv`` or ``.uff``: mode shapes, universal file dataset 55; 6 digits
 
     Returns
     -------

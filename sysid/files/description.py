@@ -130,7 +130,8 @@ def description(given: Mapping[str, Any], place: str = "the description") -> Des
     rate, axes, convention = given.get("sample_rate"), given.get("base_axes"), given.get("convention", "")
     if axes is not None:
         base_columns(axes)
-    choice(f"{place}: convention", convention, ("", *CONVENTIONS))
+    if convention != "":
+        choice(f"{place}: convention", convention, CONVENTIONS)
     join = flag(f"{place}: join", given.get("join", False))
     for name in ("time", "frequency"):
         wrong = given.get(name) is not None and not isinstance(given[name], str | int)

@@ -32,7 +32,8 @@ def read(
     Parameters
     ----------
     paths : path or sequence of paths
-        CSV and other text tables, MATLAB files, universal files with sets 58 or 58b, HDF5, NPZ; each file is a run.
+        CSV and other text tables, MATLAB files, universal files with sets 58 or 58b, HDF5, NPZ; each file is a run,
+        unless `sensors` has ``join = true``: then the files of a folder are.
     sensors : path or mapping, optional
         Which column is which sensor: a TOML file, or the same as dictionaries and lists. By default the TOML file
         beside the first file: of its name, or ``sensors.toml``.

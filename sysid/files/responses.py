@@ -55,7 +55,8 @@ def from_spectra(recordings: Sequence[Recording], said: Description) -> Recorded
         Where form or convention are neither said nor shown, roles or axes are not said, a reference is missing.
     """
     refuse((not said.channels, undescribed(recordings[0])))
-    choice(f"{said.place}: frf", said.frf, ("", *FORMS))
+    if said.frf != "":
+        choice(f"{said.place}: frf", said.frf, tuple(FORMS))
     freq = recordings[0].freq
     assert freq is not None
     said, remarks = completed(said, recordings[0])

@@ -18,7 +18,7 @@ from sysid.nlp import one_thread
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.results.identification import Identification, Recipe
-from sysid.results.judgement import judge, succeeded
+from sysid.results.judgement import judge, verdict_of
 from sysid.search.continuation import Continuation, descend, random_starts, smoothed_tests
 from sysid.search.modal import Modal
 from sysid.search.robust import settled
@@ -183,8 +183,8 @@ def _refined(job: Job, session: Session) -> JobResult:
     # What ended a search needs no widened peaks.
     end = _descended(problem, x, [] if own else _widened(bare, job.source), session)
     assert end.x is not None
-    success, message = succeeded(problem.screened, end)
-    return JobResult(job.index, job.seed, success, message, end.x, problem.residual(end.x))
+    verdict = verdict_of(problem, end)
+    return JobResult(job.index, job.seed, verdict.success, verdict.message, end.x, problem.residual(end.x))
 
 
 def _descended(problem: Problem, x: Array, steps: list[tuple[TestTerm, ...]], session: Session) -> Outcome:

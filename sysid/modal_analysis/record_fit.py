@@ -20,7 +20,7 @@ from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_masses import weigh
 from sysid.modal_analysis.record_colour import extra_numbers
-from sysid.modal_analysis.record_model import TRACES, Parameters, RecordModel, Shift
+from sysid.modal_analysis.record_model import TRACES, HeldShapes, Parameters, RecordModel, Shift
 from sysid.modal_analysis.record_noise import floors, likeliest_levels
 from sysid.modal_analysis.residues import Records
 from sysid.structure.structure import Array
@@ -39,7 +39,7 @@ class Limits(NamedTuple):
     steps: int
 
 
-_WHOLE, _ROUGH = Limits(12, 60), Limits(3, 4)
+_WHOLE, _ROUGH, _POLES = Limits(12, 60), Limits(3, 4), Limits(1, 20)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,6 +184,16 @@ def refitted(
     coarse = None if some is None else RecordModel(some, m).weighed_as_all()
     limits = _ROUGH if rough else _WHOLE
     return _fit(RecordModel(fit.test, m), p, fit.levels, monitor or (lambda i, r: None), limits, coarse)
+
+
+def with_poles_of(fit: RecordFit, test: Measurement, *, held: bool = False) -> RecordFit:
+    """Poles, transients and levels of a test of one run, with the shapes of a fit of others; or, `held`, its poles too.
+
+    Poles that leave the records unexplained are not looked for far away: a few steps are taken.
+    """
+    m, channels = fit.parameters.modes.omega.size, fit.parameters.traces.shape[1]
+    first = replace(fit.parameters, ends=np.zeros((m, 2)), traces=np.zeros((1, channels, TRACES)))
+    return _fit(HeldShapes(test, m, poles=held), first, None, lambda i, r: None, _POLES)
 
 
 def on_all_lines(fit: RecordFit, test: Measurement, *, monitor: Monitor | None = None) -> RecordFit:

@@ -262,6 +262,24 @@ class RecordModel:
         return float(sum(chunk.run.weight @ chunk.weighed(levels).power for chunk in self.chunks(p)))
 
 
+class HeldShapes(RecordModel):
+    """The same with shapes, participations and rigid-body mass held, and with `poles` these too.
+
+    What is left to be found are poles, transients and traces.
+    """
+
+    def __init__(self, test: Measurement, m: int, *, poles: bool = False) -> None:
+        super().__init__(test, m)
+        self.held = np.ones(self.size, bool)
+        self.held[self.index.log_omega] = self.held[self.index.log_ratios] = poles
+        self.held[self.kept :] = False
+
+    def _products(self, p: Parameters, levels: Array, of_chunk: Callable[[Chunk, Array, Columns], Sums]) -> Shift:
+        normal, gradient, chi2 = super()._products(p, levels, of_chunk)
+        normal[self.held], normal[:, self.held], gradient[self.held] = 0.0, 0.0, 0.0
+        return Shift(normal, gradient, chi2)
+
+
 class Chunk:
     """Some lines of one run at given parameters."""
 

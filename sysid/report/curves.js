@@ -1,9 +1,11 @@
-// Draws the curves and mode shapes of the page from the numbers that stand beside them.
+// Draws the curves and mode shapes of the page from the numbers that stand beside them, in place of its stills.
 "use strict";
 
 const SVG = "http://www.w3.org/2000/svg";
 const MARGIN = { left: 62, right: 12, top: 20, bottom: 30 };
 const LEAST = 5; // lines that remain when zooming in
+const DECADES = [1e5, 0, 1e4]; // at most, of the magnitude and of the difference
+const [LOWEST, HIGHEST] = [-270, 90]; // degrees: the step of a resonance, 0 to -180, is not cut
 
 function element(parent, name, attributes = {}, words = "") {
   const made = document.createElement(name);
@@ -52,46 +54,52 @@ function ticksOf(low, high, count) {
   return ticks;
 }
 
-function logTicks(low, high) {
+// Powers of ten, with their double and fivefold where there is room, some left out where there is not.
+function logTicks(low, high, room) {
+  const decades = Math.log10(high / low);
+  const every = Math.ceil(decades / room);
   const found = [];
-  const many = high / low > 1e4;
   for (let power = Math.floor(Math.log10(low)); power <= Math.ceil(Math.log10(high)); power += 1) {
-    for (const k of high / low > 30 ? [1] : [1, 2, 5]) {
+    for (const k of 3 * decades <= room ? [1, 2, 5] : [1]) {
       const tick = k * 10 ** power;
-      if (tick >= low && tick <= high && (!many || power % 2 === 0)) found.push(tick);
+      if (tick >= low && tick <= high && power % every === 0) found.push(tick);
     }
   }
-  return found.length > 1 ? found : ticksOf(low, high, 4);
+  return found;
 }
 
-function scale(low, high, from, to, log) {
+function scale(low, high, from, to, log, wide) {
   const [a, b] = log ? [Math.log(low), Math.log(high)] : [low, high];
-  const along = (value) => from + (((log ? Math.log(value) : value) - a) / (b - a)) * (to - from);
+  const along = (value) => {
+    const share = ((log ? Math.log(value) : value) - a) / (b - a);
+    return from + Math.min(Math.max(share, 0), 1) * (to - from);
+  };
   along.back = (pixel) => {
     const value = a + ((pixel - from) / (to - from)) * (b - a);
     return log ? Math.exp(value) : value;
   };
-  along.ticks = log ? logTicks(low, high) : ticksOf(low, high, 4);
+  const room = Math.abs(to - from) / wide;
+  along.ticks = log && high >= 10 * low ? logTicks(low, high, room) : ticksOf(low, high, room);
   return along;
 }
 
-function line(x, y, freq, values, first, last) {
+function line(x, y, freq, gaps, values, first, last, jump) {
   let path = "";
-  let pen = "M";
+  let before = NaN;
   for (let at = first; at <= last; at += 1) {
-    if (Number.isFinite(values[at]) && Number.isFinite(y(values[at]))) {
-      path += `${pen}${x(freq[at]).toFixed(1)} ${y(values[at]).toFixed(1)}`;
-      pen = "L";
-    } else pen = "M";
+    const up = Number.isFinite(values[at]) ? y(values[at]) : NaN;
+    if (Number.isFinite(up)) path += `${Math.abs(up - before) <= jump && !gaps.includes(at) ? "L" : "M"}${x(freq[at]).toFixed(1)} ${up.toFixed(1)}`;
+    before = up;
   }
   return path;
 }
 
 // One panel of curves: an array of {kind, values}, over the lines from `first` to `last`.
-function panel(svg, top, height, width, x, freq, [first, last], curves, title, options) {
+function panel(svg, top, height, width, x, { freq, gaps }, [first, last], curves, title, options) {
   const inner = [top + MARGIN.top, top + height - MARGIN.bottom];
   let [low, high] = [Infinity, -Infinity];
-  for (const { values } of curves) {
+  for (const { kind, values } of curves) {
+    if (kind === "band") continue; // it may leave the axis
     for (let at = first; at <= last; at += 1) {
       if (Number.isFinite(values[at]) && (!options.log || values[at] > 0)) {
         low = Math.min(low, values[at]);
@@ -100,9 +108,12 @@ function panel(svg, top, height, width, x, freq, [first, last], curves, title, o
     }
   }
   if (options.range) [low, high] = options.range;
-  if (!(high > low)) [low, high] = options.log ? [(low || 1) / 2, (high || 1) * 2] : [low - 1, high + 1];
-  if (options.log) [low, high] = [Math.max(low, high * 1e-9) / 1.3, high * 1.3];
-  const y = scale(low, high, inner[1], inner[0], options.log);
+  if (high === -Infinity) {
+    drawn(svg, "text", { x: (MARGIN.left + width) / 2, y: (inner[0] + inner[1]) / 2, "text-anchor": "middle" }, "0 at all lines");
+  }
+  if (!(high >= low)) [low, high] = options.log ? [(low || 1) / 2, (high || 1) * 2] : [low - 1, high + 1];
+  if (options.log) [low, high] = [Math.max(low, high / options.log) / 1.3, high * 1.3];
+  const y = scale(low, high, inner[1], inner[0], options.log, 18);
   const ticks = options.ticks || y.ticks;
   for (const tick of ticks) {
     drawn(svg, "line", { x1: MARGIN.left, x2: width - MARGIN.right, y1: y(tick), y2: y(tick), class: "grid" });
@@ -114,9 +125,13 @@ function panel(svg, top, height, width, x, freq, [first, last], curves, title, o
   }
   drawn(svg, "text", { x: MARGIN.left, y: top + 13, class: "title" }, title);
   if (options.bottom) {
-    drawn(svg, "text", { x: width - MARGIN.right, y: top + height - 2, "text-anchor": "end" }, "frequency, Hz");
+    drawn(svg, "text", { x: width - MARGIN.right, y: top + height - 2, "text-anchor": "end" }, "frequency [Hz]");
   }
-  for (const { kind, values } of curves) drawn(svg, "path", { d: line(x, y, freq, values, first, last), class: kind });
+  const jump = options.range ? Math.abs(inner[1] - inner[0]) / 2 : Infinity;
+  for (const { kind, values: all } of curves) {
+    const values = kind === "band" ? all.map((value) => (value < low || value > high ? NaN : value)) : all;
+    drawn(svg, "path", { d: line(x, y, freq, gaps, values, first, last, jump), class: kind });
+  }
 }
 
 // --- responses ------------------------------------------------------------------------------------------------------
@@ -124,38 +139,49 @@ function panel(svg, top, height, width, x, freq, [first, last], curves, title, o
 function spectra(data, channel, run) {
   const of = ([re, im]) => [numbers(re), numbers(im)];
   const size = ([re, im]) => re.map((value, at) => Math.hypot(value, im[at]));
-  const turn = ([re, im]) => re.map((value, at) => (Math.atan2(im[at], value) * 180) / Math.PI);
+  const turn = ([re, im]) => re.map((value, at) => {
+    const degrees = (Math.atan2(im[at], value) * 180) / Math.PI;
+    return degrees < HIGHEST ? degrees : degrees - 360;
+  });
+  const level = (kind) => {
+    const told = channel[kind] && numbers(channel[kind][run]);
+    return told && told.length === 1 ? new Float32Array(left.length).fill(told[0]) : told;
+  };
   const [measured, identified] = [of(channel.measured[run]), of(channel.identified[run])];
-  const left = [measured[0].map((v, at) => v - identified[0][at]), measured[1].map((v, at) => v - identified[1][at])];
+  const left = numbers(channel.left[run]);
   return {
     measured: size(measured), identified: size(identified), phase: turn(measured), phaseIdentified: turn(identified),
-    left: size(left), noise: channel.noise && numbers(channel.noise[run]),
-    recorded: channel.recorded && numbers(channel.recorded[run]), band: channel.band && numbers(channel.band[run]),
+    left, noise: level("noise"), recorded: level("recorded"), band: level("band"),
   };
 }
 
-function drawCurves(parent, freq, channel, values, [first, last], width, heights, recorded = false) {
+function drawCurves(parent, { freq, gaps }, channel, values, [first, last], width, heights, recorded = false) {
   const total = heights.reduce((sum, one) => sum + one, 0);
   const svg = drawn(parent, "svg", { viewBox: `0 0 ${width} ${total}`, width, height: total, role: "img" });
   drawn(svg, "title", {}, `${channel.name}: measured and identified ${channel.words}`);
-  const x = scale(freq[first], freq[last], MARGIN.left, width - MARGIN.right, freq[last] > 8 * freq[first] && freq[first] > 0);
+  const x = scale(freq[first], freq[last], MARGIN.left, width - MARGIN.right, freq[last] > 8 * freq[first] && freq[first] > 0, 40);
   const amplitude = [{ kind: "measured", values: values.measured }, { kind: "identified", values: values.identified }];
-  if (recorded) amplitude.unshift({ kind: "recorded", values: values.recorded });
+  if (recorded) amplitude.splice(1, 0, { kind: "recorded", values: values.recorded });
   const phase = [{ kind: "measured", values: values.phase }, { kind: "identified", values: values.phaseIdentified }];
   const left = [{ kind: "left", values: values.left }];
   for (const kind of ["noise", "band"]) if (values[kind]) left.push({ kind, values: values[kind] });
-  panel(svg, 0, heights[0], width, x, freq, [first, last], amplitude, `${channel.name}: ${channel.words}`, { log: true });
-  const turns = { range: [-185, 185], ticks: [-180, -90, 0, 90, 180] };
-  panel(svg, heights[0], heights[1], width, x, freq, [first, last], phase, "phase, degrees", turns);
-  const below = { log: true, bottom: true };
-  panel(svg, heights[0] + heights[1], heights[2], width, x, freq, [first, last], left, "what the fit leaves", below);
+  const title = `${width < 600 ? "" : `${channel.name}: `}${channel.words} [${channel.unit}]`;
+  panel(svg, 0, heights[0], width, x, { freq, gaps }, [first, last], amplitude, title, { log: DECADES[0] });
+  const turns = { range: [LOWEST, HIGHEST], ticks: [-180, -90, 0] };
+  panel(svg, heights[0], heights[1], width, x, { freq, gaps }, [first, last], phase, "phase [°]", turns);
+  const below = { log: DECADES[2], bottom: true };
+  const beside = `difference${values.noise ? " and noise" : ""} [${channel.unit}]`;
+  panel(svg, heights[0] + heights[1], heights[2], width, x, { freq, gaps }, [first, last], left, beside, below);
   return { svg, x, total };
 }
 
 function startCurves(figure) {
   const data = JSON.parse(figure.querySelector("script").textContent);
   const freq = numbers(data.freq);
+  const legend = figure.querySelector(".legend");
   const bar = element(figure, "div", { class: "controls" });
+  legend.before(bar);
+  figure.classList.add("drawn"); // its stills remain for paper
   const channels = choice(bar, "Channel", data.channels.map((one) => one.name));
   const runs = choice(bar, "Run", data.runs);
   const withTransients = element(bar, "label", {}, "");
@@ -174,11 +200,6 @@ function startCurves(figure) {
     range = [0, freq.length - 1];
     redraw();
   });
-  element(bar, "span", { class: "key measured" }, "measured");
-  element(bar, "span", { class: "key identified" }, "identified");
-  element(bar, "span", { class: "key left" }, "their difference");
-  element(bar, "span", { class: "key noise" }, "noise (standard deviation)");
-  element(bar, "span", { class: "key band" }, "95 % interval of the identified");
   const area = element(figure, "div", { class: "area", tabindex: 0 });
   area.setAttribute("aria-label", "Curves: arrow keys move the cursor from line to line");
   const told = element(figure, "p", { class: "told", role: "status" });
@@ -205,10 +226,11 @@ function startCurves(figure) {
     const channel = data.channels[channels.value];
     values = spectra(data, channel, runs.value);
     withTransients.hidden = !values.recorded;
-    for (const kind of ["noise", "band"]) bar.querySelector(`.${kind}`).hidden = !values[kind];
+    legend.querySelector(".recorded")?.toggleAttribute("hidden", !(tick.checked && values.recorded));
+    for (const kind of ["noise", "band"]) legend.querySelector(`.${kind}`)?.toggleAttribute("hidden", !values[kind]);
     area.replaceChildren();
-    const width = Math.max(300, Math.min(1072, area.clientWidth));
-    view = drawCurves(area, freq, channel, values, range, width, [230, 120, 150], tick.checked && values.recorded);
+    const width = Math.max(300, Math.min(1200, area.clientWidth));
+    view = drawCurves(area, { freq, gaps: data.gaps }, channel, values, range, width, [230, 120, 150], tick.checked && values.recorded);
     tell();
   }
 
@@ -252,17 +274,6 @@ function startCurves(figure) {
   for (const control of [channels, runs, tick]) control.addEventListener("change", redraw);
   window.addEventListener("resize", redraw);
   redraw();
-  return () => {
-    const paper = element(figure, "div", { class: "paper" });
-    for (const channel of data.channels) {
-      data.runs.forEach((name, run) => {
-        const part = element(paper, "div", { class: "sheet" });
-        if (data.runs.length > 1) element(part, "p", {}, name);
-        drawCurves(part, freq, channel, spectra(data, channel, run), [0, freq.length - 1], 680, [170, 90, 110]);
-      });
-    }
-    return paper;
-  };
 }
 
 // --- mode shapes ----------------------------------------------------------------------------------------------------
@@ -319,6 +330,7 @@ function drawMode(parent, data, mode, width, height) {
 
 function startModes(figure) {
   const data = JSON.parse(figure.querySelector("script").textContent);
+  figure.querySelector(".shapes").remove();
   const bar = element(figure, "div", { class: "controls" });
   const area = element(figure, "div", { class: "shapes" });
   const moves = data.names.map((_, mode) => drawMode(area, data, mode, 210, 260));
@@ -342,8 +354,4 @@ function startModes(figure) {
 }
 
 document.querySelectorAll("figure.modes").forEach(startModes);
-// On paper every channel stands, in place of the one that is chosen.
-const sheets = [...document.querySelectorAll("figure.curves")].map(startCurves);
-let papers = [];
-window.addEventListener("beforeprint", () => { papers = sheets.map((sheet) => sheet()); });
-window.addEventListener("afterprint", () => papers.forEach((paper) => paper.remove()));
+document.querySelectorAll("figure.curves").forEach(startCurves);

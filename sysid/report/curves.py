@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -17,6 +17,8 @@ from sysid.measurement.measurement import Measurement
 from sysid.plot.panels import run_names
 from sysid.plot.plots import stick_model
 from sysid.report.html import text
+from sysid.report.noise_level import noise_level
+from sysid.report.still import Channel, curve_sheet, mode_still, room_of_modes
 from sysid.results.identification import Identification
 from sysid.results.summary import DEVIATES
 from sysid.structure.structure import Array, ComplexArray
@@ -31,11 +33,39 @@ def script() -> str:
 
 
 def curves(it: Identification, test: Measurement) -> str:
-    """Element of the responses and the base force of a test, one channel and run at a time, both to be chosen."""
-    channels = [*_responses(it, test), *_forces(it, test)]
-    content = {"freq": _packed(test.freq), "runs": run_names(test), "channels": channels}
+    """Element of the responses and the base force of a test: of all, without the script; with it one, to be chosen."""
+    channels, runs = [*_responses(it, test), *_forces(it, test)], run_names(test)
+    content = {
+        "freq": _packed(test.freq),
+        "gaps": test.gaps.tolist(),
+        "runs": runs,
+        "channels": list(map(_told, channels)),
+    }
+    drawn = "".join(
+        curve_sheet(f"{channel.name}, {name}" if len(runs) > 1 else channel.name, test.freq, channel, run, test.gaps)
+        for channel in channels
+        for run, name in enumerate(runs)
+    )
     words = "Measured and identified spectra, their difference and the noise"
-    return _element("curves", content, words)
+    return _element(
+        "curves",
+        content,
+        words,
+        f'{_legend(channels, at_most=test.response_std is None)}<div class="sheets">{drawn}</div>',
+    )
+
+
+def _legend(channels: Sequence[Channel], *, at_most: bool) -> str:
+    """What each line is, of those that are drawn."""
+    keys = {"measured": "measured", "identified": "identified", "left": "their difference"}
+    if any(channel.noise is not None for channel in channels):
+        keys["noise"] = f"noise{' at most, by the quietest lines' * at_most} (standard deviation)"
+    if any(channel.band is not None for channel in channels):
+        keys["band"] = "half of the 95 % interval of the identified"
+    marks = "".join(f'<span class="key {kind}">{words}</span>' for kind, words in keys.items())
+    if any(channel.recorded is not None for channel in channels):
+        marks += '<span class="key recorded" hidden>as recorded</span>'  # until it is asked for
+    return f'<p class="legend">{marks}</p>'
 
 
 def mode_shapes(it: Identification) -> str:
@@ -44,7 +74,8 @@ def mode_shapes(it: Identification) -> str:
         points, motion, _ = stick_model(it.measurement)
     except InputError:
         return ""
-    return _element("modes", _modes(it, points, motion), "Mode shapes, with the base at rest")
+    content = _modes(it, points, motion)
+    return _element("modes", content, "Mode shapes, with the base at rest", _mode_stills(content))
 
 
 def _modes(it: Identification, points: Array, motion: Array) -> dict[str, Any]:
@@ -65,45 +96,61 @@ def _modes(it: Identification, points: Array, motion: Array) -> dict[str, Any]:
     return {"points": points.round(6).tolist(), "sticks": sticks, "shapes": shapes, "names": names}
 
 
-def _responses(it: Identification, test: Measurement) -> Iterator[dict[str, Any]]:
+def _mode_stills(content: dict[str, Any]) -> str:
+    points, shapes = np.array(content["points"]), np.array(content["shapes"])
+    points = points - (points.min(axis=0) + points.max(axis=0)) / 2
+    size = room_of_modes(points, shapes)
+    drawn = (
+        mode_still(name, points, shape, content["sticks"], size)
+        for name, shape in zip(content["names"], shapes, strict=True)
+    )
+    return f'<div class="shapes">{"".join(drawn)}</div>'
+
+
+def _responses(it: Identification, test: Measurement) -> Iterator[Channel]:
     own = test.has_unit_runs
     predicted = test.predict(it.structure) + np.einsum("sd,rdf->rsf", test.rigid_body, test.base)
     u = it.quick_uncertainty
     band = None if u is None else _half_widths(u.transmissibility(test.freq), test)
-    raw, words = _recorded(it, test), "transmissibility" if own else "acceleration spectrum, m/s² (own scale)"
+    raw, noise = _recorded(it, test), noise_level(test, it.structure).response
+    words, unit = ("transmissibility", "–") if own else ("spectrum of acceleration", "m/s², scaled as given")
     for s, name in enumerate(test.sensor_names):
         turn = _against_base(test, test.rigid_body[s])
-        channel = _channel(
-            name, words, turn * test.response[:, s], turn * predicted[:, s], _of(test.response_std, s), _of(band, s)
-        )
-        if raw is not None:
-            channel["recorded"] = [_packed(np.abs(run)) for run in raw.response[:, s]]
-        yield channel
+        yield Channel(
+            name, words, unit, turn * test.response[:, s], turn * predicted[:, s],
+            _levels(noise, s, test), _levels(band, s, test),
+            None if raw is None else np.abs(raw.response[:, s]),
+        )  # fmt: skip
 
 
-def _forces(it: Identification, test: Measurement) -> Iterator[dict[str, Any]]:
+def _forces(it: Identification, test: Measurement) -> Iterator[Channel]:
     if test.force is None:
         return
     predicted, u = test.predict_force(it.structure), it.quick_uncertainty
+    noise = noise_level(test, it.structure).force
     band = None if u is None else _half_widths(u.base_force(test.freq), test)
     for i, axis in enumerate(test.base_axes or ()):
-        words = "apparent mass, kg" if test.has_unit_runs else "force spectrum, N (own scale)"
+        words, unit = ("apparent mass", "kg") if test.has_unit_runs else ("spectrum of force", "N, scaled as given")
         if not test.translational.all():
-            words = "force or moment of the base"
-        yield _channel(
-            f"base force {axis}", words, test.force[:, i], predicted[:, i], _of(test.force_std, i), _of(band, i)
-        )
+            words, unit = "force or moment of the base", "N or N m" + " per unit of base motion" * test.has_unit_runs
+        turn = _against_base(test, np.eye(test.n_base)[i])
+        yield Channel(
+            f"base force {axis}", words, unit, turn * test.force[:, i], turn * predicted[:, i],
+            _levels(noise, i, test), _levels(band, i, test),
+        )  # fmt: skip
 
 
-def _channel(
-    name: str, words: str, measured: ComplexArray, predicted: ComplexArray, std: NDArray[Any] | None,
-    band: NDArray[Any] | None,
-) -> dict[str, Any]:  # fmt: skip
-    """One channel of all runs, (runs, n_freq); its noise and half of the 95 % interval where they are known."""
-    found = {"name": name, "words": words, "measured": _complex(measured), "identified": _complex(predicted)}
-    for kind, values in (("noise", std), ("band", band)):
-        if values is not None and np.all(np.isfinite(values)):
-            found[kind] = [_packed(np.broadcast_to(run, measured.shape[-1:])) for run in values]
+def _told(channel: Channel) -> dict[str, Any]:
+    """What the script draws of a channel."""
+    own = channel._asdict()
+    found = {name: own[name] for name in ("name", "words", "unit")}
+    found |= {
+        name: [[_packed(run.real), _packed(run.imag)] for run in own[name]] for name in ("measured", "identified")
+    }
+    found["left"] = [_packed(np.abs(run)) for run in channel.measured - channel.identified]
+    for name in ("noise", "band", "recorded"):
+        if own[name] is not None:
+            found[name] = [_packed(run[:1] if np.ptp(run) == 0 else run) for run in own[name]]
     return found
 
 
@@ -132,13 +179,11 @@ def _recorded(it: Identification, test: Measurement) -> Measurement | None:
     return given if test is it.measurement and given.whole is not None else None
 
 
-def _of(std: NDArray[Any] | None, channel: int) -> NDArray[Any] | None:
-    """Deviations of one channel, those of all runs."""
-    return None if std is None else std[:, channel]
-
-
-def _complex(spectra: ComplexArray) -> list[list[str]]:
-    return [[_packed(run.real), _packed(run.imag)] for run in spectra]
+def _levels(values: NDArray[Any] | None, channel: int, test: Measurement) -> Array | None:
+    """Levels of one channel in all runs, (runs, n_freq); None where they are not known."""
+    if values is None or not np.all(np.isfinite(values[:, channel])):
+        return None
+    return np.broadcast_to(values[:, channel], (test.n_runs, test.freq.size))
 
 
 def _packed(numbers: ArrayLike) -> str:
@@ -146,10 +191,9 @@ def _packed(numbers: ArrayLike) -> str:
     return base64.b64encode(np.asarray(numbers, "<f4").tobytes()).decode("ascii")
 
 
-def _element(kind: str, content: dict[str, Any], words: str) -> str:
+def _element(kind: str, content: dict[str, Any], words: str, still: str) -> str:
     data = json.dumps(content, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c")
-    missing = f"{words}: this page's script draws them, which this browser does not run; sysid.plot draws them too."
     return (
-        f'<figure class="{kind}" aria-label="{text(words)}"><noscript>{text(missing)}</noscript>'
-        f'<script type="application/json">{data}</script></figure>'
+        f'<figure class="{kind}" aria-label="{text(words)}">{still}<script type="application/json">{data}</script>'
+        "</figure>"
     )

@@ -19,21 +19,23 @@ if TYPE_CHECKING:
 
 ROUND_OFF = 1e-12
 _WIDE = 11  # columns beyond which a table is printed smaller
+_BLOCK = 10  # columns of a matrix that stand beside each other, on paper too
 
 STYLE = """
 :root { color-scheme: light dark; --paper: #fff; --ink: #1f2430; --soft: #5a6472; --line: #dde2e7; --fill: #f1f4f6;
-  --link: #0b5c96; --good: #0a7d5a; --warn: #a35f00; --bad: #b3261e; --found: #0068a8; --left: #a34a00; }
+  --link: #0b5c96; --good: #0a7d5a; --warn: #a35f00; --bad: #b3261e; --found: #0068a8; --left: #a34a00;
+  --seen: #a0a5ac; }
 @media screen and (prefers-color-scheme: dark) { :root { --paper: #14181d; --ink: #e6eaee; --soft: #a9b3be;
   --line: #39424c; --fill: #20272e; --link: #86bfee; --good: #3cc296; --warn: #e5a94b; --bad: #f47f77;
-  --found: #62b6f0; --left: #f0995a; } }
+  --found: #62b6f0; --left: #f0995a; --seen: #767f89; } }
 * { box-sizing: border-box; }
-body { margin: 0 auto; padding: 1.2rem 1.5rem 4rem; max-width: 1120px; color: var(--ink); background: var(--paper);
+body { margin: 0 auto; padding: 1.2rem 1.5rem 4rem; max-width: 1180px; color: var(--ink); background: var(--paper);
   font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", "DejaVu Sans", sans-serif; }
 h1 { font-size: 1.5rem; line-height: 1.25; margin: 0 0 .2rem; overflow-wrap: anywhere; }
 h2 { font-size: 1.25rem; margin: 2.4rem 0 .6rem; padding-bottom: .25rem; border-bottom: 1px solid var(--line); }
 h3 { font-size: 1rem; margin: 1.4rem 0 .4rem; }
-p { margin: .5rem 0; max-width: 76ch; overflow-wrap: anywhere; }
-ul { margin: .3rem 0; padding-left: 1.3rem; max-width: 76ch; overflow-wrap: anywhere; }
+p, figcaption { margin: .5rem 0; max-width: 92ch; overflow-wrap: anywhere; text-wrap: pretty; }
+ul { margin: .3rem 0; padding-left: 1.3rem; max-width: 92ch; overflow-wrap: anywhere; text-wrap: pretty; }
 .pair { display: flex; flex-wrap: wrap; gap: 0 1.5rem; align-items: flex-start; }
 .pair figure { flex: 1 1 420px; min-width: 0; }
 .mark { border: 1px solid var(--line); border-radius: 3px; padding: 0 .4em; margin-right: .5em; color: var(--soft);
@@ -49,14 +51,15 @@ td small { display: block; color: var(--soft); font-size: .82em; line-height: 1.
 .good strong { color: var(--good); } .warn strong { color: var(--warn); } .bad strong { color: var(--bad); }
 .scroll { overflow-x: auto; margin: .6rem 0 1rem; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .88rem; }
-th, td { padding: .2rem .65rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
+th, td { padding: .2rem .55rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
 thead th { border-bottom: 1.5px solid var(--soft); vertical-align: bottom; font-weight: 600;
   white-space: normal; max-width: 9em; }
+@media screen { table { width: max-content; } .words { width: auto; } }
 .words td, .words th { text-align: left; white-space: normal; vertical-align: top; }
 th:first-child, td:first-child { text-align: left; font-weight: 500; }
 .words td:first-child { white-space: nowrap; }
 figure { margin: .8rem 0 1.2rem; break-inside: avoid; }
-img { max-width: 100%; height: auto; display: block; background: #fff; }
+img { max-width: max(100%, 600px); height: auto; display: block; background: #fff; }
 pre { background: var(--fill); padding: .8rem 1rem; overflow-x: auto; font-size: .82rem; line-height: 1.45; }
 nav { margin: .8rem 0; font-size: .9rem; }
 nav a { color: var(--link); margin-right: 1rem; display: inline-block; }
@@ -72,24 +75,35 @@ svg .title { fill: var(--ink); font-size: 12px; }
 svg path, svg line { fill: none; stroke-width: 1.6; vector-effect: non-scaling-stroke; }
 svg .grid { stroke: var(--line); stroke-width: 1; } svg .cursor { stroke: var(--soft); stroke-width: 1; }
 svg .zoom { fill: var(--soft); opacity: .2; }
-svg .measured { stroke: var(--ink); opacity: .75; } svg .identified { stroke: var(--found); }
-svg .recorded, svg .rest { stroke: var(--soft); opacity: .6; stroke-width: 1; } svg .left { stroke: var(--left); }
+svg .measured { stroke: var(--seen); stroke-width: 3; } svg .identified { stroke: var(--found); }
+svg .rest { stroke: var(--soft); opacity: .6; stroke-width: 1; } svg .recorded { stroke: var(--good); }
+svg .left { stroke: var(--left); }
 svg .noise { stroke: var(--soft); stroke-dasharray: 5 3; } svg .band { stroke: var(--found); stroke-dasharray: 2 3; }
 svg .dot { fill: var(--found); } svg .base { fill: var(--soft); }
-.key { border-top: 3px solid var(--soft); font-size: .85rem; } .key.measured { border-color: var(--ink); }
+.legend { display: flex; flex-wrap: wrap; gap: .3rem .9rem; margin: .6rem 0 0; max-width: none; }
+.key { border-top: 3px solid var(--soft); font-size: .85rem; } .key.measured { border-color: var(--seen); }
 .key.identified { border-color: var(--found); } .key.left { border-color: var(--left); }
+.key.recorded { border-color: var(--good); }
 .key.noise { border-top-style: dashed; } .key.band { border-top: 3px dotted var(--found); }
-[hidden] { display: none !important; } .paper { display: none; }
+[hidden] { display: none !important; }
+.sheets { display: flex; flex-wrap: wrap; gap: 0 1rem; } .sheet { flex: 1 1 330px; max-width: 540px; min-width: 0; }
+.sheet p { margin: .6rem 0 0; font-size: .85rem; } .sheet svg { width: 100%; }
+@media screen { .drawn .sheets { display: none; } }
 @media (max-width: 600px) { body { padding: .8rem .8rem 3rem; font-size: 14px; } th, td { padding: .2rem .4rem; }
-  h1 { font-size: 1.25rem; } }
+  h1 { font-size: 1.25rem; } .shapes svg { width: calc(50% - .25rem); }
+  .shapes svg text { font-size: 13px; } .shapes svg .title { font-size: 14px; } }
 @media print { body { max-width: none; padding: 0; font-size: 10pt; }
-  nav, .controls, .area, .told { display: none; } .modes { break-inside: auto; }
-  .paper { display: block; } .sheet, .shapes svg { break-inside: avoid; } .shapes { display: block; }
-  .shapes svg { display: inline-block; }
-  .scroll { overflow: visible; } table { font-size: 7.5pt; } .wide { font-size: 5.5pt; }
-  th, td { padding: .1rem .3rem; } tr { break-inside: avoid; }
-  h2, h3, figcaption { break-after: avoid; } h2 + *, h3 + *, .soft + * { break-before: avoid; }
-  .soft { break-after: avoid; }
+  nav, .controls, .area, .told { display: none; } .modes, .curves { break-inside: auto; }
+  .sheet, .shapes svg { break-inside: avoid; } .shapes, .sheets { display: block; }
+  .sheet { display: inline-block; width: 49%; } .sheet p { margin-top: .2rem; }
+  .shapes svg { display: inline-block; width: 24%; }
+  .shapes, .sheets { orphans: 1; widows: 1; }
+  .scroll { overflow: visible; } img { max-width: 100%; max-height: 3.7in; width: auto; }
+  .pair { flex-wrap: nowrap; break-inside: avoid; } .pair figure { flex-basis: 0; }
+  table { font-size: 7.5pt; } .words { font-size: 9pt; } .wide { font-size: 5.5pt; }
+  th, td { padding: .05rem .3rem; line-height: 1.3; } td small { line-height: 1.1; } tr { break-inside: avoid; }
+  h2, h3, figcaption, .soft, .legend, .sheet p { break-after: avoid; } p, li { break-inside: avoid; }
+  h2 + *, h3 + *, .soft + *, .legend + * { break-before: avoid; }
   pre { white-space: pre-wrap; } }
 """
 
@@ -170,10 +184,16 @@ def matrix(
     """
     values = np.where(np.abs(values) > ROUND_OFF * np.abs(values).max(), values, 0.0)
     lines = [
-        [name, *(Cell(number(v), lower) for v, lower in zip(line, under, strict=True))]
-        for name, line, under in zip(rows, values, below or no_lines(values.shape), strict=True)
+        [Cell(number(v), lower) for v, lower in zip(line, under, strict=True)]
+        for line, under in zip(values, below or no_lines(values.shape), strict=True)
     ]
-    return table(["", *columns], lines, caption, label=label)
+    parts, count = [], len(columns)
+    for block in np.array_split(np.arange(count), max(1, -(-count // _BLOCK))):
+        first, last = block[0], block[-1] + 1
+        cells = [[name, *line[first:last]] for name, line in zip(rows, lines, strict=True)]
+        which = f"; columns {first + 1} to {last} of {count}" * (block.size < count)
+        parts.append(table(["", *columns[first:last]], cells, f"{caption}{which}", label=label))
+    return "".join(parts)
 
 
 def no_lines(shape: tuple[int, ...]) -> list[list[tuple[str, ...]]]:
@@ -188,7 +208,7 @@ def picture(
     width = round(92 * float(figure.get_size_inches()[0]))
     data = base64.b64encode(to_png(figure, dpi=dpi, colours=colours)).decode("ascii")
     image = f'<img width="{width}" alt="{text(alt)}" src="data:image/png;base64,{data}">'
-    return f"<figure>{image}{_caption(caption, label)}</figure>"
+    return f'<figure class="scroll">{image}{_caption(caption, label)}</figure>'
 
 
 def page(title: object, head: str, sections: Iterable[tuple[str, str]], script: str = "") -> str:

@@ -15,8 +15,8 @@ ONE_OF_MANY, CHOSEN = "one of many", "as the modal masses were chosen"
 SAME = 1e-9  # of a value: a smaller difference is round-off
 _ENDS_ELSEWHERE = " How far the entries may go is in the result's mass_interval and stiffness_interval."
 _ENDS_BELOW = (
-    " Below an entry of M_SS and K_SS: the least … and the … greatest value that it takes in any model that explains "
-    "the data and holds what was stated."
+    " Below an entry of M_SS and K_SS: from where … to where it goes in the models that explain the data and hold what "
+    "was stated."
 )
 
 Lines = list[list[tuple[str, ...]]]  # below each entry of a matrix
@@ -74,10 +74,17 @@ def half_widths(values: Array, std: Array, stated: Array | bool = False) -> Line
         return lines
     size = np.sqrt(np.abs(np.diag(values)))
     for i, j in np.ndindex(*std.shape):
-        width = half_width(float(std[i, j]), float(size[i] * size[j]))
-        told: dict[str, tuple[str, ...]] = {"open": ("open",), "0": ()}
-        lines[i][j] = ("stated",) if stated[i, j] else told.get(width, (f"± {width}",))
+        width = plain(half_width(float(std[i, j]), float(size[i] * size[j])))
+        if stated[i, j] or width == "open":
+            lines[i][j] = ("stated" if stated[i, j] else "open",)
+        elif width != "0":
+            lines[i][j] = (f"± {width}",)
     return lines
+
+
+def plain(width: str) -> str:
+    """A half-width as "110", not "1.1e+02"; words stay."""
+    return width if width == "open" else f"{float(width):.6g}"
 
 
 def stated(it: Identification) -> Array:
@@ -92,6 +99,12 @@ def _ranges(ends: Array, otherwise: Lines) -> Lines:
     """Lines below the entries of a matrix: both ends of their range (2, n, n), or `otherwise` where they are one."""
     lines = [list(line) for line in otherwise]
     for i, j in np.argwhere(~np.isclose(ends[0], ends[1], rtol=SAME, atol=0.0)):
-        least, most = (number(end, 3) if np.isfinite(end) else "unbounded" for end in ends[:, i, j])
-        lines[i][j] = (f"{least} …", f"… {most}")
+        least, most = (number(end, 3) for end in ends[:, i, j])
+        bounded = np.isfinite(ends[:, i, j])
+        told = {
+            (True, True): (f"{least} …", f"… {most}"),
+            (True, False): (f"from {least}",),
+            (False, True): (f"to {most}",),
+        }
+        lines[i][j] = told.get((bool(bounded[0]), bool(bounded[1])), ("any value",))
     return lines

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from sysid.report.html import bullets, number, paragraph, sentence, table, text
+from sysid.report.matrices import stated
+from sysid.report.noise_level import NoiseLevel, noise_level
 from sysid.results.identification import Identification
 from sysid.results.summary import DEVIATES, counted, half_width, next_steps, verdict
 from sysid.results.unknowns_table import rows_of
@@ -14,37 +16,45 @@ from sysid.structure.structure import Array, ComplexArray
 
 _KIND = {"determined": "good", "one of many": "warn", "no fit": "bad"}
 _WORD = {"determined": "Determined", "one of many": "One of many", "no fit": "No fit"}
+_HOLDS = (
+    "frequencies, damping ratios and responses to base motion hold whichever of these models is taken; mass, stiffness "
+    "and damping matrices are one choice"
+)
+_NO_END = "the search did not end"
 _MOST_MODES, _MOST_UNKNOWNS = 4, 5  # whose figures stand in the opening; all of them follow
 
 
 def opening(it: Identification) -> str:
     """HTML of what was identified, the judgement, the next thing to do, and the figures."""
     word = "Stopped before its end: the best until then. " * it.interrupted + _WORD[it.judgement]
-    judged = paragraph(_meaning(it)) + f"<p><b>Next:</b> {text(_next(it))}</p>"
+    judged = paragraph(_meaning(it)) + f"<p><b>Next:</b> {text(_steps(it)[0])}</p>"
     box = f'<div class="verdict {_KIND[it.judgement]}"><strong>{text(word)}</strong>{judged}</div>'
     rows = [*_masses(it), *_unknowns(it), *_modes(it), *_fit(it)]
     return _subject(it) + box + table(["", ""], rows, words=True)
 
 
 def trust(it: Identification) -> str:
-    """HTML of what speaks against the answer, what is open, and what fixes it; remarks after these."""
-    parts = [] if it.success else [paragraph(sentence(it.message))]
-    if it.undetermined:
-        parts.append(paragraph("Open, or against it:") + bullets(map(sentence, it.undetermined)))
-        if it.success:
-            parts.append(
-                paragraph(
-                    "Frequencies, damping ratios and responses to base motion hold whichever of these models is taken; "
-                    "mass, stiffness and damping matrices are one choice."
-                )
-                if it.is_one_of_many
-                else ""
-            )
-    if it.closed_by:
-        parts.append(paragraph("What fixes the matrices:") + bullets(map(sentence, it.closed_by)))
-    if it.remarks[1:]:
-        parts.append(paragraph("To be known besides:") + bullets(map(sentence, it.remarks[1:])))
-    return "".join(parts)
+    """HTML of what is open, what speaks against the answer, what fixes it, and what to measure next."""
+    against, open_ = _weighed(it)
+    parts = [
+        ("What the data do not determine", open_),
+        ("What speaks against it", against),
+        ("What fixes the matrices", it.closed_by),
+        ("What to measure or to do next", _steps(it)),
+        ("To be known besides", it.remarks[1:]),
+    ]
+    return "".join(f"<h3>{name}</h3>{bullets(map(sentence, told))}" for name, told in parts if told)
+
+
+def _weighed(it: Identification) -> tuple[list[str], list[str]]:
+    """What speaks against the answer, which its message tells too, and what is open."""
+    against = [told for told in it.undetermined if told in it.message or told.startswith(_NO_END)]
+    open_ = [told for told in it.undetermined if told not in against]
+    if not it.success and it.confidence[0] == it.message:
+        against.insert(0, it.message)
+    if open_ and it.success and it.is_one_of_many:
+        open_.append(_HOLDS)
+    return against, open_
 
 
 def _subject(it: Identification) -> str:
@@ -52,34 +62,31 @@ def _subject(it: Identification) -> str:
     of = f"{n} degrees of freedom"
     if n != test.n_sensors:
         of += f" from {test.n_sensors} sensors"
+    records = "whole records, their transients taken off, " * (it.problem.measurement.whole is not None)
     told = (
-        f"{of}, {counted(d, 'base direction')} ({', '.join(test.base_axes or ())}), {counted(test.n_runs, 'run')}, "
-        f"{test.lines_in_words}, {'with' if test.force is not None else 'without'} base force"
+        f"Identified: mass, stiffness and damping matrices of {of}. From: {counted(test.n_runs, 'run')}, "
+        f"{counted(d, 'base direction')} ({', '.join(test.base_axes or ())}), {records}{test.lines_in_words}, "
+        f"{'with' if test.force is not None else 'without'} base force."
     )
     return paragraph(told, "soft")
 
 
 def _meaning(it: Identification) -> str:
     if it.judgement == "no fit":
-        return sentence(f"these matrices do not explain the records: {it.message}")
+        return sentence(f"these matrices do not explain the records: {it.confidence[0]}")
     return sentence(verdict(it).partition(": ")[2] or verdict(it))
 
 
-def _next(it: Identification) -> str:
-    """The one thing to do next."""
-    if it.judgement == "no fit":
-        return (
-            "look at the curves, and at what speaks against the fit, below; check units (Hz, m/s², N, kg), the signs "
-            "and axes of the sensors, and that responses are absolute."
-        )
-    steps = next_steps(it)
+def _steps(it: Identification) -> list[str]:
+    """What to do next, the first thing first."""
+    steps = [sentence(step.removeprefix("to close it: ")) for step in next_steps(it)]
     if steps:
-        return sentence(steps[0].removeprefix("to close it: "))
+        return steps
     if it.judgement == "one of many":
-        return "mend or measure what is named first below."
+        return ["Mend or measure what speaks against it, the first thing first: below."]
     if not it.problem.validation:
-        return "predict a test that was not fitted (validation=[...]): it alone shows what the model leaves out."
-    return "take the matrices: sysid export writes them for Nastran, MATLAB and others."
+        return ["Predict a test that was not fitted (validation=[...]): it alone shows what the model leaves out."]
+    return ["Take the matrices: sysid export writes them for Nastran, MATLAB and others."]
 
 
 def _masses(it: Identification) -> Iterator[tuple[str, str]]:
@@ -87,16 +94,19 @@ def _masses(it: Identification) -> Iterator[tuple[str, str]]:
         yield "total mass", "not determined: no mass is stated and no force was measured (1 kg is taken)"
         return
     masses, std = np.diag(it.structure.rigid_body_mass), np.diag(it.quick_std("rigid_body_mass"))
-    for axis, mass, own in zip(it.measurement.base_axes or (), masses, std, strict=True):
+    by_user = np.diag(stated(it))
+    for axis, mass, deviation, known in zip(it.measurement.base_axes or (), masses, std, by_user, strict=True):
         unit = "kg m²" if axis.startswith("r") else "kg"
-        yield f"total mass, {axis}", f"{_with_interval(mass, own)} {unit}"
+        exact = known and half_width(deviation, mass) in ("open", "0")
+        told = f"{number(mass)} {unit}, as stated" if exact else _with_interval(mass, deviation, unit)
+        yield f"total mass, {axis}", told
 
 
 def _unknowns(it: Identification) -> Iterator[tuple[str, str]]:
     """Unknowns with a meaning of their own, where they are few."""
     rows = rows_of(it)
     for row in rows if len(rows) <= _MOST_UNKNOWNS else ():
-        yield row.label, f"{_with_interval(row.value, row.std)} {row.unit}"
+        yield row.label, _with_interval(row.value, row.std, row.unit).strip()
 
 
 def _modes(it: Identification) -> Iterator[tuple[str, str]]:
@@ -105,32 +115,44 @@ def _modes(it: Identification) -> Iterator[tuple[str, str]]:
     widths = np.zeros((2, n)) if u is None else np.array([u.natural_frequencies[:n], u.damping_ratios[:n]])
     for k in range(n):
         f, percent = s.natural_frequencies[k], 100 * s.damping_ratios[k]
-        damping = _with_interval(percent, 100 * widths[1, k])
-        yield f"mode {k + 1}", f"{_with_interval(f, widths[0, k])} Hz, damping {damping} %"
+        damping = _with_interval(percent, 100 * widths[1, k], "%")
+        yield f"mode {k + 1}", f"{_with_interval(f, widths[0, k], 'Hz')}, damping {damping}"
     if s.n > n:
         yield "", f"and {counted(s.n - n, 'further mode')} up to {number(s.natural_frequencies[-1], 4)} Hz, below"
 
 
 def _fit(it: Identification) -> Iterator[tuple[str, str]]:
     test = it.problem.screened.measurement
+    level = noise_level(test, it.structure)
     left = f"{number(100 * it.residual, 3)} % of the accelerations relative to the base"
-    noise = _share(test.response_std, test.relative)
-    left += f" (noise {number(100 * noise, 3)} %)" if noise else ""
+    left += _beside(_share(level.response, test.relative), level)
     if it.force_residual is not None and test.force is not None:
         left += f", {number(100 * it.force_residual, 3)} % of the base force"
-        noise = _share(test.force_std, test.force)
-        left += f" (noise {number(100 * noise, 3)} %)" if noise else ""
+        left += _beside(_share(level.force, test.force), level)
     yield "the fit leaves", left
     for i, unseen in enumerate(it.validation, start=1):
-        yield f"unfitted test {i}", f"missed by {number(100 * unseen.residual(it.structure), 3)} %"
+        missed = number(100 * unseen.residual(it.structure), 3)
+        yield f"unfitted test {i}", f"missed by {missed} % of its accelerations relative to the base"
 
 
-def _with_interval(value: float, std: float) -> str:
-    """A value and half of its 95 % interval, to two digits of that; four digits of a value without noise."""
-    if half_width(std, value) in ("open", "0"):
-        return number(value) + " (open)" * (not np.isfinite(std))
+def _beside(noise: float, level: NoiseLevel) -> str:
+    return f" (noise{level.bound} {number(100 * noise, 3)} %)" if noise else ""
+
+
+def rounded(value: float, std: float, digits: int = 4) -> tuple[str, str]:
+    """A value to two digits of half of its 95 % interval, and that; with so many `digits` where noise leaves none."""
+    width = half_width(std, value)
+    if width in ("open", "0"):
+        return number(value, digits), width
     places = int(np.clip(1 - np.floor(np.log10(DEVIATES * std)), 0, 9))
-    return f"{value:.{places}f} ± {DEVIATES * std:.{places}f}"
+    return f"{value + 0.0:.{places}f}", f"{DEVIATES * std:.{places}f}"
+
+
+def _with_interval(value: float, std: float, unit: str) -> str:
+    told, width = rounded(value, std)
+    if width == "open":
+        return f"{told} {unit}, one of many: these data do not determine it"
+    return f"{told} {unit}" if width == "0" else f"{told} ± {width} {unit}"
 
 
 def _share(std: Array | None, records: ComplexArray) -> float:

@@ -15,8 +15,9 @@ from sysid.problem.formulation import MATRICES
 from sysid.problem.problem import Problem
 from sysid.report.curves import curves, mode_shapes, script
 from sysid.report.html import Cell, beside, bullets, matrix, number, page, paragraph, picture, sentence, table, text
-from sysid.report.matrices import CHOSEN, ONE_OF_MANY, SAME, Lines, half_widths, matrices, stated
-from sysid.report.opening import opening, trust
+from sysid.report.matrices import CHOSEN, ONE_OF_MANY, SAME, Lines, half_widths, matrices, plain, stated
+from sysid.report.noise_level import noise_level, share_of_noise
+from sysid.report.opening import opening, rounded, trust
 from sysid.results.gain_table import gains_of_sensors
 from sysid.results.identification import Identification
 from sysid.results.noise_table import noise_of_channels
@@ -40,6 +41,14 @@ FILE_NAME = "report.html"
 _SUFFIXES = (".html", ".htm")
 _TOTALS = {"trace": "total of the diagonal", "rigid_body": "rigid-body total", "sensors": "total on the sensors"}
 _PER_UNIT = "Absolute acceleration of each sensor per unit base acceleration (transmissibility), magnitude and phase."
+_DRAWN_SHAPES = (
+    "Motion relative to the base, which stands still, at the places of the sensors along their axes; grey: at rest. "
+    "The largest motion is drawn alike in all modes."
+)
+_TOLD_SHAPES = (
+    "Motion of each sensor relative to the base, the largest of each mode 1. Sensors with positions have their mode "
+    "shapes drawn."
+)
 _AS_MOVED = (
     "Spectra of each sensor's absolute acceleration in each run, as the base moved: not transmissibilities. The phase "
     "is told against the base direction that moves the sensor most with it."
@@ -49,6 +58,7 @@ _WIDENED = (
     "Dashed: the swarm's objective of responses with widened peaks, which does not compare with that of the records "
     "themselves; what the phases leave of these stands below."
 )
+_FALL = 0.9  # of the objective that a search began with, below which its curve is drawn
 _MOST_OUTLIERS = 10  # that are told one by one
 _MANY_PANELS = 40  # beyond which the pictures are drawn with fewer pixels
 
@@ -110,13 +120,13 @@ def render(identification: Identification) -> str:
         [
             ("How far to trust it", trust(it)),
             ("Modes", _modes(it)),
-            ("Mode shapes", mode_shapes(it)),
+            ("Mode shapes", _shapes(it)),
+            ("Measured against identified", _responses(it, it.measurement) + _residuals(it)),
+            ("Validation", _validation(it)),
+            ("Further tests", _further(it)),
             ("Total mass", _rigid_body_mass(it)),
             ("Unknowns", _unknowns(it)),
             ("Matrices", matrices(it)),
-            ("Measured against identified", _responses(it, it.measurement)),
-            ("Validation", _validation(it)),
-            ("Further tests", _further(it)),
             ("Noise", _noise(it)),
             ("Gains", _gains(it)),
             ("Outliers", _outliers(it)),
@@ -140,7 +150,7 @@ def _title(it: Identification) -> str:
 def _unknowns(it: Identification) -> str:
     rows = [
         (
-            row.label, number(row.value, 6), half_width(row.std, row.value), row.unit, number(row.lower),
+            row.label, number(row.value, 6), plain(half_width(row.std, row.value)), row.unit, number(row.lower),
             number(row.upper), row.on_bound,
         )
         for row in rows_of(it)
@@ -155,15 +165,18 @@ def _unknowns(it: Identification) -> str:
 def _modes(it: Identification) -> str:
     structure, reference, u = it.structure, it.problem.reference, it.quick_uncertainty
     many, frequencies, percent = is_one_of_many(it), structure.natural_frequencies, 100 * structure.damping_ratios
+    widths = np.zeros((2, structure.n)) if u is None else np.array([u.natural_frequencies, 100 * u.damping_ratios])
+    told = [rounded(f, std, 6) for f, std in zip(frequencies, widths[0], strict=True)]
+    damping = [rounded(ratio, std) for ratio, std in zip(percent, widths[1], strict=True)]
     columns: list[list[object]] = [
         ["mode", *range(1, structure.n + 1), "sum"],
-        ["frequency [Hz]", *(number(f, 6) for f in frequencies), ""],
-        ["damping [%]", *map(number, percent), ""],
+        ["frequency [Hz]", *(value for value, _ in told), ""],
+        ["damping [%]", *(value for value, _ in damping), ""],
     ]
     notes = ["Effective mass in % of the rigid-body mass of its base direction."]
     if u is not None:
-        columns.insert(2, ["±", *map(half_width, u.natural_frequencies, frequencies), ""])
-        columns.append(["±", *map(half_width, 100 * u.damping_ratios, percent), ""])
+        columns.insert(2, ["±", *(width for _, width in told), ""])
+        columns.append(["±", *(width for _, width in damping), ""])
         notes.append("±: half of the 95 % interval that the noise of the records makes; 0 where it is round-off.")
         if it.measurement.response_std is None:
             notes.append("No noise is stated, so the misfit is taken for it.")
@@ -179,6 +192,18 @@ def _modes(it: Identification) -> str:
         notes.append("~: one of many values that explain the data.")
     head, *rows = zip(*columns, strict=True)
     return table(head, rows, " ".join(notes))
+
+
+def _shapes(it: Identification) -> str:
+    drawn = mode_shapes(it)
+    if drawn:
+        return paragraph(_DRAWN_SHAPES, "soft") + drawn
+    shapes = it.structure.mode_shapes
+    largest = np.take_along_axis(shapes, np.abs(shapes).argmax(axis=0)[None], axis=0)
+    shapes = np.divide(shapes, largest, out=np.zeros_like(shapes), where=largest != 0)
+    rows = [*it.measurement.sensor_names, "base"]
+    columns = [f"mode {k}" for k in range(1, it.structure.n + 1)]
+    return matrix(np.vstack([shapes, np.zeros(it.structure.n)]), rows, columns, _TOLD_SHAPES)
 
 
 def _effective_mass_columns(it: Identification, many: Array) -> Iterator[list[object]]:
@@ -211,14 +236,29 @@ def _rigid_body_mass(it: Identification) -> str:
 
 def _responses(it: Identification, test: Measurement) -> str:
     words = _PER_UNIT if test.has_unit_runs else _AS_MOVED
-    own = _as_fitted(it, test)
-    scored = zip(test.sensor_names, scores(it.structure, own).relative, strict=True)
-    rows = [(name, number(1 - score, 3)) for name, score in scored]
-    left_out = " Outliers that stand alone are left out." * (own is not test)
-    caption = f"‖predicted - measured‖ / ‖measured‖ of the accelerations relative to the base.{left_out}"
+    if test is it.measurement and it.problem.measurement.whole is not None:
+        words += " The transients of the records are taken off."
+    return paragraph(words, "soft") + curves(it, test)
+
+
+def _residuals(it: Identification) -> str:
+    """What the fit leaves of each channel, beside its noise."""
+    test = _as_fitted(it, it.measurement)
+    level = noise_level(test, it.structure)
+    left = [1 - score for score in scores(it.structure, test).relative]
+    channels = [*zip(test.sensor_names, left, share_of_noise(level.response, test.relative), strict=True)]
     if test.force is not None:
-        rows.append(("base force", number(own.force_residual(it.structure), 3)))
-    return paragraph(words, "soft") + curves(it, test) + table(("channel", "relative residual"), rows, caption)
+        noise = share_of_noise(level.force, test.force)
+        force = [*zip(test.base_axes or (), _score_of_force(it, test), noise, strict=True)]
+        channels += [(f"base force {axis}", 1 - score, own) for axis, score, own in force]
+    known = any(np.isfinite(noise) for *_, noise in channels)
+    rows = [(name, number(100 * own, 3), *[number(100 * noise, 3)] * known) for name, own, noise in channels]
+    caption = (
+        "What the fit leaves of each channel: ‖identified - measured‖ / ‖measured‖, of the accelerations relative "
+    )
+    caption += "to the base; and its noise likewise." if known else "to the base."
+    caption += " Outliers that stand alone are left out." * (test is not it.measurement)
+    return table(("channel", "left [%]", *[f"noise{level.bound} [%]"] * known), rows, caption)
 
 
 def _as_fitted(it: Identification, test: Measurement) -> Measurement:
@@ -235,15 +275,16 @@ def _noise(it: Identification) -> str:
 
 def _gains(it: Identification) -> str:
     """The gain of each sensor as the records show it."""
-    rows = [
-        (g.sensor, f"{g.gain:.4f}", half_width(g.std, g.gain), "" if np.isnan(g.worth) else number(g.worth, 2))
-        for g in gains_of_sensors(it)
-    ]
-    caption = (
-        "Gain of each sensor against the base, as the constant term of the transmissibility shows it; masses assume 1. "
-        "The last column: by how many of its stated deviations M_SS is off where a gain is 1 % off."
-    )
-    return table(("sensor", "gain", "± (95 %)", "1 % moves M_SS by, deviations"), rows, caption) if rows else ""
+    caption = "Gain of each sensor against the base, as the constant term of the transmissibility shows it; masses "
+    caption += "assume 1. ±: half of the 95 % interval."
+    head, found = ["sensor", "gain", "±"], gains_of_sensors(it)
+    rows = [[g.sensor, f"{g.gain:.4f}", half_width(g.std, g.gain)] for g in found]
+    if it.determined and any(np.isfinite(g.worth) for g in found):  # else M_SS has no deviation
+        head.append("1 % moves M_SS by, deviations")
+        caption += " The last column: by how many of its stated deviations M_SS is off where a gain is 1 % off."
+        for row, gain in zip(rows, found, strict=True):
+            row.append(number(gain.worth, 2))
+    return table(head, rows, caption) if rows else ""
 
 
 def _outliers(it: Identification) -> str:
@@ -333,12 +374,21 @@ def _convergence(it: Identification) -> str:
     caption = _LAST_PHASE * (it.strategy == "continuation")
     if history.swarm_curve.size and np.isnan(history.start):
         caption = _WIDENED
-    parts = [picture(plot.convergence(it), alt, caption), table(COLUMNS, ran, f"{told}.", words=True)]
+    parts = [picture(plot.convergence(it), alt, caption)] if _falls(it) else []
+    told_of = [k for k in range(len(COLUMNS)) if any(row[k] != "-" for row in ran)]  # of a reference only where it is
+    rows = [[row[k] for k in told_of] for row in ran]
+    parts.append(table([COLUMNS[k] for k in told_of], rows, f"{told}.", words=True))
     if history.restarts:
         again = f"{counted(history.restarts, 'further swarm')} followed, as the first ended in no good fit"
         parts.append(paragraph(f"{again}; {history.evaluations} candidates are those of all.", "soft"))
     parts.append(table(["state of the swarm", "iterations"], history.states))
     return "".join(parts)
+
+
+def _falls(it: Identification) -> bool:
+    """Whether there is a search to be seen: a swarm's, or one whose objective fell by more than a tenth."""
+    local = it.history.local_curve
+    return bool(it.history.swarm_curve.size or (local.size > 1 and local[-1] < _FALL * local[0]))
 
 
 def _mac(it: Identification) -> str:
@@ -395,6 +445,11 @@ def _what_ran(it: Identification) -> str:
         + table(["matrix", "unknowns"], counts, "Unknowns of the search, matrix by matrix.")
         + log
     )
+
+
+def _score_of_force(it: Identification, test: Measurement) -> Array:
+    assert test.force is not None
+    return _score(test.predict_force(it.structure), test.force)
 
 
 def _score(predicted: ComplexArray, measured: ComplexArray) -> Array:

@@ -94,7 +94,9 @@ class Answer:
         what else is to be known of records, bounds and sensors.
         """
         told = (*self.undetermined, *self.closed_by, *self.remarks[1:])  # the first tells why the strategy was taken
-        return told if self.success else (self.message, *told)
+        if self.success or any(sentence in self.message for sentence in self.undetermined):
+            return told
+        return (self.message, *told)  # of results of older versions, and of searches that were stopped
 
     @property
     def measurement(self) -> Measurement:

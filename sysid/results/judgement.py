@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from sysid.assessment.checks import doubts
 from sysid.assessment.determination import BY_RANK, determine
 from sysid.assessment.gains import assumed, rests_on
+from sysid.assessment.model_error import Miss, levels_in_words, missed_in_words, misses_of, model_errors
 from sysid.assessment.sensitivity import blocks_of
 from sysid.assessment.uncertainty import LARGE
 from sysid.measurement.missing import in_words
@@ -27,45 +29,67 @@ from sysid.search.strategy import HUBER, Outcome
 
 _KNOWN = 0.1  # of the root of two diagonal entries; an entry with a larger standard deviation is not known
 _OUTLIERS = "for spikes and drop-outs state Problem(..., loss='huber'), or leave these lines out"
-NO_FIT = 0.5  # relative residual above which nothing is explained
+_NO_FIT = 0.5  # relative residual above which nothing is explained
+_NO_END = "the search did not end in a fit ({}): this is not yet any structure that explains the data"
+
+
+class Verdict(NamedTuple):
+    """Whether where a search ended is a fit.
+
+    Attributes
+    ----------
+    fits : bool
+        The solver succeeded, constraints hold, and the residual is within the goal, or of any use without one.
+    wrong : tuple of str
+        Why it is no success, in sentences.
+    message : str
+        These, and what the solver says.
+    misses : list of Miss
+        What the model leaves of each record, in units of its noise.
+    """
+
+    fits: bool
+    wrong: tuple[str, ...]
+    message: str
+    misses: list[Miss]
+
+    @property
+    def success(self) -> bool:
+        """It fits, and, without a goal, within the noise of the records."""
+        return self.fits and not self.wrong
 
 
 def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session) -> Identification:
     """Judge where a search ended: `why` tells why its strategy was taken, the session has its log and clock."""
     cut_short, records = session.cut_short, problem.screened
-    success, message = succeeded(records, end, cut_short=cut_short)
-    session.log(f"done: {message}")
+    verdict = verdict_of(problem, end, cut_short=cut_short)
+    session.log(f"done: {verdict.message}")
     # What was stopped on its way has misfits of another kind.
-    judged = end.stopped is None and (success or (problem.free_modes and not cut_short))
+    judged = end.stopped is None and (end.success or (problem.free_modes and not cut_short))
     closed_by: tuple[str, ...] = ()
-    doubtful: tuple[str, ...] = ()
+    against = Against(verdict.wrong, ())
     try:
         with within(session.left):
             known = determine(records, end.structure, end.x, end.alternatives)
-            # A mistake that is named explains whatever else speaks against the fit; short segments have more to tell.
-            more = judged and (not end.mistakes or records.measurement.averaged)
-            further = doubts(records, end.structure, end.x) if more else ()
-            doubtful = (*end.doubts, *further) if judged else ()
-            open_, closed_by = (*end.mistakes, *doubtful, *known.undetermined), known.closed_by
-        if success and known.judged_by == BY_RANK and not open_:
+            against = _against(problem, end, verdict) if judged else against
+            open_, closed_by = (*end.mistakes, *against.further, *known.undetermined), known.closed_by
+        if verdict.success and known.judged_by == BY_RANK and not open_:
             end, unknown = with_other_answers(problem, end, session)
             with within(session.left):
                 others = determine(records, end.structure, end.x, end.alternatives).undetermined
             open_ = (*unknown, *others)
     except TimeIsOver:
         open_ = (NOT_JUDGED,)
-    if end.mistakes and open_[: len(end.mistakes)] != end.mistakes:
-        open_ = (*end.mistakes, *open_)
-    if not success:
-        open_ = ("the search did not end in a fit, so this is not yet any structure that explains the data", *open_)
+    told = () if verdict.fits else (_NO_END.format(end.message),)
+    open_ = tuple(dict.fromkeys((*end.mistakes, *against.first, *told, *open_)))
     it = Identification(
         structure=end.structure,
         problem=problem,
         x=end.x,
         strategy=end.strategy,
         seed=seed,
-        success=success,
-        message="; ".join((*end.mistakes, message, *doubtful)),
+        success=verdict.success,
+        message="; ".join(dict.fromkeys(_in_order(end, (*end.mistakes, *against.first, *against.further)))),
         history=replace(end.history, log=tuple(session.lines), wall_time=session.seconds),
         determined=not open_,
         closed_by=() if open_ else closed_by,
@@ -80,15 +104,41 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
         return replace(it, determined=False, closed_by=(), undetermined=(NOT_JUDGED,))
 
 
-def succeeded(problem: Problem, end: Outcome, *, cut_short: bool = False) -> tuple[bool, str]:
-    """Whether where a search ended is a fit, and the message; `cut_short` by its time it is blamed on nothing else."""
-    test, goal, wrong = problem.measurement, problem.goal, []
-    residual = test.residual(end.structure) if end.x is None or problem.free_modes else problem.residual(end.x)
-    if end.x is not None and end.success and not problem.keeps_constraints(end.x):
+class Against(NamedTuple):
+    """What speaks against an answer, in sentences: why it is no success, or what explains that; and further signs."""
+
+    first: tuple[str, ...]
+    further: tuple[str, ...]
+
+
+def _against(problem: Problem, end: Outcome, verdict: Verdict) -> Against:
+    """What speaks against an answer, in the order of its weight; a mistake that is named explains what else does."""
+    averaged = problem.screened.measurement.averaged
+    if end.mistakes:
+        further = doubts(problem.screened, end.structure, end.x) if averaged else ()
+        return Against(verdict.wrong, (*end.doubts, *further))
+    errors = model_errors(problem, end.structure, verdict.misses)
+    further = (*end.doubts, *doubts(problem.screened, end.structure, end.x, changing=errors.changing))
+    if errors.changing:
+        return Against((*errors.sentences, *verdict.wrong), further)
+    return Against(verdict.wrong, (*errors.sentences, *further))
+
+
+def _in_order(end: Outcome, told: tuple[str, ...]) -> tuple[str, ...]:
+    """Sentences, and what the solver says: first where it did not succeed, else last."""
+    return (*told, end.message) if end.success else (end.message, *told)
+
+
+def verdict_of(problem: Problem, end: Outcome, *, cut_short: bool = False) -> Verdict:
+    """Whether where a search ended is a fit; `cut_short` by its time it is blamed on nothing else."""
+    records, goal, wrong = problem.screened, problem.goal, []
+    test = records.measurement
+    residual = test.residual(end.structure) if end.x is None or problem.free_modes else records.residual(end.x)
+    if end.x is not None and end.success and not records.keeps_constraints(end.x):
         wrong.append("a constraint does not hold")
     if goal is not None and residual > goal:
         wrong.append(f"the residual {residual:.3g} is above the goal {goal:.3g}")
-    if goal is None and residual > NO_FIT and end.stopped is None and (end.success or not cut_short):
+    if goal is None and residual > _NO_FIT and end.stopped is None and (end.success or not cut_short):
         doubt = "are the frequencies in Hz, the responses absolute and complex with exp(+iwt), the axes and signs of "
         doubt += "rigid_body right, the bounds wide enough?"
         if problem.unit_mass and not problem.formulation.stiffness.free:
@@ -98,7 +148,11 @@ def succeeded(problem: Problem, end: Outcome, *, cut_short: bool = False) -> tup
                 "base force"
             )
         wrong.append(f"the residual {residual:.3g} is no fit: {doubt}")
-    return end.success and not wrong, "; ".join((end.message, *wrong))
+    fits = end.success and not wrong
+    misses = misses_of(problem, end.structure, end.x) if end.stopped is None else []
+    if goal is None:
+        wrong += missed_in_words(misses)
+    return Verdict(fits, tuple(wrong), "; ".join(_in_order(end, tuple(wrong))), misses)
 
 
 def _remarks(problem: Problem, end: Outcome) -> Iterator[str]:
@@ -110,6 +164,7 @@ def _remarks(problem: Problem, end: Outcome) -> Iterator[str]:
         names = [label for label, on in zip(formulation.labels, at, strict=True) if on]
         if names:
             yield f"on a bound of the search space, beyond which the truth may lie: {', '.join(names)}"
+    yield from levels_in_words(problem)
     tests = [term.test for term in formulation.tests]
     for i, test in enumerate(tests, start=problem.first_test):
         if test.dropped:

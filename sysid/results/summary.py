@@ -19,6 +19,10 @@ from sysid.structure.structure import Array
 _NOT_COMPUTED = (
     "uncertainty not computed, as the time was over: Identification.uncertainty and 'sysid report' compute it"
 )
+_MEND = (
+    "mend or measure what is named first; where a fit as near as this will do, state the residual that is enough: "
+    "Problem(..., goal=...)"
+)
 DEVIATES = 1.96  # standard deviations on either side of 95 % of a normal law
 _ROUND_OFF = 1e-10  # of a value: what is no noise of an instrument
 _WIDTH = 120
@@ -32,7 +36,7 @@ def summary(it: Answer) -> str:
         *_mode_table(it),
         "",
         *_unknowns(it),
-        f"{'success' if it.success else 'no success'}: {it.message}",
+        f"{'success' if it.success else 'no success'}: {_ending(it)}",
         f"relative residual {residual_in_words(it)}{force}; seed {it.seed}, {seconds_in_words(it.history.wall_time)}",
         *_phases(it),
         *it.remarks,
@@ -56,6 +60,15 @@ def summary(it: Answer) -> str:
     lines += [_NOT_COMPUTED] if it.hurried else []
     lines += [f"  > {sentence}" for sentence in next_steps(it)]
     return "\n".join(_folded(line) for line in lines)
+
+
+def _ending(it: Answer) -> str:
+    """The message, but for sentences that are told again below: of these the first alone."""
+    others = [sentence for sentence in it.undetermined if sentence in it.message][1:]
+    message = it.message
+    for sentence in others:
+        message = message.replace(f"; {sentence}", "").replace(f"{sentence}; ", "")
+    return message
 
 
 def _phases(it: Answer) -> list[str]:
@@ -111,7 +124,13 @@ def verdict(it: Answer) -> str:
 
 def next_steps(it: Answer) -> list[str]:
     """What would close what is open, in sentences."""
-    if it.determined or it.hurried or NOT_JUDGED in it.undetermined or not it.is_one_of_many:
+    if it.determined or it.hurried or NOT_JUDGED in it.undetermined:
+        return []
+    if not it.success:
+        return [
+            _MEND if it.problem.goal is None else "mend what is named first; no model reaches a goal below the noise"
+        ]
+    if not it.is_one_of_many:
         return []
     if not it.open_masses:
         return [

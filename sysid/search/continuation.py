@@ -29,6 +29,8 @@ _NEAR = 1.1  # times the misfit of free residues at the poles of the data: what 
 _CHANCE = 1e-3  # that noise alone makes the misfit of one of two answers so much larger
 _APART = 0.01  # of an unknown's size, from which two solutions are two ...
 _TOGETHER = 1e-3  # ... and up to which two ways are one
+_AGREE = 3  # starts that end at one structure, from which it is no local minimum among others ..
+_OF_SORTS = 0.5  # .. where its relative residual is not larger: there peaks are not those of the records
 _LEFT_OUT = (
     "{} of {} starts were left out for want of time: whether they end at another structure that explains the data as "
     "well is not known"
@@ -156,6 +158,7 @@ class _Run:
         self.steps = [] if self.smoother is None else self.smoother.steps
         self.ends: list[tuple[float, LocalResult]] = []
         self.ways: list[Array] = []
+        self.joined = 0  # starts whose way another one has come before
         self.stopped: BaseException | None = None
         self.begun = session.seconds
         self.wrong: InputError | None = None
@@ -196,7 +199,7 @@ class _Run:
             structure, best.x, Continuation.name, success, message,
             History(start=begun, local=objective, local_curve=best.curve, phases=phases), self.stopped,
             alternatives=tuple(_alternatives(problem, best.x, objective, self.ends)) if success else (),
-            remarks=remarks, good=self._good(objective, best),
+            remarks=remarks, good=self._good(objective, best), alone=self._alone(best),
         )  # fmt: skip
 
     def _from(self, x: Array) -> None:
@@ -207,6 +210,7 @@ class _Run:
             if way is not None and way.stopped is None:
                 if any(apart(problem, way.x, other) < _TOGETHER for other in self.ways):
                     session.log("another start comes the same way")
+                    self.joined += 1
                     return
                 self.ways.append(way.x)
                 x = way.x
@@ -236,6 +240,11 @@ class _Run:
         # What residuals of the user's own leave beside the tests has no floor of its own.
         own = sum(term.error(best.x) ** 2 for term in problem.formulation.beside if not isinstance(term, TestTerm))
         return float(np.sqrt(max(objective**2 - own, 0.0))) <= max(_NEAR * self.smoother.floor, EXACT)
+
+    def _alone(self, best: LocalResult) -> bool:
+        """Whether all of several starts ended at the best end, at a fit of sorts: only a wrong model leaves more."""
+        same = [apart(self.problem, best.x, answer.x) < _APART for _, answer in self.ends]
+        return all(same) and len(same) + self.joined >= _AGREE and self.problem.residual(best.x) < _OF_SORTS
 
 
 def _best(problem: Problem, ends: list[tuple[float, LocalResult]]) -> tuple[float, LocalResult, Structure]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 from scipy.linalg import circulant
 
 import sysid
@@ -32,7 +33,8 @@ def test_the_example_of_the_readme_is_determined(tmp_path, monkeypatch):
     assert (tmp_path / "two_floors.html").stat().st_size > 1e4
 
 
-def test_the_lines_of_the_readme_go_from_a_loggers_file_to_an_export(tmp_path, monkeypatch, capsys):
+def test_the_lines_of_the_readme_go_from_a_loggers_file_of_each_kind_to_an_export(tmp_path, monkeypatch, capsys):
+    op4, pyuff = pytest.importorskip("pyyeti.nastran.op4"), pytest.importorskip("pyuff")
     monkeypatch.chdir(tmp_path)
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     (described,) = re.findall(r"```toml\n(.*?)```", readme, re.DOTALL)
@@ -45,18 +47,42 @@ def test_the_lines_of_the_readme_go_from_a_loggers_file_to_an_export(tmp_path, m
         n_base=1,
     )
     rng, rate = np.random.default_rng(0), 50.0
-    base = rng.standard_normal((1, 3000))
-    response = truth.simulate(base, rate)
-    force = truth.simulate_force(base, rate)
-    table = np.vstack([np.arange(3000) / rate, base / 9.80665, response, force / 1000])
-    table[1:] *= 1 + 0.003 * rng.standard_normal(table[1:].shape)
-    head = "time [s],table [g],a1 [m/s²],a2 [m/s²],force [kN]"
-    np.savetxt("log.csv", table.T, "%.9g", ",", header=head, comments="", encoding="utf-8")
-    for line in lines.splitlines():
+    base = rng.standard_normal((1, 1000))
+    table = np.vstack([base / 9.80665, truth.simulate(base, rate), truth.simulate_force(base, rate) / 1000])
+    table *= 1 + 0.003 * rng.standard_normal(table.shape)
+    _write_log(table, rate, described, pyuff)
+    for line in filter(None, lines.splitlines()):
         assert cli.main(line.split()[1:]) == 0, capsys.readouterr().err
     result = sysid.load("results/test")
-    assert result.determined and (tmp_path / "model.bdf").exists() and (tmp_path / "results/test/report.html").exists()
+    assert result.determined and (tmp_path / "results/test/report.html").exists()
     assert np.all(np.abs(result.structure.mass - truth.mass)[:2, :2] < 5 * result.uncertainty.mass[:2, :2])
+    exported = {name: op4.read(f"{name}.op4")["m"] for name in ("model", "matlab", "universal")}
+    np.testing.assert_array_equal(exported["model"], result.structure.mass)
+    scale = np.abs(exported["model"]).max()
+    np.testing.assert_allclose(exported["matlab"], exported["model"], rtol=0, atol=1e-6 * scale)  # CSV has ten digits
+    np.testing.assert_allclose(exported["universal"], exported["model"], rtol=0, atol=1e-4 * scale)  # single precision
+
+
+def _write_log(table, rate, described, pyuff):
+    """log.csv, log.mat and log.unv with the same channels, and nodes.toml, which names those of the last."""
+    time, names = np.arange(table.shape[1]) / rate, ("table", "a1", "a2", "force")
+    head = "time [s],table [g],a1 [m/s²],a2 [m/s²],force [kN]"
+    np.savetxt("log.csv", np.vstack([time, table]).T, "%.10g", ",", header=head, comments="", encoding="utf-8")
+    savemat("log.mat", {"time": time} | dict(zip(names, table, strict=True)))
+    described = described.replace('time = "time" ', "# ")
+    for node, name in enumerate(names, 1):
+        described = described.replace(f'column = "{name}"', f'column = "{node}+X"')
+    Path("nodes.toml").write_text(described, encoding="utf-8")
+    sets = [
+        pyuff.prepare_58(
+            binary=0, func_type=1, rsp_node=node, rsp_dir=1, ref_node=0, ref_dir=0, x=time, num_pts=time.size, data=row,
+            id1="", id2="", id3="", id4="", id5="", load_case_id=0, rsp_ent_name="s", ref_ent_name="r", ord_data_type=2,
+            abscissa_spacing=1, abscissa_inc=1 / rate, abscissa_min=0.0, ordinate_spec_data_type=0,
+            orddenom_spec_data_type=0, abscissa_spec_data_type=17,
+        )
+        for node, row in enumerate(table, 1)
+    ]  # fmt: skip
+    pyuff.UFF("log.unv").write_sets(sets, "overwrite")
 
 
 def test_the_examples_of_the_docs_find_their_own_structure(tmp_path, monkeypatch):

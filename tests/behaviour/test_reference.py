@@ -142,6 +142,9 @@ def test_the_answer_is_that_of_the_table(name, reference, identified):
     shared = MODULES[name].parent == ROOT / "problems" and name not in DATA
     new, old = facts(identified(name, **SETTINGS.get(name, {})) if shared else answer(name)), reference[name]
     for what in ("strategy", "success", "determined"):
+        if (name, what) == ("mini_shake_table", "success"):
+            assert not new[what], what  # it leaves 20 %, several times the noise of the units
+            continue
         assert new[what] == old[what], what
     # The residual was the first test's, and is that of all fitted tests together; each test's own is in `residuals`.
     same = ("residual", "residuals", "objective") if len(old["residuals"]) == 1 else ("residuals", "objective")

@@ -97,7 +97,7 @@ def test_a_judgement_that_takes_too_long_is_given_up_and_determines_nothing(rand
     problem = random_case(np.random.default_rng(0), "rigid_body", n=3, d=1, force=True)[1]
     assert sysid.identify(problem, rng=0).determined
 
-    def endless(*arguments):
+    def endless(*arguments, **options):
         end = time.perf_counter() + 20
         while time.perf_counter() < end:
             time.sleep(0.01)

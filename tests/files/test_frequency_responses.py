@@ -222,6 +222,15 @@ def test_frequencies_are_in_the_unit_that_the_file_states_or_told_to_be_in_hz(tm
     assert "frequencies have no unit, and are taken as Hz" in test.remarks[0]
 
 
+@pytest.mark.parametrize("said", [{"frf": "FRF"}, {"convention": "+"}])
+def test_a_wrong_word_is_told_with_the_words_that_there_are(tmp_path, said):
+    np.savez(tmp_path / "a.npz", freq=FREQ, h1=H[0])
+    sensors = [{"column": "h1", "role": "response", "axis": "x"}]
+    with pytest.raises(sysid.InputError, match=f"{next(iter(said.values()))!r} is unknown".replace("+", r"\+")) as told:
+        reading.gather(tmp_path / "a.npz", {"base_axes": "x", "sensor": sensors} | said)
+    assert "''" not in str(told.value)
+
+
 @pytest.mark.parametrize("sign, axis, words", [(1, "x", "gives"), (-1, "x", "takes"), (-1, "-x", "gives")])
 def test_the_sign_of_the_base_force_is_told_by_its_power(tmp_path, sign, axis, words):
     np.savez(tmp_path / "a.npz", freq=FREQ, h1=H[0], F=sign * F)

@@ -29,12 +29,32 @@ def test_every_control_works_and_the_page_is_readable(result, tmp_path, width, d
     assert told["used"]["select"] >= 4 and set(told["used"]) >= {"Zoom in", "Zoom out", "All lines", "Stop"}
     assert "Hz: measured" in told["hover"] and "noise" in told["hover"] and "95 % interval" in told["hover"]
     assert told["zoomed"] and told["whole"] and told["all_lines"] and told["keys"] and told["moved"]
-    assert told["sheets"] == (3 + 2) * 2 and told["left"] == 0  # every channel of both runs, on paper alone
+    assert told["sheets"] == (3 + 2) * 2 and told["stills"] == 0  # every channel of both runs, on paper alone
     assert told["over"] == [] and told["sideways"] <= 0
     assert max(told["first"]) < 800  # judgement, next step, masses and frequencies on the first screen
     assert told["contrast"] >= 4.5
     assert (sum(map(int, re.findall(r"\d+", told["paper"])[:3])) < 150) == dark
 
 
+def test_without_scripts_all_curves_and_mode_shapes_are_seen(result, tmp_path):
+    told = browser.seen_without_scripts(report.render(result), tmp_path, 380)
+    assert told == {"sheets": (3 + 2) * 2, "modes": 3, "controls": 0, "sideways": 0}
+
+
 def test_the_page_prints(result, tmp_path):
     assert browser.pages_printed(report.write_report(result, tmp_path), tmp_path) > 2
+
+
+def test_whole_records_are_shown_with_their_transients_where_asked(random_structure, tmp_path):
+    truth = random_structure(np.random.default_rng(3), 1, 1, G=np.ones((1, 1)))
+    base = np.random.default_rng(4).standard_normal((1, 900))
+    rate = 8 * truth.natural_frequencies[0]
+    response = truth.simulate(base, rate)
+    noisy = response + 0.01 * np.random.default_rng(5).standard_normal(response.shape)
+    band = (0.05 * rate, 0.3 * rate)
+    test = sysid.Measurement.from_time([(base, noisy, None)], rate, rigid_body=np.ones((1, 1)), band=band)
+    it = sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), rng=0)
+    page = report.render(it)
+    assert "their transients taken off" in page
+    told = browser.measured(page, tmp_path, 768)
+    assert told["errors"] == [] and told["used"]["checkbox"] == 1

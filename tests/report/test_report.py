@@ -3,8 +3,10 @@
 import base64
 import dataclasses
 import hashlib
+import html
 import json
 import re
+from decimal import Decimal
 from html.parser import HTMLParser
 
 import casadi as ca
@@ -15,7 +17,7 @@ from scipy.stats import norm
 import sysid
 from sysid import plot
 from sysid.report import matrices as _report_matrices
-from sysid.report import report
+from sysid.report import opening, report
 
 FREQ = np.linspace(1.0, 40.0, 30)
 HOSTILE = "</td><script>alert('x')</script> & \"$\\foo$\""
@@ -145,8 +147,8 @@ def no_pictures(monkeypatch):
 def test_the_report_opens_with_the_answer_and_ends_with_the_search(complete, page):
     page = Page(page)
     assert page.headings == [
-        "How far to trust it", "Modes", "Mode shapes", "Total mass", "Matrices", "Measured against identified",
-        "Validation", "Gains", "Poles in the data", "Modal assurance criterion", "Effective masses", "How it was found",
+        "How far to trust it", "Modes", "Mode shapes", "Measured against identified", "Validation", "Total mass",
+        "Matrices", "Gains", "Poles in the data", "Modal assurance criterion", "Effective masses", "How it was found",
     ]  # fmt: skip
     opening, rest = page.text.split("How far to trust it", 1)
     f, percent = complete.structure.natural_frequencies, 100 * complete.structure.damping_ratios
@@ -164,6 +166,29 @@ def test_the_report_opens_with_the_answer_and_ends_with_the_search(complete, pag
     ):  # fmt: skip
         assert words in rest
     assert rest.index("The mass of mode 3 is open.") < rest.index("Solve_Succeeded")
+
+
+def test_what_is_open_and_what_speaks_against_the_answer_stand_apart(complete):
+    """Doubts are told in the message too, what is open is not."""
+    against, left = "the damping is not classical; ratios approximate it", "the mass of mode 3 is open"
+    doubtful = dataclasses.replace(complete, message=f"Solve_Succeeded; {against}", undetermined=(against, left))
+    told = [part.split("</h3>") for part in opening.trust(doubtful).split("<h3>")[1:]]
+    assert [name for name, _ in told] == [
+        "What the data do not determine", "What speaks against it", "What fixes the matrices",
+        "What to measure or to do next",
+    ]  # fmt: skip
+    assert left[1:] in told[0][1] and against[1:] not in told[0][1]
+    assert against[1:] in told[1][1] and left[1:] not in told[1][1]
+    ended = "the search did not end in a fit (interrupted): this is not yet any structure that explains the data"
+    for message, undetermined, expected in (
+        (f"{against}; interrupted", (against, ended, left), [against, ended]),
+        ("interrupted", (left,), ["interrupted"]),
+    ):
+        failed = dataclasses.replace(complete, success=False, message=message, undetermined=undetermined)
+        told = dict(part.split("</h3>") for part in opening.trust(failed).split("<h3>")[1:])
+        lines = {name: re.findall("<li>(.*?)</li>", content) for name, content in told.items()}
+        assert lines["What speaks against it"] == [f"{one[0].upper()}{one[1:]}." for one in expected]
+        assert lines["What the data do not determine"] == [f"T{left[1:]}."]
 
 
 def test_every_channel_of_every_test_is_in_its_curves(complete, page):
@@ -189,9 +214,30 @@ def test_every_channel_of_every_test_is_in_its_curves(complete, page):
             for s, run in np.ndindex(3, 2):
                 re_, im = map(unpacked, shown["channels"][s][kind][run])
                 np.testing.assert_allclose(re_ + 1j * im, expected[run, s], atol=1e-6 * np.abs(expected).max())
+        for s, run in np.ndindex(3, 2):
+            left = np.abs(spectra["measured"] - spectra["identified"])[run, s]
+            np.testing.assert_allclose(unpacked(shown["channels"][s]["left"][run]), left, rtol=1e-6)
     assert "noise" in fitted["channels"][0] and "noise" not in unseen["channels"][0]
     assert len(shapes["points"]) == 3 + 1 and len(shapes["shapes"]) == 3  # the sensors' places and the base
     assert shapes["shapes"][0][0] == [0, 0, 0]
+
+
+def test_without_its_script_the_page_shows_all_curves_and_modes(complete, page):
+    """Of each channel in each run; the script is what hides them."""
+    sheets = re.findall(r'<div class="sheet"><p>(.*?)</p>(.*?)</div>', page, re.DOTALL)
+    names = [*complete.measurement.sensor_names, "base force x", "base force y"]
+    assert [html.unescape(name) for name, _ in sheets] == [
+        *(f"{name}, base {axis}" for name in names for axis in "xy"),
+        *(f"{name}, run {run}" for name in names[:3] for run in (1, 2)),
+    ]
+    for k, (_, drawing) in enumerate(sheets):
+        kinds = re.findall(r'<path class="(measured|identified|left|noise|band)" d="M[^"]+"', drawing)
+        fitted = ["noise"] * (k < 10)  # no noise is known of the test that was not fitted
+        assert kinds == ["measured", "identified", "measured", "identified", "left", *fitted, "band"]
+        assert "frequency [Hz]" in drawing and "phase [°]" in drawing
+    (shapes,) = re.findall(r'<div class="shapes">(.*?)</div>', page)
+    assert shapes.count("<svg") == shapes.count('class="base"') == complete.structure.n
+    assert "noscript" not in page
 
 
 def unpacked(text):
@@ -219,9 +265,11 @@ def test_hostile_text_is_escaped_and_stays_readable(page):
 
 def test_modes_and_their_reference_are_told(complete, page):
     text = Page(page).text
-    ours, theirs = complete.structure, complete.problem.reference
+    ours, theirs, u = complete.structure, complete.problem.reference, complete.uncertainty
     for k in range(3):
-        assert f"{ours.natural_frequencies[k]:.6g}" in text and f"{theirs.natural_frequencies[k]:.6g}" in text
+        for value in to_two_digits(ours.natural_frequencies[k], u.natural_frequencies[k]):
+            assert value in text
+        assert f"{theirs.natural_frequencies[k]:.6g}" in text
     assert f"{100 * (np.sqrt(1.02) - 1):+.2g}" in text
     for matrix in (ours.mass, ours.stiffness[:3, :3], ours.damping):
         for value in matrix.ravel():
@@ -231,12 +279,22 @@ def test_modes_and_their_reference_are_told(complete, page):
 def test_what_is_absent_leaves_no_section(plain, no_pictures):
     page = Page(report.render(plain))
     assert page.headings == [
-        "How far to trust it", "Modes", "Total mass", "Matrices", "Measured against identified", "Poles in the data",
-        "Modal assurance criterion", "Effective masses", "How it was found",
+        "How far to trust it", "Modes", "Mode shapes", "Measured against identified", "Total mass", "Matrices",
+        "Poles in the data", "Modal assurance criterion", "Effective masses", "How it was found",
     ]  # fmt: skip
     assert "normalised to 1 kg" in page.text and "convergence" not in page.alts
     assert "No fit" in page.text and "The mass matrix is known." in page.text
     assert "Stopped before its end" in page.text and "AutoMAC" not in page.text and "no reference is known" in page.text
+
+
+def test_mode_shapes_without_positions_are_a_table(plain, no_pictures):
+    page = Page(report.render(plain))
+    (shapes,) = [table for table in page.tables if table[0] == ["", "mode 1", "mode 2", "mode 3"]]
+    assert [row[0] for row in shapes[1:]] == [*plain.measurement.sensor_names, "base"]
+    told = np.array([row[1:] for row in shapes[1:]], float)
+    assert not told[-1].any() and np.all(told.max(axis=0) == 1) and np.all(np.abs(told) <= 1)
+    for k, shape in enumerate(plain.structure.mode_shapes.T):
+        np.testing.assert_allclose(told[:-1, k] * shape[np.argmax(told[:-1, k])], shape, rtol=1e-3)
 
 
 def test_captions_tell_what_is_in_the_pictures(complete, plain, page, no_pictures):
@@ -341,20 +399,26 @@ def modal(truth):
 
 
 def half(std):
-    return f"{norm.ppf(0.975) * std:.2g}"
+    return f"{float(f'{norm.ppf(0.975) * std:.2g}'):.6g}"  # 110, not 1.1e+02
+
+
+def to_two_digits(value, std):
+    """A value with the decimals of half of its 95 % interval, and that."""
+    places = -Decimal(f"{norm.ppf(0.975) * std:.1e}").as_tuple().exponent
+    return [f"{value:.{places}f}", f"{norm.ppf(0.975) * std:.{places}f}"]
 
 
 def test_what_is_determined_stands_with_half_of_its_95_percent_interval(modal, no_pictures):
     it = modal(force=True, noise=0.001)
     assert it.determined
     tables = Page(report.render(it)).tables
-    modes, rigid = tables[1:3]
+    modes, (rigid, *_) = tables[1], [table for table in tables if table[0] == ["", *it.measurement.base_axes]]
     u, s = it.uncertainty, it.structure
     percent = 100 / np.diag(s.rigid_body_mass)
     for k in range(3):
         cells = modes[k + 1]
-        assert cells[1:3] == [f"{s.natural_frequencies[k]:.6g}", half(u.natural_frequencies[k])]
-        assert cells[3:5] == [f"{100 * s.damping_ratios[k]:.4g}", half(100 * u.damping_ratios[k])]
+        assert cells[1:3] == to_two_digits(s.natural_frequencies[k], u.natural_frequencies[k])
+        assert cells[3:5] == to_two_digits(100 * s.damping_ratios[k], 100 * u.damping_ratios[k])
         for i in range(2):
             mass, std = percent[i] * s.effective_masses[k, i, i], percent[i] * u.effective_masses[k, i, i]
             assert cells[5 + i] == f"{mass:.2f}|± {half(std)}"
@@ -372,10 +436,12 @@ def test_what_is_not_determined_stands_with_its_range_and_a_mark(modal, truth, n
     it = modal(force=False, mass=sysid.FullMass(total, healing="rigid_body"))
     assert not it.determined
     page = Page(report.render(it))
-    modes, rigid = page.tables[1:3]
+    modes, (rigid, *_) = page.tables[1], [t for t in page.tables if t[0] == ["", *it.measurement.base_axes]]
     assert all(cell.startswith("~") and "±" not in cell for row in modes[1:] for cell in row[5:])
     assert all(float(row[2]) > 0 and float(row[4]) > 0 for row in modes[1:-1])
     assert rigid[1][1:] == [f"{total[0]:.4g}|stated", f"{it.structure.rigid_body_mass[0, 1]:.4g}|open"]
+    opening = dict(page.tables[0])
+    assert [opening[f"total mass, {axis}"] for axis in "xy"] == [f"{mass:.4g} kg, as stated" for mass in total]
     square = [table for table in page.tables if table[0][1:] == list(it.measurement.sensor_names)]
     assert len(square) == 3
     for table, ends in zip(square, (it.mass_interval, it.stiffness_interval), strict=False):
@@ -392,8 +458,8 @@ def test_an_entry_without_an_end_is_called_unbounded(modal, no_pictures):
     upper = it.mass_interval[1]
     assert np.isinf(upper).all()  # nothing with a unit of mass was given
     square = next(t for t in Page(report.render(it)).tables if t[0][1:] == list(it.measurement.sensor_names))
-    assert all(cell.endswith("|… unbounded") for row in square[1:] for cell in row[1:])
-    assert square[1][1].split("|")[1] == "0 …"
+    for i, j in np.ndindex(3, 3):
+        assert square[i + 1][j + 1].split("|")[1:] == (["from 0"] if i == j else ["any value"])
 
 
 def test_matrices_carry_the_names_of_their_degrees_of_freedom(modal, truth, no_pictures):

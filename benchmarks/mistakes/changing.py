@@ -1,0 +1,75 @@
+"""A structure of two storeys that changes during a test: integrated step by step, independent of the package."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import scipy.linalg
+from scipy.interpolate import CubicSpline
+
+import sysid
+
+RATE, SECONDS, BAND = 80.0, 100.0, (0.5, 20.0)
+MASSES, SPRINGS, DAMPERS = np.array([2.0, 1.0]), np.array([2400.0, 1500.0]), np.array([1.2, 0.8])
+SOFTENING = 100.0  # 1/m²
+STEPS = 2  # of Runge and Kutta's a sample
+
+
+def frequencies(springs: np.ndarray) -> np.ndarray:
+    """Natural frequencies of the two storeys with these springs, (2,), Hz."""
+    k1, k2 = springs
+    stiffness = [[k1 + k2, -k2], [-k2, k2]]
+    return np.sqrt(scipy.linalg.eigh(stiffness, np.diag(MASSES), eigvals_only=True)) / (2 * np.pi)
+
+
+def motion(rng: np.random.Generator, seconds: float = SECONDS) -> np.ndarray:
+    """Random base acceleration between 1 and 15 Hz, 1 m/s² rms, (n_samples,)."""
+    n = int(seconds * RATE)
+    freq = np.fft.rfftfreq(n, 1 / RATE)
+    drawn = rng.standard_normal(freq.size) + 1j * rng.standard_normal(freq.size)
+    record = np.fft.irfft(np.where((freq > 1) & (freq < 15), drawn, 0), n)
+    return np.asarray(record / record.std())
+
+
+def response(base: np.ndarray, factor: Callable[[float], float] = lambda t: 1.0, softening: float = 0.0) -> np.ndarray:
+    """Absolute accelerations of both floors, (2, n_samples), by Runge and Kutta's fourth order from rest.
+
+    Springs are multiplied by factor(t); the force of the lowest is ``k d / sqrt(1 + softening d²)``.
+    """
+    h, n = 1 / RATE / STEPS, base.size
+    u = CubicSpline(np.arange(n), base)(np.arange(2 * STEPS * (n - 1) + 1) / (2 * STEPS))
+
+    def rates(state: np.ndarray, base: float, t: float) -> np.ndarray:
+        x1, x2, v1, v2 = state
+        k1, k2 = factor(t) * SPRINGS
+        f1 = k1 * x1 / np.sqrt(1 + softening * x1 * x1) + DAMPERS[0] * v1
+        f2 = k2 * (x2 - x1) + DAMPERS[1] * (v2 - v1)
+        return np.array([v1, v2, (f2 - f1) / MASSES[0] - base, -f2 / MASSES[1] - base])
+
+    state, out = np.zeros(4), np.empty((2, n))
+    for i in range(n):
+        out[:, i] = rates(state, u[2 * STEPS * i], i / RATE)[2:] + base[i]
+        for j in range(2 * STEPS * i, min(2 * STEPS * (i + 1), 2 * STEPS * (n - 1)), 2):
+            t = j * h / 2
+            a = rates(state, u[j], t)
+            b = rates(state + h / 2 * a, u[j + 1], t + h / 2)
+            c = rates(state + h / 2 * b, u[j + 1], t + h / 2)
+            d = rates(state + h * c, u[j + 2], t + h)
+            state = state + h / 6 * (a + 2 * b + 2 * c + d)
+    return out
+
+
+def noisy(
+    rng: np.random.Generator, base: np.ndarray, floors: np.ndarray, share: float = 0.02
+) -> tuple[np.ndarray, np.ndarray]:
+    """Records of base (1, n) and floors (2, n) with white noise of a share of the base's rms."""
+    std = share * base.std()
+    return base[None] + std * rng.standard_normal((1, base.size)), floors + std * rng.standard_normal(floors.shape)
+
+
+def measured(*runs: tuple[np.ndarray, np.ndarray], estimator: str = "records") -> sysid.Measurement:
+    """A test of these records."""
+    sensors = [sysid.Sensor(f"floor {i}", (0.0, 0.0, float(i)), "x") for i in (1, 2)]
+    given = [(base, floors, None) for base, floors in runs]
+    return sysid.Measurement.from_time(given, RATE, sensors=sensors, band=BAND, estimator=estimator)

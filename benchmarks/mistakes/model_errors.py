@@ -1,0 +1,106 @@
+"""Structures that change during a test, and measured ones: whether they are told to, and linear ones are not."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+import sysid
+from benchmarks.line import Line, above, below
+from benchmarks.mistakes.changing import SECONDS, SOFTENING, measured, motion, noisy, response
+from benchmarks.modal.spread import spread
+from benchmarks.problem_modules import load_module
+from benchmarks.swarm.shake_table import DATA
+
+GROWS, RUNS, ALONG = "as the motion grows", "differs from record to record", "changes along the records"
+MISSED = r"the model misses the accelerations by (?:at least )?[\d.]+ times their noise"
+CHANGES = "|".join((GROWS, RUNS, ALONG))
+TOLD = {  # what a structure of each kind may be told to do; a level that grows along a record is told either way
+    "level along": (GROWS, ALONG), "level of a test": (GROWS, RUNS), "drift": (ALONG,), "runs": (RUNS,),
+}  # fmt: skip
+FORMS = {"full": lambda: sysid.FullMass(), "stated masses": lambda: np.diag([2.0, 1.0, 0.0])}
+SHARE = 0.95
+
+
+class Case(NamedTuple):
+    """A kind of change ("linear" for none, "wrong" for linear with wrong masses), a form of the mass, and the draw."""
+
+    kind: str
+    form: str
+    seed: int
+
+
+def lines(reduced: bool) -> Iterator[Line]:
+    """Ten draws of each kind and form, twenty linear ones; reduced, one of each; and the measured frame."""
+    forms = [*FORMS][: 1 if reduced else None]
+    changing = [Case(kind, form, s) for kind in TOLD for form in forms for s in range(1 if reduced else 10)]
+    linear = [Case("linear", form, seed) for form in forms for seed in range(2 if reduced else 20)]
+    wrong = [Case("wrong", "stated masses", seed) for seed in range(1 if reduced else 10)]
+    told = dict(zip([*changing, *linear, *wrong], spread(said, [*changing, *linear, *wrong]), strict=True))
+    for kind, words in TOLD.items():
+        cases = [case for case in changing if case.kind == kind]
+        right = [case for case in cases if re.search("|".join(words), told[case])]
+        missed = [f"; {case.form}, draw {case.seed}: {told[case][:200]!r}" for case in cases if case not in right]
+        yield above(f"{kind}: of {len(cases)} told so{''.join(missed[:3])}", len(right) / len(cases), SHARE)
+    for what, cases, accuses in (
+        ("linear structures", linear, f"{MISSED}|{CHANGES}"), ("linear, wrong masses stated", wrong, CHANGES),
+    ):  # fmt: skip
+        accused = [
+            f"; {case.form}, draw {case.seed}: {told[case][:200]!r}" for case in cases if re.search(accuses, told[case])
+        ]
+        yield below(f"{what}, of {len(cases)}: accused{''.join(accused[:3])}", len(accused), 0)
+    yield from _frame(reduced)
+
+
+def said(case: Case) -> str:
+    """All that is said against the answer."""
+    rng = np.random.default_rng((case.seed, len(case.kind)))
+    first, second = motion(rng), motion(rng)
+    unseen: list[sysid.Measurement] = []
+    if case.kind == "level along":
+        base = first * np.interp(np.arange(first.size), [0, first.size - 1], [0.2, 2.0])
+        runs = [noisy(rng, base, response(base, softening=SOFTENING))]
+    elif case.kind == "level of a test":
+        small, large = 0.2 * first, 2 * second
+        runs = [noisy(rng, small, response(small, softening=SOFTENING))]
+        unseen = [measured(noisy(rng, large, response(large, softening=SOFTENING)))]
+    elif case.kind == "drift":
+        runs = [noisy(rng, first, response(first, lambda t: 1 - 0.06 * t / SECONDS))]
+    elif case.kind == "runs":
+        runs = [noisy(rng, first, response(first)), noisy(rng, second, response(second, lambda t: 0.94))]
+    else:
+        runs = [noisy(rng, first, response(first)), noisy(rng, 2 * second, response(2 * second))]
+    masses = np.diag([2.0, 2.0, 0.0]) if case.kind == "wrong" else FORMS[case.form]()
+    try:
+        result = sysid.identify(sysid.Problem(measured(*runs), mass=masses, validation=unseen), rng=0)
+    except (sysid.InputError, sysid.SolverError) as error:
+        return str(error)
+    return "; ".join(result.confidence)
+
+
+def _frame(reduced: bool) -> Iterator[Line]:
+    """The measured frame, fitted on either event, reduced on one: what its first two sentences say."""
+    data = Path(os.environ.get("SYSID_DATA") or DATA)
+    if not data.is_dir():
+        yield Line("mini_shake_table", "records absent: not run (set SYSID_DATA to their folder)")
+        return
+    module = load_module("mini_shake_table")
+    problem = module.problem(data=str(data))
+    for estimator in ("spectra", "records"):
+        events = [module.event(data / name, estimator) for name in ("sine_1p5", "sine_2p0")]
+        for (fitted, unseen), name in zip((events, events[::-1]), ("sine_1p5", "sine_2p0"), strict=True):
+            if reduced and (estimator, name) != ("spectra", "sine_1p5"):
+                continue
+            given = sysid.Problem(
+                fitted, mass=problem.mass, stiffness=problem.stiffness, damping=problem.damping, validation=[unseen]
+            )
+            result = sysid.identify(given, rng=0)
+            first, second = result.confidence[:2]
+            told = not result.success and re.match(MISSED, first) and "falls as the motion grows" in second
+            figures = ", ".join(re.findall(r"[\d.]+ times|[\d.]+ Hz (?:where|at)", first + second))
+            yield Line(f"{name} as {estimator}: missed by times the noise, softens", figures, "both first", bool(told))

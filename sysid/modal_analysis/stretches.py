@@ -1,0 +1,161 @@
+"""Frequencies of modes in stretches of whole records: whether they hold along a record, and from run to run.
+
+Each run is cut into stretches, and each stretch is a whole record of its own, with transients of its own. Shapes and
+participations are those of all stretches of a test together; poles are fitted to each.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sysid.measurement import spectra
+from sysid.measurement.in_time import RunInTime, in_time
+from sysid.measurement.measurement import Measurement
+from sysid.measurement.spectra import Run
+from sysid.measurement.whole import NoiseLevels, WholeRecords
+from sysid.modal_analysis.record_fit import RecordFit, record_modes, with_poles_of
+from sysid.structure.structure import Array
+
+_MOST = 12  # stretches of a run
+_PERIODS = 25  # of the lowest mode, that a stretch holds at least
+_EDGE = 2  # lines of a stretch at each end of the band, which what lies beyond it reaches
+_LEAST = 1e-3  # of the sensor that moves most: how much of the motion of one that hardly moves counts in full
+_FEWEST = 8  # lines of a stretch for each mode
+
+
+class Stretch(NamedTuple):
+    """Poles of m modes in a stretch of a run.
+
+    Attributes
+    ----------
+    run : int
+        Of the test, from 0.
+    start, end : float
+        s, from the beginning of the run.
+    frequency, std : (m,)
+        Hz, and its standard deviation, roughly, from what is left about its peak: too small by some times where a
+        stretch has only a few lines there.
+    ratio : (m,)
+    level : (m,)
+        Root mean square of what each mode makes of the acceleration of the sensor that it moves most, m/s².
+    left, left_by_all : float
+        Norms of what is left of the accelerations with poles of its own, and with those of all stretches together.
+    """
+
+    run: int
+    start: float
+    end: float
+    frequency: Array
+    std: Array
+    ratio: Array
+    level: Array
+    left: float
+    left_by_all: float
+
+
+class Piece(NamedTuple):
+    """Records of a stretch of a run: its number, seconds at both ends."""
+
+    number: int
+    start: float
+    end: float
+    records: Run
+
+
+def stretches_of(test: Measurement, omega: Array, ratios: Array) -> list[Stretch]:
+    """Poles of each stretch of the runs of a test; none where there are no two.
+
+    Parameters
+    ----------
+    test : Measurement
+        Spectra of whole records, as ``from_time`` gives them with the estimators "records" and "spectra".
+    omega, ratios : (m,)
+        Poles, rad/s and fractions, near which those of the stretches are.
+    """
+    runs = in_time(test)
+    pieces = _pieces(runs, _PERIODS * 2 * np.pi / float(omega.min()))
+    if len(pieces) < 2:
+        return []
+    rate = runs[0].rate
+    # Least squares, each sensor by its size: were levels fitted, a change would pass for noise of the base.
+    moved = [run.response - test.rigid_body @ run.base for run in runs]
+    size = np.sqrt(np.mean(np.concatenate(moved, axis=1) ** 2, axis=1))
+    noise = NoiseLevels(np.maximum(size, _LEAST * size.max()), np.zeros(test.n_base))
+    cut = _as_test(test, pieces, rate, noise)
+    if cut is None or cut.freq.size < _FEWEST * omega.size:
+        return []
+    every = record_modes(cut, omega, ratios)
+    return [
+        _stretch(piece, every, one) for piece in pieces if (one := _as_test(test, [piece], rate, noise)) is not None
+    ]
+
+
+def _stretch(piece: Piece, every: RecordFit, test: Measurement) -> Stretch:
+    """Poles of one stretch, with the shapes of all."""
+    own, held = with_poles_of(every, test), with_poles_of(every, test, held=True)
+    modes, index, model = own.parameters.modes, own.model.index, own.model
+    free = np.r_[index.log_omega, index.log_ratios, model.kept : model.size]
+    N = own.normal[np.ix_(free, free)]
+    unit = 1 / np.sqrt(np.maximum(np.diag(N), np.finfo(float).tiny))
+    m, f = modes.omega.size, modes.omega / (2 * np.pi)
+    variance = (
+        unit[:m] ** 2 * np.diag(np.linalg.pinv(N * np.outer(unit, unit), hermitian=True))[:m] / 2 * _noise_at_peaks(own)
+    )
+    std = f * np.sqrt(np.where(variance > 0, variance, np.inf))  # round-off, of a mode that shows nowhere
+    return Stretch(piece.number, piece.start, piece.end, f, std, modes.ratios, _levels(own), _left(own), _left(held))
+
+
+def _noise_at_peaks(fit: RecordFit) -> Array:
+    """What is left about each mode, over the levels, (m,): the noise of the base is larger there than elsewhere.
+
+    Each line counts by what it tells of the frequency of the mode: the power of the response's slope in it.
+    """
+    modes, total, weight = fit.parameters.modes, np.zeros(fit.model.m), np.zeros(fit.model.m)
+    for chunk in fit.model.chunks(fit.parameters):
+        slope = np.abs(chunk.g**2 * (modes.gamma @ chunk.run.base + chunk.pushed_by_ends)) ** 2
+        total += slope @ chunk.weighed(fit.levels).power  # of all sensors alike: the base's noise is in all of them
+        weight += np.sum(slope, axis=1)
+    return np.asarray(total / np.maximum(weight, np.finfo(float).tiny)) * fit.model.numbers / fit.freedom
+
+
+def _left(fit: RecordFit) -> float:
+    """Norm of what a fit leaves."""
+    return float(np.linalg.norm([np.linalg.norm(chunk.error) for chunk in fit.model.chunks(fit.parameters)]))
+
+
+def _levels(fit: RecordFit) -> Array:
+    """Root mean squares of what modes make of the acceleration of the sensor that each moves most, (m,)."""
+    modes, whole = fit.parameters.modes, fit.model.whole
+    power: Array = np.zeros(modes.omega.size)
+    for chunk in fit.model.chunks(fit.parameters):
+        moved = chunk.g * (modes.gamma @ chunk.run.base + chunk.pushed_by_ends)
+        power += np.sum(np.abs(moved) ** 2, axis=1)
+    return np.asarray(np.sqrt(2 * power) * whole.sample_rate / whole.samples[0] * np.abs(modes.phi).max(axis=0))
+
+
+def _pieces(runs: list[RunInTime], shortest: float) -> list[Piece]:
+    """Stretches of the runs of a test, each of `shortest` seconds or longer."""
+    made = []
+    for number, run in enumerate(runs):
+        n = run.base.shape[1]
+        count = int(np.clip(n / run.rate / shortest, 1, _MOST))
+        for i in range(count):
+            part = slice(i * (n // count), (i + 1) * (n // count))
+            records = Run(run.base[:, part], run.response[:, part], None)
+            made.append(Piece(number, part.start / run.rate, part.stop / run.rate, records))
+    return made
+
+
+def _as_test(test: Measurement, pieces: list[Piece], rate: float, noise: NoiseLevels) -> Measurement | None:
+    """Stretches as the runs of a test of whole records, within the band of theirs; None where that holds no line."""
+    freq, base, response, _ = spectra.whole_record([piece.records for piece in pieces], rate)
+    samples = tuple(piece.records.base.shape[1] for piece in pieces)
+    margin = _EDGE * rate / min(samples)
+    inside = (freq >= test.freq[0] + margin) & (freq <= test.freq[-1] - margin)
+    if not np.any(inside):
+        return None
+    whole = WholeRecords(samples, rate, (False,) * len(pieces), noise)
+    given = (freq[inside], base[..., inside], response[..., inside])
+    return Measurement(*given, rigid_body=test.rigid_body, base_axes=test.base_axes, sensors=test.sensors, whole=whole)

@@ -1,0 +1,239 @@
+"""Curves and mode shapes as SVG, for paper and for browsers that run no script; the page's script draws alike."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sysid.report.html import text
+from sysid.structure.structure import Array, ComplexArray
+
+_WIDTH, _LEFT, _RIGHT = 360, 48, 8  # pixels
+_TITLE, _HEIGHTS, _BELOW = 18, (86, 46, 68), 30  # pixels above each panel, of each, and below the last
+_APART, _ABOVE = 34.0, 16.0  # pixels between ticks at least: of frequencies, and of an axis upwards
+_MARGIN = 1.3  # of the largest and smallest value of a logarithmic axis
+_WIDE = 8.0  # last over first line from which frequencies stand on a logarithmic axis
+_LOWEST, _HIGHEST = -270.0, 90.0  # degrees: the step of a resonance, 0 to -180, is not cut
+_TITLED = ' class="title"'
+_FINE = 2  # steps of a curve in a pixel
+_MODE_WIDTH, _MODE_HEIGHT = 210, 260  # pixels
+_ANGLE = np.deg2rad(30.0)  # about the vertical, from which a mode shape is seen
+
+
+class Channel(NamedTuple):
+    """Spectra of one channel in all runs, each (runs, n_freq), in `unit`; None what is not known.
+
+    `noise` is a standard deviation, `band` half of the 95 % interval of `identified`, `recorded` the magnitude with
+    transients.
+    """
+
+    name: str
+    words: str
+    unit: str
+    measured: ComplexArray
+    identified: ComplexArray
+    noise: Array | None
+    band: Array | None
+    recorded: Array | None = None
+
+
+class _Axis(NamedTuple):
+    """An axis from `low` to `high`, seen at pixels `start` to `end`."""
+
+    low: float
+    high: float
+    start: float
+    end: float
+    log: bool
+
+    def __call__(self, values: Array | float) -> Array:
+        """Pixels of values, not beyond the ends; NaN for what a logarithmic axis cannot show."""
+        seen, ends = np.asarray(values, float), np.array([self.low, self.high])
+        if self.log:
+            seen, ends = np.log(np.where(seen > 0, seen, np.nan)), np.log(ends)
+        share = np.clip((seen - ends[0]) / (ends[1] - ends[0]), 0.0, 1.0)
+        return np.asarray(self.start + share * (self.end - self.start))
+
+    def ticks(self, wide: float) -> list[float]:
+        """Round numbers that stand `wide` pixels apart at least."""
+        room = abs(self.end - self.start) / wide
+        if self.log and self.high >= 10 * self.low:
+            return _log_ticks(self.low, self.high, room)
+        power = 10.0 ** np.floor(np.log10((self.high - self.low) / room))
+        step = next(k * power for k in (1, 2, 5, 10) if k * power * room >= self.high - self.low)
+        first, last = np.ceil(self.low / step - 1e-9), np.floor(self.high / step + 1e-9)
+        return [float(f"{k * step:.6g}") for k in np.arange(first, last + 1)]
+
+
+class _Panel(NamedTuple):
+    """Title and curves of a panel, (n_freq,) each, and how many decades its axis shows at most; 0 for phases."""
+
+    title: str
+    curves: dict[str, Array]
+    decades: int
+
+
+def curve_sheet(name: str, freq: Array, channel: Channel, run: int, gaps: ArrayLike = ()) -> str:
+    """One channel in one run: magnitude, phase, and what is left of it beside its noise.
+
+    No curve is joined at `gaps`, lines before which others were left out.
+    """
+    across = _Axis(freq[0], freq[-1], _LEFT, _WIDTH - _RIGHT, bool(freq[0] > 0 and freq[-1] > _WIDE * freq[0]))
+    drawn, bottom = [], 0
+    for panel, height in zip(_panels(channel, run), _HEIGHTS, strict=True):
+        top = bottom + _TITLE
+        bottom = top + height
+        drawn.append(_drawn(panel, across, _upward(panel, bottom, top), across(freq), gaps))
+    for value in across.ticks(_APART):
+        drawn.append(f'<text x="{float(across(value)):.1f}" y="{bottom + 14}" text-anchor="middle">{value:g}</text>')
+    drawn.append(f'<text x="{_WIDTH - _RIGHT}" y="{bottom + 27}" text-anchor="end">frequency [Hz]</text>')
+    image = _svg(f"{name}: measured and identified {channel.words}", _WIDTH, bottom + _BELOW, "".join(drawn))
+    return f'<div class="sheet"><p>{text(name)}</p>{image}</div>'
+
+
+def _panels(channel: Channel, run: int) -> tuple[_Panel, ...]:
+    measured, identified = channel.measured[run], channel.identified[run]
+    left, beside = {"left": np.abs(measured - identified)}, "difference"
+    if channel.noise is not None:
+        left["noise"], beside = channel.noise[run], "difference and noise"
+    if channel.band is not None:
+        left["band"] = channel.band[run]
+    size = {"measured": np.abs(measured), "identified": np.abs(identified)}
+    return (
+        _Panel(f"{channel.words} [{channel.unit}]", size, 5),
+        _Panel("phase [°]", {"measured": degrees(measured), "identified": degrees(identified)}, 0),
+        _Panel(f"{beside} [{channel.unit}]", left, 4),
+    )
+
+
+def degrees(spectrum: ComplexArray) -> Array:
+    """Phase from -270 to 90 degrees."""
+    return np.asarray((np.angle(spectrum, deg=True) - _HIGHEST) % 360.0 + _LOWEST)
+
+
+def mode_still(name: str, points: Array, shape: Array, sticks: Sequence[tuple[int, int]], size: float) -> str:
+    """One mode shape with the base, which stands still, over the structure at rest.
+
+    Parameters
+    ----------
+    name : str
+        Parts that stand below each other, with a comma between them.
+    points, shape : ndarray, shape (p, 3)
+        Where the points are about their middle, the base first; and how far they move.
+    sticks : sequence of (int, int)
+        Pairs of points.
+    size : float
+        Pixels of a unit of length.
+    """
+    rest, moved = (_seen(where, size) for where in (points, points + shape))
+    lines = "".join(
+        f'<path class="{kind}" d="{"".join(f"M{_pair(where[i])}L{_pair(where[j])}" for i, j in sticks)}"/>'
+        for kind, where in (("rest", rest), ("identified", moved))
+    )
+    dots = "".join(f'<circle class="dot" r="3" cx="{x:.1f}" cy="{y:.1f}"/>' for x, y in moved[1:])
+    x, y = rest[0]
+    base = f'<rect class="base" x="{x - 22:.1f}" y="{y - 3:.1f}" width="44" height="6"/>'
+    base += f'<text x="{x + 26:.1f}" y="{y + 5:.1f}">base</text>'
+    words = "".join(
+        f'<text{_TITLED * (at == 0)} x="{_MODE_WIDTH / 2:g}" y="{13 + 14 * at}" text-anchor="middle">'
+        f"{text(part)}</text>"
+        for at, part in enumerate(name.split(", "))
+    )
+    return _svg(name, _MODE_WIDTH, _MODE_HEIGHT, lines + dots + base + words)
+
+
+def room_of_modes(points: Array, shapes: Array) -> float:
+    """Pixels of a unit of length at which all mode shapes (modes, p, 3) about `points` (p, 3) fit in their pictures."""
+    reach = np.abs(points) + np.abs(shapes)
+    wide, high = float(np.hypot(reach[..., 0], reach[..., 1]).max()), float(reach[..., 2].max())
+    return min((_MODE_WIDTH - 40) / (2 * wide or 1.0), (_MODE_HEIGHT - 60) / (1.9 * high + 0.6 * wide or 1.0))
+
+
+def _seen(points: Array, size: float) -> Array:
+    """What the eye sees of points, slightly from above: pixels to the right and down, (p, 2)."""
+    (x, y, z), c, s = points.T, np.cos(_ANGLE), np.sin(_ANGLE)
+    right, down = c * x - s * y, 0.3 * (s * x + c * y) - 0.95 * z
+    return np.column_stack([_MODE_WIDTH / 2 + size * right, (_MODE_HEIGHT + 30) / 2 + size * down])
+
+
+def _pair(point: Array) -> str:
+    return f"{point[0]:.1f} {point[1]:.1f}"
+
+
+def _svg(title: str, width: int, height: int, content: str) -> str:
+    return (
+        f'<svg role="img" aria-label="{text(title)}" viewBox="0 0 {width} {height}" width="{width}" '
+        f'height="{height}">{content}</svg>'
+    )
+
+
+def _drawn(panel: _Panel, across: _Axis, up: _Axis, x: Array, gaps: ArrayLike) -> str:
+    """Title, grid and curves of a panel; `x` is where the frequencies are, `gaps` at which no curve is joined."""
+    parts = [f'<text class="title" x="{_LEFT}" y="{up.end - 5:g}">{text(panel.title)}</text>']
+    for value in up.ticks(_ABOVE) if panel.decades else [-180.0, -90.0, 0.0]:
+        y = float(up(value))
+        parts.append(f'<path class="grid" d="M{across.start} {y:.1f}H{across.end}"/>')
+        parts.append(f'<text x="{_LEFT - 5}" y="{y + 4:.1f}" text-anchor="end">{value:g}</text>')
+    for value in across.ticks(_APART):
+        parts.append(f'<path class="grid" d="M{float(across(value)):.1f} {up.start}V{up.end}"/>')
+    jump = np.inf if panel.decades else abs(up.start - up.end) / 2
+    paths = {}
+    for kind, values in panel.curves.items():
+        seen = np.where((values < up.low) | (values > up.high), np.nan, values) if kind == "band" else values
+        paths[kind] = _path(x, up(seen), jump, gaps)
+    drawn = "".join(f'<path class="{kind}" d="{path}"/>' for kind, path in paths.items())
+    parts.append(f'<g transform="scale({1 / _FINE:g})">{drawn}</g>')
+    if not any(paths.values()):
+        right, down = (across.start + across.end) / 2, (up.start + up.end) / 2
+        parts.append(f'<text x="{right:g}" y="{down:g}" text-anchor="middle">0 at all lines</text>')
+    return "".join(parts)
+
+
+def _upward(panel: _Panel, bottom: float, top: float) -> _Axis:
+    """Axis of phases; or the logarithmic one of all curves but intervals, which may leave it."""
+    if not panel.decades:
+        return _Axis(_LOWEST, _HIGHEST, bottom, top, False)
+    values = np.concatenate([np.ravel(curve) for kind, curve in panel.curves.items() if kind != "band"])
+    values = values[np.isfinite(values) & (values > 0)]
+    high = float(values.max(initial=0.0)) or 1.0
+    low = max(float(values.min(initial=high)), high / 10.0**panel.decades)
+    return _Axis(low / _MARGIN, high * _MARGIN, bottom, top, True)
+
+
+def _log_ticks(low: float, high: float, room: float) -> list[float]:
+    """Powers of ten, with their double and fivefold where `room` has as many, some left out where it has not."""
+    decades = np.log10(high / low)
+    factors = (1, 2, 5) if 3 * decades <= room else (1,)
+    every = int(np.ceil(decades / room))
+    powers = np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
+    numbers = (float(f"{k}e{int(power)}") for power in powers if power % every == 0 for k in factors)
+    return [value for value in numbers if low <= value <= high]
+
+
+def _path(x: Array, y: Array, jump: float, gaps: ArrayLike) -> str:
+    """A curve in whole steps of part of a pixel, left out where it is not finite and where it jumps."""
+    kept = np.flatnonzero(np.isfinite(y))
+    apart = (np.diff(kept) > 1) | (np.abs(np.diff(y[kept])) > jump) | np.isin(kept[1:], gaps)
+    breaks = np.flatnonzero(apart) + 1
+    return "".join(_segment(x[part], y[part]) for part in np.split(kept, breaks) if part.size)
+
+
+def _segment(x: Array, y: Array) -> str:
+    at = _thinned(np.rint(_FINE * x).astype(int), np.rint(_FINE * y).astype(int))
+    steps = np.diff(at, axis=0).ravel().tolist()
+    return f"M{at[0, 0]} {at[0, 1]}" + ("l" + " ".join(map(str, steps)) if steps else "h1")
+
+
+def _thinned(x: NDArray[np.intp], y: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The lowest and the highest point over each place, (points, 2); what stays level is left out."""
+    starts = np.flatnonzero(np.diff(x, prepend=x[0] - 1))
+    low, high = np.minimum.reduceat(y, starts), np.maximum.reduceat(y, starts)
+    rising = np.abs(y[starts] - low) <= np.abs(y[starts] - high)
+    both = np.column_stack([np.where(rising, low, high), np.where(rising, high, low)]).ravel()
+    at = np.column_stack([np.repeat(x[starts], 2), both])
+    at = at[np.insert(np.any(np.diff(at, axis=0) != 0, axis=1), 0, True)]
+    level = (at[1:-1, 1] == at[:-2, 1]) & (at[1:-1, 1] == at[2:, 1])
+    return at[np.concatenate([[True], ~level, [True]])[: len(at)]]
