@@ -89,12 +89,12 @@ def gain_errors(test: Measurement, structure: Structure) -> GainErrors:
     one that is then known better is taken. A record's own misfit is its noise, line by line, and lines that share it
     are counted as such; noise that is stated larger counts as stated.
     """
-    records, poles, velocity = Records(test), distinct_poles(structure), not structure.modal_damping
     if test.modal is not None:
         gain = test.modal.gain
         moved = np.any(test.rigid_body, axis=1)
         error, std = np.where(moved, gain.error, np.nan), np.where(moved, gain.std, np.nan)
         return GainErrors(error, std, np.nan_to_num(_beyond(error, std)), gain.freedom)
+    records, poles, velocity = Records(test), distinct_poles(structure), not structure.modal_damping
     count = poles[0].size * test.n_base * (2 if velocity else 1)
     if records.data.shape[0] <= _LINES * (count + 2 * test.n_base):
         unknown = np.full(test.n_sensors, np.nan)

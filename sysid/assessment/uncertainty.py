@@ -217,10 +217,9 @@ def _by_modes(problem: Problem, structure: Structure, x: Array | None) -> Uncert
     if test.force is None and open_modes(problem, structure):
         open_ = np.full((structure.n, structure.n), np.nan)
         matrices = open_, open_, open_  # zeros that a decoupled structure keeps included
-    found = _quantities(problem, structure, modes, moves, inflation, matrices)
     each = [Perturbations(1, *index.split(shift[:, None])) for shift in shifts.T]
     by_gain = np.array([np.diag(matrices_of_modes(structure, modes, own)[0]) for own in each])
-    found = replace(found, mass_by_gain=by_gain)
+    found = _quantities(problem, structure, modes, moves, inflation, matrices, by_gain)
     if x is None or not np.any(problem.formulation.outside):
         return found
     variables, at = outside_variables(problem.formulation), x[problem.formulation.outside]
@@ -281,8 +280,8 @@ def _by_unknowns(problem: Problem, structure: Structure, x: Array) -> Uncertaint
     for matrix, slope in blocks_and_slopes(structure, slopes):
         size = np.sqrt(np.abs(np.diag(matrix)))
         matrices.append(std_of(slope @ steps, count, np.outer(size, size)))
-    found = _quantities(problem, structure, modes, moves, inflation, matrices)
-    found = replace(found, mass_by_gain=np.abs(np.einsum("iic,cs->si", slopes.mass, shifts)))
+    by_gain = np.abs(np.einsum("iic,cs->si", slopes.mass, shifts))
+    found = _quantities(problem, structure, modes, moves, inflation, matrices, by_gain)
     if not structure.modal_damping:
         found = replace(found, _spectra=DirectSpectra(slopes, steps, count))
     return _with_unknowns(found, problem, formulation, x, known)
@@ -344,9 +343,12 @@ def modes_of(structure: Structure) -> Modes:
 
 def _quantities(
     problem: Problem, structure: Structure, modes: Modes, moves: Perturbations, inflation: float,
-    matrices: Sequence[Array],
+    matrices: Sequence[Array], by_gain: Array,
 ) -> Uncertainty:  # fmt: skip
-    """Standard deviations of all quantities from the perturbations; `matrices` are those of M_SS, K_SS and C."""
+    """Standard deviations of all quantities from the perturbations; `matrices` are those of M_SS, K_SS and C.
+
+    `by_gain` is `Uncertainty.mass_by_gain`.
+    """
     phi, gamma, omega, ratios = modes
     frequencies, n = omega / (2 * np.pi), structure.n
     d_frequencies, d_ratios = frequencies[:, None] * moves.log_omega, ratios[:, None] * moves.log_ratios
@@ -389,5 +391,5 @@ def _quantities(
         covariance=covariance,
         inflation=inflation,
         _spectra=ModalSpectra(modes, moves, structure.rigid_body_mass),
-        mass_by_gain=np.zeros((structure.n_sensors, n)),
+        mass_by_gain=by_gain,
     )

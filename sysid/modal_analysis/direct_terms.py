@@ -171,13 +171,13 @@ def _fitted(records: Records, omega: Array, ratios: Array) -> _Fit:
     noise = records.noise(left, functions.shape[1] * left.shape[1], least=_ROUND_OFF)
     gained = float(np.sum((beyond.T @ left) ** 2))
     shared = noise / records.variance(float(np.sum(left**2)), functions.shape[1] * left.shape[1], least=_ROUND_OFF)
-    spread = np.linalg.norm(inverse[:known], axis=1)[:, None] * level * np.sqrt(shared / freedom)
+    of_rows = inverse[:known].reshape(3, records.driven, -1)[:2]
     turn = np.array([1.0, 1 / (2 * np.pi * records.freq[-1])])[:, None, None]
     of_terms = lambda x: x.reshape(3, records.driven, -1)[:2]  # noqa: E731
     of_modes = beta[known:].reshape(omega.size, -1, beta.shape[1])[:, : records.driven]
     return _Fit(
         turn * _by_sensor(records, of_terms(beta[:known])),
-        turn * np.sqrt(_by_sensor(records, of_terms(spread) ** 2, squares=True)),
+        turn * _deviations(records, of_rows, level * np.sqrt(shared / freedom)),
         _by_sensor(records, of_modes.sum(axis=0, keepdims=True))[0],
         gained > noise * beyond_chance(beyond.shape[1] * left.shape[1]),
         float(np.linalg.norm(left) / np.sqrt(records.size)),
@@ -193,12 +193,26 @@ def _spikes(left: ComplexArray, least: float) -> NDArray[np.bool_]:
     return far if np.count_nonzero(far) < _FEW * far.size else np.zeros_like(far)
 
 
-def _by_sensor(records: Records, terms: Array, *, squares: bool = False) -> Array:
-    """Coefficients (k, driven inputs, channels), or their variances, in the test's own units, (k, n_sensors, d)."""
-    power = 2 if squares else 1
-    plain = terms / records.channel**power
+def _by_sensor(records: Records, terms: Array) -> Array:
+    """Coefficients (k, driven inputs, channels) in the test's own units, (k, n_sensors, d)."""
+    plain = terms / records.channel
     if records.unit:
         return plain.reshape(len(terms), -1, records.n_sensors).transpose(0, 2, 1)
-    moving = records.moving[:, : records.driven] ** power
-    d = len(moving) - (records.base.shape[0] - records.driven)
-    return np.einsum("kic,di->kcd", plain, moving[:d])
+    return np.einsum("kic,di->kcd", plain, _of_base(records))
+
+
+def _deviations(records: Records, rows: Array, level: Array) -> Array:
+    """Deviations of the coefficients that rows (k, driven inputs, r) make of r independent errors of each channel.
+
+    Errors of the inputs, which are combinations of base directions, are not independent of one another.
+    """
+    if records.unit:
+        return _by_sensor(records, np.linalg.norm(rows, axis=2)[:, :, None] * level)
+    of_base = np.linalg.norm(np.einsum("di,kir->kdr", _of_base(records), rows), axis=2)
+    return np.asarray(of_base[:, None] * (level / records.channel)[:, None])
+
+
+def _of_base(records: Records) -> Array:
+    """Combinations of the base directions (d, driven inputs) that the records were fitted on."""
+    d = len(records.moving) - (records.base.shape[0] - records.driven)
+    return records.moving[:d, : records.driven]

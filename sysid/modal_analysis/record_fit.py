@@ -122,10 +122,7 @@ class RecordFit:
         model, N = self.model, self.normal
         kept, size = model.kept, np.sqrt(np.maximum(np.diag(N), 1e-300))
         scaled = N / np.outer(size, size)
-        inner, cross = scaled[kept:, kept:], scaled[kept:, :kept]
-        lam, V = np.linalg.eigh(inner)
-        seen = lam > 1e-12 * lam.max(initial=0.0)
-        turned = (V[:, seen] / np.sqrt(lam[seen])).T @ cross
+        turned = half_inverse(scaled[kept:, kept:], 1e-12).T @ scaled[kept:, :kept]
         A = np.zeros((model.index.size, model.index.size))
         A[:kept, :kept] = (scaled[:kept, :kept] - turned.T @ turned) * np.outer(size[:kept], size[:kept])
         return A
@@ -296,6 +293,13 @@ def _equations(model: RecordModel, coarse: RecordModel | None, p: Parameters, le
     if coarse is None:
         return model.normal_equations(p, levels)
     return model.gradient(p, levels)._replace(normal=coarse.normal_equations(p, levels).normal)
+
+
+def half_inverse(normal: Array, least: float) -> Array:
+    """H with ``H H'`` the inverse of a scaled normal matrix, but for what shows by less than `least` of the most."""
+    lam, V = np.linalg.eigh(normal)
+    seen = lam > least * lam.max(initial=0.0)
+    return np.asarray(V[:, seen] / np.sqrt(lam[seen]))
 
 
 def _chi2(model: RecordModel, p: Parameters, levels: Array) -> float:

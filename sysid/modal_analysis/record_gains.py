@@ -6,7 +6,7 @@ import numpy as np
 import scipy.linalg
 
 from sysid.measurement.whole import Gains
-from sysid.modal_analysis.record_fit import RecordFit
+from sysid.modal_analysis.record_fit import RecordFit, half_inverse
 from sysid.structure.structure import Array
 
 _SEEN = 1e-10  # of the largest eigenvalue of the scaled information; less is round-off
@@ -25,7 +25,7 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     normal, gradient, size = _scaled(along.T @ made.normal @ along, along.T @ made.gradient)
 
     def estimate(count: int) -> tuple[Array, Array]:
-        half = _half_inverse(normal[:count, :count])
+        half = half_inverse(normal[:count, :count], _SEEN)
         step = half @ (half.T @ gradient[:count])
         std = np.sqrt(beyond / 2) * np.linalg.norm(half, axis=1)
         return step[at : at + n] / size[at : at + n], std[at : at + n] / size[at : at + n]
@@ -35,7 +35,7 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     better = plain_std < std
     # A sensor that reads too much records `1 + error` times all its motion, transients included: its rows of what is
     # linear in it take the factor, and G u beside them pulls the fit.
-    half = _half_inverse(normal[:at, :at])
+    half = half_inverse(normal[:at, :at], _SEEN)
     pulled = half @ (half.T @ normal[:at, at : at + n]) / size[:at, None] * size[at : at + n]
     moves = np.zeros((fit.model.index.size, n))
     moves[: fit.model.kept] = pulled[: fit.model.kept]
@@ -52,7 +52,7 @@ def _rigid(fit: RecordFit, beyond: float) -> tuple[Array, Array]:
     made, (n, d), at = fit.equations, fit.test.rigid_body.shape, fit.model.size
     count = at + n * d
     normal, gradient, size = _scaled(made.normal[:count, :count], made.gradient[:count])
-    half = _half_inverse(normal)
+    half = half_inverse(normal, _SEEN)
     step = (half @ (half.T @ gradient))[at:].reshape(n, d)
     own = half[at:].reshape(n, d, -1)
     covariance = beyond / 2 * own @ own.swapaxes(1, 2)
@@ -64,10 +64,3 @@ def _scaled(normal: Array, gradient: Array) -> tuple[Array, Array, Array]:
     """Normal equations in unknowns of like size, and the factors of these."""
     size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     return normal / np.outer(size, size), gradient / size, size
-
-
-def _half_inverse(normal: Array) -> Array:
-    """``H`` with ``H H'`` the inverse of scaled normal equations, but for what shows nowhere."""
-    lam, V = np.linalg.eigh(normal)
-    seen = lam > _SEEN * lam[-1]
-    return np.asarray(V[:, seen] / np.sqrt(lam[seen]))

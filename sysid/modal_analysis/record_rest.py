@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtrc
 
-from sysid.modal_analysis.record_fit import RecordFit, refitted
+from sysid.modal_analysis.record_fit import RecordFit, half_inverse, refitted
 from sysid.modal_analysis.record_model import Parameters, RecordModel
 from sysid.modal_analysis.record_spread import uneven
 from sysid.structure.structure import Array
@@ -59,9 +59,7 @@ def _score(fit: RecordFit, p: Parameters) -> tuple[float, int]:
     ends = np.zeros(p.ends.shape, bool)
     ends[:, np.all(p.ends == 0, axis=0)] = True
     added[model.kept : model.kept + model.n_ends] = ends.ravel()
-    lam, V = np.linalg.eigh(N[np.ix_(~added, ~added)])
-    seen = lam > _SEEN * lam[-1]
-    half = V[:, seen] / np.sqrt(lam[seen])
+    half = half_inverse(N[np.ix_(~added, ~added)], _SEEN)
     across = half.T @ N[np.ix_(~added, added)]
     left = gradient[added] - across.T @ (half.T @ gradient[~added])
     lam, V = np.linalg.eigh(N[np.ix_(added, added)] - across.T @ across)

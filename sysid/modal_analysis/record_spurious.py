@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.modal_analysis.record_fit import Monitor, RecordFit, record_modes, refitted, without, worth
-from sysid.modal_analysis.record_model import Chunk
 from sysid.modal_analysis.record_more import least_worth
 from sysid.modal_analysis.record_spread import blocks_of, uneven
 from sysid.structure.structure import Array
@@ -47,13 +46,14 @@ def worth_beyond_misfit(fit: RecordFit) -> Array:
     lines together.
     """
     model, p, c = fit.model, fit.parameters, fit.model.channels
-    left, moved, parts = [], [], []
-    for run in model.runs:
-        chunk = Chunk(model, p, run)
-        each = chunk.shown[:, :, None] * chunk.g * (p.modes.gamma @ run.base + chunk.pushed_by_ends)  # (c, m, L)
-        left.append(chunk.weighed(fit.levels).power)
-        moved.append(chunk.weighed(fit.levels, each.sum(axis=1)).power)
-        parts.append([chunk.weighed(fit.levels, mode).power for mode in each.swapaxes(0, 1)])
+    powers: list[list[Array]] = [[] for _ in model.runs]  # of what is left, of all modes, and of each, (2 + m, L)
+    for chunk in model.chunks(p):
+        pushed = p.modes.gamma @ chunk.run.base + chunk.pushed_by_ends
+        each = (chunk.shown[:, :, None] * chunk.g * pushed).swapaxes(0, 1)  # (m, c, L)
+        moved_by = [None, each.sum(axis=0), *each]
+        powers[chunk.run.piece].append(np.stack([chunk.weighed(fit.levels, one).power for one in moved_by]))
+    whole = [np.concatenate(one, axis=1) for one in powers]
+    left, moved, parts = [one[0] for one in whole], [one[1] for one in whole], [one[2:] for one in whole]
     share = sum(map(np.sum, left)) / sum(map(np.sum, moved))
     blocks = [blocks_of(run, fit, 0.0) for run in model.runs]
     weights = [

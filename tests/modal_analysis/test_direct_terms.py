@@ -8,8 +8,9 @@ import pytest
 from benchmarks.modal.random_structures import frequency_lines, random_structure
 from benchmarks.records.simulated import coupled
 from benchmarks.records.trial import measurement
-from sysid import simulate
-from sysid.modal_analysis.direct_terms import direct_terms
+from sysid import Measurement, simulate
+from sysid.modal_analysis.direct_terms import _fitted, direct_terms
+from sysid.modal_analysis.residues import Records
 
 
 def lied(test):
@@ -40,6 +41,31 @@ def test_errors_are_of_the_size_of_their_deviations():
         off.append(((terms.mass - truth.rigid_body_mass) / terms.mass_std).ravel())
         off.append((terms.slope / terms.slope_std).ravel())
     assert 0.8 < np.sqrt(np.mean(np.concatenate(off) ** 2)) < 1.5
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_deviations_are_those_of_least_squares_in_the_base_directions_themselves(seed):
+    """Correlated, of unequal spectra: the inputs that are fitted are combinations of both."""
+    rng = np.random.default_rng(seed)
+    freq = np.linspace(1.0, 20.0, 200)
+    base = rng.standard_normal((3, 2, freq.size)) + 1j * rng.standard_normal((3, 2, freq.size))
+    base[:, 1] = np.where(freq < 8, 1.0, 0.2) * (0.9 * base[:, 0] + 0.4 * base[:, 1])
+    omega, ratios = 2 * np.pi * np.array([3.0, 7.0, 12.0]), np.array([0.01, 0.015, 0.02])
+    noise = rng.standard_normal((3, 4, freq.size)) + 1j * rng.standard_normal((3, 4, freq.size))
+    records = Records(Measurement(freq, base, noise, rigid_body=np.zeros((4, 2))))
+    found = _fitted(records, omega, ratios)
+    w = 2 * np.pi * freq
+    g = w**2 / (omega[:, None] ** 2 - w**2 + 2j * (ratios * omega)[:, None] * w)
+    functions = [np.ones_like(w), 1j * w, w**2, *g, *(1j * w * g)]
+    X = np.array([(f * base[:, i]).ravel() for f in functions for i in range(2)]).T
+    X, y = np.vstack([X.real, X.imag]), noise.swapaxes(0, 1).reshape(4, -1)
+    y = np.hstack([y.real, y.imag]).T
+    size = np.linalg.norm(X, axis=0)
+    left = y - X / size @ np.linalg.lstsq(X / size, y)[0]
+    own = np.sqrt(np.diag(np.linalg.inv((X / size).T @ (X / size)))) / size
+    level = np.linalg.norm(left, axis=0) / np.sqrt(len(X) - X.shape[1])
+    expected = (own[:4, None] * level).reshape(2, 2, 4).swapaxes(1, 2)
+    np.testing.assert_allclose(found.std, expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("seed", [0, 2])
