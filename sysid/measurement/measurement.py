@@ -420,6 +420,8 @@ class Measurement:
                 samples = tuple(run.base.shape[1] for run in records)
                 rest = per_run("at_rest", at_rest, len(records))
                 check_cuts(records, rest, G)
+                if noise is not None:
+                    noise = noise.of(len(records), G.shape[0], G.shape[1], force is not None)
                 whole = WholeRecords(samples, float(sample_rate), rest, noise)
             test = cls(freq, base, response, force=force, whole=whole, **given)
         else:

@@ -46,6 +46,32 @@ class NoiseLevels:
                     raise InputError(f"noise of the {name}: one standard deviation >= 0 a channel, or run and channel")
                 object.__setattr__(self, name, array)
 
+    def of(self, runs: int, n_sensors: int, d: int, force: bool) -> NoiseLevels:
+        """The levels of a test of so many runs and channels: one number for all of a kind will do.
+
+        Raises
+        ------
+        InputError
+            Where there are levels of another number of channels, or none of a force that was measured.
+        """
+        refuse(
+            (
+                force and self.force is None,
+                "noise states no level of the force, which was measured: NoiseLevels(force=...)",
+            )
+        )
+        given = {"response": n_sensors, "base": d} | ({"force": d} if force else {})
+        made = {}
+        for name, count in given.items():
+            value = getattr(self, name)
+            refuse((
+                value.shape not in ((1,), (count,), (runs, count)),
+                f"noise of the {name} has shape {value.shape}: one number, ({count},), or a row of them a run, "
+                f"({runs}, {count})",
+            ))  # fmt: skip
+            made[name] = np.broadcast_to(value, (runs, count) if value.ndim == 2 else (count,)).copy()
+        return NoiseLevels(**made)
+
     @property
     def outputs(self) -> Array:
         """Of responses and, behind them, forces, (n_sensors [+ d],) or a row of them a run."""

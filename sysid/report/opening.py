@@ -21,6 +21,7 @@ _HOLDS = (
     "and damping matrices are one choice"
 )
 _NO_END = "the search did not end"
+_MOST_AGAINST = 2  # sentences in the opening; all of them follow
 _MOST_MODES, _MOST_UNKNOWNS = 4, 5  # whose figures stand in the opening; all of them follow
 
 
@@ -73,7 +74,8 @@ def _subject(it: Identification) -> str:
 
 def _meaning(it: Identification) -> str:
     if it.judgement == "no fit":
-        return sentence(f"these matrices do not explain the records: {it.confidence[0]}")
+        against = [told for told in it.confidence if told in it.message][:_MOST_AGAINST] or [it.message]
+        return " ".join(map(sentence, (f"these matrices do not explain the records: {against[0]}", *against[1:])))
     return sentence(verdict(it).partition(": ")[2] or verdict(it))
 
 

@@ -142,9 +142,7 @@ def render(identification: Identification) -> str:
 def _title(it: Identification) -> str:
     if it.recipe is None:
         return "Identification"
-    # A test that `sysid read` wrote is called by its file.
-    of_file = it.recipe.module == "recorded_test" and it.recipe.data
-    return f"Identification of {PurePath(it.recipe.data or '').name if of_file else PurePath(it.recipe.module).stem}"
+    return f"Identification of {PurePath(it.recipe.title.partition(' (')[0]).name.removesuffix('.py')}"
 
 
 def _unknowns(it: Identification) -> str:

@@ -77,9 +77,10 @@ class Recipe:
 
     @property
     def title(self) -> str:
-        """The module and its parameters: "cantilever_tower (elements=3)"."""
+        """The module and its parameters: "cantilever_tower (elements=3)"; a test read from files by its file."""
         given = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items())
-        return f"{self.module} ({given})" if given else self.module
+        name = Path(self.data).name if self.module == "recorded_test" and self.data else self.module
+        return f"{name} ({given})" if given else name
 
     def to_tree(self) -> dict[str, Any]:
         """Give the fields by their names; `from_tree` takes them back."""

@@ -20,8 +20,8 @@ _NOT_COMPUTED = (
     "uncertainty not computed, as the time was over: Identification.uncertainty and 'sysid report' compute it"
 )
 _MEND = (
-    "mend or measure what is named first; where a fit as near as this will do, state the residual that is enough: "
-    "Problem(..., goal=...)"
+    "mend what speaks against it, the first thing first; where a fit as near as this will do, state the residual that "
+    "is enough: Problem(..., goal=...)"
 )
 DEVIATES = 1.96  # standard deviations on either side of 95 % of a normal law
 _ROUND_OFF = 1e-10  # of a value: what is no noise of an instrument

@@ -73,3 +73,30 @@ class TestNoiseFromRest:
         rest = np.random.default_rng(7).standard_normal((1, 60))
         with pytest.raises(sysid.InputError, match="has 28 lines in the band, too few for a level"):
             sysid.Measurement.noise_from_rest([(rest, rest, None)], 10.0)
+
+
+def recorded():
+    base, response, force = (np.random.default_rng(n).standard_normal((n, 40)) for n in (1, 2, 1))
+    return [(base, response, force)]
+
+
+class TestStatedLevels:
+    def test_one_number_stands_for_all_channels_of_a_kind(self):
+        noise = sysid.NoiseLevels(0.02, 0.01, 3.0)
+        test = sysid.Measurement.from_time(recorded(), 10.0, rigid_body=[[1.0], [1.0]], noise=noise)
+        np.testing.assert_array_equal(test.whole.noise.outputs, [0.02, 0.02, 3.0])
+
+    @pytest.mark.parametrize(
+        ("noise", "told"),
+        [
+            (
+                sysid.NoiseLevels([0.1, 0.2, 0.3], 0.01, 1.0),
+                r"noise of the response has shape \(3,\): one number, \(2,\)",
+            ),
+            (sysid.NoiseLevels(0.1, [[0.01], [0.02]], 1.0), r"noise of the base has shape \(2, 1\)"),
+            (sysid.NoiseLevels(0.1, 0.01), "states no level of the force"),
+        ],
+    )
+    def test_levels_of_other_channels_are_refused(self, noise, told):
+        with pytest.raises(sysid.InputError, match=told):
+            sysid.Measurement.from_time(recorded(), 10.0, rigid_body=[[1.0], [1.0]], noise=noise)
