@@ -7,11 +7,11 @@ import sysid
 from sysid.files import recorded_test
 
 
-def problem(*, data=None, rng=0, mass=None, lumped=False, band=None, estimator=None, at_rest=None):
-    """`mass`: kg that move with the base, a number or one a direction; `band`: (low, high) in Hz."""
+def problem(*, data=None, rng=0, mass=None, lumped=False, band=None, goal=None, estimator=None, at_rest=None):
+    """`mass`: kg that move with the base, one or one a direction; `band`: (low, high), Hz; `goal`: see `Problem`."""
     if data is None:
         raise sysid.InputError("recorded_test needs a test: sysid run test.h5, with what 'sysid read' wrote")
     asked = {"band": band, "estimator": estimator, "at_rest": at_rest}
     test = recorded_test.load(data).measurement(**{name: value for name, value in asked.items() if value is not None})
     masses = sysid.LumpedMass(mass) if lumped else sysid.FullMass(mass, healing="rigid_body")
-    return sysid.Problem(test, mass=masses)
+    return sysid.Problem(test, mass=masses, goal=goal)

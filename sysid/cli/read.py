@@ -108,8 +108,8 @@ def is_test(name: str | None) -> bool:
 def recipe(options: argparse.Namespace, made: Recipe) -> Recipe:
     """The recipe of a run of a test file: the bundled problem, with the test as its data."""
     if not is_test(made.module):
-        asked = options.mass is not None or options.lumped or options.band is not None
-        refuse((asked, "--mass, --lumped and --band are for a test that 'sysid read' wrote"))
+        asked = options.lumped or any(one is not None for one in (options.mass, options.band, options.goal))
+        refuse((asked, "--mass, --lumped, --band and --goal are for a test that 'sysid read' wrote"))
         return made
     refuse((made.data is not None, f"--data {made.data}: {made.module} is the data already"))
     recorded_test.load(made.module)  # told before anything is made
@@ -118,11 +118,13 @@ def recipe(options: argparse.Namespace, made: Recipe) -> Recipe:
         extra["mass"] = options.mass[0] if len(options.mass) == 1 else options.mass
     if options.band is not None:
         extra["band"] = options.band
+    if options.goal is not None:
+        extra["goal"] = options.goal
     return Recipe(MODULE, made.module, made.rng, {**made.parameters, **extra})
 
 
 def add_options(command: argparse.ArgumentParser) -> None:
-    """Add to a command what it may say of a test file: its masses, and the lines that are fitted."""
+    """Add to a command what it may say of a test file: masses, lines that are fitted, and what is near enough."""
     command.add_argument(
         "--mass",
         type=_masses,
@@ -133,6 +135,10 @@ def add_options(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--band", type=band, metavar="LOW-HIGH", help="of TEST.h5: the lines that are fitted, Hz, such as 0.5-40"
     )
+    command.add_argument(
+        "--goal", type=float, metavar="SHARE",
+        help="of TEST.h5: relative residual that is near enough, such as 0.05; by default that of the noise",
+    )  # fmt: skip
 
 
 def _masses(text: str) -> list[float]:

@@ -81,8 +81,8 @@ class JobResult:
     seed : int
         Of the start, where it was a fresh point, of the noise that was drawn, or of a whole identification.
     success : bool
-        The solver's status is good, the residual meets the problem's goal, or is a fit at all where none is given, and
-        a whole identification is of more numbers than parameters.
+        The solver's status is good, the residual meets the problem's goal, or is within the noise where none is given,
+        and a whole identification is of more numbers than parameters.
     message : str
         The solver's status, or why there is no result.
     x : (n_variables,)

@@ -68,7 +68,7 @@ class Problem:
     validation : sequence of Measurement
         Tests that are predicted and never fitted.
     goal : float, optional
-        `residual` at which the identification counts as a success.
+        `residual` at which the identification counts as a success; by default what is left must be within the noise.
     loss : {"squares", "huber"}
         "huber" makes numbers of the records count little that are far from the fit: for spikes and drop-outs at some
         lines of some channels, which `Identification.outliers` then lists. What else is fitted counts by its squares.

@@ -43,8 +43,8 @@ class Answer:
     strategy : str
     seed : int or None
     success : bool
-        The last solver's status is good, and the residual meets the goal; where none is given it must
-        at least be below one half.
+        The last solver's status is good, and the residual meets the goal; where none is given, what is left is at most
+        three times the noise of the records, and below one half of them.
     message : str
     history : History
     determined : bool

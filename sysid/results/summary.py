@@ -21,7 +21,7 @@ _NOT_COMPUTED = (
 )
 _MEND = (
     "mend what speaks against it, the first thing first; where a fit as near as this will do, state the residual that "
-    "is enough: Problem(..., goal=...)"
+    "is enough: goal=0.05 (sysid run test.h5 --goal 0.05)"
 )
 DEVIATES = 1.96  # standard deviations on either side of 95 % of a normal law
 _ROUND_OFF = 1e-10  # of a value: what is no noise of an instrument

@@ -240,6 +240,13 @@ def test_three_commands_from_a_table_to_a_result(tmp_path, monkeypatch, capsys):
     np.testing.assert_allclose(np.diag(mass)[:3], [4, 3, 2], rtol=1e-6)
     assert cli.main(["new", "mine", "--data", "test.h5"]) == 0
     assert cli.main(["show", "mine.py"]) == 0
+    # A wrong total leaves what a goal may call near enough, and nothing else does.
+    wrong = ["run", "test.h5", "--mass", "12", "--lumped"]
+    for goal, status in (("0.9", 0), ("1e-6", 1)):
+        assert cli.main([*wrong, "--goal", goal, "--fresh"]) == status
+        assert sysid.load("results/test").problem.goal == float(goal)
+    assert cli.main(["run", "cantilever_tower", "--goal", "0.1"]) == 2
+    assert "--goal are for a test that 'sysid read' wrote" in capsys.readouterr().err
 
 
 def test_a_file_without_sensors_points_to_the_help_in_one_line(tmp_path, monkeypatch, capsys):
