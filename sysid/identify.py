@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from sysid.assessment.before_search import named_mistakes
 from sysid.assessment.exchanged import exchanged_sensors
+from sysid.assessment.model_error import drift_in_words
 from sysid.errors import InputError, SolverError, finite_array, function, instance, number, path_of, whole_number
 from sysid.nlp import one_thread
 from sysid.problem.problem import Problem
@@ -121,8 +122,10 @@ def identify(
         except (InputError, SolverError) as error:
             if max_time is None:  # it has ended by itself, and would end so again
                 journal.entries.clear()
-            if named and isinstance(error, InputError):
-                raise InputError("; ".join((*named, str(error)))) from error
+            # More modes than there can be, of a structure that changes.
+            told = named or (tuple(drift_in_words(problem)) if isinstance(error, DoesNotApplyError) else ())
+            if told and isinstance(error, InputError):
+                raise InputError("; ".join((*told, str(error)))) from error
             raise
         result = judge(problem, outcome, why, seed, session)
     if checkpoint is not None and file is not checkpoint and not result.interrupted:
@@ -201,7 +204,7 @@ def _instead(
     try:
         return _run(after, why, problem, session, start, follow=True)
     except InputError as other:
-        raise InputError(
+        raise DoesNotApplyError(
             f"strategy {chosen.name!r} does not apply: {error}; nor does the {after.name}: {other}"
         ) from None
 

@@ -37,7 +37,7 @@ _SHOWN = 0.03  # of the largest level of a mode, at which it shows
 _ENOUGH = 5  # stretches that tell a trend
 _TREND = 0.03  # that chance orders frequencies so by level
 _SURE_TREND = 1e-3  # the same, where poles that change explain little, as the level changes within stretches
-_OF_RUNS = 0.3  # of the whole change, within runs, where runs differ
+_OF_RUNS = 0.15  # of the variance of frequencies, within runs, where runs differ
 _LEAST_RATIO = 1e-4
 _CLOSE = 1.06  # ratio of frequencies, within which modes ..
 _ONE_SHAPE = 0.9  # .. of one shape (modal assurance criterion) are one that changes
@@ -325,8 +325,8 @@ def _how(seen: list[Seen]) -> str:
     trend, frequency = _trend(seen), np.array([one.frequency for one in seen])
     records = list(dict.fromkeys(one.record for one in seen))
     own = {record: [one for one in seen if one.record == record] for record in records}
-    within = max(float(np.ptp([one.frequency for one in part])) for part in own.values())
-    if len(records) > 1 and within < _OF_RUNS * np.ptp(frequency):
+    within = np.mean([np.var([one.frequency for one in part]) for part in own.values()])
+    if len(records) > 1 and within < _OF_RUNS * np.var(frequency):
         means = [
             (record, np.mean([(one.frequency, one.level) for one in part], axis=0)) for record, part in own.items()
         ]
