@@ -154,13 +154,12 @@ def _run(options: argparse.Namespace, out: Output) -> int:
 
     search, folder = unfinished.begun(options, out)
     recipe = search.recipe
-    problem, files = catalogue.built(recipe, check=options.max_time is None)  # with a limit under the search's clock
+    problem, files = catalogue.built(recipe, check=False)  # by the search, with its progress and under its clock
     checkpoint = Checkpoint(folder / UNFINISHED, unfinished.with_source(search, files, folder))
     if options.fresh:
         checkpoint.remove()
     test = problem.measurement
-    # Poles of the data, which may take long, are left to the search and its progress and time limit.
-    unknowns = problem.formulate(problem.geometry.unsearched()).size
+    unknowns = problem.formulate(problem.unsearched).size
     out.write(
         f"{recipe.title}: {test.n_sensors} sensors, base moving along {' '.join(test.base_axes or ())}, "
         f"{test.freq.size} lines from {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz, "

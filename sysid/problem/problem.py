@@ -171,7 +171,7 @@ class Problem:
         return {
             "measurement": self.measurement.to_tree(),
             "given": stored.to_tree(vars(self)),
-            "poles": self.geometry.found if self.screened is self else None,  # those of what is screened
+            "poles": None if self._changed else self._geometry.found,  # those of what is screened
             "reference": None if self.reference is None else self.reference.to_tree(),
             "validation": [test.to_tree() for test in self.validation],
             "goal": self.goal,
@@ -207,10 +207,20 @@ class Problem:
         return self._at_rest(None)
 
     def _at_rest(self, monitor: Callable[[int, float], object] | None) -> Problem:
-        tests = [self.measurement, *(r.measurement for r in self.residuals if isinstance(r, FurtherTest))]
-        if all(test.whole is None for test in tests):
+        if not self._in_motion:
             return self
         return self._with_tests(lambda test: without_transients(test, monitor=monitor), self.loss)
+
+    @property
+    def _in_motion(self) -> bool:
+        """Whether any test that is fitted is of whole records."""
+        tests = [self.measurement, *(r.measurement for r in self.residuals if isinstance(r, FurtherTest))]
+        return any(test.whole is not None for test in tests)
+
+    @property
+    def _changed(self) -> bool:
+        """Whether other records are fitted than were given: `screened` is not the problem itself."""
+        return self._in_motion or self.loss != "squares"
 
     @cached_property
     def screened(self) -> Problem:
