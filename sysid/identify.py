@@ -25,7 +25,7 @@ from sysid.search.journal import Journal
 from sysid.search.modal import Modal
 from sysid.search.robust import check, settled
 from sysid.search.session import DeferredInterrupt, Progress, Session, Stop
-from sysid.search.strategy import DoesNotApplyError, Outcome, Strategy
+from sysid.search.strategy import DoesNotApplyError, NoStrategyError, Outcome, Strategy
 from sysid.search.swarm import Swarm
 from sysid.structure.structure import Structure
 
@@ -123,7 +123,9 @@ def identify(
             if max_time is None:  # it has ended by itself, and would end so again
                 journal.entries.clear()
             # More modes than there can be, of a structure that changes.
-            told = named or (tuple(drift_in_words(problem)) if isinstance(error, DoesNotApplyError) else ())
+            told = named or (
+                tuple(drift_in_words(problem)) if isinstance(error, DoesNotApplyError | NoStrategyError) else ()
+            )
             if told and isinstance(error, InputError):
                 raise InputError("; ".join((*told, str(error)))) from error
             raise
@@ -204,7 +206,7 @@ def _instead(
     try:
         return _run(after, why, problem, session, start, follow=True)
     except InputError as other:
-        raise DoesNotApplyError(
+        raise NoStrategyError(
             f"strategy {chosen.name!r} does not apply: {error}; nor does the {after.name}: {other}"
         ) from None
 

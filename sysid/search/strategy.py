@@ -175,6 +175,10 @@ class DoesNotApplyError(InputError):
     """A strategy does not apply to a problem; another may."""
 
 
+class NoStrategyError(InputError):
+    """No strategy applies to a problem."""
+
+
 def as_unknowns(problem: Problem, start: ArrayLike | Structure) -> Array:
     """Unknowns of a start that the user gave."""
     if isinstance(start, Structure):
