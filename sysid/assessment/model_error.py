@@ -28,6 +28,7 @@ _UNKNOWN = 0.1  # relative residual, up to which spectra without a stated noise 
 _BLOCK = 16  # lines of a block ..
 _BLOCKS = 8  # .. of which there are so many at least, that tell the noise by the quietest quarter
 _QUIET = 0.25
+_NEAR = 5.0  # half-power widths, or distances of lines, about a mode
 _TRACE = 1e-4  # of the records; smaller ones are no noise of an instrument
 _MOVED = 0.1  # half-power widths, by which the frequency of a mode changes at least
 _KNOWN = 0.1  # the same, to which it is known at least
@@ -95,50 +96,64 @@ def _misses(problem: Problem, structure: Structure, x: Array | None, alone: list
                     at = int(np.argmin(np.abs(test.freq - one.freq)))
                     record.left[one.run - 1, record.channels.index(one.channel), at] = 0.0
             found = raw.whole is not None and raw.whole.noise is None
-            yield from _miss(record._replace(name=record.name + of), test, found)
+            yield from _miss(record._replace(name=record.name + of), test, found, _near_modes(test, its))
 
 
 def _records(test: Measurement, raw: Measurement, structure: Structure) -> Iterator[Record]:
     """Records of a test without its transients; `raw` is the test with them."""
-    std, force_std = _deviations(test, raw)
     left = test.relative - test.predict(structure)
+    quiet = _quiet_base(test, raw)
+    noise = None if test.modal is None else test.modal.noise
+    std = test.response_std
+    if std is not None and quiet is not None and noise is not None:
+        std = _bounded(test, std, noise.response, left, quiet)
     yield Record("the accelerations", test.sensor_names, test.relative, left, None if std is None else std**2)
     if test.force is not None:
         axes = tuple(f"force {axis}" for axis in test.base_axes or ())
-        left = test.force - test.predict_force(structure)
-        yield Record("the base force", axes, test.force, left, None if force_std is None else force_std**2)
+        left, std = test.force - test.predict_force(structure), test.force_std
+        if std is not None and quiet is not None and noise is not None and noise.force is not None:
+            std = _bounded(test, std, noise.force, left, quiet)
+        yield Record("the base force", axes, test.force, left, None if std is None else std**2)
 
 
-def _deviations(test: Measurement, raw: Measurement) -> tuple[Array | None, Array | None]:
-    """Of the noise of accelerations and force; where levels were found, no larger than in quiet parts of the records.
+def _quiet_base(test: Measurement, raw: Measurement) -> Array | None:
+    """Share of the base's level that its quietest parts hold, (runs,), where levels were found; else None.
 
-    Levels are found with modes of constant poles: what these leave at the peaks passes for noise, mostly the base's.
+    Levels are found with modes of constant poles: what these leave at the peaks passes for noise of the base.
     """
-    std, force_std, modal = test.response_std, test.force_std, test.modal
-    if modal is None or raw.whole is None or raw.whole.noise is not None or modal.varying:
-        return std, force_std
+    if test.modal is None or raw.whole is None or raw.whole.noise is not None or test.modal.varying:
+        return None
     quiet = quiet_levels(raw)
-    if quiet is None:
-        return std, force_std
-    passed = np.minimum(quiet.base / modal.noise.base, 1.0).max(axis=1)[:, None, None]
-    own = [(std, modal.noise.response, quiet.response), (force_std, modal.noise.force, quiet.force)]
-    first, second = (
-        None if full is None or level is None or least is None else _bounded(full, level, least, modal.density, passed)
-        for full, level, least in own
-    )
-    return first, second
+    return None if quiet is None else np.minimum(quiet.base / test.modal.noise.base, 1.0).max(axis=1)
 
 
-def _bounded(std: Array, level: Array, least: Array, density: Array, passed: Array) -> Array:
-    """Deviations (runs, channels, n_freq) of which a channel's own level, and `passed` of the base's, are less."""
-    channel = density[:, None] * np.broadcast_to(level, std.shape[:2]) ** 2
-    own = np.minimum(std**2, channel[..., None])
-    share = np.minimum(least / np.broadcast_to(level, std.shape[:2]), 1.0)[..., None]
-    return np.asarray(np.sqrt(share**2 * own + passed**2 * (std**2 - own)))
+def _bounded(test: Measurement, std: Array, level: Array, left: ComplexArray, passed: Array) -> Array:
+    """Deviations (runs, channels, n_freq) of which a channel's own is at most what quiet lines hold of what is left.
+
+    Hum and error of a model raise the level that was found. `passed` of the base's share of the noise is left.
+    """
+    assert test.modal is not None
+    quiet = _quiet(left, np.ones(left.shape), test.own_lines)
+    own = np.minimum(std**2, (test.modal.density[:, None] * np.broadcast_to(level, std.shape[:2]) ** 2)[..., None])
+    least = own if quiet is None else np.minimum(own, quiet[..., None])
+    return np.asarray(np.sqrt(least + passed[:, None, None] ** 2 * (std**2 - own)))
 
 
-def _miss(record: Record, test: Measurement, found: bool) -> Iterator[Miss]:
-    """What is left of one record in units of its noise; `found`: with the fit, so that it holds errors of the model."""
+def _near_modes(test: Measurement, structure: Structure) -> NDArray[np.bool_]:
+    """Lines near a mode of a structure or of whole records, (n_freq,)."""
+    f, ratio = structure.natural_frequencies, structure.damping_ratios
+    if test.modal is not None:
+        f = np.concatenate([f, test.modal.omega / (2 * np.pi)])
+        ratio = np.concatenate([ratio, test.modal.ratios])
+    reach = np.maximum(2 * _NEAR * ratio * f, _NEAR * np.median(np.diff(test.freq))) if test.freq.size > 1 else np.inf
+    return np.asarray(np.any(np.abs(test.freq - f[:, None]) < np.broadcast_to(reach, f.shape)[:, None], axis=0))
+
+
+def _miss(record: Record, test: Measurement, found: bool, near: NDArray[np.bool_]) -> Iterator[Miss]:
+    """What is left of one record in units of its noise; `found`: with the fit, so that it holds errors of the model.
+
+    Of noise that is not stated, what stands out far from all modes is a part, such as hum.
+    """
     own, size, missed = test.own_lines, float(np.linalg.norm(record.measured)), float(np.linalg.norm(record.left))
     variance = np.ones(record.left.shape) if record.variance is None else record.variance
     # Noise that is not stated may be in proportion to the record.
@@ -149,11 +164,14 @@ def _miss(record: Record, test: Measurement, found: bool) -> Iterator[Miss]:
         quiet = _quiet(record.left, variance, own)
         if quiet is None:
             return
-        # Levels that were found are no smaller than the noise.
-        variance = variance * (np.minimum(quiet, 1.0) if found else quiet)[..., None]
-    noise = float(np.sqrt(np.sum(variance * own[:, None])))
+        variance = variance if found else variance * quiet[..., None]
+    variance = variance * own[:, None]
+    noise = float(np.sqrt(np.sum(variance)))
+    left = np.abs(record.left) ** 2
+    if bounded:
+        left = np.where(near, left, np.minimum(left, variance))
     if noise > _TRACE * size:
-        yield Miss(missed / noise, bounded, record.name, missed / size)
+        yield Miss(float(np.sqrt(np.sum(left))) / noise, bounded, record.name, missed / size)
 
 
 def _quiet(left: ComplexArray, variance: Array, own: NDArray[np.bool_]) -> Array | None:
@@ -218,7 +236,12 @@ def model_errors(problem: Problem, structure: Structure, misses: list[Miss]) -> 
     """
     modal = problem.screened.measurement.modal
     unfitted = [without_transients_of(test, structure) for test in problem.validation]
-    missed = [m for test in unfitted for record in _records(test, test, structure) for m in _miss(record, test, False)]
+    missed = [
+        miss
+        for test in unfitted
+        for record in _records(test, test, structure)
+        for miss in _miss(record, test, False, _near_modes(test, structure))
+    ]
     uneven = modal is not None and bool(modal.scatter is not None or modal.excess)
     beyond = uneven or any(miss.times > BEYOND for miss in (*misses, *missed))
     drift = tuple(drift_in_words(problem)) if beyond else ()
