@@ -323,7 +323,7 @@ def _seen(stretches: list[Stretch], k: int, width: float, number: int, test: Mea
     """A mode in the stretches of a test in which it is known; test 0 is the one that was fitted."""
     made = []
     for one in stretches:
-        run = f"run {one.run}" if test.n_runs > 1 else "the record"
+        run = f"run {one.run + 1}" if test.n_runs > 1 else "the record"
         record = run if number == 0 else f"{run} of unfitted test {number}"
         if one.std[k] < _KNOWN * width and one.left <= one.left_by_all:
             part = f"{one.start:.3g} to {one.end:.3g} s"

@@ -182,7 +182,10 @@ class Gains:
 
 
 class Excess(NamedTuple):
-    """A band, Hz, where a fit leaves `factor` times the noise of a channel (of sensors, forces, base) of a run."""
+    """A band, Hz, where a fit leaves `factor` times the noise of a channel (of sensors, forces, base) of a run.
+
+    `channel` and `run` are indices.
+    """
 
     channel: int
     run: int
@@ -192,7 +195,7 @@ class Excess(NamedTuple):
 
 
 class VaryingLevel(NamedTuple):
-    """Noise of a channel of a run, numbered as in `Excess`, that varies over the lines: least and largest deviation."""
+    """Noise of a channel of a run, indices as in `Excess`, that varies over the lines: least and largest deviation."""
 
     channel: int
     run: int
@@ -232,9 +235,9 @@ class ModalEstimate:
     varying : tuple of VaryingLevel
         Levels that were let vary smoothly over the lines; `noise` holds their means.
     untold : tuple of (run, channel)
-        Levels of `noise` that the records do not determine.
+        Indices, as in `Excess`. Levels of `noise` that the records do not determine.
     in_motion : tuple of int
-        Runs stated to be at rest at both ends that the records show were not.
+        Indices of runs stated to be at rest at both ends that the records show were not.
     """
 
     phi: Array
