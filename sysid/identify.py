@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.assessment.before_search import named_mistakes
+from sysid.assessment.changing import changes_in_words
 from sysid.assessment.exchanged import exchanged_sensors
-from sysid.assessment.model_error import drift_in_words
 from sysid.errors import InputError, SolverError, finite_array, function, instance, number, path_of, whole_number
 from sysid.nlp import one_thread
 from sysid.problem.problem import Problem
@@ -124,7 +124,7 @@ def identify(
                 journal.entries.clear()
             # More modes than there can be, of a structure that changes.
             told = named or (
-                tuple(drift_in_words(problem)) if isinstance(error, DoesNotApplyError | NoStrategyError) else ()
+                changes_in_words(problem) if isinstance(error, DoesNotApplyError | NoStrategyError) else ()
             )
             if told and isinstance(error, InputError):
                 raise InputError("; ".join((*told, str(error)))) from error

@@ -1,7 +1,7 @@
 """Model error: what records hold beside noise that no structure of constant mass, stiffness and damping makes of them.
 
-Two signs: the model misses the records by more than their noise, and frequencies that no linear structure has, which
-change along a record, from run to run, or with the level of motion.
+The model misses the records by more than their noise, frequencies change (`sysid.assessment.changing`), or tests that
+were not fitted are predicted badly or move otherwise.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-from sysid.measurement.in_time import peaks, quiet_levels
+from sysid.assessment.changing import changes_in_words
+from sysid.errors import InputError
+from sysid.measurement.in_time import cut_in_motion, peaks, quiet_levels
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.outliers import Outlier
-from sysid.modal_analysis.stretches import Stretch, stretches_of
 from sysid.modal_analysis.transients import without_transients_of
 from sysid.problem.problem import Problem
 from sysid.problem.terms import FurtherTest
@@ -30,18 +30,6 @@ _BLOCKS = 8  # .. of which there are so many at least, that tell the noise by th
 _QUIET = 0.25
 _NEAR = 5.0  # half-power widths, or distances of lines, about a mode
 _TRACE = 1e-4  # of the records; smaller ones are no noise of an instrument
-_MOVED = 0.1  # half-power widths, by which the frequency of a mode changes at least
-_KNOWN = 0.1  # the same, to which it is known at least
-_SURE = 6.0  # standard deviations of a change
-_EXPLAINED = 0.7  # of the squares that constant poles leave, that others leave at most
-_SHOWN = 0.03  # of the largest level of a mode, at which it shows
-_ENOUGH = 5  # stretches that tell a trend
-_TREND = 0.03  # that chance orders frequencies so by level
-_SURE_TREND = 1e-3  # the same, where poles that change explain little, as the level changes within stretches
-_OF_RUNS = 0.15  # of the variance of frequencies, within runs, where runs differ
-_LEAST_RATIO = 1e-4
-_CLOSE = 1.06  # ratio of frequencies, within which modes ..
-_ONE_SHAPE = 0.9  # .. of one shape (modal assurance criterion) are one that changes
 _LEVEL = 1.25  # times the fitted levels, beyond which another is outside
 
 
@@ -53,6 +41,8 @@ class Miss(NamedTuple):
     record: str
     share: float
     """Of the record."""
+    cut: bool
+    """Whether it holds spectra of a record that neither begins nor ends at rest, with its transients."""
 
 
 class Record(NamedTuple):
@@ -130,13 +120,18 @@ def _quiet_base(test: Measurement, raw: Measurement) -> Array | None:
 def _bounded(test: Measurement, std: Array, level: Array, left: ComplexArray, passed: Array) -> Array:
     """Deviations (runs, channels, n_freq) of which a channel's own is at most what quiet lines hold of what is left.
 
-    Hum and error of a model raise the level that was found. `passed` of the base's share of the noise is left.
+    Hum and error of a model raise the level that was found. Of the base's share of the noise, `passed` is left, or less
+    where quiet lines hold less.
     """
     assert test.modal is not None
-    quiet = _quiet(left, np.ones(left.shape), test.own_lines)
     own = np.minimum(std**2, (test.modal.density[:, None] * np.broadcast_to(level, std.shape[:2]) ** 2)[..., None])
-    least = own if quiet is None else np.minimum(own, quiet[..., None])
-    return np.asarray(np.sqrt(least + passed[:, None, None] ** 2 * (std**2 - own)))
+    base, share = std**2 - own, passed**2
+    quiet = _quiet(left, np.ones(left.shape), test.own_lines)
+    if quiet is not None:
+        of_base = _quiet(left, np.maximum(base, np.finfo(float).tiny), test.own_lines)
+        share = np.minimum(share, np.asarray(of_base).min(axis=1))
+        own = np.minimum(own, quiet[..., None])
+    return np.asarray(np.sqrt(own + share[:, None, None] * base))
 
 
 def _near_modes(test: Measurement, structure: Structure) -> NDArray[np.bool_]:
@@ -171,7 +166,7 @@ def _miss(record: Record, test: Measurement, found: bool, near: NDArray[np.bool_
     if bounded:
         left = np.where(near, left, np.minimum(left, variance))
     if noise > _TRACE * size:
-        yield Miss(float(np.sqrt(np.sum(left))) / noise, bounded, record.name, missed / size)
+        yield Miss(float(np.sqrt(np.sum(left))) / noise, bounded, record.name, missed / size, cut_in_motion(test))
 
 
 def _quiet(left: ComplexArray, variance: Array, own: NDArray[np.bool_]) -> Array | None:
@@ -214,7 +209,13 @@ def missed_in_words(misses: list[Miss]) -> Iterator[str]:
         if miss.times > BEYOND
     ]
     if told:
-        yield f"the model misses {', '.join(told)} of them: what it leaves out is larger than what the instruments add"
+        why = "what it leaves out is larger than what the instruments add"
+        if any(miss.cut for miss in misses):
+            why += (
+                "; these are plain spectra of records that move at their ends, which hold transients too: take whole "
+                "records (from_time's estimator='records')"
+            )
+        yield f"the model misses {', '.join(told)} of them: {why}"
 
 
 class ModelErrors(NamedTuple):
@@ -244,132 +245,14 @@ def model_errors(problem: Problem, structure: Structure, misses: list[Miss]) -> 
     ]
     uneven = modal is not None and bool(modal.scatter is not None or modal.excess)
     beyond = uneven or any(miss.times > BEYOND for miss in (*misses, *missed))
-    drift = tuple(drift_in_words(problem)) if beyond else ()
-    told = (*missed_in_words(misses), *drift, *unpredicted_in_words(unfitted, structure))
-    return ModelErrors(told, bool(drift))
-
-
-class Seen(NamedTuple):
-    """A mode in a stretch: the record and, in words, where in it; Hz; level, m/s²."""
-
-    record: str
-    part: str
-    frequency: float
-    std: float
-    level: float
-
-
-def drift_in_words(problem: Problem) -> Iterator[str]:
-    """The mode whose frequency changes most between stretches of all records, those never fitted too, in a sentence."""
-    if not problem.formulation.fits_records:
-        return
-    tests = [problem.measurement, *problem.validation]
-    modes = _modes(problem.screened.measurement)
-    if not modes:
-        return
-    omega, ratios = np.transpose(modes)
-    made = [stretches_of(test, omega, ratios) for test in tests]
-    every = [one for part in made for one in part]
-    explained = sum(min(one.left, one.left_by_all) ** 2 for one in every) < _EXPLAINED * sum(
-        one.left_by_all**2 for one in every
-    )
-    found: list[tuple[float, float, list[Seen]]] = []
-    for k, mode in enumerate(modes):
-        width = mode.ratio * mode.omega / np.pi
-        seen = [one for i, part in enumerate(made) for one in _seen(part, k, width, i, tests[i])]
-        seen = [one for one in seen if one.level > _SHOWN * max(each.level for each in seen)]
-        if len(seen) > 1:
-            f, std = (np.array([getattr(one, name) for one in seen]) for name in ("frequency", "std"))
-            change = np.abs(f[:, None] - f)
-            clear = np.any(change > np.maximum(_MOVED * width, _SURE * np.hypot(std[:, None], std)))
-            if clear and (explained or _trend(seen, _SURE_TREND)):
-                found.append((float(np.ptp(f)) / width, mode.omega / (2 * np.pi), seen))
-    if found:
-        _, frequency, seen = max(found, key=lambda one: (_trend(one[2]) != 0, one[0]))
-        others = ", ".join(f"{one[1]:.3g}" for one in found if one[1] != frequency)
-        also = f" (and of those near {others} Hz)" if others else ""
-        yield f"the frequency of the mode near {frequency:.3g} Hz{also} {_how(seen)}"
-
-
-class Mode(NamedTuple):
-    """A pole that records show: rad/s; damping ratio."""
-
-    omega: float
-    ratio: float
-
-
-def _modes(test: Measurement) -> list[Mode]:
-    """Poles of a test; those close by of one shape, as a fit makes of a mode that changes, are one."""
-    if test.modal is not None:
-        omega, ratios, shapes = test.modal.omega, test.modal.ratios, test.modal.phi
-    else:
-        poles = PolesAndResidues.of(test)
-        if poles is None:
-            return []
-        omega, ratios, shapes = poles.omega, poles.ratios, poles.residues.reshape(poles.omega.size, -1).T
-    shapes = shapes / np.maximum(np.linalg.norm(shapes, axis=0), np.finfo(float).tiny)
-    groups: list[list[int]] = []
-    for k in range(omega.size):
-        near = [group for group in groups if omega[k] < _CLOSE * omega[group[0]] and len(shapes) > 1]
-        like = [group for group in near if (shapes[:, group[0]] @ shapes[:, k]) ** 2 > _ONE_SHAPE]
-        if like:
-            like[-1].append(k)
-        else:
-            groups.append([k])
-    return [Mode(float(omega[group].mean()), max(float(ratios[group].max()), _LEAST_RATIO)) for group in groups]
-
-
-def _seen(stretches: list[Stretch], k: int, width: float, number: int, test: Measurement) -> list[Seen]:
-    """A mode in the stretches of a test in which it is known; test 0 is the one that was fitted."""
-    made = []
-    for one in stretches:
-        run = f"run {one.run + 1}" if test.n_runs > 1 else "the record"
-        record = run if number == 0 else f"{run} of unfitted test {number}"
-        if one.std[k] < _KNOWN * width and one.left <= one.left_by_all:
-            part = f"{one.start:.3g} to {one.end:.3g} s"
-            made.append(Seen(record, part, float(one.frequency[k]), float(one.std[k]), float(one.level[k])))
-    return made
-
-
-def _trend(seen: list[Seen], chance: float = _TREND) -> float:
-    """Rank correlation of the frequency of a mode with its level; zero where chance or time make as large a one."""
-    from scipy.stats import spearmanr
-
-    if len(seen) < _ENOUGH:
-        return 0.0
-    frequency = [one.frequency for one in seen]
-    found = spearmanr([one.level for one in seen], frequency)
-    in_time = abs(spearmanr(np.arange(len(seen)), frequency).statistic)
-    return float(found.statistic) if found.pvalue < chance and abs(found.statistic) > in_time else 0.0
-
-
-def _how(seen: list[Seen]) -> str:
-    """How the frequency of a mode changes, and what to do, in words."""
-    trend, frequency = _trend(seen), np.array([one.frequency for one in seen])
-    records = list(dict.fromkeys(one.record for one in seen))
-    own = {record: [one for one in seen if one.record == record] for record in records}
-    within = np.mean([np.var([one.frequency for one in part]) for part in own.values()])
-    if len(records) > 1 and within < _OF_RUNS * np.var(frequency):
-        means = [
-            (record, np.mean([(one.frequency, one.level) for one in part], axis=0)) for record, part in own.items()
-        ]
-        told = ", ".join(f"{f:.4g} Hz in {record} at {level:.2g} m/s² rms" for record, (f, level) in means)
-        return f"differs from record to record ({told}): fit them one by one, and find what changed between them"
-    if trend != 0.0:
-        by_level = sorted(seen, key=lambda one: one.level)
-        least, most = (f"{one.frequency:.4g} Hz" for one in by_level[:: len(seen) - 1])
-        return (
-            f"{'falls' if trend < 0 else 'rises'} as the motion grows, from {least} where it moves a sensor by "
-            f"{by_level[0].level:.2g} m/s² rms to {most} at {by_level[-1].level:.2g} m/s²: the structure "
-            f"{'softens' if trend < 0 else 'stiffens'}, and no linear model holds at all levels; fit runs of the level "
-            "of interest"
-        )
-    low, high = seen[int(np.argmin(frequency))], seen[int(np.argmax(frequency))]
-    ends = (f"{one.frequency:.4g} Hz at {one.part} of {one.record}" for one in (low, high))
-    return (
-        f"changes along the records, from {' to '.join(ends)}: the structure is not the same all the time (level, "
-        "temperature, joints); fit a part in which it is"
-    )
+    changes: tuple[str, ...] = ()
+    unjudged: tuple[str, ...] = ()
+    try:
+        changes = changes_in_words(problem) if beyond else ()
+    except (InputError, np.linalg.LinAlgError) as error:
+        unjudged = (f"whether frequencies change along the records was not judged: {error}",)
+    told = (*changes, *missed_in_words(misses), *unpredicted_in_words(unfitted, structure), *unjudged)
+    return ModelErrors(told, bool(changes))
 
 
 def unpredicted_in_words(unfitted: list[Measurement], structure: Structure) -> Iterator[str]:

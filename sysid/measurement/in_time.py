@@ -13,16 +13,19 @@ from sysid.measurement.whole import NoiseLevels, WholeRecords
 from sysid.structure.structure import Array, ComplexArray
 
 _SAMPLES = 2.5  # a period of the highest line, where the sample rate is not known
-_EVEN = 1e-6  # of their distance, by which lines of whole records are evenly spaced
+_EVEN = 1e-6  # of the highest line, by which lines are off multiples of their distance at most
 _BLOCKS = 32  # of a run, of which the quietest tell its noise ..
 _LINES = 32  # .. with so many lines to a block at least
 _QUIET = 0.1
+_ENDS = 64  # of a run, that is looked at on either side ..
+_AT_REST = 0.1  # .. and holds no more of its mean square where it is at rest
 
 
 class RunInTime(NamedTuple):
     """Records of a run at `rate` Hz, and how many lines they hold.
 
-    Base (d, n), absolute responses (n_sensors, n), and force (d, n) where it was measured.
+    Base (d, n), absolute responses (n_sensors, n), and force (d, n) where it was measured: in m/s² and N, or all in one
+    unknown unit where spectra were given without their sample rate (`levels_are_known`).
     """
 
     base: Array
@@ -38,7 +41,8 @@ def in_time(test: Measurement) -> list[RunInTime]:
     Parameters
     ----------
     test : Measurement
-        As ``from_time`` gives it with the estimators "records" and "spectra".
+        As ``from_time`` gives it with the estimators "records" and "spectra". Spectra that were given as such are
+        taken for those of whole records where their lines can be, and all runs have the same.
     """
     whole = as_whole(test).whole
     if whole is None:
@@ -55,9 +59,28 @@ def in_time(test: Measurement) -> list[RunInTime]:
     return made
 
 
+def levels_are_known(test: Measurement) -> bool:
+    """Whether the spectra have the unit of `from_time`, m/s² s: the scale of those that were given is free."""
+    return test.whole is not None or test.sample_rate is not None
+
+
 def peaks(test: Measurement) -> list[float]:
-    """Largest accelerations of a sensor against the base in each run, m/s²."""
+    """Largest accelerations of a sensor against the base in each run, m/s²; none where levels are not known."""
+    if not levels_are_known(test):
+        return []
     return [float(np.abs(run.response - test.rigid_body @ run.base).max()) for run in in_time(test)]
+
+
+def cut_in_motion(test: Measurement) -> bool:
+    """Whether plain spectra are those of records that neither begin nor end at rest."""
+    if test.sample_rate is None:
+        return False
+    for run in in_time(test):
+        power = np.sum((run.response - test.rigid_body @ run.base) ** 2, axis=0)
+        ends = max(1, power.size // _ENDS)
+        if max(power[:ends].mean(), power[-ends:].mean()) > _AT_REST * power.mean():
+            return True
+    return False
 
 
 def quiet_levels(test: Measurement) -> NoiseLevels | None:
@@ -86,12 +109,19 @@ def as_whole(test: Measurement) -> Measurement:
     """Spectra as those of whole records cut in motion; as they are where their lines cannot be such."""
     if test.whole is not None or test.averaged or test.has_unit_runs or test.freq.size < 2:
         return test
-    spacing = float(np.min(np.diff(test.freq)))
-    multiple = test.freq / spacing
-    if np.any(np.abs(multiple - np.round(multiple)) > _EVEN * multiple[-1]):
+    own = test.own_lines
+    if np.any(own.sum(axis=1) < 2) or (test.sample_rate is None and not np.all(own)):
         return test
-    n, runs = int(next_fast_len(int(np.ceil(_SAMPLES * multiple[-1])))), test.n_runs
-    return replace(test, whole=WholeRecords((n,) * runs, n * spacing, (False,) * runs))
+    freq = [test.freq[lines] for lines in own]
+    spacing = np.array([float(np.min(np.diff(lines))) for lines in freq])
+    if any(np.max(np.abs(f / df - np.round(f / df))) > _EVEN * f[-1] / df for f, df in zip(freq, spacing, strict=True)):
+        return test
+    if test.sample_rate is None:
+        n = int(next_fast_len(int(np.ceil(_SAMPLES * test.freq[-1] / spacing[0]))))
+        samples, rate = [n] * test.n_runs, n * float(spacing[0])
+    else:
+        samples, rate = np.round(test.sample_rate / spacing).astype(int).tolist(), test.sample_rate
+    return replace(test, whole=WholeRecords(tuple(samples), rate, (False,) * test.n_runs))
 
 
 def _of_lines(lines: ComplexArray, at: Array, n: int) -> Array:

@@ -56,6 +56,8 @@ class Measurement:
         Averages over segments, as "h1" and "h2" of `from_time` give: their window flattens narrow peaks.
     whole : WholeRecords, optional
         Of spectra of whole records, which neither begin nor end at rest: see `from_time`.
+    sample_rate : float, optional
+        Hz; of the plain spectra of whole records, in m/s² s, that `from_time` gives with the estimator "spectra".
     modal : ModalEstimate, optional
         Of whole records whose transients were taken off: what they tell of the modes, with the noise of all channels.
 
@@ -79,6 +81,7 @@ class Measurement:
     holes: tuple[tuple[str, Array], ...] = field(default=(), kw_only=True)
     averaged: bool = field(default=False, kw_only=True)
     whole: WholeRecords | None = field(default=None, kw_only=True)
+    sample_rate: float | None = field(default=None, kw_only=True)
     modal: ModalEstimate | None = field(default=None, kw_only=True)
 
     def __post_init__(self, missing: Missing) -> None:
@@ -163,6 +166,7 @@ class Measurement:
             **({"holes": [{"name": name, "freq": freq} for name, freq in self.holes]} if self.holes else {}),
             **({"averaged": True} if self.averaged else {}),
             **({} if self.whole is None else {"whole": self.whole.to_tree()}),
+            **({} if self.sample_rate is None else {"sample_rate": self.sample_rate}),
         }  # fmt: skip
 
     @classmethod
@@ -423,7 +427,8 @@ class Measurement:
                 if noise is not None:
                     noise = noise.of(len(records), G.shape[0], G.shape[1], force is not None)
                 whole = WholeRecords(samples, float(sample_rate), rest, noise)
-            test = cls(freq, base, response, force=force, whole=whole, **given)
+            rate = None if whole is not None else float(sample_rate)
+            test = cls(freq, base, response, force=force, whole=whole, sample_rate=rate, **given)
         else:
             estimate = spectra.averaged(records, sample_rate, kind=estimator, segment=segment)
             test = cls.from_frf(

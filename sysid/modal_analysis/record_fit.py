@@ -83,15 +83,9 @@ class RecordFit:
         return self.equations.normal[:size, :size]
 
     @property
-    def unknowns(self) -> int:
-        """Numbers that the records determine: without a force the scale of each mode is none."""
-        model = self.model
-        return model.size - (0 if model.force else model.m)
-
-    @property
     def freedom(self) -> int:
         """Real numbers of the records less those of the fit."""
-        return self.model.numbers - self.unknowns
+        return self.model.numbers - self.model.unknowns
 
     @property
     def reduced(self) -> float:
@@ -101,7 +95,7 @@ class RecordFit:
     @property
     def schwarz(self) -> float:
         """The log-likelihood less half of Schwarz's price of the unknowns: the larger, the better."""
-        unknowns = self.unknowns + extra_numbers(self.model.whole.varying)
+        unknowns = self.model.unknowns + extra_numbers(self.model.whole.varying)
         return self.likelihood - unknowns * float(np.log(self.model.numbers)) / 2
 
     @cached_property
@@ -315,6 +309,7 @@ def _first(test: Measurement, omega: Array, ratios: Array, *, repeated: bool) ->
     d, free = test.n_base, records.fit(omega, ratios)
     residues = records.by_sensor(free.residues)  # (m, n, d + 2 r)
     size = np.linalg.norm(np.concatenate(list(test.inputs), axis=-1), axis=1)
+    size[size == 0] = size.max()  # a base direction that does not move: any scale will do
     u, s, vt = np.linalg.svd(residues * size)
     ranks = np.ones(omega.size, int)
     if repeated:

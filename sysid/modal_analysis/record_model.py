@@ -221,6 +221,11 @@ class RecordModel:
         shape = (len(self.whole.samples), self.channels, TRACES)
         return Parameters(modes, rigid, ends.reshape(self.m, -1), traces.reshape(shape))
 
+    @property
+    def unknowns(self) -> int:
+        """Numbers that the records determine: without a force the scale of each mode is none."""
+        return self.size - (0 if self.force else self.m)
+
     def chunks(self, p: Parameters) -> Iterator[Chunk]:
         """Lines of all runs, some thousand at a time."""
         for run in self.runs:
@@ -273,6 +278,11 @@ class HeldShapes(RecordModel):
         self.held = np.ones(self.size, bool)
         self.held[self.index.log_omega] = self.held[self.index.log_ratios] = poles
         self.held[self.kept :] = False
+
+    @property
+    def unknowns(self) -> int:
+        """Numbers that are not held."""
+        return int(np.sum(~self.held))
 
     def _products(self, p: Parameters, levels: Array, of_chunk: Callable[[Chunk, Array, Columns], Sums]) -> Shift:
         normal, gradient, chi2 = super()._products(p, levels, of_chunk)

@@ -23,6 +23,8 @@ _PERIODS = 25  # of the lowest mode, that a stretch holds at least
 _EDGE = 2  # lines of a stretch at each end of the band, which what lies beyond it reaches
 _LEAST = 1e-3  # of the sensor that moves most: how much of the motion of one that hardly moves counts in full
 _FEWEST = 8  # lines of a stretch for each mode
+_ABOUT = 12  # lines about a mode, of which ..
+_ABSORBED = 2  # .. its pole and transients explain so many
 
 
 class Stretch(NamedTuple):
@@ -37,9 +39,9 @@ class Stretch(NamedTuple):
     frequency, std : (m,)
         Hz, and its standard deviation, roughly, from what is left about its peak: too small by some times where a
         stretch has only a few lines there.
-    ratio : (m,)
     level : (m,)
-        Root mean square of what each mode makes of the acceleration of the sensor that it moves most, m/s².
+        Root mean square of what each mode makes of the acceleration of the sensor that it moves most, m/s² (see
+        `sysid.measurement.in_time.levels_are_known`).
     left, left_by_all : float
         Norms of what is left of the accelerations with poles of its own, and with those of all stretches together.
     """
@@ -49,7 +51,6 @@ class Stretch(NamedTuple):
     end: float
     frequency: Array
     std: Array
-    ratio: Array
     level: Array
     left: float
     left_by_all: float
@@ -84,7 +85,7 @@ def stretches_of(test: Measurement, omega: Array, ratios: Array) -> list[Stretch
     size = np.sqrt(np.mean(np.concatenate(moved, axis=1) ** 2, axis=1))
     noise = NoiseLevels(np.maximum(size, _LEAST * size.max()), np.zeros(test.n_base))
     cut = _as_test(test, pieces, rate, noise)
-    if cut is None or cut.freq.size < _FEWEST * omega.size:
+    if cut is None or cut.own_lines.sum(axis=1).min() < _FEWEST * omega.size:
         return []
     every = record_modes(cut, omega, ratios)
     return [
@@ -104,20 +105,29 @@ def _stretch(piece: Piece, every: RecordFit, test: Measurement) -> Stretch:
         unit[:m] ** 2 * np.diag(np.linalg.pinv(N * np.outer(unit, unit), hermitian=True))[:m] / 2 * _noise_at_peaks(own)
     )
     std = f * np.sqrt(np.where(variance > 0, variance, np.inf))  # round-off, of a mode that shows nowhere
-    return Stretch(piece.number, piece.start, piece.end, f, std, modes.ratios, _levels(own), _left(own), _left(held))
+    return Stretch(piece.number, piece.start, piece.end, f, std, _levels(own), _left(own), _left(held))
 
 
 def _noise_at_peaks(fit: RecordFit) -> Array:
-    """What is left about each mode, over the levels, (m,): the noise of the base is larger there than elsewhere.
+    """What noise there is about each mode, over the levels, (m,): that of the base is larger there than elsewhere.
 
-    Each line counts by what it tells of the frequency of the mode: the power of the response's slope in it.
+    Each line counts by what it tells of the frequency of the mode: the power of the response's slope in it. The few
+    lines at a peak may leave nothing beside poles and transients: what the base's noise makes there is told by lines
+    about it too, each by how much of that noise the sensors show.
     """
-    modes, total, weight = fit.parameters.modes, np.zeros(fit.model.m), np.zeros(fit.model.m)
+    modes, parts = fit.parameters.modes, []
     for chunk in fit.model.chunks(fit.parameters):
         slope = np.abs(chunk.g**2 * (modes.gamma @ chunk.run.base + chunk.pushed_by_ends)) ** 2
-        total += slope @ chunk.weighed(fit.levels).power  # of all sensors alike: the base's noise is in all of them
-        weight += np.sum(slope, axis=1)
-    return np.asarray(total / np.maximum(weight, np.finfo(float).tiny)) * fit.model.numbers / fit.freedom
+        own, _ = chunk.deviations(fit.levels)
+        passed = np.sum(np.abs(chunk.H) ** 2 * (own**2)[:, None, None], axis=(0, 1))
+        parts.append(np.vstack([chunk.run.w, chunk.weighed(fit.levels).power, passed, slope]))
+    w, left, passed, *slopes = np.concatenate(parts, axis=1)
+    weight = np.array(slopes) / np.maximum(np.sum(slopes, axis=1, keepdims=True), np.finfo(float).tiny)
+    of_base = []
+    for omega in modes.omega:
+        near = np.argsort(np.abs(w - omega))[:_ABOUT]
+        of_base.append(np.sum(left[near] / passed[near]) / max(near.size - _ABSORBED, 1))
+    return np.maximum(weight @ left * fit.model.numbers / fit.freedom, np.array(of_base) * (weight @ passed))
 
 
 def _left(fit: RecordFit) -> float:

@@ -1,0 +1,220 @@
+"""Frequencies that no linear structure has: they change along a record, from run to run, or with level."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from sysid.measurement.in_time import levels_are_known
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.complex_frequency import PolesAndResidues
+from sysid.modal_analysis.stretches import Stretch, stretches_of
+from sysid.problem.problem import Problem
+from sysid.structure.structure import Array
+
+_MOVED = 0.1  # half-power widths, by which the frequency of a mode changes at least
+_KNOWN = 0.5  # the same, to which it is known in a stretch
+_SURE = 6.0  # standard deviations of a change
+_EXPLAINED = 0.7  # of the squares that constant poles leave: poles that change leave no more
+_SHOWN = 0.03  # of the largest level of a mode, at which it shows
+_ENOUGH = 5  # stretches that tell a trend
+_TREND = 0.03  # chance of such an order of frequencies by level
+_SURE_TREND = 1e-3  # the same, where poles that change explain little: the level may change within stretches
+_OF_RUNS = 0.15  # of the variance of frequencies, that is left within runs where runs differ
+_CLOSE = 0.06  # of their frequency, within which modes ..
+_ONE_SHAPE = 0.9  # .. of one shape (modal assurance criterion) may be one that changes
+_LEAST_RATIO = 1e-4
+
+
+class Seen(NamedTuple):
+    """A mode in a stretch: the record and, in words, where in it; Hz; root mean square of its motion."""
+
+    record: str
+    part: str
+    frequency: float
+    std: float
+    level: float
+
+
+class Change:
+    """A mode in the stretches of all records.
+
+    Parameters
+    ----------
+    mode : float
+        Its frequency over all of them, Hz.
+    width : float
+        Half-power width, Hz.
+    seen : list of Seen
+    scaled : bool
+        Whether levels are in m/s².
+    """
+
+    def __init__(self, mode: float, width: float, seen: list[Seen], scaled: bool) -> None:
+        self.mode, self.width, self.scaled = mode, width, scaled
+        largest = max((one.level for one in seen), default=0.0)
+        self.seen = [one for one in seen if one.level > _SHOWN * largest]
+        self.frequency = np.array([one.frequency for one in self.seen])
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether two stretches differ by a part of the width, and beyond what noise makes of them."""
+        std = np.array([one.std for one in self.seen])
+        change = np.abs(self.frequency[:, None] - self.frequency)
+        return bool(np.any(change > np.maximum(_MOVED * self.width, _SURE * np.hypot(std[:, None], std))))
+
+    @property
+    def size(self) -> float:
+        """In half-power widths."""
+        return float(np.ptp(self.frequency)) / self.width
+
+    @cached_property
+    def trend(self) -> float:
+        """Rank correlation of frequency and level; zero where chance or time make as large a one."""
+        return self.trend_of(_TREND)
+
+    def trend_of(self, chance: float) -> float:
+        """The same, where chance makes as large a one no more often than stated."""
+        from scipy.stats import spearmanr
+
+        if len(self.seen) < _ENOUGH:
+            return 0.0
+        found = spearmanr([one.level for one in self.seen], self.frequency)
+        in_time = abs(spearmanr(np.arange(len(self.seen)), self.frequency).statistic)
+        return float(found.statistic) if found.pvalue < chance and abs(found.statistic) > in_time else 0.0
+
+    def in_words(self) -> str:
+        """How the frequency changes, and what to do."""
+        records = list(dict.fromkeys(one.record for one in self.seen))
+        own = {record: [one for one in self.seen if one.record == record] for record in records}
+        within = np.mean([np.var([one.frequency for one in part]) for part in own.values()])
+        if len(records) > 1 and within < _OF_RUNS * np.var(self.frequency):
+            return self._by_record(own)
+        if self.trend != 0.0:
+            return self._by_level()
+        low, high = self.seen[int(np.argmin(self.frequency))], self.seen[int(np.argmax(self.frequency))]
+        ends = (f"{one.frequency:.4g} Hz at {one.part} of {one.record}" for one in (low, high))
+        return (
+            f"changes along the records, from {' to '.join(ends)}: the structure is not the same all the time (level, "
+            "temperature, joints); fit a part in which it is"
+        )
+
+    def _by_record(self, own: dict[str, list[Seen]]) -> str:
+        means = {r: np.mean([(one.frequency, one.level) for one in part], axis=0) for r, part in own.items()}
+        told = ", ".join(f"{f:.4g} Hz in {record} at {self._motion(level)}" for record, (f, level) in means.items())
+        return f"differs from record to record ({told}): fit them one by one, and find what changed between them"
+
+    def _by_level(self) -> str:
+        first, *_, last = sorted(self.seen, key=lambda one: one.level)
+        rises, softens = ("falls", "softens") if self.trend < 0 else ("rises", "stiffens")
+        return (
+            f"{rises} as the motion grows, from {first.frequency:.4g} Hz at {self._motion(first.level)} to "
+            f"{last.frequency:.4g} Hz at {self._motion(last.level)} of the sensor that it moves most: the structure "
+            f"{softens}, and no linear model holds at all levels; fit runs of the level of interest"
+        )
+
+    def _motion(self, level: float) -> str:
+        """A level in words."""
+        least = min(one.level for one in self.seen)
+        return f"{level:.2g} m/s² rms" if self.scaled else f"{level / least:.2g} times the least motion"
+
+
+def changes_in_words(problem: Problem) -> tuple[str, ...]:
+    """The mode whose frequency changes most between stretches of all records, in a sentence; none where none does.
+
+    Parameters
+    ----------
+    problem : Problem
+        The tests that were never fitted are looked at too.
+    """
+    found = changes(problem)
+    if not found:
+        return ()
+    most = max(found, key=lambda one: (one.trend != 0, one.size))
+    others = ", ".join(f"{one.mode:.3g}" for one in found if one is not most)
+    also = f" (and of those near {others} Hz)" if others else ""
+    return (f"the frequency of the mode near {most.mode:.3g} Hz{also} {most.in_words()}",)
+
+
+def changes(problem: Problem) -> list[Change]:
+    """Modes whose frequencies change between stretches of all records, by more than noise makes of them."""
+    if not problem.formulation.fits_records:
+        return []
+    tests, scaled = [problem.measurement], levels_are_known(problem.measurement)
+    tests += [test for test in problem.validation if scaled and levels_are_known(test)]
+    every = _modes(problem.screened.measurement)
+    if every is None:
+        return []
+    modes, apart = every.joined(_CLOSE * every.omega), every.joined(2 * every.ratios * every.omega)
+    made = [stretches_of(test, modes.omega, modes.ratios) for test in tests]
+    # Modes of one shape that are close may be two, with constant poles that explain the records.
+    held = made
+    if modes.omega.size < apart.omega.size:
+        held = [stretches_of(test, apart.omega, apart.ratios) for test in tests]
+    constant = sum(one.left_by_all**2 for part in held for one in part)
+    changing = sum(min(one.left, one.left_by_all) ** 2 for part in made for one in part)
+    if 0 < constant < changing:
+        return []
+    found = []
+    for k, (f, ratio) in enumerate(zip(modes.omega / (2 * np.pi), modes.ratios, strict=True)):
+        width = 2 * ratio * f
+        seen = [one for i, part in enumerate(made) for one in _seen(part, k, width, i, tests[i])]
+        change = Change(f, width, seen, scaled)
+        if change.is_clear and (changing < _EXPLAINED * constant or change.trend_of(_SURE_TREND)):
+            found.append(change)
+    return found
+
+
+class Poles(NamedTuple):
+    """Poles that records show: rad/s, damping ratios, (m,); unit shapes of all that they move, (.., m)."""
+
+    omega: Array
+    ratios: Array
+    shapes: Array
+
+    def joined(self, reach: Array) -> Poles:
+        """With those of one shape, as a fit makes of a mode that changes, taken for one within a `reach` in rad/s."""
+        groups: list[list[int]] = []
+        for k, omega in enumerate(self.omega):
+            near = [group for group in groups if omega - self.omega[group[0]] < reach[[k, *group]].max()]
+            like = [
+                group
+                for group in near
+                if len(self.shapes) > 1 and (self.shapes[:, group[0]] @ self.shapes[:, k]) ** 2 > _ONE_SHAPE
+            ]
+            if like:
+                like[-1].append(k)
+            else:
+                groups.append([k])
+        omega = np.array([self.omega[group].mean() for group in groups])
+        ratios = np.array([self.ratios[group].max() for group in groups])
+        return Poles(omega, ratios, self.shapes[:, [group[0] for group in groups]])
+
+
+def _modes(test: Measurement) -> Poles | None:
+    """Poles of a test; None where it shows none."""
+    if test.modal is not None:
+        omega, ratios, shapes = test.modal.omega, test.modal.ratios, test.modal.phi
+    else:
+        poles = PolesAndResidues.of(test)
+        if poles is None:
+            return None
+        omega, ratios, shapes = poles.omega, poles.ratios, poles.residues.reshape(poles.omega.size, -1).T
+    if not omega.size:
+        return None
+    shapes = shapes / np.maximum(np.linalg.norm(shapes, axis=0), np.finfo(float).tiny)
+    return Poles(omega, np.maximum(ratios, _LEAST_RATIO), shapes)
+
+
+def _seen(stretches: list[Stretch], k: int, width: float, number: int, test: Measurement) -> list[Seen]:
+    """A mode in the stretches of a test in which it is known; test 0 is the one that was fitted."""
+    made = []
+    for one in stretches:
+        run = f"run {one.run + 1}" if test.n_runs > 1 else "the record"
+        record = run if number == 0 else f"{run} of unfitted test {number}"
+        if one.std[k] < _KNOWN * width and one.left <= one.left_by_all:
+            part = f"{one.start:.3g} to {one.end:.3g} s"
+            made.append(Seen(record, part, float(one.frequency[k]), float(one.std[k]), float(one.level[k])))
+    return made
