@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
 import sysid
 from benchmarks.line import Line
 from benchmarks.problem_modules import load_module
-from benchmarks.swarm.shake_table import DATA
+from benchmarks.swarm.shake_table import ABSENT, EVENTS, records_folder
 from sysid.modal_analysis.record_fit import RecordFit, record_modes, refitted
 
-EVENTS = ("sine_1p5", "sine_2p0")
 WITHIN = 1.5
 MODES = np.array([3.75, 11.2, 16.6])  # Hz, bending along X, by others
 NEAR = 0.02
@@ -24,13 +21,10 @@ SHIFTS = 4  # partitions, each begun a part of a block later
 
 
 def lines(reduced: bool) -> Iterator[Line]:
-    """mini_shake_table, fitted on either event, in the reduced form on one; `swarm.shake_table` holds its scores.
-
-    The variable SYSID_DATA names the folder of both events; by default it is looked for beside the checkout.
-    """
-    data = Path(os.environ.get("SYSID_DATA") or DATA)
-    if not data.is_dir():
-        yield Line("mini_shake_table", "records absent: not run (set SYSID_DATA to their folder)")
+    """mini_shake_table, fitted on either event, in the reduced form on one; `swarm.shake_table` holds its scores."""
+    data = records_folder()
+    if data is None:
+        yield ABSENT
         return
     event = load_module("mini_shake_table").event
     for name in EVENTS[: 1 if reduced else None]:
