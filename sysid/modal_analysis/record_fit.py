@@ -113,12 +113,11 @@ class RecordFit:
 
     def information(self) -> Array:
         """``Re J' S^-1 J`` over the unknowns of `Index`, less what transients and traces explain of it; (p, p)."""
-        model, N = self.model, self.normal
-        kept, size = model.kept, np.sqrt(np.maximum(np.diag(N), 1e-300))
-        scaled = N / np.outer(size, size)
-        turned = half_inverse(scaled[kept:, kept:], 1e-12).T @ scaled[kept:, :kept]
+        model, kept = self.model, self.model.kept
+        N, size = scaled(self.normal)
+        turned = half_inverse(N[kept:, kept:], 1e-12).T @ N[kept:, :kept]
         A = np.zeros((model.index.size, model.index.size))
-        A[:kept, :kept] = (scaled[:kept, :kept] - turned.T @ turned) * np.outer(size[:kept], size[:kept])
+        A[:kept, :kept] = (N[:kept, :kept] - turned.T @ turned) * np.outer(size[:kept], size[:kept])
         return A
 
     @property
@@ -287,6 +286,12 @@ def _equations(model: RecordModel, coarse: RecordModel | None, p: Parameters, le
     if coarse is None:
         return model.normal_equations(p, levels)
     return model.gradient(p, levels)._replace(normal=coarse.normal_equations(p, levels).normal)
+
+
+def scaled(normal: Array) -> tuple[Array, Array]:
+    """A normal matrix (p, p) of unknowns in units in which its diagonal is one, and these units, (p,)."""
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    return normal / np.outer(size, size), size
 
 
 def half_inverse(normal: Array, least: float) -> Array:
