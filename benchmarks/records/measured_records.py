@@ -11,7 +11,7 @@ import sysid
 from benchmarks.line import Line
 from benchmarks.problem_modules import load_module
 from benchmarks.swarm.shake_table import ABSENT, EVENTS, records_folder
-from sysid.modal_analysis.record_fit import RecordFit, record_modes, refitted, scaled
+from sysid.modal_analysis.record_fit import RecordFit, record_modes, refitted, unit_diagonal
 
 WITHIN = 1.5
 MODES = np.array([3.75, 11.2, 16.6])  # Hz, bending along X, by others
@@ -88,6 +88,6 @@ def _refitted(fit: RecordFit, keep: np.ndarray) -> RecordFit:
 
 def _variances(fit: RecordFit) -> np.ndarray:
     """Relative variances of frequencies where what is left is white noise of the fit's levels."""
-    information, size = scaled(fit.information())
+    information, size = unit_diagonal(fit.information())
     variance = np.diag(np.linalg.pinv(information, rcond=1e-11, hermitian=True)) / size**2
     return variance[fit.model.index.log_omega] / 2

@@ -49,6 +49,8 @@ class NoiseLevels:
     def of(self, runs: int, n_sensors: int, d: int, force: bool) -> NoiseLevels:
         """The levels of a test of so many runs and channels: one number for all of a kind will do.
 
+        Those given as a row a run stay so, (runs, channels); others are (channels,).
+
         Raises
         ------
         InputError

@@ -114,7 +114,7 @@ class RecordFit:
     def information(self) -> Array:
         """``Re J' S^-1 J`` over the unknowns of `Index`, less what transients and traces explain of it; (p, p)."""
         model, kept = self.model, self.model.kept
-        N, size = scaled(self.normal)
+        N, size = unit_diagonal(self.normal)
         turned = half_inverse(N[kept:, kept:], 1e-12).T @ N[kept:, :kept]
         A = np.zeros((model.index.size, model.index.size))
         A[:kept, :kept] = (N[:kept, :kept] - turned.T @ turned) * np.outer(size[:kept], size[:kept])
@@ -210,14 +210,13 @@ def _fit(
         levels = np.maximum(np.concatenate([stated.outputs, stated.base], axis=-1) ** 2, least)
     elif levels is None:
         levels = _rough_levels(model, p)
-    unknowns = model.size - (0 if model.force else model.m)
     settled, chi2 = False, np.inf
     for round_ in range(limits.rounds):
         p, chi2, done = _minimise(model, p, levels, monitor, (10 * round_, limits.steps), coarse)
         if stated is not None:
             settled = done
             break
-        before, levels = levels, likeliest_levels(model, p, levels, unknowns)
+        before, levels = levels, likeliest_levels(model, p, levels, model.unknowns)
         if done and np.all(np.abs(np.log(levels / before)) < 2 * _SAME_LEVELS):
             settled = True
             break
@@ -288,8 +287,8 @@ def _equations(model: RecordModel, coarse: RecordModel | None, p: Parameters, le
     return model.gradient(p, levels)._replace(normal=coarse.normal_equations(p, levels).normal)
 
 
-def scaled(normal: Array) -> tuple[Array, Array]:
-    """A normal matrix (p, p) of unknowns in units in which its diagonal is one, and these units, (p,)."""
+def unit_diagonal(normal: Array) -> tuple[Array, Array]:
+    """A normal matrix (p, p) divided so that its diagonal is one, and the roots of the diagonal that it had, (p,)."""
     size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     return normal / np.outer(size, size), size
 

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.linalg
 
 from sysid.measurement.whole import Gains
-from sysid.modal_analysis.record_fit import RecordFit, half_inverse, scaled
+from sysid.modal_analysis.record_fit import RecordFit, half_inverse, unit_diagonal
 from sysid.structure.structure import Array
 
 _SEEN = 1e-10  # of the largest eigenvalue of the scaled information; less is round-off
@@ -22,7 +22,7 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     (n, d), at = G.shape, fit.model.size  # what is asked for comes behind all that was fitted
     beyond = max(fit.reduced, 1.0)
     along = scipy.linalg.block_diag(np.eye(at), scipy.linalg.block_diag(*G[:, :, None]), np.eye(n * d))
-    normal, size = scaled(along.T @ made.normal @ along)
+    normal, size = unit_diagonal(along.T @ made.normal @ along)
     gradient = along.T @ made.gradient / size
 
     def estimate(count: int) -> tuple[Array, Array]:
@@ -52,7 +52,7 @@ def _rigid(fit: RecordFit, beyond: float) -> tuple[Array, Array]:
     """Share of the base's motion in each sensor beside what G says, (n_sensors, d), and its chi-squared of each."""
     made, (n, d), at = fit.equations, fit.test.rigid_body.shape, fit.model.size
     count = at + n * d
-    normal, size = scaled(made.normal[:count, :count])
+    normal, size = unit_diagonal(made.normal[:count, :count])
     half = half_inverse(normal, _SEEN)
     step = (half @ (half.T @ (made.gradient[:count] / size)))[at:].reshape(n, d)
     own = half[at:].reshape(n, d, -1)

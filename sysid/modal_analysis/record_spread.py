@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.modal_analysis.record_fit import RecordFit, half_inverse, scaled
+from sysid.modal_analysis.record_fit import RecordFit, half_inverse, unit_diagonal
 from sysid.modal_analysis.record_model import Chunk, Run
 from sysid.structure.structure import Array
 
@@ -47,7 +47,7 @@ def scatter(fit: RecordFit) -> Array | None:
 def scatter_over_blocks(fit: RecordFit) -> Array:
     """The same, whatever is left."""
     model, p = fit.model, fit.parameters
-    N, size = scaled(fit.normal)
+    N, size = unit_diagonal(fit.normal)
     half = half_inverse(N, 1e-12)
     meat = np.zeros((half.shape[1],) * 2)
     columns = [Chunk(model, p, run.at(slice(0, 1))).columns() for run in model.runs]
