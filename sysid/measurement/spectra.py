@@ -228,24 +228,7 @@ def resample(
     from scipy.signal import butter, sosfiltfilt
 
     given = sequence("records", records, "a list of (time, samples)")
-    clocks, samples = [], []
-    for place, entry in enumerate(given, start=1):
-        time, values = sequence(f"record {place}", entry, "(time, samples)", 2)
-        t = finite_array(f"time of record {place}", time)
-        x = np.atleast_2d(finite_array(f"samples of record {place}", values))
-        if t.ndim != 1 or x.ndim != 2 or x.shape[1] != t.size or t.size < 4:
-            raise InputError(f"record {place}: time {t.shape} and samples {x.shape} disagree (or fewer than 4 samples)")
-        gaps = np.diff(t)
-        widest, back = np.argmax(gaps), np.argmax(gaps <= 0)
-        refuse(
-            (gaps[back] <= 0, f"record {place}: time does not rise at sample {back + 1}"),
-            (
-                gaps[widest] > 3 * np.median(gaps),
-                f"record {place}: a gap of {gaps[widest]:.4g} s at {t[widest]:.6g} s; cut it there",
-            ),
-        )
-        clocks.append(t)
-        samples.append(x)
+    clocks, samples = map(list, zip(*(_timed(f"record {i}", one) for i, one in enumerate(given, start=1)), strict=True))
     rates = np.array([(t.size - 1) / (t[-1] - t[0]) for t in clocks])
     rate = float(rates.min()) if sample_rate is None else number("sample_rate", sample_rate)
     if not 0 < rate <= 1.01 * rates.min():
@@ -263,6 +246,24 @@ def resample(
         samples = [sosfiltfilt(sos, x, axis=-1) for sos, x in zip(filters, samples, strict=True)]
     splines = [CubicSpline(t, x, axis=-1) for t, x in zip(clocks, samples, strict=True)]
     return time, [np.asarray(spline(np.minimum(time, spline.x[-1]))) for spline in splines]
+
+
+def _timed(name: str, entry: Any) -> tuple[Array, Array]:
+    """Times (n,) that rise without gaps, and samples (channels, n), of a pair of both."""
+    time, values = sequence(name, entry, "(time, samples)", 2)
+    t, x = finite_array(f"time of {name}", time), np.atleast_2d(finite_array(f"samples of {name}", values))
+    if t.ndim != 1 or x.ndim != 2 or x.shape[1] != t.size or t.size < 4:
+        raise InputError(f"{name}: time {t.shape} and samples {x.shape} disagree (or fewer than 4 samples)")
+    gaps = np.diff(t)
+    widest, back = np.argmax(gaps), np.argmax(gaps <= 0)
+    refuse(
+        (gaps[back] <= 0, f"{name}: time does not rise at sample {back + 2}"),  # from 1, as in files
+        (
+            gaps[widest] > 3 * np.median(gaps),
+            f"{name}: a gap of {gaps[widest]:.4g} s at {t[widest]:.6g} s; cut it there",
+        ),
+    )
+    return t, x
 
 
 def _record(name: str, value: ArrayLike, channels: int) -> Array:

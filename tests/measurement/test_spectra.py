@@ -361,7 +361,7 @@ class TestResample:
                 [(np.arange(9.0), np.ones(9)), (np.arange(9.0), np.full(9, np.nan))],
                 None,
             ),
-            ("time does not rise at sample 3", [([0, 1, 2, 2, 3.0], np.ones(5))], None),
+            ("time does not rise at sample 4", [([0, 1, 2, 2, 3.0], np.ones(5))], None),
             ("a gap of 5 s at 2 s", [([0, 1, 2, 7, 8, 9.0], np.ones(6))], None),
             ("no time in common", [(np.arange(9.0), np.ones(9)), (np.arange(20.0, 29), np.ones(9))], None),
             ("sample_rate = 2 Hz", [(np.arange(9.0), np.ones(9))], 2.0),
