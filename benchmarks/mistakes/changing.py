@@ -40,12 +40,12 @@ def response(base: np.ndarray, factor: Callable[[float], float] = lambda t: 1.0,
     h, n = 1 / RATE / STEPS, base.size
     u = CubicSpline(np.arange(n), base)(np.arange(2 * STEPS * (n - 1) + 1) / (2 * STEPS))
 
-    def rates(state: np.ndarray, base: float, t: float) -> np.ndarray:
+    def rates(state: np.ndarray, moved: float, t: float) -> np.ndarray:
         x1, x2, v1, v2 = state
         k1, k2 = factor(t) * SPRINGS
         f1 = k1 * x1 / np.sqrt(1 + softening * x1 * x1) + DAMPERS[0] * v1
         f2 = k2 * (x2 - x1) + DAMPERS[1] * (v2 - v1)
-        return np.array([v1, v2, (f2 - f1) / MASSES[0] - base, -f2 / MASSES[1] - base])
+        return np.array([v1, v2, (f2 - f1) / MASSES[0] - moved, -f2 / MASSES[1] - moved])
 
     state, out = np.zeros(4), np.empty((2, n))
     for i in range(n):
