@@ -10,7 +10,17 @@ import numpy as np
 
 import sysid
 from benchmarks.line import Line, above, below
-from benchmarks.mistakes.changing import SECONDS, SOFTENING, measured, motion, noisy, response
+from benchmarks.mistakes.changing import (
+    SECONDS,
+    SOFTENING,
+    at_rest,
+    measured,
+    motion,
+    noisy,
+    of_lines,
+    response,
+    tuned_mass,
+)
 from benchmarks.modal.spread import spread
 from benchmarks.problem_modules import load_module
 from benchmarks.swarm.shake_table import ABSENT, EVENTS, records_folder
@@ -30,11 +40,17 @@ SEEDS = {
     "runs": 4,
     "linear": 6,
     "wrong": 5,
+    "wrong, at rest": 14,
+    "tuned mass": 10,
 }  # of all draws of a kind
 
 
 class Case(NamedTuple):
-    """A kind of change ("linear" for none, "wrong" for linear with wrong masses), a form of the mass, and the draw."""
+    """A kind of change, a form of the mass, and the draw.
+
+    Linear are "linear", "wrong" (with wrong masses), "wrong, at rest" (the same, as plain spectra of runs of two
+    lengths) and "tuned mass" (a mode more than sensors can tell, near another of its shape).
+    """
 
     kind: str
     form: str
@@ -46,8 +62,12 @@ def lines(reduced: bool) -> Iterator[Line]:
     forms = [*FORMS][: 1 if reduced else None]
     changing = [Case(kind, form, s) for kind in TOLD for form in forms for s in range(1 if reduced else 10)]
     linear = [Case("linear", form, seed) for form in forms for seed in range(2 if reduced else 20)]
-    wrong = [Case("wrong", "stated masses", seed) for seed in range(1 if reduced else 10)]
-    every = [*changing, *linear, *wrong]
+    others = [
+        Case(kind, "stated masses", seed)
+        for kind in ("wrong", "wrong, at rest", "tuned mass")
+        for seed in range(1 if reduced else 10)
+    ]
+    every = [*changing, *linear, *others]
     told = dict(zip(every, spread(said, every), strict=True))
     shown = lambda some: "".join(f"; {one.form}, draw {one.seed}: {told[one][:200]!r}" for one in some[:3])  # noqa: E731
     for kind, words in TOLD.items():
@@ -55,7 +75,7 @@ def lines(reduced: bool) -> Iterator[Line]:
         missed = [case for case in cases if not re.search("|".join(words), told[case])]
         yield above(f"{kind}: of {len(cases)} told so{shown(missed)}", 1 - len(missed) / len(cases), SHARE)
     for what, cases, accuses in (
-        ("linear structures", linear, f"{MISSED}|{CHANGES}"), ("linear, wrong masses stated", wrong, CHANGES),
+        ("linear structures", linear, f"{MISSED}|{CHANGES}"), ("linear, wrong masses or a tuned mass", others, CHANGES),
     ):  # fmt: skip
         accused = [case for case in cases if re.search(accuses, told[case])]
         yield below(f"{what}, of {len(cases)}: accused{shown(accused)}", len(accused), 0)
@@ -67,6 +87,7 @@ def said(case: Case) -> str:
     rng = np.random.default_rng((case.seed, SEEDS[case.kind]))
     first, second = motion(rng), motion(rng)
     unseen: list[sysid.Measurement] = []
+    estimator = "records"
     if case.kind == "level along":
         base = first * np.interp(np.arange(first.size), [0, first.size - 1], [0.2, 2.0])
         runs = [noisy(rng, base, response(base, softening=SOFTENING))]
@@ -78,11 +99,19 @@ def said(case: Case) -> str:
         runs = [noisy(rng, first, response(first, lambda t: 1 - 0.06 * t / SECONDS))]
     elif case.kind == "runs":
         runs = [noisy(rng, first, response(first)), noisy(rng, second, response(second, lambda t: 0.94))]
+    elif case.kind == "tuned mass":
+        runs = [noisy(rng, first, of_lines(tuned_mass(float(rng.uniform(0.001, 0.01))), first[None])[:2])]
+    elif case.kind == "wrong, at rest":
+        estimator = "spectra"
+        first, second = (at_rest(base) for base in (first, second[: int(0.9 * second.size)]))
+        runs = [noisy(rng, first, response(first), 0.005), noisy(rng, 2 * second, response(2 * second), 0.005)]
     else:
         runs = [noisy(rng, first, response(first)), noisy(rng, 2 * second, response(2 * second))]
-    masses = np.diag([2.0, 2.0, 0.0]) if case.kind == "wrong" else FORMS[case.form]()
+    masses = np.diag([2.0, 2.0, 0.0]) if case.kind.startswith("wrong") else FORMS[case.form]()
     try:
-        result = sysid.identify(sysid.Problem(measured(*runs), mass=masses, validation=unseen), rng=0)
+        result = sysid.identify(
+            sysid.Problem(measured(*runs, estimator=estimator), mass=masses, validation=unseen), rng=0
+        )
     except (sysid.InputError, sysid.SolverError) as error:
         return str(error)
     return "; ".join(result.confidence)

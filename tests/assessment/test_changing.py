@@ -7,7 +7,18 @@ import pytest
 import scipy.linalg
 
 import sysid
-from benchmarks.mistakes.changing import DAMPERS, MASSES, SECONDS, SPRINGS, frequencies, motion, noisy
+from benchmarks.mistakes.changing import (
+    DAMPERS,
+    MASSES,
+    RATE,
+    SECONDS,
+    SPRINGS,
+    frequencies,
+    motion,
+    noisy,
+    of_lines,
+    tuned_mass,
+)
 from benchmarks.mistakes.changing import measured as as_test
 from benchmarks.mistakes.changing import response as answer
 from sysid.assessment.changing import changes, changes_in_words
@@ -79,24 +90,11 @@ def test_a_drift_along_a_record_is_told_with_when_and_what():
     assert it.confidence[0] == told or "times their noise" in it.confidence[0]
 
 
-def linear(structure, base, rng, rate=80.0):
-    """Records of a linear structure under periodic base motion (d, n), by its response at each line, with 2 % noise."""
-    freq = np.fft.rfftfreq(base.shape[1], 1 / rate)
-    H = np.repeat(structure.rigid_body[:, :, None], freq.size, axis=2).astype(complex)
-    H[..., 1:] += structure.relative_acceleration(freq[1:])
-    records = base, np.fft.irfft(np.einsum("sdf,df->sf", H, np.fft.rfft(base)), base.shape[1])
-    noisy_ones = (record + 0.02 * base.std() * rng.standard_normal(record.shape) for record in records)
-    return (*noisy_ones, None)
-
-
 def test_two_close_modes_of_one_shape_are_no_mode_that_changes():
     rng = np.random.default_rng(0)
-    k1, k2, tuned = 2400.0, 1500.0, 0.002 * (2 * np.pi * frequencies(SPRINGS)[0]) ** 2  # a mass of 2 g on the roof
-    M = np.diag([2.0, 1.0, 0.002, 0.0])
-    K = np.array([[k1 + k2, -k2, 0, -k1], [-k2, k2 + tuned, -tuned, 0], [0, -tuned, tuned, 0], [-k1, 0, 0, k1]])
-    both = sysid.Structure(M, K, np.array([0.01, 0.01, 0.015]), n_base=1)
-    base, floors, _ = linear(both, motion(rng)[None], rng)
-    test = sysid.Measurement.from_time([(base, floors[:2], None)], 80.0, rigid_body=np.ones((2, 1)), band=(0.5, 12.0))
+    base = motion(rng)
+    records = noisy(rng, base, of_lines(tuned_mass(0.002), base[None])[:2])
+    test = as_test(records).in_band(0.5, 12.0)
     problem = sysid.Problem(test, mass=sysid.FullMass())
     assert problem.screened.measurement.modal.omega.size == 3
     assert changes(problem) == []
@@ -109,7 +107,9 @@ def test_a_base_direction_that_does_not_move_in_an_unfitted_test_is_no_error():
     structure = sysid.Structure(M, K, np.array([0.01, 0.02]), n_base=2)
     base = np.vstack([motion(rng), motion(rng)])
     made = {"rigid_body": structure.rigid_body, "base_axes": "xy", "band": (0.5, 20.0)}
-    fitted = sysid.Measurement.from_time([linear(structure, base, rng)], 80.0, **made)
-    u, y, _ = linear(structure, base * [[1.0], [0.0]], rng)
-    unseen = sysid.Measurement.from_time([(u * [[1.0], [0.0]], y, None)], 80.0, **made)
+    alone = base * [[1.0], [0.0]]
+    spoil = lambda record: record + 0.02 * record.std() * rng.standard_normal(record.shape)  # noqa: E731
+    fitted, unseen = (
+        sysid.Measurement.from_time([(u, spoil(of_lines(structure, u)), None)], RATE, **made) for u in (base, alone)
+    )
     assert changes_in_words(sysid.Problem(fitted, mass=sysid.FullMass(), validation=[unseen])) == ()
