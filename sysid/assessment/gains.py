@@ -202,7 +202,7 @@ def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, o
 
     The poles of `slopes` (rows, 2 m inputs) move with them, in a Gauss-Newton step: they were fitted without them.
     """
-    each, lines = records.data.shape[1] // test.n_sensors, test.freq.size
+    each = records.data.shape[1] // test.n_sensors
     by_sensor = lambda x: np.sum(x, axis=-2).reshape(*x.shape[:-2], each, test.n_sensors).sum(axis=-2)  # noqa: E731
     rigid, beside = _rigid_motion(test, records), _less(Q, free.left)
     extra, slopes = _less(Q, ones), _less(Q, slopes)
@@ -223,7 +223,8 @@ def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, o
     steps = inverse @ (pull - across @ error)
     along = (steps[:, None, None] * moved).reshape(slopes.shape[1], moved.shape[-1])
     left = beside - column * np.tile(error, each) - slopes @ along
-    by_line = by_sensor((left * column).reshape(2, -1, lines, left.shape[1]).sum(axis=0)[..., None, :])
+    of_lines = records.in_runs(left * column)
+    by_line = by_sensor((of_lines.real + of_lines.imag)[..., None, :])
     variance = np.array([_variance(own) for own in np.moveaxis(by_line, -1, 0)]) / size
     noise = by_sensor(left**2) / max((len(left) - Q.shape[1]) * each - 1, 1)
     noise = np.maximum(noise, _EXACT**2 * records.size / left.size)

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from sysid.assessment.sensitivity import sensitivity
@@ -230,7 +231,7 @@ def _weighted_misfits(result: Identification) -> Iterator[tuple[ComplexArray, fl
         parts = [(test.relative - test.predict(structure), test.response_std)]
         if test.force is not None:
             parts.append((test.force - test.predict_force(structure), test.force_std))
-        weighed = [_over(misfit, std) for misfit, std in parts]
+        weighed = [_over(misfit, std, test.own_lines) for misfit, std in parts]
         if all(std is not None for _, std in parts):
             yield np.concatenate([e for e, _ in weighed]), sum(log_std for _, log_std in weighed)
         else:
@@ -251,12 +252,16 @@ def _noise(result: Identification) -> float:
         return float(np.mean(counted**2) / (1.0 if test.response_std is None else np.mean(test.response_std**2)))
     if test.response_std is not None:
         return 1.0
-    return float(np.mean(np.abs(test.relative - test.predict(result.structure)) ** 2))
+    return float(
+        np.mean(np.abs(outliers.at_own_lines(test.relative - test.predict(result.structure), test.own_lines)) ** 2)
+    )
 
 
-def _over(misfit: ComplexArray, std: Array | None) -> tuple[ComplexArray, float]:
+def _over(misfit: ComplexArray, std: Array | None, own: NDArray[np.bool_]) -> tuple[ComplexArray, float]:
     floored = raised(std)
-    return (misfit.ravel(), 0.0) if floored is None else (np.ravel(misfit / floored), float(np.sum(np.log(floored))))
+    if floored is None:
+        return outliers.at_own_lines(misfit, own), 0.0
+    return outliers.at_own_lines(misfit / floored, own), float(np.sum(np.log(floored).transpose(0, 2, 1)[own]))
 
 
 def _parameters(result: Identification) -> int:

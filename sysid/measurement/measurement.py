@@ -233,6 +233,12 @@ class Measurement:
         return np.any(self.base != 0, axis=1)
 
     @property
+    def numbers(self) -> int:
+        """How many complex numbers were recorded: of all responses, and forces, at each run's own lines."""
+        forces = 0 if self.force is None else self.n_base
+        return int(np.count_nonzero(self.own_lines)) * (self.n_sensors + forces)
+
+    @property
     def has_unit_runs(self) -> bool:
         """Whether run i is unit motion in base direction i alone, so that responses are transmissibilities."""
         return self.n_runs == self.n_base and np.array_equal(self.base, unit_runs(self.n_base, self.freq.size))

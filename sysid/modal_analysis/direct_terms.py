@@ -180,15 +180,16 @@ def _fitted(records: Records, omega: Array, ratios: Array) -> _Fit:
         _by_sensor(records, of_modes.sum(axis=0, keepdims=True))[0],
         gained > noise * beyond_chance(beyond.shape[1] * left.shape[1]),
         float(np.linalg.norm(left) / np.sqrt(records.size)),
-        _spikes(records.in_runs(left), _ROUND_OFF * np.sqrt(records.size / records.data.size)),
+        _spikes(records, left),
     )  # fmt: skip
 
 
-def _spikes(left: ComplexArray, least: float) -> NDArray[np.bool_]:
-    """Lines of errors (runs, n_freq, channels) with a number far off its neighbours; none where these are many."""
-    size = np.abs(left)
-    level = np.maximum(np.median(size, axis=1, keepdims=True), least)
-    far = np.any(size > _FAR * level, axis=(0, 2))
+def _spikes(records: Records, left: Array) -> NDArray[np.bool_]:
+    """Lines (n_freq,) at which a fit leaves a number far off those of its run; none where these are many."""
+    size = np.hypot(*left.reshape(2, -1, left.shape[1]))
+    level = np.stack([np.median(size[records.run == run], axis=0) for run in range(len(records.blocks))])
+    level = np.maximum(level, _ROUND_OFF * np.sqrt(records.size / records.data.size))
+    far = records.largest(np.any(size > _FAR * level[records.run], axis=1)) > 0
     return far if np.count_nonzero(far) < _FEW * far.size else np.zeros_like(far)
 
 

@@ -52,11 +52,13 @@ def misfits_of(test: Measurement, structure: Structure, unknowns: int) -> list[t
     parts = [(test.response, test.response_std, test.relative - test.predict(structure))]
     if test.force is not None:
         parts.append((test.force, test.force_std, test.force - test.predict_force(structure)))
-    left = max(1 - unknowns / (2 * sum(misfit.size for *_, misfit in parts)), 0.5)
+    lines = np.count_nonzero(test.own_lines)  # of all runs
+    left = max(1 - unknowns / (2 * test.numbers), 0.5)
     made: list[tuple[ComplexArray, Array]] = []
     for record, stated, misfit in parts:
-        noise = np.sqrt(np.mean(np.abs(misfit) ** 2) / left) if stated is None else stated
-        least = _EXACT * np.sqrt(np.mean(np.abs(record) ** 2))
+        numbers = lines * record.shape[1]
+        noise = np.sqrt(np.sum(np.abs(misfit) ** 2) / numbers / left) if stated is None else stated
+        least = _EXACT * np.sqrt(np.sum(np.abs(record) ** 2) / numbers)
         made.append((misfit, np.broadcast_to(np.maximum(noise, least), record.shape)))
     return made
 
@@ -75,7 +77,7 @@ def inflation_of(test: Measurement, records: list[Record], unknowns: int) -> flo
 
     From the size of the misfit, and from its correlation between neighbouring lines, as in averaged spectra.
     """
-    freedom = 2 * sum(record.misfit.size for record in records) - unknowns
+    freedom = 2 * test.numbers - unknowns
     if freedom <= 0:
         stated = test.response_std is not None and (test.force is None or test.force_std is not None)
         return 1.0 if stated else np.nan

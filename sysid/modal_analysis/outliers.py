@@ -72,10 +72,19 @@ Flags = NDArray[np.bool_]
 
 
 class Whitened(NamedTuple):
-    """Misfit of a record in units of its noise, and these units, (runs, channels, n_freq)."""
+    """Misfit of a record in units of its noise, and these units, (runs, channels, n_freq).
+
+    `own` tells which lines are a run's own, (runs, n_freq).
+    """
 
     u: ComplexArray
     std: Array
+    own: Flags
+
+    @property
+    def numbers(self) -> ComplexArray:
+        """Those of `u` at each run's own lines, one after the other."""
+        return at_own_lines(self.u, self.own)
 
 
 class Outlier(NamedTuple):
@@ -105,21 +114,26 @@ def whitened(test: Measurement, made: Sequence[ComplexArray], unknowns: int) -> 
     found = [(test.response, test.relative - made[0], test.response_std)]
     if test.force is not None:
         found.append((test.force, test.force - made[1], test.force_std))
-    numbers = sum(misfit.size for _, misfit, _ in found)
-    left = max(1 - unknowns / (2 * numbers), 0.5)
+    of_own = lambda record: at_own_lines(record, test.own_lines)  # noqa: E731
+    left = max(1 - unknowns / (2 * test.numbers), 0.5)
     squares, stds = [], []
     for record, misfit, stated in found:
-        least = _FLOOR * float(np.sqrt(np.mean(np.abs(record) ** 2)))
-        robust = np.sqrt(np.median(np.abs(misfit) ** 2) / np.log(2) / left) if stated is None else stated
+        least = _FLOOR * float(np.sqrt(np.mean(np.abs(of_own(record)) ** 2)))
+        robust = np.sqrt(np.median(np.abs(of_own(misfit)) ** 2) / np.log(2) / left) if stated is None else stated
         stds.append(np.broadcast_to(np.maximum(robust, least), record.shape))
         if stated is not None:
-            squares.append(np.abs(misfit / stds[-1]).ravel() ** 2)
+            squares.append(np.abs(of_own(misfit / stds[-1])) ** 2)
     # Without a jump, at which rounds of a fit would turn to and fro.
     more = (
         np.sqrt(max(1.0, float(np.median(np.concatenate(squares))) / np.log(2) / left / _SUSPECT)) if squares else 1.0
     )
     stds = [std if stated is None else more * std for std, (*_, stated) in zip(stds, found, strict=True)]
-    return [Whitened(misfit / std, std) for std, (_, misfit, _) in zip(stds, found, strict=True)]
+    return [Whitened(misfit / std, std, test.own_lines) for std, (_, misfit, _) in zip(stds, found, strict=True)]
+
+
+def at_own_lines(record: ComplexArray, own: Flags) -> ComplexArray:
+    """Numbers of a record (runs, channels, n_freq) at each run's own lines (runs, n_freq), one after the other."""
+    return record.transpose(0, 2, 1)[own].ravel()
 
 
 def predicted(test: Measurement, structure: Structure) -> list[ComplexArray]:
@@ -160,7 +174,7 @@ def pseudo_values(fits: Sequence[tuple[Measurement, list[ComplexArray]]], unknow
     one mean slope, so that they count by their noise alone.
     """
     every = [(test, made, whitened(test, made, unknowns)) for test, made in fits]
-    u = np.concatenate([part.u.ravel() for *_, parts in every for part in parts])
+    u = np.concatenate([part.numbers for *_, parts in every for part in parts])
     w = weight(u)
     slopes = np.where(w < 1, w / 2, 1.0)
     slope, share = float(slopes.mean()), unknowns / (2 * u.size)
@@ -180,32 +194,37 @@ def pseudo_values(fits: Sequence[tuple[Measurement, list[ComplexArray]]], unknow
 
 
 def stand_alone(
-    u: ComplexArray, freq: Array, omega: Array, ratios: Array, *, times: float = _BESIDE, known: Flags | None = None
+    part: Whitened, freq: Array, omega: Array, ratios: Array, *, times: float = _BESIDE, known: Flags | None = None
 ) -> Flags:
-    """Which whitened numbers (..., n_freq) are far out, so many `times` those at the lines beside them.
+    """Which whitened numbers (runs, channels, n_freq) are far out, so many `times` those at the lines beside them.
 
     Those that are `known` outliers are not compared with.
 
     A misfit that a model leaves is smooth, and no outlier. Lines beside a pole that is narrower than their distance are
     not judged: its misfit stands alone too.
     """
-    flags: Flags = _beyond_neighbours(u, times=times, known=known) & ~_in_doubt(freq, omega, ratios)
+    flags = _beyond_neighbours(part, times=times, known=known)
+    for run, own in enumerate(part.own):
+        flags[run][:, own] &= ~_in_doubt(freq[own], omega, ratios)
     return flags
 
 
-def _beyond_neighbours(u: ComplexArray, *, times: float, known: Flags | None = None) -> Flags:
-    """Which whitened numbers (..., n_freq) are far out, and so many `times` those at the lines beside them."""
-    size = np.abs(u)
-    n_freq = size.shape[-1]
-    if n_freq < _LEAST_LINES:
-        return np.zeros(size.shape, dtype=bool)
+def _beyond_neighbours(part: Whitened, *, times: float, known: Flags | None = None) -> Flags:
+    """Which whitened numbers are far out, and so many `times` those at the lines of their run beside them."""
+    size = np.abs(part.u)
     others = size if known is None else np.where(known, 0.0, size)
-    here = np.arange(n_freq)
-    first = np.clip(here - 2, 0, n_freq - 5)
-    near_by = others[..., first[:, None] + np.arange(5)]
-    near_by[..., here, here - first] = np.inf
-    beside = np.sort(near_by, axis=-1)[..., 2]  # of four the last but one: another outlier may be among them
-    flags: Flags = (size > _FAR) & (size > times * beside)
+    flags: Flags = np.zeros(size.shape, dtype=bool)
+    for run, own in enumerate(part.own):
+        n_freq = np.count_nonzero(own)
+        if n_freq < _LEAST_LINES:
+            continue
+        here = np.arange(n_freq)
+        first = np.clip(here - 2, 0, n_freq - 5)
+        near_by = others[run][:, own][:, first[:, None] + np.arange(5)]
+        near_by[:, here, here - first] = np.inf
+        beside = np.sort(near_by, axis=-1)[..., 2]  # of four the last but one: another outlier may be among them
+        its = size[run][:, own]
+        flags[run][:, own] = (its > _FAR) & (its > times * beside)
     return flags
 
 
@@ -255,7 +274,7 @@ def _screened(test: Measurement, monitor: Monitor | None) -> tuple[Measurement, 
         made = _bounded_fit(test, fit)
         parts, before = whitened(test, made, 2 * fit.omega.size), flags
         flags = [
-            stand_alone(part.u, test.freq, fit.omega, fit.ratios, known=known)
+            stand_alone(part, test.freq, fit.omega, fit.ratios, known=known)
             for part, known in zip(parts, before, strict=False)
         ]
         clean = _replaced(test, made, flags)
@@ -354,7 +373,7 @@ def _bounded_fit(test: Measurement, fit: PolesAndResidues) -> list[ComplexArray]
             other = pseudo_values([(test, made)], 2 * fit.omega.size)[0]
         else:
             parts = whitened(test, made, 2 * fit.omega.size)
-            other = _replaced(test, made, [_beyond_neighbours(part.u, times=_BEHIND) for part in parts])
+            other = _replaced(test, made, [_beyond_neighbours(part, times=_BEHIND) for part in parts])
             if other is test:
                 return made
         fit = PolesAndResidues.at(other, Records(other), fit.omega, fit.ratios)
@@ -413,7 +432,7 @@ def outliers(
     omega, ratios = 2 * np.pi * structure.natural_frequencies, structure.damping_ratios
     first, found = 0, []
     for part in whitened(test, predicted(test, structure), unknowns):
-        far = stand_alone(part.u, test.freq, omega, ratios, times=_CERTAIN) if alone else np.abs(part.u) > _FAR
+        far = stand_alone(part, test.freq, omega, ratios, times=_CERTAIN) if alone else np.abs(part.u) > _FAR
         for run, channel, line in np.argwhere(far).tolist():
             size = float(np.abs(part.u[run, channel, line]))
             found.append(Outlier(number, run + 1, names[first + channel], float(test.freq[line]), size))

@@ -138,14 +138,18 @@ class Records:
             blocks = list(zip(base, relative * line[:, None], strict=True))
             self.channel = channel
         self.blocks = blocks
-        self.base = np.concatenate([base for base, _ in blocks], axis=1)
-        self.data = stacked(np.concatenate([records for _, records in blocks], axis=1))
+        # Whole records of other lengths have zeros at the lines of one another, which tell nothing.
+        own = [np.any(inputs != 0, axis=0) | np.any(records != 0, axis=0) for inputs, records in blocks]
+        self.run, self.line = np.nonzero(own)
+        self.base = np.concatenate([inputs[:, lines] for (inputs, _), lines in zip(blocks, own, strict=True)], axis=1)
+        shown = [records[:, lines] for (_, records), lines in zip(blocks, own, strict=True)]
+        self.data = stacked(np.concatenate(shown, axis=1))
         self.size = float(np.sum(self.data**2))
 
     def basis(self, gains: ComplexArray, inputs: int | None = None) -> Array:
         """Columns of gains (k, n_freq) times the first so many inputs, all by default, (rows, k * inputs)."""
-        block = np.tile(gains, len(self.blocks))[:, None] * self.base[None, :inputs]
-        return stacked(block.reshape(-1, self.base.shape[1]))
+        block = gains[:, None, self.line] * self.base[None, :inputs]
+        return stacked(block.reshape(-1, self.line.size))
 
     @cached_property
     def singular(self) -> tuple[Array, Array]:
@@ -184,12 +188,18 @@ class Records:
     def leverage(self, omega: Array, ratios: Array) -> Array:
         """Share of each line's own part in what poles and free residues of both kinds make of it, (n_freq,)."""
         Q = np.linalg.qr(unit_columns(self.functions(omega, ratios, velocity=True))[0])[0]
-        own: Array = np.sum(Q**2, axis=1).reshape(2, -1, self.freq.size).mean(axis=0).max(axis=0)
-        return own
+        return self.largest(np.sum(Q**2, axis=1).reshape(2, -1).mean(axis=0))
+
+    def largest(self, values: Array) -> Array:
+        """The largest of values of the lines of all runs, (lines,), at each frequency, (n_freq,)."""
+        found = np.zeros(self.freq.size, values.dtype)
+        np.maximum.at(found, self.line, values)
+        return found
 
     def noise(self, left: Array, unknowns: int, *, least: float = ROUND_OFF) -> float:
         """Variance of a real number of the records about a fit of so many unknowns, as it affects smooth functions."""
-        factor = line_correlation(self.in_runs(left).transpose(2, 0, 1), unknowns)
+        products, chance = _own_products(self.in_runs(left))
+        factor = _correlation_factor(products, chance, left.shape[1], self.lengths, unknowns)
         return self.variance(factor * float(np.sum(left**2)), unknowns, least=least)
 
     def variance(self, squared_error: float, unknowns: int, *, least: float = ROUND_OFF) -> float:
@@ -197,11 +207,18 @@ class Records:
         freedom = max(self.data.size - unknowns, 1)
         return max(squared_error / freedom, least**2 * self.size / self.data.size)
 
+    @property
+    def lengths(self) -> NDArray[np.intp]:
+        """Number of lines of each run."""
+        return np.bincount(self.run, minlength=len(self.blocks))
+
     def in_runs(self, rows: Array) -> ComplexArray:
-        """Rows of the records, real parts above imaginary ones, as complex lines (runs, n_freq, columns)."""
-        real, imaginary = rows.reshape(2, -1, self.freq.size, rows.shape[1])
-        whole: ComplexArray = real + 1j * imaginary
-        return whole
+        """Rows of the records, real parts above imaginary ones, as complex lines (runs, lines, columns).
+
+        Each run's own lines one after the other, and zeros behind those of shorter ones.
+        """
+        real, imaginary = rows.reshape(2, -1, rows.shape[1])
+        return by_run(real + 1j * imaginary, self.run, self.lengths)
 
     def by_sensor(self, residues: Array) -> Array:
         """Residues (m, inputs, channels) of `fit` in the test's own units, (m, n_sensors, d).
@@ -270,7 +287,7 @@ class SubsetFits:
         linear = np.einsum("lrkc,kc->lr", self._linear, z)
         products = self._constant + linear + np.einsum("lrij,ij->lr", self._quadratic, squares)
         unknowns, records = kept.size * self.per_pole, self.records
-        factor = _correlation_factor(products, self._chance, records.data.shape[1], records.freq.size, unknowns)
+        factor = _correlation_factor(products, self._chance, records.data.shape[1], records.lengths, unknowns)
         return fit.gain / records.variance(factor * squared_error, unknowns), squared_error
 
 
@@ -329,14 +346,26 @@ def line_correlation(error: ComplexArray, unknowns: int = 0) -> float:
     Parameters
     ----------
     error : (channels, runs, n_freq) complex
+        Lines at which a run has nothing but zeros are none of its own.
     unknowns : int
         Real numbers of the fit that leaves it.
     """
-    products, chance = _own_products(error.transpose(1, 2, 0))
-    return _correlation_factor(products, chance, error.shape[0], error.shape[-1], unknowns)
+    run, line = np.nonzero(np.any(error != 0, axis=0))
+    lengths = np.bincount(run, minlength=error.shape[1])
+    products, chance = _own_products(by_run(error[:, run, line].T, run, lengths))
+    return _correlation_factor(products, chance, error.shape[0], lengths, unknowns)
 
 
-def _correlation_factor(products: ComplexArray, variance: Array, channels: int, lines: int, unknowns: int) -> float:
+def by_run(lines: ComplexArray, run: NDArray[np.intp], lengths: NDArray[np.intp]) -> ComplexArray:
+    """Lines of all runs (lines, columns), each of a `run`, as (runs, lines, columns) with zeros behind short ones."""
+    found = np.zeros((lengths.size, lengths.max(initial=0), lines.shape[1]), complex)
+    found[run, np.arange(run.size) - (np.cumsum(lengths) - lengths)[run]] = lines
+    return found
+
+
+def _correlation_factor(
+    products: ComplexArray, variance: Array, channels: int, lines: NDArray[np.intp], unknowns: int
+) -> float:
     """One, and twice the correlation of errors at each lag up to the first that may be chance.
 
     `products` are sums over channels and lines, (lags, runs), and `variance` that of white noise in them over the
@@ -345,9 +374,9 @@ def _correlation_factor(products: ComplexArray, variance: Array, channels: int, 
     """
     power = products[0].real
     moved = power > 0
-    if lines <= 2 * len(_LAGS) - 2 or not np.any(moved):
+    if lines.max(initial=0) <= 2 * len(_LAGS) - 2 or not np.any(moved):
         return 1.0
-    share = unknowns / max(2 * channels * lines * moved.sum() - unknowns, 1)
+    share = unknowns / max(2 * channels * lines[moved].sum() - unknowns, 1)
     chance = chdtri(2 * moved.sum(), _CHANCE) / 2
     factor = 1.0
     for sums, level in zip(np.abs(products[1:, moved]) / power[moved], variance[1:, moved], strict=True):

@@ -195,10 +195,9 @@ def _outliers(problem: Problem, end: Outcome) -> Iterator[str]:
     for i in tests:
         found, test = [one for one in every if one.test == i], fits[i]
         which = "the records" if len(fits) == 1 else f"test {i}"
-        numbers = test.response.size + (0 if test.force is None else test.force.size)
         channels = ", ".join(f"{name} {count}" for name, count in Counter(one.channel for one in found).most_common(4))
         yield (
-            f"{len(found)} of {numbers} numbers of {which} are up to {found[0].size:.3g} deviations from the fit "
+            f"{len(found)} of {test.numbers} numbers of {which} are up to {found[0].size:.3g} deviations from the fit "
             f"({found[0].channel} at {found[0].freq:.5g} Hz; by channel {channels}){what}"
         )
 

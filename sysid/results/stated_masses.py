@@ -157,7 +157,7 @@ def _numbers(problem: Problem, index: Index) -> float:
     test = problem.measurement
     if test.response_std is not None and (test.force is None or test.force_std is not None):
         return np.inf
-    return float(max(2 * (test.response.size + (0 if test.force is None else test.force.size)) - index.size, 1))
+    return float(max(2 * test.numbers - index.size, 1))
 
 
 def _chance(found: Adjusted, numbers: float) -> float:

@@ -305,7 +305,7 @@ def as_good_as(problem: Problem, objective: float) -> float:
     from scipy.special import gammainccinv
 
     tests = [term.test for term in problem.formulation.tests]
-    numbers = 2 * sum(test.response.size + (0 if test.force is None else test.force.size) for test in tests)
+    numbers = 2 * sum(test.numbers for test in tests)
     size = problem.n_variables
     return max(objective * float(np.sqrt(1 + 2 * gammainccinv(size / 2, _CHANCE) / max(numbers - size, 1))), EXACT)
 

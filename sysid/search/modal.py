@@ -146,7 +146,8 @@ def _independent_sensors(test: Measurement, modes: Modes) -> int:
     motion = np.einsum("nm,rmf->rnf", modes.phi, q)
     error = weight * columns(test.relative - motion) / size
     unknowns = modes.phi.size + modes.gamma.size + modes.omega.size
-    variance = float(np.sum(np.abs(error) ** 2)) / max(2 * error.size - unknowns, 1)
+    numbers = len(error) * int(np.count_nonzero(test.own_lines))
+    variance = float(np.sum(np.abs(error) ** 2)) / max(2 * numbers - unknowns, 1)
     shared = line_correlation(error.reshape(len(error), -1, test.freq.size), unknowns)
     variance = max(variance * shared, ROUND_OFF**2)
     s = np.linalg.svd(stacked(weight * columns(motion) / size), compute_uv=False)[: min(n, m)]
