@@ -30,7 +30,7 @@ def modal(truth):
 
 def rows(it):
     """Cells of the table of modes."""
-    table = it.summary().split("\n+- half")[0]
+    table = it.summary().split("\n+- half")[0].split("\n\n")[-1]
     return [line.split() for line in table.splitlines()]
 
 
