@@ -156,8 +156,8 @@ def assumed(problem: Problem) -> Iterator[str]:
         )
     if test.force is not None and mass.totals is None:
         yield (
-            "no record can show whether the gain of the base force is right. M, K and C are in proportion to it: 1 % "
-            "makes 1 %"
+            "no record can show whether the gain of the base force is right. M, K and C are in proportion to it: an "
+            "error of 1 % in it makes 1 % in them"
         )
 
 

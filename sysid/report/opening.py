@@ -27,7 +27,7 @@ _MOST_MODES, _MOST_UNKNOWNS = 4, 5  # whose figures stand in the opening; all of
 def opening(it: Identification, level: NoiseLevel) -> str:
     """HTML of what was identified, the judgement, the next thing to do, and the figures; `level` of the records."""
     word = "Stopped before its end: the best until then. " * it.interrupted + _WORD[it.judgement]
-    judged = paragraph(_meaning(it)) + f"<p><b>Next:</b> {text(_steps(it)[0])}</p>"
+    judged = paragraph(_meaning(it)) + _reasons(it) + f"<p><b>Next:</b> {text(_steps(it)[0])}</p>"
     box = f'<div class="verdict {_KIND[it.judgement]}"><strong>{text(word)}</strong>{judged}</div>'
     rows = [*_masses(it), *_deck_masses(it), *_unknowns(it), *_modes(it), *_fit(it, level)]
     return _subject(it) + box + table(["", ""], rows, words=True)
@@ -70,8 +70,13 @@ def _subject(it: Identification) -> str:
 
 
 def _meaning(it: Identification) -> str:
-    judged = verdict(it).partition(": ")[2] or verdict(it)
-    return " ".join(map(sentence, (judged, *it.against[:_MOST_AGAINST])))
+    return sentence(verdict(it).partition(": ")[2] or verdict(it))
+
+
+def _reasons(it: Identification) -> str:
+    """HTML of what speaks against the answer most."""
+    told = it.against[:_MOST_AGAINST]
+    return bullets(map(sentence, told)) * bool(told)
 
 
 def _steps(it: Identification) -> list[str]:

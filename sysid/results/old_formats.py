@@ -78,7 +78,7 @@ def tree_of(path: Path) -> Tree:
 def with_against(tree: Tree) -> Tree:
     """The tree of a result that joined what speaks against it to its message, as results have it today."""
     message, undetermined = tree["message"], tuple(tree["undetermined"])
-    against = tuple(told for told in undetermined if told in message or told.startswith(_NO_END))
+    against = tuple(told for told in filter(None, undetermined) if told in message or told.startswith(_NO_END))
     for told in against:
         message = message.replace(f"{told}; ", "").replace(f"; {told}", "")
     if not (against or tree["success"]):

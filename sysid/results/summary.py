@@ -69,7 +69,7 @@ def summary(it: Answer) -> str:
         lines.append(f"test {i} of {len(problem.validation)} never fitted: relative residual {test.residual(s):.3e}")
     lines += [*_noise(it), *_gains(it)]
     further_told = [f"  - {sentence}" for sentence in told[_FIRST:]]
-    if not (it.determined or it.hurried) and it.open_masses:
+    if it.judgement == "one of many" and not it.hurried and it.open_masses:
         further_told += _ranges(it)
     lines += ["besides:"] * bool(further_told) + further_told
     lines += [_NOT_COMPUTED] if it.hurried else []
@@ -141,11 +141,11 @@ def fitted_in_words(it: Answer) -> str:
     """The runs that were fitted, and how strongly they move the sensors, where that is known."""
     test = it.problem.measurement
     moved = [f"{level:.3g}" for level in sorted(peaks(test))]
-    runs, several = counted(test.n_runs, "run"), len(moved) > 1
+    runs = counted(test.n_runs, "run")
     if not moved:
         return runs
     to = " to ".join(dict.fromkeys((moved[0], moved[-1])))
-    return f"{runs} that move{'s' * (not several)} a sensor by up to {to} m/s² against the base"
+    return f"{runs} (sensors move by up to {to} m/s² against the base)"
 
 
 def next_steps(it: Answer) -> list[str]:
@@ -174,15 +174,15 @@ def next_steps(it: Answer) -> list[str]:
 def _towards_a_fit(it: Answer) -> list[str]:
     """What to do where there is no fit, the first thing first."""
     if it.interrupted:
-        return ["let the search end: sysid run --resume FOLDER goes on with one that the command line began"]
+        return ["let the search end: 'sysid run --resume FOLDER' goes on with one that the command line began"]
     if it.problem.goal is not None:
         return ["put right what is named first; a goal below the noise of the records cannot be reached"]
     steps = ["put right what speaks against it, the first thing first"]
     if it.changing:
-        one_by_one = "; sysid refine RESULT --leave-out run shows what each run does to the answer"
+        one_by_one = "; 'sysid refine RESULT --leave-out run' shows what each run does to the answer"
         steps = [
-            "fit runs of one level of motion, the one of interest, by themselves: sysid read RUN.csv --out level.h5, "
-            "then sysid run level.h5" + one_by_one * (it.measurement.n_runs > 1)
+            "fit runs of one level of motion, the one of interest, by themselves: 'sysid read RUN.csv --out level.h5', "
+            "then 'sysid run level.h5'" + one_by_one * (it.measurement.n_runs > 1)
         ]
     if it.residual > _NEAR:
         return steps
@@ -327,5 +327,5 @@ def _folded(line: str) -> str:
     """Fold a long line at the width of a terminal, the rest indented."""
     if len(line) <= _WIDTH:
         return line
-    indent = "    " if line.startswith("  - ") else "  "
+    indent = "    " if line.startswith(("  - ", "  > ")) else "  "
     return textwrap.fill(line, _WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
