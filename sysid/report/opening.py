@@ -126,7 +126,7 @@ def _modes(it: Identification) -> Iterator[tuple[str, str]]:
         damping = _with_interval(it, percent, 100 * widths[1, k], "%")
         yield f"mode {k + 1}", f"{_with_interval(it, f, widths[0, k], 'Hz')}, damping {damping}"
     if not it.success:
-        yield "", "without intervals: those of noise alone would be too narrow, as the model misses more than noise"
+        yield "", "without intervals: they hold for a model that fits, and this one does not"
     if s.n > n:
         yield "", f"and {counted(s.n - n, 'further mode')} up to {number(s.natural_frequencies[-1], 4)} Hz, below"
 
@@ -158,7 +158,7 @@ def rounded(value: float, std: float, digits: int = 4) -> tuple[str, str]:
 
 
 def _with_interval(it: Identification, value: float, std: float, unit: str) -> str:
-    """A value with its interval; of a model that does not fit without one, as noise alone makes it too narrow."""
+    """A value with its interval; of a model that does not fit without one, as it leaves out what is missed."""
     told, width = rounded(value, std if it.success or np.isnan(std) else 0.0)
     if width == "open" and it.quick_uncertainty is not None:
         return f"{told} {unit}, one of many: these data do not determine it"

@@ -180,7 +180,7 @@ def _modes(it: Identification) -> str:
         columns.insert(2, ["±", *(width for _, width in told), ""])
         columns.append(["±", *(width for _, width in damping), ""])
         notes.append("±: half of the 95 % interval that the noise of the records makes; 0 where it is round-off.")
-        notes += ["What the model misses is not in it, and is more than the noise."] * (not it.success)
+        notes += ["It holds for a model that fits: this one does not."] * (not it.success)
         if it.measurement.response_std is None:
             notes.append("No noise is stated, so the misfit is taken for it.")
     columns += _effective_mass_columns(it, many)

@@ -35,7 +35,7 @@ _WIDTH = 120
 _FIRST = 2  # sentences beside the verdict; the others follow the tables
 _NEAR = 0.5  # relative residual, up to which a fit may be called near enough
 _MISSING = 0.5  # % of the rigid-body mass
-_OF_NOISE = ", by noise alone: what the model misses is not in it"
+_OF_A_FIT = ", which holds for a model that fits: this one does not"
 
 
 def summary(it: Answer) -> str:
@@ -145,7 +145,7 @@ def fitted_in_words(it: Answer) -> str:
     if not moved:
         return runs
     to = " to ".join(dict.fromkeys((moved[0], moved[-1])))
-    return f"{runs} (sensors move by up to {to} m/s² against the base)"
+    return f"{runs} (sensors move with up to {to} m/s² against the base)"
 
 
 def next_steps(it: Answer) -> list[str]:
@@ -248,7 +248,7 @@ def _mode_table(it: Answer) -> list[str]:
     lines = _aligned(columns + both)
     if not np.any(np.isfinite(std)) or len(lines[0]) > _WIDTH:
         lines = _aligned(columns + masses)
-    notes = [] if u is None else ["+- half of the 95 % interval" + _OF_NOISE * (not it.success)]
+    notes = [] if u is None else ["+- half of the 95 % interval" + _OF_A_FIT * (not it.success)]
     notes.append("mass: effective, in % of the rigid-body mass")
     notes += ["~ one of many values that fit as well"] if many.any() else []
     return [*lines, "; ".join(notes), *missing_mass(it)]
