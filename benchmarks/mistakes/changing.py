@@ -32,6 +32,12 @@ def motion(rng: np.random.Generator, seconds: float = SECONDS) -> np.ndarray:
     return np.asarray(record / record.std())
 
 
+def at_rest(base: np.ndarray) -> np.ndarray:
+    """Base acceleration (n,) that rises from zero and is over at three fifths of its time."""
+    t = np.arange(base.size) / (0.6 * base.size)
+    return np.asarray(base * np.where(t < 1, np.sin(np.pi * t) ** 2, 0.0))
+
+
 def response(base: np.ndarray, factor: Callable[[float], float] = lambda t: 1.0, softening: float = 0.0) -> np.ndarray:
     """Absolute accelerations of both floors, (2, n_samples), by Runge and Kutta's fourth order from rest.
 
@@ -40,12 +46,12 @@ def response(base: np.ndarray, factor: Callable[[float], float] = lambda t: 1.0,
     h, n = 1 / RATE / STEPS, base.size
     u = CubicSpline(np.arange(n), base)(np.arange(2 * STEPS * (n - 1) + 1) / (2 * STEPS))
 
-    def rates(state: np.ndarray, base: float, t: float) -> np.ndarray:
+    def rates(state: np.ndarray, moved: float, t: float) -> np.ndarray:
         x1, x2, v1, v2 = state
         k1, k2 = factor(t) * SPRINGS
         f1 = k1 * x1 / np.sqrt(1 + softening * x1 * x1) + DAMPERS[0] * v1
         f2 = k2 * (x2 - x1) + DAMPERS[1] * (v2 - v1)
-        return np.array([v1, v2, (f2 - f1) / MASSES[0] - base, -f2 / MASSES[1] - base])
+        return np.array([v1, v2, (f2 - f1) / MASSES[0] - moved, -f2 / MASSES[1] - moved])
 
     state, out = np.zeros(4), np.empty((2, n))
     for i in range(n):
@@ -58,6 +64,22 @@ def response(base: np.ndarray, factor: Callable[[float], float] = lambda t: 1.0,
             d = rates(state + h * c, u[j + 2], t + h)
             state = state + h / 6 * (a + 2 * b + 2 * c + d)
     return out
+
+
+def of_lines(structure: sysid.Structure, base: np.ndarray) -> np.ndarray:
+    """Absolute accelerations of a linear structure, (n_sensors, n), under periodic base motion (d, n), line by line."""
+    freq = np.fft.rfftfreq(base.shape[1], 1 / RATE)
+    H = np.repeat(structure.rigid_body[:, :, None], freq.size, axis=2).astype(complex)
+    H[..., 1:] += structure.relative_acceleration(freq[1:])
+    return np.asarray(np.fft.irfft(np.einsum("sdf,df->sf", H, np.fft.rfft(base)), base.shape[1]))
+
+
+def tuned_mass(share: float = 0.001) -> sysid.Structure:
+    """The two storeys with a tuned mass of this share of the second one's on it: two close modes of one shape."""
+    (k1, k2), m = SPRINGS, share * MASSES[1]
+    tuned = m * (2 * np.pi * frequencies(SPRINGS)[0]) ** 2
+    K = np.array([[k1 + k2, -k2, 0, -k1], [-k2, k2 + tuned, -tuned, 0], [0, -tuned, tuned, 0], [-k1, 0, 0, k1]])
+    return sysid.Structure(np.diag([*MASSES, m, 0.0]), K, np.array([0.01, 0.01, 0.015]), n_base=1)
 
 
 def noisy(

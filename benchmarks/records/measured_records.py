@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
 import sysid
 from benchmarks.line import Line
 from benchmarks.problem_modules import load_module
-from benchmarks.swarm.shake_table import DATA
-from sysid.modal_analysis.record_fit import RecordFit, record_modes, refitted
+from benchmarks.swarm.shake_table import ABSENT, EVENTS, records_folder
+from sysid.modal_analysis.record_fit import RecordFit, record_modes, refitted, unit_diagonal
 
-EVENTS = ("sine_1p5", "sine_2p0")
 WITHIN = 1.5
 MODES = np.array([3.75, 11.2, 16.6])  # Hz, bending along X, by others
 NEAR = 0.02
@@ -24,44 +21,24 @@ SHIFTS = 4  # partitions, each begun a part of a block later
 
 
 def lines(reduced: bool) -> Iterator[Line]:
-    """mini_shake_table, fitted on either event, in the reduced form on one; `swarm.shake_table` holds its scores.
-
-    The variable SYSID_DATA names the folder of both events; by default it is looked for beside the checkout.
-    """
-    data = Path(os.environ.get("SYSID_DATA") or DATA)
-    if not data.is_dir():
-        yield Line("mini_shake_table", "records absent: not run (set SYSID_DATA to their folder)")
+    """mini_shake_table, fitted on either event, in the reduced form on one; `swarm.shake_table` holds its scores."""
+    data = records_folder()
+    if data is None:
+        yield ABSENT
         return
     event = load_module("mini_shake_table").event
     for name in EVENTS[: 1 if reduced else None]:
-        yield from _jackknife(name, event(data / name, "records"), 2 if reduced else SHIFTS)
+        yield from _deviations(name, event(data / name, "records"), 2 if reduced else SHIFTS)
 
 
-def _jackknife(name: str, test: sysid.Measurement, shifts: int) -> Iterator[Line]:
-    """Deviations of frequencies by leaving out one block of neighbouring lines at a time, and fitting the rest.
-
-    B. Efron, The Jackknife, the Bootstrap and Other Resampling Plans (1982), chapter 3. Variances are means over the
-    partitions. A block may hold most of what tells a mode, and the jackknife is then too wide, by a known factor where
-    what is left is white: without a block an estimate moves by the difference of both variances, V_b - V. Their sum
-    over V is taken off.
-    """
+def _deviations(name: str, test: sysid.Measurement, shifts: int) -> Iterator[Line]:
+    """Stated deviations of frequencies beside those of a jackknife."""
     result = sysid.identify(sysid.Problem(test, mass=sysid.FullMass(healing="rigid_body")), rng=0)
     found = result.structure.natural_frequencies
     close = found.size == len(MODES) and bool(np.all(np.abs(found / MODES - 1) < NEAR))
     shown = " / ".join(f"{f:.3f}" for f in found)
     yield Line(f"{name}: frequencies found, Hz", shown, " / ".join(map(str, MODES)) + f" within {NEAR:.0%}", close)
-    fit = _fit(test, result.measurement)
-    variance, plain = np.zeros(found.size), np.zeros(found.size)
-    own, order = _variances(fit), np.argsort(fit.parameters.modes.omega)
-    for shift in np.arange(shifts) / shifts:
-        part = np.floor((test.freq - test.freq[0]) / WIDTH + shift)
-        blocks = np.unique(part)
-        fits = [_refitted(fit, part != block) for block in blocks]
-        left = np.array([one.parameters.modes.omega[order] / (2 * np.pi) for one in fits])
-        left -= left.mean(axis=0)
-        share = (blocks.size - 1) / blocks.size / shifts
-        variance += share * np.sum(left**2, axis=0)
-        plain += share * sum(_variances(one) / own - 1 for one in fits)[order]
+    variance, plain = _jackknife(_fit(test, result.measurement), shifts)
     wide = np.sqrt(plain)
     ratios = wide * result.uncertainty.natural_frequencies / np.sqrt(variance)
     met = bool(np.all((ratios <= WITHIN) & (ratios >= 1 / WITHIN)))
@@ -71,6 +48,28 @@ def _jackknife(name: str, test: sysid.Measurement, shifts: int) -> Iterator[Line
     yield Line(text, " / ".join(f"{r:.2f}" for r in ratios / wide))
     text = f"{name}: stated deviations of frequencies over those of a jackknife by blocks of {WIDTH:g} Hz"
     yield Line(text, " / ".join(f"{r:.2f}" for r in ratios), f"{1 / WITHIN:.2f} to {WITHIN:g}", met)
+
+
+def _jackknife(fit: RecordFit, shifts: int) -> tuple[np.ndarray, np.ndarray]:
+    """Variances of frequencies, Hz², (m,), by leaving out one block of lines at a time and refitting the rest.
+
+    B. Efron, The Jackknife, the Bootstrap and Other Resampling Plans (1982), chapter 3. Variances are means over the
+    partitions. A block may hold most of what tells a mode, and the jackknife is then too wide, by a known factor where
+    what is left is white: without a block an estimate moves by the difference of both variances, V_b - V. Their sum
+    over V, (m,), stands beside the variances.
+    """
+    freq, own, order = fit.test.freq, _variances(fit), np.argsort(fit.parameters.modes.omega)
+    variance, plain = np.zeros(own.size), np.zeros(own.size)
+    for shift in np.arange(shifts) / shifts:
+        part = np.floor((freq - freq[0]) / WIDTH + shift)
+        blocks = np.unique(part)
+        fits = [_refitted(fit, part != block) for block in blocks]
+        left = np.array([one.parameters.modes.omega[order] / (2 * np.pi) for one in fits])
+        left -= left.mean(axis=0)
+        share = (blocks.size - 1) / blocks.size / shifts
+        variance += share * np.sum(left**2, axis=0)
+        plain += share * sum(_variances(one) / own - 1 for one in fits)[order]
+    return variance, plain
 
 
 def _fit(test: sysid.Measurement, at_rest: sysid.Measurement) -> RecordFit:
@@ -89,7 +88,6 @@ def _refitted(fit: RecordFit, keep: np.ndarray) -> RecordFit:
 
 def _variances(fit: RecordFit) -> np.ndarray:
     """Relative variances of frequencies where what is left is white noise of the fit's levels."""
-    A = fit.information()
-    size = np.sqrt(np.maximum(np.diag(A), 1e-300))
-    inverse = np.linalg.pinv(A / np.outer(size, size), rcond=1e-11, hermitian=True) / np.outer(size, size)
-    return np.diag(inverse)[fit.model.index.log_omega] / 2
+    information, size = unit_diagonal(fit.information())
+    variance = np.diag(np.linalg.pinv(information, rcond=1e-11, hermitian=True)) / size**2
+    return variance[fit.model.index.log_omega] / 2

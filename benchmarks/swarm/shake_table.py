@@ -13,17 +13,22 @@ from benchmarks.line import Line, below
 from benchmarks.problem_modules import ROOT, load_module
 from benchmarks.swarm.shake_amplitude import unseen_scores_with_amplitude
 
-DATA = ROOT.parent / "shared" / "data" / "mini_shake_table" / "flexible_3_storey"
+EVENTS = ("sine_1p5", "sine_2p0")
+ABSENT = Line("mini_shake_table", "records absent: not run (set SYSID_DATA to their folder)")
+
+
+def records_folder() -> Path | None:
+    """Folder of both events: that which SYSID_DATA names, else one beside the checkout; None where there is none."""
+    beside = ROOT.parent / "shared" / "data" / "mini_shake_table" / "flexible_3_storey"
+    folder = Path(os.environ.get("SYSID_DATA") or beside)
+    return folder if folder.is_dir() else None
 
 
 def lines(reduced: bool) -> Iterator[Line]:
-    """mini_shake_table: fitted on one event, predicting the other. Both forms are the same.
-
-    The variable SYSID_DATA names the folder of both events; by default it is looked for beside the checkout.
-    """
-    data = Path(os.environ.get("SYSID_DATA") or DATA)
-    if not data.is_dir():
-        yield Line("mini_shake_table", "records absent: not run (set SYSID_DATA to their folder)")
+    """mini_shake_table: fitted on one event, predicting the other. Both forms are the same."""
+    data = records_folder()
+    if data is None:
+        yield ABSENT
         return
     problem = load_module("mini_shake_table").problem(data=str(data))
     result = sysid.identify(problem, strategy="swarm", rng=0)

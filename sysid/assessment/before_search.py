@@ -64,7 +64,9 @@ def _of_test(problem: Problem, declared: Formulation, test: Measurement, *, own:
         if found and terms is not None and terms.misfit <= CONJUGATED and test.whole is None:
             # Of records cut in motion, transients that were left in look like delays and gains.
             test = as_whole(test)
-            found = found if test.whole is None else mistakes_of(test, direct_terms(test))
+            if test.whole is not None:
+                terms = direct_terms(test)
+                found = mistakes_of(test, terms)
         if own and not found and terms is not None:
             found = [*_of_mass(declared, test, terms), *_of_frequencies(problem, declared, test)]
         if not found and test.averaged:

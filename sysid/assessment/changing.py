@@ -15,13 +15,14 @@ from sysid.problem.problem import Problem
 from sysid.structure.structure import Array
 
 _MOVED = 0.1  # half-power widths, by which the frequency of a mode changes at least
-_KNOWN = 0.5  # the same, to which it is known in a stretch
-_SURE = 6.0  # standard deviations of a change
+_KNOWN = 1.0  # the same, to which it is known in a stretch that counts
+_SURE = 5.0  # standard deviations of a change between two stretches
 _EXPLAINED = 0.7  # of the squares that constant poles leave: poles that change leave no more
 _SHOWN = 0.03  # of the largest level of a mode, at which it shows
 _ENOUGH = 5  # stretches that tell a trend
 _TREND = 0.03  # chance of such an order of frequencies by level
-_SURE_TREND = 1e-3  # the same, where poles that change explain little: the level may change within stretches
+_SURE_TREND = 1e-3  # the same, where it counts as a sign
+_SIGNS = 2  # of three, that tell a change
 _OF_RUNS = 0.15  # of the variance of frequencies, that is left within runs where runs differ
 _CLOSE = 0.06  # of their frequency, within which modes ..
 _ONE_SHAPE = 0.9  # .. of one shape (modal assurance criterion) may be one that changes
@@ -58,12 +59,17 @@ class Change:
         self.seen = [one for one in seen if one.level > _SHOWN * largest]
         self.frequency = np.array([one.frequency for one in self.seen])
 
-    @property
-    def is_clear(self) -> bool:
-        """Whether two stretches differ by a part of the width, and beyond what noise makes of them."""
+    def is_told(self, explained: bool) -> bool:
+        """Whether it changes by a part of the width, with two signs of three.
+
+        Two stretches differ beyond what noise makes of them; the order by level is no chance; poles that change have
+        `explained` the records, which they do little where the level changes within stretches.
+        """
         std = np.array([one.std for one in self.seen])
         change = np.abs(self.frequency[:, None] - self.frequency)
-        return bool(np.any(change > np.maximum(_MOVED * self.width, _SURE * np.hypot(std[:, None], std))))
+        moved = change > _MOVED * self.width
+        differ = bool(np.any(moved & (change > _SURE * np.hypot(std[:, None], std))))
+        return bool(np.any(moved)) and explained + differ + (self.trend_of(_SURE_TREND) != 0) >= _SIGNS
 
     @property
     def size(self) -> float:
@@ -162,7 +168,7 @@ def changes(problem: Problem) -> list[Change]:
         width = 2 * ratio * f
         seen = [one for i, part in enumerate(made) for one in _seen(part, k, width, i, tests[i])]
         change = Change(f, width, seen, scaled)
-        if change.is_clear and (changing < _EXPLAINED * constant or change.trend_of(_SURE_TREND)):
+        if change.is_told(changing < _EXPLAINED * constant):
             found.append(change)
     return found
 

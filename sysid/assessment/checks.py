@@ -11,6 +11,7 @@ from scipy.special import chdtri
 from sysid.assessment.gains import distinct_poles, gain_errors, told
 from sysid.assessment.leakage import leakage
 from sysid.measurement.measurement import Measurement
+from sysid.measurement.spectra import of_run
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.residues import Records, ResidueFit, beyond_chance, force_residual_left
 from sysid.modal_analysis.response import columns, weighed_mass, weighed_mass_std
@@ -88,9 +89,9 @@ def _at_rest(test: Measurement) -> Iterator[str]:
     """Whether runs of whole records are at rest at both ends where it is stated."""
     for run in () if test.modal is None else test.modal.in_motion:
         yield (
-            f"run {run} is stated to begin and end at rest (at_rest), but its records show the free vibration of a "
-            "structure that was in motion at one end: leave the statement out for this run, so that its transients are "
-            "fitted"
+            f"the records{of_run(run, test.n_runs)} are stated to begin and end at rest (at_rest), but show the free "
+            "vibration of a structure that was in motion at one end: leave the statement out for this run, so that its "
+            "transients are fitted"
         )
 
 

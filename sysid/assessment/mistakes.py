@@ -17,7 +17,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.direct_terms import DirectTerms, direct_terms
 from sysid.structure.structure import Array
 
-CONJUGATED = 0.3  # relative misfit, from which modes do not explain the records
+CONJUGATED = 0.3  # relative misfit, beyond which modes explain the records at most as conjugated ones
 _MENDED = 0.3  # of the misfit; what a mended record may leave
 _GROSS = 0.15  # of a sensor's rigid-body motion: smaller errors of gains are told by what was fitted
 _CHANCE = 3.0  # standard deviations that a factor may be off by

@@ -137,22 +137,9 @@ def _run(
         rms = float(np.sqrt(np.mean(np.abs(values) ** 2)))
         rows.append(row_of(column, channel, form.unit, form.factor, rms, recording))
     sensors = [sensor.name for sensor in sensors_of(said)]
-    missing = next((name for name in sensors if name not in parts["response"]), None)
-    refuse(
-        (
-            missing is not None,
-            f"{recording.path}: per unit of {reference or 'the reference'} the function of {missing!r} is missing: "
-            f"each sensor needs one for each reference, under the same name; {recording.in_words()}",
-        ),
-        (
-            not any(np.any(values.imag) for values in parts["response"].values()),
-            f"{recording.path}: its functions are real numbers, magnitudes it seems: export complex ones, or real and "
-            "imaginary part, or magnitude and phase in columns named so",
-        ),
-    )
+    _check_responses(parts["response"], sensors, reference, recording)
     response: Any = np.array([parts["response"][name] for name in sensors])
-    channels = [channel for channel, _ in found]
-    place = str(recording.path)
+    channels, place = [channel for channel, _ in found], str(recording.path)
     base: Any = np.array(list(parts["base"].values()))
     force: list[Any] = list(parts["force"].values())
     if base.size:
@@ -160,6 +147,25 @@ def _run(
     else:
         base = _unit_motion(lower, reference, axes, recording, freq)
     return (base, response, total_force(channels, said, axes, force, place)), rows
+
+
+def _check_responses(
+    given: dict[str, ComplexArray], sensors: Sequence[str], reference: str, recording: Recording
+) -> None:
+    """Refuse functions of responses, by name, where that of a sensor is missing, and magnitudes alone."""
+    missing = next((name for name in sensors if name not in given), None)
+    refuse(
+        (
+            missing is not None,
+            f"{recording.path}: per unit of {reference or 'the reference'} the function of {missing!r} is missing: "
+            f"each sensor needs one for each reference, under the same name; {recording.in_words()}",
+        ),
+        (
+            not any(np.any(values.imag) for values in given.values()),
+            f"{recording.path}: its functions are real numbers, magnitudes it seems: export complex ones, or real and "
+            "imaginary part, or magnitude and phase in columns named so",
+        ),
+    )
 
 
 def _of_reference(recording: Recording, channel: Channel, reference: str, said: Description) -> Column | None:

@@ -181,7 +181,7 @@ def _on(problem: Problem, test: Measurement, **others: Any) -> Problem:
 def _all_but(index: int, count: int, what: str) -> NDArray[np.bool_]:
     """Which of so many runs or sensors are left without one, (count,)."""
     if index >= count:
-        raise InputError(f"there is no {what} {index + 1}: the test has {count}")
+        raise InputError(f"there is no {what} {index + 1} ({what}={index}, counted from 0): the test has {count}")
     if count == 1:
         raise InputError(f"the test has one {what}; without it nothing is left")
     return np.arange(count) != index

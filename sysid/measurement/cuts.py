@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from sysid.errors import InputError
-from sysid.measurement.spectra import Run
+from sysid.measurement.spectra import Run, of_run
 from sysid.structure.structure import Array
 
 _STILL = 8  # samples of one value in every channel that count as padding where the structure moved just before
@@ -38,19 +38,20 @@ def check_cuts(runs: Sequence[Run], at_rest: Sequence[bool], rigid_body: Array) 
     InputError
         Names the run and what was done to it.
     """
-    for number, (run, rest) in enumerate(zip(runs, at_rest, strict=True)):
+    for i, (run, rest) in enumerate(zip(runs, at_rest, strict=True)):
         if rest:
             continue
+        where = of_run(i, len(runs))
         still = padded(run, rigid_body)
         if still:
             raise InputError(
-                f"run {number}: its last {still} samples hold one value in every channel while the structure was in "
-                "motion just before: a record that was padded with zeros, or that stopped early; leave them out: whole "
+                f"the last {still} samples{where} hold one value in every channel while the structure was in motion "
+                "just before: a record that was padded with zeros, or that stopped early; leave them out: whole "
                 "records may have any length"
             )
         if tapered(run, rigid_body):
             raise InputError(
-                f"run {number}: all channels, the base's too, fall to zero together towards both ends, faster than a "
+                f"all channels{where}, the base's too, fall to zero together towards both ends, faster than a "
                 "structure comes to rest: a window or a fade was laid over the record; give it as it was recorded: "
                 "whole records may begin and end in motion (or state at_rest=True where it was at rest at both ends)"
             )

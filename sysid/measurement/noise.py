@@ -42,8 +42,8 @@ def levels_at_rest(
         Records that do not fit each other, or are too short for a level.
     """
     given = sequence("runs", runs, "a list of (base, response, force or None)")
-    base, response, _ = sequence("run 0", given[0], "(base, response, force or None)", 3)
-    shape = tuple(np.atleast_2d(finite_array("run 0", record)).shape[0] for record in (response, base))
+    base, response, _ = sequence("run 1", given[0], "(base, response, force or None)", 3)
+    shape = tuple(np.atleast_2d(finite_array("run 1", record)).shape[0] for record in (response, base))
     records = check_runs(given, sample_rate, shape)
     low, high = (0.0, np.inf) if band is None else sequence("band", band, "(low, high) in Hz", 2)
     level = _levels(records, sample_rate, low, high)

@@ -48,6 +48,11 @@ class Estimate:
     coherence: Array
 
 
+def of_run(index: int, runs: int) -> str:
+    """Words for a message after what is of a run, such as " of run 2" for index 1 of many; none of the only run."""
+    return f" of run {index + 1}" if runs > 1 else ""
+
+
 def check_runs(
     runs: Sequence[tuple[ArrayLike, ArrayLike, ArrayLike | None]], sample_rate: float, shape: tuple[int, ...]
 ) -> list[Run]:
@@ -58,14 +63,14 @@ def check_runs(
         raise InputError(f"rigid_body has shape {shape}; (n_sensors, d) is needed")
     sensors, d = shape
     records = []
-    for index, entry in enumerate(given):
-        run = sequence(f"run {index}", entry, "(base, response, force or None)", 3)
-        base = _record(f"run {index}, base", run[0], d)
-        response = _record(f"run {index}, response", run[1], sensors)
-        force = None if run[2] is None else _record(f"run {index}, force", run[2], d)
+    for place, entry in enumerate(given, start=1):
+        run = sequence(f"run {place}", entry, "(base, response, force or None)", 3)
+        base = _record(f"run {place}, base", run[0], d)
+        response = _record(f"run {place}, response", run[1], sensors)
+        force = None if run[2] is None else _record(f"run {place}, force", run[2], d)
         lengths = {record.shape[1] for record in (base, response, force) if record is not None}
         if len(lengths) > 1:
-            raise InputError(f"run {index}: its records have different lengths {sorted(lengths)}")
+            raise InputError(f"run {place}: its records have different lengths {sorted(lengths)}")
         records.append(Run(base, response, force))
     if len({run.force is None for run in records}) > 1:
         raise InputError("some runs have a force and some have none; give it for all or for none")
@@ -223,24 +228,7 @@ def resample(
     from scipy.signal import butter, sosfiltfilt
 
     given = sequence("records", records, "a list of (time, samples)")
-    clocks, samples = [], []
-    for index, entry in enumerate(given):
-        time, values = sequence(f"record {index}", entry, "(time, samples)", 2)
-        t = finite_array(f"time of record {index}", time)
-        x = np.atleast_2d(finite_array(f"samples of record {index}", values))
-        if t.ndim != 1 or x.ndim != 2 or x.shape[1] != t.size or t.size < 4:
-            raise InputError(f"record {index}: time {t.shape} and samples {x.shape} disagree (or fewer than 4 samples)")
-        gaps = np.diff(t)
-        widest, back = np.argmax(gaps), np.argmax(gaps <= 0)
-        refuse(
-            (gaps[back] <= 0, f"record {index}: time does not rise at sample {back + 1}"),
-            (
-                gaps[widest] > 3 * np.median(gaps),
-                f"record {index}: a gap of {gaps[widest]:.4g} s at {t[widest]:.6g} s; cut it there",
-            ),
-        )
-        clocks.append(t)
-        samples.append(x)
+    clocks, samples = map(list, zip(*(_timed(f"record {i}", one) for i, one in enumerate(given, start=1)), strict=True))
     rates = np.array([(t.size - 1) / (t[-1] - t[0]) for t in clocks])
     rate = float(rates.min()) if sample_rate is None else number("sample_rate", sample_rate)
     if not 0 < rate <= 1.01 * rates.min():
@@ -251,13 +239,31 @@ def resample(
         raise InputError("the records have no time in common; check that their clocks have one origin")
     time = start + np.arange(count) / rate
     if np.any(rates > 1.1 * rate):
-        for index, t in enumerate(clocks):
+        for place, t in enumerate(clocks, start=1):
             if t.size < 60:
-                raise InputError(f"record {index}: {t.size} samples are too few to low-pass before resampling")
+                raise InputError(f"record {place}: {t.size} samples are too few to low-pass before resampling")
         filters = [butter(8, 0.8 * rate / own, output="sos") for own in rates]
         samples = [sosfiltfilt(sos, x, axis=-1) for sos, x in zip(filters, samples, strict=True)]
     splines = [CubicSpline(t, x, axis=-1) for t, x in zip(clocks, samples, strict=True)]
     return time, [np.asarray(spline(np.minimum(time, spline.x[-1]))) for spline in splines]
+
+
+def _timed(name: str, entry: Any) -> tuple[Array, Array]:
+    """Times (n,) that rise without gaps, and samples (channels, n), of a pair of both."""
+    time, values = sequence(name, entry, "(time, samples)", 2)
+    t, x = finite_array(f"time of {name}", time), np.atleast_2d(finite_array(f"samples of {name}", values))
+    if t.ndim != 1 or x.ndim != 2 or x.shape[1] != t.size or t.size < 4:
+        raise InputError(f"{name}: time {t.shape} and samples {x.shape} disagree (or fewer than 4 samples)")
+    gaps = np.diff(t)
+    widest, back = np.argmax(gaps), np.argmax(gaps <= 0)
+    refuse(
+        (gaps[back] <= 0, f"{name}: time does not rise at sample {back + 2}"),  # from 1, as in files
+        (
+            gaps[widest] > 3 * np.median(gaps),
+            f"{name}: a gap of {gaps[widest]:.4g} s at {t[widest]:.6g} s; cut it there",
+        ),
+    )
+    return t, x
 
 
 def _record(name: str, value: ArrayLike, channels: int) -> Array:

@@ -49,6 +49,8 @@ class NoiseLevels:
     def of(self, runs: int, n_sensors: int, d: int, force: bool) -> NoiseLevels:
         """The levels of a test of so many runs and channels: one number for all of a kind will do.
 
+        Those given as a row a run stay so, (runs, channels); others are (channels,).
+
         Raises
         ------
         InputError
@@ -182,7 +184,10 @@ class Gains:
 
 
 class Excess(NamedTuple):
-    """A band, Hz, where a fit leaves `factor` times the noise of a channel (of sensors, forces, base) of a run."""
+    """A band, Hz, where a fit leaves `factor` times the noise of a channel (of sensors, forces, base) of a run.
+
+    `channel` and `run` are indices.
+    """
 
     channel: int
     run: int
@@ -192,7 +197,7 @@ class Excess(NamedTuple):
 
 
 class VaryingLevel(NamedTuple):
-    """Noise of a channel of a run, numbered as in `Excess`, that varies over the lines: least and largest deviation."""
+    """Noise of a channel of a run, indices as in `Excess`, that varies over the lines: least and largest deviation."""
 
     channel: int
     run: int
@@ -232,9 +237,9 @@ class ModalEstimate:
     varying : tuple of VaryingLevel
         Levels that were let vary smoothly over the lines; `noise` holds their means.
     untold : tuple of (run, channel)
-        Levels of `noise` that the records do not determine.
+        Indices, as in `Excess`. Levels of `noise` that the records do not determine.
     in_motion : tuple of int
-        Runs stated to be at rest at both ends that the records show were not.
+        Indices of runs stated to be at rest at both ends that the records show were not.
     """
 
     phi: Array

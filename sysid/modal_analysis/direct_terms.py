@@ -171,13 +171,12 @@ def _fitted(records: Records, omega: Array, ratios: Array) -> _Fit:
     noise = records.noise(left, functions.shape[1] * left.shape[1], least=_ROUND_OFF)
     gained = float(np.sum((beyond.T @ left) ** 2))
     shared = noise / records.variance(float(np.sum(left**2)), functions.shape[1] * left.shape[1], least=_ROUND_OFF)
-    of_rows = inverse[:known].reshape(3, records.driven, -1)[:2]
     turn = np.array([1.0, 1 / (2 * np.pi * records.freq[-1])])[:, None, None]
     of_terms = lambda x: x.reshape(3, records.driven, -1)[:2]  # noqa: E731
     of_modes = beta[known:].reshape(omega.size, -1, beta.shape[1])[:, : records.driven]
     return _Fit(
         turn * _by_sensor(records, of_terms(beta[:known])),
-        turn * _deviations(records, of_rows, level * np.sqrt(shared / freedom)),
+        turn * _deviations(records, of_terms(inverse[:known]), level * np.sqrt(shared / freedom)),
         _by_sensor(records, of_modes.sum(axis=0, keepdims=True))[0],
         gained > noise * beyond_chance(beyond.shape[1] * left.shape[1]),
         float(np.linalg.norm(left) / np.sqrt(records.size)),

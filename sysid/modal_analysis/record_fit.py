@@ -113,12 +113,11 @@ class RecordFit:
 
     def information(self) -> Array:
         """``Re J' S^-1 J`` over the unknowns of `Index`, less what transients and traces explain of it; (p, p)."""
-        model, N = self.model, self.normal
-        kept, size = model.kept, np.sqrt(np.maximum(np.diag(N), 1e-300))
-        scaled = N / np.outer(size, size)
-        turned = half_inverse(scaled[kept:, kept:], 1e-12).T @ scaled[kept:, :kept]
+        model, kept = self.model, self.model.kept
+        N, size = unit_diagonal(self.normal)
+        turned = half_inverse(N[kept:, kept:], 1e-12).T @ N[kept:, :kept]
         A = np.zeros((model.index.size, model.index.size))
-        A[:kept, :kept] = (scaled[:kept, :kept] - turned.T @ turned) * np.outer(size[:kept], size[:kept])
+        A[:kept, :kept] = (N[:kept, :kept] - turned.T @ turned) * np.outer(size[:kept], size[:kept])
         return A
 
     @property
@@ -211,14 +210,13 @@ def _fit(
         levels = np.maximum(np.concatenate([stated.outputs, stated.base], axis=-1) ** 2, least)
     elif levels is None:
         levels = _rough_levels(model, p)
-    unknowns = model.size - (0 if model.force else model.m)
     settled, chi2 = False, np.inf
     for round_ in range(limits.rounds):
         p, chi2, done = _minimise(model, p, levels, monitor, (10 * round_, limits.steps), coarse)
         if stated is not None:
             settled = done
             break
-        before, levels = levels, likeliest_levels(model, p, levels, unknowns)
+        before, levels = levels, likeliest_levels(model, p, levels, model.unknowns)
         if done and np.all(np.abs(np.log(levels / before)) < 2 * _SAME_LEVELS):
             settled = True
             break
@@ -287,6 +285,12 @@ def _equations(model: RecordModel, coarse: RecordModel | None, p: Parameters, le
     if coarse is None:
         return model.normal_equations(p, levels)
     return model.gradient(p, levels)._replace(normal=coarse.normal_equations(p, levels).normal)
+
+
+def unit_diagonal(normal: Array) -> tuple[Array, Array]:
+    """A normal matrix (p, p) divided so that its diagonal is one, and the roots of the diagonal that it had, (p,)."""
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    return normal / np.outer(size, size), size
 
 
 def half_inverse(normal: Array, least: float) -> Array:

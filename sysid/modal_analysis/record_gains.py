@@ -6,7 +6,7 @@ import numpy as np
 import scipy.linalg
 
 from sysid.measurement.whole import Gains
-from sysid.modal_analysis.record_fit import RecordFit, half_inverse
+from sysid.modal_analysis.record_fit import RecordFit, half_inverse, unit_diagonal
 from sysid.structure.structure import Array
 
 _SEEN = 1e-10  # of the largest eigenvalue of the scaled information; less is round-off
@@ -22,7 +22,8 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     (n, d), at = G.shape, fit.model.size  # what is asked for comes behind all that was fitted
     beyond = max(fit.reduced, 1.0)
     along = scipy.linalg.block_diag(np.eye(at), scipy.linalg.block_diag(*G[:, :, None]), np.eye(n * d))
-    normal, gradient, size = _scaled(along.T @ made.normal @ along, along.T @ made.gradient)
+    normal, size = unit_diagonal(along.T @ made.normal @ along)
+    gradient = along.T @ made.gradient / size
 
     def estimate(count: int) -> tuple[Array, Array]:
         half = half_inverse(normal[:count, :count], _SEEN)
@@ -51,16 +52,10 @@ def _rigid(fit: RecordFit, beyond: float) -> tuple[Array, Array]:
     """Share of the base's motion in each sensor beside what G says, (n_sensors, d), and its chi-squared of each."""
     made, (n, d), at = fit.equations, fit.test.rigid_body.shape, fit.model.size
     count = at + n * d
-    normal, gradient, size = _scaled(made.normal[:count, :count], made.gradient[:count])
+    normal, size = unit_diagonal(made.normal[:count, :count])
     half = half_inverse(normal, _SEEN)
-    step = (half @ (half.T @ gradient))[at:].reshape(n, d)
+    step = (half @ (half.T @ (made.gradient[:count] / size)))[at:].reshape(n, d)
     own = half[at:].reshape(n, d, -1)
     covariance = beyond / 2 * own @ own.swapaxes(1, 2)
     chi2 = np.einsum("ni,nij,nj->n", step, np.linalg.pinv(covariance, rcond=_SEEN, hermitian=True), step)
     return step / size[at:].reshape(n, d), chi2
-
-
-def _scaled(normal: Array, gradient: Array) -> tuple[Array, Array, Array]:
-    """Normal equations in unknowns of like size, and the factors of these."""
-    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    return normal / np.outer(size, size), gradient / size, size

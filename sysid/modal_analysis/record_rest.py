@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtrc
 
-from sysid.modal_analysis.record_fit import RecordFit, half_inverse, refitted
+from sysid.modal_analysis.record_fit import RecordFit, half_inverse, refitted, unit_diagonal
 from sysid.modal_analysis.record_model import Parameters, RecordModel
 from sysid.modal_analysis.record_spread import uneven
 from sysid.structure.structure import Array
@@ -53,8 +53,8 @@ def _score(fit: RecordFit, p: Parameters) -> tuple[float, int]:
     """Chi-squared of all that the unknowns could still explain, and its degrees of freedom beyond those of the fit."""
     model = RecordModel(fit.test, p.modes.omega.size)
     made = model.normal_equations(p, fit.levels)
-    size = np.sqrt(np.maximum(np.diag(made.normal), 1e-300))
-    N, gradient = made.normal / np.outer(size, size), made.gradient / size
+    N, size = unit_diagonal(made.normal)
+    gradient = made.gradient / size
     added = np.zeros(model.size, bool)
     ends = np.zeros(p.ends.shape, bool)
     ends[:, np.all(p.ends == 0, axis=0)] = True

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.modal_analysis.record_fit import RecordFit, half_inverse
+from sysid.modal_analysis.record_fit import RecordFit, half_inverse, unit_diagonal
 from sysid.modal_analysis.record_model import Chunk, Run
 from sysid.structure.structure import Array
 
@@ -46,9 +46,8 @@ def scatter(fit: RecordFit) -> Array | None:
 
 def scatter_over_blocks(fit: RecordFit) -> Array:
     """The same, whatever is left."""
-    model, p, N = fit.model, fit.parameters, fit.normal
-    size = np.sqrt(np.maximum(np.diag(N), 1e-300))
-    N = N / np.outer(size, size)
+    model, p = fit.model, fit.parameters
+    N, size = unit_diagonal(fit.normal)
     half = half_inverse(N, 1e-12)
     meat = np.zeros((half.shape[1],) * 2)
     columns = [Chunk(model, p, run.at(slice(0, 1))).columns() for run in model.runs]

@@ -113,7 +113,7 @@ def _noise_at_peaks(fit: RecordFit) -> Array:
 
     Each line counts by what it tells of the frequency of the mode: the power of the response's slope in it. The few
     lines at a peak may leave nothing beside poles and transients: what the base's noise makes there is told by lines
-    about it too, each by how much of that noise the sensors show.
+    about it too, each by how much of that noise the sensors show; a model that errs errs at few of them.
     """
     modes, parts = fit.parameters.modes, []
     for chunk in fit.model.chunks(fit.parameters):
@@ -126,7 +126,8 @@ def _noise_at_peaks(fit: RecordFit) -> Array:
     of_base = []
     for omega in modes.omega:
         near = np.argsort(np.abs(w - omega))[:_ABOUT]
-        of_base.append(np.sum(left[near] / passed[near]) / max(near.size - _ABSORBED, 1))
+        typical = np.median(left[near] / passed[near]) / np.log(2)  # the mean of a chi-squared of two degrees
+        of_base.append(typical * near.size / max(near.size - _ABSORBED, 1))
     return np.maximum(weight @ left * fit.model.numbers / fit.freedom, np.array(of_base) * (weight @ passed))
 
 

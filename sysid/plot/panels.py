@@ -258,7 +258,7 @@ def index_of(what: str, value: int | str, names: Sequence[str]) -> int:
             raise InputError(f"{what} {value!r} is unknown; there are {', '.join(names)}")
         return list(names).index(value)
     if not -len(names) <= value < len(names):
-        raise InputError(f"{what} {value} is out of range; there are {len(names)}")
+        raise InputError(f"{what} {value} is out of range: there are {len(names)}, counted from 0")
     return int(value) % len(names)
 
 

@@ -75,7 +75,7 @@ def transmissibility(
     sensor : int or str, optional
         Index or name; with `run`, the channel with the largest relative acceleration by default.
     run : int or str, optional
-        Index; of unit runs also the base direction's name, such as "x".
+        Index, from 0, or name: of unit runs the base direction's, such as "x", else such as "run 2", the second.
     measurement : Measurement, optional
         Another test of the same sensors to predict, such as a validation; the one fitted by default.
     band : array_like, shape (n_sensors, d, n_freq), optional
@@ -132,7 +132,7 @@ def base_force(
     direction : int or str
         Of the force: index or name of a base direction.
     run : int or str, optional
-        Index or, of unit runs, name; by default the run in which the base moves most in `direction`.
+        As for `transmissibility`; by default the run in which the base moves most in `direction`.
     measurement : Measurement, optional
     band : array_like, shape (d, d, n_freq), optional
         Standard deviation of the apparent mass at the test's lines, kg, such as `Uncertainty.base_force` gives.

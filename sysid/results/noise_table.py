@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.measurement.measurement import Measurement
+from sysid.measurement.spectra import of_run
 from sysid.results.answer import Answer
 
 _TOLD = 3  # channels
@@ -58,14 +59,12 @@ def noise_in_words(test: Measurement) -> Iterator[str]:
     names = [*test.sensor_names]
     names += [f"force {axis}" for axis in axes] if test.force is not None else []
     names += [f"base {axis}" for axis in axes]
-    name = lambda one: names[one.channel] + (f" of run {one.run}" if test.n_runs > 1 else "")  # noqa: E731
+    name = lambda one: names[one.channel] + of_run(one.run, test.n_runs)  # noqa: E731
     if modal.varying:
         told = [f"{name(one)} {one.largest / one.least:.2g} times" for one in modal.varying]
         yield f"the noise is not white: levels vary smoothly over the lines, from least to largest of {', '.join(told)}"
     if modal.untold:
-        untold = ", ".join(
-            names[channel] + (f" of run {run}" if test.n_runs > 1 else "") for run, channel in modal.untold
-        )
+        untold = ", ".join(names[channel] + of_run(run, test.n_runs) for run, channel in modal.untold)
         yield (
             f"the records do not tell the noise level of {untold}, as it is small beside that of other channels or "
             "shows as theirs does: the level given is one of many that explain them as well"

@@ -36,6 +36,7 @@ from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase
 from sysid.structure.structure import Array, Structure
 
 _DEPENDENT = 1e-6  # of the largest singular value of the shapes: below, sensors move alike in all modes
+_PLAIN = "; noise of the base and transients look like modes in plain spectra: take whole records (estimator='records')"
 
 
 @dataclass(frozen=True)
@@ -233,9 +234,10 @@ def run_modal(problem: Problem, options: Modal, session: Session) -> Outcome:
     elif problem.formulation.mass.free:
         remarks = (f"degrees of freedom are {', '.join(_coordinates(problem, chosen))}",)
     else:
+        plain = problem.measurement.sample_rate is not None
         raise DoesNotApplyError(
             f"{structure.n} modes stand out of the data of {problem.geometry.n} sensors: a lumped or known mass needs "
-            "as many modes as sensors in the lines; leave sensors out or widen the lines"
+            f"as many modes as sensors in the lines; leave sensors out or widen the lines{_PLAIN * plain}"
         )
     x = answer.x if answer.x.size else None
     left = objective_of(problem, structure, x)

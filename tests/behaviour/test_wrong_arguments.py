@@ -161,10 +161,10 @@ USED = {
 
 # What else a message calls an argument: an entry of it, or what contradicts it.
 ALIASES = {
-    "axes": ["axis"], "runs": ["run 0"], "records": ["record 0"], "path": ["no result at"], "bounds": ["x0"],
+    "axes": ["axis"], "runs": ["run 1"], "records": ["record 1"], "path": ["no result at"], "bounds": ["x0"],
     "sample_rate": ["line between", "one above", "clocks", "low-pass"], "segment": ["line between"],
     "band": ["line between"],
-    "rigid_body": ["run 0"], "residuals": ["residual 1"], "constraints": ["constraint 1"],
+    "rigid_body": ["run 1"], "residuals": ["residual 1"], "constraints": ["constraint 1"],
     "damping_ratios": ["damping ratio"],
 }  # fmt: skip
 

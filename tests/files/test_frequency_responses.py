@@ -1,20 +1,15 @@
 """Frequency responses of every form and file give the same transmissibility and apparent mass, or are asked for."""
 
 import h5py
+import laboratory
 import numpy as np
 import pytest
 import scipy.io
+from laboratory import FREQ, F, H
 
 import sysid
 from sysid.files import reading, units
 
-FREQ = np.arange(1, 401) * 0.05
-STRETCH = np.array([[1.0, 0, 0, -1], [-1, 1, 0, 0], [0, -1, 1, 0]])
-TRUTH = sysid.Structure(
-    np.diag([4.0, 3.0, 2.0, 0.0]), STRETCH.T @ np.diag([9e3, 7e3, 5e3]) @ STRETCH, [0.02] * 3, n_base=1
-)
-H = TRUTH.relative_acceleration(FREQ)[:, 0] + 1
-F = TRUTH.base_force(FREQ)[0, 0]
 BASE = 1 / (10 + F)  # acceleration of a table of 10 kg for a unit force of its shaker
 IW = 2j * np.pi * FREQ
 ORDER = {"m/s²": 0, "m/s": 1, "m": 2}  # of differentiation that leads to acceleration
@@ -129,27 +124,9 @@ def test_each_reference_is_a_run_with_its_own_base_motion(tmp_path):
 
 def universal(path, **given):
     """Sets 58 of accelerations per acceleration at nodes 1 to 3, in a file in mm and mN with their positions."""
-    pyuff = pytest.importorskip("pyuff")
-    none, zero = np.zeros(3, int), np.zeros(3)
-    mm = {"type": 164, "units_code": 5, "units_description": "mm", "temp_mode": 1, "length": 1e3, "force": 1e3,
-          "temp": 1.0, "temp_offset": 273.15}  # fmt: skip
-    nodes = pyuff.prepare_2411(
-        node_nums=np.arange(1, 4), def_cs=none, disp_cs=none, color=none, x=zero, y=zero, z=np.array([1e3, 2e3, 3e3])
-    )
-    sets = [
-        pyuff.prepare_58(
-            **{
-                "binary": 0, "func_type": 4, "rsp_node": node, "rsp_dir": 1, "ref_node": 100, "ref_dir": 1, "x": FREQ,
-                "num_pts": 400, "data": row, "id1": "", "id2": "", "id3": "", "id4": "", "id5": "", "load_case_id": 0,
-                "rsp_ent_name": "s", "ref_ent_name": "r", "abscissa_spacing": 1, "abscissa_inc": 0.05,
-                "abscissa_min": 0.05, "ord_data_type": 6, "ordinate_spec_data_type": 12, "orddenom_spec_data_type": 12,
-                "abscissa_spec_data_type": 18,
-            }
-            | given
-        )
-        for node, row in enumerate(given.pop("data", H), 1)
-    ]  # fmt: skip
-    pyuff.UFF(str(path)).write_sets([mm, nodes, *sets], "overwrite")
+    rows = given.pop("data", H)
+    sets = [laboratory.function(node, row, **given) for node, row in enumerate(rows, 1)]
+    laboratory.write_universal(path, [laboratory.IN_MM, laboratory.nodes([1e3, 2e3, 3e3]), *sets])
 
 
 def test_a_universal_file_tells_axes_positions_units_and_the_sign_of_its_reference(tmp_path):

@@ -4,22 +4,17 @@ import re
 from itertools import chain
 
 import h5py
+import laboratory
 import numpy as np
 import pytest
 import scipy.io
+from laboratory import FREQ, F, H
 
 import sysid
 from sysid.cli import main as cli
 from sysid.files import reading, recorded_test
 
 G = 9.80665
-FREQ = np.arange(1, 401) * 0.05
-STRETCH = np.array([[1.0, 0, 0, -1], [-1, 1, 0, 0], [0, -1, 1, 0]])
-TRUTH = sysid.Structure(
-    np.diag([4.0, 3.0, 2.0, 0.0]), STRETCH.T @ np.diag([9e3, 7e3, 5e3]) @ STRETCH, [0.02] * 3, n_base=1
-)
-H = TRUTH.relative_acceleration(FREQ)[:, 0] + 1
-F = TRUTH.base_force(FREQ)[0, 0]
 SENSORS = {
     "sensor": [
         {"column": "table", "role": "base", "axis": "x"},
@@ -147,22 +142,12 @@ def test_the_test_file_gives_back_what_was_read(tmp_path):
 
 def functions(binary, conjugated=False):
     """Sets 58 of the three sensors, the second in g, and of the force, behind the positions of their nodes."""
-    pyuff = pytest.importorskip("pyuff")
-    none, zero = np.zeros(4, int), np.zeros(4)
     # pyuff writes the header of a binary set wrongly where it is the first in a file.
-    sets = [
-        pyuff.prepare_2411(node_nums=none + range(1, 5), def_cs=none, disp_cs=none, color=none, x=zero, y=zero, z=zero)
-    ]
+    sets = [laboratory.nodes(np.zeros(4))]
     for node, (values, unit) in enumerate([(H[0], "m/s^2"), (H[1] / G, "g"), (H[2], "m/s^2"), (F, "N")], 1):
-        sets.append(
-            pyuff.prepare_58(
-                binary=binary, func_type=4, rsp_node=node, rsp_dir=1, ref_node=100, ref_dir=1, x=FREQ, num_pts=400,
-                data=np.conj(values) if conjugated else values, id1="", id2="", id3="", id4="", id5="", load_case_id=0,
-                rsp_ent_name="s", ref_ent_name="r", abscissa_spacing=1, abscissa_inc=0.05, abscissa_min=0.05,
-                ord_data_type=6, ordinate_spec_data_type=12, orddenom_spec_data_type=12, abscissa_spec_data_type=18,
-                ordinate_axis_units_lab=unit, orddenom_axis_units_lab="m/s^2",
-            )
-        )  # fmt: skip
+        units = {"ordinate_axis_units_lab": unit, "orddenom_axis_units_lab": "m/s^2"}
+        data = np.conj(values) if conjugated else values
+        sets.append(laboratory.function(node, data, binary=binary, **units))
     return sets
 
 
@@ -179,8 +164,7 @@ UNIVERSAL = {
 @pytest.mark.parametrize("binary, exact", [(0, 1e-11), (1, 4e-16)])
 @pytest.mark.parametrize("conjugated", [False, True])
 def test_universal_files_keep_their_numbers_and_show_their_convention(tmp_path, binary, exact, conjugated):
-    pyuff = pytest.importorskip("pyuff")
-    pyuff.UFF(str(tmp_path / "a.uff")).write_sets(functions(binary, conjugated), "overwrite")
+    laboratory.write_universal(tmp_path / "a.uff", functions(binary, conjugated))
     test = reading.gather(tmp_path / "a.uff", UNIVERSAL)
     base, response, force = test.runs[0]
     np.testing.assert_allclose(response, H, rtol=exact)
@@ -193,8 +177,8 @@ def test_universal_files_keep_their_numbers_and_show_their_convention(tmp_path, 
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")  # of pyuff
 @pytest.mark.parametrize("sensors", [1, 2])
 def test_binary_sets_are_whole_whatever_their_number_or_cut_short(tmp_path, sensors):
-    pyuff, path = pytest.importorskip("pyuff"), tmp_path / "a.uff"
-    pyuff.UFF(str(path)).write_sets(functions(1)[: 1 + sensors], "overwrite")
+    path = tmp_path / "a.uff"
+    laboratory.write_universal(path, functions(1)[: 1 + sensors])
     said = {**UNIVERSAL, "sensor": UNIVERSAL["sensor"][:sensors]}
     np.testing.assert_allclose(reading.gather(path, said).runs[0][1], H[:sensors], rtol=4e-16)
     path.write_bytes(path.read_bytes()[:-3000])
@@ -211,9 +195,8 @@ def test_binary_sets_are_whole_whatever_their_number_or_cut_short(tmp_path, sens
     ],
 )
 def test_a_broken_universal_file_is_told_in_words(tmp_path, change, words):
-    pyuff = pytest.importorskip("pyuff")
     path = tmp_path / "a.uff"
-    pyuff.UFF(str(path)).write_sets(functions(0)[:2], "overwrite")
+    laboratory.write_universal(path, functions(0)[:2])
     path.write_text(change(path.read_text()))
     with pytest.raises(sysid.InputError, match=words) as told:
         reading.gather(path, UNIVERSAL)

@@ -4,6 +4,7 @@ import re
 import shlex
 from pathlib import Path
 
+import laboratory
 import numpy as np
 import pytest
 import scipy.io
@@ -50,23 +51,8 @@ def save(name, heads, rows):
 
 def universal():
     """A file in mm with two nodes and their transmissibilities."""
-    pyuff = pytest.importorskip("pyuff")
-    none, zero = np.zeros(2, int), np.zeros(2)
-    system = {"type": 164, "units_code": 5, "units_description": "mm", "temp_mode": 1, "length": 1e3, "force": 1e3,
-              "temp": 1.0, "temp_offset": 273.15}  # fmt: skip
-    nodes = pyuff.prepare_2411(
-        node_nums=np.array([1, 2]), def_cs=none, disp_cs=none, color=none, x=zero, y=zero, z=np.array([3e3, 6e3])
-    )
-    functions = [
-        pyuff.prepare_58(
-            binary=0, func_type=4, rsp_node=node, rsp_dir=1, ref_node=100, ref_dir=1, x=FREQ, num_pts=300, data=row,
-            id1="", id2="", id3="", id4="", id5="", load_case_id=0, rsp_ent_name="s", ref_ent_name="r", ord_data_type=6,
-            abscissa_spacing=1, abscissa_inc=0.025, abscissa_min=0.025, ordinate_spec_data_type=12,
-            orddenom_spec_data_type=12, abscissa_spec_data_type=18,
-        )
-        for node, row in enumerate(H, 1)
-    ]  # fmt: skip
-    pyuff.UFF("modal.unv").write_sets([system, nodes, *functions], "overwrite")
+    functions = [laboratory.function(node, row, FREQ) for node, row in enumerate(H, 1)]
+    laboratory.write_universal("modal.unv", [laboratory.IN_MM, laboratory.nodes([3e3, 6e3]), *functions])
 
 
 def commands():

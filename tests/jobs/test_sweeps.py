@@ -178,8 +178,8 @@ def test_full_matrices_are_those_of_the_other_sensors_and_do_not_predict_the_one
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (WithoutRun(2), "there is no run 3: the test has 2"),
-        (WithoutSensor(5), "there is no sensor 6: the test has 2"),
+        (WithoutRun(2), r"there is no run 3 \(run=2, counted from 0\): the test has 2"),
+        (WithoutSensor(5), r"there is no sensor 6 \(sensor=5, counted from 0\): the test has 2"),
         (Band(20.0, 30.0), "no line between 20 and 30 Hz"),
     ],
 )
@@ -419,7 +419,7 @@ def test_jobs_go_on_from_the_ledger_with_their_scores(recipe, result, tmp_path):
     changes = [None, WithoutRun(0), WithoutRun(9)]
     ends = list(submit(recipe, changes=changes, out=tmp_path))
     assert [end.success for end in ends] == [True, True, False]
-    assert ends[2].message == "there is no run 10: the test has 2" and not ends[2].has_result
+    assert ends[2].message == "there is no run 10 (run=9, counted from 0): the test has 2" and not ends[2].has_result
     assert ends[0].residual == result.residual
     np.testing.assert_equal(asdict(ends[0].score), asdict(scored(result)))  # NaN too
     again = list(submit(recipe, changes=changes[:2], out=tmp_path, executor=lambda: pytest.fail("computed again")))

@@ -258,20 +258,20 @@ class TestMistakes:
         run = self.run()
         run[which][0, 7] = bad
         name = ("base", "response", "force")[which]
-        with pytest.raises(InputError, match=f"run 1, {name} holds NaN or infinite"):
+        with pytest.raises(InputError, match=f"run 2, {name} holds NaN or infinite"):
             self.read([self.run(), run], estimator=kind)
 
     def test_shapes(self):
         x, y, f = self.run()
         with pytest.raises(InputError, match="runs has 0 entries; give a list of .base"):
             self.read([])
-        with pytest.raises(InputError, match="run 0 has 2 entries"):
+        with pytest.raises(InputError, match="run 1 has 2 entries"):
             self.read([(x, y)])
-        with pytest.raises(InputError, match="run 0, base has shape"):
+        with pytest.raises(InputError, match="run 1, base has shape"):
             self.read([(x[:1], y, f)])
-        with pytest.raises(InputError, match="run 0, response has shape"):
+        with pytest.raises(InputError, match="run 1, response has shape"):
             self.read([(x, np.vstack([y, y]), f)])
-        with pytest.raises(InputError, match="run 0, force has shape"):
+        with pytest.raises(InputError, match="run 1, force has shape"):
             self.read([(x, y, f[:1])])
         with pytest.raises(InputError, match="different lengths"):
             self.read([(x, y[:, 1:], f)])
@@ -354,14 +354,14 @@ class TestResample:
         ("match", "records", "rate"),
         [
             ("records has 0 entries", [], None),
-            ("record 0: time", [([0, 1, 2], [1, 2, 3])], None),
-            ("record 0: time", [(np.arange(5), np.ones((2, 6)))], None),
+            ("record 1: time", [([0, 1, 2], [1, 2, 3])], None),
+            ("record 1: time", [(np.arange(5), np.ones((2, 6)))], None),
             (
-                "of record 1 holds NaN",
+                "of record 2 holds NaN",
                 [(np.arange(9.0), np.ones(9)), (np.arange(9.0), np.full(9, np.nan))],
                 None,
             ),
-            ("time does not rise at sample 3", [([0, 1, 2, 2, 3.0], np.ones(5))], None),
+            ("time does not rise at sample 4", [([0, 1, 2, 2, 3.0], np.ones(5))], None),
             ("a gap of 5 s at 2 s", [([0, 1, 2, 7, 8, 9.0], np.ones(6))], None),
             ("no time in common", [(np.arange(9.0), np.ones(9)), (np.arange(20.0, 29), np.ones(9))], None),
             ("sample_rate = 2 Hz", [(np.arange(9.0), np.ones(9))], 2.0),
@@ -372,7 +372,7 @@ class TestResample:
         with pytest.raises(InputError, match=match):
             resample(records, rate)
 
-    @pytest.mark.parametrize(("match", "slow"), [("record 0: 9 samples are too few", 9), ("record 1: 14", 99)])
+    @pytest.mark.parametrize(("match", "slow"), [("record 1: 9 samples are too few", 9), ("record 2: 14", 99)])
     def test_a_record_too_short_for_the_filter_is_refused(self, match, slow):
         """Where one is faster all are low-passed alike, the slow one too."""
         with pytest.raises(InputError, match=match):

@@ -20,17 +20,15 @@ def test_traces_are_taken_off_every_run_and_motion_at_the_ends_off_those_not_at_
     assert plain.force is not None
     rng, w, n = np.random.default_rng(0), 2 * np.pi * plain.freq, truth.n
     size = np.sqrt(np.mean(np.abs(plain.response) ** 2))
-    traces = (
-        size * rng.normal(size=(plain.n_sensors, 3)) @ np.stack([np.ones_like(w) + 0j, 1j * w / w[-1], w[0] / 1j / w])
-    )
+    kinds = np.stack([np.ones_like(w) + 0j, 1j * w / w[-1], w[0] / 1j / w])
+    traces = size * rng.normal(size=(plain.n_sensors, 3)) @ kinds
     whole = WholeRecords((1000,), 100.0, (at_rest,))
     drifting = replace(plain, response=plain.response + traces, response_std=None, force_std=None, whole=whole)
     assert without_transients_of(drifting, truth).residual(truth) < 1e-9
     stiffness = truth.stiffness[:n, :n] - w[:, None, None] ** 2 * truth.mass[:n, :n]
     Z = stiffness + 1j * w[:, None, None] * truth.damping
-    ends = np.linalg.solve(Z, (truth.stiffness[:n, :n] @ rng.normal(size=n))[None, :, None])[
-        ..., 0
-    ]  # changes of velocity
+    velocity = rng.normal(size=n)  # its change over the run
+    ends = np.linalg.solve(Z, (truth.stiffness[:n, :n] @ velocity)[None, :, None])[..., 0]
     push = truth.mass[:n, :n] @ truth.rigid_body_dofs + truth.mass[:n, n:]
     ends *= size / np.sqrt(np.mean(np.abs(ends) ** 2))
     moving = replace(

@@ -14,8 +14,7 @@ pytestmark = pytest.mark.skipif(browser.CHROMIUM is None, reason="no Chromium is
 
 
 @pytest.fixture(scope="module")
-def result(random_structure):
-    truth = random_structure(np.random.default_rng(8), 3, 2, G=np.array([[1.0, 0.0], [0.6, 0.8], [0.0, 1.0]]))
+def result(truth):
     sensors = [sysid.Sensor(f"s{i}", (0, 0, i), axis) for i, axis in enumerate(("x", (0.6, 0.8, 0.0), "y"), 1)]
     test = sysid.simulate(truth, np.linspace(1.0, 120.0, 200), noise=0.01, force=True, rng=3)
     return sysid.identify(sysid.Problem(dataclasses.replace(test, sensors=sensors), mass=sysid.FullMass()), rng=0)

@@ -1,0 +1,115 @@
+"""Frequencies that change along, between or with the level of records are told; those of linear structures are not."""
+
+import re
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+import sysid
+from benchmarks.mistakes.changing import (
+    DAMPERS,
+    MASSES,
+    RATE,
+    SECONDS,
+    SPRINGS,
+    frequencies,
+    motion,
+    noisy,
+    of_lines,
+    tuned_mass,
+)
+from benchmarks.mistakes.changing import measured as as_test
+from benchmarks.mistakes.changing import response as answer
+from sysid.assessment.changing import changes, changes_in_words
+from sysid.modal_analysis.stretches import stretches_of
+
+
+def identified(test, **options):
+    return sysid.identify(sysid.Problem(test, mass=sysid.FullMass(), **options), rng=0)
+
+
+def numbers(text, unit="Hz"):
+    return [float(number) for number in re.findall(rf"([\d.]+) {unit}", text)]
+
+
+def test_poles_of_stretches_are_those_of_the_structure_within_their_deviations():
+    rng = np.random.default_rng(0)
+    base = motion(rng)
+    right = as_test(noisy(rng, base, answer(base)))
+    true = frequencies(SPRINGS)
+    found = stretches_of(right, 2 * np.pi * true * 1.002, np.array([0.01, 0.02]))
+    assert len(found) == 12 and found[-1].end == pytest.approx(SECONDS, abs=0.5)
+    chain = np.array([[1, 1], [0, -1]])  # forces of springs on the floors, signs aside
+    stiffness, damping = (chain @ np.diag(part) @ chain.T for part in (SPRINGS, DAMPERS))
+    _, phi = scipy.linalg.eigh(stiffness, np.diag(MASSES))
+    widths = np.einsum("ik,ij,jk->k", phi, damping, phi) / (2 * np.pi)  # 2 zeta f
+    errors = np.array([one.frequency for one in found]) - true
+    assert np.abs(errors / widths).max() < 0.03
+    assert 0.6 < np.sqrt(np.mean((errors / [one.std for one in found]) ** 2)) < 1.5
+    assert all(one.left <= one.left_by_all for one in found)
+
+
+@pytest.mark.parametrize("estimator", ["records", "spectra"])
+def test_a_structure_that_softens_is_told_with_its_frequencies_at_the_ends(estimator):
+    rng, small, large = np.random.default_rng(1), 0.3, 2.0
+    bases = [size * motion(rng) for size in (small, large)]
+    fitted, unseen = (as_test(noisy(rng, base, answer(base, softening=100.0)), estimator=estimator) for base in bases)
+    it = identified(fitted, validation=[unseen])
+    (told,) = [sentence for sentence in it.undetermined if "falls as the motion grows" in sentence]
+    low, high = sorted(float(f) for f in re.findall(r"([\d.]+) Hz (?:where|at)", told))
+    assert high == pytest.approx(frequencies(SPRINGS)[0], rel=0.003) and low < 0.995 * high
+    assert "never fitted" not in told and "unfitted test 1" not in told
+    assert any("moves the sensors by up to" in sentence for sentence in it.remarks)
+    assert not any("gain" in sentence or "quadrature" in sentence for sentence in it.undetermined)
+
+
+def test_runs_of_different_structures_are_told_with_the_frequencies_of_each():
+    rng, factor = np.random.default_rng(2), 0.93
+    first, second = motion(rng), motion(rng)
+    test = as_test(noisy(rng, first, answer(first)), noisy(rng, second, answer(second, lambda t: factor)))
+    it = identified(test)
+    assert it.judgement == "no fit" and not it.success
+    told = it.confidence[0] + it.confidence[1]
+    assert "times their noise" in told and "differs from record to record" in told
+    (near,) = [k for k, f in enumerate(frequencies(SPRINGS)) if abs(numbers(told.partition("(")[2])[-2] / f - 1) < 0.02]
+    both = frequencies(SPRINGS)[near] * np.array([1, np.sqrt(factor)])
+    np.testing.assert_allclose(numbers(told)[-2:], both, rtol=0.003)
+    assert "Hz in run 1 at" in told and "Hz in run 2 at" in told
+
+
+def test_a_drift_along_a_record_is_told_with_when_and_what():
+    rng = np.random.default_rng(3)
+    base, factor = motion(rng), lambda t: 1 - 0.06 * t / SECONDS
+    it = identified(as_test(noisy(rng, base, answer(base, factor))))
+    (told,) = [sentence for sentence in it.undetermined if "changes along the records" in sentence]
+    spans = [(float(a) + float(b)) / 2 for a, b in re.findall(r"at ([\d.]+) to ([\d.]+) s", told)]
+    expected = [frequencies(factor(t) * SPRINGS) for t in spans]
+    for value, of_modes in zip(numbers(told)[-2:], expected, strict=True):
+        assert np.min(np.abs(value / of_modes - 1)) < 0.003
+    assert it.confidence[0] == told or "times their noise" in it.confidence[0]
+
+
+def test_two_close_modes_of_one_shape_are_no_mode_that_changes():
+    rng = np.random.default_rng(0)
+    base = motion(rng)
+    records = noisy(rng, base, of_lines(tuned_mass(0.002), base[None])[:2])
+    test = as_test(records).in_band(0.5, 12.0)
+    problem = sysid.Problem(test, mass=sysid.FullMass())
+    assert problem.screened.measurement.modal.omega.size == 3
+    assert changes(problem) == []
+
+
+def test_a_base_direction_that_does_not_move_in_an_unfitted_test_is_no_error():
+    rng = np.random.default_rng(10)
+    M, K = np.diag([2.0, 1.0, 0.0, 0.0]), np.zeros((4, 4))
+    K[:2, :2], K[2, 2], K[3, 3], K[0, 2], K[2, 0], K[1, 3], K[3, 1] = np.diag(SPRINGS), *SPRINGS, *-SPRINGS.repeat(2)
+    structure = sysid.Structure(M, K, np.array([0.01, 0.02]), n_base=2)
+    base = np.vstack([motion(rng), motion(rng)])
+    made = {"rigid_body": structure.rigid_body, "base_axes": "xy", "band": (0.5, 20.0)}
+    alone = base * [[1.0], [0.0]]
+    spoil = lambda record: record + 0.02 * record.std() * rng.standard_normal(record.shape)  # noqa: E731
+    fitted, unseen = (
+        sysid.Measurement.from_time([(u, spoil(of_lines(structure, u)), None)], RATE, **made) for u in (base, alone)
+    )
+    assert changes_in_words(sysid.Problem(fitted, mass=sysid.FullMass(), validation=[unseen])) == ()

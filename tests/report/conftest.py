@@ -1,0 +1,92 @@
+"""What tests of the report share: two results and a page."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import sysid
+from sysid.report import matrices as _report_matrices
+from sysid.report import report
+
+FREQ = np.linspace(1.0, 40.0, 30)
+
+
+@pytest.fixture(scope="session")
+def hostile():
+    """Give a name of a sensor that would run a script if it were not escaped."""
+    return "</td><script>alert('x')</script> & \"$\\foo$\""
+
+
+@pytest.fixture(scope="session")
+def truth(random_structure):
+    return random_structure(np.random.default_rng(8), 3, 2, G=np.array([[1.0, 0.0], [0.6, 0.8], [0.0, 1.0]]))
+
+
+@pytest.fixture(scope="session")
+def complete(truth, hostile):
+    """Unit runs with force, reference and a validation of two runs in which everything moves."""
+    random = np.random.default_rng(4)
+    guess = sysid.Structure(truth.mass, 1.02 * truth.stiffness, truth.damping_ratios, n_base=2)
+    names = ("low", hostile, "tip")
+    axes = ("x", (0.6, 0.8, 0.0), "y")
+    sensors = [sysid.Sensor(name, (0, 0, i), axis) for i, (name, axis) in enumerate(zip(names, axes, strict=True))]
+    test = dataclasses.replace(sysid.simulate(truth, FREQ, noise=0.01, force=True, rng=3), sensors=sensors)
+    base = random.standard_normal((2, 2, FREQ.size)) + 1j * random.standard_normal((2, 2, FREQ.size))
+    response = np.einsum("sdf,rdf->rsf", truth.transmissibility(FREQ), base)
+    unseen = sysid.Measurement(FREQ, base, response, rigid_body=truth.rigid_body, sensors=sensors)
+    problem = sysid.Problem(
+        test,
+        mass=sysid.FullMass(np.diag(truth.rigid_body_mass)),
+        stiffness=sysid.SpectralStiffness(truth.natural_frequencies),
+        reference=truth,
+        validation=[unseen],
+        goal=0.5,
+    )
+    history = sysid.History(
+        0.9,
+        0.5,
+        0.4,
+        0.01,
+        np.array([0.9, 0.5]),
+        np.array([0.4, 0.01]),
+        1e-11,
+        (("exploration", 7),),
+        777,
+        1.5,
+        ("0.00 s  swarm over 27 unknowns", "<b>done</b>"),
+    )
+    return sysid.Identification(
+        guess, problem, problem.values(guess), "swarm", 42, True, "Solve_Succeeded; damping_ratio[1] ends on its bound",
+        history, False, ("the force weighs 2 modes",), ("the mass of mode 3 is open",),
+        ("strategy 'swarm', as asked",), False, sysid.Recipe("problems/tower.py", "data/x", 1),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def page(complete):
+    """The page of `complete`: it takes seconds."""
+    return report.render(complete)
+
+
+@pytest.fixture
+def plain(truth):
+    """No reference, no validation, no force, no names, no search, no unit of mass."""
+    problem = sysid.Problem(
+        sysid.simulate(truth, FREQ),
+        mass=sysid.FullMass(),
+        stiffness=sysid.SpectralStiffness(truth.natural_frequencies),
+    )
+    return sysid.Identification(
+        truth, problem, problem.values(truth), "swarm", None, False, "interrupted", sysid.History(), True,
+        ("the mass matrix is known",), (), (), True,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Leave the pictures out, which take most of the time."""
+    for room in (report, _report_matrices):
+        monkeypatch.setattr(
+            room, "picture", lambda figure, alt, caption="", *, label="", **_: f"<p>{label} {caption}</p>"
+        )

@@ -1,0 +1,75 @@
+"""The curves of the report: every channel of every test, with its noise and interval, with a script and without."""
+
+import base64
+import html
+import json
+import re
+
+import numpy as np
+from scipy.stats import norm
+
+
+def test_every_channel_of_every_test_is_in_its_curves(complete, page):
+    data = [json.loads(one) for one in re.findall(r'<script type="application/json">(.*?)</script>', page, re.DOTALL)]
+    shapes, fitted, unseen = data
+    force = ["base force x", "base force y"]
+    names = list(complete.measurement.sensor_names)
+    assert [one["name"] for one in fitted["channels"]] == [*names, *force]
+    assert [one["name"] for one in unseen["channels"]] == names
+    assert (fitted["runs"], unseen["runs"]) == (["base x", "base y"], ["run 1", "run 2"])
+    for shown, test in ((fitted, complete.measurement), (unseen, complete.problem.validation[0])):
+        np.testing.assert_allclose(unpacked(shown["freq"]), test.freq, rtol=1e-6)
+        with_base = np.einsum("sd,rdf->rsf", test.rigid_body, test.base)
+        # Phases against the base direction that moves a sensor most with it; in its own run a unit.
+        most = np.argmax(np.linalg.norm(test.base, axis=-1)[:, None] * np.abs(test.rigid_body), axis=-1)
+        base = np.take_along_axis(test.base, most[..., None], axis=1)
+        turn = np.where(base != 0, base.conj(), 1) / np.where(base != 0, np.abs(base), 1)
+        spectra = {
+            "measured": turn * test.response,
+            "identified": turn * (test.predict(complete.structure) + with_base),
+        }
+        for kind, expected in spectra.items():
+            for s, run in np.ndindex(3, 2):
+                re_, im = map(unpacked, shown["channels"][s][kind][run])
+                np.testing.assert_allclose(re_ + 1j * im, expected[run, s], atol=1e-6 * np.abs(expected).max())
+        for s, run in np.ndindex(3, 2):
+            left = np.abs(spectra["measured"] - spectra["identified"])[run, s]
+            np.testing.assert_allclose(unpacked(shown["channels"][s]["left"][run]), left, rtol=1e-6)
+    assert "noise" in fitted["channels"][0] and "noise" not in unseen["channels"][0]
+    assert len(shapes["points"]) == 3 + 1 and len(shapes["shapes"]) == 3  # the sensors' places and the base
+    assert shapes["shapes"][0][0] == [0, 0, 0]
+
+
+def test_without_its_script_the_page_shows_all_curves_and_modes(complete, page):
+    """Of each channel in each run; the script is what hides them."""
+    sheets = re.findall(r'<div class="sheet"><p>(.*?)</p>(.*?)</div>', page, re.DOTALL)
+    names = [*complete.measurement.sensor_names, "base force x", "base force y"]
+    assert [html.unescape(name) for name, _ in sheets] == [
+        *(f"{name}, base {axis}" for name in names for axis in "xy"),
+        *(f"{name}, run {run}" for name in names[:3] for run in (1, 2)),
+    ]
+    for k, (_, drawing) in enumerate(sheets):
+        kinds = re.findall(r'<path class="(measured|identified|left|noise|band)" d="M[^"]+"', drawing)
+        fitted = ["noise"] * (k < 10)  # no noise is known of the test that was not fitted
+        assert kinds == ["measured", "identified", "measured", "identified", "left", *fitted, "band"]
+        assert "frequency [Hz]" in drawing and "phase [°]" in drawing
+    (shapes,) = re.findall(r'<div class="shapes">(.*?)</div>', page)
+    assert shapes.count("<svg") == shapes.count('class="base"') == complete.structure.n
+    assert "noscript" not in page
+
+
+def unpacked(text):
+    return np.frombuffer(base64.b64decode(text), "<f4")
+
+
+def test_curves_have_the_interval_of_their_own_lines(complete, page):
+    _, fitted, unseen = [json.loads(one) for one in re.findall(r'json">(.*?)</script>', page, re.DOTALL)]
+    u, test, (other,) = complete.uncertainty, complete.measurement, complete.problem.validation
+    for s in range(3):
+        std = u.transmissibility(test.freq)[s]
+        for d in range(2):  # the base moves in one direction a run
+            np.testing.assert_allclose(unpacked(fitted["channels"][s]["band"][d]), norm.ppf(0.975) * std[d], rtol=1e-3)
+        both = np.sum(u.transmissibility(other.freq)[s] * np.abs(other.base[1]), axis=0)
+        np.testing.assert_allclose(unpacked(unseen["channels"][s]["band"][1]), norm.ppf(0.975) * both, rtol=1e-3)
+    std = u.base_force(test.freq)[1, 0]
+    np.testing.assert_allclose(unpacked(fitted["channels"][4]["band"][0]), norm.ppf(0.975) * std, rtol=1e-3)
