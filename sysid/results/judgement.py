@@ -90,7 +90,8 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
     except TimeIsOver:
         open_ = (NOT_JUDGED,)
     ended = () if end.success else (_NO_END.format(end.message),)
-    speak = tuple(dict.fromkeys((*against.sentences, *ended)))
+    first = ended if end.stopped is not None else ()  # what was stopped is no fit for that alone
+    speak = tuple(dict.fromkeys((*end.mistakes, *first, *against.sentences, *ended)))
     open_ = tuple(dict.fromkeys((*speak, *open_)))
     it = Identification(
         structure=end.structure,

@@ -181,8 +181,8 @@ def _towards_a_fit(it: Answer) -> list[str]:
     if it.changing:
         one_by_one = "; 'sysid refine RESULT --leave-out run' shows what each run does to the answer"
         steps = [
-            "fit runs of one level of motion, the one of interest, by themselves: 'sysid read RUN.csv --out level.h5', "
-            "then 'sysid run level.h5'" + one_by_one * (it.measurement.n_runs > 1)
+            "fit by itself a run in which structure and level of motion stay the same, at the level of interest: "
+            "'sysid read RUN.csv --out one.h5', then 'sysid run one.h5'" + one_by_one * (it.measurement.n_runs > 1)
         ]
     if it.residual > _NEAR:
         return steps

@@ -248,6 +248,7 @@ class TestStopping:
         assert result.interrupted
         assert not result.success
         assert result.message == "interrupted"
+        assert result.against[0].startswith("the search ended before it found a fit (interrupted)")
         assert (seen[-1].phase, seen[-1].iteration) == (phase, iteration)
         assert result.residual <= result.history.swarm * (1 + 1e-7)
 

@@ -154,7 +154,7 @@ def test_the_judgement_stands_first_with_what_speaks_against_it_and_the_next_ste
     )  # fmt: skip
     lines = failed.summary().splitlines()
     assert lines[0] == "No fit: these matrices do not explain the records as they should. Fitted: 2 runs."
-    assert [line[4:] for line in lines[1:3]] == list(against[:2]) and lines[3].startswith("  > fit runs of one level")
+    assert [line[4:] for line in lines[1:3]] == list(against[:2]) and lines[3].startswith("  > fit by itself a run")
     besides = lines[lines.index("besides:") :]
     assert [line[4:] for line in besides[1:3]] == ["a gain is wrong", "mode 2 is open"]
     assert besides[-1] == "search: the solver ended as it should (IPOPT: Solve_Succeeded)"
