@@ -75,8 +75,7 @@ def _meaning(it: Identification) -> str:
 
 def _reasons(it: Identification) -> str:
     """HTML of what speaks against the answer most."""
-    told = it.against[:_MOST_AGAINST]
-    return bullets(map(sentence, told)) * bool(told)
+    return bullets(map(sentence, it.against[:_MOST_AGAINST]))
 
 
 def _steps(it: Identification) -> list[str]:

@@ -54,7 +54,9 @@ def summary(it: Answer) -> str:
         f"relative residual {residual_in_words(it)}{force}; seed {it.seed}, {seconds_in_words(it.history.wall_time)}",
         *_phases(it),
         *it.remarks,
-        "rigid-body mass " + ", ".join(_rigid_masses(it, axes)) + " (~ normalised)" * problem.unit_mass,
+        "rigid-body mass "
+        + ", ".join(_rigid_masses(it, axes))
+        + " (~ normalised: no mass is stated, no force was measured)" * problem.unit_mass,
         *_deck_masses(it),
     ]
     lines += stated_values(it)

@@ -14,6 +14,7 @@ from scipy.stats import norm
 
 import sysid
 from sysid.report import opening, report
+from sysid.report.noise_level import noise_level
 
 FREQ = np.linspace(1.0, 40.0, 30)
 VOID = {"meta", "img", "br", "link"}
@@ -107,6 +108,14 @@ def test_what_is_open_and_what_speaks_against_the_answer_stand_apart(complete):
         lines = {name: re.findall("<li>(.*?)</li>", content) for name, content in told.items()}
         assert lines["What speaks against it"] == [f"{one[0].upper()}{one[1:]}." for one in expected]
         assert lines["What the data do not determine"] == [f"T{left[1:]}."]
+
+
+def test_a_model_that_does_not_fit_opens_with_why_and_without_intervals(complete):
+    level = noise_level(complete.problem.screened.measurement, complete.structure)
+    failed = dataclasses.replace(complete, success=False, against=("are they in Hz?", "it softens", "its gains"))
+    right, wrong = (opening.opening(it, level) for it in (complete, failed))
+    assert "±" in right and "±" not in wrong and "without intervals" in wrong
+    assert re.findall("<li>(.*?)</li>", wrong) == ["Are they in Hz?", "It softens."] and "<li>" not in right
 
 
 def test_the_page_is_self_contained_and_runs_one_script(page):
