@@ -184,7 +184,7 @@ def _run(
         told = exchanged_sensors(problem, outcome.structure)
         if told:
             return replace(outcome, mistakes=told), why
-    after = _after(chosen, problem, start) if follow and not (outcome.good or outcome.alone) else None
+    after = _after(chosen, problem, start) if follow and not (outcome.good or outcome.unanimous) else None
     if after is None or outcome.stopped is not None or not session.time_for_more:
         return outcome, why
     why += f"; it left {outcome.history.local:.3g}, and a {after.name} followed"

@@ -24,7 +24,7 @@ FAR = 3.0  # stated deviations
 RANDOM, STOREYS, RIGHT = 36, 4, 300  # structures of each kind, and right tests with 1 % noise
 CHANCE = 1 / 300  # of right records that may be accused
 COMMON = 70  # % of the sensors of right tests whose gain may be told as one that M_SS rests on
-RESTS = "deviations of M_SS hold where gains are right"
+RESTS = "the intervals of M_SS take the gain of each sensor to be exactly 1"
 
 
 class Case(NamedTuple):

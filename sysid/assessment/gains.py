@@ -151,11 +151,14 @@ def assumed(problem: Problem) -> Iterator[str]:
     still = [name for name, row in zip(test.sensor_names, test.rigid_body, strict=True) if not np.any(row)]
     if still:
         yield (
-            f"the gain of {', '.join(still)} is assumed to be right: the row of rigid_body is zero, so that no record "
-            "shows an error of it, and 1 % makes 2 % in the diagonal of M_SS, K_SS and C there"
+            f"no record can show whether the gain of {', '.join(still)} is right, as the row of rigid_body is zero. An "
+            "error of 1 % in it makes 2 % in the diagonal of M_SS, K_SS and C there"
         )
     if test.force is not None and mass.totals is None:
-        yield "the gain of the base force is assumed to be right: it is the scale of M, K and C, which no record shows"
+        yield (
+            "no record can show whether the gain of the base force is right. M, K and C are in proportion to it: an "
+            "error of 1 % in it makes 1 % in them"
+        )
 
 
 def worth_of(by_gain: Array, mass_std: Array) -> Array:
@@ -166,10 +169,12 @@ def worth_of(by_gain: Array, mass_std: Array) -> Array:
     by_gain : (n_sensors, m)
         Moves of the diagonal that an error of each sensor's gain makes.
     mass_std : (m, m)
-        What is stated exactly does not move.
+        What is stated exactly does not move; NaN where all that is not stated is open.
     """
     std = np.diag(mass_std)
     known = std > 0
+    if not known.any() and np.isnan(std).any():
+        return np.full(len(by_gain), np.nan)
     return np.max(by_gain[:, known] / std[known], axis=1, initial=0.0)
 
 
@@ -185,15 +190,15 @@ def rests_on(test: Measurement, errors: GainErrors, worth: Array) -> Iterator[st
         size, open_ = 100 * abs(errors.error[i]), 100 * _WITHIN * errors.std[i]
         reach = size + open_ if np.isfinite(errors.error[i]) else _UNSHOWN
         if worth[i] * reach > _MOVED:
-            shown = f"{1 + errors.error[i]:.4f} +- {open_ / 100:.1g}" if np.isfinite(errors.error[i]) else "not shown"
+            shown = f"{1 + errors.error[i]:.4f} ± {open_ / 100:.1g}" if np.isfinite(errors.error[i]) else "not shown"
             found.append(
-                f"{test.sensor_names[i]} ({shown}; an error of {reach:.2g} % moves M_SS by {worth[i] * reach:.2g})"
+                f"{test.sensor_names[i]} (gain {shown}: an error of {reach:.2g} % would move M_SS by "
+                f"{worth[i] * reach:.2g} standard deviations)"
             )
     if found:
         yield (
-            "the stated deviations of M_SS hold where gains are right, which these records show less exactly, by no "
-            f"more than chance off 1: gain of {', '.join(found)} of its deviations; calibrate these sensors where that "
-            "matters"
+            "the intervals of M_SS take the gain of each sensor to be exactly 1. The records agree, but do not show it "
+            f"closely enough for {', '.join(found)}: calibrate these sensors if that matters"
         )
 
 

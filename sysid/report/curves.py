@@ -17,7 +17,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.plot.panels import run_names
 from sysid.plot.plots import stick_model
 from sysid.report.html import text
-from sysid.report.noise_level import noise_level
+from sysid.report.noise_level import NoiseLevel
 from sysid.report.still import Channel, curve_sheet, mode_still, room_of_modes
 from sysid.results.identification import Identification
 from sysid.results.summary import DEVIATES
@@ -32,9 +32,12 @@ def script() -> str:
     return files("sysid.report").joinpath("curves.js").read_text(encoding="utf-8")
 
 
-def curves(it: Identification, test: Measurement) -> str:
-    """Element of the responses and the base force of a test: of all, without the script; with it one, to be chosen."""
-    channels, runs = [*_responses(it, test), *_forces(it, test)], run_names(test)
+def curves(it: Identification, test: Measurement, level: NoiseLevel) -> str:
+    """Element of the responses and the base force of a test: of all, without the script; with it one, to be chosen.
+
+    `level` is the noise of the test.
+    """
+    channels, runs = [*_responses(it, test, level), *_forces(it, test, level)], run_names(test)
     content = {
         "freq": _packed(test.freq),
         "gaps": test.gaps.tolist(),
@@ -107,12 +110,12 @@ def _mode_stills(content: dict[str, Any]) -> str:
     return f'<div class="shapes">{"".join(drawn)}</div>'
 
 
-def _responses(it: Identification, test: Measurement) -> Iterator[Channel]:
+def _responses(it: Identification, test: Measurement, level: NoiseLevel) -> Iterator[Channel]:
     own = test.has_unit_runs
     predicted = test.predict(it.structure) + np.einsum("sd,rdf->rsf", test.rigid_body, test.base)
     u = it.quick_uncertainty
     band = None if u is None else _half_widths(u.transmissibility(test.freq), test)
-    raw, noise = _recorded(it, test), noise_level(test, it.structure).response
+    raw, noise = _recorded(it, test), level.response
     words, unit = ("transmissibility", "–") if own else ("spectrum of acceleration", "m/s², scaled as given")
     if own and not test.translational.all():
         unit = "per unit base motion"
@@ -125,11 +128,10 @@ def _responses(it: Identification, test: Measurement) -> Iterator[Channel]:
         )  # fmt: skip
 
 
-def _forces(it: Identification, test: Measurement) -> Iterator[Channel]:
+def _forces(it: Identification, test: Measurement, level: NoiseLevel) -> Iterator[Channel]:
     if test.force is None:
         return
     predicted, u = test.predict_force(it.structure), it.quick_uncertainty
-    noise = noise_level(test, it.structure).force
     band = None if u is None else _half_widths(u.base_force(test.freq), test)
     for i, axis in enumerate(test.base_axes or ()):
         words, unit = ("apparent mass", "kg") if test.has_unit_runs else ("spectrum of force", "N, scaled as given")
@@ -141,7 +143,7 @@ def _forces(it: Identification, test: Measurement) -> Iterator[Channel]:
         turn = _against_base(test, np.eye(test.n_base)[i])
         yield Channel(
             f"base force {axis}", words, unit, turn * test.force[:, i], turn * predicted[:, i],
-            _levels(noise, i, test), _levels(band, i, test),
+            _levels(level.force, i, test), _levels(band, i, test),
         )  # fmt: skip
 
 

@@ -136,7 +136,7 @@ def paragraph(value: object, kind: str = "") -> str:
 
 def sentence(words: str) -> str:
     """Begin with a capital, end with a stop."""
-    return words[:1].upper() + words[1:] + ("" if words.endswith((".", "!")) else ".")
+    return words[:1].upper() + words[1:] + ("" if words.endswith((".", "!", "?")) else ".")
 
 
 def bullets(sentences: Iterable[object]) -> str:

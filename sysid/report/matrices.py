@@ -12,6 +12,7 @@ from sysid.results.summary import half_width
 from sysid.structure.structure import Array
 
 ONE_OF_MANY, CHOSEN = "one of many", "as the modal masses were chosen"
+_NO_FIT = "of a model that does not fit"
 SAME = 1e-9  # of a value: a smaller difference is round-off
 _ENDS_ELSEWHERE = " How far the entries may go is in the result's mass_interval and stiffness_interval."
 _ENDS_BELOW = (
@@ -34,12 +35,14 @@ def matrices(it: Identification) -> str:
     stds = [it.quick_std(name)[:n, :n] for name in ("mass", "stiffness", "damping")]
     ends = None if it.determined else it.quick_intervals
     label = "" if it.determined or np.all(np.isfinite(stds[0])) else ONE_OF_MANY
+    mark = _NO_FIT * (not it.success) or label
     words = (
         "Heat maps: each entry over the root of its two diagonal entries. Tables: entries below 10⁻¹² of a matrix's "
         "largest are round-off, and stand as 0."
     )
     if np.any(np.isfinite(stds)):
         words += " ±: half of the 95 % interval, from the noise of the records; open: the data do not tell."
+        words += " It holds for a model that fits: this one does not." * (not it.success)
     lower = list(map(half_widths, (M, K, C), stds))
     if label:
         lower[2] = no_lines(C.shape)  # half-widths about one choice tell less than its mark
@@ -50,14 +53,14 @@ def matrices(it: Identification) -> str:
         paragraph(words, "soft"),
         picture(
             plot.matrices(it), "heat maps of the mass, stiffness and damping matrices", CHOSEN if label else "",
-            colours=None, label=label,
+            colours=None, label=mark,
         ),
-        matrix(M, names, names, f"Mass M_SS, kg{scale}", below=lower[0], label=label),
-        matrix(M_full[:n, n:], names, axes, f"Coupling mass M_S0, {coupling}{scale}", label=label),
-        matrix(M_full[n:, n:], axes, axes, f"Base mass M_00, {base}{scale}", label=label),
-        matrix(K, names, names, f"Stiffness K_SS, N/m{scale}", below=lower[1], label=label),
+        matrix(M, names, names, f"Mass M_SS, kg{scale}", below=lower[0], label=mark),
+        matrix(M_full[:n, n:], names, axes, f"Coupling mass M_S0, {coupling}{scale}", label=mark),
+        matrix(M_full[n:, n:], axes, axes, f"Base mass M_00, {base}{scale}", label=mark),
+        matrix(K, names, names, f"Stiffness K_SS, N/m{scale}", below=lower[1], label=mark),
         matrix(
-            C, names, names, f"Damping C on the motion relative to the base, N s/m{scale}", below=lower[2], label=label
+            C, names, names, f"Damping C on the motion relative to the base, N s/m{scale}", below=lower[2], label=mark
         ),
     ]  # fmt: skip
     return "".join(parts)

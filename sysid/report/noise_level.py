@@ -45,3 +45,9 @@ def share_of_noise(std: Array | None, records: ComplexArray) -> Array:
     size = np.linalg.norm(records, axis=(0, 2))
     noise = np.sqrt(np.sum(np.broadcast_to(std, records.shape) ** 2, axis=(0, 2)))
     return np.divide(noise, size, out=np.full_like(size, np.nan), where=size > 0)
+
+
+def share_of_all_noise(std: Array | None, records: ComplexArray) -> float:
+    """Noise over records, all channels together; zero where it is not known."""
+    size = np.linalg.norm(records, axis=(0, 2))
+    return float(np.sqrt(np.nansum((share_of_noise(std, records) * size) ** 2)) / np.linalg.norm(size))

@@ -8,11 +8,11 @@ import numpy as np
 
 from sysid.report.html import bullets, number, paragraph, sentence, table, text
 from sysid.report.matrices import stated
-from sysid.report.noise_level import NoiseLevel, noise_level
+from sysid.report.noise_level import NoiseLevel, share_of_all_noise
+from sysid.results.deck_masses import deck_masses
 from sysid.results.identification import Identification
-from sysid.results.summary import DEVIATES, counted, half_width, next_steps, verdict
+from sysid.results.summary import DEVIATES, counted, fitted_in_words, half_width, next_steps, verdict
 from sysid.results.unknowns_table import rows_of
-from sysid.structure.structure import Array, ComplexArray
 
 _KIND = {"determined": "good", "one of many": "warn", "no fit": "bad"}
 _WORD = {"determined": "Determined", "one of many": "One of many", "no fit": "No fit"}
@@ -20,17 +20,16 @@ _HOLDS = (
     "frequencies, damping ratios and responses to base motion hold whichever of these models is taken; mass, stiffness "
     "and damping matrices are one choice"
 )
-_NO_END = "the search did not end"
 _MOST_AGAINST = 2  # sentences in the opening; all of them follow
 _MOST_MODES, _MOST_UNKNOWNS = 4, 5  # whose figures stand in the opening; all of them follow
 
 
-def opening(it: Identification) -> str:
-    """HTML of what was identified, the judgement, the next thing to do, and the figures."""
+def opening(it: Identification, level: NoiseLevel) -> str:
+    """HTML of what was identified, the judgement, the next thing to do, and the figures; `level` of the records."""
     word = "Stopped before its end: the best until then. " * it.interrupted + _WORD[it.judgement]
-    judged = paragraph(_meaning(it)) + f"<p><b>Next:</b> {text(_steps(it)[0])}</p>"
+    judged = paragraph(_meaning(it)) + _reasons(it) + f"<p><b>Next:</b> {text(_steps(it)[0])}</p>"
     box = f'<div class="verdict {_KIND[it.judgement]}"><strong>{text(word)}</strong>{judged}</div>'
-    rows = [*_masses(it), *_unknowns(it), *_modes(it), *_fit(it)]
+    rows = [*_masses(it), *_deck_masses(it), *_unknowns(it), *_modes(it), *_fit(it, level)]
     return _subject(it) + box + table(["", ""], rows, words=True)
 
 
@@ -48,11 +47,9 @@ def trust(it: Identification) -> str:
 
 
 def _weighed(it: Identification) -> tuple[list[str], list[str]]:
-    """What speaks against the answer, which its message tells too, and what is open."""
-    against = [told for told in it.undetermined if told in it.message or told.startswith(_NO_END)]
+    """What speaks against the answer, and what is open besides."""
+    against = list(it.against)
     open_ = [told for told in it.undetermined if told not in against]
-    if not it.success and it.confidence[0] == it.message:
-        against.insert(0, it.message)
     if open_ and it.success and it.is_one_of_many:
         open_.append(_HOLDS)
     return against, open_
@@ -65,7 +62,7 @@ def _subject(it: Identification) -> str:
         of += f" from {test.n_sensors} sensors"
     records = "whole records, their transients taken off, " * (it.problem.measurement.whole is not None)
     told = (
-        f"Identified: mass, stiffness and damping matrices of {of}. From: {counted(test.n_runs, 'run')}, "
+        f"Identified: mass, stiffness and damping matrices of {of}. From: {fitted_in_words(it)}, "
         f"{counted(d, 'base direction')} ({', '.join(test.base_axes or ())}), {records}{test.lines_in_words}, "
         f"{'with' if test.force is not None else 'without'} base force."
     )
@@ -73,10 +70,12 @@ def _subject(it: Identification) -> str:
 
 
 def _meaning(it: Identification) -> str:
-    if it.judgement == "no fit":
-        against = [told for told in it.confidence if told in it.message][:_MOST_AGAINST] or [it.message]
-        return " ".join(map(sentence, (f"these matrices do not explain the records: {against[0]}", *against[1:])))
     return sentence(verdict(it).partition(": ")[2] or verdict(it))
+
+
+def _reasons(it: Identification) -> str:
+    """HTML of what speaks against the answer most."""
+    return bullets(map(sentence, it.against[:_MOST_AGAINST]))
 
 
 def _steps(it: Identification) -> list[str]:
@@ -85,30 +84,36 @@ def _steps(it: Identification) -> list[str]:
     if steps:
         return steps
     if it.judgement == "one of many":
-        return ["Mend or measure what speaks against it, the first thing first: below."]
+        return ["Measure more closely what is not known well enough: it is named below."]
     if not it.problem.validation:
         return ["Predict a test that was not fitted (validation=[...]): it alone shows what the model leaves out."]
     return ["Take the matrices: sysid export writes them for Nastran, MATLAB and others."]
 
 
 def _masses(it: Identification) -> Iterator[tuple[str, str]]:
-    if it.problem.unit_mass:
-        yield "total mass", "not determined: no mass is stated and no force was measured (1 kg is taken)"
-        return
     masses, std = np.diag(it.structure.rigid_body_mass), np.diag(it.quick_std("rigid_body_mass"))
     by_user = np.diag(stated(it))
     for axis, mass, deviation, known in zip(it.measurement.base_axes or (), masses, std, by_user, strict=True):
         what, unit = ("moment of inertia", "kg m²") if axis.startswith("r") else ("total mass", "kg")
+        if it.problem.unit_mass:
+            yield f"{what}, {axis}", f"~{number(mass)} {unit}, normalised: no mass is stated, no force was measured"
+            continue
         exact = known and half_width(deviation, mass) in ("open", "0")
-        told = f"{number(mass)} {unit}, as stated" if exact else _with_interval(mass, deviation, unit)
+        told = f"{number(mass)} {unit}, as stated" if exact else _with_interval(it, mass, deviation, unit)
         yield f"{what}, {axis}", told
+
+
+def _deck_masses(it: Identification) -> Iterator[tuple[str, str]]:
+    """Masses of a lumped model, sensor by sensor."""
+    for one in deck_masses(it):
+        yield f"mass at {one.name}", _with_interval(it, one.mass, one.std, "kg")
 
 
 def _unknowns(it: Identification) -> Iterator[tuple[str, str]]:
     """Unknowns with a meaning of their own, where they are few."""
     rows = rows_of(it)
     for row in rows if len(rows) <= _MOST_UNKNOWNS else ():
-        yield row.label, _with_interval(row.value, row.std, row.unit).strip()
+        yield row.label, _with_interval(it, row.value, row.std, row.unit).strip()
 
 
 def _modes(it: Identification) -> Iterator[tuple[str, str]]:
@@ -117,20 +122,21 @@ def _modes(it: Identification) -> Iterator[tuple[str, str]]:
     widths = np.zeros((2, n)) if u is None else np.array([u.natural_frequencies[:n], u.damping_ratios[:n]])
     for k in range(n):
         f, percent = s.natural_frequencies[k], 100 * s.damping_ratios[k]
-        damping = _with_interval(percent, 100 * widths[1, k], "%")
-        yield f"mode {k + 1}", f"{_with_interval(f, widths[0, k], 'Hz')}, damping {damping}"
+        damping = _with_interval(it, percent, 100 * widths[1, k], "%")
+        yield f"mode {k + 1}", f"{_with_interval(it, f, widths[0, k], 'Hz')}, damping {damping}"
+    if not it.success:
+        yield "", "without intervals: they hold for a model that fits, and this one does not"
     if s.n > n:
         yield "", f"and {counted(s.n - n, 'further mode')} up to {number(s.natural_frequencies[-1], 4)} Hz, below"
 
 
-def _fit(it: Identification) -> Iterator[tuple[str, str]]:
+def _fit(it: Identification, level: NoiseLevel) -> Iterator[tuple[str, str]]:
     test = it.problem.screened.measurement
-    level = noise_level(test, it.structure)
     left = f"{number(100 * it.residual, 3)} % of the accelerations relative to the base"
-    left += _beside(_share(level.response, test.relative), level)
+    left += _beside(share_of_all_noise(level.response, test.relative), level)
     if it.force_residual is not None and test.force is not None:
         left += f", {number(100 * it.force_residual, 3)} % of the base force"
-        left += _beside(_share(level.force, test.force), level)
+        left += _beside(share_of_all_noise(level.force, test.force), level)
     yield "the fit leaves", left
     for i, unseen in enumerate(it.validation, start=1):
         missed = number(100 * unseen.residual(it.structure), 3)
@@ -150,15 +156,9 @@ def rounded(value: float, std: float, digits: int = 4) -> tuple[str, str]:
     return f"{value + 0.0:.{places}f}", f"{DEVIATES * std:.{places}f}"
 
 
-def _with_interval(value: float, std: float, unit: str) -> str:
-    told, width = rounded(value, std)
-    if width == "open":
+def _with_interval(it: Identification, value: float, std: float, unit: str) -> str:
+    """A value with its interval; of a model that does not fit without one, as it leaves out what is missed."""
+    told, width = rounded(value, std if it.success or np.isnan(std) else 0.0)
+    if width == "open" and it.quick_uncertainty is not None:
         return f"{told} {unit}, one of many: these data do not determine it"
-    return f"{told} {unit}" if width == "0" else f"{told} ± {width} {unit}"
-
-
-def _share(std: Array | None, records: ComplexArray) -> float:
-    """Noise over records, as the residual measures them; zero where it is not known."""
-    if std is None:
-        return 0.0
-    return float(np.sqrt(np.sum(np.broadcast_to(std, records.shape) ** 2)) / np.linalg.norm(records))
+    return f"{told} {unit}" if width in ("open", "0") else f"{told} ± {width} {unit}"

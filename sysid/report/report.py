@@ -16,7 +16,7 @@ from sysid.problem.problem import Problem
 from sysid.report.curves import curves, mode_shapes, script
 from sysid.report.html import Cell, beside, bullets, matrix, number, page, paragraph, picture, sentence, table, text
 from sysid.report.matrices import CHOSEN, ONE_OF_MANY, SAME, Lines, half_widths, matrices, plain, stated
-from sysid.report.noise_level import noise_level, share_of_noise
+from sysid.report.noise_level import NoiseLevel, noise_level, share_of_noise
 from sysid.report.opening import opening, rounded, trust
 from sysid.results.gain_table import gains_of_sensors
 from sysid.results.identification import Identification
@@ -25,10 +25,12 @@ from sysid.results.phases import COLUMNS, rows_of_phases, seconds_in_words
 from sysid.results.storage import atomically, file_or_folder
 from sysid.results.summary import (
     counted,
+    ending_in_words,
     half_width,
     is_one_of_many,
     known_half_width,
     mass_percent_std,
+    missing_mass,
     noise_source,
     residual_in_words,
     tilde,
@@ -58,6 +60,7 @@ _WIDENED = (
     "Dashed: the swarm's objective of responses with widened peaks, which does not compare with that of the records "
     "themselves; what the phases leave of these stands below."
 )
+_NORMALISED = "~ normalised, one of many"
 _FALL = 0.9  # of the objective that a search began with, below which its curve is drawn
 _MOST_OUTLIERS = 10  # that are told one by one
 _MANY_PANELS = 40  # beyond which the pictures are drawn with fewer pixels
@@ -114,14 +117,15 @@ def write_report(identification: Identification, path: str | Path) -> Path:
 def render(identification: Identification) -> str:
     """Make the page, as a string."""
     it = identification
+    level = noise_level(it.problem.screened.measurement, it.structure)
     return page(
         _title(it),
-        opening(it),
+        opening(it, level),
         [
             ("How far to trust it", trust(it)),
             ("Modes", _modes(it)),
             ("Mode shapes", _shapes(it)),
-            ("Measured against identified", _responses(it, it.measurement) + _residuals(it)),
+            ("Measured against identified", _responses(it, it.measurement, level) + _residuals(it, level)),
             ("Validation", _validation(it)),
             ("Further tests", _further(it)),
             ("Total mass", _rigid_body_mass(it)),
@@ -176,6 +180,7 @@ def _modes(it: Identification) -> str:
         columns.insert(2, ["±", *(width for _, width in told), ""])
         columns.append(["±", *(width for _, width in damping), ""])
         notes.append("±: half of the 95 % interval that the noise of the records makes; 0 where it is round-off.")
+        notes += ["It holds for a model that fits: this one does not."] * (not it.success)
         if it.measurement.response_std is None:
             notes.append("No noise is stated, so the misfit is taken for it.")
     columns += _effective_mass_columns(it, many)
@@ -187,7 +192,8 @@ def _modes(it: Identification) -> str:
             columns.append([name, *(number(value, digits) for value in theirs), ""])
             columns.append(["difference [%]", *map(_difference, ours, theirs), ""])
     if many.any():
-        notes.append("~: one of many values that explain the data.")
+        notes.append("~: one of many values that fit as well.")
+    notes += map(sentence, missing_mass(it))
     head, *rows = zip(*columns, strict=True)
     return table(head, rows, " ".join(notes))
 
@@ -226,23 +232,23 @@ def _rigid_body_mass(it: Identification) -> str:
         )
     elif u is not None:
         below = half_widths(rigid, u.rigid_body_mass, stated(it))
-    told += matrix(rigid, axes, axes, f"Total mass M_rb = [G; I]' M [G; I], {unit}.", below=below)
+    label = _NORMALISED * it.problem.unit_mass
+    told += matrix(rigid, axes, axes, f"Total mass M_rb = [G; I]' M [G; I], {unit}.", below=below, label=label)
     if reference is not None:
         told += matrix(reference.rigid_body_mass, axes, axes, f"Of the reference, {unit}.")
     return told
 
 
-def _responses(it: Identification, test: Measurement) -> str:
+def _responses(it: Identification, test: Measurement, level: NoiseLevel) -> str:
     words = _PER_UNIT if test.has_unit_runs else _AS_MOVED
     if test is it.measurement and it.problem.measurement.whole is not None:
         words += " The transients of the records are taken off."
-    return paragraph(words, "soft") + curves(it, test)
+    return paragraph(words, "soft") + curves(it, test, level)
 
 
-def _residuals(it: Identification) -> str:
+def _residuals(it: Identification, level: NoiseLevel) -> str:
     """What the fit leaves of each channel, beside its noise."""
     test = _as_fitted(it, it.measurement)
-    level = noise_level(test, it.structure)
     left = [1 - score for score in scores(it.structure, test).relative]
     channels = [*zip(test.sensor_names, left, share_of_noise(level.response, test.relative), strict=True)]
     if test.force is not None:
@@ -322,7 +328,7 @@ def _validation(it: Identification) -> str:
             f"<h3>Test {i} of {len(it.problem.validation)}: predicted, never fitted</h3>",
             paragraph(f"{_residual(test, it.structure)}."),
             _score_table(it, test),
-            _responses(it, test),
+            _responses(it, test, noise_level(test, it.structure)),
         ]
     if parts:
         parts.append(
@@ -402,7 +408,7 @@ def _mac(it: Identification) -> str:
 def _effective_masses(it: Identification) -> str:
     words, reference = "Bars: each mode; lines: their running sum", it.problem.reference
     words += "; short dashes: each mode of the reference" * (reference is not None and reference.n == it.structure.n)
-    words += ". What is missing to 100 % moves with the base."
+    words += ". What is missing to 100 % moves with the base, or in modes beyond the lines."
     label, caption = (ONE_OF_MANY, CHOSEN) if is_one_of_many(it).any() else ("", "")
     alt = "effective masses by mode and base direction"
     return paragraph(words, "soft") + picture(plot.effective_masses(it), alt, caption, label=label)
@@ -414,7 +420,7 @@ def _how(it: Identification) -> str:
     all_records += "; outliers that stand alone are left out" * (it.problem.loss == "huber")
     of = all_records if it.residuals else "of the misfit that the problem states"
     lines = [
-        f"{'Success' if it.success else 'No success'}: {it.message}.",
+        f"{'Success' if it.success else 'No success'}. The search: {ending_in_words(it)}.",
         *map(sentence, it.remarks[:1]),
         f"Relative residual {residual_in_words(it)}, {of}.",
         f"Objective {it.objective:.3e}: all that is fitted, each record weighted by its noise.",

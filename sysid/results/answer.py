@@ -46,16 +46,22 @@ class Answer:
         The last solver's status is good, and the residual meets the goal; where none is given, what is left is at most
         three times the noise of the records, and below one half of them.
     message : str
+        What the solver and the search say of how they ended.
     history : History
     determined : bool
         Every entry of M_SS, K_SS and C is fixed by the data and the stated model, nothing speaks against the fit, and
         noise leaves each entry known to a tenth of the root of its two diagonal entries (standard deviation).
     closed_by, undetermined : tuple of str
-        What fixes it, empty where anything is open; and what is open, in sentences.
+        What fixes it, empty where anything is open; and what leaves it open, in sentences: those `against` first.
     remarks : tuple of str
         How it was done, and why so, in sentences.
     interrupted : bool
         The search was stopped by Ctrl-C, and this is the best until then.
+    against : tuple of str
+        What speaks against the answer, in sentences, the weightiest first: why it is no success, what explains that,
+        and signs of wrong records, statements or models. None where the matrices are merely not the only ones.
+    changing : bool
+        Frequencies change between parts of the records, so that no structure of constant matrices explains them.
     hurried : bool
         For want of time summaries leave out what is not computed yet; not stored.
     """
@@ -73,6 +79,8 @@ class Answer:
     undetermined: tuple[str, ...]
     remarks: tuple[str, ...] = ()
     interrupted: bool = False
+    against: tuple[str, ...] = field(default=(), kw_only=True)
+    changing: bool = field(default=False, kw_only=True)
     hurried: bool = field(default=False, kw_only=True)
 
     @property
@@ -93,10 +101,8 @@ class Answer:
         Why there is no fit; what speaks against it, and what is open; what fixes the matrices where nothing is; and
         what else is to be known of records, bounds and sensors.
         """
-        told = (*self.undetermined, *self.closed_by, *self.remarks[1:])  # the first tells why the strategy was taken
-        if self.success or any(sentence in self.message for sentence in self.undetermined):
-            return told
-        return (self.message, *told)  # of results of older versions, and of searches that were stopped
+        # The first remark tells why the strategy was taken.
+        return tuple(dict.fromkeys((*self.against, *self.undetermined, *self.closed_by, *self.remarks[1:])))
 
     @property
     def measurement(self) -> Measurement:

@@ -25,6 +25,7 @@ from sysid.structure.structure import Array, Structure
 # Fields that are texts, numbers or arrays themselves.
 _PLAIN = (
     "x", "strategy", "success", "message", "determined", "closed_by", "undetermined", "remarks", "interrupted",
+    "against", "changing",
 )  # fmt: skip
 
 
@@ -144,6 +145,7 @@ class Identification(Answer):
             "unknown_units": {v.name: v.unit for v in reported},
             "total_mass_kg": np.diag(self.structure.rigid_body_mass).tolist(),
             "determined": bool(self.determined),
+            "against": list(self.against),
             "closed_by": list(self.closed_by),
             "undetermined": list(self.undetermined),
             "remarks": list(self.remarks),

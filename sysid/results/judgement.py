@@ -28,9 +28,17 @@ from sysid.search.session import Session
 from sysid.search.strategy import HUBER, Outcome
 
 _KNOWN = 0.1  # of the root of two diagonal entries; an entry with a larger standard deviation is not known
-_OUTLIERS = "for spikes and drop-outs state Problem(..., loss='huber'), or leave these lines out"
+_OUTLIERS = "if they are spikes or drop-outs, state Problem(..., loss='huber'), or leave these lines out"
 _NO_FIT = 0.5  # relative residual above which nothing is explained
-_NO_END = "the search did not end in a fit ({}): this is not yet any structure that explains the data"
+_NO_END = "the search ended before it found a fit ({}): these matrices are no more than the best until then"
+_CONVENTIONS = (
+    "are the frequencies in Hz, the responses absolute and complex with exp(+iwt), the axes and signs of rigid_body "
+    "right, the bounds wide enough?"
+)
+_SCALE = (
+    "without a base force or a mass in kg their scale is not determined, and masses are normalised to 1 kg in each "
+    "base direction, which the bounds of the stiffness may exclude: state total_mass, or give the base force"
+)
 
 
 class Verdict(NamedTuple):
@@ -67,21 +75,24 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
     # What was stopped on its way has misfits of another kind.
     judged = end.stopped is None and (end.success or (problem.free_modes and not cut_short))
     closed_by: tuple[str, ...] = ()
-    against = Against(verdict.wrong, ())
+    against = Against((*end.mistakes, *verdict.wrong))
+    open_: tuple[str, ...] = ()
     try:
         with within(session.left):
             known = determine(records, end.structure, end.x, end.alternatives)
             against = _against(problem, end, verdict) if judged else against
-            open_, closed_by = (*end.mistakes, *against.further, *known.undetermined), known.closed_by
-        if verdict.success and known.judged_by == BY_RANK and not open_:
+            open_, closed_by = known.undetermined, known.closed_by
+        if verdict.success and known.judged_by == BY_RANK and not (open_ or against.sentences):
             end, unknown = with_other_answers(problem, end, session)
             with within(session.left):
                 others = determine(records, end.structure, end.x, end.alternatives).undetermined
             open_ = (*unknown, *others)
     except TimeIsOver:
         open_ = (NOT_JUDGED,)
-    told = () if verdict.fits else (_NO_END.format(end.message),)
-    open_ = tuple(dict.fromkeys((*end.mistakes, *against.first, *told, *open_)))
+    ended = () if end.success else (_NO_END.format(end.message),)
+    first = ended if end.stopped is not None else ()  # what was stopped is no fit for that alone
+    speak = tuple(dict.fromkeys((*end.mistakes, *first, *against.sentences, *ended)))
+    open_ = tuple(dict.fromkeys((*speak, *open_)))
     it = Identification(
         structure=end.structure,
         problem=problem,
@@ -89,26 +100,28 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
         strategy=end.strategy,
         seed=seed,
         success=verdict.success,
-        message="; ".join(dict.fromkeys(_in_order(end, (*end.mistakes, *against.first, *against.further)))),
+        message=end.message,
         history=replace(end.history, log=tuple(session.lines), wall_time=session.seconds),
         determined=not open_,
         closed_by=() if open_ else closed_by,
         undetermined=open_,
         remarks=(why, *end.remarks, *_remarks(problem, end), *(() if open_ else assumed(problem))),
         interrupted=isinstance(end.stopped, KeyboardInterrupt),
+        against=speak,
+        changing=against.changing,
     )
     try:
         with within(session.left):
             return _as_certain(it)
     except TimeIsOver:
-        return replace(it, determined=False, closed_by=(), undetermined=(NOT_JUDGED,))
+        return replace(it, determined=False, closed_by=(), undetermined=(*it.against, NOT_JUDGED))
 
 
 class Against(NamedTuple):
-    """What speaks against an answer, in sentences: why it is no success, or what explains that; and further signs."""
+    """What speaks against an answer, in sentences, the weightiest first; and whether frequencies change."""
 
-    first: tuple[str, ...]
-    further: tuple[str, ...]
+    sentences: tuple[str, ...]
+    changing: bool = False
 
 
 def _against(problem: Problem, end: Outcome, verdict: Verdict) -> Against:
@@ -116,17 +129,12 @@ def _against(problem: Problem, end: Outcome, verdict: Verdict) -> Against:
     averaged = problem.screened.measurement.averaged
     if end.mistakes:
         further = doubts(problem.screened, end.structure, end.x) if averaged else ()
-        return Against(verdict.wrong, (*end.doubts, *further))
+        return Against((*end.mistakes, *verdict.wrong, *end.doubts, *further))
     errors = model_errors(problem, end.structure, verdict.misses)
     further = (*end.doubts, *doubts(problem.screened, end.structure, end.x, changing=errors.changing))
     if errors.changing:
-        return Against((*errors.sentences, *verdict.wrong), further)
-    return Against(verdict.wrong, (*errors.sentences, *further))
-
-
-def _in_order(end: Outcome, told: tuple[str, ...]) -> tuple[str, ...]:
-    """Sentences, and what the solver says: first where it did not succeed, else last."""
-    return (*told, end.message) if end.success else (end.message, *told)
+        return Against((*errors.sentences, *verdict.wrong, *further), changing=True)
+    return Against((*verdict.wrong, *errors.sentences, *further))
 
 
 def verdict_of(problem: Problem, end: Outcome, *, cut_short: bool = False) -> Verdict:
@@ -139,20 +147,15 @@ def verdict_of(problem: Problem, end: Outcome, *, cut_short: bool = False) -> Ve
     if goal is not None and residual > goal:
         wrong.append(f"the residual {residual:.3g} is above the goal {goal:.3g}")
     if goal is None and residual > _NO_FIT and end.stopped is None and (end.success or not cut_short):
-        doubt = "are the frequencies in Hz, the responses absolute and complex with exp(+iwt), the axes and signs of "
-        doubt += "rigid_body right, the bounds wide enough?"
-        if problem.unit_mass and not problem.formulation.stiffness.free:
-            doubt = (
-                "without a base force or a mass in kg their scale is not determined, and masses are normalised to 1 kg "
-                "in each base direction, which the bounds of the stiffness may exclude: state total_mass, or give the "
-                "base force"
-            )
-        wrong.append(f"the residual {residual:.3g} is no fit: {doubt}")
+        scaled = problem.unit_mass and not problem.formulation.stiffness.free
+        wrong.append(f"the residual {residual:.3g} is no fit: {_SCALE if scaled else _CONVENTIONS}")
     fits = end.success and not wrong
     misses = misses_of(problem, end.structure, end.x) if end.stopped is None else []
     if goal is None:
         wrong += missed_in_words(misses)
-    return Verdict(fits, tuple(wrong), "; ".join(_in_order(end, tuple(wrong))), misses)
+    # What the solver says stands first where it did not succeed, else last.
+    told = (*wrong, end.message) if end.success else (end.message, *wrong)
+    return Verdict(fits, tuple(wrong), "; ".join(told), misses)
 
 
 def _remarks(problem: Problem, end: Outcome) -> Iterator[str]:
@@ -182,13 +185,13 @@ def _outliers(problem: Problem, end: Outcome) -> Iterator[str]:
     """Which numbers of the records are far from the fit: all where they count little, else those that stand alone."""
     every = problem.outliers(end.structure, end.x)
     if problem.loss == "squares":
-        what = f", and the lines beside them are not: {_OUTLIERS}"
+        what = f", while the lines beside them fit: {_OUTLIERS}"
     elif any(phase.name == HUBER for phase in end.history.phases):
         what = ": they count little, by Huber's loss"
     else:
         what = (
-            ": the search ended before Huber's loss, so that they count by their squares, but for those that stand "
-            "alone, which were taken out before it"
+            ": the search ended before Huber's loss, so they count in full; those that stand alone were left out from "
+            "the beginning"
         )
     tests = sorted({one.test for one in every})
     fits = {i: test for i, (test, _) in enumerate(problem.fits(end.structure, end.x), start=problem.first_test)}

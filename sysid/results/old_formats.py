@@ -25,6 +25,7 @@ CONTENT = "sysid identification"
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 _FORMATS = (1, 2)
+_NO_END = "the search did not end in a fit"  # as results began one of their sentences
 
 
 def content(path: Path) -> Tree:
@@ -72,6 +73,17 @@ def tree_of(path: Path) -> Tree:
         },
         "recipe": {"data": None, **tree["recipe"]} if "recipe" in tree else None,
     }  # fmt: skip
+
+
+def with_against(tree: Tree) -> Tree:
+    """The tree of a result that joined what speaks against it to its message, as results have it today."""
+    message, undetermined = tree["message"], tuple(tree["undetermined"])
+    against = tuple(told for told in filter(None, undetermined) if told in message or told.startswith(_NO_END))
+    for told in against:
+        message = message.replace(f"{told}; ", "").replace(f"; {told}", "")
+    if not (against or tree["success"]):
+        against = (message,)
+    return {**tree, "message": message, "against": against, "changing": False}
 
 
 def _plain(value: Any) -> Any:

@@ -24,7 +24,7 @@ from typing import TypeVar
 
 from sysid.errors import InputError, path_of
 from sysid.files.tree import Tree, from_bytes, is_tree, to_bytes
-from sysid.results.old_formats import CONTENT, SIGNATURE, tree_of
+from sysid.results.old_formats import CONTENT, SIGNATURE, tree_of, with_against
 from sysid.results.version import __version__
 
 FORMAT = 3  # rises where an older sysid could not read the file: since 3 it is a tree with a SHA-256
@@ -74,7 +74,7 @@ def _tree(source: Path) -> Tree:
     if not is_tree(image):
         if not image.startswith(SIGNATURE):
             raise InputError("it is not a result of sysid, or its first bytes are damaged")
-        return tree_of(source)
+        return with_against(tree_of(source))
     tree, number = from_bytes(image)
     if number > FORMAT:
         raise InputError(
@@ -83,7 +83,7 @@ def _tree(source: Path) -> Tree:
         )
     if tree["content"] != CONTENT:
         raise InputError(f"it holds a {tree['content']}, not a {CONTENT}")
-    return tree
+    return tree if "against" in tree else with_against(tree)
 
 
 def file_or_folder(path: str | Path, name: str, suffixes: Sequence[str]) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Iterator, Sequence
 
@@ -9,7 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.assessment.sensitivity import blocks_of
+from sysid.measurement.in_time import peaks
 from sysid.results.answer import NOT_JUDGED, Answer
+from sysid.results.deck_masses import deck_masses
 from sysid.results.gain_table import gains_of_sensors
 from sysid.results.noise_table import noise_of_channels
 from sysid.results.phases import COLUMNS, rows_of_phases, seconds_in_words
@@ -19,28 +22,42 @@ from sysid.structure.structure import Array
 _NOT_COMPUTED = (
     "uncertainty not computed, as the time was over: Identification.uncertainty and 'sysid report' compute it"
 )
-_MEND = (
-    "mend what speaks against it, the first thing first; where a fit as near as this will do, state the residual that "
-    "is enough: goal=0.05 (sysid run test.h5 --goal 0.05)"
-)
+_ENDED = {
+    "Solve_Succeeded": "the solver ended as it should",
+    "Solved_To_Acceptable_Level": "the solver ended near enough to its optimum",
+    "Maximum_Iterations_Exceeded": "the solver ran out of iterations",
+    "Maximum_WallTime_Exceeded": "the solver ran out of time",
+    "Infeasible_Problem_Detected": "the solver found no point that keeps the constraints",
+}
 DEVIATES = 1.96  # standard deviations on either side of 95 % of a normal law
 _ROUND_OFF = 1e-10  # of a value: what is no noise of an instrument
 _WIDTH = 120
+_FIRST = 2  # sentences beside the verdict; the others follow the tables
+_NEAR = 0.5  # relative residual, up to which a fit may be called near enough
+_MISSING = 0.5  # % of the rigid-body mass
+_OF_A_FIT = ", which holds for a model that fits: this one does not"
 
 
 def summary(it: Answer) -> str:
     """Table of the result, at most 120 columns wide."""
     s, axes, problem = it.structure, it.measurement.base_axes or (), it.problem
     force = "" if it.force_residual is None else f", of the base force {it.force_residual:.3e}"
+    told = it.undetermined or it.closed_by
     lines = [
+        f"{verdict(it)}." + f" Fitted: {fitted_in_words(it)}." * (not it.success),
+        *(f"  - {sentence}" for sentence in told[:_FIRST]),
+        *(f"  > {step}" for step in next_steps(it)),
+        "",
         *_mode_table(it),
         "",
         *_unknowns(it),
-        f"{'success' if it.success else 'no success'}: {_ending(it)}",
         f"relative residual {residual_in_words(it)}{force}; seed {it.seed}, {seconds_in_words(it.history.wall_time)}",
         *_phases(it),
         *it.remarks,
-        "rigid-body mass " + ", ".join(_rigid_masses(it, axes)),
+        "rigid-body mass "
+        + ", ".join(_rigid_masses(it, axes))
+        + " (~ normalised: no mass is stated, no force was measured)" * problem.unit_mass,
+        *_deck_masses(it),
     ]
     lines += stated_values(it)
     further = it.further_tests
@@ -53,22 +70,18 @@ def summary(it: Answer) -> str:
     for i, test in enumerate(it.validation, start=1):
         lines.append(f"test {i} of {len(problem.validation)} never fitted: relative residual {test.residual(s):.3e}")
     lines += [*_noise(it), *_gains(it)]
-    lines.append(f"{verdict(it)}.")
-    lines += [f"  - {sentence}" for sentence in it.closed_by + it.undetermined]
-    if not (it.determined or it.hurried) and it.open_masses:
-        lines += _ranges(it)
+    further_told = [f"  - {sentence}" for sentence in told[_FIRST:]]
+    if it.judgement == "one of many" and not it.hurried and it.open_masses:
+        further_told += _ranges(it)
+    lines += ["besides:"] * bool(further_told) + further_told
     lines += [_NOT_COMPUTED] if it.hurried else []
-    lines += [f"  > {sentence}" for sentence in next_steps(it)]
+    lines.append(f"search: {ending_in_words(it)}")
     return "\n".join(_folded(line) for line in lines)
 
 
-def _ending(it: Answer) -> str:
-    """The message, but for sentences that are told again below: of these the first alone."""
-    others = [sentence for sentence in it.undetermined if sentence in it.message][1:]
-    message = it.message
-    for sentence in others:
-        message = message.replace(f"; {sentence}", "").replace(f"{sentence}; ", "")
-    return message
+def ending_in_words(it: Answer) -> str:
+    """How the search ended: its message, with the solver's status in words beside it."""
+    return re.sub(f"IPOPT: ({'|'.join(_ENDED)})", lambda found: f"{_ENDED[found[1]]} ({found[0]})", it.message)
 
 
 def _phases(it: Answer) -> list[str]:
@@ -111,15 +124,30 @@ def residual_in_words(it: Answer) -> str:
 
 def verdict(it: Answer) -> str:
     """What the matrices are worth, in one sentence."""
+    if not it.success:
+        return "No fit: these matrices do not explain the records as they should"
     if it.determined:
         return "Determined: data and stated model leave one mass and one stiffness matrix"
     if NOT_JUDGED in it.undetermined:
         return "Not judged: the time was over"
     if it.hurried:
         return "Not determined"
+    if it.against:
+        return "Not determined: something speaks against this model"
     if it.is_one_of_many:
         return "Not determined: this is one of many models that explain the data"
-    return "Not determined: something speaks against this model, or is not known well enough"
+    return "Not determined: some entries of the matrices are not known well enough"
+
+
+def fitted_in_words(it: Answer) -> str:
+    """The runs that were fitted, and how strongly they move the sensors, where that is known."""
+    test = it.problem.measurement
+    moved = [f"{level:.3g}" for level in sorted(peaks(test))]
+    runs = counted(test.n_runs, "run")
+    if not moved:
+        return runs
+    to = " to ".join(dict.fromkeys((moved[0], moved[-1])))
+    return f"{runs} (sensors move with up to {to} m/s² against the base)"
 
 
 def next_steps(it: Answer) -> list[str]:
@@ -127,9 +155,9 @@ def next_steps(it: Answer) -> list[str]:
     if it.determined or it.hurried or NOT_JUDGED in it.undetermined:
         return []
     if not it.success:
-        return [
-            _MEND if it.problem.goal is None else "mend what is named first; no model reaches a goal below the noise"
-        ]
+        return _towards_a_fit(it)
+    if it.against:
+        return ["put right, or measure again, what speaks against it, the first thing first"]
     if not it.is_one_of_many:
         return []
     if not it.open_masses:
@@ -143,6 +171,25 @@ def next_steps(it: Answer) -> list[str]:
         "to close it: measure the force between table and structure; or state what is known of the mass, where it is "
         "true: LumpedMass, or FullMass(known=...); a total mass alone only bounds it"
     ]
+
+
+def _towards_a_fit(it: Answer) -> list[str]:
+    """What to do where there is no fit, the first thing first."""
+    if it.interrupted:
+        return ["let the search end: 'sysid run --resume FOLDER' goes on with one that the command line began"]
+    if it.problem.goal is not None:
+        return ["put right what is named first; a goal below the noise of the records cannot be reached"]
+    steps = ["put right what speaks against it, the first thing first"]
+    if it.changing:
+        one_by_one = "; 'sysid refine RESULT --leave-out run' shows what each run does to the answer"
+        steps = [
+            "fit by itself a run in which structure and level of motion stay the same, at the level of interest: "
+            "'sysid read RUN.csv --out one.h5', then 'sysid run one.h5'" + one_by_one * (it.measurement.n_runs > 1)
+        ]
+    if it.residual > _NEAR:
+        return steps
+    enough = f"{np.ceil(100 * it.residual) / 100:.2g}"
+    return [*steps, f"if a fit as near as this one will do, say so: goal={enough} (sysid run test.h5 --goal {enough})"]
 
 
 def half_width(std: float, value: float) -> str:
@@ -203,10 +250,31 @@ def _mode_table(it: Answer) -> list[str]:
     lines = _aligned(columns + both)
     if not np.any(np.isfinite(std)) or len(lines[0]) > _WIDTH:
         lines = _aligned(columns + masses)
-    notes = [] if u is None else ["+- half of the 95 % interval"]
+    notes = [] if u is None else ["+- half of the 95 % interval" + _OF_A_FIT * (not it.success)]
     notes.append("mass: effective, in % of the rigid-body mass")
-    notes += ["~ one of many values that explain the data"] if many.any() else []
-    return [*lines, "; ".join(notes)]
+    notes += ["~ one of many values that fit as well"] if many.any() else []
+    return [*lines, "; ".join(notes), *missing_mass(it)]
+
+
+def missing_mass(it: Answer) -> list[str]:
+    """What of the rigid-body mass is in none of the modes, in a sentence, where it is no round-off of a table."""
+    missing, many = 100 - it.structure.effective_mass_percent.sum(axis=0), np.any(is_one_of_many(it), axis=0)
+    told = [
+        f"{tilde(one)}{share:.2g} % in {axis}"
+        for axis, share, one in zip(it.measurement.base_axes or (), missing, many, strict=True)
+        if share > _MISSING
+    ]
+    where = "is in none of these modes: it moves with the base, or in modes beyond the lines"
+    return [f"of the rigid-body mass, {', '.join(told)} {where}"] * bool(told)
+
+
+def _deck_masses(it: Answer) -> list[str]:
+    """The masses of a lumped model, in one line."""
+    told = [
+        f"{one.name} {tilde(one.one_of_many)}{one.mass:.5g}{known_half_width(one.std, one.mass, ' +-')} kg"
+        for one in deck_masses(it)
+    ]
+    return [f"masses at the sensors (diagonal of M_SS): {', '.join(told)}"] * bool(told)
 
 
 def _unknowns(it: Answer) -> list[str]:
@@ -236,7 +304,8 @@ def _rigid_masses(it: Answer, axes: Sequence[str]) -> Iterator[str]:
     """Rigid-body mass by base direction, with its half-width where noise moves it."""
     masses, std = np.diag(it.structure.rigid_body_mass), np.diag(it.quick_std("rigid_body_mass"))
     for axis, mass, own in zip(axes, masses, std, strict=True):
-        yield f"{axis} {mass:.6g}{known_half_width(own, mass, ' +-')} kg{' m²' * (axis[0] == 'r')}"
+        told = f"{tilde(it.problem.unit_mass)}{mass:.6g}{known_half_width(own, mass, ' +-')}"
+        yield f"{axis} {told} kg{' m²' * (axis[0] == 'r')}"
 
 
 def _ranges(it: Answer) -> Iterator[str]:
@@ -260,5 +329,5 @@ def _folded(line: str) -> str:
     """Fold a long line at the width of a terminal, the rest indented."""
     if len(line) <= _WIDTH:
         return line
-    indent = "    " if line.startswith("  - ") else "  "
+    indent = "    " if line.startswith(("  - ", "  > ")) else "  "
     return textwrap.fill(line, _WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)

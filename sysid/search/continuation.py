@@ -199,7 +199,7 @@ class _Run:
             structure, best.x, Continuation.name, success, message,
             History(start=begun, local=objective, local_curve=best.curve, phases=phases), self.stopped,
             alternatives=tuple(_alternatives(problem, best.x, objective, self.ends)) if success else (),
-            remarks=remarks, good=self._good(objective, best), alone=self._alone(best),
+            remarks=remarks, good=self._good(objective, best), unanimous=self._unanimous(best),
         )  # fmt: skip
 
     def _from(self, x: Array) -> None:
@@ -241,7 +241,7 @@ class _Run:
         own = sum(term.error(best.x) ** 2 for term in problem.formulation.beside if not isinstance(term, TestTerm))
         return float(np.sqrt(max(objective**2 - own, 0.0))) <= max(_NEAR * self.smoother.floor, EXACT)
 
-    def _alone(self, best: LocalResult) -> bool:
+    def _unanimous(self, best: LocalResult) -> bool:
         """Whether all of several starts ended at the best end, at a fit of sorts: only a wrong model leaves more."""
         same = [apart(self.problem, best.x, answer.x) < _APART for _, answer in self.ends]
         return all(same) and len(same) + self.joined >= _AGREE and self.problem.residual(best.x) < _OF_SORTS

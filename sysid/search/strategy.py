@@ -125,7 +125,7 @@ class Outcome:
         Other unknowns that explain the data as well.
     good : bool
         The fit is as good as the data let it be, as far as the strategy can tell: no other needs to follow.
-    alone : bool
+    unanimous : bool
         Every start ended there: what is left is no local minimum's, and no other strategy needs to follow.
     doubts : tuple of str
         Stated values that contradict the records.
@@ -144,7 +144,7 @@ class Outcome:
     remarks: tuple[str, ...] = ()
     alternatives: tuple[Array, ...] = ()
     good: bool = True
-    alone: bool = False
+    unanimous: bool = False
     doubts: tuple[str, ...] = ()
     mistakes: tuple[str, ...] = ()
 

@@ -78,7 +78,7 @@ class TestDamping:
         assert result.structure.n == 3
         assert not result.determined
         assert any("not classical" in sentence for sentence in result.undetermined)
-        assert "not classical" in result.message
+        assert any("not classical" in sentence for sentence in result.against)
 
 
 class TestForce:

@@ -91,7 +91,7 @@ class TestSentence:
     def test_names_gains_that_masses_rest_on_and_no_others(self, told):
         """1.2 % and two deviations of 0.5 % are 2.2 %: 4.4 of M_SS's deviations at 2 a per cent, but 2.2 at 1."""
         (sentence,) = told([0.012, 0.012, 0.0], [0.005, 0.005, 0.005], [2.0, 1.0, 2.9])
-        assert "sensor 1 (1.0120 +- 0.01; an error of 2.2 % moves M_SS by 4.4)" in sentence
+        assert "sensor 1 (gain 1.0120 ± 0.01: an error of 2.2 % would move M_SS by 4.4 standard" in sentence
         assert "sensor 2" not in sentence and "sensor 3" not in sentence and "wrong" not in sentence
 
     def test_nothing_where_the_records_show_the_gains_well(self, told):
@@ -99,7 +99,10 @@ class TestSentence:
 
     def test_a_gain_that_no_record_shows_counts_as_two_per_cent_off(self, told):
         (sentence,) = told([np.nan, np.nan, 0.0], [np.nan, np.nan, 1e-3], [1.6, 1.4, 0.0])
-        assert "sensor 1 (not shown; an error of 2 % moves M_SS by 3.2)" in sentence and "sensor 2" not in sentence
+        assert (
+            "sensor 1 (gain not shown: an error of 2 % would move M_SS by 3.2 standard" in sentence
+            and "sensor 2" not in sentence
+        )
 
 
 def test_gains_are_in_summary_and_figures(spectra):

@@ -96,7 +96,7 @@ def test_what_did_not_converge_is_not_called_known():
     result = sysid.identify(problem, rng=0, callback=stop)
     assert not result.success
     assert not result.determined
-    assert "did not end in a fit" in result.summary()
+    assert "the search ended before it found a fit" in " ".join(result.summary().split())
 
 
 @pytest.mark.parametrize("start", [0.75, 0.9, 1.15, 1.3, 2.0])
@@ -123,8 +123,7 @@ def test_a_stated_total_that_the_force_contradicts_is_kept_and_told():
     f = truth.natural_frequencies
     result = solve(truth, mass=sysid.FullMass(20.0, healing="rigid_body"), band=(0.3 * f[0], 1.3 * f[-1]))
     assert result.structure.rigid_body_mass[0, 0] == pytest.approx(20.0, rel=1e-9)
-    assert "20 kg" in result.message
-    assert "weighs 12" in result.message
+    assert any("20 kg" in sentence and "weighs 12" in sentence for sentence in result.against)
 
 
 @pytest.mark.parametrize("arms", [[1, 1, 1], [1, -1, 1], [-1, -1, 1]])
@@ -175,7 +174,7 @@ def test_a_solver_that_converged_to_no_fit_is_no_success():
     result = sysid.identify(sysid.Problem(test, mass=sysid.LumpedMass(7.0), stiffness=stiffness), rng=0, strategy=QUICK)
     assert not result.success
     assert not result.determined
-    assert "is no fit" in result.message
+    assert "is no fit" in result.against[0]
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -24,7 +24,7 @@ def test_a_goal_that_is_not_reached_ends_with_one_and_writes_all(here, beside_pr
     assert cli.main(["run", "pair.py"]) == 1
     out, error = beside_progress()
     assert error == ""
-    assert "no success: " in out
+    assert "No fit: " in out
     assert "above the goal" in out
     summary = json.loads((here / "results/pair/summary.json").read_text())
     assert summary["success"] is False
@@ -168,7 +168,7 @@ def test_the_signal_itself_saves_the_best_so_far_wherever_it_strikes(here, witho
     complaints = [line for line in error.splitlines() if " iteration " not in line]
     assert complaints == [f"sysid: interrupted; the best so far is in results/free; {on}"]
     assert running.returncode == 130
-    assert "no success: interrupted" in out
+    assert "search: interrupted" in out
     assert sysid.load(here / "results/free").interrupted
 
 

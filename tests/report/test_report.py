@@ -14,6 +14,7 @@ from scipy.stats import norm
 
 import sysid
 from sysid.report import opening, report
+from sysid.report.noise_level import noise_level
 
 FREQ = np.linspace(1.0, 40.0, 30)
 VOID = {"meta", "img", "br", "link"}
@@ -81,8 +82,9 @@ def test_the_report_opens_with_the_answer_and_ends_with_the_search(complete, pag
         assert words in opening
     for words in (
         "The mass of mode 3 is open.", "The force weighs 2 modes.", "Strategy 'swarm', as asked.",
-        "Success: Solve_Succeeded; damping_ratio[1] ends on its bound", f"Relative residual {complete.residual:.3e}",
-        f"Of the base force: {complete.force_residual:.3e}", "exploration 7", "777 candidates",
+        "Success. The search: Solve_Succeeded; damping_ratio[1] ends on its bound",
+        f"Relative residual {complete.residual:.3e}", f"Of the base force: {complete.force_residual:.3e}",
+        "exploration 7", "777 candidates",
         "swarm over 27 unknowns", "problems/tower.py", "42", sysid.__version__, "Unknowns of the search",
     ):  # fmt: skip
         assert words in rest
@@ -90,9 +92,8 @@ def test_the_report_opens_with_the_answer_and_ends_with_the_search(complete, pag
 
 
 def test_what_is_open_and_what_speaks_against_the_answer_stand_apart(complete):
-    """Doubts are told in the message too, what is open is not."""
     against, left = "the damping is not classical; ratios approximate it", "the mass of mode 3 is open"
-    doubtful = dataclasses.replace(complete, message=f"Solve_Succeeded; {against}", undetermined=(against, left))
+    doubtful = dataclasses.replace(complete, against=(against,), undetermined=(against, left))
     told = [part.split("</h3>") for part in opening.trust(doubtful).split("<h3>")[1:]]
     assert [name for name, _ in told] == [
         "What the data do not determine", "What speaks against it", "What fixes the matrices",
@@ -100,16 +101,21 @@ def test_what_is_open_and_what_speaks_against_the_answer_stand_apart(complete):
     ]  # fmt: skip
     assert left[1:] in told[0][1] and against[1:] not in told[0][1]
     assert against[1:] in told[1][1] and left[1:] not in told[1][1]
-    ended = "the search did not end in a fit (interrupted): this is not yet any structure that explains the data"
-    for message, undetermined, expected in (
-        (f"{against}; interrupted", (against, ended, left), [against, ended]),
-        ("interrupted", (left,), ["interrupted"]),
-    ):
-        failed = dataclasses.replace(complete, success=False, message=message, undetermined=undetermined)
+    ended = "the search ended before it found a fit (interrupted): these matrices are no more than the best until then"
+    for expected, undetermined in (((against, ended), (against, ended, left)), (("interrupted",), (left,))):
+        failed = dataclasses.replace(complete, success=False, against=expected, undetermined=undetermined)
         told = dict(part.split("</h3>") for part in opening.trust(failed).split("<h3>")[1:])
         lines = {name: re.findall("<li>(.*?)</li>", content) for name, content in told.items()}
         assert lines["What speaks against it"] == [f"{one[0].upper()}{one[1:]}." for one in expected]
         assert lines["What the data do not determine"] == [f"T{left[1:]}."]
+
+
+def test_a_model_that_does_not_fit_opens_with_why_and_without_intervals(complete):
+    level = noise_level(complete.problem.screened.measurement, complete.structure)
+    failed = dataclasses.replace(complete, success=False, against=("are they in Hz?", "it softens", "its gains"))
+    right, wrong = (opening.opening(it, level) for it in (complete, failed))
+    assert "±" in right and "±" not in wrong and "without intervals" in wrong
+    assert re.findall("<li>(.*?)</li>", wrong) == ["Are they in Hz?", "It softens."] and "<li>" not in right
 
 
 def test_the_page_is_self_contained_and_runs_one_script(page):

@@ -178,7 +178,7 @@ def test_judgement_and_confidence_say_first_what_weighs_most():
         found, determined=True, undetermined=(), closed_by=("force",), remarks=("why", "a bound")
     )
     open_ = dataclasses.replace(fixed, determined=False, undetermined=("mode 2 is open",), closed_by=())
-    failed = dataclasses.replace(open_, success=False, message="no fit: 60 % is left")
+    failed = dataclasses.replace(open_, success=False, against=("no fit: 60 % is left",))
     assert [it.judgement for it in (fixed, open_, failed)] == ["determined", "one of many", "no fit"]
     assert fixed.confidence == ("force", "a bound")
     assert open_.confidence == ("mode 2 is open", "a bound")

@@ -204,6 +204,23 @@ def test_a_text_keeps_every_character(tmp_path):
     assert (back.message, back.undetermined, back.closed_by) == (text, ("", text), ("",))
 
 
+def test_what_spoke_against_older_results_is_told_apart_from_their_message(tmp_path):
+    """They joined it to the message, by semicolons, and had no field of it."""
+    gain, far, ended = "gain; of a, b", "far off", "the search did not end in a fit (stopped): this is not yet any"
+    for given, undetermined, success, message, against in (
+        (f"{gain}; {far}; IPOPT: Solve_Succeeded", (gain, far, "mode 2"), True, "IPOPT: Solve_Succeeded", (gain, far)),
+        (f"stopped; {gain}", (gain, ended, "mode 2"), False, "stopped", (gain, ended)),
+        ("stopped", ("mode 2",), False, "stopped", ("stopped",)),
+        ("a; b", ("mode 2",), True, "a; b", ()),
+    ):
+        made = identification(message=given, undetermined=undetermined, success=success)
+        tree, number = from_bytes(made.save(tmp_path).read_bytes())
+        del tree["against"], tree["changing"]
+        (tmp_path / "old.h5").write_bytes(to_bytes(tree, number))
+        it = sysid.load(tmp_path / "old.h5")
+        assert (it.message, it.against, it.undetermined, it.changing) == (message, against, undetermined, False)
+
+
 def test_a_huge_seed_survives(tmp_path):
     assert sysid.load(identification(seed=2**127 + 1).save(tmp_path)).seed == 2**127 + 1
 

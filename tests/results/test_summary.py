@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -30,7 +31,7 @@ def modal(truth):
 
 def rows(it):
     """Cells of the table of modes."""
-    table = it.summary().split("\n+- half")[0]
+    table = it.summary().split("\n+- half")[0].split("\n\n")[-1]
     return [line.split() for line in table.splitlines()]
 
 
@@ -141,3 +142,45 @@ def test_the_figures_are_json_with_null_for_what_is_open(modal, truth):
     std = it.to_dict()["natural_frequencies_std_hz"]
     assert [value is None for value in std] == [False, True, False]
     assert rows(it)[2][2::2][:2] == ["open", "open"]
+
+
+def test_the_judgement_stands_first_with_what_speaks_against_it_and_the_next_step(modal):
+    it = modal(force=True)
+    assert it.summary().startswith("Determined: data and stated model leave one mass and one stiffness matrix.\n  - ")
+    against = ("the structure softens", "the model misses the records", "a gain is wrong")
+    failed = dataclasses.replace(
+        it, success=False, determined=False, closed_by=(), against=against, undetermined=(*against, "mode 2 is open"),
+        message="IPOPT: Solve_Succeeded", changing=True,
+    )  # fmt: skip
+    lines = failed.summary().splitlines()
+    assert lines[0] == "No fit: these matrices do not explain the records as they should. Fitted: 2 runs."
+    assert [line[4:] for line in lines[1:3]] == list(against[:2]) and lines[3].startswith("  > fit by itself a run")
+    besides = lines[lines.index("besides:") :]
+    assert [line[4:] for line in besides[1:3]] == ["a gain is wrong", "mode 2 is open"]
+    assert besides[-1] == "search: the solver ended as it should (IPOPT: Solve_Succeeded)"
+    assert "explain the data" not in failed.summary() and "this one does not; mass" in failed.summary()
+    goal = np.ceil(100 * it.residual) / 100
+    assert f"goal={goal:.2g} (sysid run test.h5 --goal {goal:.2g})" in failed.summary()
+    assert "Not determined: something speaks" in dataclasses.replace(failed, success=True).summary()
+
+
+def test_masses_without_a_unit_are_marked_and_a_gain_moves_none_of_them(modal):
+    it = modal(force=False)
+    assert it.problem.unit_mass
+    assert f"rigid-body mass x ~{it.structure.rigid_body_mass[0, 0]:.6g} kg" in it.summary()
+    assert np.isnan(it.gain_worth).all()
+    (head,) = [i for i, line in enumerate(it.summary().splitlines()) if line.startswith("gain against the base")]
+    assert [line.split()[-1] for line in it.summary().splitlines()[head + 1 : head + 4]] == ["-"] * 3
+
+
+@pytest.mark.parametrize("mass", [sysid.LumpedMass(), sysid.FullMass()])
+def test_masses_of_a_lumped_model_are_told_and_what_no_mode_moves(mass):
+    ring = 0.0 if isinstance(mass, sysid.LumpedMass) else 1.0  # kg that move with the base, beside 5 on springs
+    M, K = np.diag([3.0, 2.0, ring]), np.array([[9e4, -4e4, -5e4], [-4e4, 4e4, 0], [-5e4, 0, 5e4]])
+    test = sysid.simulate(sysid.Structure(M, K, [0.01, 0.02], n_base=1), FREQ, noise=0.01, force=True, rng=1)
+    it = sysid.identify(sysid.Problem(test, mass=mass), rng=0)
+    text, std = " ".join(it.summary().split()), np.diag(it.uncertainty.mass)
+    told = [f"sensor {i + 1} {it.structure.mass[i, i]:.5g} +- {half(std[i])} kg" for i in range(2)]
+    assert (f"masses at the sensors (diagonal of M_SS): {', '.join(told)}" in text) is (ring == 0)
+    missing = re.findall("of the rigid-body mass, (.*?) % in x is in none of these modes", text)
+    np.testing.assert_allclose([float(share) for share in missing], [100 / 6] * bool(ring), rtol=0.03)
