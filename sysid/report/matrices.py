@@ -16,7 +16,7 @@ _NO_FIT = "of a model that does not fit"
 SAME = 1e-9  # of a value: a smaller difference is round-off
 _ENDS_ELSEWHERE = " How far the entries may go is in the result's mass_interval and stiffness_interval."
 _ENDS_BELOW = (
-    " Below an entry of M_SS and K_SS: from where … to where it goes in the models that explain the data and hold what "
+    " Below an entry of M_SS and K_SS: from where to where it goes in the models that explain the data and hold what "
     "was stated."
 )
 
@@ -105,7 +105,7 @@ def _ranges(ends: Array, otherwise: Lines) -> Lines:
         least, most = (number(end, 3) for end in ends[:, i, j])
         bounded = np.isfinite(ends[:, i, j])
         told = {
-            (True, True): (f"{least} …", f"… {most}"),
+            (True, True): (f"{least} to", most),
             (True, False): (f"from {least}",),
             (False, True): (f"to {most}",),
         }
