@@ -72,7 +72,7 @@ def worth(it: Identification) -> str:
     """What the matrices are worth, in one line that names the statements which tell why."""
     told = _DOUBTED if it.success and it.against else _WORTH[it.judgement]
     why = " and ".join(f"'{word}'" for word, texts in (("against", it.against), ("open", left_open(it))) if texts)
-    return _INTERRUPTED * it.interrupted + told + (f": see {why}" if why else "")
+    return _INTERRUPTED * it.interrupted + told + (f"; see {why}" if why else "")
 
 
 def left_open(it: Identification) -> tuple[str, ...]:

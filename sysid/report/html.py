@@ -52,14 +52,17 @@ td small { display: block; color: var(--soft); font-size: .82em; line-height: 1.
 .scroll { overflow-x: auto; margin: .6rem 0 1rem; }
 @media screen { .scroll:has(table) { background:
     linear-gradient(to left, var(--paper) 50%, transparent) right / 3rem 100% no-repeat local,
-    linear-gradient(to left, var(--line), transparent) right / 1rem 100% no-repeat; }
-  td:first-child, thead th:first-child { position: sticky; left: 0; background: var(--paper); } }
+    linear-gradient(to left, rgb(128 138 150 / .45), transparent) right / 1rem 100% no-repeat; }
+  .scroll:has(table) figcaption, td:first-child, thead th:first-child { background: var(--paper); }
+  .scroll:has(table) figcaption { margin: 0; padding: .5rem 0; }
+  td:first-child, thead th:first-child { position: sticky; left: 0; } }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .88rem; }
 th, td { padding: .2rem .55rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
 thead th { border-bottom: 1.5px solid var(--soft); vertical-align: bottom; font-weight: 600;
-  white-space: normal; max-width: 9em; }
+  white-space: normal; }
 .words td, .words th { text-align: left; white-space: normal; vertical-align: top; }
 th:first-child, td:first-child { text-align: left; } td:first-child { font-weight: 500; }
+@media screen { td:first-child { white-space: normal; } }
 .words td:first-child { white-space: nowrap; }
 figure { margin: .8rem 0 1.2rem; break-inside: avoid; }
 img { max-width: 100%; height: auto; display: block; background: #fff; }
@@ -94,7 +97,7 @@ svg .dot { fill: var(--found); } svg .base { fill: var(--soft); }
 .sheet p { margin: .6rem 0 0; font-size: .85rem; } .sheet svg { width: 100%; }
 @media screen { .drawn .sheets { display: none; } }
 @media (max-width: 600px) { body { padding: .8rem .8rem 3rem; font-size: 14px; } th, td { padding: .2rem .4rem; }
-  td:first-child { white-space: normal; max-width: 9em; }
+  td:first-child { max-width: 9em; }
   .words td:first-child { white-space: normal; min-width: 8em; max-width: 8em; }
   h1 { font-size: 1.25rem; } .shapes svg { width: calc(50% - .25rem); }
   .shapes svg text { font-size: 13px; } .shapes svg .title { font-size: 14px; } }

@@ -97,10 +97,10 @@ def test_what_is_open_and_what_speaks_against_the_answer_stand_apart(complete):
     doubtful = dataclasses.replace(complete, against=(against,), undetermined=(against, left))
     told = [part.split("</h3>") for part in opening.trust(doubtful).split("<h3>")[1:]]
     assert [name for name, _ in told] == [
-        "What the data do not determine", "What speaks against it", "What fixes the matrices",
+        "What speaks against it", "What the data do not determine", "What fixes the matrices",
     ]  # fmt: skip
-    assert left[1:] in told[0][1] and against[1:] not in told[0][1]
-    assert against[1:] in told[1][1] and left[1:] not in told[1][1]
+    assert against[1:] in told[0][1] and left[1:] not in told[0][1]
+    assert left[1:] in told[1][1] and against[1:] not in told[1][1]
     ended = "the search ended before it found a fit (interrupted): these matrices are no more than the best until then"
     for expected, undetermined in (((against, ended), (against, ended, left)), (("interrupted",), (left,))):
         failed = dataclasses.replace(complete, success=False, against=expected, undetermined=undetermined)
@@ -287,6 +287,11 @@ def test_a_total_mass_that_is_open_is_called_one_of_many(modal, truth, no_pictur
 )
 def test_numbers_of_a_column_keep_the_zeros_at_their_ends(value, told):
     assert aligned(value) == told
+
+
+def test_blocks_of_the_base_that_are_zero_are_a_line(written, no_pictures):
+    page = Page(report.render(written))  # masses on the sensors alone
+    assert "Coupling mass M_S0, kg: zero" in page.text and "Base mass M_00, kg: zero" in page.text
 
 
 def test_an_entry_without_an_end_is_called_unbounded(modal, no_pictures):
