@@ -14,7 +14,7 @@ from sysid.measurement.in_time import peaks
 from sysid.results.answer import NOT_JUDGED, Answer
 from sysid.results.deck_masses import deck_masses
 from sysid.results.gain_table import gains_of_sensors
-from sysid.results.noise_table import noise_of_channels
+from sysid.results.noise_table import NOISE_COLUMNS, noise_of_channels
 from sysid.results.phases import COLUMNS, rows_of_phases, seconds_in_words
 from sysid.results.unknowns_table import MANY, rows_of, stated_values
 from sysid.structure.structure import Array
@@ -92,8 +92,8 @@ def _phases(it: Answer) -> list[str]:
 
 def _noise(it: Answer) -> list[str]:
     """Table of the noise of each channel, where whole records were fitted."""
-    rows = [(one.channel, f"{one.level:.3g}", one.unit, f"{one.percent:.3g}") for one in noise_of_channels(it)]
-    head = (f"noise {noise_source(it)}", "of a sample", "unit", "% of rms")
+    rows = [(one.channel, one.told, one.unit, f"{one.percent:.3g}") for one in noise_of_channels(it)]
+    head = (f"noise {noise_source(it)}", *NOISE_COLUMNS)
     return _aligned([list(column) for column in zip(head, *rows, strict=True)]) if 0 < len(rows) <= MANY else []
 
 
