@@ -18,7 +18,7 @@ _ALIKE = 1.2  # ratio of the levels of runs, up to which they are told as one
 class ChannelNoise(NamedTuple):
     """Noise of a channel: deviation of a sample, were it white up to half the sample rate, and its share of the record.
 
-    Both of all runs together, (least, most) of single runs; per cent of the rms, of noise and record at the lines alone.
+    Both of all runs together, `runs` the least and most of single ones; per cent of the rms of the record at the lines.
     """
 
     channel: str

@@ -167,9 +167,15 @@ def next_steps(it: Answer) -> list[str]:
         ]
     if it.measurement.force is not None:
         return ["to weigh these modes: more force at their frequencies, longer records, or another base direction"]
+    if it.scale_is_open:
+        return [
+            "to close it: M, K and C are known up to one common factor: state the mass of what the sensors stand for "
+            "(sysid run test.h5 --lumped --mass KG; LumpedMass(KG)), or measure the force between table and structure"
+        ]
     return [
         "to close it: measure the force between table and structure; or state what is known of the mass, where it is "
-        "true: LumpedMass, or FullMass(known=...); a total mass alone only bounds it"
+        "true: that all of it sits at the sensors (sysid run test.h5 --lumped --mass KG; LumpedMass(KG)), or single "
+        "masses (FullMass(known=...)); a total mass alone only bounds it"
     ]
 
 
@@ -311,7 +317,7 @@ def _rigid_masses(it: Answer, axes: Sequence[str]) -> Iterator[str]:
 def _ranges(it: Answer) -> Iterator[str]:
     """How far the diagonals may go, in one line, where that is known quickly and something may move."""
     ends = it.quick_intervals
-    if ends is None:
+    if ends is None or it.scale_is_open:
         return
     words = []
     M, K, _ = blocks_of(it.structure)
