@@ -107,6 +107,11 @@ def open_modes(problem: Problem, structure: Structure) -> list[int]:
     return _open_modes(_known(problem, structure, problem.measurement.residual(structure)))[0]
 
 
+def scale_is_open(problem: Problem, structure: Structure) -> bool:
+    """Whether one scale of mass, stiffness and damping is open, and nothing else."""
+    return _open_modes(_known(problem, structure, problem.measurement.residual(structure)))[1]
+
+
 def ends(problem: Problem, structure: Structure) -> tuple[Array, Array]:
     """How far each entry of M_SS and K_SS may go over the modal-mass cone.
 

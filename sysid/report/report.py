@@ -33,7 +33,7 @@ from sysid.report.noise_level import NoiseLevel, noise_level, share_of_noise
 from sysid.report.opening import opening, rounded, trust
 from sysid.results.gain_table import gains_of_sensors
 from sysid.results.identification import Identification
-from sysid.results.noise_table import noise_of_channels
+from sysid.results.noise_table import NOISE_COLUMNS, noise_of_channels
 from sysid.results.phases import COLUMNS, rows_of_phases, seconds_in_words
 from sysid.results.storage import atomically, file_or_folder
 from sysid.results.summary import (
@@ -285,9 +285,12 @@ def _as_fitted(it: Identification, test: Measurement) -> Measurement:
 
 def _noise(it: Identification) -> str:
     """The noise of each channel of whole records."""
-    rows = [(one.channel, aligned(one.level), one.unit, aligned(one.percent)) for one in noise_of_channels(it)]
-    caption = f"Noise of each channel, {noise_source(it)}: standard deviation of a sample in time."
-    return table(("channel", "of a sample", "unit", "% of its rms"), rows, caption) if rows else ""
+    rows = [(one.channel, one.told, one.unit, aligned(one.percent)) for one in noise_of_channels(it)]
+    caption = f"Noise of each channel, {noise_source(it)}: standard deviation of a sample in time, of noise up to half "
+    caption += (
+        "the sample rate (from least to most, where runs differ), and its share of what was recorded at the lines."
+    )
+    return table(("channel", *NOISE_COLUMNS), rows, caption) if rows else ""
 
 
 def _gains(it: Identification) -> str:

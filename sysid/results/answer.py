@@ -253,6 +253,13 @@ class Answer:
 
         return tuple(open_masses(self.problem.screened, self.structure))
 
+    @cached_property
+    def scale_is_open(self) -> bool:
+        """Whether one scale of mass, stiffness and damping is open, and nothing else."""
+        from sysid.assessment.modal_mass_cone import scale_is_open, speaks
+
+        return speaks(self.problem.formulation) and scale_is_open(self.problem.screened, self.structure)
+
     @property
     def is_one_of_many(self) -> bool:
         """Whether other matrices explain the same data within what was stated."""

@@ -29,6 +29,9 @@ _PLAIN = (
 )  # fmt: skip
 
 
+_OF_TESTS = {"lumped": "lumped masses", "mass": "{} kg stated", "band": "band {} Hz", "goal": "goal {}"}
+
+
 @dataclass(frozen=True)
 class Recipe:
     """What rebuilds a problem elsewhere: its module and what was passed to ``problem()``.
@@ -79,8 +82,10 @@ class Recipe:
     @property
     def title(self) -> str:
         """The module and its parameters: "cantilever_tower (elements=3)"; a test read from files by its file."""
-        given = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items())
-        name = Path(self.data).name if self.module == "recorded_test" and self.data else self.module
+        of_test = self.module == "recorded_test" and self.data
+        name = Path(self.data).name if of_test and self.data else self.module
+        words = _OF_TESTS if of_test else {}
+        given = ", ".join(words.get(key, f"{key}={{!r}}").format(value) for key, value in self.parameters.items())
         return f"{name} ({given})" if given else name
 
     def to_tree(self) -> dict[str, Any]:

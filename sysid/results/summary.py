@@ -14,7 +14,7 @@ from sysid.measurement.in_time import peaks
 from sysid.results.answer import NOT_JUDGED, Answer
 from sysid.results.deck_masses import deck_masses
 from sysid.results.gain_table import gains_of_sensors
-from sysid.results.noise_table import noise_of_channels
+from sysid.results.noise_table import NOISE_COLUMNS, noise_of_channels
 from sysid.results.phases import COLUMNS, rows_of_phases, seconds_in_words
 from sysid.results.unknowns_table import MANY, rows_of, stated_values
 from sysid.structure.structure import Array
@@ -92,8 +92,8 @@ def _phases(it: Answer) -> list[str]:
 
 def _noise(it: Answer) -> list[str]:
     """Table of the noise of each channel, where whole records were fitted."""
-    rows = [(one.channel, f"{one.level:.3g}", one.unit, f"{one.percent:.3g}") for one in noise_of_channels(it)]
-    head = (f"noise {noise_source(it)}", "of a sample", "unit", "% of rms")
+    rows = [(one.channel, one.told, one.unit, f"{one.percent:.3g}") for one in noise_of_channels(it)]
+    head = (f"noise {noise_source(it)}", *NOISE_COLUMNS)
     return _aligned([list(column) for column in zip(head, *rows, strict=True)]) if 0 < len(rows) <= MANY else []
 
 
@@ -167,9 +167,15 @@ def next_steps(it: Answer) -> list[str]:
         ]
     if it.measurement.force is not None:
         return ["to weigh these modes: more force at their frequencies, longer records, or another base direction"]
+    if it.scale_is_open:
+        return [
+            "to close it: M, K and C are known up to one common factor: state the mass of what the sensors stand for "
+            "(sysid run test.h5 --lumped --mass KG; LumpedMass(KG)), or measure the force between table and structure"
+        ]
     return [
         "to close it: measure the force between table and structure; or state what is known of the mass, where it is "
-        "true: LumpedMass, or FullMass(known=...); a total mass alone only bounds it"
+        "true: that all of it sits at the sensors (sysid run test.h5 --lumped --mass KG; LumpedMass(KG)), or single "
+        "masses (FullMass(known=...)); a total mass alone only bounds it"
     ]
 
 
@@ -311,7 +317,7 @@ def _rigid_masses(it: Answer, axes: Sequence[str]) -> Iterator[str]:
 def _ranges(it: Answer) -> Iterator[str]:
     """How far the diagonals may go, in one line, where that is known quickly and something may move."""
     ends = it.quick_intervals
-    if ends is None:
+    if ends is None or it.scale_is_open:
         return
     words = []
     M, K, _ = blocks_of(it.structure)

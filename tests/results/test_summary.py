@@ -184,3 +184,22 @@ def test_masses_of_a_lumped_model_are_told_and_what_no_mode_moves(mass):
     assert (f"masses at the sensors (diagonal of M_SS): {', '.join(told)}" in text) is (ring == 0)
     missing = re.findall("of the rigid-body mass, (.*?) % in x is in none of these modes", text)
     np.testing.assert_allclose([float(share) for share in missing], [100 / 6] * bool(ring), rtol=0.03)
+
+
+def test_one_open_factor_is_closed_by_a_total_and_what_a_total_takes_for_granted_is_told():
+    M, K = np.diag([2.0, 1.0, 0.0]), np.array([[3900.0, -1500, -2400], [-1500, 1500, 0], [-2400, 0, 2400]])
+    truth, lines = sysid.Structure(M, K, np.array([0.01, 0.02]), n_base=1), np.linspace(1, 12, 200)
+    test = sysid.simulate(truth, lines, noise=0.01, rng=0)
+    scale, every, stated = (
+        sysid.identify(sysid.Problem(test, mass=mass), rng=0)
+        for mass in (sysid.LumpedMass(), sysid.FullMass(), sysid.LumpedMass(3.0))
+    )
+    assert scale.scale_is_open and not every.scale_is_open and not stated.scale_is_open
+    assert "one common factor" in scale.summary() and "any number of times" not in scale.summary()
+    assert "any number of times" in every.summary()
+    granted = "all of the stated 3 kg is taken to sit at the sensors"
+    assert stated.determined and any(granted in sentence for sentence in stated.remarks)
+    forced = sysid.simulate(truth, lines, noise=0.01, force=True, rng=0)
+    weighed = sysid.identify(sysid.Problem(forced, mass=sysid.LumpedMass(4.0)), rng=0)
+    assert "4 kg in the base directions, but the base force weighs 3" in weighed.confidence[0]
+    assert not any("taken to sit" in sentence for sentence in weighed.remarks)
