@@ -191,7 +191,7 @@ sysid.plot.transmissibility(result, band=result.uncertainty.transmissibility(fre
 #
 # ## Where a search fails
 #
-# - The result says *no success*, or that free residues at the poles of the data fit better: the form of the matrices is
+# - The result says *No fit*, or that free residues at the poles of the data fit better: the form of the matrices is
 #   not that of the structure, or a bound keeps the truth out (the table of unknowns marks what rests on a bound).
 # - "Another structure explains the data as well": some forms have several exact answers; a further sensor tells.
 # - Give `guess=` where you have one. The search starts there, and from two other points.

@@ -155,7 +155,7 @@ def _stated_mass(problem: Problem, structure: Structure) -> Iterator[str]:
         given, told = (", ".join(f"{m:.4g}" for m in masses) for masses in (own, weighed))
         yield (
             f"the stated mass makes {given} kg in the base directions, but the base force weighs {told} kg: one of "
-            "them, or the unit of the force, is wrong"
+            "them, or the unit of the force, is wrong; the force weighs an adapter or base plate on its cells too"
         )
 
 

@@ -29,7 +29,7 @@ _PLAIN = (
 )  # fmt: skip
 
 
-_OF_TESTS = {"lumped": "lumped masses", "mass": "{} kg stated", "band": "band {} Hz", "goal": "goal {}"}
+_OF_TESTS = {"lumped": "lumped masses", "mass": "{} kg stated", "band": "{0[0]:g} to {0[1]:g} Hz", "goal": "goal {}"}
 
 
 @dataclass(frozen=True)
