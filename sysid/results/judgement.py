@@ -11,7 +11,7 @@ import numpy as np
 
 from sysid.assessment.checks import doubts
 from sysid.assessment.determination import BY_RANK, determine
-from sysid.assessment.gains import assumed, rests_on
+from sysid.assessment.gains import assumed, rests_on, taken_at_sensors
 from sysid.assessment.model_error import Miss, levels_in_words, missed_in_words, misses_of, model_errors
 from sysid.assessment.sensitivity import blocks_of
 from sysid.assessment.uncertainty import LARGE
@@ -167,6 +167,7 @@ def _remarks(problem: Problem, end: Outcome) -> Iterator[str]:
         names = [label for label, on in zip(formulation.labels, at, strict=True) if on]
         if names:
             yield f"on a bound of the search space, beyond which the truth may lie: {', '.join(names)}"
+    yield from taken_at_sensors(problem)
     yield from levels_in_words(problem)
     tests = [term.test for term in formulation.tests]
     for i, test in enumerate(tests, start=problem.first_test):
