@@ -95,7 +95,7 @@ def _merged(
 def _what_is_open(structure: Structure, free: list[int], common: bool) -> str:
     """Which modal masses are open, in words."""
     if common:
-        return "one common scale of mass, stiffness and damping is open"
+        return "mass, stiffness and damping are known up to one common factor"
     if len(free) == structure.n:
         return "all modal masses are open"
     *others, last = (f"the modal mass of {_mode(structure, k)}" for k in free)
@@ -105,6 +105,11 @@ def _what_is_open(structure: Structure, free: list[int], common: bool) -> str:
 def open_modes(problem: Problem, structure: Structure) -> list[int]:
     """Modes, counted from 0, whose modal mass neither the records nor the stated models fix."""
     return _open_modes(_known(problem, structure, problem.measurement.residual(structure)))[0]
+
+
+def only_scale_open(problem: Problem, structure: Structure) -> bool:
+    """Whether one factor common to all modal masses, and so to mass, stiffness and damping, is all that is open."""
+    return _open_modes(_known(problem, structure, problem.measurement.residual(structure)))[1]
 
 
 def ends(problem: Problem, structure: Structure) -> tuple[Array, Array]:

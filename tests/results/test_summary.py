@@ -184,3 +184,16 @@ def test_masses_of_a_lumped_model_are_told_and_what_no_mode_moves(mass):
     assert (f"masses at the sensors (diagonal of M_SS): {', '.join(told)}" in text) is (ring == 0)
     missing = re.findall("of the rigid-body mass, (.*?) % in x is in none of these modes", text)
     np.testing.assert_allclose([float(share) for share in missing], [100 / 6] * bool(ring), rtol=0.03)
+
+
+@pytest.mark.parametrize(("mass", "scale"), [(sysid.LumpedMass(), True), (sysid.FullMass(), False)])
+def test_the_step_that_closes_a_common_factor_is_one_number_in_kg(random_case, mass, scale):
+    """Effective masses in %, of which a common factor makes nothing, are then known."""
+    _, problem = random_case(np.random.default_rng(5), "lumped", n=3, d=1, total=False)
+    it = sysid.identify(dataclasses.replace(problem, mass=mass), strategy="modal")
+    told = " ".join(it.summary().split())
+    assert it.only_scale_open is scale and not it.determined
+    assert ("one number in kg is enough: state the mass (sysid run test.h5 --lumped --mass KG" in told) is scale
+    assert ("a total mass alone only bounds it" in told) is not scale
+    assert any("~" in cell for row in rows(it)[1:4] for cell in row) is not scale
+    assert ("over all these models" in told) is not scale
