@@ -8,7 +8,7 @@ from sysid.files import recorded_test
 
 
 def problem(*, data=None, rng=0, mass=None, lumped=False, band=None, goal=None, estimator=None, at_rest=None):
-    """`mass`: kg that move with the base, one or one a direction; `band`: (low, high), Hz; `goal`: see `Problem`."""
+    """`mass`: kg, one or one a direction, of all or, `lumped`, at the sensors; `band`: (low, high), Hz; `goal`."""
     if data is None:
         raise sysid.InputError("recorded_test needs a test: sysid run test.h5, with what 'sysid read' wrote")
     asked = {"band": band, "estimator": estimator, "at_rest": at_rest}

@@ -17,7 +17,7 @@ const errors = [];
 window.onerror = (words) => errors.push(words);
 for (const kind of ["error", "warn"]) console[kind] = (...words) => errors.push(words.join(" "));
 </script>"""
-# Every control is used; then the page is measured. What is scrolled sideways in a box of its own may be wider.
+# Every control is used; then the page is measured. A table that is scrolled sideways in a box of its own may be wider.
 DRIVER = """<script>
 const told = { errors, used: {} };
 const count = (name) => { told.used[name] = (told.used[name] || 0) + 1; };
@@ -64,6 +64,9 @@ told.over = [...document.querySelectorAll("body *")]
   .filter((one) => !one.closest(".scroll, pre, svg, [hidden], noscript"))
   .filter((one) => one.getBoundingClientRect().right > innerWidth + 1)
   .map((one) => one.outerHTML.slice(0, 80));
+told.cut = [...document.querySelectorAll(".scroll")]
+  .filter((one) => one.scrollWidth > one.clientWidth + 1 && (one.querySelector("img") || innerWidth > 1000))
+  .map((one) => one.textContent.slice(0, 80));
 told.sideways = document.documentElement.scrollWidth - document.documentElement.clientWidth;
 const bottom = (words) => [...document.querySelectorAll("td, b")].find((one) => one.textContent.startsWith(words));
 told.first = [document.querySelector(".verdict strong"), ...["Next:", "mode 1", "total mass"].map(bottom)]

@@ -53,13 +53,19 @@ def doubts(problem: Problem, structure: Structure, x: Array | None, *, changing:
         found += [*_priors(formulation, x), *(sentence for term in formulation.beside for sentence in term.doubts(x))]
         tests += [(term.test, term.matrices.structure(x, term.test)) for term in formulation.further_tests]
     if formulation.fits_records:
-        for check in (_stated_mass, _known_entries, _lumped_total):
-            found += check(problem, structure)
+        found += contradictions(problem, structure)
         tests.insert(0, (problem.measurement, structure))
     for i, (test, its) in enumerate(tests, start=1):
         told = _of_records(formulation, test, its, changing)
         found += told if len(tests) == 1 else [f"test {i}: {sentence}" for sentence in told]
     return tuple(found)
+
+
+def contradictions(problem: Problem, structure: Structure) -> tuple[str, ...]:
+    """Stated masses that the records of the problem's own test contradict, in sentences."""
+    if not problem.formulation.fits_records:
+        return ()
+    return tuple(told for check in (_stated_mass, _known_entries, _lumped_total) for told in check(problem, structure))
 
 
 def _of_records(formulation: Formulation, test: Measurement, structure: Structure, changing: bool) -> list[str]:

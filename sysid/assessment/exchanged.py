@@ -52,8 +52,8 @@ def exchanged_sensors(problem: Problem, structure: Structure) -> tuple[str, ...]
         return ()
     names = test.sensor_names
     return (
-        f"{names[i]} and {names[j]} are swapped: the model misses {100 * own:.2g} % of the accelerations as they are, "
-        f"and {100 * least:.2g} % with these two in each other's place; exchange their records, or their names",
+        f"{names[i]} and {names[j]} are swapped: the model misses {100 * own:.3g} % of the accelerations as they are, "
+        f"and {100 * least:.3g} % with these two in each other's place; exchange their records, or their names",
     )
 
 

@@ -91,7 +91,7 @@ def _conjugated(test: Measurement, terms: DirectTerms) -> Iterator[Mistake]:
     if other is not None and other.misfit < _MENDED * terms.misfit:
         yield Mistake(
             "the spectra follow exp(-i w t): modes that decay leave "
-            f"{100 * terms.misfit:.2g} % of the responses, and {100 * other.misfit:.2g} % of their conjugates: take "
+            f"{100 * terms.misfit:.3g} % of the responses, and {100 * other.misfit:.3g} % of their conjugates: take "
             "the complex conjugate of response and force (numpy.conj)",
             everywhere=True,
         )

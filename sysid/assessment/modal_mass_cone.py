@@ -107,8 +107,8 @@ def open_modes(problem: Problem, structure: Structure) -> list[int]:
     return _open_modes(_known(problem, structure, problem.measurement.residual(structure)))[0]
 
 
-def only_scale_open(problem: Problem, structure: Structure) -> bool:
-    """Whether one factor common to all modal masses, and so to mass, stiffness and damping, is all that is open."""
+def scale_is_open(problem: Problem, structure: Structure) -> bool:
+    """Whether one scale of mass, stiffness and damping is open, and nothing else."""
     return _open_modes(_known(problem, structure, problem.measurement.residual(structure)))[1]
 
 
@@ -381,9 +381,9 @@ def _unseen(problem: Problem, structure: Structure, misfit: float, responses: _R
             yield f"{_mode(structure, k)} is not moved by the base: nothing in these data tells its mass"
         elif share < responses.level:
             yield (
-                f"the mass of {_mode(structure, k)} is not known: it makes {100 * share:.2g} % of the response, and "
-                f"what the fit misses ({100 * responses.misfit:.2g} % of the response) can look like a mode that makes "
-                f"up to {100 * responses.level:.2g} %"
+                f"the mass of {_mode(structure, k)} is not known: it makes {100 * share:.3g} % of the response, and "
+                f"what the fit misses ({100 * responses.misfit:.3g} % of the response) can look like a mode that makes "
+                f"up to {100 * responses.level:.3g} %"
             )
         elif not test.freq[0] <= f <= test.freq[-1]:
             yield (
@@ -392,9 +392,9 @@ def _unseen(problem: Problem, structure: Structure, misfit: float, responses: _R
             )
         elif forces and (own := _shares(test, structure, k, push.T, push, forces)[0]) < forces.level:
             yield (
-                f"the mass of {_mode(structure, k)} is not weighed: it makes {100 * own:.2g} % of the base force, and "
-                f"what the fit misses ({100 * forces.misfit:.2g} % of the force) can look like a mode that makes up to "
-                f"{100 * forces.level:.2g} %"
+                f"the mass of {_mode(structure, k)} is not weighed: it makes {100 * own:.3g} % of the base force, and "
+                f"what the fit misses ({100 * forces.misfit:.3g} % of the force) can look like a mode that makes up to "
+                f"{100 * forces.level:.3g} %"
             )
 
 

@@ -8,18 +8,22 @@ from pathlib import Path
 
 from sysid.cli.output import Output
 from sysid.cli.status import SUCCESS
+from sysid.export.content import worth
 from sysid.export.export import export, format_of, precision
 from sysid.results.identification import load
 
 
 def run(options: argparse.Namespace, out: Output) -> int:
-    """Write the file and tell its precision."""
+    """Write the file, tell its precision, and warn where the matrices are not determined."""
     target = Path(options.file)
     form = format_of(target)  # a wrong ending is told before the result is read
-    written = export(load(options.result), target)
-    out.wrote(written)
-    out.write(f"{form.name}; precision: {precision(target)}\n")
-    out.answer(format=form.name, precision=precision(target))
+    result = load(options.result)
+    out.wrote(export(result, target))
+    without = "" if form.deviations else "; without deviations, which .csv and .mat have"
+    out.write(f"{form.name}; precision: {precision(target)}{without}\n")
+    out.answer(format=form.name, precision=precision(target), deviations=form.deviations, judgement=result.judgement)
+    if result.interrupted or not result.determined:
+        out.warn(f"{target.name}: {worth(result)}. Read {form.note}, or report.html")
     return SUCCESS
 
 
@@ -31,7 +35,9 @@ def add(command: Callable[..., argparse.ArgumentParser]) -> None:
         description="Write the identified structure for another program, in the format that the ending of FILE tells: "
         ".csv, M, K and C with deviations (exact); .mat, MATLAB (exact); .op4, Nastran OUTPUT4 "
         "with the Craig-Bampton superelement (exact); .bdf or .dmig, the superelement as Nastran's DMIG (10 digits); "
-        ".unv or .uff, mode shapes as dataset 55 (6 digits). The file says what the data leave open.",
+        ".unv or .uff, mode shapes as dataset 55 (6 digits). "
+        "The file says what the matrices are worth, what speaks against them and what the data leave open; where they "
+        "are not determined, a warning says so.",
         examples=tuple(
             f"sysid export results/cantilever_tower tower.{ending}" for ending in ("csv", "mat", "op4", "bdf", "unv")
         ),

@@ -129,8 +129,8 @@ def add_options(command: argparse.ArgumentParser) -> None:
         "--mass",
         type=_masses,
         metavar="KG",
-        help="of TEST.h5: mass that moves with the base, kg, a number or one a direction: 1450 or 1450,1450,1450; "
-        "with --lumped, of what the sensors stand for (what moves relative to the base): without adapter or base ring",
+        help="of TEST.h5: mass of the structure, kg, a number or one a direction: 1450 or 1450,1450,1450; with "
+        "--lumped that at the sensors alone, without what moves with the table (adapter, base ring)",
     )
     command.add_argument("--lumped", action="store_true", help="of TEST.h5: masses at the sensors alone")
     command.add_argument(

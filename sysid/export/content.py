@@ -58,23 +58,39 @@ def _records_rotation(it: Identification, sensor: int) -> bool:
     return isinstance(axis, str) and "r" in axis
 
 
-JUDGED = {
-    "no fit": "NO FIT: the search did not succeed, so these matrices do not explain the test",
+_WORTH = {
+    "no fit": "NO FIT: these matrices do not explain the records as they should",
     "determined": "determined: data and stated model fix every entry of the matrices",
-    "one of many": "ONE OF MANY: other matrices explain the test as well, or noise leaves entries open: see 'open'",
+    "one of many": "ONE OF MANY: other matrices explain the records as well, or noise leaves entries open; "
+    "frequencies, damping ratios and responses to base motion hold",
 }
+_DOUBTED = "ONE OF MANY: something speaks against this model, so that these matrices may be wrong"
+_INTERRUPTED = "the search was interrupted, these are the best matrices until then; "
+
+
+def worth(it: Identification) -> str:
+    """What the matrices are worth, in one line that names the statements which tell why."""
+    told = _DOUBTED if it.success and it.against else _WORTH[it.judgement]
+    why = " and ".join(f"'{word}'" for word, texts in (("against", it.against), ("open", left_open(it))) if texts)
+    return _INTERRUPTED * it.interrupted + told + (f"; see {why}" if why else "")
+
+
+def left_open(it: Identification) -> tuple[str, ...]:
+    """What is open besides what speaks against the answer."""
+    return tuple(text for text in it.undetermined if text not in it.against)
 
 
 def statements(it: Identification, precision: str) -> tuple[str, ...]:
-    """Sentences that go into every file: origin, judgement, what is open, units, order of the rows, precision."""
+    """Sentences of every file: origin, judgement, what is against it and open, units, order of rows, precision."""
     structure, base = it.structure, " ".join(it.measurement.base_axes or ())
     found = [
         f"written by sysid {__version__} on {datetime.now().astimezone().isoformat(timespec='seconds')}",
         f"problem: {it.recipe.title if it.recipe else 'of a script'}; strategy {it.strategy}; seed {it.seed}",
-        f"judgement: {JUDGED[it.judgement]}; relative residual {it.residual:.3g}",
+        f"judgement: {worth(it)}; relative residual {it.residual:.3g}",
         f"search: {it.message}",
         *(f"fixed by: {text}" for text in it.closed_by),
-        *(f"open: {text}" for text in it.undetermined),
+        *(f"against: {text}" for text in it.against),
+        *(f"open: {text}" for text in left_open(it)),
         "units: kg, m, s, N, rad; frequencies in Hz; damping ratios are fractions of critical damping",
         f"rows and columns: {structure.n} of the structure, then {structure.n_base} of the base ({base}); motions are "
         "absolute, and moments refer to the point at which the base motion is given",

@@ -13,22 +13,24 @@ from sysid.results.storage import atomically
 
 @dataclass(frozen=True)
 class Format:
-    """A format: the module of this room that writes it, what it is called, and the package it needs."""
+    """A format: its module of this room, its name, where its files say what they are worth, and what it needs."""
 
     module: str
     name: str
+    note: str
+    deviations: bool = False
     needs: str = ""
     extra: str = ""
 
 
 FORMATS = {
-    ".csv": Format("text_table", "table of M, K and C with deviations"),
-    ".mat": Format("matlab", "MATLAB file"),
-    ".op4": Format("op4", "Nastran OUTPUT4 file", "pyyeti", "nastran"),
-    ".dmig": Format("dmig", "Nastran DMIG superelement"),
-    ".bdf": Format("dmig", "Nastran DMIG superelement"),
-    ".unv": Format("uff55", "universal file of mode shapes"),
-    ".uff": Format("uff55", "universal file of mode shapes"),
+    ".csv": Format("text_table", "table of M, K and C with deviations", "its first lines", deviations=True),
+    ".mat": Format("matlab", "MATLAB file", "its variable 'about'", deviations=True),
+    ".op4": Format("op4", "Nastran OUTPUT4 file", "its matrix NOTE", needs="pyyeti", extra="nastran"),
+    ".dmig": Format("dmig", "Nastran DMIG superelement", "its first lines"),
+    ".bdf": Format("dmig", "Nastran DMIG superelement", "its first lines"),
+    ".unv": Format("uff55", "universal file of mode shapes", "its first lines"),
+    ".uff": Format("uff55", "universal file of mode shapes", "its first lines"),
 }
 
 
@@ -60,7 +62,8 @@ def export(identification: Identification, path: str | Path) -> Path:
 
     Notes
     -----
-    Each file says within itself what the data do not determine, its units, the order of its rows, and its precision.
+    Each file says within itself what the matrices are worth, what speaks against them, what the data do not determine,
+    its units, the order of its rows, and its precision.
     For everything else, and to go on with sysid, `Identification.save` writes HDF5.
     """
     instance("identification", identification, Identification)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sysid.export.content import JUDGED, one_line_each, statements
+from sysid.export.content import one_line_each, statements, worth
 from sysid.results.identification import Identification
 from sysid.structure.axes import sensor_row
 from sysid.structure.sensor import Sensor
@@ -32,7 +32,8 @@ def write(it: Identification, path: Path) -> None:
         *_set(164, (f"{1:10d}{'SI: meter, newton':<20}{2:10d}", _SI, f"{273.15:25.17E}".replace("E", "D"))),
         *_set(15, (f"{k:10d}{0:10d}{0:10d}{11:10d}" + _reals(place) for k, place in enumerate(places, 1))),
     ]
-    titles = one_line_each([JUDGED[it.judgement], where or "SI units, modal mass 1 kg, absolute motion"], 80)[:3]
+    units = where or "SI units, modal mass 1 kg, absolute motion"
+    titles = [*one_line_each([worth(it)], 80)[:3], *one_line_each([units], 80)[:1]]
     for mode in range(structure.n):
         figures = structure.natural_frequencies[mode], 1.0, structure.damping_ratios[mode], 0.0
         lines += _set(55, _mode(mode + 1, figures, shapes[:, :, mode], titles))

@@ -41,6 +41,7 @@ from sysid.plot.panels import (
     with_force,
 )  # fmt: skip
 from sysid.results.identification import Identification
+from sysid.results.summary import counted
 from sysid.search.strategy import HUBER
 from sysid.structure.structure import Array
 
@@ -425,7 +426,8 @@ def overview(identification: Identification, *, title: str | None = None) -> Fig
 
         recipe = identification.recipe
         head = f"{PurePath(recipe.module).stem}: " if recipe else ""
-        title = f"{head}{test.n_sensors} sensors, {test.n_base} base directions, residual {identification.residual:.2e}"
+        channels = f"{counted(test.n_sensors, 'sensor')}, {counted(test.n_base, 'base direction')}"
+        title = f"{head}{channels}, residual {identification.residual:.2e}"
     figure.suptitle(title, fontsize=13, color=INK, parse_math=False)
     return figure
 

@@ -37,7 +37,7 @@ h3 { font-size: 1rem; margin: 1.4rem 0 .4rem; }
 p, figcaption { margin: .5rem 0; max-width: 92ch; overflow-wrap: anywhere; text-wrap: pretty; }
 ul { margin: .3rem 0; padding-left: 1.3rem; max-width: 92ch; overflow-wrap: anywhere; text-wrap: pretty; }
 .pair { display: flex; flex-wrap: wrap; gap: 0 1.5rem; align-items: flex-start; }
-.pair figure { flex: 1 1 420px; min-width: 0; }
+.pair figure { flex: 1 1 500px; min-width: 0; }
 .mark { border: 1px solid var(--line); border-radius: 3px; padding: 0 .4em; margin-right: .5em; color: var(--soft);
   background: var(--fill); font-size: .8rem; white-space: nowrap; }
 td small { display: block; color: var(--soft); font-size: .82em; line-height: 1.25; }
@@ -50,20 +50,27 @@ td small { display: block; color: var(--soft); font-size: .82em; line-height: 1.
 .bad { border-left-color: var(--bad); }
 .good strong { color: var(--good); } .warn strong { color: var(--warn); } .bad strong { color: var(--bad); }
 .scroll { overflow-x: auto; margin: .6rem 0 1rem; }
+@media screen { .scroll:has(table) { background:
+    linear-gradient(to left, var(--paper) 50%, transparent) right / 3rem 100% no-repeat local,
+    linear-gradient(to left, rgb(128 138 150 / .45), transparent) right / 1rem 100% no-repeat; }
+  .scroll:has(table) figcaption, td:first-child, thead th:first-child { background: var(--paper); }
+  .scroll:has(table) figcaption { margin: 0; padding: .5rem 0; }
+  td:first-child, thead th:first-child { position: sticky; left: 0; } }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .88rem; }
 th, td { padding: .2rem .55rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
 thead th { border-bottom: 1.5px solid var(--soft); vertical-align: bottom; font-weight: 600;
-  white-space: normal; max-width: 9em; }
-@media screen { table { width: max-content; } .words { width: auto; } }
+  white-space: normal; }
 .words td, .words th { text-align: left; white-space: normal; vertical-align: top; }
-th:first-child, td:first-child { text-align: left; font-weight: 500; }
+th:first-child, td:first-child { text-align: left; } td:first-child { font-weight: 500; }
+@media screen { td:first-child { white-space: normal; } }
 .words td:first-child { white-space: nowrap; }
 figure { margin: .8rem 0 1.2rem; break-inside: avoid; }
-img { max-width: max(100%, 600px); height: auto; display: block; background: #fff; }
-pre { background: var(--fill); padding: .8rem 1rem; overflow-x: auto; font-size: .82rem; line-height: 1.45; }
+img { max-width: 100%; height: auto; display: block; background: #fff; }
+pre { background: var(--fill); padding: .8rem 1rem; font-size: .82rem; line-height: 1.45; white-space: pre-wrap;
+  overflow-wrap: anywhere; }
 nav { margin: .8rem 0; font-size: .9rem; }
 nav a { color: var(--link); margin-right: 1rem; display: inline-block; }
-.controls { display: flex; flex-wrap: wrap; gap: .4rem .9rem; align-items: center; font-size: .9rem; }
+.controls { display: flex; flex-wrap: wrap; gap: .4rem .9rem; align-items: center; font-size: .9rem; margin: .6rem 0; }
 .controls select, .controls button { font: inherit; color: var(--ink); background: var(--fill);
   border: 1px solid var(--soft); border-radius: 4px; padding: .15rem .5rem; max-width: 100%; }
 .controls label { max-width: 100%; }
@@ -90,7 +97,7 @@ svg .dot { fill: var(--found); } svg .base { fill: var(--soft); }
 .sheet p { margin: .6rem 0 0; font-size: .85rem; } .sheet svg { width: 100%; }
 @media screen { .drawn .sheets { display: none; } }
 @media (max-width: 600px) { body { padding: .8rem .8rem 3rem; font-size: 14px; } th, td { padding: .2rem .4rem; }
-  td:first-child { white-space: normal; max-width: 9em; }
+  td:first-child { max-width: 9em; }
   .words td:first-child { white-space: normal; min-width: 8em; max-width: 8em; }
   h1 { font-size: 1.25rem; } .shapes svg { width: calc(50% - .25rem); }
   .shapes svg text { font-size: 13px; } .shapes svg .title { font-size: 14px; } }
@@ -106,7 +113,7 @@ svg .dot { fill: var(--found); } svg .base { fill: var(--soft); }
   th, td { padding: .05rem .3rem; line-height: 1.3; } td small { line-height: 1.1; } tr { break-inside: avoid; }
   h2, h3, figcaption, .soft, .legend, .sheet p { break-after: avoid; } p, li { break-inside: avoid; }
   h2 + *, h3 + *, .soft + *, .legend + * { break-before: avoid; }
-  pre { white-space: pre-wrap; } }
+  .soft, figcaption { font-size: 9pt; } }
 """
 
 
@@ -127,6 +134,12 @@ def number(value: float | None, digits: int = 4) -> str:
     if value is None or not np.isfinite(value):
         return "–"
     return f"{value + 0.0:.{digits}g}"  # a zero has no sign
+
+
+def aligned(value: float | None) -> str:
+    """Write a number of a column with three significant digits, zeros at its end too: 1.00 below 0.896."""
+    told = number(value, 3)
+    return told if "e" in told or told in ("–", "0") else f"{value:#.3g}".removesuffix(".")
 
 
 def paragraph(value: object, kind: str = "") -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from sysid import plot
@@ -16,7 +18,7 @@ _NO_FIT = "of a model that does not fit"
 SAME = 1e-9  # of a value: a smaller difference is round-off
 _ENDS_ELSEWHERE = " How far the entries may go is in the result's mass_interval and stiffness_interval."
 _ENDS_BELOW = (
-    " Below an entry of M_SS and K_SS: from where … to where it goes in the models that explain the data and hold what "
+    " Below an entry of M_SS and K_SS: from where to where it goes in the models that explain the data and hold what "
     "was stated."
 )
 
@@ -56,14 +58,19 @@ def matrices(it: Identification) -> str:
             colours=None, label=mark,
         ),
         matrix(M, names, names, f"Mass M_SS, kg{scale}", below=lower[0], label=mark),
-        matrix(M_full[:n, n:], names, axes, f"Coupling mass M_S0, {coupling}{scale}", label=mark),
-        matrix(M_full[n:, n:], axes, axes, f"Base mass M_00, {base}{scale}", label=mark),
+        _of_base(M_full[:n, n:], names, axes, f"Coupling mass M_S0, {coupling}{scale}", mark),
+        _of_base(M_full[n:, n:], axes, axes, f"Base mass M_00, {base}{scale}", mark),
         matrix(K, names, names, f"Stiffness K_SS, N/m{scale}", below=lower[1], label=mark),
         matrix(
             C, names, names, f"Damping C on the motion relative to the base, N s/m{scale}", below=lower[2], label=mark
         ),
     ]  # fmt: skip
     return "".join(parts)
+
+
+def _of_base(block: Array, rows: Sequence[str], columns: Sequence[str], caption: str, label: str) -> str:
+    """HTML of a block of the base in the mass, (rows, columns); a line where it is zero, as of masses at sensors."""
+    return matrix(block, rows, columns, caption, label=label) if block.any() else paragraph(f"{caption}: zero", "soft")
 
 
 def half_widths(values: Array, std: Array, stated: Array | bool = False) -> Lines:
@@ -105,7 +112,7 @@ def _ranges(ends: Array, otherwise: Lines) -> Lines:
         least, most = (number(end, 3) for end in ends[:, i, j])
         bounded = np.isfinite(ends[:, i, j])
         told = {
-            (True, True): (f"{least} …", f"… {most}"),
+            (True, True): (f"{least} to", most),
             (True, False): (f"from {least}",),
             (False, True): (f"to {most}",),
         }

@@ -34,13 +34,13 @@ def opening(it: Identification, level: NoiseLevel) -> str:
 
 
 def trust(it: Identification) -> str:
-    """HTML of what is open, what speaks against the answer, what fixes it, and what to measure next."""
-    against, open_ = _weighed(it)
+    """HTML of what speaks against the answer, what is open, what fixes it, and what to measure next."""
+    (against, open_), steps = _weighed(it), _steps(it)
     parts = [
-        ("What the data do not determine", open_),
         ("What speaks against it", against),
+        ("What the data do not determine", open_),
         ("What fixes the matrices", it.closed_by),
-        ("What to measure or to do next", _steps(it)),
+        ("What to measure or to do next", steps if len(steps) > 1 else ()),  # one alone stands in the opening
         ("To be known besides", it.remarks[1:]),
     ]
     return "".join(f"<h3>{name}</h3>{bullets(map(sentence, told))}" for name, told in parts if told)

@@ -14,13 +14,26 @@ from sysid.plot.canvas import own_style
 from sysid.problem.formulation import MATRICES
 from sysid.problem.problem import Problem
 from sysid.report.curves import curves, mode_shapes, script
-from sysid.report.html import Cell, beside, bullets, matrix, number, page, paragraph, picture, sentence, table, text
+from sysid.report.html import (
+    Cell,
+    aligned,
+    beside,
+    bullets,
+    matrix,
+    number,
+    page,
+    paragraph,
+    picture,
+    sentence,
+    table,
+    text,
+)
 from sysid.report.matrices import CHOSEN, ONE_OF_MANY, SAME, Lines, half_widths, matrices, plain, stated
 from sysid.report.noise_level import NoiseLevel, noise_level, share_of_noise
 from sysid.report.opening import opening, rounded, trust
 from sysid.results.gain_table import gains_of_sensors
 from sysid.results.identification import Identification
-from sysid.results.noise_table import noise_of_channels
+from sysid.results.noise_table import NOISE_COLUMNS, noise_of_channels
 from sysid.results.phases import COLUMNS, rows_of_phases, seconds_in_words
 from sysid.results.storage import atomically, file_or_folder
 from sysid.results.summary import (
@@ -223,7 +236,7 @@ def _rigid_body_mass(it: Identification) -> str:
     axes, turns = it.measurement.base_axes or (), ~it.measurement.translational
     rigid, reference = it.structure.rigid_body_mass, it.problem.reference
     unit = "kg; kg m where one axis is a rotation, kg m² where both are" if turns.any() else "kg"
-    told, u = "", it.quick_uncertainty
+    told, label, u = "", _NORMALISED * it.problem.unit_mass, it.quick_uncertainty
     below: Lines = []
     if it.problem.unit_mass:
         told = paragraph(
@@ -232,7 +245,7 @@ def _rigid_body_mass(it: Identification) -> str:
         )
     elif u is not None:
         below = half_widths(rigid, u.rigid_body_mass, stated(it))
-    label = _NORMALISED * it.problem.unit_mass
+        label = ONE_OF_MANY * bool(np.all(np.isnan(u.rigid_body_mass)) and not stated(it).any())
     told += matrix(rigid, axes, axes, f"Total mass M_rb = [G; I]' M [G; I], {unit}.", below=below, label=label)
     if reference is not None:
         told += matrix(reference.rigid_body_mass, axes, axes, f"Of the reference, {unit}.")
@@ -256,7 +269,7 @@ def _residuals(it: Identification, level: NoiseLevel) -> str:
         force = [*zip(test.base_axes or (), _score_of_force(it, test), noise, strict=True)]
         channels += [(f"base force {axis}", 1 - score, own) for axis, score, own in force]
     known = any(np.isfinite(noise) for *_, noise in channels)
-    rows = [(name, number(100 * own, 3), *[number(100 * noise, 3)] * known) for name, own, noise in channels]
+    rows = [(name, aligned(100 * own), *[aligned(100 * noise)] * known) for name, own, noise in channels]
     caption = (
         "What the fit leaves of each channel: ‖identified - measured‖ / ‖measured‖, of the accelerations relative "
     )
@@ -272,9 +285,12 @@ def _as_fitted(it: Identification, test: Measurement) -> Measurement:
 
 def _noise(it: Identification) -> str:
     """The noise of each channel of whole records."""
-    rows = [(one.channel, number(one.level, 3), one.unit, number(one.percent, 3)) for one in noise_of_channels(it)]
-    caption = f"Noise of each channel, {noise_source(it)}: standard deviation of a sample in time."
-    return table(("channel", "of a sample", "unit", "% of its rms"), rows, caption) if rows else ""
+    rows = [(one.channel, one.told, one.unit, aligned(one.percent)) for one in noise_of_channels(it)]
+    caption = f"Noise of each channel, {noise_source(it)}: standard deviation of a sample in time, of noise up to half "
+    caption += (
+        "the sample rate (from least to most, where runs differ), and its share of what was recorded at the lines."
+    )
+    return table(("channel", *NOISE_COLUMNS), rows, caption) if rows else ""
 
 
 def _gains(it: Identification) -> str:
@@ -356,8 +372,11 @@ def _poles(it: Identification) -> str:
         left = "the largest singular value; why it is without poles stands in the picture"
     right = "all singular values; two that peak at one line are two modes there"
     aside = ", outliers that stand alone left out" * (it.problem.loss == "huber")
+    indicator = plot.cmif(it)
+    for figure in (diagram, indicator):
+        figure.set_size_inches(5.6, 4.2)  # beside each other, and on a phone, at nearly the size of their words
     return paragraph(f"What the records show without the model{aside}. Left: {left}. Right: {right}.", "soft") + beside(
-        picture(diagram, "stabilisation diagram"), picture(plot.cmif(it), "complex mode indicator function")
+        picture(diagram, "stabilisation diagram"), picture(indicator, "complex mode indicator function")
     )
 
 

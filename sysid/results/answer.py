@@ -254,11 +254,11 @@ class Answer:
         return tuple(open_masses(self.problem.screened, self.structure))
 
     @cached_property
-    def only_scale_open(self) -> bool:
+    def scale_is_open(self) -> bool:
         """Whether the answer explains the data, and one factor common to M, K and C is all that they leave open."""
-        from sysid.assessment.determination import only_scale_open
+        from sysid.assessment.determination import scale_is_open
 
-        return self.success and only_scale_open(self.problem.screened, self.structure, self.x)
+        return self.success and scale_is_open(self.problem.screened, self.structure, self.x)
 
     @property
     def is_one_of_many(self) -> bool:

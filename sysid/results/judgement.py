@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.assessment.checks import doubts
+from sysid.assessment.checks import contradictions, doubts
 from sysid.assessment.determination import BY_RANK, determine
 from sysid.assessment.gains import assumed, rests_on, taken_at_sensors
 from sysid.assessment.model_error import Miss, levels_in_words, missed_in_words, misses_of, model_errors
@@ -125,7 +125,7 @@ class Against(NamedTuple):
 
 
 def _against(problem: Problem, end: Outcome, verdict: Verdict) -> Against:
-    """What speaks against an answer, in the order of its weight; a mistake that is named explains what else does."""
+    """What speaks against an answer, likely causes first; a mistake that is named explains what else does."""
     averaged = problem.screened.measurement.averaged
     if end.mistakes:
         further = doubts(problem.screened, end.structure, end.x) if averaged else ()
@@ -134,7 +134,8 @@ def _against(problem: Problem, end: Outcome, verdict: Verdict) -> Against:
     further = (*end.doubts, *doubts(problem.screened, end.structure, end.x, changing=errors.changing))
     if errors.changing:
         return Against((*errors.sentences, *verdict.wrong, *further), changing=True)
-    return Against((*verdict.wrong, *errors.sentences, *further))
+    stated = contradictions(problem.screened, end.structure)
+    return Against(tuple(dict.fromkeys((*stated, *verdict.wrong, *errors.sentences, *further))))
 
 
 def verdict_of(problem: Problem, end: Outcome, *, cut_short: bool = False) -> Verdict:

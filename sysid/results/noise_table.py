@@ -12,15 +12,29 @@ from sysid.measurement.spectra import of_run
 from sysid.results.answer import Answer
 
 _TOLD = 3  # channels
+_ALIKE = 1.2  # ratio of the levels of runs, up to which they are told as one
 
 
 class ChannelNoise(NamedTuple):
-    """Noise of a channel, of all runs together: deviation of a sample, and in per cent of the rms over the lines."""
+    """Noise of a channel: deviation of a sample, were it white up to half the sample rate, and its share of the record.
+
+    Both of all runs together, `runs` the least and most of single ones; per cent of the rms of the record at the lines.
+    """
 
     channel: str
     level: float
     unit: str
     percent: float
+    runs: tuple[float, float]
+
+    @property
+    def told(self) -> str:
+        """The level; of runs that differ, the least and the most."""
+        least, most = self.runs
+        return f"{self.level:.3g}" if most < _ALIKE * least else f"{least:.3g} to {most:.3g}"
+
+
+NOISE_COLUMNS = "of a sample", "unit", "at the lines, % of rms"
 
 
 def noise_of_channels(it: Answer) -> tuple[ChannelNoise, ...]:
@@ -44,9 +58,10 @@ def noise_of_channels(it: Answer) -> tuple[ChannelNoise, ...]:
     found = np.concatenate([np.broadcast_to(part, (test.n_runs, part.shape[-1])) for part in level], axis=1)
     rms, std = np.sqrt(power / lines.sum()), np.sqrt(lines @ found**2 / lines.sum())
     percent = 100 * std / np.where(rms > 0, rms, np.inf)
+    ends = zip(found.min(axis=0).tolist(), found.max(axis=0).tolist(), strict=True)
     return tuple(
-        ChannelNoise(name, float(own), unit, float(share))
-        for (name, unit), own, share in zip(names, std, percent, strict=True)
+        ChannelNoise(name, float(own), unit, float(share), both)
+        for (name, unit), own, share, both in zip(names, std, percent, ends, strict=True)
     )
 
 

@@ -14,14 +14,14 @@ from sysid.measurement.in_time import peaks
 from sysid.results.answer import NOT_JUDGED, Answer
 from sysid.results.deck_masses import deck_masses
 from sysid.results.gain_table import gains_of_sensors
-from sysid.results.noise_table import noise_of_channels
+from sysid.results.noise_table import NOISE_COLUMNS, noise_of_channels
 from sysid.results.phases import COLUMNS, rows_of_phases, seconds_in_words
 from sysid.results.unknowns_table import MANY, rows_of, stated_values
 from sysid.structure.structure import Array
 
 _SCALE = (
-    "one number in kg is enough: state the mass (sysid run test.h5 --lumped --mass KG; in Python LumpedMass(KG), or "
-    "one unknown of a written mass), or measure the force between table and structure"
+    "one number in kg is enough: state the mass of what the sensors stand for (sysid run test.h5 --lumped --mass KG; "
+    "in Python LumpedMass(KG), or one unknown of a written mass), or measure the force between table and structure"
 )
 _NOT_COMPUTED = (
     "uncertainty not computed, as the time was over: Identification.uncertainty and 'sysid report' compute it"
@@ -75,7 +75,7 @@ def summary(it: Answer) -> str:
         lines.append(f"test {i} of {len(problem.validation)} never fitted: relative residual {test.residual(s):.3e}")
     lines += [*_noise(it), *_gains(it)]
     further_told = [f"  - {sentence}" for sentence in told[_FIRST:]]
-    if it.judgement == "one of many" and not it.hurried and it.open_masses and not it.only_scale_open:
+    if it.judgement == "one of many" and not it.hurried and it.open_masses:
         further_told += _ranges(it)
     lines += ["besides:"] * bool(further_told) + further_told
     lines += [_NOT_COMPUTED] if it.hurried else []
@@ -96,8 +96,8 @@ def _phases(it: Answer) -> list[str]:
 
 def _noise(it: Answer) -> list[str]:
     """Table of the noise of each channel, where whole records were fitted."""
-    rows = [(one.channel, f"{one.level:.3g}", one.unit, f"{one.percent:.3g}") for one in noise_of_channels(it)]
-    head = (f"noise {noise_source(it)}", "of a sample", "unit", "% of rms")
+    rows = [(one.channel, one.told, one.unit, f"{one.percent:.3g}") for one in noise_of_channels(it)]
+    head = (f"noise {noise_source(it)}", *NOISE_COLUMNS)
     return _aligned([list(column) for column in zip(head, *rows, strict=True)]) if 0 < len(rows) <= MANY else []
 
 
@@ -164,7 +164,7 @@ def next_steps(it: Answer) -> list[str]:
         return ["put right, or measure again, what speaks against it, the first thing first"]
     if not it.is_one_of_many:
         return []
-    if it.only_scale_open:
+    if it.scale_is_open:
         return [f"to close it: {_SCALE}"]
     if not it.open_masses:
         return [
@@ -175,9 +175,8 @@ def next_steps(it: Answer) -> list[str]:
         return ["to weigh these modes: more force at their frequencies, longer records, or another base direction"]
     return [
         "to close it: measure the force between table and structure; or state what is known of the mass, where it is "
-        "true: LumpedMass(KG) (sysid run test.h5 --lumped --mass KG), or FullMass(known=...)"
-        + "; a total mass alone only bounds it"
-        * it.problem.formulation.mass.free
+        "true: that all of it sits at the sensors (sysid run test.h5 --lumped --mass KG; LumpedMass(KG)), or single "
+        "masses (FullMass(known=...))" + "; a total mass alone only bounds it" * it.problem.formulation.mass.free
     ]
 
 
@@ -232,7 +231,7 @@ def mass_percent_std(it: Answer) -> Array:
 def is_one_of_many(it: Answer) -> Array:
     """Which effective masses are one choice among many, (n, d) of bool; a common factor changes none of a sum."""
     own_sum = it.problem.unit_mass and not it.problem.formulation.mass.free  # nothing in kg beside what is scaled
-    known = it.determined or it.hurried or (own_sum and it.only_scale_open)
+    known = it.determined or it.hurried or (own_sum and it.scale_is_open)
     return np.logical_and(np.isnan(mass_percent_std(it)), not known)
 
 
@@ -321,7 +320,7 @@ def _rigid_masses(it: Answer, axes: Sequence[str]) -> Iterator[str]:
 def _ranges(it: Answer) -> Iterator[str]:
     """How far the diagonals may go, in one line, where that is known quickly and something may move."""
     ends = it.quick_intervals
-    if ends is None:
+    if ends is None or it.scale_is_open:
         return
     words = []
     M, K, _ = blocks_of(it.structure)

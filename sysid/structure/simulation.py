@@ -2,8 +2,8 @@ r"""Modal accelerations in time under a base acceleration that is given by sampl
 
 The state is ``y = [w q; q']``, so that its matrix ``A = [[0, W], [-W, D]]``, with ``W = diag(w)`` and ``-D`` the modal
 damping matrix, has entries of one unit; ``y' = A y - [0; Gamma] u``. Between two samples the base acceleration is the
-cubic spline through all of them, and the step over it is exact: one matrix exponential holds the transition and the
-integrals of the four powers of time (C. F. Van Loan, IEEE Trans. Automat. Contr. 23 (1978) 395-404).
+natural spline of degree 11 through all of them, and the step over it is exact: one matrix exponential holds the
+transition and the integrals of all powers of time (C. F. Van Loan, IEEE Trans. Automat. Contr. 23 (1978) 395-404).
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.floating[Any]]
 
+_DEGREE = 11  # of the spline
 _BLOCK = 1024  # samples whose rows are reduced together
 _DECAYED = 1e-12  # free vibration below this share of its first acceleration explains nothing more
 
@@ -44,8 +45,9 @@ def modal_accelerations(modes: ModalModel, base: Array, sample_rate: float, init
 
     `initial`, (2, n), holds modal displacements and velocities at the first sample.
     """
-    transition, loads = _step(modes, 1 / sample_rate)
-    driven = np.einsum("pxd,pdi->ix", loads, _spline_derivatives(base))
+    derivatives = _spline_derivatives(base)
+    transition, loads = _step(modes, 1 / sample_rate, len(derivatives) - 1)
+    driven = np.einsum("pxd,pdi->ix", loads, derivatives)
     states = np.empty((base.shape[1], 2 * modes.omega.size))
     states[0] = state = np.concatenate([modes.omega * initial[0], initial[1]])
     for i, load in enumerate(driven, start=1):
@@ -77,21 +79,24 @@ def fitted_state(modes: ModalModel, shapes: Array, residual: Array, sample_rate:
     return np.array([state[:n] / modes.omega, state[n:]])
 
 
-def _step(modes: ModalModel, step: float) -> tuple[Array, Array]:
-    """Transition (2n, 2n) over a step, and (4, 2n, d) what a load and its derivatives at the beginning add to it."""
+def _step(modes: ModalModel, step: float, degree: int) -> tuple[Array, Array]:
+    """Transition (2n, 2n) over a step, and (degree + 1, 2n, d) what a load and its derivatives at its beginning add."""
     n, d = modes.participation.shape
-    size = 2 * n
-    A = np.zeros((size + 4 * d, size + 4 * d))
+    size, loads = 2 * n, (degree + 1) * d
+    A = np.zeros((size + loads, size + loads))
     A[:size, :size] = step * modes.state_matrix
     A[n:size, size : size + d] = -step * modes.participation
-    A[size : size + 3 * d, size + d :] = np.eye(3 * d)  # each derivative integrates the next one
+    A[size:-d, size + d :] = np.eye(loads - d)  # each derivative integrates the next one
     exponential = scipy.linalg.expm(A)
-    return exponential[:size, :size], np.moveaxis(exponential[:size, size:].reshape(size, 4, d), 1, 0)
+    return exponential[:size, :size], np.moveaxis(exponential[:size, size:].reshape(size, -1, d), 1, 0)
 
 
 def _spline_derivatives(base: Array) -> Array:
-    """Cubic spline at the beginning of each step, its derivatives 0 to 3 by steps: (4, d, n_samples - 1)."""
-    from scipy.interpolate import CubicSpline
+    """Natural spline at the beginning of each step, its derivatives by steps: (degree + 1, d, n_samples - 1)."""
+    from scipy.interpolate import make_interp_spline
 
-    coefficients = CubicSpline(np.arange(base.shape[1]), base, axis=1).c  # highest power first
-    return np.moveaxis(coefficients[::-1], 2, 1) * np.array([1, 1, 2, 6])[:, None, None]
+    samples = base.shape[1]
+    m = min(_DEGREE // 2 + 1, samples)
+    still = [(order, np.zeros(len(base))) for order in range(m, 2 * m - 1)]  # at both ends
+    spline = make_interp_spline(np.arange(samples), base.T, k=2 * m - 1, bc_type=(still, still))
+    return np.stack([spline(np.arange(samples - 1), nu=order).T for order in range(2 * m)])

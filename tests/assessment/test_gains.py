@@ -155,10 +155,12 @@ class TestTotalOfALumpedMass:
         np.testing.assert_allclose(ring.structure.mass, 1.25 * right.structure.mass, rtol=1e-6)
         assert any("all of the stated 15 kg is taken to sit at the sensors" in told for told in ring.remarks)
 
-    @pytest.mark.parametrize("mass", [FullMass(15.0), LumpedMass()])
-    def test_is_assumed_of_no_other_mass(self, mass):
+    @pytest.mark.parametrize(
+        ("mass", "force"), [(FullMass(15.0), False), (LumpedMass(), False), (LumpedMass(15.0), True)]
+    )
+    def test_is_assumed_of_no_other_mass_and_not_where_the_force_contradicts(self, mass, force):
         truth = storeys()
-        problem = Problem(simulate(truth, lines(truth), force=True), mass=mass)
+        problem = Problem(simulate(truth, lines(truth), force=force), mass=mass)
         assert not list(taken_at_sensors(problem))
 
     def test_names_the_total_of_each_direction(self, random_case):

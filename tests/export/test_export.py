@@ -10,7 +10,7 @@ from scipy.io import loadmat
 
 import sysid
 from sysid.cli.main import main
-from sysid.export.content import damping_of, rotations_of, unit
+from sysid.export.content import damping_of, rotations_of, unit, worth
 from sysid.export.state_space import control_system
 
 
@@ -120,6 +120,17 @@ def test_a_file_says_what_the_data_leave_open(result, tmp_path, ending):
     assert "judgement: NO FIT" in sysid.export(replace(result, success=False), tmp_path / f"m.{ending}").read_text()
 
 
+@pytest.mark.parametrize("ending", ["csv", "bdf", "unv"])
+def test_what_speaks_against_an_answer_and_what_is_open_stand_under_their_own_words(result, tmp_path, ending):
+    against, both = ("f1 falls with level",), ("f1 falls with level", "the modal mass of mode 2")
+    doubted = replace(result, determined=False, against=against, undetermined=both, closed_by=(), interrupted=True)
+    text = sysid.export(doubted, tmp_path / f"m.{ending}").read_text(encoding="utf-8")
+    assert text.count("against: f1 falls with level") == 1 and "open: f1 falls" not in text
+    assert "open: the modal mass of mode 2" in text
+    judged = worth(doubted)
+    assert "interrupted" in judged and "may be wrong" in judged and judged.endswith("see 'against' and 'open'")
+
+
 def test_an_unknown_ending_is_told_with_those_that_exist(result, tmp_path):
     with pytest.raises(sysid.InputError, match=r"no format has the ending '\.doc'; there are \.csv"):
         sysid.export(result, tmp_path / "m.doc")
@@ -129,5 +140,25 @@ def test_an_unknown_ending_is_told_with_those_that_exist(result, tmp_path):
 def test_the_command_writes_a_file_and_tells_its_precision(result, tmp_path, capsys):
     result.save(tmp_path / "result.h5")
     assert main(["export", str(tmp_path), str(tmp_path / "m.csv")]) == 0
-    assert "precision: exact" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "precision: exact" in said.out and "without deviations" not in said.out and not said.err
+    assert main(["export", str(tmp_path), str(tmp_path / "m.unv")]) == 0
+    assert "without deviations, which .csv and .mat have" in capsys.readouterr().out
     assert main(["export", str(tmp_path), str(tmp_path / "m.xls")]) == 2
+
+
+@pytest.mark.parametrize(
+    "changes, told",
+    [
+        ({"determined": False, "undetermined": ("the mass of mode 2",)}, ("ONE OF MANY", "'open'")),
+        ({"success": False, "determined": False, "against": ("no end",), "undetermined": ("no end",)}, ("NO FIT",)),
+        ({"interrupted": True, "determined": False, "undetermined": ("no end",)}, ("interrupted", "'open'")),
+    ],
+)
+def test_the_command_warns_in_one_line_of_matrices_that_are_not_determined(result, tmp_path, capsys, changes, told):
+    replace(result, closed_by=(), **changes).save(tmp_path / "result.h5")
+    assert main(["export", str(tmp_path), str(tmp_path / "m.csv")]) == 0
+    said = capsys.readouterr()
+    (line,) = said.err.splitlines()
+    assert line.startswith("sysid: warning: m.csv: ") and all(word in line for word in told)
+    assert "m.csv" in said.out

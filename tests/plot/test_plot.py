@@ -252,6 +252,18 @@ def test_the_stabilisation_diagram_shows_every_pole_before_the_singular_value(un
     assert told == [*reversed(names), "identified mode"]
 
 
+@pytest.mark.parametrize("size", [(6.4, 4.2), (5.6, 4.2)])
+def test_labels_of_both_axes_of_the_stabilisation_diagram_are_within_the_picture(unit, runs, size):
+    one = sysid.Measurement(FREQ, runs.measurement.base[:1], runs.measurement.response[:1], rigid_body=np.eye(3, 2))
+    for subject in (unit, one):  # a label of one line, and of two, with a remark
+        figure = plot.stabilisation(subject)
+        figure.set_size_inches(*size)
+        to_png(figure)
+        for ax in figure.axes:
+            seen = ax.get_tightbbox()
+            assert min(seen.x0, seen.y0) >= 0 and seen.x1 <= figure.bbox.x1 and seen.y1 <= figure.bbox.y1
+
+
 def test_the_cmif_shows_every_singular_value(unit, truth):
     ax = plot.cmif(unit.measurement).axes[0]
     first, second = cmif(unit.measurement)

@@ -30,6 +30,7 @@ def test_every_control_works_and_the_page_is_readable(result, tmp_path, width, d
     assert told["zoomed"] and told["whole"] and told["all_lines"] and told["keys"] and told["moved"]
     assert told["sheets"] == (3 + 2) * 2 and told["stills"] == 0  # every channel of both runs, on paper alone
     assert told["over"] == [] and told["sideways"] <= 0
+    assert told["cut"] == []  # no picture at any width, no table on a wide screen
     assert max(told["first"]) < 800  # judgement, next step, masses and frequencies on the first screen
     assert told["contrast"] >= 4.5
     assert (sum(map(int, re.findall(r"\d+", told["paper"])[:3])) < 150) == dark

@@ -14,6 +14,7 @@ from scipy.stats import norm
 
 import sysid
 from sysid.report import opening, report
+from sysid.report.html import aligned
 from sysid.report.noise_level import noise_level
 
 FREQ = np.linspace(1.0, 40.0, 30)
@@ -96,11 +97,10 @@ def test_what_is_open_and_what_speaks_against_the_answer_stand_apart(complete):
     doubtful = dataclasses.replace(complete, against=(against,), undetermined=(against, left))
     told = [part.split("</h3>") for part in opening.trust(doubtful).split("<h3>")[1:]]
     assert [name for name, _ in told] == [
-        "What the data do not determine", "What speaks against it", "What fixes the matrices",
-        "What to measure or to do next",
+        "What speaks against it", "What the data do not determine", "What fixes the matrices",
     ]  # fmt: skip
-    assert left[1:] in told[0][1] and against[1:] not in told[0][1]
-    assert against[1:] in told[1][1] and left[1:] not in told[1][1]
+    assert against[1:] in told[0][1] and left[1:] not in told[0][1]
+    assert left[1:] in told[1][1] and against[1:] not in told[1][1]
     ended = "the search ended before it found a fit (interrupted): these matrices are no more than the best until then"
     for expected, undetermined in (((against, ended), (against, ended, left)), (("interrupted",), (left,))):
         failed = dataclasses.replace(complete, success=False, against=expected, undetermined=undetermined)
@@ -270,10 +270,28 @@ def test_what_is_not_determined_stands_with_its_range_and_a_mark(modal, truth, n
     for table, ends in zip(square, (it.mass_interval, it.stiffness_interval), strict=False):
         for i, j in np.ndindex(3, 3):
             low, high = (f"{end + 0.0:.3g}" for end in ends[:, i, j])
-            assert table[i + 1][j + 1].split("|")[1:] == [f"{low} …", f"… {high}"]
+            assert table[i + 1][j + 1].split("|")[1:] == [f"{low} to", high]
     assert not any("|" in cell for row in square[2] for cell in row)  # no half-widths about one choice
     assert page.words.count("one of many") == 5  # matrices; pictures are left out here
     assert page.text.count("one of many as the modal masses were chosen") == 2
+
+
+def test_a_total_mass_that_is_open_is_called_one_of_many(modal, truth, no_pictures):
+    it = modal(force=False, mass=sysid.FullMass(np.trace(truth.mass)))
+    assert not it.problem.unit_mass and np.isnan(it.uncertainty.rigid_body_mass).all()
+    assert "one of many Total mass M_rb" in Page(report.render(it)).text
+
+
+@pytest.mark.parametrize(
+    ("value", "told"), [(0.8961, "0.896"), (1.0, "1.00"), (123.4, "123"), (0.0, "0"), (1e-7, "1e-07"), (np.nan, "–")]
+)
+def test_numbers_of_a_column_keep_the_zeros_at_their_ends(value, told):
+    assert aligned(value) == told
+
+
+def test_blocks_of_the_base_that_are_zero_are_a_line(written, no_pictures):
+    page = Page(report.render(written))  # masses on the sensors alone
+    assert "Coupling mass M_S0, kg: zero" in page.text and "Base mass M_00, kg: zero" in page.text
 
 
 def test_an_entry_without_an_end_is_called_unbounded(modal, no_pictures):

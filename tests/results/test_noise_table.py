@@ -1,6 +1,7 @@
 """The noise of each channel of whole records is told: in the summary, in figures and in the report."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -35,6 +36,23 @@ def test_the_table_gives_level_unit_and_share_of_each_channel(answer):
     assert [(row.channel, row.unit) for row in rows] == [("sensor 1", "m/s²"), ("base x", "m/s²"), ("force x", "N")]
     np.testing.assert_allclose([row.percent for row in rows], [2.0, 1.0, 3.0], rtol=0.01)
     assert rows[2].level == answer.noise.force[0]
+
+
+def test_shares_are_those_at_the_lines_and_runs_that_differ_are_told():
+    """Noise and record of half the band, passed by a filter in time, over one another; levels of both runs."""
+    rng, rate, n = np.random.default_rng(4), 50.0, 4000
+    shape = signal.butter(4, 0.3, output="sos")
+    runs, levels = [], (0.01, 0.03)
+    for level in levels:
+        clean = signal.sosfilt(shape, rng.standard_normal((2, n)), axis=1)
+        runs.append((clean[:1], clean[1:] + level * rng.standard_normal((1, n)), None))
+    test = sysid.Measurement.from_time(runs, rate, rigid_body=[[1.0]], band=(1.0, rate / 4))
+    stated = sysid.NoiseLevels(np.array(levels)[:, None], np.array([0.02]))
+    sensor, base = noise_of_channels(SimpleNamespace(noise=stated, problem=SimpleNamespace(measurement=test)))
+    half = lambda x: signal.sosfilt(signal.butter(8, [1.0, rate / 4], "bandpass", fs=rate, output="sos"), x)  # noqa: E731
+    noise = np.std([half(level * rng.standard_normal(n)) for level in levels])
+    assert sensor.percent == pytest.approx(100 * noise / np.std([half(run[1][0]) for run in runs]), rel=0.05)
+    assert sensor.told == "0.01 to 0.03" and base.told == "0.02"
 
 
 def test_summary_figures_and_report_tell_it(answer):

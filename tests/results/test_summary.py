@@ -186,14 +186,31 @@ def test_masses_of_a_lumped_model_are_told_and_what_no_mode_moves(mass):
     np.testing.assert_allclose([float(share) for share in missing], [100 / 6] * bool(ring), rtol=0.03)
 
 
+def test_one_open_factor_is_closed_by_a_total_and_what_a_total_takes_for_granted_is_told():
+    M, K = np.diag([2.0, 1.0, 0.0]), np.array([[3900.0, -1500, -2400], [-1500, 1500, 0], [-2400, 0, 2400]])
+    truth, lines = sysid.Structure(M, K, np.array([0.01, 0.02]), n_base=1), np.linspace(1, 12, 200)
+    test = sysid.simulate(truth, lines, noise=0.01, rng=0)
+    scale, every, stated = (
+        sysid.identify(sysid.Problem(test, mass=mass), rng=0)
+        for mass in (sysid.LumpedMass(), sysid.FullMass(), sysid.LumpedMass(3.0))
+    )
+    assert scale.scale_is_open and not every.scale_is_open and not stated.scale_is_open
+    assert "one common factor" in scale.summary() and "any number of times" not in scale.summary()
+    assert "any number of times" in every.summary()
+    granted = "all of the stated 3 kg is taken to sit at the sensors"
+    assert stated.determined and any(granted in sentence for sentence in stated.remarks)
+    forced = sysid.simulate(truth, lines, noise=0.01, force=True, rng=0)
+    weighed = sysid.identify(sysid.Problem(forced, mass=sysid.LumpedMass(4.0)), rng=0)
+    assert "4 kg in the base directions, but the base force weighs 3" in weighed.confidence[0]
+    assert not any("taken to sit" in sentence for sentence in weighed.remarks)
+
+
 @pytest.mark.parametrize(("mass", "scale"), [(sysid.LumpedMass(), True), (sysid.FullMass(), False)])
 def test_the_step_that_closes_a_common_factor_is_one_number_in_kg(random_case, mass, scale):
     """Effective masses in %, of which a common factor makes nothing, are then known."""
     _, problem = random_case(np.random.default_rng(5), "lumped", n=3, d=1, total=False)
     it = sysid.identify(dataclasses.replace(problem, mass=mass), strategy="modal")
     told = " ".join(it.summary().split())
-    assert it.only_scale_open is scale and not it.determined
-    assert ("one number in kg is enough: state the mass (sysid run test.h5 --lumped --mass KG" in told) is scale
+    assert ("one number in kg is enough: state the mass of what the sensors stand for" in told) is scale
     assert ("a total mass alone only bounds it" in told) is not scale
     assert any("~" in cell for row in rows(it)[1:4] for cell in row) is not scale
-    assert ("over all these models" in told) is not scale
