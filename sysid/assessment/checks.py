@@ -197,7 +197,11 @@ def _force(formulation: Formulation, test: Measurement, structure: Structure) ->
     entries, n = formulation.mass.entries, formulation.geometry.n
     # Masses are open, and none of them is below the sensors.
     lumped = not formulation.mass.free and entries is not None and np.isnan(entries).any() and not entries[:, n:].any()
-    fixture = ", and mass below the sensors (base ring, fixture), which a lumped mass has not" if lumped else ""
+    fixture = (
+        ", and mass below the sensors (base ring, fixture), which a full mass may have, a lumped one not"
+        if lumped
+        else ""
+    )
     # Both misfits in units of the stated noise: what is left at a noisy peak speaks against nothing.
     left = replace(test, force=test.force - test.predict_force(structure))
     misfit = float(np.sqrt(Records(left, force=True).size / Records(test, force=True).size))

@@ -138,6 +138,15 @@ def open_masses(problem: Problem, structure: Structure) -> list[int]:
     return modal_mass_cone.open_modes(problem, structure) if modal_mass_cone.speaks(problem.formulation) else []
 
 
+def scale_is_open(problem: Problem, structure: Structure, x: Array | None) -> bool:
+    """Whether one factor common to mass, stiffness and damping is all that is open; parameters as in `determine`."""
+    if modal_mass_cone.speaks(problem.formulation):
+        return modal_mass_cone.scale_is_open(problem, structure)
+    _, _, slopes, known = _about(problem, structure, x)
+    pairs = blocks_and_slopes(structure, slopes)
+    return _moving(pairs, known.unit, known.unseen).shape[1] == 1 and _scale_is_open(pairs, known)
+
+
 # -- by the rank of the Jacobian -----------------------------------------------------------------
 
 

@@ -161,6 +161,19 @@ def assumed(problem: Problem) -> Iterator[str]:
         )
 
 
+def taken_at_sensors(problem: Problem) -> Iterator[str]:
+    """What a stated total of a lumped mass assumes, which accelerations cannot contradict, in a sentence."""
+    totals, geometry = problem.formulation.mass.totals, problem.geometry
+    if totals is None or totals.kind != "sensors" or problem.measurement.force is not None:  # which contradicts
+        return
+    held = geometry.translational & np.isin(np.arange(geometry.d), geometry.directions[: geometry.n])
+    told = ", ".join(dict.fromkeys(f"{mass:.5g}" for mass in totals.by_direction[held]))
+    yield from [
+        f"all of the stated {told} kg is taken to sit at the sensors. Mass that moves with the table, such as an "
+        "adapter or a base ring, must not be in it: no record can show it, and M, K and C are in proportion to it"
+    ] * bool(np.any(held))
+
+
 def worth_of(by_gain: Array, mass_std: Array) -> Array:
     """By how many of its deviations the diagonal of M_SS moves at most where it moves by `by_gain`, (n_sensors,).
 

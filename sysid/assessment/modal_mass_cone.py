@@ -95,7 +95,7 @@ def _merged(
 def _what_is_open(structure: Structure, free: list[int], common: bool) -> str:
     """Which modal masses are open, in words."""
     if common:
-        return "one common scale of mass, stiffness and damping is open"
+        return "mass, stiffness and damping are known up to one common factor"
     if len(free) == structure.n:
         return "all modal masses are open"
     *others, last = (f"the modal mass of {_mode(structure, k)}" for k in free)

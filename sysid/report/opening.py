@@ -86,7 +86,11 @@ def _steps(it: Identification) -> list[str]:
     if it.judgement == "one of many":
         return ["Measure more closely what is not known well enough: it is named below."]
     if not it.problem.validation:
-        return ["Predict a test that was not fitted (validation=[...]): it alone shows what the model leaves out."]
+        one_by_one = ", or each run by the others: 'sysid refine RESULT --leave-out run'" * (it.measurement.n_runs > 1)
+        return [
+            f"Predict a test that was not fitted (in Python validation=[...]{one_by_one}): it alone shows what the "
+            "model leaves out."
+        ]
     return ["Take the matrices: sysid export writes them for Nastran, MATLAB and others."]
 
 

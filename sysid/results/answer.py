@@ -255,10 +255,10 @@ class Answer:
 
     @cached_property
     def scale_is_open(self) -> bool:
-        """Whether one scale of mass, stiffness and damping is open, and nothing else."""
-        from sysid.assessment.modal_mass_cone import scale_is_open, speaks
+        """Whether the answer explains the data, and one factor common to M, K and C is all that they leave open."""
+        from sysid.assessment.determination import scale_is_open
 
-        return speaks(self.problem.formulation) and scale_is_open(self.problem.screened, self.structure)
+        return self.success and scale_is_open(self.problem.screened, self.structure, self.x)
 
     @property
     def is_one_of_many(self) -> bool:

@@ -6,6 +6,7 @@ import ast
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import starmap
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +28,6 @@ _PLAIN = (
     "x", "strategy", "success", "message", "determined", "closed_by", "undetermined", "remarks", "interrupted",
     "against", "changing",
 )  # fmt: skip
-
-
-_OF_TESTS = {"lumped": "lumped masses", "mass": "{} kg stated", "band": "{0[0]:g} to {0[1]:g} Hz", "goal": "goal {}"}
 
 
 @dataclass(frozen=True)
@@ -81,12 +79,14 @@ class Recipe:
 
     @property
     def title(self) -> str:
-        """The module and its parameters: "cantilever_tower (elements=3)"; a test read from files by its file."""
-        of_test = self.module == "recorded_test" and self.data
-        name = Path(self.data).name if of_test and self.data else self.module
-        words = _OF_TESTS if of_test else {}
-        given = ", ".join(words.get(key, f"{key}={{!r}}").format(value) for key, value in self.parameters.items())
-        return f"{name} ({given})" if given else name
+        """The module and its parameters: "cantilever_tower (elements=3)"; of a test read from files what was said.
+
+        Such as "test.h5, lumped mass, 103 kg stated".
+        """
+        if self.module == "recorded_test" and self.data:
+            return ", ".join([Path(self.data).name, *starmap(_option_in_words, self.parameters.items())])
+        given = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items())
+        return f"{self.module} ({given})" if given else self.module
 
     def to_tree(self) -> dict[str, Any]:
         """Give the fields by their names; `from_tree` takes them back."""
@@ -100,6 +100,17 @@ class Recipe:
         """Give the recipe of a tree that `to_tree` made; earlier ones have no parameters."""
         parameters = {name: ast.literal_eval(text) for name, text in tree.get("parameters", {}).items()}
         return cls(tree["module"], tree["data"], int(tree["rng"]), parameters, tree.get("start"))
+
+
+def _option_in_words(name: str, value: Any) -> str:
+    """What was said of a test that was read from files: "0.5-40 Hz"; another parameter as it was given."""
+    parts = value if isinstance(value, list | tuple) else [value]
+    told = ("-" if name == "band" else " and ").join(str(part).removesuffix(".0") for part in parts)
+    words = {
+        "mass": f"{told} kg stated", "lumped": "lumped mass" if value else "full mass", "band": f"{told} Hz",
+        "goal": f"goal {told}",
+    }  # fmt: skip
+    return words.get(name, f"{name}={value!r}")
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -11,7 +11,7 @@ import numpy as np
 
 from sysid.assessment.checks import contradictions, doubts
 from sysid.assessment.determination import BY_RANK, determine
-from sysid.assessment.gains import assumed, rests_on
+from sysid.assessment.gains import assumed, rests_on, taken_at_sensors
 from sysid.assessment.model_error import Miss, levels_in_words, missed_in_words, misses_of, model_errors
 from sysid.assessment.sensitivity import blocks_of
 from sysid.assessment.uncertainty import LARGE
@@ -168,15 +168,7 @@ def _remarks(problem: Problem, end: Outcome) -> Iterator[str]:
         names = [label for label, on in zip(formulation.labels, at, strict=True) if on]
         if names:
             yield f"on a bound of the search space, beyond which the truth may lie: {', '.join(names)}"
-    totals = formulation.mass.totals
-    if totals is not None and totals.kind == "sensors" and problem.measurement.force is None:
-        masses = ", ".join(
-            f"{mass:.4g}" for mass in dict.fromkeys(totals.by_direction[totals.by_direction > 0].tolist())
-        )
-        yield (
-            f"all of the stated {masses} kg is taken to sit at the sensors. Mass that moves with the table, such as an "
-            "adapter or a base ring, must not be in it: no record can show it, and M, K and C are in proportion to it"
-        )
+    yield from taken_at_sensors(problem)
     yield from levels_in_words(problem)
     tests = [term.test for term in formulation.tests]
     for i, test in enumerate(tests, start=problem.first_test):

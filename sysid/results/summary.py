@@ -19,6 +19,10 @@ from sysid.results.phases import COLUMNS, rows_of_phases, seconds_in_words
 from sysid.results.unknowns_table import MANY, rows_of, stated_values
 from sysid.structure.structure import Array
 
+_SCALE = (
+    "one number in kg is enough: state the mass of what the sensors stand for (sysid run test.h5 --lumped --mass KG; "
+    "in Python LumpedMass(KG), or one unknown of a written mass), or measure the force between table and structure"
+)
 _NOT_COMPUTED = (
     "uncertainty not computed, as the time was over: Identification.uncertainty and 'sysid report' compute it"
 )
@@ -160,6 +164,8 @@ def next_steps(it: Answer) -> list[str]:
         return ["put right, or measure again, what speaks against it, the first thing first"]
     if not it.is_one_of_many:
         return []
+    if it.scale_is_open:
+        return [f"to close it: {_SCALE}"]
     if not it.open_masses:
         return [
             "to close it: state one of these unknowns (fixed=True with its value), a relation between them as a "
@@ -167,15 +173,10 @@ def next_steps(it: Answer) -> list[str]:
         ]
     if it.measurement.force is not None:
         return ["to weigh these modes: more force at their frequencies, longer records, or another base direction"]
-    if it.scale_is_open:
-        return [
-            "to close it: M, K and C are known up to one common factor: state the mass of what the sensors stand for "
-            "(sysid run test.h5 --lumped --mass KG; LumpedMass(KG)), or measure the force between table and structure"
-        ]
     return [
         "to close it: measure the force between table and structure; or state what is known of the mass, where it is "
         "true: that all of it sits at the sensors (sysid run test.h5 --lumped --mass KG; LumpedMass(KG)), or single "
-        "masses (FullMass(known=...)); a total mass alone only bounds it"
+        "masses (FullMass(known=...))" + "; a total mass alone only bounds it" * it.problem.formulation.mass.free
     ]
 
 
@@ -228,8 +229,10 @@ def mass_percent_std(it: Answer) -> Array:
 
 
 def is_one_of_many(it: Answer) -> Array:
-    """Which effective masses are one choice among many, (n, d) of bool."""
-    return np.logical_and(np.isnan(mass_percent_std(it)), not (it.determined or it.hurried))
+    """Which effective masses are one choice among many, (n, d) of bool; a common factor changes none of a sum."""
+    own_sum = it.problem.unit_mass and not it.problem.formulation.mass.free  # nothing in kg beside what is scaled
+    known = it.determined or it.hurried or (own_sum and it.scale_is_open)
+    return np.logical_and(np.isnan(mass_percent_std(it)), not known)
 
 
 def _mode_table(it: Answer) -> list[str]:

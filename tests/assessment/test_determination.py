@@ -6,7 +6,7 @@ import pytest
 
 import sysid
 from sysid import ChainStiffness, FullMass, LumpedMass, Prior, Problem, ProportionalDamping, SpectralStiffness, Variable
-from sysid.assessment.determination import BY_CONE, BY_RANK, determine, intervals, open_masses
+from sysid.assessment.determination import BY_CONE, BY_RANK, determine, intervals, open_masses, scale_is_open
 from sysid.assessment.uncertainty import uncertainty
 
 FREQ = np.linspace(1.0, 30.0, 60)
@@ -292,3 +292,33 @@ def test_a_written_chain_without_force_is_told_that_its_scale_is_open(force):
     x = np.concatenate([order[unknown.name] for unknown in problem.formulation.unknowns])
     open_ = determine(problem, truth, x).undetermined
     assert any("the scale of mass, stiffness and damping is not determined" in told for told in open_) != force
+
+
+class TestOnlyTheScale:
+    @pytest.mark.parametrize("total", [None, 6.0])
+    def test_of_a_chain_by_cone_and_by_rank(self, truth, total):
+        x = np.concatenate([MASSES, SPRINGS, [ALPHA, BETA]])
+        assert scale_is_open(by_models(truth, total), truth, None) is (total is None)
+        assert scale_is_open(by_hand(truth, total), truth, x) is (total is None)
+
+    @pytest.mark.parametrize(("mass", "open_"), [(LumpedMass(), True), (LumpedMass(6.0), False), (FullMass(), False)])
+    def test_of_lumped_and_full_masses(self, truth, mass, open_):
+        """Of a full mass every modal mass is open by itself, and a total closes none."""
+        problem = Problem(sysid.simulate(truth, FREQ), mass=mass)
+        assert scale_is_open(problem, truth, None) is open_
+
+    def test_a_scale_for_each_base_direction_is_more_than_one(self):
+        """One chain along x, one along y: records of neither tell its mass against the other's."""
+        K = T[:2, :2].T @ np.diag(SPRINGS[:2]) @ T[:2, :2]
+        G = np.kron(np.eye(2), np.ones((2, 1)))
+        K_SS = np.kron(np.diag([1.0, 1.7]), K)
+        full = np.block([[K_SS, -K_SS @ G], [-G.T @ K_SS, G.T @ K_SS @ G]])
+        two = sysid.Structure(np.diag([3.0, 2.0, 1.0, 2.5, 0.0, 0.0]), full, [0.01] * 4, n_base=2)
+        test = sysid.simulate(two, FREQ)
+        assert open_masses(Problem(test, mass=LumpedMass()), two) == [0, 1, 2, 3]
+        assert not scale_is_open(Problem(test, mass=LumpedMass()), two, None)
+        m = Variable("m", 2, lower=0.1, upper=10.0, guess=np.ones(2))
+        every = ca.diag(ca.vertcat(m[0], m[0], m[1], m[1]))
+        hand = Problem(test, mass=every @ two.mass[:4, :4], stiffness=every @ K_SS)
+        x = np.concatenate([np.ones(2), two.damping_ratios])
+        assert scale_is_open(hand, hand.structure(x), x) is False

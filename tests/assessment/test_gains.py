@@ -8,7 +8,7 @@ import pytest
 
 import sysid
 from sysid import FullMass, LumpedMass, Measurement, Problem, Structure, simulate
-from sysid.assessment.gains import gain_errors
+from sysid.assessment.gains import gain_errors, taken_at_sensors
 
 ERROR = 0.02
 
@@ -143,3 +143,28 @@ class TestAssumptions:
         test = dataclasses.replace(simulate(across, lines(across), force=True), rigid_body=[[1.0], [0.0]])
         result = sysid.identify(Problem(test, mass=sysid.KnownMass(across.mass)), rng=0)
         assert not any("the gain of" in remark for remark in result.remarks)
+
+
+class TestTotalOfALumpedMass:
+    def test_base_ring_in_the_stated_mass_is_no_contradiction_but_told(self):
+        """Accelerations of 12 kg fit 15 kg as well, 3 kg of which sit on the base: matrices are 5/4 too large."""
+        truth = storeys()
+        right = sysid.identify(Problem(simulate(truth, lines(truth)), mass=LumpedMass(12.0)))
+        ring = sysid.identify(Problem(simulate(truth, lines(truth)), mass=LumpedMass(15.0)))
+        assert right.determined and ring.determined
+        np.testing.assert_allclose(ring.structure.mass, 1.25 * right.structure.mass, rtol=1e-6)
+        assert any("all of the stated 15 kg is taken to sit at the sensors" in told for told in ring.remarks)
+
+    @pytest.mark.parametrize(
+        ("mass", "force"), [(FullMass(15.0), False), (LumpedMass(), False), (LumpedMass(15.0), True)]
+    )
+    def test_is_assumed_of_no_other_mass_and_not_where_the_force_contradicts(self, mass, force):
+        truth = storeys()
+        problem = Problem(simulate(truth, lines(truth), force=force), mass=mass)
+        assert not list(taken_at_sensors(problem))
+
+    def test_names_the_total_of_each_direction(self, random_case):
+        _, problem = random_case(np.random.default_rng(3), "lumped", n=5, d=2)
+        totals = problem.formulation.mass.totals.values
+        (told,) = taken_at_sensors(problem)
+        assert all(f"{mass:.5g}" in told for mass in totals)

@@ -94,7 +94,7 @@ class TestVerdict:
         """Modal masses in one proportion keep the mass lumped, and no others do."""
         truth, _ = random_case(np.random.default_rng(seed), "lumped", n=5, d=1)
         verdict = determine(problem_of(truth, LumpedMass()), truth, None)
-        self.check(verdict, False, says="one common scale of mass, stiffness and damping is open")
+        self.check(verdict, False, says="mass, stiffness and damping are known up to one common factor")
         assert is_lumped(member(truth, np.full(5, 3.0)))
         assert not is_lumped(member(truth, np.array([3.0, 3.0, 3.0, 3.0, 2.9])))
 

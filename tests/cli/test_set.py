@@ -27,6 +27,21 @@ def problem(*, data=None, rng=0, mass=2.0, name="mast", noise=0.0, lines=(1.0, 2
 '''
 
 
+@pytest.mark.parametrize(
+    ("said", "title"),
+    [
+        ({}, "a.h5"),
+        ({"lumped": True, "mass": 103.0}, "a.h5, lumped mass, 103 kg stated"),
+        (
+            {"estimator": "h1", "mass": [103.0, 98.5], "band": (0.5, 40.0), "goal": 0.05},
+            "a.h5, estimator='h1', 103 and 98.5 kg stated, 0.5-40 Hz, goal 0.05",
+        ),
+    ],
+)
+def test_a_test_read_from_files_is_called_by_its_file_and_what_was_said_of_it(said, title):
+    assert Recipe("recorded_test", "folder/a.h5", 0, said).title == title
+
+
 @pytest.fixture
 def here(tmp_path, monkeypatch):
     """Work in an empty folder with one module."""

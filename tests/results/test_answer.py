@@ -167,7 +167,7 @@ def test_an_open_scale_of_variables_is_one_of_many(closed):
     it = ended_at(problem, mass=MASSES, spring=SPRINGS, damping_ratio=RATIOS)
     assert it.is_one_of_many is not closed
     assert it.open_masses == ()
-    assert ("state one of these unknowns" in it.summary()) is not closed
+    assert ("one number in kg is enough" in it.summary()) is not closed
     assert "over all these models" not in it.summary()  # the rank tells of small changes only
 
 

@@ -203,3 +203,14 @@ def test_one_open_factor_is_closed_by_a_total_and_what_a_total_takes_for_granted
     weighed = sysid.identify(sysid.Problem(forced, mass=sysid.LumpedMass(4.0)), rng=0)
     assert "4 kg in the base directions, but the base force weighs 3" in weighed.confidence[0]
     assert not any("taken to sit" in sentence for sentence in weighed.remarks)
+
+
+@pytest.mark.parametrize(("mass", "scale"), [(sysid.LumpedMass(), True), (sysid.FullMass(), False)])
+def test_the_step_that_closes_a_common_factor_is_one_number_in_kg(random_case, mass, scale):
+    """Effective masses in %, of which a common factor makes nothing, are then known."""
+    _, problem = random_case(np.random.default_rng(5), "lumped", n=3, d=1, total=False)
+    it = sysid.identify(dataclasses.replace(problem, mass=mass), strategy="modal")
+    told = " ".join(it.summary().split())
+    assert ("one number in kg is enough: state the mass of what the sensors stand for" in told) is scale
+    assert ("a total mass alone only bounds it" in told) is not scale
+    assert any("~" in cell for row in rows(it)[1:4] for cell in row) is not scale
