@@ -138,12 +138,20 @@ def _channel(
     phase = f"phase to\nbase {test.base_axes[moved]} [°]"
     # The scale of a spectrum (a line, per Hz, one-sided) is the record's own affair.
     against = test.base[run, moved]
-    own = test.own_lines[run]  # whole records of other lengths have zeros at the others
-    gaps = np.concatenate([[0], np.cumsum(own)])[test.gaps]
+    own, gaps = lines_of(test, run)
     return Channel(
         test.freq[own], measured[own], predicted[own], against[own], title, spectrum, phase, negligible, std[own],
         np.zeros(0), gaps,
     )  # fmt: skip
+
+
+def lines_of(test: Measurement, run: int) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
+    """Which lines are a run's own, (n_freq,), and those of them before which others were left out.
+
+    Whole records of other lengths have zeros at the others.
+    """
+    own = test.own_lines[run]
+    return own, np.concatenate([[0], np.cumsum(own)])[test.gaps]
 
 
 def place(ax: Axes | Sequence[Axes] | None, channel: Channel) -> Any:

@@ -177,7 +177,7 @@ function drawCurves(parent, { freq, gaps }, channel, values, [first, last], widt
 
 function startCurves(figure) {
   const data = JSON.parse(figure.querySelector("script").textContent);
-  const freq = numbers(data.freq);
+  let freq = numbers(data.freq[0]);
   const legend = figure.querySelector(".legend");
   const bar = element(figure, "div", { class: "controls" });
   legend.before(bar);
@@ -222,6 +222,15 @@ function startCurves(figure) {
       `${values.phaseIdentified[cursor].toFixed(0)}°, difference ${significant(values.left[cursor])}${noise}${band}`;
   }
 
+  // Runs of other lengths have other lines: the same frequencies stay in sight.
+  function changeRun() {
+    const [low, high] = range.map((at) => freq[at]);
+    freq = numbers(data.freq[runs.value]);
+    const nearest = (wanted) => freq.reduce((best, one, at) => (Math.abs(one - wanted) < Math.abs(freq[best] - wanted) ? at : best), 0);
+    range = [nearest(low), nearest(high)];
+    cursor = null;
+  }
+
   function redraw() {
     const channel = data.channels[channels.value];
     values = spectra(data, channel, runs.value);
@@ -230,7 +239,7 @@ function startCurves(figure) {
     for (const kind of ["noise", "band"]) legend.querySelector(`.${kind}`)?.toggleAttribute("hidden", !values[kind]);
     area.replaceChildren();
     const width = Math.max(300, Math.min(1200, area.clientWidth));
-    view = drawCurves(area, { freq, gaps: data.gaps }, channel, values, range, width, [230, 120, 150], tick.checked && values.recorded);
+    view = drawCurves(area, { freq, gaps: data.gaps[runs.value] }, channel, values, range, width, [230, 120, 150], tick.checked && values.recorded);
     tell();
   }
 
@@ -271,6 +280,7 @@ function startCurves(figure) {
     cursor = Math.max(range[0], Math.min(range[1], (cursor ?? range[0] - step) + step));
     tell();
   });
+  runs.addEventListener("change", changeRun);
   for (const control of [channels, runs, tick]) control.addEventListener("change", redraw);
   window.addEventListener("resize", redraw);
   redraw();

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
-from sysid.plot.panels import run_names
+from sysid.plot.panels import lines_of, run_names
 from sysid.plot.plots import stick_model
 from sysid.report.html import text
 from sysid.report.noise_level import NoiseLevel
@@ -38,16 +38,18 @@ def curves(it: Identification, test: Measurement, level: NoiseLevel) -> str:
     `level` is the noise of the test.
     """
     channels, runs = [*_responses(it, test, level), *_forces(it, test, level)], run_names(test)
+    lines = [lines_of(test, run) for run in range(test.n_runs)]
+    each = [[channel.at(run, own) for run, (own, _) in enumerate(lines)] for channel in channels]
     content = {
-        "freq": _packed(test.freq),
-        "gaps": test.gaps.tolist(),
+        "freq": [_packed(test.freq[own]) for own, _ in lines],
+        "gaps": [gaps.tolist() for _, gaps in lines],
         "runs": runs,
-        "channels": list(map(_told, channels)),
+        "channels": list(map(_told, each)),
     }
     drawn = "".join(
-        curve_sheet(f"{channel.name}, {name}" if len(runs) > 1 else channel.name, test.freq, channel, run, test.gaps)
-        for channel in channels
-        for run, name in enumerate(runs)
+        curve_sheet(f"{one.name}, {name}" if len(runs) > 1 else one.name, test.freq[own], one, 0, gaps)
+        for of_channel in each
+        for one, name, (own, gaps) in zip(of_channel, runs, lines, strict=True)
     )
     words = "Measured and identified spectra, their difference and the noise"
     return _element(
@@ -147,17 +149,17 @@ def _forces(it: Identification, test: Measurement, level: NoiseLevel) -> Iterato
         )  # fmt: skip
 
 
-def _told(channel: Channel) -> dict[str, Any]:
-    """What the script draws of a channel."""
-    own = channel._asdict()
-    found = {name: own[name] for name in ("name", "words", "unit")}
-    found |= {
-        name: [[_packed(run.real), _packed(run.imag)] for run in own[name]] for name in ("measured", "identified")
-    }
-    found["left"] = [_packed(np.abs(run)) for run in channel.measured - channel.identified]
+def _told(runs: list[Channel]) -> dict[str, Any]:
+    """What the script draws of a channel, by its runs."""
+    first = runs[0]
+    found: dict[str, Any] = {"name": first.name, "words": first.words, "unit": first.unit}
+    for name in ("measured", "identified"):
+        found[name] = [[_packed(own.real), _packed(own.imag)] for own in (getattr(run, name)[0] for run in runs)]
+    found["left"] = [_packed(np.abs(run.measured[0] - run.identified[0])) for run in runs]
     for name in ("noise", "band", "recorded"):
-        if own[name] is not None:
-            found[name] = [_packed(run[:1] if np.ptp(run) == 0 else run) for run in own[name]]
+        if getattr(first, name) is not None:
+            every = [getattr(run, name)[0] for run in runs]
+            found[name] = [_packed(own[:1] if np.ptp(own) == 0 else own) for own in every]
     return found
 
 

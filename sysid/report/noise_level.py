@@ -39,11 +39,15 @@ def noise_level(test: Measurement, structure: Structure) -> NoiseLevel:
 
 
 def share_of_noise(std: Array | None, records: ComplexArray) -> Array:
-    """Noise over records, (channels,), as the residual measures them; NaN where it is not known."""
+    """Noise over records, (channels,), as the residual measures them; NaN where it is not known.
+
+    A run has no noise at the lines of others, where it holds zeros.
+    """
     if std is None:
         return np.full(records.shape[1], np.nan)
     size = np.linalg.norm(records, axis=(0, 2))
-    noise = np.sqrt(np.sum(np.broadcast_to(std, records.shape) ** 2, axis=(0, 2)))
+    own = np.any(records != 0, axis=1, keepdims=True)
+    noise = np.sqrt(np.sum(np.where(own, std, 0.0) ** 2 * np.ones(records.shape), axis=(0, 2)))
     return np.divide(noise, size, out=np.full_like(size, np.nan), where=size > 0)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,6 +38,11 @@ class Channel(NamedTuple):
     noise: Array | None
     band: Array | None
     recorded: Array | None = None
+
+    def at(self, run: int, lines: NDArray[np.bool_]) -> Channel:
+        """At some lines of one run alone, (1, lines)."""
+        of_run: Any = lambda part: part[[run]][:, lines] if isinstance(part, np.ndarray) else part  # noqa: E731
+        return Channel(*map(of_run, self))
 
 
 class _Axis(NamedTuple):

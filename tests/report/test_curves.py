@@ -4,9 +4,14 @@ import base64
 import html
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 from scipy.stats import norm
+
+import sysid
+from sysid.report.curves import curves
+from sysid.report.noise_level import NoiseLevel, share_of_noise
 
 
 def test_every_channel_of_every_test_is_in_its_curves(complete, page):
@@ -18,7 +23,8 @@ def test_every_channel_of_every_test_is_in_its_curves(complete, page):
     assert [one["name"] for one in unseen["channels"]] == names
     assert (fitted["runs"], unseen["runs"]) == (["base x", "base y"], ["run 1", "run 2"])
     for shown, test in ((fitted, complete.measurement), (unseen, complete.problem.validation[0])):
-        np.testing.assert_allclose(unpacked(shown["freq"]), test.freq, rtol=1e-6)
+        for lines in shown["freq"]:
+            np.testing.assert_allclose(unpacked(lines), test.freq, rtol=1e-6)
         with_base = np.einsum("sd,rdf->rsf", test.rigid_body, test.base)
         # Phases against the base direction that moves a sensor most with it; in its own run a unit.
         most = np.argmax(np.linalg.norm(test.base, axis=-1)[:, None] * np.abs(test.rigid_body), axis=-1)
@@ -73,3 +79,28 @@ def test_curves_have_the_interval_of_their_own_lines(complete, page):
         np.testing.assert_allclose(unpacked(unseen["channels"][s]["band"][1]), norm.ppf(0.975) * both, rtol=1e-3)
     std = u.base_force(test.freq)[1, 0]
     np.testing.assert_allclose(unpacked(fitted["channels"][4]["band"][0]), norm.ppf(0.975) * std, rtol=1e-3)
+
+
+def test_runs_of_other_lengths_are_drawn_at_their_own_lines():
+    """Beside them the lines of the other run, at which it has zeros."""
+    rng, lengths = np.random.default_rng(0), (400, 300)
+    runs = [(u := rng.standard_normal((1, n)), 2 * u + 0.1 * rng.standard_normal((1, n)), None) for n in lengths]
+    test = sysid.Measurement.from_time(runs, 10.0, rigid_body=[[1.0]], estimator="spectra")
+    structure = sysid.Structure(np.diag([1.0, 0.0]), 400 * np.array([[1, -1], [-1, 1]]), [0.02], n_base=1)
+    problem = SimpleNamespace(measurement=test)
+    it = SimpleNamespace(structure=structure, quick_uncertainty=None, measurement=test, problem=problem)
+    element = curves(it, test, NoiseLevel(None, None, False))
+    (data,) = map(json.loads, re.findall(r'<script type="application/json">(.*?)</script>', element, re.DOTALL))
+    for run, n in enumerate(lengths):
+        own = np.arange(1, n // 2 + 1) * 10.0 / n
+        np.testing.assert_allclose(unpacked(data["freq"][run]), own, rtol=1e-6)
+        real, imaginary = map(unpacked, data["channels"][0]["measured"][run])
+        size = np.abs(np.fft.rfft(runs[run][1][0])[1:] / 10.0)
+        np.testing.assert_allclose(np.hypot(real, imaginary), size, rtol=1e-5)
+
+
+def test_a_run_has_no_noise_at_the_lines_of_others():
+    records = np.ones((2, 3, 8), complex)
+    records[0, :, ::2], records[1, :, 1::2] = 0.0, 0.0
+    np.testing.assert_allclose(share_of_noise(np.full((2, 3, 8), 0.1), records), 0.1)
+    np.testing.assert_allclose(share_of_noise(np.full((2, 3, 1), 0.1), records), 0.1)
