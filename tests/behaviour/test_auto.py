@@ -52,7 +52,7 @@ class TestAuto:
         _, problem = random_case(np.random.default_rng(1), "lumped", stiffness, damping, n=3, d=1)
         result = self.at_once(problem)
         assert result.strategy == strategy
-        assert result.remarks == (f"strategy '{strategy}': the {reason}",)
+        assert result.remarks[0] == f"strategy '{strategy}': the {reason}"
         with pytest.raises(InputError, match="'modal' needs a free stiffness .SpectralStiffness. and ModalDamping"):
             identify(problem, strategy="modal")
 
