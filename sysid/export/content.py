@@ -7,6 +7,7 @@ from datetime import datetime
 
 import numpy as np
 
+from sysid.assessment.gains import taken_at_sensors
 from sysid.results.identification import Identification
 from sysid.results.version import __version__
 from sysid.structure.structure import Array, Structure
@@ -89,6 +90,7 @@ def statements(it: Identification, precision: str) -> tuple[str, ...]:
         f"judgement: {worth(it)}; relative residual {it.residual:.3g}",
         f"search: {it.message}",
         *(f"fixed by: {text}" for text in it.closed_by),
+        *(f"assumed: {text}" for text in taken_at_sensors(it.problem)),
         *(f"against: {text}" for text in it.against),
         *(f"open: {text}" for text in left_open(it)),
         "units: kg, m, s, N, rad; frequencies in Hz; damping ratios are fractions of critical damping",

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from sysid.assessment.sensitivity import blocks_of
 from sysid.measurement.in_time import peaks
+from sysid.problem.terms import FurtherTest
 from sysid.results.answer import NOT_JUDGED, Answer
 from sysid.results.deck_masses import deck_masses
 from sysid.results.gain_table import gains_of_sensors
@@ -33,6 +34,7 @@ _ENDED = {
     "Maximum_WallTime_Exceeded": "the solver ran out of time",
     "Infeasible_Problem_Detected": "the solver found no point that keeps the constraints",
 }
+_AS_STATED = ". No force was measured: they are as right as the mass or stiffness that is stated"
 DEVIATES = 1.96  # standard deviations on either side of 95 % of a normal law
 _ROUND_OFF = 1e-10  # of a value: what is no noise of an instrument
 _WIDTH = 120
@@ -131,7 +133,8 @@ def verdict(it: Answer) -> str:
     if not it.success:
         return "No fit: these matrices do not explain the records as they should"
     if it.determined:
-        return "Determined: data and stated model leave one mass and one stiffness matrix"
+        one = "Determined: data and stated model leave one mass and one stiffness matrix"
+        return one + _AS_STATED * _scaled_by_statements(it)
     if NOT_JUDGED in it.undetermined:
         return "Not judged: the time was over"
     if it.hurried:
@@ -141,6 +144,14 @@ def verdict(it: Answer) -> str:
     if it.is_one_of_many:
         return "Not determined: this is one of many models that explain the data"
     return "Not determined: some entries of the matrices are not known well enough"
+
+
+def _scaled_by_statements(it: Answer) -> bool:
+    """Whether what is stated sets the scale of M, K and C: accelerations alone are fitted, which leave it open."""
+    problem = it.problem
+    if problem.measurement.force is not None or problem.misfit is not None:
+        return False
+    return all(isinstance(one, FurtherTest) and one.measurement.force is None for one in problem.residuals)
 
 
 def fitted_in_words(it: Answer) -> str:

@@ -9,6 +9,8 @@ import pytest
 from scipy.stats import norm
 
 import sysid
+from sysid.export.content import statements
+from sysid.results.summary import verdict
 
 FREQ = np.linspace(3.0, 120.0, 60)
 
@@ -203,6 +205,31 @@ def test_one_open_factor_is_closed_by_a_total_and_what_a_total_takes_for_granted
     weighed = sysid.identify(sysid.Problem(forced, mass=sysid.LumpedMass(4.0)), rng=0)
     assert "4 kg in the base directions, but the base force weighs 3" in weighed.confidence[0]
     assert not any("taken to sit" in sentence for sentence in weighed.remarks)
+
+
+def test_what_is_determined_without_a_force_is_told_to_rest_on_what_is_stated():
+    """All matrices twice as large make the same accelerations: what is stated alone tells them apart."""
+    M, K = np.diag([2.0, 1.0, 0.0]), np.array([[3900.0, -1500, -2400], [-1500, 1500, 0], [-2400, 0, 2400]])
+    truth, lines = sysid.Structure(M, K, np.array([0.01, 0.02]), n_base=1), np.linspace(1, 12, 200)
+    test, forced = (sysid.simulate(truth, lines, noise=0.01, force=force, rng=0) for force in (False, True))
+    right, twice, of_force = (
+        sysid.identify(sysid.Problem(records, mass=mass), rng=0)
+        for records, mass in (
+            (test, sysid.LumpedMass(3.0)),
+            (test, sysid.LumpedMass(6.0)),
+            (forced, sysid.LumpedMass()),
+        )
+    )
+    np.testing.assert_allclose(twice.structure.stiffness, 2 * right.structure.stiffness, rtol=1e-6, atol=1e-6)
+    unforced, assumed = "No force was measured: they are as right as", "assumed: all of the stated 6 kg"
+    assert right.determined and unforced in verdict(right)
+    assert twice.determined and unforced in verdict(twice)
+    assert of_force.determined and unforced not in verdict(of_force)
+    further = sysid.FurtherTest(forced, mass=M, stiffness=K[:2, :2], damping=np.eye(2))
+    both = sysid.Problem(test, mass=sysid.LumpedMass(3.0), residuals=[further])
+    assert unforced not in verdict(dataclasses.replace(right, problem=both))
+    assert any(told.startswith(assumed) for told in statements(twice, ""))
+    assert not any(told.startswith("assumed: ") for told in statements(of_force, ""))
 
 
 @pytest.mark.parametrize(("mass", "scale"), [(sysid.LumpedMass(), True), (sysid.FullMass(), False)])
