@@ -57,15 +57,19 @@ def doubts(problem: Problem, structure: Structure, x: Array | None, *, changing:
         tests.insert(0, (problem.measurement, structure))
     for i, (test, its) in enumerate(tests, start=1):
         told = _of_records(formulation, test, its, changing)
-        found += told if len(tests) == 1 else [f"test {i}: {sentence}" for sentence in told]
+        further = [sentence for sentence in told if sentence not in found]
+        found += further if len(tests) == 1 else [f"test {i}: {sentence}" for sentence in further]
     return tuple(found)
 
 
 def contradictions(problem: Problem, structure: Structure) -> tuple[str, ...]:
-    """Stated masses that the records of the problem's own test contradict, in sentences."""
+    """Stated masses that the records of the problem's own test contradict, and a force that they do not explain."""
     if not problem.formulation.fits_records:
         return ()
-    return tuple(told for check in (_stated_mass, _known_entries, _lumped_total) for told in check(problem, structure))
+    told = [
+        sentence for check in (_stated_mass, _known_entries, _lumped_total) for sentence in check(problem, structure)
+    ]
+    return (*told, *_force(problem.formulation, problem.measurement, structure))
 
 
 def _of_records(formulation: Formulation, test: Measurement, structure: Structure, changing: bool) -> list[str]:

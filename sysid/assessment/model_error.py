@@ -32,6 +32,8 @@ _NEAR = 5.0  # half-power widths, or distances of lines, about a mode
 _TRACE = 1e-4  # of the records; smaller ones are no noise of an instrument
 _LEVEL = 1.25  # times the fitted levels, beyond which another is outside
 
+_FORCE = "the base force"
+
 
 class Miss(NamedTuple):
     """By how many times its noise a model misses a record; by as many at least where quiet lines tell the noise."""
@@ -43,6 +45,11 @@ class Miss(NamedTuple):
     """Of the record."""
     cut: bool
     """Whether it holds spectra of a record that neither begins nor ends at rest, with its transients."""
+
+    @property
+    def whose(self) -> str:
+        """The pronoun of the record."""
+        return "its" if self.record.startswith(_FORCE) else "their"
 
 
 class Record(NamedTuple):
@@ -103,7 +110,7 @@ def _records(test: Measurement, raw: Measurement, structure: Structure) -> Itera
         left, std = test.force - test.predict_force(structure), test.force_std
         if std is not None and quiet is not None and noise is not None and noise.force is not None:
             std = _bounded(test, std, noise.force, left, quiet)
-        yield Record("the base force", axes, test.force, left, None if std is None else std**2)
+        yield Record(_FORCE, axes, test.force, left, None if std is None else std**2)
 
 
 def _quiet_base(test: Measurement, raw: Measurement) -> Array | None:
@@ -204,7 +211,8 @@ def noise_at_most(test: Measurement, left: ComplexArray) -> Array | None:
 def missed_in_words(misses: list[Miss]) -> Iterator[str]:
     """Records that the model misses by more than their noise, in one sentence."""
     told = [
-        f"{miss.record} by {'at least ' * miss.at_least}{miss.times:.2g} times their noise, {100 * miss.share:.3g} %"
+        f"{miss.record} by {'at least ' * miss.at_least}{miss.times:.2g} times {miss.whose} noise "
+        f"({100 * miss.share:.3g} %)"
         for miss in misses
         if miss.times > BEYOND
     ]
@@ -215,7 +223,7 @@ def missed_in_words(misses: list[Miss]) -> Iterator[str]:
                 "; these are plain spectra of records that move at their ends, which hold transients too: take whole "
                 "records (from_time's estimator='records')"
             )
-        yield f"the model misses {', '.join(told)} of them: {why}"
+        yield f"the model misses {' and '.join(told)}: {why}"
 
 
 class ModelErrors(NamedTuple):

@@ -40,6 +40,7 @@ _ROUND_OFF = 1e-10  # of a value: what is no noise of an instrument
 _WIDTH = 120
 _FIRST = 2  # sentences beside the verdict; the others follow the tables
 _NEAR = 0.5  # relative residual, up to which a fit may be called near enough
+_FORCE = 3.0  # times the residual of the accelerations, from which that of the force is the larger concern
 _MISSING = 0.5  # % of the rigid-body mass
 _OF_A_FIT = ", which holds for a model that fits: this one does not"
 
@@ -204,7 +205,8 @@ def _towards_a_fit(it: Answer) -> list[str]:
             "fit by itself a run in which structure and level of motion stay the same, at the level of interest: "
             "'sysid read RUN.csv --out one.h5', then 'sysid run one.h5'" + one_by_one * (it.measurement.n_runs > 1)
         ]
-    if it.residual > _NEAR:
+    # A goal is of accelerations: it takes no force for explained.
+    if it.residual > _NEAR or (it.force_residual or 0.0) > _FORCE * it.residual:
         return steps
     enough = f"{np.ceil(100 * it.residual) / 100:.2g}"
     return [*steps, f"if a fit as near as this one will do, say so: goal={enough} (sysid run test.h5 --goal {enough})"]
