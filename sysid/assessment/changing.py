@@ -140,7 +140,7 @@ def changes_in_words(problem: Problem) -> tuple[str, ...]:
         return ()
     most = max(found, key=lambda one: (one.trend != 0, one.size))
     others = ", ".join(f"{one.mode:.3g}" for one in found if one is not most)
-    also = f" (so does that of others, near {others} Hz)" if others else ""
+    also = f" (and that of others near {others} Hz)" if others else ""
     return (f"the frequency of the mode near {most.mode:.3g} Hz{also} {most.in_words()}",)
 
 
