@@ -19,7 +19,7 @@ CEILINGS = {
     # told by what differs and what can be compared (117), outliers and holes told cell by cell (212), whole records
     # with their transients and noise (1,700), stated masses as statistics (420), gains (260), other answers (410),
     # motion in time (230), and what tells and refuses them (530).
-    "lines": 36_972,
+    "lines": 36_977,
 }
 
 # The counting is a benchmark, which prints the same figures; `sysid` itself is not imported from the checkout.

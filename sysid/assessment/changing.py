@@ -133,7 +133,7 @@ def changes_in_words(problem: Problem) -> tuple[str, ...]:
     Parameters
     ----------
     problem : Problem
-        The tests that were never fitted are looked at too.
+        Tests that were never fitted are looked at too, where the levels of all are known.
     """
     found = changes(problem)
     if not found:
@@ -148,17 +148,18 @@ def changes(problem: Problem) -> list[Change]:
     """Modes whose frequencies change between stretches of all records, by more than noise makes of them."""
     if not problem.formulation.fits_records:
         return []
-    tests, scaled = [problem.measurement], levels_are_known(problem.measurement)
-    tests += [test for test in problem.validation if scaled and levels_are_known(test)]
+    scaled = levels_are_known(problem.measurement)
+    unfitted = [(i, test) for i, test in enumerate(problem.validation, start=1) if scaled and levels_are_known(test)]
+    tests = [(0, problem.measurement), *unfitted]
     every = _modes(problem.screened.measurement)
     if every is None:
         return []
     modes, apart = every.joined(_CLOSE * every.omega), every.joined(2 * every.ratios * every.omega)
-    made = [stretches_of(test, modes.omega, modes.ratios) for test in tests]
+    made = [stretches_of(test, modes.omega, modes.ratios) for _, test in tests]
     # Modes of one shape that are close may be two, with constant poles that explain the records.
     held = made
     if modes.omega.size < apart.omega.size:
-        held = [stretches_of(test, apart.omega, apart.ratios) for test in tests]
+        held = [stretches_of(test, apart.omega, apart.ratios) for _, test in tests]
     constant = sum(one.left_by_all**2 for part in held for one in part)
     changing = sum(min(one.left, one.left_by_all) ** 2 for part in made for one in part)
     if 0 < constant < changing:
@@ -166,7 +167,7 @@ def changes(problem: Problem) -> list[Change]:
     found = []
     for k, (f, ratio) in enumerate(zip(modes.omega / (2 * np.pi), modes.ratios, strict=True)):
         width = 2 * ratio * f
-        seen = [one for i, part in enumerate(made) for one in _seen(part, k, width, i, tests[i])]
+        seen = [one for part, named in zip(made, tests, strict=True) for one in _seen(part, k, width, *named)]
         change = Change(f, width, seen, scaled)
         if change.is_told(changing < _EXPLAINED * constant):
             found.append(change)
@@ -181,7 +182,7 @@ class Poles(NamedTuple):
     shapes: Array
 
     def joined(self, reach: Array) -> Poles:
-        """With those of one shape, as a fit makes of a mode that changes, taken for one within a `reach` in rad/s."""
+        """Merge those of one shape within `reach`, rad/s, (m,): a fit makes several of one mode that changes."""
         groups: list[list[int]] = []
         for k, omega in enumerate(self.omega):
             near = [group for group in groups if omega - self.omega[group[0]] < reach[[k, *group]].max()]

@@ -132,4 +132,4 @@ def _missed(test: Measurement, structure: Structure, frequency: float, width: fl
     there, elsewhere = share(near), share(~near)
     if there < _MISSED * elsewhere or there < 1e-6:
         return None
-    return f", and the fit misses {100 * there:.3g} % of the response there ({100 * elsewhere:.2g} % elsewhere)"
+    return f", and the fit misses {100 * there:.3g} % of the response there ({100 * elsewhere:.3g} % elsewhere)"

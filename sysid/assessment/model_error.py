@@ -173,7 +173,8 @@ def _miss(record: Record, test: Measurement, found: bool, near: NDArray[np.bool_
     if bounded:
         left = np.where(near, left, np.minimum(left, variance))
     if noise > _TRACE * size:
-        yield Miss(float(np.sqrt(np.sum(left))) / noise, bounded, record.name, missed / size, cut_in_motion(test))
+        times = float(np.sqrt(np.sum(left))) / noise
+        yield Miss(times, bounded, record.name, missed / size, times > BEYOND and cut_in_motion(test))
 
 
 def _quiet(left: ComplexArray, variance: Array, own: NDArray[np.bool_]) -> Array | None:

@@ -9,6 +9,7 @@ import numpy as np
 from sysid.report.html import bullets, number, paragraph, sentence, table, text
 from sysid.report.matrices import stated
 from sysid.report.noise_level import NoiseLevel, share_of_all_noise
+from sysid.results.answer import NOT_JUDGED
 from sysid.results.deck_masses import deck_masses
 from sysid.results.identification import Identification
 from sysid.results.summary import DEVIATES, counted, fitted_in_words, half_width, next_steps, verdict
@@ -83,6 +84,8 @@ def _steps(it: Identification) -> list[str]:
     steps = [sentence(step.removeprefix("to close it: ")) for step in next_steps(it)]
     if steps:
         return steps
+    if it.hurried or NOT_JUDGED in it.undetermined:
+        return ["Give it more time (--max-time, max_time=): what it is worth was not judged."]
     if it.judgement == "one of many":
         return ["Measure more closely what is not known well enough: it is named below."]
     if not it.problem.validation:

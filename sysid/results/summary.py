@@ -51,7 +51,7 @@ def summary(it: Answer) -> str:
     force = "" if it.force_residual is None else f", of the base force {it.force_residual:.3e}"
     told = it.undetermined or it.closed_by
     lines = [
-        f"{verdict(it)}." + f" Fitted: {fitted_in_words(it)}." * (not it.success),
+        f"{verdict(it)}." + ("" if it.success else f" Fitted: {fitted_in_words(it)}."),
         *(f"  - {sentence}" for sentence in told[:_FIRST]),
         *(f"  > {step}" for step in next_steps(it)),
         "",
@@ -163,7 +163,7 @@ def fitted_in_words(it: Answer) -> str:
     if not moved:
         return runs
     to = " to ".join(dict.fromkeys((moved[0], moved[-1])))
-    return f"{runs} (sensors move with up to {to} m/s² against the base)"
+    return f"{runs} (peak acceleration of the sensors relative to the base: {to} m/s²)"
 
 
 def next_steps(it: Answer) -> list[str]:
@@ -173,7 +173,7 @@ def next_steps(it: Answer) -> list[str]:
     if not it.success:
         return _towards_a_fit(it)
     if it.against:
-        return ["put right, or measure again, what speaks against it, the first thing first"]
+        return ["deal with what speaks against this model, in the order given: correct it, or measure again"]
     if not it.is_one_of_many:
         return []
     if it.scale_is_open:
@@ -198,7 +198,7 @@ def _towards_a_fit(it: Answer) -> list[str]:
         return ["let the search end: 'sysid run --resume FOLDER' goes on with one that the command line began"]
     if it.problem.goal is not None:
         return ["put right what is named first; a goal below the noise of the records cannot be reached"]
-    steps = ["put right what speaks against it, the first thing first"]
+    steps = ["deal with what speaks against it, in the order given"]
     if it.changing:
         one_by_one = "; 'sysid refine RESULT --leave-out run' shows what each run does to the answer"
         steps = [
@@ -282,7 +282,7 @@ def missing_mass(it: Answer) -> list[str]:
     """What of the rigid-body mass is in none of the modes, in a sentence, where it is no round-off of a table."""
     missing, many = 100 - it.structure.effective_mass_percent.sum(axis=0), np.any(is_one_of_many(it), axis=0)
     told = [
-        f"{tilde(one)}{share:.2g} % in {axis}"
+        f"{tilde(one)}{share:.3g} % in {axis}"
         for axis, share, one in zip(it.measurement.base_axes or (), missing, many, strict=True)
         if share > _MISSING
     ]

@@ -272,9 +272,9 @@ class Structure:
         -----
         Exact for a base acceleration that is the natural spline of degree 11 through its samples, for any damping
         matrix. What is band-limited loses ``1 - sinc(x)^12 / sum_k sinc(x - k)^12`` of its amplitude, x = frequency /
-        sample rate: 0.76 % at 2.5 samples a period, 0.02 % at 3, 2e-6 at 4. The base force, which is what masses and
-        springs leave of one another, may be off by some times that share. The spline is less
-        exact over some ten samples at either end. Resample a record with fewer samples a period to a higher rate first.
+        sample rate: 0.76 % at 2.5 samples a period, 0.024 % at 3, 0.0002 % at 4. The error of the base force may be
+        several times larger, as it is a small difference of large forces. The spline is less exact over some ten
+        samples at either end. Resample a record with fewer samples a period to a higher rate first.
 
         Examples
         --------
