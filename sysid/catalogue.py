@@ -21,11 +21,11 @@ from pathlib import Path
 from types import ModuleType
 
 from sysid.errors import InputError
+from sysid.models.registry import BESIDE, PROBLEM_MODULE
 from sysid.models.unknowns import declared
 from sysid.problem.problem import Problem
 from sysid.results.identification import Recipe
 
-_PRIVATE = "_sysid_problem_"  # the modules' names in Python
 _SIGNATURE = "def problem(*, data=None, rng=0) -> sysid.Problem"
 
 
@@ -65,7 +65,7 @@ def own_folder() -> Path:
 
 
 def entries() -> tuple[Entry, ...]:
-    """Problems that can be run by name, alphabetically; the user's own hide bundled ones of the same name.
+    """Problems that can be run by name, alphabetically; at the command line the user's own hide bundled ones.
 
     Modules are read, not imported.
     """
@@ -89,8 +89,8 @@ def build(recipe: Recipe) -> Problem:
     Parameters
     ----------
     recipe : Recipe
-        ``module`` is a path to a module (it ends in .py or holds a separator), else a module in
-        ``./problems``, else a bundled problem, else a dotted module that Python can import.
+        ``module`` is a path to a module, which ends in .py, else a bundled problem, else a module in ``./problems``,
+        else a dotted module that Python can import.
         ``data`` reaches ``problem()`` as a `pathlib.Path`, or as None, ``parameters`` each by its name.
 
     Raises
@@ -171,11 +171,51 @@ def _function(name: str) -> tuple[Callable[..., object], Path]:
 
 
 def file_of(name: str) -> Path | None:
-    """The file of a problem module; None where it is a dotted module, or unknown."""
+    """The file of a problem module; None where it is a dotted module, or unknown.
+
+    What stands in the working folder hides no bundled problem here: a recipe may come from a file.
+    """
     if _is_path(name):
         return Path(name)
-    paths = (folder / f"{name}.py" for folder in (own_folder(), bundled_folder()))
-    return next((path for path in paths if path in _modules(path.parent)), None)
+    return _in_folder(bundled_folder(), name) or _in_folder(own_folder(), name)
+
+
+def typed(name: str) -> tuple[str, str]:
+    """What a user means by a name at the command line, and a remark: the user's own problem hides a bundled one."""
+    own = None if _is_path(name) else _in_folder(own_folder(), name)
+    if own is None or not is_bundled(name):
+        return name, ""
+    return str(own), f"{own} hides the bundled problem {name}: it is taken"
+
+
+def is_bundled(name: str) -> bool:
+    """Whether a recipe's module is a problem that comes with the package."""
+    return not _is_path(name) and _in_folder(bundled_folder(), name) is not None
+
+
+def import_module(module: str) -> None:
+    """Import a problem module that the user names, so that the classes of models in it can be loaded.
+
+    Its ``problem()`` is not called. Files of results name such a class, and import no module by themselves.
+
+    Parameters
+    ----------
+    module : str
+        As in a `Recipe`.
+
+    Raises
+    ------
+    InputError
+        Where it cannot be imported; tells its line.
+    """
+    with _neighbours(file_of(module)):
+        _load(module)
+
+
+def _in_folder(folder: Path, name: str) -> Path | None:
+    """The problem of a name in a folder."""
+    path = folder / f"{name}.py"
+    return path if path in _modules(folder) else None
 
 
 def _load(name: str) -> tuple[ModuleType, Path]:
@@ -191,19 +231,24 @@ def _load(name: str) -> tuple[ModuleType, Path]:
 
 def _load_file(path: Path) -> tuple[ModuleType, Path]:
     """Run a file as a module of a private name; no ``__pycache__`` is left beside it."""
+    if path.suffix != ".py":  # a test or a result that somebody else made may hold Python
+        raise InputError(
+            f"problem {path}: the name of a problem module ends in .py; a test that 'sysid read' wrote is run by "
+            "'sysid run TEST.h5'"
+        )
     try:
         if path.exists() and not path.is_file():  # a device, or a pipe, may never end
             raise InputError(f"problem {path} is not a file")
         source = path.read_bytes()
     except OSError as error:
         raise InputError(f"problem {path} cannot be read: {error.strerror or error}") from None
-    full = path.absolute()
-    name = f"{_PRIVATE}{zlib.crc32(os.fsencode(full)):08x}_{path.stem}"
+    full, name = path.absolute(), _private_name(path)
     loader = importlib.machinery.SourceFileLoader(name, str(full))
     spec = importlib.util.spec_from_file_location(name, full, loader=loader)
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
-    # Dataclasses and pickles look their module up by its name.
+    # Dataclasses and pickles look their module up by its name; of two of the same text the later one counts.
+    sys.modules.pop(name, None)
     sys.modules[name] = module
     try:
         with _telling_the_line(path):
@@ -213,6 +258,11 @@ def _load_file(path: Path) -> tuple[ModuleType, Path]:
         del sys.modules[name]
         raise
     return module, path
+
+
+def _private_name(path: Path) -> str:
+    """Name of the module of a file in Python: it hides no other, and tells files of one name apart."""
+    return f"{PROBLEM_MODULE}{zlib.crc32(os.fsencode(path.absolute())):08x}_{path.stem}"
 
 
 def _load_dotted(name: str) -> tuple[ModuleType, Path]:
@@ -235,8 +285,9 @@ def _load_dotted(name: str) -> tuple[ModuleType, Path]:
 def _neighbours(module: Path | None) -> Iterator[set[Path]]:
     """Let a module of the user's import the files and packages beside it, and gather the files at the end.
 
-    They are imported anew for each problem, also where the script at hand has imported them, and forgotten: their text
-    may change, and another folder may have some of the same name. No ``__pycache__`` is left beside them.
+    They are imported anew for each problem, also where the script at hand has imported them, and then forgotten by all
+    but their problem: their text may change, and another folder may have some of the same name. No ``__pycache__`` is
+    left beside them.
     """
     files: set[Path] = set()
     if module is None:
@@ -251,6 +302,8 @@ def _neighbours(module: Path | None) -> Iterator[set[Path]]:
     finally:
         sys.dont_write_bytecode = writes_none
         imported = _taken_out(folder)
+        if (problem := sys.modules.get(_private_name(module))) is not None:
+            vars(problem).setdefault(BESIDE, {}).update(imported)
         files.update(Path(m.__file__) for m in imported.values() if m.__file__ is not None)
         with suppress(ValueError):  # the module may have set a path of its own
             sys.path.remove(folder)

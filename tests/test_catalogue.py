@@ -4,6 +4,7 @@ import ast
 import signal
 import sys
 from importlib.machinery import EXTENSION_SUFFIXES
+from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -85,11 +86,14 @@ def test_a_path_an_own_problem_a_dotted_module_and_the_order_among_them(here, mo
     (here / "problems").mkdir()
     (here / "problems" / "chain.py").write_text(CHAIN)
     assert catalogue.build(Recipe("chain")).geometry.n == 2
-    # The user's own problem hides a bundled one of its name.
-    hidden = next(entry.name for entry in catalogue.entries() if entry.bundled)
-    (here / "problems" / f"{hidden}.py").write_text(CHAIN)
-    assert catalogue.build(Recipe(hidden)).geometry.n == 2
-    assert [entry.bundled for entry in catalogue.entries() if entry.name == hidden] == [False]
+    # The user's own problem hides a bundled one of its name where it is typed, and in no recipe.
+    (here / "problems" / "shear_building.py").write_text("raise SystemExit('it ran')\n")
+    assert catalogue.build(Recipe("shear_building")).geometry.n > 2
+    typed, remark = catalogue.typed("shear_building")
+    assert Path(typed) == Path("problems/shear_building.py") and "hides the bundled problem shear_building" in remark
+    assert "it ran" in refused(typed)
+    assert [entry.bundled for entry in catalogue.entries() if entry.name == "shear_building"] == [False]
+    assert catalogue.typed("chain") == ("chain", "")
 
     package = here / "lab_of_chains"
     package.mkdir()
@@ -320,7 +324,9 @@ def test_an_unknown_name_lists_the_known_ones_and_the_closest(here):
 
 def test_a_file_that_is_not_there_or_not_a_file(here):
     assert "nowhere.py cannot be read: No such file" in refused("nowhere.py")
-    assert "No such file" in refused("some/where/chain")
+    assert "No such file" in refused("some/where/chain.py")
+    (here / "test.h5").write_text(CHAIN)
+    assert "problem test.h5: the name of a problem module ends in .py" in refused("./test.h5")
     (here / "folder.py").mkdir()
     assert refused("folder.py") == "problem folder.py is not a file"
     assert "cannot be read" in refused("x" * 5000 + ".py")

@@ -19,7 +19,7 @@ from sysid.results.version import __version__
 
 def run(options: argparse.Namespace, out: Output) -> int:
     """Compare, tell each method's end in a line, and write table and picture."""
-    recipe = parameters.recipe_of(options)
+    recipe = parameters.recipe_of(options, out)
     problem = catalogue.build(recipe)
     folder = results_folder(options.out, Path("results") / catalogue.short_name(recipe.module))
     out.write(f"{recipe.title}: {problem.n_variables} unknowns, seed {options.seed}\n")

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import IO, Any, NoReturn, cast
 
 from sysid import catalogue
-from sysid.cli import doctor, export, parameters, read, starting, unfinished
+from sysid.cli import doctor, export, parameters, read, starting, trust, unfinished
 from sysid.cli.argument_types import band, count, orders, seconds, seed, whole
 from sysid.cli.command_parser import JSON, QUIET, Parser, adder, epilog
 from sysid.cli.display import display_on
@@ -136,7 +136,7 @@ def _new(options: argparse.Namespace, out: Output) -> int:
 def _show(options: argparse.Namespace, out: Output) -> int:
     from sysid.cli.show import figures, show
 
-    recipe = parameters.recipe_of(options, options.seed)
+    recipe = parameters.recipe_of(options, out, options.seed)
     problem = catalogue.build(recipe)
     if out.json:
         out.answer(**figures(problem, recipe.title))
@@ -193,7 +193,7 @@ def _run(options: argparse.Namespace, out: Output) -> int:
         out.complain(f"interrupted while saving; the result is there, but not every file is in {folder}")
         return INTERRUPTED
     if late.asked or writing.asked or result.interrupted:
-        on = f"; 'sysid run --resume {folder}' goes on" if checkpoint.exists else ""
+        on = f"; '{unfinished.command(search, folder)}' goes on" if checkpoint.exists else ""
         out.complain(f"interrupted; the {'best so far' if result.interrupted else 'result'} is in {folder}{on}")
         return INTERRUPTED
     return SUCCESS if result.success else NOT_REACHED
@@ -326,9 +326,10 @@ def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
     run.add_argument(
         "--resume",
         metavar="DIR",
-        help="go on with the run in this folder that was killed or interrupted; PROBLEM and its options need not be "
-        "said again",
+        help="go on with the run in this folder that was killed or interrupted; its options need not be said again, "
+        "nor PROBLEM where it is a bundled one",
     )
+    trust.add_argument(run, "the unfinished run")
     run.add_argument("--fresh", action="store_true", help="begin anew where there is an unfinished run in the folder")
     run.set_defaults(command=_run)
 
@@ -367,6 +368,12 @@ def _add_refine(command: Callable[..., argparse.ArgumentParser]) -> None:
         ),
     )
     refine.add_argument("result", metavar="RESULT", help="a result.h5 that 'sysid run' wrote, or its folder")
+    refine.add_argument(
+        "--module",
+        metavar="FILE",
+        help="the problem module of RESULT, in the place of the one that RESULT names; a bundled one need not be named",
+    )
+    trust.add_argument(refine, "RESULT")
     kinds = refine.add_mutually_exclusive_group()
     kinds.add_argument(
         "--starts",

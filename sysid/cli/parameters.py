@@ -7,10 +7,12 @@ import ast
 from typing import Any
 
 from sysid import catalogue
+from sysid.cli import trust
+from sysid.cli.output import Output
 from sysid.errors import InputError
 from sysid.results.identification import Recipe
 
-_PROBLEM = "a path to a module, else a module in ./problems, else a bundled problem, else a dotted module"
+_PROBLEM = "a path to a module (.py), else a module in ./problems, else a bundled problem, else a dotted module"
 
 
 def add_arguments(command: argparse.ArgumentParser, *, optional: bool = False) -> None:
@@ -28,13 +30,14 @@ def add_arguments(command: argparse.ArgumentParser, *, optional: bool = False) -
     )
 
 
-def recipe_of(options: argparse.Namespace, rng: int | None = None) -> Recipe:
+def recipe_of(options: argparse.Namespace, out: Output, rng: int | None = None) -> Recipe:
     """The recipe that the arguments of a command make; ``data`` and ``rng`` may be set like parameters, too.
 
     Parameters
     ----------
     options : Namespace
         With the arguments of `add_arguments`.
+    out : Output
     rng : int, optional
         The seed of the simulated noise, where the command has an option of its own for it.
 
@@ -43,7 +46,9 @@ def recipe_of(options: argparse.Namespace, rng: int | None = None) -> Recipe:
     InputError
         Where something is not KEY=VALUE or is set twice: names the parameters of the module.
     """
-    module, given, elsewhere = options.problem, {}, {"data": options.data, "rng": rng}
+    module = trust.typed_module(options.problem, out)
+    given: dict[str, str] = {}
+    elsewhere = {"data": options.data, "rng": rng}
     for setting in options.settings:
         name, equals, text = setting.partition("=")
         if not (equals and name.isidentifier()):

@@ -10,7 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from sysid.cli import draws, sweeps
+from sysid import catalogue
+from sysid.cli import draws, sweeps, trust
 from sysid.cli.files import png, results_folder, table_as_csv, write_files
 from sysid.cli.output import Output
 from sysid.cli.status import INTERRUPTED, NOT_REACHED, SUCCESS
@@ -22,7 +23,7 @@ from sysid.jobs.minima import Minimum, as_good, distinct
 from sysid.jobs.submit import submit
 from sysid.nlp import EXACT
 from sysid.problem.problem import Problem
-from sysid.results.identification import Identification, Recipe, load
+from sysid.results.identification import Recipe, load, recipe_of
 from sysid.results.summary import counted
 
 _SHOWN = 12  # minima in the table
@@ -32,12 +33,14 @@ _STARTS = 16
 def run(options: argparse.Namespace, out: Output) -> int:
     """Run the jobs that are asked for; tell each end in a line, then all of them together."""
     source = Path(options.result)
+    bare = _recipe(options, source, out)
+    catalogue.import_module(bare.module)  # its classes are those of the models in the result
     result = load(source)
-    recipe = _recipe(result, source)
+    recipe = replace(bare, start=None if result.x is None else tuple(result.x.tolist()))
     folder = results_folder(options.out, (source if source.is_dir() else source.parent) / "refine")
     executor = _executor(options)
     sweeps.check_own_records(result, recipe)
-    sweep = sweeps.sweep_of(options, result, recipe)
+    sweep = sweeps.sweep_of(options, result, recipe, out)
     if sweep is not None:
         titles, told = [*sweep.titles], sweep.told
         jobs = submit(sweep.recipes, changes=sweep.changes, strategy="auto", executor=executor, out=folder)
@@ -121,14 +124,18 @@ def _figures(minimum: Minimum) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _recipe(result: Identification, source: Path) -> Recipe:
-    if result.recipe is None:
+def _recipe(options: argparse.Namespace, source: Path, out: Output) -> Recipe:
+    """What the problem of a result was made from: by a module that the user names, or that may run."""
+    recipe = recipe_of(source)
+    if recipe is None:
         raise InputError(
             f"{source} was not made from a problem module, so that no worker could rebuild its problem: save the "
             "problem as a module and run it with 'sysid run'"
         )
-    x = result.x
-    return replace(result.recipe, start=None if x is None else tuple(x.tolist()))
+    if options.module is not None:
+        return replace(recipe, module=trust.typed_module(options.module, out))
+    trust.check(recipe, source, f"--module FILE.py, with sysid refine {source}", options)
+    return recipe
 
 
 def _started(recipe: Recipe, source: Path) -> Recipe:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from sysid import catalogue
+from sysid.cli import trust
 from sysid.cli.files import png, table_as_csv, write_files
 from sysid.cli.output import Output
 from sysid.errors import InputError
@@ -56,10 +57,11 @@ class Sweep:
         return bool(self.changes) and not isinstance(self.changes[0], Modes)
 
 
-def sweep_of(options: argparse.Namespace, result: Identification, recipe: Recipe) -> Sweep | None:
+def sweep_of(options: argparse.Namespace, result: Identification, recipe: Recipe, out: Output) -> Sweep | None:
     """What the command line asks for; None where that is starts or draws."""
     if options.variants:
-        recipes = tuple(Recipe(module, recipe.data, recipe.rng) for module in options.variants)
+        modules = [trust.typed_module(module, out) for module in options.variants]
+        recipes = tuple(Recipe(module, recipe.data, recipe.rng) for module in modules)
         for one in recipes:
             if not _same_records(result, catalogue.build(one)):
                 raise InputError(

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sysid import catalogue
-from sysid.cli import parameters, read
+from sysid.cli import parameters, read, trust
 from sysid.cli.files import results_folder
 from sysid.cli.output import Output
 from sysid.errors import InputError
@@ -26,15 +26,21 @@ def begun(options: argparse.Namespace, out: Output) -> tuple[Begun, Path]:
     """
     if options.resume is not None:
         return _resumed(options, out)
-    search = _asked(options)
+    search = _asked(options, out)
     folder = results_folder(options.out, Path("results") / _name(search.recipe))
     checkpoint = Checkpoint(folder / FILE_NAME)
     if checkpoint.exists and not options.fresh:
         raise InputError(
-            f"{folder} holds {_in_words(checkpoint, search)}: 'sysid run --resume {folder}' goes on with it, "
+            f"{folder} holds {_in_words(checkpoint, search)}: '{command(search, folder)}' goes on with it, "
             "--fresh begins anew, --out DIR writes elsewhere"
         )
     return search, folder
+
+
+def command(search: Begun, folder: Path) -> str:
+    """The command that goes on with a search; a module that is not of the package is named again."""
+    module = search.recipe.module
+    return f"sysid run {'' if catalogue.is_bundled(module) else f'{module} '}--resume {folder}"
 
 
 def with_source(search: Begun, files: Collection[Path], folder: Path) -> Begun:
@@ -53,7 +59,7 @@ def _resumed(options: argparse.Namespace, out: Output) -> tuple[Begun, Path]:
         raise InputError(f"--resume and {'--fresh' if options.fresh else '--out'} exclude each other")
     folder = results_folder(options.resume, Path(options.resume))
     checkpoint = Checkpoint(folder / FILE_NAME)
-    asked = _asked(options) if options.problem is not None else None
+    asked = _asked(options, out) if options.problem is not None else None
     if not checkpoint.exists:
         if asked is None:
             raise InputError(
@@ -66,12 +72,25 @@ def _resumed(options: argparse.Namespace, out: Output) -> tuple[Begun, Path]:
     if tree["begun"] is None:
         raise InputError(f"{checkpoint.path} was not begun by 'sysid run': go on with it as it was begun")
     search = Begun.from_tree(tree["begun"])
-    if asked is not None and asked != search:
-        raise InputError(f"{folder} holds an unfinished run of {search}, not of {asked}")
-    if asked is None and ((options.seed, options.strategy, options.data) != (None, None, None) or options.settings):
-        raise InputError(f"--resume takes --seed, --strategy, --data and --set from the run in {folder}: {search}")
+    more = (options.seed, options.strategy, options.data) != (None, None, None) or bool(options.settings)
+    if asked is None:
+        if more:
+            raise InputError(f"--resume takes --seed, --strategy, --data and --set from the run in {folder}: {search}")
+        trust.check(search.recipe, checkpoint.path, f"sysid run MODULE.py --resume {folder}", options)
+    else:
+        search = _agreed(search, asked, more or read.is_test(options.problem), folder)
     out.write(f"going on with {search}\n" if tree["entries"] else f"{search} had reached nothing: it begins anew\n")
     return search, folder
+
+
+def _agreed(search: Begun, asked: Begun, whole: bool, folder: Path) -> Begun:
+    """The unfinished run as it is asked for: `whole`, or by its module alone, which the user says again."""
+    own, its = (catalogue.short_name(one.recipe.module) for one in (asked, search))
+    if not whole and own == its:
+        return replace(search, recipe=replace(search.recipe, module=asked.recipe.module))
+    if asked != search:
+        raise InputError(f"{folder} holds an unfinished run of {search}, not of {asked}")
+    return search
 
 
 def _name(recipe: Recipe) -> str:
@@ -80,10 +99,10 @@ def _name(recipe: Recipe) -> str:
     return Path(recipe.data or "").stem if own else catalogue.short_name(recipe.module)
 
 
-def _asked(options: argparse.Namespace) -> Begun:
+def _asked(options: argparse.Namespace, out: Output) -> Begun:
     if options.problem is None:
         raise InputError("PROBLEM is missing (see 'sysid run --help')")
-    recipe = read.recipe(options, parameters.recipe_of(options))
+    recipe = read.recipe(options, parameters.recipe_of(options, out))
     return Begun(recipe, options.strategy or "auto", options.seed or 0)
 
 

@@ -1,15 +1,27 @@
-"""Matrix models as trees: the class by its name, and what the class makes of itself."""
+"""Matrix models as trees: the class by its name, and what the class makes of itself.
+
+A tree may come from a file of somebody else's. So nothing is imported for it: a class is found only in a module that
+was imported before, by the user's script or as a problem module that the user named.
+"""
 
 from __future__ import annotations
 
-import importlib
+import re
+import sys
+from collections.abc import Iterator
+from types import ModuleType
 from typing import Any
 
-from sysid.errors import InputError
+from sysid.errors import InputError, refuse, shown
 from sysid.models.damping import ModalDamping, ProportionalDamping
 from sysid.models.field_tree import plain
 from sysid.models.mass import FullMass, KnownMass, LumpedMass
 from sysid.models.stiffness import ChainStiffness, SpectralStiffness
+
+# A problem module that is a file has a name of its own in Python: this, eight digits, and the name of the file.
+PROBLEM_MODULE = "_sysid_problem_"
+_PACKAGE = __name__.partition(".")[0]
+BESIDE = "__sysid_beside__"  # in such a module: the modules by name that it imported from beside itself
 
 _OWN: dict[str, Any] = {
     kind.__name__: kind
@@ -43,7 +55,8 @@ def model_to_tree(model: Any) -> dict[str, Any]:
             f"a {kind.__name__} cannot be stored: its class stands inside a function ({kind.__qualname__}), where no "
             "other program finds it; move the class to the top of its module"
         )
-    name = kind.__name__ if _OWN.get(kind.__name__) is kind else f"{kind.__module__}:{kind.__qualname__}"
+    own = _OWN.get(kind.__name__) is kind
+    name = kind.__name__ if own else f"{_public_name(kind.__module__)}:{kind.__qualname__}"
     return {"kind": name, "fields": model.to_tree() if _has(kind, _TREE) else _attributes(model)}
 
 
@@ -61,17 +74,20 @@ def _attributes(model: Any) -> dict[str, Any]:
 
 
 def model_from_tree(tree: dict[str, Any]) -> Any:
-    """Give the model of a tree that `model_to_tree` made; the module of a user's own class is imported.
+    """Give the model of a tree that `model_to_tree` made; nothing is imported for it.
+
+    A class of the user's own has to be there already: in a module that this process has imported, or in a problem
+    module that was named to it (see `sysid.catalogue.import_module`), or beside that one.
 
     Raises
     ------
     InputError
         Where the class is not to be found; says which one, and in which module.
     """
-    module, colon, name = tree["kind"].rpartition(":")
+    module, colon, name = str(tree["kind"]).rpartition(":")
     if not colon and name not in _OWN:
-        raise InputError(f"model {name!r} is unknown to this sysid: a later one is needed")
-    kind = _imported(module, name) if colon else _OWN[name]
+        raise InputError(f"model {shown(name)} is unknown to this sysid: a later one is needed")
+    kind = _found(module, name) if colon else _OWN[name]
     if _has(kind, _TREE):
         return kind.from_tree(tree["fields"])
     model = object.__new__(kind)
@@ -79,18 +95,50 @@ def model_from_tree(tree: dict[str, Any]) -> Any:
     return model
 
 
-def _imported(module: str, name: str) -> Any:
-    """The class `name` of a module."""
-    try:
-        kind: Any = importlib.import_module(module)
-        for part in name.split("."):
-            kind = getattr(kind, part)
-        if isinstance(kind, type) and (_has(kind, _TREE) or _has(kind, _MODEL)):
-            return kind
-        problem = "it is no class of a matrix model"
-    except Exception as error:  # a module of the user's may fail in any way
-        problem = f"{type(error).__name__}: {error}"
-    raise InputError(
-        f"the class {name} of the module {module!r} is needed, of which a model is made, and cannot be imported "
-        f"({problem}); put the module on Python's path, or import it first"
-    )
+def _public_name(module: str) -> str:
+    """Name of a module as the user knows it: of a problem module that is a file, the file's."""
+    return re.sub(rf"^{PROBLEM_MODULE}[0-9a-f]{{8}}_", "", module)
+
+
+def _found(module: str, name: str) -> Any:
+    """The class `name` of a module that is imported.
+
+    Raises
+    ------
+    InputError
+        Where there is none, or there are several from different files.
+    """
+    found = [(one, kind) for one in _imported(module) if (kind := _class_in(one, name)) is not None]
+    if not found:
+        raise InputError(
+            f"the class {shown(name)} of the module {shown(module)} is needed, of which a model is made, and a file "
+            "imports no module by itself: name the module (--module FILE at the command line), or import it first"
+        )
+    places = sorted({str(getattr(one, "__file__", "")) for one, _ in found})
+    refuse((len(places) > 1, f"the class {name} stands in several modules named {module!r}: {', '.join(places)}"))
+    return found[-1][1]
+
+
+def _imported(name: str) -> Iterator[ModuleType]:
+    """Modules of this name in this process, problem modules and what they imported from beside themselves too."""
+    for own, module in list(sys.modules.items()):
+        if own == name and name.partition(".")[0] not in (_PACKAGE, *sys.stdlib_module_names):
+            yield module
+        elif own.startswith(PROBLEM_MODULE):
+            if _public_name(own) == name:
+                yield module
+            beside = vars(module).get(BESIDE, {})
+            if name in beside:
+                yield beside[name]
+
+
+def _class_in(module: ModuleType, name: str) -> Any:
+    """A class of a matrix model by its dotted name in the module that defines it; None where it is none.
+
+    It is looked up without `getattr`, by which some modules import others.
+    """
+    kind: Any = module
+    for part in name.split("."):
+        kind = getattr(kind, "__dict__", {}).get(part)
+    defined = isinstance(kind, type) and (kind.__module__, kind.__qualname__) == (module.__name__, name)
+    return kind if defined and (_has(kind, _TREE) or _has(kind, _MODEL)) else None

@@ -252,6 +252,11 @@ def load(path: str | Path) -> Identification:
     return storage.read(path, Identification.from_tree)
 
 
+def recipe_of(path: str | Path) -> Recipe | None:
+    """The recipe in the file of a result, whose problem is not made; None where it has none. Path, errors as `load`."""
+    return storage.read(path, lambda tree: _if_given(Recipe.from_tree, tree["recipe"]))
+
+
 def _is_plain(value: Any) -> bool:
     """Whether a value can be written as text and read again, here and in JSON."""
     try:

@@ -106,7 +106,7 @@ def floors(here):
 
 
 def test_identifications_without_each_sensor_are_told_beside_the_result(floors, capsys):
-    assert cli.main(["refine", str(floors), "--leave-out", "sensor", "--workers", "1"]) == 0
+    assert cli.main(["refine", str(floors), "--trust", "--leave-out", "sensor", "--workers", "1"]) == 0
     out, error = capsys.readouterr()
     lines = out.splitlines()
     assert lines[0] == "two.py: 2 identifications, each without one sensor"
@@ -122,7 +122,7 @@ def test_identifications_without_each_sensor_are_told_beside_the_result(floors, 
 
 
 def test_a_band_without_lines_is_a_line_without_a_result(floors, capsys):
-    assert cli.main(["refine", str(floors), "--bands", "0.5-8", "20-30", "--workers", "1"]) == 0
+    assert cli.main(["refine", str(floors), "--module", "two.py", "--bands", "0.5-8", "20-30", "--workers", "1"]) == 0
     out, error = capsys.readouterr()
     assert "20 to 30 Hz  no result  no line between 20 and 30 Hz" in error
     assert "predicted:" in out
@@ -133,7 +133,7 @@ def test_a_band_without_lines_is_a_line_without_a_result(floors, capsys):
 
 
 def test_a_model_that_is_too_simple_loses_by_aic_and_bic(floors, capsys):
-    assert cli.main(["refine", str(floors), "--variants", "one.py", "--workers", "1"]) == 0
+    assert cli.main(["refine", str(floors), "--trust", "--variants", "one.py", "--workers", "1"]) == 0
     lines = capsys.readouterr().out.splitlines()
     rows = {line.split()[0]: line.split() for line in lines if line.startswith(("two.py ", "one.py "))}
     assert rows["two.py"][4:7] == ["3", "0.0", "0.0"]
@@ -150,13 +150,25 @@ def test_draws_without_a_spread_leave_no_picture_of_earlier_ones(floors, capsys,
     assert [path.name for path in tmp_path.iterdir()] == ["draws.csv"]
 
 
+def test_a_module_that_a_result_names_runs_where_the_user_names_or_trusts_it(floors, capsys, tmp_path, monkeypatch):
+    (tmp_path / "two.py").write_text("raise SystemExit('it ran')\n")
+    result = str(floors.absolute())
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["refine", result]) == 2
+    error = capsys.readouterr().err
+    assert f"names the problem module {tmp_path / 'two.py'}, whose code would run" in error
+    assert "--trust" in error and "--module FILE.py" in error and error.count("\n") == 1
+    assert cli.main(["refine", result, "--module", "two.py"]) == 2
+    assert "two.py, line 1: SystemExit: it ran" in capsys.readouterr().err
+
+
 def test_a_module_that_gives_other_records_than_the_results_is_told(floors, capsys):
     module = Path("two.py")
     text = module.read_text()
     module.write_text(text.replace("noise=0.02", "noise=0.04"))
     try:
         for kind in (["--starts", "2"], ["--draws", "2"], ["--leave-out", "sensor"]):
-            assert cli.main(["refine", str(floors), *kind]) == 2
+            assert cli.main(["refine", str(floors), "--trust", *kind]) == 2
             out, error = capsys.readouterr()
             assert out == "" and error.count("\n") == 1
             assert "two.py now gives other records than those of the result" in error
@@ -212,7 +224,8 @@ if multiprocessing.parent_process():
 def test_ctrl_c_of_a_terminal_is_one_line_whatever_the_workers_are_at(place, floors, tmp_path, interruptible):
     """It reaches all processes at once: as soon as the first has been started, or when one has taken a job."""
     (tmp_path / "two.py").write_text(Path("two.py").read_text() + AT_WORK)
-    command = ["-u", "-m", "sysid", "refine", str(floors.absolute()), "--workers", "2", "--out", "refine"]
+    options = ["--module", "two.py", "--workers", "2", "--out", "refine"]
+    command = ["-u", "-m", "sysid", "refine", str(floors.absolute()), *options]
     with interruptible(*command, cwd=tmp_path, start_new_session=True) as running:
         assert running.stdout.readline() == "two.py: 16 starts, the first at the result\n"
         if place == "jobs":

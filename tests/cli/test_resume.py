@@ -27,12 +27,12 @@ def stopped(here, monkeypatch, no_pictures, capsys):
     with monkeypatch.context() as patch:
         patch.setattr(cli, "identify", identify)
         assert cli.main(RUN) == 130
-    assert "interrupted; the best so far is in out; 'sysid run --resume out' goes on" in capsys.readouterr().err
+    assert "interrupted; the best so far is in out; 'sysid run pair.py --resume out' goes on" in capsys.readouterr().err
     return here / "out"
 
 
 def test_a_resumed_run_ends_as_one_that_was_not_stopped(stopped, capsys, files):
-    assert cli.main(["run", "--resume", "out", "--max-time", "60"]) == 0
+    assert cli.main(["run", "--resume", "out", "--trust", "--max-time", "60"]) == 0
     assert capsys.readouterr().out.startswith("going on with pair.py, strategy swarm, seed 0\npair.py: 2 sensors")
     assert files(stopped) == {"result.h5", "summary.json", "report.html"}
     assert cli.main([*RUN[:-1], "other"]) == 0
@@ -46,7 +46,7 @@ def test_without_a_word_on_the_unfinished_run_nothing_is_done(stopped, complaint
     before, state = files(stopped), (stopped / FILE_NAME).read_bytes()
     assert cli.main(RUN) == 2
     error = complaint()
-    assert "out holds an unfinished run of this problem: 'sysid run --resume out' goes on with it" in error
+    assert "out holds an unfinished run of this problem: 'sysid run pair.py --resume out' goes on with it" in error
     assert "--fresh begins anew" in error
     assert cli.main([*RUN, "--seed", "1"]) == 2
     assert "an unfinished run of pair.py, strategy swarm, seed 0: " in complaint()
@@ -70,7 +70,7 @@ def test_fresh_throws_nothing_away_where_the_problem_is_wrong(stopped, complaint
 
 def test_what_a_kill_left_of_writing_the_state_goes_with_it(stopped, files):
     (stopped / f".{FILE_NAME}.12ab34cd.tmp").write_bytes(b"half")
-    assert cli.main(["run", "--resume", "out"]) == 0
+    assert cli.main(["run", "pair.py", "--resume", "out"]) == 0
     assert files(stopped) == {"result.h5", "summary.json", "report.html"}
 
 
@@ -86,7 +86,7 @@ def test_the_problem_may_be_said_again_and_must_be_the_same(stopped, complaint):
 def test_a_module_that_was_changed_gives_no_mixture(stopped, complaint, here):
     state = (stopped / FILE_NAME).read_bytes()
     (here / "pair.py").write_text((here / "pair.py").read_text().replace("[0.01, 0.02]", "[0.01, 0.03]"))
-    assert cli.main(["run", "--resume", "out"]) == 2
+    assert cli.main(["run", "pair.py", "--resume", "out"]) == 2
     error = complaint()
     assert "out holds an unfinished run of pair.py, strategy swarm, seed 0, and since it began its module or" in error
     assert "with --out out --fresh to begin anew" in error
@@ -115,18 +115,34 @@ class TestAModelOfTheUsersOwn:
 
     def test_its_edit_is_told_and_undone_the_run_goes_on(self, stopped, complaint, here, capsys):
         (here / "own.py").write_text(OWN.replace("return y", "return 2 * y"))
-        assert cli.main(["run", "--resume", "out"]) == 2
+        assert cli.main(["run", "--resume", "out", "--trust"]) == 2
         assert "its module or what this imports from beside itself was edited" in complaint()
         (here / "own.py").write_text(OWN)
-        assert cli.main(["run", "--resume", "out"]) == 0
+        assert cli.main(["run", "--resume", "out", "--trust"]) == 0
         assert capsys.readouterr().out.startswith("going on with pair.py")
 
     def test_a_folder_that_was_moved_as_a_whole_goes_on(self, stopped, here, capsys, monkeypatch, tmp_path_factory):
         place = tmp_path_factory.mktemp("elsewhere") / "moved"
         here.rename(place)
         monkeypatch.chdir(place)
-        assert cli.main(["run", "--resume", "out"]) == 0
+        assert cli.main(["run", "--resume", "out", "--trust"]) == 0
         assert capsys.readouterr().out.startswith("going on with pair.py")
+
+
+def test_a_module_that_the_state_names_runs_where_the_user_names_or_trusts_it(stopped, complaint, here, capsys):
+    """The state may come from somebody else: the file of that name in this folder is not what it was made with."""
+    module = here / "pair.py"
+    text = module.read_text()
+    module.write_text("raise SystemExit('it ran')\n")
+    assert cli.main(["run", "--resume", "out"]) == 2
+    error = complaint()
+    assert f"unfinished.h5 names the problem module {module}, whose code would run" in error
+    assert "say --trust" in error and "sysid run MODULE.py --resume out" in error
+    assert cli.main(["run", "--resume", "out", "--trust"]) == 2
+    assert "pair.py, line 1: SystemExit: it ran" in complaint()
+    module.write_text(text)
+    assert cli.main(["run", str(module), "--resume", "out"]) == 0
+    assert capsys.readouterr().out.startswith("going on with")
 
 
 @pytest.mark.parametrize(
@@ -157,7 +173,7 @@ def test_a_run_that_had_reached_nothing_begins_anew_and_says_so(stopped, capsys,
     """As after a kill before the first state is written: the file tells how the run was begun."""
     tree = Checkpoint(stopped / FILE_NAME).read()
     monkeypatch.setattr(Checkpoint, "read", lambda self: {**tree, "entries": {}})
-    assert cli.main(["run", "--resume", "out"]) == 0
+    assert cli.main(["run", "pair.py", "--resume", "out"]) == 0
     assert capsys.readouterr().out.startswith("pair.py, strategy swarm, seed 0 had reached nothing: it begins anew\n")
 
 
@@ -182,7 +198,7 @@ def test_a_killed_process_goes_on(here, process, without_pictures, interruptible
         running.send_signal(signal.SIGKILL)
     assert running.wait() == -signal.SIGKILL
     assert (here / "out" / FILE_NAME).is_file()
-    done = process("run", "--resume", "out", cwd=here)
+    done = process("run", "pair.py", "--resume", "out", cwd=here)
     assert done.returncode == 1  # that goal is beyond round-off
     assert not (here / "out" / FILE_NAME).exists()
     assert sysid.load(here / "out").residual < 1e-9

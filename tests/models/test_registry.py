@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import sysid
+from sysid import catalogue
 from sysid.files.tree import check, from_bytes, to_bytes
 from sysid.models.registry import model_from_tree, model_to_tree
 from sysid.problem import stored
@@ -100,15 +101,67 @@ def test_a_problem_stores_it_beside_expressions(tanks):
 @pytest.mark.parametrize("lost", ["nowhere_at_all:Tank", "tanks_of_mine:Cask", "tanks_of_mine:nothing", "os:system"])
 def test_a_class_that_is_missing_is_named_with_its_module(tanks, lost):
     module, name = lost.split(":")
-    with pytest.raises(sysid.InputError, match=f"the class {name} of the module '{module}' is needed"):
+    with pytest.raises(sysid.InputError, match=f"the class '{name}' of the module '{module}' is needed"):
         model_from_tree({"kind": lost, "fields": {}})
 
 
-def test_a_module_that_fails_is_named_with_its_error(tmp_path, monkeypatch):
-    (tmp_path / "broken_tanks.py").write_text("1 / 0")
+def test_a_file_imports_no_module(tmp_path, monkeypatch):
+    (tmp_path / "silent_tanks.py").write_text(OWN)
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(sysid.InputError, match="'broken_tanks' is needed.*ZeroDivisionError"):
-        model_from_tree({"kind": "broken_tanks:Tank", "fields": {}})
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(sysid.InputError, match="'silent_tanks' is needed.*a file imports no module by itself"):
+        model_from_tree({"kind": "silent_tanks:Ring", "fields": {"sectors": 3, "stiffness": None}})
+    assert "silent_tanks" not in sys.modules
+
+
+def test_no_class_of_what_the_package_imports_is_taken_for_a_model():
+    """`sysid report` has no module of the user's: only those of the table of the package's own are found."""
+    libraries = ("sysid", "numpy", "scipy", "casadi", "h5py", "matplotlib")
+    named = [(name, vars(module)) for name, module in sys.modules.items() if name.partition(".")[0] in libraries]
+    alike = {
+        f"{name}:{kind}"
+        for name, content in named
+        for kind, value in content.items()
+        if isinstance(value, type) and hasattr(value, "from_tree")
+    }
+    assert "sysid.results.identification:Recipe" in alike  # it has the methods
+    for kind in alike:
+        with pytest.raises(sysid.InputError, match="is needed"):
+            model_from_tree({"kind": kind, "fields": {}})
+
+
+PROBLEM = """
+import sysid
+from rings_beside import Ring
+
+class Light(sysid.ModalDamping):
+    pass
+"""
+
+
+def test_classes_of_a_problem_module_and_beside_it_are_stored_by_names_that_another_process_knows(
+    tmp_path, monkeypatch
+):
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "light_house.py").write_text(PROBLEM)
+        (tmp_path / folder / "rings_beside.py").write_text(OWN)
+    before = {*sys.modules}
+    try:
+        catalogue.import_module(str(tmp_path / "one" / "light_house.py"))
+        (private,) = (sys.modules[name] for name in sys.modules if name.endswith("_light_house"))
+        trees = [model_to_tree(model) for model in (private.Light(0.001, 0.1), private.Ring(3))]
+        assert [tree["kind"] for tree in trees] == ["light_house:Light", "rings_beside:Ring"]
+        assert "rings_beside" not in sys.modules
+        light, ring = map(model_from_tree, trees)
+        assert type(light) is private.Light and light.upper == 0.1
+        assert type(ring) is private.Ring and ring.sectors == 3
+        catalogue.import_module(str(tmp_path / "two" / "light_house.py"))
+        with pytest.raises(sysid.InputError, match="Light stands in several modules named 'light_house'"):
+            model_from_tree(trees[0])
+    finally:
+        for name in {*sys.modules} - before:
+            del sys.modules[name]
 
 
 def test_a_model_of_a_later_sysid_is_named():
