@@ -183,7 +183,8 @@ def file_of(name: str) -> Path | None:
 def typed(name: str) -> tuple[str, str]:
     """What a user means by a name at the command line, and a remark: the user's own problem hides a bundled one."""
     own = None if _is_path(name) else _in_folder(own_folder(), name)
-    if own is None or not is_bundled(name):
+    bundled = _in_folder(bundled_folder(), name)
+    if own is None or bundled is None or own.resolve() == bundled.resolve():  # the last in a checkout
         return name, ""
     return str(own), f"{own} hides the bundled problem {name}: it is taken"
 
@@ -391,6 +392,6 @@ def _first_line(path: Path) -> str:
         return f"(cannot be read: {error.strerror})"
     except SyntaxError as error:
         return f"(syntax error in line {error.lineno})"
-    except ValueError as error:
+    except (ValueError, RecursionError, MemoryError) as error:
         return f"(no Python source: {error})"
     return text.strip().partition("\n")[0]

@@ -19,7 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from sysid.errors import InputError
+from sysid.errors import InputError, shown
+from sysid.files import hdf5
+from sysid.files.allowance import Allowance
 
 Tree = dict[str, Any]
 
@@ -32,7 +34,6 @@ _HEADER = re.compile(
 _LENGTH = "[]"  # the attribute by which a list is told from a dictionary
 _LONGEST_ATTRIBUTE = 4096  # bytes of a text; HDF5 itself allows 64 kB
 _NUMBERS = "buifc"  # kinds of arrays
-_DEEPEST = 50  # groups in groups; in a damaged file a group may hold itself
 
 
 def to_bytes(tree: Tree, number: int) -> bytes:
@@ -92,38 +93,48 @@ def from_bytes(image: bytes) -> tuple[Tree, int]:
     digest.update(memoryview(image)[_BLOCK:])
     if digest.hexdigest().encode() != header[3]:
         raise _damaged("its bytes have another SHA-256 than those that were written")
-    with h5py.File(io.BytesIO(image), "r") as file:
-        return read_group(file, length), number
+    try:
+        with h5py.File(io.BytesIO(image), "r") as file:
+            return read_group(file, Allowance(length), set()), number
+    except InputError as error:
+        raise _damaged(str(error)) from None
+    except Exception as error:  # h5py raises what it likes, and anybody can write bytes with their right SHA-256
+        raise _damaged(f"{type(error).__name__}: {error}") from None
 
 
-def read_group(group: Any, size: int, depth: int = 0) -> Any:
+def read_group(group: Any, allowance: Allowance, before: set[int]) -> Any:
     """Everything in a group, as a dictionary or a list.
 
     Parameters
     ----------
     group : h5py.Group
-    size : int
-        Of its file, bytes.
-    depth : int
-        Groups around it.
+    allowance : Allowance
+        Of its file.
+    before : set of int
+        Addresses of the groups and data sets that were read: each stands in one place.
 
     Raises
     ------
     InputError
-        Where there is more in it than the file can hold. Other damage makes h5py raise what it likes.
+        Where there is more in it than the file may hold, or a link. Other damage makes h5py raise what it likes.
     """
     import h5py
 
-    if depth > _DEEPEST:
-        raise _damaged("its groups stand in one another")
-    tree = {name: _value(value) for name, value in group.attrs.items()}
+    hdf5.check_links(group)
+    tree = {}
+    for name in group.attrs:
+        hdf5.check_attribute(group, name, allowance)
+        tree[name] = _value(group.attrs[name])
     for name, item in group.items():
+        address = h5py.h5o.get_info(item.id).addr
+        if address in before:
+            raise InputError(f"{shown(item.name)} stands in two places")
+        before.add(address)
         if isinstance(item, h5py.Dataset):
-            if item.nbytes > size:
-                raise _damaged(f"{item.name} claims {item.nbytes} bytes")
+            hdf5.check_data(item, allowance)
             tree[name] = _value(item[()], array=True)
         else:
-            tree[name] = read_group(item, size, depth + 1)
+            tree[name] = read_group(item, allowance, before)
     if _LENGTH in tree:
         return [tree[str(i)] for i in range(tree[_LENGTH])]
     return tree
@@ -207,6 +218,8 @@ def _value(value: Any, array: bool = False) -> Any:
     if isinstance(value, h5py.Empty):
         return None
     numbers = np.asarray(value)
+    if numbers.dtype.kind not in (*_NUMBERS, "S"):
+        raise InputError(f"an array of the type {numbers.dtype} stands in it")
     if numbers.dtype.kind == "S":
         texts = tuple(text.decode("utf-8", "surrogatepass") for text in numbers.ravel().tolist())
         return texts if numbers.ndim else texts[0]

@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from sysid.errors import InputError
+from sysid.files.allowance import Allowance
 from sysid.files.guarded import guarded
 from sysid.files.tree import Tree, read_group
 from sysid.measurement.measurement import Measurement
@@ -43,7 +44,7 @@ def content(path: Path) -> Tree:
             raise InputError("it is an HDF5 file, but not a result of sysid")
         if file.attrs.get("format") not in _FORMATS:
             raise InputError(f"it is damaged: format {file.attrs.get('format')} begins with another text")
-        tree: Tree = _plain(read_group(file, path.stat().st_size))
+        tree: Tree = _plain(read_group(file, Allowance(path.stat().st_size), set()))
     if "formulation" in tree["problem"]:
         _try_functions(tree["problem"]["formulation"])
     return tree
