@@ -15,10 +15,14 @@ class Allowance:
     ----------
     size : int
         Of the file, bytes.
+
+    Attributes
+    ----------
+    left : int
     """
 
     def __init__(self, size: int) -> None:
-        self._size, self._left = size, max(_LEAST, _TIMES * size)
+        self._size, self.left = size, max(_LEAST, _TIMES * size)
 
     def take(self, name: str, count: int) -> None:
         """Take away what an array needs.
@@ -28,9 +32,9 @@ class Allowance:
         InputError
             Where that is more than is left.
         """
-        if count > self._left:
+        if count > self.left:
             raise InputError(
                 f"{name} claims {count:.3g} bytes, in a file of {self._size} bytes: it is damaged, or export fewer "
                 "channels a file"
             )
-        self._left -= count
+        self.left -= count

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from zipfile import is_zipfile
+from zipfile import ZipFile, is_zipfile
 
 import numpy as np
 
-from sysid.errors import InputError
+from sysid.errors import InputError, shown
+from sysid.files import hdf5, matlab
+from sysid.files.allowance import Allowance
 from sysid.files.recording import Column, Recording
 from sysid.files.spectral import is_abscissa
 
@@ -20,29 +23,45 @@ _HDF5 = b"\x89HDF\r\n\x1a\n"
 def read_npz(path: Path) -> Recording:
     """Arrays of an NPZ file; nothing pickled is loaded."""
     try:
+        _check_npz(path)
         with np.load(path, allow_pickle=False) as file:
             named = {name: (file[name], "") for name in file.files}
     except Exception as error:  # zipfile and NumPy raise many
-        # NumPy takes what is no archive for pickles, and advises to load them.
-        words = str(error).partition(".")[0] if is_zipfile(path) else "it is no zip archive"
+        words = str(error) if isinstance(error, InputError) else str(error).partition(".")[0]
         raise InputError(
             f"{path} is no NPZ, or is damaged ({words}): write it with numpy.savez, of numbers alone"
         ) from None
     return recording(path, named)
 
 
+def _check_npz(path: Path) -> None:
+    """Refuse an archive whose arrays claim more numbers than it holds, or that unpacks to more than memory bears."""
+    if not is_zipfile(path):  # NumPy takes it for pickles, and advises to load them
+        raise InputError("it is no zip archive")
+    allowance = Allowance(path.stat().st_size)
+    with ZipFile(path) as archive:
+        for member in archive.infolist():
+            allowance.take(shown(member.filename), member.file_size)
+            with archive.open(member) as file:
+                version = np.lib.format.read_magic(file)
+                read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+                shape, _, dtype = read[version](file)
+            if math.prod(shape) * dtype.itemsize > member.file_size:
+                raise InputError(f"{shown(member.filename)} claims {math.prod(shape)} entries, and holds fewer")
+
+
 def read_mat(path: Path) -> Recording:
     """Arrays of a MATLAB file of any version."""
     from scipy.io import loadmat
 
+    if _is_hdf5(path):
+        return read_hdf5(path)
     try:
-        if path.read_bytes()[:8] == _HDF5 or _is_hdf5(path):
-            return read_hdf5(path)
+        matlab.check(path)
         found = loadmat(path, simplify_cells=True)
-    except InputError:
-        raise
     except Exception as error:  # scipy raises many
-        raise InputError(f"{path} is no MATLAB file, or is damaged ({error}): save it again") from None
+        words = str(error) or type(error).__name__
+        raise InputError(f"{path} is no MATLAB file, or is damaged ({words}): save it again") from None
     return recording(path, dict(_flat({name: one for name, one in found.items() if not name.startswith("__")})))
 
 
@@ -51,16 +70,19 @@ def read_hdf5(path: Path) -> Recording:
     import h5py
 
     named: dict[str, tuple[Any, str]] = {}
+    allowance = Allowance(path.stat().st_size)
 
     def visit(name: str, item: Any) -> None:
         # MATLAB keeps the sizes of empty arrays, and texts as numbers.
-        text = item.attrs.get("MATLAB_class") in (b"char", b"cell") or "MATLAB_empty" in item.attrs
-        if isinstance(item, h5py.Dataset) and not (name.startswith("#") or text) and item.dtype.kind in "buifcV":
-            unit = item.attrs.get("unit", item.attrs.get("units", ""))
-            named[name.replace("/", ".")] = (_values(item[()]), unit.decode() if isinstance(unit, bytes) else str(unit))
+        text = _word(item, "MATLAB_class") in ("char", "cell") or "MATLAB_empty" in item.attrs
+        if isinstance(item, h5py.Dataset) and not (name.startswith("#") or text) and _is_numeric(item.dtype):
+            hdf5.check_data(item, allowance)
+            unit = _word(item, "unit") or _word(item, "units")
+            named[name.replace("/", ".")] = (_values(item[()]), unit)
 
     try:
         with h5py.File(path, "r") as file:
+            hdf5.check_all_links(file)
             file.visititems(visit)
             matlab = any("MATLAB_class" in item.attrs for item in file.values())
     except Exception as error:  # h5py raises many
@@ -70,10 +92,23 @@ def read_hdf5(path: Path) -> Recording:
 
 
 def _is_hdf5(path: Path) -> bool:
-    """Whether an HDF5 file begins behind the 512 bytes of text of a MATLAB file of version 7.3."""
+    """Whether it is an HDF5 file, which begins behind 512 bytes of text in a MATLAB file of version 7.3."""
     with path.open("rb") as file:
-        file.seek(512)
-        return file.read(8) == _HDF5
+        begin = file.read(520)
+    return _HDF5 in (begin[:8], begin[512:])
+
+
+def _word(item: Any, name: str) -> str:
+    """An attribute that is one text or number; "" where there is none, or a list, which may claim any memory."""
+    if name not in item.attrs or item.attrs.get_id(name).shape not in ((), (1,)):
+        return ""
+    value = np.asarray(item.attrs[name]).item()
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+
+
+def _is_numeric(dtype: Any) -> bool:
+    """Whether a data set holds numbers, each of the same few bytes."""
+    return dtype.kind in "buifcV" and not dtype.hasobject
 
 
 def _values(array: Any) -> Any:

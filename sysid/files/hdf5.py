@@ -36,11 +36,12 @@ def check_all_links(file: Any) -> None:
     """The same of a whole file; a soft link to an object of the file stays, and is not followed."""
     import h5py
 
-    def visit(name: str, link: Any) -> None:
-        if isinstance(link, h5py.ExternalLink):
-            raise _link(name)
+    def visit(name: str, link: Any) -> str | None:  # the first text ends the visit
+        return name if isinstance(link, h5py.ExternalLink) else None
 
-    file.visititems_links(visit)
+    found = file.visititems_links(visit)
+    if found is not None:
+        raise _link(found)
 
 
 def _link(name: str) -> InputError:

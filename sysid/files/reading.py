@@ -19,6 +19,7 @@ _READERS: dict[str, Callable[[Path], Recording]] = {
     **dict.fromkeys((".h5", ".hdf5"), arrays.read_hdf5),
 }
 _UNIVERSAL = (".uff", ".unv", ".ufb")
+_LONGEST = 2**30  # bytes of a text
 _TEXT = (".csv", ".txt", ".tsv", ".asc", ".dat")
 
 
@@ -66,6 +67,8 @@ def gather(paths: str | Path | Sequence[str | Path], sensors: Any = None) -> Rec
     files = [path_of("paths", path) for path in ([paths] if isinstance(paths, str | Path) else paths)]
     if not files:
         raise InputError("paths is empty: give the files of a test")
+    for file in files:
+        _check_ordinary(file)
     said = asked(sensors, files)
     if all(xsens_dot.is_export(file) for file in files):
         return assembly.in_time([xsens_dot.together(files)], said)  # a unit is a file
@@ -96,6 +99,21 @@ def _recordings(file: Path) -> list[Recording]:
         known = ", ".join((*_TEXT, *_READERS, *_UNIVERSAL))
         raise InputError(f"{file}: the ending {ending!r} is not known; known are {known}")
     return [_READERS[ending](file)]
+
+
+def _check_ordinary(file: Path) -> None:
+    """Refuse a device or a pipe, which may never end, and a text that would take all memory."""
+    if not file.is_file():
+        refuse((file.exists() and not file.is_dir(), f"{file} is no file: a device or a pipe is not read"))
+        return
+    size = file.stat().st_size
+    refuse(
+        (
+            file.suffix.lower() in _TEXT and size > _LONGEST,
+            f"{file} has {size / 2**30:.1f} GiB of text, which takes some ten times as much memory: export it as .mat, "
+            ".h5 or .npz, or fewer channels or minutes a file",
+        ),
+    )
 
 
 def _check_ending(file: Path, ending: str) -> None:

@@ -30,7 +30,10 @@ _MARK = re.compile(rb"^    -1[ \t]*\r?$", re.MULTILINE)
 # A binary set: its size in bytes in the 32nd to 43rd place of its first line, and 11 lines of text before the numbers.
 _BINARY = re.compile(rb"\s*\n {4}58b.{24}[ ]*(\d+)[^\n]*\n(?:[^\n]*\n){11}")
 _LAST = re.compile(rb"    -1[ \t]*\r?$", re.MULTILINE)
-_KNOWN = {"58", "15", "2411", "164", "82", "151"}  # read, or without need
+_NUMBERS = (15, 58, 164, 2411)  # sets that are read
+_KNOWN = {*map(str, _NUMBERS), "82", "151"}  # or without need
+# Of a set 58: how many values it says that it has, in the seventh line of its text, place 11 to 20.
+_COUNT = re.compile(rb"[^\n]*\n {4}58[^\n]*\n(?:[^\n]*\n){6}[ \d]{10}([ \d]{10})")
 _NO_LABEL = ("", "NONE")
 
 
@@ -78,7 +81,7 @@ def _sets(path: Path) -> list[dict[str, Any]]:
     file, sets = pyuff.UFF(str(path)), []
     for at, kind in enumerate(file.get_set_types()):
         try:
-            sets.append(file.read_sets(at))
+            sets.append(file.read_sets(at) if int(kind) in _NUMBERS else {"type": int(kind)})
         except Exception as error:  # pyuff raises Exception itself
             raise InputError(
                 f"{path}, set {at + 1} of {len(file.get_set_types())} (type {kind}): {error}; is it damaged, or "
@@ -88,7 +91,7 @@ def _sets(path: Path) -> list[dict[str, Any]]:
 
 
 def _check_whole(path: Path, content: bytes) -> None:
-    """Refuse a file whose last set does not end.
+    """Refuse a file whose last set does not end, or that claims more values than it has bytes.
 
     The numbers of a binary set are stepped over by the size that its first line states, which some programs state too
     small: its last mark follows them without a line end, and they may look like a mark.
@@ -102,6 +105,11 @@ def _check_whole(path: Path, content: bytes) -> None:
         end = _MARK.search(content, begin.end()) if size is None else _LAST.search(content, size.end() + int(size[1]))
         if end is None:
             raise InputError(f"{path} is cut short: its last set, number {number}, does not end; export it again")
+        count = _COUNT.match(content, begin.end())
+        if count is not None and int(count[1]) > end.start() - begin.end():
+            raise InputError(
+                f"{path}, set {number}: it claims {int(count[1])} values, and holds fewer: export it again"
+            )
         begin = _MARK.search(content, end.end())
 
 

@@ -281,7 +281,10 @@ def test_each_wrong_file_gets_its_own_sentence(tmp_path):
     [
         (lambda tree: tree["structure"].pop("mass"), "KeyError: 'mass'|missing 1 required"),
         (lambda tree: tree.pop("problem"), "KeyError: 'problem'"),
-        (lambda tree: tree["problem"]["given"]["mass"].update(kind="os:system"), "the class 'system' of the module 'os'"),
+        (
+            lambda tree: tree["problem"]["given"]["mass"].update(kind="os:system"),
+            "the class 'system' of the module 'os'",
+        ),
         (lambda tree: tree["problem"]["measurement"]["freq"].fill(0.0), "freq must rise strictly"),
         (lambda tree: tree["history"].pop("states"), "KeyError: 'states'"),
     ],
