@@ -17,6 +17,7 @@ from __future__ import annotations
 import importlib
 import math
 import operator
+import unicodedata
 from collections.abc import Sequence
 from numbers import Real
 from pathlib import Path
@@ -24,6 +25,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+# Marks that turn the direction of writing: by them a name may look like another one.
+_TURNING = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
 
 RandomSource = int | np.random.Generator | np.random.SeedSequence | None
 
@@ -97,9 +101,31 @@ def whole_number(name: str, value: Any, *, at_least: int, at_most: float = math.
 
 
 def text(name: str, value: Any) -> str:
-    """A text that is not empty."""
+    """A text that is not empty, and has no control characters."""
     refuse((not isinstance(value, str) or not value, f"{name} is {shown(value)}; give a text, such as 'top'"))
+    return printable(name, value)
+
+
+def printable(name: str, value: str) -> str:
+    """A text without control characters, which may be empty: names and units stand in tables, pages and modules."""
+    found = next((letter for letter in value if is_control(letter)), None)
+    refuse((found is not None, f"{name} is {shown(value)}: it holds the control character {found!r}; leave it out"))
     return value
+
+
+def is_control(letter: str) -> bool:
+    """Whether a letter ends a line, commands a terminal, or turns the direction of what follows."""
+    return unicodedata.category(letter) in ("Cc", "Zl", "Zp") or unicodedata.bidirectional(letter) in _TURNING
+
+
+def shown_plainly(text: str) -> str:
+    """A text with its control characters, but for line feeds and tabs, written as Python writes them."""
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(
+        letter.encode("unicode_escape").decode() if is_control(letter) and letter not in "\n\t" else letter
+        for letter in text
+    )
 
 
 def flag(name: str, value: Any) -> bool:

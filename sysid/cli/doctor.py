@@ -139,7 +139,7 @@ def _numbers(version: str) -> tuple[int, ...]:
 def linear_solvers() -> list[str]:
     """The linear solvers with which IPOPT solves a small program here."""
     done = subprocess.run(
-        [sys.executable, "-c", _TRIAL, *_LINEAR_SOLVERS], capture_output=True, text=True, timeout=120, check=False
+        [sys.executable, "-P", "-c", _TRIAL, *_LINEAR_SOLVERS], capture_output=True, text=True, timeout=120, check=False
     )
     return re.findall(r"^works: (\w+)$", done.stdout, re.MULTILINE)
 

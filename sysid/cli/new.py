@@ -39,15 +39,16 @@ def write(name: str, folder: Path | None = None, *, data: str | None = None) -> 
     """
     _check(name)
     folder = folder or Path()
-    texts = (_MODULE, _TEST) if data is None else _of_data(data)
+    named = {"NAME": name}
+    texts = [_filled(text, named | words) for text, words in _templates(data)]
     module, test = folder / f"{name}.py", folder / f"test_{name}.py"
     for path in (module, test):
         if os.path.lexists(path):
             raise InputError(f"{path} exists already, so nothing was written: choose another name, or move it away")
     try:
         with atomically(module) as module_text, atomically(test) as test_text:
-            module_text.write_text(texts[0].replace("NAME", name), encoding="utf-8")
-            test_text.write_text(texts[1].replace("NAME", name), encoding="utf-8")
+            module_text.write_text(texts[0], encoding="utf-8")
+            test_text.write_text(texts[1], encoding="utf-8")
     except BaseException:
         with contextlib.suppress(OSError):
             test.unlink(missing_ok=True)  # the first to take its place; it was not there before
@@ -80,15 +81,20 @@ def _check(name: str) -> None:
     )
 
 
-def _of_data(data: str) -> tuple[str, str]:
-    """Texts of a module and its test for a test file."""
+def _templates(data: str | None) -> tuple[tuple[str, dict[str, str]], ...]:
+    """Templates of a module and its test, of a test file where one is given, with what is filled in beside the name."""
+    if data is None:
+        return (_MODULE, {}), (_TEST, {})
     test = recorded_test.load(data)
-    sensors = "\n".join(f"#   {sensor.name}: {sensor.axis} at {sensor.position} m" for sensor in test.sensors)
-    told = {"PATH": repr(str(Path(data))), "SENSORS": sensors, "AXES": " ".join(test.base_axes)}
-    module = _DATA_MODULE
-    for word, value in told.items():
-        module = module.replace(word, value)
-    return module, _DATA_TEST
+    # In a comment, where a line feed would end it: `repr` spells that out, though a sensor has none in its name.
+    sensors = "\n".join(f"#   {sensor.name!r}: {sensor.axis!r} at {sensor.position} m" for sensor in test.sensors)
+    words = {"PATH": repr(str(Path(data))), "SENSORS": sensors, "AXES": " ".join(test.base_axes)}
+    return (_DATA_MODULE, words), (_DATA_TEST, {})
+
+
+def _filled(template: str, words: dict[str, str]) -> str:
+    """A template with words in their places, at once: what is put in may hold the name of another place."""
+    return re.sub("|".join(words), lambda found: words[found[0]], template)
 
 
 def _is_taken(name: str) -> bool:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from sysid.cli.status import MISTAKE
+from sysid.errors import shown_plainly
 
 _CLOSED = OSError(errno.EBADF, "it is closed")
 
@@ -56,7 +57,7 @@ class Stream:
 
 
 class Output:
-    """What one command says.
+    """What one command says; control characters, as a name in a file may hold some, are spelled out.
 
     Parameters
     ----------
@@ -80,7 +81,7 @@ class Output:
     def write(self, words: str) -> None:
         """Say words to people."""
         if not (self.json or self.quiet):
-            self.stdout.write(words)
+            self.stdout.write(shown_plainly(words))
 
     def flush(self) -> None:
         """Flush the words."""
@@ -90,7 +91,7 @@ class Output:
         """Say how far the work is."""
         if not self.quiet:
             self.stdout.flush()
-            self.stderr.write(words)
+            self.stderr.write(shown_plainly(words))
             self.stderr.flush()
 
     def answer(self, **figures: Any) -> None:
@@ -132,7 +133,7 @@ class Output:
 
     def _complain(self, line: str) -> None:
         self.stdout.flush()
-        self.stderr.write(f"sysid: {line}\n")
+        self.stderr.write(f"sysid: {shown_plainly(line)}\n")
         self.stderr.flush()
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sysid.errors import InputError, choice, flag, number, path_of, refuse, sequence, shown, text
+from sysid.errors import InputError, choice, flag, number, path_of, printable, refuse, sequence, shown, text
 from sysid.structure.axes import base_columns, sensor_row, vector3
 
 ROLES = ("base", "response", "force")
@@ -84,7 +84,7 @@ def from_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # of tomllib, of what is no text, of numbers of 5,000 digits
         raise InputError(f"{path} is no TOML: {error}") from None
 
 
@@ -152,7 +152,7 @@ def _channel(entry: Any, place: str) -> Channel:
         refuse((name not in _FIELDS, f"{place}: {name!r} is unknown; known are {', '.join(_FIELDS)}"))
     column: Any = entry.get("column")
     refuse((not isinstance(column, str | int) or column == "", f"{place}: column is missing (its name, or its number)"))
-    place = f"{place} (column {column})"
+    place = f"{place} (column {printable(f'{place}: column', str(column))})"
     choice(f"{place}: role", entry.get("role"), ROLES)
     axis, where = entry.get("axis"), entry.get("position")
     if axis is not None:
@@ -160,7 +160,7 @@ def _channel(entry: Any, place: str) -> Channel:
         axis = axis if isinstance(axis, str) else tuple(map(float, axis))
     x, y, z = vector3((0.0, 0.0, 0.0) if where is None else where, f"{place}: position").tolist()
     name = text(f"{place}: name", entry.get("name", str(column)))
-    words = [str(entry.get(one, "")) for one in ("unit", "reference")]
+    words = [printable(f"{place}: {one}", str(entry.get(one, ""))) for one in ("unit", "reference")]
     return Channel(column, entry["role"], axis, name, None if where is None else (x, y, z), *words)
 
 

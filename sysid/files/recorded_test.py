@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from sysid.errors import InputError
+from sysid.errors import InputError, finite_array, number, refuse
 from sysid.files.tree import Tree, from_bytes, is_tree, to_bytes
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.rigid_body import rigid_body
+from sysid.structure.axes import BASE_AXES, base_columns
 from sysid.structure.sensor import Sensor, sensors_from_tree, sensors_to_tree
 from sysid.structure.structure import Array
 
@@ -139,10 +140,26 @@ class RecordedTest:
         """The test of the tree that a file holds."""
         runs = tuple((run["base"], run["response"], run["force"]) for run in tree["runs"])
         table = tuple(Row(**row) for row in tree["table"])
-        return cls(
-            runs, sensors_from_tree(tree["sensors"]) or (), tuple(tree["base_axes"]), tuple(tree["origin"].tolist()),
+        test = cls(
+            runs, sensors_from_tree(tree["sensors"]) or (),
+            tuple(BASE_AXES[column] for column in base_columns(tree["base_axes"])), tuple(tree["origin"].tolist()),
             tree["sample_rate"], tree["freq"], table, tuple(tree["remarks"]),
         )  # fmt: skip
+        test._check()
+        return test
+
+    def _check(self) -> None:
+        """Refuse a test whose records do not fit each other: a file may be of somebody else's writing."""
+        freq, wanted = self.freq, (len(self.base_axes), len(self.sensors), len(self.base_axes))
+        if freq is None:
+            number("sample_rate", self.sample_rate, "a positive number in Hz", above=0)
+        refuse((not self.runs or any(run[0] is None or run[1] is None for run in self.runs), "a run has no records"))
+        for run in self.runs:
+            n = np.shape(run[0])[-1] if freq is None else len(freq)
+            for name, record, rows in zip(("base", "response", "force"), run, wanted, strict=True):
+                if record is not None:
+                    shape = finite_array(f"{name} of a run", record, float if freq is None else complex).shape
+                    refuse((shape != (rows, n), f"{name} of a run is {shape}: ({rows}, {n}) is needed"))
 
 
 def load(path: str | Path) -> RecordedTest:
@@ -154,6 +171,7 @@ def load(path: str | Path) -> RecordedTest:
         Where it is missing, damaged, or something else.
     """
     file = Path(path)
+    refuse((file.exists() and not file.is_file(), f"{file} is no file"))
     try:
         image = file.read_bytes()
     except OSError as error:
@@ -168,4 +186,9 @@ def load(path: str | Path) -> RecordedTest:
         raise InputError(f"{file}: {error}") from None
     if tree.get("content") != _CONTENT:
         raise InputError(f"{file} holds a {tree.get('content', 'result')}, not a test: give what 'sysid read' wrote")
-    return RecordedTest.from_tree(tree)
+    try:
+        return RecordedTest.from_tree(tree)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
+    except Exception as error:  # what is sound HDF5 and no test may lack anything
+        raise InputError(f"{file} holds no whole test ({type(error).__name__}: {error}): write it again") from error

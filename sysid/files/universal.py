@@ -106,10 +106,9 @@ def _check_whole(path: Path, content: bytes) -> None:
         if end is None:
             raise InputError(f"{path} is cut short: its last set, number {number}, does not end; export it again")
         count = _COUNT.match(content, begin.end())
-        if count is not None and int(count[1]) > end.start() - begin.end():
-            raise InputError(
-                f"{path}, set {number}: it claims {int(count[1])} values, and holds fewer: export it again"
-            )
+        claimed = 0 if count is None else int(count[1].strip() or 0)
+        if claimed > end.start() - begin.end():
+            raise InputError(f"{path}, set {number}: it claims {claimed} values, and holds fewer: export it again")
         begin = _MARK.search(content, end.end())
 
 

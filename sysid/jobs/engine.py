@@ -17,6 +17,7 @@ from sysid.search.session import DeferredInterrupt
 Task = TypeVar("Task")
 Answer = TypeVar("Answer")
 
+_SAFE = "PYTHONSAFEPATH"
 _IN_VAIN = 2  # pools in a row that a task alone may break
 _WHY = 'is there enough memory, and does the script submit below if __name__ == "__main__"?'
 
@@ -40,7 +41,8 @@ def processes(workers: int | None = None) -> Callable[[], Executor]:
 
     def make() -> Executor:
         # A fork would copy locks of threads that do not exist in the child.
-        return _Processes(count, multiprocessing.get_context("spawn"), initializer=_end_at_interrupt)
+        with _without_the_working_folder():  # the first pool starts a process that looks after what all share
+            return _Processes(count, multiprocessing.get_context("spawn"), initializer=_end_at_interrupt)
 
     return make
 
@@ -50,7 +52,7 @@ class _Processes(ProcessPoolExecutor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Hand over a task; a process that is started for it has Ctrl-C blocked until `_end_at_interrupt`."""
-        with _ctrl_c_held():
+        with _ctrl_c_held(), _without_the_working_folder():
             return super().submit(fn, *args, **kwargs)
 
     def end(self) -> None:
@@ -79,6 +81,23 @@ def _ctrl_c_held() -> Iterator[None]:
                     signal.pthread_sigmask(signal.SIG_SETMASK, before)
     finally:
         held.check()
+
+
+@contextmanager
+def _without_the_working_folder() -> Iterator[None]:
+    """Have processes that are started meanwhile import no module of the standard library's names from where they stand.
+
+    They begin with imports of their own, before they are told this process's path of modules.
+    """
+    before = os.environ.get(_SAFE)
+    os.environ[_SAFE] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[_SAFE]
+        else:
+            os.environ[_SAFE] = before
 
 
 def cluster(address: str) -> Callable[[], Executor]:

@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, finite_array, flag, numbers, refuse, shown, text
+from sysid.errors import InputError, finite_array, flag, numbers, printable, refuse, shown, text
 from sysid.structure.structure import Array
 
 _PART = 0.05  # of its range: the least step of an unknown
@@ -79,6 +79,7 @@ class Unknown:
     ) -> None:
         self.name, self.unit, self.scale = text("the name of an Unknown", name), unit, scale
         refuse((not isinstance(unit, str), f"variable {name}: its unit {unit!r} is no text"))
+        printable(f"variable {name}: unit", unit)
         self.relative = flag(f"variable {name}: relative", relative)
         self.lower = np.atleast_1d(finite_array(f"variable {name}: lower", lower))
         self.upper = np.atleast_1d(finite_array(f"variable {name}: upper", upper))
@@ -193,9 +194,10 @@ class Variable(Unknown):
         if not isinstance(name, str) or not name:
             raise InputError(f"a Variable ({self.declared}) needs a name, and {shown(name)} is none")
         where = f"variable {name!r} ({self.declared})"
-        self.name, self.unit = name, unit
+        self.name, self.unit = printable(f"the name of {where}", name), unit
         self.log, self.fixed = flag(f"{where}: log", log), flag(f"{where}: fixed", fixed)
         self._refuse_where((not isinstance(unit, str), f"its unit {unit!r} is no text"))
+        printable(f"{where}: unit", unit)
         self.scale = "log" if log else "linear"
         self.shape = self._check_shape(shape)
         self.lower, self.upper = lower, upper = self._flat("lower", lower), self._flat("upper", upper)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from sysid.errors import shown_plainly
 from sysid.plot.canvas import to_png
 
 if TYPE_CHECKING:
@@ -125,8 +126,8 @@ class Cell(NamedTuple):
 
 
 def text(value: object) -> str:
-    """Escape anything for use inside an element or a quoted attribute."""
-    return html.escape(str(value), quote=True)
+    """Escape anything for use inside an element or a quoted attribute; control characters are spelled out."""
+    return html.escape(shown_plainly(str(value)), quote=True)
 
 
 def number(value: float | None, digits: int = 4) -> str:

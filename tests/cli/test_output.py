@@ -143,7 +143,7 @@ def test_doctor_says_where_it_cannot_know_what_is_needed(capsys, monkeypatch):
     [
         (["export", "RESULT", "m.op4"], "pyyeti", "nastran"),
         (["read", "shake.unv"], "pyuff", "uff"),
-        (["refine", "RESULT", "--scheduler", "tcp://host:8786"], "distributed", "dask"),
+        (["refine", "RESULT", "--trust", "--scheduler", "tcp://host:8786"], "distributed", "dask"),
     ],
 )
 def test_a_missing_extra_is_one_line_with_the_command_that_installs_it(
