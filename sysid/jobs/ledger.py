@@ -13,16 +13,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import numpy as np
-
-from sysid.errors import InputError
+from sysid.errors import InputError, numbers
 from sysid.jobs.job import Job, JobResult
 from sysid.jobs.score import Score
 from sysid.results.version import __version__
 
 FILE_NAME = "jobs.sqlite"
 
-_TABLE = "CREATE TABLE IF NOT EXISTS results (job TEXT PRIMARY KEY, result TEXT NOT NULL, sha256 TEXT NOT NULL)"
+_COLUMNS = "results (job TEXT PRIMARY KEY, result TEXT NOT NULL, sha256 TEXT NOT NULL)"
+_FOREIGN = (sqlite3.SQLITE_ATTACH, sqlite3.SQLITE_FUNCTION)  # what no statement of a ledger does
 
 
 class Ledger:
@@ -53,17 +52,26 @@ class Ledger:
         with self._told():
             rows = {row[0]: row[1:] for row in self._file.execute("SELECT job, result, sha256 FROM results")}
         wanted = {index: rows[key] for index, key in self._keys.items() if key in rows}
-        sound = {index: text for index, (text, digest) in wanted.items() if _digest(text) == digest}
+        found = {index: self._result(index, *row) for index, row in wanted.items()}
+        sound = {index: result for index, result in found.items() if result is not None}
         if len(sound) < len(wanted):
             share = f"{len(wanted) - len(sound)} of {len(wanted)}"
             warnings.warn(f"{share} results in {self.path} are damaged: computed again", stacklevel=3)
-        return {index: self._result(index, *json.loads(text)) for index, text in sound.items()}
+        return sound
 
-    def _result(
-        self, index: int, success: bool, message: str, x: list[float], residual: float, score: dict[str, Any] | None
-    ) -> JobResult:
-        told = None if score is None else Score(**score)
-        return JobResult(index, self._seeds[index], success, message, np.array(x, dtype=float), residual, told)
+    def _result(self, index: int, text: Any, digest: Any) -> JobResult | None:
+        """The result in a row; None where it is damaged, or was never one."""
+        if _digest(text) != digest:
+            return None
+        try:
+            success, message, x, residual, score = json.loads(text)
+            told = None if score is None else Score(**score)
+            unknowns = numbers("x", x)
+            if not (isinstance(success, bool) and isinstance(message, str) and unknowns.ndim == 1):
+                return None
+            return JobResult(index, self._seeds[index], success, message, unknowns, float(residual), told)
+        except (ValueError, TypeError, RecursionError):  # anybody can write a row with its right SHA-256
+            return None
 
     def add(self, result: JobResult) -> None:
         """Write a result; it is on the disk when this returns."""
@@ -78,11 +86,26 @@ class Ledger:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = sqlite3.connect(self.path)
             try:
-                self._file.execute(_TABLE)
-            except sqlite3.Error:
+                self._prepare()
+            except BaseException:
                 self._file.close()
                 raise
         return self
+
+    def _prepare(self) -> None:
+        """Make the table where there is none.
+
+        A file that holds anything else is not used: of a view or a trigger, which run SQL of their own, and of other
+        tables, which are somebody else's.
+        """
+        deny, allow = sqlite3.SQLITE_DENY, sqlite3.SQLITE_OK
+        self._file.set_authorizer(lambda action, *_: deny if action in _FOREIGN else allow)
+        self._file.execute("PRAGMA trusted_schema = OFF")
+        made = [sql for (sql,) in self._file.execute("SELECT sql FROM sqlite_master WHERE sql IS NOT NULL")]
+        if not made:
+            self._file.execute(f"CREATE TABLE IF NOT EXISTS {_COLUMNS}")
+        elif made != [f"CREATE TABLE {_COLUMNS}"]:
+            raise InputError(f"{self.path} is no ledger of jobs of this sysid: take it away, or give another folder")
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self._file.close()

@@ -1,5 +1,6 @@
 """Refinement jobs: the same results wherever they run, whatever dies, and never twice."""
 
+import contextlib
 import hashlib
 import json
 import os
@@ -325,6 +326,43 @@ class TestLedger:
         (tmp_path / "jobs.sqlite").write_text("no ledger" * 200)
         with pytest.raises(sysid.InputError, match=r"jobs\.sqlite cannot be used: file is not a database"):
             submit(recipe, out=tmp_path)
+
+    @pytest.mark.parametrize(
+        "schema",
+        [
+            "CREATE VIEW results AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i FROM n) "
+            "SELECT i AS job, i AS result, i AS sha256 FROM n",
+            "CREATE TABLE bookmarks (place TEXT)",
+            "CREATE TABLE results (job TEXT PRIMARY KEY, result TEXT DEFAULT (load_extension('evil')), sha256 TEXT)",
+        ],
+    )
+    def test_a_file_with_sql_of_its_own_or_of_somebody_elses_is_no_ledger(self, recipe, tmp_path, schema):
+        """A view that never ends would be read for ever; a table of another program is not written to."""
+        with contextlib.closing(sqlite3.connect(tmp_path / "jobs.sqlite")) as file, file:
+            file.execute(schema)
+        before = (tmp_path / "jobs.sqlite").read_bytes()
+        with pytest.raises(sysid.InputError, match=r"jobs\.sqlite is no ledger of jobs of this sysid"):
+            submit(recipe, out=tmp_path)
+        assert (tmp_path / "jobs.sqlite").read_bytes() == before
+
+    def test_a_trigger_beside_the_table_is_refused(self, recipe, tmp_path):
+        list(submit(recipe, out=tmp_path))
+        with contextlib.closing(sqlite3.connect(tmp_path / "jobs.sqlite")) as file, file:
+            file.execute("CREATE TRIGGER t AFTER INSERT ON results BEGIN DELETE FROM results; END")
+        with pytest.raises(sysid.InputError, match="is no ledger of jobs"):
+            submit(recipe, out=tmp_path)
+
+    @pytest.mark.parametrize(
+        "row",
+        ["[" * 10**5, '[true, "", [[1.0]], 0.1, null]', "[true, 3, [1.0], 0.1, null]", "[1]", '["", "", 1, 2, {}]'],
+    )
+    def test_a_row_that_is_no_result_is_computed_again(self, recipe, tmp_path, row):
+        (first,) = submit(recipe, out=tmp_path)
+        with contextlib.closing(sqlite3.connect(tmp_path / "jobs.sqlite")) as file, file:
+            file.execute("UPDATE results SET result = ?, sha256 = ?", (row, hashlib.sha256(row.encode()).hexdigest()))
+        with pytest.warns(UserWarning, match="1 of 1 results in .* are damaged: computed again"):
+            (again,) = submit(recipe, out=tmp_path)
+        assert again.x.tobytes() == first.x.tobytes()
 
 
 def test_ends_at_one_point_are_one_minimum(recipe):
