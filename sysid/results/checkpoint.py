@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, path_of
+from sysid.errors import InputError, path_of, text
 from sysid.files.tree import Tree, from_bytes, to_bytes
 from sysid.problem.problem import Problem
 from sysid.results.identification import Recipe
@@ -26,6 +26,17 @@ from sysid.search.strategy import Strategy
 from sysid.structure.structure import Structure
 
 FILE_NAME = "unfinished.h5"
+# What numbers that fit no search make NumPy, CasADi and Python raise.
+_UNFIT = (
+    KeyError,
+    IndexError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    RuntimeError,
+    AssertionError,
+    NotImplementedError,
+)
 _CONTENT, _FORMAT = "unfinished search", 1
 
 
@@ -61,9 +72,24 @@ class Begun:
 
     @classmethod
     def from_tree(cls, tree: Tree) -> Begun:
-        """Give what `to_tree` made a tree of; earlier ones have no source."""
-        recipe = Recipe.from_tree(tree["recipe"])
-        return cls(recipe, tree["strategy"], int(tree["seed"]), tree.get("source", ""))
+        """Give what `to_tree` made a tree of; earlier ones have no source.
+
+        Raises
+        ------
+        InputError
+            Where the tree tells no search.
+        """
+        try:
+            recipe = Recipe.from_tree(tree["recipe"])
+            words = [text(name, tree[name]) for name in ("strategy", "seed")]
+            source = tree.get("source", "")
+            return cls(recipe, words[0], int(words[1]), str(source))
+        except InputError:
+            raise
+        except Exception as error:  # a tree that somebody else wrote may lack anything
+            raise InputError(
+                f"the state does not tell which search it is of ({type(error).__name__}: {error})"
+            ) from None
 
 
 @dataclass(frozen=True)
@@ -109,6 +135,17 @@ class Checkpoint:
             raise InputError(f"{self.path} is not the state of an unfinished search of this sysid")
         return tree
 
+    def _entries(self, tree: Tree) -> Tree:
+        """Parts of the search in a tree, each by its number."""
+        entries = tree.get("entries")
+        sound = isinstance(entries, dict) and all(
+            number.isdecimal() and isinstance(entry, dict) and {"part", "content"} <= set(entry)
+            for number, entry in entries.items()
+        )
+        if not sound or not isinstance(entries, dict):
+            raise InputError(f"{self.path} holds no parts of a search: take it away, or begin anew with --fresh")
+        return entries
+
     def remove(self) -> None:
         """Take the file away, and what a kill left of writing it."""
         for path in (self.path, *unfinished_writings(self.path)):
@@ -128,12 +165,12 @@ class Checkpoint:
         entries: Tree = {}
         if self.exists:
             tree = self.read()
-            if tree["search"] != search:
+            if tree.get("search") != search:
                 raise InputError(
                     f"{self.path} is of another search: the problem, its records, the strategy, the seed or sysid has "
                     "changed since; take it away, or give another file"
                 )
-            entries = tree["entries"]
+            entries = self._entries(tree)
         begun = None if self.begun is None else self.begun.to_tree()
 
         def write(kept: Tree) -> None:
@@ -153,6 +190,13 @@ class Checkpoint:
                 left.unlink(missing_ok=True)
             write(entries)
             yield journal
+        except _UNFIT as error:
+            if not entries or isinstance(error, InputError):
+                raise
+            raise InputError(
+                f"the search could not go on from {self.path} ({type(error).__name__}: {error}): take it away, or "
+                "begin anew with --fresh; where that fails too it is an error of sysid"
+            ) from error
         finally:
             journal.flush()
             if not journal.entries:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.errors import InputError, finite_array, text, whole_number
+from sysid.errors import InputError, finite_array, shown, text, whole_number
 from sysid.problem.problem import Problem
 from sysid.results import storage
 from sysid.results.answer import Answer, reported_unknowns
@@ -97,9 +97,23 @@ class Recipe:
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Recipe:
-        """Give the recipe of a tree that `to_tree` made; earlier ones have no parameters."""
-        parameters = {name: ast.literal_eval(text) for name, text in tree.get("parameters", {}).items()}
+        """Give the recipe of a tree that `to_tree` made; earlier ones have no parameters.
+
+        Raises
+        ------
+        InputError
+            Where a parameter is no plain value of Python's.
+        """
+        parameters = {name: _literal(name, text) for name, text in tree.get("parameters", {}).items()}
         return cls(tree["module"], tree["data"], int(tree["rng"]), parameters, tree.get("start"))
+
+
+def _literal(name: str, text: Any) -> Any:
+    """The value that a text stands for: a number, a text, a list of them, and no expression."""
+    try:
+        return ast.literal_eval(str(text))
+    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
+        raise InputError(f"parameter {shown(name)} is {shown(text)}, which is no plain value") from None
 
 
 def _option_in_words(name: str, value: Any) -> str:
