@@ -86,6 +86,7 @@ BENCHMARKS = (
     Benchmark("jobs.lost_workers", "jobs whose workers are killed; what a job costs; gain of two", "20 min", "25 s"),
     Benchmark("jobs.cut_link", "jobs on two machines whose link drops for 30 s", "2 min", "-"),
     Benchmark("hostile.corruptions", "damaged result files: an error or the same numbers", "2 s", "1 s"),
+    Benchmark("hostile.hand_made_files", "files made by hand to have something run: nothing does", "60 s", "60 s"),
     Benchmark("hostile.fuzz", "every reader and the command line, given what chance makes", "50 min", "100 s"),
     Benchmark("hostile.extreme_structures", "silent wrong answers at the ends of what occurs", "5 min", "15 s"),
     Benchmark("records.four_storeys", "one record cut in motion: verdicts, intervals, errors, levels", "5 min", "25 s"),
