@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import re
+import resource
 import runpy
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
-import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,7 +29,7 @@ from sysid.cli.main import main
 from sysid.files import reading
 from sysid.results.checkpoint import Begun, Checkpoint
 
-_SECONDS = 60.0  # s, from which a command counts as one that hangs
+_SECONDS = 30  # of a processor, from which a command counts as one that hangs
 _MEGABYTES = 1500.0  # that a command may take, the package itself included
 _FILES = 40
 # What must not reach a terminal, a page or an exported file.
@@ -59,7 +59,10 @@ _COMMAND = "from sysid.cli.main import command\n\nif __name__ == '__main__':\n  
 
 
 def lines(reduced: bool) -> Iterator[Line]:
-    """Of each file: what ran or was imported, how it ended, what it took; the same files in both forms."""
+    """Of each file: what ran or was imported, how it ended, what it took.
+
+    The reduced form leaves `report` and `export` to the files of one result in five.
+    """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name).resolve()
         here = _place(folder)
@@ -71,9 +74,10 @@ def lines(reduced: bool) -> Iterator[Line]:
         kept = {path for path in here.rglob("*") if path.name != "evil.c"}
         known = _Known(here, sound)
         ran, wrong, most, count = [], [], 0.0, 0
-        for file in files:
-            traces, faults, megabytes = known.tried(file)
-            count += len(file.commands)
+        for at, file in enumerate(files):
+            commands = [one for one in file.commands if not (reduced and at % 5 and one[0] in ("report", "export"))]
+            traces, faults, megabytes = known.tried(file, commands)
+            count += len(commands)
             ran += [f"{file.what}: {trace}" for trace in traces]
             wrong += [f"{file.what}, {fault}" for fault in faults]
             most = max(most, megabytes)
@@ -185,10 +189,13 @@ class _Known:
 
     def __init__(self, here: Path, sound: Sound) -> None:
         self._here, self._sound = here, sound
+        (here / "sound").mkdir()
         for name in ("models", "expressions"):
-            (here / "sound").mkdir(exist_ok=True)
             (here / "sound" / "result.h5").write_bytes(getattr(sound, name))
             setattr(self, name, _numbers(here / "sound" / "result.h5"))
+        with contextlib.redirect_stdout(io.StringIO()):  # what commands import is imported before they are forked
+            main(["report", str(here / "sound")])
+        (here / "sound" / "report.html").unlink()
         shutil.copytree(here, here.parent / "pure", ignore=lambda folder, names: {"problems", CANARIES} & set(names))
         pure = here.parent / "pure"
         (pure / "test.h5").write_bytes(sound.test)
@@ -197,13 +204,13 @@ class _Known:
             raise RuntimeError(f"run of the sound test ended with {status}: {said}")
         self.test = _numbers(pure / "out" / "result.h5")
 
-    def tried(self, file: HandMade) -> tuple[list[str], list[str], float]:
-        """Traces that a file left, faults of how its commands ended, and megabytes that they took."""
+    def tried(self, file: HandMade, commands: Sequence[tuple[str, ...]]) -> tuple[list[str], list[str], float]:
+        """Traces that a file left, faults of how commands ended that were given it, and megabytes that they took."""
         place = self._here / file.place
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_bytes(file.content)
         before, faults, most = {*self._here.rglob("*")}, [], 0.0
-        for command in file.commands:
+        for command in commands:
             status, said, megabytes = _forked(command, self._here)
             most = max(most, megabytes)
             fault = self._fault(command, status, said, place)
@@ -245,8 +252,8 @@ def _numbers(path: Path) -> bytes:
 
 
 def _leaks(text: str) -> bool:
-    """Whether control characters, HTML of a name or the bytes of another file stand in a text."""
-    return bool(_CONTROL.search(text)) or "<script>evil" in text or SECRET.decode() in text
+    """Whether control characters or the bytes of another file stand in a text."""
+    return bool(_CONTROL.search(text)) or SECRET.decode() in text
 
 
 def _forked(command: tuple[str, ...], folder: Path) -> tuple[int, str, float]:
@@ -260,16 +267,7 @@ def _forked(command: tuple[str, ...], folder: Path) -> tuple[int, str, float]:
             os.dup2(said.fileno(), 2)
             os.dup2(os.open(os.devnull, os.O_RDWR), 1)
             os._exit(_run(command, folder))
-        end = time.monotonic() + _SECONDS
-        while True:
-            done, status, usage = os.wait4(pid, os.WNOHANG)
-            if done:
-                break
-            if time.monotonic() > end:
-                os.kill(pid, signal.SIGKILL)
-                _, status, usage = os.wait4(pid, 0)
-                break
-            time.sleep(0.005)
+        _, status, usage = os.wait4(pid, 0)
         said.seek(0)
         return os.waitstatus_to_exitcode(status), said.read(), usage.ru_maxrss / 1024
 
@@ -277,6 +275,7 @@ def _forked(command: tuple[str, ...], folder: Path) -> tuple[int, str, float]:
 def _run(command: tuple[str, ...], folder: Path) -> int:
     """Run a command where its files stand, in a process that ends behind it."""
     status = 99
+    resource.setrlimit(resource.RLIMIT_CPU, (_SECONDS, _SECONDS))
     try:
         os.chdir(folder)
         sys.path.insert(0, str(folder))
@@ -311,7 +310,7 @@ def _workers(folder: Path, sound: Sound) -> list[str]:
         trace = str(place / CANARIES / module)
         (place / f"{module}.py").write_text(_RUNS.format(trace=trace).replace("import sysid\n", ""))
     command = [sys.executable, str(folder / "command.py"), "refine", "result.h5", "--starts", "2", "--workers", "2"]
-    subprocess.run(command, cwd=place, capture_output=True, check=False, timeout=10 * _SECONDS)
+    subprocess.run(command, cwd=place, capture_output=True, check=False, timeout=20 * _SECONDS)
     return [path.name for path in (place / CANARIES).iterdir()]
 
 

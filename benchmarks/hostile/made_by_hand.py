@@ -43,20 +43,17 @@ class HandMade:
     content : bytes
     commands : tuple of tuple of str
         Of ``sysid``, each with the file somewhere in it; ``load`` is `sysid.load`, ``import`` runs a module.
-    same : bool
-        Whether it may be taken: then with the numbers of the sound one.
     """
 
     what: str
     place: str
     content: bytes
     commands: tuple[tuple[str, ...], ...]
-    same: bool = False
 
 
 @dataclass(frozen=True)
 class Sound:
-    """Bytes of files that sysid wrote: a result of models and one of expressions, of a model of one's own, and so on."""
+    """Bytes of files that sysid wrote: results of models, of expressions, of a model of one's own, and the others."""
 
     models: bytes
     expressions: bytes
@@ -110,18 +107,18 @@ def put(group: Any, name: str, value: object) -> None:
 
 def results(sound: Sound, folder: Path) -> list[HandMade]:
     """Files of results."""
-    reading = (("load", "evil.h5"), ("report", "evil.h5"), ("export", "evil.h5", "out.csv"), ("refine", "evil.h5"))
+    refine = ("refine", "evil.h5", "--starts", "1", "--workers", "1")
+    reading = (("load", "evil.h5"), ("report", "evil.h5"), ("export", "evil.h5", "out.csv"), refine)
 
-    def of(
-        what: str, change: Change, image: bytes = sound.models, same: bool = False, *more: tuple[str, ...]
-    ) -> HandMade:
-        return HandMade(what, "evil.h5", changed(image, change), (*reading, *more), same)
+    def of(what: str, change: Change, image: bytes = sound.models) -> HandMade:
+        return HandMade(what, "evil.h5", changed(image, change), reading)
 
     made = [
         of(f"a model of the class {kind}", everywhere("kind", kind))
         for kind in (
             "evil_models:Tank", "beside_it:Tank", "evil_package.inside:Tank", "_sysid_problem_00000000_evil:Tank",
-            "os:system", "this:d", "antigravity:Tank", "sysid.results.identification:Recipe", "scipy:datasets.Tank", ":",
+            "os:system", "this:d", "antigravity:Tank", "sysid.results.identification:Recipe", "scipy:datasets.Tank",
+            ":",
         )
     ]  # fmt: skip
     other = str((folder / "secret").absolute())
@@ -138,7 +135,7 @@ def results(sound: Sound, folder: Path) -> list[HandMade]:
         of("a filter of a library of its own", _filtered),
         of("control characters in the names of sensors", everywhere("name", CONTROL)),
         of("control characters and HTML in its message",
-           lambda f: put(f, "message", f"<script>evil()</script>{CONTROL}"), same=True),
+           lambda f: put(f, "message", f"<script>evil()</script>{CONTROL}")),
         of("a matrix of one number in the place of many", lambda f: _replaced(f, "/structure/mass", (1, 1))),
         of("without its structure", lambda f: f.pop("structure")),
         of("the expressions of an earlier format, which CasADi reads", _of_casadi(_text()), sound.expressions),
@@ -160,15 +157,15 @@ def recipes(sound: Sound) -> list[HandMade]:
     """Results whose recipe names what is to run."""
     refine = ("refine", "evil.h5", "--starts", "1", "--workers", "1")
 
-    def of(what: str, change: Change, same: bool = False) -> HandMade:
-        return HandMade(what, "evil.h5", changed(sound.expressions, change), (refine,), same)
+    def of(what: str, change: Change) -> HandMade:
+        return HandMade(what, "evil.h5", changed(sound.expressions, change), (refine,))
 
     return [
         *(
             of(f"a recipe of the module {module!r}", lambda f, module=module: put(f["recipe"], "module", module))
             for module in ("evil.py", "./evil.py", "evil", "evil_package.inside", "evil.h5", "../here/evil.py")
         ),
-        of("a recipe of a bundled name that ./problems hides", lambda f: None, same=True),
+        of("a recipe of a bundled name that ./problems hides", lambda f: None),
         of("a parameter that is an expression", lambda f: _parameter(f, "__import__('evil_models')")),
         of("a parameter a hundred thousand brackets deep", lambda f: _parameter(f, "-" * 10**5 + "1")),
         of("a seed of 5,000 digits", lambda f: put(f["recipe"], "rng", "9" * 4000 + "9" * 90 + "x")),
@@ -180,17 +177,17 @@ def tests(sound: Sound, folder: Path) -> list[HandMade]:
     """Files of tests, which `sysid read` wrote."""
     other = str((folder / "secret").absolute())
 
-    def of(what: str, change: Change, place: str = "test.h5", same: bool = False) -> HandMade:
+    def of(what: str, change: Change, place: str = "test.h5") -> HandMade:
         name = Path(place).stem.lower()
         commands = (("new", f"x_{name}", "--data", place), ("import", f"x_{name}.py"), ("run", place, "--out", "out"))
-        return HandMade(what, place, changed(sound.test, change), commands, same)
+        return HandMade(what, place, changed(sound.test, change), commands)
 
     python = b"import pathlib\npathlib.Path('traces/evil').touch()\n"
     return [
-        of("a bundled name that ./problems hides", lambda f: None, same=True),
+        of("a bundled name that ./problems hides", lambda f: None),
         of("a line feed and Python in a sensor's name", everywhere("name", "top\nimport evil_models\n")),
         of("Python in a sensor's name, in a file called SENSORS.h5",
-           everywhere("name", "'+str(__import__('evil_models'))+'"), "SENSORS.h5", same=True),
+           everywhere("name", "'+str(__import__('evil_models'))+'"), "SENSORS.h5"),
         of("a line feed in the axes of its base", lambda f: _texts(f, "base_axes", ["x\n x"])),
         of("a line feed in the axis of a sensor", everywhere("axis", "x\nimport evil_models")),
         of("another file's bytes as a record", lambda f: _replaced(f, "/runs/0/base", external=[(other, 0, 40)])),
@@ -198,7 +195,7 @@ def tests(sound: Sound, folder: Path) -> list[HandMade]:
         of("a run without its base", lambda f: f["/runs/0"].pop("base")),
         of("records of several lengths", lambda f: _replaced(f, "/runs/0/base", (1, 7))),
         HandMade("Python in the place of a test", "test.h5", python,
-                 tuple((word, "./test.h5") for word in ("run", "compare", "show")) + (("new", "x", "--data", "test.h5"),)),
+                 (*((word, "./test.h5") for word in ("run", "compare", "show")), ("new", "x", "--data", "test.h5"))),
     ]  # fmt: skip
 
 
@@ -230,22 +227,22 @@ def ledgers(sound: Sound, folder: Path) -> list[HandMade]:
     )
     refine = ("refine", "sound", "--starts", "1", "--workers", "1")
 
-    def of(what: str, change: Callable[[sqlite3.Connection], object], same: bool = False) -> HandMade:
+    def of(what: str, change: Callable[[sqlite3.Connection], object]) -> HandMade:
         file = folder / "ledger"
         file.write_bytes(sound.ledger)
         with contextlib.closing(sqlite3.connect(file)) as opened:
             change(opened)
             opened.commit()
-        return HandMade(what, "sound/refine/jobs.sqlite", file.read_bytes(), (refine,), same)
+        return HandMade(what, "sound/refine/jobs.sqlite", file.read_bytes(), (refine,))
 
     return [
-        of("a view without an end", lambda s: (s.execute("DROP TABLE results"), s.execute(f"CREATE VIEW results AS {endless}"))),
+        of("a view without an end", lambda s: s.executescript(f"DROP TABLE results; CREATE VIEW results AS {endless}")),
         of("a trigger", lambda s: s.execute("CREATE TRIGGER t AFTER INSERT ON results BEGIN DELETE FROM results; END")),
         of("a table of another program", lambda s: s.execute("CREATE TABLE bookmarks (place TEXT)")),
-        of("a result a hundred thousand lists deep", lambda s: _row(s, "[" * 10**5), same=True),
-        of("a result of one number too few", lambda s: _row(s, json.dumps([True, "", [1.0], 0.1, None])), same=True),
+        of("a result a hundred thousand lists deep", lambda s: _row(s, "[" * 10**5)),
+        of("a result of one number too few", lambda s: _row(s, json.dumps([True, "", [1.0], 0.1, None]))),
         of("control characters in its message",
-           lambda s: _row(s, json.dumps([True, CONTROL, [], 0.1, None])), same=True),
+           lambda s: _row(s, json.dumps([True, CONTROL, [], 0.1, None]))),
     ]  # fmt: skip
 
 

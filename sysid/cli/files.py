@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sysid.cli.output import Output
-from sysid.errors import InputError
+from sysid.errors import InputError, shown_plainly
 from sysid.results.storage import atomically
 
 
@@ -31,10 +31,10 @@ def results_folder(given: str | None, default: Path) -> Path:
 
 
 def table_as_csv(rows: Sequence[Sequence[object]]) -> bytes:
-    """Rows, the first of them the names of the columns."""
+    """Rows, the first of them the names of the columns; control characters of a text are spelled out."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue().encode()
+    return shown_plainly(text.getvalue()).encode()
 
 
 def png(picture: Callable[..., Any], *given: Any, **named: Any) -> bytes:

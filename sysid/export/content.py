@@ -8,6 +8,7 @@ from datetime import datetime
 import numpy as np
 
 from sysid.assessment.gains import taken_at_sensors
+from sysid.errors import shown_plainly
 from sysid.results.identification import Identification
 from sysid.results.version import __version__
 from sysid.structure.structure import Array, Structure
@@ -102,7 +103,7 @@ def statements(it: Identification, precision: str) -> tuple[str, ...]:
     ]
     if it.problem.unit_mass:
         found.append("all masses, stiffness and damping are relative: no mass was stated, and they are scaled to 1 kg")
-    return tuple(" ".join(text.split()) for text in found)
+    return tuple(shown_plainly(" ".join(text.split())) for text in found)
 
 
 def one_line_each(texts: Sequence[str], width: int, mark: str = "") -> list[str]:
