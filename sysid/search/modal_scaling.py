@@ -36,7 +36,7 @@ def stated_totals(problem: Problem) -> Ties | None:
             return [lower_entries(off)]
         if stated.kind == "rigid_body" or phi.size1() != phi.size2():
             return [ca.diag(rigid) / totals - 1]
-        P = ca.inv(phi)
+        P = ca.solve(phi, type(phi).eye(phi.size1()))  # of a triangle by substitution
         delta = gamma - P @ ca.DM(geometry.rigid_body)
         rows = ca.diag(P.T @ P)
         base = ca.diag(rigid - gamma.T @ gamma + delta.T @ delta)
