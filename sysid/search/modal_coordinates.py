@@ -110,9 +110,10 @@ def spectrum_near(problem: Problem, structure: Structure, start: Modes, z: Nonli
 
 
 def unknowns_of(problem: Problem, modes: Modes, rigid: Array, start: Structure, x: Array) -> Array:
-    """The problem's unknowns of a fit that began at a structure, modes in any order; what enters no matrix as in `x`.
+    """The problem's unknowns of a fit that began at a structure, its modes one by one; what enters no matrix as in `x`.
 
-    The damping is put inside its search space. `rigid` (d, d), the rigid-body mass, counts where a force was measured.
+    Frequencies may have changed places. The damping is put inside its search space. `rigid` (d, d), the rigid-body
+    mass, counts where a force was measured.
     """
     if problem.measurement.force is None:
         # Accelerations leave the scale of each mode open: shapes keep the size that they had.
