@@ -36,7 +36,7 @@ from sysid.structure.triangular import lower_triangle, triangle_entries
 _ROUND = 150  # iterations, after which Psi_0 is taken anew
 _LIMIT = "Maximum_Iterations_Exceeded"  # IPOPT's word for a round that was not long enough
 _LEAST_TIME = 1.0  # s, that a round is worth beginning with
-_SECONDS, _POWER = 0.5, 5.2  # of a processor, that the graphs of 10 modes take, and how that grows with the modes
+_SECONDS, _POWER = 0.2, 4.7  # of a processor, that the graphs of 10 modes take, and how that grows with the modes
 _LEAST_MASS = 1e-6  # of the rigid-body mass; the least base mass that a fit starts with
 _FLAT = 1e-10  # of the largest curvature; along less the objective does not change
 
