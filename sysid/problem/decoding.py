@@ -8,17 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from sysid.errors import InputError
-from sysid.problem.operations import (
-    BINARY, INTERPOLANTS, JOINING, MOST_ENTRIES, MOST_MEMORY, MOST_OPERATIONS, MOST_STORED, MOST_WORK, PLAIN,
-    REPEATING, RESHAPING, SPLITTING, UNARY, casadi_number, check_library, einstein, get_nonzeros, set_nonzeros, solve,
-    split,
-)  # fmt: skip
+from sysid.problem import operations
 
 Tree = dict[str, Any]
 
@@ -46,7 +43,7 @@ def decode(tree: Tree, symbols: Sequence[ca.MX]) -> list[ca.MX]:
             reader.add(function)
         made = reader.matrices(last, symbols)
         # Its memory: what one evaluation keeps at a time.
-        limited("memory of one evaluation", ca.Function("whole", list(symbols), made).sz_w(), MOST_MEMORY)
+        limited("memory of one evaluation", ca.Function("whole", list(symbols), made).sz_w(), operations.MOST_MEMORY)
     except InputError:
         raise
     except Exception as error:  # whatever CasADi and Python say of wrong numbers
@@ -92,7 +89,7 @@ class _Reader:
     def count_operation(self, name: str) -> None:
         self.place = f" at operation {self._operations} ({name!r})"
         self._operations += 1
-        limited("the number of operations", self._operations, MOST_OPERATIONS)
+        limited("the number of operations", self._operations, operations.MOST_OPERATIONS)
 
     def count_pattern(self, pattern: ca.Sparsity) -> None:
         """Patterns are kept once by CasADi, however many matrices have them."""
@@ -100,7 +97,7 @@ class _Reader:
         if key not in self._known:
             self._known.add(key)
             self._stored += pattern.nnz()
-            limited("the size of all patterns", self._stored, MOST_STORED)
+            limited("the size of all patterns", self._stored, operations.MOST_STORED)
 
     def pattern(self, number: int) -> ca.Sparsity:
         return _at(self.patterns, number)
@@ -140,17 +137,17 @@ class _Reader:
         while at < len(code):
             operation = _at(self.names, code[at])
             self.count_operation(operation)
-            count = 1 if operation in UNARY else 2 if operation in BINARY else 0
+            count = 1 if operation in operations.UNARY else 2 if operation in operations.BINARY else 0
             arguments = [_at(values, number) for number in code[at + 1 : at + 1 + count]]
             if operation == "const":
                 values.append(ca.SX(next(numbers)))
             elif count and len(arguments) == count:
                 make = ca.SX.unary if count == 1 else ca.SX.binary
-                values.append(make(casadi_number(operation), *arguments))
+                values.append(make(operations.casadi_number(operation), *arguments))
             else:
                 raise ValueError("no operation on numbers")
             at += 1 + count
-        limited("the size of a matrix", len(values), MOST_ENTRIES)
+        limited("the size of a matrix", len(values), operations.MOST_ENTRIES)
         outputs, ends = _whole(tree["outputs"]), list[ca.SX]()
         at = 1 + outputs[0]
         for pattern in map(self.pattern, outputs[1:at]):
@@ -164,8 +161,8 @@ class _Reader:
         one = _at(self.called, number)
         f = one.function
         sizes = [f.numel_in(i) for i in range(f.n_in())] + [f.numel_out(i) for i in range(f.n_out())]
-        limited("the size of a matrix", max(sizes, default=1) * count, MOST_ENTRIES)
-        limited("the work of one evaluation", one.work * count, MOST_WORK)
+        limited("the size of a matrix", max(sizes, default=1) * count, operations.MOST_ENTRIES)
+        limited("the work of one evaluation", one.work * count, operations.MOST_WORK)
         return _Called(f.map(count), one.work * count)
 
     def _switch(self, tree: Tree, name: str) -> _Called:
@@ -174,12 +171,12 @@ class _Reader:
         return _Called(function, max(one.work for one in (default, *others)))
 
     def _interpolant(self, tree: Tree, name: str) -> _Called:
-        check_library("interpolant", tree["kind"], tuple(INTERPOLANTS))
+        operations.check_library("interpolant", tree["kind"], tuple(operations.INTERPOLANTS))
         sizes, numbers = _whole(tree["code"]), _numbers(tree)
         ends = np.cumsum([0, *sizes])
         if not sizes or min(sizes) < 2 or len(sizes) > _MOST_AXES or len(numbers) < ends[-1]:
             raise ValueError("no grid of an interpolant")
-        grid = [numbers[a:b] for a, b in zip(ends[:-1], ends[1:], strict=True)]
+        grid = [numbers[a:b] for a, b in pairwise(ends)]
         function = ca.interpolant(name, tree["kind"], grid, numbers[ends[-1] :])
         return _Called(function, 4.0 ** len(sizes) * function.nnz_out())
 
@@ -207,34 +204,35 @@ class _Matrices:
             arguments = [_at(self.values, number) for number in numbers]
             made = self._made(name, arguments, parameters)
             for value in made:
-                limited("the size of a matrix", value.numel(), MOST_ENTRIES)
+                limited("the size of a matrix", value.numel(), operations.MOST_ENTRIES)
                 self._reader.count_pattern(value.sparsity())
                 self._add_work(value.nnz())
             self.values += made
 
     def _add_work(self, work: float) -> None:
         self.work += work
-        limited("the work of one evaluation", self.work, MOST_WORK)
+        limited("the work of one evaluation", self.work, operations.MOST_WORK)
 
     def _made(self, name: str, arguments: list[ca.MX], parameters: list[int]) -> Sequence[ca.MX]:
         self._check_size(name, arguments, parameters)
-        if name in UNARY or name in BINARY:
-            make = ca.MX.unary if name in UNARY else ca.MX.binary
-            return [make(casadi_number(name), *_exactly(1 if name in UNARY else 2, arguments))]
-        if name in PLAIN:
-            count, plain = PLAIN[name]
+        if name in operations.UNARY or name in operations.BINARY:
+            make = ca.MX.unary if name in operations.UNARY else ca.MX.binary
+            return [make(operations.casadi_number(name), *_exactly(1 if name in operations.UNARY else 2, arguments))]
+        if name in operations.PLAIN:
+            count, plain = operations.PLAIN[name]
             return [plain(*_exactly(count, arguments))]
-        if name in JOINING:
-            return [JOINING[name](*arguments)]
-        if name in RESHAPING:
-            return [RESHAPING[name](*_exactly(1, arguments), self._reader.pattern(*parameters))]
-        if name in SPLITTING:
-            return split(name, *_exactly(1, arguments), parameters)
-        if name in REPEATING:
-            return [REPEATING[name](*_exactly(1, arguments), 1, *_exactly(1, parameters))]
+        if name in operations.JOINING:
+            return [operations.JOINING[name](*arguments)]
+        if name in operations.RESHAPING:
+            return [operations.RESHAPING[name](*_exactly(1, arguments), self._reader.pattern(*parameters))]
+        if name in operations.SPLITTING:
+            (whole,) = _exactly(1, arguments)
+            return operations.split(name, whole, parameters)
+        if name in operations.REPEATING:
+            return [operations.REPEATING[name](*_exactly(1, arguments), 1, *_exactly(1, parameters))]
         if name.partition(" ")[0] == "solve":
             b, a = _exactly(2, arguments)
-            return [solve(name[6:], b, a, transposed=bool(*_exactly(1, parameters)))]
+            return [operations.solve(name[6:], b, a, transposed=bool(*_exactly(1, parameters)))]
         others = {
             "const": self._const, "getnonzeros": self._getnonzeros, "setnonzeros": self._setnonzeros,
             "addnonzeros": self._addnonzeros, "einstein": self._einstein, "call": self._call,
@@ -248,7 +246,7 @@ class _Matrices:
         rows, columns = [one.size1() for one in arguments], [one.size2() for one in arguments]
         entries: float = 0
         work: float = max((one.nnz() for one in arguments), default=0)
-        if name in JOINING:
+        if name in operations.JOINING:
             down, across = sum(rows), sum(columns)
             tall, wide = max(rows, default=0), max(columns, default=0)
             entries = {"vertcat": down * wide, "horzcat": tall * across, "diagcat": down * across}[name]
@@ -263,7 +261,7 @@ class _Matrices:
         elif name.startswith("solve"):
             n = max(rows)
             entries, work = n**2, n**2 * (n + max(columns[0], 1))
-        limited("the size of a matrix", entries, MOST_ENTRIES)
+        limited("the size of a matrix", entries, operations.MOST_ENTRIES)
         self._add_work(work)
 
     def _const(self, arguments: list[ca.MX], parameters: list[int]) -> list[ca.MX]:
@@ -277,13 +275,16 @@ class _Matrices:
 
     def _getnonzeros(self, arguments: list[ca.MX], parameters: list[int]) -> list[ca.MX]:
         pattern = self._reader.pattern(parameters[0])
-        return [get_nonzeros(*_exactly(1, arguments), pattern, _places(parameters[1:]))]
+        (x,) = _exactly(1, arguments)
+        return [operations.get_nonzeros(x, pattern, _places(parameters[1:]))]
 
     def _setnonzeros(self, arguments: list[ca.MX], parameters: list[int]) -> list[ca.MX]:
-        return [set_nonzeros(*_exactly(2, arguments), _places(parameters), add=False)]
+        y, x = _exactly(2, arguments)
+        return [operations.set_nonzeros(y, x, _places(parameters), add=False)]
 
     def _addnonzeros(self, arguments: list[ca.MX], parameters: list[int]) -> list[ca.MX]:
-        return [set_nonzeros(*_exactly(2, arguments), _places(parameters), add=True)]
+        y, x = _exactly(2, arguments)
+        return [operations.set_nonzeros(y, x, _places(parameters), add=True)]
 
     def _einstein(self, arguments: list[ca.MX], parameters: list[int]) -> list[ca.MX]:
         lists, at = list[list[int]](), 0
@@ -292,7 +293,8 @@ class _Matrices:
             lists.append(one)
         sizes = dict(zip((*lists[3], *lists[4]), (*lists[0], *lists[1]), strict=True))
         self._add_work(float(np.prod([*sizes.values()], dtype=float)))
-        return [einstein(*_exactly(3, arguments), _exactly(6, lists))]
+        c, a, b = _exactly(3, arguments)
+        return [operations.einstein(c, a, b, _exactly(6, lists))]
 
     def _call(self, arguments: list[ca.MX], parameters: list[int]) -> list[ca.MX]:
         called = _at(self._reader.called, *_exactly(1, parameters))
@@ -311,8 +313,8 @@ def _patterns(numbers: list[int]) -> Iterator[ca.Sparsity]:
         rows, columns, dense = numbers[at : at + 3]
         if rows < 0 or columns < 0:
             raise ValueError("a matrix has a negative size")
-        limited("the size of a matrix", rows * columns, MOST_ENTRIES)
-        limited("the size of a matrix", max(rows, columns), MOST_ENTRIES)
+        limited("the size of a matrix", rows * columns, operations.MOST_ENTRIES)
+        limited("the size of a matrix", max(rows, columns), operations.MOST_ENTRIES)
         at += 3
         if dense:
             yield ca.Sparsity.dense(rows, columns)
@@ -349,7 +351,7 @@ def _places(parameters: Sequence[int]) -> list[int]:
     if parameters[0] == 0:
         return list(parameters[1:])
     first, step, count = _exactly(3, parameters[1:])
-    limited("the size of a matrix", count, MOST_ENTRIES)
+    limited("the size of a matrix", count, operations.MOST_ENTRIES)
     return [first + step * i for i in range(count)]
 
 

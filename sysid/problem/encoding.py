@@ -23,25 +23,16 @@ import casadi as ca
 import numpy as np
 
 from sysid.errors import InputError
+from sysid.problem import operations
 from sysid.problem.decoding import Tree, decode
-from sysid.problem.operations import (
-    BINARY, INTERPOLANTS, JOINING, PLAIN, REPEATING, RESHAPING, SOLVERS, SPLITTING, UNARY, casadi_name, casadi_number,
-    has_library, solve,
-)  # fmt: skip
 from sysid.problem.serialised import interpolant_data, is_compiled, same_text
 from sysid.structure.structure import Array
 
-_NAMES = {
-    casadi_number(name): name
-    for name in (
-        *UNARY, *BINARY, *PLAIN, *JOINING, *RESHAPING, *SPLITTING, *REPEATING, "const", "getnonzeros", "setnonzeros",
-        "addnonzeros", "einstein", "solve", "call", "input", "output",
-    )
-}  # fmt: skip
-_CLASSES = {kind: name for name, kind in INTERPOLANTS.items()}
+_NAMES = {operations.casadi_number(name): name for name in (*operations.NAMES, "input", "output")}
+_CLASSES = {kind: name for name, kind in operations.INTERPOLANTS.items()}
 
 
-class NotStorable(InputError):
+class NotStorableError(InputError):
     """An expression holds what a file cannot; the message begins with the operation."""
 
 
@@ -58,7 +49,7 @@ def encode(symbols: Sequence[ca.MX], expressions: Sequence[ca.MX], points: Seque
 
     Raises
     ------
-    NotStorable
+    NotStorableError
         Where an operation cannot be stored, or what is read again is not the same.
     """
     writer = _Writer()
@@ -67,10 +58,10 @@ def encode(symbols: Sequence[ca.MX], expressions: Sequence[ca.MX], points: Seque
     try:
         again = decode(tree, symbols)
     except InputError as error:
-        raise NotStorable(str(error)) from error
+        raise NotStorableError(str(error)) from error
     differing = _differing(symbols, expressions, again, points)
     if differing:
-        raise NotStorable(f"its operations, read again, give other {differing}")
+        raise NotStorableError(f"its operations, read again, give other {differing}")
     return tree
 
 
@@ -130,7 +121,9 @@ class _Writer:
                 self._written += [pattern.nnz(), *pattern.colind(), *pattern.row()]
         return self._patterns[key][0]
 
-    def add(self, kind: str, inputs: Sequence[ca.Sparsity], outputs: Sequence[int], code: Sequence[int], numbers: Any):
+    def add(
+        self, kind: str, inputs: Sequence[ca.Sparsity], outputs: Sequence[int], code: Sequence[int], numbers: Any
+    ) -> None:
         self._functions.append({
             "kind": kind, "inputs": _integers([self.pattern(one) for one in inputs]), "outputs": _integers(outputs),
             "code": _integers(code), "numbers": np.array(numbers, dtype=float),
@@ -148,13 +141,13 @@ class _Writer:
         kind, name = function.class_name(), function.name()
         inputs = [function.sparsity_in(i) for i in range(function.n_in())]
         if kind in ("MXFunction", "SXFunction") and is_compiled(function):
-            raise NotStorable(f"the function {name!r}, which is compiled (jit)")
+            raise NotStorableError(f"the function {name!r}, which is compiled (jit)")
         if kind == "MXFunction":
             symbols = [ca.MX.sym(f"x{i}", pattern) for i, pattern in enumerate(inputs)]
             try:
                 outputs = function.call(symbols, True, False)
             except RuntimeError:
-                raise NotStorable(f"the function {name!r}, which cannot be inlined") from None
+                raise NotStorableError(f"the function {name!r}, which cannot be inlined") from None
             self.add_mx(symbols, outputs)
         elif kind == "SXFunction":
             _add_sx(self, function, inputs)
@@ -167,7 +160,7 @@ class _Writer:
         elif kind in _CLASSES:
             _add_interpolant(self, function, inputs)
         else:
-            raise NotStorable(f"the function {name!r} ({kind})")
+            raise NotStorableError(f"the function {name!r} ({kind})")
 
     def add_mx(self, symbols: Sequence[ca.MX], expressions: Sequence[ca.MX]) -> None:
         """Add a function on matrices."""
@@ -206,7 +199,7 @@ class _Matrices:
             elif name == "output":
                 ends[target[0]] = held[source[0]]
             elif name is None:
-                raise NotStorable(f"the operation {casadi_name(number)!r}")
+                raise NotStorableError(f"the operation {operations.casadi_name(number)!r}")
             else:
                 told, parameters = self.described(name, function.instruction_MX(k))
                 first = self.record(told, [held[i] for i in source], parameters, len(target))
@@ -215,9 +208,9 @@ class _Matrices:
 
     def described(self, name: str, node: ca.MX) -> tuple[str, list[int]]:
         """The name of an operation in the file, and its parameters."""
-        if name in UNARY or name in BINARY or name in PLAIN or name in JOINING:
+        if name in operations.WITHOUT_PARAMETERS:
             return name, []
-        if name in RESHAPING:
+        if name in operations.RESHAPING:
             return name, [self.writer.pattern(node.sparsity())]
         if name == "solve":
             return _solve_in_words(node)
@@ -246,7 +239,7 @@ class _Matrices:
     def _repeat(self, node: ca.MX) -> list[int]:
         few, many = sorted((node.size2(), node.dep().size2()))
         if not few:
-            raise NotStorable("the repetition of a matrix without columns")
+            raise NotStorableError("the repetition of a matrix without columns")
         return [many // few]
 
     def _einstein(self, node: ca.MX) -> list[int]:
@@ -273,7 +266,7 @@ class _Join:
     arguments: list[int] = field(default_factory=list)
 
 
-_AT_ENDS = (*JOINING, "reshape", "sparsity_cast")
+_AT_ENDS = (*operations.JOINING, "reshape", "sparsity_cast")
 
 
 def _taken_apart(expressions: Sequence[ca.MX]) -> tuple[list[ca.MX], list[_Join], list[int]]:
@@ -322,23 +315,23 @@ def _solve_in_words(node: ca.MX) -> tuple[str, list[int]]:
     symbols = [ca.MX.sym("b", node.dep(0).sparsity()), ca.MX.sym("a", node.dep(1).sparsity())]
     own = ca.Function("solve", symbols, ca.graph_substitute([node], [node.dep(0), node.dep(1)], symbols))
     transposed = bool(node.info()["tr"])
-    for solver in ("", *SOLVERS):
-        if solver and not has_library("linsol", solver):
+    for solver in ("", *operations.SOLVERS):
+        if solver and not operations.has_library("linsol", solver):
             continue
         try:
-            same = ca.Function("solve", symbols, [solve(solver, *symbols, transposed=transposed)])
+            same = ca.Function("solve", symbols, [operations.solve(solver, *symbols, transposed=transposed)])
         except (ValueError, RuntimeError):
             continue
         if same_text(own, same):
             return f"solve {solver}".strip(), [int(transposed)]
-    raise NotStorable("the operation 'solve', by a linear solver with options or of another kind")
+    raise NotStorableError("the operation 'solve', by a linear solver with options or of another kind")
 
 
 def _add_interpolant(writer: _Writer, function: ca.Function, inputs: Sequence[ca.Sparsity]) -> None:
     kind = _CLASSES[function.class_name()]
     grid, values = interpolant_data(function)
     if not all(grid) or not values or not same_text(function, ca.interpolant(function.name(), kind, grid, values)):
-        raise NotStorable(f"the function {function.name()!r} ({function.class_name()} with options or parameters)")
+        raise NotStorableError(f"the function {function.name()!r} ({function.class_name()} with options or parameters)")
     numbers = [*(number for axis in grid for number in axis), *values]
     writer.add(kind, inputs, [], [len(axis) for axis in grid], numbers)
 
@@ -355,19 +348,21 @@ def _add_sx(writer: _Writer, function: ca.Function, inputs: Sequence[ca.Sparsity
         number, source, target = (
             function.instruction_id(k), function.instruction_input(k), function.instruction_output(k),
         )  # fmt: skip
-        name = _NAMES.get(number)
+        name = _NAMES.get(number, "")
         if name == "input":
             held[target[0]] = int(starts[source[0]]) + source[1]
         elif name == "output":
             ends[int(targets[target[0]]) + target[1]] = held[source[0]]
-        elif name == "const" or name in UNARY or name in BINARY:
+        elif name == "const" or name in operations.UNARY or name in operations.BINARY:
             if name == "const":
                 numbers.append(function.instruction_constant(k))
             code += [writer.name(name), *(held[i] for i in source)]
             held[target[0]] = count
             count += 1
         else:
-            raise NotStorable(f"the operation {casadi_name(number)!r} in the function {function.name()!r}")
+            raise NotStorableError(
+                f"the operation {operations.casadi_name(number)!r} in the function {function.name()!r}"
+            )
     writer.add("sx", inputs, [len(outputs), *map(writer.pattern, outputs), *ends], code, numbers)
 
 

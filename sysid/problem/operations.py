@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -61,6 +60,12 @@ RESHAPING: dict[str, Callable[..., ca.MX]] = {
 SPLITTING = ("vertsplit", "horzsplit", "diagsplit")
 REPEATING: dict[str, Callable[..., ca.MX]] = {"horzrepmat": ca.repmat, "horzrepsum": ca.repsum}
 
+WITHOUT_PARAMETERS = frozenset({*UNARY, *BINARY, *PLAIN, *JOINING})
+NAMES = (
+    *WITHOUT_PARAMETERS, *RESHAPING, *SPLITTING, *REPEATING, "const", "getnonzeros", "setnonzeros", "addnonzeros",
+    "einstein", "solve", "call",
+)  # fmt: skip
+
 
 def casadi_number(name: str) -> int:
     """CasADi's number of an operation, in the version at hand."""
@@ -87,7 +92,7 @@ def get_nonzeros(x: ca.MX, pattern: ca.Sparsity, places: Sequence[int]) -> ca.MX
 
 
 def set_nonzeros(y: ca.MX, x: ca.MX, places: Sequence[int], *, add: bool) -> ca.MX:
-    """y with the nonzeros of x in, or added to, those of its own at some places; place -1 is left out."""
+    """Give y with the nonzeros of x in, or added to, those of its own at some places; place -1 is left out."""
     _check_places(places, y.nnz(), least=-1)
     if len(places) != x.nnz():
         raise ValueError(f"{len(places)} places for {x.nnz()} entries")
@@ -151,7 +156,7 @@ def einstein(c: ca.MX, a: ca.MX, b: ca.MX, tensors: Sequence[Sequence[int]]) -> 
 
 
 def solve(solver: str, b: ca.MX, a: ca.MX, *, transposed: bool) -> ca.MX:
-    """a⁻¹ b, or aᵀ⁻¹ b, by a linear solver of `SOLVERS`, "" the substitution where a is triangular."""
+    """Give a⁻¹ b, or aᵀ⁻¹ b, by a linear solver of `SOLVERS`, "" the substitution where a is triangular."""
     if a.size1() != a.size2() or a.size1() != b.size1():
         raise ValueError("a system of equations is not square")
     if not solver:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from itertools import pairwise
 
 import casadi as ca
 
@@ -27,11 +28,11 @@ def interpolant_data(function: ca.Function) -> tuple[list[list[float]], list[flo
     text = _described(function)
     grid, ends = _vector(text, b"Interpolant::grid", _NUMBER), _vector(text, b"Interpolant::offset", _COUNT)
     values = _vector(text, b"Interpolant::values", _NUMBER)
-    return [grid[int(a) : int(b)] for a, b in zip(ends[:-1], ends[1:], strict=True)], values
+    return [grid[int(a) : int(b)] for a, b in pairwise(ends)], values
 
 
 def _described(function: ca.Function) -> bytes:
-    """The text with the names of its fields; each byte stands in it as two letters from "a" on, the lower half first."""
+    """The text with the names of its fields; a byte is two letters from "a" on, its lower half first."""
     text = function.serialize({"debug": True}).encode()
     halves = bytes(letter - ord("a") for letter in text)
     return bytes(low | high << 4 for low, high in zip(halves[::2], halves[1::2], strict=True))
