@@ -88,17 +88,17 @@ class Answer:
     def __post_init__(self) -> None:
         if isinstance(self.problem, PartOfProblem):  # as it comes of a file: `problem` then tells what is missing
             part: PartOfProblem = vars(self).pop("problem")
-            from sysid.results import readings
-
-            vars(self)["_part"] = part
-            vars(self).update(readings.from_tree(part.readings, self.structure))
+            vars(self).update(part.attributes, _part=part)
 
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
             """Tell what is missing where the problem is asked for and the file does not hold it whole."""
             if name == "problem" and "_part" in vars(self):
-                raise InputError(self._problem_is_missing)
+                raise InputError(
+                    f"the problem of this result is needed, and its file does not hold it: {self.part.without}. Give "
+                    "it: sysid.load(path, problem=...), or --module FILE at the command line"
+                )
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
 
     @property
@@ -106,16 +106,6 @@ class Answer:
         """What the file of this result holds of its problem, where it does not hold it whole; else None."""
         part: PartOfProblem | None = vars(self).get("_part")
         return part
-
-    @property
-    def _problem_is_missing(self) -> str:
-        """The sentence that says so, and what to do."""
-        part = self.part
-        assert part is not None
-        return (
-            f"the problem of this result is needed, and its file does not hold it: {part.without}. Give it: "
-            "sysid.load(path, problem=...), or --module FILE at the command line"
-        )
 
     @property
     def judgement(self) -> Literal["determined", "one of many", "no fit"]:

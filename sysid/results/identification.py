@@ -214,10 +214,11 @@ class Identification(Answer):
 
         Without its problem, where the tree does not hold it whole: `problem` then raises an InputError.
         """
+        structure = Structure.from_tree(tree["structure"])
         return cls(
             **{name: tree[name] for name in _PLAIN},
-            structure=Structure.from_tree(tree["structure"]),
-            problem=_problem_from_tree(tree),
+            structure=structure,
+            problem=_problem_from_tree(tree, structure),
             seed=_if_given(int, tree["seed"]),
             history=History.from_tree(tree["history"]),
             recipe=_if_given(Recipe.from_tree, tree["recipe"]),
@@ -311,7 +312,7 @@ def load(path: str | Path, problem: Problem | None = None) -> Identification:
         raise InputError(f"{path}: {error}") from error
 
 
-def _problem_from_tree(tree: dict[str, Any]) -> Any:
+def _problem_from_tree(tree: dict[str, Any], structure: Structure) -> Any:
     """The problem of a result's tree, or what is there of it."""
     part = tree["problem"]
     try:
@@ -321,7 +322,9 @@ def _problem_from_tree(tree: dict[str, Any]) -> Any:
             raise
         recipe = tree["recipe"]
         module = "" if recipe is None else f" (its problem was made by {recipe['module']})"
-        return PartOfProblem(part, tree["readings"], Records.from_tree(part), f"{error}{module}")
+        read = tree["readings"]
+        attributes = readings.from_tree(read, structure)
+        return PartOfProblem(part, read, Records.from_tree(part), attributes, f"{error}{module}")
 
 
 def _check_records(records: Problem | Records, problem: Problem) -> None:

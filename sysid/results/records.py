@@ -52,11 +52,11 @@ class PartOfProblem:
 
     Attributes
     ----------
-    tree : dict
-        What `Problem.to_tree` made.
-    readings : dict
-        What `sysid.results.readings` made: all that readers of the result ask of the problem.
+    tree, readings : dict
+        What `Problem.to_tree` and `sysid.results.readings` made.
     records : Records
+    attributes : dict
+        All that readers of the result ask of the problem: attributes of `Answer` by their names.
     without : str
         Why the problem cannot be made of it, for a message.
     """
@@ -64,4 +64,5 @@ class PartOfProblem:
     tree: dict[str, Any]
     readings: dict[str, Any]
     records: Records
+    attributes: dict[str, Any]
     without: str

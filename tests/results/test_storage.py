@@ -256,7 +256,9 @@ def test_each_wrong_file_gets_its_own_sentence(tmp_path):
             sysid.load(tmp_path / name)
     with h5py.File(tmp_path / "else.h5", "w") as file:
         file["data"] = [1, 2]
-    with pytest.raises(sysid.InputError, match=r"else\.h5 .*: it is no result of this sysid, but of one before format 3"):
+    with pytest.raises(
+        sysid.InputError, match=r"else\.h5 .*: it is no result of this sysid, but of one before format 3"
+    ):
         sysid.load(tmp_path / "else.h5")
 
 
