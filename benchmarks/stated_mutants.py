@@ -1,0 +1,24 @@
+"""Further wrong changes: of what an answer is said to be worth, and of what is stated before a search."""
+
+from __future__ import annotations
+
+from benchmarks.mutant import Mutant
+
+# None of the tests that there were noticed these.
+MISSED = (
+    Mutant("J01", "deviations of structured models on whole records never raised where misfit exceeds noise",
+        "inflation = 1.0 if as_stated else inflation_of(test, records_of(test, structure, unknowns), unknowns)",
+        "inflation = 1.0",
+        "test_slopes::test_deviations_of_whole_records_grow_with_what_is_left_beyond_the_stated_noise"),
+    Mutant("J02a", "rows of whole records without the derivative of a mode's scale",
+        'd_scale = np.einsum("kdc,kd->kc", d_gamma, estimate.gamma)',
+        'd_scale = 0 * np.einsum("kdc,kd->kc", d_gamma, estimate.gamma)',
+        "test_slopes::test_rows_of_whole_records_are_those_of_their_modes"),
+    Mutant("J02b", "rows of whole records in the estimate's scale where a force gives it",
+        "scale, d_scale = np.sign(scale), np.zeros_like(d_scale)", "pass",
+        "test_slopes::test_rows_of_whole_records_are_those_of_their_modes"),
+    Mutant("J02c", "rows of whole records with the estimate's sign of a mode left out",
+        "scale, d_scale = np.sign(scale), np.zeros_like(d_scale)",
+        "scale, d_scale = np.ones_like(scale), np.zeros_like(d_scale)",
+        "test_slopes::test_rows_of_whole_records_are_those_of_their_modes"),
+)  # fmt: skip
