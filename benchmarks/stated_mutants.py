@@ -21,4 +21,13 @@ MISSED = (
         "scale, d_scale = np.sign(scale), np.zeros_like(d_scale)",
         "scale, d_scale = np.ones_like(scale), np.zeros_like(d_scale)",
         "test_slopes::test_rows_of_whole_records_are_those_of_their_modes"),
+    Mutant("J03a", "chi-squared of whole records over its degrees of freedom, halved",
+        "return 2 * self.chi2 / self.freedom", "return self.chi2 / self.freedom",
+        "test_record_model::test_chi_squared_of_right_modes_and_levels_is_its_degrees_of_freedom"),
+    Mutant("J03b", "likelihood of whole records without the density of their spectra",
+        "np.sum(np.log(own[:c] * chunk.run.density))", "np.sum(np.log(own[:c]))",
+        "test_record_model::test_the_likelihood_is_that_of_the_dense_covariance"),
+    Mutant("J04", "scales of the modes counted among what whole records without a force determine",
+        "return self.size - (0 if self.force else self.m)", "return self.size",
+        "test_record_model::test_unknowns_are_as_many_as_the_records_determine"),
 )  # fmt: skip
