@@ -23,9 +23,10 @@ def floors(second=2.0, dampers=(5.0, 4.0)):
     return sysid.Structure(np.diag([2.0, second, 0.0]), full, damping_matrix=C, n_base=1)
 
 
-def variables():
+def damped():
+    """Dampers a and b, to be found."""
     a, b = (sysid.Variable(name, lower=0.1, upper=50.0, guess=4.0) for name in "ab")
-    return a, b, a * np.eye(2) + b * BETWEEN
+    return a * np.eye(2) + b * BETWEEN
 
 
 def judged(problem, **values):
@@ -47,7 +48,7 @@ def test_records_without_noise_know_no_more_than_the_mass_that_gives_their_scale
     """Accelerations alone: M, K and C are in proportion to a mass of 2 kg that is stated to 25 %, or to 1 %."""
     m = sysid.Variable("m", 2, lower=0.5, upper=9.0, guess=2.1)
     k = sysid.Variable("k", lower=100.0, upper=5e3, guess=820.0)
-    a, b, C = variables()
+    C = damped()
     problem = sysid.Problem(
         sysid.simulate(floors(3.0), FREQ), mass=ca.diag(m), stiffness=k * (np.eye(2) + 0.25 * BETWEEN), damping=C,
         residuals=[sysid.Prior(m[0], 2.0, std)],
@@ -62,7 +63,7 @@ def test_records_without_noise_know_no_more_than_the_mass_that_gives_their_scale
 def test_records_without_noise_know_no_more_than_the_noisy_force_of_a_further_test(noise, known, nothing_else):
     """Accelerations of both are exact; the scale of M, K and C is the force's, at 40 lines."""
     scale = sysid.Variable("scale", lower=0.1, upper=9.0, guess=1.1)
-    a, b, C = variables()
+    C = damped()
     matrices = {"mass": scale * np.diag([2.0, 3.0, 0.0]), "stiffness": scale * floors(3.0).stiffness[:2, :2]}
     rng, clean = np.random.default_rng(3), sysid.simulate(floors(3.0), FREQ[::2], force=True)
     size = noise * np.sqrt(np.mean(np.abs(clean.force) ** 2) / 2)
@@ -79,7 +80,7 @@ def test_records_without_noise_know_no_more_than_the_noisy_force_of_a_further_te
 def test_an_unknown_that_rests_on_either_bound_is_told(lower, upper):
     """The spring has 800 N/m."""
     k = sysid.Variable("spring", lower=lower, upper=upper)
-    a, b, C = variables()
+    C = damped()
     problem = sysid.Problem(
         sysid.simulate(floors(3.0), FREQ), mass=np.diag([2.0, 3.0]), stiffness=k * (np.eye(2) + 0.25 * BETWEEN),
         damping=C,
