@@ -84,4 +84,13 @@ MISSED = (
     Mutant("J15", "Gauss-Newton Hessian without that of the constraints",
         "hessian = hessian + ca.hessian(ca.dot(multipliers, rows), at)[0]", "pass",
         "test_local::TestStarts::test_the_gauss_newton_hessian_holds_the_constraints_own"),
+    Mutant("K01", "what several tests leave at their poles summed, not added in squares",
+        "np.linalg.norm([term.weight * poles.residual for", "np.sum([term.weight * poles.residual for",
+        "test_continuation::test_the_floor_of_several_tests_is_about_what_the_truth_leaves"),
+    Mutant("K02", "what the user's own residuals leave counted against a fit of the tests",
+        "np.sqrt(max(objective**2 - own, 0.0))", "np.sqrt(max(objective**2 + own, 0.0))",
+        "test_continuation::test_what_residuals_of_the_users_leave_does_not_make_a_fit_of_the_tests_worse"),
+    Mutant("K03", "starts that agree on no fit at all are the last word",
+        "and self.problem.residual(best.x) < _OF_SORTS", "",
+        "test_continuation::test_starts_are_unanimous_where_three_end_at_one_fit_of_sorts"),
 )  # fmt: skip
