@@ -215,11 +215,15 @@ def _fit_about(problem: Problem, x: Array, error: InverseFactorError, monitor: I
     skew = z.variable("rotation of modes", np.zeros(n * (n - 1) // 2))
     omega, ratios = spectrum_near(problem, structure, modes_of(structure), z)
     y = ca.vertcat(inverse, loads, base, skew, ca.log(omega), ca.log(ratios))
-    rows = error.totals(inverse, loads, base)
-    if rows.numel():
-        z.constrain(rows)
     objective, derivatives = error.gradient(y, start.psi)[0], _derivatives(z, y, error, start.psi)
     best, status = z.minimize(objective, monitor, limit, derivatives, barrier="monotone")
+    rows = error.totals(inverse, loads, base)
+    if rows.numel() and monitor.stopped is None:
+        # Held from the beginning, totals make local minima on the way.
+        z.start = [best]
+        z.constrain(rows)
+        derivatives = _derivatives(z, y, error, start.psi)
+        best, status = z.minimize(objective, monitor, limit, derivatives, barrier="monotone")
     end = ca.Function("end", [z.z], [*error.modes(y, start.psi), omega, ratios])
     phi, gamma, rigid, omega, ratios = (np.asarray(part) for part in end(best))
     try:
