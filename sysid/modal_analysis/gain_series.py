@@ -14,7 +14,7 @@ from sysid.structure.structure import Array, ComplexArray
 
 _TERMS_MORE = 4  # than the asymptotic rate of the series asks for
 _RANK = 1e-6  # of the largest singular value: directions of the gains below it are left out
-_BLOCK = 32  # candidates whose gains are made at once: those of more leave a processor's cache before they are used
+_BLOCK = 64  # candidates whose gains are made at once: those of more leave a processor's cache before they are used
 _ALIKE = 1e-12  # up to which two base motions count as proportional at all lines
 
 

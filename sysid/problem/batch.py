@@ -3,42 +3,44 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import chain
 
 import casadi as ca
 import numpy as np
 
 from sysid.structure.structure import Array
 
-CHUNK = 64  # candidates a compiled call: fixed, so that the bits do not depend on the swarm's size
+CHUNK = 64  # candidates a call by lines: fixed, so that the bits do not depend on the swarm's size
+_IN_STEP = 128  # candidates that go in step: with more, the virtual machine's memory leaves a processor's cache
+_GAP = 8  # numbers between the entries of a chunk, which a power of two would put in the same lines of a cache
 _MOST_INSTRUCTIONS = 50_000  # of a function that is replayed, which takes some ten microseconds each to set up
 
 
 class Batch:
-    """A CasADi function of one candidate, over a chunk of candidates at once and without conversions.
+    """A CasADi function of one candidate over many candidates, without conversions.
 
-    A function in scalar operations is replayed for all candidates of the chunk in step (`elementwise`), another is
-    called for one after the other. What a candidate gives does not depend on the others, to the last bit. An instance
+    A function in scalar operations is replayed for a chunk of candidates in step (`elementwise`), another is called
+    for one after the other. What a candidate gives does not depend on the others, to the last bit. An instance
     is for one thread at a time; ``copy`` makes one for another thread.
 
     Parameters
     ----------
     function : casadi.Function
-        Dense; of the arrays of one candidate.
+        Of the arrays of one candidate, dense.
     threads : int
         CasADi's own, where candidates are taken one by one; 0 for none.
-    count : int
-        Candidates a chunk.
     """
 
-    def __init__(self, function: ca.Function, threads: int = 0, count: int = CHUNK) -> None:
-        self.count = count
-        self._sizes = [function.size_in(i) for i in range(function.n_in())]
-        self._sizes_out = [function.size_out(i) for i in range(function.n_out())]
+    def __init__(self, function: ca.Function, threads: int = 0) -> None:
         self._in_step = _is_scalar(function)
+        self._chunk = _IN_STEP if self._in_step else CHUNK
         if self._in_step:
-            self._compiled = elementwise(function, count)
+            function = _without_zeros(function)
+            self._compiled = elementwise(function, self._chunk)
         else:
-            self._compiled = function.map(count, "thread", threads) if threads else function.map(count)
+            self._compiled = function.map(self._chunk, "thread", threads) if threads else function.map(self._chunk)
+        self._inputs = [function.sparsity_in(i) for i in range(function.n_in())]
+        self._outputs = [function.sparsity_out(i) for i in range(function.n_out())]
         self._allocate()
 
     def __copy__(self) -> Batch:
@@ -51,28 +53,36 @@ class Batch:
     def _allocate(self) -> None:
         """Memory of inputs and outputs, which CasADi reads and writes in place."""
         self._buffer, self._run = self._compiled.buffer()
-        self._given = [self._place(size) for size in self._sizes]
-        self._made = [self._place(size) for size in self._sizes_out]
-        for i, array in enumerate(self._given):
-            self._buffer.set_arg(i, array.base.data)
-        for i, array in enumerate(self._made):
-            self._buffer.set_res(i, array.base.data)
+        self._given, read = self._places(self._inputs)
+        self._made, written = self._places(self._outputs)
+        for i, memory in enumerate(read):
+            self._buffer.set_arg(i, memory.data)
+        for i, memory in enumerate(written):
+            self._buffer.set_res(i, memory.data)
 
-    def _place(self, size: tuple[int, int]) -> Array:
-        """Memory of one input or output of the chunk, seen as (count, rows, columns)."""
-        rows, columns = size
-        if self._in_step:  # all candidates of an entry side by side, entries column by column
-            return np.zeros((columns, rows, self.count)).transpose(2, 1, 0)
-        return np.zeros((self.count, columns, rows)).transpose(0, 2, 1)
+    def _places(self, matrices: list[ca.Sparsity]) -> tuple[list[Array], list[Array]]:
+        """Memory of inputs or outputs of a chunk, seen as (candidates, rows, columns); and that of each part."""
+        if not self._in_step:
+            memory = [np.zeros((self._chunk, *matrix.shape[::-1])) for matrix in matrices]
+            return [array.swapaxes(1, 2) for array in memory], memory
+        places = [np.zeros((*matrix.shape, self._chunk + _GAP))[..., : self._chunk] for matrix in matrices]
+        entries = [place[i, j] for place, matrix in zip(places, matrices, strict=True)
+                   for i, j in zip(*matrix.get_triplet(), strict=True)]  # fmt: skip
+        return [np.moveaxis(place, -1, 0) for place in places], entries
 
     def __call__(self, *arrays: Array) -> list[Array]:
-        """Outputs (count, rows, columns) of inputs (count, rows) or (count, rows, columns), count up to the chunk's."""
-        count = len(arrays[0])
-        for place, array in zip(self._given, arrays, strict=True):
-            place[:count] = array.reshape(count, *place.shape[1:])
-            place[count:] = place[count - 1]  # the last one again and again fills the chunk
-        self._run()
-        return [np.array(made[:count], order="C") for made in self._made]
+        """Outputs (count, rows, columns) of inputs (count, rows) or (count, rows, columns)."""
+        outputs = [np.empty((len(arrays[0]), *matrix.shape)) for matrix in self._outputs]
+        for start in range(0, len(arrays[0]), self._chunk):
+            chunk = slice(start, start + self._chunk)
+            for place, array in zip(self._given, arrays, strict=True):
+                part = array[chunk]
+                place[: len(part)] = part.reshape(len(part), *place.shape[1:])
+                place[len(part) :] = place[len(part) - 1]  # the last one again and again fills the chunk
+            self._run()
+            for output, made in zip(outputs, self._made, strict=True):
+                output[chunk] = made[: len(output[chunk])]
+        return outputs
 
 
 def elementwise(function: ca.Function, count: int) -> ca.Function:
@@ -89,17 +99,17 @@ def elementwise(function: ca.Function, count: int) -> ca.Function:
     Returns
     -------
     casadi.Function
-        Of matrices (count, entries), a column an entry of an input; to the same of the outputs.
+        Of columns (count,), one an entry of an input, one input after the other; to the same of the outputs. Columns of
+        their own because the virtual machine then reads and writes each where it is needed, and holds fewer.
     """
-    inputs = [ca.MX.sym(f"i{i}", count, function.nnz_in(i)) for i in range(function.n_in())]
-    columns = [ca.horzsplit(symbol) if symbol.numel() else [] for symbol in inputs]
+    inputs = [[ca.MX.sym("i", count) for _ in range(function.nnz_in(i))] for i in range(function.n_in())]
     outputs = [[ca.MX()] * function.nnz_out(i) for i in range(function.n_out())]
     work = [ca.MX()] * function.sz_w()
     for k in range(function.n_instructions()):
         operation, read, write = (of(k) for of in (function.instruction_id, function.instruction_input,
                                                    function.instruction_output))  # fmt: skip
         if operation == ca.OP_INPUT:
-            work[write[0]] = columns[read[0]][read[1]]
+            work[write[0]] = inputs[read[0]][read[1]]
         elif operation == ca.OP_OUTPUT:
             made = work[read[0]]
             outputs[write[0]][write[1]] = made if made.numel() == count else ca.repmat(made, count)
@@ -109,7 +119,13 @@ def elementwise(function: ca.Function, count: int) -> ca.Function:
             work[write[0]] = ca.MX.unary(operation, work[read[0]])
         else:
             work[write[0]] = ca.MX.binary(operation, work[read[0]], work[read[1]])
-    return ca.Function(function.name(), inputs, [ca.horzcat(ca.MX(count, 0), *part) for part in outputs])
+    return ca.Function(function.name(), list(chain(*inputs)), list(chain(*outputs)))
+
+
+def _without_zeros(function: ca.Function) -> ca.Function:
+    """The same function, outputs without the entries that are always zero."""
+    symbols = function.sx_in()
+    return ca.Function(function.name(), symbols, [ca.sparsify(part) for part in function.call(symbols)])
 
 
 def _is_scalar(function: ca.Function) -> bool:

@@ -38,7 +38,7 @@ def batch_modes(H: Array, right: Array, rigid: Array, *base: Array) -> tuple[Arr
     Parameters
     ----------
     H : (count, n, n)
-        ``L^-1 K_SS L^-T``; overwritten where it is not finite.
+        ``L^-1 K_SS L^-T``, the lower triangle at least; overwritten where it is not finite.
     right : (count, n, n + d)
         ``[L^-1, L^-1 B]``.
     rigid : (count, d, d)

@@ -93,7 +93,7 @@ class Matrices:
     def of_modes(self, x: ca.MX) -> list[ca.MX]:
         """What the modes of a candidate follow from, expressions.
 
-        ``H = L^-1 K_SS L^-T`` (n, n), symmetric; ``[L^-1, L^-1 B]`` (n, n + d), with ``B = M_SS G + M_S0``, whose
+        The lower triangle of ``H = L^-1 K_SS L^-T`` (n, n); ``[L^-1, L^-1 B]`` (n, n + d), ``B = M_SS G + M_S0``, whose
         products with the eigenvectors of H are shapes and participations; and the rigid-body mass (d, d). Where M may
         be indefinite also ``L^-1 M_S0`` (n, d) and M_00 (d, d).
         """
@@ -107,7 +107,7 @@ class Matrices:
             coupling = inverse @ M_S0
             loads, rigid = ca.tril(L).T @ G + coupling, G.T @ (M @ G + M_S0) + M_S0.T @ G + M_00
             base = [] if self.semidefinite else [coupling, M_00]
-        return [(H + H.T) / 2, ca.horzcat(inverse, loads), rigid, *base]
+        return [ca.tril((H + H.T) / 2), ca.horzcat(inverse, loads), rigid, *base]
 
     def factors(self, x: ca.MX) -> tuple[ca.MX, ca.MX]:
         """L with ``M_SS = L L'`` and its inverse."""

@@ -20,14 +20,13 @@ import numpy as np
 from sysid.measurement.noise import separable
 from sysid.modal_analysis.gain_series import GainSeries, SummedRecord
 from sysid.modal_analysis.response import records_of, weights_of, weights_of_test
-from sysid.problem.batch import Batch, expanded
+from sysid.problem.batch import CHUNK, Batch, expanded
 from sysid.problem.batch_modes import BatchModes, batch_modes
 from sysid.problem.problem import Problem
 from sysid.problem.terms import Term, TestTerm
 from sysid.structure.structure import Array
 
-_MOST = 60_000  # coordinates a chunk: fewer take more calls of NumPy for each, and more leave a processor's cache
-_WIDEST = 256  # candidates a chunk: with more, CasADi's virtual machine has nothing to gain
+_MOST = 65_000  # coordinates a chunk: fewer take more calls of NumPy for each, and more leave a processor's cache
 _STEP = 16  # chunks are multiples of it, because BLAS's products round alike at each of so many places
 _MOST_THREADS = 8
 # Relative squared error below which lines are summed: the difference of large numbers that stands for it has lost
@@ -85,8 +84,7 @@ class HeldSpectrumObjective:
         threads: int | None = None,
     ) -> None:
         test = term.test
-        self._most = min(_STEP * math.ceil(_MOST / (_STEP * problem.n_variables)), _WIDEST)
-        batch, workers = Batch(expansion, count=self._most), threads or min(os.cpu_count() or 1, _MOST_THREADS)
+        batch, workers = Batch(expansion), threads or min(os.cpu_count() or 1, _MOST_THREADS)
         self._share = term.weight**2
         self._series = GainSeries(test.freq, np.sort(spectrum), *_range_of_ratios(problem, batch), shift=term.shift)
         recovery = term.matrices.recovery, np.eye(problem.geometry.d)
@@ -115,7 +113,7 @@ class HeldSpectrumObjective:
         by_lines : callable
             The same summed over lines, for candidates near the records and those outside of the range of damping.
         """
-        ends = chunk_ends(len(particles), self._most)
+        ends = chunk_ends(*particles.shape)
         chunks = self._pool.map(partial(self._chunk, particles), [0, *ends[:-1]], ends)
         squared, inside = map(np.concatenate, zip(*chunks, strict=True))
         held = np.logical_and(inside, squared > self._least)
@@ -140,21 +138,16 @@ class HeldSpectrumObjective:
         return np.sum([record.squared(*made(modes), polynomials) / size for (record, size), made in parts], axis=0)
 
 
-def chunk_ends(count: int, most: int) -> list[int]:
-    """Where chunks of at most so many candidates end: an even number, nearly equal, the same for any number of threads.
+def chunk_ends(count: int, size: int) -> list[int]:
+    """Where chunks of candidates of this size end: an even number, nearly equal, the same for any number of threads.
 
-    Parameters
-    ----------
-    count : int
-    most : int
-        A multiple of 16.
-
-    >>> chunk_ends(781, 256), chunk_ends(3, 256)
+    >>> chunk_ends(781, 156), chunk_ends(3, 156)
     ([192, 384, 576, 784], [16])
     """
-    steps = math.ceil(count / _STEP)
-    chunks = min(2 * math.ceil(count / (2 * most)), steps)
-    return [_STEP * (i * steps // chunks) for i in range(1, chunks + 1)]
+    steps = math.ceil(count / CHUNK)
+    chunks = min(2 * math.ceil(count * size / (2 * _MOST)), steps)
+    ends = [CHUNK * (i * steps // chunks) for i in range(1, chunks)]
+    return [*ends, _STEP * math.ceil(count / _STEP)]
 
 
 def _range_of_ratios(problem: Problem, expansion: Batch) -> tuple[Array, Array]:
@@ -164,10 +157,7 @@ def _range_of_ratios(problem: Problem, expansion: Batch) -> tuple[Array, Array]:
     """
     lower, upper = problem.lower, problem.upper
     draws = np.random.default_rng(0).uniform(lower, upper, (_DRAWS, problem.n_variables))
-    rows = np.vstack([lower, upper, draws])
-    ratios = np.concatenate(
-        [expansion(rows[at : at + expansion.count])[0][..., 0] for at in range(0, len(rows), expansion.count)]
-    )
+    ratios = expansion(np.vstack([lower, upper, draws]))[0][..., 0]
     highest = np.nanmax(ratios, axis=0)
     return np.maximum(np.nanmin(ratios, axis=0), highest / _WIDEST_RANGE), highest
 

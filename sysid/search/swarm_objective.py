@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
-from sysid.problem.batch import Batch, expanded, in_chunks
+from sysid.problem.batch import Batch, expanded
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.search.held_spectrum_objective import held_spectrum_objective
@@ -63,7 +63,7 @@ class SwarmObjective:
 
     def _x(self, particles: Array) -> Array:
         """Unknowns of each row, (n_particles, n_variables)."""
-        return in_chunks(lambda chunk: self._all_unknowns(chunk)[0][:, :, 0], particles)
+        return self._all_unknowns(particles)[0][:, :, 0]
 
     def _by_lines(self, particles: Array) -> Array:
         """The first term's part of the squared objective, summed over all lines, (n_particles,)."""
