@@ -41,7 +41,7 @@ def held_spectrum_objective(
 ) -> HeldSpectrumObjective | None:
     """The fast objective of the problem's own test; None where it does not apply.
 
-    It does where all natural frequencies are held and all expressions of the models are scalar operations.
+    It does where all natural frequencies are held.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def held_spectrum_objective(
     x = unknowns(s)
     parts = [matrices.ratio_function(x, ca.DM(np.sort(spectrum))), *matrices.of_modes(x)]
     expansion = expanded(ca.Function("expansion", [s], [ca.densify(part) for part in parts]))
-    return HeldSpectrumObjective(problem, term, spectrum, expansion) if expansion.is_a("SXFunction") else None
+    return HeldSpectrumObjective(problem, term, spectrum, expansion)
 
 
 class HeldSpectrumObjective:
@@ -85,7 +85,7 @@ class HeldSpectrumObjective:
     ) -> None:
         test = term.test
         batch, workers = Batch(expansion), threads or min(os.cpu_count() or 1, _MOST_THREADS)
-        self._share = term.weight**2
+        self.expansion, self._share = expansion, term.weight**2
         self._series = GainSeries(test.freq, np.sort(spectrum), *_range_of_ratios(problem, batch), shift=term.shift)
         recovery = term.matrices.recovery, np.eye(problem.geometry.d)
         self._records: list[tuple[SummedRecord, float]] = []
