@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from sysid.errors import InputError
+from sysid.nlp import quiet_options
 from sysid.structure.structure import Array
 from sysid.structure.triangular import lower_entries, lower_triangle, triangle, triangle_entries
 
@@ -32,14 +33,14 @@ class Refinement:
     error : float
         Largest relative difference of the replaced eigenvalues from their targets.
     success : bool
-    message : str
-        The solver's status, or how the closed form went.
+    status : str
+        IPOPT's own, and whether it missed the spectrum; "closed-form" of that.
     """
 
     factor: Array
     error: float
     success: bool
-    message: str
+    status: str
 
 
 def replace_spectrum(lam: Array, targets: Array) -> Array:
@@ -74,7 +75,7 @@ def closed_form(factor: Array, targets: Array) -> Refinement:
         Measured circular frequencies, rad/s.
     """
     targets = _check(factor, targets)
-    return _finish(nearest_factors(factor[None], targets)[0], targets, True, "closed form")
+    return _finish(nearest_factors(factor[None], targets)[0], targets, True, "closed-form")
 
 
 def seconds_to_begin(n: int) -> float:
@@ -104,12 +105,12 @@ def by_ipopt(factor: Array, targets: Array, max_time: float | None = None) -> Re
             (1 + 1e-6) * (targets[-1] / unit[m:]) ** 2,  # what is not replaced stays above what is
         ]
     )
-    solver = _programme(n, m, max_time)
+    solver = _solver(n, m, max_time)
     solution = solver(x0=start, lbx=lower, ubx=np.inf, lbg=0, ubg=0, p=np.concatenate([unit / scale, unit]))
     status = solver.stats()["return_status"]
     refined = triangle(np.asarray(solution["x"]).ravel()[: rows[0].size], n) * scale
-    answer = _finish(refined, targets, status in SOLVED, f"IPOPT: {status}")
-    return answer if answer.error < _REACHED else replace(answer, success=False)
+    answer = _finish(refined, targets, status in SOLVED, status)
+    return answer if answer.error < _REACHED else replace(answer, success=False, status=f"{status}, spectrum missed")
 
 
 def _check(factor: Array, targets: Array) -> Array:
@@ -124,31 +125,57 @@ def _units(own: Array, targets: Array) -> Array:
     return np.concatenate([targets, np.maximum(own[targets.size :], targets[-1])])
 
 
+@dataclass(frozen=True, eq=False)
+class Programme:
+    """Eq. 31 as IPOPT is given it: z = (entries of L_H / scale, Psi by columns, lam), p = (unit / scale, unit).
+
+    Attributes
+    ----------
+    nlp : dict
+        z, p, the squared distance of the spectrum, and the ties, which are zero.
+    derivatives : dict of casadi.Function
+        The gradient, the Jacobian of the ties, and the upper triangle of the Lagrangian's Hessian, as `nlpsol` names
+        them; exact.
+    """
+
+    nlp: dict[str, ca.SX]
+    derivatives: dict[str, ca.Function]
+
+
 @lru_cache(maxsize=16)
-def _programme(n: int, m: int, max_time: float | None = None) -> ca.Function:
-    """IPOPT programme of n eigenvalues with the lowest m given; parameters: unit / scale, unit (n each)."""
+def programme(n: int, m: int) -> Programme:
+    """The nonlinear programme of n eigenvalues with the lowest m given, and its derivatives, which are made once."""
     x = ca.SX.sym("x", n * (n + 1) // 2)
     psi, lam = ca.SX.sym("psi", n, n), ca.SX.sym("lam", n)
     relative, unit = ca.SX.sym("relative", n), ca.SX.sym("unit", n)
     half = lower_triangle(x, n).T @ psi @ ca.diag(1 / relative)
-    ties = ca.vertcat(lower_entries(psi.T @ psi - ca.SX.eye(n)), lower_entries(half.T @ half - ca.diag(lam)))
-    nlp = {
-        "x": ca.vertcat(x, ca.vec(psi), lam),
-        "p": ca.vertcat(relative, unit),
-        "f": ca.sumsqr(lam[:m] - 1),
-        "g": ties,
+    f = ca.sumsqr(lam[:m] - 1)
+    g = ca.vertcat(lower_entries(psi.T @ psi - ca.SX.eye(n)), lower_entries(half.T @ half - ca.diag(lam)))
+    z, p = ca.vertcat(x, ca.vec(psi), lam), ca.vertcat(relative, unit)
+    weight, multipliers = ca.SX.sym("weight"), ca.SX.sym("multipliers", g.numel())
+    hessian = ca.triu(ca.hessian(weight * f + ca.dot(multipliers, g), z)[0])
+    derivatives = {
+        "grad_f": ca.Function("grad_f", [z, p], [f, ca.gradient(f, z)]),
+        "jac_g": ca.Function("jac_g", [z, p], [g, ca.jacobian(g, z)]),
+        "hess_lag": ca.Function("hess_lag", [z, p, weight, multipliers], [hessian]),
     }
-    options = {
-        "print_time": False,
-        "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-13, "constr_viol_tol": 1e-13, "max_iter": 300}
-        | ({} if max_time is None else {"max_wall_time": max_time}),
-    }
-    return ca.nlpsol("refinement", "ipopt", nlp, options)
+    return Programme({"x": z, "p": p, "f": f, "g": g}, derivatives)
 
 
-def _finish(factor: Array, targets: Array, success: bool, message: str) -> Refinement:
-    factor = factor * np.where(np.diag(factor) < 0, -1.0, 1.0)
+def _solver(n: int, m: int, max_time: float | None) -> ca.Function:
+    """IPOPT on the programme; with its derivatives made, a millisecond's work."""
+    made, limits = programme(n, m), {} if max_time is None else {"max_wall_time": max_time}
+    quiet = quiet_options(300, tol=1e-13, constr_viol_tol=1e-13, **limits)
+    return ca.nlpsol("refinement", "ipopt", made.nlp, {**quiet, **made.derivatives})
+
+
+def spectrum_error(factor: Array, targets: Array) -> float:
+    """Largest relative difference of the lowest eigenvalues of ``L_H L_H'`` from the squared `targets`."""
     # Singular values, not eigenvalues of L L': full relative accuracy needs no squares.
     own = np.sort(np.linalg.svd(factor, compute_uv=False))
-    error = float(np.max(np.abs((own[: targets.size] / targets) ** 2 - 1)))
-    return Refinement(factor, error, success, message)
+    return float(np.max(np.abs((own[: targets.size] / np.sort(targets)) ** 2 - 1)))
+
+
+def _finish(factor: Array, targets: Array, success: bool, status: str) -> Refinement:
+    factor = factor * np.where(np.diag(factor) < 0, -1.0, 1.0)
+    return Refinement(factor, spectrum_error(factor, targets), success, status)
