@@ -1,13 +1,14 @@
 """Eigenvalue refinement: give ``H = L_H L_H'`` the measured spectrum (Cerini et al. 2024, eq. 31).
 
-Two ways, both from the candidate's own L_H: the closed form, which is the nearest such matrix, and
-the paper's nonlinear programme, through IPOPT with exact derivatives.
+Two ways, both from the candidate's own L_H: the closed form, which is the nearest such matrix, and the paper's
+nonlinear programme in the entries of L_H, through IPOPT with exact gradient and Hessian.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -15,11 +16,12 @@ import numpy as np
 from sysid.errors import InputError
 from sysid.nlp import quiet_options
 from sysid.structure.structure import Array
-from sysid.structure.triangular import lower_entries, lower_triangle, triangle, triangle_entries
+from sysid.structure.triangular import triangle, triangle_entries
 
 SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")  # IPOPT's statuses that count as success
 _REACHED = 1e-8  # relative error of an eigenvalue up to which it counts as the target
-_SECONDS, _POWER = 5.0, 6.5  # of a processor, that the graphs of 14 eigenvalues take, and how that grows with them
+_LEAST = 1e-6  # diagonal entry of L_H over the highest target: a singular L_H has no slope towards a regular one
+_APART = 1e-12  # eigenvalues over the highest one, that count as apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,39 +80,81 @@ def closed_form(factor: Array, targets: Array) -> Refinement:
     return _finish(nearest_factors(factor[None], targets)[0], targets, True, "closed-form")
 
 
-def seconds_to_begin(n: int) -> float:
-    """About how long the graphs of `by_ipopt` take, once for n eigenvalues."""
-    return float(_SECONDS * (n / 14) ** _POWER)
-
-
 def by_ipopt(factor: Array, targets: Array, max_time: float | None = None) -> Refinement:
     """Minimise the distance of the spectrum to the target from the candidate's own factor (the paper's way).
 
-    Eq. 31 is minimised in squares, relative to each target (its square root has no derivative at
-    its own solution). Eigenvalues enter as unknowns beside the eigenvectors, tied to L_H by
-    ``Psi' Psi = I`` and ``Psi' L_H L_H' Psi = diag(lam)``: polynomials, exact to any derivative, and with
-    independent gradients even where eigenvalues repeat, because L_H is free to move. `max_time` is IPOPT's own, s.
+    Eq. 31 is minimised as `SpectrumDistance` has it, over the entries of L_H alone. `max_time` is IPOPT's own, s.
     """
     targets = _check(factor, targets)
-    n, m = factor.shape[0], targets.size
-    lam, psi = np.linalg.eigh(factor @ factor.T)
-    unit = _units(np.sqrt(np.maximum(lam, np.finfo(float).tiny)), targets)
-    scale = unit[-1]
-    rows = np.tril_indices(n)
-    start = np.concatenate([triangle_entries(factor) / scale, psi.ravel(order="F"), lam / unit**2])
-    lower = np.concatenate(
-        [
-            np.where(rows[0] == rows[1], 1e-6, -np.inf),
-            np.full(n * n + m, -np.inf),
-            (1 + 1e-6) * (targets[-1] / unit[m:]) ** 2,  # what is not replaced stays above what is
-        ]
-    )
-    solver = _solver(n, m, max_time)
-    solution = solver(x0=start, lbx=lower, ubx=np.inf, lbg=0, ubg=0, p=np.concatenate([unit / scale, unit]))
-    status = solver.stats()["return_status"]
-    refined = triangle(np.asarray(solution["x"]).ravel()[: rows[0].size], n) * scale
-    answer = _finish(refined, targets, status in SOLVED, status)
+    n, scale = factor.shape[0], targets[-1]
+    distance = SpectrumDistance(n, targets / scale)
+    rows, columns = np.tril_indices(n)
+    solver, start = _Solver(distance, max_time), triangle_entries(factor) / scale
+    x, status = solver.minimum(start, np.where(rows == columns, _LEAST, -np.inf))
+    answer = _finish(triangle(x, n) * scale, targets, status in SOLVED, status)
     return answer if answer.error < _REACHED else replace(answer, success=False, status=f"{status}, spectrum missed")
+
+
+class SpectrumDistance:
+    """Squared relative distance ``sum_k (lam_k / w_k² - 1)²`` of the lowest eigenvalues of ``L_H L_H'`` from targets.
+
+    Eq. 31 itself is the root of a sum of squares, which has no derivative at its own solution. A function of the
+    eigenvalues is as smooth as it is symmetric in those that coincide (Lewis and Sendov, SIAM J. Matrix Anal. Appl. 23
+    (2001) 368-386): this one where coinciding eigenvalues have the same target, and so at its solutions. With
+    f = sum_k f_k(lam_k) and T_jk = psi_j' dH psi_k its second differential in H is ``sum_jk F_jk T_jk²``, F_jk being
+    the divided difference of f_j' and f_k' at lam_j and lam_k.
+
+    Parameters
+    ----------
+    n : int
+    targets : (m,), m <= n
+        Circular frequencies, ascending, in the unit of L_H.
+    """
+
+    def __init__(self, n: int, targets: Array) -> None:
+        self.rows, self.columns = np.tril_indices(n)
+        self._n, self._m = n, targets.size
+        self._bend = np.zeros(n)  # of f_k; zero for what has no target
+        self._bend[: self._m] = 2 / targets**4
+        self._slope = np.zeros(n)  # of f_k at zero
+        self._slope[: self._m] = -2 / targets**2
+        self._at: Array = np.full(self.rows.size, np.nan)
+
+    def _decompose(self, x: Array) -> tuple[Array, Array, Array]:
+        """L_H, and the eigenvalues and eigenvectors of H; kept for the next call with the same x."""
+        if not np.array_equal(x, self._at):
+            factor = triangle(x, self._n)
+            # Singular values: the least eigenvalues of L L' drown in the round-off of the highest.
+            psi, sigma, _ = np.linalg.svd(factor)
+            self._at, self._parts = x.copy(), (factor, sigma[::-1] ** 2, psi[:, ::-1])
+        return self._parts
+
+    def value(self, x: Array) -> float:
+        """The squared distance at entries x of L_H, row by row."""
+        lam = self._decompose(x)[1]
+        return float(np.sum((-lam * self._slope / 2 - 1)[: self._m] ** 2))
+
+    def gradient(self, x: Array) -> Array:
+        """Its gradient, the lower triangle of ``2 Psi diag(f') Psi' L_H``."""
+        factor, lam, psi = self._decompose(x)
+        full: Array = 2 * ((psi * (self._bend * lam + self._slope)) @ psi.T) @ factor
+        return full[self.rows, self.columns]
+
+    def hessian(self, x: Array) -> Array:
+        """Its Hessian: the curvature of the distance in H, and that of H in L_H along the slope."""
+        factor, lam, psi = self._decompose(x)
+        slope, bend = self._bend * lam + self._slope, self._bend
+        apart = lam[:, None] - lam
+        least = _APART * lam[-1]  # two that coincide and differ in their targets: a kink, very bent
+        apart = np.where(np.abs(apart) < least, np.copysign(least, apart), apart)
+        alike = (bend[:, None] == bend) & (self._slope[:, None] == self._slope)
+        divided = np.where(alike, bend, (slope[:, None] - slope) / apart)
+        sides = psi[self.rows][:, :, None] * (factor.T @ psi)[self.columns][:, None, :]
+        turned = (sides + sides.swapaxes(1, 2)).reshape(self.rows.size, -1)  # T of each entry of L_H
+        along = 2 * (psi * slope) @ psi.T
+        same = self.columns[:, None] == self.columns
+        hessian: Array = (turned * divided.ravel()) @ turned.T + along[np.ix_(self.rows, self.rows)] * same
+        return hessian
 
 
 def _check(factor: Array, targets: Array) -> Array:
@@ -120,53 +164,63 @@ def _check(factor: Array, targets: Array) -> Array:
     return targets
 
 
-def _units(own: Array, targets: Array) -> Array:
-    """Circular frequency that each eigenvalue is measured in: its target, or its own."""
-    return np.concatenate([targets, np.maximum(own[targets.size :], targets[-1])])
+class _Solver:
+    """IPOPT on a distance, with the distance's own derivatives."""
+
+    def __init__(self, distance: SpectrumDistance, max_time: float | None) -> None:
+        size = distance.rows.size
+        x, none, one = ca.Sparsity.dense(size), ca.Sparsity(0, 0), ca.Sparsity.dense(1)
+        value = _InNumbers(lambda at: [distance.value(at)], [x], [one])
+        # Kept, as CasADi does not: without them the solver would call what is gone.
+        self._derivatives = {
+            "grad_f": _InNumbers(lambda at, _: [distance.value(at), distance.gradient(at)], [x, none], [one, x]),
+            "hess_lag": _InNumbers(
+                lambda at, _, weight, __: [np.triu(float(weight[0]) * distance.hessian(at))],
+                [x, none, one, ca.Sparsity.dense(0, 1)], [ca.Sparsity.upper(size)],
+            ),
+        }  # fmt: skip
+        self._value, z = value, ca.MX.sym("x", size)
+        limits = {} if max_time is None else {"max_wall_time": max_time}
+        # Relative squares need no scaling of IPOPT's; a slope of 1e-9 leaves errors below that.
+        options = quiet_options(300, tol=1e-9, nlp_scaling_method="none", **limits)
+        self._solve = ca.nlpsol("refinement", "ipopt", {"x": z, "f": value(z)}, {**options, **self._derivatives})
+
+    def minimum(self, start: Array, lower: Array) -> tuple[Array, str]:
+        """Where it ends, and IPOPT's status."""
+        end = np.asarray(self._solve(x0=start, lbx=lower)["x"]).ravel()
+        return end, str(self._solve.stats()["return_status"])
 
 
-@dataclass(frozen=True, eq=False)
-class Programme:
-    """Eq. 31 as IPOPT is given it: z = (entries of L_H / scale, Psi by columns, lam), p = (unit / scale, unit).
+class _InNumbers(ca.Callback):
+    """A function of NumPy as CasADi calls it: columns in, and numbers, columns or triangular matrices out."""
 
-    Attributes
-    ----------
-    nlp : dict
-        z, p, the squared distance of the spectrum, and the ties, which are zero.
-    derivatives : dict of casadi.Function
-        The gradient, the Jacobian of the ties, and the upper triangle of the Lagrangian's Hessian, as `nlpsol` names
-        them; exact.
-    """
+    def __init__(
+        self, function: Callable[..., list[Any]], inputs: list[ca.Sparsity], outputs: list[ca.Sparsity]
+    ) -> None:
+        ca.Callback.__init__(self)
+        self._function, self._inputs, self._outputs = function, inputs, outputs
+        self.construct("in_numbers", {})
 
-    nlp: dict[str, ca.SX]
-    derivatives: dict[str, ca.Function]
+    def get_n_in(self) -> int:
+        """How many it takes."""
+        return len(self._inputs)
 
+    def get_n_out(self) -> int:
+        """How many it gives."""
+        return len(self._outputs)
 
-@lru_cache(maxsize=16)
-def programme(n: int, m: int) -> Programme:
-    """The nonlinear programme of n eigenvalues with the lowest m given, and its derivatives, which are made once."""
-    x = ca.SX.sym("x", n * (n + 1) // 2)
-    psi, lam = ca.SX.sym("psi", n, n), ca.SX.sym("lam", n)
-    relative, unit = ca.SX.sym("relative", n), ca.SX.sym("unit", n)
-    half = lower_triangle(x, n).T @ psi @ ca.diag(1 / relative)
-    f = ca.sumsqr(lam[:m] - 1)
-    g = ca.vertcat(lower_entries(psi.T @ psi - ca.SX.eye(n)), lower_entries(half.T @ half - ca.diag(lam)))
-    z, p = ca.vertcat(x, ca.vec(psi), lam), ca.vertcat(relative, unit)
-    weight, multipliers = ca.SX.sym("weight"), ca.SX.sym("multipliers", g.numel())
-    hessian = ca.triu(ca.hessian(weight * f + ca.dot(multipliers, g), z)[0])
-    derivatives = {
-        "grad_f": ca.Function("grad_f", [z, p], [f, ca.gradient(f, z)]),
-        "jac_g": ca.Function("jac_g", [z, p], [g, ca.jacobian(g, z)]),
-        "hess_lag": ca.Function("hess_lag", [z, p, weight, multipliers], [hessian]),
-    }
-    return Programme({"x": z, "p": p, "f": f, "g": g}, derivatives)
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Shape of what it takes."""
+        return self._inputs[i]
 
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        """Shape of what it gives."""
+        return self._outputs[i]
 
-def _solver(n: int, m: int, max_time: float | None) -> ca.Function:
-    """IPOPT on the programme; with its derivatives made, a millisecond's work."""
-    made, limits = programme(n, m), {} if max_time is None else {"max_wall_time": max_time}
-    quiet = quiet_options(300, tol=1e-13, constr_viol_tol=1e-13, **limits)
-    return ca.nlpsol("refinement", "ipopt", made.nlp, {**quiet, **made.derivatives})
+    def eval(self, arguments: list[ca.DM]) -> list[ca.DM]:
+        """Call the function."""
+        results = self._function(*(np.asarray(argument).ravel() for argument in arguments))
+        return [ca.project(ca.DM(result), shape) for result, shape in zip(results, self._outputs, strict=True)]
 
 
 def spectrum_error(factor: Array, targets: Array) -> float:

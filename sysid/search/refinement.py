@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sysid.models.spectrum import seconds_to_begin, spectrum_error
+from sysid.models.spectrum import spectrum_error
 from sysid.problem.problem import Problem
 from sysid.search.session import Session
 from sysid.structure.structure import Array
@@ -97,7 +97,7 @@ class Refiner:
         """What refines a new leader, in the swarm's coordinates, for an objective of rows."""
 
         def refine(row: Array, cost: float) -> tuple[Array, float]:
-            if not self._may_try():
+            if self.session.is_over:
                 return row, cost
             solved, statuses = self._refined(row[None], by_solver=True)
             self.tally.tried += 1
@@ -112,18 +112,6 @@ class Refiner:
             return (rows[0], min(float(of_closed), cost)) if of_closed <= (1 + _ROUND_OFF) * cost else (row, cost)
 
         return refine
-
-    def _may_try(self) -> bool:
-        """Whether there is time for IPOPT."""
-        session, seconds = self.session, seconds_to_begin(self.problem.geometry.n)
-        if session.is_over:
-            return False
-        if self.tally.tried or session.allows(seconds):
-            return True
-        if not session.left_out:
-            session.log(f"leaders refined in closed form alone, as IPOPT takes some {seconds:.1g} s to set up")
-        session.left_out = True
-        return False
 
     def _refined(self, rows: Array, *, by_solver: bool) -> tuple[Array, tuple[str, ...]]:
         """Rows with refined entries of L_H, and IPOPT's status of each."""

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from sysid.errors import SolverError, choice, flag, instance, number, text, whole_number
 from sysid.modal_analysis.response import error_of_accelerations
-from sysid.models.spectrum import seconds_to_begin
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.search import local
@@ -57,8 +56,8 @@ class Swarm:
         Give each candidate the measured spectrum, from its own L_H (eq. 31).
     refine_by : {"closed-form", "ipopt", "leaders"}
         The nearest matrix of that spectrum; or the paper's nonlinear programme by IPOPT with exact derivatives for each
-        candidate, which is for small problems (some 5 ms a candidate with 4 sensors, 10 ms with 6, 0.1 s with 10); or
-        the closed form, and IPOPT on each new leader of the swarm: the better of both is written back to the leader.
+        candidate, which is for small problems (some 15 ms a candidate with 4 or 6 sensors, 30 ms with 10); or the
+        closed form, and IPOPT on each new leader of the swarm: the better of both is written back to the leader.
         Where IPOPT does not succeed the closed form stands; the history counts how it ended.
     write_back : bool
         Whether the refined L_H takes the candidate's place in the swarm, or serves its objective alone. The paper does
@@ -332,8 +331,6 @@ class _Search:
         problem, options = self.problem, self.options
         particles = options.n_particles or 5 * problem.n_variables
         seconds = _SAMPLE * particles * problem.n_variables
-        if options.refine_by == "ipopt":
-            seconds += seconds_to_begin(problem.geometry.n)
         if not self.session.allows(seconds):
             raise Stop(f"a swarm of {particles} particles takes some {seconds:.1g} s to begin: too little time")
 
