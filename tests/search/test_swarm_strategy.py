@@ -153,7 +153,7 @@ class TestPublished:
         np.testing.assert_allclose(
             result.structure.natural_frequencies, problem.reference.natural_frequencies, rtol=1e-7
         )
-        closed = sysid.identify(problem, strategy=sysid.Swarm(**{**few, "refine_by": "closed form"}), rng=0)
+        closed = sysid.identify(problem, strategy=sysid.Swarm(**{**few, "refine_by": "closed-form"}), rng=0)
         # Another solution of eq. 31 than the nearest matrix: the same particles have other objectives.
         assert result.history.start != pytest.approx(closed.history.start, rel=1e-6)
 
