@@ -9,7 +9,7 @@ import numpy as np
 import sysid
 from benchmarks.line import Line, above, below
 from benchmarks.problem_modules import load_module
-from benchmarks.swarm import controls
+from benchmarks.swarm import controls, refinement_by_ipopt
 from sysid.search.cholesky_coordinates import CholeskyError
 
 SEEDS = range(9100, 9110)
@@ -36,6 +36,7 @@ def lines(reduced: bool) -> Iterator[Line]:
         if not reduced:
             yield from controls.lines(what, sysid.Swarm.published(), results, seeds)
     yield below("exact Hessian against differences of the gradient, 5 random points, n = 6, relative", _hessian(), 1e-6)
+    yield from refinement_by_ipopt.lines(reduced)
 
 
 def _sound(what: str, problem: sysid.Problem, fits: list[sysid.Identification]) -> Iterator[Line]:

@@ -89,7 +89,7 @@ def by_ipopt(factor: Array, targets: Array, max_time: float | None = None) -> Re
     n, scale = factor.shape[0], targets[-1]
     distance = SpectrumDistance(n, targets / scale)
     rows, columns = np.tril_indices(n)
-    solver, start = _Solver(distance, max_time), triangle_entries(factor) / scale
+    solver, start = Solver(distance, max_time), triangle_entries(factor) / scale
     x, status = solver.minimum(start, np.where(rows == columns, _LEAST, -np.inf))
     answer = _finish(triangle(x, n) * scale, targets, status in SOLVED, status)
     return answer if answer.error < _REACHED else replace(answer, success=False, status=f"{status}, spectrum missed")
@@ -118,6 +118,8 @@ class SpectrumDistance:
         self._bend[: self._m] = 2 / targets**4
         self._slope = np.zeros(n)  # of f_k at zero
         self._slope[: self._m] = -2 / targets**2
+        self._alike = np.equal.outer(self._bend, self._bend)  # with the same target, or none
+        self._same = np.equal.outer(self.columns, self.columns)
         self._at: Array = np.full(self.rows.size, np.nan)
 
     def _decompose(self, x: Array) -> tuple[Array, Array, Array]:
@@ -147,13 +149,11 @@ class SpectrumDistance:
         apart = lam[:, None] - lam
         least = _APART * lam[-1]  # two that coincide and differ in their targets: a kink, very bent
         apart = np.where(np.abs(apart) < least, np.copysign(least, apart), apart)
-        alike = (bend[:, None] == bend) & (self._slope[:, None] == self._slope)
-        divided = np.where(alike, bend, (slope[:, None] - slope) / apart)
+        divided = np.where(self._alike, bend, (slope[:, None] - slope) / apart)
         sides = psi[self.rows][:, :, None] * (factor.T @ psi)[self.columns][:, None, :]
         turned = (sides + sides.swapaxes(1, 2)).reshape(self.rows.size, -1)  # T of each entry of L_H
         along = 2 * (psi * slope) @ psi.T
-        same = self.columns[:, None] == self.columns
-        hessian: Array = (turned * divided.ravel()) @ turned.T + along[np.ix_(self.rows, self.rows)] * same
+        hessian: Array = (turned * divided.ravel()) @ turned.T + along[np.ix_(self.rows, self.rows)] * self._same
         return hessian
 
 
@@ -164,18 +164,19 @@ def _check(factor: Array, targets: Array) -> Array:
     return targets
 
 
-class _Solver:
+class Solver:
     """IPOPT on a distance, with the distance's own derivatives."""
 
     def __init__(self, distance: SpectrumDistance, max_time: float | None) -> None:
         size = distance.rows.size
         x, none, one = ca.Sparsity.dense(size), ca.Sparsity(0, 0), ca.Sparsity.dense(1)
         value = _InNumbers(lambda at: [distance.value(at)], [x], [one])
+        below = np.tril_indices(size)  # by rows, as CasADi stores the upper triangle of a symmetric matrix by columns
         # Kept, as CasADi does not: without them the solver would call what is gone.
-        self._derivatives = {
+        self.derivatives = {
             "grad_f": _InNumbers(lambda at, _: [distance.value(at), distance.gradient(at)], [x, none], [one, x]),
             "hess_lag": _InNumbers(
-                lambda at, _, weight, __: [np.triu(float(weight[0]) * distance.hessian(at))],
+                lambda at, _, weight, __: [float(weight) * distance.hessian(at)[below]],
                 [x, none, one, ca.Sparsity.dense(0, 1)], [ca.Sparsity.upper(size)],
             ),
         }  # fmt: skip
@@ -183,7 +184,7 @@ class _Solver:
         limits = {} if max_time is None else {"max_wall_time": max_time}
         # Relative squares need no scaling of IPOPT's; a slope of 1e-9 leaves errors below that.
         options = quiet_options(300, tol=1e-9, nlp_scaling_method="none", **limits)
-        self._solve = ca.nlpsol("refinement", "ipopt", {"x": z, "f": value(z)}, {**options, **self._derivatives})
+        self._solve = ca.nlpsol("refinement", "ipopt", {"x": z, "f": value(z)}, {**options, **self.derivatives})
 
     def minimum(self, start: Array, lower: Array) -> tuple[Array, str]:
         """Where it ends, and IPOPT's status."""
@@ -192,7 +193,7 @@ class _Solver:
 
 
 class _InNumbers(ca.Callback):
-    """A function of NumPy as CasADi calls it: columns in, and numbers, columns or triangular matrices out."""
+    """A function of NumPy as CasADi calls it: of a column and other matrices, to the entries of what it gives."""
 
     def __init__(
         self, function: Callable[..., list[Any]], inputs: list[ca.Sparsity], outputs: list[ca.Sparsity]
@@ -219,8 +220,8 @@ class _InNumbers(ca.Callback):
 
     def eval(self, arguments: list[ca.DM]) -> list[ca.DM]:
         """Call the function."""
-        results = self._function(*(np.asarray(argument).ravel() for argument in arguments))
-        return [ca.project(ca.DM(result), shape) for result, shape in zip(results, self._outputs, strict=True)]
+        results = self._function(np.array(arguments[0].nonzeros()), *arguments[1:])
+        return [ca.DM(shape, result) for result, shape in zip(results, self._outputs, strict=True)]
 
 
 def spectrum_error(factor: Array, targets: Array) -> float:
