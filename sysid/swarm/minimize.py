@@ -261,7 +261,9 @@ class _Search:
         if self.on_leader is None or not math.isfinite(swarm.best_cost):
             return
         if self.led is None or not np.array_equal(self.led, swarm.best_x):
-            swarm.replace_best(*self.on_leader(swarm.best_x, swarm.best_cost))
+            point, cost = self.on_leader(swarm.best_x, swarm.best_cost)
+            if cost != swarm.best_cost or not np.array_equal(point, swarm.best_x):
+                swarm.replace_best(point, cost)
             self.led = swarm.best_x
 
 
