@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 
 import sysid
 from benchmarks.line import Line, above, below
-from benchmarks.modal.random_structures import frequency_lines, random_structure
 from benchmarks.problem_modules import load_module
+from benchmarks.swarm.noisy_tests import SEEDS, random_test
 from sysid.models.spectrum import Solver, SpectrumDistance
 
-SEEDS = range(20)
-TOWER = "README's tower"
 LEAST = 5  # leaders tried in a run
 STEP = 1e-30  # of complex steps; nothing is subtracted, so it may be that small
 
@@ -57,16 +56,6 @@ def derivative_errors(n: int, m: int, seed: int) -> tuple[float, float]:
     return float(off), float(np.abs(full - hessian).max() / np.abs(hessian).max())
 
 
-def coupled_problem(seed: int, n: int, *, force: bool) -> sysid.Problem:
-    """A random coupled structure on a base that moves in three directions, 1 % noise, its frequencies stated."""
-    drawn = random_structure(seed, n=n, d=3)
-    ratios = np.random.default_rng(seed).uniform(0.006, 0.04, n)  # inside the swarm's box
-    truth = sysid.Structure(drawn.mass, drawn.stiffness, ratios, n_base=3)
-    test = sysid.simulate(truth, frequency_lines(truth, 200), noise=0.01, force=force, rng=seed)
-    stiffness = sysid.SpectralStiffness([float(f"{f:.6g}") for f in truth.natural_frequencies])
-    return sysid.Problem(test, mass=sysid.FullMass(), stiffness=stiffness, reference=truth)
-
-
 def _eigenpairs(matrix: np.ndarray, start: tuple[np.ndarray, np.ndarray]) -> Iterator[tuple[complex, np.ndarray]]:
     """Eigenpairs (lam, v) of a complex symmetric matrix with v'v = 1, by Newton's method from those of a near one."""
     n = len(matrix)
@@ -93,27 +82,19 @@ def _slope(factor: np.ndarray, targets: np.ndarray, start: tuple[np.ndarray, np.
 
 
 def _leaders(reduced: bool) -> Iterator[Line]:
-    """Leaders of the swarms of hpso-ls as by default, which its local phase does not change."""
+    """Leaders of the first swarm of each run of `noisy_tests`; what follows it only adds to them."""
     strategy, seeds = sysid.Swarm.published(local=None), SEEDS[:1] if reduced else SEEDS
-    for name in (TOWER,) if reduced else (TOWER, "n = 6", "n = 10"):
-        for force in (True,) if reduced else (True, False):
-            what = f"hpso-ls, {name}, {'with' if force else 'without'} force, 1 % noise, {len(seeds)} seeds: "
-            problems = (_problem(name, seed, force) for seed in seeds)
-            histories = [
-                sysid.identify(problem, strategy=strategy, rng=seed).history
-                for problem, seed in zip(problems, seeds, strict=True)
-            ]
-            yield from _counts(what, histories)
-            if name == "n = 10":
-                won = sum(history.leaders_won for history in histories[:10])
-                yield above(what + "leaders that IPOPT won, the first ten seeds together", won, 1)
-
-
-def _problem(name: str, seed: int, force: bool) -> sysid.Problem:
-    if name == TOWER:
-        made: sysid.Problem = load_module("cantilever_tower").problem(force=force)
-        return made
-    return coupled_problem(seed, int(name.removeprefix("n = ")), force=force)
+    tower = load_module("cantilever_tower").problem
+    tests: dict[str, Callable[[int], sysid.Problem]] = {"README's tower": lambda seed: tower(rng=seed)}
+    for n, force in () if reduced else ((6, True), (6, False), (10, True), (10, False)):
+        tests[f"n = {n}, d = 3, {'with' if force else 'without'} force"] = partial(random_test, n=n, force=force)
+    for name, problem in tests.items():
+        histories = [sysid.identify(problem(seed), strategy=strategy, rng=seed).history for seed in seeds]
+        what = f"hpso-ls, {name}, 1 % noise, {len(seeds)} seeds: "
+        yield from _counts(what, histories)
+        if name.startswith("n = 10"):
+            won = sum(history.leaders_won for history in histories[:10])
+            yield above(what + "leaders that IPOPT won, the first ten seeds together", won, 1)
 
 
 def _counts(what: str, histories: list[sysid.History]) -> Iterator[Line]:

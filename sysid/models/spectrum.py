@@ -232,5 +232,5 @@ def spectrum_error(factor: Array, targets: Array) -> float:
 
 
 def _finish(factor: Array, targets: Array, success: bool, status: str) -> Refinement:
-    factor = factor * np.where(np.diag(factor) < 0, -1.0, 1.0)
+    """What came of a refinement, from its factor, whose diagonal is positive."""
     return Refinement(factor, spectrum_error(factor, targets), success, status)
