@@ -215,6 +215,8 @@ class _Matrices:
 
     def _made(self, name: str, arguments: list[ca.MX], parameters: list[int]) -> Sequence[ca.MX]:
         self._check_size(name, arguments, parameters)
+        if name in operations.WITHOUT_PARAMETERS:
+            _exactly(0, parameters)
         if name in operations.UNARY or name in operations.BINARY:
             make = ca.MX.unary if name in operations.UNARY else ca.MX.binary
             return [make(operations.casadi_number(name), *_exactly(1 if name in operations.UNARY else 2, arguments))]
@@ -271,7 +273,8 @@ class _Matrices:
         self._used += count
         if len(numbers) != count:
             raise ValueError("numbers are missing")
-        return [ca.MX(ca.DM(pattern, numbers * (pattern.nnz() if one else 1)))]
+        values = numbers * (pattern.nnz() if one else 1)
+        return [ca.MX(ca.DM(pattern, values)) if values else ca.MX(pattern)]
 
     def _getnonzeros(self, arguments: list[ca.MX], parameters: list[int]) -> list[ca.MX]:
         pattern = self._reader.pattern(parameters[0])
