@@ -133,9 +133,8 @@ def test_a_chain_of_4000_operations_is_written_and_read_within_seconds():
     for i in range(2000):
         value = ca.sin(value) + i
     begun = time.process_time()
-    tree = encode(SYMBOLS, [value], [point(np.random.default_rng(0))])
-    decode(tree, SYMBOLS)
-    assert time.process_time() - begun < 5
+    decode(encode([X], [value], [[ca.DM([0.1, 0.2, 0.3])]]), [X])
+    assert time.process_time() - begun < 3
 
 
 class Doubled(ca.Callback):
