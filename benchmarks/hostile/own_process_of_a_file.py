@@ -77,18 +77,18 @@ def digests_of_readers(result) -> list[str]:
     return [hashlib.sha256(text.encode()).hexdigest() for text in texts]
 
 
-def write(source: str, folder: str, searched: str) -> list[dict]:
-    """Store all results of a source; what was stored, and digests of it."""
+def write(source: str, folder: str, how: str) -> list[dict]:
+    """Store all results of a source, "searched" or "guessed"; what was stored, and digests of it but where "bare"."""
     told = []
-    for i, result in enumerate(results_of(Path(source), searched == "searched")):
+    for i, result in enumerate(results_of(Path(source), how in ("searched", "own"))):
         path = result.save(Path(folder) / f"{i}.h5")
-        searches = result.x is not None and not result.problem.free_modes
+        searches = how != "bare" and result.x is not None and not result.problem.free_modes
         told.append(
             {
                 "path": str(path.absolute()),
                 "bytes": path.stat().st_size,
                 "expressions": digests_of_expressions(result.problem, result.x) if searches else [],
-                "readers": digests_of_readers(result),
+                "readers": digests_of_readers(result) if how == "own" else [],
             }
         )
     return told
@@ -105,7 +105,7 @@ def read(*paths: str) -> list[dict]:
             {
                 "whole": whole,
                 "expressions": digests_of_expressions(result.problem, result.x) if searches else [],
-                "readers": digests_of_readers(result),
+                "readers": [] if whole else digests_of_readers(result),
             }
         )
     return told
