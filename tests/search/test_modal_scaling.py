@@ -201,3 +201,25 @@ class TestStatedTotals:
         assert stated_totals(self.problem(truth, FullMass(9.0), force=False)) is None
         assert stated_totals(self.problem(truth, FullMass())) is None
         assert stated_totals(self.problem(truth, KnownMass(truth.mass))) is None
+
+
+@pytest.mark.parametrize("healing", ["trace", "rigid_body"])
+def test_a_total_that_is_not_stated_is_what_known_masses_make(random_structure, healing):
+    """Of a model of some ten grams as well: no kilogram is added to the base."""
+    truth = random_structure(np.random.default_rng(4), n=3, d=2)
+    small = Structure(0.001 * truth.mass, 0.001 * truth.stiffness, truth.damping_ratios, n_base=2)
+    known = np.full((3, 3), np.nan)
+    np.fill_diagonal(known, np.diag(small.mass)[:3])
+    problem = Problem(simulate(small, lines(small)), mass=FullMass(known=known, healing=healing))
+    P, gamma, G = known_pieces(small)
+    groups = problem.geometry.directions[:3]
+    t, remainder = to_stated_totals(problem, P, gamma, G, groups, np.eye(2), scaled=True)
+    assert t == 1.0
+    M_SS, M_S0 = P.T @ P, P.T @ gamma - P.T @ P @ G
+    whole = np.block([[M_SS, M_S0], [M_S0.T, (gamma - P @ G).T @ (gamma - P @ G) + remainder]])
+    made, least = (
+        FullMass(healing=healing).total(problem.geometry, mass)
+        for mass in (whole, whole - np.pad(remainder, ((3, 0), (3, 0))))
+    )
+    np.testing.assert_allclose(made, least, rtol=0.01)
+    assert np.all(made > least)

@@ -227,3 +227,17 @@ def test_least_squares_from_many_starts_finds_every_root_and_keeps_to_the_box():
     nearest = np.where(np.abs(u - 0.2) < np.abs(u - 0.7), 0.2, 0.7)
     np.testing.assert_allclose(u, nearest, atol=1e-6)
     assert {0.2, 0.7} == set(nearest)
+
+
+def test_least_squares_slide_along_a_bound_to_its_least_and_look_nowhere_else():
+    """``100 (u - v / 2 - 0.2)² + (v - 1.5)²`` is least at (0.95, 1.5); within the box at (0.7, 1), from anywhere."""
+
+    def rows(points):
+        assert np.all((points >= 0) & (points <= 1))  # differences too
+        u, v = points.T
+        return np.stack([10 * (u - v / 2 - 0.2), v - 1.5], axis=1)
+
+    search = LeastSquares(rows, np.random.default_rng(0).random((40, 2)))
+    for _ in range(60):
+        search.step()
+    np.testing.assert_allclose(search.points, np.broadcast_to([0.7, 1.0], (40, 2)), atol=1e-4)
