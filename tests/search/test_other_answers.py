@@ -159,6 +159,15 @@ def test_no_time_is_lost_where_the_equations_are_linear(monkeypatch):
     assert sysid.identify(problem((0, 1)), rng=0).determined
 
 
+def test_a_broken_constraint_is_a_difference_too():
+    """The exchanged chain has the same response; beside it counts by how much it breaks what the first one keeps."""
+    free, held = (SameResponse(problem(constraints=c), X) for c in (lambda k, c: [], lambda k, c: [k[0] <= 2 * k[1]]))
+    (alike,), (broken,) = free(exchanged(X)[None]), held(exchanged(X)[None])
+    assert np.linalg.norm(alike) < 1e-12
+    assert np.linalg.norm(broken) > 1.0  # in units of what counts as broken at all
+    assert np.linalg.norm(held(X[None])) < 1e-12
+
+
 @pytest.mark.parametrize(
     ("damping", "residuals", "unique"),
     [
