@@ -183,7 +183,7 @@ NOTICED = (
     Mutant("C10", "a stated mass that the force contradicts never told", "max(0.01, 3 * force_residual_left",
         "max(np.inf, 3 * force_residual_left", "test_checks"),
     Mutant("C11", "sensors that move with the base never told", "if wrong.size:", "if False:",
-        "test_certainty::test_a_sensor_of_wrong_sign_gain_or_axis_is_named"),
+        "test_checks::test_a_sensor_that_moves_with_the_base_beside_its_modes_is_told_by_how_much"),
     Mutant("C13", "stated values that are missed together never told",
         "if np.sum(off**2) > chdtri(max(off.size, 1), _CHANCE) and", "if False and",
         "test_checks::TestOneListForEveryProblem::test_priors_are_checked_one_by_one_and_together"),
