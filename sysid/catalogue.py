@@ -194,25 +194,6 @@ def is_bundled(name: str) -> bool:
     return not _is_path(name) and _in_folder(bundled_folder(), name) is not None
 
 
-def import_module(module: str) -> None:
-    """Import a problem module that the user names, so that the classes of models in it can be loaded.
-
-    Its ``problem()`` is not called. Files of results name such a class, and import no module by themselves.
-
-    Parameters
-    ----------
-    module : str
-        As in a `Recipe`.
-
-    Raises
-    ------
-    InputError
-        Where it cannot be imported; tells its line.
-    """
-    with _neighbours(file_of(module)):
-        _load(module)
-
-
 def _in_folder(folder: Path, name: str) -> Path | None:
     """The problem of a name in a folder."""
     path = folder / f"{name}.py"

@@ -10,11 +10,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from sysid import catalogue
 from sysid.cli import draws, sweeps, trust
 from sysid.cli.files import png, results_folder, table_as_csv, write_files
 from sysid.cli.output import Output
 from sysid.cli.status import INTERRUPTED, NOT_REACHED, SUCCESS
+from sysid.cli.stored_result import with_problem_of
 from sysid.errors import InputError
 from sysid.jobs.engine import cluster, processes
 from sysid.jobs.job import JobResult
@@ -34,9 +34,10 @@ def run(options: argparse.Namespace, out: Output) -> int:
     """Run the jobs that are asked for; tell each end in a line, then all of them together."""
     source = Path(options.result)
     bare = _recipe(options, source, out)
-    catalogue.import_module(bare.module)  # its classes are those of the models in the result
     result = load(source)
     recipe = replace(bare, start=None if result.x is None else tuple(result.x.tolist()))
+    if result.part is not None:
+        result = with_problem_of(result, recipe, source)
     folder = results_folder(options.out, (source if source.is_dir() else source.parent) / "refine")
     executor = _executor(options)
     sweeps.check_own_records(result, recipe)

@@ -12,8 +12,11 @@ from sysid.cli import parameters, read, trust
 from sysid.cli.files import results_folder
 from sysid.cli.output import Output
 from sysid.errors import InputError
+from sysid.identify import NAMED
 from sysid.results.checkpoint import FILE_NAME, Begun, Checkpoint
 from sysid.results.identification import Recipe
+from sysid.search.strategy import Strategy
+from sysid.search.swarm import Swarm
 
 
 def begun(options: argparse.Namespace, out: Output) -> tuple[Begun, Path]:
@@ -41,6 +44,25 @@ def command(search: Begun, folder: Path) -> str:
     """The command that goes on with a search; a module that is not of the package is named again."""
     module = search.recipe.module
     return f"sysid run {'' if catalogue.is_bundled(module) else f'{module} '}--resume {folder}"
+
+
+def strategy_of(search: Begun) -> str | Strategy:
+    """The strategy of a search, with the eigenvalue refinement that was chosen.
+
+    Raises
+    ------
+    InputError
+        Where one was chosen and the strategy has none.
+    """
+    if search.refine_by is None:
+        return search.strategy
+    chosen = NAMED[search.strategy]() if search.strategy in NAMED else None
+    if not isinstance(chosen, Swarm):
+        raise InputError(
+            f"--refine-by is of the strategies 'swarm' and 'hpso-ls', and the strategy is {search.strategy!r}: leave "
+            "it out, or give --strategy swarm or hpso-ls"
+        )
+    return replace(chosen, refine_by=search.refine_by)
 
 
 def with_source(search: Begun, files: Collection[Path], folder: Path) -> Begun:
@@ -72,10 +94,13 @@ def _resumed(options: argparse.Namespace, out: Output) -> tuple[Begun, Path]:
     if tree["begun"] is None:
         raise InputError(f"{checkpoint.path} was not begun by 'sysid run': go on with it as it was begun")
     search = Begun.from_tree(tree["begun"])
-    more = (options.seed, options.strategy, options.data) != (None, None, None) or bool(options.settings)
+    given = (options.seed, options.strategy, options.refine_by, options.data)
+    more = any(one is not None for one in given) or bool(options.settings)
     if asked is None:
         if more:
-            raise InputError(f"--resume takes --seed, --strategy, --data and --set from the run in {folder}: {search}")
+            raise InputError(
+                f"--resume takes --seed, --strategy, --refine-by, --data and --set from the run in {folder}: {search}"
+            )
         trust.check(search.recipe, checkpoint.path, f"sysid run MODULE.py --resume {folder}", options)
     else:
         search = _agreed(search, asked, more or read.is_test(options.problem), folder)
@@ -103,7 +128,7 @@ def _asked(options: argparse.Namespace, out: Output) -> Begun:
     if options.problem is None:
         raise InputError("PROBLEM is missing (see 'sysid run --help')")
     recipe = read.recipe(options, parameters.recipe_of(options, out))
-    return Begun(recipe, options.strategy or "auto", options.seed or 0)
+    return Begun(recipe, options.strategy or "auto", options.seed or 0, options.refine_by)
 
 
 def _in_words(checkpoint: Checkpoint, search: Begun) -> str:

@@ -77,7 +77,7 @@ def model_from_tree(tree: dict[str, Any]) -> Any:
     """Give the model of a tree that `model_to_tree` made; nothing is imported for it.
 
     A class of the user's own has to be there already: in a module that this process has imported, or in a problem
-    module that was named to it (see `sysid.catalogue.import_module`), or beside that one.
+    module that was named to it (see `sysid.catalogue.build`), or beside that one.
 
     Raises
     ------

@@ -10,6 +10,7 @@ from sysid import catalogue
 from sysid.files.tree import check, from_bytes, to_bytes
 from sysid.models.registry import model_from_tree, model_to_tree
 from sysid.problem import stored
+from sysid.results.identification import Recipe
 
 MODELS = (
     sysid.FullMass([30.0, 31.0], healing="rigid_body"),
@@ -136,7 +137,16 @@ from rings_beside import Ring
 
 class Light(sysid.ModalDamping):
     pass
+
+def problem(*, data=None, rng=0):
+    return Ring
 """
+
+
+def run_module(path):
+    """As `sysid run` does; what its problem() gives is no problem."""
+    with pytest.raises(sysid.InputError, match="not a sysid.Problem"):
+        catalogue.build(Recipe(str(path)))
 
 
 def test_classes_of_a_problem_module_and_beside_it_are_stored_by_names_that_another_process_knows(
@@ -148,7 +158,7 @@ def test_classes_of_a_problem_module_and_beside_it_are_stored_by_names_that_anot
         (tmp_path / folder / "rings_beside.py").write_text(OWN)
     before = {*sys.modules}
     try:
-        catalogue.import_module(str(tmp_path / "one" / "light_house.py"))
+        run_module(tmp_path / "one" / "light_house.py")
         (private,) = (sys.modules[name] for name in sys.modules if name.endswith("_light_house"))
         trees = [model_to_tree(model) for model in (private.Light(0.001, 0.1), private.Ring(3))]
         assert [tree["kind"] for tree in trees] == ["light_house:Light", "rings_beside:Ring"]
@@ -156,7 +166,7 @@ def test_classes_of_a_problem_module_and_beside_it_are_stored_by_names_that_anot
         light, ring = map(model_from_tree, trees)
         assert type(light) is private.Light and light.upper == 0.1
         assert type(ring) is private.Ring and ring.sectors == 3
-        catalogue.import_module(str(tmp_path / "two" / "light_house.py"))
+        run_module(tmp_path / "two" / "light_house.py")
         with pytest.raises(sysid.InputError, match="Light stands in several modules named 'light_house'"):
             model_from_tree(trees[0])
     finally:
@@ -182,4 +192,4 @@ def test_what_could_not_be_found_again_is_refused():
 def test_a_tree_of_the_users_own_that_holds_something_else_is_refused_early(tanks, monkeypatch):
     monkeypatch.setattr(tanks.Tank.Half, "to_tree", lambda self: {"when": object()})
     with pytest.raises(sysid.InputError, match="/mass/fields/when: a object cannot be stored"):
-        stored.check_storable({"mass": tanks.Tank.Half([]), "stiffness": np.eye(1), "damping": np.eye(1)})
+        check(stored.to_tree({"mass": tanks.Tank.Half([]), "stiffness": np.eye(1), "damping": np.eye(1)}))
