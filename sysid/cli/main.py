@@ -382,12 +382,7 @@ def _add_refine(command: Callable[..., argparse.ArgumentParser]) -> None:
         ),
     )
     refine.add_argument("result", metavar="RESULT", help="a result.h5 that 'sysid run' wrote, or its folder")
-    refine.add_argument(
-        "--module",
-        metavar="FILE",
-        help="the problem module of RESULT, in the place of the one that RESULT names; a bundled one need not be named",
-    )
-    trust.add_argument(refine, "RESULT")
+    trust.add_module(refine)
     kinds = refine.add_mutually_exclusive_group()
     kinds.add_argument(
         "--starts",

@@ -27,6 +27,16 @@ def add_argument(command: argparse.ArgumentParser, of: str) -> None:
     )
 
 
+def add_module(command: argparse.ArgumentParser) -> None:
+    """Give a command that runs the module of RESULT ``--module`` and ``--trust``."""
+    command.add_argument(
+        "--module",
+        metavar="FILE",
+        help="the problem module of RESULT, in the place of the one that RESULT names; a bundled one need not be named",
+    )
+    add_argument(command, "RESULT")
+
+
 def typed_module(name: str, out: Output) -> str:
     """A problem as the user typed it, for a recipe; that an own problem hides a bundled one is told."""
     module, remark = catalogue.typed(name)
