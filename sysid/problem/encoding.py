@@ -319,8 +319,6 @@ def _solve_in_words(node: ca.MX) -> tuple[str, list[int]]:
     own = ca.Function("solve", symbols, ca.graph_substitute([node], [node.dep(0), node.dep(1)], symbols))
     transposed = bool(node.info()["tr"])
     for solver in ("", *operations.SOLVERS):
-        if solver and not operations.has_library("linsol", solver):
-            continue
         try:
             same = ca.Function("solve", symbols, [operations.solve(solver, *symbols, transposed=transposed)])
         except (ValueError, RuntimeError):

@@ -117,13 +117,11 @@ class History:
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> History:
-        """Give the history of a tree that `to_tree` made; files made before have fewer fields, or one for the end."""
-        given = {name: value for name, value in tree.items() if name != "refinement"}
-        for name, counts in (("states", "state_counts"), ("refinement_statuses", "refinement_counts")):
-            numbers = given.pop(counts, np.zeros(0)).tolist()
-            given[name] = tuple(zip(given.get(name, ()), numbers, strict=True))
-        phases = tuple(Phase(**phase) for phase in given.pop("phases", ()))
-        return cls(**{**given, "phases": phases})
+        """Give the history of a tree that `to_tree` made."""
+        given = dict(tree)
+        for name, numbers in (("states", "state_counts"), ("refinement_statuses", "refinement_counts")):
+            given[name] = tuple(zip(tree[name], given.pop(numbers).tolist(), strict=True))
+        return cls(**{**given, "phases": tuple(Phase(**phase) for phase in tree["phases"])})
 
 
 def _counts(names: str, numbers: str, counted: tuple[tuple[str, int], ...]) -> dict[str, Any]:
