@@ -271,6 +271,16 @@ class TestFullMass:
             FullMass(healing="magic")
 
 
+def test_an_entry_with_two_deviations_has_the_larger_one(geometry_of):
+    """One given on either side of the diagonal, or on one side alone; that of the coupling has no other side."""
+    nan = np.nan
+    known = [[4.0, 0.5, nan, 0.2], [0.5, 3.0, 0.1, nan], [nan, nan, nan, nan]]
+    std = [[0.2, 0.1, nan, 0.05], [0.3, 0.0, 0.02, nan], [nan, nan, nan, nan]]
+    stated = FullMass(known=known, known_std=std).stated(geometry_of(np.ones((3, 1))))
+    expected = np.array([[0.2, 0.3, 0.0, 0.05], [0.3, 0.0, 0.02, 0.0], [0.0, 0.02, 0.0, 0.0]])
+    np.testing.assert_array_equal(stated.entries_std, expected)
+
+
 class TestLumpedMass:
     @pytest.mark.parametrize("seed", SEEDS)
     def test_diagonal_without_coupling_with_the_totals_on_the_sensors(self, geometry_of, seed):
