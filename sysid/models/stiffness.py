@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import casadi as ca
@@ -103,19 +102,8 @@ class SpectralStiffness(FieldTree):
     def blocks(self, geometry: Geometry, y: ca.SX, mass: MassBlocks) -> StiffnessBlocks:
         """``K_SS = L H L'`` and ``H = L_H L_H'``, rad²/s², whatever the mass is."""
         L_H, L = lower_triangle(y, geometry.n), mass.factor
-        H = L_H @ L_H.T
+        H = ca.tril2symm(ca.tril(L_H @ L_H.T))  # each entry once
         return StiffnessBlocks(L @ H @ L.T, H)
-
-    def batch(self, geometry: Geometry) -> Callable[[Array], Array]:
-        """Factors L_H, (count, n, n), of swarm coordinates (count, size)."""
-        n, (rows, columns) = geometry.n, np.tril_indices(geometry.n)
-
-        def factors(s: Array) -> Array:
-            made = np.zeros((len(s), n, n))
-            made[:, rows, columns] = s
-            return made
-
-        return factors
 
     def values(self, geometry: Geometry, structure: Structure) -> Array:
         """Entries of L_H."""

@@ -252,7 +252,7 @@ class Identification(Answer):
         """
         tree = self.to_tree()
         written, without = storage.write(tree, path), tree["problem"]["given"]["without"]
-        if without is not None:
+        if without is not None and self.part is None:
             warnings.warn(
                 f"{written} is without the expressions of its problem, as {without} cannot be stored: to refine it, "
                 "give its module again (--module FILE; in Python sysid.load(path, problem=...))",
