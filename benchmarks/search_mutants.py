@@ -116,7 +116,7 @@ NOTICED = (
         "test_resume"),
     Mutant("R14", "each leader handed over again at every iteration",
         "self.led is None or not np.array_equal(self.led, swarm.best_x)", "True",
-        "test_minimize::test_each_new_leader_is_handed_over_once_and_what_comes_back_takes_its_place"),
+        "test_minimize::test_a_leader_that_comes_back_as_it_was_changes_nothing_and_is_not_handed_over_again"),
     Mutant("P01", "exponent of the mass distribution by the column, not the row",
         "for k in range(1, size + 1)])[rows]", "for k in range(1, size + 1)])[columns]", "test_mass_sampling"),
     Mutant("P03", "base mass by a transposed factor", "low @ low.T + base @ base.T", "low @ low.T + base.T @ base",
