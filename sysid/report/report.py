@@ -399,8 +399,10 @@ def _convergence(it: Identification) -> str:
     rows = [[row[k] for k in told_of] for row in ran]
     parts.append(table([COLUMNS[k] for k in told_of], rows, f"{told}.", words=True))
     if history.restarts:
-        again = f"{counted(history.restarts, 'further swarm')} followed, as the first ended in no good fit"
+        again = f"{counted(history.restarts, 'further swarm')} followed, as the first ended at no solution that fits"
         parts.append(paragraph(f"{again}; {history.evaluations} candidates are those of all.", "soft"))
+    if history.refinement_in_words:
+        parts.append(paragraph(f"{history.refinement_in_words}.", "soft"))
     parts.append(table(["state of the swarm", "iterations"], history.states))
     return "".join(parts)
 

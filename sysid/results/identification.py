@@ -186,6 +186,9 @@ class Identification(Answer):
                 for g in gains_of_sensors(self)
             ],
             "evaluations": int(self.history.evaluations),
+            "leaders_tried": int(self.history.leaders_tried),
+            "leaders_won": int(self.history.leaders_won),
+            "refinement_statuses": dict(self.history.refinement_statuses),
             "wall_time_s": float(self.history.wall_time),
             "version": __version__,
         }
