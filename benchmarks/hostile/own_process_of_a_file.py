@@ -1,6 +1,6 @@
 """What a process does to a stored result: writes one of a problem, reads one, or times it. A script of its own.
 
-It stands alone, so that the sysid of an earlier commit runs it too: ``python THIS write|read|size|time ...`` prints JSON.
+It stands alone, so that the sysid of an earlier commit runs it too: ``python THIS read PATH`` and the like print JSON.
 """
 
 from __future__ import annotations
