@@ -19,7 +19,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any, NoReturn, cast
+from typing import IO, Any, NoReturn, cast, get_args
 
 from sysid import catalogue
 from sysid.cli import doctor, export, parameters, read, starting, stored_result, unfinished
@@ -37,6 +37,7 @@ from sysid.results.storage import FILE_NAME as RESULT
 from sysid.results.storage import atomically, missing_folders, remove_empty
 from sysid.results.version import __version__
 from sysid.search.deadline import TimeIsOver, within
+from sysid.search.refinement import RefineBy
 from sysid.search.session import LEAST, DeferredInterrupt
 
 _LOG = "sysid-error.log"
@@ -153,17 +154,22 @@ def _run(options: argparse.Namespace, out: Output) -> int:
         return None if options.max_time is None else max(options.max_time - (time.perf_counter() - begun), least)
 
     search, folder = unfinished.begun(options, out)
-    recipe = search.recipe
+    recipe, strategy = search.recipe, unfinished.strategy_of(search)
     problem, files = catalogue.built(recipe, check=False)  # by the search, with its progress and under its clock
     checkpoint = Checkpoint(folder / UNFINISHED, unfinished.with_source(search, files, folder))
     if options.fresh:
         checkpoint.remove()
     test = problem.measurement
-    unknowns = problem.formulate(problem.unsearched).size
+    formulation = problem.formulate(problem.unsearched)
+    if search.refine_by is not None and not formulation.refinable:
+        raise InputError(
+            f"--refine-by {search.refine_by}: the stiffness of this problem has a form of its own, whose frequencies "
+            "are not searched apart from it: leave it out"
+        )
     out.write(
         f"{recipe.title}: {test.n_sensors} sensors, base moving along {' '.join(test.base_axes or ())}, "
         f"{test.freq.size} lines from {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz, "
-        f"{unknowns} unknowns, seed {search.seed}\n"
+        f"{formulation.size} unknowns, seed {search.seed}\n"
     )
     out.flush()
     failed: InputError | None = None
@@ -171,7 +177,7 @@ def _run(options: argparse.Namespace, out: Output) -> int:
     with DeferredInterrupt(patience=None) as late:
         with display_on(out) as display:
             result = identify(
-                problem, strategy=search.strategy, rng=search.seed, max_time=left(LEAST), progress=display,
+                problem, strategy=strategy, rng=search.seed, max_time=left(LEAST), progress=display,
                 checkpoint=checkpoint,
             )  # fmt: skip
         result = replace(result, recipe=recipe)
@@ -315,6 +321,14 @@ def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
         "structured models and variables of your own; swarm: the particle swarm and its refinement; hpso-ls: the "
         "published swarm, eigenvalue refinement and IPOPT in Cholesky coordinates; auto, by default: "
         "modal where the models of the problem allow it, continuation where they have a form of their own, else swarm",
+    )
+    run.add_argument(
+        "--refine-by",
+        choices=get_args(RefineBy),
+        metavar="WAY",
+        help="how swarm and hpso-ls give a candidate the measured frequencies: closed-form (swarm by default), the "
+        "nearest matrix; ipopt, the paper's nonlinear programme for every candidate, for small problems; leaders "
+        "(hpso-ls by default), the closed form, and IPOPT for each new leader of the swarm",
     )
     run.add_argument("--out", metavar="DIR", help="folder of the results, results/NAME by default")
     run.add_argument(

@@ -401,6 +401,8 @@ def _convergence(it: Identification) -> str:
     if history.restarts:
         again = f"{counted(history.restarts, 'further swarm')} followed, as the first ended at no solution that fits"
         parts.append(paragraph(f"{again}; {history.evaluations} candidates are those of all.", "soft"))
+    if history.refinement_in_words:
+        parts.append(paragraph(f"{history.refinement_in_words}.", "soft"))
     parts.append(table(["state of the swarm", "iterations"], history.states))
     return "".join(parts)
 

@@ -186,6 +186,9 @@ class Identification(Answer):
                 for g in gains_of_sensors(self)
             ],
             "evaluations": int(self.history.evaluations),
+            "leaders_tried": int(self.history.leaders_tried),
+            "leaders_won": int(self.history.leaders_won),
+            "refinement_statuses": dict(self.history.refinement_statuses),
             "wall_time_s": float(self.history.wall_time),
             "version": __version__,
         }
@@ -249,7 +252,7 @@ class Identification(Answer):
         """
         tree = self.to_tree()
         written, without = storage.write(tree, path), tree["problem"]["given"]["without"]
-        if without is not None:
+        if without is not None and self.part is None:
             warnings.warn(
                 f"{written} is without the expressions of its problem, as {without} cannot be stored: to refine it, "
                 "give its module again (--module FILE; in Python sysid.load(path, problem=...))",

@@ -60,6 +60,7 @@ def summary(it: Answer) -> str:
         f"relative residual {residual_in_words(it)}{force}; seed {it.seed}, {seconds_in_words(it.history.wall_time)}"
         + f"; {counted(it.history.restarts, 'further swarm')}" * bool(it.history.restarts),
         *_phases(it),
+        *filter(None, [it.history.refinement_in_words]),
         *it.remarks,
         "rigid-body mass "
         + ", ".join(_rigid_masses(it, axes))

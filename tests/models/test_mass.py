@@ -6,7 +6,7 @@ import pytest
 
 import sysid
 from sysid import FullMass, InputError, KnownMass, LumpedMass
-from sysid.models.mass import WrittenMass, batch_healing, heal, total_of
+from sysid.models.mass import WrittenMass, heal, total_of
 from sysid.models.model import mass_blocks
 
 SEEDS = range(4)
@@ -265,8 +265,6 @@ class TestFullMass:
         expected = np.diag([2.0, 2.5, 3.0, 2.0, 3.0])
         healed = heal(ca.SX.eye(5), geometry, totals, healing)
         np.testing.assert_allclose(np.asarray(ca.evalf(ca.densify(healed))), expected, rtol=1e-12)
-        in_numbers = batch_healing(geometry, healing)(np.eye(5)[:, :, None].copy(), totals[:, None])
-        np.testing.assert_allclose(in_numbers[:, :, 0], expected, rtol=1e-12)
 
     def test_healing_that_is_unknown(self):
         with pytest.raises(InputError, match="'magic' is unknown"):
