@@ -85,6 +85,7 @@ BENCHMARKS = (
     Benchmark("jobs.interrupted_runs", "Ctrl-C at random times of a run: what is said and kept", "5 min", "20 s"),
     Benchmark("jobs.lost_workers", "jobs whose workers are killed; what a job costs; gain of two", "20 min", "25 s"),
     Benchmark("jobs.cut_link", "jobs on two machines whose link drops for 30 s", "2 min", "-"),
+    Benchmark("jobs.one_folder", "two runs in one folder: one result, the other refused, none lost", "15 min", "30 s"),
     Benchmark("hostile.corruptions", "damaged result files: an error or the same numbers", "2 s", "1 s"),
     Benchmark("hostile.fuzz", "every reader and the command line, given what chance makes", "50 min", "100 s"),
     Benchmark("hostile.extreme_structures", "silent wrong answers at the ends of what occurs", "5 min", "15 s"),

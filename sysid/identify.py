@@ -130,8 +130,8 @@ def identify(
                 raise InputError("; ".join((*told, str(error)))) from error
             raise
         result = judge(problem, outcome, why, seed, session)
-    if checkpoint is not None and file is not checkpoint and not result.interrupted:
-        file.remove()
+        if not isinstance(checkpoint, Checkpoint) and not result.interrupted:
+            journal.entries.clear()  # so that the file goes
     return result
 
 

@@ -26,6 +26,7 @@ from sysid.cli import doctor, export, parameters, read, starting, unfinished
 from sysid.cli.argument_types import band, count, orders, seconds, seed, whole
 from sysid.cli.command_parser import JSON, QUIET, Parser, adder, epilog
 from sysid.cli.display import display_on
+from sysid.cli.files import alone_in
 from sysid.cli.output import Output, collected_warnings, keep_for_document, strict_json
 from sysid.cli.status import BUG, INTERRUPTED, MISTAKE, NOT_REACHED, SUCCESS
 from sysid.errors import InputError, SolverError
@@ -146,13 +147,20 @@ def _show(options: argparse.Namespace, out: Output) -> int:
 
 
 def _run(options: argparse.Namespace, out: Output) -> int:
+    folder = unfinished.folder_of(options)
+    remedy = "wait for its end" if options.resume else "wait for its end, or write elsewhere with --out DIR"
+    with alone_in(folder, remedy):
+        return _run_in(folder, options, out)
+
+
+def _run_in(folder: Path, options: argparse.Namespace, out: Output) -> int:
     begun = time.perf_counter()
 
     def left(least: float) -> float | None:
         """Seconds that are left, at least so many; None without a limit."""
         return None if options.max_time is None else max(options.max_time - (time.perf_counter() - begun), least)
 
-    search, folder = unfinished.begun(options, out)
+    search = unfinished.begun(options, folder, out)
     recipe = search.recipe
     problem, files = catalogue.built(recipe, check=False)  # by the search, with its progress and under its clock
     checkpoint = Checkpoint(folder / UNFINISHED, unfinished.with_source(search, files, folder))
@@ -215,9 +223,10 @@ def _report(options: argparse.Namespace, out: Output) -> int:
     from sysid.report import report
 
     source = Path(options.result)
-    result = load(source)
     folder = source if source.is_dir() else source.parent
-    out.wrote(report.write_report(result, folder / report.FILE_NAME))
+    # A run would write its result between reading the one there and writing its page.
+    with alone_in(folder, "it writes its report itself") if folder.is_dir() else contextlib.nullcontext():
+        out.wrote(report.write_report(load(source), folder / report.FILE_NAME))
     return SUCCESS
 
 
