@@ -283,6 +283,12 @@ class Answer:
         return modal_assurance(self.structure.mode_shapes, other.mode_shapes)
 
     @property
+    def identified_ratios(self) -> Array:
+        """Damping ratios of the modes, (n,); NaN where nothing that is fitted tells of the damping."""
+        ratios = self.structure.damping_ratios
+        return ratios if self.problem.formulation.tells_damping else np.full_like(ratios, np.nan)
+
+    @property
     def degrees_of_freedom(self) -> tuple[str, ...]:
         """What the rows of M_SS, K_SS and C stand for: a sensor's name, or "coordinate of mode 7"."""
         names, structure = self.measurement.sensor_names, self.structure

@@ -138,7 +138,8 @@ class Identification(Answer):
         """The figures of ``summary.json``; None for what the data leave open or what was not computed."""
         u, values = self.quick_uncertainty, self.values
         std = {} if u is None else u.variables
-        reported = () if self.x is None else reported_unknowns(self.problem, damping_ratios=True)
+        ratios = self.problem.formulation.tells_damping
+        reported = () if self.x is None else reported_unknowns(self.problem, damping_ratios=ratios)
         return {
             "problem": self.recipe.module if self.recipe else None,
             "parameters": self.recipe.parameters if self.recipe else {},
@@ -154,7 +155,7 @@ class Identification(Answer):
             "force_residual": self.force_residual,
             "natural_frequencies_hz": self.structure.natural_frequencies.tolist(),
             "natural_frequencies_std_hz": _plain(self.quick_std("natural_frequencies")),
-            "damping_ratios": self.structure.damping_ratios.tolist(),
+            "damping_ratios": _plain(self.identified_ratios),
             "damping_ratios_std": _plain(self.quick_std("damping_ratios")),
             "unknowns": {v.name: values[v.name].tolist() for v in reported},
             "unknowns_std": {v.name: _plain(std[v.name]) for v in reported if v.name in std},
