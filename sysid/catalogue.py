@@ -304,7 +304,7 @@ def _in_own_words(error: BaseException) -> str:
     said = str(error)
     if "truth value of a numeric MX" in said:
         return NO_TRUTH
-    if isinstance(error, TypeError) and "MX" in said and re.search(r"complex|\dj\b", said):
+    if isinstance(error, TypeError) and "MX" in said and re.search(r"complex|\d\.?j\b", said):
         return NO_COMPLEX
     return f"{type(error).__name__}: {said}".removesuffix(": ")
 

@@ -81,7 +81,8 @@ def identify(
     checkpoint : str, Path or Checkpoint, optional
         File in which the state of a swarm or a continuation is kept every few seconds, and at Ctrl-C. Where it is there
         of the same search (problem, strategy, `rng`), the search goes on from it, and ends with the bits that it would
-        have ended with. A file given by its name is gone once the search has ended by itself.
+        have ended with. A file given by its name is gone once the search has ended by itself. One search
+        uses it at a time.
 
     Returns
     -------

@@ -325,7 +325,9 @@ def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
         "published swarm, eigenvalue refinement and IPOPT in Cholesky coordinates; auto, by default: "
         "modal where the models of the problem allow it, continuation where they have a form of their own, else swarm",
     )
-    run.add_argument("--out", metavar="DIR", help="folder of the results, results/NAME by default")
+    run.add_argument(
+        "--out", metavar="DIR", help="folder of the results, results/NAME by default; one run at a time writes there"
+    )
     run.add_argument(
         "--max-time",
         type=seconds,
