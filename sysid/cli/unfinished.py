@@ -12,8 +12,11 @@ from sysid.cli import parameters, read
 from sysid.cli.files import results_folder
 from sysid.cli.output import Output
 from sysid.errors import InputError
+from sysid.identify import NAMED
 from sysid.results.checkpoint import FILE_NAME, Begun, Checkpoint
 from sysid.results.identification import Recipe
+from sysid.search.strategy import Strategy
+from sysid.search.swarm import Swarm
 
 
 def folder_of(options: argparse.Namespace) -> Path:
@@ -45,6 +48,25 @@ def begun(options: argparse.Namespace, folder: Path, out: Output) -> Begun:
     return search
 
 
+def strategy_of(search: Begun) -> str | Strategy:
+    """The strategy of a search, with the eigenvalue refinement that was chosen.
+
+    Raises
+    ------
+    InputError
+        Where one was chosen and the strategy has none.
+    """
+    if search.refine_by is None:
+        return search.strategy
+    chosen = NAMED[search.strategy]() if search.strategy in NAMED else None
+    if not isinstance(chosen, Swarm):
+        raise InputError(
+            f"--refine-by is of the strategies 'swarm' and 'hpso-ls', and the strategy is {search.strategy!r}: leave "
+            "it out, or give --strategy swarm or hpso-ls"
+        )
+    return replace(chosen, refine_by=search.refine_by)
+
+
 def with_source(search: Begun, files: Collection[Path], folder: Path) -> Begun:
     """The search with the digest of the files that its problem was made from; refused where it began with others."""
     source = catalogue.digest(files)
@@ -73,8 +95,11 @@ def _resumed(options: argparse.Namespace, folder: Path, out: Output) -> Begun:
     search = Begun.from_tree(tree["begun"])
     if asked is not None and asked != search:
         raise InputError(f"{folder} holds an unfinished run of {search}, not of {asked}")
-    if asked is None and ((options.seed, options.strategy, options.data) != (None, None, None) or options.settings):
-        raise InputError(f"--resume takes --seed, --strategy, --data and --set from the run in {folder}: {search}")
+    given = (options.seed, options.strategy, options.refine_by, options.data)
+    if asked is None and (any(one is not None for one in given) or options.settings):
+        raise InputError(
+            f"--resume takes --seed, --strategy, --refine-by, --data and --set from the run in {folder}: {search}"
+        )
     out.write(f"going on with {search}\n" if tree["entries"] else f"{search} had reached nothing: it begins anew\n")
     return search
 
@@ -89,7 +114,7 @@ def _asked(options: argparse.Namespace) -> Begun:
     if options.problem is None:
         raise InputError("PROBLEM is missing (see 'sysid run --help')")
     recipe = read.recipe(options, parameters.recipe_of(options))
-    return Begun(recipe, options.strategy or "auto", options.seed or 0)
+    return Begun(recipe, options.strategy or "auto", options.seed or 0, options.refine_by)
 
 
 def _in_words(checkpoint: Checkpoint, search: Begun) -> str:

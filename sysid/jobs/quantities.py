@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from sysid.results.answer import reported_unknowns
 from sysid.results.identification import Identification
 from sysid.structure.structure import Array
 
@@ -17,7 +16,7 @@ def quantities(result: Identification) -> dict[str, float]:
     Damping ratios are none of them where nothing that is fitted tells of the damping.
     """
     s, values = result.structure, result.values
-    free = [v.name for v in reported_unknowns(result.problem) if not v.fixed and v.name in values]
+    free = [v.name for v in result.facts.unknowns if not (v.fixed or v.is_ratio) and v.name in values]
     return labelled(s.natural_frequencies, result.identified_ratios, {name: values[name] for name in free})
 
 

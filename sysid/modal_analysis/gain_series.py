@@ -14,7 +14,9 @@ from sysid.structure.structure import Array, ComplexArray
 
 _TERMS_MORE = 4  # than the asymptotic rate of the series asks for
 _RANK = 1e-6  # of the largest singular value: directions of the gains below it are left out
-_BLOCK = 32  # candidates whose gains are made at once: those of more leave a processor's cache before they are used
+# Candidates whose gains are made at once: those of more leave a processor's cache before they are used. BLAS rounds by
+# the size of a product, so that all have this size.
+_BLOCK = 64
 _ALIKE = 1e-12  # up to which two base motions count as proportional at all lines
 
 
@@ -152,15 +154,21 @@ class SummedRecord:
             `GainSeries.polynomials` of the modes' ratios.
         """
         (n, count), (m, d) = polynomials.shape[1:], loads.shape[1:]
-        overlap = np.empty((m, self._overlap.shape[1], count))
-        np.matmul(self._overlap, polynomials.swapaxes(0, 1), out=overlap[:n])
+        blocks = [slice(at, at + _BLOCK) for at in range(0, count, _BLOCK)]
+        spare = -count % _BLOCK
+        polynomials = np.pad(polynomials, ((0, 0), (0, 0), (0, spare))) if spare else polynomials
+        filled = np.pad(loads, ((0, spare), (0, 0), (0, 0))) if spare else loads
+        overlap = np.empty((m, self._overlap.shape[1], polynomials.shape[2]))
+        for at in blocks:
+            np.matmul(self._overlap, polynomials[..., at].swapaxes(0, 1), out=overlap[:n, :, at])
         overlap[n:] = self._static_overlap
+        overlap = overlap[..., :count]
         by_mode = [np.ascontiguousarray(part.transpose(1, 2, 0)) for part in (shapes, loads)]
         onto_loads = np.einsum("kdsp,ksp->kdp", overlap.reshape(m, d, -1, count), by_mode[0])
         squared = self.size - 2 * np.einsum("kdp,kdp->p", onto_loads, by_mode[1])
-        blocks = [slice(at, at + _BLOCK) for at in range(0, count, _BLOCK)]
-        inner = [self._inner.products(loads[at], self._gains_of(polynomials[..., at], m)) for at in blocks]
-        return squared + np.einsum("pkl,pkl->p", shapes @ self._metric @ shapes.swapaxes(1, 2), np.concatenate(inner))
+        inner = [self._inner.products(filled[at], self._gains_of(polynomials[..., at], m)) for at in blocks]
+        metric = shapes @ self._metric @ shapes.swapaxes(1, 2)
+        return squared + np.einsum("pkl,pkl->p", metric, np.concatenate(inner)[:count])
 
     def _gains_of(self, polynomials: Array, m: int) -> Array:
         """Coordinates of the gains of m modes, (count, m, rank)."""

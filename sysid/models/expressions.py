@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from sysid.errors import InputError, finite_array
+from sysid.errors import InputError, finite_array, refuse
 from sysid.models.unknowns import Variable, expression_of, refuse_complex, user_site, variable_of
 from sysid.structure.structure import Array
 
@@ -152,11 +152,13 @@ def check_size(name: str, matrix: ca.MX, n: int, d: int) -> None:
 def check_base_last(name: str, numbers: Array, n: int) -> None:
     """Refuse the numbers of a whole mass matrix where the rows of the base, which has no mass, stand first."""
     d = len(numbers) - n
-    if d and not np.any(numbers[:d]) and np.any(numbers[n:]):
-        raise InputError(
-            f"{name} ({user_site()}) has no mass in its first {'row' if d == 1 else f'{d} rows'}: rows and columns of "
-            "the base stand last, those of the structure first"
+    refuse(
+        (
+            d and not np.any(numbers[:d]) and np.any(numbers[n:]),
+            f"{name} ({user_site()}) has no mass in its first row{'s' * (d > 1)}: rows and columns of the base stand "
+            "last, those of the structure first",
         )
+    )
 
 
 def size_of(matrix: ca.MX) -> str:

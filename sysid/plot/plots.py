@@ -162,7 +162,7 @@ def base_forces(
 
 
 def convergence(identification: Identification, ax: Axes | None = None) -> Any:
-    """Objective through the phases that ran: the swarm's best, the refinement, each iterate of the local phase.
+    """Objective through the phases that ran: the swarm's best, each iterate of the local phase.
 
     Each round of Huber's loss weighs its records anew, so that the curve may step up from one to the next.
     Fits with widened peaks on the way are left out; a swarm's curve of such responses is dashed, and says so.
@@ -174,8 +174,8 @@ def convergence(identification: Identification, ax: Axes | None = None) -> Any:
     swarm, local = positive(history.swarm_curve), positive(history.local_curve)
     rounds = sum(phase.evaluations for phase in history.phases if phase.name == HUBER)
     widened = bool(swarm.size) and bool(np.isnan(history.start))
-    _draw_curves(ax, swarm, local, history.refinement, rounds=rounds, widened=widened)
-    values = np.concatenate([swarm, local, [history.refinement]])
+    _draw_curves(ax, swarm, local, rounds=rounds, widened=widened)
+    values = np.concatenate([swarm, local])
     values = values[values > 0]
     if values.size:
         low, high = values.min(), values.max()
@@ -195,8 +195,8 @@ def convergence(identification: Identification, ax: Axes | None = None) -> Any:
     return shown
 
 
-def _draw_curves(ax: Axes, swarm: Array, local: Array, refinement: float, *, rounds: int, widened: bool) -> None:
-    """Best of the swarm, what the refinement made of it, and after them the iterates of the local phase.
+def _draw_curves(ax: Axes, swarm: Array, local: Array, *, rounds: int, widened: bool) -> None:
+    """Best of the swarm, and after it the iterates of the local phase.
 
     The last of these are of the `rounds` of Huber's loss.
     """
@@ -222,8 +222,6 @@ def _draw_curves(ax: Axes, swarm: Array, local: Array, refinement: float, *, rou
             ax.plot(iterate[first:], local[first:], color=COLOURS[1], label=told, **drawn)
     if swarm.size and local.size:
         ax.axvline(end, color=FAINT, linewidth=0.8, linestyle=":")
-    if refinement > 0:
-        ax.plot([end], [refinement], "D", color=INK, markersize=5, label="after refinement", zorder=4)
 
 
 def mac(identification: Identification, ax: Axes | None = None) -> Any:
@@ -239,7 +237,7 @@ def mac(identification: Identification, ax: Axes | None = None) -> Any:
             colour = "white" if values[i, j] > 0.55 else INK
             ax.text(j, i, f"{values[i, j]:.2f}", ha="center", va="center", fontsize=size, color=colour)
     colour_bar(image, ax, "MAC [–]")
-    known = identification.problem.reference is not None
+    known = identification.records.reference is not None
     words = ("MAC against the reference", "mode of the reference") if known else ("AutoMAC", "mode")
     dress(ax, *words, "identified mode", grid=False)
     return shown
@@ -258,7 +256,7 @@ def effective_masses(identification: Identification, ax: Axes | None = None) -> 
     for i, (name, colour) in enumerate(zip(names, COLOURS, strict=False)):
         ax.bar(at[:, i], share[:, i], width, color=colour, alpha=0.85, label=f"base {name}")
         ax.plot(modes, total[:, i], color=colour, linewidth=1.2, marker="o", markersize=3)
-    reference = identification.problem.reference
+    reference = identification.records.reference
     if reference is not None and reference.n == structure.n:
         size = max(80 / at.size, 4)
         ax.plot(

@@ -421,7 +421,10 @@ class Formulation:
     def _matrices(self, blocks: Blocks, geometry: Geometry) -> Matrices:
         by_frequency = self._function("ratios", [blocks.ratios], blocks.omega)
         function = self._function("matrices", blocks.outputs)
-        return Matrices(function, by_frequency, geometry.rigid_body, geometry.recovery, blocks.mass.mass is None)
+        whole_factor = self._function("whole_factor", [blocks.whole_factor])
+        return Matrices(
+            function, by_frequency, geometry.rigid_body, geometry.recovery, whole_factor, blocks.mass.mass is None
+        )
 
     def _function(self, name: str, expressions: Sequence[ca.MX], *further: ca.MX) -> ca.Function:
         """Expressions of the unknowns as a function of the vector x; fixed variables are numbers in it."""

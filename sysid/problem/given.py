@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from sysid.errors import InputError, finite_array, numbers
+from sysid.errors import InputError, finite_array, numbers, refuse
 from sysid.measurement.measurement import Measurement
 from sysid.models.damping import WrittenDamping
 from sysid.models.expressions import at_point, check_size, is_expression, square
@@ -74,13 +74,17 @@ def _numbers(name: str, value: Any) -> Array:
         matrix = numbers(name, value, complex)
     except InputError:
         matrix = np.zeros(())
-    if np.any(matrix.imag):
-        raise InputError(
+    refuse(
+        (
+            np.any(matrix.imag),
             f"Problem: {name} ({user_site()}) is complex, and a matrix of a structure is real: give its real part; "
-            "the loss factor eta of a complex stiffness is a damping ratio eta / 2 of each mode, damping=[eta / 2, ...]"
-        )
-    if matrix.ndim not in _DIMENSIONS[name]:
-        raise InputError(f"Problem: {name} is a {type(value).__name__}; give {_WANTED[name]}")
+            "a loss factor eta of a complex stiffness is a damping ratio eta / 2 of each mode, damping=[eta / 2, ...]",
+        ),
+        (
+            matrix.ndim not in _DIMENSIONS[name],
+            f"Problem: {name} is a {type(value).__name__}; give {_WANTED[name]}",
+        ),
+    )
     return matrix.real.copy()
 
 
@@ -99,11 +103,13 @@ def geometry_of(
         Where recovery, rigid_body_dofs and the sensors do not fit together.
     """
     for name, given in (("recovery", recovery), ("rigid_body_dofs", rigid_body_dofs)):
-        if is_expression(given):
-            raise InputError(
+        refuse(
+            (
+                is_expression(given),
                 f"{name} ({user_site()}) is written in variables, and it must be numbers: what is not known of the "
-                "degrees of freedom belongs into mass, stiffness and damping, written in those of the sensors"
+                "degrees of freedom belongs into mass, stiffness and damping, written in those of the sensors",
             )
+        )
     R = np.eye(test.n_sensors) if recovery is None else finite_array("recovery", recovery)
     if R.ndim != 2 or len(R) != test.n_sensors:
         raise InputError(f"recovery is {R.shape}; ({test.n_sensors}, n) takes n degrees of freedom to the sensors")

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 import casadi as ca
 import numpy as np
 
-from sysid.errors import InputError, finite_array, instance
+from sysid.errors import InputError, finite_array, instance, refuse
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import misfit_rows
 from sysid.modal_analysis.response import residual, weights_of_test
@@ -399,11 +399,13 @@ def _as_expressions(response: Response) -> Response:
 
 def column_of(name: str, value: Any) -> ca.MX:
     """A column of expressions, refused where it is not finite at the guess or holds no variable."""
-    if isinstance(value, Measurement):
-        raise InputError(
+    refuse(
+        (
+            isinstance(value, Measurement),
             f"{name} ({user_site()}) is a test: sysid.FurtherTest(test, mass=M, stiffness=K, damping=C) fits it beside "
-            "the first, validation=[test] predicts it"
+            "the first, validation=[test] predicts it",
         )
+    )
     column = ca.vec(ca.densify(as_matrix(name, value)))
     check_finite(name, at_point(name, column, None).ravel(), column)
     if not ca.symvar(column):

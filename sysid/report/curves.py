@@ -93,7 +93,7 @@ def _modes(it: Identification, points: Array, motion: Array) -> dict[str, Any]:
         shape *= _SHOWN * np.ptp(points, axis=0).max() / np.abs(shape).max()
         shapes.append(shape.round(6).tolist())
     names = [
-        f"mode {k}: {f:.4g} Hz" + ("" if np.isnan(ratio) else f", damping {100 * ratio:.3g} %")
+        f"mode {k}: {f:.4g} Hz" + f", damping {100 * ratio:.3g} %" * bool(np.isfinite(ratio))
         for k, (f, ratio) in enumerate(zip(it.structure.natural_frequencies, it.identified_ratios, strict=True), 1)
     ]
     return {"points": points.round(6).tolist(), "sticks": sticks, "shapes": shapes, "names": names}
@@ -182,7 +182,7 @@ def _half_widths(std: Array, test: Measurement) -> NDArray[Any]:
 
 def _recorded(it: Identification, test: Measurement) -> Measurement | None:
     """The records with their transients, where these were taken off."""
-    given = it.problem.measurement
+    given = it.records.measurement
     return given if test is it.measurement and given.whole is not None else None
 
 

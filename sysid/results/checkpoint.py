@@ -23,6 +23,7 @@ from sysid.results.lock import alone
 from sysid.results.storage import atomically, unfinished_writings
 from sysid.results.version import __version__
 from sysid.search.journal import EVERY, Journal
+from sysid.search.refinement import RefineBy
 from sysid.search.strategy import Strategy
 from sysid.structure.structure import Structure
 
@@ -40,6 +41,8 @@ class Begun:
     strategy : str
     seed : int
         Of the search.
+    refine_by : str or None
+        Of its swarm, where that was chosen.
     source : str
         Digest of the files that the problem was made from: a user's own model is code, which no problem holds.
     """
@@ -47,24 +50,28 @@ class Begun:
     recipe: Recipe
     strategy: str
     seed: int
+    refine_by: RefineBy | None = None
     source: str = field(default="", compare=False)
 
     def __str__(self) -> str:
         recipe = self.recipe
         noise = f", rng {recipe.rng}" if recipe.rng else ""
         data = "" if recipe.data is None else f", data {recipe.data}"
-        return f"{recipe.title}{noise}{data}, strategy {self.strategy}, seed {self.seed}"
+        refined = "" if self.refine_by is None else f" refined by {self.refine_by}"
+        return f"{recipe.title}{noise}{data}, strategy {self.strategy}{refined}, seed {self.seed}"
 
     def to_tree(self) -> Tree:
         """Give the fields by their names; `from_tree` takes them back."""
-        own = {"strategy": self.strategy, "seed": str(self.seed), "source": self.source}
+        own = {
+            "strategy": self.strategy, "seed": str(self.seed), "refine_by": self.refine_by, "source": self.source,
+        }  # fmt: skip
         return {"recipe": self.recipe.to_tree(), **own}
 
     @classmethod
     def from_tree(cls, tree: Tree) -> Begun:
-        """Give what `to_tree` made a tree of; earlier ones have no source."""
+        """Give what `to_tree` made a tree of; earlier ones have no source and no refinement."""
         recipe = Recipe.from_tree(tree["recipe"])
-        return cls(recipe, tree["strategy"], int(tree["seed"]), tree.get("source", ""))
+        return cls(recipe, tree["strategy"], int(tree["seed"]), tree.get("refine_by"), tree.get("source", ""))
 
 
 @dataclass(frozen=True)

@@ -22,12 +22,26 @@ if sys.platform == "win32":
 
     def _lock(file: int) -> None:
         os.lseek(file, 1024, os.SEEK_SET)  # behind the owner, which others read
-        msvcrt.locking(file, msvcrt.LK_NBLCK, 1)
+        try:
+            msvcrt.locking(file, msvcrt.LK_NBLCK, 1)
+        except OSError as error:  # all file systems have locks there
+            raise PermissionError from error
+
+    def _release(file: int, held: Path) -> None:
+        """Let the file go, then take it away, which is not possible while anybody has it open."""
+        os.close(file)
+        with contextlib.suppress(OSError):
+            held.unlink()
 else:
     import fcntl
 
     def _lock(file: int) -> None:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+    def _release(file: int, held: Path) -> None:
+        """Take the file away, then let it go: in the other order it could be the next one's."""
+        held.unlink(missing_ok=True)
+        os.close(file)
 
 
 class _HeldError(Exception):
@@ -61,7 +75,7 @@ def alone(lock: Path, what: str, remedy: str) -> Iterator[None]:
             file, held = _acquired(lock)
         except _HeldError as other:
             host, pid, _ = [*str(other).split(" "), "", ""][:3]
-            owner = f" (process {pid} on {host})" if pid else ""
+            owner = f" (process {pid} on {host})" * bool(pid)
             raise InputError(f"{what} is in use by another run{owner}: {remedy}") from None
         except OSError as error:
             raise InputError(f"{what} cannot be written: {error.strerror or error}") from error
@@ -83,8 +97,6 @@ def _acquired(lock: Path) -> tuple[int, Path]:
             except (BlockingIOError, PermissionError):
                 raise _HeldError(os.read(file, 200).decode(errors="replace")) from None
             except OSError:
-                if sys.platform == "win32":
-                    raise
                 lock.unlink(missing_ok=True)
                 return file, _named(lock)
             # The process before takes its file away while it holds it: then this is a lock on nothing.
@@ -114,16 +126,6 @@ def _is_same(file: int, lock: Path) -> bool:
         return os.path.samestat(os.fstat(file), lock.stat())
     except FileNotFoundError:
         return False
-
-
-def _release(file: int, held: Path) -> None:
-    """Take the file away, then let it go: in the other order it could be the next one's."""
-    if sys.platform != "win32":
-        held.unlink(missing_ok=True)
-    os.close(file)
-    if sys.platform == "win32":  # where an open file cannot be taken away, so that this is nobody else's
-        with contextlib.suppress(OSError):
-            held.unlink()
 
 
 # -- where the file system has no locks ---------------------------------------------------------

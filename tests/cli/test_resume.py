@@ -133,8 +133,8 @@ class TestAModelOfTheUsersOwn:
     [
         (["--fresh"], "--resume and --fresh exclude each other"),
         (["--out", "x"], "--resume and --out exclude each other"),
-        (["--seed", "3"], "--resume takes --seed, --strategy, --data and --set from the run in out"),
-        (["--set", "n=3"], "--resume takes --seed, --strategy, --data and --set from the run in out"),
+        (["--seed", "3"], "--resume takes --seed, --strategy, --refine-by, --data and --set from the run in out"),
+        (["--set", "n=3"], "--resume takes --seed, --strategy, --refine-by, --data and --set from the run in out"),
     ],
 )
 def test_what_does_not_go_together_is_told(stopped, complaint, more, said):

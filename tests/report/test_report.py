@@ -326,7 +326,7 @@ def test_convergence_tells_only_what_ran(modal, complete, plain, no_pictures):
 
     it = modal(force=False)
     assert rows(it) == [["local phase", f"{it.history.local:.4g}"]]
-    assert [name for name, _ in rows(complete)] == ["start", "swarm", "refinement", "local phase"]
+    assert [name for name, _ in rows(complete)] == ["start", "swarm", "local phase"]
     assert rows(plain) == []
 
 

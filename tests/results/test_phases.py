@@ -61,7 +61,7 @@ def test_a_phase_that_ended_at_no_structure_says_so(result):
 
 def test_each_phase_has_its_row_with_its_residual_and_errors(result):
     rows = rows_of_phases(result)
-    assert [row[0] for row in rows] == ["start", "swarm", "refinement", "local phase"]
+    assert [row[0] for row in rows] == ["start", "swarm", "local phase"]
     assert all(len(row) == len(COLUMNS) for row in rows)
     last = dict(zip(COLUMNS, rows[-1], strict=True))
     assert float(last["residual"]) == pytest.approx(result.residual, rel=5e-3)
