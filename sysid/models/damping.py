@@ -19,23 +19,50 @@ from sysid.models.unknowns import Unknown, lower_of, upper_of
 from sysid.structure.structure import Array, Structure
 
 _MISSING = (math.nan, math.nan)  # no default
+_PHYSICAL = (1e-6, 0.95)  # a vibration that hardly dies away, and one that hardly swings
+_USUAL = (0.005, 0.05)  # the swarm's search space, eq. 38
+_DECADE = 10.0  # from end to end of that, and of what is searched about a pole outside
 
 
 @dataclass(frozen=True, eq=False)
 class ModalDamping(FieldTree):
-    """One damping ratio a mode; the bounds are the swarm's search space (eq. 38 of Cerini et al. 2024)."""
+    """One damping ratio a mode.
 
-    lower: float = 0.005
-    upper: float = 0.05
+    Parameters
+    ----------
+    lower, upper : float, optional
+        Bounds of all ratios, which every strategy keeps. Without them a ratio may be whatever a vibrating structure has
+        (1e-6 to 0.95), and a swarm searches 0.005 to 0.05 (eq. 38 of Cerini et al. 2024); where poles of the data lie
+        outside, its search follows them, by half a decade either way.
+    """
+
+    lower: float | None = None
+    upper: float | None = None
 
     def __post_init__(self) -> None:
-        lower, upper = (number(f"ModalDamping: {name}", getattr(self, name)) for name in ("lower", "upper"))
+        for name in ("lower", "upper"):
+            if getattr(self, name) is not None:
+                number(f"ModalDamping: {name}", getattr(self, name))
+        lower, upper = self._bounds
         if not 0 < lower < upper < 1:
             raise InputError(f"ModalDamping: 0 < lower < upper < 1 is needed, not {lower} and {upper}")
 
+    @property
+    def _bounds(self) -> tuple[float, float]:
+        return tuple(
+            end if given is None else float(given) for given, end in zip((self.lower, self.upper), _PHYSICAL, strict=True)
+        )
+
     def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """Damping ratios, in ascending order of frequency."""
-        return (Unknown("damping_ratio", np.full(geometry.n, self.lower), np.full(geometry.n, self.upper)),)
+        lower, upper = (np.full(geometry.n, end) for end in self._bounds)
+        if self.lower is not None and self.upper is not None:
+            return (Unknown("damping_ratio", lower, upper),)
+        low, high, note = _box(geometry)
+        # A bound of the user's beyond the box takes it along.
+        low = np.clip(low, lower, upper if self.upper is None else upper / _DECADE)
+        high = np.clip(high, np.minimum(lower * _DECADE, upper) if self.lower is not None else lower, upper)
+        return (Unknown("damping_ratio", lower, upper, box=(low, high), note=note),)
 
     def blocks(self, geometry: Geometry, y: ca.SX, mass: MassBlocks, stiffness: StiffnessBlocks) -> None:
         """No matrix: ratios only."""
@@ -148,3 +175,22 @@ class WrittenDamping(Written):
     def _by_ratios(self, geometry: Geometry) -> bool:
         given, n = as_matrix("damping", self.written), geometry.n
         return given.shape == (n, 1) and (n > 1 or is_column(self.written))
+
+
+def _box(geometry: Geometry) -> tuple[Array, Array, str]:
+    """What a swarm searches for free ratios, (n,) each, and in words why; the usual box but for poles outside."""
+    n, ratios = geometry.n, np.sort(geometry.pole_ratios)
+    outside = (ratios < _USUAL[0]) | (ratios > _USUAL[1])
+    if not np.any(outside):
+        return np.full(n, _USUAL[0]), np.full(n, _USUAL[1]), ""
+    ratios = np.clip(geometry.pole_ratios, *_PHYSICAL)
+    half = np.sqrt(_DECADE)
+    low = np.where((ratios < _USUAL[0]) | (ratios > _USUAL[1]), ratios / half, _USUAL[0])
+    high = np.where((ratios < _USUAL[0]) | (ratios > _USUAL[1]), ratios * half, _USUAL[1])
+    if ratios.size != n:  # which mode has which is not known
+        low, high = np.full(n, min(low.min(), _USUAL[0])), np.full(n, max(high.max(), _USUAL[1]))
+    low, high = np.clip(low, *_PHYSICAL), np.clip(high, *_PHYSICAL)
+    return low, high, (
+        f"damping ratios are searched between {100 * low.min():.3g} and {100 * high.max():.3g} %, as poles of the data "
+        f"have {100 * ratios.min():.3g} to {100 * ratios.max():.3g} %, outside the usual 0.5 to 5 %"
+    )
