@@ -139,7 +139,7 @@ def _judged(formulation: Formulation, x: Array, rows: list[Rows], part: NDArray[
     none = Rows(np.zeros(0), np.zeros((0, x.size)), np.zeros(0))
     all_rows = stacked_rows([none, *rows])
     J, std = all_rows.jacobian[:, part] * unit, all_rows.std
-    free = _left_by_constraints(formulation, x, unit, J, part)
+    free = left_by_constraints(formulation, x, unit, J, part)
     J = J @ free
     U, s, Vt = np.linalg.svd(J, full_matrices=len(J) < J.shape[1])
     rank, V = _rank(s, _NULL), Vt.T
@@ -152,7 +152,7 @@ def _judged(formulation: Formulation, x: Array, rows: list[Rows], part: NDArray[
     return Sensitivity(unit, free, s, free @ V[:, :rank], free @ V[:, rank:], normals)
 
 
-def _left_by_constraints(
+def left_by_constraints(
     formulation: Formulation, x: Array, unit: Array, records: Array, part: NDArray[np.bool_]
 ) -> Array:
     """Orthonormal directions, in units of x, along which equalities and what presses on an inequality stay as they are.

@@ -49,9 +49,8 @@ class ModalDamping(FieldTree):
 
     @property
     def _bounds(self) -> tuple[float, float]:
-        return tuple(
-            end if given is None else float(given) for given, end in zip((self.lower, self.upper), _PHYSICAL, strict=True)
-        )
+        low, high = _PHYSICAL
+        return low if self.lower is None else float(self.lower), high if self.upper is None else float(self.upper)
 
     def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """Damping ratios, in ascending order of frequency."""
@@ -59,9 +58,9 @@ class ModalDamping(FieldTree):
         if self.lower is not None and self.upper is not None:
             return (Unknown("damping_ratio", lower, upper),)
         low, high, note = _box(geometry)
-        # A bound of the user's beyond the box takes it along.
-        low = np.clip(low, lower, upper if self.upper is None else upper / _DECADE)
-        high = np.clip(high, np.minimum(lower * _DECADE, upper) if self.lower is not None else lower, upper)
+        # A single bound beyond the box takes it along.
+        low = np.clip(low, lower, upper if self.upper is None else np.maximum(upper / _DECADE, lower))
+        high = np.clip(high, lower if self.lower is None else np.minimum(lower * _DECADE, upper), upper)
         return (Unknown("damping_ratio", lower, upper, box=(low, high), note=note),)
 
     def blocks(self, geometry: Geometry, y: ca.SX, mass: MassBlocks, stiffness: StiffnessBlocks) -> None:
@@ -178,19 +177,15 @@ class WrittenDamping(Written):
 
 
 def _box(geometry: Geometry) -> tuple[Array, Array, str]:
-    """What a swarm searches for free ratios, (n,) each, and in words why; the usual box but for poles outside."""
-    n, ratios = geometry.n, np.sort(geometry.pole_ratios)
+    """Lower and upper ends of what a swarm searches for free ratios, (n,) each, and in words why; empty if as usual."""
+    n, ratios = geometry.n, np.clip(geometry.pole_ratios, *_PHYSICAL)
     outside = (ratios < _USUAL[0]) | (ratios > _USUAL[1])
     if not np.any(outside):
         return np.full(n, _USUAL[0]), np.full(n, _USUAL[1]), ""
-    ratios = np.clip(geometry.pole_ratios, *_PHYSICAL)
     half = np.sqrt(_DECADE)
-    low = np.where((ratios < _USUAL[0]) | (ratios > _USUAL[1]), ratios / half, _USUAL[0])
-    high = np.where((ratios < _USUAL[0]) | (ratios > _USUAL[1]), ratios * half, _USUAL[1])
+    low = np.clip(np.where(outside, ratios / half, _USUAL[0]), *_PHYSICAL)
+    high = np.clip(np.where(outside, ratios * half, _USUAL[1]), *_PHYSICAL)
     if ratios.size != n:  # which mode has which is not known
         low, high = np.full(n, min(low.min(), _USUAL[0])), np.full(n, max(high.max(), _USUAL[1]))
-    low, high = np.clip(low, *_PHYSICAL), np.clip(high, *_PHYSICAL)
-    return low, high, (
-        f"damping ratios are searched between {100 * low.min():.3g} and {100 * high.max():.3g} %, as poles of the data "
-        f"have {100 * ratios.min():.3g} to {100 * ratios.max():.3g} %, outside the usual 0.5 to 5 %"
-    )
+    span, found = (f"{100 * part.min():.3g} to {100 * part.max():.3g} %" for part in (np.append(low, high), ratios))
+    return low, high, f"damping ratios are searched from {span}, as the poles of the data have {found}, not 0.5 to 5 %"

@@ -89,7 +89,7 @@ class Geometry:
 
     @cached_property
     def pole_ratios(self) -> Array:
-        """Damping ratios of the poles that stand out of the records, in ascending order of frequency; (0,) with none."""
+        """Damping ratios of the poles that stand out of the records, by ascending frequency; (0,) where none does."""
         try:
             return self.poles.ratios
         except InputError:  # too few lines, or none stands out: who needs poles asks for them, and is told

@@ -72,8 +72,8 @@ class HeldSpectrumObjective:
         formulation, test = problem.formulation, term.test
         self._batches, self._parts, self._rigid_body = batches, formulation.parts, formulation.geometry.rigid_body
         self._share = term.weight**2
-        ranges = [end[self._parts.damping] for end in formulation.box]
-        self._series = GainSeries(test.freq, np.sort(spectrum), *ranges, shift=term.shift)
+        low, high = (end[self._parts.damping] for end in formulation.box)
+        self._series = GainSeries(test.freq, np.sort(spectrum), low, high, shift=term.shift)
         recovery = term.matrices.recovery, np.eye(formulation.geometry.d)
         self._records: list[tuple[SummedRecord, float]] = []
         sizes: list[tuple[float, float]] = []
