@@ -150,6 +150,14 @@ def _modes(structure: sysid.Structure) -> tuple[np.ndarray, np.ndarray, np.ndarr
     )
 
 
+def unknowns_of(structure: sysid.Structure, like: sysid.Structure) -> np.ndarray:
+    """Theta of a structure, (p,), each mode with the sign that is nearer to that of the structure `like`."""
+    omega, zeta, Phi, Gamma = _modes(structure)
+    signs = np.where(np.sum(Phi * like.mode_shapes, axis=0) < 0, -1.0, 1.0)
+    rigid = structure.rigid_body_mass[np.triu_indices(structure.n_base)]
+    return np.concatenate([(Phi * signs).ravel(), (Gamma.T * signs).T.ravel(), np.log(omega), np.log(zeta), rigid])
+
+
 def _slices(n: int, d: int) -> dict[str, slice]:
     """Where each kind of unknown stands in theta."""
     sizes = {"phi": n * n, "gamma": n * d, "omega": n, "zeta": n, "rigid": d * (d + 1) // 2}

@@ -61,6 +61,7 @@ def lines(reduced: bool) -> Iterator[Line]:
     text = f"{what}: share of runs with every mode found whose removal raises chi² by {STANDS_OUT:g}, and no other"
     yield above(text + shown, float(np.mean(right)), SHARE)
     yield from trial.coverages(what, trials, cells=False)
+    yield trial.stated(what, trials)
     complete = [t for t in trials if t.held.get("mass")]
     yield Line(f"{what}: runs whose intervals of matrices are compared", f"{len(complete)} of {len(trials)}")
     told = [f"{t.group}: {sentence}" for t in trials for sentence in t.accusations]

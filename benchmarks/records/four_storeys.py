@@ -55,6 +55,7 @@ def lines(reduced: bool) -> Iterator[Line]:
         yield trial.verdicts(name, own, determined=statement.determined)
         yield from trial.coverages(name, own)
         yield from trial.errors(name, own)
+        yield trial.stated(name, own)
         yield trial.levels_found(name, own)
 
 

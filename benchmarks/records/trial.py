@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.stats import norm
 
 import sysid
 from benchmarks.line import Line, above, below
@@ -18,6 +19,7 @@ LEVEL = 0.95
 POOLED, EACH = (0.93, 0.97), 0.87  # share of 95 % intervals that hold the truth: of all, of a cell
 RATIOS = (1.10, 1.25)  # rms error over the bound: of all, of a cell
 FEW = ((0.85, 1.0), 1.4)  # the same, pooled, of fewer draws than prove anything: three to four deviations away
+STATED = (0.9, 1.1)  # stated deviations over those of the bound: levels of noise are found within 5 %
 LEVELS_WITHIN, LEVELS_SHARE = 0.05, 0.95
 VERDICTS = 0.97
 PROVEN = 100  # draws; cells of fewer are printed, not judged
@@ -46,10 +48,12 @@ class Trial:
         Whether each 95 % interval of a kind of quantity holds the truth.
     ratios : dict of str to list of float
         Each error over its bound.
+    stated : dict of str to float
+        Geometric mean of the stated deviations of a kind over their bounds.
     levels : list of float
         Levels of noise found over the true ones; empty where none are told.
     accusations : tuple of str
-        Sentences that doubt the records.
+        All sentences that speak against the answer, and remarks that doubt a record.
     open : tuple of str
         Why the matrices are not determined.
     said : str
@@ -61,6 +65,7 @@ class Trial:
     found: int = 0
     held: dict[str, list[bool]] = field(default_factory=dict)
     ratios: dict[str, list[float]] = field(default_factory=dict)
+    stated: dict[str, float] = field(default_factory=dict)
     levels: list[float] = field(default_factory=list)
     accusations: tuple[str, ...] = ()
     open: tuple[str, ...] = ()
@@ -90,6 +95,7 @@ def judged(group: str, result: sysid.Identification, truth: sysid.Structure, lea
     """Compare a result with the truth; modes' quantities only where matrices cannot be compared or are open."""
     held: dict[str, list[bool]] = {}
     ratios: dict[str, list[float]] = {}
+    stated: dict[str, float] = {}
     found = result.structure
     for name in KINDS if found.n == truth.n else ():
         exact, value, std = (getattr(it, name) for it in (truth, found, least))
@@ -104,10 +110,12 @@ def judged(group: str, result: sysid.Identification, truth: sysid.Structure, lea
         exact, value = exact[part][free], value[part][free]
         held[name] = ((low <= exact) & (exact <= high)).tolist()
         ratios[name] = ((value - exact) / std[part][free]).tolist()
-    accusations = [s for s in result.undetermined if s in result.message]
-    accusations += [s for s in result.remarks if "deviations from the fit" in s]
+        if np.any(free):
+            width = (high - low) / (2 * norm.ppf((1 + LEVEL) / 2))
+            stated[name] = float(np.exp(np.mean(np.log(width / std[part][free]))))
+    accusations = [*result.against, *(s for s in result.remarks if "deviations from the fit" in s)]
     return Trial(
-        group, result.determined, found.n, held, ratios, _levels(result, levels), tuple(accusations),
+        group, result.determined, found.n, held, ratios, stated, _levels(result, levels), tuple(accusations),
         result.undetermined,
     )  # fmt: skip
 
@@ -166,6 +174,19 @@ def errors(what: str, trials: list[Trial]) -> Iterator[Line]:
     yield below(text, pooled, RATIOS[0] if proven else FEW[1])
     text += f", worst cell ({KINDS[worst[0]]}, number {worst[1] + 1} of its kind)"
     yield below(text, rms[worst], RATIOS[1]) if proven else Line(text, f"{rms[worst]:.4g}")
+
+
+def stated(what: str, trials: list[Trial]) -> Line:
+    """Stated deviations over those of the Cramér-Rao bound: the median draw of the kind that is farthest off."""
+    ratios = {
+        name: float(np.median(r)) for name in KINDS if (r := [t.stated[name] for t in trials if name in t.stated])
+    }
+    if not ratios:
+        return Line(f"{what}: stated deviations", "none to compare", "", False)
+    worst = max(ratios, key=lambda name: abs(np.log(ratios[name])))
+    text = f"{what}: stated deviations over the Cramér-Rao bound, median draw, {KINDS[worst]}, farthest of all kinds"
+    low, high = STATED
+    return Line(text, f"{ratios[worst]:.4f}", f"{low:g} to {high:g}", low <= ratios[worst] <= high)
 
 
 def levels_found(what: str, trials: list[Trial]) -> Line:

@@ -15,7 +15,7 @@ import numpy as np
 def parameter_bound(
     response: Callable[[np.ndarray], np.ndarray], true: np.ndarray, std: np.ndarray | float, step: float = 1e-4
 ) -> np.ndarray:
-    """Least standard deviations of unbiased estimates of `true`, (p,).
+    """Least covariance of unbiased estimates of `true`, relative to the true values, (p, p).
 
     Parameters
     ----------
@@ -38,4 +38,4 @@ def parameter_bound(
         columns.append(((8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * h) * value / std).ravel())
     J = np.array(columns).T  # by relative changes, so that springs and dampers are alike
     information = 2 * (J.conj().T @ J).real
-    return np.sqrt(np.diag(np.linalg.inv(information))) * true
+    return np.linalg.inv(information)

@@ -5,11 +5,13 @@ from __future__ import annotations
 from types import ModuleType
 
 import numpy as np
+from scipy.stats import chi2
 
 import sysid
 from benchmarks.line import Line
 
 ABOVE = 1.3  # times the bound
+CHANCE = 1e-3  # that a few right draws pass their bound, on either side
 NORMAL = np.sqrt(2 / np.pi)  # mean |error| over standard deviation
 
 
@@ -35,13 +37,27 @@ def least_percent(bound: np.ndarray) -> float:
     return float(100 * NORMAL * bound.mean())
 
 
-def over_the_bound(errors: np.ndarray, bound: np.ndarray, *, judged: bool) -> Line:
-    """Ratio of errors (draws, unknowns) to the bound (unknowns,); a few draws do not judge it."""
+def over_the_bound(errors: np.ndarray, bound: np.ndarray) -> Line:
+    """Ratio of errors (draws, unknowns) to the bound (unknowns,), of many draws."""
     median = np.median(mean_percent(errors)) / least_percent(bound)
     ratio = np.sqrt(np.mean((errors / bound) ** 2))
     return Line(
         "  the same over the bound: median of the means; root mean square of all errors",
         f"{median:.3f}; {ratio:.3f}",
-        f"<= {ABOVE:g} each" if judged else "",
-        bool(max(median, ratio) <= ABOVE) if judged else None,
+        f"<= {ABOVE:g} each",
+        bool(max(median, ratio) <= ABOVE),
     )
+
+
+def whitened(errors: np.ndarray, covariance: np.ndarray) -> Line:
+    """Sum of squares of a few draws' errors (draws, unknowns), whitened by the bound's covariance (unknowns, unknowns).
+
+    It follows chi² with one degree of freedom a number, however the errors of one draw hang together.
+    """
+    squares = float(np.sum(errors * np.linalg.solve(covariance, errors.T).T))
+    low, high = chi2.ppf([CHANCE, 1 - CHANCE], errors.size) / errors.size
+    ratio = squares / errors.size
+    return Line(
+        f"  chi² of all {errors.size} errors, whitened by the Cramér-Rao covariance, over their number",
+        f"{ratio:.3f}", f"{low:.2f} to {high:.2f}", bool(low <= ratio <= high),
+    )  # fmt: skip

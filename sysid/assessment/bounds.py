@@ -17,7 +17,8 @@ from sysid.problem.problem import Problem
 from sysid.problem.slopes import Rows, stacked_rows
 from sysid.structure.structure import Array, Structure
 
-NEAR = 1e-6  # of an unknown's range, on the scale that it is searched on: nearer than that it rests on the bound
+NEAR = 1e-6  # of an unknown's range: nearer than that it rests on the bound ..
+_CLOSE = 1e-4  # .. and, where the range spans decades, of the bound itself
 _SHARE = 0.25  # of the squared misfit: bounds that explain less, to first order, are not its cause
 _MOST = 8  # unknowns named
 _NONE = 1e-9  # of a unit: an unknown that moves less is held by the constraints alone
@@ -47,20 +48,20 @@ class OnBound(NamedTuple):
     place: int
 
 
-def sides_of(unknown: Unknown, values: Array) -> list[str]:
-    """The bound on which each entry of an unknown rests: "lower", "upper", or "" for none.
+def sides_of(lower: Array, upper: Array, values: Array, *, relative: bool = False) -> list[str]:
+    """The bound on which each of some values rests: "lower", "upper", or "" for none.
 
-    Where ratios alone count, entries in units of the largest rest on a positive lower bound or on none.
+    Of a `relative` unknown, whose ratios alone count, entries in units of the largest rest on a positive lower bound or
+    on none.
     """
-    lower, upper = unknown.lower[: values.size], unknown.upper[: values.size]
-    if unknown.relative:
+    if relative:
         values = values / np.abs(values).max()
-        low, high = (lower > 0) & (values - lower < NEAR * (upper - lower)), np.zeros(values.size, dtype=bool)
-    elif unknown.scale == "log":
-        at, span = np.clip(values, lower, upper), NEAR * np.log(upper / lower)
-        low, high = np.log(at / lower) < span, np.log(upper / at) < span
-    else:
-        low, high = values - lower < NEAR * (upper - lower), upper - values < NEAR * (upper - lower)
+    near = [
+        np.minimum(NEAR * (upper - lower), np.where(end == 0, np.inf, _CLOSE * np.abs(end))) for end in (lower, upper)
+    ]
+    low, high = values - lower < near[0], upper - values < near[1]
+    if relative:
+        low, high = low & (lower > 0), np.zeros_like(high)
     return ["lower" if a else "upper" if b else "" for a, b in zip(low, high, strict=True)]
 
 
@@ -87,12 +88,19 @@ def on_bounds(problem: Problem, structure: Structure, x: Array | None) -> list[O
             continue
         damping = formulation.damping.free and part == formulation.parts.damping
         values = x[part] if x is not None else structure.damping_ratios[: unknown.size] if damping else None
-        for i, side in enumerate([] if values is None else sides_of(unknown, values)):
+        for i, side in enumerate(_sides(unknown, values)):
             if side:
                 bound = f"{getattr(unknown, side)[i]:.4g} {unknown.unit}".strip()
                 index = unknown.labels[i].removeprefix(unknown.title)
                 found.append(OnBound(unknown.title, index, side, bound, source, part.start + i))
     return [*found, *_on_windows(problem, structure)]
+
+
+def _sides(unknown: Unknown, values: Array | None) -> list[str]:
+    """The same of an unknown, of as many entries as are known."""
+    if values is None:
+        return []
+    return sides_of(unknown.lower[: values.size], unknown.upper[: values.size], values, relative=unknown.relative)
 
 
 def _on_windows(problem: Problem, structure: Structure) -> Iterator[OnBound]:

@@ -8,16 +8,16 @@ from pathlib import Path
 
 from sysid.cli.output import Output
 from sysid.cli.status import SUCCESS
+from sysid.cli.stored_result import add_arguments, read
 from sysid.export.content import worth
 from sysid.export.export import export, format_of, precision
-from sysid.results.identification import load
 
 
 def run(options: argparse.Namespace, out: Output) -> int:
     """Write the file, tell its precision, and warn where the matrices are not determined."""
     target = Path(options.file)
     form = format_of(target)  # a wrong ending is told before the result is read
-    result = load(options.result)
+    result = read(options)
     out.wrote(export(result, target))
     without = "" if form.deviations else "; without deviations, which .csv and .mat have"
     out.write(f"{form.name}; precision: {precision(target)}{without}\n")
@@ -42,6 +42,6 @@ def add(command: Callable[..., argparse.ArgumentParser]) -> None:
             f"sysid export results/cantilever_tower tower.{ending}" for ending in ("csv", "mat", "op4", "bdf", "unv")
         ),
     )
-    parser.add_argument("result", metavar="RESULT", help="a result.h5, or the folder that holds it")
+    add_arguments(parser)
     parser.add_argument("file", metavar="FILE", help="the file to write")
     parser.set_defaults(command=run)

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import IO, Any, NoReturn, cast
 
 from sysid import catalogue
-from sysid.cli import doctor, export, parameters, read, starting, unfinished
+from sysid.cli import doctor, export, parameters, read, starting, stored_result, unfinished
 from sysid.cli.argument_types import band, count, orders, seconds, seed, whole
 from sysid.cli.command_parser import JSON, QUIET, Parser, adder, epilog
 from sysid.cli.display import display_on
@@ -32,7 +32,7 @@ from sysid.errors import InputError, SolverError
 from sysid.identify import NAMED, identify
 from sysid.results.checkpoint import FILE_NAME as UNFINISHED
 from sysid.results.checkpoint import Checkpoint
-from sysid.results.identification import Identification, load
+from sysid.results.identification import Identification
 from sysid.results.storage import FILE_NAME as RESULT
 from sysid.results.storage import atomically, missing_folders, remove_empty
 from sysid.results.version import __version__
@@ -215,7 +215,7 @@ def _report(options: argparse.Namespace, out: Output) -> int:
     from sysid.report import report
 
     source = Path(options.result)
-    result = load(source)
+    result = stored_result.read(options)
     folder = source if source.is_dir() else source.parent
     out.wrote(report.write_report(result, folder / report.FILE_NAME))
     return SUCCESS
@@ -276,7 +276,7 @@ def _parser() -> argparse.ArgumentParser:
         summary="write report.html again, beside a result",
         examples=("sysid report results/cantilever_tower", "sysid report results/cantilever_tower/result.h5"),
     )
-    report.add_argument("result", metavar="RESULT", help="a result.h5, or the folder that holds it")
+    stored_result.add_arguments(report)
     report.set_defaults(command=_report)
 
     export.add(command)

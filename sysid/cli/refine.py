@@ -14,6 +14,7 @@ from sysid.cli import draws, sweeps
 from sysid.cli.files import png, results_folder, table_as_csv, write_files
 from sysid.cli.output import Output
 from sysid.cli.status import INTERRUPTED, NOT_REACHED, SUCCESS
+from sysid.cli.stored_result import with_problem_of
 from sysid.errors import InputError
 from sysid.jobs.engine import cluster, processes
 from sysid.jobs.job import JobResult
@@ -34,6 +35,8 @@ def run(options: argparse.Namespace, out: Output) -> int:
     source = Path(options.result)
     result = load(source)
     recipe = _recipe(result, source)
+    if result.part is not None:
+        result = with_problem_of(result, recipe, source)
     folder = results_folder(options.out, (source if source.is_dir() else source.parent) / "refine")
     executor = _executor(options)
     sweeps.check_own_records(result, recipe)

@@ -7,7 +7,6 @@ from datetime import datetime
 
 import numpy as np
 
-from sysid.assessment.gains import taken_at_sensors
 from sysid.results.identification import Identification
 from sysid.results.version import __version__
 from sysid.structure.structure import Array, Structure
@@ -90,7 +89,7 @@ def statements(it: Identification, precision: str) -> tuple[str, ...]:
         f"judgement: {worth(it)}; relative residual {it.residual:.3g}",
         f"search: {it.message}",
         *(f"fixed by: {text}" for text in it.closed_by),
-        *(f"assumed: {text}" for text in taken_at_sensors(it.problem)),
+        *(f"assumed: {text}" for text in it.facts.assumed),
         *(f"against: {text}" for text in it.against),
         *(f"open: {text}" for text in left_open(it)),
         "units: kg, m, s, N, rad; frequencies in Hz; damping ratios are fractions of critical damping",
@@ -100,7 +99,7 @@ def statements(it: Identification, precision: str) -> tuple[str, ...]:
         "damping acts on the motion relative to the base",
         f"precision: {precision}",
     ]
-    if it.problem.unit_mass:
+    if it.facts.unit_mass:
         found.append("all masses, stiffness and damping are relative: no mass was stated, and they are scaled to 1 kg")
     return tuple(" ".join(text.split()) for text in found)
 

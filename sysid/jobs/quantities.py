@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from sysid.results.answer import reported_unknowns
 from sysid.results.identification import Identification
 from sysid.structure.structure import Array
 
@@ -14,7 +13,7 @@ FREQUENCY, RATIO = "frequency, Hz", "damping ratio"
 def quantities(result: Identification) -> dict[str, float]:
     """Frequencies, damping ratios and unknowns that mean something by themselves, by label; none fixed ones."""
     s, values = result.structure, result.values
-    free = [v.name for v in reported_unknowns(result.problem) if not v.fixed and v.name in values]
+    free = [v.name for v in result.facts.unknowns if not (v.fixed or v.is_ratio) and v.name in values]
     return labelled(s.natural_frequencies, s.damping_ratios, {name: values[name] for name in free})
 
 

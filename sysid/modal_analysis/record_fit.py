@@ -100,7 +100,7 @@ class RecordFit:
 
     @cached_property
     def likelihood(self) -> float:
-        """Logarithm of the records' likelihood, up to a constant."""
+        """Logarithm of the likelihood of the records' spectra, but for the powers of pi."""
         model, c = self.model, self.model.channels
         spread = 0.0
         for chunk in model.chunks(self.parameters):

@@ -147,7 +147,7 @@ def _programme(n: int, m: int, max_time: float | None = None) -> ca.Function:
 
 
 def _finish(factor: Array, targets: Array, success: bool, message: str) -> Refinement:
-    factor = factor * np.where(np.diag(factor) < 0, -1.0, 1.0)
+    """What came of a refinement, from its factor, whose diagonal is positive."""
     # Singular values, not eigenvalues of L L': full relative accuracy needs no squares.
     own = np.sort(np.linalg.svd(factor, compute_uv=False))
     error = float(np.max(np.abs((own[: targets.size] / targets) ** 2 - 1)))

@@ -239,7 +239,7 @@ def mac(identification: Identification, ax: Axes | None = None) -> Any:
             colour = "white" if values[i, j] > 0.55 else INK
             ax.text(j, i, f"{values[i, j]:.2f}", ha="center", va="center", fontsize=size, color=colour)
     colour_bar(image, ax, "MAC [–]")
-    known = identification.problem.reference is not None
+    known = identification.records.reference is not None
     words = ("MAC against the reference", "mode of the reference") if known else ("AutoMAC", "mode")
     dress(ax, *words, "identified mode", grid=False)
     return shown
@@ -258,7 +258,7 @@ def effective_masses(identification: Identification, ax: Axes | None = None) -> 
     for i, (name, colour) in enumerate(zip(names, COLOURS, strict=False)):
         ax.bar(at[:, i], share[:, i], width, color=colour, alpha=0.85, label=f"base {name}")
         ax.plot(modes, total[:, i], color=colour, linewidth=1.2, marker="o", markersize=3)
-    reference = identification.problem.reference
+    reference = identification.records.reference
     if reference is not None and reference.n == structure.n:
         size = max(80 / at.size, 4)
         ax.plot(

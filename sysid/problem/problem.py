@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, choice, instance, number, refuse
+from sysid.files.tree import check
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.outliers import Outlier, outliers, predicted, pseudo_values, screened
 from sysid.modal_analysis.response import columns, weighed_mass
@@ -167,16 +168,24 @@ class Problem:
         declared.check()
 
     def to_tree(self) -> dict[str, Any]:
-        """Give all that the problem was given as dictionaries, lists, arrays and texts; `from_tree` takes it back."""
+        """Give all that the problem was given as dictionaries, lists, arrays and texts; `from_tree` takes it back.
+
+        Without the expressions where one holds what cannot be stored: see `sysid.problem.stored`.
+        """
         return {
             "measurement": self.measurement.to_tree(),
-            "given": stored.to_tree(vars(self)),
+            "given": self._given,
             "poles": None if self._changed else self._geometry.found,  # those of what is screened
             "reference": None if self.reference is None else self.reference.to_tree(),
             "validation": [test.to_tree() for test in self.validation],
             "goal": self.goal,
             "loss": self.loss,
         }
+
+    @cached_property
+    def _given(self) -> dict[str, Any]:
+        """Models, numbers and expressions as a tree, for which expressions are compared with what is read again."""
+        return stored.to_tree(vars(self))
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Problem:
@@ -186,8 +195,10 @@ class Problem:
 
         Raises
         ------
+        NotRebuiltError
+            Where the class of a model is not to be found, or the expressions are not in the tree.
         InputError
-            Where a model's class is not to be found, or this CasADi cannot read the expressions.
+            Where the tree is damaged.
         """
         problem = cls(
             Measurement.from_tree(tree["measurement"]),
@@ -327,8 +338,8 @@ class Problem:
         Raises
         ------
         InputError
-            Where no point of the search space makes a structure, no point keeps the constraints, or an expression
-            cannot be stored.
+            Where no point of the search space makes a structure, no point keeps the constraints, or a model cannot be
+            stored.
         """
         formulation = self.formulation
         if not formulation.variables and formulation.free_modes:
@@ -336,7 +347,7 @@ class Problem:
         points = points_of(formulation)
         if not formulation.free_modes:  # with them every point makes a structure
             check_matrices(formulation, points, self.measurement, self.site)
-        stored.check_storable(vars(self))
+        check(self._given)  # before a search what could not be stored at its end
         check_constraints(formulation, points, self.site)
 
     @cached_property

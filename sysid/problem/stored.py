@@ -1,7 +1,6 @@
 """What a problem is given beside its measurement, as a tree: models by their fields, numbers, and expressions.
 
-All expressions are the outputs of one CasADi function of the variables; its text is CasADi's own serialisation, which
-holds expressions and numbers and no Python.
+All expressions are made of the variables by one list of operations: see `sysid.problem.encoding`.
 """
 
 from __future__ import annotations
@@ -13,17 +12,22 @@ import casadi as ca
 import numpy as np
 
 from sysid.errors import InputError
-from sysid.files.tree import check
 from sysid.measurement.measurement import Measurement
 from sysid.models.expressions import as_matrix, is_column, is_expression
 from sysid.models.registry import is_storable, model_from_tree, model_to_tree
 from sysid.models.unknowns import Variable, variable_of
+from sysid.problem.decoding import decode
+from sysid.problem.encoding import NotStorableError, encode
 from sysid.problem.given import MATRICES
 from sysid.problem.terms import FurtherTest, Prior
 
 _ARRAYS = ("recovery", "rigid_body_dofs")
 
 Tree = dict[str, Any]
+
+
+class NotRebuiltError(InputError):
+    """A file does not hold all of a problem: its module is needed."""
 
 
 def to_tree(given: Mapping[str, Any]) -> Tree:
@@ -35,10 +39,16 @@ def to_tree(given: Mapping[str, Any]) -> Tree:
         By the names of the parameters of `Problem`; mass, stiffness and damping are needed, and only what stands
         beside measurement, reference, validation and goal is stored.
 
+    Returns
+    -------
+    dict
+        Without the expressions where one of them holds what cannot be stored, such as a Python callback; "without"
+        then says which, and is None elsewhere.
+
     Raises
     ------
     InputError
-        Where a Python callback stands in an expression, or a model cannot be stored.
+        Where a model cannot be stored.
     """
     outputs = _Outputs()
     tree = {
@@ -61,9 +71,15 @@ def from_tree(tree: Tree) -> dict[str, Any]:
 
     Raises
     ------
+    NotRebuiltError
+        Where a class of the user's own is missing, or the expressions were not stored.
     InputError
-        Where a class of the user's own is missing, or this CasADi cannot read the expressions.
+        Where the expressions are damaged.
     """
+    if tree["without"] is not None:
+        raise NotRebuiltError(
+            f"it was stored without the expressions of its problem, as {tree['without']} cannot be stored"
+        )
     variables = {part["name"]: _variable_from_tree(part) for part in tree["variables"]}
     outputs = _outputs_from_tree(tree, list(variables.values()))
     return {
@@ -75,15 +91,16 @@ def from_tree(tree: Tree) -> dict[str, Any]:
     }
 
 
-def check_storable(given: Mapping[str, Any]) -> None:
-    """Refuse before a search what could not be stored at its end.
+def needs_module(tree: Tree) -> bool:
+    """Whether a tree that `to_tree` made does not hold all of a problem: expressions, or the class of a model."""
+    models = [tree[name] for name in MATRICES] + [part.get("source") for part in tree["residuals"]]
+    models += [part[name] for part in tree["residuals"] if part["kind"] == "test" for name in MATRICES]
+    return tree["without"] is not None or any(isinstance(one, dict) and _is_own(one) for one in models)
 
-    Raises
-    ------
-    InputError
-        As `to_tree`, or where a model of the user's own gives a tree that holds something else than a tree can.
-    """
-    check(to_tree(given))
+
+def _is_own(tree: Tree) -> bool:
+    """Whether a model's class is one of the user's."""
+    return ":" in tree.get("kind", "")
 
 
 class _Outputs:
@@ -103,45 +120,43 @@ class _Outputs:
         """The variables of all expressions, and the function that gives the expressions."""
         found = {variable_of(s) for _, expression in self.expressions for s in ca.symvar(expression)}
         variables = sorted((v for v in found if v is not None), key=lambda variable: variable.order)
-        symbols = [variable.symbol for variable in variables]
-        text = _text(symbols, [expression for _, expression in self.expressions])
-        if text is None:
-            names = [name for name, expression in self.expressions if _text(symbols, [expression]) is None]
-            raise InputError(
-                f"{', '.join(names)}: a Python callback in an expression cannot be stored, nor sent to another "
-                "machine; write it in CasADi's own operations"
-            )
+        expressions, without = None, None
+        if self.expressions:
+            try:
+                expressions = _encoded(variables, [expression for _, expression in self.expressions])
+            except NotStorableError:
+                without = ", ".join(self._reasons(variables))
         return {
             "variables": [_variable_to_tree(variable) for variable in variables],
-            "expressions": text if self.expressions else None,
-            "casadi_version": ca.__version__,
+            "expressions": expressions,
+            "without": without,
         }
 
+    def _reasons(self, variables: Sequence[Variable]) -> list[str]:
+        """Which expressions cannot be stored, and for what in them."""
+        found = []
+        for name, expression in self.expressions:
+            try:
+                _encoded(variables, [expression])
+            except NotStorableError as error:
+                found.append(f"{error} in {name}")
+        return found or ["all of them together"]
 
-def _text(symbols: Sequence[ca.MX], expressions: Sequence[ca.MX]) -> str | None:
-    """CasADi's text of a function; None where it holds what CasADi could not read again."""
-    function = ca.Function("expressions", symbols, expressions)
-    try:
-        text = str(function.serialize())
-        ca.Function.deserialize(text)  # a callback is written without a word, and then cannot be read
-    except (RuntimeError, NotImplementedError):
-        return None
-    return text
+
+def _encoded(variables: Sequence[Variable], expressions: Sequence[ca.MX]) -> Tree:
+    """Expressions as operations, tried at the guess and at another point of the search space."""
+    share, points = np.random.default_rng(0), list[list[ca.DM]]()
+    for of_guess in (True, False):
+        at = [v.guess if of_guess else v.lower + share.random(v.size) * (v.upper - v.lower) for v in variables]
+        points.append([ca.reshape(ca.DM(np.ravel(x)), *v.symbol.shape) for x, v in zip(at, variables, strict=True)])
+    return encode([variable.symbol for variable in variables], expressions, points)
 
 
 def _outputs_from_tree(tree: Tree, variables: Sequence[Variable]) -> dict[int | None, ca.MX | None]:
     """The expressions by their numbers; None by None."""
     if tree["expressions"] is None:
         return {None: None}
-    try:
-        function = ca.Function.deserialize(tree["expressions"])
-    except RuntimeError as error:
-        raise InputError(
-            f"its expressions were written by CasADi {tree['casadi_version']}, and CasADi {ca.__version__} cannot read "
-            f"them ({str(error).strip().splitlines()[-1]})"
-        ) from error
-    # Inlined: each expression is written in its own variables only, as it was.
-    return {None: None, **dict(enumerate(function.call([variable.symbol for variable in variables], True, False)))}
+    return {None: None, **dict(enumerate(decode(tree["expressions"], [variable.symbol for variable in variables])))}
 
 
 def _matrices_to_tree(given: Mapping[str, Any], outputs: _Outputs) -> Tree:
@@ -171,7 +186,7 @@ def _matrix_from_tree(tree: Any, outputs: Mapping[int | None, Any]) -> Any:
     if not isinstance(tree, dict):
         return tree
     if "expression" not in tree:
-        return model_from_tree(tree)
+        return _model_from_tree(tree)
     expression = outputs[tree["expression"]]
     return [expression] if tree["dimensions"] == 1 else expression
 
@@ -193,7 +208,16 @@ def _residual_from_tree(tree: Tree, outputs: Mapping[int | None, Any]) -> Any:
         return FurtherTest(Measurement.from_tree(tree["measurement"]), **_matrices_from_tree(tree, outputs))
     if tree["kind"] == "prior":
         return Prior(outputs[tree["expression"]], tree["value"], tree["std"])
-    return model_from_tree(tree["source"]) if tree["kind"] == "own" else outputs[tree["expression"]]
+    return _model_from_tree(tree["source"]) if tree["kind"] == "own" else outputs[tree["expression"]]
+
+
+def _model_from_tree(tree: Tree) -> Any:
+    try:
+        return model_from_tree(tree)
+    except InputError as error:
+        if _is_own(tree):
+            raise NotRebuiltError(str(error)) from error
+        raise
 
 
 def _variable_to_tree(variable: Variable) -> Tree:

@@ -184,7 +184,7 @@ def _half_widths(std: Array, test: Measurement) -> NDArray[Any]:
 
 def _recorded(it: Identification, test: Measurement) -> Measurement | None:
     """The records with their transients, where these were taken off."""
-    given = it.problem.measurement
+    given = it.records.measurement
     return given if test is it.measurement and given.whole is not None else None
 
 

@@ -29,7 +29,7 @@ def matrices(it: Identification) -> str:
     """HTML of heat maps and tables of M_SS, K_SS, C and the base's blocks of M."""
     structure, test = it.structure, it.measurement
     n, axes, names = structure.n, test.base_axes or (), it.degrees_of_freedom
-    scale = "; masses normalised to 1 kg" if it.problem.unit_mass else ""
+    scale = "; masses normalised to 1 kg" if it.facts.unit_mass else ""
     coupling, base = "kg", "kg"
     if not test.translational.all():
         coupling, base = "kg, kg m in columns of a rotation", "kg, kg m, kg m²"
@@ -99,10 +99,7 @@ def plain(width: str) -> str:
 
 def stated(it: Identification) -> Array:
     """Which entries of the rigid-body mass were stated, (d, d) of bool."""
-    totals, d = it.problem.formulation.mass.totals, it.structure.n_base
-    if totals is None or totals.kind != "rigid_body":
-        return np.zeros((d, d), dtype=bool)
-    return np.ones((d, d), dtype=bool) if totals.values.ndim == 2 else np.eye(d, dtype=bool)
+    return it.facts.stated_rigid_body
 
 
 def _ranges(ends: Array, otherwise: Lines) -> Lines:

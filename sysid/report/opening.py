@@ -61,7 +61,7 @@ def _subject(it: Identification) -> str:
     of = f"{n} degrees of freedom"
     if n != test.n_sensors:
         of += f" from {test.n_sensors} sensors"
-    records = "whole records, their transients taken off, " * (it.problem.measurement.whole is not None)
+    records = "whole records, their transients taken off, " * (it.records.measurement.whole is not None)
     told = (
         f"Identified: mass, stiffness and damping matrices of {of}. From: {fitted_in_words(it)}, "
         f"{counted(d, 'base direction')} ({', '.join(test.base_axes or ())}), {records}{test.lines_in_words}, "
@@ -88,7 +88,7 @@ def _steps(it: Identification) -> list[str]:
         return ["Give it more time (--max-time, max_time=): what it is worth was not judged."]
     if it.judgement == "one of many":
         return ["Measure more closely what is not known well enough: it is named below."]
-    if not it.problem.validation:
+    if not it.records.validation:
         one_by_one = ", or each run by the others: 'sysid refine RESULT --leave-out run'" * (it.measurement.n_runs > 1)
         return [
             f"Predict a test that was not fitted (in Python validation=[...]{one_by_one}): it alone shows what the "
@@ -102,7 +102,7 @@ def _masses(it: Identification) -> Iterator[tuple[str, str]]:
     by_user = np.diag(stated(it))
     for axis, mass, deviation, known in zip(it.measurement.base_axes or (), masses, std, by_user, strict=True):
         what, unit = ("moment of inertia", "kg m²") if axis.startswith("r") else ("total mass", "kg")
-        if it.problem.unit_mass:
+        if it.facts.unit_mass:
             yield f"{what}, {axis}", f"~{number(mass)} {unit}, normalised: no mass is stated, no force was measured"
             continue
         exact = known and half_width(deviation, mass) in ("open", "0")
@@ -138,7 +138,7 @@ def _modes(it: Identification) -> Iterator[tuple[str, str]]:
 
 
 def _fit(it: Identification, level: NoiseLevel) -> Iterator[tuple[str, str]]:
-    test = it.problem.screened.measurement
+    test = it.records.screened.measurement
     left = f"{number(100 * it.residual, 3)} % of the accelerations relative to the base"
     left += _beside(share_of_all_noise(level.response, test.relative), level)
     if it.force_residual is not None and test.force is not None:

@@ -11,8 +11,6 @@ import numpy as np
 from sysid import plot
 from sysid.measurement.measurement import Measurement
 from sysid.plot.canvas import own_style
-from sysid.problem.formulation import MATRICES
-from sysid.problem.problem import Problem
 from sysid.report.curves import curves, mode_shapes, script
 from sysid.report.html import (
     Cell,
@@ -34,7 +32,7 @@ from sysid.report.opening import opening, rounded, trust
 from sysid.results.gain_table import gains_of_sensors
 from sysid.results.identification import Identification
 from sysid.results.noise_table import NOISE_COLUMNS, noise_of_channels
-from sysid.results.phases import COLUMNS, rows_of_phases, seconds_in_words
+from sysid.results.phases import COLUMNS, seconds_in_words
 from sysid.results.storage import atomically, file_or_folder
 from sysid.results.summary import (
     counted,
@@ -54,7 +52,6 @@ from sysid.structure.structure import Array, ComplexArray, Structure
 
 FILE_NAME = "report.html"
 _SUFFIXES = (".html", ".htm")
-_TOTALS = {"trace": "total of the diagonal", "rigid_body": "rigid-body total", "sensors": "total on the sensors"}
 _PER_UNIT = "Absolute acceleration of each sensor per unit base acceleration (transmissibility), magnitude and phase."
 _DRAWN_SHAPES = (
     "Motion relative to the base, which stands still, at the places of the sensors along their axes; grey: at rest. "
@@ -130,7 +127,7 @@ def write_report(identification: Identification, path: str | Path) -> Path:
 def render(identification: Identification) -> str:
     """Make the page, as a string."""
     it = identification
-    level = noise_level(it.problem.screened.measurement, it.structure)
+    level = noise_level(it.records.screened.measurement, it.structure)
     return page(
         _title(it),
         opening(it, level),
@@ -178,7 +175,7 @@ def _unknowns(it: Identification) -> str:
 
 
 def _modes(it: Identification) -> str:
-    structure, reference, u = it.structure, it.problem.reference, it.quick_uncertainty
+    structure, reference, u = it.structure, it.records.reference, it.quick_uncertainty
     many, frequencies, percent = is_one_of_many(it), structure.natural_frequencies, 100 * structure.damping_ratios
     widths = np.zeros((2, structure.n)) if u is None else np.array([u.natural_frequencies, 100 * u.damping_ratios])
     told = [rounded(f, std, 6) for f, std in zip(frequencies, widths[0], strict=True)]
@@ -234,11 +231,11 @@ def _effective_mass_columns(it: Identification, many: Array) -> Iterator[list[ob
 
 def _rigid_body_mass(it: Identification) -> str:
     axes, turns = it.measurement.base_axes or (), ~it.measurement.translational
-    rigid, reference = it.structure.rigid_body_mass, it.problem.reference
+    rigid, reference = it.structure.rigid_body_mass, it.records.reference
     unit = "kg; kg m where one axis is a rotation, kg m² where both are" if turns.any() else "kg"
-    told, label, u = "", _NORMALISED * it.problem.unit_mass, it.quick_uncertainty
+    told, label, u = "", _NORMALISED * it.facts.unit_mass, it.quick_uncertainty
     below: Lines = []
-    if it.problem.unit_mass:
+    if it.facts.unit_mass:
         told = paragraph(
             "No mass is stated and no base force was measured: the masses are normalised to 1 kg in each base "
             "direction. All mass, stiffness and damping entries carry this scale, which the data do not tell."
@@ -254,7 +251,7 @@ def _rigid_body_mass(it: Identification) -> str:
 
 def _responses(it: Identification, test: Measurement, level: NoiseLevel) -> str:
     words = _PER_UNIT if test.has_unit_runs else _AS_MOVED
-    if test is it.measurement and it.problem.measurement.whole is not None:
+    if test is it.measurement and it.records.measurement.whole is not None:
         words += " The transients of the records are taken off."
     return paragraph(words, "soft") + curves(it, test, level)
 
@@ -280,7 +277,7 @@ def _residuals(it: Identification, level: NoiseLevel) -> str:
 
 def _as_fitted(it: Identification, test: Measurement) -> Measurement:
     """The test with the records whose residual is told: of the one that was fitted, without what stands alone."""
-    return it.problem.screened.measurement if test is it.measurement else test
+    return it.records.screened.measurement if test is it.measurement else test
 
 
 def _noise(it: Identification) -> str:
@@ -341,7 +338,7 @@ def _validation(it: Identification) -> str:
     parts = []
     for i, test in enumerate(it.validation, start=1):
         parts += [
-            f"<h3>Test {i} of {len(it.problem.validation)}: predicted, never fitted</h3>",
+            f"<h3>Test {i} of {len(it.records.validation)}: predicted, never fitted</h3>",
             paragraph(f"{_residual(test, it.structure)}."),
             _score_table(it, test),
             _responses(it, test, noise_level(test, it.structure)),
@@ -371,7 +368,7 @@ def _poles(it: Identification) -> str:
     if diagram.axes[0].texts:
         left = "the largest singular value; why it is without poles stands in the picture"
     right = "all singular values; two that peak at one line are two modes there"
-    aside = ", outliers that stand alone left out" * (it.problem.loss == "huber")
+    aside = ", outliers that stand alone left out" * (it.records.loss == "huber")
     indicator = plot.cmif(it)
     for figure in (diagram, indicator):
         figure.set_size_inches(5.6, 4.2)  # beside each other, and on a phone, at nearly the size of their words
@@ -382,16 +379,16 @@ def _poles(it: Identification) -> str:
 
 def _convergence(it: Identification) -> str:
     history = it.history
-    if not rows_of_phases(it):
+    if not it.phases:
         return ""
     steps = max(history.local_curve.size - 1, 0)
     refined = "eigenvalues replaced by those given"
     if np.isfinite(history.refinement_error):
         refined += f", within {history.refinement_error:.1e} (relative, ω²)"
-    ran = rows_of_phases(it)
+    ran = it.phases
     swarm = f"{history.evaluations} candidates in {history.swarm_curve.size} iterations of the swarm; {refined}; "
     told = swarm * bool(history.swarm_curve.size) + f"{counted(steps, 'local iteration')}, exact gradients"
-    if it.problem.reference is not None:
+    if it.records.reference is not None:
         told += ". Errors are those of the reference: M_SS, K_SS and C in Frobenius norm"
     alt = f"objective through {', '.join(row[0] for row in ran) or 'no search'}"
     caption = _LAST_PHASE * (it.strategy == "continuation")
@@ -402,7 +399,7 @@ def _convergence(it: Identification) -> str:
     rows = [[row[k] for k in told_of] for row in ran]
     parts.append(table([COLUMNS[k] for k in told_of], rows, f"{told}.", words=True))
     if history.restarts:
-        again = f"{counted(history.restarts, 'further swarm')} followed, as the first ended in no good fit"
+        again = f"{counted(history.restarts, 'further swarm')} followed, as the first ended at no solution that fits"
         parts.append(paragraph(f"{again}; {history.evaluations} candidates are those of all.", "soft"))
     parts.append(table(["state of the swarm", "iterations"], history.states))
     return "".join(parts)
@@ -417,7 +414,7 @@ def _falls(it: Identification) -> bool:
 def _mac(it: Identification) -> str:
     words = (
         "Identified mode shapes against those of the reference at the sensors: 1 on the diagonal where they agree."
-        if it.problem.reference
+        if it.records.reference
         else "Mode shapes against each other (no reference is known): off-diagonal entries near 1 tell modes that "
         "these sensors cannot tell apart."
     )
@@ -425,7 +422,7 @@ def _mac(it: Identification) -> str:
 
 
 def _effective_masses(it: Identification) -> str:
-    words, reference = "Bars: each mode; lines: their running sum", it.problem.reference
+    words, reference = "Bars: each mode; lines: their running sum", it.records.reference
     words += "; short dashes: each mode of the reference" * (reference is not None and reference.n == it.structure.n)
     words += ". What is missing to 100 % moves with the base, or in modes beyond the lines."
     label, caption = (ONE_OF_MANY, CHOSEN) if is_one_of_many(it).any() else ("", "")
@@ -436,7 +433,7 @@ def _effective_masses(it: Identification) -> str:
 def _how(it: Identification) -> str:
     """What was minimised and how it ended, in the words of the search."""
     all_records = "over the relative accelerations of all runs, sensors and lines, unweighted"
-    all_records += "; outliers that stand alone are left out" * (it.problem.loss == "huber")
+    all_records += "; outliers that stand alone are left out" * (it.records.loss == "huber")
     of = all_records if it.residuals else "of the misfit that the problem states"
     lines = [
         f"{'Success' if it.success else 'No success'}. The search: {ending_in_words(it)}.",
@@ -450,7 +447,7 @@ def _how(it: Identification) -> str:
 
 
 def _what_ran(it: Identification) -> str:
-    problem, recipe = it.problem, it.recipe
+    of_problem, recipe = it.facts, it.recipe
     facts: list[list[object]] = []
     if recipe is not None:
         facts += [["problem", recipe.title], ["data", recipe.data or "its own"], ["problem's rng", recipe.rng]]
@@ -458,10 +455,10 @@ def _what_ran(it: Identification) -> str:
         ["strategy", it.strategy],
         ["seed", "–" if it.seed is None else it.seed],
         ["wall time", seconds_in_words(it.history.wall_time)],
-        *_models(problem),
-        ["sysid", __version__],
     ]
-    counts = [*problem.unknowns, ("together", problem.n_variables)]
+    facts += [[f"{name} model", words] for name, words in of_problem.models]
+    facts.append(["sysid", __version__])
+    counts = [*of_problem.counts, ("together", of_problem.n_variables)]
     log = f"<h3>Log</h3><pre>{text(chr(10).join(it.history.log))}</pre>" if it.history.log else ""
     return (
         table(["", ""], facts, words=True)
@@ -486,15 +483,3 @@ def _difference(value: float, reference: float) -> str:
         return "–"
     share = value / reference - 1
     return f"{100 * share:+.2g}" if abs(share) > SAME else "0"
-
-
-def _models(problem: Problem) -> list[list[object]]:
-    """A row a matrix: its model, and what that states; or that it is written in variables or numbers."""
-    formulation, counts = problem.formulation, dict(problem.unknowns)
-    stated = (formulation.mass, formulation.stiffness, formulation.damping)
-    rows: list[list[object]] = []
-    for name, model, group, known in zip(MATRICES, problem.models, formulation.of_models, stated, strict=True):
-        kind = type(model).__name__ if group else "written in variables" if counts[name] else "numbers"
-        total = "" if known.totals is None else _TOTALS[known.totals.kind]
-        rows.append([f"{name} model", "; ".join(filter(None, (kind, total, known.sentence)))])
-    return rows

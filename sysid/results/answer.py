@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -14,8 +14,9 @@ from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.outliers import Outlier
 from sysid.modal_analysis.response import weighted_error
 from sysid.modal_analysis.transients import without_transients_of
-from sysid.models.unknowns import Unknown, by_name
+from sysid.models.unknowns import by_name
 from sysid.problem.problem import Problem
+from sysid.results.records import PartOfProblem, Records
 from sysid.search.strategy import History
 from sysid.structure.structure import Array, ComplexArray, Structure
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from sysid.assessment.determination import Intervals
     from sysid.assessment.gains import GainErrors
     from sysid.assessment.uncertainty import Uncertainty
+    from sysid.results.facts import Facts
 
 NOT_JUDGED = "what data and model determine, and how far noise leaves it known, was not judged: the time was over"
 _QUICK_SHAPES = 1000  # entries of the mode shapes up to which uncertainty takes a second or less
@@ -83,6 +85,28 @@ class Answer:
     changing: bool = field(default=False, kw_only=True)
     hurried: bool = field(default=False, kw_only=True)
 
+    def __post_init__(self) -> None:
+        if isinstance(self.problem, PartOfProblem):  # as it comes of a file: `problem` then tells what is missing
+            part: PartOfProblem = vars(self).pop("problem")
+            vars(self).update(part.attributes, _part=part)
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Tell what is missing where the problem is asked for and the file does not hold it whole."""
+            if name == "problem" and "_part" in vars(self):
+                raise InputError(
+                    f"the problem of this result is needed, and its file does not hold it: {self.part.without}. Give "
+                    "it: sysid.load(path, problem=...), or --module FILE at the command line"
+                )
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
+
+    @property
+    def part(self) -> PartOfProblem | None:
+        """What the file of this result holds of its problem, where it does not hold it whole; else None."""
+        part: PartOfProblem | None = vars(self).get("_part")
+        return part
+
     @property
     def judgement(self) -> Literal["determined", "one of many", "no fit"]:
         """What the matrices are worth, in a word.
@@ -107,7 +131,27 @@ class Answer:
     @property
     def measurement(self) -> Measurement:
         """The test that was fitted; of whole records without their transients."""
-        return self.problem.at_rest.measurement
+        return self.records.at_rest.measurement
+
+    @property
+    def records(self) -> Problem | Records:
+        """What was recorded: the attributes of a problem that tell it, wherever they come from."""
+        part = self.part
+        return self.problem if part is None else part.records
+
+    @cached_property
+    def facts(self) -> Facts:
+        """What readers ask of the problem beside its records."""
+        from sysid.results.facts import facts_of
+
+        return facts_of(self.problem, self.x)
+
+    @cached_property
+    def phases(self) -> list[list[str]]:
+        """What each phase of the search left: see `sysid.results.phases.rows_of_phases`."""
+        from sysid.results.phases import rows_of_phases
+
+        return rows_of_phases(self)
 
     @property
     def noise(self) -> NoiseLevels | None:
@@ -120,7 +164,7 @@ class Answer:
         """By how much each sensor's gain differs from the base's, as the records show it, and how exactly they do."""
         from sysid.assessment.gains import gain_errors
 
-        return gain_errors(self.problem.screened.measurement, self.structure)
+        return gain_errors(self.records.screened.measurement, self.structure)
 
     @property
     def gain_worth(self) -> Array:
@@ -135,7 +179,7 @@ class Answer:
     @cached_property
     def validation(self) -> tuple[Measurement, ...]:
         """The problem's validation tests; of whole records without the transients that this structure makes of them."""
-        return tuple(without_transients_of(test, self.structure) for test in self.problem.validation)
+        return tuple(without_transients_of(test, self.structure) for test in self.records.validation)
 
     @property
     def _in_modes(self) -> bool:
@@ -186,7 +230,7 @@ class Answer:
         assert self.x is not None
         return self.x
 
-    @property
+    @cached_property
     def further_tests(self) -> tuple[tuple[Measurement, Structure], ...]:
         """Tests that were fitted beside the problem's own (`sysid.FurtherTest`), each with the structure as it was."""
         if self._in_modes:
@@ -197,7 +241,7 @@ class Answer:
     @property
     def force_residual(self) -> float | None:
         """``‖predicted - measured‖ / ‖measured‖`` over the base force; None where none was measured."""
-        return self.problem.screened.measurement.force_residual(self.structure)
+        return self.records.screened.measurement.force_residual(self.structure)
 
     def predict(self, measurement: Measurement) -> ComplexArray:
         """Relative accelerations under another test's base motion, (runs, n_sensors, n_freq)."""
@@ -261,6 +305,11 @@ class Answer:
         return self.success and scale_is_open(self.problem.screened, self.structure, self.x)
 
     @property
+    def asks_for_others(self) -> bool:
+        """Whether a summary asks for other matrices that explain the same data: nothing else leaves the answer open."""
+        return self.success and not (self.determined or self.against or NOT_JUDGED in self.undetermined)
+
+    @cached_property
     def is_one_of_many(self) -> bool:
         """Whether other matrices explain the same data within what was stated."""
         from sysid.assessment.modal_mass_cone import speaks
@@ -279,7 +328,7 @@ class Answer:
     @property
     def mac(self) -> Array:
         """Modal assurance criterion against the reference where one is known, else against itself."""
-        other = self.problem.reference or self.structure
+        other = self.records.reference or self.structure
         return modal_assurance(self.structure.mode_shapes, other.mode_shapes)
 
     @property
@@ -297,7 +346,7 @@ class Answer:
     def quick_uncertainty(self) -> Uncertainty | None:
         """`uncertainty` where it is known already or takes no longer than about a second; else None."""
         known = "uncertainty" in self.__dict__
-        quick = self.structure.mode_shapes.size <= _QUICK_SHAPES and not self.hurried
+        quick = self.structure.mode_shapes.size <= _QUICK_SHAPES and not self.hurried and self.part is None
         return self.uncertainty if known or quick else None
 
     def quick_std(self, name: str) -> Array:
@@ -309,7 +358,8 @@ class Answer:
     def quick_intervals(self) -> Intervals | None:
         """Both intervals where they are known already or take no longer than a few seconds; else None."""
         known = "_intervals" in self.__dict__
-        return self._intervals if known or (self.structure.n <= _QUICK_DOFS and not self.hurried) else None
+        quick = self.structure.n <= _QUICK_DOFS and not self.hurried and self.part is None
+        return self._intervals if known or quick else None
 
 
 def modal_assurance(phi: Array, other: Array) -> Array:
@@ -318,15 +368,3 @@ def modal_assurance(phi: Array, other: Array) -> Array:
         raise InputError(f"mode shapes at {phi.shape[0]} and {other.shape[0]} sensors cannot be compared")
     size = np.outer(np.sum(phi**2, axis=0), np.sum(other**2, axis=0))
     return (phi.T @ other) ** 2 / np.where(size > 0, size, 1.0)
-
-
-def reported_unknowns(problem: Problem, *, damping_ratios: bool = False) -> tuple[Unknown, ...]:
-    """Unknowns that mean something by themselves: those of models with a form of their own, and variables, fixed too.
-
-    The entries of a free matrix's factor are none, nor are shares of which only the ratios count. Free damping ratios
-    stand in the table of modes, and are among them only where asked for.
-    """
-    formulation = problem.formulation
-    stated = (formulation.mass.free, formulation.stiffness.free, formulation.damping.free and not damping_ratios)
-    of_models = (v for group, free in zip(formulation.of_models, stated, strict=True) for v in group if not free)
-    return (*(v for v in of_models if not v.relative), *formulation.variables)

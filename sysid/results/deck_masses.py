@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.models.mass import LumpedMass
 from sysid.results.answer import Answer
 
 _MOST = 6  # masses that are told
@@ -24,7 +23,7 @@ class DeckMass(NamedTuple):
 def deck_masses(it: Answer) -> tuple[DeckMass, ...]:
     """The diagonal of M_SS of a lumped model, where it is short."""
     n = it.structure.n
-    if not isinstance(it.problem.mass, LumpedMass) or n > _MOST:
+    if not it.facts.mass_is_lumped or n > _MOST:
         return ()
     masses, std = np.diag(it.structure.mass)[:n], np.diag(it.quick_std("mass"))[:n]
     many = np.isnan(std) & (it.quick_uncertainty is not None)

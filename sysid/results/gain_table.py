@@ -25,7 +25,7 @@ class SensorGain(NamedTuple):
 
 def gains_of_sensors(it: Answer) -> tuple[SensorGain, ...]:
     """Gains of the sensors that the records of a fit show; of none where deviations take long or nothing was fitted."""
-    if it.quick_uncertainty is None or not it.success or not it.problem.formulation.fits_records:
+    if it.quick_uncertainty is None or not it.success or not it.facts.fits_records:
         return ()
     found, names = it.gains, it.measurement.sensor_names
     shown = np.isfinite(found.error)

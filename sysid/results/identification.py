@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import ast
 import json
+import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from itertools import starmap
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sysid.errors import InputError, finite_array, text, whole_number
+from sysid.errors import InputError, finite_array, instance, text, whole_number
 from sysid.problem.problem import Problem
-from sysid.results import storage
-from sysid.results.answer import Answer, reported_unknowns
+from sysid.problem.stored import NotRebuiltError, needs_module
+from sysid.results import readings, storage
+from sysid.results.answer import Answer
 from sysid.results.gain_table import gains_of_sensors
 from sysid.results.noise_table import noise_of_channels
+from sysid.results.records import PartOfProblem, Records
 from sysid.results.summary import summary
 from sysid.results.version import __version__
 from sysid.search.strategy import History
@@ -138,7 +141,7 @@ class Identification(Answer):
         """The figures of ``summary.json``; None for what the data leave open or what was not computed."""
         u, values = self.quick_uncertainty, self.values
         std = {} if u is None else u.variables
-        reported = () if self.x is None else reported_unknowns(self.problem, damping_ratios=True)
+        reported = () if self.x is None else self.facts.unknowns
         return {
             "problem": self.recipe.module if self.recipe else None,
             "parameters": self.recipe.parameters if self.recipe else {},
@@ -192,19 +195,30 @@ class Identification(Answer):
         return {
             **{name: getattr(self, name) for name in _PLAIN},
             "structure": self.structure.to_tree(),
-            "problem": self.problem.to_tree(),
+            **self._problem_to_tree(),
             "seed": _if_given(str, self.seed),  # a number of any size
             "history": self.history.to_tree(),
             "recipe": _if_given(Recipe.to_tree, self.recipe),
         }
 
+    def _problem_to_tree(self) -> dict[str, Any]:
+        """The problem, and beside it what readers ask of it, where the tree does not hold it whole."""
+        if self.part is not None:
+            return {"problem": self.part.tree, "readings": self.part.readings}
+        tree = self.problem.to_tree()
+        return {"problem": tree, "readings": readings.to_tree(self) if needs_module(tree["given"]) else None}
+
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Identification:
-        """Give the identification of a tree that `to_tree` made, exact to the bit."""
+        """Give the identification of a tree that `to_tree` made, exact to the bit.
+
+        Without its problem, where the tree does not hold it whole: `problem` then raises an InputError.
+        """
+        structure = Structure.from_tree(tree["structure"])
         return cls(
             **{name: tree[name] for name in _PLAIN},
-            structure=Structure.from_tree(tree["structure"]),
-            problem=Problem.from_tree(tree["problem"]),
+            structure=structure,
+            problem=_problem_from_tree(tree, structure),
             seed=_if_given(int, tree["seed"]),
             history=History.from_tree(tree["history"]),
             recipe=_if_given(Recipe.from_tree, tree["recipe"]),
@@ -227,29 +241,128 @@ class Identification(Answer):
         ------
         InputError
             Where it cannot be written, or what the user described by objects of another program cannot be stored.
+
+        Warns
+        -----
+        UserWarning
+            Where it is written without the expressions of its problem, of which one holds what cannot be stored.
         """
-        return storage.write(self.to_tree(), path)
+        tree = self.to_tree()
+        written, without = storage.write(tree, path), tree["problem"]["given"]["without"]
+        if without is not None:
+            warnings.warn(
+                f"{written} is without the expressions of its problem, as {without} cannot be stored: to refine it, "
+                "give its module again (--module FILE; in Python sysid.load(path, problem=...))",
+                stacklevel=2,
+            )
+        return written
+
+    def with_problem(self, problem: Problem) -> Identification:
+        """Give the same with its problem, where a file did not hold it whole.
+
+        Parameters
+        ----------
+        problem : Problem
+            Of the same records and variables; made as it was for the identification.
+
+        Raises
+        ------
+        InputError
+            Where it has other records or other variables, or the unknowns stand for other matrices in it.
+        """
+        instance("problem", problem, Problem)
+        _check_records(self.records, problem)
+        if self.x is not None:
+            _check_unknowns(self, self.x, problem)
+        own = {
+            field.name: getattr(self, field.name) for field in fields(self) if field.init and field.name != "problem"
+        }
+        return type(self)(**own, problem=problem)
 
 
-def load(path: str | Path) -> Identification:
+def load(path: str | Path, problem: Problem | None = None) -> Identification:
     """Read an identification that `Identification.save` wrote, exact to the bit.
 
     Parameters
     ----------
     path : str or Path
         The file, or the folder that holds its ``result.h5``.
+    problem : Problem, optional
+        What was identified, with the same records and variables: where the file does not hold it whole, because a
+        matrix model is a class of the user's own that this process has not imported, or an expression holds what
+        cannot be stored. All that does not need it is there without it: figures, summary, report and export.
 
     Returns
     -------
     Identification
+        Whose `problem` raises an InputError where it is needed and not given.
 
     Raises
     ------
     InputError
-        Where there is no such file, or it is not a result of sysid, or damaged, or one of a later format, or a
-        matrix model of the user's own is not to be found; names the file.
+        Where there is no such file, or it is not a result of sysid, or damaged, or one of another format, or `problem`
+        is another one; names the file.
     """
-    return storage.read(path, Identification.from_tree)
+    result = storage.read(path, Identification.from_tree)
+    if problem is None:
+        return result
+    try:
+        return result.with_problem(problem)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _problem_from_tree(tree: dict[str, Any], structure: Structure) -> Any:
+    """The problem of a result's tree, or what is there of it."""
+    part = tree["problem"]
+    try:
+        return Problem.from_tree(part)
+    except NotRebuiltError as error:
+        if tree["readings"] is None:
+            raise
+        recipe = tree["recipe"]
+        module = "" if recipe is None else f" (its problem was made by {recipe['module']})"
+        read = tree["readings"]
+        attributes = readings.from_tree(read, structure)
+        return PartOfProblem(part, read, Records.from_tree(part), attributes, f"{error}{module}")
+
+
+def _check_records(records: Problem | Records, problem: Problem) -> None:
+    """Refuse a problem of other records."""
+    for name in ("freq", "base", "response", "force"):
+        own, other = getattr(records.measurement, name), getattr(problem.measurement, name)
+        if (own is None) != (other is None) or not np.array_equal(own, other):
+            raise InputError(
+                f"the problem that was given has other records than the result ({name}): give the problem of the same "
+                "test, with the same data and parameters"
+            )
+
+
+def _check_unknowns(result: Identification, x: Array, problem: Problem) -> None:
+    """Refuse a problem of other unknowns, or in which they stand for other matrices."""
+    own = [(unknown.name, unknown.shape) for unknown in problem.variables]
+    fixed = {unknown.name for unknown in problem.formulation.fixed}
+    its = [(name, np.shape(value)) for name, value in result.values.items() if name not in fixed]
+    if own != its:
+        raise InputError(
+            f"the problem that was given has other unknowns than the result: {_in_words(own)} instead of "
+            f"{_in_words(its)}"
+        )
+    made = problem.structure(x)
+    for name in ("mass", "stiffness"):
+        one, other = getattr(made, name), getattr(result.structure, name)
+        if one.shape != other.shape or not np.allclose(one, other, rtol=_SAME, atol=_SAME * np.abs(other).max()):
+            raise InputError(
+                f"the unknowns of the result stand for another {name} matrix in the problem that was given: it is not "
+                "made as it was for the identification"
+            )
+
+
+_SAME = 1e-6  # relative, of matrices made of the same numbers in another version of a program
+
+
+def _in_words(unknowns: list[tuple[str, tuple[int, ...]]]) -> str:
+    return ", ".join(f"{name} {shape}" if shape else name for name, shape in unknowns) or "none"
 
 
 def _is_plain(value: Any) -> bool:

@@ -42,7 +42,7 @@ def noise_of_channels(it: Answer) -> tuple[ChannelNoise, ...]:
 
     Per cent are of what the channel records over the lines of the test, noise and all, so that a band makes both alike.
     """
-    levels, test = it.noise, it.problem.measurement
+    levels, test = it.noise, it.records.measurement
     if levels is None or test.whole is None:
         return ()
     axes = test.base_axes or ()

@@ -8,9 +8,10 @@
     ├── structure      mass, stiffness, damping_ratios | damping_matrix, recovery, rigid_body, sensors
     ├── problem        goal; measurement, validation/0, validation/1, ..., reference
     │   └── given      mass, stiffness, damping: a model's kind and fields, numbers, or an expression's number;
-    │                  residuals, constraints, misfit, healing; variables, and CasADi's text of all expressions
+    │                  residuals, constraints, misfit, healing; variables, and the operations of all expressions
     ├── history        residual after each phase, both curves, states, log
-    └── recipe         module, data, rng, parameters, start
+    ├── recipe         module, data, rng, parameters, start
+    └── readings       what summary, report and export ask of a problem that the file does not hold whole
 """
 
 from __future__ import annotations
@@ -24,11 +25,14 @@ from typing import TypeVar
 
 from sysid.errors import InputError, path_of
 from sysid.files.tree import Tree, from_bytes, is_tree, to_bytes
-from sysid.results.old_formats import CONTENT, SIGNATURE, tree_of, with_against
 from sysid.results.version import __version__
 
-FORMAT = 3  # rises where an older sysid could not read the file: since 3 it is a tree with a SHA-256
+CONTENT = "sysid identification"
+FORMAT = 4  # rises with every change that an older sysid could not read
 FILE_NAME = "result.h5"
+
+_ANEW = "make it anew by 'sysid run PROBLEM'"
+_HDF5 = b"\x89HDF\r\n\x1a\n"  # formats 1 and 2 began with it, without a SHA-256
 
 _SUFFIXES = (".h5", ".hdf5")
 
@@ -46,7 +50,7 @@ def write(tree: Tree, path: str | Path) -> Path:
 
 
 def read(path: str | Path, build: Callable[[Tree], T]) -> T:
-    """What `build` makes of the tree that `write` wrote, or an earlier sysid; path and errors as in `load`.
+    """What `build` makes of the tree that `write` wrote; path and errors as in `load`.
 
     What is wrong with `build`'s tree is an error of the file.
     """
@@ -64,26 +68,31 @@ def read(path: str | Path, build: Callable[[Tree], T]) -> T:
         raise InputError(f"{source} cannot be read: {error}") from error
     except OSError as error:
         raise InputError(f"{source} cannot be read: {error.strerror or error}") from error
-    except Exception as error:  # what a damaged file of an old format leads to has no end of kinds
+    except Exception as error:  # what a tree of another program leads to has no end of kinds
         raise InputError(f"{source} cannot be read: it is damaged ({type(error).__name__}: {error})") from error
 
 
 def _tree(source: Path) -> Tree:
-    """The tree of a file, in this format whatever the file's."""
+    """The tree of a file."""
     image = source.read_bytes()
+    if image.startswith(_HDF5):
+        raise InputError(f"it is no result of this sysid, but of one before format 3, or of another program; {_ANEW}")
     if not is_tree(image):
-        if not image.startswith(SIGNATURE):
-            raise InputError("it is not a result of sysid, or its first bytes are damaged")
-        return with_against(tree_of(source))
+        raise InputError("it is not a result of sysid, or its first bytes are damaged")
     tree, number = from_bytes(image)
     if number > FORMAT:
         raise InputError(
-            f"it has format {number} (sysid {tree.get('sysid_version')}), and this one reads up to {FORMAT}: a later "
+            f"it has format {number} (sysid {tree.get('sysid_version')}), and this one reads format {FORMAT}: a later "
             "sysid is needed"
         )
     if tree["content"] != CONTENT:
         raise InputError(f"it holds a {tree['content']}, not a {CONTENT}")
-    return tree if "against" in tree else with_against(tree)
+    if number < FORMAT:
+        raise InputError(
+            f"it has format {number}, of an earlier sysid, in which expressions could hold code, and this one reads "
+            f"format {FORMAT}; {_ANEW}"
+        )
+    return tree
 
 
 def file_or_folder(path: str | Path, name: str, suffixes: Sequence[str]) -> Path:

@@ -11,12 +11,11 @@ from numpy.typing import ArrayLike
 
 from sysid.assessment.sensitivity import blocks_of
 from sysid.measurement.in_time import peaks
-from sysid.problem.terms import FurtherTest
 from sysid.results.answer import NOT_JUDGED, Answer
 from sysid.results.deck_masses import deck_masses
 from sysid.results.gain_table import gains_of_sensors
 from sysid.results.noise_table import NOISE_COLUMNS, noise_of_channels
-from sysid.results.phases import COLUMNS, rows_of_phases, seconds_in_words
+from sysid.results.phases import COLUMNS, seconds_in_words
 from sysid.results.unknowns_table import MANY, rows_of, stated_values
 from sysid.structure.structure import Array
 
@@ -47,7 +46,7 @@ _OF_A_FIT = ", which holds for a model that fits: this one does not"
 
 def summary(it: Answer) -> str:
     """Table of the result, at most 120 columns wide."""
-    s, axes, problem = it.structure, it.measurement.base_axes or (), it.problem
+    s, axes, records = it.structure, it.measurement.base_axes or (), it.records
     force = "" if it.force_residual is None else f", of the base force {it.force_residual:.3e}"
     told = it.undetermined or it.closed_by
     lines = [
@@ -58,12 +57,13 @@ def summary(it: Answer) -> str:
         *_mode_table(it),
         "",
         *_unknowns(it),
-        f"relative residual {residual_in_words(it)}{force}; seed {it.seed}, {seconds_in_words(it.history.wall_time)}",
+        f"relative residual {residual_in_words(it)}{force}; seed {it.seed}, {seconds_in_words(it.history.wall_time)}"
+        + f"; {counted(it.history.restarts, 'further swarm')}" * bool(it.history.restarts),
         *_phases(it),
         *it.remarks,
         "rigid-body mass "
         + ", ".join(_rigid_masses(it, axes))
-        + " (~ normalised: no mass is stated, no force was measured)" * problem.unit_mass,
+        + " (~ normalised: no mass is stated, no force was measured)" * it.facts.unit_mass,
         *_deck_masses(it),
     ]
     lines += stated_values(it)
@@ -75,7 +75,7 @@ def summary(it: Answer) -> str:
             f"frequencies {frequencies} Hz"
         )
     for i, test in enumerate(it.validation, start=1):
-        lines.append(f"test {i} of {len(problem.validation)} never fitted: relative residual {test.residual(s):.3e}")
+        lines.append(f"test {i} of {len(records.validation)} never fitted: relative residual {test.residual(s):.3e}")
     lines += [*_noise(it), *_gains(it)]
     further_told = [f"  - {sentence}" for sentence in told[_FIRST:]]
     if it.judgement == "one of many" and not it.hurried and it.open_masses:
@@ -93,7 +93,7 @@ def ending_in_words(it: Answer) -> str:
 
 def _phases(it: Answer) -> list[str]:
     """Table of what each phase left, where there was more than one."""
-    rows = rows_of_phases(it)
+    rows = it.phases
     return _aligned([list(column) for column in zip(COLUMNS, *rows, strict=True)]) if len(rows) > 1 else []
 
 
@@ -116,13 +116,13 @@ def _gains(it: Answer) -> list[str]:
 
 def noise_source(it: Answer) -> str:
     """Whether levels of noise were stated or found."""
-    whole = it.problem.measurement.whole
+    whole = it.records.measurement.whole
     return "as stated" if whole is not None and whole.noise is not None else "found with the fit"
 
 
 def residual_in_words(it: Answer) -> str:
     """The residual of all that is fitted, the goal beside it, and each test's own where there are more."""
-    goal = "" if it.problem.goal is None else f" (goal {it.problem.goal:.3g})"
+    goal = "" if it.records.goal is None else f" (goal {it.records.goal:.3g})"
     if len(it.residuals) < 2:
         return f"{it.residual:.3e}{goal}"
     own = ", ".join(f"{value:.3e}" for value in it.residuals)
@@ -135,7 +135,7 @@ def verdict(it: Answer) -> str:
         return "No fit: these matrices do not explain the records as they should"
     if it.determined:
         one = "Determined: data and stated model leave one mass and one stiffness matrix"
-        return one + _AS_STATED * _scaled_by_statements(it)
+        return one + _AS_STATED * it.facts.by_accelerations
     if NOT_JUDGED in it.undetermined:
         return "Not judged: the time was over"
     if it.hurried:
@@ -147,17 +147,9 @@ def verdict(it: Answer) -> str:
     return "Not determined: some entries of the matrices are not known well enough"
 
 
-def _scaled_by_statements(it: Answer) -> bool:
-    """Whether what is stated sets the scale of M, K and C: accelerations alone are fitted, which leave it open."""
-    problem = it.problem
-    if problem.measurement.force is not None or problem.misfit is not None:
-        return False
-    return all(isinstance(one, FurtherTest) and one.measurement.force is None for one in problem.residuals)
-
-
 def fitted_in_words(it: Answer) -> str:
     """The runs that were fitted, and how strongly they move the sensors, where that is known."""
-    test = it.problem.measurement
+    test = it.records.measurement
     moved = [f"{level:.3g}" for level in sorted(peaks(test))]
     runs = counted(test.n_runs, "run")
     if not moved:
@@ -188,7 +180,7 @@ def next_steps(it: Answer) -> list[str]:
     return [
         "to close it: measure the force between table and structure; or state what is known of the mass, where it is "
         "true: that all of it sits at the sensors (sysid run test.h5 --lumped --mass KG; LumpedMass(KG)), or single "
-        "masses (FullMass(known=...))" + "; a total mass alone only bounds it" * it.problem.formulation.mass.free
+        "masses (FullMass(known=...))" + "; a total mass alone only bounds it" * it.facts.mass_is_free
     ]
 
 
@@ -196,7 +188,7 @@ def _towards_a_fit(it: Answer) -> list[str]:
     """What to do where there is no fit, the first thing first."""
     if it.interrupted:
         return ["let the search end: 'sysid run --resume FOLDER' goes on with one that the command line began"]
-    if it.problem.goal is not None:
+    if it.records.goal is not None:
         return ["put right what is named first; a goal below the noise of the records cannot be reached"]
     steps = ["deal with what speaks against it, in the order given"]
     if it.changing:
@@ -243,7 +235,7 @@ def mass_percent_std(it: Answer) -> Array:
 
 def is_one_of_many(it: Answer) -> Array:
     """Which effective masses are one choice among many, (n, d) of bool; a common factor changes none of a sum."""
-    own_sum = it.problem.unit_mass and not it.problem.formulation.mass.free  # nothing in kg beside what is scaled
+    own_sum = it.facts.unit_mass and not it.facts.mass_is_free  # nothing in kg beside what is scaled
     known = it.determined or it.hurried or (own_sum and it.scale_is_open)
     return np.logical_and(np.isnan(mass_percent_std(it)), not known)
 
@@ -326,7 +318,7 @@ def _rigid_masses(it: Answer, axes: Sequence[str]) -> Iterator[str]:
     """Rigid-body mass by base direction, with its half-width where noise moves it."""
     masses, std = np.diag(it.structure.rigid_body_mass), np.diag(it.quick_std("rigid_body_mass"))
     for axis, mass, own in zip(axes, masses, std, strict=True):
-        told = f"{tilde(it.problem.unit_mass)}{mass:.6g}{known_half_width(own, mass, ' +-')}"
+        told = f"{tilde(it.facts.unit_mass)}{mass:.6g}{known_half_width(own, mass, ' +-')}"
         yield f"{axis} {told} kg{' m²' * (axis[0] == 'r')}"
 
 

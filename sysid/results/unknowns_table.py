@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.assessment.bounds import sides_of
-from sysid.results.answer import Answer, reported_unknowns
+from sysid.results.answer import Answer
 
 MANY = 60  # rows beyond which a terminal shows none
 
@@ -31,26 +31,22 @@ class Row(NamedTuple):
 
 def stated_values(it: Answer) -> list[str]:
     """How far each value that was stated as known is missed, in words."""
-    if it.x is None:
-        return []
-    return [
-        f"{name} ends {z:+.2g} standard deviations from the value stated as known"
-        for prior in it.problem.formulation.priors
-        for name, z in zip(prior.labels, prior.numbers(it.x), strict=True)
-    ]
+    return [f"{name} ends {z:+.2g} standard deviations from the value stated as known" for name, z in it.facts.misses]
 
 
 def rows_of(it: Answer) -> list[Row]:
-    """A row a scalar unknown that was searched and means something by itself: see `reported_unknowns`."""
+    """A row a scalar unknown that was searched and means something by itself: see `sysid.results.facts`."""
     if it.x is None:
         return []
     u = it.quick_uncertainty
     known = {} if u is None else u.variables
     rows: list[Row] = []
-    for unknown in (unknown for unknown in reported_unknowns(it.problem) if not unknown.fixed):
+    for unknown in (one for one in it.facts.unknowns if not (one.fixed or one.is_ratio)):
         values = np.ravel(it.values[unknown.name], order="F")
         std = np.ravel(known.get(unknown.name, np.full(unknown.shape, np.nan)), order="F").tolist()
         units = [unknown.unit] * unknown.size
         bounds = unknown.lower.tolist(), unknown.upper.tolist()
-        rows += map(Row, unknown.labels, values.tolist(), std, units, *bounds, sides_of(unknown, values))
+        rows += map(
+            Row, unknown.labels, values.tolist(), std, units, *bounds, sides_of(unknown.lower, unknown.upper, values)
+        )
     return rows

@@ -13,7 +13,7 @@ from sysid.models.spectrum import SOLVED
 from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
-from sysid.search.cholesky_coordinates import fit_in_cholesky
+from sysid.search.inverse_factor_coordinates import fit_in_inverse_factor
 from sysid.search.matrix_coordinates import fit_in_matrices
 from sysid.search.modal_coordinates import End, fit_in_modes
 from sysid.search.scaled_unknowns import add_unknowns
@@ -82,7 +82,7 @@ def solve(
     watched = IterationMonitor(monitor, max_time)
     if not problem.free_modes or coordinates == "entries":
         return _result(fit_in_matrices(problem, x, watched, max_iterations, smoothed), watched)
-    fit = fit_in_cholesky if coordinates == "cholesky" else fit_in_modes
+    fit = fit_in_inverse_factor if coordinates == "cholesky" else fit_in_modes
     return _result(fit_apart(problem, fit(problem, x, watched, max_iterations), watched, max_iterations), watched)
 
 

@@ -46,12 +46,11 @@ def fit_in_modes(problem: Problem, x: Array, monitor: IterationMonitor, max_iter
     """Minimise the objective of a problem with free modes, from the structure of `x`."""
     start = problem.structure(x)
     first, test = modes_of(start), problem.measurement
-    remainder = start.rigid_body_mass - start.participation.T @ start.participation
 
     def attempt(modes: Modes) -> ModalFit:
         return fit_modes(
             test, modes, lambda z: spectrum_near(problem, start, modes, z), unit=np.sqrt(problem.totals),
-            remainder=remainder, ties=stated_totals(problem), monitor=monitor, max_iterations=max_iterations,
+            remainder=_remainder(start), ties=stated_totals(problem), monitor=monitor, max_iterations=max_iterations,
         )  # fmt: skip
 
     best, tried = attempt(first), 1
@@ -63,12 +62,7 @@ def fit_in_modes(problem: Problem, x: Array, monitor: IterationMonitor, max_iter
         if answer.residual < best.residual:
             best = answer
     remark = f"best of {tried} starts, as the first ended in a local minimum" if tried > 1 else ""
-    modes = best.modes
-    if test.force is None:
-        # Accelerations leave the scale of each mode open: shapes keep the size that they had.
-        size = np.linalg.norm(first.phi, axis=0) / np.maximum(np.linalg.norm(modes.phi, axis=0), np.finfo(float).tiny)
-        modes = modes._replace(phi=modes.phi * size, gamma=modes.gamma / size[:, None])
-    return End(_unknowns(problem, modes, best.rigid, remainder, x), best.residual, best.status, best.bounds, remark)
+    return End(unknowns_of(problem, best.modes, best.rigid, start, x), best.residual, best.status, best.bounds, remark)
 
 
 def _linear_starts(test: Measurement, ended: ModalFit, first: Modes) -> Iterator[Modes]:
@@ -115,13 +109,23 @@ def spectrum_near(problem: Problem, structure: Structure, start: Modes, z: Nonli
     return omega, formulation.ratios(add_unknowns(z, unknowns, guess), omega)
 
 
-def _unknowns(problem: Problem, modes: Modes, rigid: Array, remainder: Array, x: Array) -> Array:
-    """The problem's unknowns of a fit in modal coordinates; the damping inside its search space."""
+def unknowns_of(problem: Problem, modes: Modes, rigid: Array, start: Structure, x: Array) -> Array:
+    """The problem's unknowns of a fit that began at a structure, its modes one by one; what enters no matrix as in `x`.
+
+    Frequencies may have changed places. The damping is put inside its search space. `rigid` (d, d), the rigid-body
+    mass, counts where a force was measured.
+    """
+    if problem.measurement.force is None:
+        # Accelerations leave the scale of each mode open: shapes keep the size that they had.
+        size = np.linalg.norm(start.mode_shapes, axis=0)
+        size = size / np.maximum(np.linalg.norm(modes.phi, axis=0), np.finfo(float).tiny)
+        modes = modes._replace(phi=modes.phi * size, gamma=modes.gamma / size[:, None])
     order = np.argsort(modes.omega)
     gamma, w, zeta = modes.gamma[order], modes.omega[order], np.maximum(modes.ratios[order], 0.0)
     P, geometry = _regular_inverse(modes.phi[:, order]), problem.geometry
     if problem.measurement.force is None:
-        t, left = to_stated_totals(problem, P, gamma, geometry.rigid_body, geometry.directions[: len(P)], remainder)
+        groups = geometry.directions[: len(P)]
+        t, left = to_stated_totals(problem, P, gamma, geometry.rigid_body, groups, _remainder(start))
         P, gamma = P * np.sqrt(t), gamma * np.sqrt(t)
     else:
         left = rigid - gamma.T @ gamma
@@ -135,6 +139,12 @@ def _unknowns(problem: Problem, modes: Modes, rigid: Array, remainder: Array, x:
     found[at] = np.clip(found[at], problem.lower[at], problem.upper[at])  # IPOPT may leave bounds by its tolerance
     found[at.stop :] = x[at.stop :]
     return found
+
+
+def _remainder(structure: Structure) -> Array:
+    """Rigid-body mass that no mode carries, (d, d)."""
+    gamma = structure.participation
+    return structure.rigid_body_mass - gamma.T @ gamma
 
 
 def _regular_inverse(phi: Array) -> Array:

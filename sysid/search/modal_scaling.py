@@ -36,7 +36,7 @@ def stated_totals(problem: Problem) -> Ties | None:
             return [lower_entries(off)]
         if stated.kind == "rigid_body" or phi.size1() != phi.size2():
             return [ca.diag(rigid) / totals - 1]
-        P = ca.inv(phi)
+        P = ca.solve(phi, type(phi).eye(phi.size1()))  # of a triangle by substitution
         delta = gamma - P @ ca.DM(geometry.rigid_body)
         rows = ca.diag(P.T @ P)
         base = ca.diag(rigid - gamma.T @ gamma + delta.T @ delta)
@@ -75,7 +75,9 @@ def to_stated_totals(
         lam, vectors = np.linalg.eigh(total - t * own)
         return t, (vectors * np.maximum(lam, 0.0)) @ vectors.T * np.outer(size, size)
     stated = problem.formulation.mass.totals
-    if stated is not None and stated.kind == "rigid_body":
+    # A mass that states no total is brought to totals of its kind all the same: 1 kg a direction, or known masses'.
+    kind = getattr(problem.mass, "healing", "trace") if stated is None else stated.kind
+    if kind == "rigid_body":
         used = np.sum(gamma**2, axis=0)
     else:
         rows = np.sum(P**2, axis=0)

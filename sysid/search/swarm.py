@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from sysid.errors import SolverError, choice, flag, instance, number, text, whole_number
 from sysid.modal_analysis.response import error_of_accelerations
 from sysid.models.spectrum import by_ipopt, closed_form, seconds_to_begin
+from sysid.nlp import EXACT
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.search import local
@@ -36,6 +37,8 @@ _MANY, _FEW = 256, 8  # candidates between two looks at the clock; few where IPO
 _UNSEEN = 1e6  # in the place of the objective of candidates that there is no time for
 _SAMPLE = 1.6e-7  # s of a processor, that a coordinate of a particle of the first sample takes
 _DOUBTFUL = 0.1  # objective above which a problem without free modes is searched again
+_ALIKE = 1e-6  # relative; objectives that differ by no more are of one answer
+_OWN_FORM = "hpso-ls searched the model's own unknowns, by the published swarm first, then through IPOPT"
 
 
 @dataclass(frozen=True)
@@ -66,12 +69,12 @@ class Swarm:
         Refine the swarm's best by a few iterations of the local phase every so many iterations; 0: never.
     local : {"modal", "cholesky", "entries"} or None
         Coordinates of the local phase by IPOPT where mass and stiffness are free: mode shapes and participations
-        (Gauss-Newton Hessian); healed entries of L_M, the spectrum of H and log zeta (exact Hessian), the paper's; the
-        paper's plain x, for comparison. Problems with a form of their own are searched in their own unknowns. None:
-        no local phase; no solver then vouches for the result, and `success` is False.
+        (Gauss-Newton Hessian); the inverse of the mass's Cholesky factor, the spectrum of H and log zeta (exact
+        Hessian); the paper's plain x, for comparison. Problems with a form of their own are searched in their own
+        unknowns. None: no local phase; no solver then vouches for the result, and `success` is False.
     restarts : int
-        How many further swarms may follow where the goal is missed, or, without a goal, where the local phase ended in
-        a local minimum or, where modes are not free, the objective is above 0.1.
+        How many further swarms may follow where IPOPT did not succeed or the goal is missed, or, without a goal, where
+        the local phase ended in a local minimum or, where modes are not free, the objective is above 0.1.
     settings : SwarmSettings
         Constants of the swarm itself. The paper leaves b1 and b2 of its eq. 11 to the user; with the usual 0.3 and 0.2
         and c1 + c2 up to 4 (``SwarmSettings()``) the swarm of this problem contracts too early. These keep it moving,
@@ -129,7 +132,8 @@ class Swarm:
         """The paper's hPSO-LS, under the name "hpso-ls"; `changes` are fields that shall differ.
 
         The usual constants of the sources that the paper names (b1 = 0.3, b2 = 0.2; c1 + c2 up to 4), the spectrum of
-        each candidate refined from its own L_H, and the local phase in Cholesky coordinates. What the paper leaves
+        each candidate refined from its own L_H, and a local phase in the inverse of the mass's Cholesky factor, where
+        the paper's own entries end on IPOPT's iteration limit with noise. What the paper leaves
         open, or its printed text has lost, is chosen here: refinement in closed form, not written back; 150 iterations,
         the stop rules, and up to four restarts; a particle stops at a bound and its velocity there is reversed; the
         state of the swarm is estimated with the leader's present position (`sysid.swarm.ParticleSwarm`).
@@ -185,7 +189,7 @@ class Swarm:
                 stopped, search.success, search.message = stop, False, str(stop) or "interrupted"
                 search.stopped()
             evaluations += search.history.evaluations
-            if search.x is not None and (best is None or problem.rank_of(search.x) < problem.rank_of(best.found)):
+            if search.x is not None and (best is None or search.beats(best)):
                 best = search
             if best is None:
                 if isinstance(stopped, KeyboardInterrupt):
@@ -194,7 +198,7 @@ class Swarm:
             spent = most is not None and 2 * evaluations > most
             if stopped or not session.time_for_more or spent or self.local is None or best.good_enough:
                 break
-            session.log(f"{best.objective:.4g} is no good fit: another swarm")
+            session.log(f"{best.objective:.4g} is no good fit, or no solution: another swarm")
         assert best is not None
         if stopped is not None:
             best.success, best.message = False, str(stopped) or "interrupted"
@@ -202,7 +206,7 @@ class Swarm:
         idle = problem.free_modes and self.local == "modal" and best.success
         return Outcome(
             problem.structure(best.found), best.found, self.name, best.success, best.message, history, stopped,
-            remarks=(_IDLE,) if idle else (),
+            remarks=(_IDLE,) * idle + (_OWN_FORM,) * (self.local == "cholesky" and not problem.free_modes),
         )  # fmt: skip
 
 
@@ -241,10 +245,17 @@ class _Search:
 
     @property
     def good_enough(self) -> bool:
-        """Whether another swarm is not worth its time."""
+        """Whether another swarm is not worth its time; never while no solver vouches for the best."""
         if self.problem.goal is not None:
-            return self.meets_goal is True
-        return not self.trapped if self.problem.free_modes else self.objective <= _DOUBTFUL
+            return self.success and self.meets_goal is True
+        return self.success and (not self.trapped if self.problem.free_modes else self.objective <= _DOUBTFUL)
+
+    def beats(self, other: _Search) -> bool:
+        """Whether it ended better, by constraints, then by objective; of two alike, what a solver vouches for."""
+        ours, theirs = self.problem.rank_of(self.found), self.problem.rank_of(other.found)
+        if self.success != other.success and ours[0] == theirs[0] and np.isclose(ours[1], theirs[1], rtol=_ALIKE):
+            return self.success
+        return ours < theirs
 
     def run(
         self, random: np.random.SeedSequence, start: ArrayLike | Structure | None, max_evaluations: int | None
@@ -408,11 +419,13 @@ class _Search:
         after = self.problem.objective(answer.x)
         self.session.log(f"local phase: {answer.message}, {answer.curve.size} iterates, objective {after:.4e}")
         self.success, self.message = answer.success, answer.message
-        if self.problem.rank_of(answer.x) < self.problem.rank_of(self.found):
+        better = self.problem.rank_of(answer.x) < self.problem.rank_of(self.found)
+        # A start that is a solution already can only end beside itself by round-off.
+        alike = answer.success and after <= max((1 + _ALIKE) * before, EXACT)
+        if better or (alike and self.problem.keeps_constraints(answer.x)):
             self.x = answer.x
         else:
-            # A start that meets the goal needs no improvement; any other was not made by a solver that succeeded.
-            self.success = self.meets_goal is True
+            self.success = False
             self.message += f"; it did not improve on {before:.3g}, so its start is kept"
         self.history = replace(self.history, local=min(after, before), local_curve=answer.curve)
         self.ended("local phase", answer.curve.size)
@@ -422,7 +435,7 @@ class _Search:
         ended = not self.session.cut_short
         self.trapped = ended and self.problem.free_modes and coordinates != "modal" and self._in_local_minimum()
         if self.trapped:
-            self.success = self.meets_goal is True
+            self.success = self.success and self.meets_goal is True
             self.message += f"; {_TRAPPED}"
             if self.problem.measurement.force is not None and self.problem.formulation.mass.totals is not None:
                 self.message += ", or the stated total contradicts the base force"

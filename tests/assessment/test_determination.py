@@ -322,3 +322,24 @@ class TestOnlyTheScale:
         hand = Problem(test, mass=every @ two.mass[:4, :4], stiffness=every @ K_SS)
         x = np.concatenate([np.ones(2), two.damping_ratios])
         assert scale_is_open(hand, hand.structure(x), x) is False
+
+
+@pytest.mark.parametrize("second", [2.0, 3.0])
+def test_a_damper_that_no_record_sees_is_open_by_itself(second):
+    """Between two equal masses on equal springs, which move alike, it does nothing; between others it shows."""
+    a, b = (Variable(name, lower=0.1, upper=50.0, guess=5.0) for name in "ab")
+    one = Variable("k", lower=100.0, upper=1e4, guess=800.0)
+    between = np.array([[1.0, -1.0], [-1.0, 1.0]])
+    truth = sysid.Structure(
+        np.diag([2.0, second, 0.0]), np.array([[1000.0, -200, -800], [-200, 1000, -800], [-800, -800, 1600]]),
+        n_base=1, damping_matrix=5 * np.eye(2) + 5 * between,
+    )  # fmt: skip
+    problem = Problem(
+        sysid.simulate(truth, np.linspace(1.0, 9.0, 60)), mass=np.diag([2.0, second]),
+        stiffness=one * np.eye(2) + 200 * between, damping=a * np.eye(2) + b * between,
+    )  # fmt: skip
+    x = np.array([{"a": 5.0, "b": 5.0, "k": 800.0}[label] for label in problem.formulation.labels])
+    told = determine(problem, problem.structure(x), x)
+    assert told.judged_by == BY_RANK
+    assert told.determined is (second != 2.0)
+    assert all("no record sees a change of b" in sentence for sentence in told.undetermined)

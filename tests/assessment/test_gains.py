@@ -89,6 +89,30 @@ class TestEstimate:
         assert gain_errors(test, two).wrong.size == 0
         assert gain_errors(misread(test, 0, 0.1), two).error[0] == pytest.approx(0.1, abs=0.03)
 
+    def test_deviations_hold_what_modes_above_the_lines_leave_in_the_constant(self):
+        """One mode in the lines, the next near: errors are all of it and of noise, within four of the law's deviations.
+
+        The constant beside the modes alone is the more exact by its noise, and wrong by many such deviations.
+        """
+        truth = storeys()
+        f, rng = truth.natural_frequencies, np.random.default_rng(1)
+        freq = np.linspace(0.3 * f[0], f[0] + 0.1 * (f[1] - f[0]), 300)
+        one = sysid.identify(
+            Problem(simulate(truth, freq), mass=FullMass()), strategy=sysid.Modal(modes=1), rng=0
+        ).structure
+        draws = [gain_errors(simulate(truth, freq, noise=0.01, rng=rng), one) for _ in range(40)]
+        squares = np.sum([(draw.error / draw.std) ** 2 for draw in draws])
+        assert squares < 120 + 4 * np.sqrt(2 * 120)
+
+    def test_poles_that_are_slightly_off_move_neither_estimate_nor_deviation(self):
+        """By 1/50 of a half width and 1/50 of the damping, which leaves several times the noise at the peaks."""
+        truth = storeys()
+        off = Structure(truth.mass, 1.0004 * truth.stiffness, 1.02 * truth.damping_ratios, n_base=1)
+        test = simulate(truth, lines(truth), noise=0.003, rng=0)
+        right, moved = gain_errors(test, truth), gain_errors(test, off)
+        np.testing.assert_allclose(moved.std, right.std, rtol=0.05)
+        assert np.all(np.abs(moved.error - right.error) < 0.1 * right.std)
+
     def test_one_error_of_all_is_the_bases(self):
         truth = storeys()
         test = simulate(truth, lines(truth), noise=0.003, rng=0)

@@ -1,6 +1,7 @@
 """What the benchmarks of records make of a result: shares of intervals, errors over the bound, verdicts, levels."""
 
 import importlib
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -42,7 +43,7 @@ def judged(modules):
     levels = modules.simulated.Levels(np.array([0.01]), np.full(n, 0.02), np.array([5.0]))
     result = SimpleNamespace(
         structure=found, determined=True, undetermined=("a record is wrong", "mode 2 is open"), remarks=("fine",),
-        message="solved; a record is wrong", uncertainty=SimpleNamespace(interval=interval),
+        against=("a record is wrong",), uncertainty=SimpleNamespace(interval=interval),
         noise=SimpleNamespace(base=1.04 * levels.base, response=0.98 * levels.response, force=None),
     )  # fmt: skip
     return modules.trial.judged("chain", result, truth, std, levels)
@@ -55,6 +56,7 @@ def test_a_result_is_compared_cell_by_cell_with_truth_and_bound(judged):
     assert judged.held["mass"] == []  # what is stated
     np.testing.assert_allclose(np.abs(judged.ratios["stiffness"]), 6.009)  # seven entries, no others are free
     assert len(judged.ratios["stiffness"]) == 7
+    assert judged.stated == pytest.approx({name: 1.0 for name in judged.held if name != "mass"}, rel=1e-4)
     np.testing.assert_allclose(judged.levels, [0.98] * 4 + [1.04])
     assert judged.accusations == ("a record is wrong",)
 
@@ -74,6 +76,9 @@ def test_lines_are_met_or_not_by_the_figures(modules, judged):
     assert (pooled.met, worst.met, worst.figure) == (False, False, "0")
     pooled, worst = trial.errors("", [judged] * trial.PROVEN)
     assert (pooled.met, worst.met) == (False, False)
+    assert trial.stated("", [judged]).met
+    assert not trial.stated("", [replace(judged, stated={**judged.stated, "damping": 1.2})]).met
+    assert not trial.stated("", [failed]).met
     assert worst.figure == f"{np.abs(np.concatenate([*judged.ratios.values()])).max():.4g}"
 
 

@@ -60,6 +60,14 @@ def test_a_table_is_read_with_any_encoding_delimiter_and_decimal_sign(tmp_path, 
     assert [row.factor for row in test.table] == pytest.approx([G, 1e-3, 1e3])
 
 
+@pytest.mark.parametrize("rate", [200.08, 199.96])
+def test_the_rate_of_a_short_record_is_that_of_its_times(tmp_path, rate):
+    """By 4 and by 2 parts in ten thousand off a round number, over 100 samples, times to twelve digits."""
+    rows = [f"{i / rate:.12g};{i % 7};{i % 5};{i % 3}" for i in range(100)]
+    (tmp_path / "run.csv").write_text("\n".join(["time;table;top;force", "s;g;mm/s²;kN", *rows]), encoding="utf-8")
+    assert reading.gather(tmp_path / "run.csv", SENSORS).sample_rate == pytest.approx(rate, rel=1e-9)
+
+
 def test_units_in_brackets_and_a_cut_last_row(tmp_path):
     heads = ("Time [s]", "table (g)", "top [mm/s^2]", "force [kN]")
     rows = [*table(",", False, heads, None), "2.0,0.1"]

@@ -8,6 +8,7 @@ import pytest
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import WholeRecords
 from sysid.modal_analysis.modal_fit import Modes
+from sysid.modal_analysis.record_fit import RecordFit
 from sysid.modal_analysis.record_model import Chunk, Parameters, RecordModel
 from sysid.modal_analysis.response import gains
 from sysid.structure.structure import Array, ComplexArray
@@ -135,3 +136,39 @@ def test_lines_of_unequal_runs_are_their_own_transforms() -> None:
         np.testing.assert_allclose(run.outputs, scale * np.fft.rfft(response)[:, lines], rtol=1e-9)
         assert scale == pytest.approx(1 / 12.0)
         assert not np.any(test.response[run.number][:, ~own])
+
+
+@CASES
+def test_the_likelihood_is_that_of_the_dense_covariance(force: bool, d: int) -> None:
+    """Of circular complex errors, but for the powers of pi; between two sets of levels as well."""
+    model, p, levels = _model(force, d)
+    for at in (levels, levels[::-1] ** 2):
+        fit = RecordFit(model.test, p, at, model.chi2(p, at), True)
+        exponents = [np.sum(np.linalg.slogdet(_dense(chunk, at))[1]) for chunk in model.chunks(p)]
+        assert fit.likelihood == pytest.approx(-sum(exponents) - _dense_chi2(model, p, at), rel=1e-10)
+
+
+@CASES
+def test_unknowns_are_as_many_as_the_records_determine(force: bool, d: int) -> None:
+    """The rank of the normal matrix: without a force the scale of each mode is not seen."""
+    model, p, levels = _model(force, d)
+    normal = model.normal_equations(p, levels).normal
+    size = np.sqrt(np.diag(normal))
+    lam = np.linalg.eigvalsh(normal / np.outer(size, size))
+    assert np.count_nonzero(lam > 1e-10 * lam[-1]) == model.unknowns
+
+
+def test_chi_squared_of_right_modes_and_levels_is_its_degrees_of_freedom() -> None:
+    """Sensors that move with the base, white noise on all channels: within four of the law's own deviations."""
+    r, d, n, samples = np.random.default_rng(11), 2, 3, 2000
+    G, levels = r.normal(size=(n, d)), np.array([0.3, 0.5, 0.2, 0.1, 0.4]) ** 2
+    base = r.normal(size=(d, samples))
+    noise = np.sqrt(levels)[:, None] * r.normal(size=(n + d, samples))
+    test = Measurement.from_time(
+        [(base + noise[n:], G @ base + noise[:n], None)], 50.0, rigid_body=G, base_axes="xy", band=(1.0, 24.0)
+    )
+    model = RecordModel(test, 1)
+    modes = Modes(np.zeros((n, 1)), np.ones((1, d)), np.array([30.0]), np.array([0.02]))
+    p = Parameters(modes, np.zeros((d, d)), np.zeros((1, 2)), np.zeros((1, n, 3)))
+    fit = RecordFit(test, p, levels[None], model.chi2(p, levels[None]), True)
+    assert fit.reduced == pytest.approx(1.0, abs=4 * np.sqrt(2 / fit.freedom))

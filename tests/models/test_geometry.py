@@ -35,6 +35,10 @@ class TestTotals:
     def test_a_scalar_stands_for_every_translation(self, geometry_of):
         np.testing.assert_array_equal(geometry_of(np.zeros((2, 3))).totals(12.0), [12, 12, 12])
 
+    def test_unstated_ones_are_a_kilogram_and_for_a_rotation_one_at_the_radius_of_gyration(self, geometry_of):
+        """Sensors 3 and 4 m from the axis: ``1 kg * (3² + 4²) / 2 m²``."""
+        np.testing.assert_allclose(geometry_of([[1.0, 3.0], [1.0, -4.0]], [True, False]).totals(None), [1.0, 12.5])
+
     def test_a_scalar_is_refused_where_the_base_rotates(self, geometry_of):
         with pytest.raises(InputError, match="one number but the base also rotates"):
             geometry_of(np.zeros((2, 2)), [True, False]).totals(12.0)

@@ -290,6 +290,13 @@ class TestLumpedMass:
         again, _ = evaluate(model, geometry)(model.values(geometry, holding(geometry, M)))
         np.testing.assert_allclose(again, M, rtol=1e-12)
 
+    def test_a_mass_of_a_hundredth_of_the_largest_can_be_found(self, geometry_of):
+        """A mast on a roof, say: its shares lie within the bounds."""
+        geometry, model = geometry_of(np.ones((3, 1))), LumpedMass(201.0)
+        y = model.values(geometry, holding(geometry, np.diag([100.0, 100.0, 1.0, 0.0])))
+        lower, upper = box(model, geometry)
+        assert np.all((lower <= y) & (y <= upper))
+
     def test_weighed_totals_are_unknowns(self, geometry_of):
         geometry = geometry_of(np.eye(2)[[0, 1, 0]], weighed=np.array([40.0, 60.0]))
         model = LumpedMass()

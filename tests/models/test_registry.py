@@ -129,4 +129,4 @@ def test_what_could_not_be_found_again_is_refused():
 def test_a_tree_of_the_users_own_that_holds_something_else_is_refused_early(tanks, monkeypatch):
     monkeypatch.setattr(tanks.Tank.Half, "to_tree", lambda self: {"when": object()})
     with pytest.raises(sysid.InputError, match="/mass/fields/when: a object cannot be stored"):
-        stored.check_storable({"mass": tanks.Tank.Half([]), "stiffness": np.eye(1), "damping": np.eye(1)})
+        check(stored.to_tree({"mass": tanks.Tank.Half([]), "stiffness": np.eye(1), "damping": np.eye(1)}))

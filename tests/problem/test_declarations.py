@@ -283,22 +283,6 @@ def test_matrices_of_a_structure_nowhere_are_refused_before_a_search(mistake, wo
     assert "test_declarations.py, line " in str(caught.value)
 
 
-def test_a_callback_is_refused_before_a_search():
-    class Doubled(ca.Callback):
-        def __init__(self):
-            super().__init__()
-            self.construct("doubled", {"enable_fd": True})
-
-        def eval(self, given):
-            return [2 * given[0]]
-
-    doubled, k = Doubled(), springs()
-    z = declare("other", (), 0.5, 1.5)
-    problem = build(stiffness=chain(k), residuals=[doubled(z) - 2])
-    with pytest.raises(sysid.InputError, match="residual 1: a Python callback in an expression cannot be stored"):
-        problem.check()
-
-
 def test_a_prior_beside_a_misfit_of_one_s_own_is_refused():
     k = springs()
     with pytest.raises(sysid.InputError, match="Prior beside a misfit of your own"):

@@ -1,11 +1,14 @@
 """First derivatives by the unknowns, against central differences of the structures themselves."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
 
 import sysid
-from sysid.problem.slopes import response_slopes, slopes_of
+from sysid.measurement.whole import Gains, ModalEstimate, NoiseLevels
+from sysid.problem.slopes import response_slopes, rows_of_test, slopes_of
 
 FREQ = np.linspace(1.0, 14.0, 12)
 G = np.array([[1.0, 0.3], [1.0, 0.8], [0.9, -0.4]])
@@ -167,3 +170,81 @@ def test_modes_of_one_frequency_keep_their_mass():
     shapes = made.structure.normal_modes
     np.testing.assert_allclose(made.d_shapes[..., 0], -shapes / (2 * 1.25), rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(made.d_log_omega, -1 / (2 * 1.25), rtol=1e-12)
+
+
+WHOLE = [0, 2]  # modes of the structure that whole records show
+
+
+def with_modes_of_records(test, structure, rng):
+    """The test with an estimate of two of the structure's three modes, nearly right, in scales of their own.
+
+    With a force a mode's sign alone is open.
+    """
+    n, d, m = test.n_sensors, test.n_base, len(WHOLE)
+    scale = np.array([-1.0, 1.0]) if test.force is not None else np.array([-2.5, 0.4])
+    near = lambda a: a * (1 + 0.05 * rng.normal(size=a.shape))  # noqa: E731
+    size = n * m + m * d + 2 * m + d * (d + 1) // 2
+    root = rng.normal(size=(size + 5, size))
+    if test.force is None:
+        root[:, n * m + m * d + 2 * m :] = 0.0  # nothing tells of the rigid-body mass
+    estimate = ModalEstimate(
+        near(structure.mode_shapes[:, WHOLE] * scale), near(structure.participation[WHOLE] / scale[:, None]),
+        near(2 * np.pi * structure.natural_frequencies[WHOLE]), near(structure.damping_ratios[WHOLE]),
+        structure.rigid_body_mass * 1.03, root.T @ root, NoiseLevels(np.ones(n), np.ones(d), np.ones(d)), 1.0,
+        np.ones(test.n_runs), Gains(np.zeros(n), np.ones(n), 100, np.zeros((size, n)), np.zeros((n, d)), np.zeros(n)),
+    )  # fmt: skip
+    return replace(test, modal=estimate)
+
+
+def off_the_modes(test, structure):
+    """Modal parameters of a structure less those of the records, in the scale of these where no force gives one."""
+    own = test.modal
+    phi, gamma = structure.mode_shapes[:, WHOLE], structure.participation[WHOLE]
+    scale = np.sum(gamma * own.gamma, axis=1) / np.sum(own.gamma**2, axis=1)
+    if test.force is not None:
+        scale = scale / np.abs(scale)
+    upper = np.triu_indices(test.n_base)
+    return np.concatenate([
+        (phi * scale - own.phi).ravel(), (gamma / scale[:, None] - own.gamma).ravel(),
+        np.log(2 * np.pi * structure.natural_frequencies[WHOLE] / own.omega),
+        np.log(structure.damping_ratios[WHOLE] / own.ratios), (structure.rigid_body_mass - own.rigid)[upper],
+    ])  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "damping"), [(models, "modal"), (mixed, "modal")], ids=["models", "mixed"])
+@pytest.mark.parametrize("force", [False, True])
+def test_rows_of_whole_records_are_those_of_their_modes(kind, damping, force):
+    """Products of the rows and of their derivatives are those of the modal parameters' information."""
+    problem, x = case(kind, damping, force=force)
+    test = with_modes_of_records(problem.measurement, problem.structure(x), np.random.default_rng(3))
+    slopes = slopes_of(problem.formulation.matrices, x, test)
+    (rows,) = rows_of_test(test, slopes, x.size, share=0.7, as_stated=True)
+    off = lambda x: off_the_modes(test, problem.structure(x))  # noqa: E731
+    expected = np.column_stack([off(x), differences(lambda x: [off(x)], x)[0] * np.abs(x)])
+    made = np.column_stack([rows.residuals, rows.jacobian * np.abs(x)])
+    weight = 0.7 / np.linalg.norm(test.relative / test.response_std)
+    gram = weight**2 * expected.T @ test.modal.information @ expected
+    np.testing.assert_allclose(made.T @ made, gram, atol=1e-7 * np.abs(gram).max())
+    np.testing.assert_allclose(rows.std, weight / np.sqrt(2), rtol=1e-9)
+
+
+@pytest.mark.parametrize("times", [1.0, 3.0])
+def test_deviations_of_whole_records_grow_with_what_is_left_beyond_the_stated_noise(times):
+    """White noise `times` as large as is stated: deviations grow by as much, but for chance."""
+    problem, x = case(models, "modal")
+    structure, rng = problem.structure(x), np.random.default_rng(4)
+    freq = np.linspace(1.0, 14.0, 600)
+    draw = lambda *size: (rng.normal(size=size) + 1j * rng.normal(size=size)) / np.sqrt(2)  # noqa: E731
+    shapes = (1, 2, freq.size), (1, 3, freq.size)
+    noise = {"response_std": np.full(shapes[1], 0.01), "force_std": np.full(shapes[0], 0.2)}
+    base = draw(*shapes[0])
+    test = sysid.Measurement(
+        freq, base, draw(*shapes[1]), rigid_body=G, base_axes=["x", "ry"], force=draw(*shapes[0]), **noise
+    )  # records in the place of those of the structure, which follow
+    relative = test.predict(structure) + times * 0.01 * draw(*shapes[1])
+    force = test.predict_force(structure) + times * 0.2 * draw(*shapes[0])
+    test = replace(test, response=relative + np.einsum("sd,rdf->rsf", G, base), force=force)
+    test = with_modes_of_records(test, structure, rng)
+    slopes = slopes_of(problem.formulation.matrices, x, test)
+    (found,), (stated,) = (rows_of_test(test, slopes, 1, as_stated=flag) for flag in (False, True))
+    np.testing.assert_allclose(found.std / stated.std, times, rtol=0.08)

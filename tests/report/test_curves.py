@@ -88,7 +88,7 @@ def test_runs_of_other_lengths_are_drawn_at_their_own_lines():
     test = sysid.Measurement.from_time(runs, 10.0, rigid_body=[[1.0]], estimator="spectra")
     structure = sysid.Structure(np.diag([1.0, 0.0]), 400 * np.array([[1, -1], [-1, 1]]), [0.02], n_base=1)
     problem = SimpleNamespace(measurement=test)
-    it = SimpleNamespace(structure=structure, quick_uncertainty=None, measurement=test, problem=problem)
+    it = SimpleNamespace(structure=structure, quick_uncertainty=None, measurement=test, records=problem)
     element = curves(it, test, NoiseLevel(None, None, False))
     (data,) = map(json.loads, re.findall(r'<script type="application/json">(.*?)</script>', element, re.DOTALL))
     for run, n in enumerate(lengths):

@@ -204,23 +204,6 @@ def test_a_text_keeps_every_character(tmp_path):
     assert (back.message, back.undetermined, back.closed_by) == (text, ("", text), ("",))
 
 
-def test_what_spoke_against_older_results_is_told_apart_from_their_message(tmp_path):
-    """They joined it to the message, by semicolons, and had no field of it."""
-    gain, far, ended = "gain; of a, b", "far off", "the search did not end in a fit (stopped): this is not yet any"
-    for given, undetermined, success, message, against in (
-        (f"{gain}; {far}; IPOPT: Solve_Succeeded", (gain, far, "mode 2"), True, "IPOPT: Solve_Succeeded", (gain, far)),
-        (f"stopped; {gain}", (gain, ended, "mode 2"), False, "stopped", (gain, ended)),
-        ("stopped", ("mode 2",), False, "stopped", ("stopped",)),
-        ("a; b", ("mode 2",), True, "a; b", ()),
-    ):
-        made = identification(message=given, undetermined=undetermined, success=success)
-        tree, number = from_bytes(made.save(tmp_path).read_bytes())
-        del tree["against"], tree["changing"]
-        (tmp_path / "old.h5").write_bytes(to_bytes(tree, number))
-        it = sysid.load(tmp_path / "old.h5")
-        assert (it.message, it.against, it.undetermined, it.changing) == (message, against, undetermined, False)
-
-
 def test_a_huge_seed_survives(tmp_path):
     assert sysid.load(identification(seed=2**127 + 1).save(tmp_path)).seed == 2**127 + 1
 
@@ -264,15 +247,18 @@ def test_each_wrong_file_gets_its_own_sentence(tmp_path):
         ("cut.h5", good[:9000], f"it has 9000 bytes, and {len(good)} were written"),
         ("longer.h5", good + b"\0", f"it has {len(good) + 1} bytes, and {len(good)} were written"),
         ("other.h5", good[:-1] + bytes([good[-1] ^ 1]), "its bytes have another SHA-256"),
-        ("later.h5", to_bytes({"sysid_version": "9.1"}, 4), r"format 4 \(sysid 9.1\), .* a later sysid is needed"),
-        ("records.h5", to_bytes({"content": "sysid test"}, 3), "it holds a sysid test, not a sysid identification"),
+        ("later.h5", to_bytes({"sysid_version": "9.1"}, 5), r"format 5 \(sysid 9.1\), .* a later sysid is needed"),
+        ("records.h5", to_bytes({"content": "sysid test"}, 4), "it holds a sysid test, not a sysid identification"),
+        ("earlier.h5", to_bytes({"content": "sysid identification"}, 3), "format 3, .*anew by 'sysid run PROBLEM'"),
     ):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(sysid.InputError, match=f"{name} cannot be read: .*{sentence}"):
             sysid.load(tmp_path / name)
     with h5py.File(tmp_path / "else.h5", "w") as file:
         file["data"] = [1, 2]
-    with pytest.raises(sysid.InputError, match=r"else\.h5 .*: it is an HDF5 file, but not a result of sysid"):
+    with pytest.raises(
+        sysid.InputError, match=r"else\.h5 .*: it is no result of this sysid, but of one before format 3"
+    ):
         sysid.load(tmp_path / "else.h5")
 
 

@@ -5,16 +5,23 @@ import numpy as np
 import pytest
 
 import sysid
+from sysid.search.continuation import _alternatives, _Run, smoothed_tests
+from sysid.search.local import LocalResult
+from sysid.search.session import DeferredInterrupt, Session
 
 STRETCH = np.array([[1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]])
 MASS, SPRINGS, DAMPERS = np.array([5.0, 4.0]), np.array([2e4, 1.5e4]), np.array([9.0, 6.0])
 FREQ = np.linspace(2.0, 20.0, 150)
+COUPLING = 8e3
+
+
+def two_floors():
+    K, C = (STRETCH.T @ np.diag(values) @ STRETCH for values in (SPRINGS, DAMPERS))
+    return sysid.Structure(np.diag([*MASS, 0.0]), K, damping_matrix=C[:2, :2], n_base=1)
 
 
 def measured(**options):
-    K, C = (STRETCH.T @ np.diag(values) @ STRETCH for values in (SPRINGS, DAMPERS))
-    truth = sysid.Structure(np.diag([*MASS, 0.0]), K, damping_matrix=C[:2, :2], n_base=1)
-    return sysid.simulate(truth, FREQ, rng=0, **options)
+    return sysid.simulate(two_floors(), FREQ, rng=0, **options)
 
 
 def springs_and_dampers(lower=1e3, upper=1e6):
@@ -84,35 +91,95 @@ def test_a_callback_that_stops_it_leaves_the_best_so_far(after):
     assert np.all(np.isfinite(result.x))
 
 
-@pytest.mark.parametrize("sensors", [1, 2])
-def test_a_second_structure_that_explains_the_data_exactly_is_told(sensors):
-    """The base drives coordinate 1 alone, so that its motion holds the square of the coupling to coordinate 2.
+def coupled(sensors):
+    """A problem of two masses whose coupling is 8000 N/m, with sensors on the first or on both of them.
 
+    The base drives coordinate 1 alone, so that its motion holds the square of the coupling to coordinate 2.
     From the motion of coordinate 1 that coupling is 8000 N/m or -8000 N/m; the motion of coordinate 2 tells the sign.
     """
     M, C, G = np.diag([5.0, 4.0]), np.diag([12.0, 9.0]), np.array([[1.0], [0.0]])
-    w, coupling = 2 * np.pi * FREQ[::3, None, None], 8e3
-    K = np.array([[3e4, coupling], [coupling, 2e4]])
+    w = 2 * np.pi * FREQ[::3, None, None]
+    K = np.array([[3e4, COUPLING], [COUPLING, 2e4]])
     absolute = np.linalg.solve(-(w**2) * M + 1j * w * C + K, w**2 * (M @ G) + 0j)[..., 0].T + G
     test = sysid.Measurement(
         FREQ[::3], np.ones((1, len(w))), absolute[None, :sensors], rigid_body=G[:sensors], base_axes="x"
     )
     k = sysid.Variable("coupling", lower=-2e4, upper=2e4, guess=3e3, unit="N/m")
-    problem = sysid.Problem(
+    return sysid.Problem(
         test, mass=M, stiffness=ca.blockcat([[3e4, k], [k, 2e4]]), damping=C,
         recovery=np.eye(2)[:sensors], rigid_body_dofs=G,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("sensors", [1, 2])
+def test_a_second_structure_that_explains_the_data_exactly_is_told(sensors):
+    problem = coupled(sensors)
     result = sysid.identify(problem, strategy=sysid.Continuation(starts=5), rng=0)
     assert result.success
     found = result.values["coupling"].item()
     if sensors == 2:
-        assert found == pytest.approx(coupling, rel=1e-8)
+        assert found == pytest.approx(COUPLING, rel=1e-8)
         assert result.determined
         return
-    assert abs(found) == pytest.approx(coupling, rel=1e-8)
+    assert abs(found) == pytest.approx(COUPLING, rel=1e-8)
     assert not result.determined
     (told,) = (sentence for sentence in result.undetermined if "another structure explains" in sentence)
     assert f"coupling = {-found:.4g} in place of {found:.4g}" in told
+
+
+def test_ends_of_other_starts_that_explain_the_data_as_well_are_alternatives_once_each():
+    """Of the coupling the sign is open; what explains nothing is none."""
+    problem = coupled(1)
+    ends = [
+        (problem.objective(np.array([k])), LocalResult(np.array([k]), True, "", np.zeros(0)))
+        for k in (COUPLING, -COUPLING, 0.5 * COUPLING, -COUPLING * (1 + 1e-9), COUPLING * (1 - 1e-9))
+    ]
+    found = _alternatives(problem, np.array([COUPLING]), ends[0][0], ends)
+    assert [other.item() for other in found] == [-COUPLING]
+
+
+def two_tests(**options):
+    """The same structure measured twice, with the same noise."""
+    k, _, K, C = springs_and_dampers()
+    tests = [sysid.simulate(two_floors(), FREQ, noise=0.01, rng=seed) for seed in (1, 2)]
+    further = sysid.FurtherTest(tests[1], mass=np.diag(MASS), stiffness=K, damping=C)
+    more = options.get("residuals", lambda k: [])(k)
+    return sysid.Problem(tests[0], mass=np.diag(MASS), stiffness=K, damping=C, residuals=[further, *more])
+
+
+def test_the_floor_of_several_tests_is_about_what_the_truth_leaves():
+    """Free residues at the poles of the data take little of the noise of hundreds of numbers with them."""
+    problem = two_tests()
+    truth = np.concatenate([SPRINGS, DAMPERS])
+    assert smoothed_tests(problem).floor == pytest.approx(problem.objective(truth), rel=0.1)
+
+
+def test_what_residuals_of_the_users_leave_does_not_make_a_fit_of_the_tests_worse():
+    """Two priors of a spring that contradict each other by 400 of their deviations, and the truth between them."""
+    problem = two_tests(residuals=lambda k: [sysid.Prior(k[0], SPRINGS[0] + off, 10.0) for off in (-2e3, 2e3)])
+    truth = np.concatenate([SPRINGS, DAMPERS])
+    with DeferredInterrupt() as interrupt:
+        outcome = sysid.Continuation(starts=1).run(problem, Session([], interrupt), truth)
+    np.testing.assert_allclose(outcome.x, truth, rtol=0.01)
+    assert problem.objective(outcome.x) > 5 * smoothed_tests(problem).floor
+    assert outcome.good
+
+
+def test_starts_are_unanimous_where_three_end_at_one_fit_of_sorts():
+    """Where peaks are not those of the records at all, all may end at one bound, and another strategy may do better."""
+    _, _, K, C = springs_and_dampers()
+    problem = sysid.Problem(measured(noise=0.01), mass=np.diag(MASS), stiffness=K, damping=C)
+    truth, soft = np.concatenate([SPRINGS, DAMPERS]), np.concatenate([SPRINGS / 9, DAMPERS])
+    assert problem.residual(truth) < 0.02 and problem.residual(soft) > 0.5
+    with DeferredInterrupt() as interrupt:
+        run = _Run(problem, Session([], interrupt))
+    for ends, joined, unanimous in (
+        ([truth, truth, truth], 0, True), ([truth], 2, True), ([truth, truth], 0, False),
+        ([truth, truth, 1.1 * truth], 0, False), ([soft, soft, soft], 0, False),
+    ):  # fmt: skip
+        results = [LocalResult(x, True, "", np.zeros(1)) for x in ends]
+        run.ends, run.joined = [(problem.objective(one.x), one) for one in results], joined
+        assert run._unanimous(results[0]) is unanimous
 
 
 def test_starts_left_out_for_want_of_time_are_told(monkeypatch):

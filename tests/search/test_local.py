@@ -13,8 +13,9 @@ import sysid
 from sysid import FullMass, SpectralStiffness
 from sysid.modal_analysis.residues import linear_residues
 from sysid.models.spectrum import SOLVED
-from sysid.nlp import NonlinearProgram
+from sysid.nlp import OBJECTIVE_SCALE, NonlinearProgram
 from sysid.search import local
+from sysid.search.matrix_coordinates import _gauss_newton
 from sysid.search.modal_coordinates import _linear_starts, _regular_inverse, frequencies, modes_of
 from sysid.search.scaled_unknowns import add_unknowns
 from sysid.search.swarm_objective import SwarmObjective
@@ -285,6 +286,18 @@ class TestStarts:
             z.constrain(x[0] * x[1], 2.0, 2.0)
             found = z.finished(ca.vertcat(x[0] - 1, 1e-6 * (x[1] - 2)), np.array([1.1, 1.9]))
             np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+    def test_the_gauss_newton_hessian_holds_the_constraints_own(self):
+        """Rows that are linear, so that 2 J'J is exact, and x0 x1 + x1² x2 = const, by hand."""
+        z = NonlinearProgram()
+        x = z.variable("x", np.zeros(3))
+        z.constrain(x[0] * x[1] + x[1] ** 2 * x[2], 1.0, 1.0)
+        J = np.array([[1.0, 2.0, -1.0], [0.5, 0.0, 3.0]])
+        at, factor, multiplier = np.array([0.3, -0.7, 1.1]), 0.4, 2.5
+        made = np.asarray(_gauss_newton(z, ca.DM(J) @ x - 1)(at, [], factor, multiplier))
+        of_constraint = np.array([[0.0, 1.0, 0.0], [1.0, 2 * at[2], 2 * at[1]], [0.0, 2 * at[1], 0.0]])
+        whole = 2 * OBJECTIVE_SCALE * factor * J.T @ J + multiplier * of_constraint
+        np.testing.assert_allclose(made, np.triu(whole), rtol=1e-12)
 
     def test_near_a_bound_is_within_a_millionth_of_the_range(self):
         z = NonlinearProgram()

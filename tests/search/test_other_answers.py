@@ -23,7 +23,7 @@ SEEDS_MISSED_BEFORE = (2, 4)  # continuation alone comes to one answer only
 TOLD = "another structure explains the data as well"
 
 
-def problem(floors=(1,), *, noise=0.01, rng=0, lower=1e3, ratios=False):
+def problem(floors=(1,), *, noise=0.01, rng=0, lower=1e3, ratios=False, constraints=lambda k, c: []):
     """The chain with sensors on some floors."""
     K, C = (STRETCH.T @ np.diag(values) @ STRETCH for values in (SPRINGS, DAMPERS))
     recovery = np.eye(2)[list(floors)]
@@ -37,7 +37,7 @@ def problem(floors=(1,), *, noise=0.01, rng=0, lower=1e3, ratios=False):
     zeta = sysid.Variable("ratio", 2, lower=1e-3, upper=0.2, log=True)
     return sysid.Problem(
         test, mass=np.diag([*MASS, 0.0]), stiffness=STRETCH.T @ ca.diag(k) @ STRETCH,
-        damping=zeta if ratios else STRETCH.T @ ca.diag(c) @ STRETCH, recovery=recovery,
+        damping=zeta if ratios else STRETCH.T @ ca.diag(c) @ STRETCH, recovery=recovery, constraints=constraints(k, c),
     )  # fmt: skip
 
 
@@ -81,6 +81,53 @@ def test_responses_are_those_of_direct_solves_also_with_ratios():
     (made,) = same(moved[None])
     direction = term.inputs.item()
     np.testing.assert_allclose(made[: expected.size] + 1j * made[expected.size :], direction * expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("base", [(1.0, 0.01), (0.01, 1.0)])
+def test_a_difference_in_any_direction_in_which_the_base_moves_is_seen(base):
+    """Two oscillators that know nothing of each other, one on either direction of the base, a run each."""
+    freq = np.linspace(1.0, 9.0, 30)
+    shaken = np.diag(base)[:, :, None] * np.ones(freq.size)
+    test = sysid.Measurement(freq, shaken, shaken + 1.0, rigid_body=np.eye(2), base_axes="xy")
+    k = sysid.Variable("k", 2, lower=100.0, upper=9e3)
+    posed = sysid.Problem(test, mass=np.diag([2.0, 3.0, 0, 0]), stiffness=ca.diag(k), damping=[0.01, 0.02])
+    x = np.array([900.0, 2500.0])
+    for i in range(2):
+        (off,) = SameResponse(posed, x)(np.where(np.arange(2) == i, 1.2 * x, x)[None])
+        assert np.linalg.norm(off) > 0.01
+
+
+def test_differences_do_not_depend_on_the_point_of_the_base_that_motions_are_relative_to():
+    """With u' = u - A u0, M' = T' M T: base forces and relative motions are the same physics."""
+    rng = np.random.default_rng(2)
+    freq, G, A = np.linspace(1.0, 9.0, 30), np.array([[1.0, 0.3], [0.9, -0.4]]), np.array([[0.6, 0.2], [-0.1, 0.3]])
+    shaken, force = rng.normal(size=(2, 2, 2, freq.size))
+    m, k = sysid.Variable("m", 3, lower=0.1, upper=9.0), sysid.Variable("k", 2, lower=100.0, upper=9e3)
+    coupling = ca.vertcat(ca.horzcat(m[2], 0.3 * m[0]), ca.horzcat(0.1 * m[1], m[2] / 2))
+    M = ca.blockcat([[ca.diag(m[:2]), coupling], [coupling.T, 5 * np.eye(2)]])
+
+    def posed(A):
+        T = np.block([[np.eye(2), A], [np.zeros((2, 2)), np.eye(2)]])
+        test = sysid.Measurement(
+            freq, shaken, shaken + np.einsum("sd,rdf->rsf", G - A, shaken), rigid_body=G - A, force=force,
+            base_axes=["x", "ry"],
+        )  # fmt: skip
+        return sysid.Problem(test, mass=T.T @ M @ T, stiffness=ca.diag(k) + 50, damping=[0.01, 0.02])
+
+    x = np.array([2.0, 3.0, 0.4, 900.0, 2500.0])
+    points = x * rng.uniform(0.8, 1.2, (4, x.size))
+    one, other = (SameResponse(posed(by), x)(points) for by in (0 * A, A))
+    assert np.linalg.norm(one) > 0.1
+    np.testing.assert_allclose(other, one, atol=1e-9)
+
+
+def test_another_answer_keeps_the_constraints():
+    """The exchanged chain explains the records as well; a constraint that holds of the first one leaves it out."""
+    other = exchanged(X)
+    for constraints, explains in ((lambda k, c: [], True), (lambda k, c: [k[0] <= 2 * k[1]], False)):
+        posed = problem(constraints=constraints)
+        assert posed.objective(other) == pytest.approx(posed.objective(X), rel=1e-6)
+        assert other_answers._explains(posed, other, posed.objective(X)) is explains
 
 
 @pytest.mark.parametrize("seed", SEEDS_MISSED_BEFORE)

@@ -156,6 +156,43 @@ def test_a_candidate_without_a_stiffness_matrix_is_no_number(damping):
 
 
 @pytest.mark.parametrize("damping", ["states", "modes"])
+def test_a_candidate_whose_base_is_lighter_than_its_coupling_is_no_number(damping):
+    """M_00 below M_S0' M_SS^-1 M_S0 = 0.8² / 3 + 0.8² / 2 + 0.8² / 1: a mass that is not positive semidefinite."""
+    base = sysid.Variable("base", lower=0.5, upper=5)
+    coupled = np.pad(np.diag([3.0, 2, 1]), (0, 1))
+    coupled[:3, 3] = coupled[3, :3] = 0.8
+    corner = np.diag([0.0, 0, 0, 1])
+    c = sysid.Variable("c", 3, lower=0.001, upper=0.2)
+    problem = sysid.Problem(
+        sysid.simulate(truth(), FREQ, force=True), mass=coupled + base * corner,
+        stiffness=chain(ca.DM([2e4, 1.5e4, 1e4])), damping=c if damping == "modes" else chain(99 * c),
+    )  # fmt: skip
+    least = 0.8**2 * (1 / 3 + 1 / 2 + 1)
+    order = [problem.formulation.labels.index(name) for name in ("base", "c[0]", "c[1]", "c[2]")]
+    rows = np.empty((2, 4))
+    rows[:, order] = np.array([[0.99 * least, 0.1, 0.1, 0.1], [1.01 * least, 0.1, 0.1, 0.1]])
+    costs = SwarmObjective(problem)(rows)
+    with pytest.raises(sysid.InputError):
+        problem.structure(rows[0])
+    assert np.isnan(costs[0])
+    assert costs[1] == pytest.approx(problem.objective(rows[1]), rel=1e-9)
+
+
+def test_a_candidate_whose_damping_feeds_energy_in_is_no_number():
+    """Dampers of 5 and c between three floors; one of less than nothing makes C indefinite."""
+    c = sysid.Variable("c", lower=-9.0, upper=9.0)
+    problem = sysid.Problem(
+        sysid.simulate(truth(), FREQ), mass=np.diag([3.0, 2, 1]), stiffness=chain(ca.DM([2e4, 1.5e4, 1e4])),
+        damping=chain(ca.vertcat(5.0, 5.0, c)),
+    )  # fmt: skip
+    costs = SwarmObjective(problem)(np.array([[2.0], [-2.0]]))
+    with pytest.raises(sysid.InputError):
+        problem.structure(np.array([-2.0]))
+    assert np.isnan(costs[1])
+    assert costs[0] == pytest.approx(problem.objective(np.array([2.0])), rel=1e-9)
+
+
+@pytest.mark.parametrize("damping", ["states", "modes"])
 def test_bits_do_not_depend_on_who_else_is_in_the_batch(damping):
     problem = make(damping, force=True, constraints=lambda m, k, c: [m[0] <= m[1]])
     cost, rows = SwarmObjective(problem), particles(problem, 150)

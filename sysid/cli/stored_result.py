@@ -1,0 +1,46 @@
+"""The result that a command reads, with the problem module that ``--module`` names."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from sysid import catalogue
+from sysid.errors import InputError
+from sysid.results.identification import Identification, Recipe, load
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """Add RESULT and ``--module``."""
+    command.add_argument("result", metavar="RESULT", help="a result.h5, or the folder that holds it")
+    command.add_argument(
+        "--module",
+        metavar="FILE",
+        help="the problem module that RESULT was made by, which is run: where RESULT does not hold all of its problem, "
+        "and more is wanted than figures, report and matrices, which it always holds",
+    )
+
+
+def read(options: argparse.Namespace) -> Identification:
+    """The result; its problem made anew where a module is named.
+
+    Raises
+    ------
+    InputError
+        As of `load`; or where the module makes another problem than that of the result.
+    """
+    result = load(options.result)
+    if options.module is None:
+        return result
+    recipe = result.recipe or Recipe(options.module)
+    return with_problem_of(result, replace(recipe, module=options.module), options.result)
+
+
+def with_problem_of(result: Identification, recipe: Recipe, source: str | Path) -> Identification:
+    """The result with the problem that a recipe makes."""
+    problem = catalogue.build(replace(recipe, start=None))
+    try:
+        return result.with_problem(problem)
+    except InputError as error:
+        raise InputError(f"{source}, with {recipe.title}: {error}") from error

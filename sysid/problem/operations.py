@@ -1,0 +1,178 @@
+"""Operations by which the expressions of a problem stand in a file: their names, and CasADi's own way to make each.
+
+A file can ask for these alone. Files name them in words; CasADi's numbers for them change from one version to the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+
+from sysid.errors import InputError
+
+# Limits of what a file can ask for: many times what a problem of some hundred degrees of freedom takes.
+MOST_OPERATIONS = 3_000_000
+MOST_ENTRIES = 10_000_000  # of one matrix, zeros too: 80 MB
+MOST_STORED = 30_000_000  # of all patterns of matrices together
+MOST_WORK = 3_000_000_000  # multiplications in one evaluation: some seconds
+MOST_MEMORY = 50_000_000  # numbers that one evaluation keeps at a time: 400 MB
+
+# Each entry by itself, with the names of CasADi's constants.
+UNARY = (
+    "neg", "exp", "log", "sqrt", "sq", "twice", "sin", "cos", "tan", "asin", "acos", "atan", "floor", "ceil", "not",
+    "fabs", "sign", "erf", "inv", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "erfinv", "log1p", "expm1",
+)  # fmt: skip
+BINARY = (
+    "add", "sub", "mul", "div", "pow", "constpow", "lt", "le", "eq", "ne", "and", "or", "fmod", "remainder", "copysign",
+    "if_else_zero", "fmin", "fmax", "atan2", "hypot",
+)  # fmt: skip
+# Linear solvers that come with CasADi and load no further library.
+SOLVERS = ("qr", "ldl", "lapackqr", "lapacklu", "csparse", "csparsecholesky", "lsqr", "tridiag", "mumps")
+INTERPOLANTS = {"linear": "LinearInterpolant", "bspline": "BSplineInterpolant"}  # CasADi's classes of them
+
+# Number of arguments, and what makes it of them; without further parameters.
+PLAIN: dict[str, tuple[int, Callable[..., ca.MX]]] = {
+    "transpose": (1, lambda x: x.T),
+    "mtimes": (3, lambda z, x, y: ca.mac(x, y, z)),  # z + x y
+    "dot": (2, ca.dot),
+    "bilin": (3, ca.bilin),
+    "rank1": (4, ca.rank1),
+    "kron": (2, ca.kron),
+    "norm1": (1, ca.norm_1),
+    "norm2": (1, ca.norm_2),
+    "normf": (1, ca.norm_fro),
+    "norminf": (1, ca.norm_inf),
+    "determinant": (1, ca.det),
+    "mmin": (1, ca.mmin),
+    "mmax": (1, ca.mmax),
+    "logsumexp": (1, ca.logsumexp),
+    "find": (1, ca.find),
+    "low": (2, ca.low),
+}
+JOINING: dict[str, Callable[..., ca.MX]] = {"vertcat": ca.vertcat, "horzcat": ca.horzcat, "diagcat": ca.diagcat}
+RESHAPING: dict[str, Callable[..., ca.MX]] = {
+    "reshape": ca.reshape, "project": ca.project, "sparsity_cast": ca.sparsity_cast,
+}  # fmt: skip
+SPLITTING = ("vertsplit", "horzsplit", "diagsplit")
+REPEATING: dict[str, Callable[..., ca.MX]] = {"horzrepmat": ca.repmat, "horzrepsum": ca.repsum}
+
+WITHOUT_PARAMETERS = frozenset({*UNARY, *BINARY, *PLAIN, *JOINING})
+NAMES = (
+    *WITHOUT_PARAMETERS, *RESHAPING, *SPLITTING, *REPEATING, "const", "getnonzeros", "setnonzeros", "addnonzeros",
+    "einstein", "solve", "call",
+)  # fmt: skip
+
+
+def casadi_number(name: str) -> int:
+    """CasADi's number of an operation, in the version at hand."""
+    return int(getattr(ca, f"OP_{name.upper()}"))
+
+
+def casadi_name(number: int) -> str:
+    """The name of an operation by CasADi's number."""
+    names = (name for name in dir(ca) if name.startswith("OP_") and getattr(ca, name) == number)
+    return next(names, f"operation {number}").removeprefix("OP_").lower()
+
+
+def has_library(kind: str, name: str) -> bool:
+    """Whether a solver or an interpolant comes with CasADi: its library stands in CasADi's own folder."""
+    return any(Path(ca.__file__).parent.glob(f"libcasadi_{kind}_{name}.*"))
+
+
+def get_nonzeros(x: ca.MX, pattern: ca.Sparsity, places: Sequence[int]) -> ca.MX:
+    """Nonzeros of x as those of another pattern; place -1 gives zero."""
+    _check_places(places, x.nnz(), least=-1)
+    if len(places) != pattern.nnz():
+        raise ValueError(f"{len(places)} places for {pattern.nnz()} entries")
+    return x.nzref(pattern, list(places))
+
+
+def set_nonzeros(y: ca.MX, x: ca.MX, places: Sequence[int], *, add: bool) -> ca.MX:
+    """Give y with the nonzeros of x in, or added to, those of its own at some places; place -1 is left out."""
+    _check_places(places, y.nnz(), least=-1)
+    if len(places) != x.nnz():
+        raise ValueError(f"{len(places)} places for {x.nnz()} entries")
+    result = ca.MX(y)
+    if not add:
+        used = [i for i, place in enumerate(places) if place >= 0]
+        result.nz[[places[i] for i in used]] = x.nz[used]
+        return result
+    # A place that occurs several times is added to in turn, as CasADi does it.
+    left = [i for i, place in enumerate(places) if place >= 0]
+    while left:
+        taken: dict[int, int] = {}
+        for i in left:
+            taken.setdefault(places[i], i)
+        at, of = list(taken), list(taken.values())
+        result.nz[at] = result.nz[at] + x.nz[of]
+        chosen = set(of)
+        left = [i for i in left if i not in chosen]
+    return result
+
+
+def _check_places(places: Sequence[int], count: int, *, least: int) -> None:
+    if len(places) and not (least <= min(places) and max(places) < count):
+        raise ValueError(f"a place is not among {count} entries")
+
+
+def split(name: str, x: ca.MX, offsets: Sequence[int]) -> list[ca.MX]:
+    """Pieces of a matrix between offsets of its rows, its columns, or both (in turn: of rows, of columns)."""
+    if name == "diagsplit":
+        rows, columns = list(offsets[::2]), list(offsets[1::2])
+        _check_offsets(rows, x.size1())
+        _check_offsets(columns, x.size2())
+        return list(ca.diagsplit(x, rows, columns))
+    _check_offsets(offsets, x.size1() if name == "vertsplit" else x.size2())
+    return list((ca.vertsplit if name == "vertsplit" else ca.horzsplit)(x, list(offsets)))
+
+
+def _check_offsets(offsets: Sequence[int], size: int) -> None:
+    if len(offsets) < 2 or offsets[0] != 0 or offsets[-1] != size or any(b < a for a, b in pairwise(offsets)):
+        raise ValueError("offsets do not rise from the first row or column to the last")
+
+
+def einstein(c: ca.MX, a: ca.MX, b: ca.MX, tensors: Sequence[Sequence[int]]) -> ca.MX:
+    """Einstein sum c + a b over indices; `tensors`: dimensions of a, b, c, then the indices of a, b, c.
+
+    CasADi checks neither, and reads beyond the arrays where they are wrong.
+    """
+    dimensions, indices = tensors[:3], tensors[3:]
+    found: dict[int, int] = {}
+    for value, sizes, names in zip((a, b, c), dimensions, indices, strict=True):
+        if len(sizes) != len(names) or len(set(names)) != len(names) or min([*sizes, 1]) < 1:
+            raise ValueError("dimensions and indices do not agree")
+        if not value.is_dense() or value.numel() != int(np.prod(sizes, dtype=float)):
+            raise ValueError("a tensor has another size than its dimensions")
+        for size, index in zip(sizes, names, strict=True):
+            if index >= 0 or found.setdefault(index, size) != size:
+                raise ValueError("an index has two sizes")
+    if any(index not in {*indices[0], *indices[1]} for index in indices[2]):
+        raise ValueError("an index of the sum is in neither factor")
+    return ca.einstein(a, b, c, *map(list, dimensions), *map(list, indices))
+
+
+def solve(solver: str, b: ca.MX, a: ca.MX, *, transposed: bool) -> ca.MX:
+    """Give a⁻¹ b, or aᵀ⁻¹ b, by a linear solver of `SOLVERS`, "" the substitution where a is triangular."""
+    if a.size1() != a.size2() or a.size1() != b.size1():
+        raise ValueError("a system of equations is not square")
+    if not solver:
+        if transposed or not (a.sparsity().is_triu() or a.sparsity().is_tril()):
+            raise ValueError("a matrix is not triangular")
+        return ca.solve(a, b)
+    check_library("linsol", solver, SOLVERS)
+    return ca.Linsol(LINEAR, solver, a.sparsity()).solve(a, b, transposed)
+
+
+LINEAR = "tmp_solve"  # as ca.solve calls its solvers
+
+
+def check_library(kind: str, name: str, allowed: Sequence[str]) -> None:
+    """Refuse a solver or an interpolant that is not allowed, or that this CasADi does not have."""
+    if name not in allowed:
+        raise ValueError(f"{name!r} is none of {', '.join(allowed)}")
+    if not has_library(kind, name):
+        raise InputError(f"they need CasADi's {name}, which this installation of CasADi does not have")

@@ -1,0 +1,160 @@
+"""What summary, report and export ask of a problem beside its records, as plain facts, which files can hold."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sysid.assessment.gains import taken_at_sensors
+from sysid.models.mass import LumpedMass
+from sysid.models.unknowns import Unknown
+from sysid.problem.given import MATRICES
+from sysid.problem.problem import Problem
+from sysid.problem.terms import FurtherTest
+from sysid.structure.structure import Array
+
+_TOTALS = {"trace": "total of the diagonal", "rigid_body": "rigid-body total", "sensors": "total on the sensors"}
+
+
+class ReportedUnknown(NamedTuple):
+    """An unknown that means something by itself; bounds are (size,). A free damping ratio stands in tables of modes."""
+
+    name: str
+    unit: str
+    shape: tuple[int, ...]
+    labels: tuple[str, ...]
+    lower: Array
+    upper: Array
+    fixed: bool
+    is_ratio: bool
+
+    @property
+    def size(self) -> int:
+        """Number of its scalars."""
+        return len(self.labels)
+
+
+class Facts(NamedTuple):
+    """What readers of a result ask of its problem.
+
+    Attributes
+    ----------
+    unit_mass, fits_records : bool
+        As of `Problem` and `Formulation`.
+    mass_is_free, mass_is_lumped : bool
+    by_accelerations : bool
+        Accelerations alone are fitted, which leave a common factor of M, K and C open.
+    misses : tuple of (str, float)
+        What was stated as known to some accuracy, and by how many standard deviations the answer misses it.
+    unknowns : tuple of ReportedUnknown
+    counts : tuple of (str, int)
+        Scalar unknowns a matrix.
+    n_variables : int
+    models : tuple of (str, str)
+        A matrix, and its model with what that states.
+    stated_rigid_body : (d, d) of bool
+        Which entries of the rigid-body mass are stated.
+    assumed : tuple of str
+        Sentences.
+    """
+
+    unit_mass: bool
+    fits_records: bool
+    mass_is_free: bool
+    mass_is_lumped: bool
+    by_accelerations: bool
+    misses: tuple[tuple[str, float], ...]
+    unknowns: tuple[ReportedUnknown, ...]
+    counts: tuple[tuple[str, int], ...]
+    n_variables: int
+    models: tuple[tuple[str, str], ...]
+    stated_rigid_body: Array
+    assumed: tuple[str, ...]
+
+    def to_tree(self) -> dict[str, Any]:
+        """Give all as dictionaries, lists, arrays, numbers and texts; `from_tree` takes it back."""
+        lists = {
+            "misses": [{"name": name, "deviations": z} for name, z in self.misses],
+            "counts": [{"name": name, "count": count} for name, count in self.counts],
+            "models": [{"name": name, "words": words} for name, words in self.models],
+        }
+        unknowns = [{**one._asdict(), "shape": np.array(one.shape, dtype=np.int64)} for one in self.unknowns]
+        return self._asdict() | lists | {"unknowns": unknowns}
+
+    @classmethod
+    def from_tree(cls, tree: dict[str, Any]) -> Facts:
+        """Give the facts of a tree that `to_tree` made."""
+        lists = {
+            "misses": tuple((one["name"], one["deviations"]) for one in tree["misses"]),
+            "counts": tuple((one["name"], one["count"]) for one in tree["counts"]),
+            "models": tuple((one["name"], one["words"]) for one in tree["models"]),
+        }
+        unknowns = tuple(ReportedUnknown(**{**one, "shape": tuple(one["shape"].tolist())}) for one in tree["unknowns"])
+        return cls(**{name: tree[name] for name in cls._fields} | lists | {"unknowns": unknowns})
+
+
+def facts_of(problem: Problem, x: Array | None) -> Facts:
+    """The facts of a problem and of its unknowns at an answer."""
+    formulation, test = problem.formulation, problem.measurement
+    further = [one.measurement.force is None for one in problem.residuals if isinstance(one, FurtherTest)]
+    misses = [
+        (name, float(z))
+        for prior in formulation.priors
+        if x is not None
+        for name, z in zip(prior.labels, prior.numbers(x), strict=True)
+    ]
+    told = {id(one) for one in reported_unknowns(problem)}
+    unknowns = [
+        ReportedUnknown(
+            one.name, one.unit, one.shape, one.labels, one.lower, one.upper, bool(one.fixed), id(one) not in told
+        )
+        for one in reported_unknowns(problem, damping_ratios=True)
+    ]
+    return Facts(
+        unit_mass=bool(problem.unit_mass),
+        fits_records=bool(formulation.fits_records),
+        mass_is_free=bool(formulation.mass.free),
+        mass_is_lumped=isinstance(problem.mass, LumpedMass),
+        by_accelerations=test.force is None
+        and problem.misfit is None
+        and len(further) == len(problem.residuals)
+        and all(further),
+        misses=tuple(misses),
+        unknowns=tuple(unknowns),
+        counts=problem.unknowns,
+        n_variables=problem.n_variables,
+        models=tuple(_models(problem)),
+        stated_rigid_body=_stated_rigid_body(problem),
+        assumed=tuple(taken_at_sensors(problem)),
+    )
+
+
+def reported_unknowns(problem: Problem, *, damping_ratios: bool = False) -> tuple[Unknown, ...]:
+    """Unknowns that mean something by themselves: those of models with a form of their own, and variables, fixed too.
+
+    The entries of a free matrix's factor are none, nor are shares of which only the ratios count. Free damping ratios
+    stand in the table of modes, and are among them only where asked for.
+    """
+    formulation = problem.formulation
+    stated = (formulation.mass.free, formulation.stiffness.free, formulation.damping.free and not damping_ratios)
+    of_models = (v for group, free in zip(formulation.of_models, stated, strict=True) for v in group if not free)
+    return (*(v for v in of_models if not v.relative), *formulation.variables)
+
+
+def _models(problem: Problem) -> Iterator[tuple[str, str]]:
+    """A matrix each: its model, and what that states; or that it is written in variables or numbers."""
+    formulation, counts = problem.formulation, dict(problem.unknowns)
+    stated = (formulation.mass, formulation.stiffness, formulation.damping)
+    for name, model, group, known in zip(MATRICES, problem.models, formulation.of_models, stated, strict=True):
+        kind = type(model).__name__ if group else "written in variables" if counts[name] else "numbers"
+        total = "" if known.totals is None else _TOTALS[known.totals.kind]
+        yield name, "; ".join(filter(None, (kind, total, known.sentence)))
+
+
+def _stated_rigid_body(problem: Problem) -> Array:
+    totals, d = problem.formulation.mass.totals, problem.measurement.n_base
+    if totals is None or totals.kind != "rigid_body":
+        return np.zeros((d, d), dtype=bool)
+    return np.ones((d, d), dtype=bool) if totals.values.ndim == 2 else np.eye(d, dtype=bool)

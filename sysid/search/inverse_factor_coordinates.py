@@ -1,0 +1,295 @@
+"""The local phase of the published algorithm: IPOPT with exact derivatives over the inverse of the mass's factor.
+
+The unknowns stand for those of Cerini et al. 2024, section 3: ``R = L^-1`` of ``M_SS = L L'``, ``P = L^-1 B`` with
+``B = M_SS G + M_S0``, N of ``M_rb = P'P + N N'`` where a base force was measured, the eigenvectors Psi of
+``H = L^-1 K_SS L^-T``, its spectrum and the damping ratios. With ``Phi = R' Psi`` and ``Gamma = Psi' P`` nothing is
+inverted. In the entries of L, ``Phi = L^-T Psi`` bends the valley of a noisy test so much that IPOPT ends on its
+iteration limit. Psi is ``Psi_0 Cayley(S)`` with a skew-symmetric S, so that no eigenvector routine is in the graph, and
+frequencies and damping ratios count in logarithms. R, P and N have no bounds. A stated total is an equality where a
+base force could tell another one; else masses are scaled to it at the end. The paper's own entries follow then. Far
+from Psi_0 the Cayley transform is steep, so every so many iterations the search goes on from a new Psi_0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+from scipy.linalg import null_space
+
+from sysid.errors import InputError
+from sysid.measurement.measurement import Measurement
+from sysid.measurement.noise import separable
+from sysid.modal_analysis.modal_error import ModalError
+from sysid.modal_analysis.modal_fit import Modes
+from sysid.modal_analysis.response import records_of, weights_of_test
+from sysid.models.spectrum import SOLVED
+from sysid.nlp import EXACT, OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, not_begun
+from sysid.problem.problem import Problem
+from sysid.search.modal_coordinates import End, modes_of, spectrum_near, unknowns_of
+from sysid.search.modal_scaling import stated_totals
+from sysid.structure.structure import Array, Structure
+from sysid.structure.triangular import lower_triangle, triangle_entries
+
+_ROUND = 150  # iterations, after which Psi_0 is taken anew
+_LIMIT = "Maximum_Iterations_Exceeded"  # IPOPT's word for a round that was not long enough
+_LEAST_TIME = 1.0  # s, that a round is worth beginning with
+_SECONDS, _POWER = 0.5, 5.2  # of a processor, that the graphs of 10 modes take, and how that grows with the modes
+_LEAST_MASS = 1e-6  # of the rigid-body mass; the least base mass that a fit starts with
+_FLAT = 1e-10  # of the largest curvature; along less the objective does not change
+
+
+def fit_in_inverse_factor(problem: Problem, x: Array, monitor: IterationMonitor, max_iterations: int) -> End:
+    """Minimise the objective of a problem with free modes, from the unknowns `x`.
+
+    Where the monitor's deadline would pass while the graph of the Hessian is made, nothing is begun.
+    """
+    first = best = End(x, problem.objective(x), "not begun", "")
+    seconds = _SECONDS * (problem.geometry.n / 10) ** _POWER
+    if not monitor.allows(seconds):
+        return first._replace(status=not_begun(seconds))
+    error, left = InverseFactorError(problem), max_iterations
+    while left > 0:
+        end = _fit_about(problem, best.x, error, monitor, min(_ROUND, left))
+        left -= _ROUND
+        falls = end.objective < best.objective
+        # A status belongs to the point that it was given for; that of the first round tells why where none is better.
+        if end.objective <= best.objective or best is first:
+            best = end
+        over = monitor.stopped is not None or monitor.left < _LEAST_TIME
+        if end.status != _LIMIT or best.objective <= EXACT or not falls or over:
+            break
+    if best.objective > first.objective:
+        return first._replace(status=f"{best.status}, above the start")
+    return best._replace(status="stopped") if monitor.stopped is not None else best
+
+
+class Coordinates(NamedTuple):
+    """A structure in the coordinates of this phase.
+
+    Attributes
+    ----------
+    inverse : (n, n)
+        R, lower triangular; ``M_SS = (R'R)^-1``, kg^-½.
+    loads : (n, d)
+        P, kg^½ (times m for a rotation).
+    base : (d, d)
+        N, lower triangular.
+    psi : (n, n)
+        Eigenvectors of H, orthogonal.
+    """
+
+    inverse: Array
+    loads: Array
+    base: Array
+    psi: Array
+
+
+def coordinates_of(structure: Structure) -> Coordinates:
+    """The coordinates of a structure; a base mass of nothing is raised, as its factor would have no slope there."""
+    n, G = structure.n, structure.rigid_body
+    M_SS, M_S0 = structure.mass[:n, :n], structure.mass[:n, n:]
+    L = np.linalg.cholesky(M_SS)
+    R = np.linalg.solve(L, np.eye(n))
+    P = L.T @ G + R @ M_S0
+    size = np.sqrt(np.diag(structure.rigid_body_mass))
+    lam, vectors = np.linalg.eigh((structure.rigid_body_mass - P.T @ P) / np.outer(size, size))
+    root = np.linalg.cholesky((vectors * np.maximum(lam, _LEAST_MASS)) @ vectors.T)
+    first, _, last = np.linalg.svd(L.T @ structure.normal_modes)
+    return Coordinates(np.tril(R), P, size[:, None] * root, first @ last)
+
+
+class InverseFactorError:
+    """The squared error of a test in the coordinates of this phase, with exact gradient and Hessian.
+
+    The coordinates are one column: the entries of R, row by row, P by columns, the entries of N, row by row, where a
+    base force was measured, the entries below the diagonal of the skew-symmetric S, log w (n,) and log zeta (n,).
+
+    Parameters
+    ----------
+    problem : Problem
+        With free modes.
+
+    Attributes
+    ----------
+    sizes : tuple of int
+        How many coordinates there are of R, P, N, S, and log w with log zeta.
+    gradient : casadi.Function
+        Coordinates and Psi_0 (n, n) to the squared error and its gradient.
+    hessian : casadi.Function
+        Coordinates and Psi_0 to the Hessian.
+    modes : casadi.Function
+        Coordinates and Psi_0 to mode shapes (n, n), participations (n, d) and rigid-body mass (d, d).
+    totals : casadi.Function
+        Entries of R, P and N to what is stated of totals beside a measured base force, each relative to its value and
+        zero where it is met; no rows where nothing is stated.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        test, n, d = problem.measurement, problem.geometry.n, problem.geometry.d
+        weighed = test.force is not None
+        self.sizes = (n * (n + 1) // 2, n * d, weighed * d * (d + 1) // 2, n * (n - 1) // 2, 2 * n)
+        y, psi_0 = ca.MX.sym("y", sum(self.sizes)), ca.MX.sym("psi_0", n, n)
+        *factors, skew, pole = (ca.MX.sym("part", size) for size in self.sizes)
+        shapes = ca.vertcat(*factors, skew)
+        R, P, N = _matrices(factors, n, d)
+        psi = psi_0 @ cayley(skew_symmetric(skew, n))
+        phi, gamma, rigid = R.T @ psi, psi.T @ P, P.T @ P + N @ N.T
+        value, gradient, hessian = ca.MX(0), ca.MX(y.numel(), 1), ca.MX(y.numel(), y.numel())
+        for error, of_force in _errors_of(test, n):
+            moved = ca.veccat(*((gamma.T, rigid) if of_force else (phi,)), gamma)
+            at = ca.vertcat(moved, pole)
+            squared, slope = error.gradient(at)
+            # What holds no lines is differentiated as it stands.
+            chain = ca.diagcat(ca.densify(ca.jacobian(moved, shapes)), ca.DM.eye(2 * n))
+            pull = ca.MX.sym("pull", moved.numel())
+            bend = ca.Function("bend", [shapes, psi_0, pull], [ca.hessian(ca.dot(pull, moved), shapes)[0]])
+            value += squared
+            gradient += chain.T @ slope
+            bent = bend(shapes, psi_0, slope[: moved.numel()])
+            hessian += chain.T @ error.hessian(at) @ chain + ca.diagcat(bent, ca.MX(2 * n, 2 * n))
+        parts, given = [*factors, skew, pole], ca.vertsplit(y, np.cumsum([0, *self.sizes]).tolist())
+
+        def function(name: str, *made: ca.MX) -> ca.Function:
+            inner = ca.Function(name, [*parts, psi_0], list(made))
+            return ca.Function(name, [y, psi_0], inner.call([*given, psi_0]))
+
+        self.gradient, self.hessian = function("gradient", value, gradient), function("hessian", hessian)
+        self.modes = function("modes", phi, gamma, rigid)
+        self.totals = _totals(problem, self.sizes[:3])
+
+
+def _matrices(factors: list[ca.MX] | list[ca.SX], n: int, d: int) -> tuple[ca.MX, ca.MX, ca.MX]:
+    """R, P and N of their entries; N is zero where it has none."""
+    R, P, N = factors
+    return lower_triangle(R, n), ca.reshape(P, n, d), lower_triangle(N, d) if N.numel() else type(N)(d, d)
+
+
+def _totals(problem: Problem, sizes: tuple[int, ...]) -> ca.Function:
+    """Stated totals as functions of the entries of R, P and N; L by forward substitution where they need it."""
+    factors = [ca.SX.sym("part", size) for size in sizes]
+    R, P, N = _matrices(factors, problem.geometry.n, problem.geometry.d)
+    ties = stated_totals(problem)
+    # The mass is that of any orthogonal Psi, the unit matrix too, which leaves R' in the place of the shapes.
+    rows = [] if ties is None else ties(R.T, P, P.T @ P + N @ N.T)
+    return ca.Function("totals", factors, [ca.densify(ca.vertcat(ca.SX(0, 1), *rows))])
+
+
+def _errors_of(test: Measurement, modes: int) -> Iterator[tuple[ModalError, bool]]:
+    """The errors of accelerations and, where it was measured, base force, in the weights of the objective."""
+    weighed = zip(records_of(test), weights_of_test(test, weighted=True), strict=True)
+    for of_force, ((record, std), (_, scale)) in enumerate(weighed):
+        channel, line = separable(std, record.shape)
+        yield (
+            ModalError(test.base, record, test.freq, channel / scale, line, modes=modes, with_base=bool(of_force)),
+            bool(of_force),
+        )
+
+
+def skew_symmetric(entries: ca.MX, n: int) -> ca.MX:
+    """Skew-symmetric (n, n) with the `entries` below its diagonal, column by column."""
+    rows, columns = np.tril_indices(n, -1)
+    order = np.lexsort((rows, columns))
+    below = ca.MX(ca.Sparsity.triplet(n, n, rows[order].tolist(), columns[order].tolist()), entries)
+    return below - below.T
+
+
+def cayley(S: ca.MX) -> ca.MX:
+    """Orthogonal ``(I + S)^-1 (I - S)`` of a skew-symmetric S; the unit matrix at zero."""
+    unit = ca.MX.eye(S.size1())
+    return ca.solve(unit + S, unit - S)
+
+
+def _fit_about(problem: Problem, x: Array, error: InverseFactorError, monitor: IterationMonitor, limit: int) -> End:
+    """One run of IPOPT of at most `limit` iterations, with Psi_0 of the unknowns `x` that it starts from."""
+    structure = problem.structure(x)
+    start, n = coordinates_of(structure), structure.n
+    z = NonlinearProgram()
+    of_mass = triangle_entries(start.inverse), start.loads.ravel(order="F"), triangle_entries(start.base)
+    size = _rms(np.concatenate(of_mass[1:]))
+    inverse = _scaled(z, "inverse of the mass's factor", of_mass[0], _rms(of_mass[0]))
+    loads = _scaled(z, "load of modes", of_mass[1], size)
+    base = _scaled(z, "base mass", of_mass[2], size) if error.sizes[2] else ca.MX(0, 1)
+    skew = z.variable("rotation of modes", np.zeros(n * (n - 1) // 2))
+    omega, ratios = spectrum_near(problem, structure, modes_of(structure), z)
+    y = ca.vertcat(inverse, loads, base, skew, ca.log(omega), ca.log(ratios))
+    rows = error.totals(inverse, loads, base)
+    if rows.numel():
+        z.constrain(rows)
+    objective, derivatives = error.gradient(y, start.psi)[0], _derivatives(z, y, error, start.psi)
+    best, status = z.minimize(objective, monitor, limit, derivatives, barrier="monotone")
+    end = ca.Function("end", [z.z], [*error.modes(y, start.psi), omega, ratios])
+    phi, gamma, rigid, omega, ratios = (np.asarray(part) for part in end(best))
+    try:
+        found = unknowns_of(problem, Modes(phi, gamma, omega.ravel(), ratios.ravel()), rigid, structure, x)
+    except (InputError, np.linalg.LinAlgError) as wrong:  # an R so ill-conditioned that it stands for no structure
+        return End(x, np.inf, f"{status}, at no structure ({wrong})", "")
+    solved = status in SOLVED or monitor.stopped is not None
+    left = "" if solved else _left_in_words(problem, z, derivatives, best)
+    return End(found, problem.objective(found), status, z.on_bounds(best), left)
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _scaled(z: NonlinearProgram, name: str, start: Array, size: float) -> ca.MX:
+    """New unknowns without bounds, in units of `size`."""
+    return size * z.variable(name, start / size)
+
+
+def _derivatives(z: NonlinearProgram, y: ca.MX, error: InverseFactorError, psi_0: Array) -> dict[str, ca.Function]:
+    """Gradient and exact Hessian by the program's unknowns, in IPOPT's scale of the objective."""
+    at, rows = z.z, ca.vertcat(ca.MX(0, 1), *z.constraints)
+    value, slope = error.gradient(y, psi_0)
+    chain, pull = ca.jacobian(y, at), ca.MX.sym("pull", y.numel())
+    bend = ca.Function("bend", [at, pull], [ca.hessian(ca.dot(pull, y), at)[0]])
+    p, factor, multipliers = ca.MX.sym("p", 0), ca.MX.sym("factor"), ca.MX.sym("multipliers", rows.numel())
+    hessian = OBJECTIVE_SCALE * factor * (chain.T @ error.hessian(y, psi_0) @ chain + bend(at, slope))
+    if rows.numel():
+        hessian += ca.hessian(ca.dot(multipliers, rows), at)[0]
+    return {
+        "grad_f": ca.Function(
+            "gradient", [at, p], [OBJECTIVE_SCALE * value, OBJECTIVE_SCALE * (chain.T @ slope)],
+            ["x", "p"], ["f", "grad_f_x"],
+        ),
+        "hess_lag": ca.Function(
+            "hessian", [at, p, factor, multipliers], [ca.triu(hessian)],
+            ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"],
+        ),
+    }  # fmt: skip
+
+
+def _left_in_words(problem: Problem, z: NonlinearProgram, derivatives: dict[str, ca.Function], at: Array) -> str:
+    """How much chi² an end that is no solution leaves to gain: half the Newton decrement, beside what is left in all.
+
+    What a fit leaves in all counts as one for each degree of freedom, as noise of its size does.
+    """
+    value, gain = half_newton_decrement(z, derivatives, at)
+    freedom = max(2 * problem.measurement.numbers - z.z.numel(), 1)
+    return f"about {gain * freedom / value:.3g} of {freedom} chi² still to gain"
+
+
+def half_newton_decrement(z: NonlinearProgram, derivatives: dict[str, ca.Function], at: Array) -> tuple[float, float]:
+    """The objective at a point, and ``g' H^-1 g / 2``: by how much a Newton step would lower it, both in one unit.
+
+    Equalities are kept and unknowns on a bound held. Where the objective is not convex, the sizes of its curvatures
+    count; directions along which it is flat gain nothing.
+    """
+    rows = ca.vertcat(ca.MX(0, 1), *z.constraints)
+    value, gradient = (np.asarray(part) for part in derivatives["grad_f"](at, []))
+    A = np.asarray(ca.Function("slopes", [z.z], [ca.densify(ca.jacobian(rows, z.z))])(at)).reshape(-1, at.size)
+    g, lower, upper = gradient.ravel(), np.concatenate(z.lower), np.concatenate(z.upper)
+    near = 1e-6 * np.where(np.isfinite(upper - lower), upper - lower, 1.0)
+    free = ~(((at - lower < near) & (g > 0)) | ((upper - at < near) & (g < 0)))
+    g, A = g[free], A[:, free]
+    multipliers = -np.linalg.lstsq(A.T, g)[0]
+    upper_half = np.asarray(ca.densify(derivatives["hess_lag"](at, [], 1.0, multipliers)))
+    H = (upper_half + np.triu(upper_half, 1).T)[np.ix_(free, free)]
+    along = null_space(A) if len(A) else np.eye(g.size)
+    curvature, vectors = np.linalg.eigh(along.T @ H @ along)
+    slopes, size = vectors.T @ (along.T @ g), np.abs(curvature)
+    bent = size > _FLAT * size.max()
+    return float(value.item()), float(np.sum(slopes[bent] ** 2 / size[bent]) / 2)
