@@ -23,6 +23,8 @@ SAME_JUDGEMENT, NEAR = 118 / 120, 1.05
 NOISE = 0.01  # of the rms over the channels of a record, at each line
 GRID, ABOUT = 30, 24  # lines: a mode over the whole band, and about each mode, within its peak
 MASS, SPRING, SPREAD = 1000.0, 2e6, 2.0  # kg, N/m: nominal, and the factor either way
+BRACE = 0.02  # of a spring: stiffness of what couples all floors
+LEAST = 0.01  # of the mass of a direction, that each mode carries: fainter ones are open at any damping
 ACCUSES = (
     r"stated mass|form of its mass|the model, a sign or axis|is not classical|weighs|one of them, or the unit|"
     r"known entries|move with the base beside|check its sign"
@@ -98,18 +100,30 @@ def drawn(case: Case) -> Matrices:
     """Masses and springs of one or two chains; where no chain is stated, braces couple floors and directions."""
     rng = np.random.default_rng((case.draw, sorted(RANGES).index(case.damping), case.force))
     d = 1 + int(rng.integers(2))
-    floors = int(rng.integers(2, 7 if d == 1 else 4))
-    n = d * floors
-    direction = np.arange(n) % d
+    n = d * int(rng.integers(2, 6 if d == 1 else 4))
+    ratios = np.exp(rng.uniform(*np.log(RANGES[case.damping]), n))
+    while True:
+        truth = _damped(_undamped(rng, n, d, braced=not case.chain), ratios)
+        if np.all(_carried(truth).max(axis=1) >= LEAST):
+            return truth
+
+
+def _undamped(rng: np.random.Generator, n: int, d: int, *, braced: bool) -> Matrices:
     masses, springs = (unit * SPREAD ** rng.uniform(-1, 1, n) for unit in (MASS, SPRING))
     strain = np.eye(n) - np.eye(n, k=-d)  # each sensor against the one below in its direction
     K = strain.T @ np.diag(springs) @ strain
-    if not case.chain:
+    if braced:
         brace = rng.standard_normal((2, n))
-        K = K + 0.02 * SPRING * brace.T @ brace
-    low, high = np.log(RANGES[case.damping])
-    plain = Matrices(np.diag(masses), K, np.zeros((n, n)), np.eye(d)[direction], np.zeros(n), np.zeros(n))
-    return _damped(plain, np.exp(rng.uniform(low, high, n)))
+        K = K + BRACE * SPRING * brace.T @ brace
+    return Matrices(np.diag(masses), K, np.zeros((n, n)), np.eye(d)[np.arange(n) % d], np.zeros(n), np.zeros(n))
+
+
+def _carried(truth: Matrices) -> np.ndarray:
+    """Part of the mass of each base direction that each mode carries, (n, d)."""
+    root = np.sqrt(np.diag(truth.mass))
+    psi = np.linalg.eigh(truth.stiffness / np.outer(root, root))[1]
+    pushed = psi.T @ (root[:, None] * truth.rigid)
+    return pushed**2 / (np.diag(truth.mass) @ truth.rigid)
 
 
 def _damped(truth: Matrices, ratios: np.ndarray) -> Matrices:

@@ -80,13 +80,21 @@ def sensitivity(
     -------
     Sensitivity
     """
+    rows = rows_of(formulation, x, slopes, priors=priors, as_stated=as_stated)
+    return _judged(formulation, x, rows, np.full(x.size, True))
+
+
+def rows_of(
+    formulation: Formulation, x: Array, slopes: Slopes | None = None, *, priors: bool = True, as_stated: bool = False
+) -> list[Rows]:
+    """All that is fitted at `x`, with its Jacobian, a term each; parameters as of `sensitivity`."""
     rows: list[Rows] = []
     if formulation.fits_records:
         rows.append(formulation.own_test.linearised(x, slopes=slopes, as_stated=as_stated))
     for term in (term for term in formulation.beside if priors or term not in formulation.priors):
         noise = float(np.sqrt(np.mean(rows[0].std ** 2))) if rows else np.nan
         rows.append(term.linearised(x, noise, as_stated=as_stated))
-    return _judged(formulation, x, rows, np.full(x.size, True))
+    return rows
 
 
 def of_outside(formulation: Formulation, x: Array) -> Sensitivity:

@@ -19,7 +19,7 @@ from sysid.models.unknowns import Unknown, lower_of, upper_of
 from sysid.structure.structure import Array, Structure
 
 _MISSING = (math.nan, math.nan)  # no default
-_PHYSICAL = (1e-6, 0.95)  # a vibration that hardly dies away, and one that hardly swings
+LEAST, MOST = 1e-6, 0.95  # a vibration that hardly dies away, and one that hardly swings
 _USUAL = (0.005, 0.05)  # the swarm's search space, eq. 38
 _DECADE = 10.0  # from end to end of that, and of what is searched about a pole outside
 
@@ -30,37 +30,30 @@ class ModalDamping(FieldTree):
 
     Parameters
     ----------
-    lower, upper : float, optional
-        Bounds of all ratios, which every strategy keeps. Without them a ratio may be whatever a vibrating structure has
-        (1e-6 to 0.95), and a swarm searches 0.005 to 0.05 (eq. 38 of Cerini et al. 2024); where poles of the data lie
-        outside, its search follows them, by half a decade either way.
+    lower, upper : float
+        Bounds of all ratios, which every strategy keeps. Those of any vibrating structure by default: then a swarm
+        searches 0.005 to 0.05 (eq. 38 of Cerini et al. 2024) and, where poles of the data have other ratios, half a
+        decade either way of these.
     """
 
-    lower: float | None = None
-    upper: float | None = None
+    lower: float = LEAST
+    upper: float = MOST
 
     def __post_init__(self) -> None:
-        for name in ("lower", "upper"):
-            if getattr(self, name) is not None:
-                number(f"ModalDamping: {name}", getattr(self, name))
-        lower, upper = self._bounds
+        lower, upper = (number(f"ModalDamping: {name}", getattr(self, name)) for name in ("lower", "upper"))
         if not 0 < lower < upper < 1:
             raise InputError(f"ModalDamping: 0 < lower < upper < 1 is needed, not {lower} and {upper}")
 
-    @property
-    def _bounds(self) -> tuple[float, float]:
-        low, high = _PHYSICAL
-        return low if self.lower is None else float(self.lower), high if self.upper is None else float(self.upper)
-
     def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """Damping ratios, in ascending order of frequency."""
-        lower, upper = (np.full(geometry.n, end) for end in self._bounds)
-        if self.lower is not None and self.upper is not None:
+        lower, upper = (np.full(geometry.n, float(end)) for end in (self.lower, self.upper))
+        if self.lower != LEAST and self.upper != MOST:
             return (Unknown("damping_ratio", lower, upper),)
         low, high, note = _box(geometry)
-        # A single bound beyond the box takes it along.
-        low = np.clip(low, lower, upper if self.upper is None else np.maximum(upper / _DECADE, lower))
-        high = np.clip(high, lower if self.lower is None else np.minimum(lower * _DECADE, upper), upper)
+        # A bound that is stated is an end of the box, which stays a decade long.
+        low, high = np.where(lower == LEAST, low, lower), np.where(upper == MOST, high, upper)
+        low = np.maximum(np.minimum(low, high / _DECADE), lower)
+        high = np.minimum(np.maximum(high, low * _DECADE), upper)
         return (Unknown("damping_ratio", lower, upper, box=(low, high), note=note),)
 
     def blocks(self, geometry: Geometry, y: ca.SX, mass: MassBlocks, stiffness: StiffnessBlocks) -> None:
@@ -178,14 +171,12 @@ class WrittenDamping(Written):
 
 def _box(geometry: Geometry) -> tuple[Array, Array, str]:
     """Lower and upper ends of what a swarm searches for free ratios, (n,) each, and in words why; empty if as usual."""
-    n, ratios = geometry.n, np.clip(geometry.pole_ratios, *_PHYSICAL)
-    outside = (ratios < _USUAL[0]) | (ratios > _USUAL[1])
-    if not np.any(outside):
-        return np.full(n, _USUAL[0]), np.full(n, _USUAL[1]), ""
-    half = np.sqrt(_DECADE)
-    low = np.clip(np.where(outside, ratios / half, _USUAL[0]), *_PHYSICAL)
-    high = np.clip(np.where(outside, ratios * half, _USUAL[1]), *_PHYSICAL)
-    if ratios.size != n:  # which mode has which is not known
-        low, high = np.full(n, min(low.min(), _USUAL[0])), np.full(n, max(high.max(), _USUAL[1]))
-    span, found = (f"{100 * part.min():.3g} to {100 * part.max():.3g} %" for part in (np.append(low, high), ratios))
-    return low, high, f"damping ratios are searched from {span}, as the poles of the data have {found}, not 0.5 to 5 %"
+    (lower, upper), half, ratios = _USUAL, np.sqrt(_DECADE), np.clip(geometry.pole_ratios, LEAST, MOST)
+    outside = (ratios < lower) | (ratios > upper)
+    low = np.maximum(np.where(outside, ratios / half, lower), LEAST)
+    high = np.minimum(np.where(outside, ratios * half, upper), MOST)
+    if ratios.size != geometry.n:  # which mode has which is not known
+        low, high = np.full(geometry.n, low.min(initial=lower)), np.full(geometry.n, high.max(initial=upper))
+    found = f"{100 * ratios.min(initial=MOST):.3g} to {100 * ratios.max(initial=LEAST):.3g} %"
+    note = f"damping ratios are searched from {100 * low.min():.3g} to {100 * high.max():.3g} %, as the poles of the "
+    return low, high, f"{note}data have {found}, beyond the usual 0.5 to 5 %" * bool(np.any(outside))

@@ -48,12 +48,14 @@ class Unknown:
     relative : bool
         Only the ratios of its entries mean something, so that tables of results leave it out.
     box : pair of array_like (size,), optional
-        Where candidates are drawn and a swarm searches, within the bounds; all that lies between the bounds by default.
+        Where candidates are drawn and a swarm searches, within the bounds; all that lies between them by default.
     note : str
         Why the box is where it is, for logs and remarks; empty where it is the usual one.
 
     Attributes
     ----------
+    box : pair of (size,)
+        Lower and upper ends of what a swarm searches.
     guess : (size,)
         Where a search may start: the middle of the box.
     has_guess, fixed : bool
@@ -69,7 +71,6 @@ class Unknown:
     fixed = False
     relative = False
     note = ""
-    _box: tuple[Array, Array] | None = None
 
     def __init__(
         self,
@@ -96,18 +97,10 @@ class Unknown:
             raise InputError(f"variable {name}: bounds must be finite with lower <= upper")
         self.shape: tuple[int, ...] = (self.lower.size,)
         self.sampling, self.unsampling, self.note = sampling, unsampling, note
-        if box is not None:
-            low, high = (finite_array(f"variable {name}: box", end) for end in box)
-            self._box = low, high
-            inside = low.shape == high.shape == self.lower.shape and np.all(
-                (self.lower <= low) & (low <= high) & (high <= self.upper)
-            )
-            refuse((not inside, f"variable {name}: its box must lie within its bounds, entry by entry"))
-
-    @property
-    def box(self) -> tuple[Array, Array]:
-        """Lower and upper ends of what a swarm searches, (size,) each."""
-        return (self.lower, self.upper) if self._box is None else self._box
+        low, high = (finite_array(f"variable {name}: box", end) for end in box or (self.lower, self.upper))
+        if low.shape != self.shape or high.shape != self.shape or np.any((low < self.lower) | (high > self.upper)):
+            raise InputError(f"variable {name}: its box must lie within its bounds, entry by entry")
+        self.box = low, high
 
     @cached_property
     def guess(self) -> Array:
@@ -218,7 +211,7 @@ class Variable(Unknown):
         self._refuse_where((not isinstance(unit, str), f"its unit {unit!r} is no text"))
         self.scale = "log" if log else "linear"
         self.shape = self._check_shape(shape)
-        self.lower, self.upper = lower, upper = self._flat("lower", lower), self._flat("upper", upper)
+        self.lower, self.upper = self.box = lower, upper = self._flat("lower", lower), self._flat("upper", upper)
         at = int(np.argmax(lower > upper))
         self._refuse_where(
             (

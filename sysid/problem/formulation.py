@@ -180,10 +180,8 @@ class Formulation:
     @cached_property
     def box(self) -> tuple[Array, Array]:
         """Lower and upper ends of what a swarm searches, within the bounds, (size,) each."""
-        boxes = [v.box for v in self.unknowns]
-        return np.concatenate([np.zeros(0), *(low for low, _ in boxes)]), np.concatenate(
-            [np.zeros(0), *(high for _, high in boxes)]
-        )
+        low, high = ([np.zeros(0), *(v.box[end] for v in self.unknowns)] for end in (0, 1))
+        return np.concatenate(low), np.concatenate(high)
 
     @property
     def guess(self) -> Array:

@@ -185,10 +185,8 @@ def _remarks(problem: Problem, end: Outcome, *, told_of_bounds: bool) -> Iterato
     """What the user should know of the unknowns and of the misfit."""
     formulation = problem.formulation
     found = on_bounds(problem.screened, end.structure, end.x)
-    if found and not told_of_bounds:
-        yield f"on a bound of the search space, beyond which the truth may lie: {told(found)}"
-    if end.strategy != Modal.name:
-        yield from (unknown.note for unknown in formulation.unknowns if unknown.note)
+    yield from (f"on a bound, beyond which the truth may lie: {told(found)}" for _ in found[:1] if not told_of_bounds)
+    yield from (unknown.note for unknown in formulation.unknowns if unknown.note and end.strategy != Modal.name)
     yield from taken_at_sensors(problem)
     yield from levels_in_words(problem)
     tests = [term.test for term in formulation.tests]

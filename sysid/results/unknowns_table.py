@@ -26,7 +26,7 @@ class Row(NamedTuple):
     @property
     def on_bound(self) -> str:
         """Words for the bound on which the value rests: "on its lower bound"; nothing elsewhere."""
-        return f"on its {self.side} bound" if self.side else ""
+        return f"on its {self.side} bound" * bool(self.side)
 
 
 def stated_values(it: Answer) -> list[str]:
