@@ -50,10 +50,10 @@ class ModalDamping(FieldTree):
         if self.lower != LEAST and self.upper != MOST:
             return (Unknown("damping_ratio", lower, upper),)
         low, high, note = _box(geometry)
-        # A bound that is stated is an end of the box, which stays a decade long.
+        # A bound that is stated is an end of the box, which is a decade long where the other end would lie beyond.
         low, high = np.where(lower == LEAST, low, lower), np.where(upper == MOST, high, upper)
-        low = np.maximum(np.minimum(low, high / _DECADE), lower)
-        high = np.minimum(np.maximum(high, low * _DECADE), upper)
+        low = np.where(low < high, low, np.maximum(np.minimum(low, high / _DECADE), lower))
+        high = np.where(low < high, high, np.minimum(low * _DECADE, upper))
         return (Unknown("damping_ratio", lower, upper, box=(low, high), note=note),)
 
     def blocks(self, geometry: Geometry, y: ca.SX, mass: MassBlocks, stiffness: StiffnessBlocks) -> None:
