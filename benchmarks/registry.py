@@ -72,6 +72,7 @@ BENCHMARKS = (
     Benchmark("modal.building", "matrices of a building, and their extremes where they are open", "2 s", "2 s"),
     Benchmark("modal.six_axis_spacecraft", "errors of predictions and rigid-body mass, 20 modes", "1 min", "10 s"),
     Benchmark("modal.large_tests", "seconds and memory for 50 and 100 modes", "2 min", "15 s"),
+    Benchmark("modal.damping_range", "lumped and chain tests of little to much damping", "8 min", "15 s"),
     Benchmark("modal.unsound_tests", "whether results say what a test cannot tell", "10 s", "10 s"),
     Benchmark(
         "records.stated_values", "stated masses: whether true ones help and wrong ones are told", "4 min", "15 s"

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.assessment.before_search import named_mistakes
+from sysid.assessment.bounds import bounds_explain
 from sysid.assessment.changing import changes_in_words
 from sysid.assessment.exchanged import exchanged_sensors
 from sysid.errors import InputError, SolverError, finite_array, function, instance, number, path_of, whole_number
@@ -181,7 +182,8 @@ def _run(
         if not follow or isinstance(chosen, STRATEGIES[-1]):  # after which there is nothing else
             raise
         return _instead(chosen, error, problem, session, start)
-    if not outcome.good and outcome.stopped is None and session.time_for_more:
+    bad = not outcome.good and outcome.stopped is None and session.time_for_more
+    if bad and not bounds_explain(problem, outcome.structure, outcome.x):  # what they leave looks like swapped sensors
         told = exchanged_sensors(problem, outcome.structure)
         if told:
             return replace(outcome, mistakes=told), why

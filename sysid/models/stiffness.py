@@ -19,6 +19,8 @@ from sysid.models.unknowns import Unknown, log_sampling, user_site
 from sysid.structure.structure import Array, Structure
 from sysid.structure.triangular import lower_triangle, triangle_entries
 
+FREQUENCY_WINDOW = 0.05  # relative; what a stated frequency, read off a peak, may be wrong by
+
 
 @dataclass(frozen=True, eq=False)
 class SpectralStiffness(FieldTree):

@@ -45,11 +45,11 @@ class Unknown:
     name : str
         As tables and results call it, with underscores for spaces.
     lower, upper : array_like, shape (size,)
-        The search space; equal where an entry is known.
+        Bounds of every search; equal where an entry is known.
     unit : str
         For tables.
     sampling : callable, optional
-        CasADi expression of the swarm's coordinates (size,) to the unknowns, both in [lower, upper]: where the swarm
+        CasADi expression of the swarm's coordinates (size,) to the unknowns, both in the box: where the swarm
         had better search another distribution than the uniform one (eq. 18 of the paper). Gradient methods never see
         it.
     unsampling : callable, optional
@@ -58,11 +58,17 @@ class Unknown:
         How the swarm spreads its candidates over the bounds, in a word: "linear", "log", "by row".
     relative : bool
         Only the ratios of its entries mean something, so that tables of results leave it out.
+    box : pair of array_like (size,), optional
+        Where candidates are drawn and a swarm searches, within the bounds; all that lies between them by default.
+    note : str
+        Why the box is where it is, for logs and remarks; empty where it is the usual one.
 
     Attributes
     ----------
+    box : pair of (size,)
+        Lower and upper ends of what a swarm searches.
     guess : (size,)
-        Where a search may start: the middle of the swarm's search space.
+        Where a search may start: the middle of the box.
     has_guess, fixed : bool
         Whether the guess was stated, and whether the unknown is held at it; both only a `Variable`'s.
 
@@ -75,6 +81,7 @@ class Unknown:
     has_guess = False
     fixed = False
     relative = False
+    note = ""
 
     def __init__(
         self,
@@ -87,6 +94,8 @@ class Unknown:
         unsampling: Callable[[Array], Array] = _same,
         scale: str = "linear",
         relative: bool = False,
+        box: tuple[ArrayLike, ArrayLike] | None = None,
+        note: str = "",
     ) -> None:
         self.name, self.unit, self.scale = text("the name of an Unknown", name), unit, scale
         refuse((not isinstance(unit, str), f"variable {name}: its unit {unit!r} is no text"))
@@ -98,12 +107,16 @@ class Unknown:
         if np.any(self.lower > self.upper):
             raise InputError(f"variable {name}: bounds must be finite with lower <= upper")
         self.shape: tuple[int, ...] = (self.lower.size,)
-        self.sampling, self.unsampling = sampling, unsampling
+        self.sampling, self.unsampling, self.note = sampling, unsampling, note
+        low, high = (finite_array(f"variable {name}: box", end) for end in box or (self.lower, self.upper))
+        if low.shape != self.shape or high.shape != self.shape or np.any((low < self.lower) | (high > self.upper)):
+            raise InputError(f"variable {name}: its box must lie within its bounds, entry by entry")
+        self.box = low, high
 
     @cached_property
     def guess(self) -> Array:
         """The middle of the swarm's search space."""
-        return np.asarray(self.sampled()((self.lower + self.upper) / 2)).ravel()
+        return np.asarray(self.sampled()(sum(self.box) / 2)).ravel()
 
     @property
     def size(self) -> int:
@@ -255,7 +268,7 @@ class Variable(Unknown):
         self._refuse_where((not isinstance(unit, str), f"its unit {unit!r} is no text"))
         self.scale = "log" if log else "linear"
         self.shape = self._check_shape(shape)
-        self.lower, self.upper = lower, upper = self._flat("lower", lower), self._flat("upper", upper)
+        self.lower, self.upper = self.box = lower, upper = self._flat("lower", lower), self._flat("upper", upper)
         at = int(np.argmax(lower > upper))
         self._refuse_where(
             (
@@ -423,7 +436,7 @@ def scales_of(unknowns: Iterable[Unknown], x: Array) -> Array:
 
     Where a range spans decades it tells nothing about the unknown.
     """
-    width = [np.zeros(v.size) if v.scale == "log" else v.upper - v.lower for v in unknowns]
+    width = [np.zeros(v.size) if v.scale == "log" else v.box[1] - v.box[0] for v in unknowns]
     return np.maximum(np.abs(x), _PART * np.concatenate([np.zeros(0), *width]))
 
 

@@ -177,9 +177,15 @@ class Formulation:
         """Upper bounds, (size,)."""
         return upper_of(self.unknowns)
 
+    @cached_property
+    def box(self) -> tuple[Array, Array]:
+        """Lower and upper ends of what a swarm searches, within the bounds, (size,) each."""
+        low, high = ([np.zeros(0), *(v.box[end] for v in self.unknowns)] for end in (0, 1))
+        return np.concatenate(low), np.concatenate(high)
+
     @property
     def guess(self) -> Array:
-        """Guesses, the middle of the search space where none is given, (size,)."""
+        """Guesses, the middle of the box where none is given, (size,)."""
         return np.concatenate([np.zeros(0), *(v.guess for v in self.unknowns)])
 
     @property
@@ -366,15 +372,15 @@ class Formulation:
         return float(left / size)
 
     def from_sampling(self, s: ca.SX | ca.MX) -> ca.SX | ca.MX:
-        """Unknowns of the swarm's coordinates, which have the same bounds (eq. 18)."""
+        """Unknowns of the swarm's coordinates, which have the same box (eq. 18)."""
         pieces = zip(self.unknowns, split(self.unknowns, s), strict=True)
         return ca.vertcat(*(unknown.sampled()(piece) for unknown, piece in pieces))
 
     def to_sampling(self, x: Array) -> Array:
         """Swarm coordinates of the unknowns `x`, clipped to the box."""
-        x = np.clip(x, self.lower, self.upper)
+        x = np.clip(x, *self.box)
         s = [v.unsampling(piece) for v, piece in zip(self.unknowns, split(self.unknowns, x), strict=True)]
-        return np.clip(np.concatenate(s), self.lower, self.upper)
+        return np.clip(np.concatenate(s), *self.box)
 
     def values(self, structure: Structure) -> Array:
         """Unknowns that stand for a structure; variables that enter no matrix at their guess.

@@ -162,7 +162,7 @@ def _range_of_ratios(problem: Problem, expansion: Batch) -> tuple[Array, Array]:
 
     Exact where ratios rise with every coordinate; elsewhere candidates beyond are left to the sum over lines.
     """
-    lower, upper = problem.lower, problem.upper
+    lower, upper = problem.formulation.box
     draws = np.random.default_rng(0).uniform(lower, upper, (_DRAWS, problem.n_variables))
     ratios = expansion(np.vstack([lower, upper, draws]))[0][..., 0]
     lowest, highest = np.fmin.reduce(ratios), np.fmax.reduce(ratios)

@@ -287,7 +287,7 @@ class _Search:
         evaluate, repair = self._functions(objective)
         result = minimize_swarm(
             evaluate,
-            np.column_stack([problem.lower, problem.upper]),
+            np.column_stack(problem.formulation.box),
             rng=np.random.default_rng(random),
             n_particles=options.n_particles,
             max_iterations=options.max_iterations,
