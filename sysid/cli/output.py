@@ -110,8 +110,10 @@ class Output:
         self._complain(line)
 
     def warn(self, message: object) -> None:
-        """The same for what is no mistake."""
+        """The same for what is no mistake, once."""
         line = " ".join(str(message).split())
+        if line in self._document["warnings"]:
+            return
         self._document["warnings"].append(line)
         self._complain(f"warning: {line}")
 

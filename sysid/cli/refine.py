@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from sysid.cli import draws, sweeps, trust
-from sysid.cli.files import png, results_folder, table_as_csv, write_files
+from sysid.cli.files import alone_in, png, results_folder, table_as_csv, write_files
 from sysid.cli.output import Output
 from sysid.cli.status import INTERRUPTED, NOT_REACHED, SUCCESS
 from sysid.cli.stored_result import with_problem_of
@@ -23,7 +23,7 @@ from sysid.jobs.minima import Minimum, as_good, distinct
 from sysid.jobs.submit import submit
 from sysid.nlp import EXACT
 from sysid.problem.problem import Problem
-from sysid.results.identification import Recipe, load, recipe_of
+from sysid.results.identification import Identification, Recipe, load
 from sysid.results.summary import counted
 
 _SHOWN = 12  # minima in the table
@@ -33,12 +33,17 @@ _STARTS = 16
 def run(options: argparse.Namespace, out: Output) -> int:
     """Run the jobs that are asked for; tell each end in a line, then all of them together."""
     source = Path(options.result)
-    bare = _recipe(options, source, out)
     result = load(source)
-    recipe = replace(bare, start=None if result.x is None else tuple(result.x.tolist()))
+    recipe = _recipe(result, options, source, out)
     if result.part is not None:
         result = with_problem_of(result, recipe, source)
     folder = results_folder(options.out, (source if source.is_dir() else source.parent) / "refine")
+    with alone_in(folder, "wait for its end, or write elsewhere with --out DIR"):
+        return _run_in(folder, result, recipe, options, out)
+
+
+def _run_in(folder: Path, result: Identification, recipe: Recipe, options: argparse.Namespace, out: Output) -> int:
+    source = Path(options.result)
     executor = _executor(options)
     sweeps.check_own_records(result, recipe)
     sweep = sweeps.sweep_of(options, result, recipe, out)
@@ -125,17 +130,18 @@ def _figures(minimum: Minimum) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _recipe(options: argparse.Namespace, source: Path, out: Output) -> Recipe:
+def _recipe(result: Identification, options: argparse.Namespace, source: Path, out: Output) -> Recipe:
     """What the problem of a result was made from: by a module that the user names, or that may run."""
-    recipe = recipe_of(source)
-    if recipe is None:
+    if result.recipe is None:
         raise InputError(
             f"{source} was not made from a problem module, so that no worker could rebuild its problem: save the "
             "problem as a module and run it with 'sysid run'"
         )
+    x = result.x
+    recipe = replace(result.recipe, start=None if x is None else tuple(x.tolist()))
     if options.module is not None:
         return replace(recipe, module=trust.typed_module(options.module, out))
-    trust.check(recipe, source, f"--module FILE.py, with sysid refine {source}", options)
+    trust.check(recipe, source, f"sysid refine {source} --module FILE.py", options)
     return recipe
 
 

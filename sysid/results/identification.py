@@ -155,7 +155,8 @@ class Identification(Answer):
         """The figures of ``summary.json``; None for what the data leave open or what was not computed."""
         u, values = self.quick_uncertainty, self.values
         std = {} if u is None else u.variables
-        reported = () if self.x is None else self.facts.unknowns
+        facts = self.facts
+        reported = () if self.x is None else [v for v in facts.unknowns if facts.tells_damping or not v.is_ratio]
         return {
             "problem": self.recipe.module if self.recipe else None,
             "parameters": self.recipe.parameters if self.recipe else {},
@@ -171,7 +172,7 @@ class Identification(Answer):
             "force_residual": self.force_residual,
             "natural_frequencies_hz": self.structure.natural_frequencies.tolist(),
             "natural_frequencies_std_hz": _plain(self.quick_std("natural_frequencies")),
-            "damping_ratios": self.structure.damping_ratios.tolist(),
+            "damping_ratios": _plain(self.identified_ratios),
             "damping_ratios_std": _plain(self.quick_std("damping_ratios")),
             "unknowns": {v.name: values[v.name].tolist() for v in reported},
             "unknowns_std": {v.name: _plain(std[v.name]) for v in reported if v.name in std},
@@ -380,11 +381,6 @@ _SAME = 1e-6  # relative, of matrices made of the same numbers in another versio
 
 def _in_words(unknowns: list[tuple[str, tuple[int, ...]]]) -> str:
     return ", ".join(f"{name} {shape}" if shape else name for name, shape in unknowns) or "none"
-
-
-def recipe_of(path: str | Path) -> Recipe | None:
-    """The recipe in the file of a result, whose problem is not made; None where it has none. Path, errors as `load`."""
-    return storage.read(path, lambda tree: _if_given(Recipe.from_tree, tree["recipe"]))
 
 
 def _is_plain(value: Any) -> bool:
