@@ -310,8 +310,9 @@ def _workers(folder: Path, sound: Sound) -> list[str]:
         trace = str(place / CANARIES / module)
         (place / f"{module}.py").write_text(_RUNS.format(trace=trace).replace("import sysid\n", ""))
     command = [sys.executable, str(folder / "command.py"), "refine", "result.h5", "--starts", "2", "--workers", "2"]
-    subprocess.run(command, cwd=place, capture_output=True, check=False, timeout=20 * _SECONDS)
-    return [path.name for path in (place / CANARIES).iterdir()]
+    done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=False, timeout=20 * _SECONDS)
+    traces = [path.name for path in (place / CANARIES).iterdir()]
+    return [*traces, *([f"it ended with {done.returncode}: {done.stderr[-200:]}"] if done.returncode else [])]
 
 
 def _clean(here: Path, kept: set[Path]) -> None:

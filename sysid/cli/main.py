@@ -350,8 +350,7 @@ def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
     run.add_argument(
         "--resume",
         metavar="DIR",
-        help="go on with the run in this folder that was killed or interrupted; its options need not be said again, "
-        "nor PROBLEM where it is a bundled one",
+        help="go on with the killed or interrupted run in this folder; a PROBLEM that is not bundled is said again",
     )
     trust.add_argument(run, "the unfinished run")
     run.add_argument("--fresh", action="store_true", help="begin anew where there is an unfinished run in the folder")
