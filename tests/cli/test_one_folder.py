@@ -25,7 +25,7 @@ def state(folder):
         (["run", "pair.py", "--out", "{folder}"], "wait for its end, or write elsewhere with --out DIR"),
         (["run", "pair.py", "--out", "{folder}", "--fresh"], "wait for its end, or write elsewhere with --out DIR"),
         (["run", "--resume", "{folder}"], "wait for its end"),
-        (["refine", "{folder}", "--out", "{folder}"], "wait for its end, or write elsewhere with --out DIR"),
+        (["refine", "{folder}", "--trust", "--out", "{folder}"], "wait for its end, or write elsewhere with --out DIR"),
         (["report", "{folder}"], "it writes its report itself"),
         (["report", "{folder}/result.h5"], "it writes its report itself"),
     ],
