@@ -71,7 +71,7 @@ MISSED = (
         "exact and not it.problem.formulation.priors",
         "test_judgement::test_records_without_noise_know_no_more_than_the_noisy_force_of_a_further_test"),
     Mutant("J10d", "unknowns on an upper bound never told",
-        "at = (end.x - problem.lower < near) | (problem.upper - end.x < near)", "at = end.x - problem.lower < near",
+        "high = (upper - values < near[1]) & ~any_scale", "high = np.zeros_like(low)",
         "test_judgement::test_an_unknown_that_rests_on_either_bound_is_told"),
     Mutant("J11", "no lumped mass below a fifth of the largest",
         'Unknown("mass_share", np.full(geometry.n, FACTOR_FLOOR),', 'Unknown("mass_share", np.full(geometry.n, 0.2),',
