@@ -29,7 +29,7 @@ from sysid.swarm import SwarmProgress, SwarmSettings, minimize_swarm
 _SETTINGS = SwarmSettings(inertia_b1=0.8, inertia_b2=0.5, acceleration_lower=0.5, acceleration_sum=3.0, guides=3)
 _IDLE = (
     "mass and stiffness are free, so the modal local phase finds this answer from wherever the swarm ends, two random "
-    "candidates too: what the swarm itself found stands in the history (strategy 'hpso-ls' depends on it)"
+    "candidates too: what the swarm itself found stands in the history"
 )
 _TRAPPED = "that is a local minimum, as free residues at these poles fit clearly better"
 _MANY, _FEW = 256, 1  # candidates between two looks at the clock; few where IPOPT refines each
