@@ -425,12 +425,9 @@ class Formulation:
         return any(symbol.__hash__() in symbols for e in expressions for symbol in ca.symvar(e))
 
     def _matrices(self, blocks: Blocks, geometry: Geometry) -> Matrices:
-        by_frequency = self._function("ratios", [blocks.ratios], blocks.omega)
-        function = self._function("matrices", blocks.outputs)
-        whole_factor = self._function("whole_factor", [blocks.whole_factor])
-        return Matrices(
-            function, by_frequency, geometry.rigid_body, geometry.recovery, whole_factor, blocks.mass.mass is None
-        )
+        functions = self._function("matrices", blocks.outputs), self._function("ratios", [blocks.ratios], blocks.omega)
+        whole = self._function("whole_factor", [blocks.whole_factor])
+        return Matrices(*functions, geometry.rigid_body, geometry.recovery, whole, blocks.mass.mass is None)
 
     def _function(self, name: str, expressions: Sequence[ca.MX], *further: ca.MX) -> ca.Function:
         """Expressions of the unknowns as a function of the vector x; fixed variables are numbers in it."""

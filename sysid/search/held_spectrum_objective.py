@@ -27,7 +27,7 @@ from sysid.problem.terms import Term, TestTerm
 from sysid.structure.structure import Array
 
 _MOST = 65_000  # coordinates a chunk: fewer take more calls of NumPy for each, and more leave a processor's cache
-_STEP = 16  # chunks are multiples of it, because BLAS's products round alike at each of so many places
+_STEP = 16  # the last chunk is filled up to a multiple of it, because NumPy sums a candidate alone in another order
 _MOST_THREADS = 8
 # Relative squared error below which lines are summed: the difference of large numbers that stands for it has lost
 # half of its digits at 1e-12.
