@@ -1,6 +1,6 @@
 """What a process does to a stored result: writes one of a problem, reads one, or times it. A script of its own.
 
-It stands alone, so that the sysid of an earlier commit runs it too: ``python THIS write|read|time ...`` prints JSON.
+It stands alone, so that the sysid of an earlier commit runs it too: ``python THIS read PATH`` and the like print JSON.
 """
 
 from __future__ import annotations
@@ -78,11 +78,11 @@ def digests_of_readers(result) -> list[str]:
 
 
 def write(source: str, folder: str, how: str) -> list[dict]:
-    """Store all results of a source, "searched" or "guessed"; what was stored, and digests of it but where "bare"."""
+    """Store all results of a source, "searched" or "guessed"; what was stored, and digests of it."""
     told = []
     for i, result in enumerate(results_of(Path(source), how in ("searched", "own"))):
         path = result.save(Path(folder) / f"{i}.h5")
-        searches = how != "bare" and result.x is not None and not result.problem.free_modes
+        searches = result.x is not None and not result.problem.free_modes
         told.append(
             {
                 "path": str(path.absolute()),
@@ -111,17 +111,29 @@ def read(*paths: str) -> list[dict]:
     return told
 
 
-def timed(path: str, count: str) -> list[float]:
-    """Seconds of a processor that each of some loads takes."""
-    sysid.load(path)  # imports
-    taken = []
-    for _ in range(int(count)):
-        begun = time.process_time()
-        sysid.load(path)
-        taken.append(time.process_time() - begun)
-    return taken
+def sized(folder: str, *sources: str) -> dict[str, int]:
+    """Bytes of the results of some modules, as they are guessed, by the names of their files in the folder."""
+    found = {}
+    for source in map(Path, sources):
+        for result in results_of(source, searched=False):
+            path = result.save(Path(folder) / f"{source.stem}.h5")
+            found[path.name] = path.stat().st_size
+    return found
+
+
+def timed(folder: str, count: str) -> dict[str, float]:
+    """Seconds of a processor that reading each result of a folder takes: the middle one of some loads."""
+    found = {}
+    for path in sorted(Path(folder).glob("*.h5")):
+        taken = []
+        for _ in range(int(count) + 1):  # the first imports
+            begun = time.process_time()
+            sysid.load(path)
+            taken.append(time.process_time() - begun)
+        found[path.name] = float(np.median(taken[1:]))
+    return found
 
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
-    print(json.dumps({"write": write, "read": read, "time": timed}[sys.argv[1]](*sys.argv[2:])))
+    print(json.dumps({"write": write, "read": read, "size": sized, "time": timed}[sys.argv[1]](*sys.argv[2:])))

@@ -25,7 +25,8 @@ SCRIPT = ROOT / "benchmarks" / "hostile" / "own_process_of_a_file.py"
 SIZE, SECONDS = 1.2, 1.5  # over those of that commit
 MUTATIONS, REDUCED = 2400, 150
 REDUCED_MODULES = ("six_springs", "unmeasured_floors")
-LOADS, ROUNDS = 9, 3  # loads a process, and processes of each commit in turn
+WITH_DATA = ("recorded_test", "mini_shake_table", "4_real_shake_table")  # their records do not come with the package
+LOADS, ROUNDS = 5, 5  # loads a process, and processes of each commit in turn
 PATIENCE = 900.0  # s of a process
 
 OWN = '''"""Six sectors in a ring; the stiffness is a class of this module."""
@@ -69,14 +70,14 @@ def lines(reduced: bool) -> Iterator[Line]:
 def _sources(place: Path) -> list[Path]:
     """Problem modules of the package, those written from the README, notebooks, and the examples of the pages."""
     folders = (ROOT / "problems", ROOT / "tests" / "modules_from_readme")
-    modules = [path for folder in folders for path in sorted(folder.glob("*.py")) if path.stem != "recorded_test"]
+    modules = [path for folder in folders for path in sorted(folder.glob("*.py")) if path.stem not in WITH_DATA]
     for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
         for i, code in enumerate(re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)):
             if "import sysid" in code and ("sysid.identify(" in code or "def problem(" in code):
                 made = place / f"{page.stem}_{i}.py"
                 made.write_text(code, encoding="utf-8")
                 modules.append(made)
-    return modules + sorted((ROOT / "notebooks").glob("*.py"))
+    return modules + [path for path in sorted((ROOT / "notebooks").glob("*.py")) if path.stem not in WITH_DATA]
 
 
 def _code(page: str, first: str) -> str:
@@ -85,9 +86,9 @@ def _code(page: str, first: str) -> str:
     return next(code for code in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if code.startswith(first))
 
 
-def _run(place: Path, *arguments: Any, package: Path | None = None) -> list[Any] | str:
+def _run(place: Path, *arguments: Any, package: Path = ROOT) -> Any:
     """What the script tells in a process of its own, in an empty folder; its last words where it fails."""
-    environment = {**os.environ, "PYTHONPATH": str(package or ROOT), "MPLBACKEND": "Agg"}
+    environment = {**os.environ, "PYTHONPATH": str(package), "MPLBACKEND": "Agg"}
     command = [sys.executable, str(SCRIPT), *map(str, arguments)]
     with tempfile.TemporaryDirectory(dir=place) as empty:
         try:
@@ -98,8 +99,7 @@ def _run(place: Path, *arguments: Any, package: Path | None = None) -> list[Any]
             return f"not done after {PATIENCE:g} s"
     if done.returncode:
         return (done.stderr.strip().splitlines() or [f"ended with {done.returncode}"])[-1]
-    told: list[Any] = json.loads(done.stdout.strip().splitlines()[-1])
-    return told
+    return json.loads(done.stdout.strip().splitlines()[-1])
 
 
 def _read_again(place: Path, written: dict[Path, Any], own: Path) -> Iterator[Line]:
@@ -145,20 +145,20 @@ def _beside_text(place: Path, sources: list[Path]) -> Iterator[Line]:
     before = place / "before"
     with tarfile.open(fileobj=io.BytesIO(done.stdout)) as archive:
         archive.extractall(before, filter="data")
-    sizes, seconds = dict[str, float](), dict[str, float]()
-    for source in (path for path in sources if path.parent.name in ("problems", "modules_from_readme")):
-        now = _run(place, "write", source, place / f"now_{source.stem}", "bare")
-        then = _run(place, "write", source, place / f"then_{source.stem}", "bare", package=before)
-        if isinstance(now, str) or isinstance(then, str):
-            yield Line(f"{source.stem}: bytes and seconds", f"{now} {then}"[:200], "a result of each", False)
-            continue
-        sizes[source.stem] = now[0]["bytes"] / then[0]["bytes"]
-        taken = np.array([
-            (_run(place, "time", now[0]["path"], LOADS), _run(place, "time", then[0]["path"], LOADS, package=before))
-            for _ in range(ROUNDS)
-        ])  # fmt: skip
-        seconds[source.stem] = float(np.median(np.median(taken[:, 0], axis=1) / np.median(taken[:, 1], axis=1)))
-    for what, ratios, bound in (("bytes", sizes, SIZE), ("seconds to load", seconds, SECONDS)):
+    modules = [path for path in sources if path.parent.name in ("problems", "modules_from_readme")]
+    packages = {"now": ROOT, "then": before}
+    sizes = [_run(place, "size", place / name, *modules, package=package) for name, package in packages.items()]
+    taken = [
+        [_run(place, "time", place / name, LOADS, package=package) for name, package in packages.items()]
+        for _ in range(ROUNDS)
+    ]
+    failed = [one for one in (*sizes, *(one for pair in taken for one in pair)) if isinstance(one, str)]
+    if failed:
+        yield Line(f"bytes and seconds over those of {BEFORE}", failed[0][:200], "figures of both", False)
+        return
+    size = {name: sizes[0][name] / sizes[1][name] for name in sizes[0]}
+    seconds = {name: float(np.median([now[name] / then[name] for now, then in taken])) for name in size}
+    for what, ratios, bound in (("bytes", size, SIZE), ("seconds to load", seconds, SECONDS)):
         worst = max(ratios, key=ratios.__getitem__)
         middle = float(np.median(list(ratios.values())))
         yield below(
@@ -218,7 +218,7 @@ def read_changed(count: int) -> tuple[int, int, str]:
     for name in (
         REDUCED_MODULES if count < MUTATIONS else sorted(path.stem for path in (ROOT / "problems").glob("*.py"))
     ):
-        if name != "recorded_test":
+        if name not in WITH_DATA:
             given = catalogue.build(sysid.Recipe(str(ROOT / "problems" / f"{name}.py"))).to_tree()["given"]
             if given["expressions"] is not None:
                 trees.append((given["expressions"], stored.from_tree(given), given["variables"]))
