@@ -189,6 +189,9 @@ class Solver:
     def minimum(self, start: Array, lower: Array) -> tuple[Array, str]:
         """Where it ends, and IPOPT's status."""
         end = np.asarray(self._solve(x0=start, lbx=lower)["x"]).ravel()
+        for one in (self._value, *self.derivatives.values()):
+            if one.interrupt is not None:
+                raise one.interrupt
         return end, str(self._solve.stats()["return_status"])
 
 
@@ -200,6 +203,7 @@ class _InNumbers(ca.Callback):
     ) -> None:
         ca.Callback.__init__(self)
         self._function, self._inputs, self._outputs = function, inputs, outputs
+        self.interrupt: BaseException | None = None  # IPOPT would take it for a step too long
         self.construct("in_numbers", {})
 
     def get_n_in(self) -> int:
@@ -220,7 +224,11 @@ class _InNumbers(ca.Callback):
 
     def eval(self, arguments: list[ca.DM]) -> list[ca.DM]:
         """Call the function."""
-        results = self._function(np.array(arguments[0].nonzeros()), *arguments[1:])
+        try:
+            results = self._function(np.array(arguments[0].nonzeros()), *arguments[1:])
+        except KeyboardInterrupt as interrupt:
+            self.interrupt = interrupt
+            raise
         return [ca.DM(shape, result) for result, shape in zip(results, self._outputs, strict=True)]
 
 

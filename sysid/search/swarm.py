@@ -59,7 +59,7 @@ class Swarm:
         Give each candidate the measured spectrum, from its own L_H (eq. 31).
     refine_by : {"closed-form", "ipopt", "leaders"}
         The nearest matrix of that spectrum; or the paper's nonlinear programme by IPOPT with exact derivatives for each
-        candidate, which is for small problems (some 15 ms a candidate with 4 or 6 sensors, 30 ms with 10); or the
+        candidate, which is for small problems (some 20 ms a candidate with 4 or 6 sensors, 40 ms with 10); or the
         closed form, and IPOPT on each new leader of the swarm: the better of both is written back to the leader.
         Where IPOPT does not succeed the closed form stands; the history counts how it ended.
     write_back : bool

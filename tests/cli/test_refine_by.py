@@ -31,7 +31,7 @@ def asked(here, monkeypatch, no_pictures):
 
     def identify(problem, *, strategy, **options):
         strategies.append(strategy)
-        return original(problem, strategy=sysid.Swarm(3, refine_by=strategy.refine_by, restarts=0), **options)
+        return original(problem, strategy=sysid.Swarm(3, 8, refine_by=strategy.refine_by, restarts=0), **options)
 
     (here / "pair.py").write_text(FREE)
     monkeypatch.setattr(cli, "identify", identify)

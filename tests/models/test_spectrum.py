@@ -180,6 +180,16 @@ def test_success_is_what_ipopt_says_and_the_spectrum_shows(monkeypatch, status, 
     assert answer.error == pytest.approx(1 - 1 / 1.21 if stays else 0.0, abs=1e-8)
 
 
+@pytest.mark.parametrize("name", ["value", "gradient", "hessian"])
+def test_ctrl_c_within_ipopt_is_not_taken_for_a_step_too_long(monkeypatch, name):
+    def interrupted(self, x):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(SpectrumDistance, name, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        by_ipopt(np.array([[10.0, 0.0], [3.0, 20.0]]), np.array([5.0, 9.0]))
+
+
 @pytest.mark.parametrize("way", [closed_form, by_ipopt])
 @pytest.mark.parametrize("seed", range(4))
 def test_with_fewer_targets_the_replaced_are_the_lowest(way, seed):

@@ -180,8 +180,8 @@ class TestLeaders:
 
 class TestEveryCandidate:
     def test_each_is_refined_by_ipopt_and_every_status_counted(self, problem, solved):
-        result = search(problem, max_iterations=3, refine_by="ipopt")
-        closed = search(problem, max_iterations=3, refine_by="closed-form")
+        result = search(problem, max_iterations=3, n_particles=8, refine_by="ipopt")
+        closed = search(problem, max_iterations=3, n_particles=8, refine_by="closed-form")
         tried, won, statuses = counts(result.history)
         assert (tried, won, sum(statuses.values())) == (0, 0, result.history.evaluations)
         assert f"IPOPT refined {result.history.evaluations} candidates (" in result.history.refinement_in_words
@@ -193,7 +193,7 @@ class TestEveryCandidate:
         )
 
     def test_written_back_the_particles_hold_it(self, problem, swarms):
-        search(problem, max_iterations=2, refine_by="ipopt", write_back=True)
+        search(problem, max_iterations=2, n_particles=6, refine_by="ipopt", write_back=True)
         rows = np.random.default_rng(0).uniform(problem.lower, problem.upper, (3, problem.n_variables))
         part = problem.formulation.parts.stiffness
         for row, given in zip(swarms[0][0]["repair"](rows), rows, strict=True):
