@@ -82,7 +82,8 @@ def identify(
     checkpoint : str, Path or Checkpoint, optional
         File in which the state of a swarm or a continuation is kept every few seconds, and at Ctrl-C. Where it is there
         of the same search (problem, strategy, `rng`), the search goes on from it, and ends with the bits that it would
-        have ended with. A file given by its name is gone once the search has ended by itself.
+        have ended with. A file given by its name is gone once the search has ended by itself. One search
+        uses it at a time.
 
     Returns
     -------
@@ -131,8 +132,8 @@ def identify(
                 raise InputError("; ".join((*told, str(error)))) from error
             raise
         result = judge(problem, outcome, why, seed, session)
-    if checkpoint is not None and file is not checkpoint and not result.interrupted:
-        file.remove()
+        if not isinstance(checkpoint, Checkpoint) and not result.interrupted:
+            journal.entries.clear()  # so that the file goes
     return result
 
 

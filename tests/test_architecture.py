@@ -18,8 +18,9 @@ CEILINGS = {
     # (567), Ctrl-C before all is imported (45) and among workers (50), a time limit that holds (190), jobs that are
     # told by what differs and what can be compared (117), outliers and holes told cell by cell (212), whole records
     # with their transients and noise (1,700), stated masses as statistics (420), gains (260), other answers (410),
-    # motion in time (230), and what tells and refuses them (530).
-    "lines": 36_977,
+    # motion in time (230), and what tells and refuses them (530), expressions as operations in place of CasADi's text
+    # and of the older formats (620), results that can be read without their problem (680).
+    "lines": 38_275,
 }
 
 # The counting is a benchmark, which prints the same figures; `sysid` itself is not imported from the checkout.

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 import sysid
 from sysid.models.mass import sampling_exponent
@@ -17,8 +18,9 @@ THREADS = 2
 class ByLines:
     """Relative residual of candidates with the stated spectrum, (count, n_variables) swarm coordinates to (count,).
 
-    Of a test with any base motion, sensors along the base directions, and a `sysid.FullMass` healed by its trace.
-    Everything is written out from the paper's equations, for all candidates of a chunk at once and with two threads.
+    Of a test with any base motion, sensors along the base directions, with or without base force, and a
+    `sysid.FullMass` healed by its trace. Everything is written out from the paper's equations, for all candidates of a
+    chunk at once and with two threads.
 
     Parameters
     ----------
@@ -36,7 +38,7 @@ class ByLines:
         self.exponents = np.array([sampling_exponent(k) for k in range(1, size + 1)])[self.of_mass[0]]
         self.lower = problem.lower[: self.exponents.size]
         self.base, self.target = test.base, test.relative
-        self.size = np.linalg.norm(self.target)
+        self.size, self.force = np.linalg.norm(self.target), test.force
         self.pool = ThreadPoolExecutor(THREADS)
 
     def __call__(self, particles: np.ndarray) -> np.ndarray:
@@ -47,19 +49,35 @@ class ByLines:
     def _chunk(self, s: np.ndarray) -> np.ndarray:
         ends = np.cumsum([self.exponents.size, self.of_factor[0].size])
         of_mass, of_stiffness, ratios = np.split(s, ends, axis=1)
-        phi, gamma = self._modes(self._mass_factors(of_mass), of_stiffness)
-        return np.sqrt(self._squared(phi, gamma, ratios)) / self.size
+        factors = self._mass_factors(of_mass)
+        phi, gamma = self._modes(factors, of_stiffness)
+        squared = self._squared(phi, gamma, ratios) / self.size**2
+        if self.force is not None:
+            squared += self._squared_force(factors, gamma, ratios)
+        return np.sqrt(squared)
+
+    def _gains(self, ratios: np.ndarray) -> np.ndarray:
+        """Eq. 14: gains of modes, (count, modes, lines)."""
+        loss = (2j * ratios * self.omega)[:, :, None] * self.w
+        return self.w**2 / (self.omega[:, None] ** 2 - self.w**2 + loss)
 
     def _squared(self, phi: np.ndarray, gamma: np.ndarray, ratios: np.ndarray) -> np.ndarray:
         """Eq. 14 and 15: squared difference from the records, (count,)."""
-        loss = (2j * ratios * self.omega)[:, :, None] * self.w
-        gains = self.w**2 / (self.omega[:, None] ** 2 - self.w**2 + loss)
-        squared = np.zeros(len(phi))
+        gains, squared = self._gains(ratios), np.zeros(len(phi))
         for base, target in zip(self.base, self.target, strict=True):
             made = phi @ (gains * (gamma @ base)) - target
             flat = made.reshape(len(phi), -1).view(float)
             squared += np.einsum("pi,pi->p", flat, flat)
         return squared
+
+    def _squared_force(self, factors: np.ndarray, gamma: np.ndarray, ratios: np.ndarray) -> np.ndarray:
+        """Squared difference of the force ``gamma' g gamma u + M_rb u``, relative to the measured one, (count,)."""
+        moved = np.hstack([self.G.T, np.eye(self.d)]) @ factors
+        gains, rigid, squared = self._gains(ratios), moved @ moved.swapaxes(1, 2), np.zeros(len(gamma))
+        for base, force in zip(self.base, self.force, strict=True):
+            made = gamma.swapaxes(1, 2) @ (gains * (gamma @ base)) + rigid @ base - force
+            squared += np.sum(np.abs(made) ** 2, axis=(1, 2))
+        return squared / np.linalg.norm(self.force) ** 2
 
     def _mass_factors(self, s: np.ndarray) -> np.ndarray:
         """Eq. 18 and 21-22: Cholesky factors of the healed mass, (count, n + d, n + d)."""
@@ -78,8 +96,20 @@ class ByLines:
         L_H = np.zeros((len(factors), n, n))
         L_H[:, self.of_factor[0], self.of_factor[1]] = of_stiffness
         psi = np.linalg.eigh(L_H @ L_H.swapaxes(1, 2))[1]
-        phi = np.linalg.inv(L).swapaxes(1, 2) @ psi
+        phi = self._shapes(L, psi)
         return phi, psi.swapaxes(1, 2) @ (L.swapaxes(1, 2) @ self.G + Z.swapaxes(1, 2))
+
+    def _shapes(self, L: np.ndarray, psi: np.ndarray) -> np.ndarray:
+        """Mode shapes ``L^-T psi``."""
+        return np.linalg.inv(L).swapaxes(1, 2) @ psi
+
+
+class ByLinesBySubstitution(ByLines):
+    """The same with substitution: a general inverse loses digits of an ill-conditioned triangle of many rows."""
+
+    def _shapes(self, L: np.ndarray, psi: np.ndarray) -> np.ndarray:
+        """As above, one candidate after the other."""
+        return np.stack([solve_triangular(own, to, lower=True, trans="T") for own, to in zip(L, psi, strict=True)])
 
 
 class ByLinesOfUnitRuns(ByLines):

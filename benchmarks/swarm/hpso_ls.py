@@ -9,7 +9,7 @@ import numpy as np
 import sysid
 from benchmarks.line import Line, above, below
 from benchmarks.problem_modules import load_module
-from benchmarks.swarm import controls, noisy_tests
+from benchmarks.swarm import controls, noisy_tests, refinement_by_ipopt
 from sysid.search.inverse_factor_coordinates import InverseFactorError
 
 SEEDS = range(9100, 9110)
@@ -37,6 +37,7 @@ def lines(reduced: bool) -> Iterator[Line]:
             yield from controls.lines(what, sysid.Swarm.published(), results, seeds)
     yield below("exact Hessian against differences of the gradient, 5 random points, n = 6, relative", _hessian(), 1e-6)
     yield from noisy_tests.lines(reduced)
+    yield from refinement_by_ipopt.lines(reduced)
 
 
 def _sound(what: str, problem: sysid.Problem, fits: list[sysid.Identification]) -> Iterator[Line]:

@@ -1,4 +1,4 @@
-"""Microseconds that the swarm's objective takes a candidate, without lines and line by line, and the swarm itself."""
+"""The swarm's objective: one source with IPOPT's rows, microseconds a candidate, and the swarm itself."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from threadpoolctl import threadpool_limits
 import sysid
 from benchmarks.line import Line, above, below
 from benchmarks.modal.random_structures import frequency_lines, random_structure
-from benchmarks.swarm.by_lines import ByLines, ByLinesOfUnitRuns
+from benchmarks.swarm import older_commit, one_source
+from benchmarks.swarm.by_lines import ByLines, ByLinesBySubstitution, ByLinesOfUnitRuns
 from sysid.compare import peers
 from sysid.search.swarm_objective import SwarmObjective
 
@@ -24,6 +25,9 @@ FASTER = 3.0
 AGREES = 1e-9  # of the records' or the candidate's square, whichever is larger
 WELL_POSED = 100.0  # relative residual: beyond it candidates are worthless, and their mass so ill-conditioned that
 # round-off in it is all that a comparison would show
+AGREEING = 200  # candidates, whatever their mass
+SIZES = (6, 10, 20)
+CHEAPER = 2.0  # than the sum over 200 lines in NumPy, in processor time of all threads, n = 10
 SPHERE = 100  # variables of the sphere function, which takes next to no time
 ITERATIONS = 5  # of both swarms on it
 LIGHTER = 5.0  # than pymoo's swarm, at least
@@ -34,8 +38,12 @@ Objective = Callable[[np.ndarray], np.ndarray]
 def lines(reduced: bool) -> Iterator[Line]:
     """All particles of a swarm, 5·D, BLAS on one thread, two threads in all.
 
-    The reduced form judges the agreement alone: wall-clock microseconds on two shared processors are judged in full.
+    The reduced form judges one source, agreement, and processor time beside a sum over lines: wall-clock microseconds
+    on two shared processors are judged in full, and there beside an older commit too.
     """
+    yield from one_source.lines()
+    yield from _agreement()
+    yield from [_processor_time()] if reduced else older_commit.lines()
     repeats = 10 if reduced else 40
     with threadpool_limits(limits=1):
         for n, count, bound in CASES[:1] if reduced else CASES:
@@ -59,6 +67,30 @@ def lines(reduced: bool) -> Iterator[Line]:
             yield Line(text, f"{ratio:.3g}") if reduced else above(text, ratio, FASTER)
             yield below(f"{what}: largest difference from the sum over lines", _difference(fast, slow, swarm), AGREES)
         yield from _overhead(reduced)
+
+
+def _agreement() -> Iterator[Line]:
+    """Difference from the sum over lines, of a test with force."""
+    for n in SIZES:
+        problem = _problem(n, 200, force=True)
+        fast = SwarmObjective(problem, spectrum=problem.formulation.stiffness.spectrum)
+        rows = np.random.default_rng(1).uniform(problem.lower, problem.upper, (AGREEING, problem.n_variables))
+        expected = ByLinesBySubstitution(problem)(rows) ** 2
+        apart = np.abs(fast(rows) ** 2 - expected) / np.maximum(expected, 1.0)
+        text = f"n = {n}, full mass, with force: largest difference from the sum over lines, {AGREEING} candidates"
+        yield below(text, float(apart.max()), AGREES)
+
+
+def _processor_time() -> Line:
+    """Processor time of a sum over lines over that of the objective."""
+    problem = _problem(10, 200)
+    fast = SwarmObjective(problem, spectrum=problem.formulation.stiffness.spectrum)
+    rows = np.random.default_rng(0).uniform(problem.lower, problem.upper, (BY_LINE, problem.n_variables))
+    took = _alternated(((fast, rows), (ByLines(problem), rows)), 10, time.process_time)
+    ratio = float(np.median(took[:, 1]) / np.median(took[:, 0]))
+    return above(
+        "n = 10, 200 lines: processor time of the sum over lines in NumPy over the objective's", ratio, CHEAPER
+    )
 
 
 def _overhead(reduced: bool) -> Iterator[Line]:
@@ -108,9 +140,9 @@ def _sphere(rows: np.ndarray) -> np.ndarray:
     return np.einsum("ij,ij->i", rows, rows)
 
 
-def _problem(n: int, count: int) -> sysid.Problem:
+def _problem(n: int, count: int, *, force: bool = False) -> sysid.Problem:
     truth = random_structure(SEED, n=n, d=DIRECTIONS)
-    test = sysid.simulate(truth, frequency_lines(truth, count))
+    test = sysid.simulate(truth, frequency_lines(truth, count), force=force)
     return sysid.Problem(
         test,
         mass=sysid.FullMass(np.diag(truth.rigid_body_mass)),
@@ -119,16 +151,18 @@ def _problem(n: int, count: int) -> sysid.Problem:
     )
 
 
-def _alternated(objectives: Sequence[tuple[Objective, np.ndarray]], repeats: int) -> np.ndarray:
+def _alternated(
+    objectives: Sequence[tuple[Objective, np.ndarray]], repeats: int, clock: Callable[[], float] = time.perf_counter
+) -> np.ndarray:
     """Microseconds a candidate, (repeats, objectives), one objective after the other in each repeat."""
     took = np.zeros((repeats, len(objectives)))
     for objective, swarm in objectives:
         objective(swarm)  # what is made once is made
     for row in took:
         for i, (objective, swarm) in enumerate(objectives):
-            start = time.perf_counter()
+            start = clock()
             objective(swarm)
-            row[i] = 1e6 * (time.perf_counter() - start) / len(swarm)
+            row[i] = 1e6 * (clock() - start) / len(swarm)
     return took
 
 

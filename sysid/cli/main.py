@@ -19,13 +19,14 @@ import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any, NoReturn, cast
+from typing import IO, Any, NoReturn, cast, get_args
 
 from sysid import catalogue
 from sysid.cli import doctor, export, parameters, read, starting, stored_result, unfinished
 from sysid.cli.argument_types import band, count, orders, seconds, seed, whole
 from sysid.cli.command_parser import JSON, QUIET, Parser, adder, epilog
 from sysid.cli.display import display_on
+from sysid.cli.files import alone_in
 from sysid.cli.output import Output, collected_warnings, keep_for_document, strict_json
 from sysid.cli.status import BUG, INTERRUPTED, MISTAKE, NOT_REACHED, SUCCESS
 from sysid.errors import InputError, SolverError
@@ -37,6 +38,7 @@ from sysid.results.storage import FILE_NAME as RESULT
 from sysid.results.storage import atomically, missing_folders, remove_empty
 from sysid.results.version import __version__
 from sysid.search.deadline import TimeIsOver, within
+from sysid.search.refinement import RefineBy
 from sysid.search.session import LEAST, DeferredInterrupt
 
 _LOG = "sysid-error.log"
@@ -146,24 +148,35 @@ def _show(options: argparse.Namespace, out: Output) -> int:
 
 
 def _run(options: argparse.Namespace, out: Output) -> int:
+    folder = unfinished.folder_of(options)
+    with alone_in(folder, "wait for its end" + ", or write elsewhere with --out DIR" * (options.resume is None)):
+        return _run_in(folder, options, out)
+
+
+def _run_in(folder: Path, options: argparse.Namespace, out: Output) -> int:
     begun = time.perf_counter()
 
     def left(least: float) -> float | None:
         """Seconds that are left, at least so many; None without a limit."""
         return None if options.max_time is None else max(options.max_time - (time.perf_counter() - begun), least)
 
-    search, folder = unfinished.begun(options, out)
-    recipe = search.recipe
+    search = unfinished.begun(options, folder, out)
+    recipe, strategy = search.recipe, unfinished.strategy_of(search)
     problem, files = catalogue.built(recipe, check=False)  # by the search, with its progress and under its clock
     checkpoint = Checkpoint(folder / UNFINISHED, unfinished.with_source(search, files, folder))
     if options.fresh:
         checkpoint.remove()
     test = problem.measurement
-    unknowns = problem.formulate(problem.unsearched).size
+    formulation = problem.formulate(problem.unsearched)
+    if search.refine_by is not None and not formulation.refinable:
+        raise InputError(
+            f"--refine-by {search.refine_by}: the stiffness of this problem has a form of its own, whose frequencies "
+            "are not searched apart from it: leave it out"
+        )
     out.write(
         f"{recipe.title}: {test.n_sensors} sensors, base moving along {' '.join(test.base_axes or ())}, "
         f"{test.freq.size} lines from {test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz, "
-        f"{unknowns} unknowns, seed {search.seed}\n"
+        f"{formulation.size} unknowns, seed {search.seed}\n"
     )
     out.flush()
     failed: InputError | None = None
@@ -171,7 +184,7 @@ def _run(options: argparse.Namespace, out: Output) -> int:
     with DeferredInterrupt(patience=None) as late:
         with display_on(out) as display:
             result = identify(
-                problem, strategy=search.strategy, rng=search.seed, max_time=left(LEAST), progress=display,
+                problem, strategy=strategy, rng=search.seed, max_time=left(LEAST), progress=display,
                 checkpoint=checkpoint,
             )  # fmt: skip
         result = replace(result, recipe=recipe)
@@ -215,9 +228,10 @@ def _report(options: argparse.Namespace, out: Output) -> int:
     from sysid.report import report
 
     source = Path(options.result)
-    result = stored_result.read(options)
     folder = source if source.is_dir() else source.parent
-    out.wrote(report.write_report(result, folder / report.FILE_NAME))
+    # A run would write its result between reading the one there and writing its page.
+    with alone_in(folder, "it writes its report itself") if folder.is_dir() else contextlib.nullcontext():
+        out.wrote(report.write_report(stored_result.read(options), folder / report.FILE_NAME))
     return SUCCESS
 
 
@@ -316,7 +330,17 @@ def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
         "published swarm, eigenvalue refinement and IPOPT in Cholesky coordinates; auto, by default: "
         "modal where the models of the problem allow it, continuation where they have a form of their own, else swarm",
     )
-    run.add_argument("--out", metavar="DIR", help="folder of the results, results/NAME by default")
+    run.add_argument(
+        "--refine-by",
+        choices=get_args(RefineBy),
+        metavar="WAY",
+        help="how swarm and hpso-ls give a candidate the measured frequencies: closed-form (swarm by default), the "
+        "nearest matrix; ipopt, the paper's nonlinear programme for every candidate, for small problems; leaders "
+        "(hpso-ls by default), the closed form, and IPOPT for each new leader of the swarm",
+    )
+    run.add_argument(
+        "--out", metavar="DIR", help="folder of the results, results/NAME by default; one run at a time writes there"
+    )
     run.add_argument(
         "--max-time",
         type=seconds,

@@ -163,7 +163,7 @@ def _strategy(
 def _own(name: str, result: Identification, recorder: Recorder) -> MethodResult:
     """The row of an identification."""
     history = result.history
-    before = [value for value in (history.refinement, history.swarm, history.start) if np.isfinite(value)]
+    before = [value for value in (history.swarm, history.start) if np.isfinite(value)]
     return MethodResult(
         name,
         status_of(result.success, result.interrupted),

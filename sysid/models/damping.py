@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -63,10 +62,6 @@ class ModalDamping(FieldTree):
     def ratios(self, geometry: Geometry, y: ca.SX, omega: ca.SX) -> ca.SX:
         """Damping ratios (n,), in ascending order of frequency."""
         return y
-
-    def batch(self, geometry: Geometry) -> Callable[[Array], Array]:
-        """Ratios (count, n) of swarm coordinates."""
-        return lambda s: s
 
     def values(self, geometry: Geometry, structure: Structure) -> Array:
         """Damping ratios of a structure."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,9 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, choice, finite_array, numbers, refuse, shown
+from sysid.models.expressions import at_point, check_base_last
 from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import FACTOR_FLOOR, Geometry, check_sane, check_total_mass
-from sysid.models.model import MassBlocks, Stated, Totals, Written, constant
+from sysid.models.model import FactoredMass, MassBlocks, Stated, Totals, Written, constant
 from sysid.models.unknowns import Unknown
 from sysid.structure.structure import Array, Structure, lowest_eigenvalue
 from sysid.structure.triangular import lower_triangle, triangle_entries
@@ -38,10 +38,10 @@ def sampling_exponent(k: int, c: float = _ROW_EXPECTATION) -> float:
 def spread_rows(x: ca.SX | Array, exponents: Array) -> ca.SX | Array:
     """Eq. 18: ``y = sgn(x) (1 - (1 - |x|)^alpha)``, from the swarm's uniform coordinates to factor entries."""
     if isinstance(x, np.ndarray):
-        left = 1 - np.minimum(np.abs(x), 1.0)
+        left = np.abs(1 - np.abs(x))
         return np.copysign(1 - np.power(left, exponents, out=left), x)
-    size = ca.fmin(ca.fabs(x), 1.0)  # a round-off beyond 1 would be a power of a negative number
-    return ca.sign(x) * (1 - (1 - size) ** exponents)
+    left = ca.fabs(1 - ca.fabs(x))  # a round-off beyond 1 would have the logarithm of a negative number
+    return ca.copysign(1 - ca.exp(exponents * ca.log(left)), x)  # faster than a power, and as exact
 
 
 def gather_rows(y: Array, exponents: Array) -> Array:
@@ -128,7 +128,7 @@ class FullMass(FieldTree):
                 "mass_factor",
                 lower,
                 np.ones(lower.size),
-                sampling=lambda x: ca.fmax(spread_rows(x, exponents), lower),
+                sampling=lambda x: _above_floor(spread_rows(x, exponents), lower),
                 unsampling=lambda y: gather_rows(y, exponents),
                 scale="by row",
             ),
@@ -139,27 +139,7 @@ class FullMass(FieldTree):
         n = geometry.n
         totals, entries = geometry.split_totals(self.total_mass, y)
         healed = heal(lower_triangle(entries, n + geometry.d), geometry, totals, self.healing)
-        L, low, base = healed[:n, :n], healed[n:, :n], healed[n:, n:]
-        return MassBlocks(L, L @ low.T, low @ low.T + base @ base.T)
-
-    def batch(self, geometry: Geometry) -> Callable[[Array], Array] | None:
-        """Healed factors (n + d, n + d, count) of swarm coordinates (count, size); None where scales are coupled."""
-        healed = batch_healing(geometry, self.healing)
-        if healed is None:
-            return None
-        exponents, lower = (part[:, None] for part in _spread(geometry))
-        size = geometry.n + geometry.d
-        triangle, entries = np.tril_indices(size), len(lower)
-        unknown = self.total_mass is None and geometry.weighs
-        stated = None if unknown else geometry.totals(self.total_mass)[:, None]
-
-        def factors(s: Array) -> Array:
-            y = np.ascontiguousarray(s.T)
-            made = np.zeros((size, size, len(s)))
-            made[triangle] = np.maximum(spread_rows(y[-entries:], exponents), lower)
-            return healed(made, y[:-entries] if stated is None else stated)
-
-        return factors
+        return FactoredMass.of(healed, n)
 
     def values(self, geometry: Geometry, structure: Structure) -> Array:
         """Factor entries that `blocks` takes back to the structure's mass, which has the stated totals."""
@@ -310,6 +290,7 @@ class KnownMass(FieldTree):
             matrix = np.pad(matrix, (0, geometry.d))
         if matrix.shape != (size, size):
             raise InputError(f"the known mass matrix is {matrix.shape}; ({n}, {n}) or ({size}, {size}) is needed")
+        check_base_last("the known mass matrix", matrix, n)
         if np.any(np.abs(matrix[n:][np.diag(matrix)[n:] == 0]) > 1e-9 * np.abs(matrix).max()):
             raise InputError(
                 "the known mass matrix couples a base direction that has no mass: its diagonal entry is 0, others of "
@@ -330,7 +311,9 @@ class WrittenMass(Written):
 
     def blocks(self, geometry: Geometry, y: ca.MX) -> ca.MX:
         """The expression; no coupling and no base mass where it has no base rows."""
-        return self.whole(geometry)
+        whole = self.whole(geometry)
+        check_base_last(self.name, at_point(self.name, whole, None), geometry.n)
+        return whole
 
 
 def _deviations(name: str, std: ArrayLike | None, of: str, values: ArrayLike | None) -> Array | None:
@@ -363,6 +346,12 @@ def _spread(geometry: Geometry) -> tuple[Array, Array]:
     return exponents, np.where(rows == columns, FACTOR_FLOOR, -1.0)
 
 
+def _above_floor(y: ca.SX, lower: Array) -> ca.SX:
+    """Factor entries (size,), those of the diagonal kept off zero; the others are in [-1, 1] as they are."""
+    entries = zip(ca.vertsplit(y), lower.tolist(), strict=True)
+    return ca.vertcat(*(entry if low < 0 else ca.fmax(entry, low) for entry, low in entries))
+
+
 def total_of(geometry: Geometry, mass: Array, kind: str) -> Array:
     """What a kind of healing calls the total of `mass` (n + d, n + d), (d,)."""
     if kind == "rigid_body":  # the diagonal of [G; I]' M [G; I]
@@ -384,29 +373,6 @@ def heal(factor: ca.SX, geometry: Geometry, totals: ca.SX | Array, kind: str) ->
         scales = [ca.sqrt(totals[i] / ca.sumsqr(factor[rows, :])) for i, rows in enumerate(members)]
     of_groups = [*scales, sum(scales) / d]  # -1, no direction, is the last
     return ca.diag(ca.vertcat(*(of_groups[g] for g in groups.tolist()))) @ factor
-
-
-def batch_healing(geometry: Geometry, kind: str) -> Callable[[Array, Array], Array] | None:
-    """`heal` in numbers, of factors (n + d, n + d, count) and totals (d, 1 or count); None where scales are coupled."""
-    groups = geometry.directions
-    parts, coupled = _rigid_parts(geometry)
-    own, members = np.einsum("iij->ij", parts), 1.0 * (groups == np.arange(geometry.d)[:, None])
-
-    def rigid_body(factors: Array) -> Array:
-        moved = (own @ factors.reshape(len(factors), -1)).reshape(-1, *factors.shape[1:])
-        return np.einsum("ijp,ijp->ip", moved, moved)
-
-    def trace(factors: Array) -> Array:
-        return members @ np.einsum("ijp,ijp->ip", factors, factors)
-
-    total = rigid_body if kind == "rigid_body" else trace
-
-    def healed(factors: Array, totals: Array) -> Array:
-        scales = np.sqrt(totals / total(factors))
-        factors *= np.concatenate([scales, scales.mean(axis=0, keepdims=True)])[groups][:, None]
-        return factors
-
-    return None if coupled and kind == "rigid_body" else healed
 
 
 def _rigid_parts(geometry: Geometry) -> tuple[Array, bool]:

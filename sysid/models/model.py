@@ -107,6 +107,27 @@ class MassBlocks(NamedTuple):
     mass: Any = None
 
 
+class FactoredMass(MassBlocks):
+    """Blocks of a mass whose Cholesky factor over sensors and base is known: ``M = whole whole'``.
+
+    Attributes
+    ----------
+    whole : expression (n + d, n + d) or None
+        The lower-triangular factor. A swarm takes participations and rigid-body mass from it, because ``L^-1 M_S0``
+        loses the digits of ``M_S0 = L Z'`` where L is ill-conditioned. None where blocks were changed afterwards.
+    """
+
+    whole: Any = None
+
+    @classmethod
+    def of(cls, whole: Any, n: int) -> FactoredMass:
+        """The blocks of a factor ``[[L, 0], [Z, L_00]]``, n the rows of L."""
+        L, low, base = whole[:n, :n], whole[n:, :n], whole[n:, n:]
+        made = cls(L, L @ low.T, low @ low.T + base @ base.T)
+        made.whole = whole
+        return made
+
+
 class StiffnessBlocks(NamedTuple):
     """Expressions: K_SS (n, n), and ``H = L^-1 K_SS L^-T`` (n, n), L the Cholesky factor of M_SS."""
 
@@ -123,9 +144,7 @@ class MatrixModel(Protocol):
     (n,), at the circular frequencies `omega` (n,), in ascending order; None where C tells them. A stiffness that can
     give its unknowns a spectrum has ``with_spectrum``, see `SpectralStiffness`; the swarm then refines its candidates.
 
-    A model may have ``batch(geometry)`` besides: the same in numbers, as a function of the coordinates (count, size) of
-    many candidates of the swarm; None where there is none. A mass's function gives the Cholesky factors of M,
-    (n + d, n + d, count); a stiffness's those of H, (count, n, n); a damping's the ratios of the modes, (count, n).
+    IPOPT and the swarm both evaluate these expressions, and nothing else of a model.
     """
 
     def unknowns(self, geometry: Geometry) -> Sequence[Unknown]:

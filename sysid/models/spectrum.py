@@ -1,24 +1,27 @@
 """Eigenvalue refinement: give ``H = L_H L_H'`` the measured spectrum (Cerini et al. 2024, eq. 31).
 
-Two ways, both from the candidate's own L_H: the closed form, which is the nearest such matrix, and
-the paper's nonlinear programme, through IPOPT with exact derivatives.
+Two ways, both from the candidate's own L_H: the closed form, which is the nearest such matrix, and the paper's
+nonlinear programme in the entries of L_H, through IPOPT with exact gradient and Hessian.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from sysid.errors import InputError
+from sysid.nlp import quiet_options
 from sysid.structure.structure import Array
-from sysid.structure.triangular import lower_entries, lower_triangle, triangle, triangle_entries
+from sysid.structure.triangular import triangle, triangle_entries
 
 SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")  # IPOPT's statuses that count as success
 _REACHED = 1e-8  # relative error of an eigenvalue up to which it counts as the target
-_SECONDS, _POWER = 5.0, 6.5  # of a processor, that the graphs of 14 eigenvalues take, and how that grows with them
+_LEAST = 1e-6  # diagonal entry of L_H over the highest target: a singular L_H has no slope towards a regular one
+_APART = 1e-12  # eigenvalues over the highest one, that count as apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,14 +35,14 @@ class Refinement:
     error : float
         Largest relative difference of the replaced eigenvalues from their targets.
     success : bool
-    message : str
-        The solver's status, or how the closed form went.
+    status : str
+        IPOPT's own, and whether it missed the spectrum; "closed-form" of that.
     """
 
     factor: Array
     error: float
     success: bool
-    message: str
+    status: str
 
 
 def replace_spectrum(lam: Array, targets: Array) -> Array:
@@ -74,42 +77,84 @@ def closed_form(factor: Array, targets: Array) -> Refinement:
         Measured circular frequencies, rad/s.
     """
     targets = _check(factor, targets)
-    return _finish(nearest_factors(factor[None], targets)[0], targets, True, "closed form")
-
-
-def seconds_to_begin(n: int) -> float:
-    """About how long the graphs of `by_ipopt` take, once for n eigenvalues."""
-    return float(_SECONDS * (n / 14) ** _POWER)
+    return _finish(nearest_factors(factor[None], targets)[0], targets, True, "closed-form")
 
 
 def by_ipopt(factor: Array, targets: Array, max_time: float | None = None) -> Refinement:
     """Minimise the distance of the spectrum to the target from the candidate's own factor (the paper's way).
 
-    Eq. 31 is minimised in squares, relative to each target (its square root has no derivative at
-    its own solution). Eigenvalues enter as unknowns beside the eigenvectors, tied to L_H by
-    ``Psi' Psi = I`` and ``Psi' L_H L_H' Psi = diag(lam)``: polynomials, exact to any derivative, and with
-    independent gradients even where eigenvalues repeat, because L_H is free to move. `max_time` is IPOPT's own, s.
+    Eq. 31 is minimised as `SpectrumDistance` has it, over the entries of L_H alone. `max_time` is IPOPT's own, s.
     """
     targets = _check(factor, targets)
-    n, m = factor.shape[0], targets.size
-    lam, psi = np.linalg.eigh(factor @ factor.T)
-    unit = _units(np.sqrt(np.maximum(lam, np.finfo(float).tiny)), targets)
-    scale = unit[-1]
-    rows = np.tril_indices(n)
-    start = np.concatenate([triangle_entries(factor) / scale, psi.ravel(order="F"), lam / unit**2])
-    lower = np.concatenate(
-        [
-            np.where(rows[0] == rows[1], 1e-6, -np.inf),
-            np.full(n * n + m, -np.inf),
-            (1 + 1e-6) * (targets[-1] / unit[m:]) ** 2,  # what is not replaced stays above what is
-        ]
-    )
-    solver = _programme(n, m, max_time)
-    solution = solver(x0=start, lbx=lower, ubx=np.inf, lbg=0, ubg=0, p=np.concatenate([unit / scale, unit]))
-    status = solver.stats()["return_status"]
-    refined = triangle(np.asarray(solution["x"]).ravel()[: rows[0].size], n) * scale
-    answer = _finish(refined, targets, status in SOLVED, f"IPOPT: {status}")
-    return answer if answer.error < _REACHED else replace(answer, success=False)
+    n, scale = factor.shape[0], targets[-1]
+    distance = SpectrumDistance(n, targets / scale)
+    rows, columns = np.tril_indices(n)
+    solver, start = Solver(distance, max_time), triangle_entries(factor) / scale
+    x, status = solver.minimum(start, np.where(rows == columns, _LEAST, -np.inf))
+    answer = _finish(triangle(x, n) * scale, targets, status in SOLVED, status)
+    return answer if answer.error < _REACHED else replace(answer, success=False, status=f"{status}, spectrum missed")
+
+
+class SpectrumDistance:
+    """Squared relative distance ``sum_k (lam_k / w_k² - 1)²`` of the lowest eigenvalues of ``L_H L_H'`` from targets.
+
+    Eq. 31 itself is the root of a sum of squares, which has no derivative at its own solution. A function of the
+    eigenvalues is as smooth as it is symmetric in those that coincide (Lewis and Sendov, SIAM J. Matrix Anal. Appl. 23
+    (2001) 368-386): this one where coinciding eigenvalues have the same target, and so at its solutions. With
+    f = sum_k f_k(lam_k) and T_jk = psi_j' dH psi_k its second differential in H is ``sum_jk F_jk T_jk²``, F_jk being
+    the divided difference of f_j' and f_k' at lam_j and lam_k.
+
+    Parameters
+    ----------
+    n : int
+    targets : (m,), m <= n
+        Circular frequencies, ascending, in the unit of L_H.
+    """
+
+    def __init__(self, n: int, targets: Array) -> None:
+        self.rows, self.columns = np.tril_indices(n)
+        self._n, self._m = n, targets.size
+        self._bend = np.zeros(n)  # of f_k; zero for what has no target
+        self._bend[: self._m] = 2 / targets**4
+        self._slope = np.zeros(n)  # of f_k at zero
+        self._slope[: self._m] = -2 / targets**2
+        self._alike = np.equal.outer(self._bend, self._bend)  # with the same target, or none
+        self._same = np.equal.outer(self.columns, self.columns)
+        self._at: Array = np.full(self.rows.size, np.nan)
+
+    def _decompose(self, x: Array) -> tuple[Array, Array, Array]:
+        """L_H, and the eigenvalues and eigenvectors of H; kept for the next call with the same x."""
+        if not np.array_equal(x, self._at):
+            factor = triangle(x, self._n)
+            # Singular values: the least eigenvalues of L L' drown in the round-off of the highest.
+            psi, sigma, _ = np.linalg.svd(factor)
+            self._at, self._parts = x.copy(), (factor, sigma[::-1] ** 2, psi[:, ::-1])
+        return self._parts
+
+    def value(self, x: Array) -> float:
+        """The squared distance at entries x of L_H, row by row."""
+        lam = self._decompose(x)[1]
+        return float(np.sum((-lam * self._slope / 2 - 1)[: self._m] ** 2))
+
+    def gradient(self, x: Array) -> Array:
+        """Its gradient, the lower triangle of ``2 Psi diag(f') Psi' L_H``."""
+        factor, lam, psi = self._decompose(x)
+        full: Array = 2 * ((psi * (self._bend * lam + self._slope)) @ psi.T) @ factor
+        return full[self.rows, self.columns]
+
+    def hessian(self, x: Array) -> Array:
+        """Its Hessian: the curvature of the distance in H, and that of H in L_H along the slope."""
+        factor, lam, psi = self._decompose(x)
+        slope, bend = self._bend * lam + self._slope, self._bend
+        apart = lam[:, None] - lam
+        least = _APART * lam[-1]  # two that coincide and differ in their targets: a kink, very bent
+        apart = np.where(np.abs(apart) < least, np.copysign(least, apart), apart)
+        divided = np.where(self._alike, bend, (slope[:, None] - slope) / apart)
+        sides = psi[self.rows][:, :, None] * (factor.T @ psi)[self.columns][:, None, :]
+        turned = (sides + sides.swapaxes(1, 2)).reshape(self.rows.size, -1)  # T of each entry of L_H
+        along = 2 * (psi * slope) @ psi.T
+        hessian: Array = (turned * divided.ravel()) @ turned.T + along[np.ix_(self.rows, self.rows)] * self._same
+        return hessian
 
 
 def _check(factor: Array, targets: Array) -> Array:
@@ -119,36 +164,73 @@ def _check(factor: Array, targets: Array) -> Array:
     return targets
 
 
-def _units(own: Array, targets: Array) -> Array:
-    """Circular frequency that each eigenvalue is measured in: its target, or its own."""
-    return np.concatenate([targets, np.maximum(own[targets.size :], targets[-1])])
+class Solver:
+    """IPOPT on a distance, with the distance's own derivatives."""
+
+    def __init__(self, distance: SpectrumDistance, max_time: float | None) -> None:
+        size = distance.rows.size
+        x, none, one = ca.Sparsity.dense(size), ca.Sparsity(0, 0), ca.Sparsity.dense(1)
+        value = _InNumbers(lambda at: [distance.value(at)], [x], [one])
+        below = np.tril_indices(size)  # by rows, as CasADi stores the upper triangle of a symmetric matrix by columns
+        # Kept, as CasADi does not: without them the solver would call what is gone.
+        self.derivatives = {
+            "grad_f": _InNumbers(lambda at, _: [distance.value(at), distance.gradient(at)], [x, none], [one, x]),
+            "hess_lag": _InNumbers(
+                lambda at, _, weight, __: [float(weight) * distance.hessian(at)[below]],
+                [x, none, one, ca.Sparsity.dense(0, 1)], [ca.Sparsity.upper(size)],
+            ),
+        }  # fmt: skip
+        self._value, z = value, ca.MX.sym("x", size)
+        limits = {} if max_time is None else {"max_wall_time": max_time}
+        # Relative squares need no scaling of IPOPT's; a slope of 1e-9 leaves errors below that.
+        options = quiet_options(300, tol=1e-9, nlp_scaling_method="none", **limits)
+        self._solve = ca.nlpsol("refinement", "ipopt", {"x": z, "f": value(z)}, {**options, **self.derivatives})
+
+    def minimum(self, start: Array, lower: Array) -> tuple[Array, str]:
+        """Where it ends, and IPOPT's status."""
+        end = np.asarray(self._solve(x0=start, lbx=lower)["x"]).ravel()
+        return end, str(self._solve.stats()["return_status"])
 
 
-@lru_cache(maxsize=16)
-def _programme(n: int, m: int, max_time: float | None = None) -> ca.Function:
-    """IPOPT programme of n eigenvalues with the lowest m given; parameters: unit / scale, unit (n each)."""
-    x = ca.SX.sym("x", n * (n + 1) // 2)
-    psi, lam = ca.SX.sym("psi", n, n), ca.SX.sym("lam", n)
-    relative, unit = ca.SX.sym("relative", n), ca.SX.sym("unit", n)
-    half = lower_triangle(x, n).T @ psi @ ca.diag(1 / relative)
-    ties = ca.vertcat(lower_entries(psi.T @ psi - ca.SX.eye(n)), lower_entries(half.T @ half - ca.diag(lam)))
-    nlp = {
-        "x": ca.vertcat(x, ca.vec(psi), lam),
-        "p": ca.vertcat(relative, unit),
-        "f": ca.sumsqr(lam[:m] - 1),
-        "g": ties,
-    }
-    options = {
-        "print_time": False,
-        "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-13, "constr_viol_tol": 1e-13, "max_iter": 300}
-        | ({} if max_time is None else {"max_wall_time": max_time}),
-    }
-    return ca.nlpsol("refinement", "ipopt", nlp, options)
+class _InNumbers(ca.Callback):
+    """A function of NumPy as CasADi calls it: of a column and other matrices, to the entries of what it gives."""
+
+    def __init__(
+        self, function: Callable[..., list[Any]], inputs: list[ca.Sparsity], outputs: list[ca.Sparsity]
+    ) -> None:
+        ca.Callback.__init__(self)
+        self._function, self._inputs, self._outputs = function, inputs, outputs
+        self.construct("in_numbers", {})
+
+    def get_n_in(self) -> int:
+        """How many it takes."""
+        return len(self._inputs)
+
+    def get_n_out(self) -> int:
+        """How many it gives."""
+        return len(self._outputs)
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Shape of what it takes."""
+        return self._inputs[i]
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        """Shape of what it gives."""
+        return self._outputs[i]
+
+    def eval(self, arguments: list[ca.DM]) -> list[ca.DM]:
+        """Call the function."""
+        results = self._function(np.array(arguments[0].nonzeros()), *arguments[1:])
+        return [ca.DM(shape, result) for result, shape in zip(results, self._outputs, strict=True)]
 
 
-def _finish(factor: Array, targets: Array, success: bool, message: str) -> Refinement:
-    """What came of a refinement, from its factor, whose diagonal is positive."""
+def spectrum_error(factor: Array, targets: Array) -> float:
+    """Largest relative difference of the lowest eigenvalues of ``L_H L_H'`` from the squared `targets`."""
     # Singular values, not eigenvalues of L L': full relative accuracy needs no squares.
     own = np.sort(np.linalg.svd(factor, compute_uv=False))
-    error = float(np.max(np.abs((own[: targets.size] / targets) ** 2 - 1)))
-    return Refinement(factor, error, success, message)
+    return float(np.max(np.abs((own[: targets.size] / targets) ** 2 - 1)))
+
+
+def _finish(factor: Array, targets: Array, success: bool, status: str) -> Refinement:
+    """What came of a refinement, from its factor, whose diagonal is positive."""
+    return Refinement(factor, spectrum_error(factor, targets), success, status)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import casadi as ca
@@ -16,7 +15,7 @@ from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import FACTOR_FLOOR, Geometry
 from sysid.models.model import MassBlocks, Stated, StiffnessBlocks, Written
 from sysid.models.spectrum import by_ipopt, nearest_factors
-from sysid.models.unknowns import Unknown, log_sampling
+from sysid.models.unknowns import Unknown, log_sampling, user_site
 from sysid.structure.structure import Array, Structure
 from sysid.structure.triangular import lower_triangle, triangle_entries
 
@@ -105,19 +104,8 @@ class SpectralStiffness(FieldTree):
     def blocks(self, geometry: Geometry, y: ca.SX, mass: MassBlocks) -> StiffnessBlocks:
         """``K_SS = L H L'`` and ``H = L_H L_H'``, rad²/s², whatever the mass is."""
         L_H, L = lower_triangle(y, geometry.n), mass.factor
-        H = L_H @ L_H.T
+        H = ca.tril2symm(ca.tril(L_H @ L_H.T))  # each entry once
         return StiffnessBlocks(L @ H @ L.T, H)
-
-    def batch(self, geometry: Geometry) -> Callable[[Array], Array]:
-        """Factors L_H, (count, n, n), of swarm coordinates (count, size)."""
-        n, (rows, columns) = geometry.n, np.tril_indices(geometry.n)
-
-        def factors(s: Array) -> Array:
-            made = np.zeros((len(s), n, n))
-            made[:, rows, columns] = s
-            return made
-
-        return factors
 
     def values(self, geometry: Geometry, structure: Structure) -> Array:
         """Entries of L_H."""
@@ -127,22 +115,24 @@ class SpectralStiffness(FieldTree):
         H = np.linalg.solve(L, half.T)
         return triangle_entries(np.linalg.cholesky((H + H.T) / 2))
 
-    def with_spectrum(self, rows: Array, omega: Array, *, by_solver: bool = False) -> tuple[Array, int]:
+    def with_spectrum(
+        self, rows: Array, omega: Array, *, by_solver: bool = False, max_time: float | None = None
+    ) -> tuple[Array, tuple[str, ...]]:
         """Entries of L_H (k, size) with the lowest eigenvalues of H at `omega` (m,), rad/s: eq. 31, from each own L_H.
 
-        In closed form, or of each row by IPOPT; where IPOPT does not succeed the closed form stands, and how many rows
-        that are is the second answer.
+        In closed form, or of each row by IPOPT, `max_time` seconds at most; where IPOPT does not succeed the closed
+        form stands. The second answer is IPOPT's status of each row.
         """
         n = (math.isqrt(8 * rows.shape[1] + 1) - 1) // 2
         factors, lower = np.zeros((len(rows), n, n)), np.tril_indices(n)
         factors[:, *lower] = rows
         refined = nearest_factors(factors, omega)[:, *lower]
         if not by_solver:
-            return refined, 0
-        solved = [by_ipopt(factor, omega) for factor in factors]
+            return refined, ()
+        solved = [by_ipopt(factor, omega, max_time) for factor in factors]
         for row, answer in zip(refined, solved, strict=True):
             row[:] = triangle_entries(answer.factor) if answer.success else row
-        return refined, sum(not answer.success for answer in solved)
+        return refined, tuple(answer.status for answer in solved)
 
     def stated(self, geometry: Geometry) -> Stated:
         """The spectrum, stated or found."""
@@ -220,14 +210,27 @@ class WrittenStiffness(Written):
 
 def check_rigid(stiffness: ca.MX, rigid_body: Array) -> None:
     """Refuse a stiffness with base columns that strains when the base moves as a rigid body."""
-    n = len(rigid_body)
-    K = at_point("stiffness", stiffness, None)
-    left = np.abs(K[:, :n] @ rigid_body + K[:, n:]).max()
-    if left > 1e-6 * np.abs(K).max():
-        raise InputError(
+    K, d = at_point("stiffness", stiffness, None), rigid_body.shape[1]
+    if not _strains(K, rigid_body):
+        return
+    refuse(
+        (
+            not _strains(np.roll(K, (-d, -d), (0, 1)), rigid_body),
+            f"stiffness ({user_site()}) has the rows and columns of the base first: they stand last, in mass and "
+            f"damping too{written_in(stiffness)}",
+        ),
+        (
+            True,
             "stiffness strains when the base moves as a rigid body: K_S0 must be -K_SS G, and K_00 G' K_SS G (a "
-            "spring to the base counts in all; are its last rows those of the base?)" + written_in(stiffness)
-        )
+            "spring to the base counts in all; are its last rows those of the base?)" + written_in(stiffness),
+        ),
+    )
+
+
+def _strains(K: Array, rigid_body: Array) -> bool:
+    """Whether a stiffness (n + d, n + d) holds a rigid structure to the ground."""
+    n = len(rigid_body)
+    return bool(np.abs(K[:, :n] @ rigid_body + K[:, n:]).max() > 1e-6 * np.abs(K).max())
 
 
 def _arms(geometry: Geometry) -> Array:

@@ -162,7 +162,7 @@ def base_forces(
 
 
 def convergence(identification: Identification, ax: Axes | None = None) -> Any:
-    """Objective through the phases that ran: the swarm's best, the refinement, each iterate of the local phase.
+    """Objective through the phases that ran: the swarm's best, each iterate of the local phase.
 
     Each round of Huber's loss weighs its records anew, so that the curve may step up from one to the next.
     Fits with widened peaks on the way are left out; a swarm's curve of such responses is dashed, and says so.
@@ -174,8 +174,8 @@ def convergence(identification: Identification, ax: Axes | None = None) -> Any:
     swarm, local = positive(history.swarm_curve), positive(history.local_curve)
     rounds = sum(phase.evaluations for phase in history.phases if phase.name == HUBER)
     widened = bool(swarm.size) and bool(np.isnan(history.start))
-    _draw_curves(ax, swarm, local, history.refinement, rounds=rounds, widened=widened)
-    values = np.concatenate([swarm, local, [history.refinement]])
+    _draw_curves(ax, swarm, local, rounds=rounds, widened=widened)
+    values = np.concatenate([swarm, local])
     values = values[values > 0]
     if values.size:
         low, high = values.min(), values.max()
@@ -195,8 +195,8 @@ def convergence(identification: Identification, ax: Axes | None = None) -> Any:
     return shown
 
 
-def _draw_curves(ax: Axes, swarm: Array, local: Array, refinement: float, *, rounds: int, widened: bool) -> None:
-    """Best of the swarm, what the refinement made of it, and after them the iterates of the local phase.
+def _draw_curves(ax: Axes, swarm: Array, local: Array, *, rounds: int, widened: bool) -> None:
+    """Best of the swarm, and after it the iterates of the local phase.
 
     The last of these are of the `rounds` of Huber's loss.
     """
@@ -222,8 +222,6 @@ def _draw_curves(ax: Axes, swarm: Array, local: Array, refinement: float, *, rou
             ax.plot(iterate[first:], local[first:], color=COLOURS[1], label=told, **drawn)
     if swarm.size and local.size:
         ax.axvline(end, color=FAINT, linewidth=0.8, linestyle=":")
-    if refinement > 0:
-        ax.plot([end], [refinement], "D", color=INK, markersize=5, label="after refinement", zorder=4)
 
 
 def mac(identification: Identification, ax: Axes | None = None) -> Any:

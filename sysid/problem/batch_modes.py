@@ -1,4 +1,4 @@
-"""Modes of many candidates at once, from the factors of their matrices by batched products and LAPACK's `eigh`."""
+"""Modes of many candidates at once, from what their models' expressions gave."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.structure.structure import Array
-from sysid.structure.triangular import inverse_triangles
+
+ROUND_OFF = 1e-9  # of the largest entry
 
 
 class BatchModes(NamedTuple):
@@ -19,46 +20,51 @@ class BatchModes(NamedTuple):
         One mode a row.
     loads : (count, n, d)
         Participations.
-    base : (count, d, n + d)
-        ``[G; I]' L_M``.
+    rigid_body_mass : (count, d, d)
+        ``[G; I]' M [G; I]``.
     """
 
     shapes: Array
     loads: Array
-    base: Array
-
-    @property
-    def rigid_body_mass(self) -> Array:
-        """``[G; I]' M [G; I]``, (count, d, d)."""
-        return self.base @ np.array(self.base).swapaxes(1, 2)
+    rigid_body_mass: Array
 
 
-def batch_modes(mass_factors: Array, stiffness_factors: Array, rigid_body: Array) -> BatchModes:
-    """Modes of ``M = L_M L_M'`` and ``K_SS = L H L'``, ``H = L_H L_H'``, L the leading block of L_M.
+def batch_modes(H: Array, right: Array, rigid: Array, *base: Array) -> tuple[Array, BatchModes]:
+    """Squared circular frequencies (count, n), ascending, and modes; a candidate that is no structure has NaN.
 
-    With ``H = Psi Lambda Psi'``, ``L_M = [[L, 0], [Z, L_00]]`` and G the rigid-body motion, the modes are
-    ``Phi = L^-T Psi`` and their participations ``Phi' (M_SS G + M_S0) = Psi' (L' G + Z')``. In brackets are the first
-    n rows of ``L_M' [G; I]``.
+    With ``H = Psi Lambda Psi'`` and L the Cholesky factor of M_SS, the modes are ``Phi = L^-T Psi`` and their
+    participations ``Phi' B = Psi' L^-1 B``, ``B = M_SS G + M_S0``.
 
     Parameters
     ----------
-    mass_factors : (n + d, n + d, count)
-        The L_M.
-    stiffness_factors : (count, n, n)
-        The L_H. A candidate with numbers that are not finite has modes that are no numbers.
-    rigid_body : (n, d)
+    H : (count, n, n)
+        ``L^-1 K_SS L^-T``, the lower triangle at least; overwritten where it is not finite.
+    right : (count, n, n + d)
+        ``[L^-1, L^-1 B]``.
+    rigid : (count, d, d)
+        Rigid-body mass.
+    *base : (count, n, d), (count, d, d)
+        ``L^-1 M_S0`` and M_00, where the whole mass may be indefinite.
     """
-    n, d = rigid_body.shape
-    rigid = np.vstack([rigid_body, np.eye(d)])
-    moved = (rigid.T @ mass_factors.reshape(n + d, -1)).reshape(d, n + d, -1)
-    right = np.empty((len(stiffness_factors), n, n + d))
-    right[..., :n] = inverse_triangles(mass_factors[:n, :n]).transpose(2, 0, 1)
-    right[..., n:] = moved[:, :n].transpose(2, 1, 0)
-    # A copy, because BLAS's kernel for products of small matrices is faster than that for a matrix with itself.
-    H = stiffness_factors @ np.array(stiffness_factors).swapaxes(1, 2)
-    broken = ~np.isfinite(np.einsum("pii->p", H))  # the trace of a square with a number that is not finite is not
+    n = H.shape[1]
+    broken = ~np.isfinite(np.einsum("pij->p", H))
     H[broken] = np.eye(n)  # must not stop the eigensolver for the others
-    psi = np.linalg.eigh(H)[1]
-    psi[broken] = np.nan
+    lam, psi = np.linalg.eigh(H)
+    if base:
+        broken |= base_is_light(*base)
+    lam[broken], psi[broken] = np.nan, np.nan
     made = psi.swapaxes(1, 2) @ right
-    return BatchModes(made[..., :n], made[..., n:], moved.transpose(2, 0, 1))
+    return lam, BatchModes(made[..., :n], made[..., n:], rigid)
+
+
+def base_is_light(low: Array, base: Array) -> Array:
+    """Whether M_00 is less than ``M_S0' M_SS^-1 M_S0``, ``low = L^-1 M_S0``, which no structure's is, (count,)."""
+    size = np.abs(base).max(axis=(1, 2)) + np.abs(low).max(axis=(1, 2)) ** 2
+    return least(base - low.swapaxes(1, 2) @ low) < -ROUND_OFF * size
+
+
+def least(stack: Array) -> Array:
+    """Least eigenvalue of each symmetric matrix; minus infinity where it is no number."""
+    bad = ~np.all(np.isfinite(stack), axis=(1, 2))
+    clean = np.where(bad[:, None, None], 0.0, (stack + stack.swapaxes(1, 2)) / 2)
+    return np.where(bad, -np.inf, np.linalg.eigvalsh(clean)[:, 0])

@@ -137,15 +137,12 @@ class _Reader:
         while at < len(code):
             operation = _at(self.names, code[at])
             self.count_operation(operation)
-            count = 1 if operation in operations.UNARY else 2 if operation in operations.BINARY else 0
+            count = operations.ENTRYWISE.get(operation, 0)
             arguments = [_at(values, number) for number in code[at + 1 : at + 1 + count]]
             if operation == "const":
                 values.append(ca.SX(next(numbers)))
-            elif count and len(arguments) == count:
-                make = ca.SX.unary if count == 1 else ca.SX.binary
-                values.append(make(operations.casadi_number(operation), *arguments))
             else:
-                raise ValueError("no operation on numbers")
+                values.append(_entrywise(ca.SX, operation, arguments))
             at += 1 + count
         limited("the size of a matrix", len(values), operations.MOST_ENTRIES)
         outputs, ends = _whole(tree["outputs"]), list[ca.SX]()
@@ -214,10 +211,11 @@ class _Matrices:
         limited("the work of one evaluation", self.work, operations.MOST_WORK)
 
     def _made(self, name: str, arguments: list[ca.MX], parameters: list[int]) -> Sequence[ca.MX]:
+        if name in operations.WITHOUT_PARAMETERS:
+            _exactly(0, parameters)
+        if name in operations.ENTRYWISE:  # of which no result is larger than the largest argument
+            return [_entrywise(ca.MX, name, arguments)]
         self._check_size(name, arguments, parameters)
-        if name in operations.UNARY or name in operations.BINARY:
-            make = ca.MX.unary if name in operations.UNARY else ca.MX.binary
-            return [make(operations.casadi_number(name), *_exactly(1 if name in operations.UNARY else 2, arguments))]
         if name in operations.PLAIN:
             count, plain = operations.PLAIN[name]
             return [plain(*_exactly(count, arguments))]
@@ -271,7 +269,8 @@ class _Matrices:
         self._used += count
         if len(numbers) != count:
             raise ValueError("numbers are missing")
-        return [ca.MX(ca.DM(pattern, numbers * (pattern.nnz() if one else 1)))]
+        values = numbers * (pattern.nnz() if one else 1)
+        return [ca.MX(ca.DM(pattern, values)) if values else ca.MX(pattern)]
 
     def _getnonzeros(self, arguments: list[ca.MX], parameters: list[int]) -> list[ca.MX]:
         pattern = self._reader.pattern(parameters[0])
@@ -336,6 +335,15 @@ def _check_pattern(rows: int, starts: Any, within: Any, columns: int, count: int
     rising[starts[(starts > 0) & (starts < count)] - 1] = False  # from one column to the next
     if count and (within.min() < 0 or within.max() >= rows or np.any(np.diff(within)[rising] <= 0)):
         raise ValueError("the rows of a pattern do not rise")
+
+
+def _entrywise(kind: Any, name: str, arguments: Sequence[Any]) -> Any:
+    """An operation on each entry of matrices (MX), or on numbers (SX)."""
+    count = operations.ENTRYWISE.get(name)
+    if count is None:
+        raise ValueError("no operation on numbers")
+    make = kind.unary if count == 1 else kind.binary
+    return make(operations.casadi_number(name), *_exactly(count, arguments))
 
 
 def _counted(code: Sequence[int], at: int) -> tuple[list[int], int]:

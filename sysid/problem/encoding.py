@@ -25,7 +25,7 @@ import numpy as np
 from sysid.errors import InputError
 from sysid.problem import operations
 from sysid.problem.decoding import Tree, decode
-from sysid.problem.serialised import interpolant_data, is_compiled, same_text
+from sysid.problem.serialised import interpolant_data, interpolant_options, is_compiled, same_text
 from sysid.structure.structure import Array
 
 _NAMES = {operations.casadi_number(name): name for name in (*operations.NAMES, "input", "output")}
@@ -190,7 +190,10 @@ class _Matrices:
     def operations(self, function: ca.Function, outputs: int) -> list[int]:
         """Add all operations of a function; the values that are its outputs."""
         held: dict[int, int] = {}  # values by CasADi's places in its memory, which it uses again
-        ends = [0] * outputs
+        # CasADi has no operation for an output without nonzeros.
+        empty = [i for i in range(outputs) if not function.nnz_out(i)]
+        ends = dict.fromkeys(range(outputs), 0)
+        ends |= {i: self.record("const", [], [self.writer.pattern(function.sparsity_out(i)), 0], 1) for i in empty}
         for k in range(function.n_instructions()):
             number, target = function.instruction_id(k), function.instruction_output(k)
             name, source = _NAMES.get(number), function.instruction_input(k)
@@ -204,7 +207,7 @@ class _Matrices:
                 told, parameters = self.described(name, function.instruction_MX(k))
                 first = self.record(told, [held[i] for i in source], parameters, len(target))
                 held |= {place: first + i for i, place in enumerate(target) if place >= 0}
-        return ends
+        return list(ends.values())
 
     def described(self, name: str, node: ca.MX) -> tuple[str, list[int]]:
         """The name of an operation in the file, and its parameters."""
@@ -316,8 +319,6 @@ def _solve_in_words(node: ca.MX) -> tuple[str, list[int]]:
     own = ca.Function("solve", symbols, ca.graph_substitute([node], [node.dep(0), node.dep(1)], symbols))
     transposed = bool(node.info()["tr"])
     for solver in ("", *operations.SOLVERS):
-        if solver and not operations.has_library("linsol", solver):
-            continue
         try:
             same = ca.Function("solve", symbols, [operations.solve(solver, *symbols, transposed=transposed)])
         except (ValueError, RuntimeError):
@@ -330,10 +331,25 @@ def _solve_in_words(node: ca.MX) -> tuple[str, list[int]]:
 def _add_interpolant(writer: _Writer, function: ca.Function, inputs: Sequence[ca.Sparsity]) -> None:
     kind = _CLASSES[function.class_name()]
     grid, values = interpolant_data(function)
-    if not all(grid) or not values or not same_text(function, ca.interpolant(function.name(), kind, grid, values)):
+    same = all(grid) and bool(values)
+    if same:
+        again = ca.interpolant("again", kind, grid, values)
+        same = interpolant_options(function) == interpolant_options(again) and _same_values(function, again, grid)
+    if not same:
         raise NotStorableError(f"the function {function.name()!r} ({function.class_name()} with options or parameters)")
     numbers = [*(number for axis in grid for number in axis), *values]
     writer.add(kind, inputs, [], [len(axis) for axis in grid], numbers)
+
+
+def _same_values(one: ca.Function, other: ca.Function, grid: Sequence[Sequence[float]]) -> bool:
+    """Whether two interpolants are the same to the bit all over their grid, and beyond its ends."""
+    share = np.random.default_rng(0).uniform(-0.1, 1.1, (len(grid), _TRIED))
+    ends = np.array([(axis[0], axis[-1]) for axis in grid])
+    points = ca.DM(ends[:, :1] + share * np.diff(ends, axis=1))
+    return one.size_in(0) == other.size_in(0) and _same_bits(one.map(_TRIED)(points), other.map(_TRIED)(points))
+
+
+_TRIED = 200  # points
 
 
 def _add_sx(writer: _Writer, function: ca.Function, inputs: Sequence[ca.Sparsity]) -> None:

@@ -226,6 +226,15 @@ class Formulation:
         """Whether nothing but the problem's own records tells about the matrices."""
         return self.fits_records and all(self.apart) and not self._touches([r.expression for r in self._relations])
 
+    @cached_property
+    def tells_damping(self) -> bool:
+        """Whether anything that is fitted depends on an unknown of the damping alone; records always do."""
+        if self.fits_records or self.further_tests:
+            return True
+        *others, own = ({symbol.__hash__() for symbol in group} for group in self._in_matrices)
+        own = own.difference(*others, (v.symbol.__hash__() for v in self.fixed))
+        return any(symbol.__hash__() in own for group in self._in_sources for e in group for symbol in ca.symvar(e))
+
     @property
     def free_modes(self) -> bool:
         """Whether mode shapes and participations are free, so that modal coordinates can take the unknowns' place."""
@@ -418,7 +427,10 @@ class Formulation:
     def _matrices(self, blocks: Blocks, geometry: Geometry) -> Matrices:
         by_frequency = self._function("ratios", [blocks.ratios], blocks.omega)
         function = self._function("matrices", blocks.outputs)
-        return Matrices(function, by_frequency, geometry.rigid_body, geometry.recovery, blocks.mass.mass is None)
+        whole_factor = self._function("whole_factor", [blocks.whole_factor])
+        return Matrices(
+            function, by_frequency, geometry.rigid_body, geometry.recovery, whole_factor, blocks.mass.mass is None
+        )
 
     def _function(self, name: str, expressions: Sequence[ca.MX], *further: ca.MX) -> ca.Function:
         """Expressions of the unknowns as a function of the vector x; fixed variables are numbers in it."""

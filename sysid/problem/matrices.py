@@ -12,6 +12,7 @@ import numpy as np
 from sysid.measurement.measurement import Measurement
 from sysid.models.geometry import Geometry
 from sysid.models.model import (
+    FactoredMass,
     MassBlocks,
     MatrixModel,
     StiffnessBlocks,
@@ -50,6 +51,8 @@ class Matrices:
     rigid_body : (n, d)
         Motion of the degrees of freedom for unit base motion.
     recovery : (n_sensors, n)
+    whole_factor : casadi.Function
+        x to the Cholesky factor of the whole mass (n + d, n + d), or to nothing where the model has none.
     semidefinite : bool
         M is positive semidefinite for every x, as its model makes it so.
     """
@@ -58,6 +61,7 @@ class Matrices:
     ratio_function: ca.Function
     rigid_body: Array
     recovery: Array
+    whole_factor: ca.Function
     semidefinite: bool = False
 
     @property
@@ -85,6 +89,25 @@ class Matrices:
         L = ca.SX.sym("L", ca.Sparsity.lower(factor.size1()))
         inverse = ca.Function("inverse", [L], [ca.densify(ca.solve(L, ca.SX.eye(L.size1())))])
         return inverse(ca.tril(factor))
+
+    def of_modes(self, x: ca.MX) -> list[ca.MX]:
+        """What the modes of a candidate follow from, expressions.
+
+        The lower triangle of ``H = L^-1 K_SS L^-T`` (n, n); ``[L^-1, L^-1 B]`` (n, n + d), ``B = M_SS G + M_S0``, whose
+        products with the eigenvectors of H are shapes and participations; and the rigid-body mass (d, d). Where M may
+        be indefinite also ``L^-1 M_S0`` (n, d) and M_00 (d, d).
+        """
+        M, M_S0, M_00, _, _, L, H = self.function(x)
+        G, (n, d) = ca.DM(self.rigid_body), self.rigid_body.shape
+        inverse, whole, base = self.inverse(L), self.whole_factor(x), []
+        if whole.numel():
+            moved = ca.horzcat(G.T, ca.DM.eye(d)) @ whole  # [G; I]' L_M, whose first columns are (L^-1 B)'
+            loads, rigid = moved[:, :n].T, moved @ moved.T
+        else:
+            coupling = inverse @ M_S0
+            loads, rigid = ca.tril(L).T @ G + coupling, G.T @ (M @ G + M_S0) + M_S0.T @ G + M_00
+            base = [] if self.semidefinite else [coupling, M_00]
+        return [ca.tril((H + H.T) / 2), ca.horzcat(inverse, loads), rigid, *base]
 
     def factors(self, x: ca.MX) -> tuple[ca.MX, ca.MX]:
         """L with ``M_SS = L L'`` and its inverse."""
@@ -132,7 +155,8 @@ def assemble(
 class Blocks(NamedTuple):
     """The matrices as expressions.
 
-    `damping` and `ratios` are empty where there is none; `omega` is the symbol of the circular frequencies in `ratios`.
+    `damping` and `ratios` are empty where there is none, as `whole_factor` is; `omega` is the symbol of the circular
+    frequencies in `ratios`.
     """
 
     mass: MassBlocks
@@ -140,6 +164,7 @@ class Blocks(NamedTuple):
     damping: ca.MX
     ratios: ca.MX
     omega: ca.MX
+    whole_factor: ca.MX
 
     @property
     def by_matrix(self) -> tuple[ca.MX, ca.MX, ca.MX]:
@@ -172,7 +197,8 @@ def blocks_of(
     n = geometry.n
     y_mass, y_stiffness, y_damping = (ca.vertcat(ca.MX(0, 1), *group) for group in symbols)
 
-    made = MassBlocks(*_evaluated(lambda y: mass_blocks(mass.blocks(geometry, y), geometry), y_mass, ()))
+    *parts, whole = _evaluated(lambda y: _with_factor(mass_blocks(mass.blocks(geometry, y), geometry)), y_mass, ())
+    made = MassBlocks(*parts)
     L = made.factor
     of_mass = made._replace(factor=ca.tril(L), mass=L @ L.T if made.mass is None else made.mass)
     K = StiffnessBlocks(
@@ -190,7 +216,12 @@ def blocks_of(
         ca.MX(0, 0) if part is None else check_shape("damping", part, shape)
         for part, shape in ((C, (n, n)), (ratios, (n, 1)))
     )
-    return Blocks(made, K, C, ratios, omega)
+    return Blocks(made, K, C, ratios, omega, ca.MX(0, 0) if whole is None else whole)
+
+
+def _with_factor(made: MassBlocks) -> tuple[Any, ...]:
+    """The blocks, and the factor of the whole mass where the model has one."""
+    return (*made, made.whole if isinstance(made, FactoredMass) else None)
 
 
 def _evaluated(expressions: Any, y: ca.MX, before: tuple[ca.MX, ...]) -> list[ca.MX | None]:

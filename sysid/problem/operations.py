@@ -60,7 +60,8 @@ RESHAPING: dict[str, Callable[..., ca.MX]] = {
 SPLITTING = ("vertsplit", "horzsplit", "diagsplit")
 REPEATING: dict[str, Callable[..., ca.MX]] = {"horzrepmat": ca.repmat, "horzrepsum": ca.repsum}
 
-WITHOUT_PARAMETERS = frozenset({*UNARY, *BINARY, *PLAIN, *JOINING})
+ENTRYWISE = dict.fromkeys(UNARY, 1) | dict.fromkeys(BINARY, 2)  # number of arguments
+WITHOUT_PARAMETERS = frozenset({*ENTRYWISE, *PLAIN, *JOINING})
 NAMES = (
     *WITHOUT_PARAMETERS, *RESHAPING, *SPLITTING, *REPEATING, "const", "getnonzeros", "setnonzeros", "addnonzeros",
     "einstein", "solve", "call",

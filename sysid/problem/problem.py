@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -126,7 +127,8 @@ class Problem:
         for name in ("residuals", "constraints", "validation"):
             given = getattr(self, name)
             if not isinstance(given, list | tuple):
-                raise InputError(f"Problem: {name} is a {type(given).__name__}; give a list of them: {name}=[...]")
+                kind = "MX" if isinstance(given, ca.MX) else type(given).__name__
+                raise InputError(f"Problem: {name} is a {kind}; give a list of them: {name}=[...]")
             object.__setattr__(self, name, tuple(given))
         for at, test in enumerate(self.validation):
             instance(f"Problem: validation[{at}]", test, Measurement)

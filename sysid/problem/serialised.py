@@ -31,6 +31,12 @@ def interpolant_data(function: ca.Function) -> tuple[list[list[float]], list[flo
     return [grid[int(a) : int(b)] for a, b in pairwise(ends)], values
 
 
+def interpolant_options(function: ca.Function) -> bytes:
+    """All that an interpolant keeps beside the values of its inputs and what CasADi has derived of it."""
+    text = _described(function)
+    return text[text.index(b"Interpolant::ndim") :].partition(b"BSplineInterpolant::")[0]
+
+
 def _described(function: ca.Function) -> bytes:
     """The text with the names of its fields; a byte is two letters from "a" on, its lower half first."""
     text = function.serialize({"debug": True}).encode()

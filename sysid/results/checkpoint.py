@@ -19,9 +19,11 @@ from sysid.errors import InputError, path_of
 from sysid.files.tree import Tree, from_bytes, to_bytes
 from sysid.problem.problem import Problem
 from sysid.results.identification import Recipe
-from sysid.results.storage import atomically, missing_folders, remove_empty, unfinished_writings
+from sysid.results.lock import alone
+from sysid.results.storage import atomically, unfinished_writings
 from sysid.results.version import __version__
 from sysid.search.journal import EVERY, Journal
+from sysid.search.refinement import RefineBy
 from sysid.search.strategy import Strategy
 from sysid.structure.structure import Structure
 
@@ -39,6 +41,8 @@ class Begun:
     strategy : str
     seed : int
         Of the search.
+    refine_by : str or None
+        Of its swarm, where that was chosen.
     source : str
         Digest of the files that the problem was made from: a user's own model is code, which no problem holds.
     """
@@ -46,24 +50,28 @@ class Begun:
     recipe: Recipe
     strategy: str
     seed: int
+    refine_by: RefineBy | None = None
     source: str = field(default="", compare=False)
 
     def __str__(self) -> str:
         recipe = self.recipe
         noise = f", rng {recipe.rng}" if recipe.rng else ""
         data = "" if recipe.data is None else f", data {recipe.data}"
-        return f"{recipe.title}{noise}{data}, strategy {self.strategy}, seed {self.seed}"
+        refined = "" if self.refine_by is None else f" refined by {self.refine_by}"
+        return f"{recipe.title}{noise}{data}, strategy {self.strategy}{refined}, seed {self.seed}"
 
     def to_tree(self) -> Tree:
         """Give the fields by their names; `from_tree` takes them back."""
-        own = {"strategy": self.strategy, "seed": str(self.seed), "source": self.source}
+        own = {
+            "strategy": self.strategy, "seed": str(self.seed), "refine_by": self.refine_by, "source": self.source,
+        }  # fmt: skip
         return {"recipe": self.recipe.to_tree(), **own}
 
     @classmethod
     def from_tree(cls, tree: Tree) -> Begun:
-        """Give what `to_tree` made a tree of; earlier ones have no source."""
+        """Give what `to_tree` made a tree of; earlier ones have no source and no refinement."""
         recipe = Recipe.from_tree(tree["recipe"])
-        return cls(recipe, tree["strategy"], int(tree["seed"]), tree.get("source", ""))
+        return cls(recipe, tree["strategy"], int(tree["seed"]), tree.get("refine_by"), tree.get("source", ""))
 
 
 @dataclass(frozen=True)
@@ -123,8 +131,14 @@ class Checkpoint:
         Raises
         ------
         InputError
-            Where the file is of another search than `search` (see `identity`), or cannot be written.
+            Where the file is of another search than `search` (see `identity`), is in use, or cannot be written.
         """
+        lock = self.path.with_name(f".{self.path.name}.lock")
+        with alone(lock, str(self.path), "wait for its end, or give another file"), self._journal(search) as journal:
+            yield journal
+
+    @contextlib.contextmanager
+    def _journal(self, search: str) -> Iterator[Journal]:
         entries: Tree = {}
         if self.exists:
             tree = self.read()
@@ -147,7 +161,7 @@ class Checkpoint:
             except InputError as error:  # no reason to lose the search itself
                 warnings.warn(f"the search goes on, but its state is not kept: {error}", stacklevel=2)
 
-        journal, missing = Journal(try_to_write, entries, self.every), missing_folders(self.path.parent)
+        journal = Journal(try_to_write, entries, self.every)
         try:
             for left in unfinished_writings(self.path):
                 left.unlink(missing_ok=True)
@@ -158,7 +172,6 @@ class Checkpoint:
             if not journal.entries:
                 with contextlib.suppress(OSError):
                     self.remove()
-                remove_empty(missing)
 
 
 def identity(

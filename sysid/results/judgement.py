@@ -200,6 +200,8 @@ def _remarks(problem: Problem, end: Outcome, *, told_of_bounds: bool) -> Iterato
     yield from _outliers(problem, end)
     if not formulation.fits_records:
         yield "the problem states a misfit of its own; pictures and scores compare with the records as they are"
+    told = "no damping ratio is identified: no unknown of the damping alone enters what is fitted"
+    yield from [told] * (not formulation.tells_damping)
 
 
 def _outliers(problem: Problem, end: Outcome) -> Iterator[str]:

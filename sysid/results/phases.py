@@ -49,8 +49,8 @@ def rows_of_phases(it: Searched) -> list[list[str]]:
     """
     history = it.history
     rows = [_row(it, phase) for phase in history.phases if phase.x.size]
-    left = ("start", history.start), ("swarm", history.swarm), ("refinement", history.refinement)
-    plain = [(name, value) for name, value in (*left, ("local phase", history.local)) if np.isfinite(value)]
+    left = ("start", history.start), ("swarm", history.swarm), ("local phase", history.local)
+    plain = [(name, value) for name, value in left if np.isfinite(value)]
     return rows or [[name, f"{value:.4g}", *["-"] * (len(COLUMNS) - 2)] for name, value in plain]
 
 

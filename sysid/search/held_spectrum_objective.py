@@ -8,41 +8,55 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from functools import partial
+from queue import SimpleQueue
 
+import casadi as ca
 import numpy as np
 
 from sysid.measurement.noise import separable
 from sysid.modal_analysis.gain_series import GainSeries, SummedRecord
 from sysid.modal_analysis.response import records_of, weights_of, weights_of_test
+from sysid.problem.batch import CHUNK, Batch, expanded
 from sysid.problem.batch_modes import BatchModes, batch_modes
-from sysid.problem.given import MATRICES
 from sysid.problem.problem import Problem
 from sysid.problem.terms import Term, TestTerm
 from sysid.structure.structure import Array
 
-_MOST = 60_000  # coordinates a chunk: fewer take more calls of NumPy for each, and more leave a processor's cache
+_MOST = 65_000  # coordinates a chunk: fewer take more calls of NumPy for each, and more leave a processor's cache
 _STEP = 16  # chunks are multiples of it, because BLAS's products round alike at each of so many places
 _MOST_THREADS = 8
 # Relative squared error below which lines are summed: the difference of large numbers that stands for it has lost
 # half of its digits at 1e-12.
 _LEAST = 1e-6
+_DRAWS = 254  # candidates beside the corners of the box, from which the range of damping ratios is read
+_NARROWEST_RANGE, _WIDEST_RANGE = 1.01, 1e4  # of a ratio, upper over lower: the series of a wider one would be long
 
 
-def held_spectrum_objective(problem: Problem, term: Term, spectrum: Array | None) -> HeldSpectrumObjective | None:
+def held_spectrum_objective(
+    problem: Problem, term: Term, spectrum: Array | None, unknowns: ca.Function
+) -> HeldSpectrumObjective | None:
     """The fast objective of the problem's own test; None where it does not apply.
 
-    It does where all natural frequencies are held and the models of mass, stiffness and damping have their factors and
-    ratios in numbers (``batch``, see `sysid.models.model.MatrixModel`).
+    It does where all natural frequencies are held.
+
+    Parameters
+    ----------
+    problem, term, spectrum
+        As in `HeldSpectrumObjective`; no spectrum where none is held.
+    unknowns : casadi.Function
+        The swarm's coordinates to the unknowns x.
     """
-    formulation = problem.formulation
     if spectrum is None or not isinstance(term, TestTerm) or len(spectrum) != problem.geometry.n:
         return None
-    makers = [model.batch for model in formulation.models if hasattr(model, "batch")]
-    batches = [batch for maker in makers if (batch := maker(formulation.geometry)) is not None]
-    return HeldSpectrumObjective(problem, term, spectrum, batches) if len(batches) == len(MATRICES) else None
+    s, matrices = ca.MX.sym("s", problem.n_variables), term.matrices
+    x = unknowns(s)
+    parts = [matrices.ratio_function(x, ca.DM(np.sort(spectrum))), *matrices.of_modes(x)]
+    expansion = expanded(ca.Function("expansion", [s], [ca.densify(part) for part in parts]))
+    return HeldSpectrumObjective(problem, term, spectrum, expansion)
 
 
 class HeldSpectrumObjective:
@@ -55,8 +69,8 @@ class HeldSpectrumObjective:
         The problem's own test, or one in its place.
     spectrum : (n,), rad/s
         All natural frequencies, which take the place of each candidate's own.
-    batches : sequence of callable
-        The ``batch`` of the models of mass, stiffness and damping.
+    expansion : casadi.Function
+        The swarm's coordinates to damping ratios, and what `sysid.problem.batch_modes.batch_modes` takes.
     threads : int, optional
         The result does not depend on it, to the last bit; the machine's processors, at most eight, by default.
     """
@@ -66,15 +80,14 @@ class HeldSpectrumObjective:
         problem: Problem,
         term: TestTerm,
         spectrum: Array,
-        batches: Sequence[Callable[[Array], Array]],
+        expansion: ca.Function,
         threads: int | None = None,
     ) -> None:
-        formulation, test = problem.formulation, term.test
-        self._batches, self._parts, self._rigid_body = batches, formulation.parts, formulation.geometry.rigid_body
-        self._share = term.weight**2
-        low, high = (end[self._parts.damping] for end in formulation.box)
-        self._series = GainSeries(test.freq, np.sort(spectrum), low, high, shift=term.shift)
-        recovery = term.matrices.recovery, np.eye(formulation.geometry.d)
+        test = term.test
+        batch, workers = Batch(expansion), threads or min(os.cpu_count() or 1, _MOST_THREADS)
+        self.expansion, self._share = expansion, term.weight**2
+        self._series = GainSeries(test.freq, np.sort(spectrum), *_range_of_ratios(problem, batch), shift=term.shift)
+        recovery = term.matrices.recovery, np.eye(problem.geometry.d)
         self._records: list[tuple[SummedRecord, float]] = []
         sizes: list[tuple[float, float]] = []
         scales = weights_of_test(test, weighted=True)
@@ -85,7 +98,10 @@ class HeldSpectrumObjective:
             sizes.append((weights_of(record, std)[1], scale))
         # A record that weighs more than the accelerations loses its digits earlier.
         self._least = _LEAST * max(1.0, *(weighed**2 / scale**2 for weighed, scale in sizes))
-        self._pool = ThreadPoolExecutor(threads or min(os.cpu_count() or 1, _MOST_THREADS))
+        self._pool = ThreadPoolExecutor(workers)
+        self._expansions: SimpleQueue[Batch] = SimpleQueue()  # one a thread
+        for _ in range(workers):
+            self._expansions.put(copy(batch))
 
     def __call__(self, particles: Array, by_lines: Callable[[Array], Array]) -> Array:
         """Of each candidate.
@@ -98,25 +114,35 @@ class HeldSpectrumObjective:
             The same summed over lines, for candidates near the records and those outside of the range of damping.
         """
         ends = chunk_ends(*particles.shape)
-        squared = np.concatenate(list(self._pool.map(partial(self._chunk, particles), [0, *ends[:-1]], ends)))
-        held = np.logical_and(self._series.holds(particles[:, self._parts.damping]), squared > self._least)
+        chunks = self._pool.map(partial(self._chunk, particles), [0, *ends[:-1]], ends)
+        squared, inside = map(np.concatenate, zip(*chunks, strict=True))
+        held = np.logical_and(inside, squared > self._least)
         if not np.all(held):
             squared[~held] = by_lines(particles[~held]) / self._share
         return self._share * squared
 
-    def _chunk(self, particles: Array, start: int, end: int) -> Array:
+    def _chunk(self, particles: Array, start: int, end: int) -> tuple[Array, Array]:
+        """Squares, and whether the ratios are within the range of the series."""
         count = len(particles)
         full = particles[np.minimum(np.arange(start, end), count - 1)]  # the last one again and again fills the last
+        expansion = self._expansions.get()
+        ratios, *parts = expansion(full)
+        self._expansions.put(expansion)
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            return self._squared(full)[: count - start]
+            squared = self._squared(ratios[..., 0].T, batch_modes(*parts)[1])
+        return squared[: count - start], self._series.holds(ratios[: count - start, :, 0])
 
-    def _squared(self, particles: Array) -> Array:
-        pieces = zip(self._batches, self._parts, strict=True)
-        mass, stiffness, damping = (batch(particles[:, part]) for batch, part in pieces)
-        modes = batch_modes(mass, stiffness, self._rigid_body)
-        polynomials = self._series.polynomials(damping.T)
-        parts = zip(self._records, (_accelerations, _force), strict=False)
-        return np.sum([record.squared(*made(modes), polynomials) / size for (record, size), made in parts], axis=0)
+    def _squared(self, ratios: Array, modes: BatchModes) -> Array:
+        polynomials, inner = self._series.polynomials(ratios), None
+        (accelerations, size), *of_force = self._records
+        squared = np.zeros(len(modes.loads))
+        for force, size_of_force in of_force:
+            shapes, loads = _of_force(modes)
+            of_all = force.inner(loads, polynomials)
+            squared += force.squared(shapes, loads, polynomials, of_all) / size_of_force
+            n = modes.shapes.shape[1]
+            inner = np.ascontiguousarray(of_all[:, :n, :n]) if accelerations.weighs_like(force) else None
+        return squared + accelerations.squared(modes.shapes, modes.loads, polynomials, inner) / size
 
 
 def chunk_ends(count: int, size: int) -> list[int]:
@@ -125,18 +151,28 @@ def chunk_ends(count: int, size: int) -> list[int]:
     >>> chunk_ends(781, 156), chunk_ends(3, 156)
     ([192, 384, 576, 784], [16])
     """
-    steps = math.ceil(count / _STEP)
+    steps = math.ceil(count / CHUNK)
     chunks = min(2 * math.ceil(count * size / (2 * _MOST)), steps)
-    return [_STEP * (i * steps // chunks) for i in range(1, chunks + 1)]
+    ends = [CHUNK * (i * steps // chunks) for i in range(1, chunks)]
+    return [*ends, _STEP * math.ceil(count / _STEP)]
 
 
-def _accelerations(modes: BatchModes) -> tuple[Array, Array]:
-    """Shapes and participations."""
-    return modes.shapes, modes.loads
+def _range_of_ratios(problem: Problem, expansion: Batch) -> tuple[Array, Array]:
+    """Least and largest damping ratios (n,) that a swarm's box gives, of its ends and of draws between them.
+
+    Exact where ratios rise with every coordinate; elsewhere candidates beyond are left to the sum over lines.
+    """
+    lower, upper = problem.formulation.box
+    draws = np.random.default_rng(0).uniform(lower, upper, (_DRAWS, problem.n_variables))
+    ratios = expansion(np.vstack([lower, upper, draws]))[0][..., 0]
+    lowest, highest = np.fmin.reduce(ratios), np.fmax.reduce(ratios)
+    highest = np.where(highest > 0, highest, 1.0)  # no ratio of a structure: all goes by lines
+    lowest = np.maximum(lowest, highest / _WIDEST_RANGE)
+    return lowest, np.maximum(highest, lowest * _NARROWEST_RANGE)
 
 
-def _force(modes: BatchModes) -> tuple[Array, Array]:
-    """The same of the base force, with the rigid-body mass behind the modes."""
+def _of_force(modes: BatchModes) -> tuple[Array, Array]:
+    """Shapes and participations of the base force, with the rigid-body mass behind the modes."""
     rigid = modes.rigid_body_mass
     still = np.broadcast_to(np.eye(rigid.shape[1]), rigid.shape)
     return np.concatenate([modes.loads, still], axis=1), np.concatenate([modes.loads, rigid], axis=1)

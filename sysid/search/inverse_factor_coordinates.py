@@ -36,7 +36,7 @@ from sysid.structure.triangular import lower_triangle, triangle_entries
 _ROUND = 150  # iterations, after which Psi_0 is taken anew
 _LIMIT = "Maximum_Iterations_Exceeded"  # IPOPT's word for a round that was not long enough
 _LEAST_TIME = 1.0  # s, that a round is worth beginning with
-_SECONDS, _POWER = 0.5, 5.2  # of a processor, that the graphs of 10 modes take, and how that grows with the modes
+_SECONDS, _POWER = 0.2, 4.7  # of a processor, that the graphs of 10 modes take, and how that grows with the modes
 _LEAST_MASS = 1e-6  # of the rigid-body mass; the least base mass that a fit starts with
 _FLAT = 1e-10  # of the largest curvature; along less the objective does not change
 
@@ -203,7 +203,7 @@ def cayley(S: ca.MX) -> ca.MX:
 
 
 def _fit_about(problem: Problem, x: Array, error: InverseFactorError, monitor: IterationMonitor, limit: int) -> End:
-    """One run of IPOPT of at most `limit` iterations, with Psi_0 of the unknowns `x` that it starts from."""
+    """IPOPT from the unknowns `x`, with their Psi_0, in at most `limit` iterations; then again with totals held."""
     structure = problem.structure(x)
     start, n = coordinates_of(structure), structure.n
     z = NonlinearProgram()
@@ -215,11 +215,15 @@ def _fit_about(problem: Problem, x: Array, error: InverseFactorError, monitor: I
     skew = z.variable("rotation of modes", np.zeros(n * (n - 1) // 2))
     omega, ratios = spectrum_near(problem, structure, modes_of(structure), z)
     y = ca.vertcat(inverse, loads, base, skew, ca.log(omega), ca.log(ratios))
-    rows = error.totals(inverse, loads, base)
-    if rows.numel():
-        z.constrain(rows)
     objective, derivatives = error.gradient(y, start.psi)[0], _derivatives(z, y, error, start.psi)
     best, status = z.minimize(objective, monitor, limit, derivatives, barrier="monotone")
+    rows = error.totals(inverse, loads, base)
+    if rows.numel() and monitor.stopped is None:
+        # Held from the beginning, totals make local minima on the way.
+        z.start = [best]
+        z.constrain(rows)
+        derivatives = _derivatives(z, y, error, start.psi)
+        best, status = z.minimize(objective, monitor, limit, derivatives, barrier="monotone")
     end = ca.Function("end", [z.z], [*error.modes(y, start.psi), omega, ratios])
     phi, gamma, rigid, omega, ratios = (np.asarray(part) for part in end(best))
     try:

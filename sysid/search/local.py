@@ -30,8 +30,8 @@ class LocalResult:
     Attributes
     ----------
     x : (n_variables,)
-        The problem's unknowns; not held by the box where the coordinates are modal, nor, in Cholesky coordinates, are
-        the entries of L_H: frequencies have windows about those stated.
+        The problem's unknowns; where modes are free, only the damping is held by the box, and frequencies have windows
+        about those stated.
     success : bool
         IPOPT's status is Solve_Succeeded or Solved_To_Acceptable_Level, or the fit is exact to round-off.
     message : str
@@ -75,9 +75,10 @@ def solve(
     smoothed : sequence of TestTerm, optional
         To be fitted in the place of the problem's tests, where modes are not free.
     coordinates : {"modal", "cholesky", "entries"}
-        Where modes are free: mode shapes and participations; healed entries of L_M, the spectrum of H near the stated
-        one and log zeta, as in the paper; or the paper's plain x, the spectrum of H free, which goes nowhere from
-        most starts and serves comparison. Other problems are searched in their own unknowns, whatever is given.
+        Where modes are free: mode shapes and participations; the inverse of the mass's Cholesky factor, the spectrum of
+        H near the stated one and log zeta, for the published algorithm; or the paper's plain x, the spectrum of H free,
+        which goes nowhere from most starts and serves comparison. Other problems are searched in their own unknowns,
+        whatever is given.
     """
     watched = IterationMonitor(monitor, max_time)
     if not problem.free_modes or coordinates == "entries":

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from sysid.modal_analysis.response import columns
-from sysid.problem.batch_objective import Batch, expanded, in_chunks
+from sysid.problem.batch import Batch, expanded, in_chunks
 from sysid.problem.problem import Problem
 from sysid.problem.terms import ExpressionTerm, TestTerm
 from sysid.structure.structure import Array, ComplexArray

@@ -15,7 +15,7 @@ from sysid.nlp import suffices
 from sysid.search.journal import Journal
 from sysid.structure.structure import Array
 
-Phase = Literal["poles", "swarm", "refinement", "continuation", "local phase", "other answers"]
+Phase = Literal["poles", "swarm", "continuation", "local phase", "other answers"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +25,8 @@ class Progress:
     Attributes
     ----------
     phase : str
-        "poles" (of the records), "swarm", "refinement", "continuation" (of widened peaks), "local phase" or
-        "other answers" (the search for them, before an answer is called determined).
+        "poles" (of the records), "swarm", "continuation" (of widened peaks), "local phase" or "other answers" (the
+        search for them, before an answer is called determined).
     iteration, of : int
         The iteration, and the most there can be (0: not known).
     objective : float

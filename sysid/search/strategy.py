@@ -23,7 +23,7 @@ class Phase:
     Attributes
     ----------
     name : str
-        "start", "swarm", "refinement", "continuation", "local phase" or "Huber's loss" (its rounds together).
+        "start", "swarm", "continuation", "local phase" or "Huber's loss" (its rounds together).
     objective : float
     x : (n_variables,)
         The best unknowns then; empty where the phase had none.
@@ -50,15 +50,21 @@ class History:
 
     Attributes
     ----------
-    start, swarm, refinement, local : float
+    start, swarm, local : float
         Objective of the best candidate after each phase: the Latin hypercube (or the start that was given; of
-        continuation the guess), the swarm, the eigenvalue refinement, the local phase.
+        continuation the guess), the swarm, the local phase.
     swarm_curve, local_curve : ndarray
         Best objective after each iteration of the swarm, and objective of each local iterate. Where the swarm searched
         responses with widened peaks its curve is theirs, and `start` is NaN. Where modes are free and
         the noise of a force is not stated, IPOPT weighs the force by what free residues leave of it.
     refinement_error : float
-        Largest relative difference of a refined eigenvalue (w²) from the one that was given.
+        Largest relative difference of a refined eigenvalue (w²) of the swarm's best from the one that was given.
+    leaders_tried, leaders_won : int
+        Leaders of the swarm that IPOPT refined beside the closed form, and those of them that it left at a lower
+        objective; over all swarms.
+    refinement_statuses : tuple of (str, int)
+        How often IPOPT ended with each status when it refined eigenvalues, of leaders or of every candidate; over all
+        swarms.
     states : tuple of (str, int)
         How often the swarm was in each evolutionary state.
     evaluations : int
@@ -75,11 +81,13 @@ class History:
 
     start: float = np.nan
     swarm: float = np.nan
-    refinement: float = np.nan
     local: float = np.nan
     swarm_curve: Array = field(default_factory=lambda: np.zeros(0))
     local_curve: Array = field(default_factory=lambda: np.zeros(0))
     refinement_error: float = np.nan
+    leaders_tried: int = 0
+    leaders_won: int = 0
+    refinement_statuses: tuple[tuple[str, int], ...] = ()
     states: tuple[tuple[str, int], ...] = ()
     evaluations: int = 0
     wall_time: float = 0.0
@@ -87,19 +95,41 @@ class History:
     restarts: int = 0
     phases: tuple[Phase, ...] = ()
 
+    @property
+    def refinement_in_words(self) -> str:
+        """What IPOPT's refinement of eigenvalues came to; empty where it did not run."""
+        if not self.refinement_statuses:
+            return ""
+        ended = ", ".join(f"{status} {count}" for status, count in self.refinement_statuses)
+        if not self.leaders_tried:
+            return f"IPOPT refined {sum(count for _, count in self.refinement_statuses)} candidates ({ended})"
+        leaders = f"{self.leaders_tried} leader" + "s" * (self.leaders_tried != 1)
+        return f"IPOPT refined {leaders} of the swarm, {self.leaders_won} better than the closed form ({ended})"
+
     def to_tree(self) -> dict[str, Any]:
         """Give all of it as numbers, arrays and texts; `from_tree` takes them back."""
-        names, counts = tuple(name for name, _ in self.states), [count for _, count in self.states]
         phases = [vars(phase) for phase in self.phases]
-        return {**vars(self), "states": names, "state_counts": np.array(counts, dtype=np.int64), "phases": phases}
+        return {
+            **vars(self), "phases": phases,
+            **_counts("states", "state_counts", self.states),
+            **_counts("refinement_statuses", "refinement_counts", self.refinement_statuses),
+        }  # fmt: skip
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> History:
         """Give the history of a tree that `to_tree` made."""
         given = dict(tree)
-        counts = given.pop("state_counts").tolist()
-        phases = tuple(Phase(**phase) for phase in given.pop("phases", ()))  # files made before have none
-        return cls(**{**given, "states": tuple(zip(tree["states"], counts, strict=True)), "phases": phases})
+        for name, numbers in (("states", "state_counts"), ("refinement_statuses", "refinement_counts")):
+            given[name] = tuple(zip(tree[name], given.pop(numbers).tolist(), strict=True))
+        return cls(**{**given, "phases": tuple(Phase(**phase) for phase in tree["phases"])})
+
+
+def _counts(names: str, numbers: str, counted: tuple[tuple[str, int], ...]) -> dict[str, Any]:
+    """Counted words as a text and an array, under these two names."""
+    return {
+        names: tuple(name for name, _ in counted),
+        numbers: np.array([number for _, number in counted], dtype=np.int64),
+    }
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import SolverError, choice, flag, instance, number, text, whole_number
 from sysid.modal_analysis.response import error_of_accelerations
-from sysid.models.spectrum import by_ipopt, closed_form, seconds_to_begin
 from sysid.nlp import EXACT
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
@@ -20,11 +19,11 @@ from sysid.search.continuation import descend, smoothed_tests
 from sysid.search.journal import Part
 from sysid.search.local import Coordinates
 from sysid.search.modal_coordinates import fits_worse_than_free_residues, modes_of
+from sysid.search.refinement import RefineBy, Refiner, Tally
 from sysid.search.session import Session, Stop, in_time
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, as_unknowns
 from sysid.search.swarm_objective import SwarmObjective
 from sysid.structure.structure import Array, Structure
-from sysid.structure.triangular import triangle, triangle_entries
 from sysid.swarm import SwarmProgress, SwarmSettings, minimize_swarm
 
 _SETTINGS = SwarmSettings(inertia_b1=0.8, inertia_b2=0.5, acceleration_lower=0.5, acceleration_sum=3.0, guides=3)
@@ -33,7 +32,7 @@ _IDLE = (
     "candidates too: what the swarm itself found stands in the history (strategy 'hpso-ls' depends on it)"
 )
 _TRAPPED = "that is a local minimum, as free residues at these poles fit clearly better"
-_MANY, _FEW = 256, 8  # candidates between two looks at the clock; few where IPOPT refines each
+_MANY, _FEW = 256, 1  # candidates between two looks at the clock; few where IPOPT refines each
 _UNSEEN = 1e6  # in the place of the objective of candidates that there is no time for
 _SAMPLE = 1.6e-7  # s of a processor, that a coordinate of a particle of the first sample takes
 _DOUBTFUL = 0.1  # objective above which a problem without free modes is searched again
@@ -58,10 +57,11 @@ class Swarm:
         The swarm ends where its best has not improved by this fraction in so many iterations.
     refine : bool
         Give each candidate the measured spectrum, from its own L_H (eq. 31).
-    refine_by : {"closed form", "ipopt"}
+    refine_by : {"closed-form", "ipopt", "leaders"}
         The nearest matrix of that spectrum; or the paper's nonlinear programme by IPOPT with exact derivatives for each
-        candidate, 30 ms each with 6 unknown frequencies, for small problems. Either way the swarm's best is refined by
-        both at the end, and the better taken.
+        candidate, which is for small problems (some 15 ms a candidate with 4 or 6 sensors, 30 ms with 10); or the
+        closed form, and IPOPT on each new leader of the swarm: the better of both is written back to the leader.
+        Where IPOPT does not succeed the closed form stands; the history counts how it ended.
     write_back : bool
         Whether the refined L_H takes the candidate's place in the swarm, or serves its objective alone. The paper does
         not say; alone, the swarm keeps its own motion.
@@ -105,7 +105,7 @@ class Swarm:
     stall_iterations: int = 40
     stall_tolerance: float = 1e-3
     refine: bool = True
-    refine_by: Literal["closed form", "ipopt"] = "closed form"
+    refine_by: RefineBy = "closed-form"
     write_back: bool = False
     gradient_every: int = 0
     local: Coordinates | None = "modal"
@@ -115,7 +115,7 @@ class Swarm:
 
     def __post_init__(self) -> None:
         choice("Swarm: local", self.local, (*get_args(Coordinates), None))
-        choice("Swarm: refine_by", self.refine_by, ("closed form", "ipopt"))
+        choice("Swarm: refine_by", self.refine_by, get_args(RefineBy))
         least = {"max_iterations": 1, "n_particles": 2, "stall_iterations": 1, "gradient_every": 0, "restarts": 0}
         for field, at_least in least.items():
             value = getattr(self, field)
@@ -133,12 +133,15 @@ class Swarm:
 
         The usual constants of the sources that the paper names (b1 = 0.3, b2 = 0.2; c1 + c2 up to 4), the spectrum of
         each candidate refined from its own L_H, and a local phase in the inverse of the mass's Cholesky factor, where
-        the paper's own entries end on IPOPT's iteration limit with noise. What the paper leaves
-        open, or its printed text has lost, is chosen here: refinement in closed form, not written back; 150 iterations,
-        the stop rules, and up to four restarts; a particle stops at a bound and its velocity there is reversed; the
-        state of the swarm is estimated with the leader's present position (`sysid.swarm.ParticleSwarm`).
+        the paper's own entries end on IPOPT's iteration limit with noise. What the paper leaves open, or its printed
+        text has lost, is chosen here: refinement in closed form, not written back, and by IPOPT of each new leader
+        alone (``refine_by="ipopt"`` refines every candidate so, as the paper does); 150 iterations, the stop rules, and
+        up to four restarts; a particle stops at a bound and its velocity there is reversed; the state of the swarm is
+        estimated with the leader's present position (`sysid.swarm.ParticleSwarm`).
         """
-        return cls(**{"settings": SwarmSettings(), "local": "cholesky", "name": "hpso-ls", **changes})
+        return cls(
+            **{"settings": SwarmSettings(), "local": "cholesky", "name": "hpso-ls", "refine_by": "leaders", **changes}
+        )
 
     def refusal(self, problem: Problem, start: ArrayLike | Structure | None) -> str | None:
         """Why it cannot search a problem: what healing cannot meet, or more modes than degrees of freedom."""
@@ -178,7 +181,7 @@ class Swarm:
         if refusal:
             raise DoesNotApplyError(refusal)
         best: _Search | None = None
-        evaluations, restarts, most = 0, -1, session.max_evaluations
+        evaluations, restarts, most, tally = 0, -1, session.max_evaluations, Tally()
         for child in session.random.spawn(1 + self.restarts):
             search = _Search(problem, self, session)
             restarts += 1
@@ -189,6 +192,7 @@ class Swarm:
                 stopped, search.success, search.message = stop, False, str(stop) or "interrupted"
                 search.stopped()
             evaluations += search.history.evaluations
+            tally.add(search.tally)
             if search.x is not None and (best is None or search.beats(best)):
                 best = search
             if best is None:
@@ -203,6 +207,7 @@ class Swarm:
         if stopped is not None:
             best.success, best.message = False, str(stopped) or "interrupted"
         history = replace(best.history, evaluations=evaluations, restarts=restarts, phases=tuple(best.phases))
+        history = replace(history, **tally.of_history)
         idle = problem.free_modes and self.local == "modal" and best.success
         return Outcome(
             problem.structure(best.found), best.found, self.name, best.success, best.message, history, stopped,
@@ -211,15 +216,14 @@ class Swarm:
 
 
 class _Search:
-    """One swarm, its refinement and its local phase: the best so far and its history."""
+    """One swarm and its local phase: the best so far and its history."""
 
     def __init__(self, problem: Problem, options: Swarm, session: Session) -> None:
         self.problem, self.options, self.session = problem, options, session
         self.x: Array | None = None
-        self.raw: Array = np.zeros(0)
-        self.unrefined = 0  # candidates that IPOPT could not refine
+        self.tally = Tally()
+        self.refiner: Refiner | None = None  # where each candidate is given the measured spectrum
         self.steps: list[tuple[TestTerm, ...]] = []
-        self.spectrum: Array | None = None  # the measured one, where each candidate is given it
         self.history = History()
         self.phases: list[Phase] = []
         self.trapped = False
@@ -262,8 +266,6 @@ class _Search:
     ) -> None:
         """All phases."""
         self.swarm(random, start, max_evaluations)
-        if self.spectrum is not None:
-            self.refine(self.spectrum)
         if self.options.local is not None:
             self.local(self.options.local)
 
@@ -278,15 +280,11 @@ class _Search:
         problem, options, session = self.problem, self.options, self.session
         self._check_time()
         objective, self.steps = options.searched(problem, session)
-        self.spectrum = objective.spectrum
+        if objective.spectrum is not None:
+            self.refiner = Refiner(problem, options.refine_by, objective.spectrum, session, self.tally)
         self._log_start()
         record = _SwarmRecord(self, objective, session.journal.part("swarm"))
-        repair = None if self.spectrum is None else in_time(self.refined_rows, lambda rows: rows, session, _FEW)
-        slow = options.refine_by == "ipopt" and not options.write_back and repair is not None
-        evaluate = in_time(
-            (lambda rows: objective(self.refined_rows(rows))) if slow else objective,
-            lambda rows: np.full(len(rows), _UNSEEN), session, _FEW if slow else _MANY,
-        )  # fmt: skip
+        evaluate, repair = self._functions(objective)
         result = minimize_swarm(
             evaluate,
             np.column_stack(problem.formulation.box),
@@ -301,7 +299,8 @@ class _Search:
             callback=record.take,
             improve=self._improver(objective) if options.gradient_every else None,
             improve_every=options.gradient_every,
-            repair=repair if options.write_back else None,
+            on_leader=self.refiner.of_leader(objective) if self.refiner and options.refine_by == "leaders" else None,
+            repair=repair,
             x0=None if start is None else problem.formulation.to_sampling(as_unknowns(problem, start)),
             settings=options.settings,
             resume=record.resumed(),
@@ -317,17 +316,32 @@ class _Search:
             self.history = replace(self.history, swarm=self.objective)
         if result.n_nan:
             session.log(f"{result.n_nan} of {result.nfev} candidates were no structure (not a number)")
-        if self.unrefined:
-            session.log(f"IPOPT refined all but {self.unrefined} candidates, which took the closed form")
+        if self.refiner is not None:
+            error = self.refiner.error(self.found)
+            self.history = replace(self.history, refinement_error=error, **self.tally.of_history)
+            session.log(f"eigenvalues of its best within {error:.1e} of the given ones")
+        if self.history.refinement_in_words:
+            session.log(self.history.refinement_in_words)
         self.ended("swarm", result.nfev - sum(phase.evaluations for phase in self.phases))
+
+    def _functions(self, objective: SwarmObjective) -> tuple[Callable[[Array], Array], Callable[[Array], Array] | None]:
+        """What gives rows their objectives, and what writes refined entries of L_H back to them; both in time."""
+        session, options, refiner = self.session, self.options, self.refiner
+        slow = refiner is not None and options.refine_by == "ipopt"
+        repair, at_once = None, _FEW if slow else _MANY
+        if refiner is not None and options.write_back:
+            repair = in_time(refiner.rows, lambda rows: rows, session, at_once)
+
+        def evaluate(rows: Array) -> Array:
+            return objective(refiner.rows(rows) if refiner is not None and slow and repair is None else rows)
+
+        return in_time(evaluate, lambda rows: np.full(len(rows), _UNSEEN), session, at_once), repair
 
     def _check_time(self) -> None:
         """Stop where the time cannot suffice for the first sample."""
         problem, options = self.problem, self.options
         particles = options.n_particles or 5 * problem.n_variables
         seconds = _SAMPLE * particles * problem.n_variables
-        if options.refine_by == "ipopt":
-            seconds += seconds_to_begin(problem.geometry.n)
         if not self.session.allows(seconds):
             raise Stop(f"a swarm of {particles} particles takes some {seconds:.1g} s to begin: too little time")
 
@@ -364,53 +378,9 @@ class _Search:
         if self.x is not None and [phase.name for phase in self.phases] == ["start"]:
             self.ended("swarm", self.history.evaluations - self.phases[0].evaluations)
 
-    def refined_rows(self, rows: Array) -> Array:
-        """Rows (k, n_variables), of the swarm or of unknowns alike, with refined entries of L_H."""
-        refined, failed = self._with_spectrum(rows, by_solver=self.options.refine_by == "ipopt")
-        self.unrefined += failed
-        return refined
-
-    def _with_spectrum(self, rows: Array, *, by_solver: bool) -> tuple[Array, int]:
-        """Rows with refined entries of L_H, and of how many IPOPT failed."""
-        assert self.spectrum is not None
-        part, with_spectrum = self.problem.formulation.parts.stiffness, self.problem.formulation.with_spectrum
-        refined = rows.copy()
-        refined[:, part], failed = with_spectrum(rows[:, part], self.spectrum, by_solver=by_solver)
-        return refined, failed
-
     def refined(self, x: Array) -> Array:
         """The unknowns of the structure that `x` was given its objective for: its spectrum replaced."""
-        if self.spectrum is None:
-            return x
-        return self._with_spectrum(x[None], by_solver=self.options.refine_by == "ipopt")[0][0]
-
-    def refine(self, spectrum: Array) -> None:
-        """Refine the swarm's best from its own L_H through IPOPT, as the paper does, beside the closed form."""
-        self.session.report("refinement", 0, 1, self.history.swarm)
-        part, n = self.problem.formulation.parts.stiffness, self.problem.geometry.n
-        factor = triangle(self.raw[part], n)
-        session, seconds = self.session, seconds_to_begin(n)
-        ways = [closed_form(factor, spectrum)]
-        if session.allows(seconds):
-            ways.append(by_ipopt(factor, spectrum, session.left))
-        ends = []
-        for way in ways:
-            x = self.raw.copy()
-            x[part] = triangle_entries(way.factor)
-            ends.append((self.problem.objective(x), x, way))
-        (closed, _, _), (other, _, solved) = ends[0], ends[-1]
-        told = f"refinement of eigenvalues 1 to {spectrum.size} of {n}"
-        if len(ends) > 1:
-            session.log(
-                f"{told}: {solved.message}, within {solved.error:.1e} of the given ones, objective {other:.4e} "
-                f"(closed form {closed:.4e})"
-            )
-        else:
-            session.left_out = True
-            session.log(f"{told}: in closed form alone, as IPOPT takes some {seconds:.1g} s to set up: too little time")
-        objective, self.x, chosen = ends[1] if solved.success and other < closed else ends[0]
-        self.history = replace(self.history, refinement=objective, refinement_error=chosen.error)
-        self.ended("refinement", 1)
+        return x if self.refiner is None else self.refiner.one(x)
 
     def local(self, coordinates: Coordinates) -> None:
         """Run the local phase; keep its answer where it is better."""
@@ -459,7 +429,8 @@ class _SwarmRecord:
         if found is None:
             return None
         swarm = found["search"]["swarm"]
-        self.search.phases, self.search.unrefined = [Phase(**found["start"])], found["unrefined"]
+        self.search.phases = [Phase(**found["start"])]
+        self.search.tally.resume(found["refinements"])
         self.curve = swarm["history"].tolist()
         self._tell(swarm["best_x"], swarm["best_cost"], swarm["nfev"])
         return dict(found["search"])
@@ -485,8 +456,7 @@ class _SwarmRecord:
     def _tell(self, x: Array, objective: float, evaluations: int) -> None:
         search, curve = self.search, self.curve
         if np.isfinite(objective):
-            search.raw = self.objective.unknowns(x)
-            search.x = search.refined(search.raw)
+            search.x = search.refined(self.objective.unknowns(x))
             if not search.phases:
                 search.ended("start", evaluations)
         start, best = (np.nan, np.nan) if search.steps else (curve[0], curve[-1])  # the steps' are not the records' own
@@ -497,4 +467,4 @@ class _SwarmRecord:
     def _content(self) -> dict[str, Any]:
         assert self.last is not None
         start = dict(vars(self.search.phases[0]))
-        return {"search": self.last.snapshot(), "start": start, "unrefined": self.search.unrefined}
+        return {"search": self.last.snapshot(), "start": start, "refinements": self.search.tally.to_tree()}

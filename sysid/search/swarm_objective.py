@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
-from sysid.problem.batch_objective import Batch, expanded, in_chunks
+from sysid.problem.batch import Batch, expanded
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.search.held_spectrum_objective import held_spectrum_objective
@@ -44,7 +44,7 @@ class SwarmObjective:
             x = ca.fmin(ca.fmax(formulation.healing(x), ca.DM(formulation.lower)), ca.DM(formulation.upper))
         self._unknowns = expanded(ca.Function("unknowns", [s], [ca.densify(x)]))
         self._all_unknowns = Batch(self._unknowns)
-        self._held = held_spectrum_objective(problem, self.terms[0], spectrum)
+        self._held = held_spectrum_objective(problem, self.terms[0], spectrum, self._unknowns)
 
     def __call__(self, particles: Array) -> Array:
         """Objective of each row; NaN where a candidate is no structure."""
@@ -63,7 +63,7 @@ class SwarmObjective:
 
     def _x(self, particles: Array) -> Array:
         """Unknowns of each row, (n_particles, n_variables)."""
-        return in_chunks(lambda chunk: self._all_unknowns(chunk)[0][:, :, 0], particles)
+        return self._all_unknowns(particles)[0][:, :, 0]
 
     def _by_lines(self, particles: Array) -> Array:
         """The first term's part of the squared objective, summed over all lines, (n_particles,)."""

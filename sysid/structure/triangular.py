@@ -27,16 +27,6 @@ def triangle(entries: Array, size: int) -> Array:
     return matrix
 
 
-def inverse_triangles(stack: Array) -> Array:
-    """Inverses of lower-triangular matrices that stand side by side, (n, n, count) each."""
-    scale = 1 / np.einsum("iip->ip", stack)
-    inverse = np.zeros_like(stack)
-    for i, row in enumerate(inverse):  # forward substitution
-        np.einsum("jp,jkp->kp", stack[i, :i] * -scale[i], inverse[:i, :i], out=row[:i])
-        row[i] = scale[i]
-    return inverse
-
-
 def triangle_entries(matrix: Array) -> Array:
     """Entries of a matrix's lower triangle, row by row."""
     return matrix[np.tril_indices(len(matrix))]

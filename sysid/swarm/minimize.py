@@ -67,6 +67,7 @@ def minimize_swarm(
     callback: Callable[[SwarmProgress], object] | None = None,
     improve: Callable[[FloatArray], ArrayLike] | None = None,
     improve_every: int = 0,
+    on_leader: Callable[[FloatArray, float], tuple[ArrayLike, float]] | None = None,
     repair: Callable[[FloatArray], ArrayLike] | None = None,
     x0: ArrayLike | None = None,
     settings: SwarmSettings | None = None,
@@ -110,6 +111,10 @@ def minimize_swarm(
         not finite is dropped. It is called once for each best point.
     improve_every : int
         Iterations between two calls of `improve`; with 0 it is never called.
+    on_leader : callable, optional
+        Called with each new global best (n_dim,) and its cost, at the end of the iteration that found it, the sample's
+        too; returns the point (n_dim,), inside the bounds, and the cost that take its place in the swarm: the same ones
+        or others whose cost is not higher. What it evaluates is not counted.
     repair : callable, optional
         Takes the rows (k, n_dim) of an iteration to finite rows of the same shape, which are clipped to the bounds,
         evaluated, and become the particles' positions: a correction that is written back.
@@ -134,12 +139,14 @@ def minimize_swarm(
     Raises
     ------
     InputError
-        If an argument cannot be used, or `fun` or `improve` returns the wrong shape.
+        If an argument cannot be used, `fun`, `improve` or `on_leader` returns the wrong shape, or the last one a point
+        outside the bounds or of a higher cost.
 
     Notes
     -----
-    Any other exception of `fun`, `improve` or `callback`, and KeyboardInterrupt, is passed on to the caller. To keep
-    the best so far then, keep the last `SwarmProgress` that the callback was given, or drive a `ParticleSwarm`.
+    Any other exception of `fun`, `improve`, `on_leader` or `callback`, and KeyboardInterrupt, is passed on to the
+    caller. To keep the best so far then, keep the last `SwarmProgress` that the callback was given, or drive a
+    `ParticleSwarm`.
 
     The steps of elitist learning shrink over `max_iterations`, or over as many as `max_evaluations` allows.
 
@@ -161,7 +168,9 @@ def minimize_swarm(
         stall_iterations=stall_iterations,
         stall_tolerance=stall_tolerance,
     )
-    for name, given in (("callback", callback), ("improve", improve), ("repair", repair)):
+    for name, given in (
+        ("callback", callback), ("improve", improve), ("on_leader", on_leader), ("repair", repair),
+    ):  # fmt: skip
         function(name, given)
     refuse((not callable(fun), f"fun is {fun!r}; give a function of rows (k, n_dim) that returns their costs."))
     improve_every = whole_number("improve_every", improve_every, at_least=0)
@@ -175,7 +184,7 @@ def minimize_swarm(
                 "raise it or lower n_particles."
             )
         swarm.horizon = min(max_iterations, max_evaluations // swarm.n_particles)
-    search = _Search(swarm, fun, repair, rules, improve if improve_every else None, improve_every)
+    search = _Search(swarm, fun, repair, rules, improve if improve_every else None, improve_every, on_leader)
     if resume is not None:
         search.resume(resume)
     reason = search.run(callback)
@@ -199,15 +208,18 @@ class _Search:
     rules: StopRules
     improve: Callable[[FloatArray], ArrayLike] | None
     improve_every: int
+    on_leader: Callable[[FloatArray, float], tuple[ArrayLike, float]] | None
     n_improved: int = 0  # how often `improve` found better
     refined: FloatArray | None = None  # the last point that it was given, or gave
+    led: FloatArray | None = None  # the last point that `on_leader` gave
 
     def snapshot(self) -> dict[str, Any]:
-        return {"swarm": self.swarm.to_tree(), "n_improved": self.n_improved, "refined": self.refined}
+        own = {name: getattr(self, name) for name in ("n_improved", "refined", "led")}
+        return {"swarm": self.swarm.to_tree(), **own}
 
     def resume(self, snapshot: dict[str, Any]) -> None:
         self.swarm.resume(snapshot["swarm"])
-        self.n_improved, self.refined = snapshot["n_improved"], snapshot["refined"]
+        self.n_improved, self.refined, self.led = (snapshot[name] for name in ("n_improved", "refined", "led"))
 
     def run(self, callback: Callable[[SwarmProgress], object] | None) -> StopReason:
         """Iterate; why it ended."""
@@ -219,6 +231,7 @@ class _Search:
             if not rules.room_for(len(rows), swarm.nfev):
                 return StopReason.MAX_EVALUATIONS
             self._tell(rows)
+            self._follow_leader()
             if self.improve is not None and swarm.nit % self.improve_every == 0 and math.isfinite(swarm.best_cost):
                 seen = self.refined is not None and np.array_equal(self.refined, swarm.best_x)
                 if not seen and rules.room_for(1, swarm.nfev):
@@ -241,6 +254,17 @@ class _Search:
             repaired = swarm.box.clip(checked_rows(self.repair(rows), rows.shape, "that repair returned"))
             rows = repaired.copy()
         swarm.tell(checked_costs(self.fun(rows), len(rows), "that fun returned"), repaired)
+
+    def _follow_leader(self) -> None:
+        """Let `on_leader` put another point in the place of a new global best."""
+        swarm = self.swarm
+        if self.on_leader is None or not math.isfinite(swarm.best_cost):
+            return
+        if self.led is None or not np.array_equal(self.led, swarm.best_x):
+            point, cost = self.on_leader(swarm.best_x, swarm.best_cost)
+            if cost != swarm.best_cost or not np.array_equal(point, swarm.best_x):
+                swarm.replace_best(point, cost)
+            self.led = swarm.best_x
 
 
 def _refine(

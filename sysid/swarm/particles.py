@@ -302,6 +302,34 @@ class ParticleSwarm:
             self.history[-1] = value
         return True
 
+    def replace_best(self, x: ArrayLike, cost: float) -> None:
+        """Put another point in the place of the global best, between `tell` and the next `ask`.
+
+        The leading particle is moved there and carries it as its own best. Nothing is counted.
+
+        Parameters
+        ----------
+        x : (n_dim,) array-like
+            The point, inside the bounds.
+        cost : float
+            Its cost, not above that of the global best.
+
+        Raises
+        ------
+        InputError
+            If the point has the wrong shape or lies outside the bounds, or the cost is higher.
+        RuntimeError
+            If rows have been asked for whose costs are not told.
+        """
+        if self._asked is not None:
+            raise RuntimeError("replace_best was called between ask and tell; tell the costs of the asked rows first.")
+        point, value = self.box.point(x, "x"), float(checked_costs([cost], 1, "given")[0])
+        if not value <= self.best_cost:
+            raise InputError(f"cost {value:g} is above that of the global best, {self.best_cost:g}; keep that one.")
+        self._lead(self.box.to_unit(point), point, value)
+        if self.history:
+            self.history[-1] = value
+
     def _finite_or_inf(self, values: FloatArray) -> FloatArray:
         finite = np.isfinite(values)
         self.nfev += values.size

@@ -133,6 +133,20 @@ class TestForce:
         assert len(said(wrong, truth)) == 1
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.005])
+@pytest.mark.parametrize(("share", "is_told"), [(0.3, True), (0.0, False)])
+def test_a_sensor_that_moves_with_the_base_beside_its_modes_is_told_by_how_much(noise, share, is_told):
+    """The second floor records 30 % of the base's motion more than it makes: neither modes nor G hold that."""
+    truth = building()
+    test = simulate(truth, lines(truth), noise=noise, rng=2)
+    wrong = changed(test, response=test.response + share * np.array([0.0, 1.0, 0.0])[:, None] * test.base)
+    sentences = said(wrong, truth)
+    found = [sentence for sentence in sentences if "move with the base beside their modes" in sentence]
+    assert len(found) == is_told
+    for sentence in found:
+        assert sentence.startswith("1 of 3 sensors") and "sensor 2 by 0.3 times base direction 1" in sentence
+
+
 class TestTwins:
     @staticmethod
     def with_twin(sign, noise, *, apart=0.0):

@@ -267,6 +267,9 @@ class TestMassesThatNobodyWeighed:
         assert "normalised to 1 kg" in unit
         ends = intervals(problem, problem.structure(x), x)
         assert np.all(np.isinf(np.diagonal(ends.mass[1]))) and np.all(np.isinf(np.diagonal(ends.stiffness[1])))
+        # A diagonal stays positive; to first order nothing stops the coupling of the springs.
+        np.testing.assert_array_equal(np.diagonal(ends.stiffness[0]), 0.0)
+        np.testing.assert_array_equal(np.diagonal(ends.stiffness[0], 1), -np.inf)
         assert np.all(np.isnan(uncertainty(problem, problem.structure(x), x).variables["k"]))
 
     def test_their_total_closes_it(self, truth):
@@ -343,3 +346,24 @@ def test_a_damper_that_no_record_sees_is_open_by_itself(second):
     assert told.judged_by == BY_RANK
     assert told.determined is (second != 2.0)
     assert all("no record sees a change of b" in sentence for sentence in told.undetermined)
+
+
+@pytest.mark.parametrize(("off", "hardly"), [(0.0, False), (1e-9, True)])
+def test_an_unknown_that_moves_exact_records_by_less_than_is_left_of_them_is_hardly_held(off, hardly):
+    """A damper of a hundred millionth beside another: a fit that is off by 1e-9 of that one says nothing of it."""
+    a, b = (Variable(name, lower=0.1, upper=50.0, guess=5.0) for name in "ab")
+    between = np.array([[1.0, -1.0], [-1.0, 1.0]])
+    K = np.array([[1000.0, -200], [-200, 1000]])
+    G = np.ones((2, 1))
+    full = np.block([[K, -K @ G], [-(K @ G).T, G.T @ K @ G]])
+    truth = sysid.Structure(np.diag([2.0, 3, 0]), full, n_base=1, damping_matrix=5 * np.eye(2) + 5e-8 * between)
+    problem = Problem(
+        sysid.simulate(truth, np.linspace(1.0, 9.0, 60)), mass=np.diag([2.0, 3.0]), stiffness=K,
+        damping=a * np.eye(2) + 1e-8 * b * between,
+    )  # fmt: skip
+    order = [problem.formulation.labels.index(label) for label in "ab"]
+    x = np.empty(2)
+    x[order] = 5.0 * (1 + off), 5.0
+    told = determine(problem, problem.structure(x), x)
+    assert any("by which b +1 % is hardly held" in sentence for sentence in told.undetermined) is hardly
+    assert told.determined is not hardly

@@ -50,6 +50,13 @@ def test_of_lines(spectra, models):
     assert_shift(lambda sensor, error: identified(misread(spectra, sensor, error), **models), 1)
 
 
+def test_of_lines_whose_noise_no_weights_share(spectra):
+    """What an error makes of the fit is the weights' matter, whatever the noise is."""
+    times = np.random.default_rng(5).uniform(0.3, 3.0, spectra.response.shape)
+    uneven = dataclasses.replace(spectra, response_std=0.01 * times)
+    assert_shift(lambda sensor, error: identified(misread(uneven, sensor, error), FullMass()), 1)
+
+
 def test_of_lines_beside_a_stated_entry(spectra):
     """What is stated is where the records alone lead, so that no second order of the adjustment counts."""
     known, std = np.full((2, 3, 3), np.nan)

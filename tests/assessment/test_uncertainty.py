@@ -325,6 +325,18 @@ class TestWhatTheDataDoNotShow:
             assert np.all(np.isfinite(value[0])) and np.all(np.isnan(value[1])), name
         assert np.all(np.isnan(u.mass)) and np.all(np.isnan(u.stiffness))
         assert np.all(np.isfinite(u.rigid_body_mass)) and np.all(np.isfinite(u.transmissibility(FREQ)))
+        # Frequencies and ratios of both modes, and the participation of the first: known where their deviations are.
+        stds = np.concatenate([u.natural_frequencies, u.damping_ratios, u.participation[0]])
+        np.testing.assert_allclose(np.sqrt(np.diag(u.covariance)), stds, rtol=1e-9)
+        assert np.all(np.isnan(u.covariance[[1, 3]]))
+
+    def test_without_force_no_entry_is_known_of_masses_that_nothing_couples(self):
+        """Two oscillators, one on either base direction: zeros between them are no knowledge of the matrix."""
+        K = np.diag([4e3, 9e3])
+        truth = Structure(np.diag([1.0, 2, 0, 0]), np.block([[K, -K], [-K, K]]), [0.01, 0.02], n_base=2)
+        u = uncertainty(problem_of(truth, sysid.simulate(truth, FREQ, noise=0.01, rng=1)), truth, None)
+        for matrix in (u.mass, u.stiffness, u.damping):
+            assert np.all(np.isnan(matrix))
 
     def test_one_run_in_one_direction(self, random_structure):
         """Without force the participation across it is open; with force each mode's whole participation shows in it."""

@@ -9,6 +9,7 @@ import pytest
 import sysid
 from sysid import LumpedMass, SpectralStiffness, Structure
 from sysid.assessment.uncertainty import uncertainty
+from sysid.measurement.whole import Gains, ModalEstimate, NoiseLevels
 
 
 @pytest.fixture(autouse=True)
@@ -123,6 +124,34 @@ class TestStructuredModels:
         check(u, expected, names, rtol=1e-4)
         if mass == "known":
             assert np.all(u.mass < 1e-10 * np.diag(truth.mass).max())
+
+
+def test_where_damping_is_a_matrix_the_scatter_of_modes_of_whole_records_does_not_count():
+    """Their modes are normal ones, and this structure has none: it is fitted to the lines, and judged by them."""
+    K = 2000.0 * np.array([[2.0, -1, -1], [-1, 1, 0], [-1, 0, 1]])
+    truth = Structure(np.diag([5.0, 4.0, 0.0]), K, damping_matrix=np.array([[9.0, -2], [-2, 3]]), n_base=1)
+    test = sysid.simulate(truth, np.linspace(0.5, 8.0, 200), noise=0.03, rng=1)
+    test = dataclasses.replace(test, response_std=test.response_std / 3)
+    k, c = sysid.Variable("k", lower=1e3, upper=4e3), sysid.Variable("c", 3, lower=-10, upper=10)
+    size = 2 * 2 + 2 + 2 + 2 + 1
+    modes = ModalEstimate(
+        truth.mode_shapes, truth.participation, 2 * np.pi * truth.natural_frequencies, truth.damping_ratios,
+        truth.rigid_body_mass, np.eye(size), NoiseLevels([0.1], [0.1]), 4.0, np.ones(1),
+        Gains(np.zeros(2), np.ones(2), 100, np.zeros((size, 2)), np.zeros((2, 1)), np.zeros(2)), scatter=np.eye(size),
+    )  # fmt: skip
+    found = []
+    for modal in (None, modes):
+        problem = sysid.Problem(
+            dataclasses.replace(test, modal=modal), mass=np.diag([5.0, 4.0]), stiffness=k * K[:2, :2] / 2000,
+            damping=[[c[0], c[1]], [c[1], c[2]]],
+        )  # fmt: skip
+        at = {"k": 2000.0, "c[0]": 9.0, "c[1]": -2.0, "c[2]": 3.0}
+        found.append(uncertainty(problem, truth, np.array([at[label] for label in problem.formulation.labels])))
+    plain, beside = found
+    assert plain.inflation == pytest.approx(3.0, rel=0.1)
+    assert beside.inflation == pytest.approx(plain.inflation, rel=1e-12)
+    for name, std in plain.variables.items():
+        np.testing.assert_allclose(beside.variables[name], std, rtol=1e-9)
 
 
 @pytest.mark.parametrize("mass", ["known", "lumped"])

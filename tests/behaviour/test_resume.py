@@ -57,7 +57,8 @@ class Counted:
 
 @pytest.mark.parametrize(
     ("form", "strategy"),
-    [("chain", "continuation"), ("chain", SHORT), ("free", SHORT), ("free", sysid.Swarm(12, local="cholesky")),
+    [("chain", "continuation"), ("chain", SHORT), ("free", SHORT),
+     ("free", sysid.Swarm(12, local="cholesky", refine_by="leaders")),
      ("chain", "auto"), ("free", "auto")],
 )  # fmt: skip
 def test_killed_at_any_report_a_search_goes_on_to_the_same_bits(form, strategy, random_case, tmp_path):

@@ -132,8 +132,8 @@ CASES = {
         {
             "fun": lambda rows: rows.sum(axis=1), "bounds": [(0, 1), (0, 2)], "rng": 1, "n_particles": 4,
             "max_iterations": 2, "max_evaluations": 20, "max_time": 1.0, "target": 0.1, "stall_iterations": 2,
-            "stall_tolerance": 0.1, "callback": None, "improve": None, "improve_every": 0, "repair": None,
-            "x0": [0.5, 0.5], "settings": None,
+            "stall_tolerance": 0.1, "callback": None, "improve": None, "improve_every": 0, "on_leader": None,
+            "repair": None, "x0": [0.5, 0.5], "settings": None,
         },
     ),
     "Continuation": (sysid.Continuation, {"starts": 2}),

@@ -54,6 +54,19 @@ def test_what_is_not_found_is_not_noticed(mutants, code, tests, detail):
     assert re.search(detail, result.detail)
 
 
+def test_a_test_that_fails_without_the_change_too_gives_no_verdict(mutants, tmp_path, monkeypatch):
+    """One test of a file passes and one does not, whatever the package is."""
+    (tmp_path / "test_two.py").write_text("def test_good():\n    pass\n\n\ndef test_bad():\n    assert False\n")
+    monkeypatch.setattr(mutants, "ROOT", tmp_path)
+    mutant = mutants.Mutant("X", "nothing", "code", "pass", "test_two")
+    given = [
+        mutants.Result(mutant, "killed", "there", 0.0, f"test_two.py::{name}") for name in ("test_good", "test_bad")
+    ]
+    good, bad = mutants.without_changes(given)
+    assert (good.verdict, bad.verdict) == ("killed", "no verdict")
+    assert "does not pass without the change" in str(bad)
+
+
 def test_an_unknown_identifier_is_an_error_that_names_those_there_are(mutants):
     with pytest.raises(ValueError, match="no mutant is called A0; give some of A07, "):
         mutants.run(["A0"])

@@ -119,7 +119,7 @@ def test_plain_output_has_no_control_codes_whatever_the_environment_asks(here, p
         assert b"\x1b" not in stream
         assert b"\r" not in stream.replace(os.linesep.encode(), b"\n")
     text = done.stderr.decode("ascii")
-    for phase in ("swarm", "refinement", "local phase"):
+    for phase in ("swarm", "local phase"):
         assert re.search(rf"^{phase} +iteration +\d+ +objective +\S+ +[\d.]+ s$", text, re.M)
 
 
@@ -127,7 +127,7 @@ def test_the_modal_strategy_tells_its_only_phase(here, capsys, no_pictures):
     assert cli.main(["run", "pair.py", "--strategy", "modal"]) == 0
     out, error = capsys.readouterr()
     assert re.search(r"^local phase +iteration +\d+ +objective +\S+ +[\d.]+ s$", error, re.M)
-    assert not re.search(r"^(swarm|refinement) ", error, re.M)
+    assert not re.search(r"^swarm ", error, re.M)
     assert "strategy 'modal', as asked" in out
     assert "nan" not in out
 

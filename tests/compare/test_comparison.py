@@ -51,7 +51,7 @@ def test_figures_are_those_of_the_same_identification(compared):
     result = sysid.identify(two_masses(), strategy="swarm", rng=3)
     assert (swarm.residual, swarm.after) == (result.residual, result.objective)
     assert swarm.evaluations == result.history.evaluations > 0
-    assert swarm.before == result.history.refinement
+    assert swarm.before == result.history.swarm
     # A lumped mass with its total is determined: the truth itself is found.
     np.testing.assert_allclose(swarm.errors, 0.0, atol=1e-5)
     phases = dict(swarm.phases)

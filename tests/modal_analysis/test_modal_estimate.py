@@ -10,7 +10,16 @@ import pytest
 from scipy.optimize import minimize
 
 from sysid.measurement.whole import Gains, ModalEstimate, NoiseLevels
-from sysid.modal_analysis.modal_estimate import above_modes, index_of, information_about, misfit_rows, theta_of
+from sysid.modal_analysis.modal_estimate import (
+    above_modes,
+    independent_rows,
+    index_of,
+    information_about,
+    matched,
+    misfit_rows,
+    shifts_about,
+    theta_of,
+)  # fmt: skip
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.structure.structure import Array
 
@@ -103,3 +112,46 @@ def test_information_in_another_scale_prices_the_same_change_alike() -> None:
     there = theta_of(Modes(dphi / scale, dgamma * scale[:, None], np.ones(3), np.ones(3)), np.zeros((2, 2)), index)
     price = here @ estimate.information @ here
     assert there @ information_about(estimate, modes)[0] @ there == pytest.approx(price, rel=1e-10)
+
+
+def test_independent_rows_have_the_deviations_of_the_scatter() -> None:
+    """With scatter B the covariance is ``A^-1 B A^-1 / 2``, A the information; without one ``A^-1 / 2``."""
+    estimate = _estimate(2, 1.05)
+    A = estimate.information
+    root = np.random.default_rng(3).normal(size=A.shape)
+    for B in (None, root @ root.T):
+        R, std = independent_rows(replace(estimate, scatter=B))
+        covariance = np.linalg.solve(A, np.linalg.solve(A, A if B is None else B).T) / 2
+        moves = R @ covariance @ R.T
+        np.testing.assert_allclose(moves, np.diag(std**2), atol=1e-7 * np.abs(moves).max())
+        np.testing.assert_allclose(R.T @ R, A, atol=1e-7 * np.abs(A).max())
+
+
+def test_scatter_and_shifts_in_another_scale_are_of_the_same_changes() -> None:
+    """A change of the estimate's parameters, in the other scale, has the same score, and the same share of a gain."""
+    estimate, scale, r = _estimate(2, 1.05), np.array([2.0, -0.5, 3.0]), np.random.default_rng(4)
+    root, moves = r.normal(size=estimate.information.shape), r.normal(size=(len(estimate.information), 2))
+    estimate = replace(estimate, scatter=root @ root.T, gain=replace(estimate.gain, moves=moves))
+    other = Modes(estimate.phi / scale, estimate.gamma * scale[:, None], estimate.omega, estimate.ratios)
+    index = index_of(estimate)
+
+    def there(theta: Array) -> Array:
+        phi, gamma, *rest = (part[..., 0] for part in index.split(theta[:, None]))
+        pairs = rest[2][tuple(np.array(index.pairs).T)]
+        return np.concatenate([(phi / scale).ravel(), (gamma * scale[:, None]).ravel(), rest[0], rest[1], pairs])
+
+    change = r.normal(size=len(root))
+    _, scatter = information_about(estimate, other)
+    assert scatter is not None and estimate.scatter is not None
+    assert there(change) @ scatter @ there(change) == pytest.approx(change @ estimate.scatter @ change, rel=1e-10)
+    np.testing.assert_allclose(shifts_about(estimate, other), np.array([there(one) for one in moves.T]).T, rtol=1e-10)
+
+
+def test_modes_are_matched_by_the_ratio_of_their_frequencies_each_once() -> None:
+    """10, 25 and 40 rad/s among five modes; two that are near 40 do not both go to it."""
+    estimate = _estimate(2, 1.05)
+    found = matched(estimate, np.array([9.0, 24.0, 26.5, 39.5, 41.0]))
+    assert found is not None and found.tolist() == [0, 1, 3]
+    found = matched(estimate, np.array([39.0, 41.0, 200.0]))
+    assert found is not None and sorted(found.tolist()) == [0, 1, 2]
+    assert matched(estimate, np.array([10.0, 25.0])) is None

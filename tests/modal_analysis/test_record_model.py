@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -136,6 +138,68 @@ def test_lines_of_unequal_runs_are_their_own_transforms() -> None:
         np.testing.assert_allclose(run.outputs, scale * np.fft.rfft(response)[:, lines], rtol=1e-9)
         assert scale == pytest.approx(1 / 12.0)
         assert not np.any(test.response[run.number][:, ~own])
+
+
+@CASES
+def test_weights_of_lines_count_in_sum_gradient_and_normal_matrix(force: bool, d: int) -> None:
+    """Weights of 0, 1 and 2: a line that is left out, as it is, and twice there."""
+    model, p, levels = _model(force, d)
+    weights = [np.arange(run.w.size) % 3 for run in model.runs]
+    weighed = model.weighed_by([weight.astype(float) for weight in weights])
+    parts = []
+    for times in (1, 2):
+        some = model.weighed_by([np.ones(np.count_nonzero(weight == times)) for weight in weights])
+        some.runs = [run._replace(weight=one.weight) for run, one in zip(
+            (run.at(weight == times) for run, weight in zip(model.runs, weights, strict=True)), some.runs, strict=True
+        )]  # fmt: skip
+        parts.append(some.normal_equations(p, levels))
+    once, twice = parts
+    made, slope = weighed.normal_equations(p, levels), weighed.gradient(p, levels)
+    np.testing.assert_allclose(made.normal, once.normal + 2 * twice.normal, atol=1e-9 * np.abs(made.normal).max())
+    for gradient in (made.gradient, slope.gradient):
+        expected = once.gradient + 2 * twice.gradient
+        np.testing.assert_allclose(gradient, expected, atol=1e-9 * np.abs(expected).max())
+    for chi2 in (made.chi2, slope.chi2, weighed.chi2(p, levels)):
+        assert chi2 == pytest.approx(once.chi2 + 2 * twice.chi2, rel=1e-10)
+
+
+@CASES
+def test_what_transients_take_off_the_information_is_as_they_move_along(force: bool, d: int) -> None:
+    """The covariance of the modes is that part of the inverse of all unknowns' normal matrix."""
+    model, p, levels = _model(force, d)
+    normal = model.normal_equations(p, levels).normal
+    made = RecordFit(model.test, p, levels, 1.0, True).information()[: model.kept, : model.kept]
+    inner, across = normal[model.kept :, model.kept :], normal[model.kept :, : model.kept]
+    expected = normal[: model.kept, : model.kept] - across.T @ np.linalg.solve(inner, across)
+    np.testing.assert_allclose(made, expected, atol=1e-9 * np.abs(expected).max())
+    assert np.abs(across.T @ np.linalg.solve(inner, across)).max() > 0.01 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("d", [1, 2])
+def test_columns_of_gains_are_those_of_base_motion_and_of_a_mode_far_above_the_lines(d: int) -> None:
+    """A share e of the base's motion is a change of G by e; a mode at W far above the lines adds e w² for ``e W²``."""
+    model, p, levels = _model(False, d)
+    n, fit = model.n, RecordModel(model.test, 2, gains=True)
+    gradient = fit.normal_equations(p, levels).gradient[fit.n_fit :].reshape(2, n, d)
+    h, last, far = 1e-5, 2 * np.pi * model.test.freq[-1], 1e4
+    more = RecordModel(model.test, 3)
+
+    def left(i: int, j: int, share: float, rising: float) -> float:
+        G = model.test.rigid_body.copy()
+        G[i, j] += share
+        phi, gamma = rising * np.eye(n)[:, [i]], far**2 * np.eye(d)[[j]]
+        modes = Modes(
+            np.hstack([p.modes.phi, phi]), np.vstack([p.modes.gamma, gamma]), np.append(p.modes.omega, far * last),
+            np.append(p.modes.ratios, 1e-6),
+        )  # fmt: skip
+        every = Parameters(modes, p.rigid, np.vstack([p.ends, np.zeros((1, p.ends.shape[1]))]), p.traces)
+        more.test = replace(model.test, rigid_body=G)
+        return _dense_chi2(more, every, levels)
+
+    for i, j in np.ndindex(n, d):
+        for kind, step in enumerate(((h, 0.0), (0.0, h))):
+            slope = (left(i, j, *step) - left(i, j, *(-one for one in step))) / (2 * h)
+            assert -2 * gradient[kind, i, j] == pytest.approx(slope, rel=1e-4, abs=1e-4 * np.abs(gradient).max())
 
 
 @CASES

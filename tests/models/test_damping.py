@@ -60,6 +60,21 @@ def test_alpha_and_beta_of_other_ratios_are_those_of_least_squares(geometry_of):
     np.testing.assert_allclose(alpha_beta, np.linalg.solve(left, right), rtol=1e-12)
 
 
+def test_alpha_and_beta_stay_within_their_bounds(geometry_of):
+    """Ratios that rise faster than in proportion to the frequency would need an alpha below zero: beta is left alone.
+
+    ``beta = c . zeta / c . c`` with c = w / 2 = (1/2, 1, 2).
+    """
+    omega, ratios = np.array([1.0, 2.0, 4.0]), np.array([0.001, 0.02, 0.05])
+    K = np.diag(omega**2)
+    base = K.sum(axis=1)
+    full = np.block([[K, -base[:, None]], [-base[None], np.array([[base.sum()]])]])
+    s = sysid.Structure(np.diag([1.0, 1, 1, 0]), full, ratios, n_base=1)
+    alpha, beta = ProportionalDamping((0, 1), (0, 1)).values(geometry_of(np.ones((3, 1))), s)
+    assert alpha == pytest.approx(0.0, abs=1e-12)
+    assert beta == pytest.approx((0.001 / 2 + 0.02 + 0.05 * 2) / (1 / 4 + 1 + 4), rel=1e-9)
+
+
 def test_modal_ratios_are_the_unknowns_and_there_is_no_matrix(geometry_of):
     y, geometry, model = np.array([0.01, 0.02, 0.03, 0.04]), geometry_of(np.ones((4, 1))), ModalDamping()
     np.testing.assert_array_equal(numbers(model.ratios(geometry, ca.DM(y), ca.DM([1, 2, 3, 4]))).ravel(), y)

@@ -6,7 +6,7 @@ import pytest
 
 import sysid
 from sysid import FullMass, InputError, KnownMass, LumpedMass
-from sysid.models.mass import WrittenMass, batch_healing, heal, total_of
+from sysid.models.mass import WrittenMass, heal, total_of
 from sysid.models.model import mass_blocks
 
 SEEDS = range(4)
@@ -265,12 +265,20 @@ class TestFullMass:
         expected = np.diag([2.0, 2.5, 3.0, 2.0, 3.0])
         healed = heal(ca.SX.eye(5), geometry, totals, healing)
         np.testing.assert_allclose(np.asarray(ca.evalf(ca.densify(healed))), expected, rtol=1e-12)
-        in_numbers = batch_healing(geometry, healing)(np.eye(5)[:, :, None].copy(), totals[:, None])
-        np.testing.assert_allclose(in_numbers[:, :, 0], expected, rtol=1e-12)
 
     def test_healing_that_is_unknown(self):
         with pytest.raises(InputError, match="'magic' is unknown"):
             FullMass(healing="magic")
+
+
+def test_an_entry_with_two_deviations_has_the_larger_one(geometry_of):
+    """One given on either side of the diagonal, or on one side alone; that of the coupling has no other side."""
+    nan = np.nan
+    known = [[4.0, 0.5, nan, 0.2], [0.5, 3.0, 0.1, nan], [nan, nan, nan, nan]]
+    std = [[0.2, 0.1, nan, 0.05], [0.3, 0.0, 0.02, nan], [nan, nan, nan, nan]]
+    stated = FullMass(known=known, known_std=std).stated(geometry_of(np.ones((3, 1))))
+    expected = np.array([[0.2, 0.3, 0.0, 0.05], [0.3, 0.0, 0.02, 0.0], [0.0, 0.02, 0.0, 0.0]])
+    np.testing.assert_array_equal(stated.entries_std, expected)
 
 
 class TestLumpedMass:

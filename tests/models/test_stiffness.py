@@ -105,11 +105,11 @@ class TestSpectral:
             Refinement(np.array([[1.0, 0.0], [2.0, 3.0]]), 0.0, True, "solved"),
             Refinement(np.array([[8.0, 0.0], [9.0, 8.0]]), 0.5, False, "not solved"),
         ])  # fmt: skip
-        monkeypatch.setattr("sysid.models.stiffness.by_ipopt", lambda factor, targets: next(answers))
+        monkeypatch.setattr("sysid.models.stiffness.by_ipopt", lambda factor, targets, max_time: next(answers))
         rows = np.array([[5.0, 1.0, 6.0], [3.0, 0.0, 5.0]])
-        refined, failed = SpectralStiffness().with_spectrum(rows, np.array([4.0, 7.0]), by_solver=True)
+        refined, statuses = SpectralStiffness().with_spectrum(rows, np.array([4.0, 7.0]), by_solver=True)
         np.testing.assert_allclose(refined, [[1, 2, 3], [4, 0, 7]], atol=1e-12)
-        assert failed == 1
+        assert statuses == ("solved", "not solved")
 
     def test_targets_are_the_given_frequencies_in_radians_a_second(self, geometry_of):
         geometry = geometry_of(np.ones((3, 1)))

@@ -57,7 +57,6 @@ def unit(truth, guess):
         test,
         start=0.9,
         swarm=0.5,
-        refinement=0.4,
         local=0.01,
         swarm_curve=np.array([0.9, 0.7, 0.5]),
         local_curve=np.array([0.4, 0.1, 0.02, 0.01]),
@@ -163,13 +162,12 @@ def test_responses_have_a_panel_a_run_however_many(truth, guess):
     assert [ax.get_title() for ax in figure.axes if ax.get_title()] == [f"sensor 1, run {r + 1}" for r in range(5)]
 
 
-def test_convergence_joins_both_curves_and_marks_the_refinement(unit):
+def test_convergence_joins_both_curves(unit):
     ax = plot.convergence(unit).axes[0]
-    swarm, local, mark = (lines(ax)[name] for name in ("swarm (best so far)", "local phase", "after refinement"))
+    swarm, local = (lines(ax)[name] for name in ("swarm (best so far)", "local phase"))
     np.testing.assert_array_equal(swarm.get_ydata(), [0.9, 0.7, 0.5])
     np.testing.assert_array_equal(local.get_xdata(), [2, 3, 4, 5])
     np.testing.assert_array_equal(local.get_ydata(), [0.4, 0.1, 0.02, 0.01])
-    assert (mark.get_xdata()[0], mark.get_ydata()[0]) == (2, 0.4)
     assert ax.get_yscale() == "log" and ax.get_ylabel() == "objective [–]"
 
 
@@ -186,8 +184,8 @@ def test_convergence_without_a_swarm_marks_each_iterate(unit):
 
 
 def test_convergence_tells_widened_peaks_from_the_records(unit):
-    history = dataclasses.replace(unit.history, start=np.nan, refinement=np.nan)
-    swarm, local, _ = plot.convergence(dataclasses.replace(unit, history=history)).axes[0].lines
+    history = dataclasses.replace(unit.history, start=np.nan)
+    swarm, local, *_ = plot.convergence(dataclasses.replace(unit, history=history)).axes[0].lines
     assert (swarm.get_label(), swarm.get_linestyle()) == ("swarm, of widened peaks", "--")
     assert (local.get_label(), local.get_linestyle()) == ("local phase, of the records", "-")
 

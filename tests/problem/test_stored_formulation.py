@@ -224,14 +224,6 @@ def test_names_and_lines_of_the_author_are_kept(pair):
     assert [v.declared for v in after.fixed] == [v.declared for v in before.fixed]
 
 
-def test_what_this_casadi_cannot_read_is_said_with_its_version():
-    tree = single().to_tree()
-    given = tree["given"]
-    given |= {"expressions": given["expressions"][:600], "casadi_version": "9.9"}
-    with pytest.raises(sysid.InputError, match="its expressions were written by CasADi 9.9, and CasADi .* cannot read"):
-        sysid.Problem.from_tree(tree)
-
-
 def test_the_file_holds_text_and_numbers_and_no_pickle(pair):
     import h5py
 
@@ -248,7 +240,7 @@ def test_the_file_holds_text_and_numbers_and_no_pickle(pair):
 
     with h5py.File(pair[2], "r") as file:
         file.visititems(look)
-        assert int(file.attrs["format"]) == 3
+        assert int(file.attrs["format"]) == 4
     assert found
 
 
@@ -278,9 +270,64 @@ def callback():
     return Same()
 
 
-def test_a_python_callback_is_refused_before_a_search_whose_result_could_not_be_saved():
-    same, k = callback(), unknown("k", SPRINGS)
-    with pytest.raises(sysid.InputError, match="callback"):
-        sysid.Problem(
-            sysid.simulate(structure(), FREQ), mass=np.diag(MASSES), stiffness=chain(same(k)), damping=1e-4 * chain(k)
-        ).check()
+@pytest.fixture(scope="module")
+def of_a_callback():
+    """A result whose stiffness holds a Python callback, and the same problem without it."""
+    test, same = sysid.simulate(structure(), FREQ, noise=0.01, rng=0), callback()
+
+    def problem(spring=lambda k: k, name="k", test=test):
+        k = unknown(name, SPRINGS)
+        prior = sysid.Prior(k[0], 1.01 * SPRINGS[0], 500.0)
+        given = {"mass": np.diag(MASSES), "damping": chain(DAMPERS)}
+        return sysid.Problem(test, stiffness=chain(spring(k)), residuals=[prior], **given)
+
+    result = sysid.identify(problem(same), rng=0, strategy=sysid.Continuation(starts=1))
+    return result, problem, same
+
+
+def stored_without(of_a_callback, tmp_path):
+    with pytest.warns(
+        UserWarning, match=r"is without the expressions of its problem, as the function 'same' \(Callback"
+    ):
+        return of_a_callback[0].save(tmp_path)
+
+
+def test_a_result_with_a_callback_is_stored_and_tells_all_that_readers_ask(of_a_callback, tmp_path):
+    result, path = of_a_callback[0], stored_without(of_a_callback, tmp_path)
+    back = sysid.load(path)
+    assert result.success and back.summary() == result.summary() and back.to_dict() == result.to_dict()
+    for name in ("mass", "natural_frequencies", "covariance"):
+        np.testing.assert_array_equal(getattr(back.uncertainty, name), getattr(result.uncertainty, name))
+    at = np.linspace(1.0, 30.0, 7)
+    np.testing.assert_array_equal(back.uncertainty.transmissibility(at), result.uncertainty.transmissibility(at))
+    np.testing.assert_array_equal(back.values["k"], result.values["k"])
+    assert back.residual == result.residual and back.outliers == result.outliers
+    assert sysid.load(back.save(tmp_path / "again")).summary() == result.summary()
+
+
+def test_a_result_without_its_problem_says_what_it_needs(of_a_callback, tmp_path):
+    back = sysid.load(stored_without(of_a_callback, tmp_path))
+    with pytest.raises(
+        sysid.InputError, match=r"the function 'same' \(Callback.* in stiffness cannot be .*problem=\.\.\."
+    ):
+        _ = back.problem
+
+
+def test_a_problem_of_the_same_records_and_unknowns_is_taken(of_a_callback, tmp_path):
+    result, problem, same = of_a_callback
+    back = sysid.load(stored_without(of_a_callback, tmp_path), problem=problem(same))
+    assert back.problem.objective(back.x) == result.objective
+    assert back.x.tobytes() == result.x.tobytes() and back.history.log == result.history.log
+
+
+def test_another_problem_is_not_taken(of_a_callback, tmp_path):
+    (_, problem, same), path = of_a_callback, stored_without(of_a_callback, tmp_path)
+    others = {
+        "other records": problem(same, test=sysid.simulate(structure(), FREQ, noise=0.01, rng=1)),
+        "other unknowns than the result: c": problem(same, name="c"),
+        "stand for another stiffness matrix": problem(lambda k: 2 * same(k)),
+        "is a int, not a sysid.Problem": 3,
+    }
+    for words, other in others.items():
+        with pytest.raises(sysid.InputError, match=words):
+            sysid.load(path, problem=other)

@@ -73,9 +73,11 @@ def identification(
         validation=[other, test], goal=0.05,
     )  # fmt: skip
     history = sysid.History(
-        start=0.9, swarm=0.1 + 0.2, refinement=float("nan"), local=1e-300,
+        start=0.9, swarm=0.1 + 0.2, local=1e-300,
         swarm_curve=np.array([0.9, 0.3]), local_curve=np.zeros(0), refinement_error=1e-12,
-        states=(("exploration", 3), ("jumping out", 0)), evaluations=12345, wall_time=1.25,
+        states=(("exploration", 3), ("jumping out", 0)), leaders_tried=7, leaders_won=2,
+        refinement_statuses=(("Maximum_Iterations_Exceeded", 1), ("Solve_Succeeded", 6)), evaluations=12345,
+        wall_time=1.25,
         log=("    0.00 s  swarm – α", "    1.00 s  done"),
     )  # fmt: skip
     made = sysid.Identification(

@@ -3,9 +3,10 @@
 import casadi as ca
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 import sysid
-from sysid.search.continuation import _alternatives, _Run, smoothed_tests
+from sysid.search.continuation import _alternatives, _best, _Run, apart, as_good_as, smoothed_tests
 from sysid.search.local import LocalResult
 from sysid.search.session import DeferredInterrupt, Session
 
@@ -180,6 +181,37 @@ def test_starts_are_unanimous_where_three_end_at_one_fit_of_sorts():
         results = [LocalResult(x, True, "", np.zeros(1)) for x in ends]
         run.ends, run.joined = [(problem.objective(one.x), one) for one in results], joined
         assert run._unanimous(results[0]) is unanimous
+
+
+def test_the_best_end_keeps_the_constraints_even_where_one_that_breaks_them_fits_better():
+    k, _, K, C = springs_and_dampers()
+    problem = sysid.Problem(measured(), mass=np.diag(MASS), stiffness=K, damping=C, constraints=[k[0] <= 1.9e4])
+    truth, kept = np.concatenate([SPRINGS, DAMPERS]), np.array([1.8e4, 1.6e4, *DAMPERS])
+    ends = [(problem.objective(x), LocalResult(x, True, "", np.zeros(1))) for x in (truth, kept)]
+    assert ends[0][0] < ends[1][0]
+    np.testing.assert_array_equal(_best(problem, ends)[1].x, kept)
+
+
+def test_as_good_as_another_is_what_chance_explains_in_one_of_a_thousand():
+    """Two answers of p unknowns differ by a chi-squared of p in the squares of N numbers over N - p."""
+    problem = two_tests()
+    numbers, p = 2 * 2 * 2 * FREQ.size, 4  # real numbers of two tests of two sensors
+    expected = 0.03 * np.sqrt(1 + chi2.isf(1e-3, p) / (numbers - p))
+    assert as_good_as(problem, 0.03) == pytest.approx(expected, rel=1e-12)
+
+
+def test_distances_are_of_the_size_of_an_unknown_or_of_its_range():
+    """a may be zero: a thousandth of its range of 4 is its least size; b is larger than its range of 1."""
+    a, b = sysid.Variable("a", lower=-2.0, upper=2.0), sysid.Variable("b", lower=100.0, upper=101.0)
+    problem = sysid.Problem(
+        measured(), mass=np.diag(MASS), stiffness=STRETCH.T @ ca.diag(ca.vertcat(2e4 + 100 * a, 150 * b)) @ STRETCH,
+        damping=1e-3 * np.eye(2),
+    )  # fmt: skip
+    for x, other, far in (
+        ([0.5, 100.5], [0.4, 100.5], 0.1 / 0.4), ([0.001, 100.5], [0.0, 100.5], 0.001 / 0.004),
+        ([0.5, 100.5], [0.5, 100.2], 0.3), ([0.5, 100.5], [0.5, 100.5], 0.0),
+    ):  # fmt: skip
+        assert apart(problem, np.array(x), np.array(other)) == pytest.approx(far, rel=1e-9)
 
 
 def test_starts_left_out_for_want_of_time_are_told(monkeypatch):

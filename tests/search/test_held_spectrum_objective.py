@@ -74,6 +74,7 @@ def by_lines(made, cost, rows):
     [
         {},
         {"healing": "rigid_body"},
+        {"healing": "rigid_body", "rigid_body": G @ TURN},  # scales that are coupled
         {"noise": True},
         {"force": True},
         {"force": True, "noise": True},
@@ -90,8 +91,11 @@ def test_it_agrees_with_the_sum_over_lines(options):
     made = problem(**options)
     cost, rows = objective(made), particles(made, 70)
     assert cost._held is not None
-    expected = by_lines(made, cost, rows)
-    assert np.all(np.abs(cost(rows) ** 2 - expected) <= 1e-9 * np.maximum(expected, 1.0))
+    expected, found = by_lines(made, cost, rows), cost(rows) ** 2
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))  # scales that no candidate can have
+    made_one = ~np.isnan(expected)
+    assert np.count_nonzero(made_one) > 35
+    assert np.all(np.abs(found - expected)[made_one] <= 1e-9 * np.maximum(expected[made_one], 1.0))
 
 
 def test_sensors_that_are_no_degrees_of_freedom_are_recovered():
@@ -111,9 +115,8 @@ def test_sensors_that_are_no_degrees_of_freedom_are_recovered():
     np.testing.assert_allclose(cost(rows) ** 2, by_lines(made, cost, rows), rtol=1e-9)
 
 
-@pytest.mark.parametrize("options", [{"given": 3}, {"healing": "rigid_body", "rigid_body": G @ TURN}], ids=str)
-def test_frequencies_that_are_free_and_coupled_scales_go_by_lines(options):
-    made = problem(**options)
+def test_frequencies_that_are_free_go_by_lines():
+    made = problem(given=3)
     cost, rows = objective(made), particles(made, 5)
     assert cost._held is None
     np.testing.assert_allclose(cost(rows) ** 2, by_lines(made, cost, rows), rtol=1e-12)
@@ -154,7 +157,9 @@ def test_ratios_outside_of_the_range_go_by_lines_and_no_number_stays_none():
     np.testing.assert_allclose(costs[:2] ** 2, by_lines(made, cost, rows[:2]), rtol=1e-9)
 
 
-@pytest.mark.parametrize(("count", "ends"), [(1, [16]), (17, [16, 32]), (480, [240, 480]), (496, [112, 240, 368, 496])])
+@pytest.mark.parametrize(
+    ("count", "ends"), [(1, [16]), (17, [32]), (480, [256, 480]), (496, [256, 496]), (600, [128, 320, 448, 608])]
+)
 def test_chunks_are_nearly_equal_and_as_many_for_each_of_two_threads(count, ends):
     assert chunk_ends(count, 250) == ends
 
@@ -163,14 +168,15 @@ def test_neither_threads_nor_the_place_among_candidates_change_a_bit():
     made = problem(force=True)
     cost, rows = objective(made), particles(made, 2601)  # of four chunks
     formulation = made.formulation
-    batches = [model.batch(formulation.geometry) for model in made.models]
-    alone = HeldSpectrumObjective(made, formulation.own_test, formulation.stiffness.spectrum, batches, threads=1)
+    given = made, formulation.own_test, formulation.stiffness.spectrum, cost._held.expansion
+    alone = HeldSpectrumObjective(*given, threads=1)
     expected = alone(rows, None)
-    many = HeldSpectrumObjective(made, formulation.own_test, formulation.stiffness.spectrum, batches, threads=5)
+    many = HeldSpectrumObjective(*given, threads=5)
     np.testing.assert_array_equal(many(rows, None), expected)
     order = np.random.default_rng(0).permutation(len(rows))
     np.testing.assert_array_equal(alone(rows[order], None), expected[order])
-    np.testing.assert_allclose(np.concatenate([alone(row[None], None) for row in rows[:4]]), expected[:4], rtol=1e-13)
+    for count in (1, 15, 16, 63, 65, 130, 1000):
+        np.testing.assert_array_equal(alone(rows[:count], None), expected[:count])
     np.testing.assert_allclose(cost(rows), np.sqrt(expected), rtol=1e-15)
 
 

@@ -308,7 +308,7 @@ def test_half_the_newton_decrement_is_what_a_quadratic_has_to_gain():
 
 def test_an_end_on_the_limit_says_how_much_chi_squared_is_left(random_case):
     """Beside what a fit that goes on gains: in units of what it leaves for each degree of freedom."""
-    _, problem = random_case(np.random.default_rng(8), "trace", n=3, d=2, force=True, noise=0.01)
+    _, problem = random_case(np.random.default_rng(8), "trace", n=3, d=2, force=True, total=False, noise=0.01)
     start = perturbed(problem, np.random.default_rng(9), 0.02)
     solved = local.solve(problem, start, coordinates="cholesky")
     taken = solved.curve.size

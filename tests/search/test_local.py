@@ -11,12 +11,13 @@ import pytest
 
 import sysid
 from sysid import FullMass, SpectralStiffness
+from sysid.modal_analysis.modal_fit import ModalFit
 from sysid.modal_analysis.residues import linear_residues
 from sysid.models.spectrum import SOLVED
-from sysid.nlp import OBJECTIVE_SCALE, NonlinearProgram
+from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram
 from sysid.search import local
 from sysid.search.matrix_coordinates import _gauss_newton
-from sysid.search.modal_coordinates import _linear_starts, _regular_inverse, frequencies, modes_of
+from sysid.search.modal_coordinates import _linear_starts, _regular_inverse, fit_in_modes, frequencies, modes_of
 from sysid.search.scaled_unknowns import add_unknowns
 from sysid.search.swarm_objective import SwarmObjective
 
@@ -262,6 +263,21 @@ class TestStarts:
         residues = np.einsum("nk,kd->knd", other.phi, other.gamma)
         expected = np.einsum("nk,kd->knd", first.phi, first.gamma)
         np.testing.assert_allclose(residues, expected, atol=1e-8 * np.abs(expected).max())
+
+    def test_the_best_end_is_kept_not_the_last(self, random_case, monkeypatch):
+        """Ends of three starts that leave 0.5, 0.3 and 0.4."""
+        truth, problem = random_case(np.random.default_rng(1), n=3, d=2)
+        ends = [
+            ModalFit(modes_of(truth), truth.rigid_body_mass, left, left, f"end {left}", "") for left in (0.5, 0.3, 0.4)
+        ]
+        monkeypatch.setattr("sysid.search.modal_coordinates.fit_modes", lambda *args, **options: ends.pop(0))
+        monkeypatch.setattr(
+            "sysid.search.modal_coordinates._linear_starts", lambda test, best, first: iter([first, first])
+        )
+        end = fit_in_modes(problem, problem.values(truth), IterationMonitor(None, None), 1)
+        assert not ends
+        assert (end.objective, end.status) == (0.3, "end 0.3")
+        assert "best of 3 starts" in end.remark
 
     def test_shapes_that_are_nearly_alike_have_a_regular_inverse(self):
         """Singular values 2, 1 and 1e-9: the last counts as a millionth of the first."""

@@ -6,9 +6,12 @@ import pytest
 
 import sysid
 from sysid import FullMass, InputError, KnownMass, LumpedMass, Measurement, Problem, Structure, simulate
-from sysid.modal_analysis.modal_fit import Modes
+from sysid.modal_analysis.modal_fit import ModalFit, Modes
 from sysid.modal_analysis.modal_masses import weigh
+from sysid.modal_analysis.response import weighted_error
+from sysid.nlp import IterationMonitor
 from sysid.search.modal_scaling import nearest_lumped, of_known_mass, stated_totals, to_stated_totals
+from sysid.search.mode_fit import held_to_totals
 
 
 def lines(truth, count=200):
@@ -201,3 +204,43 @@ class TestStatedTotals:
         assert stated_totals(self.problem(truth, FullMass(9.0), force=False)) is None
         assert stated_totals(self.problem(truth, FullMass())) is None
         assert stated_totals(self.problem(truth, KnownMass(truth.mass))) is None
+
+
+@pytest.mark.parametrize("healing", ["trace", "rigid_body"])
+def test_a_total_that_is_not_stated_is_what_known_masses_make(random_structure, healing):
+    """Of a model of some ten grams as well: no kilogram is added to the base."""
+    truth = random_structure(np.random.default_rng(4), n=3, d=2)
+    small = Structure(0.001 * truth.mass, 0.001 * truth.stiffness, truth.damping_ratios, n_base=2)
+    known = np.full((3, 3), np.nan)
+    np.fill_diagonal(known, np.diag(small.mass)[:3])
+    problem = Problem(simulate(small, lines(small)), mass=FullMass(known=known, healing=healing))
+    P, gamma, G = known_pieces(small)
+    groups = problem.geometry.directions[:3]
+    t, remainder = to_stated_totals(problem, P, gamma, G, groups, np.eye(2), scaled=True)
+    assert t == 1.0
+    M_SS, M_S0 = P.T @ P, P.T @ gamma - P.T @ P @ G
+    whole = np.block([[M_SS, M_S0], [M_S0.T, (gamma - P @ G).T @ (gamma - P @ G) + remainder]])
+    made, least = (
+        FullMass(healing=healing).total(problem.geometry, mass)
+        for mass in (whole, whole - np.pad(remainder, ((3, 0), (3, 0))))
+    )
+    np.testing.assert_allclose(made, least, rtol=0.01)
+    assert np.all(made > least)
+
+
+@pytest.mark.parametrize(
+    ("noise", "factor", "held"), [(0.0, 1.0, True), (0.0, 1.005, False), (0.05, 1.005, True), (0.05, 1.03, False)]
+)
+def test_a_total_is_held_where_the_force_weighs_it_and_the_records_allow_it(random_structure, noise, factor, held):
+    """Within 1 % of what the force weighs, and where the fit leaves hardly more: else it is met after the fit."""
+    truth = random_structure(np.random.default_rng(7), n=3, d=1)
+    total = factor * truth.rigid_body_mass[0, 0]
+    test = simulate(truth, lines(truth), noise=noise, force=True, rng=1)
+    problem = Problem(test, mass=FullMass(total, healing="rigid_body"))
+    modes = rescaled(truth, np.ones(3))
+    left = weighted_error(test, truth)
+    first = ModalFit(modes, truth.rigid_body_mass, left, left, "Solve_Succeeded", "")
+    found = held_to_totals(problem, first, IterationMonitor(None, None), 100)
+    assert (found is not None) is held
+    if found is not None:
+        assert found.rigid[0, 0] == pytest.approx(total, rel=1e-9)

@@ -159,6 +159,51 @@ def test_no_time_is_lost_where_the_equations_are_linear(monkeypatch):
     assert sysid.identify(problem((0, 1)), rng=0).determined
 
 
+def test_a_broken_constraint_is_a_difference_too():
+    """The exchanged chain has the same response; beside it counts by how much it breaks what the first one keeps."""
+    free, held = (SameResponse(problem(constraints=c), X) for c in (lambda k, c: [], lambda k, c: [k[0] <= 2 * k[1]]))
+    (alike,), (broken,) = free(exchanged(X)[None]), held(exchanged(X)[None])
+    assert np.linalg.norm(alike) < 1e-12
+    assert np.linalg.norm(broken) > 1.0  # in units of what counts as broken at all
+    assert np.linalg.norm(held(X[None])) < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("damping", "residuals", "unique"),
+    [
+        (lambda z: z, lambda z: [], True),
+        (lambda z: ca.vertcat(z[0] * z[1], z[1]), lambda z: [], False),
+        (lambda z: z, lambda z: [sysid.Prior(z[0] ** 2, 1e-4, 1e-6)], False),
+    ],
+)
+def test_nothing_but_records_and_equations_that_are_linear_leaves_one_answer(damping, residuals, unique):
+    """A product of unknowns, or something stated beside the records, may be met in other ways far away."""
+    posed, z = problem((0, 1)), sysid.Variable("z", 2, lower=-0.2, upper=0.2)
+    again = sysid.Problem(
+        posed.measurement, mass=posed.mass, stiffness=posed.stiffness, damping=damping(z), residuals=residuals(z)
+    )
+    assert other_answers.is_unique_if_rank_is_full(again) is unique
+
+
+def test_structures_are_apart_by_the_entry_of_any_matrix_that_differs_most():
+    """Each over the root of the other's two diagonal entries: 0.3 of sqrt(5 * 4), 900 of 1.5e4, 2 of 15."""
+    M, K = np.diag([5.0, 4.0, 0.0]), STRETCH.T @ np.diag(SPRINGS) @ STRETCH
+    C = (STRETCH.T @ np.diag(DAMPERS) @ STRETCH)[:2, :2]
+    G = np.ones((2, 1))
+
+    def moved(mass=0.0, stiffness=0.0, damping=0.0):
+        K_SS = K[:2, :2] + np.diag([0.0, stiffness])
+        full = np.block([[K_SS, -K_SS @ G], [-(K_SS @ G).T, G.T @ K_SS @ G]])
+        coupled = M + mass * np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 0]])
+        return sysid.Structure(coupled, full, damping_matrix=C + np.diag([damping, 0.0]), n_base=1)
+
+    for change, expected in (
+        ({}, 0.0), ({"mass": 0.3}, 0.3 / np.sqrt(20)), ({"stiffness": 900.0}, 900 / 1.5e4),
+        ({"damping": 2.0}, 2 / 15.0), ({"mass": 0.3, "damping": 2.0}, 2 / 15.0),
+    ):  # fmt: skip
+        assert other_answers._matrices_apart(moved(**change), moved()) == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
 def test_the_same_seed_finds_the_same_bits():
     one, two = (sysid.identify(problem(rng=2), rng=2, start=X) for _ in range(2))
     assert one.undetermined == two.undetermined
@@ -227,3 +272,17 @@ def test_least_squares_from_many_starts_finds_every_root_and_keeps_to_the_box():
     nearest = np.where(np.abs(u - 0.2) < np.abs(u - 0.7), 0.2, 0.7)
     np.testing.assert_allclose(u, nearest, atol=1e-6)
     assert {0.2, 0.7} == set(nearest)
+
+
+def test_least_squares_slide_along_a_bound_to_its_least_and_look_nowhere_else():
+    """``100 (u - v / 2 - 0.2)² + (v - 1.5)²`` is least at (0.95, 1.5); within the box at (0.7, 1), from anywhere."""
+
+    def rows(points):
+        assert np.all((points >= 0) & (points <= 1))  # differences too
+        u, v = points.T
+        return np.stack([10 * (u - v / 2 - 0.2), v - 1.5], axis=1)
+
+    search = LeastSquares(rows, np.random.default_rng(0).random((40, 2)))
+    for _ in range(60):
+        search.step()
+    np.testing.assert_allclose(search.points, np.broadcast_to([0.7, 1.0], (40, 2)), atol=1e-4)

@@ -340,6 +340,78 @@ def test_improve_waits_for_a_finite_cost():
     assert not minimize_swarm(nowhere, SQUARE, rng=0, max_iterations=4, improve=never, improve_every=1).success
 
 
+# Leaders
+
+
+def test_each_new_leader_is_handed_over_once_and_what_comes_back_takes_its_place():
+    """A leader moved half way to the optimum of the sphere costs a quarter."""
+    given, seen = [], []
+
+    def halve(x, cost):
+        assert cost == sphere(x[None])[0]
+        given.append(x)
+        return x / 2, cost / 4
+
+    fun = Counted(sphere)
+    result = minimize_swarm(fun, SQUARE, rng=0, max_iterations=20, on_leader=halve, callback=seen.append)
+    first = ParticleSwarm(SQUARE, rng=0, horizon=20).ask()
+    np.testing.assert_array_equal(given[0], first[np.argmin(sphere(first))])  # the best of the sample
+    bests = np.array([progress.x for progress in seen])
+    assert len(given) == 1 + np.count_nonzero(np.any(np.diff(bests, axis=0) != 0, axis=1)) > 3
+    np.testing.assert_array_equal(result.x, given[-1] / 2)
+    assert result.fun == result.history[-1] == sphere(result.x[None])[0]
+    assert np.all(np.diff(result.history) <= 0)
+    assert result.nfev == sum(fun.calls)  # what it evaluates is its own affair
+
+
+def test_a_leader_that_comes_back_as_it_was_changes_nothing_and_is_not_handed_over_again():
+    given = []
+
+    def keep(x, cost):
+        given.append(x)
+        return x, cost
+
+    plain = minimize_swarm(sphere, SQUARE, rng=0, max_iterations=20)
+    same = minimize_swarm(sphere, SQUARE, rng=0, max_iterations=20, on_leader=keep)
+    assert len(given) == np.unique(plain.history).size < 20
+    np.testing.assert_array_equal(same.history, plain.history)
+    np.testing.assert_array_equal(same.x, plain.x)
+
+
+def test_what_improves_a_leader_is_a_leader_too():
+    given = []
+
+    def seen(x, cost):
+        given.append(x)
+        return x, cost
+
+    minimize_swarm(
+        sphere, SQUARE, rng=0, max_iterations=4, improve=lambda x: np.zeros(2), improve_every=2, on_leader=seen
+    )
+    np.testing.assert_array_equal(given[-1], [0, 0])
+
+
+def test_a_leader_waits_for_a_finite_cost():
+    def never(x, cost):
+        raise AssertionError("on_leader was called")
+
+    assert not minimize_swarm(nowhere, SQUARE, rng=0, max_iterations=4, on_leader=never).success
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        (lambda x, cost: (x, cost + 1), "is above that of the global best"),
+        (lambda x, cost: (x, np.nan), "is above that of the global best"),
+        (lambda x, cost: (x + 100, cost), "outside its bounds"),
+        (lambda x, cost: (x[None], cost), r"x has shape \(1, 2\)"),
+    ],
+)
+def test_a_leader_that_is_none_is_refused(answer, words):
+    with pytest.raises(InputError, match=words):
+        minimize_swarm(sphere, SQUARE, rng=0, on_leader=answer)
+
+
 # Mistakes
 
 

@@ -359,6 +359,23 @@ def test_a_point_that_is_no_better_changes_only_the_counts(cost):
     assert run(swarm, 5).history == run(quiet, 5).history
 
 
+def test_the_best_is_replaced_by_a_point_of_the_same_cost_and_nothing_is_counted():
+    swarm = run(ParticleSwarm(BOUNDS, rng=1), 3)
+    point, cost, evaluations = CENTRE + 0.1 * RANGE, swarm.best_cost, swarm.nfev
+    swarm.replace_best(point, cost)
+    np.testing.assert_array_equal(swarm.best_x, point)
+    assert (swarm.best_cost, swarm.history[-1], swarm.nfev) == (cost, cost, evaluations)
+    assert any(np.allclose(position, point, rtol=1e-12) for position in swarm.positions)
+    assert coordinates_off_the_best(swarm, next_candidate(swarm)) == 1
+
+
+def test_the_best_is_not_replaced_between_ask_and_tell():
+    swarm = run(ParticleSwarm(BOUNDS, rng=1), 3)
+    swarm.ask()
+    with pytest.raises(RuntimeError, match="between ask and tell"):
+        swarm.replace_best(CENTRE, -7.0)
+
+
 def test_a_point_injected_before_the_start_leads_the_swarm():
     swarm = ParticleSwarm(BOUNDS, rng=1)
     assert swarm.inject(CENTRE, -3.0)

@@ -21,6 +21,7 @@ WAYS = {
     "plain": {},
     "evaluations": {"max_evaluations": 333},
     "improved": {"improve": lambda x: x + 0.1 * (CENTRE - x), "improve_every": 7},
+    "leaders": {"on_leader": lambda x, cost: (x + 0.2 * (CENTRE - x), 0.64 * cost)},
     "repaired": {"repair": lambda rows: np.round(rows, 2)},
     "target": {"target": 1e-3},
     "start": {"x0": CENTRE + np.array([0.5, 2.0, 0.2, 0.0])},
