@@ -131,8 +131,8 @@ def pressed_in_words(found: Sequence[OnBound]) -> str:
     """That bounds keep the fit from the records, and what to do, in a sentence."""
     sources = dict.fromkeys(one.source for one in found)
     return (
-        f"bounds keep the fit from the records: {bounds_in_words(found)}; widen them first ({', '.join(sources)}): the truth lies "
-        "beyond, or these unknowns make up for something else that is wrong, which is not judged before"
+        f"bounds keep the fit from the records: {bounds_in_words(found)}; widen them first ({', '.join(sources)}): the "
+        "truth lies beyond, or these unknowns make up for something else that is wrong, which is not judged before"
     )
 
 
