@@ -111,7 +111,7 @@ def _on_windows(problem: Problem, structure: Structure) -> Iterator[OnBound]:
         yield OnBound("natural frequency", f" {i + 1}", side, edge, type(problem.stiffness).__name__, -1)
 
 
-def told(found: Sequence[OnBound]) -> str:
+def bounds_in_words(found: Sequence[OnBound]) -> str:
     """The unknowns with their bounds, in words: "spring 2, 3 (upper, 1e+06 N/m)"."""
     groups: dict[tuple[str, str, str], list[str]] = {}
     for one in found:
@@ -131,8 +131,8 @@ def pressed_in_words(found: Sequence[OnBound]) -> str:
     """That bounds keep the fit from the records, and what to do, in a sentence."""
     sources = dict.fromkeys(one.source for one in found)
     return (
-        f"bounds keep the fit from the records: {told(found)}; widen them first ({', '.join(sources)}): the truth lies "
-        "beyond, or these unknowns make up for something else that is wrong, which is not judged before"
+        f"bounds keep the fit from the records: {bounds_in_words(found)}; widen them first ({', '.join(sources)}): the "
+        "truth lies beyond, or these unknowns make up for something else that is wrong, which is not judged before"
     )
 
 

@@ -452,6 +452,13 @@ def upper_of(unknowns: Iterable[Unknown]) -> Array:
     return np.concatenate([np.zeros(0), *(v.upper for v in unknowns)])
 
 
+def box_of(unknowns: Iterable[Unknown]) -> tuple[Array, Array]:
+    """Lower and upper ends of what a swarm searches of all unknowns, one after the other."""
+    boxes = [v.box for v in unknowns]
+    low, high = ([np.zeros(0), *(box[end] for box in boxes)] for end in (0, 1))
+    return np.concatenate(low), np.concatenate(high)
+
+
 def slices_of(unknowns: Iterable[Unknown]) -> list[slice]:
     """Where each unknown stands in the vector of all."""
     ends = np.cumsum([0, *(unknown.size for unknown in unknowns)]).tolist()

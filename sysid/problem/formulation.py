@@ -23,7 +23,7 @@ from sysid.modal_analysis.complex_frequency import noise_level
 from sysid.models.expressions import as_matrix, variables_of, written_in
 from sysid.models.geometry import Geometry
 from sysid.models.model import MatrixModel, Stated, ratios_of
-from sysid.models.unknowns import Unknown, Variable, expression_of, lower_of, split, upper_of, user_site  # fmt: skip
+from sysid.models.unknowns import Unknown, Variable, box_of, expression_of, lower_of, split, upper_of, user_site
 from sysid.problem.given import MATRICES
 from sysid.problem.matrices import Blocks, Matrices, blocks_of, symbols_in
 from sysid.problem.terms import Builder, ExpressionTerm, Prior, Residual, Term, TermSource, TestTerm, column_of
@@ -107,8 +107,7 @@ class Formulation:
         Raises
         ------
         InputError
-            Where a matrix, residual or constraint is not what it must be; named with the variables that it is written
-            in.
+            Where a matrix, residual or constraint is not what it must be; it names the variables in it.
         """
         _check_names([*(unknown for group in self.of_models for unknown in group), *self.variables])
         _check_healing(self.healed, self.unknowns)
@@ -180,8 +179,7 @@ class Formulation:
     @cached_property
     def box(self) -> tuple[Array, Array]:
         """Lower and upper ends of what a swarm searches, within the bounds, (size,) each."""
-        low, high = ([np.zeros(0), *(v.box[end] for v in self.unknowns)] for end in (0, 1))
-        return np.concatenate(low), np.concatenate(high)
+        return box_of(self.unknowns)
 
     @property
     def guess(self) -> Array:
@@ -378,9 +376,8 @@ class Formulation:
 
     def to_sampling(self, x: Array) -> Array:
         """Swarm coordinates of the unknowns `x`, clipped to the box."""
-        x = np.clip(x, *self.box)
-        s = [v.unsampling(piece) for v, piece in zip(self.unknowns, split(self.unknowns, x), strict=True)]
-        return np.clip(np.concatenate(s), *self.box)
+        pieces = zip(self.unknowns, split(self.unknowns, np.clip(x, *self.box)), strict=True)
+        return np.clip(np.concatenate([v.unsampling(piece) for v, piece in pieces]), *self.box)
 
     def values(self, structure: Structure) -> Array:
         """Unknowns that stand for a structure; variables that enter no matrix at their guess.

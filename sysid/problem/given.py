@@ -11,6 +11,7 @@ import numpy as np
 
 from sysid.errors import InputError, finite_array, numbers, refuse
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.response import columns, weighed_mass
 from sysid.models.damping import WrittenDamping
 from sysid.models.expressions import at_point, check_size, is_expression, square
 from sysid.models.geometry import Geometry
@@ -142,3 +143,34 @@ def _rigid_body_dofs(test: Measurement, stiffness: MatrixModel, R: Array, other:
     check_size("stiffness", whole, n, d)
     K = at_point("stiffness", whole, None)
     return -np.linalg.lstsq(K[:n, :n], K[:n, n:], rcond=None)[0]
+
+
+def rough_mass(test: Measurement, geometry: Geometry, stated: Array | None) -> Array:
+    """Rough rigid-body mass of each base direction from the base force, (d,): it only places the search.
+
+    Beside modes of `stated` circular frequencies, rad/s; where there are none, of the poles in the data.
+
+    Raises
+    ------
+    InputError
+        Where the force weighs a negative mass, with lines far below the first mode.
+    """
+    assert test.force is not None
+    if stated is None:
+        quiet, ratios = test, geometry.pole_ratios
+        omega: Array = geometry.poles.omega if ratios.size else np.zeros(0)
+    else:
+        omega, ratios = stated, np.full(stated.size, 0.01)
+        # Away from resonance the damping, which is not known, hardly matters.
+        away = np.all(np.abs(2 * np.pi * test.freq / omega[:, None] - 1) > 0.1, axis=0)
+        quiet = test if np.count_nonzero(away) < 2 * (omega.size + 1) else test.at(away)
+    mass = np.diag(weighed_mass(quiet, omega, ratios))
+    if np.all(mass > 0):
+        return mass
+    if omega.size and test.freq[0] < 0.3 * omega[0] / (2 * np.pi):
+        raise InputError(
+            f"the base force gives a mass of {mass.min():.3g} kg, with lines well below the first mode: check its "
+            "sign (it is the base's on the structure, in phase with the base acceleration at low frequency) and "
+            "its unit"
+        )
+    return np.linalg.norm(columns(test.force), axis=1) / np.linalg.norm(columns(test.base), axis=1)

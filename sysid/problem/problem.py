@@ -15,7 +15,6 @@ from sysid.errors import InputError, choice, instance, number, refuse
 from sysid.files.tree import check
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.outliers import Outlier, outliers, predicted, pseudo_values, screened
-from sysid.modal_analysis.response import columns, weighed_mass
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.modal_analysis.whole_records import without_transients
 from sysid.models.damping import ModalDamping
@@ -26,7 +25,7 @@ from sysid.models.unknowns import Unknown, Variable, user_site
 from sysid.problem import stored
 from sysid.problem.feasibility import HELD, LOOSE, check_constraints, check_matrices, points_of, scale_of  # fmt: skip
 from sysid.problem.formulation import Formulation
-from sysid.problem.given import MATRICES, as_models, geometry_of
+from sysid.problem.given import MATRICES, as_models, geometry_of, rough_mass
 from sysid.problem.terms import FurtherTest
 from sysid.structure.structure import Array, Structure
 
@@ -481,25 +480,5 @@ class Problem:
 
     def _weigh(self) -> Array:
         """Rough rigid-body mass of each base direction from the base force, (d,): it only places the search."""
-        test, geometry = self.measurement, self.geometry
-        assert test.force is not None
-        if not self.states_frequencies and geometry.pole_ratios.size:
-            omega, quiet, ratios = geometry.poles.omega, test, geometry.pole_ratios
-        else:
-            spectrum = self.stiffness.stated(geometry).spectrum
-            omega = np.zeros(0) if spectrum is None else spectrum
-            # Away from resonance the damping, which is not known yet, hardly matters.
-            away = np.all(np.abs(2 * np.pi * test.freq / omega[:, None] - 1) > 0.1, axis=0)
-            quiet = test if np.count_nonzero(away) < 2 * (omega.size + 1) else test.at(away)
-            ratios = np.full(omega.size, 0.01)
-        freq = omega / (2 * np.pi)
-        mass = np.diag(weighed_mass(quiet, omega, ratios))
-        if np.all(mass > 0):
-            return mass
-        if freq.size and test.freq[0] < 0.3 * freq[0]:
-            raise InputError(
-                f"the base force gives a mass of {mass.min():.3g} kg, with lines well below the first mode: check its "
-                "sign (it is the base's on the structure, in phase with the base acceleration at low frequency) and "
-                "its unit"
-            )
-        return np.linalg.norm(columns(test.force), axis=1) / np.linalg.norm(columns(test.base), axis=1)
+        stated = self.stiffness.stated(self.geometry).spectrum if self.states_frequencies else None
+        return rough_mass(self.measurement, self.geometry, stated)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.assessment.bounds import on_bounds, pressed_in_words, pressure, told
+from sysid.assessment.bounds import bounds_in_words, on_bounds, pressed_in_words, pressure
 from sysid.assessment.checks import contradictions, doubts
 from sysid.assessment.determination import BY_RANK, determine
 from sysid.assessment.gains import assumed, rests_on, taken_at_sensors
@@ -185,7 +185,9 @@ def _remarks(problem: Problem, end: Outcome, *, told_of_bounds: bool) -> Iterato
     """What the user should know of the unknowns and of the misfit."""
     formulation = problem.formulation
     found = on_bounds(problem.screened, end.structure, end.x)
-    yield from (f"on a bound, beyond which the truth may lie: {told(found)}" for _ in found[:1] if not told_of_bounds)
+    yield from (
+        f"on a bound, beyond which the truth may lie: {bounds_in_words(found)}" for _ in found[:1] if not told_of_bounds
+    )
     yield from (unknown.note for unknown in formulation.unknowns if unknown.note and end.strategy != Modal.name)
     yield from taken_at_sensors(problem)
     yield from levels_in_words(problem)

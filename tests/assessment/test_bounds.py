@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 import sysid
-from sysid.assessment.bounds import on_bounds, pressed_in_words, pressure, sides_of, told
+from sysid.assessment.bounds import bounds_in_words, on_bounds, pressed_in_words, pressure, sides_of
 
 FREQ = np.linspace(1.0, 12.0, 60)
 STRETCH = np.array([[1.0, 0.0], [-1.0, 1.0]])
@@ -77,7 +77,7 @@ def test_alike_bounds_are_told_together():
         TEST, mass=np.diag([2.0, 1.0]), stiffness=sysid.ChainStiffness(400.0, 900.0), damping=np.eye(2)
     )
     found = on_bounds(problem, TRUTH, np.array([400.0, 400.0]))
-    assert told(found) == "spring 1, 2 (lower, 400 N/m)"
+    assert bounds_in_words(found) == "spring 1, 2 (lower, 400 N/m)"
     assert pressed_in_words(found).startswith(
         "bounds keep the fit from the records: spring 1, 2 (lower, 400 N/m); widen them first (ChainStiffness)"
     )

@@ -8,7 +8,7 @@ import pytest
 
 import sysid
 from sysid.models import geometry
-from sysid.problem import formulation, problem
+from sysid.problem import formulation, given
 from sysid.swarm import sampling
 
 SPRINGS = np.array([2e4, 1.5e4, 1e4])
@@ -69,7 +69,7 @@ def calls(monkeypatch):
 
     counted(geometry, "find_poles")
     counted(formulation, "noise_level")
-    counted(problem, "weighed_mass")
+    counted(given, "weighed_mass")
     counted(ca, "nlpsol")
     counted(sampling, "latin_hypercube")
     return ran
