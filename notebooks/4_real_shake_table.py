@@ -139,7 +139,6 @@ problem = sysid.Problem(
     fitted,
     mass=sysid.FullMass(healing="rigid_body"),  # no number in kg is known: normalised to 1 kg
     stiffness=sysid.SpectralStiffness([3.75, 11.2, 16.6]),  # Hz, read off the spectra
-    damping=sysid.ModalDamping(0.0005, 0.05),
     validation=[unseen],  # predicted, never fitted
 )
 result = sysid.identify(problem, rng=0)

@@ -53,6 +53,5 @@ def problem(*, data=None, rng=0):
         fitted,
         mass=sysid.FullMass(healing="rigid_body"),
         stiffness=sysid.SpectralStiffness([3.75, 11.2, 16.6]),
-        damping=sysid.ModalDamping(0.0005, 0.05),
         validation=[unseen],
     )

@@ -11,6 +11,7 @@ import importlib.machinery
 import importlib.util
 import inspect
 import os
+import re
 import sys
 import traceback
 import zlib
@@ -21,7 +22,7 @@ from pathlib import Path
 from types import ModuleType
 
 from sysid.errors import InputError
-from sysid.models.unknowns import declared
+from sysid.models.unknowns import NO_COMPLEX, NO_TRUTH, declared
 from sysid.problem.problem import Problem
 from sysid.results.identification import Recipe
 
@@ -295,8 +296,17 @@ def _telling_the_line(path: Path) -> Iterator[None]:
             raise InputError(f"{path}, line {error.lineno}: syntax error: {error.msg}") from None
         lines = [line for frame, line in traceback.walk_tb(error.__traceback__) if frame.f_code.co_filename == full]
         where = f"{path}, line {lines[-1]}" if lines else f"{path}"
-        told = f"{type(error).__name__}: {error}".removesuffix(": ")
-        raise InputError(f"{where}: {told}") from error
+        raise InputError(f"{where}: {_in_own_words(error)}") from error
+
+
+def _in_own_words(error: BaseException) -> str:
+    """What an exception of a module says; of what CasADi cannot do with expressions, what to write instead."""
+    said = str(error)
+    if "truth value of a numeric MX" in said:
+        return NO_TRUTH
+    if isinstance(error, TypeError) and "MX" in said and re.search(r"complex|\d\.?j\b", said):
+        return NO_COMPLEX
+    return f"{type(error).__name__}: {said}".removesuffix(": ")
 
 
 def _was_raised(interrupt: KeyboardInterrupt, file: str) -> bool:

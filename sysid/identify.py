@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.assessment.before_search import named_mistakes
+from sysid.assessment.bounds import bounds_explain
 from sysid.assessment.changing import changes_in_words
 from sysid.assessment.exchanged import exchanged_sensors
 from sysid.errors import InputError, SolverError, finite_array, function, instance, number, path_of, whole_number
@@ -81,7 +82,8 @@ def identify(
     checkpoint : str, Path or Checkpoint, optional
         File in which the state of a swarm or a continuation is kept every few seconds, and at Ctrl-C. Where it is there
         of the same search (problem, strategy, `rng`), the search goes on from it, and ends with the bits that it would
-        have ended with. A file given by its name is gone once the search has ended by itself.
+        have ended with. A file given by its name is gone once the search has ended by itself. One search
+        uses it at a time.
 
     Returns
     -------
@@ -130,8 +132,8 @@ def identify(
                 raise InputError("; ".join((*told, str(error)))) from error
             raise
         result = judge(problem, outcome, why, seed, session)
-    if checkpoint is not None and file is not checkpoint and not result.interrupted:
-        file.remove()
+        if not isinstance(checkpoint, Checkpoint) and not result.interrupted:
+            journal.entries.clear()  # so that the file goes
     return result
 
 
@@ -180,7 +182,8 @@ def _run(
         if not follow or isinstance(chosen, STRATEGIES[-1]):  # after which there is nothing else
             raise
         return _instead(chosen, error, problem, session, start)
-    if not outcome.good and outcome.stopped is None and session.time_for_more:
+    bad = not outcome.good and outcome.stopped is None and session.time_for_more
+    if bad and not bounds_explain(problem, outcome.structure, outcome.x):  # what they leave looks like swapped sensors
         told = exchanged_sensors(problem, outcome.structure)
         if told:
             return replace(outcome, mistakes=told), why

@@ -178,6 +178,36 @@ def test_a_mistake_in_a_module_is_told_with_its_place(here, text, told):
         assert words in message
 
 
+@pytest.mark.parametrize(
+    ("line", "remedy"),
+    [
+        ("0 <= ca.sum1(k) <= 5", "[lower <= k, k <= upper]"),
+        ("1 if ca.sum1(k) > 3 else 2", "ca.if_else"),
+        ("ca.diag(k) * (1 + 0.02j)", "damping=[eta / 2"),
+        ("np.array([1 + 2j, 3.0]) - ca.exp(k)", "record.real - real"),
+        ("ca.exp(k) - np.complex128(1j)", "record.real - real"),
+        ("ca.exp(-1j * ca.sum1(k))", "ca.cos(a) and -ca.sin(a)"),
+    ],
+)
+def test_what_casadi_cannot_do_with_what_its_functions_gave_is_told_with_the_remedy(here, line, remedy):
+    (here / "symbolic.py").write_text(
+        "import casadi as ca\nimport numpy as np\nimport sysid\n\n\ndef problem(*, data=None, rng=0):\n"
+        f"    k = sysid.Variable('k', 2, lower=0, upper=1)\n    {line}\n"
+    )
+    message = refused("symbolic.py")
+    assert message.startswith("symbolic.py, line 8: ")
+    assert remedy in message
+
+
+def test_another_error_of_casadi_is_told_as_it_is(here):
+    (here / "symbolic.py").write_text(
+        "import casadi as ca\n\n\ndef problem(*, data=None, rng=0):\n    ca.MX.sym('a', 2) + ca.MX.sym('b', 3)\n"
+    )
+    message = refused("symbolic.py")
+    assert message.startswith("symbolic.py, line 5: RuntimeError: ")
+    assert "imension mismatch" in message
+
+
 def test_an_input_error_from_inside_passes_as_it_is(here):
     (here / "bad.py").write_text(
         "import sysid\ndef problem(*, data=None, rng=0):\n    raise sysid.InputError('no records on Sundays')\n"

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import os
+import re
+import runpy
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import sysid
 from benchmarks.command_line import sysid_run
 from benchmarks.line import Line
+from sysid.cli.main import main
 
 _MODULE = '''"""A chain of two floors."""
 import casadi as ca
@@ -26,7 +33,7 @@ def problem(*, data=None, rng=0):
     M, K = ca.diag(m), STRETCH.T @ ca.diag(k) @ STRETCH
     constraints = [ca.sum1(m) == 5.0]
     {change}
-    return sysid.Problem(test, mass=M, stiffness=K, constraints=constraints)
+    return sysid.Problem(test, mass=M, stiffness=K, constraints=constraints{more})
 '''
 _FREE = "K = K + ca.diag(ca.vertcat(ca.MX.sym('stray'), 0, 0))"
 _TWIN = "k2 = sysid.Variable('spring', lower=1.0, upper=2.0); K = K * k2"
@@ -49,19 +56,85 @@ CASES = {
 }
 
 
+_ETA = "eta = sysid.Variable('loss factor', lower=0.0, upper=0.1); "
+_TAU = "tau = sysid.Variable('delay', lower=0.0, upper=0.1); "
+_TWO = "a, b = (sysid.Variable(name, lower=0.0, upper=0.1) for name in 'ab')"
+_OTHER = "of = sysid.FurtherTest(test, mass=M, stiffness=K, damping=0.1 * np.eye(2)).response; "
+
+# Of the modelling language: what is done in the line {change}, what more is given to Problem, and the remedy.
+OF_THE_LANGUAGE = {
+    "chained relations": ("constraints = [k[0] <= k[1] <= 1e6]", "", "make two constraints"),
+    "an if on a variable": ("K = K if k[0] > 3 else 2 * K", "", "ca.if_else("),
+    "a complex stiffness": (f"{_ETA}K = K * (1 + 1j * eta)", "", "damping=[eta / 2"),
+    "a complex exponential": (f"{_TAU}K = K * np.exp(-1j * tau)", "", "ca.cos(a) and -ca.sin(a)"),
+    "a complex record less an expression": (f"{_OTHER}r = test.response[0, :1] - of.real[:1, :]", "", "record.real - "),
+    "a complex damping": ("pass", ", damping=(0.02 + 0.01j) * np.eye(2)", "give its real part"),
+    "a measurement among residuals": ("pass", ", residuals=[test]", "sysid.FurtherTest(test, "),
+    "the base first in M": ("M = ca.diag(ca.vertcat(0.0, m))", "", "the base stand last"),
+    "damping of two variables": (_TWO, ", damping=(a, b)", "write a list, [a, b]"),
+    "a recovery of variables": (_TWO, ", recovery=[[1, 0], [a, 1]]", "it must be numbers"),
+}
+
+
 def lines(reduced: bool) -> Iterator[Line]:
-    """One line a mistake: status 2, one message, with name, file and line. Both forms are the same."""
+    """One line a mistake: status 2, one message, with name, file and line; those of the language from Python too.
+
+    The reduced form runs the command line in this process.
+    """
     for name, (change, words) in CASES.items():
-        with tempfile.TemporaryDirectory() as place:
-            folder = Path(place)
-            (folder / "variant.py").write_text(_MODULE.replace("{change}", change), encoding="utf-8")
+        status, said, left = _run(_MODULE.replace("{change}", change).replace("{more}", ""), reduced)
+        named = all(word in said for word in (*words, "variant.py, line "))
+        yield Line(
+            f"mistake: {name}", f"status {status}: {said[:160]}", "status 2, one line with name, file and line",
+            status == 2 and _is_one_line(said) and named and not left,
+        )  # fmt: skip
+    for name, (change, more, remedy) in OF_THE_LANGUAGE.items():
+        module = _MODULE.replace("{change}", change).replace("{more}", more)
+        mark = "return sysid.Problem" if more or change.startswith("M = ") else change
+        place = f"variant.py, line {module[: module.index(mark)].count(chr(10)) + 1}"
+        status, said, left = _run(module, reduced)
+        error = _from_python(module)
+        yield Line(
+            f"mistake: {name}, by sysid run and from Python",
+            f"status {status}: {said[:160]}" + ("" if error in said else f"; from Python {error[:160]}"),
+            "both one line with file, line and remedy",
+            status == 2
+            and not left
+            and all(_is_one_line(one) and place in one and remedy in one for one in (said, error)),
+        )
+
+
+def _run(module: str, reduced: bool) -> tuple[int, str, bool]:
+    """Status of ``sysid run``, what it says on standard error, and whether it leaves a folder of results."""
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        (folder / "variant.py").write_text(module, encoding="utf-8")
+        if not reduced:
             run = sysid_run(["variant.py"], folder)
-            said = run.stderr.strip().splitlines()
-            named = all(word in run.stderr for word in (*words, "variant.py, line "))
-            alone = not (folder / "out").exists() and len(said) == 1 and run.returncode == 2
-            yield Line(
-                f"mistake: {name}",
-                f"status {run.returncode}, {len(said)} line(s): {said[0][:160] if said else ''}",
-                "status 2, one line with name, file and line",
-                bool(alone and named),
-            )
+            return run.returncode, run.stderr.strip(), (folder / "out").exists()
+        before, said = Path.cwd(), io.StringIO()
+        os.chdir(folder)
+        try:
+            with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+                status = main(["run", "variant.py", "--out", "out"])
+        finally:
+            os.chdir(before)
+        return status, said.getvalue().strip(), (folder / "out").exists()
+
+
+def _from_python(module: str) -> str:
+    """The message of the InputError that the module raises where Python runs it; of anything else its kind."""
+    with tempfile.TemporaryDirectory() as place:
+        file = Path(place) / "variant.py"
+        file.write_text(module, encoding="utf-8")
+        try:
+            runpy.run_path(str(file))["problem"]()
+        except sysid.InputError as error:
+            return str(error).replace(f"{place}{os.sep}", "")
+        except Exception as error:
+            return re.sub(r"\s+", " ", f"no InputError but {type(error).__name__}: {error}")
+        return "nothing"
+
+
+def _is_one_line(said: str) -> bool:
+    return len(said.splitlines()) == 1

@@ -108,7 +108,9 @@ def _masses(declared: Formulation) -> tuple[Array, Array] | None:
     totals = declared.mass.totals
     if totals is not None:
         return totals.by_direction, totals.by_direction
-    if declared.mass.free or declared.stiffness.free:
+    # A total that is not stated is searched about what the force weighs, of which nothing is known yet.
+    weighed = declared.geometry.weighs and any(u.name == "total_mass" for u in declared.of_models[0])
+    if declared.mass.free or declared.stiffness.free or weighed:
         return None
     found = [np.diag(s.rigid_body_mass) for s in _structures(declared)]
     return (np.min(found, axis=0), np.max(found, axis=0)) if found else None

@@ -80,13 +80,21 @@ def sensitivity(
     -------
     Sensitivity
     """
+    rows = rows_of(formulation, x, slopes, priors=priors, as_stated=as_stated)
+    return _judged(formulation, x, rows, np.full(x.size, True))
+
+
+def rows_of(
+    formulation: Formulation, x: Array, slopes: Slopes | None = None, *, priors: bool = True, as_stated: bool = False
+) -> list[Rows]:
+    """All that is fitted at `x`, with its Jacobian, a term each; parameters as of `sensitivity`."""
     rows: list[Rows] = []
     if formulation.fits_records:
         rows.append(formulation.own_test.linearised(x, slopes=slopes, as_stated=as_stated))
     for term in (term for term in formulation.beside if priors or term not in formulation.priors):
         noise = float(np.sqrt(np.mean(rows[0].std ** 2))) if rows else np.nan
         rows.append(term.linearised(x, noise, as_stated=as_stated))
-    return _judged(formulation, x, rows, np.full(x.size, True))
+    return rows
 
 
 def of_outside(formulation: Formulation, x: Array) -> Sensitivity:
@@ -139,7 +147,7 @@ def _judged(formulation: Formulation, x: Array, rows: list[Rows], part: NDArray[
     none = Rows(np.zeros(0), np.zeros((0, x.size)), np.zeros(0))
     all_rows = stacked_rows([none, *rows])
     J, std = all_rows.jacobian[:, part] * unit, all_rows.std
-    free = _left_by_constraints(formulation, x, unit, J, part)
+    free = left_by_constraints(formulation, x, unit, J, part)
     J = J @ free
     U, s, Vt = np.linalg.svd(J, full_matrices=len(J) < J.shape[1])
     rank, V = _rank(s, _NULL), Vt.T
@@ -152,7 +160,7 @@ def _judged(formulation: Formulation, x: Array, rows: list[Rows], part: NDArray[
     return Sensitivity(unit, free, s, free @ V[:, :rank], free @ V[:, rank:], normals)
 
 
-def _left_by_constraints(
+def left_by_constraints(
     formulation: Formulation, x: Array, unit: Array, records: Array, part: NDArray[np.bool_]
 ) -> Array:
     """Orthonormal directions, in units of x, along which equalities and what presses on an inequality stay as they are.

@@ -353,6 +353,7 @@ def _quantities(
     frequencies, n = omega / (2 * np.pi), structure.n
     d_frequencies, d_ratios = frequencies[:, None] * moves.log_omega, ratios[:, None] * moves.log_ratios
     frequency_std, ratio_std = moves.std(d_frequencies, frequencies), moves.std(d_ratios, ratios)
+    ratio_std = np.where(problem.formulation.tells_damping, ratio_std, np.nan)  # it may be stated, and is not found
     shape_std = moves.std(moves.phi, np.abs(phi).max(axis=0))
     hidden = np.isnan(shape_std).any(axis=0)  # a shape of unknown scale leaves its participation unknown
     push_std = moves.std(moves.gamma, np.abs(gamma).max())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import os
@@ -11,6 +12,8 @@ from typing import Any
 
 from sysid.cli.output import Output
 from sysid.errors import InputError
+from sysid.results.lock import FILE_NAME as LOCK
+from sysid.results.lock import alone
 from sysid.results.storage import atomically
 
 
@@ -28,6 +31,11 @@ def results_folder(given: str | None, default: Path) -> Path:
     if not os.access(place, os.W_OK | os.X_OK):
         raise InputError(f"folder of results {folder}: {place} cannot be written")
     return folder
+
+
+def alone_in(folder: Path, remedy: str) -> contextlib.AbstractContextManager[None]:
+    """Let no other run write in a folder of results; where one does, it is refused with the remedy."""
+    return alone(folder / LOCK, f"folder of results {folder}", remedy)
 
 
 def table_as_csv(rows: Sequence[Sequence[object]]) -> bytes:

@@ -26,6 +26,7 @@ from sysid.cli import doctor, export, parameters, read, starting, stored_result,
 from sysid.cli.argument_types import band, count, orders, seconds, seed, whole
 from sysid.cli.command_parser import JSON, QUIET, Parser, adder, epilog
 from sysid.cli.display import display_on
+from sysid.cli.files import alone_in
 from sysid.cli.output import Output, collected_warnings, keep_for_document, strict_json
 from sysid.cli.status import BUG, INTERRUPTED, MISTAKE, NOT_REACHED, SUCCESS
 from sysid.errors import InputError, SolverError
@@ -147,13 +148,19 @@ def _show(options: argparse.Namespace, out: Output) -> int:
 
 
 def _run(options: argparse.Namespace, out: Output) -> int:
+    folder = unfinished.folder_of(options)
+    with alone_in(folder, "wait for its end" + ", or write elsewhere with --out DIR" * (options.resume is None)):
+        return _run_in(folder, options, out)
+
+
+def _run_in(folder: Path, options: argparse.Namespace, out: Output) -> int:
     begun = time.perf_counter()
 
     def left(least: float) -> float | None:
         """Seconds that are left, at least so many; None without a limit."""
         return None if options.max_time is None else max(options.max_time - (time.perf_counter() - begun), least)
 
-    search, folder = unfinished.begun(options, out)
+    search = unfinished.begun(options, folder, out)
     recipe, strategy = search.recipe, unfinished.strategy_of(search)
     problem, files = catalogue.built(recipe, check=False)  # by the search, with its progress and under its clock
     checkpoint = Checkpoint(folder / UNFINISHED, unfinished.with_source(search, files, folder))
@@ -221,9 +228,10 @@ def _report(options: argparse.Namespace, out: Output) -> int:
     from sysid.report import report
 
     source = Path(options.result)
-    result = stored_result.read(options)
     folder = source if source.is_dir() else source.parent
-    out.wrote(report.write_report(result, folder / report.FILE_NAME))
+    # A run would write its result between reading the one there and writing its page.
+    with alone_in(folder, "it writes its report itself") if folder.is_dir() else contextlib.nullcontext():
+        out.wrote(report.write_report(stored_result.read(options), folder / report.FILE_NAME))
     return SUCCESS
 
 
@@ -330,7 +338,9 @@ def _add_run(command: Callable[..., argparse.ArgumentParser]) -> None:
         "nearest matrix; ipopt, the paper's nonlinear programme for every candidate, for small problems; leaders "
         "(hpso-ls by default), the closed form, and IPOPT for each new leader of the swarm",
     )
-    run.add_argument("--out", metavar="DIR", help="folder of the results, results/NAME by default")
+    run.add_argument(
+        "--out", metavar="DIR", help="folder of the results, results/NAME by default; one run at a time writes there"
+    )
     run.add_argument(
         "--max-time",
         type=seconds,

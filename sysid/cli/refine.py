@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from sysid.cli import draws, sweeps
-from sysid.cli.files import png, results_folder, table_as_csv, write_files
+from sysid.cli.files import alone_in, png, results_folder, table_as_csv, write_files
 from sysid.cli.output import Output
 from sysid.cli.status import INTERRUPTED, NOT_REACHED, SUCCESS
 from sysid.cli.stored_result import with_problem_of
@@ -38,6 +38,12 @@ def run(options: argparse.Namespace, out: Output) -> int:
     if result.part is not None:
         result = with_problem_of(result, recipe, source)
     folder = results_folder(options.out, (source if source.is_dir() else source.parent) / "refine")
+    with alone_in(folder, "wait for its end, or write elsewhere with --out DIR"):
+        return _run_in(folder, result, recipe, options, out)
+
+
+def _run_in(folder: Path, result: Identification, recipe: Recipe, options: argparse.Namespace, out: Output) -> int:
+    source = Path(options.result)
     executor = _executor(options)
     sweeps.check_own_records(result, recipe)
     sweep = sweeps.sweep_of(options, result, recipe)

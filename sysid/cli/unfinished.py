@@ -19,8 +19,17 @@ from sysid.search.strategy import Strategy
 from sysid.search.swarm import Swarm
 
 
-def begun(options: argparse.Namespace, out: Output) -> tuple[Begun, Path]:
-    """The search that the arguments of ``run`` ask for, and the folder of its results.
+def folder_of(options: argparse.Namespace) -> Path:
+    """The folder of results that the arguments of ``run`` ask for."""
+    if options.resume is None:
+        return results_folder(options.out, Path("results") / _name(_asked(options).recipe))
+    if options.fresh or options.out is not None:
+        raise InputError(f"--resume and {'--fresh' if options.fresh else '--out'} exclude each other")
+    return results_folder(options.resume, Path(options.resume))
+
+
+def begun(options: argparse.Namespace, folder: Path, out: Output) -> Begun:
+    """The search that the arguments of ``run`` ask for, in the folder of its results.
 
     Raises
     ------
@@ -28,16 +37,15 @@ def begun(options: argparse.Namespace, out: Output) -> tuple[Begun, Path]:
         Where the folder holds an unfinished search and nothing is said of it, or another one than is to be resumed.
     """
     if options.resume is not None:
-        return _resumed(options, out)
+        return _resumed(options, folder, out)
     search = _asked(options)
-    folder = results_folder(options.out, Path("results") / _name(search.recipe))
     checkpoint = Checkpoint(folder / FILE_NAME)
     if checkpoint.exists and not options.fresh:
         raise InputError(
             f"{folder} holds {_in_words(checkpoint, search)}: 'sysid run --resume {folder}' goes on with it, "
             "--fresh begins anew, --out DIR writes elsewhere"
         )
-    return search, folder
+    return search
 
 
 def strategy_of(search: Begun) -> str | Strategy:
@@ -70,10 +78,7 @@ def with_source(search: Begun, files: Collection[Path], folder: Path) -> Begun:
     return replace(search, source=source)
 
 
-def _resumed(options: argparse.Namespace, out: Output) -> tuple[Begun, Path]:
-    if options.fresh or options.out is not None:
-        raise InputError(f"--resume and {'--fresh' if options.fresh else '--out'} exclude each other")
-    folder = results_folder(options.resume, Path(options.resume))
+def _resumed(options: argparse.Namespace, folder: Path, out: Output) -> Begun:
     checkpoint = Checkpoint(folder / FILE_NAME)
     asked = _asked(options) if options.problem is not None else None
     if not checkpoint.exists:
@@ -83,7 +88,7 @@ def _resumed(options: argparse.Namespace, out: Output) -> tuple[Begun, Path]:
                 "with it where there is one"
             )
         out.write(f"no unfinished run in {folder}: it begins anew\n")
-        return asked, folder
+        return asked
     tree = checkpoint.read()
     if tree["begun"] is None:
         raise InputError(f"{checkpoint.path} was not begun by 'sysid run': go on with it as it was begun")
@@ -96,7 +101,7 @@ def _resumed(options: argparse.Namespace, out: Output) -> tuple[Begun, Path]:
             f"--resume takes --seed, --strategy, --refine-by, --data and --set from the run in {folder}: {search}"
         )
     out.write(f"going on with {search}\n" if tree["entries"] else f"{search} had reached nothing: it begins anew\n")
-    return search, folder
+    return search
 
 
 def _name(recipe: Recipe) -> str:

@@ -63,12 +63,12 @@ class Landscape:
     def of(cls, problem: Problem, session: Session) -> Landscape:
         """The objective and the steps that the strategy "swarm" takes for a problem; both compiled."""
         objective, steps = Swarm().searched(problem, session)
-        objective(problem.lower[None])
+        objective(problem.formulation.box[0][None])
         return cls(problem, objective, steps)
 
     def at(self, unit: Array) -> Array:
         """The swarm's coordinates of points of the unit cube."""
-        lower, upper = self.problem.lower, self.problem.upper
+        lower, upper = self.problem.formulation.box
         return lower + np.clip(unit, 0.0, 1.0) * (upper - lower)
 
 

@@ -11,16 +11,19 @@ FREQUENCY, RATIO = "frequency, Hz", "damping ratio"
 
 
 def quantities(result: Identification) -> dict[str, float]:
-    """Frequencies, damping ratios and unknowns that mean something by themselves, by label; none fixed ones."""
+    """Frequencies, damping ratios and unknowns that mean something by themselves, by label; none fixed ones.
+
+    Damping ratios are none of them where nothing that is fitted tells of the damping.
+    """
     s, values = result.structure, result.values
     free = [v.name for v in result.facts.unknowns if not (v.fixed or v.is_ratio) and v.name in values]
-    return labelled(s.natural_frequencies, s.damping_ratios, {name: values[name] for name in free})
+    return labelled(s.natural_frequencies, result.identified_ratios, {name: values[name] for name in free})
 
 
 def labelled(frequencies: Array, ratios: Array, unknowns: dict[str, Array]) -> dict[str, float]:
-    """All numbers by their names, entries of an unknown from 1, column by column."""
+    """All numbers by their names, entries of an unknown from 1, column by column; without ratios that are NaN."""
     made = {label(i, FREQUENCY): float(f) for i, f in enumerate(frequencies)}
-    made |= {label(i, RATIO): float(ratio) for i, ratio in enumerate(ratios)}
+    made |= {label(i, RATIO): float(ratio) for i, ratio in enumerate(ratios) if not np.isnan(ratio)}
     for name, value in unknowns.items():
         entries = np.ravel(value, order="F").tolist()
         made |= {name if len(entries) == 1 else f"{name} {i + 1}": entry for i, entry in enumerate(entries)}

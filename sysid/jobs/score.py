@@ -180,9 +180,10 @@ def moves(own: Score, other: Score, *, part: bool) -> tuple[Move, ...]:
         better fit leaves: what a model lacks is in its own deviations too, and would hide its steps.
     """
     of_modes = {label(i, what) for i in range(own.modes) for what in (FREQUENCY, RATIO)}
-    pairs = [(name, name) for name in own.values if name not in of_modes and name in other.values]
+    pairs = [(name, name) for name in own.values if name not in of_modes]
     for i, j in _nearest(own, other):
         pairs += [(label(i, what), label(j, what)) for what in (FREQUENCY, RATIO)]
+    pairs = [(here, there) for here, there in pairs if here in own.values and there in other.values]
     made = []
     for here, there in pairs:
         was, step = own.values[here], other.values[there] - own.values[here]

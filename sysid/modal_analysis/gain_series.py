@@ -125,7 +125,7 @@ class SummedRecord:
         *,
         static: bool = False,
     ) -> None:
-        recovery = channel[:, None] * recovery
+        recovery, self._line = channel[:, None] * recovery, line
         self._metric = recovery.T @ recovery
         made, u = channel[:, None] * line[:, None] * record, line[:, None] * base
         self.size = float(np.sum(np.abs(made) ** 2))
@@ -141,7 +141,7 @@ class SummedRecord:
         self._overlap = np.ascontiguousarray(overlap[: n * terms].reshape(n, terms, -1).swapaxes(1, 2))
         self._static_overlap = overlap[n * terms :]
 
-    def squared(self, shapes: Array, loads: Array, polynomials: Array) -> Array:
+    def squared(self, shapes: Array, loads: Array, polynomials: Array, inner: Array | None = None) -> Array:
         """Squared error of candidates, (count,).
 
         Parameters
@@ -152,23 +152,32 @@ class SummedRecord:
             Participations of the modes, rows of the rigid-body mass of the static ones.
         polynomials : (terms, n, count)
             `GainSeries.polynomials` of the modes' ratios.
+        inner : (count, m, m), optional
+            `inner` of these loads and polynomials where it is known, of this record or one that `weighs_like` it.
         """
         (n, count), (m, d) = polynomials.shape[1:], loads.shape[1:]
-        blocks = [slice(at, at + _BLOCK) for at in range(0, count, _BLOCK)]
-        spare = -count % _BLOCK
-        polynomials = np.pad(polynomials, ((0, 0), (0, 0), (0, spare))) if spare else polynomials
-        filled = np.pad(loads, ((0, spare), (0, 0), (0, 0))) if spare else loads
+        inner = self.inner(loads, polynomials) if inner is None else inner
+        polynomials = _filled(polynomials, 2)
         overlap = np.empty((m, self._overlap.shape[1], polynomials.shape[2]))
-        for at in blocks:
+        for at in _blocks(count):
             np.matmul(self._overlap, polynomials[..., at].swapaxes(0, 1), out=overlap[:n, :, at])
         overlap[n:] = self._static_overlap
         overlap = overlap[..., :count]
         by_mode = [np.ascontiguousarray(part.transpose(1, 2, 0)) for part in (shapes, loads)]
         onto_loads = np.einsum("kdsp,ksp->kdp", overlap.reshape(m, d, -1, count), by_mode[0])
         squared = self.size - 2 * np.einsum("kdp,kdp->p", onto_loads, by_mode[1])
-        inner = [self._inner.products(filled[at], self._gains_of(polynomials[..., at], m)) for at in blocks]
-        metric = shapes @ self._metric @ shapes.swapaxes(1, 2)
-        return squared + np.einsum("pkl,pkl->p", metric, np.concatenate(inner)[:count])
+        return squared + np.einsum("pkl,pkl->p", shapes @ self._metric @ shapes.swapaxes(1, 2), inner)
+
+    def inner(self, loads: Array, polynomials: Array) -> Array:
+        """Inner products of the modes' accelerations over all lines, (count, m, m)."""
+        count, m, _ = loads.shape
+        loads, polynomials = _filled(loads, 0), _filled(polynomials, 2)
+        made = [self._inner.products(loads[at], self._gains_of(polynomials[..., at], m)) for at in _blocks(count)]
+        return np.concatenate(made)[:count]
+
+    def weighs_like(self, other: SummedRecord) -> bool:
+        """Whether the lines of both have the same weights, so that `inner` is the same."""
+        return np.array_equal(self._line, other._line)
 
     def _gains_of(self, polynomials: Array, m: int) -> Array:
         """Coordinates of the gains of m modes, (count, m, rank)."""
@@ -177,6 +186,17 @@ class SummedRecord:
         np.matmul(polynomials.transpose(1, 2, 0), self._gains, out=made[:n])
         made[n:] = self._static_gains
         return made.swapaxes(0, 1)
+
+
+def _blocks(count: int) -> list[slice]:
+    """Candidates that go together."""
+    return [slice(at, at + _BLOCK) for at in range(0, count, _BLOCK)]
+
+
+def _filled(array: Array, axis: int) -> Array:
+    """An array of candidates, those along an axis filled up to whole blocks by zeros."""
+    spare = -array.shape[axis] % _BLOCK
+    return np.pad(array, [(0, spare if i == axis else 0) for i in range(array.ndim)]) if spare else array
 
 
 class _Proportional:

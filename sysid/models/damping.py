@@ -18,14 +18,25 @@ from sysid.models.unknowns import Unknown, lower_of, upper_of
 from sysid.structure.structure import Array, Structure
 
 _MISSING = (math.nan, math.nan)  # no default
+LEAST, MOST = 1e-6, 0.95  # a vibration that hardly dies away, and one that hardly swings
+_USUAL = (0.005, 0.05)  # the swarm's search space, eq. 38
+_DECADE = 10.0  # from end to end of that, and of what is searched about a pole outside
 
 
 @dataclass(frozen=True, eq=False)
 class ModalDamping(FieldTree):
-    """One damping ratio a mode; the bounds are the swarm's search space (eq. 38 of Cerini et al. 2024)."""
+    """One damping ratio a mode.
 
-    lower: float = 0.005
-    upper: float = 0.05
+    Parameters
+    ----------
+    lower, upper : float
+        Bounds of all ratios, which every strategy keeps. Those of any vibrating structure by default: then a swarm
+        searches 0.005 to 0.05 (eq. 38 of Cerini et al. 2024) and, where poles of the data have other ratios, half a
+        decade either way of these.
+    """
+
+    lower: float = LEAST
+    upper: float = MOST
 
     def __post_init__(self) -> None:
         lower, upper = (number(f"ModalDamping: {name}", getattr(self, name)) for name in ("lower", "upper"))
@@ -34,7 +45,15 @@ class ModalDamping(FieldTree):
 
     def unknowns(self, geometry: Geometry) -> tuple[Unknown, ...]:
         """Damping ratios, in ascending order of frequency."""
-        return (Unknown("damping_ratio", np.full(geometry.n, self.lower), np.full(geometry.n, self.upper)),)
+        lower, upper = (np.full(geometry.n, float(end)) for end in (self.lower, self.upper))
+        if self.lower != LEAST and self.upper != MOST:
+            return (Unknown("damping_ratio", lower, upper),)
+        low, high, note = _box(geometry)
+        # A bound that is stated is an end of the box, which is a decade long where the other end would lie beyond.
+        low, high = np.where(lower == LEAST, low, lower), np.where(upper == MOST, high, upper)
+        low = np.where(low < high, low, np.maximum(np.minimum(low, high / _DECADE), lower))
+        high = np.where(low < high, high, np.minimum(low * _DECADE, upper))
+        return (Unknown("damping_ratio", lower, upper, box=(low, high), note=note),)
 
     def blocks(self, geometry: Geometry, y: ca.SX, mass: MassBlocks, stiffness: StiffnessBlocks) -> None:
         """No matrix: ratios only."""
@@ -143,3 +162,16 @@ class WrittenDamping(Written):
     def _by_ratios(self, geometry: Geometry) -> bool:
         given, n = as_matrix("damping", self.written), geometry.n
         return given.shape == (n, 1) and (n > 1 or is_column(self.written))
+
+
+def _box(geometry: Geometry) -> tuple[Array, Array, str]:
+    """Lower and upper ends of what a swarm searches for free ratios, (n,) each, and in words why; empty if as usual."""
+    (lower, upper), half, ratios = _USUAL, np.sqrt(_DECADE), np.clip(geometry.pole_ratios, LEAST, MOST)
+    outside = (ratios < lower) | (ratios > upper)
+    low = np.maximum(np.where(outside, ratios / half, lower), LEAST)
+    high = np.minimum(np.where(outside, ratios * half, upper), MOST)
+    if ratios.size != geometry.n:  # which mode has which is not known
+        low, high = np.full(geometry.n, low.min(initial=lower)), np.full(geometry.n, high.max(initial=upper))
+    found = f"{100 * ratios.min(initial=MOST):.3g} to {100 * ratios.max(initial=LEAST):.3g} %"
+    note = f"damping ratios are searched from {100 * low.min():.3g} to {100 * high.max():.3g} %, as the poles of the "
+    return low, high, f"{note}data have {found}, beyond the usual 0.5 to 5 %" * bool(np.any(outside))

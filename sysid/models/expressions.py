@@ -8,8 +8,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from sysid.errors import InputError, finite_array
-from sysid.models.unknowns import Variable, expression_of, user_site, variable_of
+from sysid.errors import InputError, finite_array, refuse
+from sysid.models.unknowns import Variable, expression_of, refuse_complex, user_site, variable_of
 from sysid.structure.structure import Array
 
 
@@ -48,6 +48,7 @@ def as_matrix(name: str, value: Any) -> ca.MX:
 def _entry(name: str, value: Any) -> Any:
     """An entry of a matrix that is given by rows."""
     value = _without_sx(name, value)
+    refuse_complex([value])
     if isinstance(value, ca.MX | ca.DM | np.ndarray) or (np.isscalar(value) and not isinstance(value, str | bytes)):
         return value
     raise InputError(
@@ -146,6 +147,18 @@ def check_size(name: str, matrix: ca.MX, n: int, d: int) -> None:
             f"{name} is {size_of(matrix)} ({user_site()}); ({n}, {n}) or, with the base, ({n + d}, {n + d}) "
             f"is needed{ratios}, or recovery= beside it, from degrees of freedom to {n} sensors{written_in(matrix)}"
         )
+
+
+def check_base_last(name: str, numbers: Array, n: int) -> None:
+    """Refuse the numbers of a whole mass matrix where the rows of the base, which has no mass, stand first."""
+    d = len(numbers) - n
+    refuse(
+        (
+            d and not np.any(numbers[:d]) and np.any(numbers[n:]),
+            f"{name} ({user_site()}) has no mass in its first row{'s' * (d > 1)}: rows and columns of the base stand "
+            "last, those of the structure first",
+        )
+    )
 
 
 def size_of(matrix: ca.MX) -> str:

@@ -88,6 +88,14 @@ class Geometry:
         return find_poles(self.test, monitor=self.monitor)
 
     @cached_property
+    def pole_ratios(self) -> Array:
+        """Damping ratios of the poles that stand out of the records, by ascending frequency; (0,) where none does."""
+        try:
+            return self.poles.ratios
+        except InputError:  # too few lines, or none stands out: who needs poles asks for them, and is told
+            return np.zeros(0)
+
+    @cached_property
     def natural_frequencies(self) -> Array:
         """Circular frequencies of the modes that stand out of the records, rad/s, ascending, at most n.
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, choice, finite_array, numbers, refuse, shown
+from sysid.models.expressions import at_point, check_base_last
 from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import FACTOR_FLOOR, Geometry, check_sane, check_total_mass
 from sysid.models.model import FactoredMass, MassBlocks, Stated, Totals, Written, constant
@@ -289,6 +290,7 @@ class KnownMass(FieldTree):
             matrix = np.pad(matrix, (0, geometry.d))
         if matrix.shape != (size, size):
             raise InputError(f"the known mass matrix is {matrix.shape}; ({n}, {n}) or ({size}, {size}) is needed")
+        check_base_last("the known mass matrix", matrix, n)
         if np.any(np.abs(matrix[n:][np.diag(matrix)[n:] == 0]) > 1e-9 * np.abs(matrix).max()):
             raise InputError(
                 "the known mass matrix couples a base direction that has no mass: its diagonal entry is 0, others of "
@@ -309,7 +311,9 @@ class WrittenMass(Written):
 
     def blocks(self, geometry: Geometry, y: ca.MX) -> ca.MX:
         """The expression; no coupling and no base mass where it has no base rows."""
-        return self.whole(geometry)
+        whole = self.whole(geometry)
+        check_base_last(self.name, at_point(self.name, whole, None), geometry.n)
+        return whole
 
 
 def _deviations(name: str, std: ArrayLike | None, of: str, values: ArrayLike | None) -> Array | None:

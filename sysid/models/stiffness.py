@@ -15,9 +15,11 @@ from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import FACTOR_FLOOR, Geometry
 from sysid.models.model import MassBlocks, Stated, StiffnessBlocks, Written
 from sysid.models.spectrum import by_ipopt, nearest_factors
-from sysid.models.unknowns import Unknown, log_sampling
+from sysid.models.unknowns import Unknown, log_sampling, user_site
 from sysid.structure.structure import Array, Structure
 from sysid.structure.triangular import lower_triangle, triangle_entries
+
+FREQUENCY_WINDOW = 0.05  # relative; what a stated frequency, read off a peak, may be wrong by
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,14 +210,27 @@ class WrittenStiffness(Written):
 
 def check_rigid(stiffness: ca.MX, rigid_body: Array) -> None:
     """Refuse a stiffness with base columns that strains when the base moves as a rigid body."""
-    n = len(rigid_body)
-    K = at_point("stiffness", stiffness, None)
-    left = np.abs(K[:, :n] @ rigid_body + K[:, n:]).max()
-    if left > 1e-6 * np.abs(K).max():
-        raise InputError(
+    K, d = at_point("stiffness", stiffness, None), rigid_body.shape[1]
+    if not _strains(K, rigid_body):
+        return
+    refuse(
+        (
+            not _strains(np.roll(K, (-d, -d), (0, 1)), rigid_body),
+            f"stiffness ({user_site()}) has the rows and columns of the base first: they stand last, in mass and "
+            f"damping too{written_in(stiffness)}",
+        ),
+        (
+            True,
             "stiffness strains when the base moves as a rigid body: K_S0 must be -K_SS G, and K_00 G' K_SS G (a "
-            "spring to the base counts in all; are its last rows those of the base?)" + written_in(stiffness)
-        )
+            "spring to the base counts in all; are its last rows those of the base?)" + written_in(stiffness),
+        ),
+    )
+
+
+def _strains(K: Array, rigid_body: Array) -> bool:
+    """Whether a stiffness (n + d, n + d) holds a rigid structure to the ground."""
+    n = len(rigid_body)
+    return bool(np.abs(K[:, :n] @ rigid_body + K[:, n:]).max() > 1e-6 * np.abs(K).max())
 
 
 def _arms(geometry: Geometry) -> Array:

@@ -20,6 +20,17 @@ from sysid.structure.structure import Array
 
 _PART = 0.05  # of its range: the least step of an unknown
 
+# What is told of what CasADi cannot do, here and where a module's own line meets it.
+NO_TRUTH = (
+    "an expression in variables has no value yet, so it is neither true nor false: of lower <= k <= upper make two "
+    "constraints, [lower <= k, k <= upper]; in the place of `if` give both cases, ca.if_else(k > 3, a, b)"
+)
+NO_COMPLEX = (
+    "complex numbers meet an expression in variables, and CasADi has real ones only: write two real expressions, of a "
+    "record as [record.real - real, record.imag - imag], of exp(-1j * a) as ca.cos(a) and -ca.sin(a); of a stiffness "
+    "K * (1 + 1j * eta) give K, and damping=[eta / 2, ...], a ratio a mode"
+)
+
 
 def _same(x: Any) -> Any:
     """What is searched on a linear scale."""
@@ -34,11 +45,11 @@ class Unknown:
     name : str
         As tables and results call it, with underscores for spaces.
     lower, upper : array_like, shape (size,)
-        The search space; equal where an entry is known.
+        Bounds of every search; equal where an entry is known.
     unit : str
         For tables.
     sampling : callable, optional
-        CasADi expression of the swarm's coordinates (size,) to the unknowns, both in [lower, upper]: where the swarm
+        CasADi expression of the swarm's coordinates (size,) to the unknowns, both in the box: where the swarm
         had better search another distribution than the uniform one (eq. 18 of the paper). Gradient methods never see
         it.
     unsampling : callable, optional
@@ -47,11 +58,17 @@ class Unknown:
         How the swarm spreads its candidates over the bounds, in a word: "linear", "log", "by row".
     relative : bool
         Only the ratios of its entries mean something, so that tables of results leave it out.
+    box : pair of array_like (size,), optional
+        Where candidates are drawn and a swarm searches, within the bounds; all that lies between them by default.
+    note : str
+        Why the box is where it is, for logs and remarks; empty where it is the usual one.
 
     Attributes
     ----------
+    box : pair of (size,)
+        Lower and upper ends of what a swarm searches.
     guess : (size,)
-        Where a search may start: the middle of the swarm's search space.
+        Where a search may start: the middle of the box.
     has_guess, fixed : bool
         Whether the guess was stated, and whether the unknown is held at it; both only a `Variable`'s.
 
@@ -64,6 +81,7 @@ class Unknown:
     has_guess = False
     fixed = False
     relative = False
+    note = ""
 
     def __init__(
         self,
@@ -76,6 +94,8 @@ class Unknown:
         unsampling: Callable[[Array], Array] = _same,
         scale: str = "linear",
         relative: bool = False,
+        box: tuple[ArrayLike, ArrayLike] | None = None,
+        note: str = "",
     ) -> None:
         self.name, self.unit, self.scale = text("the name of an Unknown", name), unit, scale
         refuse((not isinstance(unit, str), f"variable {name}: its unit {unit!r} is no text"))
@@ -87,12 +107,16 @@ class Unknown:
         if np.any(self.lower > self.upper):
             raise InputError(f"variable {name}: bounds must be finite with lower <= upper")
         self.shape: tuple[int, ...] = (self.lower.size,)
-        self.sampling, self.unsampling = sampling, unsampling
+        self.sampling, self.unsampling, self.note = sampling, unsampling, note
+        low, high = (finite_array(f"variable {name}: box", end) for end in box or (self.lower, self.upper))
+        if low.shape != self.shape or high.shape != self.shape or np.any((low < self.lower) | (high > self.upper)):
+            raise InputError(f"variable {name}: its box must lie within its bounds, entry by entry")
+        self.box = low, high
 
     @cached_property
     def guess(self) -> Array:
         """The middle of the swarm's search space."""
-        return np.asarray(self.sampled()((self.lower + self.upper) / 2)).ravel()
+        return np.asarray(self.sampled()(sum(self.box) / 2)).ravel()
 
     @property
     def size(self) -> int:
@@ -127,6 +151,52 @@ def _of_symbols(operation: Callable[..., Any]) -> Callable[..., Any]:
 def _from_the_right(operation: Callable[..., Any]) -> Callable[..., Any]:
     """The same of two operands, the variable the second of them."""
     return lambda variable, other: operation(expression_of(other), variable.symbol)
+
+
+def _closed(method: Callable[..., Any]) -> Callable[..., Any]:
+    """A method of `Expression` that does as CasADi's, gives an `Expression`, and refuses complex numbers."""
+
+    def closed(self: ca.MX, *others: Any) -> Any:
+        refuse_complex(others)
+        result = method(self, *map(expression_of, others))
+        return Expression(result) if isinstance(result, ca.MX) else result
+
+    return closed
+
+
+class Expression(ca.MX):
+    """What is written in variables with operators: a CasADi MX that tells its author what CasADi cannot do.
+
+    CasADi's functions give a plain MX; what is asked of that is told by `sysid.catalogue`, of a problem module alone.
+    """
+
+    def __bool__(self) -> bool:
+        if self.is_constant():
+            return bool(super().__bool__())
+        raise InputError(f"{user_site()}: {NO_TRUTH}")
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
+        return _closed(lambda _, *given: ca.MX.__array_ufunc__(self, ufunc, method, *given, **options))(self, *inputs)
+
+    __getitem__ = _closed(ca.MX.__getitem__)
+    __neg__, __abs__ = _closed(ca.MX.__neg__), _closed(ca.MX.__abs__)
+    __add__, __radd__ = _closed(ca.MX.__add__), _closed(ca.MX.__radd__)
+    __sub__, __rsub__ = _closed(ca.MX.__sub__), _closed(ca.MX.__rsub__)
+    __mul__, __rmul__ = _closed(ca.MX.__mul__), _closed(ca.MX.__rmul__)
+    __truediv__, __rtruediv__ = _closed(ca.MX.__truediv__), _closed(ca.MX.__rtruediv__)
+    __pow__, __rpow__ = _closed(ca.MX.__pow__), _closed(ca.MX.__rpow__)
+    __matmul__, __rmatmul__ = _closed(ca.MX.__matmul__), _closed(ca.MX.__rmatmul__)
+    __lt__, __le__ = _closed(ca.MX.__lt__), _closed(ca.MX.__le__)
+    __gt__, __ge__ = _closed(ca.MX.__gt__), _closed(ca.MX.__ge__)
+    __eq__, __ne__ = _closed(ca.MX.__eq__), _closed(ca.MX.__ne__)
+    __hash__ = ca.MX.__hash__
+
+
+def refuse_complex(operands: Iterable[Any]) -> None:
+    """Refuse complex numbers, arrays of them too, beside an expression."""
+    for one in operands:
+        if isinstance(one, complex) or (isinstance(one, np.ndarray | np.generic) and one.dtype.kind == "c"):
+            raise InputError(f"{user_site()}: {NO_COMPLEX}")
 
 
 class Variable(Unknown):
@@ -198,7 +268,7 @@ class Variable(Unknown):
         self._refuse_where((not isinstance(unit, str), f"its unit {unit!r} is no text"))
         self.scale = "log" if log else "linear"
         self.shape = self._check_shape(shape)
-        self.lower, self.upper = lower, upper = self._flat("lower", lower), self._flat("upper", upper)
+        self.lower, self.upper = self.box = lower, upper = self._flat("lower", lower), self._flat("upper", upper)
         at = int(np.argmax(lower > upper))
         self._refuse_where(
             (
@@ -225,7 +295,7 @@ class Variable(Unknown):
                 f"its guess {given[at]:g} is outside the bounds {lower[at]:g} to {upper[at]:g}",
             ),
         )
-        self.symbol = ca.MX.sym(self.name, *(*self.shape, 1, 1)[:2])
+        self.symbol = Expression(ca.MX.sym(self.name, *(*self.shape, 1, 1)[:2]))
         self.order = len(_declared)
         _declared[self.symbol.__hash__()] = self
 
@@ -286,7 +356,10 @@ class Variable(Unknown):
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
         return self.symbol.__array_ufunc__(ufunc, method, *map(expression_of, inputs), **options)
 
-    def __getitem__(self, index: Any) -> ca.MX:
+    def __bool__(self) -> bool:
+        return bool(self.symbol)
+
+    def __getitem__(self, index: Any) -> Any:
         try:
             return self.symbol[index]
         except RuntimeError:
@@ -302,7 +375,7 @@ class Variable(Unknown):
     def __iter__(self) -> Any:
         return iter([self.symbol[i, :] for i in range(len(self))])
 
-    __pos__, __neg__, __abs__ = _of_symbols(operator.pos), _of_symbols(operator.neg), _of_symbols(ca.fabs)
+    __pos__, __neg__, __abs__ = _of_symbols(operator.pos), _of_symbols(operator.neg), _of_symbols(abs)
     __add__, __radd__ = _of_symbols(operator.add), _from_the_right(operator.add)
     __sub__, __rsub__ = _of_symbols(operator.sub), _from_the_right(operator.sub)
     __mul__, __rmul__ = _of_symbols(operator.mul), _from_the_right(operator.mul)
@@ -363,7 +436,7 @@ def scales_of(unknowns: Iterable[Unknown], x: Array) -> Array:
 
     Where a range spans decades it tells nothing about the unknown.
     """
-    width = [np.zeros(v.size) if v.scale == "log" else v.upper - v.lower for v in unknowns]
+    width = [np.zeros(v.size) if v.scale == "log" else v.box[1] - v.box[0] for v in unknowns]
     return np.maximum(np.abs(x), _PART * np.concatenate([np.zeros(0), *width]))
 
 

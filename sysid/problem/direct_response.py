@@ -7,13 +7,15 @@ r"""The response of written matrices as CasADi expressions: direct solves, line 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
+from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.response import parts_of, weights_of_test
+from sysid.models.unknowns import NO_COMPLEX, user_site
 from sysid.structure.structure import Array
 
 _SOLVER = "lapacklu"  # of the wheels' plugins the fastest on small dense systems
@@ -52,6 +54,10 @@ class Response(NamedTuple):
 
     real: ca.MX
     imag: ca.MX
+
+    def __array_ufunc__(self, *operation: Any, **options: Any) -> None:
+        """Refuse an operation with an array, such as a complex record."""
+        raise InputError(f"{user_site()}: {NO_COMPLEX}")
 
 
 def relative_response(test: Measurement, motion: Motion, *, shift: float = 0.0) -> tuple[Response, Response]:

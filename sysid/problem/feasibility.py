@@ -27,7 +27,8 @@ def points_of(formulation: Formulation) -> Array:
 def latin_hypercube(formulation: Formulation, count: int, rng: np.random.Generator) -> list[Array]:
     """Points spread over the search space as the swarm's are."""
     unit = sampling.latin_hypercube(count, formulation.size, rng)
-    rows = formulation.lower + unit * (formulation.upper - formulation.lower)
+    low, high = formulation.box
+    rows = low + unit * (high - low)
     s = ca.MX.sym("s", formulation.size)
     unknowns = ca.Function("unknowns", [s], [formulation.from_sampling(s)])
     return [np.asarray(unknowns(row)).ravel() for row in rows]

@@ -177,9 +177,15 @@ class Formulation:
         """Upper bounds, (size,)."""
         return upper_of(self.unknowns)
 
+    @cached_property
+    def box(self) -> tuple[Array, Array]:
+        """Lower and upper ends of what a swarm searches, within the bounds, (size,) each."""
+        low, high = ([np.zeros(0), *(v.box[end] for v in self.unknowns)] for end in (0, 1))
+        return np.concatenate(low), np.concatenate(high)
+
     @property
     def guess(self) -> Array:
-        """Guesses, the middle of the search space where none is given, (size,)."""
+        """Guesses, the middle of the box where none is given, (size,)."""
         return np.concatenate([np.zeros(0), *(v.guess for v in self.unknowns)])
 
     @property
@@ -219,6 +225,15 @@ class Formulation:
     def test_alone(self) -> bool:
         """Whether nothing but the problem's own records tells about the matrices."""
         return self.fits_records and all(self.apart) and not self._touches([r.expression for r in self._relations])
+
+    @cached_property
+    def tells_damping(self) -> bool:
+        """Whether anything that is fitted depends on an unknown of the damping alone; records always do."""
+        if self.fits_records or self.further_tests:
+            return True
+        *others, own = ({symbol.__hash__() for symbol in group} for group in self._in_matrices)
+        own = own.difference(*others, (v.symbol.__hash__() for v in self.fixed))
+        return any(symbol.__hash__() in own for group in self._in_sources for e in group for symbol in ca.symvar(e))
 
     @property
     def free_modes(self) -> bool:
@@ -357,15 +372,15 @@ class Formulation:
         return float(left / size)
 
     def from_sampling(self, s: ca.SX | ca.MX) -> ca.SX | ca.MX:
-        """Unknowns of the swarm's coordinates, which have the same bounds (eq. 18)."""
+        """Unknowns of the swarm's coordinates, which have the same box (eq. 18)."""
         pieces = zip(self.unknowns, split(self.unknowns, s), strict=True)
         return ca.vertcat(*(unknown.sampled()(piece) for unknown, piece in pieces))
 
     def to_sampling(self, x: Array) -> Array:
         """Swarm coordinates of the unknowns `x`, clipped to the box."""
-        x = np.clip(x, self.lower, self.upper)
+        x = np.clip(x, *self.box)
         s = [v.unsampling(piece) for v, piece in zip(self.unknowns, split(self.unknowns, x), strict=True)]
-        return np.clip(np.concatenate(s), self.lower, self.upper)
+        return np.clip(np.concatenate(s), *self.box)
 
     def values(self, structure: Structure) -> Array:
         """Unknowns that stand for a structure; variables that enter no matrix at their guess.

@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from sysid.errors import InputError, finite_array, numbers
+from sysid.errors import InputError, finite_array, numbers, refuse
 from sysid.measurement.measurement import Measurement
 from sysid.models.damping import WrittenDamping
 from sysid.models.expressions import at_point, check_size, is_expression, square
@@ -17,6 +17,7 @@ from sysid.models.geometry import Geometry
 from sysid.models.mass import KnownMass, WrittenMass
 from sysid.models.model import MatrixModel
 from sysid.models.stiffness import WrittenStiffness
+from sysid.models.unknowns import Variable, user_site
 from sysid.structure.structure import Array
 
 MATRICES = ("mass", "stiffness", "damping")
@@ -37,6 +38,15 @@ def as_models(mass: Any, stiffness: Any, damping: Any) -> tuple[MatrixModel, Mat
     InputError
         Where something is none of these.
     """
+    if (
+        isinstance(damping, tuple)
+        and len(damping) == 2
+        and all(isinstance(v, Variable) and not v.shape for v in damping)
+    ):
+        raise InputError(
+            f"damping=({', '.join(v.name for v in damping)}) ({user_site()}) may mean one ratio a mode or two factors: "
+            "write a list, [a, b], for ratios, and a * M + b * K for factors of mass and stiffness"
+        )
     found: list[Any] = []
     for name, value in zip(MATRICES, (mass, stiffness, damping), strict=True):
         if _is_model(value, len(found)):
@@ -61,12 +71,21 @@ def _is_model(value: object, before: int) -> bool:
 
 def _numbers(name: str, value: Any) -> Array:
     try:
-        matrix = numbers(name, value)
+        matrix = numbers(name, value, complex)
     except InputError:
         matrix = np.zeros(())
-    if matrix.ndim not in _DIMENSIONS[name]:
-        raise InputError(f"Problem: {name} is a {type(value).__name__}; give {_WANTED[name]}")
-    return matrix
+    refuse(
+        (
+            np.any(matrix.imag),
+            f"Problem: {name} ({user_site()}) is complex, and a matrix of a structure is real: give its real part; "
+            "a loss factor eta of a complex stiffness is a damping ratio eta / 2 of each mode, damping=[eta / 2, ...]",
+        ),
+        (
+            matrix.ndim not in _DIMENSIONS[name],
+            f"Problem: {name} is a {type(value).__name__}; give {_WANTED[name]}",
+        ),
+    )
+    return matrix.real.copy()
 
 
 def geometry_of(
@@ -83,6 +102,14 @@ def geometry_of(
     InputError
         Where recovery, rigid_body_dofs and the sensors do not fit together.
     """
+    for name, given in (("recovery", recovery), ("rigid_body_dofs", rigid_body_dofs)):
+        refuse(
+            (
+                is_expression(given),
+                f"{name} ({user_site()}) is written in variables, and it must be numbers: what is not known of the "
+                "degrees of freedom belongs into mass, stiffness and damping, written in those of the sensors",
+            )
+        )
     R = np.eye(test.n_sensors) if recovery is None else finite_array("recovery", recovery)
     if R.ndim != 2 or len(R) != test.n_sensors:
         raise InputError(f"recovery is {R.shape}; ({test.n_sensors}, n) takes n degrees of freedom to the sensors")

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -126,7 +127,8 @@ class Problem:
         for name in ("residuals", "constraints", "validation"):
             given = getattr(self, name)
             if not isinstance(given, list | tuple):
-                raise InputError(f"Problem: {name} is a {type(given).__name__}; give a list of them: {name}=[...]")
+                kind = "MX" if isinstance(given, ca.MX) else type(given).__name__
+                raise InputError(f"Problem: {name} is a {kind}; give a list of them: {name}=[...]")
             object.__setattr__(self, name, tuple(given))
         for at, test in enumerate(self.validation):
             instance(f"Problem: validation[{at}]", test, Measurement)
@@ -479,14 +481,19 @@ class Problem:
 
     def _weigh(self) -> Array:
         """Rough rigid-body mass of each base direction from the base force, (d,): it only places the search."""
-        test, spectrum = self.measurement, self.stiffness.stated(self.geometry).spectrum
+        test, geometry = self.measurement, self.geometry
         assert test.force is not None
-        omega = np.zeros(0) if spectrum is None else spectrum
+        if not self.states_frequencies and geometry.pole_ratios.size:
+            omega, quiet, ratios = geometry.poles.omega, test, geometry.pole_ratios
+        else:
+            spectrum = self.stiffness.stated(geometry).spectrum
+            omega = np.zeros(0) if spectrum is None else spectrum
+            # Away from resonance the damping, which is not known yet, hardly matters.
+            away = np.all(np.abs(2 * np.pi * test.freq / omega[:, None] - 1) > 0.1, axis=0)
+            quiet = test if np.count_nonzero(away) < 2 * (omega.size + 1) else test.at(away)
+            ratios = np.full(omega.size, 0.01)
         freq = omega / (2 * np.pi)
-        # Away from resonance the damping, which is not known yet, hardly matters.
-        away = np.all(np.abs(test.freq / freq[:, None] - 1) > 0.1, axis=0)
-        quiet = test if np.count_nonzero(away) < 2 * (freq.size + 1) else test.at(away)
-        mass = np.diag(weighed_mass(quiet, omega, np.full(omega.size, 0.01)))
+        mass = np.diag(weighed_mass(quiet, omega, ratios))
         if np.all(mass > 0):
             return mass
         if freq.size and test.freq[0] < 0.3 * freq[0]:

@@ -14,13 +14,13 @@ from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 import casadi as ca
 import numpy as np
 
-from sysid.errors import InputError, finite_array, instance
+from sysid.errors import InputError, finite_array, instance, refuse
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import misfit_rows
 from sysid.modal_analysis.response import residual, weights_of_test
 from sysid.models.expressions import as_matrix, at_point, check_finite, written_in
 from sysid.models.geometry import Geometry
-from sysid.models.unknowns import user_site, variable_of
+from sysid.models.unknowns import Expression, user_site, variable_of
 from sysid.problem.batch_objective import TestObjective
 from sysid.problem.direct_response import Response, absolute_response, relative_misfit, relative_response
 from sysid.problem.given import MATRICES, as_models, geometry_of
@@ -305,12 +305,12 @@ class FurtherTest:
     @property
     def response(self) -> Response:
         """Absolute accelerations of the sensors as expressions, (n_sensors, runs * n_freq)."""
-        return absolute_response(self.measurement, self.blocks[0].motion(self.blocks[1]))
+        return _as_expressions(absolute_response(self.measurement, self.blocks[0].motion(self.blocks[1])))
 
     @property
     def force(self) -> Response:
         """The base force as expressions, (d, runs * n_freq)."""
-        return relative_response(self.measurement, self.blocks[0].motion(self.blocks[1]))[1]
+        return _as_expressions(relative_response(self.measurement, self.blocks[0].motion(self.blocks[1]))[1])
 
     @property
     def expression(self) -> ca.MX:
@@ -392,8 +392,20 @@ class Residual:
         return ExpressionTerm(name, function, like_records=not self.is_misfit)
 
 
+def _as_expressions(response: Response) -> Response:
+    """The same response, whose parts tell where complex numbers meet them."""
+    return Response(*map(Expression, response))
+
+
 def column_of(name: str, value: Any) -> ca.MX:
     """A column of expressions, refused where it is not finite at the guess or holds no variable."""
+    refuse(
+        (
+            isinstance(value, Measurement),
+            f"{name} ({user_site()}) is a test: sysid.FurtherTest(test, mass=M, stiffness=K, damping=C) fits it beside "
+            "the first, validation=[test] predicts it",
+        )
+    )
     column = ca.vec(ca.densify(as_matrix(name, value)))
     check_finite(name, at_point(name, column, None).ravel(), column)
     if not ca.symvar(column):

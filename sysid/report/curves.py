@@ -93,10 +93,8 @@ def _modes(it: Identification, points: Array, motion: Array) -> dict[str, Any]:
         shape *= _SHOWN * np.ptp(points, axis=0).max() / np.abs(shape).max()
         shapes.append(shape.round(6).tolist())
     names = [
-        f"mode {k}: {f:.4g} Hz, damping {100 * ratio:.3g} %"
-        for k, (f, ratio) in enumerate(
-            zip(it.structure.natural_frequencies, it.structure.damping_ratios, strict=True), 1
-        )
+        f"mode {k}: {f:.4g} Hz" + f", damping {100 * ratio:.3g} %" * bool(np.isfinite(ratio))
+        for k, (f, ratio) in enumerate(zip(it.structure.natural_frequencies, it.identified_ratios, strict=True), 1)
     ]
     return {"points": points.round(6).tolist(), "sticks": sticks, "shapes": shapes, "names": names}
 

@@ -128,8 +128,8 @@ def _modes(it: Identification) -> Iterator[tuple[str, str]]:
     n = min(s.n, _MOST_MODES)
     widths = np.zeros((2, n)) if u is None else np.array([u.natural_frequencies[:n], u.damping_ratios[:n]])
     for k in range(n):
-        f, percent = s.natural_frequencies[k], 100 * s.damping_ratios[k]
-        damping = _with_interval(it, percent, 100 * widths[1, k], "%")
+        f, percent = s.natural_frequencies[k], 100 * it.identified_ratios[k]
+        damping = "not determined" if np.isnan(percent) else _with_interval(it, percent, 100 * widths[1, k], "%")
         yield f"mode {k + 1}", f"{_with_interval(it, f, widths[0, k], 'Hz')}, damping {damping}"
     if not it.success:
         yield "", "without intervals: they hold for a model that fits, and this one does not"

@@ -176,7 +176,7 @@ def _unknowns(it: Identification) -> str:
 
 def _modes(it: Identification) -> str:
     structure, reference, u = it.structure, it.records.reference, it.quick_uncertainty
-    many, frequencies, percent = is_one_of_many(it), structure.natural_frequencies, 100 * structure.damping_ratios
+    many, frequencies, percent = is_one_of_many(it), structure.natural_frequencies, 100 * it.identified_ratios
     widths = np.zeros((2, structure.n)) if u is None else np.array([u.natural_frequencies, 100 * u.damping_ratios])
     told = [rounded(f, std, 6) for f, std in zip(frequencies, widths[0], strict=True)]
     damping = [rounded(ratio, std) for ratio, std in zip(percent, widths[1], strict=True)]

@@ -332,6 +332,11 @@ class Answer:
         return modal_assurance(self.structure.mode_shapes, other.mode_shapes)
 
     @property
+    def identified_ratios(self) -> Array:
+        """Damping ratios of the modes, (n,); NaN where nothing that is fitted tells of the damping."""
+        return np.where(self.facts.tells_damping, self.structure.damping_ratios, np.nan)
+
+    @property
     def degrees_of_freedom(self) -> tuple[str, ...]:
         """What the rows of M_SS, K_SS and C stand for: a sensor's name, or "coordinate of mode 7"."""
         names, structure = self.measurement.sensor_names, self.structure

@@ -19,7 +19,8 @@ from sysid.errors import InputError, path_of
 from sysid.files.tree import Tree, from_bytes, to_bytes
 from sysid.problem.problem import Problem
 from sysid.results.identification import Recipe
-from sysid.results.storage import atomically, missing_folders, remove_empty, unfinished_writings
+from sysid.results.lock import alone
+from sysid.results.storage import atomically, unfinished_writings
 from sysid.results.version import __version__
 from sysid.search.journal import EVERY, Journal
 from sysid.search.refinement import RefineBy
@@ -130,8 +131,14 @@ class Checkpoint:
         Raises
         ------
         InputError
-            Where the file is of another search than `search` (see `identity`), or cannot be written.
+            Where the file is of another search than `search` (see `identity`), is in use, or cannot be written.
         """
+        lock = self.path.with_name(f".{self.path.name}.lock")
+        with alone(lock, str(self.path), "wait for its end, or give another file"), self._journal(search) as journal:
+            yield journal
+
+    @contextlib.contextmanager
+    def _journal(self, search: str) -> Iterator[Journal]:
         entries: Tree = {}
         if self.exists:
             tree = self.read()
@@ -154,7 +161,7 @@ class Checkpoint:
             except InputError as error:  # no reason to lose the search itself
                 warnings.warn(f"the search goes on, but its state is not kept: {error}", stacklevel=2)
 
-        journal, missing = Journal(try_to_write, entries, self.every), missing_folders(self.path.parent)
+        journal = Journal(try_to_write, entries, self.every)
         try:
             for left in unfinished_writings(self.path):
                 left.unlink(missing_ok=True)
@@ -165,7 +172,6 @@ class Checkpoint:
             if not journal.entries:
                 with contextlib.suppress(OSError):
                     self.remove()
-                remove_empty(missing)
 
 
 def identity(

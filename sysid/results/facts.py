@@ -58,6 +58,8 @@ class Facts(NamedTuple):
         Which entries of the rigid-body mass are stated.
     assumed : tuple of str
         Sentences.
+    tells_damping : bool
+        As of `Formulation`.
     """
 
     unit_mass: bool
@@ -72,6 +74,7 @@ class Facts(NamedTuple):
     models: tuple[tuple[str, str], ...]
     stated_rigid_body: Array
     assumed: tuple[str, ...]
+    tells_damping: bool
 
     def to_tree(self) -> dict[str, Any]:
         """Give all as dictionaries, lists, arrays, numbers and texts; `from_tree` takes it back."""
@@ -128,6 +131,7 @@ def facts_of(problem: Problem, x: Array | None) -> Facts:
         models=tuple(_models(problem)),
         stated_rigid_body=_stated_rigid_body(problem),
         assumed=tuple(taken_at_sensors(problem)),
+        tells_damping=bool(formulation.tells_damping),
     )
 
 

@@ -141,7 +141,8 @@ class Identification(Answer):
         """The figures of ``summary.json``; None for what the data leave open or what was not computed."""
         u, values = self.quick_uncertainty, self.values
         std = {} if u is None else u.variables
-        reported = () if self.x is None else self.facts.unknowns
+        facts = self.facts
+        reported = () if self.x is None else [v for v in facts.unknowns if facts.tells_damping or not v.is_ratio]
         return {
             "problem": self.recipe.module if self.recipe else None,
             "parameters": self.recipe.parameters if self.recipe else {},
@@ -157,7 +158,7 @@ class Identification(Answer):
             "force_residual": self.force_residual,
             "natural_frequencies_hz": self.structure.natural_frequencies.tolist(),
             "natural_frequencies_std_hz": _plain(self.quick_std("natural_frequencies")),
-            "damping_ratios": self.structure.damping_ratios.tolist(),
+            "damping_ratios": _plain(self.identified_ratios),
             "damping_ratios_std": _plain(self.quick_std("damping_ratios")),
             "unknowns": {v.name: values[v.name].tolist() for v in reported},
             "unknowns_std": {v.name: _plain(std[v.name]) for v in reported if v.name in std},

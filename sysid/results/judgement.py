@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sysid.assessment.bounds import on_bounds, pressed_in_words, pressure, told
 from sysid.assessment.checks import contradictions, doubts
 from sysid.assessment.determination import BY_RANK, determine
 from sysid.assessment.gains import assumed, rests_on, taken_at_sensors
@@ -21,8 +22,8 @@ from sysid.problem.problem import Problem
 from sysid.results.answer import NOT_JUDGED
 from sysid.results.identification import Identification
 from sysid.results.noise_table import noise_in_words
-from sysid.results.unknowns_table import ON_BOUND
 from sysid.search.deadline import TimeIsOver, within
+from sysid.search.modal import Modal
 from sysid.search.other_answers import with_other_answers
 from sysid.search.session import Session
 from sysid.search.strategy import HUBER, Outcome
@@ -105,7 +106,12 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
         determined=not open_,
         closed_by=() if open_ else closed_by,
         undetermined=open_,
-        remarks=(why, *end.remarks, *_remarks(problem, end), *(() if open_ else assumed(problem))),
+        remarks=(
+            why,
+            *end.remarks,
+            *_remarks(problem, end, told_of_bounds=against.on_bounds),
+            *(() if open_ else assumed(problem)),
+        ),
         interrupted=isinstance(end.stopped, KeyboardInterrupt),
         against=speak,
         changing=against.changing,
@@ -118,10 +124,20 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
 
 
 class Against(NamedTuple):
-    """What speaks against an answer, in sentences, the weightiest first; and whether frequencies change."""
+    """What speaks against an answer, in sentences, the weightiest first.
+
+    Attributes
+    ----------
+    sentences : tuple of str
+    changing : bool
+        Frequencies change.
+    on_bounds : bool
+        Unknowns on bounds are the first of them.
+    """
 
     sentences: tuple[str, ...]
     changing: bool = False
+    on_bounds: bool = False
 
 
 def _against(problem: Problem, end: Outcome, verdict: Verdict) -> Against:
@@ -132,6 +148,12 @@ def _against(problem: Problem, end: Outcome, verdict: Verdict) -> Against:
         return Against((*end.mistakes, *verdict.wrong, *end.doubts, *further))
     errors = model_errors(problem, end.structure, verdict.misses)
     further = (*end.doubts, *doubts(problem.screened, end.structure, end.x, changing=errors.changing))
+    found = on_bounds(problem.screened, end.structure, end.x)
+    press = pressure(problem.screened, end.structure, end.x, found)
+    if press.explains or (press.significant and not (verdict.wrong or errors.sentences or further)):
+        # Whatever else a misfit speaks against may be right once the bounds are wider.
+        told_first = (pressed_in_words(found), *verdict.wrong, *errors.sentences)
+        return Against(tuple(dict.fromkeys(told_first)), errors.changing, on_bounds=True)
     if errors.changing:
         return Against((*errors.sentences, *verdict.wrong, *further), changing=True)
     stated = contradictions(problem.screened, end.structure)
@@ -159,15 +181,12 @@ def verdict_of(problem: Problem, end: Outcome, *, cut_short: bool = False) -> Ve
     return Verdict(fits, tuple(wrong), "; ".join(told), misses)
 
 
-def _remarks(problem: Problem, end: Outcome) -> Iterator[str]:
+def _remarks(problem: Problem, end: Outcome, *, told_of_bounds: bool) -> Iterator[str]:
     """What the user should know of the unknowns and of the misfit."""
     formulation = problem.formulation
-    if end.x is not None and formulation.variables:
-        near = ON_BOUND * (problem.upper - problem.lower)
-        at = (end.x - problem.lower < near) | (problem.upper - end.x < near)
-        names = [label for label, on in zip(formulation.labels, at, strict=True) if on]
-        if names:
-            yield f"on a bound of the search space, beyond which the truth may lie: {', '.join(names)}"
+    found = on_bounds(problem.screened, end.structure, end.x)
+    yield from (f"on a bound, beyond which the truth may lie: {told(found)}" for _ in found[:1] if not told_of_bounds)
+    yield from (unknown.note for unknown in formulation.unknowns if unknown.note and end.strategy != Modal.name)
     yield from taken_at_sensors(problem)
     yield from levels_in_words(problem)
     tests = [term.test for term in formulation.tests]
@@ -181,6 +200,8 @@ def _remarks(problem: Problem, end: Outcome) -> Iterator[str]:
     yield from _outliers(problem, end)
     if not formulation.fits_records:
         yield "the problem states a misfit of its own; pictures and scores compare with the records as they are"
+    told = "no damping ratio is identified: no unknown of the damping alone enters what is fitted"
+    yield from [told] * (not formulation.tells_damping)
 
 
 def _outliers(problem: Problem, end: Outcome) -> Iterator[str]:

@@ -249,7 +249,7 @@ def _mode_table(it: Answer) -> list[str]:
     columns = [
         ["mode", *(f"{i + 1}" for i in k), "sum"],
         ["frequency, Hz", *(f"{f:.5g}" for f in s.natural_frequencies), ""],
-        ["damping, %", *(f"{100 * zeta:.4g}" for zeta in s.damping_ratios), ""],
+        ["damping, %", *("-" if np.isnan(zeta) else f"{100 * zeta:.4g}" for zeta in it.identified_ratios), ""],
     ]
     if u is not None:
         columns.insert(2, ["+-", *map(half_width, u.natural_frequencies, s.natural_frequencies), ""])

@@ -6,14 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sysid.assessment.bounds import sides_of
 from sysid.results.answer import Answer
 
-ON_BOUND = 1e-6  # of an unknown's range: nearer than that it rests on the bound
 MANY = 60  # rows beyond which a terminal shows none
 
 
 class Row(NamedTuple):
-    """A scalar unknown; `std` is NaN where no record sees it."""
+    """A scalar unknown; `std` is NaN where no record sees it, `side` the bound on which it rests, empty for none."""
 
     label: str
     value: float
@@ -21,13 +21,12 @@ class Row(NamedTuple):
     unit: str
     lower: float
     upper: float
+    side: str
 
     @property
     def on_bound(self) -> str:
         """Words for the bound on which the value rests: "on its lower bound"; nothing elsewhere."""
-        near = ON_BOUND * (self.upper - self.lower)
-        rests = ("lower", self.value - self.lower < near), ("upper", self.upper - self.value < near)
-        return next((f"on its {name} bound" for name, there in rests if there), "")
+        return f"on its {self.side} bound" * bool(self.side)
 
 
 def stated_values(it: Answer) -> list[str]:
@@ -43,8 +42,11 @@ def rows_of(it: Answer) -> list[Row]:
     known = {} if u is None else u.variables
     rows: list[Row] = []
     for unknown in (one for one in it.facts.unknowns if not (one.fixed or one.is_ratio)):
-        values = np.ravel(it.values[unknown.name], order="F").tolist()
+        values = np.ravel(it.values[unknown.name], order="F")
         std = np.ravel(known.get(unknown.name, np.full(unknown.shape, np.nan)), order="F").tolist()
         units = [unknown.unit] * unknown.size
-        rows += map(Row, unknown.labels, values, std, units, unknown.lower.tolist(), unknown.upper.tolist())
+        bounds = unknown.lower.tolist(), unknown.upper.tolist()
+        rows += map(
+            Row, unknown.labels, values.tolist(), std, units, *bounds, sides_of(unknown.lower, unknown.upper, values)
+        )
     return rows

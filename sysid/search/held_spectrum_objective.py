@@ -33,7 +33,7 @@ _MOST_THREADS = 8
 # half of its digits at 1e-12.
 _LEAST = 1e-6
 _DRAWS = 254  # candidates beside the corners of the box, from which the range of damping ratios is read
-_WIDEST_RANGE = 1e4  # of a ratio, upper over lower: the series of a wider one would be long
+_NARROWEST_RANGE, _WIDEST_RANGE = 1.01, 1e4  # of a ratio, upper over lower: the series of a wider one would be long
 
 
 def held_spectrum_objective(
@@ -133,9 +133,16 @@ class HeldSpectrumObjective:
         return squared[: count - start], self._series.holds(ratios[: count - start, :, 0])
 
     def _squared(self, ratios: Array, modes: BatchModes) -> Array:
-        polynomials = self._series.polynomials(ratios)
-        parts = zip(self._records, (_accelerations, _force), strict=False)
-        return np.sum([record.squared(*made(modes), polynomials) / size for (record, size), made in parts], axis=0)
+        polynomials, inner = self._series.polynomials(ratios), None
+        (accelerations, size), *of_force = self._records
+        squared = np.zeros(len(modes.loads))
+        for force, size_of_force in of_force:
+            shapes, loads = _of_force(modes)
+            of_all = force.inner(loads, polynomials)
+            squared += force.squared(shapes, loads, polynomials, of_all) / size_of_force
+            n = modes.shapes.shape[1]
+            inner = np.ascontiguousarray(of_all[:, :n, :n]) if accelerations.weighs_like(force) else None
+        return squared + accelerations.squared(modes.shapes, modes.loads, polynomials, inner) / size
 
 
 def chunk_ends(count: int, size: int) -> list[int]:
@@ -155,20 +162,17 @@ def _range_of_ratios(problem: Problem, expansion: Batch) -> tuple[Array, Array]:
 
     Exact where ratios rise with every coordinate; elsewhere candidates beyond are left to the sum over lines.
     """
-    lower, upper = problem.lower, problem.upper
+    lower, upper = problem.formulation.box
     draws = np.random.default_rng(0).uniform(lower, upper, (_DRAWS, problem.n_variables))
     ratios = expansion(np.vstack([lower, upper, draws]))[0][..., 0]
-    highest = np.nanmax(ratios, axis=0)
-    return np.maximum(np.nanmin(ratios, axis=0), highest / _WIDEST_RANGE), highest
+    lowest, highest = np.fmin.reduce(ratios), np.fmax.reduce(ratios)
+    highest = np.where(highest > 0, highest, 1.0)  # no ratio of a structure: all goes by lines
+    lowest = np.maximum(lowest, highest / _WIDEST_RANGE)
+    return lowest, np.maximum(highest, lowest * _NARROWEST_RANGE)
 
 
-def _accelerations(modes: BatchModes) -> tuple[Array, Array]:
-    """Shapes and participations."""
-    return modes.shapes, modes.loads
-
-
-def _force(modes: BatchModes) -> tuple[Array, Array]:
-    """The same of the base force, with the rigid-body mass behind the modes."""
+def _of_force(modes: BatchModes) -> tuple[Array, Array]:
+    """Shapes and participations of the base force, with the rigid-body mass behind the modes."""
     rigid = modes.rigid_body_mass
     still = np.broadcast_to(np.eye(rigid.shape[1]), rigid.shape)
     return np.concatenate([modes.loads, still], axis=1), np.concatenate([modes.loads, rigid], axis=1)

@@ -203,7 +203,7 @@ def cayley(S: ca.MX) -> ca.MX:
 
 
 def _fit_about(problem: Problem, x: Array, error: InverseFactorError, monitor: IterationMonitor, limit: int) -> End:
-    """IPOPT of at most `limit` iterations, with Psi_0 of the unknowns `x` that it starts from; totals are held after."""
+    """IPOPT from the unknowns `x`, with their Psi_0, in at most `limit` iterations; then again with totals held."""
     structure = problem.structure(x)
     start, n = coordinates_of(structure), structure.n
     z = NonlinearProgram()

@@ -24,13 +24,14 @@ from sysid.modal_analysis.residues import ROUND_OFF, beyond_chance, line_correla
 from sysid.modal_analysis.response import columns, gains, stacked, weighted_error, weights_of
 from sysid.modal_analysis.vector_fitting import Poles, find_poles, poles_near
 from sysid.models.spectrum import SOLVED
+from sysid.models.stiffness import FREQUENCY_WINDOW
 from sysid.nlp import EXACT, IterationMonitor
 from sysid.problem.matrices import assemble
 from sysid.problem.problem import Problem
 from sysid.search.local import LocalResult, fit_apart, solve
-from sysid.search.modal_coordinates import FREQUENCY_WINDOW, End
+from sysid.search.modal_coordinates import End
 from sysid.search.modal_scaling import nearest_lumped, of_known_mass, to_stated_totals
-from sysid.search.mode_fit import Integers, ModeFit, held_to_totals
+from sysid.search.mode_fit import Integers, ModeFit, held_to_bounds, held_to_totals
 from sysid.search.session import Session, Stop
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase
 from sysid.structure.structure import Array, Structure
@@ -222,6 +223,7 @@ def run_modal(problem: Problem, options: Modal, session: Session) -> Outcome:
         + f" Hz (free residues fit within {poles.residual:.2e})"
     )
     success, message = end.status in SOLVED or end.residual <= EXACT, f"IPOPT: {end.status}"
+    message += f"; ended on a bound: {end.bounds}" * bool(end.bounds)
     modal = problem.measurement.modal
     if modal is not None:  # fitted with the transients, before
         success = modal.settled
@@ -303,6 +305,7 @@ def modal_structure(
     test, mass = problem.measurement, problem.formulation.mass
     poles = poles_of(problem)
     end = _of_whole_records(problem, options) or _fitted(problem, poles, options, monitor)
+    end = held_to_bounds(problem, end, monitor, options.max_iterations)
     # With all modes at the sensors totals are adjusted together with the other statements, afterwards.
     later = mass.weighs and end.modes.omega.size == test.n_sensors
     held = None if later else held_to_totals(problem, end, monitor, options.max_iterations)

@@ -18,6 +18,7 @@ import numpy as np
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, fit_modes, rank_one
 from sysid.modal_analysis.residues import linear_residues
+from sysid.models.stiffness import FREQUENCY_WINDOW
 from sysid.models.unknowns import lower_of, upper_of
 from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram
 from sysid.problem.matrices import assemble
@@ -26,7 +27,6 @@ from sysid.search.modal_scaling import stated_totals, to_stated_totals
 from sysid.search.scaled_unknowns import add_unknowns
 from sysid.structure.structure import Array, Structure
 
-FREQUENCY_WINDOW = 0.05  # relative; what a frequency read off a peak may be wrong by
 _OPEN_WINDOW = 20.0  # factor either way for a frequency that nobody gave
 _SUSPECT = 1.05  # a residual so many times that of free residues at the same poles is a local minimum
 _LEAST_SHAPE = 1e-6  # of the largest singular value of the shapes, below which M_SS would be no mass matrix

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sysid.errors import InputError, SolverError
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.modal_fit import ModalFit, Modes, Spectrum, fit_modes
+from sysid.modal_analysis.modal_fit import ModalFit, Modes, Spectrum, Ties, fit_modes
 from sysid.modal_analysis.modal_masses import weigh
 from sysid.modal_analysis.residues import (
     Records,
@@ -23,6 +23,7 @@ from sysid.modal_analysis.residues import (
 )  # fmt: skip
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.spectrum import SOLVED
+from sysid.models.unknowns import lower_of, upper_of
 from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram
 from sysid.problem.problem import Problem
 from sysid.search.modal_scaling import stated_totals
@@ -221,29 +222,55 @@ def _ascending(fit: ModalFit) -> ModalFit:
 
 def held_to_totals(problem: Problem, end: ModalFit, monitor: IterationMonitor, max_iterations: int) -> ModalFit | None:
     """The same fit with stated totals held, where what the base force weighs agrees with them; else None."""
-    ties, test, modes = stated_totals(problem), problem.measurement, end.modes
+    ties, modes = stated_totals(problem), end.modes
     if ties is None or monitor.is_over:
         return None
     off = ca.vertcat(*ties(ca.DM(modes.phi), ca.DM(modes.gamma), ca.DM(end.rigid)))
     if np.any(np.abs(np.asarray(off)) > _AGREES):
         return None
-    _, first, pole = np.unique(modes.omega + 1j * modes.ratios, return_index=True, return_inverse=True)
-    held = fit_modes(
-        test, modes, _free_spectrum(modes.omega[first], modes.ratios[first], pole), unit=np.sqrt(problem.totals),
-        remainder=end.rigid - modes.gamma.T @ modes.gamma, ties=ties, monitor=monitor, max_iterations=max_iterations,
-    )  # fmt: skip
+    held = _again(problem, end, monitor, max_iterations, ties)
     agrees = held.residual <= _AS_GOOD * end.residual + EXACT
     return held if agrees and held.status in SOLVED else None
 
 
-def _free_spectrum(omega: Array, ratios: Array, pole: Integers) -> Spectrum:
-    """Frequencies and damping ratios of each pole without bounds; modes of one pole share them."""
+def held_to_bounds(problem: Problem, end: ModalFit, monitor: IterationMonitor, max_iterations: int) -> ModalFit:
+    """The same fit with damping ratios within their bounds; itself where they are."""
+    low, high = damping_bounds(problem)
+    if monitor.is_over or np.all((end.modes.ratios >= low) & (end.modes.ratios <= high)):
+        return end
+    return _again(problem, end, monitor, max_iterations)
+
+
+def damping_bounds(problem: Problem) -> tuple[float, float]:
+    """Bounds of the free damping ratios of a problem, those of all modes alike."""
+    unknowns = problem.formulation.of_models[2]
+    return float(lower_of(unknowns).min()), float(upper_of(unknowns).max())
+
+
+def _again(
+    problem: Problem, end: ModalFit, monitor: IterationMonitor, max_iterations: int, ties: Ties | None = None
+) -> ModalFit:
+    """A fit from where another ended, with ties, and damping ratios within the problem's bounds."""
+    modes = end.modes
+    _, first, pole = np.unique(modes.omega + 1j * modes.ratios, return_index=True, return_inverse=True)
+    unit = np.sqrt(problem.totals)
+    spectrum = _free_spectrum(modes.omega[first], modes.ratios[first], pole, *damping_bounds(problem))
+    return fit_modes(
+        problem.measurement, modes, spectrum, unit=unit, remainder=end.rigid - modes.gamma.T @ modes.gamma, ties=ties,
+        monitor=monitor, max_iterations=max_iterations,
+    )  # fmt: skip
+
+
+def _free_spectrum(omega: Array, ratios: Array, pole: Integers, lower: float = 0.0, upper: float = np.inf) -> Spectrum:
+    """Frequencies without bounds and damping ratios, of each pole; modes of one pole share them."""
 
     def spectrum(z: NonlinearProgram) -> tuple[ca.MX, ca.MX]:
         # In units of the half-power half-width, which is what frequencies are known in.
         # Cut off where no step of use leads.
         shift = _within(z.variable("frequency", np.zeros(omega.size)) * ca.DM(ratios), 1.0)
-        loss = _within(z.variable("damping ratio", np.zeros(omega.size)), 10.0)
+        with np.errstate(divide="ignore"):
+            low, high = np.log(lower / ratios), np.log(upper / ratios)
+        loss = _within(z.variable("damping ratio", np.clip(np.zeros(omega.size), low, high), low, high), 10.0)
         moved, lossy = ca.DM(omega) * ca.exp(shift), ca.DM(ratios) * ca.exp(loss)
         # Entries of a scalar are a row.
         return ca.vec(moved[pole.tolist()]), ca.vec(lossy[pole.tolist()])

@@ -127,7 +127,8 @@ class _Box:
 
     def __init__(self, problem: Problem) -> None:
         formulation = problem.formulation
-        self.lower, self.width = formulation.lower, formulation.upper - formulation.lower
+        self.lower, upper = formulation.box
+        self.width = upper - self.lower
         s = ca.MX.sym("s", formulation.size)
         self.function = ca.Function("unknowns", [s], [formulation.from_sampling(s)])
 

@@ -133,11 +133,11 @@ class Swarm:
 
         The usual constants of the sources that the paper names (b1 = 0.3, b2 = 0.2; c1 + c2 up to 4), the spectrum of
         each candidate refined from its own L_H, and a local phase in the inverse of the mass's Cholesky factor, where
-        the paper's own entries end on IPOPT's iteration limit with noise. What the paper leaves
-        open, or its printed text has lost, is chosen here: refinement in closed form, not written back, and by IPOPT of
-        each new leader alone (``refine_by="ipopt"`` refines every candidate so, as the paper does); 150 iterations,
-        the stop rules, and up to four restarts; a particle stops at a bound and its velocity there is reversed; the
-        state of the swarm is estimated with the leader's present position (`sysid.swarm.ParticleSwarm`).
+        the paper's own entries end on IPOPT's iteration limit with noise. What the paper leaves open, or its printed
+        text has lost, is chosen here: refinement in closed form, not written back, and by IPOPT of each new leader
+        alone (``refine_by="ipopt"`` refines every candidate so, as the paper does); 150 iterations, the stop rules, and
+        up to four restarts; a particle stops at a bound and its velocity there is reversed; the state of the swarm is
+        estimated with the leader's present position (`sysid.swarm.ParticleSwarm`).
         """
         return cls(
             **{"settings": SwarmSettings(), "local": "cholesky", "name": "hpso-ls", "refine_by": "leaders", **changes}
@@ -287,7 +287,7 @@ class _Search:
         evaluate, repair = self._functions(objective)
         result = minimize_swarm(
             evaluate,
-            np.column_stack([problem.lower, problem.upper]),
+            np.column_stack(problem.formulation.box),
             rng=np.random.default_rng(random),
             n_particles=options.n_particles,
             max_iterations=options.max_iterations,

@@ -21,7 +21,7 @@ from benchmarks.mistakes.changing import (
 )
 from benchmarks.mistakes.changing import measured as as_test
 from benchmarks.mistakes.changing import response as answer
-from sysid.assessment.changing import changes, changes_in_words
+from sysid.assessment.changing import Change, Seen, changes, changes_in_words
 from sysid.modal_analysis.stretches import stretches_of
 
 
@@ -123,3 +123,38 @@ def test_unfitted_tests_keep_their_numbers():
     problem = sysid.Problem(fitted, mass=sysid.FullMass(), validation=[given, large])
     records = {one.record for change in changes(problem) for one in change.seen}
     assert records == {"the record", "the record of unfitted test 2"}
+
+
+def _seen(frequencies, levels, std):
+    return [
+        Seen("the record", f"stretch {i}", f, std, level)
+        for i, (f, level) in enumerate(zip(frequencies, levels, strict=True))
+    ]
+
+
+RISING, SHUFFLED = [5.00, 5.01, 5.02, 5.03, 5.04, 5.05], [5.02, 5.00, 5.05, 5.01, 5.04, 5.03]
+BY_LEVEL = [30.0 - 500 * (f - 5.0) for f in SHUFFLED]  # the higher the level, the lower the frequency
+CHANCE = [3.0, 3.1, 2.9, 3.05, 2.95, 3.02]
+
+
+@pytest.mark.parametrize(
+    ("frequencies", "levels", "std", "explained", "told"),
+    [
+        (SHUFFLED, CHANCE, 0.001, True, True),  # beyond noise, and poles that change explain the records
+        (SHUFFLED, CHANCE, 0.001, False, False),  # beyond noise alone
+        (SHUFFLED, CHANCE, 0.020, True, False),  # noise explains the differences
+        (SHUFFLED, BY_LEVEL, 0.001, False, True),  # beyond noise, in the order of the level
+        (SHUFFLED, BY_LEVEL, 0.020, False, False),
+        ([5 + (f - 5) / 10 for f in SHUFFLED], BY_LEVEL, 0.0001, True, False),  # by a twentieth of the width
+    ],
+)
+def test_a_change_is_told_by_two_signs_of_three(frequencies, levels, std, explained, told):
+    """Of a mode with a half-power width of 0.1 Hz, in six stretches."""
+    assert Change(5.0, 0.1, _seen(frequencies, levels, std), scaled=True).is_told(explained) is told
+
+
+def test_an_order_by_level_that_time_makes_as_well_is_no_trend():
+    assert Change(5.0, 0.1, _seen(SHUFFLED, BY_LEVEL, 0.001), scaled=True).trend == pytest.approx(-1.0)
+    falling = sorted(BY_LEVEL, reverse=True)
+    assert Change(5.0, 0.1, _seen(RISING, falling, 0.001), scaled=True).trend == 0.0
+    assert Change(5.0, 0.1, _seen(SHUFFLED[:4], BY_LEVEL[:4], 0.001), scaled=True).trend == 0.0  # too few to tell

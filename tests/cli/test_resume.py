@@ -1,7 +1,6 @@
 """``sysid run --resume`` and ``--fresh``: what a folder with an unfinished run allows, and what is said of it."""
 
 import signal
-import time
 
 import pytest
 
@@ -170,7 +169,9 @@ def test_a_damaged_state_is_told_and_fresh_leads_on(stopped, complaint):
     assert cli.main([*RUN, "--fresh"]) == 0
 
 
-def test_a_killed_process_goes_on(here, process, without_pictures, interruptible):
+def test_while_a_process_runs_another_is_refused_and_once_it_is_killed_that_one_goes_on(
+    here, process, without_pictures, interruptible, complaint, files
+):
     """By -9, whatever it is doing."""
     (here / "pair.py").write_text(without_pictures.replace("goal=1e-6", "goal=1e-30"))
     running = interruptible("-m", "sysid", "run", "pair.py", "--strategy", "swarm", "--out", "out", cwd=here)
@@ -178,11 +179,12 @@ def test_a_killed_process_goes_on(here, process, without_pictures, interruptible
         for line in running.stderr:
             if line.startswith("swarm"):
                 break
-        time.sleep(0.2)
+        assert cli.main(["run", "pair.py", "--strategy", "swarm", "--out", "out", "--fresh"]) == 2
+        assert f"out is in use by another run (process {running.pid} on " in complaint()
         running.send_signal(signal.SIGKILL)
     assert running.wait() == -signal.SIGKILL
     assert (here / "out" / FILE_NAME).is_file()
     done = process("run", "--resume", "out", cwd=here)
     assert done.returncode == 1  # that goal is beyond round-off
-    assert not (here / "out" / FILE_NAME).exists()
+    assert files(here / "out") == {"result.h5", "summary.json", "report.html"}
     assert sysid.load(here / "out").residual < 1e-9

@@ -83,12 +83,52 @@ def test_modal_ratios_are_the_unknowns_and_there_is_no_matrix(geometry_of):
     np.testing.assert_array_equal(model.values(geometry, s), y)
 
 
+def with_poles(geometry_of, ratios, n=4):
+    geometry = geometry_of(np.ones((n, 1)))
+    geometry.found = {"omega": 1.0 + np.arange(len(ratios)), "ratios": np.array(ratios), "residual": 0.01}
+    return geometry
+
+
 def test_search_spaces(geometry_of):
-    geometry = geometry_of(np.ones((4, 1)))
+    geometry = with_poles(geometry_of, [0.005, 0.01, 0.02, 0.05])
     (unknown,) = ModalDamping().unknowns(geometry)
-    np.testing.assert_array_equal([unknown.lower, unknown.upper], [[0.005] * 4, [0.05] * 4])  # eq. 38
+    np.testing.assert_array_equal(unknown.box, [[0.005] * 4, [0.05] * 4])  # eq. 38
+    assert unknown.note == ""
+    np.testing.assert_array_equal([unknown.lower, unknown.upper], [[1e-6] * 4, [0.95] * 4])
+    np.testing.assert_allclose(unknown.guess, 0.0275)
     alpha, beta = ProportionalDamping((0.1, 2), (1e-5, 1e-3)).unknowns(geometry)
     assert [(v.lower.item(), v.upper.item(), v.unit) for v in (alpha, beta)] == [(0.1, 2, "1/s"), (1e-5, 1e-3, "s")]
+
+
+def test_the_box_follows_poles_outside_the_usual_one_by_half_a_decade_either_way(geometry_of):
+    (unknown,) = ModalDamping().unknowns(with_poles(geometry_of, [0.001, 0.02, 0.2, 0.4]))
+    root = 10**0.5
+    np.testing.assert_allclose(unknown.box[0], [0.001 / root, 0.005, 0.2 / root, 0.4 / root])
+    np.testing.assert_allclose(unknown.box[1], [0.001 * root, 0.05, 0.2 * root, 0.95])
+    assert "0.1 to 40 %" in unknown.note
+
+
+def test_where_poles_and_modes_are_not_as_many_all_modes_have_the_box_of_all_poles(geometry_of):
+    (unknown,) = ModalDamping().unknowns(with_poles(geometry_of, [0.001, 0.1]))
+    np.testing.assert_allclose(unknown.box, [[0.001 / 10**0.5] * 4, [0.1 * 10**0.5] * 4])
+    (unknown,) = ModalDamping().unknowns(with_poles(geometry_of, []))
+    np.testing.assert_array_equal(unknown.box, [[0.005] * 4, [0.05] * 4])
+
+
+def test_stated_bounds_are_bounds_and_box_whatever_the_poles(geometry_of):
+    geometry = with_poles(geometry_of, [0.001, 0.02, 0.2, 0.4])
+    (unknown,) = ModalDamping(0.002, 0.08).unknowns(geometry)
+    for ends in ((unknown.lower, unknown.upper), unknown.box):
+        np.testing.assert_array_equal(ends, [[0.002] * 4, [0.08] * 4])
+
+
+@pytest.mark.parametrize("bounds", [(0.1, 0.95), (0.9, 0.95), (1e-6, 0.002), (1e-6, 5e-6)])
+def test_a_single_bound_is_an_end_of_a_box_within_the_bounds(geometry_of, bounds):
+    """An unknown refuses a box that leaves its bounds."""
+    (unknown,) = ModalDamping(*bounds).unknowns(with_poles(geometry_of, [0.01] * 4))
+    stated = 0 if bounds[1] == 0.95 else 1
+    np.testing.assert_array_equal(unknown.box[stated], [bounds[stated]] * 4)
+    assert np.all(unknown.box[0] < unknown.box[1])
 
 
 def test_what_is_stated(geometry_of):

@@ -330,6 +330,15 @@ def test_convergence_tells_only_what_ran(modal, complete, plain, no_pictures):
     assert rows(plain) == []
 
 
+def test_leaders_and_every_status_are_told_on_page_and_in_summary(complete, no_pictures):
+    words = (
+        "IPOPT refined 12 leaders of the swarm, 5 better than the closed form (Restoration_Failed 1, "
+        "Solve_Succeeded 11)"
+    )
+    assert words in Page(report._convergence(complete)).text
+    assert words in " ".join(complete.summary().split())
+
+
 def test_a_large_structure_is_told_without_what_takes_long(modal, monkeypatch, no_pictures):
     it = modal(force=False)
     monkeypatch.setattr("sysid.results.answer._QUICK_SHAPES", 0)

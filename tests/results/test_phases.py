@@ -92,3 +92,10 @@ def test_the_answer_is_told_without_building_it_again(random_case, monkeypatch):
 def test_seconds_are_neither_rounded_to_nothing_nor_written_with_a_power():
     told = {0.0004: "0.0004 s", 0.0312: "0.031 s", 4.21: "4.2 s", 99.4: "99 s", 99.6: "100 s", 1234.5: "1234 s"}
     assert {seconds: seconds_in_words(seconds) for seconds in told} == told
+
+
+@pytest.mark.parametrize(("restarts", "told"), [(0, None), (1, "1 further swarm"), (3, "3 further swarms")])
+def test_further_swarms_are_told_by_summary_and_report(result, restarts, told):
+    searched = replace(result, history=replace(result.history, restarts=restarts))
+    for page in (searched.summary(), render(searched)):
+        assert "further swarm" not in page if told is None else f"{told} " in page.replace("\n", " ")

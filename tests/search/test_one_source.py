@@ -156,3 +156,21 @@ def test_a_coefficient_of_damping_ratios_changes_both_alike(damping):
 
 def test_a_coefficient_of_a_written_mass_changes_both_alike():
     agree(make({"mass": WRITTEN}), make({"mass": 1.05 * WRITTEN}))
+
+
+def test_what_the_base_moves_keeps_its_digits_where_the_mass_is_ill_conditioned():
+    """Of a factor with small diagonal entries, ``L' G + Z'`` by hand; through M_S0 it would have lost them."""
+    n, rng = 14, np.random.default_rng(5)
+    G = np.ones((n, 1))
+    test = sysid.Measurement(FREQ, np.ones((1, 1, 30)), rng.normal(size=(1, n, 30)) + 0j, rigid_body=G)
+    model = sysid.Problem(test, mass=sysid.FullMass(10.0), stiffness=sysid.SpectralStiffness(np.arange(1.0, n + 1)))
+    factor = np.tril(rng.uniform(-1, 1, (n + 1, n + 1)), -1) + 0.02 * np.eye(n + 1)
+    x = np.concatenate([factor[np.tril_indices(n + 1)], rng.uniform(1, 9, model.n_variables - (n + 1) * (n + 2) // 2)])
+    healed = factor * np.sqrt(10.0 / np.sum(factor**2))
+    symbol = ca.MX.sym("x", x.size)
+    right = np.asarray(ca.Function("right", [symbol], [model.formulation.matrices.of_modes(symbol)[1]])(x))
+    L, Z = healed[:n, :n], healed[n:, :n]
+    expected = L.T @ G + Z.T
+    np.testing.assert_allclose(right[:, n:], expected, rtol=1e-12, atol=1e-15)
+    through_coupling = L.T @ G + np.linalg.solve(L, L @ Z.T)
+    assert np.abs(through_coupling - expected).max() > 1e-6 * np.abs(expected).max()

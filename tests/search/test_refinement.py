@@ -110,6 +110,20 @@ class TestLeaders:
         assert cost == (1.0 if better else 2.0)
         assert (tally.tried, tally.won, tally.statuses) == (1, int(better), {"Solve_Succeeded": 1})
 
+    def test_ipopt_starts_from_the_leaders_own_factor(self, problem, monkeypatch):
+        """And not from what the closed form made of it."""
+        given = []
+
+        def spy(factor, targets, max_time):
+            given.append(factor)
+            return by_ipopt(factor, targets, max_time)
+
+        monkeypatch.setattr("sysid.models.stiffness.by_ipopt", spy)
+        refiner, _ = made(problem, Tally())
+        row = middle(problem)
+        refiner.of_leader(lambda rows: np.ones(len(rows)))(row, 1.0)
+        np.testing.assert_array_equal(given[0][np.tril_indices(3)], row[problem.formulation.parts.stiffness])
+
     def test_round_off_is_no_win(self, problem):
         refiner, tally = made(problem, Tally())
         refiner.of_leader(lambda rows: np.array([1.0, 1.0 - 1e-12]))(middle(problem), 1.0)

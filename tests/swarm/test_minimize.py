@@ -364,9 +364,16 @@ def test_each_new_leader_is_handed_over_once_and_what_comes_back_takes_its_place
     assert result.nfev == sum(fun.calls)  # what it evaluates is its own affair
 
 
-def test_a_leader_that_comes_back_as_it_was_changes_nothing():
+def test_a_leader_that_comes_back_as_it_was_changes_nothing_and_is_not_handed_over_again():
+    given = []
+
+    def keep(x, cost):
+        given.append(x)
+        return x, cost
+
     plain = minimize_swarm(sphere, SQUARE, rng=0, max_iterations=20)
-    same = minimize_swarm(sphere, SQUARE, rng=0, max_iterations=20, on_leader=lambda x, cost: (x, cost))
+    same = minimize_swarm(sphere, SQUARE, rng=0, max_iterations=20, on_leader=keep)
+    assert len(given) == np.unique(plain.history).size < 20
     np.testing.assert_array_equal(same.history, plain.history)
     np.testing.assert_array_equal(same.x, plain.x)
 

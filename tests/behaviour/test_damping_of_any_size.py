@@ -1,0 +1,114 @@
+"""Structures of little and much damping are identified; bounds that keep a fit from the records are told first."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import sysid
+
+N = 3
+STRETCH = np.eye(N) - np.eye(N, k=-1)
+MASSES, SPRINGS = np.array([3.0, 2.0, 2.5]), np.array([4000.0, 3000.0, 2500.0])
+LITTLE, MUCH = np.array([0.0008, 0.0015, 0.0006]), np.array([0.18, 0.12, 0.08])
+CHAIN = sysid.ChainStiffness(400.0, 40000.0)
+ACCUSES = ("stated mass", "is not classical", "sign or axis", "rigid_body says", "are swapped", "weighs")
+
+
+def shaken(ratios, *, force=False, noise=0.01):
+    """Responses of a chain by eq. 13 line by line, C = M Phi diag(2 zeta w) Phi' M; half of the lines about peaks."""
+    M, K, ones = np.diag(MASSES), STRETCH.T @ np.diag(SPRINGS) @ STRETCH, np.ones((N, 1))
+    half = np.sqrt(MASSES)
+    lam, psi = np.linalg.eigh(K / np.outer(half, half))
+    w = np.sqrt(lam)
+    C = (half[:, None] * psi * 2 * ratios * w) @ (half[:, None] * psi).T
+    peaks = w[:, None] * (1 + ratios[:, None] * np.tan(np.linspace(-1.35, 1.35, 25)))
+    lines = np.unique(np.concatenate([np.geomspace(0.4 * w[0], 1.5 * w[-1], 75), np.abs(peaks.ravel())]))
+    B = M @ ones
+    moved = np.stack([np.linalg.solve(-(s**2) * M + 1j * s * C + K, s**2 * B)[:, 0] for s in lines], axis=1)
+    response, reaction = (moved + 1)[None], ((B.T @ moved) + B.sum())[None]
+    rng = np.random.default_rng(0)
+    std = noise * np.sqrt(np.mean(np.abs(response) ** 2, axis=1, keepdims=True))
+    std_force = noise * np.abs(reaction)
+    noisy = lambda record, s: record + s * (rng.normal(size=record.shape) + 1j * rng.normal(size=record.shape)) / 2**0.5  # noqa: E731
+    base = np.ones((1, 1, lines.size), dtype=complex)
+    given = {"force": noisy(reaction, std_force), "force_std": std_force} if force else {}
+    std = np.broadcast_to(std, response.shape)
+    test = sysid.Measurement(
+        lines / (2 * np.pi), base, noisy(response, std), rigid_body=ones, response_std=std, **given
+    )
+    return test, float(np.linalg.norm(test.response - response) / np.linalg.norm(test.response - 1))
+
+
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("ratios", [LITTLE, MUCH], ids=["little", "much"])
+@pytest.mark.parametrize("stiffness", [None, CHAIN], ids=["free", "chain"])
+def test_whatever_the_damping_the_matrices_are_found(ratios, force, stiffness):
+    test, floor = shaken(ratios, force=force)
+    mass = sysid.LumpedMass(None if force else MASSES.sum())
+    given = {} if stiffness is None else {"stiffness": stiffness}
+    result = sysid.identify(sysid.Problem(test, mass=mass, **given), rng=0)
+    assert result.residual < 1.02 * floor
+    assert result.judgement == "determined"
+    np.testing.assert_allclose(np.diag(result.structure.mass)[:N], MASSES, rtol=0.05)
+    np.testing.assert_allclose(result.structure.damping_ratios, ratios, rtol=0.05)
+
+
+def test_a_swarm_follows_the_poles_of_the_data_and_says_so():
+    test, floor = shaken(MUCH, force=True)
+    problem = sysid.Problem(test, mass=sysid.FullMass())
+    result = sysid.identify(problem, rng=0, strategy="hpso-ls")
+    low, high = (end[problem.formulation.parts.damping] for end in problem.formulation.box)
+    assert np.all((low < MUCH) & (high > MUCH))
+    assert any("damping ratios are searched from" in told for told in result.remarks)
+    assert result.residual < 1.02 * floor
+    np.testing.assert_allclose(result.structure.damping_ratios, MUCH, rtol=0.05)
+    assert not any("are searched" in told for told in sysid.identify(problem, rng=0).remarks)  # by the modal strategy
+
+
+@pytest.mark.parametrize(
+    "mass", [sysid.FullMass(), sysid.LumpedMass(), np.diag(MASSES)], ids=["full", "lumped", "known"]
+)
+@pytest.mark.parametrize(("ratios", "bound"), [(LITTLE, "lower, 0.005"), (MUCH, "upper, 0.05")])
+def test_stated_bounds_of_damping_hold_and_are_told_before_the_misfit_that_they_make(mass, ratios, bound):
+    test, _ = shaken(ratios, force=True)
+    result = sysid.identify(sysid.Problem(test, mass=mass, damping=sysid.ModalDamping(0.005, 0.05)), rng=0)
+    found = result.structure.damping_ratios
+    assert np.all((found >= 0.005 - 1e-9) & (found <= 0.05 + 1e-9))
+    assert result.judgement == "no fit"
+    first = result.against[0]
+    assert first.startswith("bounds keep the fit from the records: damping ratio 1")
+    assert bound in first
+    assert "(ModalDamping)" in first
+    assert not [told for told in (*result.against, *result.remarks) for words in ACCUSES if words in told]
+
+
+def test_a_spring_on_its_bound_is_told_first_and_accuses_nothing_else():
+    test, _ = shaken(LITTLE)
+    tight = sysid.ChainStiffness(400.0, 3600.0)
+    result = sysid.identify(sysid.Problem(test, mass=sysid.LumpedMass(MASSES.sum()), stiffness=tight), rng=0)
+    assert result.against[0].startswith("bounds keep the fit from the records: ")
+    assert "spring 1 (upper, 3600 N/m)" in result.against[0]
+    assert not [told for told in (*result.against, *result.remarks) for words in ACCUSES if words in told]
+
+
+def test_a_wrong_mass_is_accused_beside_a_damper_that_rests_on_zero():
+    """The damper makes up for what the mass spoils, and explains little of it."""
+    test, _ = shaken(np.array([0.01, 0.012, 0.015]))
+    k = sysid.Variable("spring", N, lower=400.0, upper=40000.0, log=True)
+    c = sysid.Variable("damper", N, lower=0.0, upper=100.0)
+    written = {"stiffness": STRETCH.T @ ca.diag(k) @ STRETCH, "damping": STRETCH.T @ ca.diag(c) @ STRETCH}
+    result = sysid.identify(sysid.Problem(test, mass=np.diag(MASSES * [1, 1.3, 1]), **written), rng=0)
+    assert not any("bounds keep the fit" in told for told in result.against)
+    assert any("stated mass" in told for told in result.against)
+
+
+def test_the_mass_that_a_force_weighs_is_not_contradicted_before_anything_is_weighed():
+    """2,500 kg are a thousand times what an unstated total is made up as until then."""
+    test, _ = shaken(np.array([0.01, 0.012, 0.015]), force=True)
+    heavy = sysid.Measurement(
+        test.freq, test.base, test.response, rigid_body=test.rigid_body, response_std=test.response_std,
+        force=1000 / 7.5 * test.force, force_std=1000 / 7.5 * test.force_std,
+    )  # fmt: skip
+    chain = sysid.ChainStiffness(1e4, 1e8)
+    result = sysid.identify(sysid.Problem(heavy, mass=sysid.LumpedMass(), stiffness=chain), rng=0)
+    np.testing.assert_allclose(np.diag(result.structure.mass)[:N], 1000 / 7.5 * MASSES, rtol=0.05)
