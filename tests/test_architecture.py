@@ -20,7 +20,7 @@ CEILINGS = {
     # with their transients and noise (1,700), stated masses as statistics (420), gains (260), other answers (410),
     # motion in time (230), and what tells and refuses them (530), expressions as operations in place of CasADi's text
     # and of the older formats (620), results that can be read without their problem (680).
-    "lines": 38_818,
+    "lines": 39_558,
 }
 
 # The counting is a benchmark, which prints the same figures; `sysid` itself is not imported from the checkout.
