@@ -169,10 +169,7 @@ class Problem:
         declared.check()
 
     def to_tree(self) -> dict[str, Any]:
-        """Give all that the problem was given as dictionaries, lists, arrays and texts; `from_tree` takes it back.
-
-        Without the expressions where one holds what cannot be stored: see `sysid.problem.stored`.
-        """
+        """Give all as dictionaries, lists, arrays and texts, but expressions that `sysid.problem.stored` cannot."""
         return {
             "measurement": self.measurement.to_tree(),
             "given": self._given,
@@ -196,10 +193,8 @@ class Problem:
 
         Raises
         ------
-        NotRebuiltError
-            Where the class of a model is not to be found, or the expressions are not in the tree.
         InputError
-            Where the tree is damaged.
+            Where the tree is damaged; NotRebuiltError where it lacks expressions, or the class of a model is not found.
         """
         problem = cls(
             Measurement.from_tree(tree["measurement"]),

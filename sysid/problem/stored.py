@@ -78,7 +78,7 @@ def from_tree(tree: Tree) -> dict[str, Any]:
     """
     if tree["without"] is not None:
         raise NotRebuiltError(
-            f"it was stored without the expressions of its problem, as {tree['without']} cannot be stored"
+            f"it was stored without the expressions of its problem, as {_printable(tree['without'])} cannot be stored"
         )
     variables = {part["name"]: _variable_from_tree(part) for part in tree["variables"]}
     outputs = _outputs_from_tree(tree, list(variables.values()))
@@ -89,6 +89,11 @@ def from_tree(tree: Tree) -> dict[str, Any]:
         "misfit": outputs[tree["misfit"]],
         "healing": {variables[part["variable"]]: outputs[part["expression"]] for part in tree["healing"]},
     }
+
+
+def _printable(text: str) -> str:
+    """A text of a file without what would move a terminal's cursor."""
+    return "".join(letter for letter in text if letter.isprintable())
 
 
 def needs_module(tree: Tree) -> bool:
