@@ -214,14 +214,14 @@ def _load(name: str) -> tuple[ModuleType, Path]:
 
 def _load_file(path: Path) -> tuple[ModuleType, Path]:
     """Run a file as a module of a private name; no ``__pycache__`` is left beside it."""
-    if path.suffix != ".py":  # a test or a result that somebody else made may hold Python
-        raise InputError(
-            f"problem {path}: the name of a problem module ends in .py; a test that 'sysid read' wrote is run by "
-            "'sysid run TEST.h5'"
-        )
     try:
         if path.exists() and not path.is_file():  # a device, or a pipe, may never end
             raise InputError(f"problem {path} is not a file")
+        if path.exists() and path.suffix != ".py":  # a test or a result that somebody else made may hold Python
+            raise InputError(
+                f"problem {path}: the name of a problem module ends in .py; a test that 'sysid read' wrote is run by "
+                "'sysid run TEST.h5'"
+            )
         source = path.read_bytes()
     except OSError as error:
         raise InputError(f"problem {path} cannot be read: {error.strerror or error}") from None

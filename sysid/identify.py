@@ -183,8 +183,9 @@ def _run(
             raise
         return _instead(chosen, error, problem, session, start)
     bad = not outcome.good and outcome.stopped is None and session.time_for_more
-    if bad and not bounds_explain(problem, outcome.structure, outcome.x):  # what they leave looks like swapped sensors
-        told = exchanged_sensors(problem, outcome.structure)
+    if bad:
+        pressed = bounds_explain(problem, outcome.structure, outcome.x)  # what they leave may look like swapped sensors
+        told = exchanged_sensors(problem, outcome.structure, wholly=pressed)
         if told:
             return replace(outcome, mistakes=told), why
     after = _after(chosen, problem, start) if follow and not (outcome.good or outcome.unanimous) else None

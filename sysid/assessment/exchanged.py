@@ -20,13 +20,14 @@ from sysid.problem.problem import Problem
 from sysid.structure.structure import Array, Structure
 
 _BETTER = 0.3  # of the residual of the records as they are; what they leave with two sensors swapped
+_WHOLLY = 1.05  # of what free residues leave: nothing else is wrong then
 _CLEARLY = 2.0  # times the least residual, that the next best exchange leaves
 _PAIRS = 15  # at most: those of six sensors
 _STEPS = 40
 _FREQUENCY, _DAMPING = 5.0, 0.1  # weights of errors of log w and log zeta; residues are relative to all of them
 
 
-def exchanged_sensors(problem: Problem, structure: Structure) -> tuple[str, ...]:
+def exchanged_sensors(problem: Problem, structure: Structure, *, wholly: bool = False) -> tuple[str, ...]:
     """Two sensors that stand in each other's place, in a sentence; none where the model cannot tell.
 
     Parameters
@@ -34,6 +35,8 @@ def exchanged_sensors(problem: Problem, structure: Structure) -> tuple[str, ...]
     problem : Problem
     structure : Structure
         The best fit to the records as they are.
+    wholly : bool
+        Whether the exchange must leave no more than free residues do, as there is another cause of the misfit.
     """
     formulation, test = problem.formulation, problem.measurement
     told = formulation.fits_records and not formulation.stiffness.free and structure.n == test.n_sensors
@@ -43,12 +46,13 @@ def exchanged_sensors(problem: Problem, structure: Structure) -> tuple[str, ...]
     try:
         omega, ratios = poles_of_test(test)
         found = [(_residual_of(problem, omega, ratios, pair), pair) for pair in pairs]
+        floor = linear_residues(test, omega, ratios)[1]
     except (InputError, np.linalg.LinAlgError):
         return ()
     found.sort()
     (least, (i, j)), others = found[0], [residual for residual, _ in found[1:]]
     own = test.residual(structure)
-    if least > _BETTER * own or (others and others[0] < _CLEARLY * least):
+    if least > _BETTER * own or (others and others[0] < _CLEARLY * least) or (wholly and least > _WHOLLY * floor):
         return ()
     names = test.sensor_names
     return (

@@ -96,8 +96,8 @@ class Answer:
             """Tell what is missing where the problem is asked for and the file does not hold it whole."""
             if name == "problem" and "_part" in vars(self):
                 raise InputError(
-                    f"the problem of this result is needed, and its file does not hold it: {self.part.without}. Give "
-                    "it: sysid.load(path, problem=...), or --module FILE at the command line"
+                    f"the file of this result does not hold its problem: {self.part.without}. Give it by "
+                    "sysid.load(path, problem=...), or --module FILE at the command line"
                 )
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
 

@@ -339,7 +339,7 @@ def _problem_from_tree(tree: dict[str, Any], structure: Structure) -> Any:
         if tree["readings"] is None:
             raise
         recipe = tree["recipe"]
-        module = "" if recipe is None else f" (its problem was made by {recipe['module']!r})"
+        module = "" if recipe is None else f" (the problem was made by {recipe['module']!r})"
         read = tree["readings"]
         attributes = readings.from_tree(read, structure)
         return PartOfProblem(part, read, Records.from_tree(part), attributes, f"{error}{module}")

@@ -23,7 +23,7 @@ from sysid.models.unknowns import lower_of, upper_of
 from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram
 from sysid.problem.matrices import assemble
 from sysid.problem.problem import Problem
-from sysid.search.modal_scaling import stated_totals, to_stated_totals
+from sysid.search.modal_scaling import positive_part, stated_totals, to_stated_totals
 from sysid.search.scaled_unknowns import add_unknowns
 from sysid.structure.structure import Array, Structure
 
@@ -128,7 +128,10 @@ def unknowns_of(problem: Problem, modes: Modes, rigid: Array, start: Structure, 
         t, left = to_stated_totals(problem, P, gamma, geometry.rigid_body, groups, _remainder(start))
         P, gamma = P * np.sqrt(t), gamma * np.sqrt(t)
     else:
-        left = rigid - gamma.T @ gamma
+        # IPOPT may leave a base without mass below zero by its tolerance.
+        unit = np.sqrt(np.diag(start.rigid_body_mass))
+        size = np.outer(unit, unit)
+        left = positive_part((rigid - gamma.T @ gamma) / size) * size
     G = geometry.rigid_body
     M_SS = P.T @ P
     M_S0 = P.T @ gamma - M_SS @ G

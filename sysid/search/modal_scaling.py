@@ -72,8 +72,7 @@ def to_stated_totals(
         size = np.sqrt(problem.totals)
         own, total = ((part / np.outer(size, size)) for part in (gamma.T @ gamma, problem.rigid_total))
         t = 1.0 if scaled else min(1.0, (1 - spare) / float(scipy.linalg.eigvalsh(own, total)[-1]))
-        lam, vectors = np.linalg.eigh(total - t * own)
-        return t, (vectors * np.maximum(lam, 0.0)) @ vectors.T * np.outer(size, size)
+        return t, positive_part(total - t * own) * np.outer(size, size)
     stated = problem.formulation.mass.totals
     # A mass that states no total is brought to totals of its kind all the same: 1 kg a direction, or known masses'.
     kind = getattr(problem.mass, "healing", "trace") if stated is None else stated.kind
@@ -89,6 +88,13 @@ def to_stated_totals(
     t = 1.0 if scaled else min(1.0, float(np.min((1 - spare) * totals / used)))
     share = np.sqrt(np.maximum(totals - t * used, 0.0) / np.maximum(np.diag(remainder), np.finfo(float).tiny))
     return t, remainder * np.outer(share, share)
+
+
+def positive_part(matrix: Array) -> Array:
+    """The positive semidefinite matrix nearest to a symmetric one (Frobenius)."""
+    lam, vectors = np.linalg.eigh(matrix)
+    positive: Array = (vectors * np.maximum(lam, 0.0)) @ vectors.T
+    return positive
 
 
 def nearest_lumped(

@@ -91,7 +91,7 @@ def test_an_interrupted_search_saves_the_best_so_far_and_ends_with_130(here, com
 
     def identify(*arguments, **options):
         def interrupt(progress):
-            if progress.iteration == 3:
+            if progress.phase == "swarm" and progress.iteration == 3:
                 raise KeyboardInterrupt
 
         return original(*arguments, **(options | {"callback": interrupt}))
@@ -164,7 +164,7 @@ def test_the_signal_itself_saves_the_best_so_far_wherever_it_strikes(here, witho
         time.sleep(delay)
         running.send_signal(signal.SIGINT)
         out, error = running.communicate(timeout=60)
-    on = "'sysid run --resume results/free' goes on"
+    on = "'sysid run free.py --resume results/free' goes on"
     complaints = [line for line in error.splitlines() if " iteration " not in line]
     assert complaints == [f"sysid: interrupted; the best so far is in results/free; {on}"]
     assert running.returncode == 130

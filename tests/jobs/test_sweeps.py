@@ -12,6 +12,7 @@ import pytest
 from scipy.stats import norm
 
 import sysid
+from sysid.cli.output import Output
 from sysid.cli.sweeps import sweep_of
 from sysid.errors import InputError, SolverError
 from sysid.jobs import Band, Modes, Score, WithoutRun, WithoutSensor, moves, scored, submit
@@ -163,7 +164,7 @@ def test_a_variant_with_hubers_loss_has_the_same_further_tests(result, tmp_path)
     named = MODULE.format(folder=__file__.rpartition("/")[0]).replace("problem", "with_further_test as problem")
     file.write_text(named)
     own = replace(result, problem=with_further_test(loss="squares"))
-    sweep = sweep_of(Namespace(variants=[str(file)]), own, sysid.Recipe(str(file)))
+    sweep = sweep_of(Namespace(variants=[str(file)]), own, sysid.Recipe(str(file)), Output())
     assert sweep.titles == (str(file),)
 
 
