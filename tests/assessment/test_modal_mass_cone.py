@@ -208,7 +208,9 @@ class TestVerdict:
 def test_a_mode_too_faint_for_the_force_is_weighed_by_a_lumped_mass():
     """Of a lumped mass one modal mass gives all others, so the mode that the force shows is enough."""
     mass, springs, ratios = np.array([1800.0, 600.0]), np.array([1e6, 4e6]), np.array([0.01, 0.1])
-    K = np.array([[springs.sum(), -springs[1], -springs[0]], [-springs[1], springs[1], 0], [-springs[0], 0, springs[0]]])
+    K = np.array(
+        [[springs.sum(), -springs[1], -springs[0]], [-springs[1], springs[1], 0], [-springs[0], 0, springs[0]]]
+    )
     truth = Structure(np.diag([*mass, 0.0]), K, ratios, n_base=1)
     carried = truth.effective_masses[1, 0, 0] / mass.sum()
     assert carried < 0.01
