@@ -148,7 +148,7 @@ class HeldSpectrumObjective:
 def chunk_ends(count: int, size: int) -> list[int]:
     """Where chunks of candidates of this size end: an even number, nearly equal, the same for any number of threads.
 
-    >>> chunk_ends(781, 156), chunk_ends(3, 156)
+    >>> chunk_ends(781, 300), chunk_ends(3, 300)
     ([192, 384, 576, 784], [16])
     """
     steps = math.ceil(count / CHUNK)
