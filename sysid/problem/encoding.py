@@ -71,23 +71,22 @@ def _differing(
     """In a word what of two lists of expressions is not the same; empty where all is."""
     if [one.sparsity() for one in own] != [one.sparsity() for one in again]:
         return "patterns"
-    of_both = []
-    unknowns = ca.vertcat(*map(ca.vec, symbols))
-    for expressions in (own, again):
-        rows = ca.vertcat(*(ca.vec(ca.densify(one)) for one in expressions))
-        try:
-            slopes = ca.jacobian(rows, unknowns)
-        except RuntimeError:  # an operation without derivatives: those of both
-            slopes = ca.MX()
-        of_both.append(ca.Function("compared", symbols, [rows, slopes]))
+    of_own, of_again = _with_slopes(symbols, own), _with_slopes(symbols, again)
     for point in points:
-        for (mine, other), told in zip(zip(*(one(*point) for one in of_both), strict=True), _COMPARED, strict=True):
+        for what, mine, other in zip(("values", "derivatives"), of_own(*point), of_again(*point), strict=True):
             if mine.sparsity() != other.sparsity() or not _same_bits(mine, other):
-                return told
+                return what
     return ""
 
 
-_COMPARED = ("values", "derivatives")
+def _with_slopes(symbols: Sequence[ca.MX], expressions: Sequence[ca.MX]) -> ca.Function:
+    """Symbols to the entries of expressions, and their Jacobian; without it where an operation has no derivative."""
+    rows = ca.vertcat(*(ca.vec(ca.densify(one)) for one in expressions))
+    try:
+        slopes = ca.jacobian(rows, ca.vertcat(*map(ca.vec, symbols)))
+    except RuntimeError:
+        slopes = ca.MX()
+    return ca.Function("compared", symbols, [rows, slopes])
 
 
 def _same_bits(mine: ca.DM, other: ca.DM) -> bool:
