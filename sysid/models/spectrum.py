@@ -207,19 +207,19 @@ class _InNumbers(ca.Callback):
         self.construct("in_numbers", {})
 
     def get_n_in(self) -> int:
-        """How many it takes."""
+        """Number of inputs."""
         return len(self._inputs)
 
     def get_n_out(self) -> int:
-        """How many it gives."""
+        """Number of outputs."""
         return len(self._outputs)
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Shape of what it takes."""
+        """Pattern of an input."""
         return self._inputs[i]
 
     def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        """Shape of what it gives."""
+        """Pattern of an output."""
         return self._outputs[i]
 
     def eval(self, arguments: list[ca.DM]) -> list[ca.DM]:

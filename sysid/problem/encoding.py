@@ -30,6 +30,7 @@ from sysid.structure.structure import Array
 
 _NAMES = {operations.casadi_number(name): name for name in (*operations.NAMES, "input", "output")}
 _CLASSES = {kind: name for name, kind in operations.INTERPOLANTS.items()}
+_TRIED = 200  # points at which interpolants are compared
 
 
 class NotStorableError(InputError):
@@ -91,7 +92,7 @@ def _with_slopes(symbols: Sequence[ca.MX], expressions: Sequence[ca.MX]) -> ca.F
 
 def _same_bits(mine: ca.DM, other: ca.DM) -> bool:
     a, b = (np.array(one.nonzeros(), dtype=float) for one in (mine, other))
-    both = np.isnan(a) & np.isnan(b)  # of which there are many
+    both = np.isnan(a) & np.isnan(b)  # which has many patterns of bits
     return bool(np.all((a.view(np.int64) == b.view(np.int64)) | both))
 
 
@@ -348,9 +349,6 @@ def _same_values(one: ca.Function, other: ca.Function, grid: Sequence[Sequence[f
     return one.size_in(0) == other.size_in(0) and _same_bits(one.map(_TRIED)(points), other.map(_TRIED)(points))
 
 
-_TRIED = 200  # points
-
-
 def _add_sx(writer: _Writer, function: ca.Function, inputs: Sequence[ca.Sparsity]) -> None:
     """Add a function on numbers."""
     starts = np.cumsum([0, *(pattern.nnz() for pattern in inputs)])
@@ -382,6 +380,6 @@ def _add_sx(writer: _Writer, function: ca.Function, inputs: Sequence[ca.Sparsity
 
 
 def _integers(values: Sequence[int]) -> Array:
-    """Integers, none longer than the longest needs."""
+    """Integers in the shortest type that holds all of them."""
     least, most = min([*values, 0]), max([*values, 0])
     return np.array(values, dtype=np.promote_types(np.min_scalar_type(least), np.min_scalar_type(most)))

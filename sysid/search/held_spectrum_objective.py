@@ -124,7 +124,7 @@ class HeldSpectrumObjective:
     def _chunk(self, particles: Array, start: int, end: int) -> tuple[Array, Array]:
         """Squares, and whether the ratios are within the range of the series."""
         count = len(particles)
-        full = particles[np.minimum(np.arange(start, end), count - 1)]  # the last one again and again fills the last
+        full = particles[np.minimum(np.arange(start, end), count - 1)]  # the last chunk is filled up
         expansion = self._expansions.get()
         ratios, *parts = expansion(full)
         self._expansions.put(expansion)
