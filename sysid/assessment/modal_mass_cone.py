@@ -59,7 +59,7 @@ def verdict(problem: Problem, structure: Structure) -> tuple[tuple[str, ...], tu
     known = _known(problem, structure, misfit)
     free, common = _open_modes(known)
     responses = _responses(test, structure)
-    open_ = [*_unseen(problem, structure, misfit, responses), *_merged(known, test, structure, free, responses)]
+    open_ = [*_unseen(problem, structure, misfit, responses, free), *_merged(known, test, structure, free, responses)]
     if free:
         bounded = ", within what is stated" if len(known.equations) else ""
         open_.append(
@@ -74,9 +74,18 @@ def verdict(problem: Problem, structure: Structure) -> tuple[tuple[str, ...], tu
             "hold for the stated degrees of freedom only; the Craig-Bampton form (to_craig_bampton(), modal and base "
             f"coordinates) is what the data determine, {how_far}"
         )
-    weighed = "" if test.force is None else "the measured base force weighs each mode that the base moves"
-    closed = () if free else tuple(filter(None, (known.sentence, weighed)))
+    closed = () if free else tuple(filter(None, (known.sentence, _weighed_in_words(known, test, structure))))
     return closed, tuple(open_)
+
+
+def _weighed_in_words(known: _Known, test: Measurement, structure: Structure) -> str:
+    """Of modal masses that are all fixed, those that the base force fixes; empty where it was not measured."""
+    if test.force is None:
+        return ""
+    moved, weighed = (sum(W.shape[1] for W in of) for of in (_moved(structure, known.clusters), known.weighed))
+    if weighed == moved:
+        return "the measured base force weighs each mode that the base moves"
+    return f"the measured base force weighs {weighed} of {moved} modes that the base moves"
 
 
 def _merged(
@@ -359,8 +368,10 @@ def _seen(test: Measurement, structure: Structure, cluster: list[int], rows: Arr
     return W[:, shares >= record.level]
 
 
-def _unseen(problem: Problem, structure: Structure, misfit: float, responses: _Record) -> Iterator[str]:
-    """What the records do not show, in sentences."""
+def _unseen(
+    problem: Problem, structure: Structure, misfit: float, responses: _Record, free: list[int]
+) -> Iterator[str]:
+    """What the records do not show, in sentences; a mode needs no force of its own where what is stated fixes it."""
     test = problem.measurement
     base = columns(test.base)
     sizes = np.linalg.norm(base, axis=1, keepdims=True)
@@ -390,7 +401,7 @@ def _unseen(problem: Problem, structure: Structure, misfit: float, responses: _R
                 f"{_mode(structure, k)} lies outside the lines ({test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz) and "
                 f"answers for all modes there{_like_rigid(test, structure, k)}"
             )
-        elif forces and (own := _shares(test, structure, k, push.T, push, forces)[0]) < forces.level:
+        elif k in free and forces and (own := _shares(test, structure, k, push.T, push, forces)[0]) < forces.level:
             yield (
                 f"the mass of {_mode(structure, k)} is not weighed: it makes {100 * own:.3g} % of the base force, and "
                 f"what the fit misses ({100 * forces.misfit:.3g} % of the force) can look like a mode that makes up to "

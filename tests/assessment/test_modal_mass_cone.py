@@ -203,3 +203,21 @@ class TestVerdict:
             verdict = determine(problem_of(truth, FullMass(), force=True), truth, None)
             self.check(verdict, determined, says="base force weighs" if determined else "mode 2")
             self.check(determine(problem_of(truth, FullMass(20.0)), truth, None), False)
+
+
+def test_a_mode_too_faint_for_the_force_is_weighed_by_a_lumped_mass():
+    """Of a lumped mass one modal mass gives all others, so the mode that the force shows is enough."""
+    mass, springs, ratios = np.array([1800.0, 600.0]), np.array([1e6, 4e6]), np.array([0.01, 0.1])
+    K = np.array([[springs.sum(), -springs[1], -springs[0]], [-springs[1], springs[1], 0], [-springs[0], 0, springs[0]]])
+    truth = Structure(np.diag([*mass, 0.0]), K, ratios, n_base=1)
+    carried = truth.effective_masses[1, 0, 0] / mass.sum()
+    assert carried < 0.01
+    freq = np.linspace(0.4, 1.6, 80) * truth.natural_frequencies[:, None]
+    test = sysid.simulate(truth, np.unique(freq.ravel()), noise=0.01, force=True, rng=3)
+    full, lumped = (sysid.identify(Problem(test, mass=model), rng=0) for model in (FullMass(), LumpedMass()))
+    assert not full.determined and any("mode 2" in sentence for sentence in full.undetermined)
+    assert lumped.determined, lumped.undetermined
+    assert "the measured base force weighs 1 of 2 modes that the base moves" in lumped.closed_by
+    off = np.diag(lumped.structure.mass)[:2] - mass
+    assert np.all(np.abs(off) < 5 * np.diag(lumped.uncertainty.mass))
+    assert np.all(np.diag(lumped.uncertainty.mass) < 0.05 * mass)
