@@ -166,17 +166,12 @@ class WrittenDamping(Written):
 
 def _box(geometry: Geometry) -> tuple[Array, Array, str]:
     """Lower and upper ends of what a swarm searches for free ratios, (n,) each, and in words why; empty if as usual."""
-    (lower, upper), half, n = _USUAL, np.sqrt(_DECADE), geometry.n
-    ratios = np.clip(geometry.pole_ratios, LEAST, MOST)
+    (lower, upper), half, ratios = _USUAL, np.sqrt(_DECADE), np.clip(geometry.pole_ratios, LEAST, MOST)
     outside = (ratios < lower) | (ratios > upper)
-    if not np.any(outside):
-        return np.full(n, lower), np.full(n, upper), ""
     low = np.maximum(np.where(outside, ratios / half, lower), LEAST)
     high = np.minimum(np.where(outside, ratios * half, upper), MOST)
-    if ratios.size != n:  # which mode has which is not known
-        low, high = np.full(n, low.min(initial=lower)), np.full(n, high.max(initial=upper))
-    note = (
-        f"damping ratios are searched from {100 * low.min():.3g} to {100 * high.max():.3g} %, as the poles of the data "
-        f"have {100 * ratios.min():.3g} to {100 * ratios.max():.3g} %, beyond the usual 0.5 to 5 %"
-    )
-    return low, high, note
+    if ratios.size != geometry.n:  # which mode has which is not known
+        low, high = np.full(geometry.n, low.min(initial=lower)), np.full(geometry.n, high.max(initial=upper))
+    found = f"{100 * ratios.min(initial=MOST):.3g} to {100 * ratios.max(initial=LEAST):.3g} %"
+    note = f"damping ratios are searched from {100 * low.min():.3g} to {100 * high.max():.3g} %, as the poles of the "
+    return low, high, f"{note}data have {found}, beyond the usual 0.5 to 5 %" * bool(np.any(outside))
