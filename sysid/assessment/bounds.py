@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,7 @@ from sysid.modal_analysis.residues import Records, beyond_chance
 from sysid.models.stiffness import FREQUENCY_WINDOW
 from sysid.models.unknowns import scales_of, split
 from sysid.nlp import EXACT
+from sysid.problem.formulation import Formulation
 from sysid.problem.problem import Problem
 from sysid.problem.slopes import stacked_rows
 from sysid.structure.structure import Array, Structure
@@ -74,10 +75,7 @@ def on_bounds(problem: Problem, structure: Structure, x: Array | None) -> list[O
         The unknowns that stand for it; None where the modal strategy chose other degrees of freedom.
     """
     formulation, parts = problem.formulation, problem.formulation.parts
-    at = np.full(formulation.size, np.nan)
-    ratios = structure.damping_ratios[: parts.damping.stop - parts.damping.start]
-    at[parts.damping.start : parts.damping.start + ratios.size] = ratios
-    at = at if x is None else x
+    at = _ratios_alone(formulation, structure) if x is None else x
     unknowns = formulation.unknowns
     relative = np.repeat([v.relative for v in unknowns], [v.size for v in unknowns])
     largest = [np.full(v.size, np.abs(own).max()) for v, own in zip(unknowns, split(unknowns, at), strict=True)]
@@ -99,9 +97,17 @@ def on_bounds(problem: Problem, structure: Structure, x: Array | None) -> list[O
     return [*found, *_on_windows(problem, structure)]
 
 
+def _ratios_alone(formulation: Formulation, structure: Structure) -> Array:
+    """Unknowns (n_variables,) of which only the damping ratios are known; NaN for the others."""
+    at, part = np.full(formulation.size, np.nan), formulation.parts.damping
+    ratios = structure.damping_ratios[: part.stop - part.start]
+    at[part.start : part.start + ratios.size] = ratios
+    return at
+
+
 def _on_windows(problem: Problem, structure: Structure) -> Iterator[OnBound]:
     """Natural frequencies on the edge of what a stated one may be wrong by."""
-    stated: Any = problem.formulation.stiffness.spectrum
+    stated = problem.formulation.stiffness.spectrum
     given = np.zeros(0) if stated is None else stated
     found, window = structure.natural_frequencies[: given.size], np.log1p(FREQUENCY_WINDOW)
     off = np.log(2 * np.pi * found / given[: found.size])

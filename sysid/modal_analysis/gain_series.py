@@ -14,8 +14,8 @@ from sysid.structure.structure import Array, ComplexArray
 
 _TERMS_MORE = 4  # than the asymptotic rate of the series asks for
 _RANK = 1e-6  # of the largest singular value: directions of the gains below it are left out
-# Candidates whose gains are made at once: those of more leave a processor's cache before they are used. BLAS rounds by
-# the size of a product, so that all have this size.
+# Candidates whose gains are made at once: those of more leave a processor's cache before they are used. Products of all
+# candidates have this size, because BLAS rounds differently where the size differs.
 _BLOCK = 64
 _ALIKE = 1e-12  # up to which two base motions count as proportional at all lines
 

@@ -26,7 +26,7 @@ _APART = 1e-12  # eigenvalues over the highest one, that count as apart
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """A refined factor.
+    """A factor refined by IPOPT.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class Refinement:
         Largest relative difference of the replaced eigenvalues from their targets.
     success : bool
     status : str
-        IPOPT's own, and whether it missed the spectrum; "closed-form" of that.
+        IPOPT's own, and whether it missed the spectrum.
     """
 
     factor: Array
@@ -58,7 +58,21 @@ def replace_spectrum(lam: Array, targets: Array) -> Array:
 
 
 def nearest_factors(factors: Array, targets: Array) -> Array:
-    """`closed_form` of many factors (k, n, n) at once: their refined factors, with positive diagonals."""
+    """The closed form: of each ``L_H L_H'`` the nearest matrix (Frobenius) with the target spectrum.
+
+    Parameters
+    ----------
+    factors : (k, n, n)
+        Lower-triangular L_H, rad/s.
+    targets : (m,), m <= n
+        Measured circular frequencies, rad/s.
+
+    Returns
+    -------
+    (k, n, n)
+        Refined factors, with positive diagonals.
+    """
+    _check(factors, targets)
     lam, psi = np.linalg.eigh(factors @ factors.swapaxes(1, 2))
     # The triangular factor by QR of a square root keeps the small eigenvalues that a Cholesky of H loses.
     upper: Array = np.linalg.qr(np.sqrt(replace_spectrum(lam, targets))[:, :, None] * psi.swapaxes(1, 2))[1]
@@ -66,32 +80,20 @@ def nearest_factors(factors: Array, targets: Array) -> Array:
     return (upper * signs[:, :, None]).swapaxes(1, 2)
 
 
-def closed_form(factor: Array, targets: Array) -> Refinement:
-    """The matrix nearest to ``L_H L_H'`` (Frobenius) with the target spectrum: its own eigenvectors.
-
-    Parameters
-    ----------
-    factor : ndarray, shape (n, n)
-        Lower-triangular L_H, rad/s.
-    targets : ndarray, shape (m,), m <= n
-        Measured circular frequencies, rad/s.
-    """
-    targets = _check(factor, targets)
-    return _finish(nearest_factors(factor[None], targets)[0], targets, True, "closed-form")
-
-
 def by_ipopt(factor: Array, targets: Array, max_time: float | None = None) -> Refinement:
     """Minimise the distance of the spectrum to the target from the candidate's own factor (the paper's way).
 
     Eq. 31 is minimised as `SpectrumDistance` has it, over the entries of L_H alone. `max_time` is IPOPT's own, s.
     """
-    targets = _check(factor, targets)
+    _check(factor, targets)
+    targets = np.sort(targets)
     n, scale = factor.shape[0], targets[-1]
     distance = SpectrumDistance(n, targets / scale)
     rows, columns = np.tril_indices(n)
     solver, start = Solver(distance, max_time), triangle_entries(factor) / scale
     x, status = solver.minimum(start, np.where(rows == columns, _LEAST, -np.inf))
-    answer = _finish(triangle(x, n) * scale, targets, status in SOLVED, status)
+    refined = triangle(x, n) * scale
+    answer = Refinement(refined, spectrum_error(refined, targets), status in SOLVED, status)
     return answer if answer.error < _REACHED else replace(answer, success=False, status=f"{status}, spectrum missed")
 
 
@@ -157,11 +159,9 @@ class SpectrumDistance:
         return hessian
 
 
-def _check(factor: Array, targets: Array) -> Array:
-    targets = np.sort(np.asarray(targets, dtype=float))
-    if targets.size > factor.shape[0]:
-        raise InputError(f"{targets.size} target frequencies for a model with {factor.shape[0]}")
-    return targets
+def _check(factors: Array, targets: Array) -> None:
+    if targets.size > factors.shape[-1]:
+        raise InputError(f"{targets.size} target frequencies for a model with {factors.shape[-1]}")
 
 
 class Solver:
@@ -207,19 +207,19 @@ class _InNumbers(ca.Callback):
         self.construct("in_numbers", {})
 
     def get_n_in(self) -> int:
-        """How many it takes."""
+        """Number of inputs."""
         return len(self._inputs)
 
     def get_n_out(self) -> int:
-        """How many it gives."""
+        """Number of outputs."""
         return len(self._outputs)
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Shape of what it takes."""
+        """Pattern of an input."""
         return self._inputs[i]
 
     def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        """Shape of what it gives."""
+        """Pattern of an output."""
         return self._outputs[i]
 
     def eval(self, arguments: list[ca.DM]) -> list[ca.DM]:
@@ -237,8 +237,3 @@ def spectrum_error(factor: Array, targets: Array) -> float:
     # Singular values, not eigenvalues of L L': full relative accuracy needs no squares.
     own = np.sort(np.linalg.svd(factor, compute_uv=False))
     return float(np.max(np.abs((own[: targets.size] / targets) ** 2 - 1)))
-
-
-def _finish(factor: Array, targets: Array, success: bool, status: str) -> Refinement:
-    """What came of a refinement, from its factor, whose diagonal is positive."""
-    return Refinement(factor, spectrum_error(factor, targets), success, status)

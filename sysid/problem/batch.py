@@ -78,7 +78,7 @@ class Batch:
             for place, array in zip(self._given, arrays, strict=True):
                 part = array[chunk]
                 place[: len(part)] = part.reshape(len(part), *place.shape[1:])
-                place[len(part) :] = place[len(part) - 1]  # the last one again and again fills the chunk
+                place[len(part) :] = place[len(part) - 1]  # the last one fills up the chunk
             self._run()
             for output, made in zip(outputs, self._made, strict=True):
                 output[chunk] = made[: len(output[chunk])]

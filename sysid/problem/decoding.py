@@ -377,7 +377,7 @@ def _at(values: Sequence[Any], number: int) -> Any:
 
 
 def _whole(numbers: Any) -> list[int]:
-    """Whole numbers of an array as Python's, which have no end."""
+    """Whole numbers of an array as Python's, which do not overflow."""
     values = np.asarray(numbers)
     if values.ndim != 1 or (values.size and values.dtype.kind not in "iu"):
         raise ValueError("whole numbers are needed")

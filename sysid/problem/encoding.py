@@ -30,6 +30,7 @@ from sysid.structure.structure import Array
 
 _NAMES = {operations.casadi_number(name): name for name in (*operations.NAMES, "input", "output")}
 _CLASSES = {kind: name for name, kind in operations.INTERPOLANTS.items()}
+_TRIED = 200  # points at which interpolants are compared
 
 
 class NotStorableError(InputError):
@@ -71,28 +72,27 @@ def _differing(
     """In a word what of two lists of expressions is not the same; empty where all is."""
     if [one.sparsity() for one in own] != [one.sparsity() for one in again]:
         return "patterns"
-    of_both = []
-    unknowns = ca.vertcat(*map(ca.vec, symbols))
-    for expressions in (own, again):
-        rows = ca.vertcat(*(ca.vec(ca.densify(one)) for one in expressions))
-        try:
-            slopes = ca.jacobian(rows, unknowns)
-        except RuntimeError:  # an operation without derivatives: those of both
-            slopes = ca.MX()
-        of_both.append(ca.Function("compared", symbols, [rows, slopes]))
+    of_own, of_again = _with_slopes(symbols, own), _with_slopes(symbols, again)
     for point in points:
-        for (mine, other), told in zip(zip(*(one(*point) for one in of_both), strict=True), _COMPARED, strict=True):
+        for what, mine, other in zip(("values", "derivatives"), of_own(*point), of_again(*point), strict=True):
             if mine.sparsity() != other.sparsity() or not _same_bits(mine, other):
-                return told
+                return what
     return ""
 
 
-_COMPARED = ("values", "derivatives")
+def _with_slopes(symbols: Sequence[ca.MX], expressions: Sequence[ca.MX]) -> ca.Function:
+    """Symbols to the entries of expressions, and their Jacobian; without it where an operation has no derivative."""
+    rows = ca.vertcat(*(ca.vec(ca.densify(one)) for one in expressions))
+    try:
+        slopes = ca.jacobian(rows, ca.vertcat(*map(ca.vec, symbols)))
+    except RuntimeError:
+        slopes = ca.MX()
+    return ca.Function("compared", symbols, [rows, slopes])
 
 
 def _same_bits(mine: ca.DM, other: ca.DM) -> bool:
     a, b = (np.array(one.nonzeros(), dtype=float) for one in (mine, other))
-    both = np.isnan(a) & np.isnan(b)  # of which there are many
+    both = np.isnan(a) & np.isnan(b)  # which has many patterns of bits
     return bool(np.all((a.view(np.int64) == b.view(np.int64)) | both))
 
 
@@ -349,9 +349,6 @@ def _same_values(one: ca.Function, other: ca.Function, grid: Sequence[Sequence[f
     return one.size_in(0) == other.size_in(0) and _same_bits(one.map(_TRIED)(points), other.map(_TRIED)(points))
 
 
-_TRIED = 200  # points
-
-
 def _add_sx(writer: _Writer, function: ca.Function, inputs: Sequence[ca.Sparsity]) -> None:
     """Add a function on numbers."""
     starts = np.cumsum([0, *(pattern.nnz() for pattern in inputs)])
@@ -383,6 +380,6 @@ def _add_sx(writer: _Writer, function: ca.Function, inputs: Sequence[ca.Sparsity
 
 
 def _integers(values: Sequence[int]) -> Array:
-    """Integers, none longer than the longest needs."""
+    """Integers in the shortest type that holds all of them."""
     least, most = min([*values, 0]), max([*values, 0])
     return np.array(values, dtype=np.promote_types(np.min_scalar_type(least), np.min_scalar_type(most)))

@@ -17,16 +17,17 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.errors import InputError, refuse
+from sysid.errors import refuse
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.complex_frequency import noise_level
 from sysid.models.expressions import as_matrix, variables_of, written_in
 from sysid.models.geometry import Geometry
 from sysid.models.model import MatrixModel, Stated, ratios_of
-from sysid.models.unknowns import Unknown, Variable, box_of, expression_of, lower_of, split, upper_of, user_site
+from sysid.models.unknowns import Unknown, Variable, box_of, lower_of, split, upper_of
+from sysid.problem.constraints import Constraints, Row, row_of
 from sysid.problem.given import MATRICES
 from sysid.problem.matrices import Blocks, Matrices, blocks_of, symbols_in
-from sysid.problem.terms import Builder, ExpressionTerm, Prior, Residual, Term, TermSource, TestTerm, column_of
+from sysid.problem.terms import Builder, ExpressionTerm, Prior, Residual, Term, TermSource, TestTerm
 from sysid.structure.structure import Array, Structure
 
 
@@ -36,32 +37,6 @@ class Parts(NamedTuple):
     mass: slice
     stiffness: slice
     damping: slice
-
-
-class Constraints(NamedTuple):
-    """``lower <= function(x) <= upper``; `sources` names the constraint of each row, and its variables.
-
-    Without constraints it has no rows.
-    """
-
-    function: ca.Function
-    lower: Array
-    upper: Array
-    sources: tuple[str, ...]
-
-    @property
-    def equal(self) -> Array:
-        """Which rows are equalities, (rows,)."""
-        return self.lower == self.upper
-
-    def at(self, x: Array) -> Array:
-        """Values at `x`, (rows,)."""
-        return np.asarray(self.function(x)).ravel()
-
-    def violation(self, x: Array) -> Array:
-        """By how much they leave their bounds at `x`, (rows,)."""
-        values = self.at(x)
-        return np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0)
 
 
 class Formulation:
@@ -402,8 +377,8 @@ class Formulation:
         return [tuple(source.expressions(name)) for name, source in self.sources]
 
     @cached_property
-    def _relations(self) -> list[_Row]:
-        return [_relation(i, constraint) for i, constraint in enumerate(self._constraints, start=1)]
+    def _relations(self) -> list[Row]:
+        return [row_of(i, constraint) for i, constraint in enumerate(self._constraints, start=1)]
 
     @cached_property
     def _of_models(self) -> list[list[ca.MX]]:
@@ -434,14 +409,6 @@ class Formulation:
         pieces = [ca.reshape(piece, *s.shape) for piece, s in zip(split(self.unknowns, x), symbols, strict=True)]
         constants = [ca.reshape(ca.MX(ca.DM(v.guess)), *v.symbol.shape) for v in self.fixed]
         return ca.Function(name, [x, *further], inner.call([*pieces, *further, *constants], True, False))
-
-
-class _Row(NamedTuple):
-    """A constraint ``lower <= expression <= 0``, an equality where `lower` is 0, and what messages call it."""
-
-    expression: ca.MX
-    lower: float
-    source: str
 
 
 def _variables(expressions: Sequence[ca.MX]) -> tuple[Variable, ...]:
@@ -479,19 +446,3 @@ def _check_healing(healed: Mapping[Variable, ca.MX], free: Sequence[Unknown]) ->
                 f"variable is {variable.symbol.shape}",
             ),
         )
-
-
-def _relation(number: int, value: Any) -> _Row:
-    """A constraint that was given."""
-    relation = expression_of(value)
-    name = f"constraint {number}"
-    kinds = {ca.OP_LE: -np.inf, ca.OP_LT: -np.inf, ca.OP_EQ: 0.0}
-    lower = next((low for k, low in kinds.items() if isinstance(relation, ca.MX) and relation.is_op(k)), None)
-    if lower is None:
-        what = type(value).__name__ if not isinstance(value, ca.MX) else f"the expression {str(value)[:60]}"
-        raise InputError(
-            f"{name} is {what} ({user_site()}): a constraint is a relation of variables, such as "
-            f"k[0] <= k[1] or ca.sum1(m) == 9{written_in(relation) if isinstance(relation, ca.MX) else ''}"
-        )
-    row = column_of(name, relation.dep(0) - relation.dep(1))
-    return _Row(row, lower, name + written_in(relation).replace("; it is", ","))

@@ -86,7 +86,7 @@ def has_library(kind: str, name: str) -> bool:
 
 def get_nonzeros(x: ca.MX, pattern: ca.Sparsity, places: Sequence[int]) -> ca.MX:
     """Nonzeros of x as those of another pattern; place -1 gives zero."""
-    _check_places(places, x.nnz(), least=-1)
+    _check_places(places, x.nnz())
     if len(places) != pattern.nnz():
         raise ValueError(f"{len(places)} places for {pattern.nnz()} entries")
     return x.nzref(pattern, list(places))
@@ -94,7 +94,7 @@ def get_nonzeros(x: ca.MX, pattern: ca.Sparsity, places: Sequence[int]) -> ca.MX
 
 def set_nonzeros(y: ca.MX, x: ca.MX, places: Sequence[int], *, add: bool) -> ca.MX:
     """Give y with the nonzeros of x in, or added to, those of its own at some places; place -1 is left out."""
-    _check_places(places, y.nnz(), least=-1)
+    _check_places(places, y.nnz())
     if len(places) != x.nnz():
         raise ValueError(f"{len(places)} places for {x.nnz()} entries")
     result = ca.MX(y)
@@ -115,8 +115,8 @@ def set_nonzeros(y: ca.MX, x: ca.MX, places: Sequence[int], *, add: bool) -> ca.
     return result
 
 
-def _check_places(places: Sequence[int], count: int, *, least: int) -> None:
-    if len(places) and not (least <= min(places) and max(places) < count):
+def _check_places(places: Sequence[int], count: int) -> None:
+    if len(places) and not (min(places) >= -1 and max(places) < count):
         raise ValueError(f"a place is not among {count} entries")
 
 

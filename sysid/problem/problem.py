@@ -202,9 +202,9 @@ class Problem:
             reference=None if tree["reference"] is None else Structure.from_tree(tree["reference"]),
             validation=[Measurement.from_tree(test) for test in tree["validation"]],
             goal=tree["goal"],
-            loss=tree.get("loss", "squares"),  # earlier files have none
+            loss=tree["loss"],
         )
-        if tree.get("poles") is not None:
+        if tree["poles"] is not None:
             problem.geometry.found = tree["poles"]
         return problem
 

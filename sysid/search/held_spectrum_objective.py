@@ -124,7 +124,7 @@ class HeldSpectrumObjective:
     def _chunk(self, particles: Array, start: int, end: int) -> tuple[Array, Array]:
         """Squares, and whether the ratios are within the range of the series."""
         count = len(particles)
-        full = particles[np.minimum(np.arange(start, end), count - 1)]  # the last one again and again fills the last
+        full = particles[np.minimum(np.arange(start, end), count - 1)]  # the last chunk is filled up
         expansion = self._expansions.get()
         ratios, *parts = expansion(full)
         self._expansions.put(expansion)
@@ -148,7 +148,7 @@ class HeldSpectrumObjective:
 def chunk_ends(count: int, size: int) -> list[int]:
     """Where chunks of candidates of this size end: an even number, nearly equal, the same for any number of threads.
 
-    >>> chunk_ends(781, 156), chunk_ends(3, 156)
+    >>> chunk_ends(781, 300), chunk_ends(3, 300)
     ([192, 384, 576, 784], [16])
     """
     steps = math.ceil(count / CHUNK)

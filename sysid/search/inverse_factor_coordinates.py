@@ -3,7 +3,7 @@
 The unknowns stand for those of Cerini et al. 2024, section 3: ``R = L^-1`` of ``M_SS = L L'``, ``P = L^-1 B`` with
 ``B = M_SS G + M_S0``, N of ``M_rb = P'P + N N'`` where a base force was measured, the eigenvectors Psi of
 ``H = L^-1 K_SS L^-T``, its spectrum and the damping ratios. With ``Phi = R' Psi`` and ``Gamma = Psi' P`` nothing is
-inverted. In the entries of L, ``Phi = L^-T Psi`` bends the valley of a noisy test so much that IPOPT ends on its
+inverted. ``Phi = L^-T Psi`` is so far from linear in the entries of L that with noise IPOPT ends in them on its
 iteration limit. Psi is ``Psi_0 Cayley(S)`` with a skew-symmetric S, so that no eigenvector routine is in the graph, and
 frequencies and damping ratios count in logarithms. R, P and N have no bounds. A stated total is an equality where a
 base force could tell another one; else masses are scaled to it at the end. The paper's own entries follow then. Far

@@ -51,14 +51,12 @@ class Tally:
         }  # fmt: skip
 
     def to_tree(self) -> dict[str, Any]:
-        """Give the counts as numbers and texts; `resume` takes them back."""
-        counts = np.array(list(self.statuses.values()), dtype=np.int64)
-        return {"tried": self.tried, "won": self.won, "statuses": tuple(self.statuses), "counts": counts}
+        """Give the counts as numbers; `resume` takes them back."""
+        return {"tried": self.tried, "won": self.won, "statuses": dict(self.statuses)}
 
     def resume(self, tree: dict[str, Any]) -> None:
         """Go on from the counts of an earlier run."""
-        self.tried, self.won = tree["tried"], tree["won"]
-        self.statuses = Counter(dict(zip(tree["statuses"], tree["counts"].tolist(), strict=True)))
+        self.tried, self.won, self.statuses = tree["tried"], tree["won"], Counter(tree["statuses"])
 
 
 class Refiner:

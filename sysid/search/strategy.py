@@ -76,7 +76,7 @@ class History:
     restarts : int
         Further swarms after the first.
     phases : tuple of Phase
-        In their order, of the swarm that gave the answer; none in results of older versions.
+        In their order, of the swarm that gave the answer.
     """
 
     start: float = np.nan

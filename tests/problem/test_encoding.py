@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import sysid
+from benchmarks.hostile.stored_expressions import changed
 from sysid.files.tree import from_bytes, to_bytes
 from sysid.problem import operations
 from sysid.problem.decoding import decode
@@ -320,33 +321,13 @@ def test_an_evaluation_that_needs_too_much_memory_is_refused(monkeypatch):
         decode(tree, SYMBOLS)
 
 
-def mutated(tree, rng):
-    """The tree with one to three of its numbers, names or kinds changed."""
-    tree = copy.deepcopy(tree)
-    for _ in range(int(rng.integers(1, 4))):
-        function = tree["functions"][rng.integers(len(tree["functions"]))]
-        part = ("code", "code", "code", "inputs", "outputs", "numbers", "kind", "names", "patterns")[rng.integers(9)]
-        place = tree if part in ("names", "patterns") else function
-        if part == "kind":
-            function[part] = ("mx", "sx", "map", "switch", "linear", "bspline", "jit")[rng.integers(7)]
-        elif part == "names":
-            names = [*tree["names"], *operations.NAMES]
-            tree[part] = tuple(names[rng.integers(len(names))] for _ in tree["names"])
-        elif place[part].size:
-            values = place[part].astype(float if part == "numbers" else np.int64)
-            wild = (-1, 0, 1, 2, 7, 300, 10**6, 2**62, values[rng.integers(values.size)])
-            values[rng.integers(values.size)] = wild[rng.integers(len(wild))]
-            place[part] = values[: rng.integers(1, values.size + 1)] if rng.random() < 0.1 else values
-    return tree
-
-
 def test_of_mutated_lists_none_ends_in_anything_but_an_input_error_or_expressions():
     """In this process: a crash of CasADi would end the tests. `hostile` has 2,400 of them."""
     rng, trees = np.random.default_rng(8), [tree_of(expression) for expression in CASES.values()]
     refused = 0
     for k in range(300):
         try:
-            made = decode(mutated(trees[k % len(trees)], rng), SYMBOLS)
+            made = decode(changed(trees[k % len(trees)], rng), SYMBOLS)
         except sysid.InputError:
             refused += 1
         else:

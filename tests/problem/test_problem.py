@@ -9,7 +9,7 @@ import pytest
 
 import sysid
 from sysid import FullMass, InputError, KnownMass, Measurement, Problem, SpectralStiffness
-from sysid.models.spectrum import closed_form
+from sysid.models.spectrum import nearest_factors
 from sysid.problem import batch_objective
 from sysid.structure.triangular import triangle, triangle_entries
 
@@ -38,7 +38,8 @@ def batch(problem, rows, spectrum=None):
 def refined(problem, x):
     """The unknowns whose spectrum is the stated one: the nearest factor of H with it."""
     x, part, n = x.copy(), problem.formulation.parts.stiffness, problem.geometry.n
-    x[part] = triangle_entries(closed_form(triangle(x[part], n), problem.formulation.stiffness.spectrum).factor)
+    factors = nearest_factors(triangle(x[part], n)[None], problem.formulation.stiffness.spectrum)
+    x[part] = triangle_entries(factors[0])
     return x
 
 
