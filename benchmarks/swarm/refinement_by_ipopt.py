@@ -10,7 +10,7 @@ import numpy as np
 import sysid
 from benchmarks.line import Line, above, below
 from benchmarks.problem_modules import load_module
-from benchmarks.swarm.noisy_tests import SEEDS, random_test
+from benchmarks.swarm.noisy_tests import SEEDS, TOTALS, random_test
 from sysid.models.spectrum import Solver, SpectrumDistance
 
 LEAST = 5  # leaders tried in a run
@@ -86,8 +86,11 @@ def _leaders(reduced: bool) -> Iterator[Line]:
     strategy, seeds = sysid.Swarm.published(local=None), SEEDS[:1] if reduced else SEEDS
     tower = load_module("cantilever_tower").problem
     tests: dict[str, Callable[[int], sysid.Problem]] = {"README's tower": lambda seed: tower(rng=seed)}
-    for n, force in () if reduced else ((6, True), (6, False), (10, True), (10, False)):
-        tests[f"n = {n}, d = 3, {'with' if force else 'without'} force"] = partial(random_test, n=n, force=force)
+    for n in () if reduced else (6, 10):
+        for force in (True, False):
+            tests[f"n = {n}, d = 3, {'with' if force else 'without'} force"] = partial(random_test, n=n, force=force)
+        for kind, words in TOTALS.items():
+            tests[f"n = {n}, d = 3, with force and {words}"] = partial(random_test, n=n, kind=kind)
     for name, problem in tests.items():
         histories = [sysid.identify(problem(seed), strategy=strategy, rng=seed).history for seed in seeds]
         what = f"hpso-ls, {name}, 1 % noise, {len(seeds)} seeds: "

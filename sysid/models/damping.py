@@ -8,6 +8,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from sysid.errors import InputError, finite_array, number, shown
 from sysid.models.expressions import as_matrix, at_point, check_finite, is_column, written_in
@@ -48,12 +49,12 @@ class ModalDamping(FieldTree):
         lower, upper = (np.full(geometry.n, float(end)) for end in (self.lower, self.upper))
         if self.lower != LEAST and self.upper != MOST:
             return (Unknown("damping_ratio", lower, upper),)
-        low, high, note = _box(geometry)
+        low, high = _box(geometry)
         # A bound that is stated is an end of the box, which is a decade long where the other end would lie beyond.
         low, high = np.where(lower == LEAST, low, lower), np.where(upper == MOST, high, upper)
         low = np.where(low < high, low, np.maximum(np.minimum(low, high / _DECADE), lower))
         high = np.where(low < high, high, np.minimum(low * _DECADE, upper))
-        return (Unknown("damping_ratio", lower, upper, box=(low, high), note=note),)
+        return (Unknown("damping_ratio", lower, upper, box=(low, high), note=_why(low, high, _poles(geometry))),)
 
     def blocks(self, geometry: Geometry, y: ca.SX, mass: MassBlocks, stiffness: StiffnessBlocks) -> None:
         """No matrix: ratios only."""
@@ -164,14 +165,31 @@ class WrittenDamping(Written):
         return given.shape == (n, 1) and (n > 1 or is_column(self.written))
 
 
-def _box(geometry: Geometry) -> tuple[Array, Array, str]:
-    """Lower and upper ends of what a swarm searches for free ratios, (n,) each, and in words why; empty if as usual."""
-    (lower, upper), half, ratios = _USUAL, np.sqrt(_DECADE), np.clip(geometry.pole_ratios, LEAST, MOST)
-    outside = (ratios < lower) | (ratios > upper)
+def _poles(geometry: Geometry) -> Array:
+    """Damping ratios of the poles in the data, as far as a vibrating structure has such, (poles,)."""
+    return np.clip(geometry.pole_ratios, LEAST, MOST)
+
+
+def _beyond_usual(ratios: Array) -> NDArray[np.bool_]:
+    return (ratios < _USUAL[0]) | (ratios > _USUAL[1])
+
+
+def _box(geometry: Geometry) -> tuple[Array, Array]:
+    """Lower and upper ends of what a swarm searches for free ratios, (n,) each."""
+    (lower, upper), half, ratios = _USUAL, np.sqrt(_DECADE), _poles(geometry)
+    outside = _beyond_usual(ratios)
     low = np.maximum(np.where(outside, ratios / half, lower), LEAST)
     high = np.minimum(np.where(outside, ratios * half, upper), MOST)
     if ratios.size != geometry.n:  # which mode has which is not known
         low, high = np.full(geometry.n, low.min(initial=lower)), np.full(geometry.n, high.max(initial=upper))
-    found = f"{100 * ratios.min(initial=MOST):.3g} to {100 * ratios.max(initial=LEAST):.3g} %"
-    note = f"damping ratios are searched from {100 * low.min():.3g} to {100 * high.max():.3g} %, as the poles of the "
-    return low, high, f"{note}data have {found}, beyond the usual 0.5 to 5 %" * bool(np.any(outside))
+    return low, high
+
+
+def _why(low: Array, high: Array, ratios: Array) -> str:
+    """Why a box (n,) is not the usual one, in words; empty where all poles have usual ratios."""
+    if not np.any(_beyond_usual(ratios)):
+        return ""
+    return (
+        f"damping ratios are searched from {100 * low.min():.3g} to {100 * high.max():.3g} %, as the poles of the data "
+        f"have {100 * ratios.min():.3g} to {100 * ratios.max():.3g} %, beyond the usual 0.5 to 5 %"
+    )

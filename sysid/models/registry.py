@@ -111,8 +111,8 @@ def _found(module: str, name: str) -> Any:
     found = [(one, kind) for one in _imported(module) if (kind := _class_in(one, name)) is not None]
     if not found:
         raise InputError(
-            f"a model is made of the class {shown(name)} of the module {shown(module)}, and a file imports no module by "
-            "itself: import it first, or name the module (--module FILE at the command line)"
+            f"a model is made of the class {shown(name)} of the module {shown(module)}, and a file imports no module "
+            "by itself: import it first, or name the module (--module FILE at the command line)"
         )
     places = sorted({str(getattr(one, "__file__", "")) for one, _ in found})
     refuse((len(places) > 1, f"the class {name} stands in several modules named {module!r}: {', '.join(places)}"))

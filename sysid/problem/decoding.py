@@ -269,6 +269,8 @@ class _Matrices:
         self._used += count
         if len(numbers) != count:
             raise ValueError("numbers are missing")
+        if one and np.isnan(numbers[0]):  # CasADi keeps equal numbers once, but not these, which differ from themselves
+            return [ca.MX.nan(pattern)]
         values = numbers * (pattern.nnz() if one else 1)
         return [ca.MX(ca.DM(pattern, values)) if values else ca.MX(pattern)]
 

@@ -23,7 +23,6 @@ from sysid.results.answer import NOT_JUDGED
 from sysid.results.identification import Identification
 from sysid.results.noise_table import noise_in_words
 from sysid.search.deadline import TimeIsOver, within
-from sysid.search.modal import Modal
 from sysid.search.other_answers import with_other_answers
 from sysid.search.session import Session
 from sysid.search.strategy import HUBER, Outcome
@@ -188,7 +187,8 @@ def _remarks(problem: Problem, end: Outcome, *, told_of_bounds: bool) -> Iterato
     yield from (
         f"on a bound, beyond which the truth may lie: {bounds_in_words(found)}" for _ in found[:1] if not told_of_bounds
     )
-    yield from (unknown.note for unknown in formulation.unknowns if unknown.note and end.strategy != Modal.name)
+    if any(phase.name == "swarm" for phase in end.history.phases):  # other strategies search all between the bounds
+        yield from (unknown.note for unknown in formulation.unknowns if unknown.note)
     yield from taken_at_sensors(problem)
     yield from levels_in_words(problem)
     tests = [term.test for term in formulation.tests]

@@ -101,7 +101,7 @@ class Refiner:
             self.tally.tried += 1
             self.tally.statuses.update(statuses)
             closed = self._refined(row[None], by_solver=False)[0]
-            rows = np.clip(np.concatenate([closed, solved]), self.problem.lower, self.problem.upper)
+            rows = np.clip(np.concatenate([closed, solved]), *self.problem.formulation.box)
             of_closed, of_solved = objective(rows)
             if of_solved < (1 - _ROUND_OFF) * np.fmin(of_closed, cost):
                 self.tally.won += 1

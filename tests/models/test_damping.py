@@ -131,6 +131,12 @@ def test_a_single_bound_is_an_end_of_a_box_within_the_bounds(geometry_of, bounds
     assert np.all(unknown.box[0] < unknown.box[1])
 
 
+def test_the_note_tells_the_box_that_a_stated_bound_leaves(geometry_of):
+    """Poles from 10 to 40 % would have a box up to 95 %."""
+    (unknown,) = ModalDamping(upper=0.3).unknowns(with_poles(geometry_of, [0.1, 0.1, 0.2, 0.4]))
+    assert "searched from 3.16 to 30 %" in unknown.note
+
+
 def test_what_is_stated(geometry_of):
     geometry = geometry_of(np.ones((4, 1)))
     for model, free in ((ModalDamping(), True), (ProportionalDamping((0, 1), (0, 1)), False)):

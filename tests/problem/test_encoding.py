@@ -308,6 +308,15 @@ def test_calls_in_calls_multiply_and_are_limited():
         decode(made, [X])
 
 
+@pytest.mark.parametrize(("value", "as_written"), [(1.5, "all_1.5(40000x1)"), (np.nan, "nan(40000x1)")])
+def test_a_number_for_all_entries_is_kept_once(value, as_written):
+    """Else a short list could ask for any amount of memory; CasADi writes a matrix otherwise entry by entry."""
+    tree = encode([X], [ca.MX(ca.DM.ones(40_000) * value)], [])
+    (made,) = decode(tree, [X])
+    assert str(made) == as_written
+    np.testing.assert_array_equal(made.to_DM().nonzeros(), np.full(40_000, value))
+
+
 def test_a_list_of_too_many_operations_is_refused(monkeypatch):
     monkeypatch.setattr(operations, "MOST_OPERATIONS", 5)
     with pytest.raises(sysid.InputError, match="ask for too much: the number of operations is 6, at most 5 is read"):

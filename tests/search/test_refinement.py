@@ -110,6 +110,14 @@ class TestLeaders:
         assert cost == (1.0 if better else 2.0)
         assert (tally.tried, tally.won, tally.statuses) == (1, int(better), {"Solve_Succeeded": 1})
 
+    def test_a_refined_leader_stays_in_the_box_of_the_swarm(self, problem, monkeypatch):
+        """Which may be narrower than the bounds: a swarm refuses points beyond it."""
+        ends = tuple(end / 2 for end in problem.formulation.box)
+        monkeypatch.setattr(problem.formulation, "box", ends)
+        refiner, _ = made(problem, Tally())
+        point, _ = refiner.of_leader(lambda rows: np.array([1.0, 0.5]))(middle(problem), 2.0)
+        assert np.all((point >= ends[0]) & (point <= ends[1]))
+
     def test_ipopt_starts_from_the_leaders_own_factor(self, problem, monkeypatch):
         """And not from what the closed form made of it."""
         given = []
