@@ -185,7 +185,7 @@ def typed(name: str) -> tuple[str, str]:
     """What a user means by a name at the command line, and a remark: the user's own problem hides a bundled one."""
     own = None if _is_path(name) else _in_folder(own_folder(), name)
     bundled = _in_folder(bundled_folder(), name)
-    if own is None or bundled is None or own.resolve() == bundled.resolve():  # the last in a checkout
+    if own is None or bundled is None or own.read_bytes() == bundled.read_bytes():  # the last in a checkout
         return name, ""
     return str(own), f"{own} hides the bundled problem {name}: it is taken"
 

@@ -19,7 +19,7 @@ from benchmarks.line import Line, above
 PAIRS, TOGETHER = 40, 0.05  # s between the two of a pair
 COMMAND = [sys.executable, "-m", "sysid", "run", "shear_building", "--strategy", "continuation", "--quiet"]
 FILES = {"result.h5", "summary.json", "report.html"}
-REFUSED, ONE, BOTH = "is in use by another run (process ", "the other refused", "the other after its end"
+REFUSED, ONE, BOTH = "is in use by another run", "the other refused", "the other after its end"
 
 
 def lines(reduced: bool) -> Iterator[Line]:

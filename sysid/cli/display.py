@@ -7,6 +7,7 @@ import time
 from typing import IO, TYPE_CHECKING, cast
 
 from sysid.cli.output import Output
+from sysid.errors import InputError
 from sysid.search.session import Progress
 
 if TYPE_CHECKING:
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 _PLAIN_EVERY = 5.0  # s between lines where the display is no terminal
+_HELD = 1.0  # s, for which lines of the poles are held back: a mistake that is found by then is told alone
 
 
 def display_on(out: Output) -> _LiveTable | _Lines:
@@ -37,12 +39,15 @@ class _Lines:
         self._phase = ""
         self._printed = -math.inf
         self._pending: Progress | None = None  # the newest, where it is not printed
+        self._held: list[str] = []
 
     def __enter__(self) -> _Lines:
         return self
 
-    def __exit__(self, *exception: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *exception: object) -> None:
         self._print()
+        if kind is None or not issubclass(kind, InputError):
+            self._release()
 
     def __call__(self, progress: Progress) -> None:
         """Take the newest progress."""
@@ -52,12 +57,19 @@ class _Lines:
         self._phase, self._pending = progress.phase, progress
         if begins or progress.seconds - self._printed >= _PLAIN_EVERY:
             self._print()
+        if progress.phase != "poles" or progress.seconds >= _HELD:
+            self._release()
 
     def _print(self) -> None:
         if self._pending is not None:
             self._printed = self._pending.seconds
-            self._out.progress(f"{self._pending}\n")
+            self._held.append(f"{self._pending}\n")
         self._pending = None
+
+    def _release(self) -> None:
+        for line in self._held:
+            self._out.progress(line)
+        self._held = []
 
 
 class _LiveTable:
