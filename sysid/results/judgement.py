@@ -191,7 +191,9 @@ def _remarks(problem: Problem, end: Outcome, *, told_of_bounds: bool) -> Iterato
         yield from (unknown.note for unknown in formulation.unknowns if unknown.note)
     yield from taken_at_sensors(problem)
     yield from levels_in_words(problem)
-    tests = [term.test for term in formulation.tests]
+    # Not `formulation.tests`: the term of the problem's own test has matrices that the modal strategy has no use for.
+    own = [problem.measurement] if formulation.fits_records else []
+    tests = [*own, *(term.test for term in formulation.further_tests)]
     for i, test in enumerate(tests, start=problem.first_test):
         if test.dropped:
             where = f" ({in_words(test.holes, test.freq)})" if test.holes else ""
