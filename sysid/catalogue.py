@@ -111,7 +111,10 @@ def built(recipe: Recipe, *, check: bool = True) -> tuple[Problem, frozenset[Pat
     """
     data = None if recipe.data is None else Path(recipe.data)
     if recipe.data is not None and not os.path.exists(recipe.data):  # noqa: PTH110 - a path may be "", or too long
-        raise InputError(f"data {recipe.data!r}: there is no such file or folder")
+        raise InputError(
+            f"data {recipe.data!r}: there is no such file or folder; where a result names it, put it there, or work in "
+            "the folder that the result was made in"
+        )
     before = len(declared())
     with _neighbours(file_of(recipe.module)) as imported:
         function, path = _function(recipe.module)

@@ -67,6 +67,10 @@ def check(recipe: Recipe, source: Path, instead: str, options: argparse.Namespac
         return
     file = catalogue.file_of(recipe.module)
     place = shown(recipe.module) if file is None else file.absolute()
+    if file is not None and not file.exists():
+        raise InputError(
+            f"{source} names the problem module {place}, which is not here: get it, and name it: {instead}"
+        )
     raise InputError(
         f"{source} names the problem module {place}, whose code would run: say {TRUST} where you know what stands in "
         f"it, or name the module yourself: {instead}"

@@ -23,8 +23,14 @@ _PART = 0.05  # of its range: the least step of an unknown
 # What is told of what CasADi cannot do, here and where a module's own line meets it.
 NO_TRUTH = (
     "an expression in variables has no value yet, so it is neither true nor false: of lower <= k <= upper make two "
-    "constraints, [lower <= k, k <= upper]; in the place of `if` give both cases, ca.if_else(k > 3, a, b)"
+    "constraints, [lower <= k, k <= upper], and of `a and b` [a, b]; in the place of `if` give both cases, "
+    "ca.if_else(k > 3, a, b), and of max(a, b) ca.fmax(a, b)"
 )
+NO_NUMBER = (
+    "an expression in variables has no value yet, so it is no float or int: leave it as it is, CasADi's functions and "
+    "NumPy's take it; what is known is a number of its own, or a Variable with fixed=True"
+)
+NO_CHANGE = "an entry of what is written in variables is not changed in place: write all entries, ca.vertcat(a, b, c)"
 NO_COMPLEX = (
     "complex numbers meet an expression in variables, and CasADi has real ones only: write two real expressions, of a "
     "record as [record.real - real, record.imag - imag], of exp(-1j * a) as ca.cos(a) and -ca.sin(a); of a stiffness "
@@ -175,6 +181,14 @@ class Expression(ca.MX):
         if self.is_constant():
             return bool(super().__bool__())
         raise InputError(f"{user_site()}: {NO_TRUTH}")
+
+    def __float__(self) -> float:
+        if self.is_constant():
+            return float(super().__float__())
+        raise InputError(f"{user_site()}: {NO_NUMBER}")
+
+    def __int__(self) -> int:
+        return int(float(self))
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
         return _closed(lambda _, *given: ca.MX.__array_ufunc__(self, ufunc, method, *given, **options))(self, *inputs)
@@ -360,6 +374,15 @@ class Variable(Unknown):
 
     def __bool__(self) -> bool:
         return bool(self.symbol)
+
+    def __float__(self) -> float:
+        return float(self.symbol)
+
+    def __int__(self) -> int:
+        return int(self.symbol)
+
+    def __setitem__(self, index: Any, value: Any) -> None:
+        raise InputError(f"{user_site()}: {NO_CHANGE}")
 
     def __getitem__(self, index: Any) -> Any:
         try:

@@ -42,10 +42,11 @@ def as_models(mass: Any, stiffness: Any, damping: Any) -> tuple[MatrixModel, Mat
     if (
         isinstance(damping, tuple)
         and len(damping) == 2
-        and all(isinstance(v, Variable) and not v.shape for v in damping)
+        and all(not v.shape if isinstance(v, Variable) else is_expression(v) and v.is_scalar() for v in damping)
     ):
+        names = ", ".join(v.name if isinstance(v, Variable) else str(v) for v in damping)
         raise InputError(
-            f"damping=({', '.join(v.name for v in damping)}) ({user_site()}) may mean one ratio a mode or two factors: "
+            f"damping=({names}) ({user_site()}) may mean one ratio a mode or two factors: "
             "write a list, [a, b], for ratios, and a * M + b * K for factors of mass and stiffness"
         )
     found: list[Any] = []

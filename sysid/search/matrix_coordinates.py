@@ -113,13 +113,14 @@ def _in_order(problem: Problem, x: Array, shapes: Array, omega: Array, *, tied: 
         x[at] = x[at][order]
     if tied:
         return x
-    M_SS, M_S0, M_00, *_ = formulation.matrices.numbers(x)
+    matrices = formulation.matrices
+    M_SS, M_S0, M_00, *_ = matrices.numbers(x)
     L = np.linalg.cholesky(M_SS)
     u, _, vt = np.linalg.svd(L.T @ shapes[:, order])
     root = L @ (u @ vt) * omega[order]  # Psi exactly orthogonal
     structure = assemble(
-        M_SS, M_S0, M_00, root @ root.T, formulation.matrices.rigid_body, ratios=np.full(omega.size, 0.01),
-        test=problem.measurement,
+        M_SS, M_S0, M_00, root @ root.T, matrices.rigid_body, ratios=np.full(omega.size, 0.01),
+        recovery=None if matrices.at_sensors else matrices.recovery, test=problem.measurement,
     )  # fmt: skip
     at = formulation.parts.stiffness
     x[at] = formulation.models[1].values(formulation.geometry, structure)

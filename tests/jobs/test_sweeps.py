@@ -176,6 +176,20 @@ def test_full_matrices_are_those_of_the_other_sensors_and_do_not_predict_the_one
     assert np.isnan(WithoutSensor(0).predicted(whole, result))
 
 
+def test_described_sensors_may_be_left_out_of_a_lumped_mass():
+    """The degree of freedom stays without its sensor, whether or not places of sensors were stated."""
+    test = sysid.simulate(truth(), np.linspace(0.5, 12.0, 80), noise=0.01, rng=1)
+    places = [sysid.Sensor(f"floor {i}", position=(0.0, 0.0, i + 1.0), axis="x") for i in range(test.n_sensors)]
+    total = float(np.trace(truth().mass))
+    plain, described = (
+        sysid.identify(WithoutSensor(0).of(sysid.Problem(one, mass=sysid.LumpedMass(total))), rng=0)
+        for one in (test, replace(test, sensors=places))
+    )
+    assert described.success
+    np.testing.assert_array_equal(described.x, plain.x)
+    assert [sensor.name for sensor in described.structure.sensors] == ["floor 1"]
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [

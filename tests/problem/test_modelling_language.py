@@ -46,7 +46,8 @@ SYMBOLIC = {
     "chained relations": (lambda k, z: k[0] <= k[1] <= 1e6, "[lower <= k, k <= upper]"),
     "an if": (lambda k, z: 1 if k[0] > 3 else 2, "ca.if_else"),
     "an if on a variable itself": (lambda k, z: 1 if k else 2, "ca.if_else"),
-    "the larger of two": (lambda k, z: max(k[0], k[1]), "neither true nor false"),
+    "the larger of two": (lambda k, z: max(k[0], k[1]), "ca.fmax(a, b)"),
+    "both of two": (lambda k, z: (k[0] <= k[1]) and (k[1] <= k[2]), "of `a and b` [a, b]"),
     "complex after an operation": (lambda k, z: (2 * k[0] + np.exp(z)) * (1 + 0.02j), "damping=[eta / 2"),
     "complex after a product of matrices": (lambda k, z: 1j * (T.T @ k), "real ones only"),
     "a complex variable": (lambda k, z: k * (1 + 1j * z), "damping=[eta / 2"),
@@ -78,6 +79,13 @@ SYMBOLIC = {
     "two factors as damping": (
         lambda k, z: build(stiffness=chain(k), damping=(z, declare("a", (), 0, 1))), "write a list, [a, b], for ratios"
     ),
+    "two entries of a column as damping": (
+        lambda k, z: build(stiffness=chain(k), damping=(k[0], k[1])), "write a list, [a, b], for ratios"
+    ),
+    "a float": (lambda k, z: float(k[0]), "fixed=True"),
+    "a float of a variable": (lambda k, z: float(z), "fixed=True"),
+    "an int": (lambda k, z: int(k[0] + 1), "fixed=True"),
+    "an entry that is changed": (lambda k, z: k.__setitem__(0, 9e3), "ca.vertcat(a, b, c)"),
     "recovery of variables": (
         lambda k, z: build(stiffness=chain(k), recovery=z * np.eye(3)), "is written in variables, and it must be"
     ),
