@@ -42,9 +42,9 @@ def as_models(mass: Any, stiffness: Any, damping: Any) -> tuple[MatrixModel, Mat
     if (
         isinstance(damping, tuple)
         and len(damping) == 2
-        and all(not v.shape if isinstance(v, Variable) else is_expression(v) and v.is_scalar() for v in damping)
+        and all(isinstance(v, Variable | ca.MX) and np.prod(v.shape) == 1 for v in damping)
     ):
-        names = ", ".join(v.name if isinstance(v, Variable) else str(v) for v in damping)
+        names = ", ".join(str(getattr(v, "symbol", v)) for v in damping)
         raise InputError(
             f"damping=({names}) ({user_site()}) may mean one ratio a mode or two factors: "
             "write a list, [a, b], for ratios, and a * M + b * K for factors of mass and stiffness"
