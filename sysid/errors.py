@@ -180,12 +180,15 @@ def random_generator(rng: RandomSource) -> np.random.Generator:
 
 
 def numbers(name: str, value: ArrayLike, kind: type = float) -> NDArray[Any]:
-    """A new array of numbers, float or complex, which may be NaN or infinite; texts and masked entries are none."""
+    """A new array of numbers, float or complex, which may be NaN or infinite; texts and masked entries are none.
+
+    It lies in memory row by row, however the given one lies, so that sums over it have the same bits as after storing.
+    """
     words = {float: "real numbers", complex: "numbers"}[kind]
     if _is_masked(value):
         raise InputError(f"{name} has masked entries: drop those lines, or fill them with numbers (numpy.ma.filled)")
     try:
-        given = np.array(value)
+        given = np.array(value, order="C")
         code = given.dtype.kind
         if code == "O" and any(entry is None for entry in given.flat):  # which NumPy makes NaN
             code = "U"

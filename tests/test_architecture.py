@@ -23,7 +23,7 @@ CEILINGS = {
     # make run, hold and claim (640), one run in a folder and mistakes of the modelling language (422), bounds that
     # press and damping of any size (350), IPOPT's refinement of each leader (310), and the inverse factor with the
     # swarm on the models' own expressions (317).
-    "lines": 40_316,
+    "lines": 40_340,
 }
 
 # The counting is a benchmark, which prints the same figures; `sysid` itself is not imported from the checkout.

@@ -9,6 +9,7 @@ import contextlib
 import hashlib
 import io
 import json
+import re
 import sys
 import time
 import warnings
@@ -26,7 +27,7 @@ PATIENCE = 30.0  # s of a search
 def results_of(source: Path, searched: bool) -> list:
     """Results of the problem of a module; of a script or page all that it identifies."""
     text = source.read_text(encoding="utf-8")
-    if "def problem(" in text:
+    if re.search(r"^def problem\(", text, re.MULTILINE):
         problem = catalogue.build(sysid.Recipe(str(source)))
         if searched:
             return [sysid.identify(problem, rng=0, max_time=PATIENCE)]

@@ -10,7 +10,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from sysid.errors import InputError, shown
+import numpy as np
+
+from sysid.errors import InputError, refuse, shown
 from sysid.files.allowance import Allowance
 
 # Filters that are part of HDF5 or h5py, by their numbers: deflate, shuffle, Fletcher32, szip, n-bit, scale-offset, LZF.
@@ -67,10 +69,17 @@ def check_data(item: Any, allowance: Allowance) -> None:
     allowance.take(name, _bytes_of(item.shape, item.dtype))
 
 
-def check_attribute(group: Any, name: str, allowance: Allowance) -> None:
-    """Refuse an attribute that would take more memory than is allowed."""
+def attribute(group: Any, name: str, allowance: Allowance) -> Any:
+    """The array of an attribute, or None where it is empty; refused where it would take more memory than is allowed."""
     stored = group.attrs.get_id(name)
-    allowance.take(shown(f"{group.name}: {name}"), _bytes_of(stored.shape, stored.dtype))
+    shape, dtype = stored.shape, stored.dtype  # each read from the file anew
+    if shape is None:
+        return None
+    allowance.take(shown(name), _bytes_of(shape, dtype))
+    refuse((dtype.kind == "O", f"{shown(name)}: an array of the type {dtype} stands in it"))
+    found = np.zeros(shape, dtype)
+    stored.read(found)
+    return found
 
 
 def _bytes_of(shape: tuple[int, ...] | None, dtype: Any) -> int:

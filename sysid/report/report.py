@@ -73,7 +73,6 @@ _WIDENED = (
 _NORMALISED = "~ normalised, one of many"
 _FALL = 0.9  # of the objective that a search began with, below which its curve is drawn
 _MOST_OUTLIERS = 10  # that are told one by one
-_MANY_PANELS = 40  # beyond which the pictures are drawn with fewer pixels
 
 
 class Scores(NamedTuple):

@@ -80,7 +80,7 @@ class Begun:
 
     @classmethod
     def from_tree(cls, tree: Tree) -> Begun:
-        """Give what `to_tree` made a tree of; earlier ones have no source and no refinement.
+        """Give what `to_tree` made a tree of.
 
         Raises
         ------
@@ -90,7 +90,7 @@ class Begun:
         try:
             recipe = Recipe.from_tree(tree["recipe"])
             words = [text(name, tree[name]) for name in ("strategy", "seed")]
-            return cls(recipe, words[0], int(words[1]), tree.get("refine_by"), str(tree.get("source", "")))
+            return cls(recipe, words[0], int(words[1]), tree["refine_by"], str(tree["source"]))
         except InputError:
             raise
         except Exception as error:  # a tree that somebody else wrote may lack anything

@@ -100,14 +100,14 @@ class Recipe:
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Recipe:
-        """Give the recipe of a tree that `to_tree` made; earlier ones have no parameters.
+        """Give the recipe of a tree that `to_tree` made.
 
         Raises
         ------
         InputError
             Where a parameter is no plain value of Python's.
         """
-        parameters = {name: _literal(name, text) for name, text in tree.get("parameters", {}).items()}
+        parameters = {name: _literal(name, text) for name, text in tree["parameters"].items()}
         return cls(tree["module"], tree["data"], int(tree["rng"]), parameters, tree.get("start"))
 
 

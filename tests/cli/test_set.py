@@ -73,10 +73,6 @@ def test_a_result_keeps_the_parameters_it_was_made_with(here, capsys, no_picture
     assert json.loads((here / "results/mast/summary.json").read_text())["parameters"] == recipe.parameters
 
 
-def test_recipes_of_earlier_results_have_no_parameters():
-    assert Recipe.from_tree({"module": "mast", "data": None, "rng": "3"}) == Recipe("mast", rng=3)
-
-
 def test_equal_recipes_have_one_hash_and_come_back_from_their_tree():
     one, other = Recipe("mast", parameters={"a": [1], "b": "x"}), Recipe("mast", parameters={"b": "x", "a": [1]})
     assert one == other

@@ -87,6 +87,13 @@ class TestRigidBody:
 
 
 class TestRecords:
+    def test_lie_in_memory_row_by_row_as_a_file_gives_them_back(self, records):
+        """A reader fills time first: `records.T`; products of such arrays differ in their last bits."""
+        turned = {name: np.asfortranarray(value) for name, value in records.items()}
+        test = Measurement(**turned)
+        assert not turned["response"].flags.c_contiguous
+        assert all(getattr(test, name).flags.c_contiguous for name in records)
+
     def test_relative_takes_the_rigid_motion_off(self, records):
         test = Measurement(**records)
         for run in range(3):
