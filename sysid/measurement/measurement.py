@@ -161,19 +161,16 @@ class Measurement:
             "freq": self.freq, "base": self.base, "response": self.response, "rigid_body": self.rigid_body,
             "force": self.force, "sensors": sensors_to_tree(self.sensors), "response_std": self.response_std,
             "force_std": self.force_std, "base_axes": self.base_axes,
-            # So that an older sysid reads all others.
-            **({"dropped": self.dropped} if self.dropped else {}),
-            **({"holes": [{"name": name, "freq": freq} for name, freq in self.holes]} if self.holes else {}),
-            **({"averaged": True} if self.averaged else {}),
-            **({} if self.whole is None else {"whole": self.whole.to_tree()}),
-            **({} if self.sample_rate is None else {"sample_rate": self.sample_rate}),
+            "dropped": self.dropped, "holes": [{"name": name, "freq": freq} for name, freq in self.holes],
+            "averaged": self.averaged, "whole": None if self.whole is None else self.whole.to_tree(),
+            "sample_rate": self.sample_rate,
         }  # fmt: skip
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Measurement:
         """Give the measurement of a tree that `to_tree` made."""
-        holes = tuple((hole["name"], hole["freq"]) for hole in tree.get("holes", ()))  # earlier files have none
-        whole = WholeRecords.from_tree(tree.get("whole"))
+        holes = tuple((hole["name"], hole["freq"]) for hole in tree["holes"])
+        whole = WholeRecords.from_tree(tree["whole"])
         return cls(**{**tree, "sensors": sensors_from_tree(tree["sensors"]), "holes": holes, "whole": whole})
 
     @property
