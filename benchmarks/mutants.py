@@ -190,7 +190,7 @@ NOTICED = (
     Mutant("C11", "sensors that move with the base never told", "if wrong.size:", "if False:",
         "test_checks::test_a_sensor_that_moves_with_the_base_beside_its_modes_is_told_by_how_much"),
     Mutant("C13", "stated values that are missed together never told",
-        "if np.sum(off**2) > chdtri(max(off.size, 1), _CHANCE) and", "if False and",
+        "if np.sum(off**2) > scipy.special.chdtri(max(off.size, 1), _CHANCE) and", "if False and",
         "test_checks::TestOneListForEveryProblem::test_priors_are_checked_one_by_one_and_together"),
     Mutant("D01", "status of the local phase ignored", "success = end.status in SOLVED or end.objective <= EXACT",
         "success = True", "test_local::TestControl"),

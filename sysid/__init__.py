@@ -1,6 +1,6 @@
 """Mass, stiffness and damping matrices of a structure from shaker-table (base excitation) tests."""
 
-from sysid.cli import starting as _starting  # noqa: F401 - first: what follows takes a third of a second
+from sysid.cli import starting as _starting  # noqa: F401 - first: what follows takes a sixth of a second
 
 # isort: split
 import casadi as _casadi

@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import null_space
 from threadpoolctl import OpenBLASController, register, threadpool_limits
 
 Array = NDArray[np.floating[Any]]
@@ -58,7 +58,9 @@ register(_BlasOfIpopt)
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
     """Hold NumPy's, SciPy's and IPOPT's linear algebra to one thread: the same bits on any number of processors."""
-    ca.has_nlpsol("ipopt")  # loads it, as only libraries that are loaded can be limited
+    import scipy.linalg  # noqa: F401 - only libraries that are loaded can be limited
+
+    ca.has_nlpsol("ipopt")  # loads it
     with threadpool_limits(limits=1):
         yield
 
@@ -177,7 +179,7 @@ class NonlinearProgram:
             if not (np.linalg.norm(r) < left / 2 and over <= violated):
                 break
             best, left, violated = at, float(np.linalg.norm(r)), over
-            free = null_space(A[held]) if np.any(held) else np.eye(at.size)
+            free = scipy.linalg.null_space(A[held]) if np.any(held) else np.eye(at.size)
             back = np.linalg.lstsq(A[held], (below - c)[held])[0]
             at = at + back - free @ np.linalg.lstsq(J @ free, r + J @ back)[0]
         return best

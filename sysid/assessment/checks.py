@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import chdtri
+import scipy
 
 from sysid.assessment.gains import distinct_poles, gain_errors, told
 from sysid.assessment.leakage import leakage
@@ -109,7 +109,7 @@ def _priors(formulation: Formulation, x: Array) -> Iterator[str]:
     """Values that are stated as known, where errors as stated do not miss them all so far."""
     names = [name for term in formulation.priors for name in term.labels]
     off = np.concatenate([np.zeros(0), *(term.numbers(x) for term in formulation.priors)])
-    if np.sum(off**2) > chdtri(max(off.size, 1), _CHANCE) and np.all(np.abs(off) <= _FAR):
+    if np.sum(off**2) > scipy.special.chdtri(max(off.size, 1), _CHANCE) and np.all(np.abs(off) <= _FAR):
         told = ", ".join(f"{name} by {z:+.2g}" for name, z in zip(names, off, strict=True))
         yield (
             f"the values that are stated as known are missed together, in standard deviations: {told}; they, another "

@@ -15,8 +15,8 @@ from itertools import combinations_with_replacement, pairwise
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import linprog
 
 from sysid.structure.structure import Array
 
@@ -313,7 +313,7 @@ def _varying(at_start: Array, slopes: Array) -> Affine:
 
 def _programme(function: Array, rows: Array, at_start: Array, box: float = np.inf) -> Array:
     """The z with the largest ``function @ z`` where ``at_start + rows @ z >= 0`` and |z| <= box."""
-    answer = linprog(
+    answer = scipy.optimize.linprog(
         -function / (np.abs(function).max() or 1.0), A_ub=-rows, b_ub=at_start, bounds=(-box, box),
         options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
     )  # fmt: skip

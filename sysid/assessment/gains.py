@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import stdtr
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.residues import Records, ResidueFit
@@ -65,7 +65,7 @@ class GainErrors:
         """Sensors whose gain is wrong beyond chance and by more than is usual, the worst first."""
         shown = np.isfinite(self.error)
         off = np.where(shown, np.abs(self.error) / np.where(shown, self.std, 1.0), 0.0)
-        chance = 2 * stdtr(self.freedom, -off) * np.count_nonzero(shown)
+        chance = 2 * scipy.special.stdtr(self.freedom, -off) * np.count_nonzero(shown)
         size = np.abs(np.nan_to_num(self.error))
         found = np.flatnonzero((chance < _CHANCE) & (size > max(_LEAST, _BESIDE * size.max())))
         return found[np.argsort(-off[found])]

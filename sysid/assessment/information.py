@@ -14,8 +14,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
-import scipy.sparse
+import scipy
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Index, Modes

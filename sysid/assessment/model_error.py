@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import gammaincinv
 
 from sysid.assessment.changing import changes_in_words
 from sysid.errors import InputError
@@ -180,7 +180,7 @@ def _miss(record: Record, test: Measurement, found: bool, near: NDArray[np.bool_
 def _quiet(left: ComplexArray, variance: Array, own: NDArray[np.bool_]) -> Array | None:
     """What the quietest quarter of the blocks of lines holds, over the variance, (runs, channels); None with few."""
     out = np.ones(left.shape[:2])
-    mean = float(gammaincinv(_BLOCK, _QUIET)) / _BLOCK
+    mean = float(scipy.special.gammaincinv(_BLOCK, _QUIET)) / _BLOCK
     for run, lines in enumerate(own):
         power = np.abs(left[run][:, lines]) ** 2 / variance[run][:, lines]
         blocks = power.shape[1] // _BLOCK

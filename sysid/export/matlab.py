@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from scipy.io import savemat
+import scipy
 
 from sysid.export.content import deviations_of, matrices_of, names_of, statements
 from sysid.results.identification import Identification
@@ -31,7 +31,7 @@ def write(it: Identification, path: Path) -> None:
         "about": _cells(statements(it, PRECISION)),
     }  # fmt: skip
     with path.open("wb") as file:
-        savemat(file, variables, oned_as="column")
+        scipy.io.savemat(file, variables, oned_as="column")
 
 
 def _cells(texts: tuple[str, ...]) -> np.ndarray:

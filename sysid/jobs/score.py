@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from sysid.assessment.sensitivity import sensitivity
 from sysid.jobs.quantities import FREQUENCY, RATIO, label, labelled, quantities
@@ -220,7 +220,9 @@ def _nearest(own: Score, other: Score) -> list[tuple[int, int]]:
         one, two = (unit_columns(np.array(score.shapes))[0] for score in (own, other))
         mac = (one.T @ two) ** 2
     cost = np.where((apart < 1) & (mac >= _ALIKE), apart**2 + 1 - mac, _NONE)
-    return [(int(i), int(j)) for i, j in zip(*linear_sum_assignment(cost), strict=True) if cost[i, j] < _NONE]
+    return [
+        (int(i), int(j)) for i, j in zip(*scipy.optimize.linear_sum_assignment(cost), strict=True) if cost[i, j] < _NONE
+    ]
 
 
 def _weighted_misfits(result: Identification) -> Iterator[tuple[ComplexArray, float]]:

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.fft import next_fast_len
+import scipy
 
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels, WholeRecords
@@ -117,7 +117,7 @@ def as_whole(test: Measurement) -> Measurement:
     if any(np.max(np.abs(f / df - np.round(f / df))) > _EVEN * f[-1] / df for f, df in zip(freq, spacing, strict=True)):
         return test
     if test.sample_rate is None:
-        n = int(next_fast_len(int(np.ceil(_SAMPLES * test.freq[-1] / spacing[0]))))
+        n = int(scipy.fft.next_fast_len(int(np.ceil(_SAMPLES * test.freq[-1] / spacing[0]))))
         samples, rate = [n] * test.n_runs, n * float(spacing[0])
     else:
         samples, rate = np.round(test.sample_rate / spacing).astype(int).tolist(), test.sample_rate

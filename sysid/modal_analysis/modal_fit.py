@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-import scipy.linalg
+import scipy
 from numpy.typing import NDArray
 
 from sysid.errors import SolverError

@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels

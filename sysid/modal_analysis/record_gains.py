@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from sysid.measurement.whole import Gains
 from sysid.modal_analysis.record_fit import RecordFit, half_inverse, unit_diagonal

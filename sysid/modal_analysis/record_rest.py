@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import chdtrc
+import scipy
 
 from sysid.modal_analysis.record_fit import RecordFit, half_inverse, refitted, unit_diagonal
 from sysid.modal_analysis.record_model import Parameters, RecordModel
@@ -28,7 +28,7 @@ def runs_in_motion(fit: RecordFit) -> tuple[int, ...]:
     for run in stated:
         moving, p = _moving(fit, (run,))
         chi2, freedom = _score(moving, p)
-        if chdtrc(freedom, chi2) < LEVEL / len(stated):
+        if scipy.special.chdtrc(freedom, chi2) < LEVEL / len(stated):
             found.append(run)
     if not found:
         return ()

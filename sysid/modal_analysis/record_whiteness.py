@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import gammaincc
 
 from sysid.measurement.whole import Excess
 from sysid.modal_analysis.record_fit import RecordFit
@@ -94,6 +94,6 @@ def most_unlikely(power: Array, bands: int) -> tuple[int, int, float] | None:
         weight = size * (ratio - 1 - np.log(np.maximum(ratio, 1e-300)))  # Chernoff's bound
         weight[ratio <= 1] = 0.0
         at = int(np.argmax(weight))
-        if (best is None or weight[at] > best[2]) and gammaincc(size, held[at]) < LEVEL / bands:
+        if (best is None or weight[at] > best[2]) and scipy.special.gammaincc(size, held[at]) < LEVEL / bands:
             best = int(first[at]), int(first[at] + size), float(weight[at])
     return best

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy.linalg
+import scipy
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.noise import separable
@@ -377,7 +376,7 @@ def _correlation_factor(
     if lines.max(initial=0) <= 2 * len(_LAGS) - 2 or not np.any(moved):
         return 1.0
     share = unknowns / max(2 * channels * lines[moved].sum() - unknowns, 1)
-    chance = chdtri(2 * moved.sum(), _CHANCE) / 2
+    chance = scipy.special.chdtri(2 * moved.sum(), _CHANCE) / 2
     factor = 1.0
     for sums, level in zip(np.abs(products[1:, moved]) / power[moved], variance[1:, moved], strict=True):
         beyond = np.maximum(sums - share, 0) ** 2

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-import scipy.linalg
+import scipy
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement

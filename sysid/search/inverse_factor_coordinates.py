@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-from scipy.linalg import null_space
+import scipy
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
@@ -292,7 +292,7 @@ def half_newton_decrement(z: NonlinearProgram, derivatives: dict[str, ca.Functio
     multipliers = -np.linalg.lstsq(A.T, g)[0]
     upper_half = np.asarray(ca.densify(derivatives["hess_lag"](at, [], 1.0, multipliers)))
     H = (upper_half + np.triu(upper_half, 1).T)[np.ix_(free, free)]
-    along = null_space(A) if len(A) else np.eye(g.size)
+    along = scipy.linalg.null_space(A) if len(A) else np.eye(g.size)
     curvature, vectors = np.linalg.eigh(along.T @ H @ along)
     slopes, size = vectors.T @ (along.T @ g), np.abs(curvature)
     bent = size > _FLAT * size.max()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-import scipy.linalg
+import scipy
 
 from sysid.modal_analysis.modal_fit import Ties
 from sysid.problem.problem import Problem

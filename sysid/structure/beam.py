@@ -7,8 +7,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-import scipy.linalg
-import scipy.sparse
+import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError

@@ -19,8 +19,7 @@ from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 import numpy as np
-import scipy.linalg
-import scipy.sparse.csgraph
+import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError
