@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sysid.structure.structure import Array
 
@@ -27,23 +28,38 @@ INK, FAINT, GRID = "#3c4450", "#8a94a0", "#e4e8ec"
 
 def to_png(figure: Figure, *, dpi: float = 100, colours: int | None = None) -> bytes:
     """PNG of a figure; with `colours`, in a palette of so many, which is a third of the size."""
+    from PIL import Image  # matplotlib's own dependency
+
+    image = Image.fromarray(_drawn(figure, dpi))
+    if colours is not None:
+        image = image.quantize(colours, dither=Image.Dither.NONE)
+    out = io.BytesIO()
+    image.save(out, format="png", optimize=colours is not None, dpi=(dpi, dpi))
+    return out.getvalue()
+
+
+def _drawn(figure: Figure, dpi: float) -> NDArray[np.uint8]:
+    """Pixels of a figure on white, (rows, columns, 3).
+
+    Drawn once: where the layout is found by drawing, `savefig` draws twice.
+    """
     import warnings
 
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    out = io.BytesIO()
-    with warnings.catch_warnings():
-        # A sensor's name may be in a script that the font lacks; a box in its place will do.
-        warnings.filterwarnings("ignore", message="Glyph .* missing from")
-        FigureCanvasAgg(figure)
-        figure.savefig(out, format="png", dpi=dpi, facecolor="white", metadata={"Software": None})
-    if colours is None:
-        return out.getvalue()
-    from PIL import Image  # matplotlib's own dependency
-
-    small = io.BytesIO()
-    Image.open(out).convert("RGB").quantize(colours, dither=Image.Dither.NONE).save(small, format="png", optimize=True)
-    return small.getvalue()
+    before = figure.dpi, figure.get_facecolor()
+    canvas = FigureCanvasAgg(figure)
+    try:
+        figure.set_dpi(dpi)
+        figure.set_facecolor("white")
+        with warnings.catch_warnings():
+            # A sensor's name may be in a script that the font lacks; a box in its place will do.
+            warnings.filterwarnings("ignore", message="Glyph .* missing from")
+            canvas.draw()
+        return np.array(canvas.buffer_rgba())[..., :3]
+    finally:
+        figure.set_dpi(before[0])
+        figure.set_facecolor(before[1])
 
 
 @contextlib.contextmanager
