@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
+from multiprocessing.context import BaseContext
 from typing import Any, TypeVar, cast
 
 from sysid.errors import InputError, needed, whole_number
@@ -17,13 +18,21 @@ from sysid.search.session import DeferredInterrupt
 Task = TypeVar("Task")
 Answer = TypeVar("Answer")
 
-_SAFE = "PYTHONSAFEPATH"
+_STARTED_WITH = {
+    "PYTHONSAFEPATH": "1",  # before they are told this process's path of modules, they import from where they stand
+    "OPENBLAS_NUM_THREADS": "1",  # a process that forks others must have no threads, and IPOPT bears none
+}
+_IMPORTED = ("sysid.jobs.job", "scipy.linalg", "scipy.special", "scipy.sparse", "scipy.optimize")
 _IN_VAIN = 2  # pools in a row that a task alone may break
 _WHY = 'is there enough memory, and does the script submit below if __name__ == "__main__"?'
 
 
 def processes(workers: int | None = None) -> Callable[[], Executor]:
-    """A maker of process pools for `submit`: workers are spawned, each with one thread.
+    """A maker of process pools for `submit`, each worker with one thread.
+
+    Workers are forked from a process that is started once, has no threads and has imported what a job needs; on
+    Windows each is spawned and imports by itself. The environment is that in which the first of them was started. A
+    maker that is given to `submit` again has the same workers, which hold the problems that they built.
 
     A worker imports the script that was started, which therefore submits below ``if __name__ == "__main__":``.
 
@@ -37,22 +46,45 @@ def processes(workers: int | None = None) -> Callable[[], Executor]:
     InputError
         Where it is not a positive whole number.
     """
-    count = _processors() if workers is None else whole_number("workers", workers, at_least=1)
+    return _Maker(_processors() if workers is None else whole_number("workers", workers, at_least=1))
 
-    def make() -> Executor:
-        # A fork would copy locks of threads that do not exist in the child.
-        with _without_the_working_folder():  # the first pool starts a process that looks after what all share
-            return _Processes(count, multiprocessing.get_context("spawn"), initializer=_end_at_interrupt)
 
-    return make
+class _Maker:
+    """Makes a pool of processes, anew only where the last one is over: workers hold the problems that they built."""
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._pool: _Processes | None = None
+
+    def __call__(self) -> Executor:
+        if self._pool is None or self._pool.over:
+            with _environment_of_workers():  # the first pool starts a process that looks after what all share
+                self._pool = _Processes(self._count, _context(), initializer=_end_at_interrupt)
+        return self._pool
+
+
+def _context() -> BaseContext:
+    """How workers start: never as a fork of this process, with locks of threads that do not exist in the child."""
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(list(_IMPORTED))
+    return context
 
 
 class _Processes(ProcessPoolExecutor):
-    """Processes that Ctrl-C ends without a word, while they still import too."""
+    """Processes that Ctrl-C ends without a word, while they still import too; `over` is a pool that was shut down."""
+
+    over = False
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Take no further tasks."""
+        self.over = True
+        super().shutdown(wait, cancel_futures=cancel_futures)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Hand over a task; a process that is started for it has Ctrl-C blocked until `_end_at_interrupt`."""
-        with _ctrl_c_held(), _without_the_working_folder():
+        with _ctrl_c_held(), _environment_of_workers():
             return super().submit(fn, *args, **kwargs)
 
     def end(self) -> None:
@@ -84,20 +116,18 @@ def _ctrl_c_held() -> Iterator[None]:
 
 
 @contextmanager
-def _without_the_working_folder() -> Iterator[None]:
-    """Have processes that are started meanwhile import no module of the standard library's names from where they stand.
-
-    They begin with imports of their own, before they are told this process's path of modules.
-    """
-    before = os.environ.get(_SAFE)
-    os.environ[_SAFE] = "1"
+def _environment_of_workers() -> Iterator[None]:
+    """Start processes with `_STARTED_WITH` meanwhile: no threads, no modules from the working folder."""
+    before = {name: os.environ.get(name) for name in _STARTED_WITH}
+    os.environ.update(_STARTED_WITH)
     try:
         yield
     finally:
-        if before is None:
-            del os.environ[_SAFE]
-        else:
-            os.environ[_SAFE] = before
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def cluster(address: str) -> Callable[[], Executor]:
@@ -219,7 +249,7 @@ def _rebuilding(
     while left:
         tasks = left[:1] if in_vain else left
         left = left[len(tasks) :]
-        executor, unfinished = checked(make()), list[Task]()
+        executor, unfinished, whole = checked(make()), list[Task](), False
         ours = executor if isinstance(executor, _Processes) else None
         try:
             for task, future in _submitted(function, tasks, executor, cancel=ours is None):
@@ -227,8 +257,12 @@ def _rebuilding(
                     unfinished.append(task)
                 else:
                     yield _answer(task, future, lost)
+            whole = not unfinished
         finally:
-            executor.shutdown(wait=False) if ours is None else ours.end()
+            if ours is None:
+                executor.shutdown(wait=False)
+            elif not whole:  # else its workers stay, with the problems that they built
+                ours.end()
         in_vain = in_vain + 1 if len(unfinished) == len(tasks) else 0
         if in_vain > _IN_VAIN:
             yield lost(unfinished.pop(), f"its worker died, {_IN_VAIN} times in a row: {_WHY}")

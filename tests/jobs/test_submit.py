@@ -144,6 +144,21 @@ def test_a_pool_whose_worker_dies_is_built_again_and_only_the_task_to_blame_is_l
     assert task == DIES and "its worker died" in why
 
 
+def test_workers_of_one_maker_start_once_and_have_one_thread_and_those_given_up_end():
+    lost = lambda task, why: why  # noqa: E731
+    where = '[__import__("os").getpid(), len(__import__("os").listdir("/proc/self/task"))]'
+    one = processes(1)
+    if not Path("/proc/self/task").is_dir():
+        where = '[__import__("os").getpid(), 1]'
+    (first,), (second,) = ([*each(eval, [where], one, lost)] for _ in range(2))
+    assert first == second and first[1] == 1
+    given_up = each(eval, [where, where], one, lost)
+    assert next(given_up) == first
+    given_up.close()
+    (third,) = each(eval, [where], one, lost)
+    assert third[0] != first[0]
+
+
 def test_what_a_worker_raises_is_the_answer_of_its_task_alone():
     answers = list(each(eval, ["1/0", "2"], processes(1), lambda task, why: (task, why)))
     assert sorted(map(str, answers)) == [str(("1/0", "its worker failed (ZeroDivisionError: division by zero)")), "2"]
