@@ -85,6 +85,7 @@ BENCHMARKS = (
     Benchmark("jobs.killed_searches", "searches killed at random times and resumed: the same bits", "8 min", "25 s"),
     Benchmark("jobs.interrupted_runs", "Ctrl-C at random times of a run: what is said and kept", "5 min", "20 s"),
     Benchmark("jobs.lost_workers", "jobs whose workers are killed; what a job costs; gain of two", "20 min", "25 s"),
+    Benchmark("jobs.two_workers", "eight draws of the tower by two workers, over one", "60 s", "25 s"),
     Benchmark("jobs.cut_link", "jobs on two machines whose link drops for 30 s", "2 min", "-"),
     Benchmark("jobs.one_folder", "two runs in one folder: one result, the other refused, none lost", "15 min", "30 s"),
     Benchmark("hostile.corruptions", "damaged result files: an error or the same numbers", "2 s", "1 s"),

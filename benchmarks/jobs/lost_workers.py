@@ -137,7 +137,7 @@ def _clocked(clock: Path, call: Callable[..., object], *given: object, **options
 
 def _gain(recipe: sysid.Recipe) -> Iterator[Line]:
     ratios = np.zeros((REPEATS, 2))
-    with jobs.processes(1)() as one, jobs.processes(2)() as two, _bare(1) as bare_one, _bare(2) as bare_two:
+    with jobs.processes(1)() as one, jobs.processes(2)() as two, bare_pool(1) as bare_one, bare_pool(2) as bare_two:
         ways: tuple[tuple[Callable[[Executor], object], Executor, Executor], ...] = (
             (lambda pool: list(jobs.submit(recipe, starts=BATCH, executor=pool)), one, two),
             (lambda pool: list(pool.map(_numbers, range(BATCH))), bare_one, bare_two),
@@ -156,7 +156,8 @@ def _gain(recipe: sysid.Recipe) -> Iterator[Line]:
     )
 
 
-def _bare(workers: int) -> ProcessPoolExecutor:
+def bare_pool(workers: int) -> ProcessPoolExecutor:
+    """Processes without anything of sysid's."""
     return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
 
 
