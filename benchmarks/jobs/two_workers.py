@@ -23,7 +23,7 @@ def lines(reduced: bool) -> Iterator[Line]:
     """Seconds of the same draws by one worker and by two, alternated, of each the least.
 
     Workers that have started hold the problem; those of a new pool are forked, and build it. The first pool comes with
-    the process that its workers are forked from. Other work on a shared machine takes processors: in turn with the draws
+    the process that its workers are forked from. Other work on a shared machine takes processors: in turn with draws
     runs fixed work of NumPy alone, which two free processors halve; what is judged is at its pace.
     """
     rounds = 4 if reduced else 12
@@ -77,4 +77,4 @@ def _piece(seed: int) -> float:
     """About a tenth of a second of NumPy on one thread."""
     with threadpool_limits(limits=1):
         matrix = np.random.default_rng(seed).normal(size=(60, 60))
-        return float(sum(np.abs(np.linalg.eigvals(matrix + i)).max() for i in range(20)))
+        return float(sum(np.abs(np.linalg.eigvals(matrix + i)).max() for i in range(120)))
