@@ -5,6 +5,7 @@ const SVG = "http://www.w3.org/2000/svg";
 const MARGIN = { left: 62, right: 12, top: 20, bottom: 30 };
 const LEAST = 5; // lines that remain when zooming in
 const DECADES = [1e5, 0, 1e4]; // at most, of the magnitude and of the difference
+const DEGREES = 0.5; // steps of phases
 const [LOWEST, HIGHEST] = [-270, 90]; // degrees: the step of a resonance, 0 to -180, is not cut
 
 function element(parent, name, attributes = {}, words = "") {
@@ -27,6 +28,25 @@ function numbers(packed) {
   return new Float32Array(Uint8Array.from(atob(packed), (letter) => letter.charCodeAt(0)).buffer);
 }
 
+// Whole numbers, each packed as its difference from the one before: twice its size, less one below zero, in groups of
+// seven bits, the lowest first; a byte's eighth bit says that another follows.
+function steps(packed) {
+  const found = [];
+  let [value, whole, place] = [0, 0, 1];
+  for (const letter of atob(packed)) {
+    const byte = letter.charCodeAt(0);
+    whole += (byte & 127) * place;
+    place *= 128;
+    if (byte & 128) continue;
+    value += whole % 2 ? -(whole + 1) / 2 : whole / 2;
+    found.push(value);
+    [whole, place] = [0, 1];
+  }
+  return found;
+}
+
+const sizes = ([least, step, packed]) => Float64Array.from(steps(packed), (k) => (k ? least * Math.exp((k - 1) * step) : 0));
+
 function choice(parent, label, names) {
   const box = element(parent, "label", {}, label + " ");
   const select = element(box, "select");
@@ -41,7 +61,7 @@ function button(parent, words, action) {
   return made;
 }
 
-const significant = (value) => (Number.isFinite(value) ? Number(value.toPrecision(4)).toString() : "–");
+const significant = (value, digits = 4) => (Number.isFinite(value) ? Number(value.toPrecision(digits)).toString() : "–");
 
 // --- axes -----------------------------------------------------------------------------------------------------------
 
@@ -137,20 +157,15 @@ function panel(svg, top, height, width, x, { freq, gaps }, [first, last], curves
 // --- responses ------------------------------------------------------------------------------------------------------
 
 function spectra(data, channel, run) {
-  const of = ([re, im]) => [numbers(re), numbers(im)];
-  const size = ([re, im]) => re.map((value, at) => Math.hypot(value, im[at]));
-  const turn = ([re, im]) => re.map((value, at) => {
-    const degrees = (Math.atan2(im[at], value) * 180) / Math.PI;
-    return degrees < HIGHEST ? degrees : degrees - 360;
-  });
+  const phase = ([, turned]) => Float64Array.from(steps(turned), (k) => k * DEGREES);
   const level = (kind) => {
-    const told = channel[kind] && numbers(channel[kind][run]);
-    return told && told.length === 1 ? new Float32Array(left.length).fill(told[0]) : told;
+    const told = channel[kind] && sizes(channel[kind][run]);
+    return told && told.length === 1 ? new Float64Array(left.length).fill(told[0]) : told;
   };
-  const [measured, identified] = [of(channel.measured[run]), of(channel.identified[run])];
-  const left = numbers(channel.left[run]);
+  const [measured, identified] = [channel.measured[run], channel.identified[run]];
+  const left = sizes(channel.left[run]);
   return {
-    measured: size(measured), identified: size(identified), phase: turn(measured), phaseIdentified: turn(identified),
+    measured: sizes(measured[0]), identified: sizes(identified[0]), phase: phase(measured), phaseIdentified: phase(identified),
     left, noise: level("noise"), recorded: level("recorded"), band: level("band"),
   };
 }
@@ -214,12 +229,12 @@ function startCurves(figure) {
     }
     const at = view.x(freq[cursor]);
     view.mark = drawn(view.svg, "line", { x1: at, x2: at, y1: MARGIN.top, y2: view.total - MARGIN.bottom, class: "cursor" });
-    const noise = values.noise ? `, noise ${significant(values.noise[cursor])}` : "";
-    const band = values.band ? `, 95 % interval ± ${significant(values.band[cursor])}` : "";
+    const noise = values.noise ? `, noise ${significant(values.noise[cursor], 3)}` : "";
+    const band = values.band ? `, 95 % interval ± ${significant(values.band[cursor], 3)}` : "";
     told.textContent =
-      `${significant(freq[cursor])} Hz: measured ${significant(values.measured[cursor])} at ` +
-      `${values.phase[cursor].toFixed(0)}°, identified ${significant(values.identified[cursor])} at ` +
-      `${values.phaseIdentified[cursor].toFixed(0)}°, difference ${significant(values.left[cursor])}${noise}${band}`;
+      `${significant(freq[cursor])} Hz: measured ${significant(values.measured[cursor], 3)} at ` +
+      `${values.phase[cursor].toFixed(0)}°, identified ${significant(values.identified[cursor], 3)} at ` +
+      `${values.phaseIdentified[cursor].toFixed(0)}°, difference ${significant(values.left[cursor], 2)}${noise}${band}`;
   }
 
   // Runs of other lengths have other lines: the same frequencies stay in sight.

@@ -18,11 +18,14 @@ from sysid.plot.panels import lines_of, run_names
 from sysid.plot.plots import stick_model
 from sysid.report.html import text
 from sysid.report.noise_level import NoiseLevel
-from sysid.report.still import Channel, curve_sheet, mode_still, room_of_modes
+from sysid.report.still import Channel, curve_sheet, degrees, mode_still, room_of_modes
 from sysid.results.identification import Identification
 from sysid.results.summary import DEVIATES
 from sysid.structure.structure import Array, ComplexArray
 
+_FINE, _ROUGH = 1e-3, 1e-2  # relative steps of sizes, and of differences, which are noise
+_DEGREES = 0.5  # steps of phases
+_GROUPS = 5  # of seven bits, at most in a number
 _SHOWN = 0.18  # of the structure's size: the largest motion of a mode shape
 
 
@@ -104,8 +107,8 @@ def _mode_stills(content: dict[str, Any]) -> str:
     points = points - (points.min(axis=0) + points.max(axis=0)) / 2
     size = room_of_modes(points, shapes)
     drawn = (
-        mode_still(name, points, shape, content["sticks"], size)
-        for name, shape in zip(content["names"], shapes, strict=True)
+        mode_still(name, points, shape, content["sticks"], size, first=k == 0)
+        for k, (name, shape) in enumerate(zip(content["names"], shapes, strict=True))
     )
     return f'<div class="shapes">{"".join(drawn)}</div>'
 
@@ -152,13 +155,18 @@ def _told(runs: list[Channel]) -> dict[str, Any]:
     first = runs[0]
     found: dict[str, Any] = {"name": first.name, "words": first.words, "unit": first.unit}
     for name in ("measured", "identified"):
-        found[name] = [[_packed(own.real), _packed(own.imag)] for own in (getattr(run, name)[0] for run in runs)]
-    found["left"] = [_packed(np.abs(run.measured[0] - run.identified[0])) for run in runs]
+        found[name] = [[_sizes(np.abs(own)), _steps(degrees(own) / _DEGREES)] for own in _of(runs, name)]
+    found["left"] = [_sizes(np.abs(run.measured[0] - run.identified[0]), _ROUGH) for run in runs]
     for name in ("noise", "band", "recorded"):
         if getattr(first, name) is not None:
-            every = [getattr(run, name)[0] for run in runs]
-            found[name] = [_packed(own[:1] if np.ptp(own) == 0 else own) for own in every]
+            every = _of(runs, name)
+            found[name] = [_sizes(own[:1] if np.ptp(own) == 0 else own) for own in every]
     return found
+
+
+def _of(runs: list[Channel], name: str) -> list[NDArray[Any]]:
+    """One of the spectra of a channel, run by run."""
+    return [getattr(run, name)[0] for run in runs]
 
 
 def _against_base(test: Measurement, moves: Array) -> ComplexArray:
@@ -196,6 +204,33 @@ def _levels(values: NDArray[Any] | None, channel: int, test: Measurement) -> Arr
 def _packed(numbers: ArrayLike) -> str:
     """Single-precision numbers in base 64: a third of what their digits take."""
     return base64.b64encode(np.asarray(numbers, "<f4").tobytes()).decode("ascii")
+
+
+def _sizes(values: Array, step: float = _FINE) -> tuple[float, float, str]:
+    """Sizes within half a `step` of their logarithm: the least of them, the step and whole steps above it from 1 on.
+
+    0 is zero, and what is 10⁻³⁰ of the largest or less.
+    """
+    kept = values > 1e-30 * values.max(initial=0.0)
+    least = float(values.min(where=kept, initial=np.inf)) if np.any(kept) else 1.0
+    above = np.log(np.divide(values, least, out=np.ones_like(values), where=kept)) / step
+    return float(f"{least:.7g}"), step, _steps(np.where(kept, 1 + above, 0.0))
+
+
+def _steps(values: Array) -> str:
+    """Whole numbers in base 64, each as its difference from the one before.
+
+    A difference d is 2 d, or -2 d - 1 below zero, in groups of seven bits, the lowest first; the eighth bit of a byte
+    says that another group follows (LEB128).
+    """
+    moves = np.diff(np.rint(values).astype(np.int64), prepend=0)
+    whole = np.where(moves < 0, -2 * moves - 1, 2 * moves)
+    groups = whole[:, None] >> (7 * np.arange(_GROUPS))
+    follows = groups[:, 1:] > 0
+    bytes_ = (groups & 127).astype(np.uint8)
+    bytes_[:, :-1] |= np.where(follows, 128, 0).astype(np.uint8)
+    used = np.column_stack([np.ones(len(groups), bool), follows])
+    return base64.b64encode(bytes_[used].tobytes()).decode("ascii")
 
 
 def _element(kind: str, content: dict[str, Any], words: str, still: str) -> str:

@@ -87,7 +87,7 @@ svg .measured { stroke: var(--seen); stroke-width: 3; } svg .identified { stroke
 svg .rest { stroke: var(--soft); opacity: .6; stroke-width: 1; } svg .recorded { stroke: var(--good); }
 svg .left { stroke: var(--left); }
 svg .noise { stroke: var(--soft); stroke-dasharray: 5 3; } svg .band { stroke: var(--found); stroke-dasharray: 2 3; }
-svg .dot { fill: var(--found); } svg .base { fill: var(--soft); }
+svg .dot { fill: var(--found); } .dot circle { r: 3px; } svg .base { fill: var(--soft); }
 .legend { display: flex; flex-wrap: wrap; gap: .3rem .9rem; margin: .6rem 0 0; max-width: none; }
 .key { border-top: 3px solid var(--soft); font-size: .85rem; } .key.measured { border-color: var(--seen); }
 .key.identified { border-color: var(--found); } .key.left { border-color: var(--left); }

@@ -55,7 +55,7 @@ def matrices(it: Identification) -> str:
         paragraph(words, "soft"),
         picture(
             plot.matrices(it), "heat maps of the mass, stiffness and damping matrices", CHOSEN if label else "",
-            colours=None, label=mark,
+            colours=256, label=mark,
         ),
         matrix(M, names, names, f"Mass M_SS, kg{scale}", below=lower[0], label=mark),
         _of_base(M_full[:n, n:], names, axes, f"Coupling mass M_S0, {coupling}{scale}", mark),

@@ -419,7 +419,7 @@ def _mac(it: Identification) -> str:
         else "Mode shapes against each other (no reference is known): off-diagonal entries near 1 tell modes that "
         "these sensors cannot tell apart."
     )
-    return paragraph(words, "soft") + picture(plot.mac(it), "modal assurance criterion", colours=None)
+    return paragraph(words, "soft") + picture(plot.mac(it), "modal assurance criterion", colours=256)
 
 
 def _effective_masses(it: Identification) -> str:

@@ -19,6 +19,9 @@ _WIDE = 8.0  # last over first line from which frequencies stand on a logarithmi
 _LOWEST, _HIGHEST = -270.0, 90.0  # degrees: the step of a resonance, 0 to -180, is not cut
 _TITLED = ' class="title"'
 _FINE = 2  # steps of a curve in a pixel
+_COLUMN = 4  # such steps, in which of a difference, which is noise, the least and the largest are drawn
+_ROUNDS = 3  # in which a curve loses points that it does not need: it then stays within so many steps of all of them
+_AT_REST = "rest"
 _MODE_WIDTH, _MODE_HEIGHT = 210, 260  # pixels
 _ANGLE = np.deg2rad(30.0)  # about the vertical, from which a mode shape is seen
 
@@ -119,7 +122,9 @@ def degrees(spectrum: ComplexArray) -> Array:
     return np.asarray((np.angle(spectrum, deg=True) - _HIGHEST) % 360.0 + _LOWEST)
 
 
-def mode_still(name: str, points: Array, shape: Array, sticks: Sequence[tuple[int, int]], size: float) -> str:
+def mode_still(
+    name: str, points: Array, shape: Array, sticks: Sequence[tuple[int, int]], size: float, first: bool
+) -> str:
     """One mode shape with the base, which stands still, over the structure at rest.
 
     Parameters
@@ -132,13 +137,15 @@ def mode_still(name: str, points: Array, shape: Array, sticks: Sequence[tuple[in
         Pairs of points.
     size : float
         Pixels of a unit of length.
+    first : bool
+        Of those of a page: the others show its structure at rest again.
     """
     rest, moved = (_seen(where, size) for where in (points, points + shape))
-    lines = "".join(
-        f'<path class="{kind}" d="{"".join(f"M{_pair(where[i])}L{_pair(where[j])}" for i, j in sticks)}"/>'
-        for kind, where in (("rest", rest), ("identified", moved))
-    )
-    dots = "".join(f'<circle class="dot" r="3" cx="{x:.1f}" cy="{y:.1f}"/>' for x, y in moved[1:])
+    joined = [_joined(where, sticks) for where in (rest, moved)]
+    at_rest = f'<path id="{_AT_REST}" class="rest" d="{joined[0]}"/>' if first else f'<use href="#{_AT_REST}"/>'
+    lines = f'{at_rest}<path class="identified" d="{joined[1]}"/>'
+    dots = "".join(f'<circle cx="{x:.1f}" cy="{y:.1f}"/>' for x, y in moved[1:])
+    dots = f'<g class="dot">{dots}</g>'
     x, y = rest[0]
     base = f'<rect class="base" x="{x - 22:.1f}" y="{y - 3:.1f}" width="44" height="6"/>'
     base += f'<text x="{x + 26:.1f}" y="{y + 5:.1f}">base</text>'
@@ -148,6 +155,11 @@ def mode_still(name: str, points: Array, shape: Array, sticks: Sequence[tuple[in
         for at, part in enumerate(name.split(", "))
     )
     return _svg(name, _MODE_WIDTH, _MODE_HEIGHT, lines + dots + base + words)
+
+
+def _joined(where: Array, sticks: Sequence[tuple[int, int]]) -> str:
+    """The sticks between points (p, 2), as a path."""
+    return "".join(f"M{_pair(where[i])}L{_pair(where[j])}" for i, j in sticks)
 
 
 def room_of_modes(points: Array, shapes: Array) -> float:
@@ -178,17 +190,17 @@ def _svg(title: str, width: int, height: int, content: str) -> str:
 def _drawn(panel: _Panel, across: _Axis, up: _Axis, x: Array, gaps: ArrayLike) -> str:
     """Title, grid and curves of a panel; `x` is where the frequencies are, `gaps` at which no curve is joined."""
     parts = [f'<text class="title" x="{_LEFT}" y="{up.end - 5:g}">{text(panel.title)}</text>']
-    for value in up.ticks(_ABOVE) if panel.decades else [-180.0, -90.0, 0.0]:
-        y = float(up(value))
-        parts.append(f'<path class="grid" d="M{across.start} {y:.1f}H{across.end}"/>')
-        parts.append(f'<text x="{_LEFT - 5}" y="{y + 4:.1f}" text-anchor="end">{value:g}</text>')
-    for value in across.ticks(_APART):
-        parts.append(f'<path class="grid" d="M{float(across(value)):.1f} {up.start}V{up.end}"/>')
+    ticks = up.ticks(_ABOVE) if panel.decades else [-180.0, -90.0, 0.0]
+    grid = [f"M{across.start} {float(up(value)):.1f}H{across.end}" for value in ticks]
+    grid += [f"M{float(across(value)):.1f} {up.start}V{up.end}" for value in across.ticks(_APART)]
+    parts.append(f'<path class="grid" d="{"".join(grid)}"/>')
+    numbers = (f'<text x="{_LEFT - 5}" y="{float(up(value)) + 4:.1f}">{value:g}</text>' for value in ticks)
+    parts.append(f'<g text-anchor="end">{"".join(numbers)}</g>')
     jump = np.inf if panel.decades else abs(up.start - up.end) / 2
     paths = {}
     for kind, values in panel.curves.items():
         seen = np.where((values < up.low) | (values > up.high), np.nan, values) if kind == "band" else values
-        paths[kind] = _path(x, up(seen), jump, gaps)
+        paths[kind] = _path(x, up(seen), jump, gaps, _COLUMN if kind == "left" else 1)
     drawn = "".join(f'<path class="{kind}" d="{path}"/>' for kind, path in paths.items())
     parts.append(f'<g transform="scale({1 / _FINE:g})">{drawn}</g>')
     if not any(paths.values()):
@@ -218,22 +230,23 @@ def _log_ticks(low: float, high: float, room: float) -> list[float]:
     return [value for value in numbers if low <= value <= high]
 
 
-def _path(x: Array, y: Array, jump: float, gaps: ArrayLike) -> str:
-    """A curve in whole steps of part of a pixel, left out where it is not finite and where it jumps."""
+def _path(x: Array, y: Array, jump: float, gaps: ArrayLike, column: int) -> str:
+    """A curve in whole steps of part of a pixel, `column` to the right, with gaps where it is not finite or jumps."""
     kept = np.flatnonzero(np.isfinite(y))
     apart = (np.diff(kept) > 1) | (np.abs(np.diff(y[kept])) > jump) | np.isin(kept[1:], gaps)
     breaks = np.flatnonzero(apart) + 1
-    return "".join(_segment(x[part], y[part]) for part in np.split(kept, breaks) if part.size)
+    return "".join(_segment(x[part], y[part], column) for part in np.split(kept, breaks) if part.size)
 
 
-def _segment(x: Array, y: Array) -> str:
-    at = _thinned(np.rint(_FINE * x).astype(int), np.rint(_FINE * y).astype(int))
+def _segment(x: Array, y: Array, column: int) -> str:
+    at = _thinned(column * np.rint(_FINE * x / column).astype(int), np.rint(_FINE * y).astype(int))
     steps = np.diff(at, axis=0).ravel().tolist()
-    return f"M{at[0, 0]} {at[0, 1]}" + ("l" + " ".join(map(str, steps)) if steps else "h1")
+    # a sign separates numbers as a space does
+    return f"M{at[0, 0]} {at[0, 1]}" + ("l" + " ".join(map(str, steps)).replace(" -", "-") if steps else "h1")
 
 
 def _thinned(x: NDArray[np.intp], y: NDArray[np.intp]) -> NDArray[np.intp]:
-    """The lowest and the highest point over each place, (points, 2); what stays level is left out."""
+    """The lowest and the highest point over each place, (points, 2), without those on the line of their neighbours."""
     starts = np.flatnonzero(np.diff(x, prepend=x[0] - 1))
     low, high = np.minimum.reduceat(y, starts), np.maximum.reduceat(y, starts)
     rising = np.abs(y[starts] - low) <= np.abs(y[starts] - high)
@@ -241,4 +254,19 @@ def _thinned(x: NDArray[np.intp], y: NDArray[np.intp]) -> NDArray[np.intp]:
     at = np.column_stack([np.repeat(x[starts], 2), both])
     at = at[np.insert(np.any(np.diff(at, axis=0) != 0, axis=1), 0, True)]
     level = (at[1:-1, 1] == at[:-2, 1]) & (at[1:-1, 1] == at[2:, 1])
-    return at[np.concatenate([[True], ~level, [True]])[: len(at)]]
+    at = at[np.concatenate([[True], ~level, [True]])[: len(at)]]
+    for _ in range(_ROUNDS):
+        at = at[_bends(at)]
+    return at
+
+
+def _bends(at: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Which points of a curve (points, 2) to keep: all but every other one within a step of the neighbours' line.
+
+    Peaks stay: the neighbours of a point that is left out are kept.
+    """
+    kept = np.ones(len(at), bool)
+    before, this, after = at[:-2:2], at[1:-1:2], at[2::2]
+    (wide, high), (x, y) = (after - before).T, (this - before).T
+    kept[1:-1:2] = np.abs(y * wide - high * x) > wide
+    return kept
