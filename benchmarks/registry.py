@@ -109,6 +109,7 @@ BENCHMARKS = (
     ),
     Benchmark("files.exported_files", "exported files read by other programs: what they keep", "20 s", "10 s"),
     Benchmark("page.report_page", "the report page: size, seconds, and a browser's measure of it", "90 s", "15 s"),
+    Benchmark("page.page_speed", "the page of 40 sensors, a summary, the import: seconds, bytes", "60 s", "30 s"),
     Benchmark("mistakes.named_mistakes", "one mistake a test: named first, right ones not accused", "6 min", "20 s"),
     Benchmark("mistakes.model_errors", "structures that change: told so, linear ones not", "5 min", "15 s"),
     Benchmark("house", "imports one way, tests of types, branches, sizes of functions and files", "2 s", "2 s"),

@@ -95,8 +95,10 @@ def curve_sheet(name: str, freq: Array, channel: Channel, run: int, gaps: ArrayL
         top = bottom + _TITLE
         bottom = top + height
         drawn.append(_drawn(panel, across, _upward(panel, bottom, top), across(freq), gaps))
-    for value in across.ticks(_APART):
-        drawn.append(f'<text x="{float(across(value)):.1f}" y="{bottom + 14}" text-anchor="middle">{value:g}</text>')
+    numbers = (
+        f'<text x="{float(across(value)):.1f}" y="{bottom + 14}">{value:g}</text>' for value in across.ticks(_APART)
+    )
+    drawn.append(f'<g text-anchor="middle">{"".join(numbers)}</g>')
     drawn.append(f'<text x="{_WIDTH - _RIGHT}" y="{bottom + 27}" text-anchor="end">frequency [Hz]</text>')
     image = _svg(f"{name}: measured and identified {channel.words}", _WIDTH, bottom + _BELOW, "".join(drawn))
     return f'<div class="sheet"><p>{text(name)}</p>{image}</div>'
@@ -240,21 +242,24 @@ def _path(x: Array, y: Array, jump: float, gaps: ArrayLike, column: int) -> str:
 
 def _segment(x: Array, y: Array, column: int) -> str:
     at = _thinned(column * np.rint(_FINE * x / column).astype(int), np.rint(_FINE * y).astype(int))
-    steps = np.diff(at, axis=0).ravel().tolist()
+    steps = (at[1:] - at[:-1]).ravel().tolist()
     # a sign separates numbers as a space does
     return f"M{at[0, 0]} {at[0, 1]}" + ("l" + " ".join(map(str, steps)).replace(" -", "-") if steps else "h1")
 
 
 def _thinned(x: NDArray[np.intp], y: NDArray[np.intp]) -> NDArray[np.intp]:
     """The lowest and the highest point over each place, (points, 2), without those on the line of their neighbours."""
-    starts = np.flatnonzero(np.diff(x, prepend=x[0] - 1))
+    starts = np.flatnonzero(np.concatenate([[True], x[1:] != x[:-1]]))
     low, high = np.minimum.reduceat(y, starts), np.maximum.reduceat(y, starts)
     rising = np.abs(y[starts] - low) <= np.abs(y[starts] - high)
-    both = np.column_stack([np.where(rising, low, high), np.where(rising, high, low)]).ravel()
-    at = np.column_stack([np.repeat(x[starts], 2), both])
-    at = at[np.insert(np.any(np.diff(at, axis=0) != 0, axis=1), 0, True)]
+    at = np.empty((2 * starts.size, 2), int)
+    at[::2, 0] = at[1::2, 0] = x[starts]
+    at[::2, 1], at[1::2, 1] = np.where(rising, low, high), np.where(rising, high, low)
+    at = at[np.concatenate([[True], (at[1:] != at[:-1]).any(axis=1)])]
+    if len(at) < 3:
+        return at
     level = (at[1:-1, 1] == at[:-2, 1]) & (at[1:-1, 1] == at[2:, 1])
-    at = at[np.concatenate([[True], ~level, [True]])[: len(at)]]
+    at = at[np.concatenate([[True], ~level, [True]])]
     for _ in range(_ROUNDS):
         at = at[_bends(at)]
     return at

@@ -26,6 +26,10 @@ _SCALE = (
 _NOT_COMPUTED = (
     "uncertainty not computed, as the time was over: Identification.uncertainty and 'sysid report' compute it"
 )
+_RANGES_LEFT = (
+    "how far the entries may go over all these models is not computed here: Identification.mass_interval and "
+    "stiffness_interval compute it"
+)
 _ENDED = {
     "Solve_Succeeded": "the solver ended as it should",
     "Solved_To_Acceptable_Level": "the solver ended near enough to its optimum",
@@ -324,9 +328,12 @@ def _rigid_masses(it: Answer, axes: Sequence[str]) -> Iterator[str]:
 
 
 def _ranges(it: Answer) -> Iterator[str]:
-    """How far the diagonals may go, in one line, where that is known quickly and something may move."""
-    ends = it.quick_intervals
-    if ends is None or it.scale_is_open:
+    """How far the diagonals may go, in one line, where something may move; where that takes time, what computes it."""
+    if it.scale_is_open:
+        return
+    ends = it.intervals_at_once
+    if ends is None:
+        yield f"  - {_RANGES_LEFT}"
         return
     words = []
     M, K, _ = blocks_of(it.structure)

@@ -75,6 +75,15 @@ def test_masses_that_are_one_choice_are_marked_and_their_range_is_told(modal, tr
     assert f"over all these models the diagonal entries are {told[0]} M_SS, {told[1]} K_SS" in text
 
 
+def test_ranges_that_would_take_time_are_not_computed_and_the_summary_says_so(modal, monkeypatch):
+    monkeypatch.setattr("sysid.results.answer._DOFS_AT_ONCE", 2)
+    it = modal(force=False)
+    text = " ".join(it.summary().split())
+    assert "_intervals" not in vars(it) and "is not computed here: Identification.mass_interval" in text
+    assert it.mass_interval.shape == (2, 3, 3)
+    assert "over all these models the diagonal entries are" in " ".join(it.summary().split())
+
+
 def test_a_range_without_an_end_is_no_number(modal):
     text = " ".join(modal(force=False).summary().split())
     assert "entries are 0 to any number of times those of this M_SS" in text and "inf" not in text
@@ -115,6 +124,7 @@ def test_what_takes_long_is_asked_for_only_where_it_is_known(modal, monkeypatch)
     it = modal(force=False)
     monkeypatch.setattr("sysid.results.answer._QUICK_SHAPES", 0)
     monkeypatch.setattr("sysid.results.answer._QUICK_DOFS", 0)
+    monkeypatch.setattr("sysid.results.answer._DOFS_AT_ONCE", 0)
     assert it.quick_uncertainty is None and it.quick_intervals is None
     assert "+-" not in it.summary() and "diagonal entries" not in it.summary()
     assert it.to_dict()["natural_frequencies_std_hz"] == [None] * 3

@@ -1,0 +1,76 @@
+"""What the page of a large answer, its summary and the import of the package take."""
+
+from __future__ import annotations
+
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+import sysid
+from benchmarks.line import Line, below
+from benchmarks.modal.random_structures import frequency_lines, random_structure
+
+MOST_SECONDS, MOST_BYTES = 2.0, 2e6  # of the page
+AT_ONCE = 0.1  # s, of a summary
+IMPORT = 0.25  # s beyond NumPy and CasADi
+_IMPORTED = """
+import time
+import numpy, casadi
+begun = time.process_time()
+import sysid
+print(time.process_time() - begun)
+"""
+
+
+def lines(reduced: bool) -> Iterator[Line]:
+    """Processor seconds on one thread: the least of some of the page and the summary, the median of some imports."""
+    with tempfile.TemporaryDirectory() as folder, threadpool_limits(limits=1):
+        large = _answer(40, 600, force=True)
+        page = sysid.write_report(large, Path(folder) / "large.html")  # what is imported at first is not counted
+        rounds = 3 if reduced else 8
+        taken = [_seconds(lambda: sysid.write_report(large, page)) for _ in range(rounds)]
+        text = f"page of 40 sensors, 3 directions and force, 600 lines: least of {rounds}, processor s"
+        yield below(text, min(taken), MOST_SECONDS)
+        yield below("its bytes", page.stat().st_size, MOST_BYTES)
+        # one of many: without a force, whose matrices have 840 ends
+        taken = [_seconds(_answer(20, 500, force=False).summary) for _ in range(1 if reduced else 3)]
+        yield below("first summary of 20 sensors without a force, processor s", min(taken), AT_ONCE)
+        count = 5 if reduced else 15
+        text = f"import of sysid beyond NumPy and CasADi, median of {count} processes with compiled files, processor s"
+        yield below(text, _import_seconds(Path(folder), count), IMPORT)
+
+
+def _import_seconds(folder: Path, count: int) -> float:
+    """Median over fresh processes; as in an installation, Python's compiled files are there."""
+    environment = os.environ | {"PYTHONPYCACHEPREFIX": str(folder / "compiled")}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
+    told = [
+        subprocess.run(
+            [sys.executable, "-c", _IMPORTED], check=True, capture_output=True, text=True, env=environment
+        ).stdout
+        for _ in range(count + 1)
+    ]
+    return statistics.median(map(float, told[1:]))
+
+
+def _answer(n: int, count: int, *, force: bool) -> sysid.Identification:
+    truth = random_structure(7, n=n, d=3)
+    test = sysid.simulate(truth, frequency_lines(truth, count), noise=0.01, force=force, rng=7)
+    axes = ["xyz"[k] for k in np.argmax(np.abs(truth.rigid_body), axis=1)]
+    sensors = [sysid.Sensor(f"sensor {k}", (0.1 * (k % 4), 0.1, float(k)), axis) for k, axis in enumerate(axes)]
+    return sysid.identify(sysid.Problem(replace(test, sensors=sensors), mass=sysid.FullMass()), rng=0)
+
+
+def _seconds(run: Callable[[], object]) -> float:
+    begun = time.process_time()
+    run()
+    return time.process_time() - begun
