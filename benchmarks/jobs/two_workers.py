@@ -23,8 +23,8 @@ def lines(reduced: bool) -> Iterator[Line]:
     """Seconds of the same draws by one worker and by two, alternated, of each the least.
 
     Workers that have started hold the problem; those of a new pool are forked, and build it. The first pool comes with
-    the process that its workers are forked from. Other work on a shared machine takes processors: in turn with draws
-    runs fixed work of NumPy alone, which two free processors halve; what is judged is at its pace.
+    the process that its workers are forked from. Fixed work of NumPy alone runs in turn with the draws: what a second
+    worker can gain on this machine at that time, which two free processors halve.
     """
     rounds = 4 if reduced else 12
     recipe = sysid.Recipe("cantilever_tower")
@@ -51,10 +51,7 @@ def lines(reduced: bool) -> Iterator[Line]:
     told = "; ".join(f"{name} {seconds:.2f}" for name, seconds in least.items())
     share, bare = least["two"] / least["one"], least["bare two"] / least["bare one"]
     what = f"two workers over one, which hold the problem, least of {rounds - 1} each"
-    yield Line(f"{what} (s: {told}; new two at first {first:.2f})", f"{share:.3g}")
-    yield below(
-        f"the same where fixed work takes half, as on two free processors; here {bare:.2g}", share * 0.5 / bare, SHARE
-    )
+    yield below(f"{what} (s: {told}; new two at first {first:.2f}; fixed work {bare:.2g})", share, SHARE)
     text = "two new workers, which build the problem, over this process alone"
     yield Line(text, f"{least['new two'] / least['here']:.3g}")
 
