@@ -24,7 +24,8 @@ def lines(reduced: bool) -> Iterator[Line]:
 
     Workers that have started hold the problem; those of a new pool are forked, and build it. The first pool comes with
     the process that its workers are forked from. Fixed work of NumPy alone runs in turn with the draws: what a second
-    worker can gain on this machine at that time, which two free processors halve. The reduced form tells the share without holding it to the bound.
+    worker can gain on this machine at that time, which two free processors halve. The reduced form tells the share
+    without holding it to the bound.
     """
     rounds = 4 if reduced else 12
     recipe = sysid.Recipe("cantilever_tower")
