@@ -209,7 +209,7 @@ def _run_in(folder: Path, options: argparse.Namespace, out: Output) -> int:
         on = f"; '{unfinished.command(search, folder)}' goes on" if checkpoint.exists else ""
         out.complain(f"interrupted; the {'best so far' if result.interrupted else 'result'} is in {folder}{on}")
         return INTERRUPTED
-    return SUCCESS if result.success else NOT_REACHED
+    return SUCCESS if result.judgement in ("determined", "one of many") else NOT_REACHED
 
 
 def _compare(options: argparse.Namespace, out: Output) -> int:
@@ -245,7 +245,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog=epilog(
             ("sysid run cantilever_tower", "sysid read sine.csv --sensors sensors.toml --out test.h5",
              "sysid run test.h5 --mass 1450", "sysid export results/test test.bdf", "sysid run --help"),
-            "Exit status: 0 success, 1 the search did not reach its goal, 2 a mistake in what was\n"
+            "Exit status: 0 determined or one of many, 1 doubtful or no fit, 2 a mistake in what was\n"
             "given, 130 interrupted (the best so far is saved), 70 an error of sysid itself.",
         ),
         formatter_class=argparse.RawDescriptionHelpFormatter,

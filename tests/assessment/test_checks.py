@@ -9,7 +9,7 @@ import pytest
 import sysid
 from benchmarks.records.simulated import four_storeys
 from sysid import FullMass, KnownMass, LumpedMass, Measurement, Problem, Structure, simulate
-from sysid.assessment.checks import doubts
+from sysid.assessment.checks.against_records import doubts
 
 
 def lines(truth, count=240):

@@ -7,7 +7,7 @@ import pytest
 
 import sysid
 from sysid import ChainStiffness, FullMass, LumpedMass, Measurement, Problem, Structure, simulate
-from sysid.assessment.gains import GainErrors, rests_on
+from sysid.assessment.checks.gains import GainErrors, rests_on
 
 STEP = 2e-4  # of a gain
 K = 5000.0 * np.array([[2.0, -1, 0, -1], [-1, 2, -1, 0], [0, -1, 1, 0], [-1, 0, 0, 1]])

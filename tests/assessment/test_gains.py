@@ -8,7 +8,7 @@ import pytest
 
 import sysid
 from sysid import FullMass, LumpedMass, Measurement, Problem, Structure, simulate
-from sysid.assessment.gains import gain_errors, taken_at_sensors
+from sysid.assessment.checks.gains import gain_errors, taken_at_sensors
 
 ERROR = 0.02
 

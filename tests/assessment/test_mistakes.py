@@ -10,7 +10,7 @@ import sysid
 from benchmarks.mistakes.wrong_tests import CAUSES, SPECTRA, problem, right
 from benchmarks.modal.random_structures import frequency_lines, random_structure
 from sysid import FullMass, InputError, LumpedMass, Problem, SpectralStiffness, identify, simulate
-from sysid.assessment.mistakes import mistakes_of
+from sysid.assessment.checks.mistakes import mistakes_of
 from sysid.modal_analysis.direct_terms import direct_terms
 
 BY_RECORDS = [name for name, cause in CAUSES.items() if SPECTRA in cause.kinds and not cause.untold]
