@@ -9,6 +9,8 @@ from collections.abc import Iterable, Mapping
 from enum import StrEnum
 from typing import Any, Literal, NamedTuple, get_args
 
+import numpy as np
+
 Kind = Literal[
     # Mistakes in records, or in what is stated of them; the first of them explains what else speaks against a fit.
     "conjugated spectra", "late sensor", "relative responses", "positions", "unit", "sign", "swapped sensors", "gain",
@@ -83,14 +85,16 @@ class Finding(NamedTuple):
         )
 
     def to_tree(self) -> dict[str, Any]:
-        """Give the fields by their names; `from_tree` takes them back, and JSON writes them."""
-        numbers = {name: float(value) for name, value in self.numbers.items()}
-        return {**self._asdict(), "severity": str(self.severity), "numbers": numbers}
+        """Give the fields by their names, figures beside theirs, which may be any text; `from_tree` takes them back."""
+        values = np.array(list(self.numbers.values()), dtype=float)
+        return {**self._asdict(), "severity": str(self.severity), "numbers": tuple(self.numbers), "values": values}
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Finding:
         """Give the finding of a tree that `to_tree` made."""
-        return cls(**{**tree, "severity": Severity(tree["severity"])})
+        given = dict(tree)
+        numbers = dict(zip(tree["numbers"], given.pop("values").tolist(), strict=True))
+        return cls(**{**given, "severity": Severity(tree["severity"]), "numbers": numbers})
 
 
 def weightiest_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:

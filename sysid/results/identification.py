@@ -179,7 +179,7 @@ class Identification(Answer):
             "determined": bool(self.determined),
             "closed_by": list(self.closed_by),
             "undetermined": list(self.undetermined),
-            "findings": [{**one.to_tree(), "numbers": _finite(one.numbers)} for one in self.findings],
+            "findings": [{**one._asdict(), "numbers": _finite(one.numbers)} for one in self.findings],
             "outliers": [
                 {"test": o.test, "run": o.run, "channel": o.channel, "frequency_hz": o.freq, "deviations": o.size}
                 for o in self.outliers

@@ -148,7 +148,7 @@ def test_nobody_accuses_unique_answers():
     for posed in (problem((0, 1), rng=2), problem(rng=2, lower=1e4)):
         result = sysid.identify(posed, rng=2, start=start)
         assert result.determined, result.undetermined
-        assert not any("looked for" in told for told in result.remarks)
+        assert not result.of_kind("search", "other answers")
 
 
 def test_no_time_is_lost_where_the_equations_are_linear(monkeypatch):
@@ -221,7 +221,8 @@ def test_ctrl_c_during_the_look_keeps_the_answer_and_says_so(ctrl_c):
     assert result.success
     assert not result.determined
     np.testing.assert_allclose(result.values["spring"], SPRINGS, rtol=0.01)
-    assert result.undetermined == (other_answers.NOT_LOOKED_FOR.format("interrupted"),)
+    (told,) = (*result.contradictions, *result.open_findings)
+    assert told.kind == "other answers" and "interrupted" in told.sentence
 
 
 def test_a_callback_may_stop_it():
@@ -231,7 +232,8 @@ def test_a_callback_may_stop_it():
 
     result = sysid.identify(problem(rng=2), rng=2, callback=stop)
     assert not result.determined
-    assert result.undetermined == (other_answers.NOT_LOOKED_FOR.format("the callback stopped the search"),)
+    (told,) = (*result.contradictions, *result.open_findings)
+    assert told.kind == "other answers" and "callback" in told.sentence
 
 
 def test_the_time_limit_ends_it(monkeypatch):
@@ -245,13 +247,14 @@ def test_the_time_limit_ends_it(monkeypatch):
 
     monkeypatch.setattr("sysid.results.judgement.with_other_answers", late)
     result = sysid.identify(problem(rng=2), rng=2)
-    assert result.undetermined == (other_answers.NOT_LOOKED_FOR.format("the time was over"),)
+    (told,) = (*result.contradictions, *result.open_findings)
+    assert told.kind == "other answers" and "time" in told.sentence
 
 
 def test_too_many_unknowns_are_a_remark(monkeypatch):
     monkeypatch.setattr(other_answers, "_FEWEST_STARTS", 65)
     result = sysid.identify(problem(rng=2), rng=2)
-    assert any("no other structure that explains the data as well was looked for" in told for told in result.remarks)
+    assert len(result.of_kind("search")) == 1
 
 
 def test_least_squares_from_many_starts_finds_every_root_and_keeps_to_the_box():
