@@ -10,23 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.assessment.checks import run as run_checks
+from sysid.assessment.checks import check_records
 from sysid.assessment.checks.bounds import bounds_explain
 from sysid.assessment.checks.changing import changing
-from sysid.assessment.checks.context import Context
 from sysid.assessment.checks.exchanged import exchanged_sensors
-from sysid.errors import (
-    InputError,
-    SolverError,
-    finite_array,
-    function,
-    instance,
-    number,
-    path_of,
-    refuse,
-    whole_number,
-)
-from sysid.finding import Finding, Severity
+from sysid.errors import InputError, SolverError, finite_array, function, instance, number, path_of, whole_number
 from sysid.nlp import one_thread
 from sysid.problem.problem import Problem
 from sysid.results.checkpoint import Checkpoint, identity
@@ -145,19 +133,6 @@ def identify(
         if not isinstance(checkpoint, Checkpoint) and not result.interrupted:
             journal.entries.clear()  # so that the file goes
     return result
-
-
-def check_records(problem: Problem) -> tuple[Finding, ...]:
-    """Mistakes that records show before a search, the worst first.
-
-    Raises
-    ------
-    InputError
-        Where one is blocking, so that a search would be in vain.
-    """
-    found = tuple(run_checks(Context(problem)))
-    refuse(*((one.severity is Severity.BLOCKING, str(one)) for one in found))
-    return found
 
 
 def prepare(problem: Problem, session: Session) -> None:

@@ -1,9 +1,9 @@
 """Commands: ``sysid list``, ``new``, ``read``, ``show``, ``run``, ``compare``, ``refine``, ``report``, ``export``.
 
 What they say is words, or with ``--json`` one document, on standard output; progress, warnings and mistakes are on
-standard error. Exit status: 0 success; 1 the search did not reach its goal; 2 a mistake in what was given, told in
-one line; 130 interrupted, with the best so far saved; 70 an error of sysid itself, told in one line
-with the traceback in a log file.
+standard error. Exit status: 0 determined or one of many; 1 doubtful or no fit; 2 a mistake in what was given, told in
+one line; 130 interrupted, with the best so far saved; 70 an error of sysid itself, told in one line with the traceback
+in a log file.
 """
 
 from __future__ import annotations

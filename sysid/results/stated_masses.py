@@ -104,20 +104,24 @@ def _contradictions(
         return
     chance = _chance(best, numbers)
     told = f"the stated masses cannot all be met together with the records (chance {chance:.1g})"
-    explained: list[tuple[float, float, str]] = []
+    explained: list[tuple[float, tuple[float, float], str]] = []
     for row in range(stated.values.size):
         without = adjust(problem, stated.without(row), theta, index, normals)
         if without.freedom == best.freedom or _chance(without, numbers) < _CHANCE:
             continue
         value = (made(problem, stated, without.theta, index)[0] * stated.scale)[row]
         off = np.sqrt(max(best.misfit - without.misfit, 0.0))
-        explained.append((off, value, _in_words(problem, stated, row, value, off)))
+        both = (float(stated.values[row]), float(value))
+        explained.append((off, both, _in_words(problem, stated, row, value, off)))
     if explained:
         explained.sort(key=lambda one: -one[0])
         near = [words for off, _, words in explained if off**2 > explained[0][0] ** 2 - _ALIKE**2]
         yield Finding(
             "stated masses", Severity.CONTRADICTS, f"{told}: {'; or '.join(near[:_TOLD])}",
-            numbers={"chance": chance, "deviations": explained[0][0], "by the records": explained[0][1]},
+            numbers={
+                "chance": chance, "deviations": float(explained[0][0]), "stated": explained[0][1][0],
+                "by the records": explained[0][1][1], "statements": float(len(near)),
+            },
         )  # fmt: skip
         return
     factor = _common_factor(problem, stated, theta, index, normals)

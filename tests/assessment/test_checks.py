@@ -13,14 +13,14 @@ from sysid.assessment.checks import run
 from sysid.assessment.checks.against_records import records_of_fit
 from sysid.assessment.checks.context import Context
 from sysid.assessment.checks.stated_mass import stated_masses
-from sysid.assessment.checks.stated_values import stated_values
+from sysid.assessment.checks.stated_values import missed_values
 from sysid.search.strategy import Outcome
 
 
 def doubts(problem, structure, x):
     """What speaks against a search that ended there, by the stated values and the records."""
     end = Outcome(structure, x, "made by hand", True, "", sysid.History())
-    return run(Context(problem, end), (stated_masses, stated_values, records_of_fit))
+    return run(Context(problem, end), (stated_masses, missed_values, records_of_fit))
 
 
 def kinds(findings):

@@ -12,7 +12,8 @@ MASSES, SPRINGS = np.array([3.0, 2.0, 2.5]), np.array([4000.0, 3000.0, 2500.0])
 LITTLE, MUCH = np.array([0.0008, 0.0015, 0.0006]), np.array([0.18, 0.12, 0.08])
 CHAIN = sysid.ChainStiffness(400.0, 40000.0)
 ACCUSES = (
-    "stated mass", "stated masses", "damping", "misfit", "force misfit", "rigid motion", "gain", "sign", "swapped sensors",
+    "stated mass", "stated masses", "damping", "misfit", "force misfit", "rigid motion", "gain", "sign",
+    "swapped sensors",
 )  # fmt: skip
 
 

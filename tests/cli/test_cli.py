@@ -45,7 +45,7 @@ def test_run_writes_three_files_under_the_name_of_the_module_and_tells_where(her
     exact = np.sqrt(eigh(K, np.diag([2.0, 1.0]), eigvals_only=True)) / (2 * np.pi)
     for frequency in exact:
         assert f"{frequency:.5g}" in out
-    assert "Not determined: " in out
+    assert "One of many: " in out
     assert "determined" in out.lower()
 
     summary = json.loads((here / "results/pair/summary.json").read_text(), parse_constant=pytest.fail)
@@ -114,7 +114,7 @@ def test_plain_output_has_no_control_codes_whatever_the_environment_asks(here, p
     environment = os.environ | {"FORCE_COLOR": "1", "TTY_COMPATIBLE": "1", "PYTHONIOENCODING": "ascii", "COLUMNS": "40"}
     done = process("run", "pair.py", "--strategy", "swarm", env=environment, cwd=here)
     assert done.returncode == 0
-    assert b"Not determined: " in done.stdout and b" iteration " not in done.stdout
+    assert b"One of many: " in done.stdout and b" iteration " not in done.stdout
     for stream in (done.stdout, done.stderr):
         assert b"\x1b" not in stream
         assert b"\r" not in stream.replace(os.linesep.encode(), b"\n")

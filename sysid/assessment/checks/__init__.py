@@ -14,16 +14,17 @@ from sysid.assessment.checks.changing import changing_frequencies
 from sysid.assessment.checks.context import Check, Context
 from sysid.assessment.checks.gains import assumed_totals
 from sysid.assessment.checks.goal import missed_goal
-from sysid.assessment.checks.limits import search_boxes, unfitted_records
-from sysid.assessment.checks.lines_left_out import lines_left_out
+from sysid.assessment.checks.limits import lines_left_out, search_boxes, unfitted_records
 from sysid.assessment.checks.model_error import beyond_noise, other_levels, unpredicted_tests
 from sysid.assessment.checks.noise import noise_of_records
-from sysid.assessment.checks.outliers import outliers
+from sysid.assessment.checks.outliers import numbers_far_off
 from sysid.assessment.checks.search_end import no_solution, search_notes, stopped
 from sysid.assessment.checks.stated_mass import stated_masses
-from sysid.assessment.checks.stated_values import stated_values
+from sysid.assessment.checks.stated_values import missed_values
 from sysid.assessment.checks.wrong_records import wrong_records
-from sysid.finding import Finding
+from sysid.errors import refuse
+from sysid.finding import Finding, Severity
+from sysid.problem.problem import Problem
 
 CHECKS: tuple[Check, ...] = (
     wrong_records,
@@ -34,7 +35,7 @@ CHECKS: tuple[Check, ...] = (
     missed_goal,
     beyond_noise,
     unpredicted_tests,
-    stated_values,
+    missed_values,
     records_of_fit,
     pressed_bounds,
     no_solution,
@@ -45,7 +46,7 @@ CHECKS: tuple[Check, ...] = (
     other_levels,
     lines_left_out,
     noise_of_records,
-    outliers,
+    numbers_far_off,
     unfitted_records,
 )
 OF_THE_END: tuple[Check, ...] = (stopped, missed_goal, beyond_noise, no_solution)  # whether a search ended at a fit
@@ -59,3 +60,16 @@ def run(context: Context, checks: Iterable[Check] = CHECKS) -> list[Finding]:
             if one not in context.found:
                 context.found.append(one)
     return context.found
+
+
+def check_records(problem: Problem) -> tuple[Finding, ...]:
+    """Mistakes that records show before a search, the worst first.
+
+    Raises
+    ------
+    InputError
+        Where one is blocking, so that a search would be in vain.
+    """
+    found = tuple(run(Context(problem)))
+    refuse(*((one.severity is Severity.BLOCKING, str(one)) for one in found))
+    return found

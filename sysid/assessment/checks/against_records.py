@@ -10,7 +10,7 @@ import numpy as np
 from sysid.assessment.checks.context import Context
 from sysid.assessment.checks.gains import distinct_poles, gain_errors, wrong_gains
 from sysid.assessment.checks.leakage import leakage
-from sysid.assessment.checks.stated_mass import force_misfit
+from sysid.assessment.checks.stated_mass import MISFIT, ROUND_OFF, force_misfit
 from sysid.finding import Finding, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.spectra import of_run
@@ -20,17 +20,12 @@ from sysid.modal_analysis.response import columns
 from sysid.problem.formulation import Formulation
 from sysid.structure.structure import Array, Structure
 
-_ROUND_OFF = 1e-8  # of the records: what counts as noise where there is none
 _ALIKE = 0.5  # of the power of a motion; another that differs by more, noise included, is not the same
 _NEIGHBOURS = 11  # lines that tell the noise about one, where it is not stated
 _SEEN = 3.0  # times the noise, the least motion that two sensors can share
 _EQUAL = 1e-9  # of a sensor's motion: what counts as noise where there is none
-_MISFIT = 1.5  # times what free residues leave, beyond which a record is not what the modes make of it
 _LINES = 2  # times the free residues: fewer numbers than these tell nothing beside noise
 _MIMICKED = 1e-2  # of a constant; less of it is left where a mode far below the lines answers like one
-_CHANCE = 1e-4  # that errors as stated are so large together
-_FAR = 4.0  # standard deviations from a stated value, beyond which it is told by itself
-_MOST_SENSORS = 3  # told
 _GAIN = 0.03  # of the base's motion; smaller errors of a sensor's gain are usual
 
 
@@ -92,8 +87,8 @@ def _misfit(
     left = Records(replace(test, response=test.response - test.predict(structure)))
     misfit = float(np.sqrt(left.size / records.size))
     misses = f"{model} misses {100 * misfit:.3g} % of the accelerations"
-    possible = max(float(np.sqrt(free.squared_error / records.size)), _ROUND_OFF)
-    if misfit > _MISFIT * possible:
+    possible = max(float(np.sqrt(free.squared_error / records.size)), ROUND_OFF)
+    if misfit > MISFIT * possible:
         yield Finding(
             "misfit", Severity.CONTRADICTS,
             f"{misses}, its poles with free residues {100 * possible:.3g} %: the model, a sign or axis in rigid_body, "
@@ -104,8 +99,8 @@ def _misfit(
     poles = None if formulation.free_modes else PolesAndResidues.of(test)
     if poles is None:
         return
-    possible = max(poles.of_accelerations, _ROUND_OFF)
-    if misfit > _MISFIT * possible:
+    possible = max(poles.of_accelerations, ROUND_OFF)
+    if misfit > MISFIT * possible:
         yield Finding(
             "misfit", Severity.CONTRADICTS,
             f"{misses}, the poles of the data with free residues {100 * possible:.3g} %: the form of its mass, "
@@ -127,7 +122,7 @@ def _rigid(test: Measurement, records: Records, free: ResidueFit) -> Iterator[Fi
     moved /= np.where(reach > 0, reach, np.inf)
     most, size = np.abs(moved).argmax(axis=1), np.abs(moved).max(axis=1)
     wrong = np.flatnonzero((chi2 > beyond_chance(test.n_base)) & (size > _GAIN))
-    for i in wrong[np.argsort(-size[wrong])][:_MOST_SENSORS]:
+    for i in wrong[np.argsort(-size[wrong])][:3]:
         yield Finding(
             "rigid motion", Severity.CONTRADICTS,
             f"{test.sensor_names[i]} moves with the base beside its modes and what rigid_body says, by "
@@ -150,7 +145,7 @@ def _along_the_base(test: Measurement, records: Records, free: ResidueFit) -> tu
     along = Q.T @ free.left
     left = free.left - Q @ along
     gained = np.sum(along**2, axis=0).reshape(-1, test.n_sensors).sum(axis=0)
-    noise = records.noise(left, free.residues.size + along.size, least=_ROUND_OFF)
+    noise = records.noise(left, free.residues.size + along.size, least=ROUND_OFF)
     return records.by_sensor(np.linalg.solve(R, along)[None])[0], gained / noise
 
 
@@ -160,7 +155,7 @@ def _damping(records: Records, poles: tuple[Array, Array], free: ResidueFit) -> 
         return
     both = records.fit(*poles, velocity=True)
     extra = poles[0].size * records.n_base * records.n_sensors
-    noise = records.noise(both.left, 2 * extra, least=_ROUND_OFF)
+    noise = records.noise(both.left, 2 * extra, least=ROUND_OFF)
     gained = free.squared_error - both.squared_error
     if gained > noise * beyond_chance(extra):
         share = float(np.sqrt(gained / records.size))

@@ -9,17 +9,18 @@ from sysid.assessment.checks.context import Context
 from sysid.finding import Finding, Severity
 from sysid.modal_analysis.outliers import HUBER
 
-_IN_SQUARES = "if they are spikes or drop-outs, state Problem(..., loss='huber'), or leave these lines out"
 
-
-def outliers(context: Context) -> Iterator[Finding]:
+def numbers_far_off(context: Context) -> Iterator[Finding]:
     """Numbers far from the fit: all where they count little, else those that stand alone."""
     if context.outcome is None:
         return
     end, problem = context.outcome, context.problem
-    what, remedy = "", ""
+    remedy = ""
     if problem.loss == "squares":
-        what, remedy = ", while the lines beside them fit", _IN_SQUARES
+        what, remedy = (
+            ", while the lines beside them fit",
+            ("if they are spikes or drop-outs, state Problem(..., loss='huber'), or leave these lines out"),
+        )
     elif any(phase.name == HUBER for phase in end.history.phases):
         what = ": they count little, by Huber's loss"
     else:

@@ -8,15 +8,15 @@ import numpy as np
 from scipy.special import chdtri
 
 from sysid.assessment.checks.context import Context
+from sysid.assessment.checks.stated_mass import FAR
 from sysid.finding import Finding, Severity
 from sysid.problem.formulation import Formulation
 from sysid.structure.structure import Array
 
 _CHANCE = 1e-4  # that errors as stated are so large together
-_FAR = 4.0  # standard deviations from a stated value, beyond which it is told by itself
 
 
-def stated_values(context: Context) -> Iterator[Finding]:
+def missed_values(context: Context) -> Iterator[Finding]:
     """Stated masses, or values stated as known, cannot be met together with the records."""
     if context.outcome is not None and not context.has("bounds"):
         yield from (one for one in context.outcome.findings if one.kind == "stated masses")
@@ -30,7 +30,7 @@ def _priors(formulation: Formulation, x: Array) -> Iterator[Finding]:
     """Values that are stated as known, where errors as stated do not miss them all so far."""
     names = [name for term in formulation.priors for name in term.labels]
     off = np.concatenate([np.zeros(0), *(term.numbers(x) for term in formulation.priors)])
-    if np.sum(off**2) > chdtri(max(off.size, 1), _CHANCE) and np.all(np.abs(off) <= _FAR):
+    if np.sum(off**2) > chdtri(max(off.size, 1), _CHANCE) and np.all(np.abs(off) <= FAR):
         told = ", ".join(f"{name} by {z:+.2g}" for name, z in zip(names, off, strict=True))
         yield Finding(
             "stated values", Severity.CONTRADICTS,
