@@ -92,7 +92,7 @@ class TestDamping:
         result = sysid.identify(Problem(test, mass=FullMass()), rng=0)
         assert result.structure.n == 3
         assert not result.determined
-        assert kinds(result.contradictions) == ["damping"] and result.judgement == "doubtful"
+        assert "damping" in kinds(result.contradictions) and result.judgement == "no fit"
 
 
 class TestForce:

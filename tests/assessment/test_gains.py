@@ -131,8 +131,8 @@ class TestAnswer:
 
     def test_tells_sensor_gain_and_remedy(self, answer, noise):
         _, result = answer
-        (told,) = result.contradictions
-        assert (told.kind, told.channel) == ("gain", "sensor 2") and told.remedy
+        (told,) = result.of_kind("gain")
+        assert (told.severity, told.channel) == ("contradicts", "sensor 2") and told.remedy
         assert told.numbers["gain"] == pytest.approx(1 + ERROR, abs=max(5 * told.numbers["std"], 1e-6))
         assert told.numbers["std"] < 1e-3 if noise else 1e-6
         assert result.judgement == "doubtful"

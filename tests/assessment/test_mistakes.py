@@ -58,7 +58,8 @@ def test_each_cause_is_named_and_nothing_else(name):
 def test_mistakes_of_two_directions(change, kind, severity, channel, numbers):
     first = told(change(replace(random_test(noise=0.002), base_axes=("x", "y"))))[0]
     assert (first.kind, first.severity, first.channel) == (kind, severity, channel)
-    assert {name: first.numbers[name] for name in numbers} == pytest.approx(numbers, rel=0.03)
+    for name, value in numbers.items():  # a delay is known by the first terms of a series
+        assert first.numbers[name] == pytest.approx(value, rel=0.1 if name == "delay" else 0.03)
 
 
 def test_swapped_sensors_of_two_directions_are_told_without_any_model():

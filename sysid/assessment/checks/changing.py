@@ -233,8 +233,9 @@ class Poles(NamedTuple):
 
 def _modes(test: Measurement) -> Poles | None:
     """Poles of a test; None where it shows none."""
-    if test.modal is not None:
-        omega, ratios, shapes = test.modal.omega, test.modal.ratios, test.modal.phi
+    modal = test.modal
+    if modal is not None:
+        omega, ratios, shapes = modal.omega, modal.ratios, modal.phi
     else:
         poles = PolesAndResidues.of(test)
         if poles is None:
