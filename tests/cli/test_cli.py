@@ -22,7 +22,8 @@ FREQUENCIES = "truth.natural_frequencies"
 KEYS = {
     "problem", "strategy", "seed", "success", "message", "residual", "natural_frequencies_hz", "damping_ratios",
     "total_mass_kg", "determined", "evaluations", "wall_time_s", "version", "natural_frequencies_std_hz",
-    "damping_ratios_std", "remarks", "objective", "residuals", "unknowns", "unknowns_std", "unknown_units",
+    "damping_ratios_std", "findings", "judgement", "confidence", "objective", "residuals", "unknowns", "unknowns_std",
+    "unknown_units",
 }  # fmt: skip
 
 
