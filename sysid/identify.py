@@ -129,7 +129,7 @@ def identify(
             if told and isinstance(error, InputError):
                 raise InputError("; ".join(map(str, (*told, error)))) from error
             raise
-        result = judge(problem, outcome, why, seed, session)
+        result = judge(problem, outcome, f"strategy {why}", seed, session)
         if not isinstance(checkpoint, Checkpoint) and not result.interrupted:
             journal.entries.clear()  # so that the file goes
     return result

@@ -59,10 +59,7 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
     found = [*context.found, *end.findings, *open_]
     if not (contradicting(found) or cautions(found)):
         found = [*closed, *found, *assumed(problem)]
-    strategy, ending = (
-        Finding("strategy", Severity.NOTE, f"strategy {why}"),
-        Finding("ending", Severity.NOTE, end.message),
-    )
+    strategy, ending = Finding("strategy", Severity.NOTE, why), Finding("ending", Severity.NOTE, end.message)
     it = Identification(
         structure=end.structure,
         problem=problem,
@@ -88,7 +85,7 @@ def verdict_of(problem: Problem, end: Outcome) -> Verdict:
 
 def _verdict(context: Context) -> Verdict:
     """The same, by checks of the end of a search alone."""
-    found, end = run(replace(context, found=[]), OF_THE_END), context.end
+    found, end = [one for check in OF_THE_END for one in check(context)], context.end
     wrong = [str(one) for one in contradicting(found) if one.kind not in ("stopped", "no solution")]
     # What the solver says stands first where it did not succeed, else last.
     return Verdict(is_fit(found), "; ".join((*wrong, end.message) if end.success else (end.message, *wrong)))

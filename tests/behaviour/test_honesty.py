@@ -124,7 +124,8 @@ def test_a_stated_total_that_the_force_contradicts_is_kept_and_told():
     result = solve(truth, mass=sysid.FullMass(20.0, healing="rigid_body"), band=(0.3 * f[0], 1.3 * f[-1]))
     assert result.structure.rigid_body_mass[0, 0] == pytest.approx(20.0, rel=1e-9)
     (told,) = result.of_kind("stated mass")
-    assert told.numbers == pytest.approx({"stated 1": 20.0, "weighed 1": 12.0}, rel=1e-3)
+    assert told.numbers["stated 1"] == pytest.approx(20.0)
+    assert told.numbers["weighed 1"] == pytest.approx(12.0, rel=0.03)
 
 
 @pytest.mark.parametrize("arms", [[1, 1, 1], [1, -1, 1], [-1, -1, 1]])
