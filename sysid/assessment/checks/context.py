@@ -97,8 +97,9 @@ class Context:
 
         Beside that mistake averages over segments are looked at all the same, for their leakage.
         """
-        averaged = self.problem.screened.measurement.averaged
-        return not self.is_judged or self.has("bounds") or (bool(self.named) and not averaged)
+        if not self.is_judged or self.has("bounds"):
+            return True
+        return bool(self.named) and not self.problem.screened.measurement.averaged
 
     def has(self, *kinds: str) -> bool:
         """Whether a check before has found one of these."""

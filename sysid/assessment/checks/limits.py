@@ -20,20 +20,22 @@ def search_boxes(context: Context) -> Iterator[Finding]:
 
 def unfitted_records(context: Context) -> Iterator[Finding]:
     """Records that a misfit of the user's own replaces, and damping that nothing tells."""
+    if context.outcome is None:
+        return
     formulation = context.problem.formulation
-    if context.outcome is not None and not formulation.fits_records:
+    if not formulation.fits_records:
         told = "the problem states a misfit of its own; pictures and scores compare with the records as they are"
         yield Finding("own misfit", Severity.NOTE, told)
-    if context.outcome is not None and not formulation.tells_damping:
+    if not formulation.tells_damping:
         told = "no damping ratio is identified: no unknown of the damping alone enters what is fitted"
         yield Finding("no damping ratio", Severity.NOTE, told)
 
 
 def lines_left_out(context: Context) -> Iterator[Finding]:
     """Lines are left out for all channels, as a record holds NaN there."""
-    problem, formulation = context.problem, context.problem.formulation
     if context.outcome is None:
         return
+    problem, formulation = context.problem, context.problem.formulation
     # Not `formulation.tests`: the term of the problem's own test has matrices that the modal strategy has no use for.
     own = [problem.measurement] if formulation.fits_records else []
     tests = [*own, *(term.test for term in formulation.further_tests)]

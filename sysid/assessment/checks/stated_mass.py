@@ -25,10 +25,9 @@ FAR = 4.0  # standard deviations by which a mass, or another value, may differ f
 
 def stated_masses(context: Context) -> Iterator[Finding]:
     """A stated mass, or the base force, is not that of the modes that the accelerations show."""
-    problem = context.problem.screened
-    if context.is_explained or not problem.formulation.fits_records:
+    if context.is_explained or not context.problem.formulation.fits_records:
         return
-    structure = context.end.structure
+    problem, structure = context.problem.screened, context.end.structure
     for check in (_stated_mass, _known_entries, _lumped_total):
         yield from check(problem, structure)
     yield from force_misfit(problem.formulation, problem.measurement, structure)
