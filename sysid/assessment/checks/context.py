@@ -83,8 +83,9 @@ class Context:
     def is_judged(self) -> bool:
         """Whether a search ended by itself; what was stopped on its way has misfits of another kind."""
         end = self.outcome
-        free = self.problem.free_modes and not self.cut_short
-        return end is not None and end.stopped is None and (end.success or free)
+        if end is None or end.stopped is not None:
+            return False
+        return end.success or (self.problem.free_modes and not self.cut_short)
 
     @cached_property
     def named(self) -> tuple[Finding, ...]:
