@@ -26,7 +26,7 @@ CEILINGS = {
     # by checks that share one context (600).
     "lines": 40_941,
     # What was counted when these counts began; the modes once, in the open, brings them down.
-    "branches": 79.1,
+    "branches": 79.2,
     "files": 250,
     "main": 241,
     "modal": 67,
