@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.assessment.before_search import named_mistakes
-from sysid.assessment.bounds import bounds_explain
-from sysid.assessment.changing import changes_in_words
-from sysid.assessment.exchanged import exchanged_sensors
+from sysid.assessment.checks import check_records
+from sysid.assessment.checks.bounds import bounds_explain
+from sysid.assessment.checks.changing import changing
+from sysid.assessment.checks.exchanged import exchanged_sensors
 from sysid.errors import InputError, SolverError, finite_array, function, instance, number, path_of, whole_number
 from sysid.nlp import one_thread
 from sysid.problem.problem import Problem
@@ -62,7 +62,7 @@ def identify(
         for matrices with a form of their own: gradients from the guess and from further starts, through responses
         whose peaks were widened. A `Modal`, `Swarm` or `Continuation` object is that with other
         settings. "auto" takes the first of modal, continuation and swarm that applies, and the next where that one
-        turns out not to apply or finds no good fit; the result's remarks say which and why.
+        turns out not to apply or finds no good fit; the result's finding "strategy" says which and why.
     rng : int, numpy Generator or None
         The same seed gives the same bits. None draws one, which the result reports.
     start : array_like (n_variables,) or Structure, optional
@@ -110,7 +110,7 @@ def identify(
         kept = file.journal(identity(problem, strategy, seed, start, max_evaluations))
     with one_thread(), DeferredInterrupt() as interrupt, kept as journal:
         session = Session(listeners, interrupt, max_time, random, max_evaluations, journal)
-        named = named_mistakes(problem)
+        named = check_records(problem)
         try:
             prepare(problem, session)
             chosen, why = choose(strategy, problem, start)
@@ -118,20 +118,18 @@ def identify(
             outcome, why = _run(chosen, why, problem.screened, session, start, follow=strategy == "auto" and not named)
             outcome = settled(problem, outcome, chosen, session)
             outcome = with_stated_masses(problem.screened, outcome, session)
-            outcome = replace(outcome, mistakes=(*named, *outcome.mistakes))
+            outcome = replace(outcome, findings=(*named, *outcome.findings))
         except Stop as stop:  # before there was any structure
             raise SolverError(f"{stop}: nothing is identified") from None
         except (InputError, SolverError) as error:
             if max_time is None:  # it has ended by itself, and would end so again
                 journal.entries.clear()
             # More modes than there can be, of a structure that changes.
-            told = named or (
-                changes_in_words(problem) if isinstance(error, DoesNotApplyError | NoStrategyError) else ()
-            )
+            told = named or (changing(problem) if isinstance(error, DoesNotApplyError | NoStrategyError) else ())
             if told and isinstance(error, InputError):
-                raise InputError("; ".join((*told, str(error)))) from error
+                raise InputError("; ".join(map(str, (*told, error)))) from error
             raise
-        result = judge(problem, outcome, why, seed, session)
+        result = judge(problem, outcome, f"strategy {why}", seed, session)
         if not isinstance(checkpoint, Checkpoint) and not result.interrupted:
             journal.entries.clear()  # so that the file goes
     return result
@@ -150,15 +148,15 @@ def choose(strategy: str | Strategy, problem: Problem, start: ArrayLike | Struct
     """The strategy that is taken, and why it is."""
     _check_strategy(strategy)
     if not isinstance(strategy, str):
-        return strategy, f"strategy {strategy.name!r}, as asked"
+        return strategy, f"{strategy.name!r}, as asked"
     if strategy in NAMED:
-        return NAMED[strategy](), f"strategy {strategy!r}, as asked"
+        return NAMED[strategy](), f"{strategy!r}, as asked"
     refusals: list[str] = []
     for kind in STRATEGIES:
         refusal = kind().refusal(problem, start)
         if refusal is None:
             why = refusals[0] if refusals else "mass, stiffness and modal damping follow from poles and residues"
-            return kind(), f"strategy {kind.name!r}: {why}"
+            return kind(), f"{kind.name!r}: {why}"
         refusals.append(refusal)
     raise InputError(f"no strategy applies: {'; '.join(refusals)}")
 
@@ -175,7 +173,7 @@ def _run(
     chosen: Strategy, why: str, problem: Problem, session: Session, start: ArrayLike | Structure | None, follow: bool
 ) -> tuple[Outcome, str]:
     """Run a strategy, and under "auto" those after it while there is no good fit: the best."""
-    session.log(why)
+    session.log(f"strategy {why}")
     try:
         outcome = chosen.run(problem, session, start)
     except DoesNotApplyError as error:
@@ -187,7 +185,7 @@ def _run(
         pressed = bounds_explain(problem, outcome.structure, outcome.x)  # what they leave may look like swapped sensors
         told = exchanged_sensors(problem, outcome.structure, wholly=pressed)
         if told:
-            return replace(outcome, mistakes=told), why
+            return replace(outcome, findings=(*outcome.findings, *told)), why
     after = _after(chosen, problem, start) if follow and not (outcome.good or outcome.unanimous) else None
     if after is None or outcome.stopped is not None or not session.time_for_more:
         return outcome, why
@@ -206,7 +204,7 @@ def _instead(
 ) -> tuple[Outcome, str]:
     """Run what comes after a strategy that turned out not to apply."""
     after = _after(chosen, problem, start) or STRATEGIES[-1]()
-    why = f"strategy {after.name!r}: the {chosen.name} one does not apply ({error})"
+    why = f"{after.name!r}: the {chosen.name} one does not apply ({error})"
     try:
         return _run(after, why, problem, session, start, follow=True)
     except InputError as other:

@@ -18,10 +18,22 @@ Array = NDArray[np.floating[Any]]
 OBJECTIVE_SCALE = 1e3  # lifts a residual of 1e-8 above IPOPT's tolerance
 EXACT = 1e-8  # a relative residual that needs no second look
 _TOLERANCE = 1e-9  # of IPOPT
+_ENDED = {
+    "Solve_Succeeded": "the solver ended as it should",
+    "Solved_To_Acceptable_Level": "the solver ended near enough to its optimum",
+    "Maximum_Iterations_Exceeded": "the solver ran out of iterations",
+    "Maximum_WallTime_Exceeded": "the solver ran out of time",
+    "Infeasible_Problem_Detected": "the solver found no point that keeps the constraints",
+}
 _ROUND_OFF = 1e-11  # of constraints
 _LOADED = 3.0  # times the seconds of an idle processor that work may take on a machine that does other things too
 _GRACE = 0.4  # s, by which work may end late
 _LATE = "Maximum_WallTime_Exceeded"  # IPOPT's word, which does not count the making of the graphs
+
+
+def ended_in_words(status: str) -> str:
+    """How IPOPT ended: its status, and what that means."""
+    return f"IPOPT: {status}" + (f" ({_ENDED[status]})" if status in _ENDED else "")
 
 
 def suffices(left: float, seconds: float) -> bool:

@@ -22,19 +22,19 @@ CEILINGS = {
     # and of the older formats (620), results that can be read without their problem (680), what files from others may
     # make run, hold and claim (640), one run in a folder and mistakes of the modelling language (422), bounds that
     # press and damping of any size (350), IPOPT's refinement of each leader (310), and the inverse factor with the
-    # swarm on the models' own expressions (317).
-    "lines": 40_340,
+    # swarm on the models' own expressions (317), and findings with kind, channel and numbers in the place of sentences,
+    # by checks that share one context (600).
+    "lines": 40_941,
     # What was counted when these counts began; the modes once, in the open, brings them down.
-    "branches": 80,
-    "files": 239,
-    "main": 243,
-    "modal": 69,
-    "fits": 37,
+    "branches": 79.2,
+    "files": 250,
+    "main": 241,
+    "modal": 67,
+    "fits": 36,
     "constants": 459,
     "shared": 45,
-    "everyday": 398,
-    "sentences": 11,
-    "prose": 188,
+    "everyday": 387,
+    "prose": 141,
 }
 
 # The counting is a benchmark, which prints the same figures; `sysid` itself is not imported from the checkout.

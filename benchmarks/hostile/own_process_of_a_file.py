@@ -19,6 +19,7 @@ import numpy as np
 
 import sysid
 from sysid import catalogue
+from sysid.finding import Finding, Severity
 
 POINTS = 3  # random ones beside the answer
 PATIENCE = 30.0  # s of a search
@@ -33,7 +34,8 @@ def results_of(source: Path, searched: bool) -> list:
             return [sysid.identify(problem, rng=0, max_time=PATIENCE)]
         x = problem.formulation.guess
         structure = problem.reference or problem.structure(x)
-        made = (structure, problem, x, "none", 0, True, "", sysid.History(), False, (), ("not searched",))
+        not_searched = Finding("open", Severity.CAUTION, "not searched")
+        made = (structure, problem, x, "none", 0, sysid.History(), (not_searched,))
         return [sysid.Identification(*made)]
     found, identify = [], sysid.identify
 

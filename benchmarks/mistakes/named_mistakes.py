@@ -18,6 +18,7 @@ from benchmarks.modal.spread import spread
 SECONDS = 10.0
 EQUALLY = 1.02  # residual of the other right model over that of the true one on the right records
 ANY = "|".join(f"(?:{cause.named})" for cause in CAUSES.values())  # what accuses a test of any mistake
+MISTAKES = {cause.finding for cause in CAUSES.values()} - {""}
 RIGHT = "right"
 
 
@@ -40,10 +41,11 @@ class Cell(NamedTuple):
 
 
 class End(NamedTuple):
-    """The first sentence, all that speaks against the records, and how long a processor took, s."""
+    """The first sentence, all that speaks against the records, its kinds, and how long a processor took, s."""
 
     first: str
     said: str
+    kinds: tuple[str, ...]
     seconds: float
 
 
@@ -62,7 +64,7 @@ def lines(reduced: bool) -> Iterator[Line]:
     fits = [fit_of_other(cell) for cell in untold if cell.kind == SPECTRA]
     yield below("cells that cannot be told: residual of the other right model over the noise", max(fits), EQUALLY)
     for what, group in (("cells that cannot be told", untold), ("right tests", sound)):
-        accused = [cell for cell in group if re.search(ANY, ends[cell].said)]
+        accused = [cell for cell in group if re.search(ANY, ends[cell].said) or MISTAKES & set(ends[cell].kinds)]
         told = "".join(f"; {cell}: {ends[cell].first[:160]!r}" for cell in accused[:4])
         yield below(f"{what}, of {len(group)}: accused of a mistake{told}", len(accused), 0)
     slowest = max(ends, key=lambda cell: ends[cell].seconds)
@@ -96,11 +98,11 @@ def end_of(cell: Cell) -> End:
     begun = time.process_time()
     try:
         result = sysid.identify(problem(cell.form, (cause.made(data) if cause else data).test), rng=0)
-        told = (result.message, *result.undetermined)
+        told, kinds = (result.message, *result.undetermined), tuple(one.kind for one in result.contradictions)
         first = result.confidence[0] if result.confidence else ""
     except sysid.SysidError as error:
-        told, first = (str(error),), str(error)
-    return End(first, " | ".join(told), time.process_time() - begun)
+        told, first, kinds = (str(error),), str(error), ()
+    return End(first, " | ".join(told), kinds, time.process_time() - begun)
 
 
 def fit_of_other(cell: Cell) -> float:

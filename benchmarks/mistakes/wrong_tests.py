@@ -170,6 +170,8 @@ class Cause:
         The data with it.
     named : str
         Regular expression that the first sentence matches.
+    finding : str
+        Kind of the first finding; empty where reading refuses the records, or nothing is wrong.
     untold : dict of str to callable
         By form: the right model that fits the same records, where there is one.
     kinds : tuple of str
@@ -182,6 +184,7 @@ class Cause:
 
     made: Callable[[Data], Data]
     named: str
+    finding: str
     untold: dict[str, Callable[[sysid.Structure], sysid.Structure]] = field(default_factory=dict)
     kinds: tuple[str, ...] = (SPECTRA, RECORDS)
     force: bool | None = None
@@ -203,33 +206,38 @@ def exchanged(s: sysid.Structure) -> sysid.Structure:
 _OTHER = {"full": times(1.0, (2 * np.pi) ** 2), "lumped": times(1.0, (2 * np.pi) ** 2)}
 CAUSES = {
     "lines in rad/s": Cause(
-        lambda it: replace(it, axis=2 * np.pi * it.axis), r"rad/s.*2 pi|2 pi.*rad/s", _OTHER, (SPECTRA,)
+        lambda it: replace(it, axis=2 * np.pi * it.axis), r"rad/s.*2 pi|2 pi.*rad/s", "frequencies in rad/s", _OTHER,
+        (SPECTRA,),
     ),
-    "conjugated": Cause(_conjugated, r"conjugate", kinds=(SPECTRA,)),
-    "relative": Cause(_relative, r"relative to the base"),
-    "one sign": Cause(lambda it: _scaled(it, sensors=_one(-1.0, 1)), r"sign of storey 2"),
+    "conjugated": Cause(_conjugated, r"conjugate", "conjugated spectra", kinds=(SPECTRA,)),
+    "relative": Cause(_relative, r"relative to the base", "relative responses"),
+    "one sign": Cause(lambda it: _scaled(it, sensors=_one(-1.0, 1)), r"sign of storey 2", "sign"),
     "swapped": Cause(
-        _swapped, r"storey 2 and storey 3 .*(swapped|exchanged)", {"full": exchanged, "lumped": exchanged}
+        _swapped, r"storey 2 and storey 3 .*(swapped|exchanged)", "swapped sensors",
+        {"full": exchanged, "lumped": exchanged},
     ),
-    "swapped, rows of G differ": Cause(_swapped, r"sensor 2 and sensor 3 .*swapped", axes="x ry"),
-    "one sensor in g": Cause(lambda it: _scaled(it, sensors=_one(1 / GRAVITY, 2)), r"storey 3.*9\.81"),
-    "sensors in g": Cause(lambda it: _scaled(it, sensors=1 / GRAVITY), r"sensors.*9\.81"),
-    "base in g": Cause(lambda it: _scaled(it, base=1 / GRAVITY), r"base.*9\.81"),
+    "swapped, rows of G differ": Cause(_swapped, r"sensor 2 and sensor 3 .*swapped", "swapped sensors", axes="x ry"),
+    "one sensor in g": Cause(lambda it: _scaled(it, sensors=_one(1 / GRAVITY, 2)), r"storey 3.*9\.81", "unit"),
+    "sensors in g": Cause(lambda it: _scaled(it, sensors=1 / GRAVITY), r"sensors.*9\.81", "unit"),
+    "base in g": Cause(lambda it: _scaled(it, base=1 / GRAVITY), r"base.*9\.81", "unit"),
     "all in g, no force": Cause(
-        lambda it: _scaled(it, base=1 / GRAVITY, sensors=1 / GRAVITY), "nothing is wrong",
+        lambda it: _scaled(it, base=1 / GRAVITY, sensors=1 / GRAVITY), "nothing is wrong", "",
         {form: times(1.0, 1.0) for form in FORMS}, force=False,
     ),
     "all in g": Cause(
-        lambda it: _scaled(it, base=1 / GRAVITY, sensors=1 / GRAVITY), r"9\.81",
+        lambda it: _scaled(it, base=1 / GRAVITY, sensors=1 / GRAVITY), r"9\.81", "force unit",
         {"full": times(GRAVITY, GRAVITY)}, force=True,
     ),
-    "force sign": Cause(lambda it: _scaled(it, force=-1.0), r"sign of the base force", force=True),
-    "force in kN": Cause(lambda it: _scaled(it, force=1e-3), r"force.*1,000", {"full": times(1e-3, 1e-3)}, force=True),
-    "one gain 1.3": Cause(lambda it: _scaled(it, sensors=_one(1.3, 2)), r"gain.*storey 3"),
-    "positions in mm": Cause(_in_millimetres, r"positions.*1,000", axes="x ry"),
-    "short segments": Cause(
-        lambda it: replace(it, estimator="h1", segment=round(SHORT * it.axis)), r"segments", kinds=(RECORDS,)
+    "force sign": Cause(lambda it: _scaled(it, force=-1.0), r"sign of the base force", "force sign", force=True),
+    "force in kN": Cause(
+        lambda it: _scaled(it, force=1e-3), r"force.*1,000", "force unit", {"full": times(1e-3, 1e-3)}, force=True
     ),
-    "clock skew": Cause(_late, r"late|delay"),
-    "tapered": Cause(_tapered, r"window|taper|fade", kinds=(RECORDS,)),
+    "one gain 1.3": Cause(lambda it: _scaled(it, sensors=_one(1.3, 2)), r"gain.*storey 3", "gain"),
+    "positions in mm": Cause(_in_millimetres, r"positions.*1,000", "positions", axes="x ry"),
+    "short segments": Cause(
+        lambda it: replace(it, estimator="h1", segment=round(SHORT * it.axis)), r"segments", "short segments",
+        kinds=(RECORDS,),
+    ),
+    "clock skew": Cause(_late, r"late|delay", "late sensor"),
+    "tapered": Cause(_tapered, r"window|taper|fade", "", kinds=(RECORDS,)),
 }  # fmt: skip

@@ -87,7 +87,7 @@ def compared(case: Case) -> tuple[float, str, str, str]:
         usual, _ = identified(case, _damped(truth, np.full(len(truth.omega), USUAL)))
     except sysid.SysidError as error:
         return np.inf, "an error", "", str(error)
-    said = "; ".join((*result.undetermined, *result.remarks))
+    said = "; ".join(result.confidence)
     return result.residual / floor, result.judgement, usual.judgement, said
 
 

@@ -24,7 +24,6 @@ FAR = 3.0  # stated deviations
 RANDOM, STOREYS, RIGHT = 36, 4, 300  # structures of each kind, and right tests with 1 % noise
 CHANCE = 1 / 300  # of right records that may be accused
 COMMON = 70  # % of the sensors of right tests whose gain may be told as one that M_SS rests on
-RESTS = "the intervals of M_SS take the gain of each sensor to be exactly 1"
 
 
 class Case(NamedTuple):
@@ -78,12 +77,8 @@ def outcome(case: Case) -> Outcome:
         result = sysid.identify(case.problem, rng=0)
     except sysid.InputError as error:
         return Outcome(False, "gain" in str(error), np.inf, sensors=sensors)
-    accused = [sentence for sentence in result.undetermined if "gain" in sentence]
-    rests = [sentence for sentence in result.remarks if RESTS in sentence]
-    told = frozenset(
-        name for name in case.test.sensor_names
-        if any(f"{name} by " in it for it in accused) or any(f"{name} (" in it for it in rests)
-    )  # fmt: skip
+    accused = result.of_kind("gain")
+    told = frozenset(one.channel for one in (*accused, *result.of_kind("gain not shown")) if one.channel)
     n = case.truth.n
     if result.structure.n != n:
         return Outcome(result.determined, bool(accused), np.inf, told, sensors)

@@ -22,7 +22,6 @@ from sysid.results import judgement
 
 NOISE = 0.01
 DRAWS = range(20)
-TOLD = "another structure explains the data as well"
 VALUE = re.compile(r"= ([-+.0-9e]+) in place of")
 NEAR = 0.02  # relative, of a told value from the other answer to the one found
 SECONDS, LOOK = 10.0, 4.0  # that a user may wait for an answer, and of these for the search for other answers
@@ -128,7 +127,7 @@ def _tells(chain: Chain, seed: int) -> bool:
     """Whether the other answer is told by its values, and the first not called determined."""
     result = sysid.identify(chain.problem(seed), rng=seed)
     assert result.x is not None
-    others = [sentence for sentence in result.undetermined if sentence.startswith(TOLD)]
+    others = [one.sentence for one in result.of_kind("other answers")]
     values = [np.array([float(value) for value in VALUE.findall(sentence)]) for sentence in others]
     expected = chain.other(result.x)
     right = [v.shape == expected.shape and np.allclose(v, expected, rtol=NEAR) for v in values]
@@ -152,7 +151,7 @@ def _accused(problem: sysid.Problem, seed: int, clock: Callable[[], float]) -> t
         result = sysid.identify(problem, rng=seed)
     finally:
         judgement.with_other_answers = look
-    return any(TOLD in sentence for sentence in result.undetermined), clock() - begun, sum(looked)
+    return bool(result.of_kind("other answers")), clock() - begun, sum(looked)
 
 
 def _of_module(name: str) -> Callable[[int], sysid.Problem]:

@@ -148,7 +148,7 @@ def _known(truth: sysid.Structure, count: int) -> np.ndarray:
 
 
 def _contradicted(found: sysid.Identification) -> str:
-    return " ".join(sentence for sentence in found.undetermined if "cannot all be met" in sentence)
+    return " ".join(map(str, found.of_kind("stated masses")))
 
 
 def _squared_error(truth: sysid.Structure, found: sysid.Identification) -> float:

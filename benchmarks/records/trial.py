@@ -113,7 +113,7 @@ def judged(group: str, result: sysid.Identification, truth: sysid.Structure, lea
         if np.any(free):
             width = (high - low) / (2 * norm.ppf((1 + LEVEL) / 2))
             stated[name] = float(np.exp(np.mean(np.log(width / std[part][free]))))
-    accusations = [*result.against, *(s for s in result.remarks if "deviations from the fit" in s)]
+    accusations = [str(one) for one in (*result.contradictions, *result.of_kind("outliers"))]
     return Trial(
         group, result.determined, found.n, held, ratios, stated, _levels(result, levels), tuple(accusations),
         result.undetermined,

@@ -25,6 +25,7 @@ from sysid.assessment.sensitivity import (
 )  # fmt: skip
 from sysid.assessment.uncertainty import LARGE, uncertainty
 from sysid.errors import InputError
+from sysid.finding import Finding, Severity, cautions
 from sysid.models.unknowns import scales_of, split
 from sysid.nlp import EXACT
 from sysid.problem.formulation import Formulation
@@ -52,19 +53,30 @@ class Determination:
 
     Attributes
     ----------
-    determined : bool
-    closed_by : tuple of str
-        What fixes them, or the modal masses where these alone are fixed, in sentences.
-    undetermined : tuple of str
-        What is left open, in sentences; empty where determined.
+    findings : tuple of Finding
+        What is left open ("open", and "other answers" that were found), and what fixes them, or the modal masses where
+        these alone are fixed ("fixed").
     judged_by : str
         `BY_CONE` or `BY_RANK`.
     """
 
-    determined: bool
-    closed_by: tuple[str, ...]
-    undetermined: tuple[str, ...]
+    findings: tuple[Finding, ...]
     judged_by: str
+
+    @property
+    def determined(self) -> bool:
+        """Whether nothing is left open."""
+        return not cautions(self.findings)
+
+    @property
+    def closed_by(self) -> tuple[str, ...]:
+        """What fixes the matrices, in sentences."""
+        return tuple(one.sentence for one in self.findings if one.kind == "fixed")
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """What is left open, in sentences; empty where determined."""
+        return tuple(one.sentence for one in cautions(self.findings))
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,12 +120,20 @@ def determine(problem: Problem, structure: Structure, x: Array | None, rivals: S
         closed, open_ = modal_mass_cone.verdict(problem, structure)
         beside = tuple(_open_outside(problem.formulation, x))
         if open_:  # other answers are members of the cone
-            return Determination(False, closed, (*open_, *beside), BY_CONE)
+            return Determination((*_open((*open_, *beside)), *_fixed(closed)), BY_CONE)
         others = tuple(_others(problem, structure, x, rivals))
-        return Determination(not others, closed if others else (*closed, *beside), others, BY_CONE)
+        return Determination((*others, *_fixed(closed if others else (*closed, *beside))), BY_CONE)
     closed, open_ = _by_rank(problem, structure, x)
-    open_ = (*open_, *_others(problem, structure, x, rivals))
-    return Determination(not open_, () if open_ else closed, open_, BY_RANK)
+    found = (*_open(open_), *_others(problem, structure, x, rivals))
+    return Determination(found or _fixed(closed), BY_RANK)
+
+
+def _open(sentences: Sequence[str]) -> tuple[Finding, ...]:
+    return tuple(Finding("open", Severity.CAUTION, sentence) for sentence in sentences)
+
+
+def _fixed(sentences: Sequence[str]) -> tuple[Finding, ...]:
+    return tuple(Finding("fixed", Severity.NOTE, sentence) for sentence in sentences)
 
 
 def intervals(problem: Problem, structure: Structure, x: Array | None) -> Intervals:
@@ -253,7 +273,7 @@ def _open_outside(formulation: Formulation, x: Array | None) -> Iterator[str]:
         yield f"no term sees a change of {'; nor of '.join(words)}; {_SAME_MATRICES}"
 
 
-def _others(problem: Problem, structure: Structure, x: Array | None, rivals: Sequence[Array]) -> Iterator[str]:
+def _others(problem: Problem, structure: Structure, x: Array | None, rivals: Sequence[Array]) -> Iterator[Finding]:
     """Other answers whose matrices are others."""
     if x is None:
         return
@@ -264,7 +284,9 @@ def _others(problem: Problem, structure: Structure, x: Array | None, rivals: Seq
         far = [j for j in np.argsort(-off, kind="stable")[:_TOLD] if off[j] > _OTHER]
         told = ", ".join(f"{labels[j]} = {other[j]:.4g} in place of {x[j]:.4g}" for j in sorted(far))
         if _other_matrices(problem, structure, x, other):
-            yield ": ".join(filter(None, ("another structure explains the data as well", told)))
+            sentence = ": ".join(filter(None, ("another structure explains the data as well", told)))
+            numbers = {labels[j]: float(other[j]) for j in sorted(far)}
+            yield Finding("other answers", Severity.CAUTION, sentence, numbers=numbers)
 
 
 def _other_matrices(problem: Problem, mine: Structure, x: Array, other: Array) -> bool:

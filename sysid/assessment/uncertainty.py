@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.assessment.gains import gain_errors
+from sysid.assessment.checks.gains import gain_errors
 from sysid.assessment.information import gain_gradients, information, spectra_of, spread
 from sysid.assessment.modal_mass_cone import open_modes
 from sysid.assessment.parametrisation import parametrisation

@@ -1,9 +1,9 @@
 """Commands: ``sysid list``, ``new``, ``read``, ``show``, ``run``, ``compare``, ``refine``, ``report``, ``export``.
 
 What they say is words, or with ``--json`` one document, on standard output; progress, warnings and mistakes are on
-standard error. Exit status: 0 success; 1 the search did not reach its goal; 2 a mistake in what was given, told in
-one line; 130 interrupted, with the best so far saved; 70 an error of sysid itself, told in one line
-with the traceback in a log file.
+standard error. Exit status: 0 determined or one of many; 1 doubtful or no fit; 2 a mistake in what was given, told in
+one line; 130 interrupted, with the best so far saved; 70 an error of sysid itself, told in one line with the traceback
+in a log file.
 """
 
 from __future__ import annotations
@@ -209,7 +209,7 @@ def _run_in(folder: Path, options: argparse.Namespace, out: Output) -> int:
         on = f"; '{unfinished.command(search, folder)}' goes on" if checkpoint.exists else ""
         out.complain(f"interrupted; the {'best so far' if result.interrupted else 'result'} is in {folder}{on}")
         return INTERRUPTED
-    return SUCCESS if result.success else NOT_REACHED
+    return SUCCESS if result.judgement in ("determined", "one of many") else NOT_REACHED
 
 
 def _compare(options: argparse.Namespace, out: Output) -> int:
@@ -245,7 +245,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog=epilog(
             ("sysid run cantilever_tower", "sysid read sine.csv --sensors sensors.toml --out test.h5",
              "sysid run test.h5 --mass 1450", "sysid export results/test test.bdf", "sysid run --help"),
-            "Exit status: 0 success, 1 the search did not reach its goal, 2 a mistake in what was\n"
+            "Exit status: 0 determined or one of many, 1 doubtful or no fit, 2 a mistake in what was\n"
             "given, 130 interrupted (the best so far is saved), 70 an error of sysid itself.",
         ),
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -107,7 +107,7 @@ def _test(problem: Problem, name: str) -> Iterator[str]:
     )
     known = [sentence for holds, sentence in stated if holds]
     yield "; ".join([f"degrees of freedom {problem.geometry.n}, unknowns {problem.n_variables}", *known])
-    yield f"--strategy auto takes {choose('auto', problem, None)[1].removeprefix('strategy ')}"
+    yield f"--strategy auto takes {choose('auto', problem, None)[1]}"
 
 
 def _records(test: Measurement) -> str:
@@ -163,6 +163,8 @@ class _Point:
     known: Sensitivity
     where: str
     sentences: tuple[str, ...] = ()
+    at_guess: bool = False
+    in_box: bool = False  # a point of the search space, the guess or another
 
 
 def _point(problem: Problem) -> _Point:
@@ -180,13 +182,14 @@ def _at_guess(problem: Problem, sentences: tuple[str, ...]) -> _Point:
     free = problem.formulation.stiffness.free
     why = "as the guess has all frequencies equal" if free else "as the guess makes no structure with derivatives"
     names = ["the guess", *[f"a point of the search space, {why}"] * (_TRIED - 1)]
-    point = _first_judged(problem, names, free)
+    guess = _first_judged(problem, names[:1], free)
+    point = guess or _first_judged(problem, names, 1)
     if point is None:
         raise InputError(
             f"neither the guess nor any of {_TRIED - 1} points of the search space makes a structure with finite "
             "derivatives: state a guess, or tighter bounds"
         )
-    return replace(point, sentences=sentences)
+    return replace(point, sentences=sentences, at_guess=guess is not None, in_box=True)
 
 
 def _first_judged(problem: Problem, names: Sequence[str], start: int) -> _Point | None:
@@ -278,7 +281,7 @@ def _at(problem: Problem, point: _Point) -> Iterator[str]:
     noise = "the stated noise" if _all_stated(problem) else f"{100 * _NOISE:g} % noise"
     moves = _moves(problem, point)
     free = known.free.shape[1]
-    missed = problem.reference is not None and "guess" in point.where
+    missed = problem.reference is not None and point.in_box
     yield f"At {point.where}" + (" (the models cannot be inverted to the reference):" if missed else ":")
     yield from _values(problem, point, moves, noise)
     yield from _coordinates(problem)
@@ -348,8 +351,7 @@ def _unseen(problem: Problem, point: _Point) -> Iterator[str]:
     more = f" (the {_SHORTEST} shortest of {len(words)})" if len(words) > _SHORTEST else ""
     yield f"  - unseen{more}:"
     yield from (f"      {word}" for word in words[:_SHORTEST])
-    guessed = point.where.startswith("the guess")
-    other = _first_judged(problem, ["another point of the search space"] * _TRIED, 1) if guessed else None
+    other = _first_judged(problem, ["another point of the search space"] * _TRIED, 1) if point.at_guess else None
     if other is not None and other.known.rank > known.rank:
         yield (
             "  - this point is special, by a symmetry for instance: at another point of the search space the records "

@@ -61,24 +61,19 @@ def _records_rotation(it: Identification, sensor: int) -> bool:
 
 _WORTH = {
     "no fit": "NO FIT: these matrices do not explain the records as they should",
+    "doubtful": "DOUBTFUL: something speaks against this model, so that these matrices may be wrong",
     "determined": "determined: data and stated model fix every entry of the matrices",
     "one of many": "ONE OF MANY: other matrices explain the records as well, or noise leaves entries open; "
     "frequencies, damping ratios and responses to base motion hold",
 }
-_DOUBTED = "ONE OF MANY: something speaks against this model, so that these matrices may be wrong"
 _INTERRUPTED = "the search was interrupted, these are the best matrices until then; "
 
 
 def worth(it: Identification) -> str:
     """What the matrices are worth, in one line that names the statements which tell why."""
-    told = _DOUBTED if it.success and it.against else _WORTH[it.judgement]
-    why = " and ".join(f"'{word}'" for word, texts in (("against", it.against), ("open", left_open(it))) if texts)
-    return _INTERRUPTED * it.interrupted + told + (f"; see {why}" if why else "")
-
-
-def left_open(it: Identification) -> tuple[str, ...]:
-    """What is open besides what speaks against the answer."""
-    return tuple(text for text in it.undetermined if text not in it.against)
+    parts = (("against", it.contradictions), ("open", it.open_findings))
+    why = " and ".join(f"'{word}'" for word, findings in parts if findings)
+    return _INTERRUPTED * it.interrupted + _WORTH[it.judgement] + (f"; see {why}" if why else "")
 
 
 def statements(it: Identification, precision: str) -> tuple[str, ...]:
@@ -91,8 +86,8 @@ def statements(it: Identification, precision: str) -> tuple[str, ...]:
         f"search: {it.message}",
         *(f"fixed by: {text}" for text in it.closed_by),
         *(f"assumed: {text}" for text in it.facts.assumed),
-        *(f"against: {text}" for text in it.against),
-        *(f"open: {text}" for text in left_open(it)),
+        *(f"against: {one}" for one in it.contradictions),
+        *(f"open: {one}" for one in it.open_findings),
         "units: kg, m, s, N, rad; frequencies in Hz; damping ratios are fractions of critical damping",
         f"rows and columns: {structure.n} of the structure, then {structure.n_base} of the base ({base}); motions are "
         "absolute, and moments refer to the point at which the base motion is given",

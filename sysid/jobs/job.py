@@ -144,7 +144,7 @@ def _identified(job: Job, session: Session) -> JobResult:
         if result.interrupted:
             raise KeyboardInterrupt
     score = scored(result, None if job.change is None else _predicted(problem, result, job.change))
-    success, message = result.success, "; ".join((*result.against, result.message))
+    success, message = result.success, "; ".join((*map(str, result.contradictions), result.message))
     if score.numbers <= score.parameters:
         success = False
         message = f"{message}; {score.numbers} numbers of the records do not suffice for {score.parameters} parameters"

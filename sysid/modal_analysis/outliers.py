@@ -48,6 +48,7 @@ from sysid.modal_analysis.response import gains
 from sysid.modal_analysis.vector_fitting import Monitor, poles_from, poles_of_any_damping
 from sysid.structure.structure import Array, ComplexArray, Structure
 
+HUBER = "Huber's loss"  # the phase of its rounds
 TUNING = 1.06147  # c, in units of sqrt(E|e|²): 95 % efficient where the noise is normal
 _FAR = 5.0  # deviations, beyond which one number in 10^10 is chance
 _BESIDE = 5.0  # times the numbers beside it: as much as a wrong pole leaves of a peak one line wide

@@ -97,13 +97,13 @@ def check_finite(name: str, numbers: Array, expression: ca.MX) -> None:
         raise InputError(f"{name} {where}is {numbers[tuple(at)]:g} at the guess{written_in(entry)}")
 
 
-def written_in(expression: ca.MX) -> str:
+def written_in(expression: ca.MX, lead: str = "; it is") -> str:
     """The variables of an expression with their declarations, for the end of a message."""
     found = [v for v in map(variable_of, ca.symvar(expression)) if v is not None]
     if not found:
         return ""
     named = ", ".join(f"{v.name!r} ({v.declared})" for v in found[:6])
-    return f"; it is written in {named}" + (f" and {len(found) - 6} more" if len(found) > 6 else "")
+    return f"{lead} written in {named}" + (f" and {len(found) - 6} more" if len(found) > 6 else "")
 
 
 def at_point(name: str, expression: ca.MX, share: float | None) -> Array:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.rigid_body import axis_vector
+from sysid.modal_analysis.outliers import HUBER
 from sysid.plot.canvas import (
     COLOURS,
     FAINT,
@@ -42,7 +43,6 @@ from sysid.plot.panels import (
 )  # fmt: skip
 from sysid.results.identification import Identification
 from sysid.results.summary import counted
-from sysid.search.strategy import HUBER
 from sysid.structure.structure import Array
 
 if TYPE_CHECKING:

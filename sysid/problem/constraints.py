@@ -61,4 +61,4 @@ def row_of(number: int, value: Any) -> Row:
             f"k[0] <= k[1] or ca.sum1(m) == 9{written_in(relation) if isinstance(relation, ca.MX) else ''}"
         )
     row = column_of(name, relation.dep(0) - relation.dep(1))
-    return Row(row, lower, name + written_in(relation).replace("; it is", ","))
+    return Row(row, lower, name + written_in(relation, ","))

@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from sysid.errors import InputError, finite_array, instance, refuse
+from sysid.finding import Finding, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import misfit_rows
 from sysid.modal_analysis.response import residual, weights_of_test
@@ -60,8 +61,8 @@ class Term(Protocol):
         Noise of records that is larger than stated counts as the misfit shows it, unless `as_stated`.
         """
 
-    def doubts(self, x: Array) -> Sequence[str]:
-        """What speaks against the fit at x, in sentences."""
+    def findings(self, x: Array) -> Sequence[Finding]:
+        """What speaks against the fit at x."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +155,7 @@ class TestTerm:
         slopes = slopes or slopes_of(self.matrices, x, self.test)
         return stacked_rows(rows_of_test(self.test, slopes, x.size, share=self.weight, as_stated=as_stated))
 
-    def doubts(self, x: Array) -> Sequence[str]:
+    def findings(self, x: Array) -> Sequence[Finding]:
         """None of its own: records are checked in `sysid.assessment.checks`."""
         return ()
 
@@ -215,11 +216,16 @@ class ExpressionTerm:
             std = max(float(np.linalg.norm(left)) / np.sqrt(max(left.size - x.size, 1)), 1e-15)
         return Rows(self.weight * left, self.weight * slope, np.full(left.size, self.weight * std))
 
-    def doubts(self, x: Array) -> Sequence[str]:
+    def findings(self, x: Array) -> Sequence[Finding]:
         """Values known to some accuracy from which the fit is far."""
         return [
-            f"{name} ends {abs(off):.3g} of the stated standard deviations from the value that is stated as known: "
-            "that value, its deviation, or the model is wrong"
+            Finding(
+                "stated value",
+                Severity.CONTRADICTS,
+                f"{name} ends {abs(off):.3g} of the stated standard deviations from the value that is stated as known",
+                "that value, its deviation, or the model is wrong",
+                numbers={name: float(off)},
+            )
             for name, off in zip(self.labels, self.numbers(x) if self.labels else (), strict=True)
             if abs(off) > _FAR
         ]

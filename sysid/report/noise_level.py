@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.assessment.model_error import noise_at_most
+from sysid.assessment.checks.noise_multiples import noise_at_most
 from sysid.measurement.measurement import Measurement
 from sysid.structure.structure import Array, ComplexArray, Structure
 

@@ -9,14 +9,12 @@ import numpy as np
 from sysid.report.html import bullets, number, paragraph, sentence, table, text
 from sysid.report.matrices import stated
 from sysid.report.noise_level import NoiseLevel, share_of_all_noise
-from sysid.results.answer import NOT_JUDGED
 from sysid.results.deck_masses import deck_masses
 from sysid.results.identification import Identification
-from sysid.results.summary import DEVIATES, counted, fitted_in_words, half_width, next_steps, verdict
+from sysid.results.summary import DEVIATES, JUDGEMENTS, counted, fitted_in_words, half_width, next_steps, verdict
 from sysid.results.unknowns_table import rows_of
 
-_KIND = {"determined": "good", "one of many": "warn", "no fit": "bad"}
-_WORD = {"determined": "Determined", "one of many": "One of many", "no fit": "No fit"}
+_COLOUR = {"determined": "good", "one of many": "warn", "doubtful": "warn", "no fit": "bad"}
 _HOLDS = (
     "frequencies, damping ratios and responses to base motion hold whichever of these models is taken; mass, stiffness "
     "and damping matrices are one choice"
@@ -27,33 +25,25 @@ _MOST_MODES, _MOST_UNKNOWNS = 4, 5  # whose figures stand in the opening; all of
 
 def opening(it: Identification, level: NoiseLevel) -> str:
     """HTML of what was identified, the judgement, the next thing to do, and the figures; `level` of the records."""
-    word = "Stopped before its end: the best until then. " * it.interrupted + _WORD[it.judgement]
-    judged = paragraph(_meaning(it)) + _reasons(it) + f"<p><b>Next:</b> {text(_steps(it)[0])}</p>"
-    box = f'<div class="verdict {_KIND[it.judgement]}"><strong>{text(word)}</strong>{judged}</div>'
+    word = "Stopped before its end: the best until then. " * it.interrupted + JUDGEMENTS[it.judgement]
+    judged = paragraph(sentence(verdict(it))) + _reasons(it) + f"<p><b>Next:</b> {text(_steps(it)[0])}</p>"
+    box = f'<div class="verdict {_COLOUR[it.judgement]}"><strong>{text(word)}</strong>{judged}</div>'
     rows = [*_masses(it), *_deck_masses(it), *_unknowns(it), *_modes(it), *_fit(it, level)]
     return _subject(it) + box + table(["", ""], rows, words=True)
 
 
 def trust(it: Identification) -> str:
     """HTML of what speaks against the answer, what is open, what fixes it, and what to measure next."""
-    (against, open_), steps = _weighed(it), _steps(it)
+    open_, steps = [str(one) for one in it.open_findings], _steps(it)
+    open_ += [_HOLDS] * bool(open_ and it.success and it.is_one_of_many)
     parts = [
-        ("What speaks against it", against),
+        ("What speaks against it", [str(one) for one in it.contradictions]),
         ("What the data do not determine", open_),
         ("What fixes the matrices", it.closed_by),
         ("What to measure or to do next", steps if len(steps) > 1 else ()),  # one alone stands in the opening
-        ("To be known besides", it.remarks[1:]),
+        ("To be known besides", [str(one) for one in it.notes]),
     ]
     return "".join(f"<h3>{name}</h3>{bullets(map(sentence, told))}" for name, told in parts if told)
-
-
-def _weighed(it: Identification) -> tuple[list[str], list[str]]:
-    """What speaks against the answer, and what is open besides."""
-    against = list(it.against)
-    open_ = [told for told in it.undetermined if told not in against]
-    if open_ and it.success and it.is_one_of_many:
-        open_.append(_HOLDS)
-    return against, open_
 
 
 def _subject(it: Identification) -> str:
@@ -70,21 +60,17 @@ def _subject(it: Identification) -> str:
     return paragraph(told, "soft")
 
 
-def _meaning(it: Identification) -> str:
-    return sentence(verdict(it).partition(": ")[2] or verdict(it))
-
-
 def _reasons(it: Identification) -> str:
     """HTML of what speaks against the answer most."""
-    return bullets(map(sentence, it.against[:_MOST_AGAINST]))
+    return bullets(sentence(str(one)) for one in it.contradictions[:_MOST_AGAINST])
 
 
 def _steps(it: Identification) -> list[str]:
     """What to do next, the first thing first."""
-    steps = [sentence(step.removeprefix("to close it: ")) for step in next_steps(it)]
+    steps = [sentence(step) for step in next_steps(it)]
     if steps:
         return steps
-    if it.hurried or NOT_JUDGED in it.undetermined:
+    if it.hurried or it.of_kind("not judged"):
         return ["Give it more time (--max-time, max_time=): what it is worth was not judged."]
     if it.judgement == "one of many":
         return ["Measure more closely what is not known well enough: it is named below."]

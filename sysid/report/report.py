@@ -35,8 +35,8 @@ from sysid.results.noise_table import NOISE_COLUMNS, noise_of_channels
 from sysid.results.phases import COLUMNS, seconds_in_words
 from sysid.results.storage import atomically, file_or_folder
 from sysid.results.summary import (
+    JUDGEMENTS,
     counted,
-    ending_in_words,
     half_width,
     is_one_of_many,
     known_half_width,
@@ -437,8 +437,8 @@ def _how(it: Identification) -> str:
     all_records += "; outliers that stand alone are left out" * (it.records.loss == "huber")
     of = all_records if it.residuals else "of the misfit that the problem states"
     lines = [
-        f"{'Success' if it.success else 'No success'}. The search: {ending_in_words(it)}.",
-        *map(sentence, it.remarks[:1]),
+        f"{JUDGEMENTS[it.judgement]}. The search: {it.message}.",
+        *(sentence(str(one)) for one in it.of_kind("strategy")),
         f"Relative residual {residual_in_words(it)}, {of}.",
         f"Objective {it.objective:.3e}: all that is fitted, each record weighted by its noise.",
     ]

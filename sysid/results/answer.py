@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from sysid.errors import InputError
+from sysid.finding import (
+    KINDS,
+    Finding,
+    Judgement,
+    Severity,
+    cautions,
+    contradicting,
+    is_fit,
+    judgement_of,
+    weightiest_first,
+)
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.outliers import Outlier
@@ -21,12 +33,11 @@ from sysid.search.strategy import History
 from sysid.structure.structure import Array, ComplexArray, Structure
 
 if TYPE_CHECKING:
+    from sysid.assessment.checks.gains import GainErrors
     from sysid.assessment.determination import Intervals
-    from sysid.assessment.gains import GainErrors
     from sysid.assessment.uncertainty import Uncertainty
     from sysid.results.facts import Facts
 
-NOT_JUDGED = "what data and model determine, and how far noise leaves it known, was not judged: the time was over"
 _QUICK_SHAPES = 1000  # entries of the mode shapes up to which uncertainty takes a second or less
 _QUICK_DOFS = 20  # degrees of freedom up to which intervals take a few seconds or less
 _DOFS_AT_ONCE = 6  # the same for a tenth of a second: 84 linear programmes
@@ -45,26 +56,12 @@ class Answer:
         freedom than the sensors.
     strategy : str
     seed : int or None
-    success : bool
-        The last solver's status is good, and the residual meets the goal; where none is given, what is left is at most
-        three times the noise of the records, and below one half of them.
-    message : str
-        What the solver and the search say of how they ended.
     history : History
-    determined : bool
-        Every entry of M_SS, K_SS and C is fixed by the data and the stated model, nothing speaks against the fit, and
-        noise leaves each entry known to a tenth of the root of its two diagonal entries (standard deviation).
-    closed_by, undetermined : tuple of str
-        What fixes it, empty where anything is open; and what leaves it open, in sentences: those `against` first.
-    remarks : tuple of str
-        How it was done, and why so, in sentences.
+    findings : tuple of Finding
+        All that checks found, the weightiest first: what speaks against the answer, what is open, what fixes it, and
+        what is to be known besides. `judgement`, `success`, `determined` and all sentences follow from them.
     interrupted : bool
         The search was stopped by Ctrl-C, and this is the best until then.
-    against : tuple of str
-        What speaks against the answer, in sentences, the weightiest first: why it is no success, what explains that,
-        and signs of wrong records, statements or models. None where the matrices are merely not the only ones.
-    changing : bool
-        Frequencies change between parts of the records, so that no structure of constant matrices explains them.
     hurried : bool
         For want of time summaries leave out what is not computed yet; not stored.
     """
@@ -74,16 +71,9 @@ class Answer:
     x: Array | None
     strategy: str
     seed: int | None
-    success: bool
-    message: str
     history: History
-    determined: bool
-    closed_by: tuple[str, ...]
-    undetermined: tuple[str, ...]
-    remarks: tuple[str, ...] = ()
+    findings: tuple[Finding, ...]
     interrupted: bool = False
-    against: tuple[str, ...] = field(default=(), kw_only=True)
-    changing: bool = field(default=False, kw_only=True)
     hurried: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
@@ -109,15 +99,58 @@ class Answer:
         return part
 
     @property
-    def judgement(self) -> Literal["determined", "one of many", "no fit"]:
+    def judgement(self) -> Judgement:
         """What the matrices are worth, in a word.
 
-        "determined" as the field of that name; "one of many" where other matrices explain the records as well, noise
-        leaves entries open, or something speaks against the fit; "no fit" without `success`.
+        "determined": nothing speaks against the fit, data and stated model fix every entry of M_SS, K_SS and C, and
+        noise leaves each known to a tenth of the root of its two diagonal entries (standard deviation). "one of many":
+        other matrices explain the records as well, noise leaves entries open, or that was not judged. "doubtful": a
+        fit, but a finding contradicts it. "no fit" without `success`.
         """
-        if not self.success:
-            return "no fit"
-        return "determined" if self.determined else "one of many"
+        return judgement_of(self.findings)
+
+    @property
+    def success(self) -> bool:
+        """Whether there is a fit, doubtful ones among them: all but "no fit".
+
+        The last solver's status is good, and the residual meets the goal; where none is given, what is left is at most
+        three times the noise of the records, and below one half of them.
+        """
+        return is_fit(self.findings)
+
+    @property
+    def determined(self) -> bool:
+        """Whether the judgement is "determined"."""
+        return self.judgement == "determined"
+
+    @property
+    def contradictions(self) -> tuple[Finding, ...]:
+        """Findings that speak against the answer."""
+        return contradicting(self.findings)
+
+    @property
+    def open_findings(self) -> tuple[Finding, ...]:
+        """Findings of what is open besides."""
+        return cautions(self.findings)
+
+    @property
+    def notes(self) -> tuple[Finding, ...]:
+        """What is to be known besides, but for why the strategy was taken, and how it ended."""
+        return self.of_kind(*(set(KINDS) - {"fixed", "strategy", "ending"}), severity=Severity.NOTE)
+
+    def of_kind(self, *kinds: str, severity: Severity | None = None) -> tuple[Finding, ...]:
+        """Findings of these kinds, and of one severity if it is given."""
+        return tuple(one for one in self.findings if one.kind in kinds and severity in (None, one.severity))
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """What speaks against the answer and what leaves it open, in sentences."""
+        return tuple(map(str, (*self.contradictions, *self.open_findings)))
+
+    @property
+    def closed_by(self) -> tuple[str, ...]:
+        """What fixes the matrices, in sentences; empty where anything is open."""
+        return tuple(map(str, self.of_kind("fixed")))
 
     @property
     def confidence(self) -> tuple[str, ...]:
@@ -126,8 +159,19 @@ class Answer:
         Why there is no fit; what speaks against it, and what is open; what fixes the matrices where nothing is; and
         what else is to be known of records, bounds and sensors.
         """
-        # The first remark tells why the strategy was taken.
-        return tuple(dict.fromkeys((*self.against, *self.undetermined, *self.closed_by, *self.remarks[1:])))
+        return (*self.undetermined, *self.closed_by, *map(str, self.notes))
+
+    @property
+    def message(self) -> str:
+        """What the solver and the search say of how they ended."""
+        return "; ".join(map(str, self.of_kind("ending")))
+
+    def with_findings(self, findings: Iterable[Finding]) -> Self:
+        """The same with further findings; what fixes the matrices is left out where they leave any open."""
+        every = (*self.findings, *findings)
+        if judgement_of(every) != "determined":
+            every = tuple(one for one in every if one.kind != "fixed")
+        return replace(self, findings=weightiest_first(every))
 
     @property
     def measurement(self) -> Measurement:
@@ -163,7 +207,7 @@ class Answer:
     @cached_property
     def gains(self) -> GainErrors:
         """By how much each sensor's gain differs from the base's, as the records show it, and how exactly they do."""
-        from sysid.assessment.gains import gain_errors
+        from sysid.assessment.checks.gains import gain_errors
 
         return gain_errors(self.records.screened.measurement, self.structure)
 
@@ -173,7 +217,7 @@ class Answer:
 
         Of the entry that moves by most of them.
         """
-        from sysid.assessment.gains import worth_of
+        from sysid.assessment.checks.gains import worth_of
 
         return worth_of(0.01 * self.uncertainty.mass_by_gain, self.uncertainty.mass)
 
@@ -308,7 +352,7 @@ class Answer:
     @property
     def asks_for_others(self) -> bool:
         """Whether a summary asks for other matrices that explain the same data: nothing else leaves the answer open."""
-        return self.success and not (self.determined or self.against or NOT_JUDGED in self.undetermined)
+        return self.judgement == "one of many" and not self.of_kind("not judged")
 
     @cached_property
     def is_one_of_many(self) -> bool:

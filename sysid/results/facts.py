@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sysid.assessment.gains import taken_at_sensors
+from sysid.assessment.checks.gains import taken_at_sensors
 from sysid.models.mass import LumpedMass
 from sysid.models.unknowns import Unknown
 from sysid.problem.given import MATRICES
@@ -130,7 +130,7 @@ def facts_of(problem: Problem, x: Array | None) -> Facts:
         n_variables=problem.n_variables,
         models=tuple(_models(problem)),
         stated_rigid_body=_stated_rigid_body(problem),
-        assumed=tuple(taken_at_sensors(problem)),
+        assumed=tuple(map(str, taken_at_sensors(problem))),
         tells_damping=bool(formulation.tells_damping),
     )
 

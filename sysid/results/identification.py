@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from sysid.errors import InputError, finite_array, instance, shown, text, whole_number
+from sysid.finding import Finding
 from sysid.problem.problem import Problem
 from sysid.problem.stored import NotRebuiltError, needs_module
 from sysid.results import readings, storage
@@ -28,8 +29,7 @@ from sysid.structure.structure import Array, Structure
 
 # Fields that are texts, numbers or arrays themselves.
 _PLAIN = (
-    "x", "strategy", "success", "message", "determined", "closed_by", "undetermined", "remarks", "interrupted",
-    "against", "changing",
+    "x", "strategy", "interrupted",
 )  # fmt: skip
 
 
@@ -143,9 +143,7 @@ class Identification(Answer):
     recipe: Recipe | None = None
 
     def __repr__(self) -> str:
-        word = "success" if self.success else "no success"
-        known = "determined" if self.determined else "not determined"
-        return f"<Identification: {word}, residual {self.residual:.3g}, {known}; {self.structure!r}>"
+        return f"<Identification: {self.judgement}, residual {self.residual:.3g}; {self.structure!r}>"
 
     def summary(self) -> str:
         """Table of the result, for a terminal."""
@@ -179,10 +177,9 @@ class Identification(Answer):
             "unknown_units": {v.name: v.unit for v in reported},
             "total_mass_kg": np.diag(self.structure.rigid_body_mass).tolist(),
             "determined": bool(self.determined),
-            "against": list(self.against),
             "closed_by": list(self.closed_by),
             "undetermined": list(self.undetermined),
-            "remarks": list(self.remarks),
+            "findings": [{**one._asdict(), "numbers": _finite(one.numbers)} for one in self.findings],
             "outliers": [
                 {"test": o.test, "run": o.run, "channel": o.channel, "frequency_hz": o.freq, "deviations": o.size}
                 for o in self.outliers
@@ -215,6 +212,7 @@ class Identification(Answer):
             "structure": self.structure.to_tree(),
             **self._problem_to_tree(),
             "seed": _if_given(str, self.seed),  # a number of any size
+            "findings": [one.to_tree() for one in self.findings],
             "history": self.history.to_tree(),
             "recipe": _if_given(Recipe.to_tree, self.recipe),
         }
@@ -238,6 +236,7 @@ class Identification(Answer):
             structure=structure,
             problem=_problem_from_tree(tree, structure),
             seed=_if_given(int, tree["seed"]),
+            findings=tuple(map(Finding.from_tree, tree["findings"])),
             history=History.from_tree(tree["history"]),
             recipe=_if_given(Recipe.from_tree, tree["recipe"]),
         )
@@ -397,6 +396,11 @@ def _plain(values: Array) -> Any:
     plain = values.astype(object)
     plain[~np.isfinite(values)] = None
     return plain.tolist()
+
+
+def _finite(numbers: Mapping[str, float]) -> dict[str, float | None]:
+    """Figures by their names, None for what is not finite."""
+    return {name: float(value) if np.isfinite(value) else None for name, value in numbers.items()}
 
 
 def _if_given(convert: Callable[[Any], Any], value: Any) -> Any:

@@ -1,17 +1,13 @@
-"""The noise of each channel of whole records, for summary, summary.json and report, and where fits leave more."""
+"""The noise of each channel of whole records, for summary, summary.json and report."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 
-from sysid.measurement.measurement import Measurement
-from sysid.measurement.spectra import of_run
 from sysid.results.answer import Answer
 
-_TOLD = 3  # channels
 _ALIKE = 1.2  # ratio of the levels of runs, up to which they are told as one
 
 
@@ -63,36 +59,3 @@ def noise_of_channels(it: Answer) -> tuple[ChannelNoise, ...]:
         ChannelNoise(name, float(own), unit, float(share), both)
         for (name, unit), own, share, both in zip(names, std, percent, ends, strict=True)
     )
-
-
-def noise_in_words(test: Measurement) -> Iterator[str]:
-    """Where the noise of whole records, their transients taken off, is not white, and what the fit leaves beside it."""
-    modal = test.modal
-    if modal is None:
-        return
-    axes = test.base_axes or ()
-    names = [*test.sensor_names]
-    names += [f"force {axis}" for axis in axes] if test.force is not None else []
-    names += [f"base {axis}" for axis in axes]
-    name = lambda one: names[one.channel] + of_run(one.run, test.n_runs)  # noqa: E731
-    if modal.varying:
-        told = [f"{name(one)} {one.largest / one.least:.2g} times" for one in modal.varying]
-        yield f"the noise is not white: levels vary smoothly over the lines, from least to largest of {', '.join(told)}"
-    if modal.untold:
-        untold = ", ".join(names[channel] + of_run(run, test.n_runs) for run, channel in modal.untold)
-        yield (
-            f"the records do not tell the noise level of {untold}, as it is small beside that of other channels or "
-            "shows as theirs does: the level given is one of many that explain them as well"
-        )
-    told = [
-        f"in {name(one)} is {one.factor:.2g} times the noise level between {one.low:.3g} and {one.high:.3g} Hz"
-        for one in modal.excess[:_TOLD]
-    ]
-    if told:
-        more = len(modal.excess) - len(told)
-        others = f", and so in {more} more" if more else ""
-        source = "intervals are by its scatter" if modal.scatter is not None else "intervals are as if it were white"
-        yield (
-            f"what the fit leaves {', '.join(told)}{others}: the noise there is not white, or the model misses "
-            f"something; {source}"
-        )

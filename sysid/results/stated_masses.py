@@ -11,6 +11,7 @@ from sysid.assessment.information import Index
 from sysid.assessment.statements import Adjusted, Statements, adjust, made, statements_of
 from sysid.assessment.uncertainty import moves_by_records
 from sysid.errors import InputError
+from sysid.finding import Finding, Severity
 from sysid.modal_analysis.modal_estimate import theta_of
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.problem.matrices import assemble
@@ -29,7 +30,7 @@ _ROUND_OFF = 1e-8  # of the records: what counts as noise where there is none
 
 
 def with_stated_masses(problem: Problem, end: Outcome, session: Session) -> Outcome:
-    """The fit adjusted to records and statements together, and sentences on statements that contradict the rest."""
+    """The fit adjusted to records and statements together, told of statements that contradict the rest."""
     if end.stopped is not None or statements_of(problem, end.structure) is None:
         return end
     try:
@@ -56,15 +57,16 @@ def _adjusted(problem: Problem, end: Outcome) -> Outcome:
     except (InputError, np.linalg.LinAlgError):
         structure = None
     if structure is None or not best.holds:
-        said = said or ("the stated masses cannot all be met together with the records",)
-        return replace(end, doubts=said)
+        unmet = "the stated masses cannot all be met together with the records"
+        said = said or (Finding("stated masses", Severity.CONTRADICTS, unmet),)
+        return replace(end, findings=(*end.findings, *said))
     x = problem.values(structure)
     if end.x is not None:
         at = problem.formulation.parts.damping
         x[at] = np.clip(x[at], problem.lower[at], problem.upper[at])
         x[at.stop :] = end.x[at.stop :]
     history = replace(end.history, local=objective_of(problem, structure, x))
-    return replace(end, structure=structure, x=x, history=history, doubts=said)
+    return replace(end, structure=structure, x=x, history=history, findings=(*end.findings, *said))
 
 
 def _structure(problem: Problem, first: Structure, before: Array, after: Array, index: Index) -> Structure:
@@ -95,32 +97,44 @@ def _structure(problem: Problem, first: Structure, before: Array, after: Array, 
 
 def _contradictions(
     problem: Problem, stated: Statements, best: Adjusted, theta: Array, index: Index, normals: Array
-) -> Iterator[str]:
+) -> Iterator[Finding]:
     """Whether statements and records disagree beyond chance, and which statements explain it."""
     numbers = _numbers(problem, index)
     if _chance(best, numbers) >= _CHANCE:
         return
-    told = f"the stated masses cannot all be met together with the records (chance {_chance(best, numbers):.1g})"
-    explained: list[tuple[float, str]] = []
+    chance = _chance(best, numbers)
+    told = f"the stated masses cannot all be met together with the records (chance {chance:.1g})"
+    explained: list[tuple[float, tuple[float, float], str]] = []
     for row in range(stated.values.size):
         without = adjust(problem, stated.without(row), theta, index, normals)
         if without.freedom == best.freedom or _chance(without, numbers) < _CHANCE:
             continue
         value = (made(problem, stated, without.theta, index)[0] * stated.scale)[row]
         off = np.sqrt(max(best.misfit - without.misfit, 0.0))
-        explained.append((off, _in_words(problem, stated, row, value, off)))
+        both = (float(stated.values[row]), float(value))
+        explained.append((off, both, _in_words(problem, stated, row, value, off)))
     if explained:
         explained.sort(key=lambda one: -one[0])
-        near = [words for off, words in explained if off**2 > explained[0][0] ** 2 - _ALIKE**2]
-        yield f"{told}: {'; or '.join(near[:_TOLD])}"
+        near = [words for off, _, words in explained if off**2 > explained[0][0] ** 2 - _ALIKE**2]
+        yield Finding(
+            "stated masses", Severity.CONTRADICTS, f"{told}: {'; or '.join(near[:_TOLD])}",
+            numbers={
+                "chance": chance, "deviations": float(explained[0][0]), "stated": explained[0][1][0],
+                "by the records": explained[0][1][1], "statements": float(len(near)),
+            },
+        )  # fmt: skip
         return
     factor = _common_factor(problem, stated, theta, index, normals)
     if factor > 0:
         scaled = stated._replace(values=factor * stated.values, std=factor * stated.std)
         if _chance(adjust(problem, scaled, theta, index, normals), numbers) >= _CHANCE:
-            yield f"{told}; all of them would be met {factor:.4g} times as large: is a unit or the force's gain wrong?"
+            yield Finding(
+                "stated masses", Severity.CONTRADICTS, f"{told}; all of them would be met {factor:.4g} times as large",
+                "is a unit or the force's gain wrong?", numbers={"chance": chance, "factor": factor},
+            )  # fmt: skip
             return
-    yield f"{told}; no single one of them explains it"
+    unexplained = f"{told}; no single one of them explains it"
+    yield Finding("stated masses", Severity.CONTRADICTS, unexplained, numbers={"chance": chance})
 
 
 def _common_factor(problem: Problem, stated: Statements, theta: Array, index: Index, normals: Array) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import textwrap
 from collections.abc import Iterator, Sequence
 
@@ -10,8 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.assessment.sensitivity import blocks_of
+from sysid.finding import Judgement
 from sysid.measurement.in_time import peaks
-from sysid.results.answer import NOT_JUDGED, Answer
+from sysid.results.answer import Answer
 from sysid.results.deck_masses import deck_masses
 from sysid.results.gain_table import gains_of_sensors
 from sysid.results.noise_table import NOISE_COLUMNS, noise_of_channels
@@ -30,13 +30,9 @@ _RANGES_LEFT = (
     "how far the entries may go over all these models is not computed here: Identification.mass_interval and "
     "stiffness_interval compute it"
 )
-_ENDED = {
-    "Solve_Succeeded": "the solver ended as it should",
-    "Solved_To_Acceptable_Level": "the solver ended near enough to its optimum",
-    "Maximum_Iterations_Exceeded": "the solver ran out of iterations",
-    "Maximum_WallTime_Exceeded": "the solver ran out of time",
-    "Infeasible_Problem_Detected": "the solver found no point that keeps the constraints",
-}
+JUDGEMENTS: dict[Judgement, str] = {  # as screen, page and files write them
+    "determined": "Determined", "one of many": "One of many", "doubtful": "Doubtful", "no fit": "No fit",
+}  # fmt: skip
 _AS_STATED = ". No force was measured: they are as right as the mass or stiffness that is stated"
 DEVIATES = 1.96  # standard deviations on either side of 95 % of a normal law
 _ROUND_OFF = 1e-10  # of a value: what is no noise of an instrument
@@ -54,7 +50,7 @@ def summary(it: Answer) -> str:
     force = "" if it.force_residual is None else f", of the base force {it.force_residual:.3e}"
     told = it.undetermined or it.closed_by
     lines = [
-        f"{verdict(it)}." + ("" if it.success else f" Fitted: {fitted_in_words(it)}."),
+        f"{JUDGEMENTS[it.judgement]}: {verdict(it)}." + ("" if it.success else f" Fitted: {fitted_in_words(it)}."),
         *(f"  - {sentence}" for sentence in told[:_FIRST]),
         *(f"  > {step}" for step in next_steps(it)),
         "",
@@ -65,7 +61,7 @@ def summary(it: Answer) -> str:
         + f"; {counted(it.history.restarts, 'further swarm')}" * bool(it.history.restarts),
         *_phases(it),
         *filter(None, [it.history.refinement_in_words]),
-        *it.remarks,
+        *map(str, (*it.of_kind("strategy"), *it.notes)),
         "rigid-body mass "
         + ", ".join(_rigid_masses(it, axes))
         + " (~ normalised: no mass is stated, no force was measured)" * it.facts.unit_mass,
@@ -87,13 +83,8 @@ def summary(it: Answer) -> str:
         further_told += _ranges(it)
     lines += ["besides:"] * bool(further_told) + further_told
     lines += [_NOT_COMPUTED] if it.hurried else []
-    lines.append(f"search: {ending_in_words(it)}")
+    lines.append(f"search: {it.message}")
     return "\n".join(_folded(line) for line in lines)
-
-
-def ending_in_words(it: Answer) -> str:
-    """How the search ended: its message, with the solver's status in words beside it."""
-    return re.sub(f"IPOPT: ({'|'.join(_ENDED)})", lambda found: f"{_ENDED[found[1]]} ({found[0]})", it.message)
 
 
 def _phases(it: Answer) -> list[str]:
@@ -135,21 +126,20 @@ def residual_in_words(it: Answer) -> str:
 
 
 def verdict(it: Answer) -> str:
-    """What the matrices are worth, in one sentence."""
-    if not it.success:
-        return "No fit: these matrices do not explain the records as they should"
-    if it.determined:
-        one = "Determined: data and stated model leave one mass and one stiffness matrix"
-        return one + _AS_STATED * it.facts.by_accelerations
-    if NOT_JUDGED in it.undetermined:
-        return "Not judged: the time was over"
-    if it.hurried:
-        return "Not determined"
-    if it.against:
-        return "Not determined: something speaks against this model"
-    if it.is_one_of_many:
-        return "Not determined: this is one of many models that explain the data"
-    return "Not determined: some entries of the matrices are not known well enough"
+    """What the judgement means for this answer."""
+    match it.judgement:
+        case "no fit":
+            return "these matrices do not explain the records as they should"
+        case "determined":
+            one = "data and stated model leave one mass and one stiffness matrix"
+            return one + _AS_STATED * it.facts.by_accelerations
+        case "doubtful":
+            return "a fit, but something speaks against this model, so that its matrices may be wrong"
+    if it.of_kind("not judged"):
+        return "as far as was judged until the time was over"
+    if it.hurried or it.is_one_of_many:
+        return "other models explain the data as well"
+    return "some entries of the matrices are not known well enough"
 
 
 def fitted_in_words(it: Answer) -> str:
@@ -165,25 +155,25 @@ def fitted_in_words(it: Answer) -> str:
 
 def next_steps(it: Answer) -> list[str]:
     """What would close what is open, in sentences."""
-    if it.determined or it.hurried or NOT_JUDGED in it.undetermined:
+    if it.determined or it.hurried or it.of_kind("not judged"):
         return []
     if not it.success:
         return _towards_a_fit(it)
-    if it.against:
+    if it.judgement == "doubtful":
         return ["deal with what speaks against this model, in the order given: correct it, or measure again"]
     if not it.is_one_of_many:
         return []
     if it.scale_is_open:
-        return [f"to close it: {_SCALE}"]
+        return [_SCALE]
     if not it.open_masses:
         return [
-            "to close it: state one of these unknowns (fixed=True with its value), a relation between them as a "
+            "state one of these unknowns (fixed=True with its value), a relation between them as a "
             "constraint, or fit another record that sees them: a base force, a sensor, a test with a known mass added"
         ]
     if it.measurement.force is not None:
         return ["to weigh these modes: more force at their frequencies, longer records, or another base direction"]
     return [
-        "to close it: measure the force between table and structure; or state what is known of the mass, where it is "
+        "measure the force between table and structure; or state what is known of the mass, where it is "
         "true: that all of it sits at the sensors (sysid run test.h5 --lumped --mass KG; LumpedMass(KG)), or single "
         "masses (FullMass(known=...))" + "; a total mass alone only bounds it" * it.facts.mass_is_free
     ]
@@ -196,7 +186,7 @@ def _towards_a_fit(it: Answer) -> list[str]:
     if it.records.goal is not None:
         return ["put right what is named first; a goal below the noise of the records cannot be reached"]
     steps = ["deal with what speaks against it, in the order given"]
-    if it.changing:
+    if it.of_kind("changing"):
         one_by_one = "; 'sysid refine RESULT --leave-out run' shows what each run does to the answer"
         steps = [
             "fit by itself a run in which structure and level of motion stay the same, at the level of interest: "

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.assessment.bounds import sides_of
+from sysid.assessment.checks.bounds import sides_of
 from sysid.results.answer import Answer
 
 MANY = 60  # rows beyond which a terminal shows none

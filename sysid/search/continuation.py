@@ -19,7 +19,7 @@ from sysid.problem.terms import TestTerm
 from sysid.search import local
 from sysid.search.local import Coordinates, LocalResult
 from sysid.search.session import Session, Stop
-from sysid.search.strategy import History, Outcome, Phase, as_unknowns
+from sysid.search.strategy import History, Outcome, Phase, as_unknowns, search_note
 from sysid.structure.structure import Array, Structure
 
 SHIFTS = (0.5, 0.2, 0.08, 0.03, 0.01)  # of the geometric mean of the natural frequencies
@@ -170,15 +170,15 @@ class _Run:
             "" if self.smoother is None else f"; free residues at the poles of the data leave {self.smoother.floor:.3g}"
         )
         session.log(f"continuation over {problem.n_variables} unknowns in {len(self.steps)} steps{floor}")
+        left_out = 0
         first = problem.formulation.guess if start is None else as_unknowns(problem, start)
         points = (first, *random_starts(problem, starts - 1, session.random))
-        remarks: tuple[str, ...] = ()
         for left, x in zip(reversed(range(len(points))), points, strict=True):
             self._from(x)
             if self.stopped is not None:
                 break
             if self.ends and not session.time_for_more:
-                remarks = (_LEFT_OUT.format(left, len(points)),) if left else ()
+                left_out = left
                 break
         if self.stopped is not None and not isinstance(self.stopped, Stop | KeyboardInterrupt):
             raise self.stopped
@@ -199,7 +199,8 @@ class _Run:
             structure, best.x, Continuation.name, success, message,
             History(start=begun, local=objective, local_curve=best.curve, phases=phases), self.stopped,
             alternatives=tuple(_alternatives(problem, best.x, objective, self.ends)) if success else (),
-            remarks=remarks, good=self._good(objective, best), unanimous=self._unanimous(best),
+            findings=(search_note(_LEFT_OUT.format(left_out, len(points))),) * bool(left_out),
+            good=self._good(objective, best), unanimous=self._unanimous(best),
         )  # fmt: skip
 
     def _from(self, x: Array) -> None:

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from sysid.models.spectrum import SOLVED
-from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram
+from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram, ended_in_words
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.search.inverse_factor_coordinates import fit_in_inverse_factor
@@ -124,7 +124,7 @@ def fit_apart(problem: Problem, end: End, monitor: IterationMonitor, max_iterati
 
 
 def _result(end: End, monitor: IterationMonitor) -> LocalResult:
-    words = [f"IPOPT: {end.status}"]
+    words = [ended_in_words(end.status)]
     if end.bounds:
         words.append(f"ended on a bound: {end.bounds}")
     if end.remark:

@@ -17,6 +17,7 @@ import scipy
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, SolverError, sequence, whole_number
+from sysid.finding import Finding
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import above_modes, residual_of
 from sysid.modal_analysis.modal_fit import ModalFit, Modes
@@ -25,7 +26,7 @@ from sysid.modal_analysis.response import columns, gains, stacked, weighted_erro
 from sysid.modal_analysis.vector_fitting import Poles, find_poles, poles_near
 from sysid.models.spectrum import SOLVED
 from sysid.models.stiffness import FREQUENCY_WINDOW
-from sysid.nlp import EXACT, IterationMonitor
+from sysid.nlp import EXACT, IterationMonitor, ended_in_words
 from sysid.problem.matrices import assemble
 from sysid.problem.problem import Problem
 from sysid.search.local import LocalResult, fit_apart, solve
@@ -33,7 +34,7 @@ from sysid.search.modal_coordinates import End
 from sysid.search.modal_scaling import nearest_lumped, of_known_mass, to_stated_totals
 from sysid.search.mode_fit import Integers, ModeFit, held_to_bounds, held_to_totals
 from sysid.search.session import Session, Stop
-from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase
+from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, search_note
 from sysid.structure.structure import Array, Structure
 
 _DEPENDENT = 1e-6  # of the largest singular value of the shapes: below, sensors move alike in all modes
@@ -222,7 +223,7 @@ def run_modal(problem: Problem, options: Modal, session: Session) -> Outcome:
         + ", ".join(f"{f:.4g}" for f in structure.natural_frequencies)
         + f" Hz (free residues fit within {poles.residual:.2e})"
     )
-    success, message = end.status in SOLVED or end.residual <= EXACT, f"IPOPT: {end.status}"
+    success, message = end.status in SOLVED or end.residual <= EXACT, ended_in_words(end.status)
     message += f"; ended on a bound: {end.bounds}" * bool(end.bounds)
     modal = problem.measurement.modal
     if modal is not None:  # fitted with the transients, before
@@ -231,11 +232,11 @@ def run_modal(problem: Problem, options: Modal, session: Session) -> Outcome:
     if monitor.is_over and end.residual > EXACT:
         success, message = False, f"{message}; the time was over before every further fit was tried"
     answer = LocalResult(np.zeros(0), success, message, np.array(monitor.curve), monitor.stopped)
-    remarks: tuple[str, ...] = ()
+    notes: tuple[Finding, ...] = ()
     if structure.at_sensors:
         structure, answer = _in_unknowns(problem, structure, answer, monitor, session)
     elif problem.formulation.mass.free:
-        remarks = (f"degrees of freedom are {', '.join(_coordinates(problem, chosen))}",)
+        notes = (search_note(f"degrees of freedom are {', '.join(_coordinates(problem, chosen))}"),)
     else:
         plain = problem.measurement.sample_rate is not None
         raise DoesNotApplyError(
@@ -252,7 +253,7 @@ def run_modal(problem: Problem, options: Modal, session: Session) -> Outcome:
         if not isinstance(stopped, Stop | KeyboardInterrupt):
             raise stopped
         success, message = False, str(stopped) or "interrupted"
-    return Outcome(structure, x, options.name, success, message, history, stopped, remarks)
+    return Outcome(structure, x, options.name, success, message, history, stopped, findings=notes)
 
 
 def _in_unknowns(

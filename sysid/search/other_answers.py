@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from sysid.errors import InputError
+from sysid.finding import Finding, Severity
 from sysid.problem.problem import Problem
 from sysid.problem.terms import ExpressionTerm
 from sysid.search import local
@@ -37,7 +38,7 @@ _SAME = 1e-6  # relative difference of responses that counts as none
 _TRIED = 4  # structures of nearly the same response, fitted to the records
 _APART = 0.01  # of the root of two diagonal entries, by which an entry of another structure's matrices differs
 _SEED = 0x6F74686572  # a source of its own, so that no other phase draws other numbers
-NOT_LOOKED_FOR = "whether another structure explains the data as well was not looked for to its end: {}"
+_NOT_LOOKED_FOR = "whether another structure explains the data as well was not looked for to its end: {}"
 
 
 def is_unique_if_rank_is_full(problem: Problem) -> bool:
@@ -55,27 +56,33 @@ def is_unique_if_rank_is_full(problem: Problem) -> bool:
     return all(ca.is_linear(ca.densify(part), x) for part in (M, M_S0, M_00, K, C, ratios))
 
 
-def with_other_answers(problem: Problem, end: Outcome, session: Session) -> tuple[Outcome, tuple[str, ...]]:
-    """The outcome with another answer among its alternatives if one is found, and what was not looked for to its end.
+def with_other_answers(problem: Problem, end: Outcome, session: Session) -> Outcome:
+    """The outcome with another answer among its alternatives if one is found, or told that it was not looked for.
 
     The search ends with the first one. It is not begun where none can be, or where unknowns are too many for it.
     """
     if end.x is None or end.stopped is not None or is_unique_if_rank_is_full(problem):
-        return end, ()
+        return end
     starts = _number_of_starts(problem)
     if starts < _FEWEST_STARTS:
         told = f"no other structure that explains the data as well was looked for: {problem.n_variables} unknowns"
-        return replace(end, remarks=(*end.remarks, f"{told} in {problem.geometry.n} degrees of freedom take long")), ()
+        return end.with_note(f"{told} in {problem.geometry.n} degrees of freedom take long")
     fitted = problem if problem.loss == "squares" else problem.pseudo_values(end.structure, end.x)
     try:
         found = _first(fitted, end.x, session, starts)
     except (Stop, KeyboardInterrupt) as stop:
-        why = str(stop) or "interrupted"
-        return replace(end, stopped=stop), (NOT_LOOKED_FOR.format(why),)
+        return replace(_unfinished(end, str(stop) or "interrupted"), stopped=stop)
     if found is None and session.is_over:
-        return end, (NOT_LOOKED_FOR.format("the time was over"),)
+        return _unfinished(end, "the time was over")
     session.log("no other answer was found" if found is None else "another answer explains the data as well")
-    return (end if found is None else replace(end, alternatives=(*end.alternatives, found))), ()
+    return end if found is None else replace(end, alternatives=(*end.alternatives, found))
+
+
+def _unfinished(end: Outcome, why: str) -> Outcome:
+    """The outcome, told that other answers were not looked for to the end."""
+    return replace(
+        end, findings=(*end.findings, Finding("other answers", Severity.CAUTION, _NOT_LOOKED_FOR.format(why)))
+    )
 
 
 def _number_of_starts(problem: Problem) -> int:

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from sysid.errors import InputError, SolverError
-from sysid.modal_analysis.outliers import loss, predicted, whitened
+from sysid.modal_analysis.outliers import HUBER, loss, predicted, whitened
 from sysid.problem.problem import Problem
 from sysid.search.local import solve
 from sysid.search.modal import Modal, objective_of
 from sysid.search.session import Session, Stop
-from sysid.search.strategy import HUBER, History, Outcome, Phase, Strategy
+from sysid.search.strategy import History, Outcome, Phase, Strategy
 from sysid.search.swarm import Swarm
 from sysid.structure.structure import Array, Structure
 
@@ -55,11 +55,11 @@ def settled(problem: Problem, end: Outcome, strategy: Strategy, session: Session
         session.log(f"round {number} of Huber's loss: {again.message}; the unknowns move by {moved:.2g} deviations")
         end = _with_round(problem.screened, end, again, session)
         if moved < _SETTLED:
-            return replace(end, remarks=(*end.remarks, f"Huber's loss settled after {number} rounds"))
+            return end.with_note(f"Huber's loss settled after {number} rounds")
         if session.is_over:
             break
     told = f"Huber's loss did not settle in {number} rounds: the last moved by {moved:.2g} deviations"
-    return replace(end, remarks=(*end.remarks, told)) if moved < _NEAR else _cut_short(end, told)
+    return end.with_note(told) if moved < _NEAR else _cut_short(end, told)
 
 
 def check(problem: Problem, strategy: Strategy) -> None:
@@ -83,7 +83,7 @@ def _with_round(problem: Problem, end: Outcome, again: Outcome, session: Session
     x = np.zeros(0) if again.x is None else again.x
     phases.append(Phase(HUBER, left, x, session.seconds, before + again.history.local_curve.size))
     history = replace(end.history, local=left, local_curve=curve, phases=tuple(phases))
-    return replace(again, remarks=end.remarks, history=history)
+    return replace(again, findings=end.findings, history=history)
 
 
 def _cut_short(end: Outcome, why: str, stopped: BaseException | None = None) -> Outcome:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, finite_array
+from sysid.finding import Finding, Severity
 from sysid.problem.problem import Problem
 from sysid.search.session import Session
 from sysid.structure.structure import Array, Structure
-
-HUBER = "Huber's loss"  # the phase of its rounds
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,19 +148,14 @@ class Outcome:
     history : History
     stopped : BaseException or None
         What ended it early.
-    remarks : tuple of str
-        What the user should know of how it was done.
     alternatives : tuple of (n_variables,)
         Other unknowns that explain the data as well.
     good : bool
         The fit is as good as the data let it be, as far as the strategy can tell: no other needs to follow.
     unanimous : bool
         Every start ended there: what is left is no local minimum's, and no other strategy needs to follow.
-    doubts : tuple of str
-        Stated values that contradict the records.
-    mistakes : tuple of str
-        What is wrong with the records or with what is stated of them, by name; it explains whatever else speaks against
-        the fit.
+    findings : tuple of Finding
+        Mistakes that were named before or by the search, contradictions that it met, and what should be known of it.
     """
 
     structure: Structure
@@ -171,12 +165,19 @@ class Outcome:
     message: str
     history: History
     stopped: BaseException | None = None
-    remarks: tuple[str, ...] = ()
     alternatives: tuple[Array, ...] = ()
     good: bool = True
     unanimous: bool = False
-    doubts: tuple[str, ...] = ()
-    mistakes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
+
+    def with_note(self, sentence: str) -> Outcome:
+        """The same, and a sentence on how it was done."""
+        return replace(self, findings=(*self.findings, search_note(sentence)))
+
+
+def search_note(sentence: str) -> Finding:
+    """What should be known of how a search was done."""
+    return Finding("search", Severity.NOTE, sentence)
 
 
 class Strategy(Protocol):

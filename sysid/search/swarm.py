@@ -21,7 +21,7 @@ from sysid.search.local import Coordinates
 from sysid.search.modal_coordinates import fits_worse_than_free_residues, modes_of
 from sysid.search.refinement import RefineBy, Refiner, Tally
 from sysid.search.session import Session, Stop, in_time
-from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, as_unknowns
+from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, as_unknowns, search_note
 from sysid.search.swarm_objective import SwarmObjective
 from sysid.structure.structure import Array, Structure
 from sysid.swarm import SwarmProgress, SwarmSettings, minimize_swarm
@@ -211,7 +211,8 @@ class Swarm:
         idle = problem.free_modes and self.local == "modal" and best.success
         return Outcome(
             problem.structure(best.found), best.found, self.name, best.success, best.message, history, stopped,
-            remarks=(_IDLE,) * idle + (_OWN_FORM,) * (self.local == "cholesky" and not problem.free_modes),
+            findings=(search_note(_IDLE),) * idle
+            + (search_note(_OWN_FORM),) * (self.local == "cholesky" and not problem.free_modes),
         )  # fmt: skip
 
 

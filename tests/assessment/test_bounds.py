@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 import sysid
-from sysid.assessment.bounds import bounds_in_words, on_bounds, pressed_in_words, pressure, sides_of
+from sysid.assessment.checks.bounds import bounds_in_words, on_bounds, pressure, sides_of
 
 FREQ = np.linspace(1.0, 12.0, 60)
 STRETCH = np.array([[1.0, 0.0], [-1.0, 1.0]])
@@ -78,9 +78,7 @@ def test_alike_bounds_are_told_together():
     )
     found = on_bounds(problem, TRUTH, np.array([400.0, 400.0]))
     assert bounds_in_words(found) == "spring 1, 2 (lower, 400 N/m)"
-    assert pressed_in_words(found).startswith(
-        "bounds keep the fit from the records: spring 1, 2 (lower, 400 N/m); widen them first (ChainStiffness)"
-    )
+    assert {one.source for one in found} == {"ChainStiffness"}
 
 
 class TestPressure:

@@ -21,7 +21,7 @@ from benchmarks.mistakes.changing import (
 )
 from benchmarks.mistakes.changing import measured as as_test
 from benchmarks.mistakes.changing import response as answer
-from sysid.assessment.changing import Change, Seen, changes, changes_in_words
+from sysid.assessment.checks.changing import Change, Seen, changes, changing
 from sysid.modal_analysis.stretches import stretches_of
 
 
@@ -56,11 +56,12 @@ def test_a_structure_that_softens_is_told_with_its_frequencies_at_the_ends(estim
     bases = [size * motion(rng) for size in (small, large)]
     fitted, unseen = (as_test(noisy(rng, base, answer(base, softening=100.0)), estimator=estimator) for base in bases)
     it = identified(fitted, validation=[unseen])
-    (told,) = [sentence for sentence in it.undetermined if "falls as the motion grows" in sentence]
-    low, high = sorted(float(f) for f in re.findall(r"([\d.]+) Hz at", told))
+    (told,) = it.of_kind("changing")
+    low, high = told.numbers["lowest"], told.numbers["highest"]
+    assert told.numbers["trend"] < 0
     assert high == pytest.approx(frequencies(SPRINGS)[0], rel=0.003) and low < 0.995 * high
-    assert any("moves the sensors by up to" in sentence for sentence in it.remarks)
-    assert not any("gain" in sentence or "quadrature" in sentence for sentence in it.undetermined)
+    assert [one.numbers["test"] for one in it.of_kind("level")] == [1]
+    assert not it.of_kind("gain", "damping")
 
 
 def test_runs_of_different_structures_are_told_with_the_frequencies_of_each():
@@ -69,8 +70,8 @@ def test_runs_of_different_structures_are_told_with_the_frequencies_of_each():
     test = as_test(noisy(rng, first, answer(first)), noisy(rng, second, answer(second, lambda t: factor)))
     it = identified(test)
     assert it.judgement == "no fit" and not it.success
-    told = it.confidence[0] + it.confidence[1]
-    assert "times their noise" in told and "differs from record to record" in told
+    assert it.findings[0].kind == "changing" and it.of_kind("beyond noise", severity="contradicts")
+    told = it.findings[0].sentence
     (near,) = [k for k, f in enumerate(frequencies(SPRINGS)) if abs(numbers(told.partition("(")[2])[-2] / f - 1) < 0.02]
     both = frequencies(SPRINGS)[near] * np.array([1, np.sqrt(factor)])
     np.testing.assert_allclose(numbers(told)[-2:], both, rtol=0.003)
@@ -81,12 +82,12 @@ def test_a_drift_along_a_record_is_told_with_when_and_what():
     rng = np.random.default_rng(3)
     base, factor = motion(rng), lambda t: 1 - 0.06 * t / SECONDS
     it = identified(as_test(noisy(rng, base, answer(base, factor))))
-    (told,) = [sentence for sentence in it.undetermined if "changes along the records" in sentence]
+    told = it.of_kind("changing")[0].sentence
     spans = [(float(a) + float(b)) / 2 for a, b in re.findall(r"at ([\d.]+) to ([\d.]+) s", told)]
     expected = [frequencies(factor(t) * SPRINGS) for t in spans]
     for value, of_modes in zip(numbers(told)[-2:], expected, strict=True):
         assert np.min(np.abs(value / of_modes - 1)) < 0.003
-    assert it.confidence[0] == told or "times their noise" in it.confidence[0]
+    assert it.findings[0].kind == "changing"
 
 
 def test_two_close_modes_of_one_shape_are_no_mode_that_changes():
@@ -111,7 +112,7 @@ def test_a_base_direction_that_does_not_move_in_an_unfitted_test_is_no_error():
     fitted, unseen = (
         sysid.Measurement.from_time([(u, spoil(of_lines(structure, u)), None)], RATE, **made) for u in (base, alone)
     )
-    assert changes_in_words(sysid.Problem(fitted, mass=sysid.FullMass(), validation=[unseen])) == ()
+    assert changing(sysid.Problem(fitted, mass=sysid.FullMass(), validation=[unseen])) == ()
 
 
 def test_unfitted_tests_keep_their_numbers():

@@ -9,8 +9,8 @@ import sysid
 from benchmarks.mistakes.changing import RATE, motion, noisy
 from benchmarks.mistakes.changing import measured as as_test
 from benchmarks.mistakes.changing import response as answer
-from sysid.assessment.changing import changes_in_words
-from sysid.assessment.model_error import BEYOND, misses_of, noise_at_most
+from sysid.assessment.checks.changing import changing
+from sysid.assessment.checks.noise_multiples import BEYOND, misses_of, noise_at_most
 from sysid.measurement.in_time import cut_in_motion, in_time, peaks, quiet_levels
 
 
@@ -29,7 +29,7 @@ def test_right_records_are_missed_by_their_noise_and_nothing_is_said_to_change(r
     it = identified(right)
     (miss,) = misses_of(it.problem, it.structure, it.x)
     assert it.success and 0.9 < miss.times < 1.1
-    assert changes_in_words(it.problem) == ()
+    assert changing(it.problem) == ()
 
 
 def test_what_is_missed_of_stated_noise_is_the_residual_over_it():
@@ -49,7 +49,7 @@ def test_what_is_missed_of_stated_noise_is_the_residual_over_it():
     )
     assert max(accelerations.times, force.times) > BEYOND and not it.success and it.judgement == "no fit"
     enough = sysid.identify(sysid.Problem(test, mass=wrong, goal=1.01 * it.residual), rng=0)
-    assert enough.success and any("times their noise" in sentence for sentence in enough.undetermined)
+    assert enough.success and [one.severity for one in enough.of_kind("beyond noise")] == ["caution"] * 2
 
 
 def test_spikes_are_not_counted_as_what_the_model_misses():

@@ -98,27 +98,26 @@ def test_a_wrong_entry_is_named_with_its_factor():
     wrong = M_SS + np.diag([0.0, 10.0])
     result = identify(Problem(test, mass=FullMass(known=wrong, known_std=0.2)), strategy="modal")
     assert not result.determined
-    (told,) = (sentence for sentence in result.undetermined if "cannot all be met" in sentence)
-    assert "row sensor 2, column sensor 2 is stated as 35" in told
-    assert "or row" not in told
-    factor = float(told.split(" times as much")[0].rsplit(" ", 1)[1])
-    assert factor == pytest.approx(25 / 35, rel=0.01)
+    (told,) = result.of_kind("stated masses")
+    assert (told.numbers["stated"], told.numbers["statements"]) == (35.0, 1)
+    assert told.numbers["by the records"] == pytest.approx(25, rel=0.01)
+    assert "row sensor 2" in told.sentence
 
 
 def test_masses_in_another_unit_are_told_with_their_common_factor():
     test = simulate(TRUTH, FREQ, noise=0.01, rng=3, force=True)
     pounds = M_SS / 0.45359237
     result = identify(Problem(test, mass=FullMass(known=pounds, known_std=0.2)), strategy="modal")
-    (told,) = (sentence for sentence in result.undetermined if "cannot all be met" in sentence)
-    factor = float(told.split(" times as large")[0].rsplit(" ", 1)[1])
-    assert factor == pytest.approx(0.45359237, rel=0.01)
+    (told,) = result.of_kind("stated masses")
+    assert told.numbers["factor"] == pytest.approx(0.45359237, rel=0.01)
 
 
 def test_a_wrong_total_is_told_against_the_force():
     test = simulate(TRUTH, FREQ, noise=0.01, rng=3, force=True)
     total = TRUTH.rigid_body_mass[0, 0]
     result = identify(Problem(test, mass=FullMass(total + 10.0, healing="rigid_body", total_std=0.5)), strategy="modal")
-    assert any("the total in" in sentence and "deviations off" in sentence for sentence in result.undetermined)
+    (told,) = result.of_kind("stated masses")
+    assert (told.numbers["stated"], told.numbers["by the records"]) == pytest.approx((total + 10, total), rel=0.01)
 
 
 @pytest.fixture

@@ -20,6 +20,12 @@ def problem(case):
     return case[1]
 
 
+def strategy_of(result):
+    """Why it was taken."""
+    (told,) = result.of_kind("strategy")
+    return told.sentence
+
+
 class TestAuto:
     """Which strategy is taken, and that the result says why."""
 
@@ -37,8 +43,8 @@ class TestAuto:
         _, problem = random_case(np.random.default_rng(1), mass, n=3, d=1)
         result = identify(problem, rng=0)
         assert result.strategy == "modal"
-        assert result.remarks[0].startswith("strategy 'modal': ")
-        assert any(result.remarks[0] in line for line in [*result.summary().splitlines(), *result.remarks])
+        assert strategy_of(result).startswith("strategy 'modal': ")
+        assert any(strategy_of(result) in line for line in result.summary().splitlines())
         assert result.residual < 1e-10
 
     @pytest.mark.parametrize(
@@ -52,7 +58,7 @@ class TestAuto:
         _, problem = random_case(np.random.default_rng(1), "lumped", stiffness, damping, n=3, d=1)
         result = self.at_once(problem)
         assert result.strategy == strategy
-        assert result.remarks[0] == f"strategy '{strategy}': the {reason}"
+        assert strategy_of(result) == f"strategy '{strategy}': the {reason}"
         with pytest.raises(InputError, match="'modal' needs a free stiffness .SpectralStiffness. and ModalDamping"):
             identify(problem, strategy="modal")
 
@@ -60,7 +66,7 @@ class TestAuto:
         truth, problem = case
         result = self.at_once(problem, start=truth)
         assert result.strategy == "swarm"
-        assert result.remarks[0] == "strategy 'swarm': a start was given"
+        assert strategy_of(result) == "strategy 'swarm': a start was given"
 
     @pytest.mark.parametrize("mass", ["lumped", "known"])
     def test_swarm_where_a_structured_mass_has_other_than_one_mode_a_sensor(self, random_case, mass):
@@ -73,9 +79,9 @@ class TestAuto:
         )  # fmt: skip
         result = self.at_once(low)
         assert result.strategy == "swarm"
-        assert "the modal one does not apply" in result.remarks[0]
-        assert "modes stand out of the data of 4 sensors" in result.remarks[0]
-        assert any(result.remarks[0] in line for line in result.history.log)
+        assert "the modal one does not apply" in strategy_of(result)
+        assert "modes stand out of the data of 4 sensors" in strategy_of(result)
+        assert any(strategy_of(result) in line for line in result.history.log)
         with pytest.raises(InputError, match="as many modes as sensors"):
             identify(low, strategy="modal")
 
@@ -85,8 +91,8 @@ class TestAuto:
         wrong = Problem(problem.measurement, mass=problem.mass, stiffness=sysid.SpectralStiffness(given))
         result = self.at_once(wrong)
         assert result.strategy == "swarm"
-        assert f"{given[2]:.5g} Hz does not stand out" in result.remarks[0]
-        assert "of the stated natural frequencies" in result.remarks[0]
+        assert f"{given[2]:.5g} Hz does not stand out" in strategy_of(result)
+        assert "of the stated natural frequencies" in strategy_of(result)
 
     def test_where_none_applies_one_error_tells_of_each(self, problem, monkeypatch):
         def run(strategy, *_):
@@ -103,4 +109,4 @@ class TestAuto:
         result = self.at_once(problem, strategy=asked)
         name = asked if isinstance(asked, str) else type(asked).__name__.lower()
         assert result.strategy == name
-        assert result.remarks[0] == f"strategy {name!r}, as asked"
+        assert strategy_of(result) == f"strategy {name!r}, as asked"

@@ -10,7 +10,6 @@ import pytest
 
 import sysid
 from sysid import FullMass, Identification, InputError, Problem, Swarm, identify
-from sysid.results.summary import ending_in_words
 
 QUICK = Swarm(max_iterations=8, n_particles=20)
 SWARM_ONLY = Swarm(max_iterations=8, n_particles=20, local=None)
@@ -182,7 +181,7 @@ class TestGoal:
     def test_missed_is_no_success_and_says_so(self, problem):
         result = identify(self.with_goal(problem, 1e-30), strategy=QUICK, rng=0)
         assert not result.success
-        assert any("above the goal 1e-30" in sentence for sentence in result.against)
+        assert [one.numbers["goal"] for one in result.of_kind("goal")] == [1e-30]
         result = identify(self.with_goal(problem, 1e-9), strategy=SWARM_ONLY, rng=0)
         assert not result.success
 
@@ -246,7 +245,7 @@ class TestStopping:
         assert result.interrupted
         assert not result.success
         assert result.message == "interrupted"
-        assert result.against[0].startswith("the search ended before it found a fit (interrupted)")
+        assert result.findings[0].kind == "stopped" and result.judgement == "no fit"
         assert (seen[-1].phase, seen[-1].iteration) == (phase, iteration)
         assert result.residual <= result.history.swarm * (1 + 1e-7)
 
@@ -364,8 +363,8 @@ class TestResult:
 
     def test_summary_is_a_table_of_the_modes(self, done):
         text = done.summary()
-        assert text.splitlines()[0].startswith("Not determined: " if done.success else "No fit: ")
-        assert f"search: {ending_in_words(done)}" in " ".join(text.split())
+        assert text.splitlines()[0].startswith("One of many: " if done.success else "No fit: ")
+        assert f"search: {done.message}" in " ".join(text.split())
         assert f"seed {done.seed}" in text
         rows = [line for line in text.splitlines() if line[:4].strip().isdigit()]
         frequencies = [float(line.split()[1]) for line in rows]

@@ -51,14 +51,14 @@ def test_imports_go_down_only_late_ones_and_those_for_types_too(count):
 
 def test_assessment_and_search_do_not_know_each_other_and_the_swarm_knows_errors_alone(count):
     files = ROOMS | {
-        "assessment/checks.py": "from sysid.search import local\n",
+        "assessment/checks/against_records.py": "from sysid.search import local\n",
         "search/local.py": "from sysid.assessment import checks\n",
         "swarm/box.py": "from sysid.errors import InputError\nfrom . import stop\nfrom sysid import nlp\n",
         "swarm/stop.py": "",
         "nlp.py": "",
         "errors.py": "",
     }
-    assert count("assessment", files) == (1, ["assessment/checks.py:1"])
+    assert count("assessment", files) == (1, ["assessment/checks/against_records.py:1"])
     assert count("arrows", files) == (1, ["search/local.py:1"])
     assert count("swarm", files) == (1, ["swarm/box.py:3"])
 

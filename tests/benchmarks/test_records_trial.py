@@ -42,8 +42,8 @@ def judged(modules):
 
     levels = modules.simulated.Levels(np.array([0.01]), np.full(n, 0.02), np.array([5.0]))
     result = SimpleNamespace(
-        structure=found, determined=True, undetermined=("a record is wrong", "mode 2 is open"), remarks=("fine",),
-        against=("a record is wrong",), uncertainty=SimpleNamespace(interval=interval),
+        structure=found, determined=True, undetermined=("a record is wrong", "mode 2 is open"),
+        contradictions=("a record is wrong",), of_kind=lambda kind: (), uncertainty=SimpleNamespace(interval=interval),
         noise=SimpleNamespace(base=1.04 * levels.base, response=0.98 * levels.response, force=None),
     )  # fmt: skip
     return modules.trial.judged("chain", result, truth, std, levels)

@@ -19,6 +19,20 @@ from sysid.search.session import DeferredInterrupt
 from sysid.search.swarm_objective import SwarmObjective
 
 
+def test_a_doubtful_fit_ends_with_one_and_the_same_word_everywhere(here, beside_progress, module, no_pictures):
+    misread = module.replace("# a mistake goes here", "response[:, 1] *= 1.02").replace("goal=1e-6", "goal=0.1")
+    (here / "pair.py").write_text(misread)
+    assert cli.main(["run", "pair.py"]) == 1
+    out, error = beside_progress()
+    summary = json.loads((here / "results/pair/summary.json").read_text())
+    first = summary["findings"][0]
+    assert error == "" and out.lstrip().splitlines()[2].startswith("Doubtful: ")
+    assert (summary["judgement"], summary["success"]) == ("doubtful", True)
+    assert (first["kind"], first["severity"], first["channel"]) == ("gain", "contradicts", "sensor 2")
+    assert first["numbers"]["gain"] == pytest.approx(1.02, abs=1e-4)
+    assert sysid.load(here / "results/pair").judgement == "doubtful"
+
+
 def test_a_goal_that_is_not_reached_ends_with_one_and_writes_all(here, beside_progress, module, no_pictures):
     (here / "pair.py").write_text(module.replace("noise=0.0", "noise=0.05"))
     assert cli.main(["run", "pair.py"]) == 1

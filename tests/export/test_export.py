@@ -12,6 +12,11 @@ import sysid
 from sysid.cli.main import main
 from sysid.export.content import damping_of, rotations_of, unit, worth
 from sysid.export.state_space import control_system
+from sysid.finding import Finding, Severity
+
+OPEN = Finding("open", Severity.CAUTION, "the modal mass of mode 2")
+CHANGING = Finding("changing", Severity.CONTRADICTS, "f1 falls with level")
+NO_END = Finding("no solution", Severity.CONTRADICTS, "no end")
 
 
 def read_table(path):
@@ -114,21 +119,21 @@ def test_a_rigid_motion_strains_nothing_and_carries_the_total_mass(result, tmp_p
 
 @pytest.mark.parametrize("ending", ["csv", "bdf", "unv"])
 def test_a_file_says_what_the_data_leave_open(result, tmp_path, ending):
-    doubtful = replace(result, determined=False, undetermined=("the modal mass of mode 2",), closed_by=())
-    text = sysid.export(doubtful, tmp_path / f"m.{ending}").read_text(encoding="utf-8")
-    assert "judgement: ONE OF MANY" in text and "open: the modal mass of mode 2" in text
-    assert "judgement: NO FIT" in sysid.export(replace(result, success=False), tmp_path / f"m.{ending}").read_text()
+    open_ = result.with_findings([OPEN])
+    text = sysid.export(open_, tmp_path / f"m.{ending}").read_text(encoding="utf-8")
+    assert "judgement: ONE OF MANY" in text and f"open: {OPEN}" in text
+    assert "judgement: NO FIT" in sysid.export(result.with_findings([NO_END]), tmp_path / f"m.{ending}").read_text()
 
 
 @pytest.mark.parametrize("ending", ["csv", "bdf", "unv"])
 def test_what_speaks_against_an_answer_and_what_is_open_stand_under_their_own_words(result, tmp_path, ending):
-    against, both = ("f1 falls with level",), ("f1 falls with level", "the modal mass of mode 2")
-    doubted = replace(result, determined=False, against=against, undetermined=both, closed_by=(), interrupted=True)
+    doubted = replace(result.with_findings([CHANGING, OPEN]), interrupted=True)
     text = sysid.export(doubted, tmp_path / f"m.{ending}").read_text(encoding="utf-8")
-    assert text.count("against: f1 falls with level") == 1 and "open: f1 falls" not in text
-    assert "open: the modal mass of mode 2" in text
+    assert "judgement: the search was interrupted" in text and "DOUBTFUL" in text
+    assert text.count(f"against: {CHANGING}") == 1 and f"open: {CHANGING}" not in text
+    assert text.count(f"open: {OPEN}") == 1
     judged = worth(doubted)
-    assert "interrupted" in judged and "may be wrong" in judged and judged.endswith("see 'against' and 'open'")
+    assert "interrupted" in judged and judged.endswith("see 'against' and 'open'")
 
 
 def test_an_unknown_ending_is_told_with_those_that_exist(result, tmp_path):
@@ -148,15 +153,18 @@ def test_the_command_writes_a_file_and_tells_its_precision(result, tmp_path, cap
 
 
 @pytest.mark.parametrize(
-    "changes, told",
+    "finding, interrupted, told",
     [
-        ({"determined": False, "undetermined": ("the mass of mode 2",)}, ("ONE OF MANY", "'open'")),
-        ({"success": False, "determined": False, "against": ("no end",), "undetermined": ("no end",)}, ("NO FIT",)),
-        ({"interrupted": True, "determined": False, "undetermined": ("no end",)}, ("interrupted", "'open'")),
+        (OPEN, False, ("ONE OF MANY", "'open'")),
+        (CHANGING, False, ("DOUBTFUL", "'against'")),
+        (NO_END, False, ("NO FIT", "'against'")),
+        (OPEN, True, ("interrupted", "'open'")),
     ],
 )
-def test_the_command_warns_in_one_line_of_matrices_that_are_not_determined(result, tmp_path, capsys, changes, told):
-    replace(result, closed_by=(), **changes).save(tmp_path / "result.h5")
+def test_the_command_warns_in_one_line_of_matrices_that_are_not_determined(
+    result, tmp_path, capsys, finding, interrupted, told
+):
+    replace(result.with_findings([finding]), interrupted=interrupted).save(tmp_path / "result.h5")
     assert main(["export", str(tmp_path), str(tmp_path / "m.csv")]) == 0
     said = capsys.readouterr()
     (line,) = said.err.splitlines()

@@ -39,7 +39,7 @@ def test_one_in_a_thousand_white_draws_is_accused() -> None:
 
 def test_white_noise_is_not_told() -> None:
     for seed in range(2):
-        assert not any("what the fit leaves" in remark for remark in fitted(made(seed)).remarks)
+        assert not fitted(made(seed)).of_kind("noise left")
 
 
 def test_a_band_of_one_sensor_with_three_times_the_noise_is_told() -> None:
@@ -56,9 +56,10 @@ def test_a_band_of_one_sensor_with_three_times_the_noise_is_told() -> None:
     assert (worst.channel, worst.run) == (1, 0)
     assert 3.8 < worst.low < worst.high < 6.3
     assert worst.factor == pytest.approx(3.0 / np.sqrt(1 + 8 * 2 / 19), rel=0.2)  # of its level over all 19 Hz
-    (told,) = [remark for remark in result.remarks if "what the fit leaves" in remark]
-    assert told.startswith(f"what the fit leaves in sensor 2 is {worst.factor:.2g} times the noise level between ")
-    assert told.replace("\n", " ")[:60] in result.summary().replace("\n  ", " ")
+    told = result.of_kind("noise left")[0]
+    assert (told.channel, told.run) == ("sensor 2", 1)
+    assert told.numbers == {"times": worst.factor, "low": worst.low, "high": worst.high}
+    assert told.sentence[:60] in result.summary().replace("\n  ", " ")
 
 
 @pytest.mark.parametrize(("noise", "told"), [(0.01, True), (0.0, False)])

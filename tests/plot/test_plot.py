@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 import sysid
 from sysid import plot
+from sysid.finding import Finding, Severity
 from sysid.modal_analysis.stabilisation import LEVELS, cmif, stabilisation
 from sysid.plot.canvas import to_png
 from sysid.plot.panels import draw, key, response_channel, strongest
@@ -39,7 +40,7 @@ def result(structure, test, *, goal=None, validation=(), **history):
     )
     x = problem.values(structure)
     return sysid.Identification(
-        structure, problem, x, "swarm", 0, True, "made by hand", sysid.History(**history), False, (), ("all is open",)
+        structure, problem, x, "swarm", 0, sysid.History(**history), (Finding("open", Severity.CAUTION, "all is open"),)
     )
 
 

@@ -240,7 +240,7 @@ def test_the_file_holds_text_and_numbers_and_no_pickle(pair):
 
     with h5py.File(pair[2], "r") as file:
         file.visititems(look)
-        assert int(file.attrs["format"]) == 4
+        assert int(file.attrs["format"]) == 5
     assert found
 
 

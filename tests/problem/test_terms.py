@@ -246,11 +246,11 @@ class TestExpressions:
         np.testing.assert_allclose(rows.jacobian, level * expected, rtol=1e-9)
         np.testing.assert_allclose(rows.std, level, rtol=1e-9)
         assert prior.labels == ("k[1]", "k[2]")
-        assert prior.doubts(x) == []
+        assert prior.findings(x) == []
         far = x.copy()
         far[1] = 2700.0
-        (doubt,) = prior.doubts(far)
-        assert doubt.startswith("k[1] ends 6 of the stated standard deviations")
+        (found,) = prior.findings(far)
+        assert found.kind == "stated value" and found.numbers == pytest.approx({"k[1]": 6.0})
 
     def test_rows_of_a_residual_are_as_exact_as_numbers_of_the_test(self):
         problem = self.problem(lambda k: ca.vertcat(k[0] / 1000 - 2.9, k[1] * k[2] / 1e6 - 1))

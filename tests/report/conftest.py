@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import sysid
+from sysid.finding import Finding, Severity
 from sysid.report import matrices as _report_matrices
 from sysid.report import report
 
@@ -59,9 +60,14 @@ def complete(truth, hostile):
         log=("0.00 s  swarm over 27 unknowns", "<b>done</b>"),
     )
     return sysid.Identification(
-        guess, problem, problem.values(guess), "swarm", 42, True, "Solve_Succeeded; damping_ratio[1] ends on its bound",
-        history, False, ("the force weighs 2 modes",), ("the mass of mode 3 is open",),
-        ("strategy 'swarm', as asked",), False, sysid.Recipe("problems/tower.py", "data/x", 1),
+        guess, problem, problem.values(guess), "swarm", 42, history,
+        (
+            Finding("open", Severity.CAUTION, "the mass of mode 3 is open"),
+            Finding("fixed", Severity.NOTE, "the force weighs 2 modes"),
+            Finding("strategy", Severity.NOTE, "strategy 'swarm', as asked"),
+            Finding("ending", Severity.NOTE, "Solve_Succeeded; damping_ratio[1] ends on its bound"),
+        ),
+        recipe=sysid.Recipe("problems/tower.py", "data/x", 1),
     )  # fmt: skip
 
 
@@ -80,8 +86,13 @@ def plain(truth):
         stiffness=sysid.SpectralStiffness(truth.natural_frequencies),
     )
     return sysid.Identification(
-        truth, problem, problem.values(truth), "swarm", None, False, "interrupted", sysid.History(), True,
-        ("the mass matrix is known",), (), (), True,
+        truth, problem, problem.values(truth), "swarm", None, sysid.History(),
+        (
+            Finding("stopped", Severity.CONTRADICTS, "the search ended before it found a fit (interrupted)"),
+            Finding("fixed", Severity.NOTE, "the mass matrix is known"),
+            Finding("ending", Severity.NOTE, "interrupted"),
+        ),
+        interrupted=True,
     )  # fmt: skip
 
 

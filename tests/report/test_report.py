@@ -13,6 +13,7 @@ import pytest
 from scipy.stats import norm
 
 import sysid
+from sysid.finding import Finding, Severity
 from sysid.report import opening, report
 from sysid.report.html import aligned
 from sysid.report.noise_level import noise_level
@@ -83,7 +84,7 @@ def test_the_report_opens_with_the_answer_and_ends_with_the_search(complete, pag
         assert words in opening
     for words in (
         "The mass of mode 3 is open.", "The force weighs 2 modes.", "Strategy 'swarm', as asked.",
-        "Success. The search: Solve_Succeeded; damping_ratio[1] ends on its bound",
+        "One of many. The search: Solve_Succeeded; damping_ratio[1] ends on its bound",
         f"Relative residual {complete.residual:.3e}", f"Of the base force: {complete.force_residual:.3e}",
         "exploration 7", "777 candidates",
         "swarm over 27 unknowns", "problems/tower.py", "42", sysid.__version__, "Unknowns of the search",
@@ -94,16 +95,15 @@ def test_the_report_opens_with_the_answer_and_ends_with_the_search(complete, pag
 
 def test_what_is_open_and_what_speaks_against_the_answer_stand_apart(complete):
     against, left = "the damping is not classical; ratios approximate it", "the mass of mode 3 is open"
-    doubtful = dataclasses.replace(complete, against=(against,), undetermined=(against, left))
+    doubtful = complete.with_findings([Finding("damping", Severity.CONTRADICTS, against)])
     told = [part.split("</h3>") for part in opening.trust(doubtful).split("<h3>")[1:]]
     assert [name for name, _ in told] == [
-        "What speaks against it", "What the data do not determine", "What fixes the matrices",
+        "What speaks against it", "What the data do not determine",
     ]  # fmt: skip
     assert against[1:] in told[0][1] and left[1:] not in told[0][1]
     assert left[1:] in told[1][1] and against[1:] not in told[1][1]
-    ended = "the search ended before it found a fit (interrupted): these matrices are no more than the best until then"
-    for expected, undetermined in (((against, ended), (against, ended, left)), (("interrupted",), (left,))):
-        failed = dataclasses.replace(complete, success=False, against=expected, undetermined=undetermined)
+    for expected in ((against, "the solver failed"), ("interrupted",)):
+        failed = complete.with_findings(Finding("no solution", Severity.CONTRADICTS, one) for one in expected)
         told = dict(part.split("</h3>") for part in opening.trust(failed).split("<h3>")[1:])
         lines = {name: re.findall("<li>(.*?)</li>", content) for name, content in told.items()}
         assert lines["What speaks against it"] == [f"{one[0].upper()}{one[1:]}." for one in expected]
@@ -112,7 +112,8 @@ def test_what_is_open_and_what_speaks_against_the_answer_stand_apart(complete):
 
 def test_a_model_that_does_not_fit_opens_with_why_and_without_intervals(complete):
     level = noise_level(complete.problem.screened.measurement, complete.structure)
-    failed = dataclasses.replace(complete, success=False, against=("are they in Hz?", "it softens", "its gains"))
+    reasons = ("are they in Hz?", "it softens", "its gains")
+    failed = complete.with_findings(Finding("residual", Severity.CONTRADICTS, one) for one in reasons)
     right, wrong = (opening.opening(it, level) for it in (complete, failed))
     assert "±" in right and "±" not in wrong and "without intervals" in wrong
     assert re.findall("<li>(.*?)</li>", wrong) == ["Are they in Hz?", "It softens."] and "<li>" not in right
@@ -372,9 +373,7 @@ def written(truth):
         test, mass=sysid.LumpedMass([3.0, 4.0]), stiffness=truth.stiffness, damping=C, residuals=[further]
     )
     x = np.array([0.3, 0.6, 0.9, 20.0, 500.0, 40.0])
-    return sysid.Identification(
-        problem.structure(x), problem, x, "continuation", 0, True, "", sysid.History(), False, (), (), ()
-    )
+    return sysid.Identification(problem.structure(x), problem, x, "continuation", 0, sysid.History(), ())
 
 
 def test_unknowns_stand_with_units_and_mark_the_bound_that_they_rest_on(written, no_pictures):

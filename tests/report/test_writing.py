@@ -69,7 +69,5 @@ def test_a_page_of_12_panels_stays_below_1_megabyte(random_structure, tmp_path):
         mass=sysid.FullMass(),
         stiffness=sysid.SpectralStiffness(truth.natural_frequencies),
     )
-    it = sysid.Identification(
-        truth, problem, problem.values(truth), "swarm", 0, True, "", sysid.History(), False, (), (), ()
-    )
+    it = sysid.Identification(truth, problem, problem.values(truth), "swarm", 0, sysid.History(), ())
     assert report.write_report(it, tmp_path).stat().st_size < 1e6

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 import sysid
+from sysid.finding import Finding, Severity
 
 MASSES, SPRINGS = np.array([2.0, 1.0]), np.array([3e4, 2e4])
 STRETCH = np.array([[1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]])
 M, K = np.diag([*MASSES, 0.0]), STRETCH.T @ np.diag(SPRINGS) @ STRETCH
 RATIOS = np.array([0.02, 0.03])
+NOT_CLOSED = (Finding("open", Severity.CAUTION, "not judged here"),)
 LINES = np.linspace(5.0, 60.0, 50)
 
 
@@ -33,7 +35,7 @@ def ended_at(problem, **values):
 
 
 def stood_for(problem, structure, x):
-    return sysid.Identification(structure, problem, x, "made by hand", 0, True, "", sysid.History(), False, (), ())
+    return sysid.Identification(structure, problem, x, "made by hand", 0, sysid.History(), NOT_CLOSED)
 
 
 def springs(**options):
@@ -174,13 +176,19 @@ def test_an_open_scale_of_variables_is_one_of_many(closed):
 def test_judgement_and_confidence_say_first_what_weighs_most():
     test = measured(force=True)
     found = stood_for(sysid.Problem(test, mass=sysid.FullMass()), floors(), None)
-    fixed = dataclasses.replace(
-        found, determined=True, undetermined=(), closed_by=("force",), remarks=("why", "a bound")
-    )
-    open_ = dataclasses.replace(fixed, determined=False, undetermined=("mode 2 is open",), closed_by=())
-    failed = dataclasses.replace(open_, success=False, against=("no fit: 60 % is left",))
-    assert [it.judgement for it in (fixed, open_, failed)] == ["determined", "one of many", "no fit"]
+    fixed = dataclasses.replace(found, findings=()).with_findings([
+        Finding("strategy", Severity.NOTE, "why"), Finding("fixed", Severity.NOTE, "force"),
+        Finding("on a bound", Severity.NOTE, "a bound"),
+    ])  # fmt: skip
+    open_ = fixed.with_findings([Finding("open", Severity.CAUTION, "mode 2", "weigh it")])
+    doubtful = open_.with_findings([Finding("gain", Severity.CONTRADICTS, "a gain is wrong")])
+    failed = doubtful.with_findings([Finding("residual", Severity.CONTRADICTS, "60 % is left")])
+    each = (fixed, open_, doubtful, failed)
+    assert [it.judgement for it in each] == ["determined", "one of many", "doubtful", "no fit"]
+    assert [it.determined for it in each] == [True, False, False, False]
+    assert [it.success for it in each] == [True, True, True, False]
     assert fixed.confidence == ("force", "a bound")
-    assert open_.confidence == ("mode 2 is open", "a bound")
-    assert failed.confidence == ("no fit: 60 % is left", "mode 2 is open", "a bound")
+    assert open_.confidence == ("mode 2; weigh it", "a bound")
+    assert failed.confidence == ("a gain is wrong", "60 % is left", "mode 2; weigh it", "a bound")
+    assert failed.undetermined == failed.confidence[:3] and not failed.closed_by
     assert failed.to_dict()["judgement"] == "no fit" and failed.to_dict()["confidence"] == list(failed.confidence)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import sysid
+from sysid.finding import Finding, Severity
 
 
 def result(path):
@@ -16,9 +17,10 @@ def result(path):
         sysid.simulate(truth, np.linspace(1.0, 40.0, 60), noise=0.01, rng=0), mass=sysid.LumpedMass(5.0),
         stiffness=[[k[0] + k[1], -k[0]], [-k[0], k[0]]], damping=[0.01, 0.02],
     )  # fmt: skip
+    findings = (Finding("open", Severity.CAUTION, "all"),)
     made = sysid.Identification(
-        truth, problem, np.ones(4), "swarm", 1, True, "", sysid.History(log=("one",) * 9), False, (), ("all",)
-    )
+        truth, problem, np.ones(4), "swarm", 1, sysid.History(log=("one",) * 9), findings
+    )  # fmt: skip
     return made.save(path)
 
 

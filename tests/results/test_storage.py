@@ -9,6 +9,7 @@ import pytest
 
 import sysid
 from sysid.files.tree import from_bytes, to_bytes
+from sysid.finding import Finding, Severity
 from sysid.models.unknowns import Unknown
 from sysid.results import storage
 
@@ -81,9 +82,13 @@ def identification(
         log=("    0.00 s  swarm – α", "    1.00 s  done"),
     )  # fmt: skip
     made = sysid.Identification(
-        truth, problem, np.pi * np.arange(problem.n_variables), "swarm", 2**62 + 1, True, "Solve_Succeeded; ζ",
-        history, False, (), ("mode 1 is open", "no unit"), ("strategy 'swarm', as asked", "degrés de liberté: β"), True,
-        sysid.Recipe("problems/häuser.py", None, 3),
+        truth, problem, np.pi * np.arange(problem.n_variables), "swarm", 2**62 + 1, history,
+        (
+            Finding("open", Severity.CAUTION, "mode 1 is open"),
+            Finding("gain not shown", Severity.NOTE, "degré: β", "remède", 2, "α", {"g": 1.01}),
+            Finding("ending", Severity.NOTE, "Solve_Succeeded; ζ"),
+        ),
+        True, recipe=sysid.Recipe("problems/häuser.py", None, 3),
     )  # fmt: skip
     return dataclasses.replace(made, **changes)
 
@@ -140,8 +145,8 @@ def test_round_trip_keeps_what_is_absent(tmp_path):
         sysid.simulate(truth, [1.0, 2.0, 3.0]), mass=sysid.FullMass(), stiffness=STIFFNESSES["spectral"]
     )
     original = identification(
-        structure=truth, problem=problem, x=np.zeros(problem.n_variables), seed=None, recipe=None, undetermined=(),
-        determined=True, interrupted=False, history=sysid.History(),
+        structure=truth, problem=problem, x=np.zeros(problem.n_variables), seed=None, recipe=None, findings=(),
+        interrupted=False, history=sysid.History(),
     )  # fmt: skip
     assert_same(original, sysid.load(original.save(tmp_path / "a.h5")))
 
@@ -201,9 +206,12 @@ def test_the_file_holds_numbers_and_text_only(tmp_path):
 
 def test_a_text_keeps_every_character(tmp_path):
     text = "a\nb\t<&\"'> \u2028 \U0001f527 \udcff"
-    original = identification(message=text, undetermined=("", text), closed_by=("",))
+    each = [Finding(kind, severity, told, told, None, told, {text: 1.5, "": np.inf}) for kind, severity, told in (
+        ("ending", Severity.NOTE, text), ("open", Severity.CAUTION, ""), ("open", Severity.CAUTION, text),
+    )]  # fmt: skip
+    original = identification(findings=tuple(each))
     back = sysid.load(original.save(tmp_path))
-    assert (back.message, back.undetermined, back.closed_by) == (text, ("", text), ("",))
+    assert back.findings == original.findings
 
 
 def test_a_huge_seed_survives(tmp_path):
@@ -229,8 +237,8 @@ def test_a_failure_while_writing_leaves_the_old_file_and_nothing_else(tmp_path, 
 
 
 def test_what_cannot_be_stored_leaves_nothing(tmp_path):
-    with pytest.raises(sysid.InputError, match="/message: a object cannot be stored"):
-        identification(message=object()).save(tmp_path / "a.h5")
+    with pytest.raises(sysid.InputError, match="/strategy: a object cannot be stored"):
+        identification(strategy=object()).save(tmp_path / "a.h5")
     assert not list(tmp_path.iterdir())
 
 
@@ -249,9 +257,9 @@ def test_each_wrong_file_gets_its_own_sentence(tmp_path):
         ("cut.h5", good[:9000], f"it has 9000 bytes, and {len(good)} were written"),
         ("longer.h5", good + b"\0", f"it has {len(good) + 1} bytes, and {len(good)} were written"),
         ("other.h5", good[:-1] + bytes([good[-1] ^ 1]), "its bytes have another SHA-256"),
-        ("later.h5", to_bytes({"sysid_version": "9.1"}, 5), r"format 5 \(sysid 9.1\), .* a later sysid is needed"),
-        ("records.h5", to_bytes({"content": "sysid test"}, 4), "it holds a sysid test, not a sysid identification"),
-        ("earlier.h5", to_bytes({"content": "sysid identification"}, 3), "format 3, .*anew by 'sysid run PROBLEM'"),
+        ("later.h5", to_bytes({"sysid_version": "9.1"}, 6), r"format 6 \(sysid 9.1\), .* a later sysid is needed"),
+        ("records.h5", to_bytes({"content": "sysid test"}, 5), "it holds a sysid test, not a sysid identification"),
+        ("earlier.h5", to_bytes({"content": "sysid identification"}, 4), "format 4, .*anew by 'sysid run PROBLEM'"),
     ):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(sysid.InputError, match=f"{name} cannot be read: .*{sentence}"):

@@ -10,6 +10,7 @@ from scipy.stats import norm
 
 import sysid
 from sysid.export.content import statements
+from sysid.finding import Finding, Severity
 from sysid.results.summary import verdict
 
 FREQ = np.linspace(3.0, 120.0, 60)
@@ -94,9 +95,9 @@ def test_no_line_is_wider_than_120_columns(random_structure):
     for force in (True, False):
         test = sysid.simulate(wide, np.linspace(2, 30, 80), noise=0.01, force=force, rng=2)
         it = sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), strategy="modal", rng=0)
-        it = dataclasses.replace(it, message="word " * 60, remarks=("remark " * 40,))
+        it = it.with_findings([Finding("search", Severity.NOTE, "remark " * 40)])
         assert max(map(len, it.summary().splitlines())) <= 120
-        assert all(remark.strip() in " ".join(it.summary().split()) for remark in it.remarks)
+        assert all(str(note).strip() in " ".join(it.summary().split()) for note in it.notes)
 
 
 def test_degrees_of_freedom_are_sensors_or_modal_coordinates(modal, truth):
@@ -138,7 +139,8 @@ def test_the_figures_are_json_with_null_for_what_is_open(modal, truth):
     figures = json.loads(json.dumps(it.to_dict(), allow_nan=False))
     assert figures["natural_frequencies_std_hz"] == it.uncertainty.natural_frequencies.tolist()
     assert figures["damping_ratios_std"] == it.uncertainty.damping_ratios.tolist()
-    assert figures["remarks"] == list(it.remarks) and "as asked" in figures["remarks"][0]
+    assert [one["kind"] for one in figures["findings"]] == [one.kind for one in it.findings]
+    assert figures["confidence"] == list(it.confidence)
     # A mode with no momentum along any base direction answers nothing.
     phi = truth.normal_modes
     blind = truth.mass.copy()
@@ -160,20 +162,19 @@ def test_the_judgement_stands_first_with_what_speaks_against_it_and_the_next_ste
     it = modal(force=True)
     assert it.summary().startswith("Determined: data and stated model leave one mass and one stiffness matrix.\n  - ")
     against = ("the structure softens", "the model misses the records", "a gain is wrong")
-    failed = dataclasses.replace(
-        it, success=False, determined=False, closed_by=(), against=against, undetermined=(*against, "mode 2 is open"),
-        message="IPOPT: Solve_Succeeded", changing=True,
-    )  # fmt: skip
+    kinds = ("changing", "beyond noise", "gain")
+    contradict = [Finding(kind, Severity.CONTRADICTS, told) for kind, told in zip(kinds, against, strict=True)]
+    failed = it.with_findings([*contradict, Finding("open", Severity.CAUTION, "mode 2 is open")])
     lines = failed.summary().splitlines()
     assert lines[0] == "No fit: these matrices do not explain the records as they should. Fitted: 2 runs."
     assert [line[4:] for line in lines[1:3]] == list(against[:2]) and lines[3].startswith("  > fit by itself a run")
     besides = lines[lines.index("besides:") :]
     assert [line[4:] for line in besides[1:3]] == ["a gain is wrong", "mode 2 is open"]
-    assert besides[-1] == "search: the solver ended as it should (IPOPT: Solve_Succeeded)"
+    assert besides[-1] == f"search: {it.message}" and it.message
     assert "explain the data" not in failed.summary() and "this one does not; mass" in failed.summary()
     goal = np.ceil(100 * it.residual) / 100
     assert f"goal={goal:.2g} (sysid run test.h5 --goal {goal:.2g})" in failed.summary()
-    assert "Not determined: something speaks" in dataclasses.replace(failed, success=True).summary()
+    assert it.with_findings([contradict[2]]).summary().startswith("Doubtful: a fit, but ")
 
 
 def test_masses_without_a_unit_are_marked_and_a_gain_moves_none_of_them(modal):
@@ -210,11 +211,11 @@ def test_one_open_factor_is_closed_by_a_total_and_what_a_total_takes_for_granted
     assert "one common factor" in scale.summary() and "any number of times" not in scale.summary()
     assert "any number of times" in every.summary()
     granted = "all of the stated 3 kg is taken to sit at the sensors"
-    assert stated.determined and any(granted in sentence for sentence in stated.remarks)
+    assert stated.determined and any(granted in str(note) for note in stated.notes)
     forced = sysid.simulate(truth, lines, noise=0.01, force=True, rng=0)
     weighed = sysid.identify(sysid.Problem(forced, mass=sysid.LumpedMass(4.0)), rng=0)
     assert "4 kg in the base directions, but the base force weighs 3" in weighed.confidence[0]
-    assert not any("taken to sit" in sentence for sentence in weighed.remarks)
+    assert not weighed.of_kind("assumed total")
 
 
 def test_what_is_determined_without_a_force_is_told_to_rest_on_what_is_stated():

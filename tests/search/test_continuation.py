@@ -124,8 +124,8 @@ def test_a_second_structure_that_explains_the_data_exactly_is_told(sensors):
         return
     assert abs(found) == pytest.approx(COUPLING, rel=1e-8)
     assert not result.determined
-    (told,) = (sentence for sentence in result.undetermined if "another structure explains" in sentence)
-    assert f"coupling = {-found:.4g} in place of {found:.4g}" in told
+    (told,) = result.of_kind("other answers")
+    assert told.numbers["coupling"] == pytest.approx(-found)
 
 
 def test_ends_of_other_starts_that_explain_the_data_as_well_are_alternatives_once_each():
@@ -221,7 +221,7 @@ def test_starts_left_out_for_want_of_time_are_told(monkeypatch):
     problem = sysid.Problem(measured(noise=0.01), mass=np.diag(MASS), stiffness=K, damping=C)
     result = sysid.identify(problem, strategy=sysid.Continuation(starts=4), rng=0)
     assert result.success
-    assert any(told.startswith("3 of 4 starts were left out for want of time") for told in result.remarks)
+    assert any(one.sentence.startswith("3 of 4 starts") for one in result.of_kind("search"))
 
 
 def test_time_over_before_there_is_any_structure_is_an_error_of_the_search(monkeypatch):

@@ -20,7 +20,6 @@ STRETCH = np.array([[1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]])
 MASS, SPRINGS, DAMPERS = np.array([5.0, 4.0]), np.array([2e4, 1.5e4]), np.array([9.0, 6.0])
 EXCHANGE = MASS.sum() / MASS[1]
 SEEDS_MISSED_BEFORE = (2, 4)  # continuation alone comes to one answer only
-TOLD = "another structure explains the data as well"
 
 
 def problem(floors=(1,), *, noise=0.01, rng=0, lower=1e3, ratios=False, constraints=lambda k, c: []):
@@ -135,11 +134,9 @@ def test_a_second_answer_is_told_with_its_values(seed):
     result = sysid.identify(problem(rng=seed), rng=seed)
     assert result.success
     assert not result.determined
-    (told,) = result.undetermined
-    other = exchanged(result.x)
-    assert told.startswith(f"{TOLD}: spring[0] = ")
-    values = [float(part.split(" in place")[0].split("= ")[1]) for part in told.split(", ")]
-    np.testing.assert_allclose(values, other, rtol=2e-3)
+    (told,) = (*result.contradictions, *result.open_findings)
+    assert told.kind == "other answers"
+    np.testing.assert_allclose([*told.numbers.values()], exchanged(result.x), rtol=2e-3)
 
 
 def test_nobody_accuses_unique_answers():
@@ -148,7 +145,7 @@ def test_nobody_accuses_unique_answers():
     for posed in (problem((0, 1), rng=2), problem(rng=2, lower=1e4)):
         result = sysid.identify(posed, rng=2, start=start)
         assert result.determined, result.undetermined
-        assert not any("looked for" in told for told in result.remarks)
+        assert not result.of_kind("search", "other answers")
 
 
 def test_no_time_is_lost_where_the_equations_are_linear(monkeypatch):
@@ -221,7 +218,8 @@ def test_ctrl_c_during_the_look_keeps_the_answer_and_says_so(ctrl_c):
     assert result.success
     assert not result.determined
     np.testing.assert_allclose(result.values["spring"], SPRINGS, rtol=0.01)
-    assert result.undetermined == (other_answers.NOT_LOOKED_FOR.format("interrupted"),)
+    (told,) = (*result.contradictions, *result.open_findings)
+    assert told.kind == "other answers" and "interrupted" in told.sentence
 
 
 def test_a_callback_may_stop_it():
@@ -231,7 +229,8 @@ def test_a_callback_may_stop_it():
 
     result = sysid.identify(problem(rng=2), rng=2, callback=stop)
     assert not result.determined
-    assert result.undetermined == (other_answers.NOT_LOOKED_FOR.format("the callback stopped the search"),)
+    (told,) = (*result.contradictions, *result.open_findings)
+    assert told.kind == "other answers" and "callback" in told.sentence
 
 
 def test_the_time_limit_ends_it(monkeypatch):
@@ -245,13 +244,14 @@ def test_the_time_limit_ends_it(monkeypatch):
 
     monkeypatch.setattr("sysid.results.judgement.with_other_answers", late)
     result = sysid.identify(problem(rng=2), rng=2)
-    assert result.undetermined == (other_answers.NOT_LOOKED_FOR.format("the time was over"),)
+    (told,) = (*result.contradictions, *result.open_findings)
+    assert told.kind == "other answers" and "time" in told.sentence
 
 
 def test_too_many_unknowns_are_a_remark(monkeypatch):
     monkeypatch.setattr(other_answers, "_FEWEST_STARTS", 65)
     result = sysid.identify(problem(rng=2), rng=2)
-    assert any("no other structure that explains the data as well was looked for" in told for told in result.remarks)
+    assert len(result.of_kind("search")) == 1
 
 
 def test_least_squares_from_many_starts_finds_every_root_and_keeps_to_the_box():

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
+from sysid.assessment.checks.context import Context
+from sysid.assessment.checks.noise_multiples import BEYOND, misses_of_test
+from sysid.errors import InputError
+from sysid.finding import Finding, Severity
 from sysid.measurement.in_time import levels_are_known
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.stretches import Stretch, stretches_of
+from sysid.modal_analysis.transients import without_transients_of
 from sysid.problem.problem import Problem
 from sysid.structure.structure import Array
 
@@ -91,7 +97,7 @@ class Change:
         in_time = abs(spearmanr(np.arange(len(self.seen)), self.frequency).statistic)
         return float(found.statistic) if found.pvalue < chance and abs(found.statistic) > in_time else 0.0
 
-    def in_words(self) -> str:
+    def in_words(self) -> tuple[str, str]:
         """How the frequency changes, and what to do."""
         records = list(dict.fromkeys(one.record for one in self.seen))
         own = {record: [one for one in self.seen if one.record == record] for record in records}
@@ -104,21 +110,23 @@ class Change:
         ends = (f"{one.frequency:.4g} Hz at {one.part} of {one.record}" for one in (low, high))
         return (
             f"changes along the records, from {' to '.join(ends)}: the structure is not the same all the time (level, "
-            "temperature, joints); fit a part in which it is"
+            "temperature, joints)",
+            "fit a part in which it is",
         )
 
-    def _by_record(self, own: dict[str, list[Seen]]) -> str:
+    def _by_record(self, own: dict[str, list[Seen]]) -> tuple[str, str]:
         means = {r: np.mean([(one.frequency, one.level) for one in part], axis=0) for r, part in own.items()}
         told = ", ".join(f"{f:.4g} Hz in {record} at {self._motion(level)}" for record, (f, level) in means.items())
-        return f"differs from record to record ({told}): fit them one by one, and find what changed between them"
+        return f"differs from record to record ({told})", "fit them one by one, and find what changed between them"
 
-    def _by_level(self) -> str:
+    def _by_level(self) -> tuple[str, str]:
         first, *_, last = sorted(self.seen, key=lambda one: one.level)
         rises, softens = ("falls", "softens") if self.trend < 0 else ("rises", "stiffens")
         return (
             f"{rises} as the motion grows, from {first.frequency:.4g} Hz at {self._motion(first.level)} to "
             f"{last.frequency:.4g} Hz at {self._motion(last.level)} of the sensor that it moves most: the structure "
-            f"{softens}, and no linear model holds at all levels; fit runs of the level of interest"
+            f"{softens}, and no linear model holds at all levels",
+            "fit runs of the level of interest",
         )
 
     def _motion(self, level: float) -> str:
@@ -127,8 +135,25 @@ class Change:
         return f"{level:.2g} m/s² rms" if self.scaled else f"{level / least:.2g} times the least motion"
 
 
-def changes_in_words(problem: Problem) -> tuple[str, ...]:
-    """The mode whose frequency changes most between stretches of all records, in a sentence; none where none does.
+def changing_frequencies(context: Context) -> Iterator[Finding]:
+    """Frequencies change along the records, from run to run, or with level."""
+    if not context.is_judged or context.named:
+        return
+    structure, modal = context.end.structure, context.modal
+    unfitted = [without_transients_of(test, structure) for test in context.problem.validation]
+    missed = [miss for test in unfitted for miss in misses_of_test(test, structure)]
+    uneven = modal is not None and bool(modal.scatter is not None or modal.excess)
+    if not (uneven or any(miss.times > BEYOND for miss in (*context.misses, *missed))):
+        return
+    try:
+        yield from changing(context.problem, context.weight)
+    except (InputError, np.linalg.LinAlgError) as error:
+        why = f"whether frequencies change along the records was not judged: {error}"
+        yield Finding("changes not judged", context.weight, why)
+
+
+def changing(problem: Problem, severity: Severity = Severity.CONTRADICTS) -> tuple[Finding, ...]:
+    """The mode whose frequency changes most between stretches of all records; none where none does.
 
     Parameters
     ----------
@@ -141,7 +166,13 @@ def changes_in_words(problem: Problem) -> tuple[str, ...]:
     most = max(found, key=lambda one: (one.trend != 0, one.size))
     others = ", ".join(f"{one.mode:.3g}" for one in found if one is not most)
     also = f" (and that of others near {others} Hz)" if others else ""
-    return (f"the frequency of the mode near {most.mode:.3g} Hz{also} {most.in_words()}",)
+    how, remedy = most.in_words()
+    numbers = {
+        "frequency": most.mode, "lowest": float(most.frequency.min()), "highest": float(most.frequency.max()),
+        "trend": most.trend,
+    }  # fmt: skip
+    sentence = f"the frequency of the mode near {most.mode:.3g} Hz{also} {how}"
+    return (Finding("changing", severity, sentence, remedy, numbers=numbers),)
 
 
 def changes(problem: Problem) -> list[Change]:
@@ -202,8 +233,9 @@ class Poles(NamedTuple):
 
 def _modes(test: Measurement) -> Poles | None:
     """Poles of a test; None where it shows none."""
-    if test.modal is not None:
-        omega, ratios, shapes = test.modal.omega, test.modal.ratios, test.modal.phi
+    modal = test.modal
+    if modal is not None:
+        omega, ratios, shapes = modal.omega, modal.ratios, modal.phi
     else:
         poles = PolesAndResidues.of(test)
         if poles is None:

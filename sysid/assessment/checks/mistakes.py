@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sysid.finding import Finding, Kind, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.direct_terms import DirectTerms, direct_terms
 from sysid.structure.structure import Array
@@ -44,27 +45,20 @@ _UNITS = (  # what sensors over base are multiplied by, in words, and the units 
 _CLEAR = (-1.0, *(unit[0] for unit in _UNITS))  # factors that no mode makes
 
 
-@dataclass(frozen=True)
-class Mistake:
-    """A mistake that the records show.
+def is_gross(mistake: Finding) -> bool:
+    """Whether no model with a form of its own fits a channel with it: a search in its unknowns is not worth its time.
 
-    Attributes
-    ----------
-    sentence : str
-        What is wrong, by what it shows, and what to do.
-    everywhere : bool
-        It spoils all channels, so that nothing is worth a search.
-    gross : bool
-        No model with a form of its own fits one channel, so that a search in its unknowns is not worth its time.
+    A gain of one sensor and a small delay may be fitted so far that the rest is of use.
     """
+    if mistake.kind == "late sensor":
+        return mistake.numbers["turn"] > _LARGE_TURN
+    return mistake.kind not in ("gain", "short segments")
 
-    sentence: str
-    everywhere: bool = False
-    gross: bool = True
 
-
-def mistakes_of(test: Measurement, terms: DirectTerms | None) -> list[Mistake]:
+def mistakes_of(test: Measurement, terms: DirectTerms | None) -> list[Finding]:
     """Mistakes that the records of a test show by themselves, the worst first; none where they cannot tell.
+
+    Those that spoil all channels are blocking.
 
     Parameters
     ----------
@@ -82,22 +76,23 @@ def mistakes_of(test: Measurement, terms: DirectTerms | None) -> list[Mistake]:
     return [*late, *_of_motion(test, terms), *_of_force(test, terms)]
 
 
-def _conjugated(test: Measurement, terms: DirectTerms) -> Iterator[Mistake]:
+def _conjugated(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
     """Whether the conjugates of the spectra are those of modes, and the spectra are not."""
     if test.whole is not None:
         return
     force = None if test.force is None else test.force.conj()
     other = direct_terms(replace(test, base=test.base.conj(), response=test.response.conj(), force=force))
     if other is not None and other.misfit < _MENDED * terms.misfit:
-        yield Mistake(
+        yield Finding(
+            "conjugated spectra", Severity.BLOCKING,
             "the spectra follow exp(-i w t): modes that decay leave "
-            f"{100 * terms.misfit:.3g} % of the responses, and {100 * other.misfit:.3g} % of their conjugates: take "
-            "the complex conjugate of response and force (numpy.conj)",
-            everywhere=True,
-        )
+            f"{100 * terms.misfit:.3g} % of the responses, and {100 * other.misfit:.3g} % of their conjugates",
+            "take the complex conjugate of response and force (numpy.conj)",
+            numbers={"misfit": terms.misfit, "conjugated": other.misfit},
+        )  # fmt: skip
 
 
-def _late(test: Measurement, terms: DirectTerms) -> tuple[list[Mistake], DirectTerms]:
+def _late(test: Measurement, terms: DirectTerms) -> tuple[list[Finding], DirectTerms]:
     """Sensors whose records are late against the base's, and the terms of the records without that delay."""
     total = np.zeros(test.n_sensors)
     first: Array | None = None
@@ -121,13 +116,15 @@ def _late(test: Measurement, terms: DirectTerms) -> tuple[list[Mistake], DirectT
     who = "the records of all sensors are" if of_all else f"the record of {_names(test, which)} is"
     delay = float(np.mean(total[which]))
     word = "late" if delay > 0 else "early"
-    sentence = (
+    turn = abs(delay) * 2 * np.pi * float(test.freq[-1])
+    late = Finding(
+        "late sensor", Severity.BLOCKING if of_all and turn > _LARGE_TURN else Severity.CONTRADICTS,
         f"{who} {1e3 * abs(delay):.3g} ms {word} against the base's: beside their modes the sensors follow the base "
-        "with a phase that grows with frequency, as two clocks or a filter on some channels alone make it; bring them "
-        "to one clock (sysid.resample), or filter all channels alike"
-    )
-    turned = abs(delay) * 2 * np.pi * test.freq[-1]
-    return [Mistake(sentence, everywhere=of_all and turned > _LARGE_TURN, gross=turned > _LARGE_TURN)], terms
+        "with a phase that grows with frequency, as two clocks or a filter on some channels alone make it",
+        "bring them to one clock (sysid.resample), or filter all channels alike",
+        channel=test.sensor_names[which[0]] if which.size == 1 else None, numbers={"delay": delay, "turn": turn},
+    )  # fmt: skip
+    return [late], terms
 
 
 def _delays(test: Measurement, terms: DirectTerms) -> Array | None:
@@ -187,7 +184,7 @@ class _Motion:
         return np.asarray(np.all(off < np.maximum(within * size, _SURE * self.std), axis=1))
 
 
-def _of_motion(test: Measurement, terms: DirectTerms) -> Iterator[Mistake]:
+def _of_motion(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
     """What the recorded rigid-body motion differs by from what is stated, the simplest explanation of all of it."""
     reach = _reach(test)
     G, c, std = test.rigid_body / reach, terms.rigid / reach, terms.rigid_std / reach
@@ -216,19 +213,20 @@ def _of_motion(test: Measurement, terms: DirectTerms) -> Iterator[Mistake]:
     yield from _swapped(test, motion, right) or _of_sensors(test, motion, right)
 
 
-def _relative(motion: _Motion) -> Iterator[Mistake]:
+def _relative(motion: _Motion) -> Iterator[Finding]:
     """Whether no sensor moves with the base, though their modes carry what moves with it."""
     size = np.linalg.norm(motion.stated, axis=1)
     carried = np.sum(motion.modal * motion.stated) / np.sum(motion.stated**2)
     if np.all(np.linalg.norm(motion.recorded, axis=1) < _NONE * size) and carried > _CARRIED:
-        yield Mistake(
+        yield Finding(
+            "relative responses", Severity.BLOCKING,
             "the responses are relative to the base, not absolute: beside their modes the sensors do not move with the "
-            "base at all; add what rigid_body makes of the base's acceleration (response + G base)",
-            everywhere=True,
-        )
+            "base at all",
+            "add what rigid_body makes of the base's acceleration (response + G base)",
+        )  # fmt: skip
 
 
-def _of_columns(test: Measurement, motion: _Motion) -> Iterator[Mistake]:
+def _of_columns(test: Measurement, motion: _Motion) -> Iterator[Finding]:
     """Whether each base direction has one factor of its own in all sensors."""
     weight = np.sum(motion.stated**2, axis=0)
     moved = weight > 0
@@ -249,42 +247,44 @@ def _of_columns(test: Measurement, motion: _Motion) -> Iterator[Mistake]:
             (1e3, "km in the place of m"),
         ):
             if np.all(np.abs(factor[turns] / value - 1) < _GROSS):
-                yield Mistake(
+                yield Finding(
+                    "positions", Severity.BLOCKING,
                     f"the positions behind rigid_body are in {words}, not m: for a rotation of the base the sensors "
-                    f"move {value:g} times what it says, a factor of {1 / value:,.0f}, and for translations as "
-                    "it says; give positions in m",
-                    everywhere=True,
-                )
+                    f"move {value:g} times what it says, a factor of {1 / value:,.0f}, and for translations as it says",
+                    "give positions in m", numbers={"factor": value},
+                )  # fmt: skip
     reversed_ = [int(i) for i in np.flatnonzero(moved) if abs(factor[i] + 1) < _GROSS]
     # Where one sensor alone shows a direction, it is told of that sensor.
     if not alike and reversed_ and np.all(several[reversed_]) and np.all(np.abs(np.abs(factor[moved]) - 1) < _GROSS):
         assert test.base_axes is not None
-        yield Mistake(
-            f"the sign of the base in {', '.join(test.base_axes[i] for i in reversed_)} is reversed: beside their "
-            "modes all sensors move against it; change the sign of its record, or of its column of rigid_body",
-            everywhere=True,
-        )
+        axes = ", ".join(test.base_axes[i] for i in reversed_)
+        yield Finding(
+            "sign", Severity.BLOCKING,
+            f"the sign of the base in {axes} is reversed: beside their modes all sensors move against it",
+            "change the sign of its record, or of its column of rigid_body", channel=f"base {axes}",
+        )  # fmt: skip
 
 
-def _of_all(motion: _Motion, factor: float) -> Iterator[Mistake]:
+def _of_all(motion: _Motion, factor: float) -> Iterator[Finding]:
     """What one factor in all sensors and directions means."""
     if abs(factor + 1) < _GROSS:
-        yield Mistake(
-            "the sign of the base is reversed, or that of all sensors: beside their modes all move against the base; "
-            "change the sign of the base's record",
-            everywhere=True,
-        )
+        yield Finding(
+            "sign", Severity.BLOCKING,
+            "the sign of the base is reversed, or that of all sensors: beside their modes all move against the base",
+            "change the sign of the base's record", numbers={"factor": factor},
+        )  # fmt: skip
     for value, times, small, large in _UNITS:
         if abs(factor / value - 1) < _LIKE:
             first, second = ("the base is", "the sensors are") if value > 1 else ("the sensors are", "the base is")
-            yield Mistake(
+            yield Finding(
+                "unit", Severity.BLOCKING,
                 f"{first} in {small} where {second} in {large}: beside their modes the sensors move {factor:.3g} times "
-                f"as rigid_body says, a factor of {times}; bring both to m/s²",
-                everywhere=True,
-            )
+                f"as rigid_body says, a factor of {times}",
+                "bring both to m/s²", numbers={"factor": factor},
+            )  # fmt: skip
 
 
-def _swapped(test: Measurement, motion: _Motion, right: NDArray[np.bool_]) -> list[Mistake]:
+def _swapped(test: Measurement, motion: _Motion, right: NDArray[np.bool_]) -> list[Finding]:
     """Whether two sensors stand in each other's place, and a third is right."""
     wrong = np.flatnonzero(~right)
     if wrong.size != 2 or right.size < 3:
@@ -293,15 +293,18 @@ def _swapped(test: Measurement, motion: _Motion, right: NDArray[np.bool_]) -> li
     there[wrong] = there[wrong[::-1]]
     if not np.all(motion.agree(there)):
         return []
-    return [
-        Mistake(
-            f"{_names(test, motion.sensors[wrong])} are swapped: beside their modes each moves with the base as "
-            "rigid_body says of the other; exchange their records, or their rows of rigid_body"
-        )
-    ]
+    first, second = motion.sensors[wrong].tolist()
+    swapped = Finding(
+        "swapped sensors", Severity.CONTRADICTS,
+        f"{_names(test, motion.sensors[wrong])} are swapped: beside their modes each moves with the base as "
+        "rigid_body says of the other",
+        "exchange their records, or their rows of rigid_body", channel=test.sensor_names[first],
+        numbers={"sensor": float(first), "other": float(second)},
+    )  # fmt: skip
+    return [swapped]
 
 
-def _of_sensors(test: Measurement, motion: _Motion, right: NDArray[np.bool_]) -> Iterator[Mistake]:
+def _of_sensors(test: Measurement, motion: _Motion, right: NDArray[np.bool_]) -> Iterator[Finding]:
     """Which few sensors have a sign, a unit or a gain of their own, where most are right."""
     wrong = np.flatnonzero(~right)
     if 2 * wrong.size > right.size:
@@ -318,39 +321,42 @@ def _of_sensors(test: Measurement, motion: _Motion, right: NDArray[np.bool_]) ->
         if agree[i] and (alone or any(abs(value / own - 1) < _LIKE for own in _CLEAR)):
             carried = np.sum(motion.modal[i] * motion.stated[i]) / np.sum(motion.stated[i] ** 2)
             value = next((u[0] for u in _UNITS if abs(value - u[0]) < min(_CHANCE * std, _GROSS * u[0])), value)
-            sentence = _of_sensor(test.sensor_names[motion.sensors[i]], float(value), float(carried))
-            if sentence:
-                yield Mistake(sentence, gross="gain" not in sentence)
+            yield from _of_sensor(test.sensor_names[motion.sensors[i]], float(value), float(carried))
 
 
-def _of_sensor(name: str, factor: float, carried: float) -> str | None:
+def _of_sensor(name: str, factor: float, carried: float) -> Iterator[Finding]:
     """What a factor of one sensor alone means."""
     shown = "beside its modes it moves with the base"
+    unit = next((one for one in _UNITS if abs(factor / one[0] - 1) < _LIKE), None)
+    kind: Kind | None = None
     if abs(factor + 1) < _GROSS:
-        return f"the sign of {name} is reversed: {shown} by {factor:.3g} times what rigid_body says; change its sign"
-    for value, times, small, large in _UNITS:
-        if abs(factor / value - 1) < _LIKE:
-            own, base = (small, large) if value < 1 else (large, small)
-            return (
-                f"{name} is in another unit than the base: {shown} by {factor:.4g} times what rigid_body says, a "
-                f"factor of {times}, as of a sensor in {own} and a base in {base}; bring both to m/s²"
-            )
-    if abs(factor) < _NONE:
-        return (
-            f"{name} is relative to the base, where the other sensors are absolute: {shown} by {factor:.2g} times what "
-            "rigid_body says; add the base's acceleration to its record"
-            if carried > _CARRIED
-            else None
+        kind, remedy = "sign", "change its sign"
+        sentence = f"the sign of {name} is reversed: {shown} by {factor:.3g} times what rigid_body says"
+    elif unit is not None:
+        _, times, small, large = unit
+        of_sensor, of_base = (small, large) if factor < 1 else (large, small)
+        kind, remedy = "unit", "bring both to m/s²"
+        sentence = (
+            f"{name} is in another unit than the base: {shown} by {factor:.4g} times what rigid_body says, a factor of "
+            f"{times}, as of a sensor in {of_sensor} and a base in {of_base}"
         )
-    return (
-        f"the gain of {name} is {factor:.3g}: {shown} by so many times what rigid_body says, and the other sensors as "
-        "it says; divide its record by its gain, or correct its row of rigid_body"
-        if factor > 0
-        else None
-    )
+    elif abs(factor) < _NONE and carried > _CARRIED:
+        kind, remedy = "relative responses", "add the base's acceleration to its record"
+        sentence = (
+            f"{name} is relative to the base, where the other sensors are absolute: {shown} by {factor:.2g} times what "
+            "rigid_body says"
+        )
+    elif factor >= _NONE:
+        kind, remedy = "gain", f"divide its record by {factor:.3g}, or correct its row of rigid_body"
+        sentence = (
+            f"the gain of {name} is {factor:.3g}: {shown} by so many times what rigid_body says, and the other sensors "
+            "as it says"
+        )
+    if kind is not None:
+        yield Finding(kind, Severity.CONTRADICTS, sentence, remedy, channel=name, numbers={"factor": factor})
 
 
-def _of_force(test: Measurement, terms: DirectTerms) -> Iterator[Mistake]:
+def _of_force(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
     """Whether the base force weighs a negative mass, at low frequency and by its modes."""
     if terms.mass is None or terms.mass_std is None or terms.modal_mass is None:
         return
@@ -360,8 +366,9 @@ def _of_force(test: Measurement, terms: DirectTerms) -> Iterator[Mistake]:
         assert test.base_axes is not None
         masses = ", ".join(f"{weighed[i]:.4g}" for i in against)
         axes = "" if against.size == test.n_base else f" in {', '.join(test.base_axes[i] for i in against)}"
-        yield Mistake(
-            f"the sign of the base force{axes} is reversed: it weighs {masses} (kg, or kg m²); give the force of the "
-            "base on the structure, in phase with the base's acceleration at low frequency",
-            everywhere=True,
-        )
+        yield Finding(
+            "force sign", Severity.BLOCKING,
+            f"the sign of the base force{axes} is reversed: it weighs {masses} (kg, or kg m²)",
+            "give the force of the base on the structure, in phase with the base's acceleration at low frequency",
+            numbers={f"weighed {i + 1}": float(weighed[i]) for i in against},
+        )  # fmt: skip

@@ -1,8 +1,4 @@
-"""Model error: what records hold beside noise that no structure of constant mass, stiffness and damping makes of them.
-
-The model misses the records by more than their noise, frequencies change (`sysid.assessment.changing`), or tests that
-were not fitted are predicted badly or move otherwise.
-"""
+"""By how many times its noise a model misses a record, and what quiet lines hold of noise that is not known."""
 
 from __future__ import annotations
 
@@ -13,12 +9,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from sysid.assessment.changing import changes_in_words
-from sysid.errors import InputError
-from sysid.measurement.in_time import cut_in_motion, peaks, quiet_levels
+from sysid.measurement.in_time import cut_in_motion, quiet_levels
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.outliers import Outlier
-from sysid.modal_analysis.transients import without_transients_of
 from sysid.problem.problem import Problem
 from sysid.problem.terms import FurtherTest
 from sysid.structure.structure import Array, ComplexArray, Structure
@@ -30,7 +23,6 @@ _BLOCKS = 8  # .. of which there are so many at least, that tell the noise by th
 _QUIET = 0.25
 _NEAR = 5.0  # half-power widths, or distances of lines, about a mode
 _TRACE = 1e-4  # of the records; smaller ones are no noise of an instrument
-_LEVEL = 1.25  # times the fitted levels, beyond which another is outside
 
 _FORCE = "the base force"
 
@@ -209,85 +201,7 @@ def noise_at_most(test: Measurement, left: ComplexArray) -> Array | None:
     return None if quiet is None else np.asarray(np.sqrt(quiet)[..., None])
 
 
-def missed_in_words(misses: list[Miss]) -> Iterator[str]:
-    """Records that the model misses by more than their noise, in one sentence."""
-    told = [
-        f"{miss.record} by {'at least ' * miss.at_least}{miss.times:.2g} times {miss.whose} noise "
-        f"({100 * miss.share:.3g} %)"
-        for miss in misses
-        if miss.times > BEYOND
-    ]
-    if told:
-        why = "what it leaves out is larger than what the instruments add"
-        if any(miss.cut for miss in misses):
-            why += (
-                "; these are plain spectra of records that move at their ends, which hold transients too: take whole "
-                "records (from_time's estimator='records')"
-            )
-        yield f"the model misses {' and '.join(told)}: {why}"
-
-
-class ModelErrors(NamedTuple):
-    """Signs of model error, in sentences, the weightiest first, and whether frequencies change."""
-
-    sentences: tuple[str, ...]
-    changing: bool
-
-
-def model_errors(problem: Problem, structure: Structure, misses: list[Miss]) -> ModelErrors:
-    """Signs that no structure of constant matrices explains the records.
-
-    Parameters
-    ----------
-    problem : Problem
-    structure : Structure
-    misses : list of Miss
-        Of the structure, as `misses_of` gives them.
-    """
-    modal = problem.screened.measurement.modal
-    unfitted = [without_transients_of(test, structure) for test in problem.validation]
-    missed = [
-        miss
-        for test in unfitted
-        for record in _records(test, test, structure)
-        for miss in _miss(record, test, False, _near_modes(test, structure))
-    ]
-    uneven = modal is not None and bool(modal.scatter is not None or modal.excess)
-    beyond = uneven or any(miss.times > BEYOND for miss in (*misses, *missed))
-    changes: tuple[str, ...] = ()
-    unjudged: tuple[str, ...] = ()
-    try:
-        changes = changes_in_words(problem) if beyond else ()
-    except (InputError, np.linalg.LinAlgError) as error:
-        unjudged = (f"whether frequencies change along the records was not judged: {error}",)
-    told = (*changes, *missed_in_words(misses), *unpredicted_in_words(unfitted, structure), *unjudged)
-    return ModelErrors(told, bool(changes))
-
-
-def unpredicted_in_words(unfitted: list[Measurement], structure: Structure) -> Iterator[str]:
-    """Tests that a structure predicts worse than a rigid body does, in sentences."""
-    for i, test in enumerate(unfitted, start=1):
-        residual = test.residual(structure)
-        if residual > 1.0:
-            yield (
-                f"test {i} that was not fitted is predicted worse ({100 * residual:.3g} % missed) than by saying that "
-                "the sensors move with the table (100 %)"
-            )
-
-
-def levels_in_words(problem: Problem) -> Iterator[str]:
-    """Tests never fitted whose motion is larger or smaller than any that was fitted, in sentences."""
-    if not problem.formulation.fits_records:
-        return
-    fitted = peaks(problem.measurement)
-    for i, test in enumerate(problem.validation, start=1):
-        own = peaks(test)
-        if not (fitted and own):
-            continue
-        if max(own) > _LEVEL * max(fitted) or max(own) < min(fitted) / _LEVEL:
-            span = f"{max(fitted):.3g}" if len(fitted) == 1 else f"{min(fitted):.3g} to {max(fitted):.3g}"
-            yield (
-                f"test {i} that was not fitted moves the sensors by up to {max(own):.3g} m/s² against the base, the "
-                f"fitted {'run' if len(fitted) == 1 else 'runs'} by {span} m/s²: what holds at one level need not "
-                "hold at another"
-            )
+def misses_of_test(test: Measurement, structure: Structure) -> list[Miss]:
+    """What a structure misses of a test that was not fitted."""
+    near = _near_modes(test, structure)
+    return [miss for record in _records(test, test, structure) for miss in _miss(record, test, False, near)]

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sysid.finding import Finding, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.structure.structure import Array, Structure
 
@@ -30,8 +31,8 @@ class Peaks(NamedTuple):
     spacing: Array
 
 
-def leakage(test: Measurement, structure: Structure) -> Iterator[str]:
-    """Whether lines are too coarse for the modes that were found, and which modes may be none, in sentences.
+def leakage(test: Measurement, structure: Structure) -> Iterator[Finding]:
+    """Whether lines are too coarse for the modes that were found, and which modes may be none.
 
     Averages over segments (`Measurement.averaged`) are judged by their lines alone. Frequency response functions of
     unknown origin may be exact at any lines, so that they must miss more at the peak than elsewhere. Spectra of whole
@@ -46,25 +47,33 @@ def leakage(test: Measurement, structure: Structure) -> Iterator[str]:
     if groups:
         of_groups = ", ".join(" and ".join(f"{f:.4g}" for f in peaks.frequency[group]) for group in groups)
         most = np.max(peaks.spacing[[group[0] for group in groups]])
-        yield (
+        yield Finding(
+            "one mode twice", Severity.CONTRADICTS,
             f"modes at {of_groups} Hz have the same shape, and lines are up to {most:.2g} Hz apart: {averaged}one mode "
-            "found twice is leakage of segments that are too short, no second mode"
-        )
+            "found twice is leakage of segments that are too short, no second mode",
+            numbers={"frequency": float(peaks.frequency[groups[0][0]]), "spacing": float(most)},
+        )  # fmt: skip
     if not np.any(coarse):
         return
     k = int(np.argmax(np.where(coarse, peaks.spacing / peaks.width, 0.0)))
     missed = "" if test.averaged else _missed(test, structure, float(peaks.frequency[k]), float(peaks.width[k]))
     if missed is None:
         return
-    yield (
+    seconds = _FEWEST / float(peaks.width[k])
+    yield Finding(
+        "coarse lines", Severity.CONTRADICTS,
         f"lines are {peaks.spacing[k]:.2g} Hz apart, mode {peaks.number[k]} is {peaks.width[k]:.2g} Hz wide{missed}: "
-        f"{averaged}their window flattens its peak, and damping and masses come out wrong; take whole records "
-        f"(from_time with estimator='records'), or segments of {_FEWEST / peaks.width[k]:.3g} s or longer"
-    )
+        f"{averaged}their window flattens its peak, and damping and masses come out wrong",
+        f"take whole records (from_time with estimator='records'), or segments of {seconds:.3g} s or longer",
+        numbers={
+            "mode": float(peaks.number[k]), "spacing": float(peaks.spacing[k]), "width": float(peaks.width[k]),
+            "seconds": seconds,
+        },
+    )  # fmt: skip
 
 
-def unresolved(test: Measurement, omega: Array, ratios: Array) -> Iterator[str]:
-    """Whether averages over segments have too few lines in most peaks of poles found in them, in a sentence.
+def unresolved(test: Measurement, omega: Array, ratios: Array) -> Iterator[Finding]:
+    """Whether averages over segments have too few lines in most peaks of poles found in them.
 
     Where only some are so narrow `leakage` tells it of the structure that was fitted. The window itself makes a narrow
     peak about one and a half distances of lines wide.
@@ -82,11 +91,14 @@ def unresolved(test: Measurement, omega: Array, ratios: Array) -> Iterator[str]:
     spacing = np.interp(f, test.freq, np.gradient(test.freq))
     k = int(np.argmax(spacing / width))
     if 2 * np.count_nonzero(width < _RESOLVED * spacing) >= f.size:
-        yield (
+        yield Finding(
+            "short segments", Severity.CONTRADICTS,
             f"the segments are too short: lines are {spacing[k]:.2g} Hz apart ({1 / spacing[k]:.3g} s a segment), and "
             f"the peak at {f[k]:.4g} Hz is no wider than their window makes any peak, so that damping and masses are "
-            "the window's; take whole records (from_time with estimator='records'), or segments several times as long"
-        )
+            "the window's",
+            "take whole records (from_time with estimator='records'), or segments several times as long",
+            numbers={"spacing": float(spacing[k]), "frequency": float(f[k])},
+        )  # fmt: skip
 
 
 def _peaks(test: Measurement, structure: Structure) -> Peaks:

@@ -13,6 +13,7 @@ from itertools import combinations
 import numpy as np
 
 from sysid.errors import InputError
+from sysid.finding import Finding, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.poles_of_test import poles_of_test
 from sysid.modal_analysis.residues import linear_residues
@@ -27,8 +28,8 @@ _STEPS = 40
 _FREQUENCY, _DAMPING = 5.0, 0.1  # weights of errors of log w and log zeta; residues are relative to all of them
 
 
-def exchanged_sensors(problem: Problem, structure: Structure, *, wholly: bool = False) -> tuple[str, ...]:
-    """Two sensors that stand in each other's place, in a sentence; none where the model cannot tell.
+def exchanged_sensors(problem: Problem, structure: Structure, *, wholly: bool = False) -> tuple[Finding, ...]:
+    """Two sensors that stand in each other's place; none where the model cannot tell.
 
     Parameters
     ----------
@@ -55,10 +56,14 @@ def exchanged_sensors(problem: Problem, structure: Structure, *, wholly: bool = 
     if least > _BETTER * own or (others and others[0] < _CLEARLY * least) or (wholly and least > _WHOLLY * floor):
         return ()
     names = test.sensor_names
-    return (
+    swapped = Finding(
+        "swapped sensors", Severity.CONTRADICTS,
         f"{names[i]} and {names[j]} are swapped: the model misses {100 * own:.3g} % of the accelerations as they are, "
-        f"and {100 * least:.3g} % with these two in each other's place; exchange their records, or their names",
-    )
+        f"and {100 * least:.3g} % with these two in each other's place",
+        "exchange their records, or their names", channel=names[i],
+        numbers={"sensor": float(i), "other": float(j), "residual": own, "residual exchanged": least},
+    )  # fmt: skip
+    return (swapped,)
 
 
 def _alike(test: Measurement) -> Iterator[tuple[int, int]]:

@@ -15,6 +15,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from sysid.assessment.checks.context import Context
+from sysid.finding import Finding, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.residues import Records, ResidueFit
 from sysid.modal_analysis.response import gain_slopes
@@ -127,51 +129,63 @@ def distinct_poles(structure: Structure) -> tuple[Array, Array]:
     return omega[first], structure.damping_ratios[first]
 
 
-def told(test: Measurement, errors: GainErrors) -> Iterator[str]:
-    """Gains that are wrong, with their deviations and the remedy, in a sentence."""
-    if not errors.wrong.size:
-        return
-    name = lambda i: (  # noqa: E731
-        f"{test.sensor_names[i]} by {100 * errors.error[i]:+.2g} % (standard deviation {100 * errors.std[i]:.1g} %)"
-    )
+def wrong_gains(test: Measurement, errors: GainErrors) -> Iterator[Finding]:
+    """Sensors whose gain is wrong, the worst first."""
     base = errors.of_base
-    alike = "" if base is None else f", or that of the base by {-100 * base:+.2g} %, as all sensors show the same error"
-    yield (
-        f"the gain is wrong of {', '.join(map(name, errors.wrong[:_TOLD]))}{alike}: by so much the constant term of "
-        "the transmissibility differs from the row of rigid_body, and M_SS, K_SS and C are wrong in these rows and "
-        "columns; calibrate the sensor and divide its record by its gain, or correct rigid_body"
-    )
+    alike = "" if base is None else f", or the base {-100 * base:+.2g} %, as all sensors show the same error"
+    for i in errors.wrong[:_TOLD]:
+        error, name = float(errors.error[i]), test.sensor_names[i]
+        numbers = {"gain": 1 + error, "std": float(errors.std[i])} | ({} if base is None else {"base": 1 - base})
+        yield Finding(
+            "gain", Severity.CONTRADICTS,
+            f"{name} reads {100 * abs(error):.2g} % {'high' if error > 0 else 'low'} against the base (standard "
+            f"deviation {100 * errors.std[i]:.1g} %){alike}: M_SS, K_SS and C are wrong in its row and column",
+            f"calibrate it and divide its record by {1 + error:.4f}, or correct its row of rigid_body", channel=name,
+            numbers=numbers,
+        )  # fmt: skip
 
 
-def assumed(problem: Problem) -> Iterator[str]:
-    """Gains on which masses rest and that no record can show to be wrong, in sentences."""
+def assumed(problem: Problem) -> Iterator[Finding]:
+    """Gains on which masses rest and that no record can show to be wrong."""
     test, mass = problem.measurement, problem.formulation.mass
     if mass.entries is not None and np.all(np.isfinite(mass.entries)):
         return
     still = [name for name, row in zip(test.sensor_names, test.rigid_body, strict=True) if not np.any(row)]
-    if still:
-        yield (
-            f"no record can show whether the gain of {', '.join(still)} is right, as the row of rigid_body is zero. An "
-            "error of 1 % in it makes 2 % in the diagonal of M_SS, K_SS and C there"
-        )
+    for name in still:
+        yield Finding(
+            "assumed gain", Severity.NOTE,
+            f"no record can show whether the gain of {name} is right, as its row of rigid_body is zero. An error of "
+            "1 % in it makes 2 % in the diagonal of M_SS, K_SS and C there",
+            channel=name,
+        )  # fmt: skip
     if test.force is not None and mass.totals is None:
-        yield (
+        yield Finding(
+            "assumed force gain", Severity.NOTE,
             "no record can show whether the gain of the base force is right. M, K and C are in proportion to it: an "
-            "error of 1 % in it makes 1 % in them"
-        )
+            "error of 1 % in it makes 1 % in them",
+        )  # fmt: skip
 
 
-def taken_at_sensors(problem: Problem) -> Iterator[str]:
-    """What a stated total of a lumped mass assumes, which accelerations cannot contradict, in a sentence."""
+def assumed_totals(context: Context) -> Iterator[Finding]:
+    """A stated total of a lumped mass is taken to sit at the sensors."""
+    yield from () if context.outcome is None else taken_at_sensors(context.problem)
+
+
+def taken_at_sensors(problem: Problem) -> Iterator[Finding]:
+    """What a stated total of a lumped mass assumes, which accelerations cannot contradict."""
     totals, geometry = problem.formulation.mass.totals, problem.geometry
     if totals is None or totals.kind != "sensors" or problem.measurement.force is not None:  # which contradicts
         return
     held = geometry.translational & np.isin(np.arange(geometry.d), geometry.directions[: geometry.n])
-    told = ", ".join(dict.fromkeys(f"{mass:.5g}" for mass in totals.by_direction[held]))
-    yield from [
-        f"all of the stated {told} kg is taken to sit at the sensors. Mass that moves with the table, such as an "
-        "adapter or a base ring, must not be in it: no record can show it, and M, K and C are in proportion to it"
-    ] * bool(np.any(held))
+    masses = {f"direction {i + 1}": float(totals.by_direction[i]) for i in np.flatnonzero(held)}
+    if masses:
+        yield Finding(
+            "assumed total", Severity.NOTE,
+            f"all of the stated {', '.join(dict.fromkeys(f'{mass:.5g}' for mass in masses.values()))} kg is taken to "
+            "sit at the sensors. Mass that moves with the table, such as an adapter or a base ring, must not be in it: "
+            "no record can show it, and M, K and C are in proportion to it",
+            numbers=masses,
+        )  # fmt: skip
 
 
 def worth_of(by_gain: Array, mass_std: Array) -> Array:
@@ -191,28 +205,26 @@ def worth_of(by_gain: Array, mass_std: Array) -> Array:
     return np.max(by_gain[:, known] / std[known], axis=1, initial=0.0)
 
 
-def rests_on(test: Measurement, errors: GainErrors, worth: Array) -> Iterator[str]:
-    """Gains that M_SS rests on more closely than the records show them, in a sentence that accuses none.
+def rests_on(test: Measurement, errors: GainErrors, worth: Array) -> Iterator[Finding]:
+    """Gains that M_SS rests on more closely than the records show them; none is accused.
 
     `worth` (n_sensors,): deviations that an error of 1 % moves M_SS by. The records leave a gain open to its estimate
     and two deviations on either side. Where an error within that would move M_SS by more than `_MOVED` of its stated
     deviations, which hold for right gains, that the gain is right is an assumption that matters.
     """
-    found = []
     for i in np.flatnonzero(np.any(test.rigid_body, axis=1)):
         size, open_ = 100 * abs(errors.error[i]), 100 * _WITHIN * errors.std[i]
         reach = size + open_ if np.isfinite(errors.error[i]) else _UNSHOWN
         if worth[i] * reach > _MOVED:
             shown = f"{1 + errors.error[i]:.4f} ± {open_ / 100:.1g}" if np.isfinite(errors.error[i]) else "not shown"
-            found.append(
-                f"{test.sensor_names[i]} (gain {shown}: an error of {reach:.2g} % would move M_SS by "
-                f"{worth[i] * reach:.2g} standard deviations)"
-            )
-    if found:
-        yield (
-            "the intervals of M_SS take the gain of each sensor to be exactly 1. The records agree, but do not show it "
-            f"closely enough for {', '.join(found)}: calibrate these sensors if that matters"
-        )
+            yield Finding(
+                "gain not shown", Severity.NOTE,
+                f"the intervals of M_SS take the gain of {test.sensor_names[i]} to be exactly 1, and the records do "
+                f"not show it closely enough (gain {shown}: an error of {reach:.2g} % would move M_SS by "
+                f"{worth[i] * reach:.2g} standard deviations)",
+                "calibrate this sensor if that matters", channel=test.sensor_names[i],
+                numbers={"gain": 1 + float(errors.error[i]), "deviations": float(worth[i] * reach)},
+            )  # fmt: skip
 
 
 def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, ones: Array, slopes: Array) -> Estimate:

@@ -8,8 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.assessment.gains import distinct_poles
+from sysid.assessment.checks.context import Context
+from sysid.assessment.checks.gains import distinct_poles
 from sysid.assessment.sensitivity import left_by_constraints, rows_of
+from sysid.finding import Finding, Severity, contradicting
 from sysid.modal_analysis.residues import Records, beyond_chance
 from sysid.models.stiffness import FREQUENCY_WINDOW
 from sysid.models.unknowns import scales_of, split
@@ -133,13 +135,45 @@ def _more(count: int) -> str:
     return f" and {count - _TOLD} more" * (count > _TOLD)
 
 
-def pressed_in_words(found: Sequence[OnBound]) -> str:
-    """That bounds keep the fit from the records, and what to do, in a sentence."""
+def keeping_bounds(context: Context) -> Iterator[Finding]:
+    """Bounds keep the fit from the records; whatever else a misfit speaks against may be right once they are wider."""
+    if context.is_judged and not context.named:
+        found, press = _pressure_of(context)
+        yield from (_pressing(found, press),) if press.explains else ()
+
+
+def pressed_bounds(context: Context) -> Iterator[Finding]:
+    """Bounds take a little of the fit, where nothing else speaks against it."""
+    if context.is_judged and not (contradicting(context.found) or context.has("changing", "beyond noise")):
+        found, press = _pressure_of(context)
+        yield from (_pressing(found, press),) if press.significant else ()
+
+
+def on_a_bound(context: Context) -> Iterator[Finding]:
+    """Unknowns end on a bound, beyond which the truth may lie."""
+    if context.outcome is None or context.has("bounds"):
+        return
+    found = on_bounds(context.problem.screened, context.outcome.structure, context.outcome.x)
+    if found:
+        told = f"on a bound, beyond which the truth may lie: {bounds_in_words(found)}"
+        yield Finding("on a bound", Severity.NOTE, told, numbers={"unknowns": float(len(found))})
+
+
+def _pressure_of(context: Context) -> tuple[list[OnBound], Pressure]:
+    problem, end = context.problem.screened, context.end
+    found = on_bounds(problem, end.structure, end.x)
+    return found, pressure(problem, end.structure, end.x, found)
+
+
+def _pressing(found: Sequence[OnBound], press: Pressure) -> Finding:
+    """That bounds keep the fit from the records."""
     sources = dict.fromkeys(one.source for one in found)
-    return (
-        f"bounds keep the fit from the records: {bounds_in_words(found)}; widen them first ({', '.join(sources)}): the "
-        "truth lies beyond, or these unknowns make up for something else that is wrong, which is not judged before"
-    )
+    return Finding(
+        "bounds", Severity.CONTRADICTS, f"bounds keep the fit from the records: {bounds_in_words(found)}",
+        f"widen them first ({', '.join(sources)}): the truth lies beyond, or these unknowns make up for something "
+        "else that is wrong, which is not judged before",
+        numbers={"unknowns": float(len(found)), "share": press.share},
+    )  # fmt: skip
 
 
 class Pressure(NamedTuple):

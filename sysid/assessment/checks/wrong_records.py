@@ -7,9 +7,11 @@ from itertools import product
 
 import numpy as np
 
-from sysid.assessment.leakage import unresolved
-from sysid.assessment.mistakes import CONJUGATED, GRAVITY, Mistake, mistakes_of
-from sysid.errors import InputError, refuse
+from sysid.assessment.checks.context import Context
+from sysid.assessment.checks.leakage import unresolved
+from sysid.assessment.checks.mistakes import CONJUGATED, GRAVITY, is_gross, mistakes_of
+from sysid.errors import InputError
+from sysid.finding import Finding, Severity
 from sysid.measurement.in_time import as_whole
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.direct_terms import DirectTerms, direct_terms
@@ -36,28 +38,27 @@ _FACTORS = (  # of the weighed mass over the right one, and what they are in wor
 )
 
 
-def named_mistakes(problem: Problem) -> tuple[str, ...]:
-    """Mistakes that the tests of a problem show before a search, in sentences, the worst first.
+def wrong_records(context: Context) -> Iterator[Finding]:
+    """Records, or what is stated of them, are wrong by a sign, a unit, a delay, a swapped sensor.
 
-    Raises
-    ------
-    InputError
-        Where one spoils all channels, or a channel of a problem whose model has a form of its own, so that a search
-        would be in vain.
+    Blocking where it spoils all channels, or a channel of a problem whose model has a form of its own, so that a
+    search would be in vain. After a search, what was named before or by it.
     """
+    if context.outcome is not None:
+        yield from context.named
+        return
+    problem = context.problem
     declared = problem.formulate(problem.unsearched)
     tests = [problem.measurement] if problem.misfit is None else []
     tests += [given.measurement for given in problem.residuals if isinstance(given, FurtherTest)]
-    told: list[str] = []
-    for i, test in enumerate(tests):
+    for i, test in enumerate(tests, start=1):
         for mistake in _of_test(problem, declared, test, own=test is problem.measurement):
-            sentence = mistake.sentence if len(tests) == 1 else f"test {i + 1}: {mistake.sentence}"
-            refuse((mistake.everywhere or (mistake.gross and not declared.free_modes), sentence))
-            told.append(sentence)
-    return tuple(told)
+            in_vain = mistake.severity is Severity.BLOCKING or (is_gross(mistake) and not declared.free_modes)
+            one = mistake._replace(severity=Severity.BLOCKING if in_vain else mistake.severity)
+            yield one if len(tests) == 1 else one.of_test(i)
 
 
-def _of_test(problem: Problem, declared: Formulation, test: Measurement, *, own: bool) -> list[Mistake]:
+def _of_test(problem: Problem, declared: Formulation, test: Measurement, *, own: bool) -> list[Finding]:
     try:
         terms = direct_terms(test)
         found = mistakes_of(test, terms)
@@ -70,13 +71,13 @@ def _of_test(problem: Problem, declared: Formulation, test: Measurement, *, own:
         if own and not found and terms is not None:
             found = [*_of_mass(declared, test, terms), *_of_frequencies(problem, declared, test)]
         if not found and test.averaged:
-            found = [Mistake(sentence, gross=False) for sentence in unresolved(test, *poles_of_test(test))]
+            found = list(unresolved(test, *poles_of_test(test)))
     except (np.linalg.LinAlgError, InputError):  # records that tell nothing; the search says so
         return []
     return found
 
 
-def _of_mass(declared: Formulation, test: Measurement, terms: DirectTerms) -> Iterator[Mistake]:
+def _of_mass(declared: Formulation, test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
     """Whether the base force weighs what is stated by a factor of two units."""
     allowed = None if terms.mass is None or terms.below else _masses(declared)
     if allowed is None or terms.mass is None or terms.modal_mass is None or terms.mass_std is None:
@@ -96,10 +97,11 @@ def _of_mass(declared: Formulation, test: Measurement, terms: DirectTerms) -> It
         if np.all(agree):
             masses = ", ".join(f"{m:.4g}" for m in weighed)
             stated = ", ".join(f"{a:.4g}" if a == b else f"{a:.4g} to {b:.4g}" for a, b in zip(low, high, strict=True))
-            yield Mistake(
+            yield Finding(
+                "force unit", Severity.BLOCKING,
                 f"the base force weighs {masses} kg where {stated} kg are stated, a factor of {told}: {words}",
-                everywhere=True,
-            )
+                numbers={"factor": factor},
+            )  # fmt: skip
             return
 
 
@@ -116,7 +118,7 @@ def _masses(declared: Formulation) -> tuple[Array, Array] | None:
     return (np.min(found, axis=0), np.max(found, axis=0)) if found else None
 
 
-def _of_frequencies(problem: Problem, declared: Formulation, test: Measurement) -> Iterator[Mistake]:
+def _of_frequencies(problem: Problem, declared: Formulation, test: Measurement) -> Iterator[Finding]:
     """Whether lines are in rad/s, as frequencies that are stated, or that the bounds allow, show."""
     stated = getattr(problem.stiffness, "natural_frequencies", None)
     if declared.stiffness.free and stated is None:
@@ -133,21 +135,22 @@ def _of_frequencies(problem: Problem, declared: Formulation, test: Measurement) 
         what = "the bounds of the model allow first natural frequencies"
     inside = lambda f: bool(low[0] / _WITHIN < f[0] < high[0] * _WITHIN and f[-1] < high[-1] * _WITHIN)  # noqa: E731
     if stated is not None and found[0] < low[0] / _BEYOND and inside(2 * np.pi * found):
-        yield Mistake(
+        yield Finding(
+            "frequencies in rad/s", Severity.BLOCKING,
             f"the stated natural frequencies are in rad/s, not Hz: {', '.join(f'{f:.4g}' for f in low[:4])} Hz are "
             f"stated, the records have modes at {', '.join(f'{f:.4g}' for f in found[:4])} Hz, and a factor of 2 pi = "
-            "6.283 lies between; divide what is stated by 2 pi",
-            everywhere=True,
-        )
+            "6.283 lies between",
+            "divide what is stated by 2 pi", numbers={"stated": float(low[0]), "found": float(found[0])},
+        )  # fmt: skip
     mended = found / (2 * np.pi)
     if found[0] > _BEYOND * high[0] and inside(mended):
         span = f"{low[0]:.4g}" if stated is not None else f"of {low[0]:.4g} to {high[0]:.4g}"
-        yield Mistake(
+        yield Finding(
+            "frequencies in rad/s", Severity.BLOCKING,
             f"the lines are in rad/s, not Hz: the records have modes at {', '.join(f'{f:.4g}' for f in found[:4])} Hz "
-            f"as they are given, {what} {span} Hz, and a factor of 2 pi = 6.283 lies between; divide the frequencies "
-            "by 2 pi",
-            everywhere=True,
-        )
+            f"as they are given, {what} {span} Hz, and a factor of 2 pi = 6.283 lies between",
+            "divide the frequencies by 2 pi", numbers={"stated": float(low[0]), "found": float(found[0])},
+        )  # fmt: skip
 
 
 def _structures(declared: Formulation) -> list[Structure]:

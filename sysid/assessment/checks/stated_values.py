@@ -1,0 +1,40 @@
+"""Values that are stated as known, and that the fit misses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import scipy
+
+from sysid.assessment.checks.context import Context
+from sysid.assessment.checks.stated_mass import FAR
+from sysid.finding import Finding, Severity
+from sysid.problem.formulation import Formulation
+from sysid.structure.structure import Array
+
+_CHANCE = 1e-4  # that errors as stated are so large together
+
+
+def missed_values(context: Context) -> Iterator[Finding]:
+    """Stated masses, or values stated as known, cannot be met together with the records."""
+    if context.outcome is not None and not context.has("bounds"):
+        yield from (one for one in context.outcome.findings if one.kind == "stated masses")
+    if not context.is_explained and context.end.x is not None:
+        formulation, x = context.problem.screened.formulation, context.end.x
+        yield from _priors(formulation, x)
+        yield from (one for term in formulation.beside for one in term.findings(x))
+
+
+def _priors(formulation: Formulation, x: Array) -> Iterator[Finding]:
+    """Values that are stated as known, where errors as stated do not miss them all so far."""
+    names = [name for term in formulation.priors for name in term.labels]
+    off = np.concatenate([np.zeros(0), *(term.numbers(x) for term in formulation.priors)])
+    if np.sum(off**2) > scipy.special.chdtri(max(off.size, 1), _CHANCE) and np.all(np.abs(off) <= FAR):
+        told = ", ".join(f"{name} by {z:+.2g}" for name, z in zip(names, off, strict=True))
+        yield Finding(
+            "stated values", Severity.CONTRADICTS,
+            f"the values that are stated as known are missed together, in standard deviations: {told}",
+            "they, another number, or the model is wrong",
+            numbers=dict(zip(names, off.tolist(), strict=True)),
+        )  # fmt: skip
