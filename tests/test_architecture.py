@@ -23,18 +23,18 @@ CEILINGS = {
     # make run, hold and claim (640), one run in a folder and mistakes of the modelling language (422), bounds that
     # press and damping of any size (350), IPOPT's refinement of each leader (310), and the inverse factor with the
     # swarm on the models' own expressions (317), and findings with kind, channel and numbers in the place of sentences,
-    # by checks that share one context (600).
-    "lines": 40_941,
+    # by checks that share one context (600), and a page of half the size and time (140).
+    "lines": 41_078,
     # What was counted when these counts began; the modes once, in the open, brings them down.
     "branches": 79.2,
     "files": 250,
     "main": 241,
     "modal": 67,
     "fits": 36,
-    "constants": 459,
+    "constants": 465,
     "shared": 45,
     "everyday": 387,
-    "prose": 141,
+    "prose": 143,
 }
 
 # The counting is a benchmark, which prints the same figures; `sysid` itself is not imported from the checkout.
