@@ -1,9 +1,14 @@
 """Random structures that the tests share, built from modes and geometry: their properties are known beforehand."""
 
 import importlib.util
+import os
 import signal
 import sys
 from pathlib import Path
+
+# Before NumPy loads it, and for every process that a test starts: OpenBLAS's own threads wait for each other in loops
+# that use processor time, and its products here are too small to gain from them.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import pytest
