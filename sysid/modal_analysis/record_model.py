@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Index, Modes
 from sysid.modal_analysis.record_colour import pieces
-from sysid.modal_analysis.response import gain_slopes, gains
+from sysid.modal_analysis.response import gains, motion_and_slopes, real_times
 from sysid.structure.structure import Array, ComplexArray
 
 _AT_ONCE = 4096  # lines whose derivatives are held in memory together
@@ -71,10 +72,10 @@ class Columns(NamedTuple):
     def seen(self, weights: ComplexArray, spectra: ComplexArray) -> ComplexArray:
         """Sums of all columns (k, L) over the channels, with weights (c, L)."""
         first, *others = self.layers
-        out = _times(first.values, weights)
+        out = real_times(first.values, weights)
         out *= spectra[first.spectrum]
         for column, spectrum, values in others:
-            out[column] += _times(values, weights) * spectra[spectrum]
+            out[column] += real_times(values, weights) * spectra[spectrum]
         return out
 
     def products(self, sums: Sums, scale: Array) -> Shift:
@@ -144,7 +145,52 @@ class Parameters:
     traces: Array
 
 
-class RecordModel:
+class ModalModel:
+    """A test as m modes, without transients or traces: what plain spectra and whole records have in common.
+
+    Attributes
+    ----------
+    n, d, m, channels : int
+        Sensors, base directions, modes; sensors and, where a force was measured, its directions.
+    kept : int
+        How many of the unknowns of `Index` there are: without a force the rigid-body mass is left out.
+    """
+
+    def __init__(self, test: Measurement, m: int, runs: list[Run]) -> None:
+        self.test, self.m, self.runs = test, m, runs
+        self.n, self.d, self.force = test.n_sensors, test.n_base, test.force is not None
+        self.channels = self.n + self.d * self.force
+        self.index = Index(self.n, m, self.d)
+        self.kept = self.index.size if self.force else int(self.index.rigid[0])
+        self.moving: dict[int, int] = {}
+        self.n_ends = 0
+        self.gains = False
+
+    @property
+    def numbers(self) -> int:
+        """Real numbers of the records."""
+        return 2 * sum(run.outputs.size for run in self.runs)
+
+    def transients(self, freq: Array) -> ComplexArray:
+        """What the motion at the ends of a run adds to the load of a mode, (2, L), each times a number of that mode."""
+        raise NotImplementedError
+
+    def trace_spectra(self, freq: Array) -> ComplexArray:
+        """What the traces of a channel are multiples of, (traces, L)."""
+        return np.zeros((0, freq.size), complex)
+
+    def chunks(self, p: Parameters) -> Iterator[Chunk]:
+        """Lines of all runs, some thousand at a time."""
+        for run in self.runs:
+            for at in range(0, run.w.size, _AT_ONCE):
+                yield Chunk(self, p, run.at(slice(at, at + _AT_ONCE)))
+
+    def chi2(self, p: Parameters, levels: Array) -> float:
+        """Sum of ``e' S^-1 e`` over all lines, half a chi-squared of `numbers` degrees."""
+        return float(sum(chunk.run.weight @ chunk.weighed(levels).power for chunk in self.chunks(p)))
+
+
+class RecordModel(ModalModel):
     """The model of a test of whole records with m modes.
 
     The unknowns are those of `Index`, then ``ends`` and ``traces``, each in the order of its entries; without a force
@@ -157,15 +203,9 @@ class RecordModel:
 
     def __init__(self, test: Measurement, m: int, *, gains: bool = False) -> None:
         assert test.whole is not None
-        self.test, self.whole, self.m = test, test.whole, m
-        self.n, self.d, self.force = test.n_sensors, test.n_base, test.force is not None
-        self.channels = self.n + self.d * self.force
-        self.index = Index(self.n, m, self.d)
-        self.kept = self.index.size if self.force else int(self.index.rigid[0])
-        self.moving = {run: at for at, run in enumerate(self.whole.moving)}
-        self.n_ends = m * 2 * len(self.moving)
+        self.whole = test.whole
         outputs = test.response if test.force is None else np.concatenate([test.response, test.force], axis=1)
-        self.runs = [
+        runs = [
             Run(
                 2 * np.pi * test.freq[own], test.base[r][:, own], outputs[r][:, own], float(self.whole.density[r]), r,
                 np.ones(np.count_nonzero(own)), r,
@@ -173,18 +213,28 @@ class RecordModel:
             for r, own in enumerate(test.own_lines)
         ]  # fmt: skip
         if self.whole.varying is not None:
-            cut = [run.at(lines) for run in self.runs for lines in pieces(run.w)]
-            self.runs = [run._replace(piece=piece) for piece, run in enumerate(cut)]
+            cut = [run.at(lines) for run in runs for lines in pieces(run.w)]
+            runs = [run._replace(piece=piece) for piece, run in enumerate(cut)]
+        super().__init__(test, m, runs)
+        self.moving = {run: at for at, run in enumerate(self.whole.moving)}
+        self.n_ends = m * 2 * len(self.moving)
         self.n_fit = self.kept + self.n_ends + test.n_runs * self.channels * TRACES
         self.gains = gains
         self.size = self.n_fit + gains * 2 * self.n * self.d
-        self.numbers = 2 * sum(run.outputs.size for run in self.runs)
+
+    def transients(self, freq: Array) -> ComplexArray:
+        """See `ModalModel`."""
+        return self.whole.transients(freq)
+
+    def trace_spectra(self, freq: Array) -> ComplexArray:
+        """What the traces of a channel are multiples of, (TRACES, L)."""
+        unit = freq / self.test.freq[-1]
+        return np.stack([np.ones_like(unit) + 0j, 1j * unit, -1j / unit])
 
     def thinned(self, step: int) -> RecordModel:
         """The same with every `step`-th line, for steps that need not be exact."""
         other = copy(self)
         other.runs = [run.at(slice(None, None, step)) for run in self.runs]
-        other.numbers = 2 * sum(run.outputs.size for run in other.runs)
         return other
 
     def weighed_as_all(self) -> RecordModel:
@@ -226,12 +276,6 @@ class RecordModel:
         """Numbers that the records determine: without a force the scale of each mode is none."""
         return self.size - (0 if self.force else self.m)
 
-    def chunks(self, p: Parameters) -> Iterator[Chunk]:
-        """Lines of all runs, some thousand at a time."""
-        for run in self.runs:
-            for at in range(0, run.w.size, _AT_ONCE):
-                yield Chunk(self, p, run.at(slice(at, at + _AT_ONCE)))
-
     def normal_equations(self, p: Parameters, levels: Array) -> Shift:
         """Products with the base as the records of all channels make it likely, for noise of these levels.
 
@@ -262,10 +306,6 @@ class RecordModel:
             chi2 += made.chi2
         return Shift(normal, gradient, chi2)
 
-    def chi2(self, p: Parameters, levels: Array) -> float:
-        """Sum of ``e' S^-1 e`` over all lines, half a chi-squared of `numbers` degrees."""
-        return float(sum(chunk.run.weight @ chunk.weighed(levels).power for chunk in self.chunks(p)))
-
 
 class HeldShapes(RecordModel):
     """The same with shapes, participations and rigid-body mass held, and with `poles` these too.
@@ -293,25 +333,29 @@ class HeldShapes(RecordModel):
 class Chunk:
     """Some lines of one run at given parameters."""
 
-    def __init__(self, model: RecordModel, p: Parameters, run: Run) -> None:
+    def __init__(self, model: ModalModel, p: Parameters, run: Run) -> None:
         self.model, self.p, self.run = model, p, run
         freq = run.w / (2 * np.pi)
         modes = p.modes
         self.g = gains(freq, modes.omega, modes.ratios)
         self.shown = modes.phi if not model.force else np.vstack([modes.phi, modes.gamma.T])  # (c, m)
-        direct = model.test.rigid_body if not model.force else np.vstack([model.test.rigid_body, p.rigid])
-        # From base to outputs, (c, d, L).
-        pushed = (self.g[:, None] * modes.gamma[:, :, None]).reshape(len(self.g), -1)
-        self.H = _times(self.shown, pushed).reshape(len(direct), -1, run.w.size) + direct[:, :, None]
+        self.direct = model.test.rigid_body if not model.force else np.vstack([model.test.rigid_body, p.rigid])
         at = model.moving.get(run.number)
         self.at_ends = None if at is None else slice(2 * at, 2 * at + 2)
-        self.transients = model.whole.transients(freq)
-        self.pushed_by_ends = 0.0 if at is None else _times(p.ends[:, self.at_ends], self.transients)  # (m, L)
-        unit = freq / model.test.freq[-1]
-        self.trace_spectra = np.stack([np.ones_like(run.w) + 0j, 1j * unit, -1j / unit])
-        moved = self.g * (_times(modes.gamma, run.base) + self.pushed_by_ends)
-        made = _times(self.shown, moved) + _times(direct, run.base) + _times(p.traces[run.number], self.trace_spectra)
+        self.transients = np.zeros((0, run.w.size)) if at is None else model.transients(freq)
+        self.pushed_by_ends = 0.0 if at is None else real_times(p.ends[:, self.at_ends], self.transients)  # (m, L)
+        self.trace_spectra = model.trace_spectra(freq)
+        self.motion = self.g * (real_times(modes.gamma, run.base) + self.pushed_by_ends)
+        made = real_times(self.shown, self.motion) + real_times(self.direct, run.base)
+        if len(self.trace_spectra):
+            made += real_times(p.traces[run.number], self.trace_spectra)
         self.error = run.outputs - made
+
+    @cached_property
+    def H(self) -> ComplexArray:  # noqa: N802
+        """From base to outputs, (c, d, L)."""
+        pushed = (self.g[:, None] * self.p.modes.gamma[:, :, None]).reshape(len(self.g), -1)
+        return real_times(self.shown, pushed).reshape(len(self.direct), -1, self.run.w.size) + self.direct[:, :, None]
 
     def deviations(self, levels: Array) -> tuple[Array, Array]:
         """Inverse deviations of the outputs' own noise at a line, (c,), and deviations of the base's, (d,)."""
@@ -344,6 +388,9 @@ class Chunk:
     def weighed(self, levels: Array, error: ComplexArray | None = None) -> Weighed:
         """Errors, or other spectra (c, L), weighed by their full covariance."""
         scale, root = self.deviations(levels)
+        if not np.any(root):
+            e = scale[:, None] * (self.error if error is None else error)
+            return Weighed(scale[:, None] * e, _power(e), self.run.base)
         V, factor = self._base_noise(levels)
         e = scale[:, None] * (self.error if error is None else error)
         # What is likeliest of the base's noise, in its own units; what it makes of the errors is taken off them.
@@ -379,11 +426,8 @@ class Chunk:
         """What all columns of the Jacobian are made of, (spectra, L)."""
         modes, g = self.p.modes, self.g
         freq = self.run.w / (2 * np.pi)
-        push = _times(modes.gamma, base) + self.pushed_by_ends
         parts = [
-            g * push,
-            (g[:, None] * base).reshape(-1, base.shape[1]),
-            gain_slopes(freq, modes.omega, modes.ratios) * np.tile(push, (2, 1)),
+            motion_and_slopes(freq, modes.omega, modes.ratios, modes.gamma, base, self.pushed_by_ends),
             base,
         ]
         if self.at_ends is not None:
@@ -448,7 +492,7 @@ class Chunk:
     def sums_of_errors(self, levels: Array, columns: Columns) -> Sums:
         """Products of the spectra of these lines with the errors alone."""
         weighed = self.weighed(levels)
-        cross = _dots(self.spectra(weighed.base), self.run.weight * weighed.seen)
+        cross = dots(self.spectra(weighed.base), self.run.weight * weighed.seen)
         return Sums(np.zeros((0, 0)), cross, np.zeros((0, 0)), float(self.run.weight @ weighed.power))
 
     def sums(self, levels: Array, columns: Columns) -> Sums:
@@ -458,18 +502,13 @@ class Chunk:
         hidden = np.zeros((columns.unknowns.size,) * 2)
         for part in self.covered(levels):
             seen = columns.seen(part.conj(), spectra)
-            hidden += _dots(seen, seen)
-        cross = _dots(spectra, root * weighed.seen)
-        return Sums(_dots(spectra, spectra), cross, hidden, float(self.run.weight @ weighed.power))
+            hidden += dots(seen, seen)
+        cross = dots(spectra, root * weighed.seen)
+        return Sums(dots(spectra, spectra), cross, hidden, float(self.run.weight @ weighed.power))
 
     def products(self, levels: Array, columns: Columns) -> Shift:
         """Products of the Jacobian of these lines; unknowns as in `columns`."""
         return columns.products(self.sums(levels, columns), self.deviations(levels)[0])
-
-
-def _times(matrix: Array, rows: ComplexArray) -> ComplexArray:
-    """A real matrix times rows (k, L) in real arithmetic: half of what a complex product would take."""
-    return np.asarray((np.ascontiguousarray(matrix) @ np.ascontiguousarray(rows).view(float)).view(complex))
 
 
 def _power(rows: ComplexArray) -> Array:
@@ -477,7 +516,7 @@ def _power(rows: ComplexArray) -> Array:
     return np.asarray(np.sum(rows.real**2 + rows.imag**2, axis=0))
 
 
-def _dots(rows: ComplexArray, others: ComplexArray) -> Array:
+def dots(rows: ComplexArray, others: ComplexArray) -> Array:
     """``Re X Y'`` of rows (k, L), (l, L)."""
     one = np.ascontiguousarray(rows).view(float)
     two = one if others is rows else np.ascontiguousarray(others).view(float)

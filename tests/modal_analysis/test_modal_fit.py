@@ -8,7 +8,7 @@ import pytest
 
 from sysid import Measurement, Structure
 from sysid.measurement.measurement import unit_runs
-from sysid.modal_analysis.modal_fit import Modes, _derivatives, _Error, _gauge, fit_modes, rank_one
+from sysid.modal_analysis.modal_fit import Modes, rank_one
 from sysid.models.spectrum import SOLVED
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram
 from sysid.structure.triangular import lower_triangle, triangle_entries

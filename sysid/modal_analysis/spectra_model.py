@@ -1,0 +1,178 @@
+"""The modal model of plain spectra, its mode shapes eliminated sensor by sensor.
+
+The base is exact, so that no sensor shares its errors with another: at given participations and poles the shapes are a
+small linear least-squares problem of each sensor, the same matrix for all of them. What is left has (d + 2) unknowns a
+mode, whatever the number of sensors (variable projection, Golub and Pereyra 1973). Its gradient is exact, and its
+normal matrix is that of Kaufman (1975): the columns of the shapes projected off the others, which is the Jacobian of
+the projected residual but for a term that vanishes with the residual.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sysid.measurement.measurement import Measurement
+from sysid.measurement.noise import separable
+from sysid.modal_analysis.modal_fit import Modes, Weights, force_columns, mode_of_slopes
+from sysid.modal_analysis.record_model import Chunk, ModalModel, Parameters, Run, Shift, dots
+from sysid.modal_analysis.residues import force_residual_left, linear_residues
+from sysid.modal_analysis.response import real_times
+from sysid.structure.structure import Array
+
+_RIDGE = 1e-14  # of the modes' size: keeps shapes finite where two modes become one, and changes them by less than noise
+_LEAST_MISFIT = 1e-9  # relative; records that fit better than this weigh alike
+
+
+def weights_at(test: Measurement, omega: Array, ratios: Array) -> Weights:
+    """Weights by the stated noise; a force whose noise is not stated weighs by what free residues at these poles leave.
+
+    Parameters
+    ----------
+    test : Measurement
+    omega, ratios : (m,)
+        Circular frequencies, rad/s, and damping ratios, each pole once.
+    """
+    channel, line = separable(test.response_std, test.response.shape)
+    size = float(np.linalg.norm(test.relative * channel[:, None] * line[:, None]))
+    sensors = channel / size
+    if test.force is None:
+        return Weights(sensors, line, None, line)
+    own, force_line = separable(test.force_std, test.force.shape)
+    if np.allclose(force_line / force_line.mean(), line / line.mean(), rtol=1e-12):
+        own, force_line = own * force_line.mean() / line.mean(), line
+    if test.response_std is not None and test.force_std is not None:
+        return Weights(sensors, line, own / size, force_line)
+    force_size = float(np.linalg.norm(test.force * own[:, None] * force_line[:, None]))
+    left = max(linear_residues(test, omega, ratios)[1], _LEAST_MISFIT)
+    force_left = max(force_residual_left(test, omega, ratios), _LEAST_MISFIT)
+    weight = left / force_left * float(np.sqrt(test.force.size / test.relative.size)) / force_size
+    return Weights(sensors, line, weight * own, force_line)
+
+
+class SpectraModel(ModalModel):
+    """Plain spectra as a sum of modes whose shapes are the best for their participations and poles.
+
+    The unknowns are participations (mode by mode), the logarithms of frequencies and damping ratios of each pole, and
+    where a force was measured the rigid-body mass, as `Index` has it. Modes may share a pole.
+
+    Parameters
+    ----------
+    test : Measurement
+    weights : Weights
+    pole : (m,) of int
+        The pole of each mode.
+    """
+
+    def __init__(self, test: Measurement, weights: Weights, pole: NDArray[np.intp]) -> None:
+        outputs = test.response if test.force is None else np.concatenate([test.response, test.force], axis=1)
+        every = [(weights.lines, 0)] + [(weights.force_lines, 1)] * (weights.force_lines is not weights.lines)
+        runs = [
+            Run(2 * np.pi * test.freq, base * line, records * line, 1.0, number, np.ones(line.size), piece)
+            for lines, piece in every
+            for number, (base, records, line) in enumerate(zip(test.base, outputs, lines, strict=True))
+        ]
+        super().__init__(test, pole.size, runs)
+        force = np.zeros(0) if weights.force is None else weights.force
+        # A channel without weight in a piece has infinite noise there; the base has none.
+        scale = np.zeros((len(every), self.channels))
+        scale[0, : self.n], scale[-1, self.n :] = weights.sensors, force
+        with np.errstate(divide="ignore"):
+            self.levels = np.hstack([scale**-2.0, np.zeros((len(every), self.d))])
+        self.pole, self._first = pole, np.unique(pole, return_index=True)[1]
+        # Columns of the plain unknowns, of which those of modes that share a pole are one.
+        count = self.m * self.d
+        at = np.concatenate([np.arange(count), count + pole, count + self._first.size + pole])
+        rigid = count + 2 * self._first.size + np.arange(self.kept - int(self.index.rigid[0]))
+        self._at = np.concatenate([at, rigid])
+
+    @property
+    def levels_of_accelerations(self) -> Array:
+        """Variances with which the force has no weight."""
+        levels = self.levels.copy()
+        levels[:, self.n : self.channels] = np.inf
+        return levels
+
+    def pack(self, p: Parameters) -> Array:
+        """The unknowns as one column, without the shapes."""
+        modes = p.modes
+        rigid = [p.rigid[i, j] for i, j in self.index.pairs] if self.force else []
+        poles = np.log(modes.omega[self._first]), np.log(modes.ratios[self._first])
+        return np.concatenate([modes.gamma.ravel(), *poles, rigid])
+
+    def unpack(self, x: Array) -> Parameters:
+        """Parameters with the best shapes."""
+        gamma, log_omega, log_ratios, corner = np.split(
+            x[self._at], np.cumsum([self.m * self.d, self.m, self.m]).tolist()
+        )
+        rigid = np.zeros((self.d, self.d))
+        for (i, j), value in zip(self.index.pairs, corner, strict=False):
+            rigid[i, j] = rigid[j, i] = value
+        with np.errstate(over="ignore"):
+            omega, ratios = np.exp(log_omega), np.exp(log_ratios)
+        return self.with_best_shapes(Modes(np.zeros((self.n, self.m)), gamma.reshape(self.m, -1), omega, ratios), rigid)
+
+    def with_best_shapes(self, modes: Modes, rigid: Array) -> Parameters:
+        """Parameters with the shapes that leave least of the accelerations; those of `modes` are not read."""
+        start = self._parameters(modes._replace(phi=np.zeros((self.n, self.m))), rigid)
+        if not (np.all(np.isfinite(modes.omega)) and np.all(modes.ratios < 1.0)):
+            return start
+        parts = [Chunk(self, start, run) for run in self.runs if run.piece == 0]
+        inverse = _inverse(sum(dots(part.motion, part.motion) for part in parts))
+        phi = np.zeros((self.n, self.m))
+        # Once more for what round-off in the products has left.
+        for _ in range(2):
+            left = [part.error[: self.n] - real_times(phi, part.motion) for part in parts]
+            pull = sum(dots(error, part.motion) for error, part in zip(left, parts, strict=True))
+            phi = phi + pull @ inverse
+        return self._parameters(modes._replace(phi=phi), rigid)
+
+    def _parameters(self, modes: Modes, rigid: Array) -> Parameters:
+        runs = self.test.n_runs
+        return Parameters(modes, rigid, np.zeros((self.m, 0)), np.zeros((runs, self.channels, 0)))
+
+    def normal_equations(self, p: Parameters, levels: Array) -> Shift:
+        """Kaufman's normal matrix and the exact gradient by the unknowns, of parameters with the best shapes."""
+        normal, gradient, chi2 = self.slopes(p, levels)
+        size = self._at.max(initial=-1) + 1
+        joined = np.zeros((size, len(normal)))
+        joined[self._at, np.arange(len(normal))] = 1.0
+        return Shift(joined @ normal @ joined.T, joined @ gradient, chi2)
+
+    def slopes(self, p: Parameters, levels: Array) -> Shift:
+        """The same by participations, log w, log zeta of each mode, and rigid-body mass: theta without the shapes."""
+        modes, m, n = p.modes, self.m, self.n
+        spectra = m * (self.d + 3) + self.d
+        grams = np.zeros((len(levels), spectra, spectra))
+        cross = np.zeros((len(levels), spectra, self.channels))
+        chi2, scale = 0.0, np.zeros((len(levels), self.channels))
+        for chunk in self.chunks(p):
+            piece, weighed, made = chunk.run.piece, chunk.weighed(levels), chunk.spectra(chunk.run.base)
+            grams[piece] += dots(made, made)
+            cross[piece] += dots(made, weighed.seen)
+            chi2 += float(np.sum(weighed.power))
+            scale[piece] = chunk.deviations(levels)[0]
+        own, others = slice(m), slice(m, m * (self.d + 3))
+        gram = grams[0]
+        onto = gram[others, own]
+        inner = gram[others, others] - onto @ _inverse(gram[own, own]) @ onto.T
+        mode = mode_of_slopes(m, self.d)
+        alike = (modes.phi.T * scale[0, :n] ** 2) @ modes.phi
+        size = self.kept - self.index.gamma.start
+        normal, gradient = np.zeros((size, size)), np.zeros(size)
+        count = mode.size
+        normal[:count, :count] = inner * alike[np.ix_(mode, mode)]
+        gradient[:count] = np.sum(cross[0, others, :n] * modes.phi[:, mode].T, axis=1)
+        for i in range(self.channels - n):
+            mix = force_columns(modes.gamma, self.index, i)
+            normal += scale[-1, n + i] ** 2 * (mix.T @ grams[-1] @ mix)
+            gradient += mix.T @ cross[-1, :, n + i]
+        return Shift(normal, gradient, chi2)
+
+
+def _inverse(gram: Array) -> Array:
+    """Inverse of the Gram matrix of the modes' motions, which may be next to singular."""
+    size = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
+    lam, V = np.linalg.eigh(gram / np.outer(size, size))
+    half = V / np.sqrt(np.maximum(lam, 0.0) + _RIDGE) / size[:, None]
+    return np.asarray(half @ half.T)
