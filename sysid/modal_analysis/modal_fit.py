@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 from sysid.structure.structure import Array
@@ -68,6 +69,29 @@ def force_columns(gamma: Array, index: Index, i: int) -> Array:
         if i in (a, b):
             mix[m + mode.size + (b if i == a else a), column] = 1.0
     return mix
+
+
+def gauge_of(first: Modes, unit: Array, weighed: bool) -> tuple[Array, NDArray[np.bool_]]:
+    """Participations in one of the equivalent forms, and which of them are held to keep it.
+
+    Accelerations leave the scale of each mode open: its largest participation is held. Of modes that share a pole they
+    leave every mixture open, and the block in as many directions is held to a unit matrix; a force leaves only
+    rotations of these modes into each other, and the block is held triangular.
+    """
+    gauge, held = first.gamma / unit, np.zeros(first.gamma.shape, dtype=bool)
+    _, start = np.unique(first.omega + 1j * first.ratios, return_index=True)
+    for same in np.split(np.arange(first.omega.size), np.sort(start)[1:]):
+        pivots = scipy.linalg.qr(gauge[same], pivoting=True, mode="r")[1]  # directions best conditioned together first
+        block = np.ix_(same, pivots[: same.size])
+        if weighed:
+            gauge[same] = np.linalg.qr(gauge[block])[0].T @ gauge[same]
+            lower = np.tril(np.ones((same.size, same.size), dtype=bool), -1)
+            gauge[block] = np.where(lower, 0.0, gauge[block])
+            held[block] = lower
+        else:
+            gauge[same] = np.linalg.solve(gauge[block], gauge[same])
+            held[block] = True
+    return gauge, held
 
 
 def rank_one(residues: Array, omega: Array, ratios: Array, size: Array) -> Modes:

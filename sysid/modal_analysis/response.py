@@ -239,6 +239,37 @@ def motion_and_slopes(
     return np.concatenate([g * load, (g[:, None] * base).reshape(-1, freq.size), *by_pole])
 
 
+def motion_curvature(
+    freq: Array, omega: Array, ratios: Array, gamma: Array, base: ComplexArray, pull: ComplexArray
+) -> Array:
+    """Second derivatives of the modal motions, summed over the lines: ``Re conj(pull_k) q_k''``.
+
+    Parameters
+    ----------
+    freq, omega, ratios, gamma, base :
+        As in `motion_and_slopes`.
+    pull : (m, L)
+
+    Returns
+    -------
+    (m, d + 2, d + 2)
+        By the participations of each mode, log w_k and log zeta_k.
+    """
+    d, s = gamma.shape[1], 2j * np.pi * freq
+    stiff, loss = (omega**2)[:, None], (2 * ratios * omega)[:, None] * s
+    over = 1 / (stiff + s**2 + loss)
+    by = np.stack([(2 * stiff + loss) * over, loss * over])  # slopes of the denominator, over itself
+    weight = pull.conj() * -(s**2) * over
+    out = np.zeros((len(omega), d + 2, d + 2))
+    out[:, d:, :d] = -np.einsum("akl,kl,jl->kaj", by, weight, base, optimize=True).real
+    out[:, :d, d:] = out[:, d:, :d].swapaxes(1, 2)
+    weight = weight * real_times(gamma, base)
+    twice = {(0, 0): (4 * stiff + loss) * over, (0, 1): by[1], (1, 1): by[1]}
+    for (a, b), bend in twice.items():
+        out[:, d + a, d + b] = out[:, d + b, d + a] = np.sum((weight * (2 * by[a] * by[b] - bend)).real, axis=1)
+    return out
+
+
 def real_times(matrix: Array, rows: ComplexArray) -> ComplexArray:
     """A real matrix times rows (k, L) in real arithmetic: half of what a complex product would take."""
     return np.asarray((np.ascontiguousarray(matrix) @ np.ascontiguousarray(rows).view(float)).view(complex))

@@ -6,7 +6,7 @@ import numpy as np
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.least_squares import LeastSquares, minimise
-from sysid.modal_analysis.modal_fit import ModalFit, Modes, poles_of
+from sysid.modal_analysis.modal_fit import ModalFit, Modes, gauge_of, poles_of
 from sysid.modal_analysis.record_model import Parameters
 from sysid.modal_analysis.spectra_model import SpectraModel, weights_at
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor
@@ -34,6 +34,10 @@ def fit_spectra(
     poles, pole = poles_of(first)
     weights = weights_at(test, first.omega[poles], first.ratios[poles])
     model = SpectraModel(test, weights, pole)
+    unit = np.sqrt(np.maximum(np.mean(first.gamma**2, axis=0), np.finfo(float).tiny))
+    gauge, held = gauge_of(first, unit, test.force is not None)
+    first = first._replace(gamma=gauge * unit)
+    model.hold(first.gamma, held)
 
     def tell(_: int, p: Parameters, chi2: float) -> bool:
         return monitor.record(model.pack(p), OBJECTIVE_SCALE * chi2)

@@ -10,6 +10,7 @@ the projected residual but for a term that vanishes with the residual.
 from __future__ import annotations
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
@@ -17,10 +18,11 @@ from sysid.measurement.noise import separable
 from sysid.modal_analysis.modal_fit import Modes, Weights, force_columns, mode_of_slopes
 from sysid.modal_analysis.record_model import Chunk, ModalModel, Parameters, Run, Shift, dots
 from sysid.modal_analysis.residues import force_residual_left, linear_residues
-from sysid.modal_analysis.response import real_times
+from sysid.modal_analysis.response import motion_curvature, real_times
 from sysid.structure.structure import Array
 
 _RIDGE = 1e-14  # of the modes' size: keeps shapes finite where two modes become one, and changes them by less than noise
+_CURVED = 1e-11  # of a scaled Hessian: less curvature is round-off
 _LEAST_MISFIT = 1e-9  # relative; records that fit better than this weigh alike
 
 
@@ -85,6 +87,13 @@ class SpectraModel(ModalModel):
         at = np.concatenate([np.arange(count), count + pole, count + self._first.size + pole])
         rigid = count + 2 * self._first.size + np.arange(self.kept - int(self.index.rigid[0]))
         self._at = np.concatenate([at, rigid])
+        self._size = int(self._at.max()) + 1
+        self._free, self._held = np.ones(self._size, bool), np.zeros(self._size)
+
+    def hold(self, gamma: Array, held: NDArray[np.bool_]) -> None:
+        """Leave some participations (m, d) as they are."""
+        self._free[: gamma.size] = ~held.ravel()
+        self._held[: gamma.size] = gamma.ravel()
 
     @property
     def levels_of_accelerations(self) -> Array:
@@ -98,12 +107,14 @@ class SpectraModel(ModalModel):
         modes = p.modes
         rigid = [p.rigid[i, j] for i, j in self.index.pairs] if self.force else []
         poles = np.log(modes.omega[self._first]), np.log(modes.ratios[self._first])
-        return np.concatenate([modes.gamma.ravel(), *poles, rigid])
+        return np.concatenate([modes.gamma.ravel(), *poles, rigid])[self._free]
 
     def unpack(self, x: Array) -> Parameters:
         """Parameters with the best shapes."""
+        every = self._held.copy()
+        every[self._free] = x
         gamma, log_omega, log_ratios, corner = np.split(
-            x[self._at], np.cumsum([self.m * self.d, self.m, self.m]).tolist()
+            every[self._at], np.cumsum([self.m * self.d, self.m, self.m]).tolist()
         )
         rigid = np.zeros((self.d, self.d))
         for (i, j), value in zip(self.index.pairs, corner, strict=False):
@@ -132,42 +143,94 @@ class SpectraModel(ModalModel):
         return Parameters(modes, rigid, np.zeros((self.m, 0)), np.zeros((runs, self.channels, 0)))
 
     def normal_equations(self, p: Parameters, levels: Array) -> Shift:
-        """Kaufman's normal matrix and the exact gradient by the unknowns, of parameters with the best shapes."""
-        normal, gradient, chi2 = self.slopes(p, levels)
-        size = self._at.max(initial=-1) + 1
-        joined = np.zeros((size, len(normal)))
-        joined[self._at, np.arange(len(normal))] = 1.0
-        return Shift(joined @ normal @ joined.T, joined @ gradient, chi2)
+        """Half the Hessian and minus half the gradient of the sum of squares by the unknowns, and the sum.
 
-    def slopes(self, p: Parameters, levels: Array) -> Shift:
-        """The same by participations, log w, log zeta of each mode, and rigid-body mass: theta without the shapes."""
+        Of parameters with the best shapes. The Hessian is exact where it has no negative curvature, else Kaufman's.
+        """
+        plain, curved = self.slopes(p, levels)
+        joined = np.zeros((self._size, self._at.size))
+        joined[self._at, np.arange(self._at.size)] = 1.0
+        joined = joined[self._free]
+        exact = joined @ curved @ joined.T
+        normal = exact if _is_definite(exact) else joined @ plain.normal @ joined.T
+        return Shift(normal, joined @ plain.gradient, plain.chi2)
+
+    def slopes(self, p: Parameters, levels: Array) -> tuple[Shift, Array]:
+        """The same by participations, log w, log zeta of each mode, and rigid-body mass: theta without the shapes.
+
+        First with Kaufman's normal matrix, then half the exact Hessian.
+        """
         modes, m, n = p.modes, self.m, self.n
         spectra = m * (self.d + 3) + self.d
         grams = np.zeros((len(levels), spectra, spectra))
         cross = np.zeros((len(levels), spectra, self.channels))
-        chi2, scale = 0.0, np.zeros((len(levels), self.channels))
+        chi2, scale, curvature = 0.0, np.zeros((len(levels), self.channels)), np.zeros((m, self.d + 2, self.d + 2))
         for chunk in self.chunks(p):
             piece, weighed, made = chunk.run.piece, chunk.weighed(levels), chunk.spectra(chunk.run.base)
             grams[piece] += dots(made, made)
             cross[piece] += dots(made, weighed.seen)
             chi2 += float(np.sum(weighed.power))
             scale[piece] = chunk.deviations(levels)[0]
-        own, others = slice(m), slice(m, m * (self.d + 3))
-        gram = grams[0]
-        onto = gram[others, own]
-        inner = gram[others, others] - onto @ _inverse(gram[own, own]) @ onto.T
+            pull = real_times(chunk.shown.T, weighed.seen)
+            curvature += motion_curvature(
+                chunk.run.w / (2 * np.pi), modes.omega, modes.ratios, modes.gamma, chunk.run.base, pull
+            )
         mode = mode_of_slopes(m, self.d)
-        alike = (modes.phi.T * scale[0, :n] ** 2) @ modes.phi
-        size = self.kept - self.index.gamma.start
-        normal, gradient = np.zeros((size, size)), np.zeros(size)
-        count = mode.size
-        normal[:count, :count] = inner * alike[np.ix_(mode, mode)]
-        gradient[:count] = np.sum(cross[0, others, :n] * modes.phi[:, mode].T, axis=1)
+        count, size = mode.size, self.kept - self.index.gamma.start
+        normal, bent, gradient = np.zeros((size, size)), np.zeros((size, size)), np.zeros(size)
+        normal[:count, :count], bent[:count, :count], gradient[:count] = _eliminated(
+            modes.phi, grams[0], cross[0, : m + count, :n], scale[0, :n], mode
+        )
+        at = np.hstack([np.arange(m * self.d).reshape(m, -1), m * self.d + np.arange(2 * m).reshape(2, m).T])
+        np.subtract.at(bent, (at[:, :, None], at[:, None]), curvature)
         for i in range(self.channels - n):
             mix = force_columns(modes.gamma, self.index, i)
             normal += scale[-1, n + i] ** 2 * (mix.T @ grams[-1] @ mix)
             gradient += mix.T @ cross[-1, :, n + i]
-        return Shift(normal, gradient, chi2)
+            # The force is the product of a participation and a motion.
+            own, others = mode * self.d + i, np.arange(count)
+            np.subtract.at(bent, (own, others), cross[-1, m + others, n + i])
+            np.subtract.at(bent, (others, own), cross[-1, m + others, n + i])
+        return Shift(normal, gradient, chi2), normal + bent
+
+
+def _eliminated(
+    phi: Array, gram: Array, cross: Array, scale: Array, mode: NDArray[np.intp]
+) -> tuple[Array, Array, Array]:
+    """Sums over the sensors with their shapes eliminated: Kaufman's normal matrix, what is exact beyond it, gradient.
+
+    Parameters
+    ----------
+    phi : (n, m)
+        The best shapes.
+    gram : (spectra, spectra)
+        Products of motions and their slopes, motions first.
+    cross : (m + slopes, n)
+        Of these with weighed errors.
+    scale : (n,)
+        Inverse deviations.
+    mode : (slopes,)
+    """
+    m, count = phi.shape[1], mode.size
+    own, slopes = slice(m), slice(m, m + count)
+    inverse = _inverse(gram[own, own])
+    onto = gram[slopes, own] @ inverse
+    inner = gram[slopes, slopes] - onto @ gram[own, slopes]
+    alike = ((phi.T * scale**2) @ phi)[np.ix_(mode, mode)]
+    errors = cross[slopes]
+    by_shape = errors @ phi[:, mode]  # (slopes, slopes), of the second's mode
+    across = onto[:, mode] * by_shape.T
+    alone = inverse[np.ix_(mode, mode)] * ((errors / scale**2) @ errors.T)
+    return inner * alike, across + across.T - alone, np.sum(errors * phi[:, mode].T, axis=1)
+
+
+def _is_definite(matrix: Array) -> bool:
+    """Whether a symmetric matrix has positive curvature in all directions, by more than round-off."""
+    size = np.diag(matrix)
+    if np.any(size <= 0):
+        return False
+    scaled = matrix / np.sqrt(np.outer(size, size)) - _CURVED * np.eye(len(size))
+    return scipy.linalg.lapack.dpotrf(scaled, lower=1)[1] == 0
 
 
 def _inverse(gram: Array) -> Array:

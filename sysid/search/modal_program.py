@@ -1,8 +1,8 @@
 """The program in modal coordinates: participations, frequencies and damping ratios through IPOPT, shapes eliminated.
 
 Every answer in modal coordinates ends here, most of them after one to three iterations from an estimate. The residual
-is symbolic, its gradient is CasADi's own; the Hessian is the Gauss-Newton one of Kaufman, whose products of all lines
-are NumPy's (`SpectraModel`), as CasADi multiplies dense matrices many times slower. A measured base force is fitted
+is symbolic, its gradient is CasADi's own; the Hessian is exact, its products of all lines are NumPy's (`SpectraModel`), as
+CasADi multiplies dense matrices many times slower. A measured base force is fitted
 jointly; it sets the scale of each mode.
 """
 
@@ -12,12 +12,10 @@ from collections.abc import Callable
 
 import casadi as ca
 import numpy as np
-import scipy.linalg
-from numpy.typing import NDArray
 
 from sysid.errors import SolverError
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.modal_fit import ModalFit, Modes, poles_of
+from sysid.modal_analysis.modal_fit import ModalFit, Modes, gauge_of, poles_of
 from sysid.modal_analysis.response import columns, modal_gains, modal_motion, parts_of, stacked
 from sysid.modal_analysis.spectra_model import SpectraModel, Weights, weights_at
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram
@@ -74,7 +72,7 @@ def fit_modes(
     (m, d), (poles, pole) = first.gamma.shape, poles_of(first)
     weights = weights_at(test, first.omega[poles], first.ratios[poles]) if weights is None else weights
     weighed = test.force is not None
-    gauge, held = _gauge(first, unit, weighed)
+    gauge, held = gauge_of(first, unit, weighed)
     low, high = np.full((m, d), -np.inf), np.full((m, d), np.inf)
     low[held], high[held] = gauge[held], gauge[held]
     gamma = z.variable("participation", gauge, low, high) @ ca.diag(ca.DM(unit))
@@ -90,7 +88,7 @@ def fit_modes(
     if ties is not None:
         for tie in ties(error.phi, gamma, rigid):
             z.constrain(tie)
-    hessian = NormalMatrix(SpectraModel(test, weights, np.arange(m)))
+    hessian = ModalHessian(SpectraModel(test, weights, np.arange(m)))
     best, status = z.minimize(error.value, monitor, max_iterations, _derivatives(z, error, hessian))
     end = ca.Function("end", [z.z], [error.phi, gamma, omega, ratios, rigid, error.value, ca.norm_fro(error.left)])
     try:
@@ -102,29 +100,6 @@ def fit_modes(
     modes = Modes(values[0], values[1], values[2].ravel(), values[3].ravel())
     left = float(np.sqrt(values[5].item())), float(values[6].item())
     return ModalFit(modes, values[4], *left, status, z.on_bounds(best), weights)
-
-
-def _gauge(first: Modes, unit: Array, weighed: bool) -> tuple[Array, NDArray[np.bool_]]:
-    """Participations in one of the equivalent forms, and which of them are held to keep it.
-
-    Accelerations leave the scale of each mode open: its largest participation is held. Of modes that share a pole they
-    leave every mixture open, and the block in as many directions is held to a unit matrix; a force leaves only
-    rotations of these modes into each other, and the block is held triangular.
-    """
-    gauge, held = first.gamma / unit, np.zeros(first.gamma.shape, dtype=bool)
-    _, start = np.unique(first.omega + 1j * first.ratios, return_index=True)
-    for same in np.split(np.arange(first.omega.size), np.sort(start)[1:]):
-        pivots = scipy.linalg.qr(gauge[same], pivoting=True, mode="r")[1]  # directions best conditioned together first
-        block = np.ix_(same, pivots[: same.size])
-        if weighed:
-            gauge[same] = np.linalg.qr(gauge[block])[0].T @ gauge[same]
-            lower = np.tril(np.ones((same.size, same.size), dtype=bool), -1)
-            gauge[block] = np.where(lower, 0.0, gauge[block])
-            held[block] = lower
-        else:
-            gauge[same] = np.linalg.solve(gauge[block], gauge[same])
-            held[block] = True
-    return gauge, held
 
 
 class ModalResidual:
@@ -185,7 +160,7 @@ class ModalResidual:
         return 2 * ca.diag(self.force_channel) @ self.force_left @ self.force_base.T
 
     def theta(self) -> ca.MX:
-        """What `NormalMatrix` takes: participations mode by mode, log w, log zeta and, with a force, the rigid mass."""
+        """What `ModalHessian` takes: participations mode by mode, log w, log zeta and, with a force, the rigid mass."""
         d = self.rigid.size1()
         corner = [self.rigid[i, j] for i in range(d) for j in range(i, d)] if self.force_left is not None else []
         return ca.vertcat(ca.vec(self.gamma.T), ca.log(self.omega), ca.log(self.ratios), *corner)
@@ -196,13 +171,13 @@ def _times(one: ca.MX, other: ca.MX) -> ca.MX:
     return ca.mtimes(one, other, "classic")
 
 
-class NormalMatrix(ca.Callback):
-    """Twice the normal matrix of a `SpectraModel` as a function of theta without the shapes, for CasADi."""
+class ModalHessian(ca.Callback):
+    """Hessian of the sum of squares of a `SpectraModel` by theta without the shapes, as CasADi calls it."""
 
     def __init__(self, model: SpectraModel) -> None:
         ca.Callback.__init__(self)
         self.model, self.size = model, model.kept - model.index.gamma.start
-        self.construct("normal", {})
+        self.construct("hessian", {})
 
     def get_n_in(self) -> int:
         """One column of parameters."""
@@ -223,18 +198,17 @@ class NormalMatrix(ca.Callback):
     def eval(self, arg: list) -> list:
         """The matrix at the best shapes."""
         model = self.model
-        return [2 * model.slopes(model.unpack(np.asarray(arg[0]).ravel()), model.levels).normal]
+        return [2 * model.slopes(model.unpack(np.asarray(arg[0]).ravel()), model.levels)[1]]
 
 
-def _derivatives(z: NonlinearProgram, error: ModalResidual, normal: NormalMatrix) -> dict[str, ca.Function]:
-    """Gradient and Gauss-Newton Hessian by the unknowns, in IPOPT's scale of the objective."""
+def _derivatives(z: NonlinearProgram, error: ModalResidual, normal: ModalHessian) -> dict[str, ca.Function]:
+    """Gradient and Hessian by the unknowns, in IPOPT's scale of the objective."""
     unknowns, theta = z.z, error.theta()
     chain = ca.jacobian(theta, unknowns)
     hessian = chain.T @ normal(theta) @ chain
-    # Where the data want less base mass than none its factor ends at zero, where it has no slope, only curvature.
+    # Of theta, the rigid-body mass alone bends by the unknowns, but for stated laws of the damping.
     slope = ca.MX.sym("slope", *error.rigid.shape)
-    remainder = error.rigid - error.gamma.T @ error.gamma
-    bend = ca.substitute(ca.hessian(ca.dot(slope, remainder), unknowns)[0], slope, error.by_rigid())
+    bend = ca.substitute(ca.hessian(ca.dot(slope, error.rigid), unknowns)[0], slope, error.by_rigid())
     p, factor, multipliers = ca.MX.sym("p", 0), ca.MX.sym("factor"), ca.MX.sym("multipliers", sum(
         tie.numel() for tie in z.constraints
     ))  # fmt: skip

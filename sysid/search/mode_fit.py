@@ -229,14 +229,21 @@ def ended(problem: Problem, estimate: ModalFit, monitor: IterationMonitor, max_i
     DoesNotApplyError
         Where modes move so much alike that no shapes can be told apart.
     """
-    low, high = damping_bounds(problem)
-    within = np.all((estimate.modes.ratios >= low) & (estimate.modes.ratios <= high))
+    within = _within_bounds(problem, estimate)
     if monitor.is_over or monitor.stopped is not None or (within and estimate.weights is None):
         return estimate
     try:
-        return _again(problem, estimate, monitor, max_iterations)
+        # Bounds that nothing presses on would cost iterations, as IPOPT begins away from them.
+        end = _again(problem, estimate, monitor, max_iterations, bounded=False) if within else estimate
+        return end if within and _within_bounds(problem, end) else _again(problem, end, monitor, max_iterations)
     except SolverError as error:
         raise DoesNotApplyError(f"{error}: use fewer modes, Modal(modes=), or narrow the band") from None
+
+
+def _within_bounds(problem: Problem, end: ModalFit) -> bool:
+    """Whether all damping ratios are within the problem's bounds."""
+    low, high = damping_bounds(problem)
+    return bool(np.all((end.modes.ratios >= low) & (end.modes.ratios <= high)))
 
 
 def damping_bounds(problem: Problem) -> tuple[float, float]:
@@ -246,16 +253,17 @@ def damping_bounds(problem: Problem) -> tuple[float, float]:
 
 
 def _again(
-    problem: Problem, end: ModalFit, monitor: IterationMonitor, max_iterations: int, ties: Ties | None = None
-) -> ModalFit:
+    problem: Problem, end: ModalFit, monitor: IterationMonitor, max_iterations: int, ties: Ties | None = None,
+    *, bounded: bool = True,
+) -> ModalFit:  # fmt: skip
     """A fit from where another ended, with ties, and damping ratios within the problem's bounds."""
     modes = end.modes
     first, pole = poles_of(modes)
-    unit = np.sqrt(problem.totals)
-    spectrum = _free_spectrum(modes.omega[first], modes.ratios[first], pole, *damping_bounds(problem))
+    unit, bounds = np.sqrt(problem.totals), damping_bounds(problem) if bounded else (0.0, np.inf)
     return fit_modes(
-        problem.measurement, modes, spectrum, unit=unit, remainder=end.rigid - modes.gamma.T @ modes.gamma, ties=ties,
-        weights=end.weights, monitor=monitor, max_iterations=max_iterations,
+        problem.measurement, modes, _free_spectrum(modes.omega[first], modes.ratios[first], pole, *bounds), unit=unit,
+        remainder=end.rigid - modes.gamma.T @ modes.gamma, ties=ties, weights=end.weights, monitor=monitor,
+        max_iterations=max_iterations,
     )  # fmt: skip
 
 
