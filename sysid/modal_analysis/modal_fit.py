@@ -55,6 +55,17 @@ def mode_of_slopes(m: int, d: int) -> NDArray[np.intp]:
     return np.concatenate([np.repeat(k, d), k, k])
 
 
+def slopes_of_modes(m: int, d: int) -> NDArray[np.intp]:
+    """Where the derivatives of each mode stand in the order of `motion_and_slopes`, (m, d + 2)."""
+    count = m * d
+    return np.hstack([np.arange(count).reshape(m, d), count + np.arange(2 * m).reshape(2, m).T])
+
+
+def by_columns(m: int, d: int) -> NDArray[np.intp]:
+    """Where these derivatives stand with participations direction by direction, (m (d + 2),)."""
+    return np.concatenate([np.arange(m * d).reshape(m, d).T.ravel(), m * d + np.arange(2 * m)])
+
+
 def force_columns(gamma: Array, index: Index, i: int) -> Array:
     """Derivatives of the force in direction i as sums of spectra, (m (d + 3) + d, m (d + 2) + pairs).
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
-from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.least_squares import LeastSquares, minimise, units_of
+from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_masses import weigh
 from sysid.modal_analysis.record_colour import extra_numbers
 from sysid.modal_analysis.record_model import TRACES, HeldShapes, Parameters, RecordModel, Shift

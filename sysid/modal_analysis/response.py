@@ -263,10 +263,10 @@ def motion_curvature(
     out = np.zeros((len(omega), d + 2, d + 2))
     out[:, d:, :d] = -np.einsum("akl,kl,jl->kaj", by, weight, base, optimize=True).real
     out[:, :d, d:] = out[:, d:, :d].swapaxes(1, 2)
-    weight = weight * real_times(gamma, base)
+    turned = weight * real_times(gamma, base)
     twice = {(0, 0): (4 * stiff + loss) * over, (0, 1): by[1], (1, 1): by[1]}
     for (a, b), bend in twice.items():
-        out[:, d + a, d + b] = out[:, d + b, d + a] = np.sum((weight * (2 * by[a] * by[b] - bend)).real, axis=1)
+        out[:, d + a, d + b] = out[:, d + b, d + a] = np.sum((turned * (2 * by[a] * by[b] - bend)).real, axis=1)
     return out
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.least_squares import LeastSquares, minimise
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, gauge_of, poles_of
-from sysid.modal_analysis.record_model import Parameters
+from sysid.modal_analysis.modal_model import Parameters
 from sysid.modal_analysis.spectra_model import SpectraModel, weights_at
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor
 from sysid.structure.structure import Array

@@ -15,13 +15,15 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.noise import separable
-from sysid.modal_analysis.modal_fit import Modes, Weights, force_columns, mode_of_slopes
-from sysid.modal_analysis.record_model import Chunk, ModalModel, Parameters, Run, Shift, dots
+from sysid.modal_analysis.modal_fit import Modes, Weights, force_columns, mode_of_slopes, slopes_of_modes
+from sysid.modal_analysis.modal_model import Lines, ModalModel, Parameters, Run, Shift, dots
 from sysid.modal_analysis.residues import force_residual_left, linear_residues
 from sysid.modal_analysis.response import motion_curvature, real_times
 from sysid.structure.structure import Array
 
-_RIDGE = 1e-14  # of the modes' size: keeps shapes finite where two modes become one, and changes them by less than noise
+_RIDGE = (
+    1e-14  # of the modes' size: keeps shapes finite where two modes become one, and changes them by less than noise
+)
 _CURVED = 1e-11  # of a scaled Hessian: less curvature is round-off
 _LEAST_MISFIT = 1e-9  # relative; records that fit better than this weigh alike
 
@@ -128,14 +130,14 @@ class SpectraModel(ModalModel):
         start = self._parameters(modes._replace(phi=np.zeros((self.n, self.m))), rigid)
         if not (np.all(np.isfinite(modes.omega)) and np.all(modes.ratios < 1.0)):
             return start
-        parts = [Chunk(self, start, run) for run in self.runs if run.piece == 0]
-        inverse = _inverse(sum(dots(part.motion, part.motion) for part in parts))
+        parts = [Lines(self, start, run) for run in self.runs if run.piece == 0]
+        inverse = _inverse(np.sum([dots(part.motion, part.motion) for part in parts], axis=0))
         phi = np.zeros((self.n, self.m))
         # Once more for what round-off in the products has left.
         for _ in range(2):
             left = [part.error[: self.n] - real_times(phi, part.motion) for part in parts]
-            pull = sum(dots(error, part.motion) for error, part in zip(left, parts, strict=True))
-            phi = phi + pull @ inverse
+            pull = [dots(error, part.motion) for error, part in zip(left, parts, strict=True)]
+            phi = phi + np.sum(pull, axis=0) @ inverse
         return self._parameters(modes._replace(phi=phi), rigid)
 
     def _parameters(self, modes: Modes, rigid: Array) -> Parameters:
@@ -181,7 +183,7 @@ class SpectraModel(ModalModel):
         normal[:count, :count], bent[:count, :count], gradient[:count] = _eliminated(
             modes.phi, grams[0], cross[0, : m + count, :n], scale[0, :n], mode
         )
-        at = np.hstack([np.arange(m * self.d).reshape(m, -1), m * self.d + np.arange(2 * m).reshape(2, m).T])
+        at = slopes_of_modes(m, self.d)
         np.subtract.at(bent, (at[:, :, None], at[:, None]), curvature)
         for i in range(self.channels - n):
             mix = force_columns(modes.gamma, self.index, i)

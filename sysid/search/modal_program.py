@@ -18,7 +18,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, gauge_of, poles_of
 from sysid.modal_analysis.response import columns, modal_gains, modal_motion, parts_of, stacked
 from sysid.modal_analysis.spectra_model import SpectraModel, Weights, weights_at
-from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram
+from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, NumpyFunction
 from sysid.structure.structure import Array
 from sysid.structure.triangular import lower_triangle, triangle_entries
 
@@ -69,7 +69,7 @@ def fit_modes(
     G. H. Golub, V. Pereyra, SIAM J. Numer. Anal. 10 (1973) 413-432; L. Kaufman, BIT 15 (1975) 49-57.
     """
     z = NonlinearProgram()
-    (m, d), (poles, pole) = first.gamma.shape, poles_of(first)
+    (m, d), poles = first.gamma.shape, poles_of(first)[0]
     weights = weights_at(test, first.omega[poles], first.ratios[poles]) if weights is None else weights
     weighed = test.force is not None
     gauge, held = gauge_of(first, unit, weighed)
@@ -88,7 +88,7 @@ def fit_modes(
     if ties is not None:
         for tie in ties(error.phi, gamma, rigid):
             z.constrain(tie)
-    hessian = ModalHessian(SpectraModel(test, weights, np.arange(m)))
+    hessian = hessian_of(SpectraModel(test, weights, np.arange(m)))
     best, status = z.minimize(error.value, monitor, max_iterations, _derivatives(z, error, hessian))
     end = ca.Function("end", [z.z], [error.phi, gamma, omega, ratios, rigid, error.value, ca.norm_fro(error.left)])
     try:
@@ -134,7 +134,7 @@ class ModalResidual:
         self.phi = ca.diag(ca.DM(1 / weights.sensors)) @ self.shapes
         self.value = ca.sumsqr(self.left)
         self.force_left: ca.MX | None = None
-        if test.force is not None:
+        if test.force is not None and weights.force is not None:
             base = test.base * weights.force_lines[:, None]
             q = ca.horzcat(*modal_motion(base, gamma, gains)) if weights.force_lines is not weights.lines else self.q
             target = stacked(columns(test.force * weights.force[:, None] * weights.force_lines[:, None])).T
@@ -160,7 +160,7 @@ class ModalResidual:
         return 2 * ca.diag(self.force_channel) @ self.force_left @ self.force_base.T
 
     def theta(self) -> ca.MX:
-        """What `ModalHessian` takes: participations mode by mode, log w, log zeta and, with a force, the rigid mass."""
+        """What `hessian_of` takes: participations mode by mode, log w, log zeta and, with a force, the rigid mass."""
         d = self.rigid.size1()
         corner = [self.rigid[i, j] for i in range(d) for j in range(i, d)] if self.force_left is not None else []
         return ca.vertcat(ca.vec(self.gamma.T), ca.log(self.omega), ca.log(self.ratios), *corner)
@@ -171,41 +171,17 @@ def _times(one: ca.MX, other: ca.MX) -> ca.MX:
     return ca.mtimes(one, other, "classic")
 
 
-class ModalHessian(ca.Callback):
-    """Hessian of the sum of squares of a `SpectraModel` by theta without the shapes, as CasADi calls it."""
-
-    def __init__(self, model: SpectraModel) -> None:
-        ca.Callback.__init__(self)
-        self.model, self.size = model, model.kept - model.index.gamma.start
-        self.construct("hessian", {})
-
-    def get_n_in(self) -> int:
-        """One column of parameters."""
-        return 1
-
-    def get_n_out(self) -> int:
-        """One matrix."""
-        return 1
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Shape of the parameters."""
-        return ca.Sparsity.dense(self.size, 1)
-
-    def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        """Shape of the matrix."""
-        return ca.Sparsity.dense(self.size, self.size)
-
-    def eval(self, arg: list) -> list:
-        """The matrix at the best shapes."""
-        model = self.model
-        return [2 * model.slopes(model.unpack(np.asarray(arg[0]).ravel()), model.levels)[1]]
+def hessian_of(model: SpectraModel) -> NumpyFunction:
+    """Hessian of the sum of squares of a model by theta without the shapes, for CasADi."""
+    size = model.kept - model.index.gamma.start
+    return NumpyFunction(size, [(size, size)], lambda x: [2 * model.slopes(model.unpack(x), model.levels)[1]])
 
 
-def _derivatives(z: NonlinearProgram, error: ModalResidual, normal: ModalHessian) -> dict[str, ca.Function]:
+def _derivatives(z: NonlinearProgram, error: ModalResidual, of_theta: NumpyFunction) -> dict[str, ca.Function]:
     """Gradient and Hessian by the unknowns, in IPOPT's scale of the objective."""
     unknowns, theta = z.z, error.theta()
     chain = ca.jacobian(theta, unknowns)
-    hessian = chain.T @ normal(theta) @ chain
+    hessian = chain.T @ of_theta(theta) @ chain
     # Of theta, the rigid-body mass alone bends by the unknowns, but for stated laws of the damping.
     slope = ca.MX.sym("slope", *error.rigid.shape)
     bend = ca.substitute(ca.hessian(ca.dot(slope, error.rigid), unknowns)[0], slope, error.by_rigid())
