@@ -79,8 +79,8 @@ class ModalError:
         return np.concatenate([made[:m], self.base]) if self.shapes[1][0] else made[:m]
 
     def _gradient(self, y: Array) -> tuple[float, Array]:
-        A, (omega, _, gamma), made, seen = self._at(y)
-        m, d = gamma.shape
+        A, modes, made, seen = self._at(y)
+        m, d = modes[2].shape
         order = by_columns(m, d)
         by_factors = dots(self._rows(made, m), seen)  # by columns of A and B
         by_motion = np.sum(dots(made[m:], seen) * A.T[mode_of_slopes(m, d)], axis=1)
@@ -89,7 +89,7 @@ class ModalError:
 
     def _hessian(self, y: Array) -> tuple[Array]:
         A, modes, made, seen = self._at(y)
-        (c, m), d = A.shape, modes[2].shape[1]
+        m, d = modes[2].shape
         mode, order, twice = mode_of_slopes(m, d), by_columns(m, d), 2 * self.channel**2
         rows, slopes = self._rows(made, m), made[m:]
         of_factors = np.kron(dots(rows, rows), np.diag(twice))

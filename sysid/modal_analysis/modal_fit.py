@@ -115,7 +115,7 @@ def rank_one(residues: Array, omega: Array, ratios: Array, size: Array) -> Modes
 class Weights:
     """Weights of plain spectra: one factor a channel and one a line.
 
-    With them the sum of squares of the accelerations' errors is relative to that of the weighted relative accelerations.
+    With them the sum of squares of the accelerations' errors is relative to that of the weighted accelerations.
 
     Attributes
     ----------

@@ -1,9 +1,9 @@
 """The program in modal coordinates: participations, frequencies and damping ratios through IPOPT, shapes eliminated.
 
 Every answer in modal coordinates ends here, most of them after one to three iterations from an estimate. The residual
-is symbolic, its gradient is CasADi's own; the Hessian is exact, its products of all lines are NumPy's (`SpectraModel`), as
-CasADi multiplies dense matrices many times slower. A measured base force is fitted
-jointly; it sets the scale of each mode.
+is symbolic, its gradient CasADi's own. The Hessian is exact; its products of all lines are NumPy's (`SpectraModel`), as
+CasADi multiplies dense matrices many times slower. A measured base force is fitted jointly; it sets the scale of each
+mode.
 """
 
 from __future__ import annotations
