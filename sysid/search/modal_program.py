@@ -18,11 +18,12 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, gauge_of, poles_of
 from sysid.modal_analysis.response import columns, modal_gains, modal_motion, parts_of, stacked
 from sysid.modal_analysis.spectra_model import SpectraModel, Weights, weights_at
-from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, NumpyFunction
+from sysid.nlp import EXACT, OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, NumpyFunction
 from sysid.structure.structure import Array
 from sysid.structure.triangular import lower_triangle, triangle_entries
 
 _RIDGE = 1e-14  # of the modes' own size
+_AGREES = 1e-6  # relative; by which a residual may differ from the same sum formed anew
 _LEAST_MASS = 1e-6  # of the rigid-body mass; the least remainder that a fit starts with
 
 Spectrum = Callable[[NonlinearProgram], tuple[ca.MX, ca.MX]]
@@ -88,7 +89,8 @@ def fit_modes(
     if ties is not None:
         for tie in ties(error.phi, gamma, rigid):
             z.constrain(tie)
-    hessian = hessian_of(SpectraModel(test, weights, np.arange(m)))
+    model = SpectraModel(test, weights, np.arange(m))
+    hessian = hessian_of(model)
     best, status = z.minimize(error.value, monitor, max_iterations, _derivatives(z, error, hessian))
     end = ca.Function("end", [z.z], [error.phi, gamma, omega, ratios, rigid, error.value, ca.norm_fro(error.left)])
     try:
@@ -99,6 +101,9 @@ def fit_modes(
         raise SolverError(f"{m} modes move so much alike that no shapes can be told apart") from None
     modes = Modes(values[0], values[1], values[2].ravel(), values[3].ravel())
     left = float(np.sqrt(values[5].item())), float(values[6].item())
+    counted = np.sqrt(model.chi2(model.with_best_shapes(modes, values[4]), model.levels))
+    if abs(counted - left[0]) > _AGREES * left[0] + EXACT:
+        status = f"{status}, but the residual {left[0]:.6g} of its end is {counted:.6g} when counted anew"
     return ModalFit(modes, values[4], *left, status, z.on_bounds(best), weights)
 
 
