@@ -24,6 +24,17 @@ CEILINGS = {
     # press and damping of any size (350), IPOPT's refinement of each leader (310), and the inverse factor with the
     # swarm on the models' own expressions (317).
     "lines": 40_340,
+    # What was counted when these counts began; the modes once, in the open, brings them down.
+    "branches": 80,
+    "files": 239,
+    "main": 243,
+    "modal": 69,
+    "fits": 37,
+    "constants": 459,
+    "shared": 45,
+    "everyday": 398,
+    "sentences": 11,
+    "prose": 188,
 }
 
 # The counting is a benchmark, which prints the same figures; `sysid` itself is not imported from the checkout.
