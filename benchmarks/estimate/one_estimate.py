@@ -1,6 +1,6 @@
 """Processor seconds of one identification, or of its modal fit alone, on one thread, in a process of its own.
 
-``python one_estimate.py`` takes the package on its path, reads a case a line, ``[what, n, d, lines, seed]``, and answers
+``python one_estimate.py`` takes the package on its path, reads a case, ``[what, n, d, lines, seed]``, and answers
 each with processor seconds: of ``identify``, of the ``fit`` of modes at poles that are found before, or of ``records``
 from samples to a judged answer.
 """

@@ -21,7 +21,7 @@ class Modes(NamedTuple):
     ratios: Array
 
 
-def poles_of(modes: Modes) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def separate_poles(modes: Modes) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """The first mode of each pole, in ascending order of these modes, and the pole of each mode, (m,)."""
     _, first, pole = np.unique(modes.omega + 1j * modes.ratios, return_index=True, return_inverse=True)
     order = np.argsort(first)

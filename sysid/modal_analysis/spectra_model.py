@@ -15,16 +15,25 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.noise import separable
-from sysid.modal_analysis.modal_fit import Modes, Weights, force_columns, mode_of_slopes, slopes_of_modes
+from sysid.modal_analysis.least_squares import LeastSquares, minimise
+from sysid.modal_analysis.modal_fit import (
+    ModalFit,
+    Modes,
+    Weights,
+    force_columns,
+    gauge_of,
+    mode_of_slopes,
+    separate_poles,
+    slopes_of_modes,
+)
 from sysid.modal_analysis.modal_model import Lines, ModalModel, Parameters, Run, Shift, dots
 from sysid.modal_analysis.residues import force_residual_left, linear_residues
 from sysid.modal_analysis.response import motion_curvature, real_times
+from sysid.nlp import EXACT, OBJECTIVE_SCALE, IterationMonitor
 from sysid.structure.structure import Array
 
-_RIDGE = (
-    1e-14  # of the modes' size: keeps shapes finite where two modes become one, and changes them by less than noise
-)
-_CURVED = 1e-11  # of a scaled Hessian: less curvature is round-off
+RIDGE = 1e-14  # of the modes' size: keeps shapes finite where two modes become one, and changes them by less than noise
+_SETTLED = EXACT**1.5  # of the sum of squares: a fall that is promised, at which the fit stands still
 _LEAST_MISFIT = 1e-9  # relative; records that fit better than this weigh alike
 
 
@@ -231,7 +240,7 @@ def _is_definite(matrix: Array) -> bool:
     size = np.diag(matrix)
     if np.any(size <= 0):
         return False
-    scaled = matrix / np.sqrt(np.outer(size, size)) - _CURVED * np.eye(len(size))
+    scaled = matrix / np.sqrt(np.outer(size, size)) - len(size) * np.finfo(float).eps * np.eye(len(size))
     return scipy.linalg.lapack.dpotrf(scaled, lower=1)[1] == 0
 
 
@@ -239,5 +248,48 @@ def _inverse(gram: Array) -> Array:
     """Inverse of the Gram matrix of the modes' motions, which may be next to singular."""
     size = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
     lam, V = np.linalg.eigh(gram / np.outer(size, size))
-    half = V / np.sqrt(np.maximum(lam, 0.0) + _RIDGE) / size[:, None]
+    half = V / np.sqrt(np.maximum(lam, 0.0) + RIDGE) / size[:, None]
     return np.asarray(half @ half.T)
+
+
+def fit_spectra(
+    test: Measurement, first: Modes, rigid: Array, *, monitor: IterationMonitor, max_iterations: int
+) -> ModalFit:
+    """Modes with the least weighted squared error of accelerations and, where it was measured, base force.
+
+    The rigid-body mass is as free as the records have it: what no mode carries may come out as a negative mass.
+
+    Parameters
+    ----------
+    test : Measurement
+    first : Modes
+        Where to start; shapes are not read. Modes whose poles are equal keep one pole.
+    rigid : (d, d)
+        Rigid-body mass to start with; read where a force was measured.
+    """
+    poles, pole = separate_poles(first)
+    weights = weights_at(test, first.omega[poles], first.ratios[poles])
+    model = SpectraModel(test, weights, pole)
+    unit = np.sqrt(np.maximum(np.mean(first.gamma**2, axis=0), np.finfo(float).tiny))
+    gauge, held = gauge_of(first, unit, test.force is not None)
+    first = first._replace(gamma=gauge * unit)
+    model.hold(first.gamma, held)
+
+    def tell(_: int, p: Parameters, chi2: float) -> bool:
+        return monitor.record(model.pack(p), OBJECTIVE_SCALE * chi2)
+
+    def chi2_of(p: Parameters) -> float:
+        good = np.all(np.isfinite(p.modes.omega)) and np.all(p.modes.ratios < 1.0)
+        value = model.chi2(p, model.levels) if good else np.inf
+        return value if np.isfinite(value) else np.inf
+
+    problem = LeastSquares(
+        model.pack(model.with_best_shapes(first, rigid)), model.unpack, chi2_of,
+        lambda p: model.normal_equations(p, model.levels),
+    )  # fmt: skip
+    # Far below the noise, so that IPOPT finds its tolerance met where it begins.
+    enough = lambda chi2: _SETTLED * (chi2 + _SETTLED)  # noqa: E731
+    p, chi2, settled = minimise(problem, tell, max_iterations, enough)
+    status = "settled" if settled else "stopped" if monitor.stopped is not None else "not settled"
+    of_accelerations = np.sqrt(model.chi2(p, model.levels_of_accelerations))
+    return ModalFit(p.modes, p.rigid, float(np.sqrt(chi2)), float(of_accelerations), status, "", weights)

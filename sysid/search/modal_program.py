@@ -15,15 +15,13 @@ import numpy as np
 
 from sysid.errors import SolverError
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.modal_fit import ModalFit, Modes, gauge_of, poles_of
+from sysid.modal_analysis.modal_fit import ModalFit, Modes, Weights, gauge_of, separate_poles
 from sysid.modal_analysis.response import columns, modal_gains, modal_motion, parts_of, stacked
-from sysid.modal_analysis.spectra_model import SpectraModel, Weights, weights_at
+from sysid.modal_analysis.spectra_model import RIDGE, SpectraModel, weights_at
 from sysid.nlp import EXACT, OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, NumpyFunction
 from sysid.structure.structure import Array
 from sysid.structure.triangular import lower_triangle, triangle_entries
 
-_RIDGE = 1e-14  # of the modes' own size
-_AGREES = 1e-6  # relative; by which a residual may differ from the same sum formed anew
 _LEAST_MASS = 1e-6  # of the rigid-body mass; the least remainder that a fit starts with
 
 Spectrum = Callable[[NonlinearProgram], tuple[ca.MX, ca.MX]]
@@ -70,7 +68,7 @@ def fit_modes(
     G. H. Golub, V. Pereyra, SIAM J. Numer. Anal. 10 (1973) 413-432; L. Kaufman, BIT 15 (1975) 49-57.
     """
     z = NonlinearProgram()
-    (m, d), poles = first.gamma.shape, poles_of(first)[0]
+    (m, d), poles = first.gamma.shape, separate_poles(first)[0]
     weights = weights_at(test, first.omega[poles], first.ratios[poles]) if weights is None else weights
     weighed = test.force is not None
     gauge, held = gauge_of(first, unit, weighed)
@@ -102,7 +100,7 @@ def fit_modes(
     modes = Modes(values[0], values[1], values[2].ravel(), values[3].ravel())
     left = float(np.sqrt(values[5].item())), float(values[6].item())
     counted = np.sqrt(model.chi2(model.with_best_shapes(modes, values[4]), model.levels))
-    if abs(counted - left[0]) > _AGREES * left[0] + EXACT:
+    if abs(counted - left[0]) > EXACT:
         status = f"{status}, but the residual {left[0]:.6g} of its end is {counted:.6g} when counted anew"
     return ModalFit(modes, values[4], *left, status, z.on_bounds(best), weights)
 
@@ -132,7 +130,7 @@ class ModalResidual:
         scale = ca.sqrt(ca.sum2(self.q**2))
         scaled = self.q / ca.repmat(scale, 1, self.q.size2())
         # The ridge keeps the system regular where two modes become one; it changes shapes by less than their error.
-        normal = _times(scaled, scaled.T) + _RIDGE * ca.DM.eye(scaled.size1())
+        normal = _times(scaled, scaled.T) + RIDGE * ca.DM.eye(scaled.size1())
         shapes = ca.solve(normal, _times(scaled, ca.DM(target).T)) / ca.repmat(scale, 1, test.n_sensors)
         self.shapes = shapes.T  # of weighted sensors
         self.left = ca.DM(target) - _times(self.shapes, self.q)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sysid.errors import InputError, SolverError
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.modal_fit import ModalFit, Modes, poles_of
+from sysid.modal_analysis.modal_fit import ModalFit, Modes, separate_poles
 from sysid.modal_analysis.modal_masses import weigh
 from sysid.modal_analysis.residues import (
     Records,
@@ -21,7 +21,7 @@ from sysid.modal_analysis.residues import (
     independent,
     linear_residues,
 )  # fmt: skip
-from sysid.modal_analysis.spectra_fit import fit_spectra
+from sysid.modal_analysis.spectra_model import fit_spectra
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.spectrum import SOLVED
 from sysid.models.unknowns import lower_of, upper_of
@@ -258,7 +258,7 @@ def _again(
 ) -> ModalFit:  # fmt: skip
     """A fit from where another ended, with ties, and damping ratios within the problem's bounds."""
     modes = end.modes
-    first, pole = poles_of(modes)
+    first, pole = separate_poles(modes)
     unit, bounds = np.sqrt(problem.totals), damping_bounds(problem) if bounded else (0.0, np.inf)
     return fit_modes(
         problem.measurement, modes, _free_spectrum(modes.omega[first], modes.ratios[first], pole, *bounds), unit=unit,

@@ -8,9 +8,8 @@ import pytest
 
 from sysid import Measurement, Structure
 from sysid.measurement.measurement import unit_runs
-from sysid.modal_analysis.modal_fit import Modes, gauge_of, poles_of, rank_one
-from sysid.modal_analysis.spectra_fit import fit_spectra
-from sysid.modal_analysis.spectra_model import SpectraModel, weights_at
+from sysid.modal_analysis.modal_fit import Modes, gauge_of, rank_one, separate_poles
+from sysid.modal_analysis.spectra_model import SpectraModel, fit_spectra, weights_at
 from sysid.models.spectrum import SOLVED
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram
 from sysid.search.modal_program import ModalResidual, _derivatives, fit_modes, hessian_of
@@ -199,7 +198,7 @@ def fitted(test, first, *, monitor=None):
     monitor = IterationMonitor(None, None) if monitor is None else monitor
     found = fit_spectra(test, first, np.diag(unit**2), monitor=monitor, max_iterations=100)
     assert found.status == "settled"
-    apart, pole = poles_of(found.modes)
+    apart, pole = separate_poles(found.modes)
     of_poles = relative_spectrum(found.modes.omega[apart], found.modes.ratios[apart])
     return fit_modes(
         test, found.modes, lambda z: tuple(value[pole.tolist()] for value in of_poles(z)), unit=unit,
