@@ -21,18 +21,19 @@ CEILINGS = {
     # motion in time (230), and what tells and refuses them (530), expressions as operations in place of CasADi's text
     # and of the older formats (620), results that can be read without their problem (680), what files from others may
     # make run, hold and claim (640), one run in a folder and mistakes of the modelling language (422), bounds that
-    # press and damping of any size (350), IPOPT's refinement of each leader (310), and the inverse factor with the
-    # swarm on the models' own expressions (317).
-    "lines": 40_340,
+    # press and damping of any size (350), IPOPT's refinement of each leader (310), the inverse factor with the
+    # swarm on the models' own expressions (317), and one model of modes for spectra and whole records, its shapes
+    # eliminated with exact second derivatives, before the rest of the record fit is drawn together (530).
+    "lines": 40_870,
     # What was counted when these counts began; the modes once, in the open, brings them down.
     "branches": 80,
-    "files": 239,
+    "files": 243,
     "main": 243,
     "modal": 69,
     "fits": 37,
     "constants": 459,
     "shared": 45,
-    "everyday": 398,
+    "everyday": 396,
     "sentences": 11,
     "prose": 188,
 }

@@ -15,7 +15,7 @@ _DAMPING = (1e-12, 1e-6, 1e6)  # of a scaled normal matrix: least, at first, and
 
 
 @dataclass(frozen=True, eq=False)
-class LeastSquares:
+class SumOfSquares:
     """A sum of squares and its normal equations.
 
     Attributes
@@ -36,7 +36,7 @@ class LeastSquares:
 
 
 def minimise(
-    problem: LeastSquares,
+    problem: SumOfSquares,
     tell: Callable[[int, Parameters, float], bool],
     most: int,
     settled: Callable[[float], float],
@@ -45,7 +45,7 @@ def minimise(
 
     Parameters
     ----------
-    problem : LeastSquares
+    problem : SumOfSquares
     tell : callable
         Called with the number of steps so far, parameters and sum of squares; whether to stop.
     most : int

@@ -68,36 +68,36 @@ class ModalError:
         flat = np.split(y, self.ends[:-1])
         A, B, gamma, log_w, log_zeta = (part.reshape(shape).T for part, shape in zip(flat, self.shapes, strict=True))
         modes = np.exp(log_w[:, 0]), np.exp(log_zeta[:, 0]), gamma
-        made = motion_and_slopes(self.freq, *modes, self.base)
-        left = real_times(A, made[: len(gamma)]) - self.target
+        motions = motion_and_slopes(self.freq, *modes, self.base)
+        left = real_times(A, motions[: len(gamma)]) - self.target
         if B.size:
             left = left + real_times(B, self.base)
-        return A, modes, made, 2 * self.channel[:, None] ** 2 * left
+        return A, modes, motions, 2 * self.channel[:, None] ** 2 * left
 
-    def _rows(self, made: ComplexArray, m: int) -> ComplexArray:
+    def _rows(self, motions: ComplexArray, m: int) -> ComplexArray:
         """What A and B multiply, (m [+ d], L)."""
-        return np.concatenate([made[:m], self.base]) if self.shapes[1][0] else made[:m]
+        return np.concatenate([motions[:m], self.base]) if self.shapes[1][0] else motions[:m]
 
     def _gradient(self, y: Array) -> tuple[float, Array]:
-        A, modes, made, seen = self._at(y)
+        A, modes, motions, pull = self._at(y)
         m, d = modes[2].shape
         order = by_columns(m, d)
-        by_factors = dots(self._rows(made, m), seen)  # by columns of A and B
-        by_motion = np.sum(dots(made[m:], seen) * A.T[mode_of_slopes(m, d)], axis=1)
-        value = float(np.sum(np.abs(seen) ** 2 / self.channel[:, None] ** 2)) / 4
+        by_factors = dots(self._rows(motions, m), pull)  # by columns of A and B
+        by_motion = np.sum(dots(motions[m:], pull) * A.T[mode_of_slopes(m, d)], axis=1)
+        value = float(np.sum(np.abs(pull) ** 2 / self.channel[:, None] ** 2)) / 4
         return value, np.concatenate([by_factors.ravel(), by_motion[order]])
 
     def _hessian(self, y: Array) -> tuple[Array]:
-        A, modes, made, seen = self._at(y)
+        A, modes, motions, pull = self._at(y)
         m, d = modes[2].shape
         mode, order, twice = mode_of_slopes(m, d), by_columns(m, d), 2 * self.channel**2
-        rows, slopes = self._rows(made, m), made[m:]
+        rows, slopes = self._rows(motions, m), motions[m:]
         of_factors = np.kron(dots(rows, rows), np.diag(twice))
         mixed = dots(rows, slopes)[:, None] * (twice[:, None] * A)[:, mode]
         # What A multiplies is what the slopes are of.
-        mixed[mode, :, np.arange(mode.size)] += dots(slopes, seen)
+        mixed[mode, :, np.arange(mode.size)] += dots(slopes, pull)
         alike = (A.T * twice) @ A
-        curvature = motion_curvature(self.freq, *modes, self.base, real_times(A.T, seen))
+        curvature = motion_curvature(self.freq, *modes, self.base, real_times(A.T, pull))
         of_motion = dots(slopes, slopes) * alike[np.ix_(mode, mode)]
         at = slopes_of_modes(m, d)
         np.add.at(of_motion, (at[:, :, None], at[:, None]), curvature)

@@ -82,7 +82,7 @@ def force_columns(gamma: Array, index: Index, i: int) -> Array:
     return mix
 
 
-def gauge_of(first: Modes, unit: Array, weighed: bool) -> tuple[Array, NDArray[np.bool_]]:
+def held_gauge(first: Modes, unit: Array, weighed: bool) -> tuple[Array, NDArray[np.bool_]]:
     """Participations in one of the equivalent forms, and which of them are held to keep it.
 
     Accelerations leave the scale of each mode open: its largest participation is held. Of modes that share a pole they

@@ -82,7 +82,7 @@ class Parameters:
     traces: Array
 
 
-class ModalModel:
+class SpectralModel:
     """A test as m modes, without transients or traces: what plain spectra and whole records have in common.
 
     Attributes
@@ -134,7 +134,7 @@ class ModalModel:
 class Lines:
     """Some lines of one run at given parameters."""
 
-    def __init__(self, model: ModalModel, p: Parameters, run: Run) -> None:
+    def __init__(self, model: SpectralModel, p: Parameters, run: Run) -> None:
         self.model, self.p, self.run = model, p, run
         freq = run.w / (2 * np.pi)
         modes = p.modes
@@ -147,10 +147,10 @@ class Lines:
         self.pushed_by_ends = 0.0 if at is None else real_times(p.ends[:, self.at_ends], self.transients)  # (m, L)
         self.trace_spectra = model.trace_spectra(freq)
         self.motion = self.g * (real_times(modes.gamma, run.base) + self.pushed_by_ends)
-        made = real_times(self.shown, self.motion) + real_times(self.direct, run.base)
+        predicted = real_times(self.shown, self.motion) + real_times(self.direct, run.base)
         if len(self.trace_spectra):
-            made += real_times(p.traces[run.number], self.trace_spectra)
-        self.error = run.outputs - made
+            predicted += real_times(p.traces[run.number], self.trace_spectra)
+        self.error = run.outputs - predicted
 
     @cached_property
     def H(self) -> ComplexArray:  # noqa: N802

@@ -16,7 +16,7 @@ import numpy as np
 
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
-from sysid.modal_analysis.least_squares import LeastSquares, minimise, units_of
+from sysid.modal_analysis.least_squares import SumOfSquares, minimise, units_of
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_masses import weigh
 from sysid.modal_analysis.record_colour import extra_numbers
@@ -240,7 +240,7 @@ def _minimise(
         monitor(done + i, float(np.sqrt(2 * chi2 / model.numbers)))
         return False
 
-    problem = LeastSquares(
+    problem = SumOfSquares(
         model.pack(p), model.unpack, lambda trial: _chi2(model, trial, levels),
         lambda at: _equations(model, coarse, at, levels),
     )  # fmt: skip

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.modal_analysis.modal_model import Lines, ModalModel, Parameters, Run, Shift, dots
+from sysid.modal_analysis.modal_model import Lines, Parameters, Run, Shift, SpectralModel, dots
 from sysid.modal_analysis.record_colour import pieces
 from sysid.modal_analysis.response import real_times
 from sysid.structure.structure import Array, ComplexArray
@@ -81,7 +81,7 @@ class Sums(NamedTuple):
         )  # fmt: skip
 
 
-class RecordModel(ModalModel):
+class RecordModel(SpectralModel):
     """The model of a test of whole records with m modes.
 
     The unknowns are those of `Index`, then ``ends`` and ``traces``, each in the order of its entries; without a force
@@ -114,7 +114,7 @@ class RecordModel(ModalModel):
         self.size = self.n_fit + gains * 2 * self.n * self.d
 
     def transients(self, freq: Array) -> ComplexArray:
-        """See `ModalModel`."""
+        """See `SpectralModel`."""
         return self.whole.transients(freq)
 
     def trace_spectra(self, freq: Array) -> ComplexArray:
@@ -168,7 +168,7 @@ class RecordModel(ModalModel):
         return self.size - (0 if self.force else self.m)
 
     def chunks(self, p: Parameters) -> Iterator[Chunk]:
-        """See `ModalModel`."""
+        """See `SpectralModel`."""
         return (Chunk(self, p, run) for run in self.parts())
 
     def normal_equations(self, p: Parameters, levels: Array) -> Shift:

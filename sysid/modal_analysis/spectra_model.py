@@ -15,18 +15,18 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.noise import separable
-from sysid.modal_analysis.least_squares import LeastSquares, minimise
+from sysid.modal_analysis.least_squares import SumOfSquares, minimise
 from sysid.modal_analysis.modal_fit import (
     ModalFit,
     Modes,
     Weights,
     force_columns,
-    gauge_of,
+    held_gauge,
     mode_of_slopes,
     separate_poles,
     slopes_of_modes,
 )
-from sysid.modal_analysis.modal_model import Lines, ModalModel, Parameters, Run, Shift, dots
+from sysid.modal_analysis.modal_model import Lines, Parameters, Run, Shift, SpectralModel, dots
 from sysid.modal_analysis.residues import force_residual_left, linear_residues
 from sysid.modal_analysis.response import motion_curvature, real_times
 from sysid.nlp import EXACT, OBJECTIVE_SCALE, IterationMonitor
@@ -51,19 +51,19 @@ def weights_at(test: Measurement, omega: Array, ratios: Array) -> Weights:
     sensors = channel / size
     if test.force is None:
         return Weights(sensors, line, None, line)
-    own, force_line = separable(test.force_std, test.force.shape)
+    of_force, force_line = separable(test.force_std, test.force.shape)
     if np.allclose(force_line / force_line.mean(), line / line.mean(), rtol=1e-12):
-        own, force_line = own * force_line.mean() / line.mean(), line
+        of_force, force_line = of_force * force_line.mean() / line.mean(), line
     if test.response_std is not None and test.force_std is not None:
-        return Weights(sensors, line, own / size, force_line)
-    force_size = float(np.linalg.norm(test.force * own[:, None] * force_line[:, None]))
+        return Weights(sensors, line, of_force / size, force_line)
+    force_size = float(np.linalg.norm(test.force * of_force[:, None] * force_line[:, None]))
     left = max(linear_residues(test, omega, ratios)[1], _LEAST_MISFIT)
     force_left = max(force_residual_left(test, omega, ratios), _LEAST_MISFIT)
     weight = left / force_left * float(np.sqrt(test.force.size / test.relative.size)) / force_size
-    return Weights(sensors, line, weight * own, force_line)
+    return Weights(sensors, line, weight * of_force, force_line)
 
 
-class SpectraModel(ModalModel):
+class SpectraModel(SpectralModel):
     """Plain spectra as a sum of modes whose shapes are the best for their participations and poles.
 
     The unknowns are participations (mode by mode), the logarithms of frequencies and damping ratios of each pole, and
@@ -177,9 +177,9 @@ class SpectraModel(ModalModel):
         cross = np.zeros((len(levels), spectra, self.channels))
         chi2, scale, curvature = 0.0, np.zeros((len(levels), self.channels)), np.zeros((m, self.d + 2, self.d + 2))
         for chunk in self.chunks(p):
-            piece, weighed, made = chunk.run.piece, chunk.weighed(levels), chunk.spectra(chunk.run.base)
-            grams[piece] += dots(made, made)
-            cross[piece] += dots(made, weighed.seen)
+            piece, weighed, spectra_there = chunk.run.piece, chunk.weighed(levels), chunk.spectra(chunk.run.base)
+            grams[piece] += dots(spectra_there, spectra_there)
+            cross[piece] += dots(spectra_there, weighed.seen)
             chi2 += float(np.sum(weighed.power))
             scale[piece] = chunk.deviations(levels)[0]
             pull = real_times(chunk.shown.T, weighed.seen)
@@ -199,9 +199,9 @@ class SpectraModel(ModalModel):
             normal += scale[-1, n + i] ** 2 * (mix.T @ grams[-1] @ mix)
             gradient += mix.T @ cross[-1, :, n + i]
             # The force is the product of a participation and a motion.
-            own, others = mode * self.d + i, np.arange(count)
-            np.subtract.at(bent, (own, others), cross[-1, m + others, n + i])
-            np.subtract.at(bent, (others, own), cross[-1, m + others, n + i])
+            first, others = mode * self.d + i, np.arange(count)
+            np.subtract.at(bent, (first, others), cross[-1, m + others, n + i])
+            np.subtract.at(bent, (others, first), cross[-1, m + others, n + i])
         return Shift(normal, gradient, chi2), normal + bent
 
 
@@ -223,10 +223,10 @@ def _eliminated(
     mode : (slopes,)
     """
     m, count = phi.shape[1], mode.size
-    own, slopes = slice(m), slice(m, m + count)
-    inverse = _inverse(gram[own, own])
-    onto = gram[slopes, own] @ inverse
-    inner = gram[slopes, slopes] - onto @ gram[own, slopes]
+    shapes, slopes = slice(m), slice(m, m + count)
+    inverse = _inverse(gram[shapes, shapes])
+    onto = gram[slopes, shapes] @ inverse
+    inner = gram[slopes, slopes] - onto @ gram[shapes, slopes]
     alike = ((phi.T * scale**2) @ phi)[np.ix_(mode, mode)]
     errors = cross[slopes]
     by_shape = errors @ phi[:, mode]  # (slopes, slopes), of the second's mode
@@ -271,7 +271,7 @@ def fit_spectra(
     weights = weights_at(test, first.omega[poles], first.ratios[poles])
     model = SpectraModel(test, weights, pole)
     unit = np.sqrt(np.maximum(np.mean(first.gamma**2, axis=0), np.finfo(float).tiny))
-    gauge, held = gauge_of(first, unit, test.force is not None)
+    gauge, held = held_gauge(first, unit, test.force is not None)
     first = first._replace(gamma=gauge * unit)
     model.hold(first.gamma, held)
 
@@ -283,7 +283,7 @@ def fit_spectra(
         value = model.chi2(p, model.levels) if good else np.inf
         return value if np.isfinite(value) else np.inf
 
-    problem = LeastSquares(
+    problem = SumOfSquares(
         model.pack(model.with_best_shapes(first, rigid)), model.unpack, chi2_of,
         lambda p: model.normal_equations(p, model.levels),
     )  # fmt: skip

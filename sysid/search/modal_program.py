@@ -15,7 +15,7 @@ import numpy as np
 
 from sysid.errors import SolverError
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.modal_fit import ModalFit, Modes, Weights, gauge_of, separate_poles
+from sysid.modal_analysis.modal_fit import ModalFit, Modes, Weights, held_gauge, separate_poles
 from sysid.modal_analysis.response import columns, modal_gains, modal_motion, parts_of, stacked
 from sysid.modal_analysis.spectra_model import RIDGE, SpectraModel, weights_at
 from sysid.nlp import EXACT, OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, NumpyFunction
@@ -71,7 +71,7 @@ def fit_modes(
     (m, d), poles = first.gamma.shape, separate_poles(first)[0]
     weights = weights_at(test, first.omega[poles], first.ratios[poles]) if weights is None else weights
     weighed = test.force is not None
-    gauge, held = gauge_of(first, unit, weighed)
+    gauge, held = held_gauge(first, unit, weighed)
     low, high = np.full((m, d), -np.inf), np.full((m, d), np.inf)
     low[held], high[held] = gauge[held], gauge[held]
     gamma = z.variable("participation", gauge, low, high) @ ca.diag(ca.DM(unit))

@@ -8,7 +8,7 @@ import pytest
 
 from sysid import Measurement, Structure
 from sysid.measurement.measurement import unit_runs
-from sysid.modal_analysis.modal_fit import Modes, gauge_of, rank_one, separate_poles
+from sysid.modal_analysis.modal_fit import Modes, held_gauge, rank_one, separate_poles
 from sysid.modal_analysis.spectra_model import SpectraModel, fit_spectra, weights_at
 from sysid.models.spectrum import SOLVED
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram
@@ -342,7 +342,7 @@ def test_modes_that_share_a_pole_start_turned_into_each_other_where_a_force_weig
     rng = np.random.default_rng(0)
     first = Modes(np.eye(4), rng.normal(size=(4, 3)), np.array([5.0, 9.0, 9.0, 9.0]), np.full(4, 0.01))
     unit = np.array([1.0, 2.0, 4.0])
-    gauge, held = gauge_of(first, unit, True)
+    gauge, held = held_gauge(first, unit, True)
     np.testing.assert_allclose(gauge[0], first.gamma[0] / unit, rtol=1e-12)
     before = first.gamma[1:] / unit
     np.testing.assert_allclose(gauge[1:].T @ gauge[1:], before.T @ before, atol=1e-12)
