@@ -182,7 +182,7 @@ TRIED = (
         "parts.append((freq / self.model.test.freq[-1]) * base)",
         "test_record_model::test_columns_of_gains_are_those_of_base_motion_and_of_a_mode_far_above_the_lines"),
     Mutant("K26", "gradient of whole records without the weights of lines",
-        "_dots(self.spectra(weighed.base), self.run.weight * weighed.seen)",
-        "_dots(self.spectra(weighed.base), weighed.seen)",
+        "dots(self.spectra(weighed.base), self.run.weight * weighed.seen)",
+        "dots(self.spectra(weighed.base), weighed.seen)",
         "test_record_model::test_weights_of_lines_count_in_sum_gradient_and_normal_matrix"),
 )  # fmt: skip

@@ -77,6 +77,49 @@ def one_thread() -> Iterator[None]:
         yield
 
 
+class NumpyFunction(ca.Callback):
+    """A function of one column that NumPy computes, as CasADi calls it.
+
+    It must live as long as what calls it: CasADi holds no Python object.
+
+    Parameters
+    ----------
+    size : int
+        Of the column.
+    shapes : sequence of (rows, columns)
+        Of its values.
+    call : callable
+        The values at a column (size,).
+    """
+
+    def __init__(
+        self, size: int, shapes: Sequence[tuple[int, int]], call: Callable[[Array], Sequence[Array | float]]
+    ) -> None:
+        ca.Callback.__init__(self)
+        self.size, self.shapes, self.values = size, shapes, call
+        self.construct("by_numpy", {})
+
+    def get_n_in(self) -> int:
+        """One column."""
+        return 1
+
+    def get_n_out(self) -> int:
+        """As many values as there are shapes."""
+        return len(self.shapes)
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Shape of the column."""
+        return ca.Sparsity.dense(self.size, 1)
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        """Shape of a value."""
+        return ca.Sparsity.dense(*self.shapes[i])
+
+    def eval(self, arg: list) -> list:
+        """Values at a column."""
+        return [*self.values(np.asarray(arg[0]).ravel())]
+
+
 class NonlinearProgram:
     """Unknowns z, and the equalities and inequalities between them."""
 

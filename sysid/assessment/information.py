@@ -17,16 +17,11 @@ import numpy as np
 import scipy
 
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.modal_fit import Index, Modes
-from sysid.modal_analysis.response import columns, gain_slopes, gains
+from sysid.modal_analysis.modal_fit import Index, Modes, force_columns, mode_of_slopes
+from sysid.modal_analysis.response import columns, motion_and_slopes
 from sysid.structure.structure import Array, ComplexArray
 
 _UNSEEN = 1e-10  # of the strongest parameter's part in the records: below it there is round-off only
-
-
-def gains_of(freq: Array, modes: Modes) -> tuple[ComplexArray, ComplexArray]:
-    """Modal gains (m, n_freq), and their slopes by log w, then by log zeta (2m, n_freq)."""
-    return gains(freq, modes.omega, modes.ratios), gain_slopes(freq, modes.omega, modes.ratios)
 
 
 def spectra_of(test: Measurement, modes: Modes) -> ComplexArray:
@@ -34,10 +29,9 @@ def spectra_of(test: Measurement, modes: Modes) -> ComplexArray:
 
     ``q_k = g_k gamma_k u``; ``g_k u_j``; the slopes of q_k by log w_k, then by log zeta_k; ``u_j``.
     """
-    g, slopes = (np.tile(part, test.n_runs) for part in gains_of(test.freq, modes))
     u = columns(test.base)
-    push = modes.gamma @ u
-    return np.concatenate([g * push, (g[:, None] * u).reshape(-1, u.shape[1]), slopes * np.tile(push, (2, 1)), u])
+    motion = motion_and_slopes(np.tile(test.freq, test.n_runs), modes.omega, modes.ratios, modes.gamma, u)
+    return np.concatenate([motion, u])
 
 
 def information(modes: Modes, index: Index, grams: list[Iterator[Array]]) -> Array:
@@ -45,20 +39,14 @@ def information(modes: Modes, index: Index, grams: list[Iterator[Array]]) -> Arr
     phi, gamma = modes.phi, modes.gamma
     m, d = gamma.shape
     A = np.zeros((index.size, index.size))
-    common = np.arange(index.gamma.start, index.log_ratios.stop)
+    common, mode = np.arange(index.gamma.start, index.log_ratios.stop), mode_of_slopes(m, d)
     for i, gram in enumerate(grams[0]):
         at = np.concatenate([np.arange(i * m, (i + 1) * m), common])
-        factor = np.concatenate([np.ones(m), np.repeat(phi[i], d), phi[i], phi[i]])
+        factor = np.concatenate([np.ones(m), phi[i, mode]])
         A[np.ix_(at, at)] += np.outer(factor, factor) * gram[: at.size, : at.size]
     at = np.concatenate([common, index.rigid])
     for i, gram in enumerate(grams[1] if len(grams) > 1 else ()):
-        mix = np.zeros((len(gram), at.size))
-        factor = np.concatenate([np.repeat(gamma[:, i], d), gamma[:, i], gamma[:, i]])
-        mix[m : m + factor.size, : factor.size] = np.diag(factor)
-        mix[np.arange(m), np.arange(m) * d + i] += 1.0  # gamma_ki is also the share of q_k in direction i
-        for column, (a, b) in enumerate(index.pairs, start=factor.size):
-            if i in (a, b):
-                mix[m + factor.size + (b if i == a else a), column] = 1.0
+        mix = force_columns(gamma, index, i)
         A[np.ix_(at, at)] += mix.T @ gram @ mix
     return A
 

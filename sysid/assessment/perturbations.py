@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.assessment.information import gains_of
 from sysid.modal_analysis.modal_fit import Modes
+from sysid.modal_analysis.response import gains, gains_and_slopes
 from sysid.problem.slopes import Slopes, response_slopes
 from sysid.structure.structure import Array, Structure
 
@@ -64,7 +64,7 @@ class ModalSpectra:
     def transmissibility(self, freq: Array) -> Array:
         """Standard deviations, (n_sensors, d, n_freq)."""
         phi, gamma, _, _ = self.modes
-        g, _ = gains_of(freq, self.modes)
+        g = gains(freq, self.modes.omega, self.modes.ratios)
         size = np.full((len(phi), gamma.shape[1]), np.max(np.abs(np.einsum("ik,kj,kf->ijf", phi, gamma, g))))
         return self._std(freq, phi, self.moves.phi, np.zeros((*size.shape, self.moves.phi.shape[2])), size)
 
@@ -77,7 +77,7 @@ class ModalSpectra:
     def _std(self, freq: Array, left: Array, d_left: Array, d_constant: Array, size: Array) -> Array:
         """Of ``sum_k left_ik g_k gamma_kj + constant_ij``, whose parts move by d_left (a, m, moves), d_constant."""
         gamma, moves = self.modes.gamma, self.moves
-        g, slopes = gains_of(freq, self.modes)
+        g, slopes = gains_and_slopes(freq, self.modes.omega, self.modes.ratios)
         std = np.empty((*size.shape, g.shape[1]))
         for i, j in np.ndindex(*size.shape):
             residue = np.tile(left[i] * gamma[:, j], 2)[:, None]

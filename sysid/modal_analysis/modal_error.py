@@ -2,22 +2,19 @@
 
 A record is ``A q + B u`` with modal accelerations ``q_k = g_k gamma_k u``: relative accelerations have the mode shapes
 for A and no B, base forces ``A = Gamma'`` and the rigid-body mass for B. Each q_k depends on its own participations,
-frequency and damping ratio alone, so all second derivatives are products of small matrices and sums over lines:
-nothing that holds the lines is differentiated.
+frequency and damping ratio alone, so all second derivatives are products of small matrices and sums over lines.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-import casadi as ca
 import numpy as np
 
 from sysid.measurement.measurement import ComplexArray
-from sysid.modal_analysis.response import columns
+from sysid.modal_analysis.modal_fit import by_columns, mode_of_slopes, slopes_of_modes
+from sysid.modal_analysis.modal_model import dots
+from sysid.modal_analysis.response import columns, motion_and_slopes, motion_curvature, real_times
+from sysid.nlp import NumpyFunction
 from sysid.structure.structure import Array
-
-Pair = tuple[ca.MX, ca.MX]  # real and imaginary part
 
 
 class ModalError:
@@ -57,92 +54,52 @@ class ModalError:
         modes: int,
         with_base: bool = False,
     ) -> None:
+        self.base, self.target = columns(base * line[:, None]), columns(record * line[:, None])
+        self.freq, self.channel = np.tile(freq, len(base)), channel
         c, m, d = record.shape[1], modes, base.shape[1]
-        y = ca.MX.sym("y", c * (m + d * with_base) + m * (d + 2))
-        flat_A, flat_B, flat_gamma, log_w, log_zeta = ca.vertsplit(
-            y, np.cumsum([0, c * m, c * d * with_base, m * d, m, m]).tolist()
-        )
-        A, gamma = ca.reshape(flat_A, c, m), ca.reshape(flat_gamma, m, d)
-        motion = _Motion(base * line[:, None], np.tile(2 * np.pi * freq, len(base)), gamma, log_w, log_zeta)
-        rows = ca.vertcat(motion.q, motion.u) if with_base else motion.q
-        B = ca.reshape(flat_B, c, d * with_base)
-        target = columns(record * line[:, None])
-        weight = ca.diag(ca.DM(channel))
-        left = weight @ (ca.horzcat(A, B) @ rows - ca.DM(np.hstack([target.real, target.imag])))
-        value, seen = ca.sumsqr(left), 2 * weight @ left
-        pull = A.T @ seen
-        gradient = ca.vertcat(ca.vec(seen @ rows.T), *(ca.sum2(pull * slope) for slope in motion.slopes))
+        self.shapes = (m, c), (d * with_base, c), (d, m), (1, m), (1, m)  # each by columns, so that rows are entries
+        self.ends = np.cumsum([rows * across for rows, across in self.shapes])
+        size = int(self.ends[-1])
+        self.gradient = NumpyFunction(size, [(1, 1), (size, 1)], self._gradient)
+        self.hessian = NumpyFunction(size, [(size, size)], self._hessian)
 
-        slopes, blocks = ca.vertcat(*motion.slopes), len(motion.slopes)
-        of_factors = ca.kron(rows @ rows.T, 2 * weight**2)
-        onto, own = rows @ slopes.T, seen @ slopes.T
-        across = 2 * weight**2 @ ca.horzcat(*([A] * blocks))
-        mixed = [
-            across * ca.repmat(onto[k, :], c, 1) + own * ca.DM(np.tile(np.arange(m) == k, (c, blocks)).astype(float))
-            for k in range(rows.size1())
-        ]
-        mixed = ca.vertcat(*mixed)
-        alike = ca.repmat(A.T @ (2 * weight**2) @ A, blocks, blocks)
-        of_motion = (slopes @ slopes.T) * alike + motion.curvature(pull)
-        hessian = ca.vertcat(ca.horzcat(of_factors, mixed), ca.horzcat(mixed.T, of_motion))
-        self.gradient = ca.Function("gradient", [y], [value, gradient])
-        self.hessian = ca.Function("hessian", [y], [ca.densify(hessian)])
+    def _at(self, y: Array) -> tuple[Array, tuple[Array, Array, Array], ComplexArray, ComplexArray]:
+        """A, the modes (omega, ratios, Gamma), motions above their slopes, and the derivative by what is recorded."""
+        flat = np.split(y, self.ends[:-1])
+        A, B, gamma, log_w, log_zeta = (part.reshape(shape).T for part, shape in zip(flat, self.shapes, strict=True))
+        modes = np.exp(log_w[:, 0]), np.exp(log_zeta[:, 0]), gamma
+        motions = motion_and_slopes(self.freq, *modes, self.base)
+        left = real_times(A, motions[: len(gamma)]) - self.target
+        if B.size:
+            left = left + real_times(B, self.base)
+        return A, modes, motions, 2 * self.channel[:, None] ** 2 * left
 
+    def _rows(self, motions: ComplexArray, m: int) -> ComplexArray:
+        """What A and B multiply, (m [+ d], L)."""
+        return np.concatenate([motions[:m], self.base]) if self.shapes[1][0] else motions[:m]
 
-class _Motion:
-    """Modal accelerations of a test, their slopes and their curvature; real parts beside imaginary ones.
+    def _gradient(self, y: Array) -> tuple[float, Array]:
+        A, modes, motions, pull = self._at(y)
+        m, d = modes[2].shape
+        order = by_columns(m, d)
+        by_factors = dots(self._rows(motions, m), pull)  # by columns of A and B
+        by_motion = np.sum(dots(motions[m:], pull) * A.T[mode_of_slopes(m, d)], axis=1)
+        value = float(np.sum(np.abs(pull) ** 2 / self.channel[:, None] ** 2)) / 4
+        return value, np.concatenate([by_factors.ravel(), by_motion[order]])
 
-    ``q`` (m, 2 L) and ``u`` (d, 2 L); ``slopes`` of q by the participations in each direction, by log w and by
-    log zeta, (m, 2 L) each.
-    """
-
-    def __init__(self, base: ComplexArray, w: Array, gamma: ca.MX, log_w: ca.MX, log_zeta: ca.MX) -> None:
-        m, d = gamma.shape
-        u = columns(base)
-        u_re, u_im = (ca.sparsify(ca.DM(part)) for part in (u.real, u.imag))
-        squared = ca.repmat(ca.DM(w**2).T, m, 1)
-        stiff = ca.exp(2 * log_w) @ ca.DM.ones(1, w.size)
-        loss = ca.MX(m, w.size), 2 * ca.exp(log_zeta + log_w) @ ca.DM(w).T
-        by_w = 2 * stiff, loss[1]  # slope of the denominator w_k² - w² + 2 i zeta_k w_k w by log w
-        size = (stiff - squared) ** 2 + loss[1] ** 2
-        over = (stiff - squared) / size, -loss[1] / size
-        g = squared * over[0], squared * over[1]
-        g_over = _times(g, over)
-        slope_w, slope_z = _scaled(_times(g_over, by_w), -1.0), _scaled(_times(g_over, loss), -1.0)
-        push = gamma @ u_re, gamma @ u_im
-        self.q, self.u = ca.horzcat(*_times(g, push)), ca.horzcat(u_re, u_im)
-        single = [(ca.repmat(u_re[i, :], m, 1), ca.repmat(u_im[i, :], m, 1)) for i in range(d)]
-        self.slopes = [ca.horzcat(*pair) for pair in (
-            *(_times(g, one) for one in single), _times(slope_w, push), _times(slope_z, push)
-        )]  # fmt: skip
-        # Second slopes: 2 (D')² g / D² - D'' g / D, with D'' = 4 w_k² + loss by log w twice, else the loss.
-        twice = _times(_scaled(g_over, 2.0), over)
-        bends = [
-            _plus(_times(_times(twice, first), second), _scaled(_times(g_over, bend), -1.0))
-            for first, second, bend in (
-                (by_w, by_w, (4 * stiff, loss[1])), (by_w, loss, loss), (loss, loss, loss)
-            )
-        ]  # fmt: skip
-        self._by_gamma = [[ca.horzcat(*_times(slope, one)) for slope in (slope_w, slope_z)] for one in single]
-        self._by_pole = [ca.horzcat(*_times(bend, push)) for bend in bends]
-
-    def curvature(self, pull: ca.MX) -> ca.MX:
-        """Sum over lines of `pull` (m, 2 L) times the second slopes of q, over (Gamma by columns, log w, log zeta)."""
-        d, zero = len(self._by_gamma), ca.MX(pull.size1(), pull.size1())
-        sums = [[ca.diag(ca.sum2(pull * bend)) for bend in pair] for pair in self._by_gamma]
-        ww, wz, zz = (ca.diag(ca.sum2(pull * bend)) for bend in self._by_pole)
-        blocks = [[*([zero] * d), *pair] for pair in sums]
-        blocks += [[*(pair[0] for pair in sums), ww, wz], [*(pair[1] for pair in sums), wz, zz]]
-        return ca.vertcat(*(ca.horzcat(*row) for row in blocks))
-
-
-def _times(a: Sequence[ca.MX], b: Sequence[ca.MX]) -> Pair:
-    return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
-
-
-def _plus(a: Pair, b: Pair) -> Pair:
-    return a[0] + b[0], a[1] + b[1]
-
-
-def _scaled(a: Pair, by: float) -> Pair:
-    return by * a[0], by * a[1]
+    def _hessian(self, y: Array) -> tuple[Array]:
+        A, modes, motions, pull = self._at(y)
+        m, d = modes[2].shape
+        mode, order, twice = mode_of_slopes(m, d), by_columns(m, d), 2 * self.channel**2
+        rows, slopes = self._rows(motions, m), motions[m:]
+        of_factors = np.kron(dots(rows, rows), np.diag(twice))
+        mixed = dots(rows, slopes)[:, None] * (twice[:, None] * A)[:, mode]
+        # What A multiplies is what the slopes are of.
+        mixed[mode, :, np.arange(mode.size)] += dots(slopes, pull)
+        alike = (A.T * twice) @ A
+        curvature = motion_curvature(self.freq, *modes, self.base, real_times(A.T, pull))
+        of_motion = dots(slopes, slopes) * alike[np.ix_(mode, mode)]
+        at = slopes_of_modes(m, d)
+        np.add.at(of_motion, (at[:, :, None], at[:, None]), curvature)
+        across = mixed.reshape(-1, mode.size)[:, order]
+        return (np.block([[of_factors, across], [across.T, of_motion[np.ix_(order, order)]]]),)

@@ -13,10 +13,10 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
+from sysid.modal_analysis.least_squares import SumOfSquares, minimise, units_of
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_masses import weigh
 from sysid.modal_analysis.record_colour import extra_numbers
@@ -234,50 +234,17 @@ def _minimise(
     coarse: RecordModel | None,
 ) -> tuple[Parameters, float, bool]:
     """Levenberg-Marquardt steps at given levels; `counts` of iterations so far, and of steps at most."""
-    x: Array = model.pack(p)
-    damping = 1e-6
-    here = _equations(model, coarse, p, levels)
     done, most = counts
-    for i in range(most):
-        monitor(done + i, float(np.sqrt(2 * here.chi2 / model.numbers)))
-        unit = _units(here.normal)
-        scaled = here.normal * np.outer(unit, unit)
-        while True:
-            step = _step(scaled, damping, here.gradient * unit) * unit
-            promised = float(here.gradient @ step)
-            trial = model.unpack(x + step)
-            after = _chi2(model, trial, levels)
-            if after <= here.chi2 or promised < _SETTLED:
-                break
-            damping = max(10 * damping, 1e-6)
-            if damping > 1e6:
-                return model.unpack(x), here.chi2, False
-        if after <= here.chi2:
-            x = np.asarray(x + step)
-            damping = max(damping / 10, 1e-12)
-            if promised < _SETTLED:
-                return model.unpack(x), after, True
-            here = _equations(model, coarse, model.unpack(x), levels)
-        else:
-            return model.unpack(x), here.chi2, True
-    return model.unpack(x), here.chi2, False
 
+    def tell(i: int, _: Parameters, chi2: float) -> bool:
+        monitor(done + i, float(np.sqrt(2 * chi2 / model.numbers)))
+        return False
 
-def _units(normal: Array) -> Array:
-    """What each unknown moves by to show as much as the noise; zero for one that shows nowhere, but for round-off."""
-    known = np.diag(normal)
-    return np.where(known > np.finfo(float).tiny, 1 / np.sqrt(np.maximum(known, np.finfo(float).tiny)), 0.0)
-
-
-def _step(scaled: Array, damping: float, gradient: Array) -> Array:
-    """A damped step; with more damping where round-off has made the normal matrix indefinite."""
-    while True:
-        try:
-            factor = scipy.linalg.cho_factor(scaled + damping * np.eye(gradient.size), check_finite=False)
-        except np.linalg.LinAlgError:
-            damping = max(10 * damping, 1e-12)
-            continue
-        return np.asarray(scipy.linalg.cho_solve(factor, gradient))
+    problem = SumOfSquares(
+        model.pack(p), model.unpack, lambda trial: _chi2(model, trial, levels),
+        lambda at: _equations(model, coarse, at, levels),
+    )  # fmt: skip
+    return minimise(problem, tell, most, lambda _: _SETTLED)
 
 
 def _equations(model: RecordModel, coarse: RecordModel | None, p: Parameters, levels: Array) -> Shift:
@@ -361,7 +328,7 @@ def worth(fit: RecordFit, normal: Array | None = None) -> Array:
     With `normal` in place of the fit's ``Re J' S^-1 J``, as of lines that count for less.
     """
     model, p, N = fit.model, fit.parameters, fit.normal if normal is None else normal
-    unit = _units(N)
+    unit = units_of(N)
     scaled = N * np.outer(unit, unit)
     m, n, index = model.m, model.n, model.index
     out = np.zeros(m)

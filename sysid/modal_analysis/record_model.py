@@ -1,54 +1,27 @@
-r"""Whole records as a modal model with transients, and its derivatives: everything the fit of records needs a line.
+"""Whole records as a modal model with transients, and its derivatives: everything the fit of records needs a line.
 
-A run of a test is, at its lines,
-
-.. math:: a = \sum_k \phi_k g_k (\gamma_k u + \alpha_k / w^2 + i \beta_k / w), \quad y = G u + a + p, \quad
-          f = M_{rb} u + \sum_k \gamma_k' g_k (\ldots) + p,
-
-with two real numbers alpha, beta a mode and run for its motion at the ends, and p the traces of sampling and
-detrending: real multiples of 1, i w and 1 / (i w), a channel and run. Each column of the Jacobian is a few real numbers
-times a few spectra, so that normal equations come from products of spectra, and no Jacobian of all lines is kept.
+Each column of the Jacobian is a few real numbers times a few spectra, so that normal equations come from products of
+spectra, and no Jacobian of all lines is kept.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.modal_fit import Index, Modes
+from sysid.modal_analysis.modal_fit import Modes
+from sysid.modal_analysis.modal_model import Lines, Parameters, Run, Shift, SpectralModel, dots
 from sysid.modal_analysis.record_colour import pieces
-from sysid.modal_analysis.response import gain_slopes, gains
+from sysid.modal_analysis.response import real_times
 from sysid.structure.structure import Array, ComplexArray
 
-_AT_ONCE = 4096  # lines whose derivatives are held in memory together
 _FAR = 30.0  # logarithms of frequencies and damping ratios
 TRACES = 3  # real numbers a channel and run: of 1, i w and 1 / (i w)
-
-
-class Run(NamedTuple):
-    """Spectra of one run: lines (L,), rad/s; base (d, L); outputs (c, L); `density` of `WholeRecords`; its number."""
-
-    w: Array
-    base: ComplexArray
-    outputs: ComplexArray
-    density: float
-    number: int
-    weight: Array
-    """(L,): of how many lines each stands for."""
-    piece: int
-    """Row of the levels of noise: runs are cut where levels vary over the lines."""
-
-    def at(self, lines: Any) -> Run:
-        """Some of its lines."""
-        return self._replace(
-            w=self.w[lines], base=self.base[:, lines], outputs=self.outputs[:, lines], weight=self.weight[lines]
-        )
 
 
 class Layer(NamedTuple):
@@ -71,10 +44,10 @@ class Columns(NamedTuple):
     def seen(self, weights: ComplexArray, spectra: ComplexArray) -> ComplexArray:
         """Sums of all columns (k, L) over the channels, with weights (c, L)."""
         first, *others = self.layers
-        out = _times(first.values, weights)
+        out = real_times(first.values, weights)
         out *= spectra[first.spectrum]
         for column, spectrum, values in others:
-            out[column] += _times(values, weights) * spectra[spectrum]
+            out[column] += real_times(values, weights) * spectra[spectrum]
         return out
 
     def products(self, sums: Sums, scale: Array) -> Shift:
@@ -108,43 +81,7 @@ class Sums(NamedTuple):
         )  # fmt: skip
 
 
-class Weighed(NamedTuple):
-    """Errors by the inverse of their covariance: ``S^-1 e`` (c, L), ``e' S^-1 e`` (L,), the likeliest base (d, L)."""
-
-    seen: ComplexArray
-    power: Array
-    base: ComplexArray
-
-
-class Shift(NamedTuple):
-    """Products of the Jacobian with errors: ``Re J' S^-1 J`` (p, p), ``Re J' S^-1 e`` (p,) and ``e' S^-1 e``."""
-
-    normal: Array
-    gradient: Array
-    chi2: float
-
-
-@dataclass(frozen=True, eq=False)
-class Parameters:
-    """All that is fitted to whole records, beside the levels of the noise.
-
-    Attributes
-    ----------
-    modes : Modes
-    rigid : (d, d)
-        Rigid-body mass, kg; zero where no force was measured.
-    ends : (m, 2 r)
-        alpha, beta of each mode and moving run.
-    traces : (runs, c, 3)
-    """
-
-    modes: Modes
-    rigid: Array
-    ends: Array
-    traces: Array
-
-
-class RecordModel:
+class RecordModel(SpectralModel):
     """The model of a test of whole records with m modes.
 
     The unknowns are those of `Index`, then ``ends`` and ``traces``, each in the order of its entries; without a force
@@ -157,15 +94,9 @@ class RecordModel:
 
     def __init__(self, test: Measurement, m: int, *, gains: bool = False) -> None:
         assert test.whole is not None
-        self.test, self.whole, self.m = test, test.whole, m
-        self.n, self.d, self.force = test.n_sensors, test.n_base, test.force is not None
-        self.channels = self.n + self.d * self.force
-        self.index = Index(self.n, m, self.d)
-        self.kept = self.index.size if self.force else int(self.index.rigid[0])
-        self.moving = {run: at for at, run in enumerate(self.whole.moving)}
-        self.n_ends = m * 2 * len(self.moving)
+        self.whole = test.whole
         outputs = test.response if test.force is None else np.concatenate([test.response, test.force], axis=1)
-        self.runs = [
+        runs = [
             Run(
                 2 * np.pi * test.freq[own], test.base[r][:, own], outputs[r][:, own], float(self.whole.density[r]), r,
                 np.ones(np.count_nonzero(own)), r,
@@ -173,18 +104,28 @@ class RecordModel:
             for r, own in enumerate(test.own_lines)
         ]  # fmt: skip
         if self.whole.varying is not None:
-            cut = [run.at(lines) for run in self.runs for lines in pieces(run.w)]
-            self.runs = [run._replace(piece=piece) for piece, run in enumerate(cut)]
+            cut = [run.at(lines) for run in runs for lines in pieces(run.w)]
+            runs = [run._replace(piece=piece) for piece, run in enumerate(cut)]
+        super().__init__(test, m, runs)
+        self.moving = {run: at for at, run in enumerate(self.whole.moving)}
+        self.n_ends = m * 2 * len(self.moving)
         self.n_fit = self.kept + self.n_ends + test.n_runs * self.channels * TRACES
         self.gains = gains
         self.size = self.n_fit + gains * 2 * self.n * self.d
-        self.numbers = 2 * sum(run.outputs.size for run in self.runs)
+
+    def transients(self, freq: Array) -> ComplexArray:
+        """See `SpectralModel`."""
+        return self.whole.transients(freq)
+
+    def trace_spectra(self, freq: Array) -> ComplexArray:
+        """What the traces of a channel are multiples of, (TRACES, L)."""
+        unit = freq / self.test.freq[-1]
+        return np.stack([np.ones_like(unit) + 0j, 1j * unit, -1j / unit])
 
     def thinned(self, step: int) -> RecordModel:
         """The same with every `step`-th line, for steps that need not be exact."""
         other = copy(self)
         other.runs = [run.at(slice(None, None, step)) for run in self.runs]
-        other.numbers = 2 * sum(run.outputs.size for run in other.runs)
         return other
 
     def weighed_as_all(self) -> RecordModel:
@@ -227,10 +168,8 @@ class RecordModel:
         return self.size - (0 if self.force else self.m)
 
     def chunks(self, p: Parameters) -> Iterator[Chunk]:
-        """Lines of all runs, some thousand at a time."""
-        for run in self.runs:
-            for at in range(0, run.w.size, _AT_ONCE):
-                yield Chunk(self, p, run.at(slice(at, at + _AT_ONCE)))
+        """See `SpectralModel`."""
+        return (Chunk(self, p, run) for run in self.parts())
 
     def normal_equations(self, p: Parameters, levels: Array) -> Shift:
         """Products with the base as the records of all channels make it likely, for noise of these levels.
@@ -262,10 +201,6 @@ class RecordModel:
             chi2 += made.chi2
         return Shift(normal, gradient, chi2)
 
-    def chi2(self, p: Parameters, levels: Array) -> float:
-        """Sum of ``e' S^-1 e`` over all lines, half a chi-squared of `numbers` degrees."""
-        return float(sum(chunk.run.weight @ chunk.weighed(levels).power for chunk in self.chunks(p)))
-
 
 class HeldShapes(RecordModel):
     """The same with shapes, participations and rigid-body mass held, and with `poles` these too.
@@ -290,112 +225,16 @@ class HeldShapes(RecordModel):
         return Shift(normal, gradient, chi2)
 
 
-class Chunk:
-    """Some lines of one run at given parameters."""
+class Chunk(Lines):
+    """Some lines of one run at given parameters, with the columns of their Jacobian."""
 
     def __init__(self, model: RecordModel, p: Parameters, run: Run) -> None:
-        self.model, self.p, self.run = model, p, run
-        freq = run.w / (2 * np.pi)
-        modes = p.modes
-        self.g = gains(freq, modes.omega, modes.ratios)
-        self.shown = modes.phi if not model.force else np.vstack([modes.phi, modes.gamma.T])  # (c, m)
-        direct = model.test.rigid_body if not model.force else np.vstack([model.test.rigid_body, p.rigid])
-        # From base to outputs, (c, d, L).
-        pushed = (self.g[:, None] * modes.gamma[:, :, None]).reshape(len(self.g), -1)
-        self.H = _times(self.shown, pushed).reshape(len(direct), -1, run.w.size) + direct[:, :, None]
-        at = model.moving.get(run.number)
-        self.at_ends = None if at is None else slice(2 * at, 2 * at + 2)
-        self.transients = model.whole.transients(freq)
-        self.pushed_by_ends = 0.0 if at is None else _times(p.ends[:, self.at_ends], self.transients)  # (m, L)
-        unit = freq / model.test.freq[-1]
-        self.trace_spectra = np.stack([np.ones_like(run.w) + 0j, 1j * unit, -1j / unit])
-        moved = self.g * (_times(modes.gamma, run.base) + self.pushed_by_ends)
-        made = _times(self.shown, moved) + _times(direct, run.base) + _times(p.traces[run.number], self.trace_spectra)
-        self.error = run.outputs - made
-
-    def deviations(self, levels: Array) -> tuple[Array, Array]:
-        """Inverse deviations of the outputs' own noise at a line, (c,), and deviations of the base's, (d,)."""
-        own, c = levels[self.run.piece] * self.run.density, self.model.channels
-        return 1 / np.sqrt(own[:c]), np.sqrt(own[c:])
-
-    def _base_noise(self, levels: Array) -> tuple[ComplexArray, ComplexArray]:
-        """What the noise of the base hides in units of the outputs' own, and its factor.
-
-        With ``B = D H sqrt(v_u)``, D the inverse deviations of the outputs, and ``L L' = I + B' B``: ``B L'^-1``
-        (d, c, L) and L (d, d, L), a line of vectors at a time as d is at most a few.
-        """
-        scale, root = self.deviations(levels)
-        B = np.asarray(scale[:, None] * self.H.transpose(1, 0, 2) * root[:, None, None], dtype=complex)
-        d = len(B)
-        factor = np.zeros((d, d, B.shape[2]), dtype=complex)
-        for j in range(d):
-            for i in range(j + 1):
-                product = np.sum(B[j].conj() * B[i], axis=0) + (i == j)  # of the rows of B' B + I
-                for k in range(i):
-                    product -= factor[j, k] * factor[i, k].conj()
-                # Never less than one on the diagonal, round-off aside.
-                factor[j, i] = np.sqrt(np.maximum(product.real, 1.0)) if i == j else product / factor[i, i].real
-        for j in range(d):
-            for i in range(j):
-                B[j] -= B[i] * factor[j, i].conj()
-            B[j] /= factor[j, j].real
-        return B, factor
-
-    def weighed(self, levels: Array, error: ComplexArray | None = None) -> Weighed:
-        """Errors, or other spectra (c, L), weighed by their full covariance."""
-        scale, root = self.deviations(levels)
-        V, factor = self._base_noise(levels)
-        e = scale[:, None] * (self.error if error is None else error)
-        # What is likeliest of the base's noise, in its own units; what it makes of the errors is taken off them.
-        noise = np.array([np.sum(part.conj() * e, axis=0) for part in V])
-        for part, own in zip(V, noise, strict=True):
-            e -= part * own
-        for j in reversed(range(len(V))):
-            for i in range(j + 1, len(V)):
-                noise[j] -= factor[i, j].conj() * noise[i]
-            noise[j] /= factor[j, j].real
-        power = _power(e) + _power(noise)
-        return Weighed(scale[:, None] * e, power, self.run.base + root[:, None] * noise)
-
-    def covered(self, levels: Array) -> ComplexArray:
-        """V (d, c, L) with ``S^-1 = D² - V V'``: what the noise of the base hides."""
-        V = self._base_noise(levels)[0]
-        V *= self.deviations(levels)[0][:, None]
-        return V
-
-    def weighed_errors(self, levels: Array) -> tuple[Array, ComplexArray, ComplexArray, ComplexArray]:
-        """Lines (L,), rad/s, likeliest inputs (d + 2 r, L), ``S^-1 e`` (c, L) and ``S^-1`` (c, c, L)."""
-        weighed, V = self.weighed(levels), self.covered(levels)
-        inverse = -np.einsum("jcl,jel->cel", V, V.conj())
-        c = np.arange(self.model.channels)
-        inverse[c, c] += self.deviations(levels)[0][:, None] ** 2
-        base = weighed.base
-        ends = np.zeros((2 * len(self.model.moving), base.shape[1]), complex)
-        if self.at_ends is not None:
-            ends[self.at_ends] = self.transients
-        return self.run.w, np.concatenate([base, ends]), weighed.seen, inverse
-
-    def spectra(self, base: ComplexArray) -> ComplexArray:
-        """What all columns of the Jacobian are made of, (spectra, L)."""
-        modes, g = self.p.modes, self.g
-        freq = self.run.w / (2 * np.pi)
-        push = _times(modes.gamma, base) + self.pushed_by_ends
-        parts = [
-            g * push,
-            (g[:, None] * base).reshape(-1, base.shape[1]),
-            gain_slopes(freq, modes.omega, modes.ratios) * np.tile(push, (2, 1)),
-            base,
-        ]
-        if self.at_ends is not None:
-            parts.append((g[:, None] * self.transients).reshape(-1, base.shape[1]))
-        parts.append(self.trace_spectra)
-        if self.model.gains:
-            parts.append((freq / self.model.test.freq[-1]) ** 2 * base)
-        return np.concatenate(parts)
+        super().__init__(model, p, run)
+        self.records = model
 
     def columns(self) -> Columns:
         """How the columns of all channels are made of the spectra."""
-        every = np.array([self.coefficients(channel) for channel in range(self.model.channels)])
+        every = np.array([self.coefficients(channel) for channel in range(self.records.channels)])
         row, spectrum = np.nonzero(np.any(every != 0, axis=0))
         unknowns, starts, count = np.unique(row, return_index=True, return_counts=True)
         layers = []
@@ -407,7 +246,7 @@ class Chunk:
 
     def coefficients(self, channel: int) -> Array:
         """How the columns of a channel's Jacobian are made of the spectra, (p, spectra)."""
-        model = self.model
+        model = self.records
         n, m, d, index = model.n, model.m, model.d, model.index
         k = np.arange(m)
         shown = self.shown[channel]
@@ -448,7 +287,7 @@ class Chunk:
     def sums_of_errors(self, levels: Array, columns: Columns) -> Sums:
         """Products of the spectra of these lines with the errors alone."""
         weighed = self.weighed(levels)
-        cross = _dots(self.spectra(weighed.base), self.run.weight * weighed.seen)
+        cross = dots(self.spectra(weighed.base), self.run.weight * weighed.seen)
         return Sums(np.zeros((0, 0)), cross, np.zeros((0, 0)), float(self.run.weight @ weighed.power))
 
     def sums(self, levels: Array, columns: Columns) -> Sums:
@@ -458,27 +297,10 @@ class Chunk:
         hidden = np.zeros((columns.unknowns.size,) * 2)
         for part in self.covered(levels):
             seen = columns.seen(part.conj(), spectra)
-            hidden += _dots(seen, seen)
-        cross = _dots(spectra, root * weighed.seen)
-        return Sums(_dots(spectra, spectra), cross, hidden, float(self.run.weight @ weighed.power))
+            hidden += dots(seen, seen)
+        cross = dots(spectra, root * weighed.seen)
+        return Sums(dots(spectra, spectra), cross, hidden, float(self.run.weight @ weighed.power))
 
     def products(self, levels: Array, columns: Columns) -> Shift:
         """Products of the Jacobian of these lines; unknowns as in `columns`."""
         return columns.products(self.sums(levels, columns), self.deviations(levels)[0])
-
-
-def _times(matrix: Array, rows: ComplexArray) -> ComplexArray:
-    """A real matrix times rows (k, L) in real arithmetic: half of what a complex product would take."""
-    return np.asarray((np.ascontiguousarray(matrix) @ np.ascontiguousarray(rows).view(float)).view(complex))
-
-
-def _power(rows: ComplexArray) -> Array:
-    """Sums of squares of the moduli over the rows, (L,)."""
-    return np.asarray(np.sum(rows.real**2 + rows.imag**2, axis=0))
-
-
-def _dots(rows: ComplexArray, others: ComplexArray) -> Array:
-    """``Re X Y'`` of rows (k, L), (l, L)."""
-    one = np.ascontiguousarray(rows).view(float)
-    two = one if others is rows else np.ascontiguousarray(others).view(float)
-    return np.asarray(one @ two.T)

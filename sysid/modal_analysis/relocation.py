@@ -14,7 +14,7 @@ from sysid.modal_analysis.response import gains_with_velocity, stacked
 from sysid.structure.structure import Array, ComplexArray
 
 _SHARE = 1e-8  # of noise in squares, below which they have not eight digits of it
-_FEW = 60  # channels, for which factors take no longer than squares that round-off may refuse
+_FEW = 8  # channels, for which factors take no longer than squares that round-off may refuse
 
 Blocks = list[tuple[ComplexArray, ComplexArray, ComplexArray]]  # of each: `Records.principal`
 

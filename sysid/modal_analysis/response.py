@@ -44,6 +44,21 @@ def modal_gains(omega: ca.MX, ratios: ca.MX, freq: Array, shift: float = 0.0) ->
     return size * (squared * detuning - turned * loss), -size * (squared * loss + turned * detuning)
 
 
+def modal_motion(base: ComplexArray, gamma: ca.MX, gains: tuple[ca.MX, ca.MX]) -> tuple[ca.MX, ca.MX]:
+    """Real and imaginary part of ``q_k = g_k gamma_k u``, (m, runs * n_freq) each.
+
+    Parameters
+    ----------
+    base : (runs, d, n_freq) complex
+    gamma : (m, d)
+    gains : (m, n_freq) each
+        Of `modal_gains`.
+    """
+    g_re, g_im = (ca.repmat(part, 1, len(base)) for part in gains)
+    push_re, push_im = (gamma @ part for part in parts_of(base))
+    return g_re * push_re - g_im * push_im, g_re * push_im + g_im * push_re
+
+
 def residual(
     test: Measurement,
     phi: ca.MX,
@@ -80,10 +95,8 @@ def residual(
         ``(A_estimated - A_target) / ‖A_target‖`` (eq. 15), real then imaginary parts, then the
         same of the base force.
     """
-    g_re, g_im = (ca.repmat(part, 1, test.n_runs) for part in modal_gains(omega, ratios, test.freq, shift))
     u_re, u_im = parts_of(test.base)
-    push_re, push_im = gamma @ u_re, gamma @ u_im
-    q_re, q_im = g_re * push_re - g_im * push_im, g_re * push_im + g_im * push_re
+    q_re, q_im = modal_motion(test.base, gamma, modal_gains(omega, ratios, test.freq, shift))
     a_re, a_im = parts_of(test.relative)
     made = [(phi @ q_re - a_re, phi @ q_im - a_im)]
     if test.force is not None:
@@ -183,11 +196,80 @@ def gains_with_velocity(freq: Array, omega: Array, ratios: Array, shift: float =
     return np.stack([g, (shift + 2j * np.pi * freq) / omega[:, None] * g])
 
 
+def gains_and_slopes(freq: Array, omega: Array, ratios: Array) -> tuple[ComplexArray, ComplexArray]:
+    """`gains` (m, n_freq), and their derivatives by log w_k, then by log zeta_k, (2m, n_freq)."""
+    s = 2j * np.pi * freq
+    loss = (2 * ratios * omega)[:, None] * s
+    over = 1 / ((omega**2)[:, None] + s**2 + loss)
+    g = -(s**2) * over
+    by = -g * over
+    return g, np.concatenate([by * (2 * (omega**2)[:, None] + loss), by * loss])
+
+
 def gain_slopes(freq: Array, omega: Array, ratios: Array) -> ComplexArray:
     """Derivatives of `gains` by log w_k, then by log zeta_k, (2m, n_freq)."""
-    w = 2 * np.pi * freq
-    g = gains(freq, omega, ratios)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        over = np.where(w > 0, g / w**2, 0.0)  # one over the denominator; at rest nothing moves
-    loss = 2j * (ratios * omega)[:, None] * w
-    return np.concatenate([-g * over * (2 * omega[:, None] ** 2 + loss), -g * over * loss])
+    return gains_and_slopes(freq, omega, ratios)[1]
+
+
+def motion_and_slopes(
+    freq: Array, omega: Array, ratios: Array, gamma: Array, base: ComplexArray, ends: ComplexArray | float = 0.0
+) -> ComplexArray:
+    """Modal motions ``q_k = g_k (gamma_k u + ends_k)`` and their derivatives, which are written nowhere else.
+
+    Parameters
+    ----------
+    freq : (L,), Hz
+    omega, ratios : (m,)
+        Circular frequencies, rad/s, and damping ratios.
+    gamma : (m, d)
+        Participations.
+    base : (d, L)
+        Motion u of the base.
+    ends : (m, L), optional
+        Load of each mode by its motion at the ends of the record.
+
+    Returns
+    -------
+    (m + m d + 2 m, L)
+        q; its derivatives by gamma, mode by mode; by log w_k; by log zeta_k.
+    """
+    g, slopes = gains_and_slopes(freq, omega, ratios)
+    load = real_times(gamma, base) + ends
+    by_pole = slopes.reshape(2, *g.shape) * load
+    return np.concatenate([g * load, (g[:, None] * base).reshape(-1, freq.size), *by_pole])
+
+
+def motion_curvature(
+    freq: Array, omega: Array, ratios: Array, gamma: Array, base: ComplexArray, pull: ComplexArray
+) -> Array:
+    """Second derivatives of the modal motions, summed over the lines: ``Re conj(pull_k) q_k''``.
+
+    Parameters
+    ----------
+    freq, omega, ratios, gamma, base :
+        As in `motion_and_slopes`.
+    pull : (m, L)
+
+    Returns
+    -------
+    (m, d + 2, d + 2)
+        By the participations of each mode, log w_k and log zeta_k.
+    """
+    d, s = gamma.shape[1], 2j * np.pi * freq
+    stiff, loss = (omega**2)[:, None], (2 * ratios * omega)[:, None] * s
+    over = 1 / (stiff + s**2 + loss)
+    by = np.stack([(2 * stiff + loss) * over, loss * over])  # slopes of the denominator, over itself
+    weight = pull.conj() * -(s**2) * over
+    out = np.zeros((len(omega), d + 2, d + 2))
+    out[:, d:, :d] = -np.einsum("akl,kl,jl->kaj", by, weight, base, optimize=True).real
+    out[:, :d, d:] = out[:, d:, :d].swapaxes(1, 2)
+    turned = weight * real_times(gamma, base)
+    twice = {(0, 0): (4 * stiff + loss) * over, (0, 1): by[1], (1, 1): by[1]}
+    for (a, b), bend in twice.items():
+        out[:, d + a, d + b] = out[:, d + b, d + a] = np.sum((turned * (2 * by[a] * by[b] - bend)).real, axis=1)
+    return out
+
+
+def real_times(matrix: Array, rows: ComplexArray) -> ComplexArray:
+    """A real matrix times rows (k, L) in real arithmetic: half of what a complex product would take."""
+    return np.asarray((np.ascontiguousarray(matrix) @ np.ascontiguousarray(rows).view(float)).view(complex))

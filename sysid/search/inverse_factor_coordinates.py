@@ -138,7 +138,8 @@ class InverseFactorError:
         psi = psi_0 @ cayley(skew_symmetric(skew, n))
         phi, gamma, rigid = R.T @ psi, psi.T @ P, P.T @ P + N @ N.T
         value, gradient, hessian = ca.MX(0), ca.MX(y.numel(), 1), ca.MX(y.numel(), y.numel())
-        for error, of_force in _errors_of(test, n):
+        self._errors = list(_errors_of(test, n))  # which must live as long as the functions made of them
+        for error, of_force in self._errors:
             moved = ca.veccat(*((gamma.T, rigid) if of_force else (phi,)), gamma)
             at = ca.vertcat(moved, pole)
             squared, slope = error.gradient(at)

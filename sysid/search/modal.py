@@ -32,7 +32,7 @@ from sysid.problem.problem import Problem
 from sysid.search.local import LocalResult, fit_apart, solve
 from sysid.search.modal_coordinates import End
 from sysid.search.modal_scaling import nearest_lumped, of_known_mass, to_stated_totals
-from sysid.search.mode_fit import Integers, ModeFit, held_to_bounds, held_to_totals
+from sysid.search.mode_fit import Integers, ModeFit, ended, held_to_totals
 from sysid.search.session import Session, Stop
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, search_note
 from sysid.structure.structure import Array, Structure
@@ -306,7 +306,7 @@ def modal_structure(
     test, mass = problem.measurement, problem.formulation.mass
     poles = poles_of(problem)
     end = _of_whole_records(problem, options) or _fitted(problem, poles, options, monitor)
-    end = held_to_bounds(problem, end, monitor, options.max_iterations)
+    end = ended(problem, end, monitor, options.max_iterations)
     # With all modes at the sensors totals are adjusted together with the other statements, afterwards.
     later = mass.weighs and end.modes.omega.size == test.n_sensors
     held = None if later else held_to_totals(problem, end, monitor, options.max_iterations)

@@ -16,13 +16,14 @@ import casadi as ca
 import numpy as np
 
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.modal_fit import ModalFit, Modes, fit_modes, rank_one
+from sysid.modal_analysis.modal_fit import ModalFit, Modes, rank_one
 from sysid.modal_analysis.residues import linear_residues
 from sysid.models.stiffness import FREQUENCY_WINDOW
 from sysid.models.unknowns import lower_of, upper_of
 from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram
 from sysid.problem.matrices import assemble
 from sysid.problem.problem import Problem
+from sysid.search.modal_program import fit_modes
 from sysid.search.modal_scaling import positive_part, stated_totals, to_stated_totals
 from sysid.search.scaled_unknowns import add_unknowns
 from sysid.structure.structure import Array, Structure

@@ -11,8 +11,8 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from sysid.modal_analysis.modal_fit import Ties
 from sysid.problem.problem import Problem
+from sysid.search.modal_program import Ties
 from sysid.structure.structure import Array
 from sysid.structure.triangular import lower_entries
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sysid.errors import InputError, SolverError
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.modal_fit import ModalFit, Modes, Spectrum, Ties, fit_modes
+from sysid.modal_analysis.modal_fit import ModalFit, Modes, separate_poles
 from sysid.modal_analysis.modal_masses import weigh
 from sysid.modal_analysis.residues import (
     Records,
@@ -21,11 +21,13 @@ from sysid.modal_analysis.residues import (
     independent,
     linear_residues,
 )  # fmt: skip
+from sysid.modal_analysis.spectra_model import fit_spectra
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.spectrum import SOLVED
 from sysid.models.unknowns import lower_of, upper_of
 from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram
 from sysid.problem.problem import Problem
+from sysid.search.modal_program import Spectrum, Ties, fit_modes
 from sysid.search.modal_scaling import stated_totals
 from sysid.search.strategy import DoesNotApplyError
 from sysid.structure.structure import Array
@@ -84,8 +86,8 @@ class ModeFit:
         # An exact fit lacks nothing; round-off in residues of poles that nearly coincide would ask for more modes.
         lacks = best.of_accelerations > EXACT and excess > noise * beyond_chance(m * (n - 1) * (d - 1))
         wanting = lacks or ranks.sum() < best.modes.omega.size
-        if self._goes_on and wanting and np.any(ranks > 1) and (first := self._tried(ranks)) is not None:
-            other = self._grown(first, ranks)
+        if self._goes_on and wanting and np.any(ranks > 1):
+            other = self._grown(self._with(ranks), ranks)
             more = other.modes.omega.size - best.modes.omega.size
             gained = (best.of_accelerations**2 - other.of_accelerations**2) * records.size / noise
             if gained > np.sign(more) * beyond_chance(abs(more) * (n + d)):
@@ -151,8 +153,7 @@ class ModeFit:
         while self._goes_on and (lacking := self._lacking_rank(best, multiplicity)) is not None:
             more = multiplicity.copy()
             more[lacking] += 1
-            if (again := self._tried(more)) is None:
-                break
+            again = self._with(more)
             gained = (best.of_accelerations**2 - again.of_accelerations**2) * self.records.size
             noise = self._free(again, more)[1]
             if gained < beyond_chance(self.test.n_sensors + self.test.n_base) * noise:
@@ -195,22 +196,7 @@ class ModeFit:
         if test.force is not None:
             t, rigid = weigh(test, modes)
             modes = modes._replace(phi=modes.phi / np.sqrt(t), gamma=modes.gamma * np.sqrt(t)[:, None])
-        lam, vectors = np.linalg.eigh((rigid - modes.gamma.T @ modes.gamma) / np.outer(unit, unit))
-        remainder = (vectors * np.maximum(lam, 0.0)) @ vectors.T * np.outer(unit, unit)
-        try:
-            return fit_modes(
-                test, modes, _free_spectrum(poles.omega, poles.ratios, pole), unit=unit, remainder=remainder,
-                monitor=self.monitor, max_iterations=self.max_iterations,
-            )  # fmt: skip
-        except SolverError as error:
-            raise DoesNotApplyError(f"{error}: use fewer modes, Modal(modes=), or narrow the band") from None
-
-    def _tried(self, multiplicity: Integers) -> ModalFit | None:
-        """The same; None where the modes cannot be told apart."""
-        try:
-            return self._with(multiplicity)
-        except DoesNotApplyError:
-            return None
+        return fit_spectra(test, modes, rigid, monitor=self.monitor, max_iterations=self.max_iterations)
 
 
 def _ascending(fit: ModalFit) -> ModalFit:
@@ -233,12 +219,31 @@ def held_to_totals(problem: Problem, end: ModalFit, monitor: IterationMonitor, m
     return held if agrees and held.status in SOLVED else None
 
 
-def held_to_bounds(problem: Problem, end: ModalFit, monitor: IterationMonitor, max_iterations: int) -> ModalFit:
-    """The same fit with damping ratios within their bounds; itself where they are."""
+def ended(problem: Problem, estimate: ModalFit, monitor: IterationMonitor, max_iterations: int) -> ModalFit:
+    """Where IPOPT ends from an estimate, with damping ratios within their bounds and no negative mass.
+
+    The estimate itself where nobody wants to wait for it, or where it is one of whole records and within the bounds.
+
+    Raises
+    ------
+    DoesNotApplyError
+        Where modes move so much alike that no shapes can be told apart.
+    """
+    within = _within_bounds(problem, estimate)
+    if monitor.is_over or monitor.stopped is not None or (within and estimate.weights is None):
+        return estimate
+    try:
+        # Bounds that nothing presses on would cost iterations, as IPOPT begins away from them.
+        end = _again(problem, estimate, monitor, max_iterations, bounded=False) if within else estimate
+        return end if within and _within_bounds(problem, end) else _again(problem, end, monitor, max_iterations)
+    except SolverError as error:
+        raise DoesNotApplyError(f"{error}: use fewer modes, Modal(modes=), or narrow the band") from None
+
+
+def _within_bounds(problem: Problem, end: ModalFit) -> bool:
+    """Whether all damping ratios are within the problem's bounds."""
     low, high = damping_bounds(problem)
-    if monitor.is_over or np.all((end.modes.ratios >= low) & (end.modes.ratios <= high)):
-        return end
-    return _again(problem, end, monitor, max_iterations)
+    return bool(np.all((end.modes.ratios >= low) & (end.modes.ratios <= high)))
 
 
 def damping_bounds(problem: Problem) -> tuple[float, float]:
@@ -248,16 +253,17 @@ def damping_bounds(problem: Problem) -> tuple[float, float]:
 
 
 def _again(
-    problem: Problem, end: ModalFit, monitor: IterationMonitor, max_iterations: int, ties: Ties | None = None
-) -> ModalFit:
+    problem: Problem, end: ModalFit, monitor: IterationMonitor, max_iterations: int, ties: Ties | None = None,
+    *, bounded: bool = True,
+) -> ModalFit:  # fmt: skip
     """A fit from where another ended, with ties, and damping ratios within the problem's bounds."""
     modes = end.modes
-    _, first, pole = np.unique(modes.omega + 1j * modes.ratios, return_index=True, return_inverse=True)
-    unit = np.sqrt(problem.totals)
-    spectrum = _free_spectrum(modes.omega[first], modes.ratios[first], pole, *damping_bounds(problem))
+    first, pole = separate_poles(modes)
+    unit, bounds = np.sqrt(problem.totals), damping_bounds(problem) if bounded else (0.0, np.inf)
     return fit_modes(
-        problem.measurement, modes, spectrum, unit=unit, remainder=end.rigid - modes.gamma.T @ modes.gamma, ties=ties,
-        monitor=monitor, max_iterations=max_iterations,
+        problem.measurement, modes, _free_spectrum(modes.omega[first], modes.ratios[first], pole, *bounds), unit=unit,
+        remainder=end.rigid - modes.gamma.T @ modes.gamma, ties=ties, weights=end.weights, monitor=monitor,
+        max_iterations=max_iterations,
     )  # fmt: skip
 
 

@@ -6,6 +6,7 @@ import pytest
 import sysid
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.models.damping import ProportionalDamping
+from sysid.search import modal_program
 from sysid.search.modal import degrees_of_freedom
 
 
@@ -169,6 +170,18 @@ def test_a_repeated_pole_is_two_modes_where_the_base_force_weighs_them():
     np.testing.assert_allclose(
         result.structure.stiffness, truth.stiffness, rtol=1e-6, atol=1e-8 * truth.stiffness.max()
     )
+
+
+@pytest.mark.parametrize("part", [0, 1])
+def test_a_wrong_sign_in_the_symbolic_residual_alone_is_no_success(monkeypatch, part):
+    """An estimate is no end: IPOPT judges it by another form of the residual, and both must agree."""
+    right = modal_program.modal_gains
+    wrong = lambda *of: tuple(-g if i == part else g for i, g in enumerate(right(*of)))  # noqa: E731
+    truth = structure(0, 4, 2)
+    problem = sysid.Problem(sysid.simulate(truth, lines(truth), force=True, noise=0.01, rng=0), mass=sysid.FullMass())
+    assert sysid.identify(problem, strategy="modal", rng=0).success
+    monkeypatch.setattr(modal_program, "modal_gains", wrong)
+    assert not sysid.identify(problem, strategy="modal", rng=0).success
 
 
 def test_a_callback_can_stop_it():

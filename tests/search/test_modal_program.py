@@ -1,4 +1,4 @@
-"""The fit in modal coordinates: its derivatives against CasADi's own, its gauges, and where it ends."""
+"""The program in modal coordinates: its derivatives against CasADi's own, its gauges, and where it ends."""
 
 from types import SimpleNamespace
 
@@ -8,9 +8,11 @@ import pytest
 
 from sysid import Measurement, Structure
 from sysid.measurement.measurement import unit_runs
-from sysid.modal_analysis.modal_fit import Modes, _derivatives, _Error, _gauge, fit_modes, rank_one
+from sysid.modal_analysis.modal_fit import Modes, held_gauge, rank_one, separate_poles
+from sysid.modal_analysis.spectra_model import SpectraModel, fit_spectra, weights_at
 from sysid.models.spectrum import SOLVED
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram
+from sysid.search.modal_program import ModalResidual, _derivatives, fit_modes, hessian_of
 from sysid.structure.triangular import lower_triangle, triangle_entries
 
 
@@ -60,8 +62,13 @@ def graph(test, structure):
         root = np.linalg.cholesky(structure.rigid_body_mass - first.gamma.T @ first.gamma)
         factor = lower_triangle(z.variable("base mass", triangle_entries(root)), d)
         rigid = rigid + factor @ factor.T
-    error = _Error(test, gamma, omega, ratios, rigid, first)
-    functions = _derivatives(z, error, gamma, omega, ratios, rigid)
+    weights = weights_at(test, first.omega, first.ratios)
+    error, model = (
+        ModalResidual(test, weights, gamma, omega, ratios, rigid),
+        SpectraModel(test, weights, np.arange(first.omega.size)),
+    )
+    of_theta = hessian_of(model)
+    functions = _derivatives(z, error, of_theta)
 
     def derivatives(at):
         value, gradient = functions["grad_f"](at, [])
@@ -73,8 +80,8 @@ def graph(test, structure):
         return [np.asarray(v) for v in ca.Function("numbers", [z.z], list(expressions)).call([at])]
 
     return SimpleNamespace(
-        test=test, z=z.z, start=np.concatenate(z.start), error=error, model=(gamma, omega, ratios, rigid),
-        derivatives=derivatives, numbers=numbers,
+        test=test, z=z.z, start=np.concatenate(z.start), error=error, modes=(gamma, omega, ratios, rigid), model=model,
+        derivatives=derivatives, numbers=numbers, of_theta=of_theta,
     )  # fmt: skip
 
 
@@ -99,7 +106,7 @@ class TestDerivatives:
     def test_value_is_the_error_that_the_best_shapes_leave(self, made):
         """The shapes by numpy, sensor by sensor."""
         test = made.test
-        gamma, omega, ratios, rigid, phi, value = made.numbers(made.at, *made.model, made.error.phi, made.error.value)
+        gamma, omega, ratios, rigid, phi, value = made.numbers(made.at, *made.modes, made.error.phi, made.error.value)
         w = 2 * np.pi * test.freq
         q = w**2 / (omega**2 - w**2 + 2j * ratios * omega * w) * np.einsum("kd,rdf->rkf", gamma, test.base)
         std = np.ones(test.response.shape) if test.response_std is None else test.response_std
@@ -127,22 +134,38 @@ class TestDerivatives:
         assert got_value == pytest.approx(value.item(), rel=1e-12)
         np.testing.assert_allclose(got, gradient.ravel(), atol=1e-8 * np.abs(gradient).max())
 
-    def test_hessian_is_the_gauss_newton_one_of_kaufmans_jacobian(self, made, d):
+    def test_hessian_is_casadis_own(self, made):
+        (expected,) = made.numbers(made.at, ca.hessian(made.error.value, made.z)[0])
+        np.testing.assert_allclose(made.derivatives(made.at)[2], expected, atol=1e-8 * np.abs(expected).max())
+
+    def test_normal_matrix_is_that_of_kaufmans_jacobian(self, made, d):
         """Slopes of the motions times the shapes, less what other shapes could answer; the whole slope of the force."""
-        q = made.error.motion.q
-        shapes, values, slopes = made.numbers(made.at, made.error.shapes, q, ca.jacobian(q, made.z))
-        slopes = slopes.reshape(*values.shape, -1, order="F")
+        theta, q = made.error.theta(), made.error.q
+        shapes, values, at = made.numbers(made.at, made.error.shapes, q, theta)
+        by_z = [made.numbers(made.at, ca.jacobian(what, made.z))[0] for what in (ca.vec(q), theta)]
+        # All unknowns move theta alone, as many of them as it has entries.
+        slopes = (by_z[0] @ np.linalg.inv(by_z[1])).reshape(*values.shape, -1, order="F")
         onto = np.linalg.qr(values.T)[0]
         slopes = slopes - np.einsum("ab,kbz->kaz", onto @ onto.T, slopes)
         J = np.einsum("nk,kaz->naz", shapes, slopes).reshape(-1, slopes.shape[2])
-        expected = 2 * J.T @ J
+        expected = J.T @ J
         if made.test.force is not None:
             (F,) = made.numbers(made.at, ca.jacobian(ca.vec(made.error.force_left), made.z))
-            expected += 2 * F.T @ F
-            # The factor of the base mass ends at zero where the data want less than none: there its curvature is all.
-            base = slice(made.start.size - d * (d + 1) // 2, None)
-            expected[base, base] = made.numbers(made.at, ca.hessian(made.error.value, made.z)[0])[0][base, base]
-        np.testing.assert_allclose(made.derivatives(made.at)[2], expected, atol=1e-8 * np.abs(expected).max())
+            F = F @ np.linalg.inv(by_z[1])
+            expected += F.T @ F
+        model = made.model
+        plain, _ = model.slopes(model.unpack(at.ravel()), model.levels)
+        np.testing.assert_allclose(plain.normal, expected, atol=1e-8 * np.abs(expected).max())
+
+    def test_numpys_gradient_and_sum_are_those_of_the_symbolic_residual(self, made):
+        model = made.model
+        at, by_z, value, gradient = made.numbers(
+            made.at, made.error.theta(), ca.jacobian(made.error.theta(), made.z), made.error.value,
+            ca.gradient(made.error.value, made.z),
+        )  # fmt: skip
+        plain, _ = model.slopes(model.unpack(at.ravel()), model.levels)
+        assert plain.chi2 == pytest.approx(value.item(), rel=1e-10)
+        np.testing.assert_allclose(-2 * plain.gradient @ by_z, gradient.ravel(), atol=1e-8 * np.abs(gradient).max())
 
 
 @pytest.mark.parametrize("general", [False, True])
@@ -169,12 +192,18 @@ def test_a_force_whose_deviation_is_not_stated_weighs_by_the_noise_that_it_has(r
     np.testing.assert_allclose(weight, motion / pull, rtol=0.05)
 
 
-def fitted(test, first, spectrum=None, *, monitor=None):
-    """The fit from `first`, in participations of order one, its base mass from anywhere."""
+def fitted(test, first, *, monitor=None):
+    """The estimate from `first`, its base mass from anywhere, and where IPOPT ends from there."""
     unit = np.full(test.n_base, np.linalg.norm(first.gamma) / np.sqrt(first.gamma.size))
-    spectrum = relative_spectrum(first.omega, first.ratios) if spectrum is None else spectrum
     monitor = IterationMonitor(None, None) if monitor is None else monitor
-    return fit_modes(test, first, spectrum, unit=unit, remainder=np.diag(unit**2), monitor=monitor)
+    found = fit_spectra(test, first, np.diag(unit**2), monitor=monitor, max_iterations=100)
+    assert found.status == "settled"
+    apart, pole = separate_poles(found.modes)
+    of_poles = relative_spectrum(found.modes.omega[apart], found.modes.ratios[apart])
+    return fit_modes(
+        test, found.modes, lambda z: tuple(value[pole.tolist()] for value in of_poles(z)), unit=unit,
+        remainder=found.rigid - found.modes.gamma.T @ found.modes.gamma, weights=found.weights, monitor=monitor,
+    )  # fmt: skip
 
 
 def residues(modes):
@@ -216,9 +245,12 @@ class TestFit:
         rng = np.random.default_rng(7)
         structure = random_structure(rng, n=4, d=2)
         first = modes_of(structure)._replace(gamma=rng.normal(size=(4, 2)))
-        end = fitted(trial(rng, structure), first)
-        # One participation of each mode is held at the size of all (`unit` of `fitted`), the one that was largest.
+        # One participation of each mode is held in units of `unit`, the one that was largest.
         unit = np.linalg.norm(first.gamma) / np.sqrt(8)
+        end = fit_modes(
+            trial(rng, structure), first, relative_spectrum(first.omega, first.ratios), unit=np.full(2, unit),
+            remainder=unit**2 * np.eye(2), monitor=IterationMonitor(None, None),
+        )  # fmt: skip
         largest = np.argmax(np.abs(first.gamma), axis=1)
         np.testing.assert_allclose(end.modes.gamma[np.arange(4), largest], unit, rtol=1e-12)
 
@@ -281,17 +313,12 @@ def test_modes_that_share_a_pole_are_fitted_in_a_gauge_of_their_own(random_struc
     full = np.block([[K, -K @ G], [-(K @ G).T, G.T @ K @ G]])
     structure = Structure(other.mass, (full + full.T) / 2, ratios, n_base=d)
     truth, test = modes_of(structure), trial(rng, structure, force=force, noise=noise, lines=200)
-    pole = [0, 1, 1, 2, 3]
-    apart = [0, 1, 3, 4]
-
-    def spectrum(z):
-        values = relative_spectrum(omega[apart] * (1 + 0.1 * ratios[apart]), 1.1 * ratios[apart])(z)
-        return tuple(value[pole] for value in values)
+    pole, apart = [0, 1, 1, 2, 3], [0, 1, 3, 4]
 
     # Poles that are one must be so to the last bit in the start too.
     first = near(rng, truth, 0.2)._replace(omega=(omega[apart] * (1 + 0.1 * ratios[apart]))[pole])
     first = first._replace(ratios=(1.1 * ratios[apart])[pole])
-    end = fitted(test, first, spectrum)
+    end = fitted(test, first)
     assert end.status in SOLVED
     summed, whole = ([r[0], r[1] + r[2], r[3], r[4]] for r in (residues(end.modes), residues(truth)))
     if noise == 0:
@@ -315,7 +342,7 @@ def test_modes_that_share_a_pole_start_turned_into_each_other_where_a_force_weig
     rng = np.random.default_rng(0)
     first = Modes(np.eye(4), rng.normal(size=(4, 3)), np.array([5.0, 9.0, 9.0, 9.0]), np.full(4, 0.01))
     unit = np.array([1.0, 2.0, 4.0])
-    gauge, held = _gauge(first, unit, True)
+    gauge, held = held_gauge(first, unit, True)
     np.testing.assert_allclose(gauge[0], first.gamma[0] / unit, rtol=1e-12)
     before = first.gamma[1:] / unit
     np.testing.assert_allclose(gauge[1:].T @ gauge[1:], before.T @ before, atol=1e-12)

@@ -1,0 +1,1 @@
+"""The modal estimate: what it costs beside an older commit."""

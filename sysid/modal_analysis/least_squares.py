@@ -1,0 +1,99 @@
+"""Damped Gauss-Newton steps (Levenberg-Marquardt) on normal equations, of modes of whole records and of spectra."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from sysid.modal_analysis.modal_model import Parameters, Shift
+from sysid.structure.structure import Array
+
+_DAMPING = (1e-12, 1e-6, 1e6)  # of a scaled normal matrix: least, at first, and at which no step helps
+
+
+@dataclass(frozen=True, eq=False)
+class SumOfSquares:
+    """A sum of squares and its normal equations.
+
+    Attributes
+    ----------
+    start : (p,)
+    unpack : callable
+        Parameters of a column of unknowns.
+    chi2 : callable
+        The sum of squares at parameters; infinite where there is none.
+    equations : callable
+        Normal equations at parameters, by the unknowns.
+    """
+
+    start: Array
+    unpack: Callable[[Array], Parameters]
+    chi2: Callable[[Parameters], float]
+    equations: Callable[[Parameters], Shift]
+
+
+def minimise(
+    problem: SumOfSquares,
+    tell: Callable[[int, Parameters, float], bool],
+    most: int,
+    settled: Callable[[float], float],
+) -> tuple[Parameters, float, bool]:
+    """Parameters of the least sum of squares near the start, the sum, and whether the end was reached.
+
+    Parameters
+    ----------
+    problem : SumOfSquares
+    tell : callable
+        Called with the number of steps so far, parameters and sum of squares; whether to stop.
+    most : int
+        Steps.
+    settled : callable
+        The promised fall, of a sum of squares, at which the fit stands still.
+    """
+    least, damping, greatest = _DAMPING
+    x, p = problem.start, problem.unpack(problem.start)
+    here = problem.equations(p)
+    for i in range(most):
+        if tell(i, p, here.chi2):
+            return p, here.chi2, False
+        unit = units_of(here.normal)
+        scaled = here.normal * np.outer(unit, unit)
+        enough = settled(here.chi2)
+        while True:
+            step = _step(scaled, damping, here.gradient * unit) * unit
+            promised = float(here.gradient @ step)
+            trial = problem.unpack(x + step)
+            after = problem.chi2(trial)
+            if after <= here.chi2 or promised < enough:
+                break
+            damping = max(10 * damping, _DAMPING[1])
+            if damping > greatest:
+                return p, here.chi2, False
+        if after > here.chi2:
+            return p, here.chi2, True
+        x, p = np.asarray(x + step), trial
+        damping = max(damping / 10, least)
+        if promised < enough:
+            return p, after, True
+        here = problem.equations(p)
+    return p, here.chi2, False
+
+
+def units_of(normal: Array) -> Array:
+    """What each unknown moves by to show as much as the noise; zero for one that shows nowhere, but for round-off."""
+    known = np.diag(normal)
+    return np.where(known > np.finfo(float).tiny, 1 / np.sqrt(np.maximum(known, np.finfo(float).tiny)), 0.0)
+
+
+def _step(scaled: Array, damping: float, gradient: Array) -> Array:
+    """A damped step; with more damping where round-off has made the normal matrix indefinite."""
+    while True:
+        try:
+            factor = scipy.linalg.cho_factor(scaled + damping * np.eye(gradient.size), check_finite=False)
+        except np.linalg.LinAlgError:
+            damping = max(10 * damping, 1e-12)
+            continue
+        return np.asarray(scipy.linalg.cho_solve(factor, gradient))

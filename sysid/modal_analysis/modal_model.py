@@ -1,0 +1,251 @@
+r"""The modal model of the spectra of a test, some lines at a time: predictions, errors and how these are weighed.
+
+A run of a test is, at its lines,
+
+.. math:: a = \sum_k \phi_k g_k (\gamma_k u + \alpha_k / w^2 + i \beta_k / w), \quad y = G u + a + p, \quad
+          f = M_{rb} u + \sum_k \gamma_k' g_k (\ldots) + p,
+
+with two real numbers alpha, beta a mode and run for its motion at the ends, and p the traces of sampling and
+detrending: real multiples of 1, i w and 1 / (i w), a channel and run. Plain spectra have neither.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.modal_fit import Index, Modes
+from sysid.modal_analysis.response import gains, motion_and_slopes, real_times
+from sysid.structure.structure import Array, ComplexArray
+
+_AT_ONCE = 4096  # lines whose derivatives are held in memory together
+
+
+class Run(NamedTuple):
+    """Spectra of one run: lines (L,), rad/s; base (d, L); outputs (c, L); `density` of `WholeRecords`; its number."""
+
+    w: Array
+    base: ComplexArray
+    outputs: ComplexArray
+    density: float
+    number: int
+    weight: Array
+    """(L,): of how many lines each stands for."""
+    piece: int
+    """Row of the levels of noise: runs are cut where levels vary over the lines."""
+
+    def at(self, lines: Any) -> Run:
+        """Some of its lines."""
+        return self._replace(
+            w=self.w[lines], base=self.base[:, lines], outputs=self.outputs[:, lines], weight=self.weight[lines]
+        )
+
+
+class Weighed(NamedTuple):
+    """Errors by the inverse of their covariance: ``S^-1 e`` (c, L), ``e' S^-1 e`` (L,), the likeliest base (d, L)."""
+
+    seen: ComplexArray
+    power: Array
+    base: ComplexArray
+
+
+class Shift(NamedTuple):
+    """Products of the Jacobian with errors: ``Re J' S^-1 J`` (p, p), ``Re J' S^-1 e`` (p,) and ``e' S^-1 e``."""
+
+    normal: Array
+    gradient: Array
+    chi2: float
+
+
+@dataclass(frozen=True, eq=False)
+class Parameters:
+    """All that is fitted to whole records, beside the levels of the noise.
+
+    Attributes
+    ----------
+    modes : Modes
+    rigid : (d, d)
+        Rigid-body mass, kg; zero where no force was measured.
+    ends : (m, 2 r)
+        alpha, beta of each mode and moving run.
+    traces : (runs, c, 3)
+    """
+
+    modes: Modes
+    rigid: Array
+    ends: Array
+    traces: Array
+
+
+class SpectralModel:
+    """A test as m modes, without transients or traces: what plain spectra and whole records have in common.
+
+    Attributes
+    ----------
+    n, d, m, channels : int
+        Sensors, base directions, modes; sensors and, where a force was measured, its directions.
+    kept : int
+        How many of the unknowns of `Index` there are: without a force the rigid-body mass is left out.
+    """
+
+    def __init__(self, test: Measurement, m: int, runs: list[Run]) -> None:
+        self.test, self.m, self.runs = test, m, runs
+        self.n, self.d, self.force = test.n_sensors, test.n_base, test.force is not None
+        self.channels = self.n + self.d * self.force
+        self.index = Index(self.n, m, self.d)
+        self.kept = self.index.size if self.force else int(self.index.rigid[0])
+        self.moving: dict[int, int] = {}
+        self.n_ends = 0
+        self.gains = False
+
+    @property
+    def numbers(self) -> int:
+        """Real numbers of the records."""
+        return 2 * sum(run.outputs.size for run in self.runs)
+
+    def transients(self, freq: Array) -> ComplexArray:
+        """What the motion at the ends of a run adds to the load of a mode, (2, L), each times a number of that mode."""
+        raise NotImplementedError
+
+    def trace_spectra(self, freq: Array) -> ComplexArray:
+        """What the traces of a channel are multiples of, (traces, L)."""
+        return np.zeros((0, freq.size), complex)
+
+    def parts(self) -> Iterator[Run]:
+        """Lines of all runs, some thousand at a time."""
+        for run in self.runs:
+            for at in range(0, run.w.size, _AT_ONCE):
+                yield run.at(slice(at, at + _AT_ONCE))
+
+    def chunks(self, p: Parameters) -> Iterator[Lines]:
+        """The same at given parameters."""
+        return (Lines(self, p, run) for run in self.parts())
+
+    def chi2(self, p: Parameters, levels: Array) -> float:
+        """Sum of ``e' S^-1 e`` over all lines, half a chi-squared of `numbers` degrees."""
+        return float(sum(chunk.run.weight @ chunk.weighed(levels).power for chunk in self.chunks(p)))
+
+
+class Lines:
+    """Some lines of one run at given parameters."""
+
+    def __init__(self, model: SpectralModel, p: Parameters, run: Run) -> None:
+        self.model, self.p, self.run = model, p, run
+        freq = run.w / (2 * np.pi)
+        modes = p.modes
+        self.g = gains(freq, modes.omega, modes.ratios)
+        self.shown = modes.phi if not model.force else np.vstack([modes.phi, modes.gamma.T])  # (c, m)
+        self.direct = model.test.rigid_body if not model.force else np.vstack([model.test.rigid_body, p.rigid])
+        at = model.moving.get(run.number)
+        self.at_ends = None if at is None else slice(2 * at, 2 * at + 2)
+        self.transients = np.zeros((0, run.w.size), complex) if at is None else model.transients(freq)
+        self.pushed_by_ends = 0.0 if at is None else real_times(p.ends[:, self.at_ends], self.transients)  # (m, L)
+        self.trace_spectra = model.trace_spectra(freq)
+        self.motion = self.g * (real_times(modes.gamma, run.base) + self.pushed_by_ends)
+        predicted = real_times(self.shown, self.motion) + real_times(self.direct, run.base)
+        if len(self.trace_spectra):
+            predicted += real_times(p.traces[run.number], self.trace_spectra)
+        self.error = run.outputs - predicted
+
+    @cached_property
+    def H(self) -> ComplexArray:  # noqa: N802
+        """From base to outputs, (c, d, L)."""
+        pushed = (self.g[:, None] * self.p.modes.gamma[:, :, None]).reshape(len(self.g), -1)
+        return real_times(self.shown, pushed).reshape(len(self.direct), -1, self.run.w.size) + self.direct[:, :, None]
+
+    def deviations(self, levels: Array) -> tuple[Array, Array]:
+        """Inverse deviations of the outputs' own noise at a line, (c,), and deviations of the base's, (d,)."""
+        own, c = levels[self.run.piece] * self.run.density, self.model.channels
+        return 1 / np.sqrt(own[:c]), np.sqrt(own[c:])
+
+    def _base_noise(self, levels: Array) -> tuple[ComplexArray, ComplexArray]:
+        """What the noise of the base hides in units of the outputs' own, and its factor.
+
+        With ``B = D H sqrt(v_u)``, D the inverse deviations of the outputs, and ``L L' = I + B' B``: ``B L'^-1``
+        (d, c, L) and L (d, d, L), a line of vectors at a time as d is at most a few.
+        """
+        scale, root = self.deviations(levels)
+        B = np.asarray(scale[:, None] * self.H.transpose(1, 0, 2) * root[:, None, None], dtype=complex)
+        d = len(B)
+        factor = np.zeros((d, d, B.shape[2]), dtype=complex)
+        for j in range(d):
+            for i in range(j + 1):
+                product = np.sum(B[j].conj() * B[i], axis=0) + (i == j)  # of the rows of B' B + I
+                for k in range(i):
+                    product -= factor[j, k] * factor[i, k].conj()
+                # Never less than one on the diagonal, round-off aside.
+                factor[j, i] = np.sqrt(np.maximum(product.real, 1.0)) if i == j else product / factor[i, i].real
+        for j in range(d):
+            for i in range(j):
+                B[j] -= B[i] * factor[j, i].conj()
+            B[j] /= factor[j, j].real
+        return B, factor
+
+    def weighed(self, levels: Array, error: ComplexArray | None = None) -> Weighed:
+        """Errors, or other spectra (c, L), weighed by their full covariance."""
+        scale, root = self.deviations(levels)
+        if not np.any(root):
+            e = scale[:, None] * (self.error if error is None else error)
+            return Weighed(scale[:, None] * e, _power(e), self.run.base)
+        V, factor = self._base_noise(levels)
+        e = scale[:, None] * (self.error if error is None else error)
+        # What is likeliest of the base's noise, in its own units; what it makes of the errors is taken off them.
+        noise = np.array([np.sum(part.conj() * e, axis=0) for part in V])
+        for part, own in zip(V, noise, strict=True):
+            e -= part * own
+        for j in reversed(range(len(V))):
+            for i in range(j + 1, len(V)):
+                noise[j] -= factor[i, j].conj() * noise[i]
+            noise[j] /= factor[j, j].real
+        power = _power(e) + _power(noise)
+        return Weighed(scale[:, None] * e, power, self.run.base + root[:, None] * noise)
+
+    def covered(self, levels: Array) -> ComplexArray:
+        """V (d, c, L) with ``S^-1 = D² - V V'``: what the noise of the base hides."""
+        V = self._base_noise(levels)[0]
+        V *= self.deviations(levels)[0][:, None]
+        return V
+
+    def weighed_errors(self, levels: Array) -> tuple[Array, ComplexArray, ComplexArray, ComplexArray]:
+        """Lines (L,), rad/s, likeliest inputs (d + 2 r, L), ``S^-1 e`` (c, L) and ``S^-1`` (c, c, L)."""
+        weighed, V = self.weighed(levels), self.covered(levels)
+        inverse = -np.einsum("jcl,jel->cel", V, V.conj())
+        c = np.arange(self.model.channels)
+        inverse[c, c] += self.deviations(levels)[0][:, None] ** 2
+        base = weighed.base
+        ends = np.zeros((2 * len(self.model.moving), base.shape[1]), complex)
+        if self.at_ends is not None:
+            ends[self.at_ends] = self.transients
+        return self.run.w, np.concatenate([base, ends]), weighed.seen, inverse
+
+    def spectra(self, base: ComplexArray) -> ComplexArray:
+        """What all columns of the Jacobian are made of, (spectra, L)."""
+        modes, g = self.p.modes, self.g
+        freq = self.run.w / (2 * np.pi)
+        parts = [
+            motion_and_slopes(freq, modes.omega, modes.ratios, modes.gamma, base, self.pushed_by_ends),
+            base,
+        ]
+        if self.at_ends is not None:
+            parts.append((g[:, None] * self.transients).reshape(-1, base.shape[1]))
+        parts.append(self.trace_spectra)
+        if self.model.gains:
+            parts.append((freq / self.model.test.freq[-1]) ** 2 * base)
+        return np.concatenate(parts)
+
+
+def _power(rows: ComplexArray) -> Array:
+    """Sums of squares of the moduli over the rows, (L,)."""
+    return np.asarray(np.sum(rows.real**2 + rows.imag**2, axis=0))
+
+
+def dots(rows: ComplexArray, others: ComplexArray) -> Array:
+    """``Re X Y'`` of rows (k, L), (l, L)."""
+    one = np.ascontiguousarray(rows).view(float)
+    two = one if others is rows else np.ascontiguousarray(others).view(float)
+    return np.asarray(one @ two.T)

@@ -1,0 +1,295 @@
+"""The modal model of plain spectra, its mode shapes eliminated sensor by sensor.
+
+The base is exact, so that no sensor shares its errors with another: at given participations and poles the shapes are a
+small linear least-squares problem of each sensor, the same matrix for all of them. What is left has (d + 2) unknowns a
+mode, whatever the number of sensors (variable projection, Golub and Pereyra 1973). Its gradient is exact, and its
+normal matrix is that of Kaufman (1975): the columns of the shapes projected off the others, which is the Jacobian of
+the projected residual but for a term that vanishes with the residual.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from sysid.measurement.measurement import Measurement
+from sysid.measurement.noise import separable
+from sysid.modal_analysis.least_squares import SumOfSquares, minimise
+from sysid.modal_analysis.modal_fit import (
+    ModalFit,
+    Modes,
+    Weights,
+    force_columns,
+    held_gauge,
+    mode_of_slopes,
+    separate_poles,
+    slopes_of_modes,
+)
+from sysid.modal_analysis.modal_model import Lines, Parameters, Run, Shift, SpectralModel, dots
+from sysid.modal_analysis.residues import force_residual_left, linear_residues
+from sysid.modal_analysis.response import motion_curvature, real_times
+from sysid.nlp import EXACT, OBJECTIVE_SCALE, IterationMonitor
+from sysid.structure.structure import Array
+
+RIDGE = 1e-14  # of the modes' size: keeps shapes finite where two modes become one, and changes them by less than noise
+_SETTLED = EXACT**1.5  # of the sum of squares: a fall that is promised, at which the fit stands still
+_LEAST_MISFIT = 1e-9  # relative; records that fit better than this weigh alike
+
+
+def weights_at(test: Measurement, omega: Array, ratios: Array) -> Weights:
+    """Weights by the stated noise; a force whose noise is not stated weighs by what free residues at these poles leave.
+
+    Parameters
+    ----------
+    test : Measurement
+    omega, ratios : (m,)
+        Circular frequencies, rad/s, and damping ratios, each pole once.
+    """
+    channel, line = separable(test.response_std, test.response.shape)
+    size = float(np.linalg.norm(test.relative * channel[:, None] * line[:, None]))
+    sensors = channel / size
+    if test.force is None:
+        return Weights(sensors, line, None, line)
+    of_force, force_line = separable(test.force_std, test.force.shape)
+    if np.allclose(force_line / force_line.mean(), line / line.mean(), rtol=1e-12):
+        of_force, force_line = of_force * force_line.mean() / line.mean(), line
+    if test.response_std is not None and test.force_std is not None:
+        return Weights(sensors, line, of_force / size, force_line)
+    force_size = float(np.linalg.norm(test.force * of_force[:, None] * force_line[:, None]))
+    left = max(linear_residues(test, omega, ratios)[1], _LEAST_MISFIT)
+    force_left = max(force_residual_left(test, omega, ratios), _LEAST_MISFIT)
+    weight = left / force_left * float(np.sqrt(test.force.size / test.relative.size)) / force_size
+    return Weights(sensors, line, weight * of_force, force_line)
+
+
+class SpectraModel(SpectralModel):
+    """Plain spectra as a sum of modes whose shapes are the best for their participations and poles.
+
+    The unknowns are participations (mode by mode), the logarithms of frequencies and damping ratios of each pole, and
+    where a force was measured the rigid-body mass, as `Index` has it. Modes may share a pole.
+
+    Parameters
+    ----------
+    test : Measurement
+    weights : Weights
+    pole : (m,) of int
+        The pole of each mode.
+    """
+
+    def __init__(self, test: Measurement, weights: Weights, pole: NDArray[np.intp]) -> None:
+        outputs = test.response if test.force is None else np.concatenate([test.response, test.force], axis=1)
+        every = [(weights.lines, 0)] + [(weights.force_lines, 1)] * (weights.force_lines is not weights.lines)
+        runs = [
+            Run(2 * np.pi * test.freq, base * line, records * line, 1.0, number, np.ones(line.size), piece)
+            for lines, piece in every
+            for number, (base, records, line) in enumerate(zip(test.base, outputs, lines, strict=True))
+        ]
+        super().__init__(test, pole.size, runs)
+        force = np.zeros(0) if weights.force is None else weights.force
+        # A channel without weight in a piece has infinite noise there; the base has none.
+        scale = np.zeros((len(every), self.channels))
+        scale[0, : self.n], scale[-1, self.n :] = weights.sensors, force
+        with np.errstate(divide="ignore"):
+            self.levels = np.hstack([scale**-2.0, np.zeros((len(every), self.d))])
+        self.pole, self._first = pole, np.unique(pole, return_index=True)[1]
+        # Columns of the plain unknowns, of which those of modes that share a pole are one.
+        count = self.m * self.d
+        at = np.concatenate([np.arange(count), count + pole, count + self._first.size + pole])
+        rigid = count + 2 * self._first.size + np.arange(self.kept - int(self.index.rigid[0]))
+        self._at = np.concatenate([at, rigid])
+        self._size = int(self._at.max()) + 1
+        self._free, self._held = np.ones(self._size, bool), np.zeros(self._size)
+
+    def hold(self, gamma: Array, held: NDArray[np.bool_]) -> None:
+        """Leave some participations (m, d) as they are."""
+        self._free[: gamma.size] = ~held.ravel()
+        self._held[: gamma.size] = gamma.ravel()
+
+    @property
+    def levels_of_accelerations(self) -> Array:
+        """Variances with which the force has no weight."""
+        levels = self.levels.copy()
+        levels[:, self.n : self.channels] = np.inf
+        return levels
+
+    def pack(self, p: Parameters) -> Array:
+        """The unknowns as one column, without the shapes."""
+        modes = p.modes
+        rigid = [p.rigid[i, j] for i, j in self.index.pairs] if self.force else []
+        poles = np.log(modes.omega[self._first]), np.log(modes.ratios[self._first])
+        return np.concatenate([modes.gamma.ravel(), *poles, rigid])[self._free]
+
+    def unpack(self, x: Array) -> Parameters:
+        """Parameters with the best shapes."""
+        every = self._held.copy()
+        every[self._free] = x
+        gamma, log_omega, log_ratios, corner = np.split(
+            every[self._at], np.cumsum([self.m * self.d, self.m, self.m]).tolist()
+        )
+        rigid = np.zeros((self.d, self.d))
+        for (i, j), value in zip(self.index.pairs, corner, strict=False):
+            rigid[i, j] = rigid[j, i] = value
+        with np.errstate(over="ignore"):
+            omega, ratios = np.exp(log_omega), np.exp(log_ratios)
+        return self.with_best_shapes(Modes(np.zeros((self.n, self.m)), gamma.reshape(self.m, -1), omega, ratios), rigid)
+
+    def with_best_shapes(self, modes: Modes, rigid: Array) -> Parameters:
+        """Parameters with the shapes that leave least of the accelerations; those of `modes` are not read."""
+        start = self._parameters(modes._replace(phi=np.zeros((self.n, self.m))), rigid)
+        if not (np.all(np.isfinite(modes.omega)) and np.all(modes.ratios < 1.0)):
+            return start
+        parts = [Lines(self, start, run) for run in self.runs if run.piece == 0]
+        inverse = _inverse(np.sum([dots(part.motion, part.motion) for part in parts], axis=0))
+        phi = np.zeros((self.n, self.m))
+        # Once more for what round-off in the products has left.
+        for _ in range(2):
+            left = [part.error[: self.n] - real_times(phi, part.motion) for part in parts]
+            pull = [dots(error, part.motion) for error, part in zip(left, parts, strict=True)]
+            phi = phi + np.sum(pull, axis=0) @ inverse
+        return self._parameters(modes._replace(phi=phi), rigid)
+
+    def _parameters(self, modes: Modes, rigid: Array) -> Parameters:
+        runs = self.test.n_runs
+        return Parameters(modes, rigid, np.zeros((self.m, 0)), np.zeros((runs, self.channels, 0)))
+
+    def normal_equations(self, p: Parameters, levels: Array) -> Shift:
+        """Half the Hessian and minus half the gradient of the sum of squares by the unknowns, and the sum.
+
+        Of parameters with the best shapes. The Hessian is exact where it has no negative curvature, else Kaufman's.
+        """
+        plain, curved = self.slopes(p, levels)
+        joined = np.zeros((self._size, self._at.size))
+        joined[self._at, np.arange(self._at.size)] = 1.0
+        joined = joined[self._free]
+        exact = joined @ curved @ joined.T
+        normal = exact if _is_definite(exact) else joined @ plain.normal @ joined.T
+        return Shift(normal, joined @ plain.gradient, plain.chi2)
+
+    def slopes(self, p: Parameters, levels: Array) -> tuple[Shift, Array]:
+        """The same by participations, log w, log zeta of each mode, and rigid-body mass: theta without the shapes.
+
+        First with Kaufman's normal matrix, then half the exact Hessian.
+        """
+        modes, m, n = p.modes, self.m, self.n
+        spectra = m * (self.d + 3) + self.d
+        grams = np.zeros((len(levels), spectra, spectra))
+        cross = np.zeros((len(levels), spectra, self.channels))
+        chi2, scale, curvature = 0.0, np.zeros((len(levels), self.channels)), np.zeros((m, self.d + 2, self.d + 2))
+        for chunk in self.chunks(p):
+            piece, weighed, spectra_there = chunk.run.piece, chunk.weighed(levels), chunk.spectra(chunk.run.base)
+            grams[piece] += dots(spectra_there, spectra_there)
+            cross[piece] += dots(spectra_there, weighed.seen)
+            chi2 += float(np.sum(weighed.power))
+            scale[piece] = chunk.deviations(levels)[0]
+            pull = real_times(chunk.shown.T, weighed.seen)
+            curvature += motion_curvature(
+                chunk.run.w / (2 * np.pi), modes.omega, modes.ratios, modes.gamma, chunk.run.base, pull
+            )
+        mode = mode_of_slopes(m, self.d)
+        count, size = mode.size, self.kept - self.index.gamma.start
+        normal, bent, gradient = np.zeros((size, size)), np.zeros((size, size)), np.zeros(size)
+        normal[:count, :count], bent[:count, :count], gradient[:count] = _eliminated(
+            modes.phi, grams[0], cross[0, : m + count, :n], scale[0, :n], mode
+        )
+        at = slopes_of_modes(m, self.d)
+        np.subtract.at(bent, (at[:, :, None], at[:, None]), curvature)
+        for i in range(self.channels - n):
+            mix = force_columns(modes.gamma, self.index, i)
+            normal += scale[-1, n + i] ** 2 * (mix.T @ grams[-1] @ mix)
+            gradient += mix.T @ cross[-1, :, n + i]
+            # The force is the product of a participation and a motion.
+            first, others = mode * self.d + i, np.arange(count)
+            np.subtract.at(bent, (first, others), cross[-1, m + others, n + i])
+            np.subtract.at(bent, (others, first), cross[-1, m + others, n + i])
+        return Shift(normal, gradient, chi2), normal + bent
+
+
+def _eliminated(
+    phi: Array, gram: Array, cross: Array, scale: Array, mode: NDArray[np.intp]
+) -> tuple[Array, Array, Array]:
+    """Sums over the sensors with their shapes eliminated: Kaufman's normal matrix, what is exact beyond it, gradient.
+
+    Parameters
+    ----------
+    phi : (n, m)
+        The best shapes.
+    gram : (spectra, spectra)
+        Products of motions and their slopes, motions first.
+    cross : (m + slopes, n)
+        Of these with weighed errors.
+    scale : (n,)
+        Inverse deviations.
+    mode : (slopes,)
+    """
+    m, count = phi.shape[1], mode.size
+    shapes, slopes = slice(m), slice(m, m + count)
+    inverse = _inverse(gram[shapes, shapes])
+    onto = gram[slopes, shapes] @ inverse
+    inner = gram[slopes, slopes] - onto @ gram[shapes, slopes]
+    alike = ((phi.T * scale**2) @ phi)[np.ix_(mode, mode)]
+    errors = cross[slopes]
+    by_shape = errors @ phi[:, mode]  # (slopes, slopes), of the second's mode
+    across = onto[:, mode] * by_shape.T
+    alone = inverse[np.ix_(mode, mode)] * ((errors / scale**2) @ errors.T)
+    return inner * alike, across + across.T - alone, np.sum(errors * phi[:, mode].T, axis=1)
+
+
+def _is_definite(matrix: Array) -> bool:
+    """Whether a symmetric matrix has positive curvature in all directions, by more than round-off."""
+    size = np.diag(matrix)
+    if np.any(size <= 0):
+        return False
+    scaled = matrix / np.sqrt(np.outer(size, size)) - len(size) * np.finfo(float).eps * np.eye(len(size))
+    return scipy.linalg.lapack.dpotrf(scaled, lower=1)[1] == 0
+
+
+def _inverse(gram: Array) -> Array:
+    """Inverse of the Gram matrix of the modes' motions, which may be next to singular."""
+    size = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
+    lam, V = np.linalg.eigh(gram / np.outer(size, size))
+    half = V / np.sqrt(np.maximum(lam, 0.0) + RIDGE) / size[:, None]
+    return np.asarray(half @ half.T)
+
+
+def fit_spectra(
+    test: Measurement, first: Modes, rigid: Array, *, monitor: IterationMonitor, max_iterations: int
+) -> ModalFit:
+    """Modes with the least weighted squared error of accelerations and, where it was measured, base force.
+
+    The rigid-body mass is as free as the records have it: what no mode carries may come out as a negative mass.
+
+    Parameters
+    ----------
+    test : Measurement
+    first : Modes
+        Where to start; shapes are not read. Modes whose poles are equal keep one pole.
+    rigid : (d, d)
+        Rigid-body mass to start with; read where a force was measured.
+    """
+    poles, pole = separate_poles(first)
+    weights = weights_at(test, first.omega[poles], first.ratios[poles])
+    model = SpectraModel(test, weights, pole)
+    unit = np.sqrt(np.maximum(np.mean(first.gamma**2, axis=0), np.finfo(float).tiny))
+    gauge, held = held_gauge(first, unit, test.force is not None)
+    first = first._replace(gamma=gauge * unit)
+    model.hold(first.gamma, held)
+
+    def tell(_: int, p: Parameters, chi2: float) -> bool:
+        return monitor.record(model.pack(p), OBJECTIVE_SCALE * chi2)
+
+    def chi2_of(p: Parameters) -> float:
+        good = np.all(np.isfinite(p.modes.omega)) and np.all(p.modes.ratios < 1.0)
+        value = model.chi2(p, model.levels) if good else np.inf
+        return value if np.isfinite(value) else np.inf
+
+    problem = SumOfSquares(
+        model.pack(model.with_best_shapes(first, rigid)), model.unpack, chi2_of,
+        lambda p: model.normal_equations(p, model.levels),
+    )  # fmt: skip
+    # Far below the noise, so that IPOPT finds its tolerance met where it begins.
+    enough = lambda chi2: _SETTLED * (chi2 + _SETTLED)  # noqa: E731
+    p, chi2, settled = minimise(problem, tell, max_iterations, enough)
+    status = "settled" if settled else "stopped" if monitor.stopped is not None else "not settled"
+    of_accelerations = np.sqrt(model.chi2(p, model.levels_of_accelerations))
+    return ModalFit(p.modes, p.rigid, float(np.sqrt(chi2)), float(of_accelerations), status, "", weights)

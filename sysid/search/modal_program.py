@@ -1,0 +1,204 @@
+"""The program in modal coordinates: participations, frequencies and damping ratios through IPOPT, shapes eliminated.
+
+Every answer in modal coordinates ends here, most of them after one to three iterations from an estimate. The residual
+is symbolic, its gradient CasADi's own. The Hessian is exact; its products of all lines are NumPy's (`SpectraModel`), as
+CasADi multiplies dense matrices many times slower. A measured base force is fitted jointly; it sets the scale of each
+mode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import casadi as ca
+import numpy as np
+
+from sysid.errors import SolverError
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.modal_fit import ModalFit, Modes, Weights, held_gauge, separate_poles
+from sysid.modal_analysis.response import columns, modal_gains, modal_motion, parts_of, stacked
+from sysid.modal_analysis.spectra_model import RIDGE, SpectraModel, weights_at
+from sysid.nlp import EXACT, OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, NumpyFunction
+from sysid.structure.structure import Array
+from sysid.structure.triangular import lower_triangle, triangle_entries
+
+_LEAST_MASS = 1e-6  # of the rigid-body mass; the least remainder that a fit starts with
+
+Spectrum = Callable[[NonlinearProgram], tuple[ca.MX, ca.MX]]
+Ties = Callable[[ca.MX, ca.MX, ca.MX], list[ca.MX]]
+
+
+def fit_modes(
+    test: Measurement,
+    first: Modes,
+    spectrum: Spectrum,
+    *,
+    unit: Array,
+    remainder: Array,
+    ties: Ties | None = None,
+    weights: Weights | None = None,
+    monitor: IterationMonitor,
+    max_iterations: int = 500,
+) -> ModalFit:
+    """Minimise the weighted squared error of accelerations and, where it was measured, base force.
+
+    Parameters
+    ----------
+    test : Measurement
+    first : Modes
+        Where to start; shapes are not read.
+    spectrum : callable
+        Adds its unknowns to the program, and gives circular frequencies and damping ratios, (m, 1) each.
+    unit : (d,), kg^½ (times m for a rotation)
+        Makes participations of order one.
+    remainder : (d, d)
+        Start of the rigid-body mass that no mode carries; positive semidefinite.
+    ties : callable, optional
+        Equalities between shapes, participations and rigid-body mass.
+    weights : Weights, optional
+        Those of an estimate that the program goes on from; else by what free residues at the first poles leave.
+
+    Raises
+    ------
+    SolverError
+        Where the modes' motions are linearly dependent.
+
+    References
+    ----------
+    G. H. Golub, V. Pereyra, SIAM J. Numer. Anal. 10 (1973) 413-432; L. Kaufman, BIT 15 (1975) 49-57.
+    """
+    z = NonlinearProgram()
+    (m, d), poles = first.gamma.shape, separate_poles(first)[0]
+    weights = weights_at(test, first.omega[poles], first.ratios[poles]) if weights is None else weights
+    weighed = test.force is not None
+    gauge, held = held_gauge(first, unit, weighed)
+    low, high = np.full((m, d), -np.inf), np.full((m, d), np.inf)
+    low[held], high[held] = gauge[held], gauge[held]
+    gamma = z.variable("participation", gauge, low, high) @ ca.diag(ca.DM(unit))
+    omega, ratios = spectrum(z)
+    rigid = gamma.T @ gamma
+    if weighed:
+        lam, vectors = np.linalg.eigh(remainder / np.outer(unit, unit))
+        # A factor of zero has no slope.
+        root = np.linalg.cholesky((vectors * np.maximum(lam, _LEAST_MASS * max(1.0, lam[-1]))) @ vectors.T)
+        factor = ca.diag(ca.DM(unit)) @ lower_triangle(z.variable("base mass", triangle_entries(root)), d)
+        rigid = rigid + factor @ factor.T
+    error = ModalResidual(test, weights, gamma, omega, ratios, rigid)
+    if ties is not None:
+        for tie in ties(error.phi, gamma, rigid):
+            z.constrain(tie)
+    model = SpectraModel(test, weights, np.arange(m))
+    hessian = hessian_of(model)
+    best, status = z.minimize(error.value, monitor, max_iterations, _derivatives(z, error, hessian))
+    end = ca.Function("end", [z.z], [error.phi, gamma, omega, ratios, rigid, error.value, ca.norm_fro(error.left)])
+    try:
+        values = [np.asarray(v) for v in end(best)]
+        if not all(np.all(np.isfinite(v)) for v in values):
+            values = [np.asarray(v) for v in end(np.concatenate(z.start))]
+    except RuntimeError:  # of CasADi: the normal equations are singular
+        raise SolverError(f"{m} modes move so much alike that no shapes can be told apart") from None
+    modes = Modes(values[0], values[1], values[2].ravel(), values[3].ravel())
+    left = float(np.sqrt(values[5].item())), float(values[6].item())
+    counted = np.sqrt(model.chi2(model.with_best_shapes(modes, values[4]), model.levels))
+    if abs(counted - left[0]) > EXACT:
+        status = f"{status}, but the residual {left[0]:.6g} of its end is {counted:.6g} when counted anew"
+    return ModalFit(modes, values[4], *left, status, z.on_bounds(best), weights)
+
+
+class ModalResidual:
+    """Weighted residual as CasADi expressions, its shapes eliminated.
+
+    Attributes
+    ----------
+    phi : (n, m)
+        The best shapes.
+    left : (n, 2 L)
+        Weighted errors of the accelerations, real parts beside imaginary ones.
+    force_left : (d, 2 L), or None
+    value :
+        Their sum of squares.
+    """
+
+    def __init__(
+        self, test: Measurement, weights: Weights, gamma: ca.MX, omega: ca.MX, ratios: ca.MX, rigid: ca.MX
+    ) -> None:
+        self.gamma, self.omega, self.ratios, self.rigid = gamma, omega, ratios, rigid
+        gains = modal_gains(omega, ratios, test.freq)
+        self.q = ca.horzcat(*modal_motion(test.base * weights.lines[:, None], gamma, gains))
+        target = stacked(columns(test.relative * weights.sensors[:, None] * weights.lines[:, None])).T
+        # Rows of very different size would spoil the solve.
+        scale = ca.sqrt(ca.sum2(self.q**2))
+        scaled = self.q / ca.repmat(scale, 1, self.q.size2())
+        # The ridge keeps the system regular where two modes become one; it changes shapes by less than their error.
+        normal = _times(scaled, scaled.T) + RIDGE * ca.DM.eye(scaled.size1())
+        shapes = ca.solve(normal, _times(scaled, ca.DM(target).T)) / ca.repmat(scale, 1, test.n_sensors)
+        self.shapes = shapes.T  # of weighted sensors
+        self.left = ca.DM(target) - _times(self.shapes, self.q)
+        self.phi = ca.diag(ca.DM(1 / weights.sensors)) @ self.shapes
+        self.value = ca.sumsqr(self.left)
+        self.force_left: ca.MX | None = None
+        if test.force is not None and weights.force is not None:
+            base = test.base * weights.force_lines[:, None]
+            q = ca.horzcat(*modal_motion(base, gamma, gains)) if weights.force_lines is not weights.lines else self.q
+            target = stacked(columns(test.force * weights.force[:, None] * weights.force_lines[:, None])).T
+            self.force_channel, self.force_base = ca.DM(weights.force), ca.horzcat(*parts_of(base))
+            self.force_left = ca.diag(self.force_channel) @ (gamma.T @ q + rigid @ self.force_base) - ca.DM(target)
+            self.value += ca.sumsqr(self.force_left)
+
+    def gradient(self, z: ca.MX) -> ca.MX:
+        """Of the value by the unknowns z, CasADi's own.
+
+        The best shapes leave no slope by themselves, so that they count as constants.
+        """
+        pull = ca.vec(-2 * _times(self.shapes.T, self.left))
+        slope = ca.jtimes(ca.vec(self.q), z, pull, True)
+        if self.force_left is not None:
+            slope += ca.gradient(ca.sumsqr(self.force_left), z)
+        return slope
+
+    def by_rigid(self) -> ca.MX:
+        """Gradient of the value by the rigid-body mass, (d, d)."""
+        if self.force_left is None:
+            return ca.MX(*self.rigid.shape)
+        return 2 * ca.diag(self.force_channel) @ self.force_left @ self.force_base.T
+
+    def theta(self) -> ca.MX:
+        """What `hessian_of` takes: participations mode by mode, log w, log zeta and, with a force, the rigid mass."""
+        d = self.rigid.size1()
+        corner = [self.rigid[i, j] for i in range(d) for j in range(i, d)] if self.force_left is not None else []
+        return ca.vertcat(ca.vec(self.gamma.T), ca.log(self.omega), ca.log(self.ratios), *corner)
+
+
+def _times(one: ca.MX, other: ca.MX) -> ca.MX:
+    """A dense product by BLAS."""
+    return ca.mtimes(one, other, "classic")
+
+
+def hessian_of(model: SpectraModel) -> NumpyFunction:
+    """Hessian of the sum of squares of a model by theta without the shapes, for CasADi."""
+    size = model.kept - model.index.gamma.start
+    return NumpyFunction(size, [(size, size)], lambda x: [2 * model.slopes(model.unpack(x), model.levels)[1]])
+
+
+def _derivatives(z: NonlinearProgram, error: ModalResidual, of_theta: NumpyFunction) -> dict[str, ca.Function]:
+    """Gradient and Hessian by the unknowns, in IPOPT's scale of the objective."""
+    unknowns, theta = z.z, error.theta()
+    chain = ca.jacobian(theta, unknowns)
+    hessian = chain.T @ of_theta(theta) @ chain
+    # Of theta, the rigid-body mass alone bends by the unknowns, but for stated laws of the damping.
+    slope = ca.MX.sym("slope", *error.rigid.shape)
+    bend = ca.substitute(ca.hessian(ca.dot(slope, error.rigid), unknowns)[0], slope, error.by_rigid())
+    p, factor, multipliers = ca.MX.sym("p", 0), ca.MX.sym("factor"), ca.MX.sym("multipliers", sum(
+        tie.numel() for tie in z.constraints
+    ))  # fmt: skip
+    return {
+        "grad_f": ca.Function(
+            "gradient", [unknowns, p], [OBJECTIVE_SCALE * error.value, OBJECTIVE_SCALE * error.gradient(unknowns)],
+            ["x", "p"], ["f", "grad_f_x"],
+        ),
+        "hess_lag": ca.Function(
+            "hessian", [unknowns, p, factor, multipliers],
+            [ca.triu(factor * OBJECTIVE_SCALE * (hessian + bend))],
+            ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"],
+        ),
+    }  # fmt: skip
