@@ -25,16 +25,16 @@ CEILINGS = {
     # swarm on the models' own expressions (317), and findings with kind, channel and numbers in the place of sentences,
     # by checks that share one context (600), a page of half the size and time (140),
     # and one model of modes for spectra and whole records, its shapes eliminated with exact second derivatives (530).
-    "lines": 41_078,
+    "lines": 41_604,
     # What was counted when these counts began; the modes once, in the open, brings them down.
-    "branches": 79.2,
-    "files": 250,
+    "branches": 78.8,
+    "files": 254,
     "main": 241,
     "modal": 67,
     "fits": 36,
     "constants": 465,
     "shared": 45,
-    "everyday": 387,
+    "everyday": 385,
     "prose": 143,
 }
 
