@@ -34,7 +34,7 @@ def to_png(figure: Figure, *, dpi: float = 100, colours: int | None = None) -> b
     if colours is not None:
         image = image.quantize(colours, dither=Image.Dither.NONE)
     out = io.BytesIO()
-    image.save(out, format="png", dpi=(dpi, dpi))
+    image.save(out, format="png", dpi=(dpi, dpi), compress_level=9)
     return out.getvalue()
 
 
