@@ -234,11 +234,13 @@ def test_three_commands_from_a_table_to_a_result(tmp_path, monkeypatch, capsys):
     np.testing.assert_allclose(np.diag(mass)[:3], [4, 3, 2], rtol=1e-6)
     assert cli.main(["new", "mine", "--data", "test.h5"]) == 0
     assert cli.main(["show", "mine.py"]) == 0
-    # A wrong total leaves what a goal may call near enough, and nothing else does.
-    wrong = ["run", "test.h5", "--mass", "12", "--lumped"]
-    for goal, status in (("0.9", 0), ("1e-6", 1)):
-        assert cli.main([*wrong, "--goal", goal, "--fresh"]) == status
+    # Masses of 4, 3 and 2 kg; a goal that is met does not make a total right that the force contradicts.
+    for mass, goal, status in (("9", "0.9", 0), ("9", "1e-15", 1), ("12", "0.9", 1)):
+        assert cli.main(["run", "test.h5", "--lumped", "--mass", mass, "--goal", goal, "--fresh"]) == status
         assert sysid.load("results/test").problem.goal == float(goal)
+    result = sysid.load("results/test")
+    assert result.judgement == "doubtful"
+    assert result.contradictions[0].kind == "stated mass"  # before what it makes the model miss
     assert cli.main(["run", "cantilever_tower", "--goal", "0.1"]) == 2
     assert "--goal are for a test that 'sysid read' wrote" in capsys.readouterr().err
 
