@@ -131,7 +131,7 @@ def built(recipe: Recipe, *, check: bool = True) -> tuple[Problem, frozenset[Pat
             problem = function(data=data, rng=recipe.rng, **recipe.parameters)
     if not isinstance(problem, Problem):
         raise InputError(f"{path}: problem() gives a {type(problem).__name__}, not a sysid.Problem")
-    used = set(problem.formulate(problem.unsearched).variables)
+    used = set(problem.declared.variables)
     idle = [variable for variable in declared()[before:] if variable not in used]
     if idle:
         told = ", ".join(f"{variable.name!r} ({variable.declared})" for variable in idle)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import sysid
+from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.models.geometry import Geometry
 
 
@@ -147,7 +148,7 @@ def _geometry_of(G, translational=None, weighed=None):
     moves, turns = iter(["x", "y", "z"]), iter(["rx", "ry", "rz"])
     axes = [next(moves if moved else turns) for moved in (np.ones(d) if translational is None else translational)]
     test = sysid.Measurement([1.0, 2.0], np.ones((1, d, 2)), np.ones((1, sensors, 2)), rigid_body=G, base_axes=axes)
-    return Geometry(test, weighed=weighed)
+    return Geometry(ModalEstimate.of_lines(test), weighed=weighed)
 
 
 @pytest.fixture(scope="session")

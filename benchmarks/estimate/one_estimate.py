@@ -46,9 +46,9 @@ def seconds_of(what: str, *case: int) -> float:
         return time.process_time() - begun
     problem = spectra(*case)
     if what == "fit":
-        poles_of(problem)
+        poles_of(problem.prepared)
         begun = time.process_time()
-        modal_structure(problem, Modal(), IterationMonitor(None, None))
+        modal_structure(problem.prepared, Modal(), IterationMonitor(None, None))
         return time.process_time() - begun
     begun = time.process_time()
     sysid.identify(problem, rng=0)

@@ -85,7 +85,7 @@ def write(source: str, folder: str, how: str) -> list[dict]:
     told = []
     for i, result in enumerate(results_of(Path(source), how in ("searched", "own"))):
         path = result.save(Path(folder) / f"{i}.h5")
-        searches = result.x is not None and not result.problem.free_modes
+        searches = result.x is not None and not result.problem.prepared.free_modes
         told.append(
             {
                 "path": str(path.absolute()),
@@ -103,7 +103,7 @@ def read(*paths: str) -> list[dict]:
     for path in paths:
         result = sysid.load(path)
         whole = result.part is None
-        searches = whole and result.x is not None and not result.problem.free_modes
+        searches = whole and result.x is not None and not result.problem.prepared.free_modes
         told.append(
             {
                 "whole": whole,

@@ -14,6 +14,7 @@ from benchmarks.line import Line, above, below
 from benchmarks.modal.random_structures import frequency_lines, random_structure
 from benchmarks.problem_modules import load_module
 from benchmarks.swarm import controls
+from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.response import weighted_error
 from sysid.models.geometry import Geometry
 from sysid.models.mass import total_of
@@ -69,7 +70,7 @@ def random_test(seed: int, *, n: int, force: bool = True, kind: str | None = Non
     test = sysid.simulate(truth, frequency_lines(truth), noise=NOISE, force=force, rng=seed)
     mass = sysid.FullMass()
     if kind is not None:
-        total = total_of(Geometry(test), truth.mass, kind)
+        total = total_of(Geometry(ModalEstimate.of_lines(test)), truth.mass, kind)
         mass = sysid.FullMass(total, healing=kind)
     return sysid.Problem(test, mass=mass, reference=truth, goal=GOAL * test.residual(truth))
 

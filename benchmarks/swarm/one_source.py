@@ -127,7 +127,7 @@ def _both(problem: sysid.Problem, rows: np.ndarray) -> tuple[np.ndarray, float]:
     """The swarm's objective, and its largest relative difference from IPOPT's rows; infinite where one alone is NaN."""
     formulation, n = problem.formulation, problem.geometry.n
     spectrum = formulation.stiffness.spectrum if formulation.refinable else None
-    objective = SwarmObjective(problem, spectrum=spectrum)
+    objective = SwarmObjective(problem.prepared, spectrum=spectrum)
     x, modes = ca.MX.sym("x", problem.n_variables), ModeSymbols(ca.MX.sym("shapes", n, n), ca.MX.sym("omega", n))
     of_rows = ca.Function("rows", [x, *modes], [ca.norm_2(formulation.own_test.rows(x, modes))])
     costs, expected = objective(rows), np.full(len(rows), np.nan)

@@ -37,7 +37,7 @@ def objective_of(n: int, count: int) -> tuple[Callable[[np.ndarray], np.ndarray]
     )
     start = time.process_time()
     with patch("os.cpu_count", lambda: 1):  # so that the objective makes one worker
-        objective = SwarmObjective(problem, spectrum=problem.formulation.stiffness.spectrum)
+        objective = SwarmObjective(problem.prepared, spectrum=problem.formulation.stiffness.spectrum)
     seconds = time.process_time() - start
     size = problem.n_variables
     swarm = np.random.default_rng(0).uniform(problem.lower, problem.upper, (5 * size, size))

@@ -48,7 +48,7 @@ def lines(reduced: bool) -> Iterator[Line]:
     with threadpool_limits(limits=1):
         for n, count, bound in CASES[:1] if reduced else CASES:
             problem = _problem(n, count)
-            fast = SwarmObjective(problem, spectrum=problem.formulation.stiffness.spectrum)
+            fast = SwarmObjective(problem.prepared, spectrum=problem.formulation.stiffness.spectrum)
             slow, real = ByLines(problem), ByLinesOfUnitRuns(problem)
             swarm = np.random.default_rng(0).uniform(
                 problem.lower, problem.upper, (5 * problem.n_variables, problem.n_variables)
@@ -73,7 +73,7 @@ def _agreement() -> Iterator[Line]:
     """Difference from the sum over lines, of a test with force."""
     for n in SIZES:
         problem = _problem(n, 200, force=True)
-        fast = SwarmObjective(problem, spectrum=problem.formulation.stiffness.spectrum)
+        fast = SwarmObjective(problem.prepared, spectrum=problem.formulation.stiffness.spectrum)
         rows = np.random.default_rng(1).uniform(problem.lower, problem.upper, (AGREEING, problem.n_variables))
         expected = ByLinesBySubstitution(problem)(rows) ** 2
         apart = np.abs(fast(rows) ** 2 - expected) / np.maximum(expected, 1.0)
@@ -84,7 +84,7 @@ def _agreement() -> Iterator[Line]:
 def _processor_time() -> Line:
     """Processor time of a sum over lines over that of the objective."""
     problem = _problem(10, 200)
-    fast = SwarmObjective(problem, spectrum=problem.formulation.stiffness.spectrum)
+    fast = SwarmObjective(problem.prepared, spectrum=problem.formulation.stiffness.spectrum)
     rows = np.random.default_rng(0).uniform(problem.lower, problem.upper, (BY_LINE, problem.n_variables))
     took = _alternated(((fast, rows), (ByLines(problem), rows)), 10, time.process_time)
     ratio = float(np.median(took[:, 1]) / np.median(took[:, 0]))

@@ -17,11 +17,13 @@ import numpy as np
 
 from sysid.assessment.cone import Cone, Pairs, forms, null_space, unknowns
 from sysid.measurement.measurement import Measurement
+from sysid.measurement.whole import NoiseLevels
+from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.response import columns, gains
 from sysid.models.geometry import Geometry
 from sysid.models.model import Stated
 from sysid.problem.formulation import Formulation
-from sysid.problem.problem import Problem
+from sysid.problem.prepared import PreparedProblem
 from sysid.structure.structure import Array, ComplexArray, Structure
 
 UNIT_MASS = "no number with a unit of mass is given: masses are normalised to 1 kg in each base direction"
@@ -47,7 +49,7 @@ def speaks(formulation: Formulation) -> bool:
     return told and formulation.by_ratios and formulation.geometry.at_sensors and formulation.test_alone
 
 
-def verdict(problem: Problem, structure: Structure) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def verdict(problem: PreparedProblem, structure: Structure) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What closes the modal masses of `structure`, and what is left open, in sentences.
 
     What counts as seen is judged against the misfit that the structure leaves: a mode whose share of
@@ -58,7 +60,7 @@ def verdict(problem: Problem, structure: Structure) -> tuple[tuple[str, ...], tu
     misfit = test.residual(structure)
     known = _known(problem, structure, misfit)
     free, common = _open_modes(known)
-    responses = _responses(test, structure)
+    responses = _responses(problem.modal[0], structure)
     open_ = [*_unseen(problem, structure, misfit, responses, free), *_merged(known, test, structure, free, responses)]
     if free:
         bounded = ", within what is stated" if len(known.equations) else ""
@@ -111,22 +113,22 @@ def _what_is_open(structure: Structure, free: list[int], common: bool) -> str:
     return f"{', '.join(others)} and {last} are open" if others else f"{last} is open"
 
 
-def open_modes(problem: Problem, structure: Structure) -> list[int]:
+def open_modes(problem: PreparedProblem, structure: Structure) -> list[int]:
     """Modes, counted from 0, whose modal mass neither the records nor the stated models fix."""
     return _open_modes(_known(problem, structure, problem.measurement.residual(structure)))[0]
 
 
-def scale_is_open(problem: Problem, structure: Structure) -> bool:
+def scale_is_open(problem: PreparedProblem, structure: Structure) -> bool:
     """Whether one scale of mass, stiffness and damping is open, and nothing else."""
     return _open_modes(_known(problem, structure, problem.measurement.residual(structure)))[1]
 
 
-def ends(problem: Problem, structure: Structure) -> tuple[Array, Array]:
+def ends(problem: PreparedProblem, structure: Structure) -> tuple[Array, Array]:
     """How far each entry of M_SS and K_SS may go over the modal-mass cone.
 
     Parameters
     ----------
-    problem : Problem
+    problem : PreparedProblem
     structure : Structure
         A member of the cone, and one that the models of `problem` can hold: what is known is taken to be equal to what
         it has, so that misfit closes nothing. Its poles, residues and mode shapes are kept, also the shape of a mode
@@ -191,9 +193,9 @@ class _Known(NamedTuple):
     sentence: str
 
 
-def _known(problem: Problem, structure: Structure, misfit: float) -> _Known:
+def _known(problem: PreparedProblem, structure: Structure, misfit: float) -> _Known:
     clusters = _clusters(structure, misfit)
-    weighed = _weighed(problem.measurement, structure, clusters)
+    weighed = _weighed(problem.modal[0], structure, clusters)
     return _Known(clusters, weighed, *_model_equations(problem, structure, unknowns(clusters)))
 
 
@@ -209,7 +211,7 @@ def _open_modes(known: _Known) -> tuple[list[int], bool]:
     return free, bool(common) and sum(map(len, known.clusters)) > 1
 
 
-def _cone(problem: Problem, structure: Structure, known: _Known) -> Cone:
+def _cone(problem: PreparedProblem, structure: Structure, known: _Known) -> Cone:
     """The modal-mass cone, with the bounds that a total mass or a rigid-body mass puts on it."""
     totals, n = problem.formulation.mass.totals, structure.n
     visible = sum((W @ (W.T @ structure.participation) for W in _moved(structure, known.clusters)), np.zeros((n, 1)))
@@ -262,12 +264,12 @@ def _moved(structure: Structure, clusters: list[list[int]]) -> list[Array]:
     return moved
 
 
-def _weighed(test: Measurement, structure: Structure, clusters: list[list[int]]) -> list[Array]:
+def _weighed(modal: ModalEstimate, structure: Structure, clusters: list[list[int]]) -> list[Array]:
     """The same for what stands out of the misfit of the base force."""
-    record = _forces(test, structure)
+    record = _forces(modal, structure)
     if record is None:
         return []
-    weighed = [_seen(test, structure, cluster, structure.participation.T, record) for cluster in clusters]
+    weighed = [_seen(modal.records, structure, cluster, structure.participation.T, record) for cluster in clusters]
     return [W for W in weighed if W.shape[1]]
 
 
@@ -334,18 +336,20 @@ def _record_a_line(record: ComplexArray, predicted: ComplexArray, std: Array) ->
     return _Record(weight, size, left / size, float(_RESOLVED * more / np.sqrt(2) / size))
 
 
-def _responses(test: Measurement, structure: Structure) -> _Record:
+def _responses(modal: ModalEstimate, structure: Structure) -> _Record:
     """The relative accelerations."""
-    if test.modal is not None and test.response_std is not None:
+    test = modal.records
+    if modal.has_modes and test.response_std is not None:
         return _record_a_line(test.relative, test.predict(structure), test.response_std)
     return _record(test.relative, test.predict(structure), test.response_std, _CLEAR)
 
 
-def _forces(test: Measurement, structure: Structure) -> _Record | None:
+def _forces(modal: ModalEstimate, structure: Structure) -> _Record | None:
     """The base force, where it was measured."""
+    test = modal.records
     if test.force is None:
         return None
-    if test.modal is not None and test.force_std is not None:
+    if modal.has_modes and test.force_std is not None:
         return _record_a_line(test.force, test.predict_force(structure), test.force_std)
     return _record(test.force, test.predict_force(structure), test.force_std, 1.0)
 
@@ -369,7 +373,7 @@ def _seen(test: Measurement, structure: Structure, cluster: list[int], rows: Arr
 
 
 def _unseen(
-    problem: Problem, structure: Structure, misfit: float, responses: _Record, free: list[int]
+    problem: PreparedProblem, structure: Structure, misfit: float, responses: _Record, free: list[int]
 ) -> Iterator[str]:
     """What the records do not show, in sentences; a mode needs no force of its own where what is stated fixes it."""
     test = problem.measurement
@@ -377,14 +381,15 @@ def _unseen(
     sizes = np.linalg.norm(base, axis=1, keepdims=True)
     spread = np.linalg.svd(base / np.where(sizes > 0, sizes, 1.0), compute_uv=False)
     # With the noise of the base known, a direction is not moved where that noise makes most of its motion.
-    chance = min(misfit, 0.5) if test.modal is None else _base_noise(test, sizes.ravel()) / spread[0]
+    noise = problem.modal[0].noise
+    chance = min(misfit, 0.5) if noise is None else _base_noise(problem.modal[0], noise, sizes.ravel()) / spread[0]
     rank = int(np.count_nonzero(spread > max(1e-9, chance) * spread[0]))
     if rank < test.n_base:
         yield f"the base moves in only {rank} of {test.n_base} independent directions: responses to the others are open"
     count = int(np.count_nonzero(~problem.formulation.outside))
     if 2 * test.response.size < count:
         yield f"{2 * test.response.size} measured numbers cannot fix {count} unknowns"
-    forces = _forces(test, structure)
+    forces = _forces(problem.modal[0], structure)
     for k in range(structure.n):
         f, push = structure.natural_frequencies[k], structure.participation[[k]]
         (share,) = _shares(test, structure, k, structure.mode_shapes[:, [k]], push, responses)
@@ -409,12 +414,11 @@ def _unseen(
             )
 
 
-def _base_noise(test: Measurement, sizes: Array) -> float:
+def _base_noise(modal: ModalEstimate, noise: NoiseLevels, sizes: Array) -> float:
     """Largest noise of a base direction over all lines, its record's size being 1."""
-    assert test.modal is not None
-    lines = test.modal.density * np.count_nonzero(test.own_lines, axis=1)
-    noise = np.sqrt(np.sum(test.modal.noise.base**2 * lines[:, None], axis=0))
-    return float(np.max(noise / np.where(sizes > 0, sizes, np.inf)))
+    lines = modal.density * np.count_nonzero(modal.records.own_lines, axis=1)
+    size = np.sqrt(np.sum(noise.base**2 * lines[:, None], axis=0))
+    return float(np.max(size / np.where(sizes > 0, sizes, np.inf)))
 
 
 def _clusters(structure: Structure, misfit: float) -> list[list[int]]:
@@ -425,7 +429,7 @@ def _clusters(structure: Structure, misfit: float) -> list[list[int]]:
     return [part.tolist() for part in np.split(np.arange(structure.n), np.flatnonzero(apart) + 1)]
 
 
-def _model_equations(problem: Problem, structure: Structure, pairs: Pairs) -> tuple[Array, Array | None, str]:
+def _model_equations(problem: PreparedProblem, structure: Structure, pairs: Pairs) -> tuple[Array, Array | None, str]:
     """What the stated models add: `_Known.equations`, `signs` and `sentence`."""
     nothing = np.zeros((0, len(pairs)))
     if not structure.at_sensors:

@@ -36,7 +36,7 @@ from sysid.modal_analysis.modal_fit import Index, Modes
 from sysid.modal_analysis.response import columns, weights_of_test
 from sysid.models.unknowns import by_name, split
 from sysid.problem.formulation import Formulation
-from sysid.problem.problem import Problem
+from sysid.problem.prepared import PreparedProblem
 from sysid.problem.slopes import Slopes, rows_of_test, slopes_of
 from sysid.structure.structure import Array, Structure, check_frequencies
 
@@ -174,12 +174,12 @@ class Uncertainty:
         return self._spectra.base_force(check_frequencies(freq, increasing=False))
 
 
-def uncertainty(problem: Problem, structure: Structure, x: Array | None) -> Uncertainty:
+def uncertainty(problem: PreparedProblem, structure: Structure, x: Array | None) -> Uncertainty:
     """Standard deviations of everything that was identified.
 
     Parameters
     ----------
-    problem : Problem
+    problem : PreparedProblem
         The standard deviations that its measurement states are the noise; where none are stated, the misfit that
         `structure` leaves is.
     structure : Structure
@@ -203,11 +203,11 @@ def uncertainty(problem: Problem, structure: Structure, x: Array | None) -> Unce
     return _by_unknowns(problem, structure, problem.values(structure) if x is None else x)
 
 
-def _by_modes(problem: Problem, structure: Structure, x: Array | None) -> Uncertainty:
+def _by_modes(problem: PreparedProblem, structure: Structure, x: Array | None) -> Uncertainty:
     """Standard deviations where the modal parameters are free, from their Fisher information."""
     test = problem.measurement
     modes, index, inflation, normals, unseen, shifts = moves_by_records(problem, structure, gains=True)
-    possible = gain_errors(test, structure).possible
+    possible = gain_errors(problem.modal[0], structure).possible
     # What makes up for an error that a gain may have counts beside the noise.
     normals = np.hstack([normals, (shifts * possible)[:, possible > 0]])
     normals, unseen, shifts = conditioned(problem, structure, modes, index, normals, unseen, shifts)
@@ -229,39 +229,39 @@ def _by_modes(problem: Problem, structure: Structure, x: Array | None) -> Uncert
 
 
 def moves_by_records(
-    problem: Problem, structure: Structure, *, gains: bool = False
+    problem: PreparedProblem, structure: Structure, *, gains: bool = False
 ) -> tuple[Modes, Index, float, Array, Array, Array]:
     """Modes, index, inflation, and moves of theta that the records leave: of a standard normal each, and unseen.
 
     With `gains` also what an error of one of each sensor's gain makes of theta, in columns; none without it.
     """
-    test, modes = problem.measurement, modes_of(structure)
+    modal, modes = problem.modal[0], modes_of(structure)
+    test = modal.records
     index = Index(structure.n_sensors, structure.n, structure.n_base)
     path = parametrisation(problem, structure, modes, index)
     unknowns = path.unit.size - path.gauge.shape[1]
     records, B, spectra = records_of(test, structure, unknowns), None, None
-    if test.modal is not None:
-        A, B = information_about(test.modal, modes)
+    if modal.has_modes:
+        A, B = information_about(modal, modes)
     else:
         spectra = spectra_of(test, modes)
         A = information(modes, index, [record.grams(spectra) for record in records])
         if not all(record.shared for record in records):
             B = information(modes, index, [record.sandwich_grams(spectra) for record in records])
     normals, unseen = spread(A, B, path)
-    inflation = inflation_of(test, records, unknowns)
+    inflation = inflation_of(test, records, unknowns, modal.scattered)
     shifts = np.zeros((index.size, 0))
     if gains:
         if spectra is not None:
             pulls = gain_gradients(modes, index, test.rigid_body, records[0].grams(spectra))
         else:
-            assert test.modal is not None
-            pulls = A @ shifts_about(test.modal, modes)
+            pulls = A @ shifts_about(modal, modes)
         plain = normals if B is None else spread(A, None, path)[0]
         shifts = 2 * plain @ (plain.T @ pulls)  # these make half the inverse of the information
     return modes, index, inflation, (1.0 if np.isnan(inflation) else inflation) * normals, unseen, shifts
 
 
-def _by_unknowns(problem: Problem, structure: Structure, x: Array) -> Uncertainty:
+def _by_unknowns(problem: PreparedProblem, structure: Structure, x: Array) -> Uncertainty:
     """Standard deviations from the Jacobian of all that is fitted, in the problem's unknowns."""
     test, modes = problem.measurement, modes_of(structure)
     formulation, x = with_totals(problem, structure, x)
@@ -271,8 +271,10 @@ def _by_unknowns(problem: Problem, structure: Structure, x: Array) -> Uncertaint
     if formulation.fits_records:
         known, shifts = _with_gains(formulation, x, slopes, known)
     steps, count = known.steps, known.normals.shape[1]
-    weighed = test if structure.modal_damping else replace(test, modal=None)  # as `rows_of_test` does
-    inflation = inflation_of(weighed, records_of(test, structure, x.size), x.size) if formulation.fits_records else 1.0
+    scattered = problem.modal[0].scattered if structure.modal_damping else None  # as `rows_of_test` does
+    inflation = 1.0
+    if formulation.fits_records:
+        inflation = inflation_of(test, records_of(test, structure, x.size), x.size, scattered)
     shapes = np.einsum("si,ikc->skc", structure.recovery, slopes.d_shapes)
     parts = (shapes, slopes.d_participation, slopes.d_log_omega, slopes.d_log_ratios, slopes.d_rigid)
     moves = Perturbations(count, *(part @ steps for part in parts))
@@ -294,14 +296,14 @@ def _with_gains(formulation: Formulation, x: Array, slopes: Slopes, known: Sensi
     """
     own, structure = formulation.own_test, slopes.structure
     test = own.test
-    possible = gain_errors(test, structure).possible
-    rows = rows_of_test(test, slopes, x.size, share=own.weight)[0]
+    possible = gain_errors(own.modal, structure).possible
+    rows = rows_of_test(own.modal, slopes, x.size, share=own.weight)[0]
     weight, scale = weights_of_test(test, weighted=True)[0]
     whole = columns(test.predict(structure) + test.response - test.relative)  # G u + a
     size = own.weight * weight / scale * whole
-    if test.modal is not None and len(rows.jacobian) != 2 * size.size:  # rows of modes in place of those of lines
-        factor = own.weight / scale * independent_rows(test.modal)[0]
-        pull = rows.jacobian.T @ (factor @ test.modal.gain.moves)
+    if len(rows.jacobian) != 2 * size.size:  # rows of modes in place of those of lines
+        factor = own.weight / scale * independent_rows(own.modal)[0]
+        pull = rows.jacobian.T @ (factor @ own.modal.gain.moves)
     else:
         pulls = rows.jacobian.reshape(2, *size.shape, -1)
         pull = np.einsum("slc,sl->cs", pulls[0], size.real) + np.einsum("slc,sl->cs", pulls[1], size.imag)
@@ -312,7 +314,7 @@ def _with_gains(formulation: Formulation, x: Array, slopes: Slopes, known: Sensi
 
 
 def _with_unknowns(
-    found: Uncertainty, problem: Problem, formulation: Formulation, x: Array, known: Sensitivity
+    found: Uncertainty, problem: PreparedProblem, formulation: Formulation, x: Array, known: Sensitivity
 ) -> Uncertainty:
     """Add the unknowns that mean something by themselves, and their covariance where all do."""
     unknowns, names = formulation.unknowns, {unknown.name for unknown in problem.variables}
@@ -342,7 +344,7 @@ def modes_of(structure: Structure) -> Modes:
 
 
 def _quantities(
-    problem: Problem, structure: Structure, modes: Modes, moves: Perturbations, inflation: float,
+    problem: PreparedProblem, structure: Structure, modes: Modes, moves: Perturbations, inflation: float,
     matrices: Sequence[Array], by_gain: Array,
 ) -> Uncertainty:  # fmt: skip
     """Standard deviations of all quantities from the perturbations; `matrices` are those of M_SS, K_SS and C.

@@ -30,13 +30,14 @@ from sysid.cli.files import alone_in
 from sysid.cli.output import Output, collected_warnings, keep_for_document, strict_json
 from sysid.cli.status import BUG, INTERRUPTED, MISTAKE, NOT_REACHED, SUCCESS
 from sysid.errors import InputError, SolverError
-from sysid.identify import NAMED, identify
+from sysid.identify import identify
 from sysid.results.checkpoint import FILE_NAME as UNFINISHED
 from sysid.results.checkpoint import Checkpoint
 from sysid.results.identification import Identification
 from sysid.results.storage import FILE_NAME as RESULT
 from sysid.results.storage import atomically, missing_folders, remove_empty
 from sysid.results.version import __version__
+from sysid.search.auto import NAMED
 from sysid.search.deadline import TimeIsOver, within
 from sysid.search.refinement import RefineBy
 from sysid.search.session import LEAST, DeferredInterrupt
@@ -167,7 +168,7 @@ def _run_in(folder: Path, options: argparse.Namespace, out: Output) -> int:
     if options.fresh:
         checkpoint.remove()
     test = problem.measurement
-    formulation = problem.formulate(problem.unsearched)
+    formulation = problem.declared
     if search.refine_by is not None and not formulation.refinable:
         raise InputError(
             f"--refine-by {search.refine_by}: the stiffness of this problem has a form of its own, whose frequencies "

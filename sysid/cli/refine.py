@@ -70,7 +70,7 @@ def _run_in(folder: Path, result: Identification, recipe: Recipe, options: argpa
         elif options.draws is not None:
             draws.tell(folder, result, recipe, ends, out)
         else:
-            minima = distinct(result.problem, ends)
+            minima = distinct(result.prepared, ends)
             out.write(f"\n{table(minima, len(ends))}\n\n")
             out.answer(minima=[_figures(minimum) for minimum in minima])
             _write(folder, recipe, ends, minima, result.problem, out)

@@ -18,15 +18,16 @@ import numpy as np
 from sysid.assessment.determination import determine
 from sysid.assessment.sensitivity import Sensitivity, directions_in_words, sensitivity
 from sysid.errors import InputError, SysidError
-from sysid.identify import choose, identify
+from sysid.identify import identify
 from sysid.measurement.measurement import Measurement
 from sysid.models.unknowns import Unknown, scales_of, slices_of
 from sysid.nlp import quiet_options
 from sysid.problem.feasibility import HELD, LOOSE, points_of
+from sysid.problem.prepared import PreparedProblem
 from sysid.problem.problem import Problem
 from sysid.problem.slopes import Slopes, slopes_of
-from sysid.problem.terms import FurtherTest
 from sysid.results.summary import counted
+from sysid.search.auto import choose
 from sysid.structure.structure import Array, ComplexArray, Structure
 
 _WIDTH = 120
@@ -61,23 +62,24 @@ def show(problem: Problem, name: str) -> str:
     InputError
         Where the problem cannot be searched, or the Jacobian is finite at no point that was looked at.
     """
-    problem.check()
-    judged = problem.screened  # as a search judges them
-    blocks = (_test(problem, name), _variables(problem), _unknowns(problem), _at(judged, _point(judged)))
+    prepared = problem.prepared
+    prepared.check()
+    judged = prepared.screened  # as a search judges them
+    blocks = (_test(problem, name), _variables(problem), _unknowns(judged), _at(judged, _point(judged, problem)))
     return "\n\n".join("\n".join(_folded(line) for line in block) for block in blocks)
 
 
 def figures(problem: Problem, name: str) -> dict[str, Any]:
     """What `show` tells, for scripts: numbers, texts, and lists and dictionaries of them; errors as there."""
     problem.check()
-    test, point = problem.measurement, _point(problem.screened)
+    test, point = problem.measurement, _point(problem.prepared.screened, problem)
     known = point.known
     members = zip(problem.variables, slices_of(problem.variables), strict=True)
     return {
         "problem": name,
         "sensors": list(test.sensor_names),
         "base_axes": list(test.base_axes or ()),
-        "strategy": choose("auto", problem, None)[0].name,
+        "strategy": choose("auto", problem.prepared, None)[0].name,
         "degrees_of_freedom": problem.geometry.n,
         "unknowns": problem.n_variables,
         "variables": [
@@ -107,7 +109,7 @@ def _test(problem: Problem, name: str) -> Iterator[str]:
     )
     known = [sentence for holds, sentence in stated if holds]
     yield "; ".join([f"degrees of freedom {problem.geometry.n}, unknowns {problem.n_variables}", *known])
-    yield f"--strategy auto takes {choose('auto', problem, None)[1]}"
+    yield f"--strategy auto takes {choose('auto', problem.prepared, None)[1]}"
 
 
 def _records(test: Measurement) -> str:
@@ -138,7 +140,7 @@ def _variable(v: Unknown, declared: str) -> list[str]:
     return [v.title, shape, v.unit or "-", _range(v.lower), _range(v.upper), guess, scale, declared]
 
 
-def _unknowns(problem: Problem) -> Iterator[str]:
+def _unknowns(problem: PreparedProblem) -> Iterator[str]:
     """Variables by matrix; a model counts its own, a written matrix all that enter it."""
     formulation = problem.formulation
     told, counts = {v.name: f"{v.title} ({v.size})" for v in formulation.unknowns}, dict(problem.unknowns)
@@ -167,16 +169,16 @@ class _Point:
     in_box: bool = False  # a point of the search space, the guess or another
 
 
-def _point(problem: Problem) -> _Point:
+def _point(problem: PreparedProblem, stated: Problem) -> _Point:
     """The point at which the data are judged: the reference, what the modal strategy finds, or a guess."""
     sentences: tuple[str, ...] = ()
     found = _at_reference(problem)
     if found is None and choose("auto", problem, None)[0].name == "modal":
-        found, sentences = _at_modes(problem)
+        found, sentences = _at_modes(problem, stated)
     return found or _at_guess(problem, sentences)
 
 
-def _at_guess(problem: Problem, sentences: tuple[str, ...]) -> _Point:
+def _at_guess(problem: PreparedProblem, sentences: tuple[str, ...]) -> _Point:
     """The guess, else the first of some points of the search space at which there are derivatives."""
     # A free stiffness has all its frequencies equal in the middle of its search space.
     free = problem.formulation.stiffness.free
@@ -192,7 +194,7 @@ def _at_guess(problem: Problem, sentences: tuple[str, ...]) -> _Point:
     return replace(point, sentences=sentences, at_guess=guess is not None, in_box=True)
 
 
-def _first_judged(problem: Problem, names: Sequence[str], start: int) -> _Point | None:
+def _first_judged(problem: PreparedProblem, names: Sequence[str], start: int) -> _Point | None:
     """The first of the named points of the search space, from `start` on, at which there are derivatives."""
     for x, where in list(zip(points_of(problem.formulation), names, strict=False))[start:]:
         with contextlib.suppress(InputError, np.linalg.LinAlgError):
@@ -200,7 +202,7 @@ def _first_judged(problem: Problem, names: Sequence[str], start: int) -> _Point 
     return None
 
 
-def _feasible(problem: Problem, x: Array, where: str) -> tuple[Array, str]:
+def _feasible(problem: PreparedProblem, x: Array, where: str) -> tuple[Array, str]:
     """The point next to `x` that keeps the constraints, clear of inequalities where it can be, and where that is."""
     constraints = problem.formulation.constraints
     # What each makes over the search space.
@@ -223,7 +225,7 @@ def _feasible(problem: Problem, x: Array, where: str) -> tuple[Array, str]:
     return x, f"{where}, where the constraints do not hold"
 
 
-def _judged(problem: Problem, x: Array, where: str) -> _Point:
+def _judged(problem: PreparedProblem, x: Array, where: str) -> _Point:
     with np.errstate(all="ignore"):  # what is not finite is passed over
         slopes = slopes_of(problem.formulation.matrices, x, problem.measurement)
         known = sensitivity(problem.formulation, x, slopes, as_stated=True)
@@ -232,9 +234,9 @@ def _judged(problem: Problem, x: Array, where: str) -> _Point:
     return _Point(x, slopes, known, where)
 
 
-def _at_reference(problem: Problem) -> _Point | None:
+def _at_reference(problem: PreparedProblem) -> _Point | None:
     """The reference, where there is one that the models can hold or come near."""
-    truth = problem.reference
+    truth = problem.stated.reference
     if truth is None or not (truth.at_sensors and problem.geometry.at_sensors):
         return None
     try:
@@ -259,10 +261,10 @@ def _sizes(matrix: Array) -> Array:
     return np.outer(root, root)
 
 
-def _at_modes(problem: Problem) -> tuple[_Point | None, tuple[str, ...]]:
+def _at_modes(problem: PreparedProblem, stated: Problem) -> tuple[_Point | None, tuple[str, ...]]:
     """What the modal strategy finds in the data; only sentences where it has other degrees of freedom."""
     try:
-        found = identify(problem, strategy="modal", rng=0)
+        found = identify(stated, strategy="modal", rng=0)
     except SysidError:
         return None, ()
     sentences = (*found.closed_by, *found.undetermined)
@@ -275,13 +277,13 @@ def _at_modes(problem: Problem) -> tuple[_Point | None, tuple[str, ...]]:
 # -- what the data determine --------------------------------------------------------------------
 
 
-def _at(problem: Problem, point: _Point) -> Iterator[str]:
+def _at(problem: PreparedProblem, point: _Point) -> Iterator[str]:
     """Values, units and expected errors; rank; what is not seen, and what is seen least."""
     known, count = point.known, point.x.size
     noise = "the stated noise" if _all_stated(problem) else f"{100 * _NOISE:g} % noise"
     moves = _moves(problem, point)
     free = known.free.shape[1]
-    missed = problem.reference is not None and point.in_box
+    missed = problem.stated.reference is not None and point.in_box
     yield f"At {point.where}" + (" (the models cannot be inverted to the reference):" if missed else ":")
     yield from _values(problem, point, moves, noise)
     yield from _coordinates(problem)
@@ -304,7 +306,7 @@ def _at(problem: Problem, point: _Point) -> Iterator[str]:
     yield from (f"  - {sentence}" for sentence in point.sentences)
 
 
-def _values(problem: Problem, point: _Point, moves: Array, noise: str) -> Iterator[str]:
+def _values(problem: PreparedProblem, point: _Point, moves: Array, noise: str) -> Iterator[str]:
     """A line a variable: the largest error of its entries stands for all."""
     known, x = point.known, point.x
     std = np.linalg.norm(moves, axis=1)
@@ -322,7 +324,7 @@ def _values(problem: Problem, point: _Point, moves: Array, noise: str) -> Iterat
     yield from _table(rows)
 
 
-def _coordinates(problem: Problem) -> Iterator[str]:
+def _coordinates(problem: PreparedProblem) -> Iterator[str]:
     """What IPOPT has in the place of these unknowns, or beside them."""
     formulation = problem.formulation
     if problem.free_modes:
@@ -335,7 +337,7 @@ def _coordinates(problem: Problem) -> Iterator[str]:
         yield f"IPOPT has mode shapes and frequencies as further unknowns{held}, as damping is by ratios"
 
 
-def _unseen(problem: Problem, point: _Point) -> Iterator[str]:
+def _unseen(problem: PreparedProblem, point: _Point) -> Iterator[str]:
     """The null directions: what they change, and the shortest in words."""
     known, x = point.known, point.x
     words = sorted(directions_in_words(problem.variables, x, known.unit, known.unseen), key=len)
@@ -377,7 +379,7 @@ def _moved_matrices(point: _Point) -> tuple[int, int]:
     return rank, int(np.linalg.matrix_rank(np.concatenate([own, base]), tol=_SAME)) - rank
 
 
-def _seen_least(problem: Problem, point: _Point, moves: Array, noise: str) -> str:
+def _seen_least(problem: PreparedProblem, point: _Point, moves: Array, noise: str) -> str:
     """The direction of the largest variance, in units."""
     known = point.known
     U, s, _ = np.linalg.svd(moves / known.unit[:, None], full_matrices=False)
@@ -386,7 +388,7 @@ def _seen_least(problem: Problem, point: _Point, moves: Array, noise: str) -> st
     return f"  - seen least: {words}; its standard deviation at {noise} is {size:.3g} times that"
 
 
-def _moves(problem: Problem, point: _Point) -> Array:
+def _moves(problem: PreparedProblem, point: _Point) -> Array:
     """Moves of x that one standard normal of noise each makes, (p, rank); of 1 % noise where none is stated."""
     formulation, known = problem.formulation, point.known
     if not formulation.fits_records:
@@ -396,15 +398,11 @@ def _moves(problem: Problem, point: _Point) -> Array:
         return known.unit[:, None] * known.seen / s * (_NOISE / np.sqrt(rows))
     if _all_stated(problem):
         return known.normals
-    residuals = [
-        replace(r, measurement=_with_noise(r.measurement)) if isinstance(r, FurtherTest) else r
-        for r in problem.residuals
-    ]
-    noisy = replace(problem, measurement=_with_noise(problem.measurement), residuals=residuals)
+    noisy = problem.of_lines(_with_noise(one.records) for one in problem.modal)
     return sensitivity(noisy.formulation, point.x, point.slopes, as_stated=True).normals
 
 
-def _all_stated(problem: Problem) -> bool:
+def _all_stated(problem: PreparedProblem) -> bool:
     """Whether every record that is fitted states its noise."""
     formulation = problem.formulation
     return formulation.fits_records and all(_noise_is_stated(term.test) for term in formulation.tests)
@@ -421,7 +419,7 @@ def _with_noise(test: Measurement) -> Measurement:
         return np.array(_NOISE * np.sqrt(np.mean(np.abs(record) ** 2))) if stated is None else stated
 
     force_std = None if test.force is None else std(test.force, test.force_std)
-    return replace(test, response_std=std(test.response, test.response_std), force_std=force_std, modal=None)
+    return replace(test, response_std=std(test.response, test.response_std), force_std=force_std)
 
 
 # -- lines --------------------------------------------------------------------------------------

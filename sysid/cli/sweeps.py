@@ -92,7 +92,7 @@ def _orders(low: int, high: int, problem: Problem) -> tuple[tuple[Change, ...], 
     """Numbers of modes up to those that stand out of the noise, and what the jobs are."""
     changes, told = tuple(Modes(count) for count in range(low, high + 1)), "identification{s}, each of so many modes"
     _check_possible(changes, problem)
-    found = poles_of(problem.screened).omega.size
+    found = poles_of(problem.prepared.screened).omega.size
     if low > found:
         raise InputError(f"{found} modes stand out of the noise, fewer than the {low} asked for")
     return changes[: found + 1 - low], told if high <= found else f"{told}: no more than {found} stand out of the noise"

@@ -12,9 +12,9 @@ from sysid.cli import parameters, read, trust
 from sysid.cli.files import results_folder
 from sysid.cli.output import Output
 from sysid.errors import InputError
-from sysid.identify import NAMED
 from sysid.results.checkpoint import FILE_NAME, Begun, Checkpoint
 from sysid.results.identification import Recipe
+from sysid.search.auto import NAMED
 from sysid.search.strategy import Strategy
 from sysid.search.swarm import Swarm
 

@@ -11,10 +11,11 @@ import numpy as np
 from sysid.compare import peers
 from sysid.compare.method_result import MethodResult, Recorder, Status, errors_of, status_of
 from sysid.errors import InputError, SolverError
-from sysid.identify import NAMED, identify, prepare
+from sysid.identify import identify, prepare
 from sysid.nlp import one_thread
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification
+from sysid.search.auto import NAMED
 from sysid.search.session import DeferredInterrupt, Session
 from sysid.search.strategy import DoesNotApplyError, Strategy
 from sysid.search.swarm import Swarm
@@ -120,12 +121,12 @@ def _results(problem: Problem, rng: int, max_time: float | None) -> Iterator[Met
     """Run one method after the other."""
     with one_thread(), DeferredInterrupt() as interrupt:
         session = Session([], interrupt)
-        prepare(problem, session)
+        prepared = prepare(problem, session)
         strategies = {name: make() for name, make in NAMED.items()}
-        refusals = {name: strategy.refusal(problem, None) for name, strategy in strategies.items()}
+        refusals = {name: strategy.refusal(prepared, None) for name, strategy in strategies.items()}
         if all(refusals.values()):
             raise InputError(f"no strategy applies: {'; '.join(f'{name}: {why}' for name, why in refusals.items())}")
-        landscape = None if refusals[Swarm.name] else peers.Landscape.of(problem, session)
+        landscape = None if refusals[Swarm.name] else peers.Landscape.of(prepared, session)
         interrupt.check()
     most = 0
     for name, strategy in strategies.items():

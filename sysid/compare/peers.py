@@ -13,7 +13,7 @@ import numpy as np
 
 from sysid.compare.method_result import MethodResult, Recorder, Status, errors_of, status_of
 from sysid.errors import InputError, SolverError, how_to_install
-from sysid.problem.problem import Problem
+from sysid.problem.prepared import PreparedProblem
 from sysid.problem.terms import TestTerm
 from sysid.results.judgement import verdict_of
 from sysid.search.continuation import descend
@@ -49,18 +49,18 @@ class Landscape:
 
     Attributes
     ----------
-    problem : Problem
+    problem : PreparedProblem
     objective : SwarmObjective
     steps : list of tuple of TestTerm
         Tests with widened peaks for the local phase, where the swarm takes them.
     """
 
-    problem: Problem
+    problem: PreparedProblem
     objective: SwarmObjective
     steps: list[tuple[TestTerm, ...]]
 
     @classmethod
-    def of(cls, problem: Problem, session: Session) -> Landscape:
+    def of(cls, problem: PreparedProblem, session: Session) -> Landscape:
         """The objective and the steps that the strategy "swarm" takes for a problem; both compiled."""
         objective, steps = Swarm().searched(problem, session)
         objective(problem.formulation.box[0][None])
@@ -136,7 +136,7 @@ def run(name: str, landscape: Landscape, most: int, session: Session, recorder: 
         problem.objective(start),
         problem.objective(x),
         problem.residual(x),
-        errors_of(structure, problem.reference),
+        errors_of(structure, problem.stated.reference),
         evaluator.count,
         session.seconds,
         (("search", np.array(evaluator.curve).reshape(-1, 2)), *recorder.phases),

@@ -13,6 +13,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.residues import independent
 from sysid.modal_analysis.transients import without_transients_of
 from sysid.models.stiffness import SpectralStiffness
+from sysid.problem.prepared import PreparedProblem
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification
 
@@ -42,7 +43,7 @@ class Band:
         """The problem with these lines alone."""
         return _on(problem, problem.measurement.in_band(self.low, self.high))
 
-    def predicted(self, problem: Problem, result: Identification) -> float:
+    def predicted(self, problem: PreparedProblem, result: Identification) -> float:
         """Relative residual of the lines outside; NaN where there are none, or mass and stiffness are free.
 
         Free matrices are those of the modes inside.
@@ -78,17 +79,17 @@ class WithoutRun:
         """The problem with the other runs; refused where they do not excite all that free matrices' modes need."""
         test = problem.measurement
         kept = _all_but(self.run, test.n_runs, "run")
-        if problem.free_modes and independent(test.base[kept]).shape[1] < independent(test.base).shape[1]:
+        if problem.declared.free_modes and independent(test.base[kept]).shape[1] < independent(test.base).shape[1]:
             raise InputError(
                 f"without run {self.run + 1} the base does not move in every direction: modes that this run alone "
                 "excites cannot be found from the others"
             )
-        return _on(problem, _runs(test, kept))
+        return _on(problem, test.of_runs(kept))
 
-    def predicted(self, problem: Problem, result: Identification) -> float:
+    def predicted(self, problem: PreparedProblem, result: Identification) -> float:
         """Relative residual of the run that was left out."""
         test = problem.measurement
-        left_out = _runs(test, ~_all_but(self.run, test.n_runs, "run"))
+        left_out = test.of_runs(~_all_but(self.run, test.n_runs, "run"))
         return without_transients_of(left_out, result.structure).residual(result.structure)
 
 
@@ -122,15 +123,15 @@ class WithoutSensor:
         """The problem with the other sensors."""
         test = problem.measurement
         kept = _all_but(self.sensor, test.n_sensors, "sensor")
-        other = _sensors(test, kept)
-        if problem.free_modes:
+        other = test.of_sensors(kept)
+        if problem.declared.free_modes:
             return _on(problem, other, stiffness=_for_fewer(problem.stiffness, test.n_sensors - 1))
         own = problem.recovery is None
         G = test.rigid_body if own else problem.rigid_body_dofs
         recovery = np.eye(test.n_sensors) if own else np.asarray(problem.recovery)
         return _on(problem, other, recovery=recovery[kept], rigid_body_dofs=G)
 
-    def predicted(self, problem: Problem, result: Identification) -> float:
+    def predicted(self, problem: PreparedProblem, result: Identification) -> float:
         """Relative residual of the sensor that was left out; NaN where the structure does not tell its motion."""
         if problem.free_modes or result.x is None:
             return np.nan
@@ -160,11 +161,11 @@ class Modes:
 
     def of(self, problem: Problem) -> Problem:
         """The problem itself, without the goal and the truth, which belong to all modes."""
-        if not problem.free_modes:
+        if not problem.declared.free_modes:
             raise InputError("the number of modes is open only where mass and stiffness are free")
         return replace(problem, goal=None, reference=None)
 
-    def predicted(self, problem: Problem, result: Identification) -> None:
+    def predicted(self, problem: PreparedProblem, result: Identification) -> None:
         """Nothing is left out: the validation tests are what is predicted."""
 
 
@@ -173,7 +174,7 @@ Change = Band | WithoutRun | WithoutSensor | Modes
 
 def _on(problem: Problem, test: Measurement, **others: Any) -> Problem:
     """The problem on another part of its test; a goal and the truth belonged to the whole one."""
-    if not problem.formulation.fits_records:
+    if not problem.declared.fits_records:
         raise InputError("the problem states a misfit of its own: what part of the records it reads is not known")
     return replace(problem, measurement=test, validation=(), reference=None, goal=None, **others)
 
@@ -193,25 +194,3 @@ def _for_fewer(stiffness: SpectralStiffness, sensors: int) -> SpectralStiffness:
     if given is None or np.size(given) <= sensors:
         return stiffness
     return SpectralStiffness(max_frequency=stiffness.max_frequency)
-
-
-def _runs(test: Measurement, kept: NDArray[np.bool_]) -> Measurement:
-    """The runs where `kept` is true."""
-    names = ("base", "response", "force", "response_std", "force_std")
-    given = {name: getattr(test, name) for name in names}
-    whole = None if test.whole is None else test.whole.of_runs(kept)
-    some = replace(test, whole=whole, **{name: record[kept] for name, record in given.items() if record is not None})
-    return some.at(np.any(some.own_lines, axis=0))
-
-
-def _sensors(test: Measurement, kept: NDArray[np.bool_]) -> Measurement:
-    """The sensors where `kept` is true."""
-    std, described = test.response_std, test.sensors
-    return replace(
-        test,
-        response=test.response[:, kept],
-        rigid_body=test.rigid_body[kept],
-        response_std=None if std is None else std[:, kept],
-        whole=None if test.whole is None else test.whole.of_sensors(kept),
-        sensors=None if described is None else tuple(one for one, keep in zip(described, kept, strict=True) if keep),
-    )

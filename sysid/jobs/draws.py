@@ -8,13 +8,16 @@ import numpy as np
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
+from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.misfit import inflation_of, misfits_of, records_of
-from sysid.problem.problem import Problem
+from sysid.modal_analysis.modal_estimate import ModalEstimate
+from sysid.problem.prepared import PreparedProblem
+from sysid.problem.stated import StatedProblem
 from sysid.problem.terms import FurtherTest, Prior
 from sysid.structure.structure import Array, ComplexArray, Structure
 
 
-def drawn(problem: Problem, x: Array, random: np.random.SeedSequence) -> Problem:
+def drawn(problem: PreparedProblem, x: Array, random: np.random.SeedSequence) -> StatedProblem:
     """The problem with records simulated from the structure of `x` in the place of the measured ones.
 
     Their noise has the stated standard deviations, raised as the linear uncertainty is where the misfit is larger, else
@@ -28,12 +31,12 @@ def drawn(problem: Problem, x: Array, random: np.random.SeedSequence) -> Problem
     InputError
         See `check_drawable`.
     """
-    check_drawable(problem)
+    check_drawable(problem.stated)
     formulation, rng = problem.formulation, np.random.default_rng(random)
     tests = iter(formulation.further_tests)
     priors = iter(formulation.priors)
     residuals = []
-    for given in problem.residuals:
+    for given in problem.stated.residuals:
         if isinstance(given, FurtherTest):
             term = next(tests)
             structure = term.matrices.structure(x, term.test)
@@ -43,18 +46,18 @@ def drawn(problem: Problem, x: Array, random: np.random.SeedSequence) -> Problem
             at = value + std * next(priors).numbers(x)
             again = replace(given, value=at + std * rng.standard_normal(at.size))
         residuals.append(again)
-    structure, test = problem.structure(x), problem.measurement
-    if test.whole is None:
-        test = _again(test, structure, problem.n_variables, rng)
+    structure, modal = problem.structure(x), problem.modal[0]
+    if modal.noise is None:
+        test = _again(modal.records, structure, problem.n_variables, rng)
     else:
-        test = _whole_again(test, problem.at_rest.measurement, structure, rng)
-    return replace(problem, measurement=test, residuals=residuals, validation=(), reference=None)
+        test = _whole_again(modal, modal.noise, structure, rng)
+    return replace(problem.stated, measurement=test, residuals=residuals, loss="squares", validation=(), reference=None)
 
 
-def check_drawable(problem: Problem) -> None:
+def check_drawable(problem: StatedProblem) -> None:
     """Refuse a problem with something fitted whose noise nobody knows: a misfit or residuals of the user's own."""
     own = [given for given in problem.residuals if not isinstance(given, FurtherTest | Prior)]
-    if own or not problem.formulation.fits_records:
+    if own or problem.misfit is not None:
         raise InputError(
             "draws of noise need records, and values known to some accuracy (Prior): what noise the misfit or the "
             "residuals have that this problem states for itself is not known"
@@ -66,19 +69,18 @@ def _again(test: Measurement, structure: Structure, unknowns: int, rng: np.rando
     inflation = inflation_of(test, records_of(test, structure, unknowns), unknowns)
     more = inflation if np.isfinite(inflation) else 1.0
     response, *force = [_noise(more * std, rng) - misfit for misfit, std in misfits_of(test, structure, unknowns)]
-    other = replace(test, response=test.response + response, modal=None)
+    other = replace(test, response=test.response + response)
     return other if test.force is None else replace(other, force=test.force + force[0])
 
 
 def _whole_again(
-    test: Measurement, at_rest: Measurement, structure: Structure, rng: np.random.Generator
+    modal: ModalEstimate, noise: NoiseLevels, structure: Structure, rng: np.random.Generator
 ) -> Measurement:
     """Whole records that the structure makes with the same transients, and noise of the same levels in all channels."""
-    assert test.whole is not None and at_rest.modal is not None
-    noise = at_rest.modal.noise
+    test, at_rest = modal.given, modal.records
 
     def drawn(record: ComplexArray, levels: Array) -> ComplexArray:
-        std = np.sqrt(test.whole.density)[:, None, None] * levels[..., None]  # type: ignore[union-attr]
+        std = np.sqrt(modal.density)[:, None, None] * levels[..., None]
         return np.where(test.own_lines[:, None], _noise(np.broadcast_to(std, record.shape), rng), 0.0)
 
     response = test.response - (at_rest.relative - at_rest.predict(structure)) + drawn(test.response, noise.response)

@@ -15,6 +15,7 @@ from sysid.jobs.changes import Change, Modes
 from sysid.jobs.draws import drawn
 from sysid.jobs.score import Score, scored
 from sysid.nlp import one_thread
+from sysid.problem.prepared import PreparedProblem
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.results.identification import Identification, Recipe
@@ -134,10 +135,13 @@ def _identified(job: Job, session: Session) -> JobResult:
     """
     problem = _built(replace(job.recipe, start=None), job.source)
     changed = problem if job.change is None else job.change.of(problem)
-    from_start = job.change is not None and job.strategy == "auto" and not changed.free_modes
+    from_start = job.change is not None and job.strategy == "auto" and not changed.declared.free_modes
     if job.recipe.start is not None and from_start:
-        x = as_unknowns(changed, np.array(job.recipe.start))
-        result = judge(changed, _descended(changed, x, [], session), "from the result's unknowns", job.seed, session)
+        prepared = changed.prepared
+        x = as_unknowns(prepared, np.array(job.recipe.start))
+        result = judge(
+            changed, prepared, _descended(prepared, x, [], session), "from the result's unknowns", job.seed, session
+        )
     else:
         strategy = Modal(modes=job.change.count) if isinstance(job.change, Modes) else job.strategy
         result = identify(changed, strategy=strategy, rng=job.seed)
@@ -155,26 +159,26 @@ def _identified(job: Job, session: Session) -> JobResult:
 def _predicted(problem: Problem, result: Identification, change: Change) -> float | None:
     """What was left out, as the rest predicts it; NaN where the rest does not tell all that the whole test does."""
     x = result.x
-    if x is not None and not problem.free_modes:
+    if x is not None and not problem.declared.free_modes:
         part, whole = (sensitivity(one.formulation, x, priors=False).rank for one in (result.problem, problem))
         if part < whole:
             return np.nan
     try:
-        return change.predicted(problem.screened, result)  # whose residual is of such records too
+        return change.predicted(problem.prepared.screened, result)  # whose residual is of such records too
     except InputError:  # such as a base that does not move outside a band
         return np.nan
 
 
 def _refined(job: Job, session: Session) -> JobResult:
     bare = replace(job.recipe, start=None)
-    problem = _built(bare, job.source)
+    problem = _built(bare, job.source).prepared
     own = job.start == 0 and job.recipe.start is not None
     if own:
         x = as_unknowns(problem, np.array(job.recipe.start))
         if job.draw:
             # Noise of the size that counts: there are no outliers in it, so that squares are as good.
-            fitted = problem if problem.loss == "squares" else problem.pseudo_values(problem.structure(x), x)
-            problem = drawn(fitted, x, np.random.SeedSequence(job.seed))
+            fitted = problem if problem.in_squares else problem.pseudo_values(problem.structure(x), x)
+            problem = PreparedProblem(drawn(fitted, x, np.random.SeedSequence(job.seed)))
     else:
         found = random_starts(problem, 1, np.random.SeedSequence(job.seed))
         if not found:
@@ -187,7 +191,7 @@ def _refined(job: Job, session: Session) -> JobResult:
     return JobResult(job.index, job.seed, verdict.success, verdict.message, end.x, problem.residual(end.x))
 
 
-def _descended(problem: Problem, x: Array, steps: list[tuple[TestTerm, ...]], session: Session) -> Outcome:
+def _descended(problem: PreparedProblem, x: Array, steps: list[tuple[TestTerm, ...]], session: Session) -> Outcome:
     """Where the local phase ends from `x`."""
     answer = descend(problem.screened, x, steps, session)
     if answer.stopped is not None:
@@ -209,6 +213,6 @@ def _built(recipe: Recipe, source: str) -> Problem:
 @lru_cache(maxsize=_BUILT)
 def _widened(recipe: Recipe, source: str) -> list[tuple[TestTerm, ...]]:
     """Its tests with widened peaks, step by step, once a worker."""
-    problem = _built(recipe, source)
+    problem = _built(recipe, source).prepared
     smoother = None if problem.free_modes else smoothed_tests(problem)
     return [] if smoother is None else smoother.steps

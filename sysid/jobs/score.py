@@ -227,10 +227,11 @@ def _nearest(own: Score, other: Score) -> list[tuple[int, int]]:
 
 def _weighted_misfits(result: Identification) -> Iterator[tuple[ComplexArray, float]]:
     """Misfits over the stated deviations, and the sum of the logarithms of these; those of one array share a scale."""
-    problem = result.problem
+    problem = result.prepared
     fits = problem.fits(result.structure, result.x)  # of the records as they are given
-    own = [] if problem.formulation.fits_records else [(result.measurement, result.structure)]
-    for test, structure in own + fits:
+    own = [] if problem.formulation.fits_records else [(problem.modal[0], result.structure)]
+    for modal, structure in own + fits:
+        test = modal.records
         parts = [(test.relative - test.predict(structure), test.response_std)]
         if test.force is not None:
             parts.append((test.force - test.predict_force(structure), test.force_std))
@@ -248,8 +249,8 @@ def _normal_deviance(misfit: ComplexArray) -> float:
 
 def _noise(result: Identification) -> float:
     """Variance of the accelerations' noise that the uncertainty supposes, over the stated one where one is stated."""
-    problem, test = result.problem, result.measurement
-    if problem.loss == "huber":
+    problem, test = result.prepared, result.measurement
+    if not problem.in_squares:
         counted = problem.pseudo_values(result.structure, result.x).measurement.response_std
         assert counted is not None
         return float(np.mean(counted**2) / (1.0 if test.response_std is None else np.mean(test.response_std**2)))
@@ -268,7 +269,7 @@ def _over(misfit: ComplexArray, std: Array | None, own: NDArray[np.bool_]) -> tu
 
 
 def _parameters(result: Identification) -> int:
-    problem, s = result.problem, result.structure
+    problem, s = result.prepared, result.structure
     formulation = problem.formulation
     if result.x is not None and not problem.free_modes:
         return sensitivity(formulation, result.x, priors=False).rank

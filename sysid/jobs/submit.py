@@ -13,13 +13,13 @@ from pathlib import Path
 
 from sysid import catalogue
 from sysid.errors import InputError, sequence, whole_number
-from sysid.identify import NAMED, NAMES
 from sysid.jobs.changes import Change
 from sysid.jobs.draws import check_drawable
 from sysid.jobs.engine import checked, each
 from sysid.jobs.job import Job, JobResult, run, without_result
 from sysid.jobs.ledger import Ledger
 from sysid.results.identification import Recipe
+from sysid.search.auto import NAMED, NAMES
 
 
 def submit(

@@ -15,7 +15,7 @@ from sysid.measurement.cuts import check_cuts
 from sysid.measurement.missing import Missing, complete, named, present
 from sysid.measurement.noise import levels_at_rest
 from sysid.measurement.rigid_body import axis_vector, check_axes, told_by
-from sysid.measurement.whole import ModalEstimate, NoiseLevels, WholeRecords, check_options, per_run
+from sysid.measurement.whole import NoiseLevels, WholeRecords, check_options, per_run
 from sysid.structure.axes import BASE_AXES, base_columns
 from sysid.structure.sensor import Sensor, checked_sensors, sensors_from_tree, sensors_to_tree
 from sysid.structure.structure import Array, ComplexArray, Structure, check_frequencies
@@ -58,8 +58,6 @@ class Measurement:
         Of spectra of whole records, which neither begin nor end at rest: see `from_time`.
     sample_rate : float, optional
         Hz; of the plain spectra of whole records, in m/s² s, that `from_time` gives with the estimator "spectra".
-    modal : ModalEstimate, optional
-        Of whole records whose transients were taken off: what they tell of the modes, with the noise of all channels.
 
     Notes
     -----
@@ -82,7 +80,6 @@ class Measurement:
     averaged: bool = field(default=False, kw_only=True)
     whole: WholeRecords | None = field(default=None, kw_only=True)
     sample_rate: float | None = field(default=None, kw_only=True)
-    modal: ModalEstimate | None = field(default=None, kw_only=True)
 
     def __post_init__(self, missing: Missing) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731 - a frozen class fills itself
@@ -225,6 +222,11 @@ class Measurement:
         return np.concatenate([self.base, ends], axis=1)
 
     @property
+    def is_whole(self) -> bool:
+        """Whether it is of whole records, which hold their transients."""
+        return self.whole is not None
+
+    @property
     def own_lines(self) -> NDArray[np.bool_]:
         """Which lines are a run's own, (runs, n_freq): whole records of other lengths have zeros at the others."""
         return np.any(self.base != 0, axis=1)
@@ -290,7 +292,26 @@ class Measurement:
         """The lines where `keep`, (n_freq,), is true."""
         given = {name: getattr(self, name) for name in _RECORDS}
         lines: Any = {name: record[..., keep] for name, record in given.items() if record is not None}
-        return replace(self, **lines, modal=None)
+        return replace(self, **lines)
+
+    def of_runs(self, keep: NDArray[np.bool_]) -> Measurement:
+        """The runs where `keep`, (runs,), is true, at their own lines."""
+        given = {name: getattr(self, name) for name in _RECORDS if name != "freq"}
+        runs: Any = {name: record[keep] for name, record in given.items() if record is not None}
+        some = replace(self, whole=None if self.whole is None else self.whole.of_runs(keep), **runs)
+        return some.at(np.any(some.own_lines, axis=0))
+
+    def of_sensors(self, keep: NDArray[np.bool_]) -> Measurement:
+        """The sensors where `keep`, (n_sensors,), is true."""
+        std, described = self.response_std, self.sensors
+        return replace(
+            self,
+            response=self.response[:, keep],
+            rigid_body=self.rigid_body[keep],
+            response_std=None if std is None else std[:, keep],
+            whole=None if self.whole is None else self.whole.of_sensors(keep),
+            sensors=None if described is None else tuple(one for one, own in zip(described, keep, strict=True) if own),
+        )
 
     @classmethod
     def from_frf(

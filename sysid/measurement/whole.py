@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,100 +164,6 @@ class WholeRecords:
         noise = None if tree["noise"] is None else NoiseLevels(**tree["noise"])
         samples, rest = tuple(map(int, tree["samples"])), tuple(map(bool, tree["at_rest"]))
         return cls(samples, float(tree["sample_rate"]), rest, noise)
-
-
-@dataclass(frozen=True, eq=False)
-class Gains:
-    """Relative errors of the sensors' gains that whole records show, (n_sensors,), and their deviations.
-
-    `moves` (p, n_sensors) is what an error of one of each gain makes of the fitted modal parameters, to first order;
-    `rigid` (n_sensors, d) the share of the base's motion in each sensor beside what its row of G says, as a wrong sign,
-    axis or gain makes it, and `rigid_chi2` (n_sensors,) how far it stands out, with d degrees of freedom.
-    """
-
-    error: Array
-    std: Array
-    freedom: int
-    moves: Array
-    rigid: Array
-    rigid_chi2: Array
-
-
-class Excess(NamedTuple):
-    """A band, Hz, where a fit leaves `factor` times the noise of a channel (of sensors, forces, base) of a run.
-
-    `channel` and `run` are indices.
-    """
-
-    channel: int
-    run: int
-    low: float
-    high: float
-    factor: float
-
-
-class VaryingLevel(NamedTuple):
-    """Noise of a channel of a run, indices as in `Excess`, that varies over the lines: least and largest deviation."""
-
-    channel: int
-    run: int
-    least: float
-    largest: float
-
-
-@dataclass(frozen=True, eq=False)
-class ModalEstimate:
-    """What whole records tell of the modes: the likeliest ones, and how exactly they are known.
-
-    Attributes
-    ----------
-    phi : (n_sensors, m)
-    gamma : (m, d)
-        Shapes at the sensors and participations; without a force only their products mean something.
-    omega, ratios : (m,)
-        rad/s; damping ratios.
-    rigid : (d, d)
-        Rigid-body mass; of no meaning where no force was measured.
-    information : (p, p)
-        ``Re J' S^-1 J`` over phi, gamma, log omega, log ratios and the upper triangle of the rigid-body mass, with what
-        the transients take away of it: half the inverse of the covariance. Zero for the mass without a force.
-    noise : NoiseLevels
-        Stated, or found with the fit.
-    reduced : float
-        Chi-squared over its degrees of freedom.
-    density : (runs,)
-        Of `WholeRecords`.
-    gain : Gains
-    scatter : (p, p) or None
-        B, where what is left is no white noise and the covariance is ``A^-1 B A^-1 / 2``, A the information.
-    settled : bool
-        Whether modes and levels of noise stood still at the end of the fit.
-    excess : tuple of Excess
-        Where the fit leaves more than the noise; empty where what it leaves is white.
-    varying : tuple of VaryingLevel
-        Levels that were let vary smoothly over the lines; `noise` holds their means.
-    untold : tuple of (run, channel)
-        Indices, as in `Excess`. Levels of `noise` that the records do not determine.
-    in_motion : tuple of int
-        Indices of runs stated to be at rest at both ends that the records show were not.
-    """
-
-    phi: Array
-    gamma: Array
-    omega: Array
-    ratios: Array
-    rigid: Array
-    information: Array
-    noise: NoiseLevels
-    reduced: float
-    density: Array
-    gain: Gains
-    scatter: Array | None = None
-    settled: bool = True
-    excess: tuple[Excess, ...] = ()
-    varying: tuple[VaryingLevel, ...] = ()
-    in_motion: tuple[int, ...] = ()
-    untold: tuple[tuple[int, int], ...] = ()
 
 
 def check_options(estimator: str, *, at_rest: Any, noise: Any, segment: Any) -> None:

@@ -72,10 +72,12 @@ def records_of(test: Measurement, structure: Structure, unknowns: int) -> list[R
     return records
 
 
-def inflation_of(test: Measurement, records: list[Record], unknowns: int) -> float:
+def inflation_of(test: Measurement, records: list[Record], unknowns: int, scattered: float | None = None) -> float:
     """Factor by which errors exceed what the stated noise explains; NaN where the noise is unknown.
 
-    From the size of the misfit, and from its correlation between neighbouring lines, as in averaged spectra.
+    From the size of the misfit, and from its correlation between neighbouring lines, as in averaged spectra. Where
+    modes have a scatter of their own, `scattered` times the noise, it holds the size of what the modes leave, and what
+    neighbours share of it.
     """
     freedom = 2 * test.numbers - unknowns
     if freedom <= 0:
@@ -84,10 +86,8 @@ def inflation_of(test: Measurement, records: list[Record], unknowns: int) -> flo
     reduced = 2 * sum(np.sum(np.abs(record.misfit / record.std) ** 2) for record in records) / freedom
     if reduced < _FAR_BELOW:
         return 1.0
-    # Scatter over blocks of lines holds the size of what the modes leave, and what neighbours share of it.
-    scattered = test.modal if test.modal is not None and test.modal.scatter is not None else None
     if scattered is not None:
-        reduced /= max(scattered.reduced, 1.0)
+        reduced /= scattered
     beyond = reduced if reduced > max(_SUSPECT, 1 + _DEVIATIONS * np.sqrt(2 / freedom)) else 1.0
     if scattered is not None:
         return float(np.sqrt(beyond))

@@ -1,15 +1,20 @@
-"""Modes of whole records as statistics: what a structure's modes miss them by, in units of the noise."""
+"""What a test tells of its modes, and these as statistics: what a structure misses them by, in units of the noise."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
-from sysid.measurement.whole import ModalEstimate
+from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.modal_fit import Index, Modes
 from sysid.modal_analysis.response import columns, gains, weights_of
+from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.structure.structure import Array
 
 _UNSEEN = 1e-12  # of the largest eigenvalue of the scaled information: round-off
@@ -17,14 +22,152 @@ _STEPS = 200
 _BELOW = 1e-3  # of the rigid-body mass; the least remainder to begin with, as a factor of zero has no slope
 
 
-def residual_of(test: Measurement) -> float:
-    """Relative, weighted residual of the accelerations that the modes of whole records leave."""
-    modal = test.modal
-    assert modal is not None
-    q = gains(test.freq, modal.omega, modal.ratios) * np.einsum("md,rdf->rmf", modal.gamma, test.base)
+@dataclass(frozen=True, eq=False)
+class Gains:
+    """Relative errors of the sensors' gains that whole records show, (n_sensors,), and their deviations.
+
+    `moves` (p, n_sensors) is what an error of one of each gain makes of the fitted modal parameters, to first order;
+    `rigid` (n_sensors, d) the share of the base's motion in each sensor beside what its row of G says, as a wrong sign,
+    axis or gain makes it, and `rigid_chi2` (n_sensors,) how far it stands out, with d degrees of freedom.
+    """
+
+    error: Array
+    std: Array
+    freedom: int
+    moves: Array
+    rigid: Array
+    rigid_chi2: Array
+
+
+class Excess(NamedTuple):
+    """A band, Hz, where a fit leaves `factor` times the noise of a channel (of sensors, forces, base) of a run.
+
+    `channel` and `run` are indices.
+    """
+
+    channel: int
+    run: int
+    low: float
+    high: float
+    factor: float
+
+
+class VaryingLevel(NamedTuple):
+    """Noise of a channel of a run, indices as in `Excess`, that varies over the lines: least and largest deviation."""
+
+    channel: int
+    run: int
+    least: float
+    largest: float
+
+
+@dataclass(frozen=True, eq=False)
+class ModalEstimate:
+    """What a test tells before any matrices are fitted: its modes, how exactly they are known, its noise.
+
+    Attributes
+    ----------
+    given : Measurement
+        The test as it was given.
+    records : Measurement
+        What is fitted: whole records as they would be at rest at both ends, their noise stated; others as given.
+    phi : (n_sensors, m)
+    gamma : (m, d)
+        Shapes at the sensors and participations; without a force only their products mean something.
+    omega, ratios : (m,)
+        rad/s; damping ratios. None, m = 0, where lines stand for themselves: of spectra and frequency responses.
+    rigid : (d, d)
+        Rigid-body mass; of no meaning where no force was measured.
+    information : (p, p)
+        ``Re J' S^-1 J`` over phi, gamma, log omega, log ratios and the upper triangle of the rigid-body mass, with what
+        the transients take away of it: half the inverse of the covariance. Zero for the mass without a force.
+    noise : NoiseLevels or None
+        Of whole records, stated or found with the fit.
+    reduced : float
+        Chi-squared over its degrees of freedom.
+    density : (runs,)
+        Of `WholeRecords`.
+    gain : Gains
+        Of whole records; NaN where they are not known.
+    scatter : (p, p) or None
+        B, where what is left is no white noise and the covariance is ``A^-1 B A^-1 / 2``, A the information.
+    settled : bool
+        Whether modes and levels of noise stood still at the end of the fit.
+    excess : tuple of Excess
+        Where the fit leaves more than the noise; empty where what it leaves is white.
+    varying : tuple of VaryingLevel
+        Levels that were let vary smoothly over the lines; `noise` holds their means.
+    untold : tuple of (run, channel)
+        Indices, as in `Excess`. Levels of `noise` that the records do not determine.
+    in_motion : tuple of int
+        Indices of runs stated to be at rest at both ends that the records show were not.
+    """
+
+    given: Measurement
+    records: Measurement
+    phi: Array
+    gamma: Array
+    omega: Array
+    ratios: Array
+    rigid: Array
+    information: Array
+    noise: NoiseLevels | None
+    reduced: float
+    density: Array
+    gain: Gains
+    scatter: Array | None = None
+    settled: bool = True
+    excess: tuple[Excess, ...] = ()
+    varying: tuple[VaryingLevel, ...] = ()
+    in_motion: tuple[int, ...] = ()
+    untold: tuple[tuple[int, int], ...] = ()
+
+    @classmethod
+    def of_lines(cls, test: Measurement) -> ModalEstimate:
+        """That of a test whose lines stand for themselves."""
+        (n, d), none, unknown = test.rigid_body.shape, np.zeros(0), np.full(test.n_sensors, np.nan)
+        gain = Gains(unknown, unknown, 1, np.zeros((0, n)), np.zeros((n, d)), np.zeros(n))
+        return cls(
+            test, test, np.zeros((n, 0)), np.zeros((0, d)), none, none, np.eye(d), np.zeros((0, 0)), None, 1.0,
+            np.zeros(test.n_runs), gain,
+        )  # fmt: skip
+
+    @property
+    def has_modes(self) -> bool:
+        """Whether modes were fitted, whose statistics stand for the lines."""
+        return self.omega.size > 0
+
+    @property
+    def found_noise(self) -> bool:
+        """Whether the levels of its noise were found with the fit, so that they hold what the modes miss."""
+        whole = self.given.whole
+        return self.noise is not None and whole is not None and whole.noise is None
+
+    @property
+    def scattered(self) -> float | None:
+        """Times the noise that `scatter` holds; None where what is left is white."""
+        return None if self.scatter is None else max(self.reduced, 1.0)
+
+    @property
+    def modes(self) -> Modes:
+        """The likeliest modes."""
+        return Modes(self.phi, self.gamma, self.omega, self.ratios)
+
+
+def residual_of(estimate: ModalEstimate) -> float:
+    """Relative, weighted residual of the accelerations that the estimate's modes leave."""
+    test = estimate.records
+    q = gains(test.freq, estimate.omega, estimate.ratios) * np.einsum("md,rdf->rmf", estimate.gamma, test.base)
     weight, size = weights_of(test.relative, test.response_std)
-    left = weight * columns(test.relative - np.einsum("nm,rmf->rnf", modal.phi, q))
+    left = weight * columns(test.relative - np.einsum("nm,rmf->rnf", estimate.phi, q))
     return float(np.linalg.norm(left)) / size
+
+
+def poles_of(estimate: ModalEstimate, monitor: Callable[[int, float], object] | None = None) -> Poles:
+    """Poles of the modes, or, where none were fitted, those that stand out of the lines: see `find_poles`."""
+    if estimate.has_modes:
+        return Poles(estimate.omega, estimate.ratios, residual_of(estimate))
+    return find_poles(estimate.records, monitor=monitor)
 
 
 def index_of(estimate: ModalEstimate) -> Index:
@@ -104,16 +247,16 @@ def misfit_rows(
     phi, gamma = phi * ca.repmat(scale.T, n, 1), gamma / ca.repmat(scale, 1, d)
     corner = ca.vertcat(*(rigid[i, j] for i, j in index.pairs))
     theta = ca.vertcat(ca.vec(phi.T), ca.vec(gamma.T), ca.log(omega), ca.log(ratios), corner)
-    own = theta_of(Modes(estimate.phi, estimate.gamma, estimate.omega, estimate.ratios), estimate.rigid, index)
+    own = theta_of(estimate.modes, estimate.rigid, index)
     assert theta.numel() == own.size and phi.shape == (n, m)
     return ca.DM(factor_of(estimate)) @ (theta - ca.DM(own))
 
 
 def matched(estimate: ModalEstimate, omega: Array) -> NDArray[np.intp] | None:
-    """For each mode of the estimate the nearest of a structure's, each once; None where it has fewer."""
+    """For each mode of the estimate the nearest of a structure's, each once; None where one of both has too few."""
     from scipy.optimize import linear_sum_assignment
 
-    if omega.size < estimate.omega.size:
+    if not estimate.has_modes or omega.size < estimate.omega.size:
         return None
     apart = np.abs(np.log(omega[None] / estimate.omega[:, None]))
     return np.asarray(linear_sum_assignment(apart)[1])
@@ -127,7 +270,7 @@ def above_modes(estimate: ModalEstimate) -> tuple[Modes, Array]:
     from scipy.optimize import least_squares
 
     index = index_of(estimate)
-    modes, rigid = Modes(estimate.phi, estimate.gamma, estimate.omega, estimate.ratios), estimate.rigid
+    modes, rigid = estimate.modes, estimate.rigid
     size = np.sqrt(np.maximum(np.diag(rigid), np.diag(modes.gamma.T @ modes.gamma)))
     size[size == 0] = 1.0
     scaled = lambda gamma: (rigid - gamma.T @ gamma) / np.outer(size, size)  # noqa: E731

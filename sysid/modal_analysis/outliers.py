@@ -189,7 +189,7 @@ def pseudo_values(fits: Sequence[tuple[Measurement, list[ComplexArray]]], unknow
         stds = [
             part.std * (spread if own is None else max(spread, 1.0)) for part, own in zip(parts, stated, strict=False)
         ]
-        other = replace(test, response=test.response - test.relative + values[0], response_std=stds[0], modal=None)
+        other = replace(test, response=test.response - test.relative + values[0], response_std=stds[0])
         changed.append(other if test.force is None else replace(other, force=values[1], force_std=stds[1]))
     return changed
 
@@ -325,7 +325,7 @@ def _replaced(test: Measurement, values: Sequence[ComplexArray], flags: Sequence
     if not any(np.any(of_record) for of_record in flags):
         return test
     response = np.where(flags[0], values[0] + test.response - test.relative, test.response)
-    changed = replace(test, response=response, modal=None)
+    changed = replace(test, response=response)
     return changed if test.force is None else replace(changed, force=np.where(flags[1], values[1], test.force))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import scipy
 
-from sysid.measurement.whole import Gains
+from sysid.modal_analysis.modal_estimate import Gains
 from sysid.modal_analysis.record_fit import RecordFit, half_inverse, unit_diagonal
 from sysid.structure.structure import Array
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.measurement.whole import VaryingLevel
+from sysid.modal_analysis.modal_estimate import VaryingLevel
 from sysid.modal_analysis.record_fit import Monitor, RecordFit, refitted
 from sysid.modal_analysis.record_noise import NO_NOISE, level_deviations, likeliest_levels
 from sysid.modal_analysis.record_whiteness import excess_of

@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from sysid.measurement.whole import Excess
+from sysid.modal_analysis.modal_estimate import Excess
 from sysid.modal_analysis.record_fit import RecordFit
 from sysid.modal_analysis.record_noise import NO_NOISE
 from sysid.structure.structure import Array

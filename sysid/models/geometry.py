@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, finite_array, refuse, shown
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.modal_estimate import residual_of
+from sysid.modal_analysis.modal_estimate import ModalEstimate, poles_of
 from sysid.modal_analysis.residues import Records
-from sysid.modal_analysis.vector_fitting import Poles, find_poles
+from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.unknowns import Unknown
 from sysid.structure.structure import Array
 
@@ -55,7 +55,8 @@ class Geometry:
 
     Parameters
     ----------
-    test : Measurement
+    modal : ModalEstimate
+        Of the test.
     rigid_body : ndarray, shape (n, d), optional
         G, motion of the degrees of freedom for unit base motion; those of the sensors where it is not given.
     recovery : ndarray, shape (n_sensors, n), optional
@@ -67,25 +68,27 @@ class Geometry:
 
     def __init__(
         self,
-        test: Measurement,
+        modal: ModalEstimate,
         rigid_body: Array | None = None,
         recovery: Array | None = None,
         weighed: Array | Callable[[], Array] | None = None,
     ) -> None:
-        self.test = test
+        self.modal, test = modal, modal.records
         self.rigid_body = test.rigid_body if rigid_body is None else rigid_body
         self.recovery = np.eye(len(self.rigid_body)) if recovery is None else recovery
         self.translational = test.translational
         self._weighed = weighed
         self.monitor: Callable[[int, float], object] | None = None  # of a search for poles
 
+    @property
+    def test(self) -> Measurement:
+        """The records that are fitted."""
+        return self.modal.records
+
     @cached_property
     def poles(self) -> Poles:
         """Poles that stand out of the records."""
-        modal = self.test.modal
-        if modal is not None:
-            return Poles(modal.omega, modal.ratios, residual_of(self.test))
-        return find_poles(self.test, monitor=self.monitor)
+        return poles_of(self.modal, self.monitor)
 
     @cached_property
     def pole_ratios(self) -> Array:
@@ -102,7 +105,7 @@ class Geometry:
         A pole counts as often as its residue has rank, where the model has room for all.
         """
         omega, test = self.poles.omega, self.test
-        if omega.size < self.n and test.n_base > 1 and test.modal is None:
+        if omega.size < self.n and test.n_base > 1 and not self.modal.has_modes:
             records = Records(test)
             free = records.fit(omega, self.poles.ratios)
             ranks = free.ranks(records.noise(free.left, free.residues.size), test.n_sensors, test.n_base)
@@ -127,7 +130,7 @@ class Geometry:
 
     def unsearched(self) -> Geometry:
         """The same with made-up poles and weights, to check what is declared before anything is searched."""
-        other = Geometry(self.test, self.rigid_body, self.recovery, None if self._weighed is None else np.ones(self.d))
+        other = Geometry(self.modal, self.rigid_body, self.recovery, None if self._weighed is None else np.ones(self.d))
         low = 1e-6 * self.test.freq[-1]  # within any limit that is stated
         other.__dict__["poles"] = Poles(np.full(self.n, low), np.full(self.n, 0.01), 0.0)
         return other

@@ -90,7 +90,7 @@ def draw_cmif(ax: Axes, subject: Identification | Measurement) -> None:
 def _modes_of(subject: Identification | Measurement) -> tuple[Measurement, Array, str]:
     """Test, the modes to compare with (Hz), and whose they are: the result's, else those that vector fitting finds."""
     if isinstance(subject, Identification):
-        return subject.records.screened.measurement, subject.structure.natural_frequencies, "identified mode"
+        return subject.fitted.records, subject.structure.natural_frequencies, "identified mode"
     try:
         return subject, find_poles(subject).omega / (2 * np.pi), "vector fitting"
     except InputError:

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.errors import refuse
-from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.complex_frequency import noise_level
+from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.models.expressions import as_matrix, variables_of, written_in
 from sysid.models.geometry import Geometry
 from sysid.models.model import MatrixModel, Stated, ratios_of
@@ -27,7 +27,7 @@ from sysid.models.unknowns import Unknown, Variable, box_of, lower_of, split, up
 from sysid.problem.constraints import Constraints, Row, row_of
 from sysid.problem.given import MATRICES
 from sysid.problem.matrices import Blocks, Matrices, blocks_of, symbols_in
-from sysid.problem.terms import Builder, ExpressionTerm, Prior, Residual, Term, TermSource, TestTerm
+from sysid.problem.terms import Builder, ExpressionTerm, FurtherTest, Prior, Residual, Term, TermSource, TestTerm
 from sysid.structure.structure import Array, Structure
 
 
@@ -44,7 +44,8 @@ class Formulation:
 
     Parameters
     ----------
-    measurement : Measurement
+    modal : sequence of ModalEstimate
+        Of the problem's own test, and of further ones among the residuals.
     models : tuple of MatrixModel
         Of mass, stiffness and damping.
     geometry : Geometry
@@ -56,7 +57,7 @@ class Formulation:
 
     def __init__(
         self,
-        measurement: Measurement,
+        modal: Sequence[ModalEstimate],
         models: tuple[MatrixModel, MatrixModel, MatrixModel],
         geometry: Geometry,
         residuals: Sequence[Any] = (),
@@ -64,7 +65,7 @@ class Formulation:
         misfit: Any = None,
         healing: Mapping[Variable, Any] | None = None,
     ) -> None:
-        self.measurement, self.models, self.geometry = measurement, models, geometry
+        self.models, self.geometry = models, geometry
         self.sources: list[tuple[str, TermSource]] = []
         if misfit is not None:
             self.sources.append(("misfit", Residual(misfit, is_misfit=True)))
@@ -72,6 +73,8 @@ class Formulation:
             (f"residual {i}", given if isinstance(given, TermSource) else Residual(given))
             for i, given in enumerate(residuals, start=1)
         ]
+        further = [source for _, source in self.sources if isinstance(source, FurtherTest)]
+        self._modal, self._of_further = modal[0], dict(zip(further, modal[1:], strict=True))
         self.fits_records = misfit is None
         self._constraints, self._healing = constraints, healing or {}
         self.monitor: Callable[[int, float], object] | None = None  # of a search for poles
@@ -245,14 +248,14 @@ class Formulation:
     @cached_property
     def own_test(self) -> TestTerm:
         """The problem's own records, fitted or not."""
-        return TestTerm(self.measurement, self.matrices)
+        return TestTerm(self._modal, self.matrices)
 
     @cached_property
     def beside(self) -> tuple[Term, ...]:
         """The terms beside the problem's own records, or in their place."""
         build = Builder(
             self._function, self._matrices, lambda: self.matrices, lambda: self.noise,
-            lambda test: noise_level(test, monitor=self.monitor), not self.fits_records,
+            self._of_further.__getitem__, lambda test: noise_level(test, monitor=self.monitor), not self.fits_records,
         )  # fmt: skip
         return tuple(source.term(name, build) for name, source in self.sources)
 
@@ -269,7 +272,7 @@ class Formulation:
     @cached_property
     def noise(self) -> float:
         """Standard deviation of a real number of the measurement's relative, weighted residual."""
-        return noise_level(self.measurement, monitor=self.monitor)
+        return noise_level(self._modal.records, monitor=self.monitor)
 
     @property
     def further_tests(self) -> tuple[TestTerm, ...]:

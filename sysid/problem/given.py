@@ -11,6 +11,7 @@ import numpy as np
 
 from sysid.errors import InputError, finite_array, numbers, refuse
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.response import columns, weighed_mass
 from sysid.models.damping import WrittenDamping
 from sysid.models.expressions import at_point, check_size, is_expression, square
@@ -91,19 +92,20 @@ def _numbers(name: str, value: Any) -> Array:
 
 
 def geometry_of(
-    test: Measurement,
+    modal: ModalEstimate,
     stiffness: MatrixModel,
     recovery: Any = None,
     rigid_body_dofs: Any = None,
     weighed: Callable[[], Array] | None = None,
 ) -> Geometry:
-    """Geometry of the degrees of freedom of a problem or of a further test.
+    """Geometry of the degrees of freedom of a problem or of a further test, of which the modal estimate is.
 
     Raises
     ------
     InputError
         Where recovery, rigid_body_dofs and the sensors do not fit together.
     """
+    test = modal.records
     for name, given in (("recovery", recovery), ("rigid_body_dofs", rigid_body_dofs)):
         refuse(
             (
@@ -122,7 +124,7 @@ def geometry_of(
             f"recovery @ rigid_body_dofs differs from the measurement's rigid_body by up to {moved:.3g}: the order of "
             "the degrees of freedom, or signs and axes of the sensors, are not what the matrices have"
         )
-    return Geometry(test, G, R, weighed)
+    return Geometry(modal, G, R, weighed)
 
 
 def _rigid_body_dofs(test: Measurement, stiffness: MatrixModel, R: Array, other: bool, stated: Any) -> Array:

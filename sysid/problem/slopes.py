@@ -6,7 +6,7 @@ accelerations by :math:`dX = Z^{-1} (\omega^2 dB - dZ\, X)`; modes follow by fir
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import casadi as ca
@@ -14,7 +14,7 @@ import numpy as np
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.misfit import inflation_of, records_of
-from sysid.modal_analysis.modal_estimate import independent_rows, index_of, matched, theta_of
+from sysid.modal_analysis.modal_estimate import ModalEstimate, independent_rows, index_of, matched, theta_of
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.response import weights_of_test
 from sysid.problem.matrices import Matrices
@@ -135,15 +135,16 @@ class Rows:
 
 
 def rows_of_test(
-    test: Measurement, s: Slopes, unknowns: int, *, share: float = 1.0, as_stated: bool = False
+    modal: ModalEstimate, s: Slopes, unknowns: int, *, share: float = 1.0, as_stated: bool = False
 ) -> list[Rows]:
     """Rows of the accelerations and, where it was measured, of the force, as the local phase weighs them.
 
     Noise that is larger than stated, or shared by neighbouring lines, counts as the misfit shows it; with `as_stated`
     it is not, as where a test is planned.
     """
-    if test.modal is not None and s.structure.modal_damping:
-        of_modes = _rows_of_modes(test, s, unknowns, share=share, as_stated=as_stated)
+    test = modal.records
+    if s.structure.modal_damping:
+        of_modes = _rows_of_modes(modal, s, unknowns, share=share, as_stated=as_stated)
         if of_modes is not None:
             return of_modes
     X, dX = response_slopes(s, test.freq)
@@ -158,8 +159,7 @@ def rows_of_test(
         parts.append(d_f.reshape(d_f.shape[0], -1, d_f.shape[-1]))
     rows: list[Rows] = []
     records = records_of(test, s.structure, unknowns)
-    by_lines = replace(test, modal=None)  # the scatter of the modes does not count here
-    inflation = 1.0 if as_stated else inflation_of(by_lines, records, unknowns)
+    inflation = 1.0 if as_stated else inflation_of(test, records, unknowns)
     for record, change, (weight, scale) in zip(records, parts, weights_of_test(test, weighted=True), strict=True):
         weights = share * weight / scale
         flat = (weights[..., None] * change).reshape(-1, change.shape[-1])
@@ -168,10 +168,11 @@ def rows_of_test(
     return rows
 
 
-def _rows_of_modes(test: Measurement, s: Slopes, unknowns: int, *, share: float, as_stated: bool) -> list[Rows] | None:
-    """Rows of whole records, which are those of their modes; None where the structure has fewer modes."""
-    estimate, structure = test.modal, s.structure
-    assert estimate is not None
+def _rows_of_modes(
+    estimate: ModalEstimate, s: Slopes, unknowns: int, *, share: float, as_stated: bool
+) -> list[Rows] | None:
+    """Rows of a test's modes in the place of its lines; None where none were fitted, or the structure has fewer."""
+    test, structure = estimate.records, s.structure
     chosen = matched(estimate, 2 * np.pi * structure.natural_frequencies)
     if chosen is None:
         return None
@@ -196,12 +197,14 @@ def _rows_of_modes(test: Measurement, s: Slopes, unknowns: int, *, share: float,
         d_phi.reshape(-1, d_phi.shape[-1]), d_gamma.reshape(-1, d_phi.shape[-1]), s.d_log_omega[chosen],
         s.d_log_ratios[chosen], corner,
     ])  # fmt: skip
-    own = Modes(estimate.phi, estimate.gamma, estimate.omega, estimate.ratios)
+    own = estimate.modes
     off = theta_of(modes, structure.rigid_body_mass, index) - theta_of(own, estimate.rigid, index)
     weight = share / weights_of_test(test, weighted=True)[0][1]
     factor, std = independent_rows(estimate)
     factor = weight * factor
-    inflation = 1.0 if as_stated else inflation_of(test, records_of(test, structure, unknowns), unknowns)
+    inflation = (
+        1.0 if as_stated else inflation_of(test, records_of(test, structure, unknowns), unknowns, estimate.scattered)
+    )
     std = weight * inflation * std
     return [Rows(factor @ off, factor @ slope, std)]
 

@@ -17,7 +17,7 @@ import numpy as np
 from sysid.errors import InputError, finite_array, instance, refuse
 from sysid.finding import Finding, Severity
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.modal_estimate import misfit_rows
+from sysid.modal_analysis.modal_estimate import ModalEstimate, misfit_rows
 from sysid.modal_analysis.response import residual, weights_of_test
 from sysid.models.expressions import as_matrix, at_point, check_finite, written_in
 from sysid.models.geometry import Geometry
@@ -74,7 +74,8 @@ class TestTerm:
 
     Attributes
     ----------
-    test : Measurement
+    modal : ModalEstimate
+        Of the test.
     matrices : Matrices
         Of the structure as it was in this test.
     weight : float
@@ -86,11 +87,16 @@ class TestTerm:
 
     __test__ = False  # pytest takes names in Test for its own
 
-    test: Measurement
+    modal: ModalEstimate
     matrices: Matrices
     weight: float = 1.0
     shift: float = 0.0
     name: str = "the test"
+
+    @property
+    def test(self) -> Measurement:
+        """The records that are fitted."""
+        return self.modal.records
 
     def rows(self, x: ca.MX, modes: ModeSymbols | None = None) -> ca.MX:
         """Relative residuals of accelerations and, where measured, of the force; modes are read with ratios only."""
@@ -101,13 +107,13 @@ class TestTerm:
         phi, omega = modes
         ratios = self.matrices.ratio_function(x, omega)
         shapes = ca.DM(motion.recovery) @ phi
-        if self.test.modal is not None and self.test.modal.omega.size == omega.numel():
+        if self.modal.omega.size == omega.numel():
             gamma, size = phi.T @ motion.push, weights_of_test(self.test, weighted=True)[0][1]
             weighed = self.test.force is not None
             return (
                 self.weight
                 / size
-                * misfit_rows(self.test.modal, shapes, gamma, omega, ratios, motion.rigid_body_mass, weighed=weighed)
+                * misfit_rows(self.modal, shapes, gamma, omega, ratios, motion.rigid_body_mass, weighed=weighed)
             )
         miss = residual(
             self.test, shapes, phi.T @ motion.push, omega, ratios, motion.rigid_body_mass, weighted=True,
@@ -153,7 +159,7 @@ class TestTerm:
     ) -> Rows:
         """As in `Term`; `slopes` are those at x where they are known."""
         slopes = slopes or slopes_of(self.matrices, x, self.test)
-        return stacked_rows(rows_of_test(self.test, slopes, x.size, share=self.weight, as_stated=as_stated))
+        return stacked_rows(rows_of_test(self.modal, slopes, x.size, share=self.weight, as_stated=as_stated))
 
     def findings(self, x: Array) -> Sequence[Finding]:
         """None of its own: records are checked in `sysid.assessment.checks`."""
@@ -236,14 +242,15 @@ class Builder(NamedTuple):
 
     ``function(name, expressions)`` is a CasADi function of x; ``matrices(blocks, geometry)`` are matrices of x;
     ``own()`` are the problem's; ``noise()`` is the standard deviation of a number of the measurement's relative
-    residual, ``noise_of(test)`` of a further test's; ``replaced`` tells whether a misfit stands in the place of the
-    measurement's.
+    residual, ``noise_of(test)`` of a further test's; ``modal_of(given)`` is the modal estimate of a further test;
+    ``replaced`` tells whether a misfit stands in the place of the measurement's.
     """
 
     function: Callable[[str, Sequence[ca.MX]], ca.Function]
     matrices: Callable[[Blocks, Geometry], Matrices]
     own: Callable[[], Matrices]
     noise: Callable[[], float]
+    modal_of: Callable[[FurtherTest], ModalEstimate]
     noise_of: Callable[[Measurement], float]
     replaced: bool
 
@@ -290,7 +297,7 @@ class FurtherTest:
     def blocks(self) -> tuple[Blocks, Geometry]:
         """The blocks of its matrices, and their geometry."""
         models = as_models(self.mass, self.stiffness, self.damping)
-        geometry = geometry_of(self.measurement, models[1], self.recovery, self.rigid_body_dofs)
+        geometry = geometry_of(ModalEstimate.of_lines(self.measurement), models[1], self.recovery, self.rigid_body_dofs)
         for name, model in zip(MATRICES, models, strict=True):
             if model.unknowns(geometry.unsearched()):
                 raise InputError(f"FurtherTest: {name} is a model; write the matrix in the variables of the problem")
@@ -305,8 +312,9 @@ class FurtherTest:
 
     def term(self, name: str, build: Builder) -> TestTerm:
         """Its records, weighed by their noise beside that of the problem's own."""
-        weight = 1.0 if build.replaced else build.noise() / build.noise_of(self.measurement)
-        return TestTerm(self.measurement, build.matrices(*self.blocks), weight, name=name)
+        modal = build.modal_of(self)
+        weight = 1.0 if build.replaced else build.noise() / build.noise_of(modal.records)
+        return TestTerm(modal, build.matrices(*self.blocks), weight, name=name)
 
     @property
     def response(self) -> Response:

@@ -191,7 +191,7 @@ def _half_widths(std: Array, test: Measurement) -> NDArray[Any]:
 def _recorded(it: Identification, test: Measurement) -> Measurement | None:
     """The records with their transients, where these were taken off."""
     given = it.records.measurement
-    return given if test is it.measurement and given.whole is not None else None
+    return given if test is it.measurement and given.is_whole else None
 
 
 def _levels(values: NDArray[Any] | None, channel: int, test: Measurement) -> Array | None:

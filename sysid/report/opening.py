@@ -51,7 +51,7 @@ def _subject(it: Identification) -> str:
     of = f"{n} degrees of freedom"
     if n != test.n_sensors:
         of += f" from {test.n_sensors} sensors"
-    records = "whole records, their transients taken off, " * (it.records.measurement.whole is not None)
+    records = "whole records, their transients taken off, " * it.records.measurement.is_whole
     told = (
         f"Identified: mass, stiffness and damping matrices of {of}. From: {fitted_in_words(it)}, "
         f"{counted(d, 'base direction')} ({', '.join(test.base_axes or ())}), {records}{test.lines_in_words}, "
@@ -124,7 +124,7 @@ def _modes(it: Identification) -> Iterator[tuple[str, str]]:
 
 
 def _fit(it: Identification, level: NoiseLevel) -> Iterator[tuple[str, str]]:
-    test = it.records.screened.measurement
+    test = it.fitted.records
     left = f"{number(100 * it.residual, 3)} % of the accelerations relative to the base"
     left += _beside(share_of_all_noise(level.response, test.relative), level)
     if it.force_residual is not None and test.force is not None:

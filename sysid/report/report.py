@@ -126,7 +126,7 @@ def write_report(identification: Identification, path: str | Path) -> Path:
 def render(identification: Identification) -> str:
     """Make the page, as a string."""
     it = identification
-    level = noise_level(it.records.screened.measurement, it.structure)
+    level = noise_level(it.fitted.records, it.structure)
     return page(
         _title(it),
         opening(it, level),
@@ -250,7 +250,7 @@ def _rigid_body_mass(it: Identification) -> str:
 
 def _responses(it: Identification, test: Measurement, level: NoiseLevel) -> str:
     words = _PER_UNIT if test.has_unit_runs else _AS_MOVED
-    if test is it.measurement and it.records.measurement.whole is not None:
+    if test is it.measurement and it.records.measurement.is_whole:
         words += " The transients of the records are taken off."
     return paragraph(words, "soft") + curves(it, test, level)
 
@@ -276,7 +276,7 @@ def _residuals(it: Identification, level: NoiseLevel) -> str:
 
 def _as_fitted(it: Identification, test: Measurement) -> Measurement:
     """The test with the records whose residual is told: of the one that was fitted, without what stands alone."""
-    return it.records.screened.measurement if test is it.measurement else test
+    return it.fitted.records if test is it.measurement else test
 
 
 def _noise(it: Identification) -> str:

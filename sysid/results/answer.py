@@ -23,11 +23,15 @@ from sysid.finding import (
 )
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
-from sysid.modal_analysis.outliers import Outlier
+from sysid.modal_analysis.fit import fit_modes
+from sysid.modal_analysis.modal_estimate import ModalEstimate
+from sysid.modal_analysis.outliers import Outlier, screened
 from sysid.modal_analysis.response import weighted_error
 from sysid.modal_analysis.transients import without_transients_of
 from sysid.models.unknowns import by_name
+from sysid.problem.prepared import PreparedProblem
 from sysid.problem.problem import Problem
+from sysid.problem.stated import StatedProblem
 from sysid.results.records import PartOfProblem, Records
 from sysid.search.strategy import History
 from sysid.structure.structure import Array, ComplexArray, Structure
@@ -64,6 +68,9 @@ class Answer:
         The search was stopped by Ctrl-C, and this is the best until then.
     hurried : bool
         For want of time summaries leave out what is not computed yet; not stored.
+    prepared : PreparedProblem
+        The problem with what its records tell of the modes; found when it is first asked for where it is not given, and
+        not stored.
     """
 
     structure: Structure
@@ -75,17 +82,21 @@ class Answer:
     findings: tuple[Finding, ...]
     interrupted: bool = False
     hurried: bool = field(default=False, kw_only=True)
+    prepared: PreparedProblem = field(default=None, kw_only=True)  # type: ignore[assignment] # filled below
 
     def __post_init__(self) -> None:
         if isinstance(self.problem, PartOfProblem):  # as it comes of a file: `problem` then tells what is missing
             part: PartOfProblem = vars(self).pop("problem")
             vars(self).update(part.attributes, _part=part)
+            del vars(self)["prepared"]
+        elif self.prepared is None or self.prepared.stated is not self.problem:
+            vars(self)["prepared"] = self.problem.prepared
 
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
             """Tell what is missing where the problem is asked for and the file does not hold it whole."""
-            if name == "problem" and "_part" in vars(self):
+            if name in ("problem", "prepared") and "_part" in vars(self):
                 raise InputError(
                     f"the file of this result does not hold its problem: {self.part.without}. Give it by "
                     "sysid.load(path, problem=...), or --module FILE at the command line"
@@ -176,10 +187,24 @@ class Answer:
     @property
     def measurement(self) -> Measurement:
         """The test that was fitted; of whole records without their transients."""
-        return self.records.at_rest.measurement
+        return self.modal[0].records
+
+    @cached_property
+    def modal(self) -> tuple[ModalEstimate, ...]:
+        """What each fitted test tells of its modes and noise, the problem's own first."""
+        part = self.part
+        return self.prepared.modal if part is None else (fit_modes(part.records.measurement),)
+
+    @cached_property
+    def fitted(self) -> ModalEstimate:
+        """That of the problem's own test in squares: with Huber's loss without numbers that stand alone."""
+        if self.part is None:
+            return self.prepared.screened.modal[0]
+        own = self.modal[0]
+        return own if self.part.records.loss == "squares" else replace(own, records=screened(own.records))
 
     @property
-    def records(self) -> Problem | Records:
+    def records(self) -> StatedProblem | Records:
         """What was recorded: the attributes of a problem that tell it, wherever they come from."""
         part = self.part
         return self.problem if part is None else part.records
@@ -189,7 +214,7 @@ class Answer:
         """What readers ask of the problem beside its records."""
         from sysid.results.facts import facts_of
 
-        return facts_of(self.problem, self.x)
+        return facts_of(self.prepared, self.x)
 
     @cached_property
     def phases(self) -> list[list[str]]:
@@ -201,15 +226,14 @@ class Answer:
     @property
     def noise(self) -> NoiseLevels | None:
         """Noise of all channels of whole records, stated or found with the fit; None for other records."""
-        modal = self.measurement.modal
-        return None if modal is None else modal.noise
+        return self.modal[0].noise
 
     @cached_property
     def gains(self) -> GainErrors:
         """By how much each sensor's gain differs from the base's, as the records show it, and how exactly they do."""
         from sysid.assessment.checks.gains import gain_errors
 
-        return gain_errors(self.records.screened.measurement, self.structure)
+        return gain_errors(self.fitted, self.structure)
 
     @property
     def gain_worth(self) -> Array:
@@ -232,7 +256,7 @@ class Answer:
 
         With free modes a graph of the matrices has some n³ operations, which a hundred sensors cannot wait for.
         """
-        return self.x is None or (self.problem.free_modes and not self.problem.formulation.sources)
+        return self.x is None or (self.prepared.free_modes and not self.prepared.formulation.sources)
 
     @cached_property
     def residual(self) -> float:
@@ -241,15 +265,16 @@ class Answer:
         Of the accelerations relative to the base, over all runs, sensors and lines. Where the problem states a misfit
         of its own and no test is fitted beside it, the norm of that misfit.
         """
-        records = self.problem.screened.measurement
-        return records.residual(self.structure) if self._in_modes else self.problem.residual(self._unknowns)
+        if self._in_modes:
+            return self.fitted.records.residual(self.structure)
+        return self.prepared.residual(self._unknowns)
 
     @cached_property
     def residuals(self) -> tuple[float, ...]:
         """`residual` of each test that is fitted: the problem's own first, then further ones."""
         if self._in_modes:
             return (self.residual,)
-        return self.problem.formulation.residuals(self._unknowns)
+        return self.prepared.formulation.residuals(self._unknowns)
 
     @cached_property
     def objective(self) -> float:
@@ -259,16 +284,16 @@ class Answer:
         else the problem states among its residuals.
         """
         if self._in_modes:
-            return weighted_error(self.problem.screened.measurement, self.structure)
-        return self.problem.objective(self._unknowns)
+            return weighted_error(self.fitted.records, self.structure)
+        return self.prepared.objective(self._unknowns)
 
     @cached_property
     def values(self) -> dict[str, Array]:
         """The problem's unknowns at the answer, by name and in their shapes, fixed ones too; empty where x is None."""
         if self.x is None:
             return {}
-        fixed = {v.name: v.shaped(v.guess) for v in self.problem.formulation.fixed}
-        return by_name(self.problem.variables, self.x) | fixed
+        fixed = {v.name: v.shaped(v.guess) for v in self.prepared.formulation.fixed}
+        return by_name(self.prepared.variables, self.x) | fixed
 
     @property
     def _unknowns(self) -> Array:
@@ -280,13 +305,13 @@ class Answer:
         """Tests that were fitted beside the problem's own (`sysid.FurtherTest`), each with the structure as it was."""
         if self._in_modes:
             return ()
-        terms = self.problem.formulation.further_tests
+        terms = self.prepared.formulation.further_tests
         return tuple((term.test, term.matrices.structure(self._unknowns, term.test)) for term in terms)
 
     @property
     def force_residual(self) -> float | None:
         """``‖predicted - measured‖ / ‖measured‖`` over the base force; None where none was measured."""
-        return self.records.screened.measurement.force_residual(self.structure)
+        return self.fitted.records.force_residual(self.structure)
 
     def predict(self, measurement: Measurement) -> ComplexArray:
         """Relative accelerations under another test's base motion, (runs, n_sensors, n_freq)."""
@@ -300,8 +325,9 @@ class Answer:
         """
         from sysid.assessment.uncertainty import uncertainty
 
-        huber = self.problem.loss == "huber"
-        fitted = self.problem.pseudo_values(self.structure, self.x) if huber else self.problem.at_rest
+        fitted = self.prepared
+        if not fitted.in_squares:
+            fitted = fitted.pseudo_values(self.structure, self.x)
         return uncertainty(fitted, self.structure, self.x)
 
     @cached_property
@@ -312,7 +338,7 @@ class Answer:
         that fit: spikes and drop-outs. Each tells its `test` and `run` (from 1; test 1 is the problem's own, further
         ones follow), its `channel` (a sensor's name, or "force x"), `freq` in Hz, and `size` in deviations.
         """
-        return tuple(self.problem.outliers(self.structure, self.x))
+        return tuple(self.prepared.outliers(self.structure, self.x))
 
     @property
     def covariance(self) -> Array:
@@ -340,14 +366,14 @@ class Answer:
         """
         from sysid.assessment.determination import open_masses
 
-        return tuple(open_masses(self.problem.screened, self.structure))
+        return tuple(open_masses(self.prepared.screened, self.structure))
 
     @cached_property
     def scale_is_open(self) -> bool:
         """Whether the answer explains the data, and one factor common to M, K and C is all that they leave open."""
         from sysid.assessment.determination import scale_is_open
 
-        return self.success and scale_is_open(self.problem.screened, self.structure, self.x)
+        return self.success and scale_is_open(self.prepared.screened, self.structure, self.x)
 
     @property
     def asks_for_others(self) -> bool:
@@ -359,7 +385,7 @@ class Answer:
         """Whether other matrices explain the same data within what was stated."""
         from sysid.assessment.modal_mass_cone import speaks
 
-        if speaks(self.problem.formulation):
+        if speaks(self.prepared.formulation):
             return bool(self.open_masses)
         ends = self._intervals
         return not (np.all(np.isfinite(ends.mass)) and np.all(np.isfinite(ends.stiffness)))
@@ -368,7 +394,7 @@ class Answer:
     def _intervals(self) -> Intervals:
         from sysid.assessment.determination import intervals
 
-        return intervals(self.problem.screened, self.structure, self.x)
+        return intervals(self.prepared.screened, self.structure, self.x)
 
     @property
     def mac(self) -> Array:

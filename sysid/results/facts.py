@@ -11,7 +11,7 @@ from sysid.assessment.checks.gains import taken_at_sensors
 from sysid.models.mass import LumpedMass
 from sysid.models.unknowns import Unknown
 from sysid.problem.given import MATRICES
-from sysid.problem.problem import Problem
+from sysid.problem.prepared import PreparedProblem
 from sysid.problem.terms import FurtherTest
 from sysid.structure.structure import Array
 
@@ -98,10 +98,10 @@ class Facts(NamedTuple):
         return cls(**{name: tree[name] for name in cls._fields} | lists | {"unknowns": unknowns})
 
 
-def facts_of(problem: Problem, x: Array | None) -> Facts:
+def facts_of(problem: PreparedProblem, x: Array | None) -> Facts:
     """The facts of a problem and of its unknowns at an answer."""
     formulation, test = problem.formulation, problem.measurement
-    further = [one.measurement.force is None for one in problem.residuals if isinstance(one, FurtherTest)]
+    further = [one.measurement.force is None for one in problem.stated.residuals if isinstance(one, FurtherTest)]
     misses = [
         (name, float(z))
         for prior in formulation.priors
@@ -119,10 +119,10 @@ def facts_of(problem: Problem, x: Array | None) -> Facts:
         unit_mass=bool(problem.unit_mass),
         fits_records=bool(formulation.fits_records),
         mass_is_free=bool(formulation.mass.free),
-        mass_is_lumped=isinstance(problem.mass, LumpedMass),
+        mass_is_lumped=isinstance(problem.stated.mass, LumpedMass),
         by_accelerations=test.force is None
-        and problem.misfit is None
-        and len(further) == len(problem.residuals)
+        and problem.stated.misfit is None
+        and len(further) == len(problem.stated.residuals)
         and all(further),
         misses=tuple(misses),
         unknowns=tuple(unknowns),
@@ -135,7 +135,7 @@ def facts_of(problem: Problem, x: Array | None) -> Facts:
     )
 
 
-def reported_unknowns(problem: Problem, *, damping_ratios: bool = False) -> tuple[Unknown, ...]:
+def reported_unknowns(problem: PreparedProblem, *, damping_ratios: bool = False) -> tuple[Unknown, ...]:
     """Unknowns that mean something by themselves: those of models with a form of their own, and variables, fixed too.
 
     The entries of a free matrix's factor are none, nor are shares of which only the ratios count. Free damping ratios
@@ -147,17 +147,17 @@ def reported_unknowns(problem: Problem, *, damping_ratios: bool = False) -> tupl
     return (*(v for v in of_models if not v.relative), *formulation.variables)
 
 
-def _models(problem: Problem) -> Iterator[tuple[str, str]]:
+def _models(problem: PreparedProblem) -> Iterator[tuple[str, str]]:
     """A matrix each: its model, and what that states; or that it is written in variables or numbers."""
     formulation, counts = problem.formulation, dict(problem.unknowns)
     stated = (formulation.mass, formulation.stiffness, formulation.damping)
-    for name, model, group, known in zip(MATRICES, problem.models, formulation.of_models, stated, strict=True):
+    for name, model, group, known in zip(MATRICES, problem.stated.models, formulation.of_models, stated, strict=True):
         kind = type(model).__name__ if group else "written in variables" if counts[name] else "numbers"
         total = "" if known.totals is None else _TOTALS[known.totals.kind]
         yield name, "; ".join(filter(None, (kind, total, known.sentence)))
 
 
-def _stated_rigid_body(problem: Problem) -> Array:
+def _stated_rigid_body(problem: PreparedProblem) -> Array:
     totals, d = problem.formulation.mass.totals, problem.measurement.n_base
     if totals is None or totals.kind != "rigid_body":
         return np.zeros((d, d), dtype=bool)

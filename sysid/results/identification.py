@@ -16,6 +16,7 @@ import numpy as np
 from sysid.errors import InputError, finite_array, instance, shown, text, whole_number
 from sysid.finding import Finding
 from sysid.problem.problem import Problem
+from sysid.problem.stated import StatedProblem
 from sysid.problem.stored import NotRebuiltError, needs_module
 from sysid.results import readings, storage
 from sysid.results.answer import Answer
@@ -221,7 +222,7 @@ class Identification(Answer):
         """The problem, and beside it what readers ask of it, where the tree does not hold it whole."""
         if self.part is not None:
             return {"problem": self.part.tree, "readings": self.part.readings}
-        tree = self.problem.to_tree()
+        tree = self.prepared.to_tree()
         return {"problem": tree, "readings": readings.to_tree(self) if needs_module(tree["given"]) else None}
 
     @classmethod
@@ -292,7 +293,9 @@ class Identification(Answer):
         if self.x is not None:
             _check_unknowns(self, self.x, problem)
         own = {
-            field.name: getattr(self, field.name) for field in fields(self) if field.init and field.name != "problem"
+            field.name: getattr(self, field.name)
+            for field in fields(self)
+            if field.init and field.name not in ("problem", "prepared")
         }
         return type(self)(**own, problem=problem)
 
@@ -344,7 +347,7 @@ def _problem_from_tree(tree: dict[str, Any], structure: Structure) -> Any:
         return PartOfProblem(part, read, Records.from_tree(part), attributes, f"{error}{module}")
 
 
-def _check_records(records: Problem | Records, problem: Problem) -> None:
+def _check_records(records: StatedProblem | Records, problem: Problem) -> None:
     """Refuse a problem of other records."""
     for name in ("freq", "base", "response", "force"):
         own, other = getattr(records.measurement, name), getattr(problem.measurement, name)

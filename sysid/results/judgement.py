@@ -16,6 +16,7 @@ from sysid.assessment.sensitivity import blocks_of
 from sysid.assessment.uncertainty import LARGE
 from sysid.finding import Finding, Severity, cautions, contradicting, is_fit, weightiest_first
 from sysid.nlp import EXACT
+from sysid.problem.prepared import PreparedProblem
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification
 from sysid.search.deadline import TimeIsOver, within
@@ -38,31 +39,34 @@ class Verdict(NamedTuple):
     message: str
 
 
-def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session) -> Identification:
+def judge(
+    problem: Problem, prepared: PreparedProblem, end: Outcome, why: str, seed: int, session: Session
+) -> Identification:
     """Judge where a search ended: `why` tells why its strategy was taken, the session has its log and clock."""
-    context = Context(problem, end, session.cut_short)
+    context = Context(prepared, end, session.cut_short)
     verdict = _verdict(context)
     session.log(f"done: {verdict.message}")
     try:
         with within(session.left):
-            known = determine(problem.screened, end.structure, end.x, end.alternatives)
+            known = determine(prepared.screened, end.structure, end.x, end.alternatives)
             run(context)
         open_ = cautions(known.findings)
         if verdict.success and known.judged_by == BY_RANK and not (open_ or contradicting(context.found)):
-            end = with_other_answers(problem, end, session)
+            end = with_other_answers(prepared, end, session)
             with within(session.left):
-                open_ = cautions(determine(problem.screened, end.structure, end.x, end.alternatives).findings)
+                open_ = cautions(determine(prepared.screened, end.structure, end.x, end.alternatives).findings)
         closed = tuple(one for one in known.findings if one not in cautions(known.findings))
     except TimeIsOver:
         run(context, QUICK)
         open_, closed = (_NOT_JUDGED,), ()
     found = [*context.found, *end.findings, *open_]
     if not (contradicting(found) or cautions(found)):
-        found = [*closed, *found, *assumed(problem)]
+        found = [*closed, *found, *assumed(prepared)]
     strategy, ending = Finding("strategy", Severity.NOTE, why), Finding("ending", Severity.NOTE, end.message)
     it = Identification(
         structure=end.structure,
         problem=problem,
+        prepared=prepared,
         x=end.x,
         strategy=end.strategy,
         seed=seed,
@@ -78,7 +82,7 @@ def judge(problem: Problem, end: Outcome, why: str, seed: int, session: Session)
         return it.with_findings((_NOT_JUDGED,))
 
 
-def verdict_of(problem: Problem, end: Outcome) -> Verdict:
+def verdict_of(problem: PreparedProblem, end: Outcome) -> Verdict:
     """Whether where a search ended is a fit."""
     return _verdict(Context(problem, end))
 
@@ -99,9 +103,9 @@ def _by_noise(it: Identification) -> Iterator[Finding]:
     if not it.determined:
         return
     exact = max(it.residual, it.force_residual or 0.0) < EXACT
-    if it.x is not None and not it.problem.free_modes:
+    if it.x is not None and not it.prepared.free_modes:
         # A further test may be noisy, and what is stated as known always is.
-        exact = exact and not it.problem.formulation.priors and it.problem.objective(it.x) < EXACT
+        exact = exact and not it.prepared.formulation.priors and it.prepared.objective(it.x) < EXACT
     if exact:
         return
     if it.structure.mode_shapes.size > LARGE:
@@ -118,5 +122,5 @@ def _by_noise(it: Identification) -> Iterator[Finding]:
             up_to = "open" if np.isnan(largest) else f"with standard deviations up to {100 * largest:.2g} %"
             told, open_ = f"noise leaves entries of {name} {up_to}", True
             yield Finding("noise", Severity.CAUTION, told, numbers={"largest": largest})
-    if not open_ and it.problem.formulation.fits_records:
-        yield from rests_on(it.problem.screened.measurement, it.gains, it.gain_worth)
+    if not open_ and it.prepared.formulation.fits_records:
+        yield from rests_on(it.measurement, it.gains, it.gain_worth)

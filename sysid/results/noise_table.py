@@ -38,8 +38,8 @@ def noise_of_channels(it: Answer) -> tuple[ChannelNoise, ...]:
 
     Per cent are of what the channel records over the lines of the test, noise and all, so that a band makes both alike.
     """
-    levels, test = it.noise, it.records.measurement
-    if levels is None or test.whole is None:
+    levels, test, density = it.noise, it.records.measurement, it.modal[0].density
+    if levels is None:
         return ()
     axes = test.base_axes or ()
     turns = ["r" in axis for axis in axes]
@@ -50,7 +50,7 @@ def noise_of_channels(it: Answer) -> tuple[ChannelNoise, ...]:
         names += [(f"force {axis}", "N m" if turn else "N") for axis, turn in zip(axes, turns, strict=True)]
         spectra, level = [*spectra, test.force], [*level, levels.force]
     power = np.sum(np.abs(np.concatenate(spectra, axis=1)) ** 2, axis=(0, 2))
-    lines = test.whole.density * test.own_lines.sum(axis=1)  # of each run
+    lines = density * test.own_lines.sum(axis=1)  # of each run
     found = np.concatenate([np.broadcast_to(part, (test.n_runs, part.shape[-1])) for part in level], axis=1)
     rms, std = np.sqrt(power / lines.sum()), np.sqrt(lines @ found**2 / lines.sum())
     percent = 100 * std / np.where(rms > 0, rms, np.inf)

@@ -8,7 +8,7 @@ import numpy as np
 
 from sysid.assessment.sensitivity import blocks_of
 from sysid.errors import InputError
-from sysid.problem.problem import Problem
+from sysid.problem.prepared import PreparedProblem
 from sysid.search.strategy import History, Phase
 from sysid.structure.structure import Array, Structure
 
@@ -24,7 +24,7 @@ class Searched(Protocol):
     """A result, as far as its phases go."""
 
     @property
-    def problem(self) -> Problem:
+    def prepared(self) -> PreparedProblem:
         """What was identified."""
 
     @property
@@ -73,7 +73,7 @@ def matrix_errors(found: Structure, truth: Structure) -> tuple[float, ...]:
 
 
 def _row(it: Searched, phase: Phase) -> list[str]:
-    problem, truth = it.problem, it.problem.reference
+    problem, truth = it.prepared, it.prepared.stated.reference
     # The graph of the matrices, which a hundred sensors cannot wait for, is not built for the answer itself.
     answered = it.x is not None and np.array_equal(phase.x, it.x)
     try:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Any
 
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.outliers import screened
-from sysid.modal_analysis.whole_records import without_transients
 from sysid.structure.structure import Structure
 
 
@@ -32,18 +29,6 @@ class Records:
             tree["goal"],
             tree["loss"],
         )
-
-    @cached_property
-    def at_rest(self) -> Records:
-        """The same without the transients of whole records."""
-        test = self.measurement
-        return self if test.whole is None else replace(self, measurement=without_transients(test))
-
-    @cached_property
-    def screened(self) -> Records:
-        """The same without transients and, where the loss is Huber's, without numbers that stand alone."""
-        rest = self.at_rest
-        return rest if self.loss == "squares" else replace(rest, measurement=screened(rest.measurement))
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.spectrum import SOLVED
 from sysid.models.unknowns import lower_of, upper_of
 from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram
-from sysid.problem.problem import Problem
+from sysid.problem.prepared import PreparedProblem
 from sysid.search.modal_program import Spectrum, Ties, fit_modes
 from sysid.search.modal_scaling import stated_totals
 from sysid.search.strategy import DoesNotApplyError
@@ -206,7 +206,9 @@ def _ascending(fit: ModalFit) -> ModalFit:
     return replace(fit, modes=Modes(end.phi[:, order], end.gamma[order], end.omega[order], end.ratios[order]))
 
 
-def held_to_totals(problem: Problem, end: ModalFit, monitor: IterationMonitor, max_iterations: int) -> ModalFit | None:
+def held_to_totals(
+    problem: PreparedProblem, end: ModalFit, monitor: IterationMonitor, max_iterations: int
+) -> ModalFit | None:
     """The same fit with stated totals held, where what the base force weighs agrees with them; else None."""
     ties, modes = stated_totals(problem), end.modes
     if ties is None or monitor.is_over:
@@ -219,7 +221,7 @@ def held_to_totals(problem: Problem, end: ModalFit, monitor: IterationMonitor, m
     return held if agrees and held.status in SOLVED else None
 
 
-def ended(problem: Problem, estimate: ModalFit, monitor: IterationMonitor, max_iterations: int) -> ModalFit:
+def ended(problem: PreparedProblem, estimate: ModalFit, monitor: IterationMonitor, max_iterations: int) -> ModalFit:
     """Where IPOPT ends from an estimate, with damping ratios within their bounds and no negative mass.
 
     The estimate itself where nobody wants to wait for it, or where it is one of whole records and within the bounds.
@@ -240,20 +242,20 @@ def ended(problem: Problem, estimate: ModalFit, monitor: IterationMonitor, max_i
         raise DoesNotApplyError(f"{error}: use fewer modes, Modal(modes=), or narrow the band") from None
 
 
-def _within_bounds(problem: Problem, end: ModalFit) -> bool:
+def _within_bounds(problem: PreparedProblem, end: ModalFit) -> bool:
     """Whether all damping ratios are within the problem's bounds."""
     low, high = damping_bounds(problem)
     return bool(np.all((end.modes.ratios >= low) & (end.modes.ratios <= high)))
 
 
-def damping_bounds(problem: Problem) -> tuple[float, float]:
+def damping_bounds(problem: PreparedProblem) -> tuple[float, float]:
     """Bounds of the free damping ratios of a problem, those of all modes alike."""
     unknowns = problem.formulation.of_models[2]
     return float(lower_of(unknowns).min()), float(upper_of(unknowns).max())
 
 
 def _again(
-    problem: Problem, end: ModalFit, monitor: IterationMonitor, max_iterations: int, ties: Ties | None = None,
+    problem: PreparedProblem, end: ModalFit, monitor: IterationMonitor, max_iterations: int, ties: Ties | None = None,
     *, bounded: bool = True,
 ) -> ModalFit:  # fmt: skip
     """A fit from where another ended, with ties, and damping ratios within the problem's bounds."""

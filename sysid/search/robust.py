@@ -8,7 +8,7 @@ import numpy as np
 
 from sysid.errors import InputError, SolverError
 from sysid.modal_analysis.outliers import HUBER, loss, predicted, whitened
-from sysid.problem.problem import Problem
+from sysid.problem.prepared import PreparedProblem
 from sysid.search.local import solve
 from sysid.search.modal import Modal, objective_of
 from sysid.search.session import Session, Stop
@@ -22,21 +22,21 @@ _FARTHEST = 64.0  # times a step
 _EXACT = 1e-10  # of the records: predictions that move by less stay, whatever the noise
 
 
-def settled(problem: Problem, end: Outcome, strategy: Strategy, session: Session) -> Outcome:
+def settled(problem: PreparedProblem, end: Outcome, strategy: Strategy, session: Session) -> Outcome:
     """Where Huber's loss is least, from the answer to the screened records.
 
     The modal strategy fits each round anew; after all others the local phase goes on from the last unknowns.
 
     Parameters
     ----------
-    problem : Problem
+    problem : PreparedProblem
     end : Outcome
         Of a search in ``problem.screened``.
     strategy : Strategy
         With the settings of that search, as far as it was its own.
     session : Session
     """
-    if problem.loss == "squares" or end.stopped is not None:
+    if problem.in_squares or end.stopped is not None:
         return end
     moved, fitted = np.inf, problem.pseudo_values(end.structure, end.x)
     for number in range(1, _ROUNDS + 1):
@@ -62,7 +62,7 @@ def settled(problem: Problem, end: Outcome, strategy: Strategy, session: Session
     return end.with_note(told) if moved < _NEAR else _cut_short(end, told)
 
 
-def check(problem: Problem, strategy: Strategy) -> None:
+def check(problem: PreparedProblem, strategy: Strategy) -> None:
     """Refuse settings that leave nothing to go on from.
 
     Raises
@@ -70,11 +70,11 @@ def check(problem: Problem, strategy: Strategy) -> None:
     InputError
         Where a swarm is to run without its local phase.
     """
-    if problem.loss == "huber" and isinstance(strategy, Swarm) and strategy.local is None:
+    if problem.stated.loss == "huber" and isinstance(strategy, Swarm) and strategy.local is None:
         raise InputError("loss='huber' is fitted by the local phase, and Swarm(local=None) has none")
 
 
-def _with_round(problem: Problem, end: Outcome, again: Outcome, session: Session) -> Outcome:
+def _with_round(problem: PreparedProblem, end: Outcome, again: Outcome, session: Session) -> Outcome:
     """A round's answer, with all that ran before it in its history; objectives are of the screened records."""
     left = objective_of(problem, again.structure, again.x)
     curve = np.concatenate([end.history.local_curve, again.history.local_curve])
@@ -90,7 +90,7 @@ def _cut_short(end: Outcome, why: str, stopped: BaseException | None = None) -> 
     return replace(end, success=False, message=f"{end.message}; {why}", stopped=stopped)
 
 
-def _fitted(problem: Problem, end: Outcome, strategy: Strategy, session: Session) -> Outcome:
+def _fitted(problem: PreparedProblem, end: Outcome, strategy: Strategy, session: Session) -> Outcome:
     """The answer to pseudo-values, from the last one."""
     if end.strategy == Modal.name:
         return (strategy if isinstance(strategy, Modal) else Modal()).run(problem, session, None)
@@ -105,19 +105,21 @@ def _fitted(problem: Problem, end: Outcome, strategy: Strategy, session: Session
     )  # fmt: skip
 
 
-def _farther(problem: Problem, before: Outcome, after: Outcome) -> Outcome:
+def _farther(problem: PreparedProblem, before: Outcome, after: Outcome) -> Outcome:
     """The answer, or one farther along its step, as far as the loss falls while steps double.
 
     Where most of what tells an unknown is still far off, each number pulls as little as an outlier.
     """
     assert before.x is not None and after.x is not None
     fits = problem.fits(after.structure, after.x)
-    stds = [part.std for test, its in fits for part in whitened(test, predicted(test, its), problem.n_variables)]
+    made = [(modal.records, predicted(modal.records, its)) for modal, its in fits]
+    stds = [part.std for test, values in made for part in whitened(test, values, problem.n_variables)]
 
     def left(x: Array, structure: Structure) -> float:
         found = 0.0
         units = iter(stds)
-        for test, its in problem.fits(structure, x):
+        for modal, its in problem.fits(structure, x):
+            test = modal.records
             records = [record for record in (test.relative, test.force) if record is not None]
             found += sum(loss((y - f) / next(units)) for y, f in zip(records, predicted(test, its), strict=True))
         return found
@@ -136,11 +138,12 @@ def _farther(problem: Problem, before: Outcome, after: Outcome) -> Outcome:
     return after
 
 
-def _moved(problem: Problem, before: Outcome, after: Outcome) -> float:
+def _moved(problem: PreparedProblem, before: Outcome, after: Outcome) -> float:
     """Distance of two answers by what they make of the records, in standard deviations of an unknown; 0 where exact."""
     squares = change = size = 0.0
     fits = zip(problem.fits(before.structure, before.x), problem.fits(after.structure, after.x), strict=True)
-    for (test, one), (_, other) in fits:
+    for (modal, one), (_, other) in fits:
+        test = modal.records
         # Pseudo-values state the noise as it counts.
         stds = [std for std in (test.response_std, test.force_std) if std is not None]
         for a, b, std in zip(predicted(test, one), predicted(test, other), stds, strict=True):

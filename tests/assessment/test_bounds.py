@@ -39,7 +39,9 @@ class TestSides:
 
 
 def places(problem, x):
-    return [(one.name + one.entry, one.side, one.source) for one in on_bounds(problem, problem.structure(x), x)]
+    return [
+        (one.name + one.entry, one.side, one.source) for one in on_bounds(problem.prepared, problem.structure(x), x)
+    ]
 
 
 def test_unknowns_of_models_and_variables_are_named_with_who_states_the_bound():
@@ -76,7 +78,7 @@ def test_alike_bounds_are_told_together():
     problem = sysid.Problem(
         TEST, mass=np.diag([2.0, 1.0]), stiffness=sysid.ChainStiffness(400.0, 900.0), damping=np.eye(2)
     )
-    found = on_bounds(problem, TRUTH, np.array([400.0, 400.0]))
+    found = on_bounds(problem.prepared, TRUTH, np.array([400.0, 400.0]))
     assert bounds_in_words(found) == "spring 1, 2 (lower, 400 N/m)"
     assert {one.source for one in found} == {"ChainStiffness"}
 
@@ -102,9 +104,9 @@ class TestPressure:
         at = {"x": np.append(bounded, bounded[1:] if tied else []), "k": 1.5}
         values = np.concatenate([np.ravel(at[v.name]) for v in problem.variables])
         left = lambda z: np.sum((A @ z - b) ** 2)  # noqa: E731
-        found = on_bounds(problem, problem.structure(values), values)
+        found = on_bounds(problem.prepared, problem.structure(values), values)
         assert [one.name + one.entry for one in found] == ["x[0]"]
-        share = pressure(problem, problem.structure(values), values, found).share
+        share = pressure(problem.prepared, problem.structure(values), values, found).share
         assert share == pytest.approx((left(bounded) - left(free)) / left(bounded), rel=1e-6)
 
     def test_bounds_explain_a_misfit_that_they_make_and_none_that_a_wrong_mass_makes(self):
@@ -114,9 +116,9 @@ class TestPressure:
             ratio = sysid.Variable("ratio", 2, lower=[0.0019, 0.0], upper=0.3, guess=[0.002, 0.1])
             problem = sysid.Problem(TEST, mass=np.diag(mass), stiffness=STRETCH.T @ ca.diag(k) @ STRETCH, damping=ratio)
             result = sysid.identify(problem, rng=0, strategy=sysid.Continuation(starts=1))
-            found = on_bounds(problem, result.structure, result.x)
+            found = on_bounds(problem.prepared, result.structure, result.x)
             assert found
-            assert pressure(problem, result.structure, result.x, found).explains is explains
+            assert pressure(problem.prepared, result.structure, result.x, found).explains is explains
 
     def test_exact_records_on_a_bound_press_on_nothing(self):
         exact = sysid.simulate(TRUTH, FREQ)
@@ -125,18 +127,18 @@ class TestPressure:
             damping=sysid.ModalDamping(0.001, 0.2),
         )  # fmt: skip
         x = np.array([900.0, 400.0, 0.002, 0.1])
-        found = on_bounds(problem, TRUTH, x)
+        found = on_bounds(problem.prepared, TRUTH, x)
         assert len(found) == 1
-        assert not pressure(problem, TRUTH, x, found).significant
+        assert not pressure(problem.prepared, TRUTH, x, found).significant
 
     def test_of_free_modes_by_the_poles_of_the_data(self):
         problem = sysid.Problem(TEST, mass=sysid.FullMass(3.0), damping=sysid.ModalDamping(0.005, 0.05))
         narrow = sysid.Structure(TRUTH.mass, TRUTH.stiffness, [0.005, 0.05], n_base=1)
         x = problem.values(narrow)
-        press = pressure(problem, narrow, x, on_bounds(problem, narrow, x))
+        press = pressure(problem.prepared, narrow, x, on_bounds(problem.prepared, narrow, x))
         assert press.explains
         wide = replace(problem, damping=sysid.ModalDamping(0.002, 0.1))
         x = wide.values(TRUTH)
-        found = on_bounds(wide, TRUTH, x)
+        found = on_bounds(wide.prepared, TRUTH, x)
         assert len(found) == 2
-        assert not pressure(wide, TRUTH, x, found).significant
+        assert not pressure(wide.prepared, TRUTH, x, found).significant

@@ -96,8 +96,8 @@ def test_two_close_modes_of_one_shape_are_no_mode_that_changes():
     records = noisy(rng, base, of_lines(tuned_mass(0.002), base[None])[:2])
     test = as_test(records).in_band(0.5, 12.0)
     problem = sysid.Problem(test, mass=sysid.FullMass())
-    assert problem.screened.measurement.modal.omega.size == 3
-    assert changes(problem) == []
+    assert problem.prepared.modal[0].omega.size == 3
+    assert changes(problem.prepared) == []
 
 
 def test_a_base_direction_that_does_not_move_in_an_unfitted_test_is_no_error():
@@ -112,7 +112,7 @@ def test_a_base_direction_that_does_not_move_in_an_unfitted_test_is_no_error():
     fitted, unseen = (
         sysid.Measurement.from_time([(u, spoil(of_lines(structure, u)), None)], RATE, **made) for u in (base, alone)
     )
-    assert changing(sysid.Problem(fitted, mass=sysid.FullMass(), validation=[unseen])) == ()
+    assert changing(sysid.Problem(fitted, mass=sysid.FullMass(), validation=[unseen]).prepared) == ()
 
 
 def test_unfitted_tests_keep_their_numbers():
@@ -122,7 +122,7 @@ def test_unfitted_tests_keep_their_numbers():
     fitted, other, large = (as_test(noisy(rng, base, answer(base, softening=100.0))) for base in bases)
     given = sysid.Measurement(other.freq, other.base, other.response, rigid_body=other.rigid_body)
     problem = sysid.Problem(fitted, mass=sysid.FullMass(), validation=[given, large])
-    records = {one.record for change in changes(problem) for one in change.seen}
+    records = {one.record for change in changes(problem.prepared) for one in change.seen}
     assert records == {"the record", "the record of unfitted test 2"}
 
 

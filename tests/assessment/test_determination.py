@@ -60,17 +60,17 @@ class TestWhichSpeaks:
     def test_the_cone_where_models_tell_all_of_the_matrices(self, truth):
         for problem in (free(truth), free(truth, force=True), by_models(truth), by_models(truth, 6.0)):
             x = problem.values(truth)
-            assert determine(problem, truth, x).judged_by == BY_CONE
+            assert determine(problem.prepared, truth, x).judged_by == BY_CONE
 
     def test_the_rank_where_a_matrix_is_written_or_something_beside_the_records_tells_of_it(self, truth):
         ratios = Variable("z", 3, lower=0.001, upper=0.1, guess=truth.damping_ratios)
         problems = by_hand(truth), free(truth, damping=ratios, residuals=[Prior(ratios[0], 0.01, 0.001)])
         for problem in problems:
             x = problem.formulation.guess
-            told = determine(problem, problem.structure(x), x)
+            told = determine(problem.prepared, problem.structure(x), x)
             assert told.judged_by == BY_RANK
             assert not told.determined
-            assert open_masses(problem, truth) == []
+            assert open_masses(problem.prepared, truth) == []
 
     def test_the_rank_needs_the_unknowns(self, truth):
         problem = by_hand(truth)
@@ -82,17 +82,20 @@ class TestWhichSpeaks:
     def test_both_say_the_same_of_one_chain(self, truth, total):
         """A chain on accelerations alone has one scale open, which its total closes."""
         x_models, hand = by_models(truth, total).values(truth), by_hand(truth, total)
-        cone = determine(by_models(truth, total), truth, x_models)
-        rank = determine(hand, truth, np.concatenate([MASSES, SPRINGS, [ALPHA, BETA]]))
+        cone = determine(by_models(truth, total).prepared, truth, x_models)
+        rank = determine(hand.prepared, truth, np.concatenate([MASSES, SPRINGS, [ALPHA, BETA]]))
         assert cone.determined is rank.determined is (total is not None)
-        ends = intervals(by_models(truth, total), truth, None), intervals(hand, truth, hand.formulation.guess)
+        ends = (
+            intervals(by_models(truth, total).prepared, truth, None),
+            intervals(hand.prepared, truth, hand.formulation.guess),
+        )
         for one, other in zip(*((e.mass, e.stiffness) for e in ends), strict=True):
             # To first order both ends of an open entry are.
             np.testing.assert_array_equal(np.any(np.isinf(one), axis=0), np.any(np.isinf(other), axis=0))
 
     def test_ratios_that_are_written_leave_the_cone_valid(self, truth):
         ratios = Variable("z", 3, lower=0.001, upper=0.1, guess=truth.damping_ratios)
-        told = determine(free(truth, force=True, damping=ratios), truth, None)
+        told = determine(free(truth, force=True, damping=ratios).prepared, truth, None)
         assert told.judged_by == BY_CONE and told.determined
 
 
@@ -103,10 +106,13 @@ class TestVariablesBeside:
         v = weighed()
         problem = free(truth, force=True, noise=0.01, residuals=[Prior(v, 0.4, 0.05)])
         x = np.concatenate([problem.values(truth)[:-1], [0.4]])
-        told = determine(problem, truth, x)
+        told = determine(problem.prepared, truth, x)
         assert told.determined and told.judged_by == BY_CONE
-        assert told == determine(free(truth, force=True, noise=0.01), truth, None)
-        u, alone = uncertainty(problem, truth, x), uncertainty(free(truth, force=True, noise=0.01), truth, None)
+        assert told == determine(free(truth, force=True, noise=0.01).prepared, truth, None)
+        u, alone = (
+            uncertainty(problem.prepared, truth, x),
+            uncertainty(free(truth, force=True, noise=0.01).prepared, truth, None),
+        )
         assert u.variables == {v.name: pytest.approx(0.05, rel=1e-9)}
         assert u.values == {v.name: 0.4}
         np.testing.assert_array_equal(u.mass, alone.mass)
@@ -118,23 +124,23 @@ class TestVariablesBeside:
         problem = free(truth, residuals=[Prior(v, 0.41, 0.03), Prior(2 * v, 0.78, 0.08)])
         x = np.concatenate([problem.values(truth)[:-1], [0.4]])
         expected = 1 / np.sqrt(1 / 0.03**2 + 4 / 0.08**2)
-        assert uncertainty(problem, truth, x).variables[v.name] == pytest.approx(expected, rel=1e-9)
+        assert uncertainty(problem.prepared, truth, x).variables[v.name] == pytest.approx(expected, rel=1e-9)
 
     def test_one_that_nothing_sees_is_named_and_the_matrices_stay_determined(self, truth):
         v, w = weighed(), Variable("other", lower=0.0, upper=1.0)
         problem = free(truth, force=True, residuals=[Prior(v + w, 0.9, 0.05)])
         x = np.concatenate([problem.values(truth)[:-2], [0.4, 0.5]])
-        told = determine(problem, truth, x)
+        told = determine(problem.prepared, truth, x)
         assert told.determined
         (sentence,) = (s for s in told.closed_by if v.name in s)
         assert "other" in sentence and "stay the same all the same" in sentence
-        assert all(np.isnan(std) for std in uncertainty(problem, truth, x).variables.values())
+        assert all(np.isnan(std) for std in uncertainty(problem.prepared, truth, x).variables.values())
 
     def test_beside_open_masses_it_is_one_more_thing_open(self, truth):
         v, w = weighed(), Variable("other", lower=0.0, upper=1.0)
         problem = free(truth, residuals=[Prior(v + w, 0.9, 0.05)])
         x = np.concatenate([problem.values(truth)[:-2], [0.4, 0.5]])
-        told = determine(problem, truth, x)
+        told = determine(problem.prepared, truth, x)
         assert not told.determined
         assert any(v.name in sentence for sentence in told.undetermined)
 
@@ -142,8 +148,8 @@ class TestVariablesBeside:
         v, w = weighed(), Variable("other", lower=0.0, upper=1.0)
         problem = free(truth, force=True, residuals=[Prior(v + w, 0.9, 0.05)], constraints=[v - w == -0.1])
         x = np.concatenate([problem.values(truth)[:-2], [0.4, 0.5]])
-        assert not any(v.name in sentence for sentence in determine(problem, truth, x).closed_by)
-        for std in uncertainty(problem, truth, x).variables.values():
+        assert not any(v.name in sentence for sentence in determine(problem.prepared, truth, x).closed_by)
+        for std in uncertainty(problem.prepared, truth, x).variables.values():
             assert std == pytest.approx(0.025, rel=1e-9)
 
 
@@ -152,20 +158,20 @@ class TestOtherAnswers:
         problem, x = by_hand(truth, 6.0), np.concatenate([MASSES, SPRINGS, [ALPHA, BETA]])
         other = x.copy()
         other[3] *= 1.5
-        told = determine(problem, truth, x, [other])
+        told = determine(problem.prepared, truth, x, [other])
         assert not told.determined
         assert told.undetermined == ("another structure explains the data as well: k[0] = 3e+04 in place of 2e+04",)
-        assert determine(problem, truth, x, [x]).determined
+        assert determine(problem.prepared, truth, x, [x]).determined
 
     def test_one_that_noise_does_not_tell_apart_is_the_same(self, truth):
         """The other spring is off by a part of its deviation, and by so many that no noise explains it."""
         problem, x = by_hand(truth, 6.0, noise=0.2), np.concatenate([MASSES, SPRINGS, [ALPHA, BETA]])
-        std = uncertainty(problem, problem.structure(x), x).variables["k"][0]
+        std = uncertainty(problem.prepared, problem.structure(x), x).variables["k"][0]
         assert std > 2e-3 * SPRINGS[0]  # so that the two structures are not the same to a thousandth
         for times, same in ((1, True), (100, False)):
             other = x.copy()
             other[3] += times * std
-            told = determine(problem, problem.structure(x), x, [other])
+            told = determine(problem.prepared, problem.structure(x), x, [other])
             assert told.determined is same, told
 
     def test_models_tell_it_too(self, truth):
@@ -173,18 +179,18 @@ class TestOtherAnswers:
         x = problem.values(truth)
         other = x.copy()
         other[3] *= 1.5
-        told = determine(problem, truth, x, [other])
+        told = determine(problem.prepared, truth, x, [other])
         assert told.undetermined == ("another structure explains the data as well: spring 1 = 3e+04 in place of 2e+04",)
         shares = x.copy()
         shares[:3] *= 0.5  # the same masses
-        assert determine(problem, truth, x, [shares]).determined
+        assert determine(problem.prepared, truth, x, [shares]).determined
 
     def test_where_the_cone_is_open_it_is_a_member_and_nothing_new(self, truth):
         problem = by_models(truth)
         x = problem.values(truth)
         other = x.copy()
         other[3] *= 1.5
-        assert determine(problem, truth, x, [other]) == determine(problem, truth, x)
+        assert determine(problem.prepared, truth, x, [other]) == determine(problem.prepared, truth, x)
 
 
 def test_entries_of_factors_are_counted_and_not_named(truth):
@@ -193,10 +199,10 @@ def test_entries_of_factors_are_counted_and_not_named(truth):
     problem = free(truth, damping=ratios, residuals=[Prior(ratios[0], 0.02, 0.001)])
     of_models = [model.values(problem.geometry, truth) for model in problem.models[:2]]
     x = np.concatenate([*of_models, truth.damping_ratios])
-    told = determine(problem, problem.structure(x), x)
+    told = determine(problem.prepared, problem.structure(x), x)
     assert not told.determined
     assert "mass factor, stiffness factor together, in" in told.undetermined[0]
-    u = uncertainty(problem, problem.structure(x), x)
+    u = uncertainty(problem.prepared, problem.structure(x), x)
     assert list(u.variables) == ["z"]
     assert np.all(np.isfinite(u.variables["z"])) and np.all(np.isnan(np.diag(u.mass)))
 
@@ -204,8 +210,8 @@ def test_entries_of_factors_are_counted_and_not_named(truth):
 class TestUnknownsOfModels:
     def test_springs_of_a_chain_have_the_deviations_of_the_same_chain_by_hand(self, truth):
         models, hand = by_models(truth, 6.0, noise=0.01), by_hand(truth, 6.0, noise=0.01)
-        one = uncertainty(models, truth, models.values(truth))
-        other = uncertainty(hand, truth, np.concatenate([MASSES, SPRINGS, [ALPHA, BETA]]))
+        one = uncertainty(models.prepared, truth, models.values(truth))
+        other = uncertainty(hand.prepared, truth, np.concatenate([MASSES, SPRINGS, [ALPHA, BETA]]))
         np.testing.assert_allclose(one.values["spring"], SPRINGS, rtol=1e-9)
         # Both have 8 unknowns, one of them tied by the total in one way or another.
         np.testing.assert_allclose(one.variables["spring"], other.variables["k"], rtol=1e-6)
@@ -218,19 +224,19 @@ class TestUnknownsOfModels:
 
     def test_without_a_total_they_are_open_and_ratios_are_not(self, truth):
         problem = by_models(truth, noise=0.01)
-        u = uncertainty(problem, truth, problem.values(truth))
+        u = uncertainty(problem.prepared, truth, problem.values(truth))
         assert np.all(np.isnan(u.variables["spring"]))
         assert np.all(np.isfinite(u.variables["rayleigh_alpha"])) and np.all(np.isfinite(u.variables["rayleigh_beta"]))
 
     def test_their_covariance_is_given_where_all_of_them_mean_something(self, truth):
         test = sysid.simulate(truth, FREQ, noise=0.01, rng=1)
         chain = Problem(test, mass=np.diag(MASSES), stiffness=ChainStiffness(1e3, 1e6))
-        u = uncertainty(chain, truth, chain.values(truth))
+        u = uncertainty(chain.prepared, truth, chain.values(truth))
         assert u.parameters == (*(f"spring {i}" for i in (1, 2, 3)), *(f"damping ratio {i}" for i in (1, 2, 3)))
         np.testing.assert_allclose(np.sqrt(np.diag(u.covariance))[:3], u.variables["spring"])
         np.testing.assert_allclose(u.variables["damping_ratio"], u.damping_ratios, rtol=1e-6)
         lumped = Problem(test, mass=LumpedMass(6.0), stiffness=ChainStiffness(1e3, 1e6))
-        assert uncertainty(lumped, truth, lumped.values(truth)).parameters[0] == "frequency 1, Hz"
+        assert uncertainty(lumped.prepared, truth, lumped.values(truth)).parameters[0] == "frequency 1, Hz"
 
     def test_a_model_of_ones_own_is_judged_by_what_it_states(self, truth):
         """Masses stated to be lumped, in a class that the package does not know."""
@@ -246,7 +252,7 @@ class TestUnknownsOfModels:
             damping=ProportionalDamping((0.0, 5.0), (0.0, 1e-2)),
         )  # fmt: skip
         x = other.values(truth)
-        assert determine(other, truth, x) == determine(by_models(truth, 6.0), truth, x)
+        assert determine(other.prepared, truth, x) == determine(by_models(truth, 6.0).prepared, truth, x)
 
 
 class TestMassesThatNobodyWeighed:
@@ -260,26 +266,26 @@ class TestMassesThatNobodyWeighed:
     def test_a_written_stiffness_beside_them_is_open_by_their_scale(self, truth):
         problem = self.chain(truth)
         x = np.concatenate([MASSES / 3.0, truth.damping_ratios, SPRINGS / 6.0])
-        told = determine(problem, problem.structure(x), x)
+        told = determine(problem.prepared, problem.structure(x), x)
         assert told.judged_by == BY_RANK and not told.determined
         direction, unit = told.undetermined
         assert direction.endswith("no record sees a change of total mass +1 %, k +1 %")
         assert "normalised to 1 kg" in unit
-        ends = intervals(problem, problem.structure(x), x)
+        ends = intervals(problem.prepared, problem.structure(x), x)
         assert np.all(np.isinf(np.diagonal(ends.mass[1]))) and np.all(np.isinf(np.diagonal(ends.stiffness[1])))
         # A diagonal stays positive; to first order nothing stops the coupling of the springs.
         np.testing.assert_array_equal(np.diagonal(ends.stiffness[0]), 0.0)
         np.testing.assert_array_equal(np.diagonal(ends.stiffness[0], 1), -np.inf)
-        assert np.all(np.isnan(uncertainty(problem, problem.structure(x), x).variables["k"]))
+        assert np.all(np.isnan(uncertainty(problem.prepared, problem.structure(x), x).variables["k"]))
 
     def test_their_total_closes_it(self, truth):
         problem = self.chain(truth, 6.0)
         x = np.concatenate([MASSES / 3.0, truth.damping_ratios, SPRINGS])
-        told = determine(problem, problem.structure(x), x)
+        told = determine(problem.prepared, problem.structure(x), x)
         assert told.determined
         assert told.closed_by == ("the data and the written model fix mass, stiffness and damping",)
-        assert np.all(np.isfinite(intervals(problem, problem.structure(x), x).stiffness))
-        assert np.all(np.isfinite(uncertainty(problem, problem.structure(x), x).variables["k"]))
+        assert np.all(np.isfinite(intervals(problem.prepared, problem.structure(x), x).stiffness))
+        assert np.all(np.isfinite(uncertainty(problem.prepared, problem.structure(x), x).variables["k"]))
 
 
 @pytest.mark.parametrize("force", [False, True])
@@ -293,7 +299,7 @@ def test_a_written_chain_without_force_is_told_that_its_scale_is_open(force):
     problem = sysid.Problem(test, mass=ca.diagcat(m[0], m[1]), stiffness=stiffness)
     order = {"m": [2.0, 1.0], "k": [1e3, 1e3], "damping_ratio": [0.01, 0.02]}
     x = np.concatenate([order[unknown.name] for unknown in problem.formulation.unknowns])
-    open_ = determine(problem, truth, x).undetermined
+    open_ = determine(problem.prepared, truth, x).undetermined
     assert any("the scale of mass, stiffness and damping is not determined" in told for told in open_) != force
 
 
@@ -301,14 +307,14 @@ class TestOnlyTheScale:
     @pytest.mark.parametrize("total", [None, 6.0])
     def test_of_a_chain_by_cone_and_by_rank(self, truth, total):
         x = np.concatenate([MASSES, SPRINGS, [ALPHA, BETA]])
-        assert scale_is_open(by_models(truth, total), truth, None) is (total is None)
-        assert scale_is_open(by_hand(truth, total), truth, x) is (total is None)
+        assert scale_is_open(by_models(truth, total).prepared, truth, None) is (total is None)
+        assert scale_is_open(by_hand(truth, total).prepared, truth, x) is (total is None)
 
     @pytest.mark.parametrize(("mass", "open_"), [(LumpedMass(), True), (LumpedMass(6.0), False), (FullMass(), False)])
     def test_of_lumped_and_full_masses(self, truth, mass, open_):
         """Of a full mass every modal mass is open by itself, and a total closes none."""
         problem = Problem(sysid.simulate(truth, FREQ), mass=mass)
-        assert scale_is_open(problem, truth, None) is open_
+        assert scale_is_open(problem.prepared, truth, None) is open_
 
     def test_a_scale_for_each_base_direction_is_more_than_one(self):
         """One chain along x, one along y: records of neither tell its mass against the other's."""
@@ -318,13 +324,13 @@ class TestOnlyTheScale:
         full = np.block([[K_SS, -K_SS @ G], [-G.T @ K_SS, G.T @ K_SS @ G]])
         two = sysid.Structure(np.diag([3.0, 2.0, 1.0, 2.5, 0.0, 0.0]), full, [0.01] * 4, n_base=2)
         test = sysid.simulate(two, FREQ)
-        assert open_masses(Problem(test, mass=LumpedMass()), two) == [0, 1, 2, 3]
-        assert not scale_is_open(Problem(test, mass=LumpedMass()), two, None)
+        assert open_masses(Problem(test, mass=LumpedMass()).prepared, two) == [0, 1, 2, 3]
+        assert not scale_is_open(Problem(test, mass=LumpedMass()).prepared, two, None)
         m = Variable("m", 2, lower=0.1, upper=10.0, guess=np.ones(2))
         every = ca.diag(ca.vertcat(m[0], m[0], m[1], m[1]))
         hand = Problem(test, mass=every @ two.mass[:4, :4], stiffness=every @ K_SS)
         x = np.concatenate([np.ones(2), two.damping_ratios])
-        assert scale_is_open(hand, hand.structure(x), x) is False
+        assert scale_is_open(hand.prepared, hand.structure(x), x) is False
 
 
 @pytest.mark.parametrize("second", [2.0, 3.0])
@@ -342,7 +348,7 @@ def test_a_damper_that_no_record_sees_is_open_by_itself(second):
         stiffness=one * np.eye(2) + 200 * between, damping=a * np.eye(2) + b * between,
     )  # fmt: skip
     x = np.array([{"a": 5.0, "b": 5.0, "k": 800.0}[label] for label in problem.formulation.labels])
-    told = determine(problem, problem.structure(x), x)
+    told = determine(problem.prepared, problem.structure(x), x)
     assert told.judged_by == BY_RANK
     assert told.determined is (second != 2.0)
     assert all("no record sees a change of b" in sentence for sentence in told.undetermined)
@@ -364,6 +370,6 @@ def test_an_unknown_that_moves_exact_records_by_less_than_is_left_of_them_is_har
     order = [problem.formulation.labels.index(label) for label in "ab"]
     x = np.empty(2)
     x[order] = 5.0 * (1 + off), 5.0
-    told = determine(problem, problem.structure(x), x)
+    told = determine(problem.prepared, problem.structure(x), x)
     assert any("by which b +1 % is hardly held" in sentence for sentence in told.undetermined) is hardly
     assert told.determined is not hardly

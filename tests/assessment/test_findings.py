@@ -44,13 +44,13 @@ def test_the_page_on_mistakes_has_a_row_for_each_check_in_their_order():
 def test_all_but_blocking_checks_wait_for_the_end_of_a_search():
     truth = sysid.Structure(np.diag([1.0, 0.0]), 900.0 * np.array([[1.0, -1], [-1, 1]]), [0.02], n_base=1)
     problem = sysid.Problem(sysid.simulate(truth, np.linspace(2, 8, 60)), mass=sysid.FullMass())
-    assert run(Context(problem)) == []
+    assert run(Context(problem.prepared)) == []
     assert not {"screened", "at_rest", "formulation"} & set(vars(problem))  # nothing is fitted before a search
     assert set(OF_THE_END) < set(QUICK) < set(CHECKS)
     end = Outcome(truth, problem.values(truth), "by hand", False, "no end", sysid.History())
-    assert [one.kind for one in run(Context(problem, end, cut_short=True))] == ["no solution"]
+    assert [one.kind for one in run(Context(problem.prepared, end, cut_short=True))] == ["no solution"]
     end = Outcome(truth, problem.values(truth), "by hand", False, "no end", sysid.History(), KeyboardInterrupt())
-    assert [one.kind for one in run(Context(problem, end))] == ["stopped"]
+    assert [one.kind for one in run(Context(problem.prepared, end))] == ["stopped"]
 
 
 @pytest.mark.parametrize(

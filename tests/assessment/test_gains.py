@@ -8,6 +8,7 @@ import pytest
 import sysid
 from sysid import FullMass, LumpedMass, Measurement, Problem, Structure, simulate
 from sysid.assessment.checks.gains import gain_errors, taken_at_sensors
+from sysid.modal_analysis.modal_estimate import ModalEstimate
 
 ERROR = 0.02
 
@@ -50,14 +51,14 @@ class TestEstimate:
         truth = random_structure(rng, n=4, d=2)
         test = simulate(truth, lines(truth)) if unit else shaken(truth, rng)
         expected = np.where(np.arange(4) == sensor, ERROR, 0.0)
-        found = gain_errors(misread(test, sensor), truth)
+        found = gain_errors(ModalEstimate.of_lines(misread(test, sensor)), truth)
         np.testing.assert_allclose(found.error, expected, atol=1e-9)
         assert found.wrong.tolist() == [sensor]
 
     def test_of_a_damping_matrix_too(self):
         truth = storeys(matrix=True)
         assert not truth.modal_damping
-        found = gain_errors(misread(simulate(truth, lines(truth)), 1), truth)
+        found = gain_errors(ModalEstimate.of_lines(misread(simulate(truth, lines(truth)), 1)), truth)
         # Poles are taken from modal ratios, which are not quite those of such a matrix.
         np.testing.assert_allclose(found.error, [0.0, ERROR, 0.0], atol=5e-4)
         assert found.wrong.tolist() == [1]
@@ -66,7 +67,10 @@ class TestEstimate:
         """The sum of squares of 300 errors over their deviations is chi-squared, within 4 of its deviations."""
         truth = storeys()
         rng = np.random.default_rng(0)
-        draws = [gain_errors(simulate(truth, lines(truth), noise=0.01, rng=rng), truth) for _ in range(100)]
+        draws = [
+            gain_errors(ModalEstimate.of_lines(simulate(truth, lines(truth), noise=0.01, rng=rng)), truth)
+            for _ in range(100)
+        ]
         squares = np.sum([(draw.error / draw.std) ** 2 for draw in draws])
         # Blocks of lines count where they scatter more than lines, so that deviations are rather too large.
         assert 0.75 * 300 < squares < 300 + 4 * np.sqrt(2 * 300)
@@ -74,7 +78,7 @@ class TestEstimate:
     def test_nothing_shows_where_the_base_does_not_move_the_sensor(self, random_structure):
         truth = random_structure(np.random.default_rng(0), n=3, d=1)
         still = dataclasses.replace(simulate(truth, lines(truth)), rigid_body=truth.rigid_body * [[1.0], [0.0], [1.0]])
-        assert np.isnan(gain_errors(still, truth).error).tolist() == [False, True, False]
+        assert np.isnan(gain_errors(ModalEstimate.of_lines(still), truth).error).tolist() == [False, True, False]
 
     @pytest.mark.parametrize("noise", [0.0, 0.003])
     def test_modes_above_the_lines_are_no_gain(self, noise):
@@ -85,8 +89,8 @@ class TestEstimate:
         test = simulate(truth, freq, noise=noise, rng=0)
         two = sysid.identify(Problem(test, mass=FullMass()), strategy=sysid.Modal(modes=2), rng=0).structure
         assert two.n == 2
-        assert gain_errors(test, two).wrong.size == 0
-        assert gain_errors(misread(test, 0, 0.1), two).error[0] == pytest.approx(0.1, abs=0.03)
+        assert gain_errors(ModalEstimate.of_lines(test), two).wrong.size == 0
+        assert gain_errors(ModalEstimate.of_lines(misread(test, 0, 0.1)), two).error[0] == pytest.approx(0.1, abs=0.03)
 
     def test_deviations_hold_what_modes_above_the_lines_leave_in_the_constant(self):
         """One mode in the lines, the next near: errors are all of it and of noise, within four of the law's deviations.
@@ -99,7 +103,9 @@ class TestEstimate:
         one = sysid.identify(
             Problem(simulate(truth, freq), mass=FullMass()), strategy=sysid.Modal(modes=1), rng=0
         ).structure
-        draws = [gain_errors(simulate(truth, freq, noise=0.01, rng=rng), one) for _ in range(40)]
+        draws = [
+            gain_errors(ModalEstimate.of_lines(simulate(truth, freq, noise=0.01, rng=rng)), one) for _ in range(40)
+        ]
         squares = np.sum([(draw.error / draw.std) ** 2 for draw in draws])
         assert squares < 120 + 4 * np.sqrt(2 * 120)
 
@@ -108,16 +114,18 @@ class TestEstimate:
         truth = storeys()
         off = Structure(truth.mass, 1.0004 * truth.stiffness, 1.02 * truth.damping_ratios, n_base=1)
         test = simulate(truth, lines(truth), noise=0.003, rng=0)
-        right, moved = gain_errors(test, truth), gain_errors(test, off)
+        right, moved = gain_errors(ModalEstimate.of_lines(test), truth), gain_errors(ModalEstimate.of_lines(test), off)
         np.testing.assert_allclose(moved.std, right.std, rtol=0.05)
         assert np.all(np.abs(moved.error - right.error) < 0.1 * right.std)
 
     def test_one_error_of_all_is_the_bases(self):
         truth = storeys()
         test = simulate(truth, lines(truth), noise=0.003, rng=0)
-        found = gain_errors(dataclasses.replace(test, response=test.response / (1 + ERROR)), truth)
+        found = gain_errors(
+            ModalEstimate.of_lines(dataclasses.replace(test, response=test.response / (1 + ERROR))), truth
+        )
         assert found.of_base == pytest.approx(-ERROR, abs=4e-3)
-        assert gain_errors(misread(test, 0), truth).of_base is None
+        assert gain_errors(ModalEstimate.of_lines(misread(test, 0)), truth).of_base is None
 
 
 @pytest.mark.parametrize("mass", [FullMass(), LumpedMass()], ids=["full", "lumped"])
@@ -184,10 +192,10 @@ class TestTotalOfALumpedMass:
     def test_is_assumed_of_no_other_mass_and_not_where_the_force_contradicts(self, mass, force):
         truth = storeys()
         problem = Problem(simulate(truth, lines(truth), force=force), mass=mass)
-        assert not list(taken_at_sensors(problem))
+        assert not list(taken_at_sensors(problem.prepared))
 
     def test_names_the_total_of_each_direction(self, random_case):
         _, problem = random_case(np.random.default_rng(3), "lumped", n=5, d=2)
         totals = problem.formulation.mass.totals.values
-        (told,) = taken_at_sensors(problem)
+        (told,) = taken_at_sensors(problem.prepared)
         assert list(told.numbers.values()) == pytest.approx(totals)

@@ -20,7 +20,9 @@ def problem_of(structure, mass, *, force=False, stiffness=None, test=None):
 
 def extremes(problem, structure):
     """Members at the lower and upper ends of each entry of M_SS, then of K_SS, (2, n, n, n, n)."""
-    cone = _cone(problem, structure, _known(problem, structure, problem.measurement.residual(structure)))
+    cone = _cone(
+        problem.prepared, structure, _known(problem.prepared, structure, problem.measurement.residual(structure))
+    )
     P = np.linalg.inv(structure.normal_modes)
     for rows in (P, P * 2 * np.pi * structure.natural_frequencies[:, None]):
         n, unit = structure.n, (rows / np.linalg.norm(rows, axis=0)).T
@@ -42,7 +44,7 @@ def answers_of(structure, T):
 
 def check_ends(problem, structure, *, freq=FREQ):
     """Truth inside, and every finite end the entry of a member that answers as the structure does; the intervals."""
-    found = intervals(problem, structure, None)
+    found = intervals(problem.prepared, structure, None)
     n = structure.n
     own, unit = (structure.mass[:n, :n], structure.stiffness[:n, :n]), answers_of(structure, np.eye(n))
     w = 2 * np.pi * freq[:, None, None]
@@ -133,7 +135,7 @@ class TestIntervals:
         lines = np.linspace(0.2, 6, 60)
         test = sysid.simulate(truth, lines)
         problem = problem_of(truth, FullMass(m.sum(), healing=healing), test=test)
-        assert not determine(problem, truth, None).determined
+        assert not determine(problem.prepared, truth, None).determined
         found = check_ends(problem, truth, freq=lines)
         assert np.all(np.isfinite(found.mass)) and np.all(np.isfinite(found.stiffness))
         P, w = np.linalg.inv(truth.mode_shapes), 2 * np.pi * truth.natural_frequencies
@@ -184,7 +186,9 @@ class TestIntervals:
 
         check_samples(truth, found, rng, draw=draw)
         # The whole matrix says more than its diagonal.
-        wide = intervals(problem_of(truth, FullMass(np.diag(truth.rigid_body_mass), healing="rigid_body")), truth, None)
+        wide = intervals(
+            problem_of(truth, FullMass(np.diag(truth.rigid_body_mass), healing="rigid_body")).prepared, truth, None
+        )
         assert np.all(wide.mass[1] >= found.mass[1] * (1 - 1e-7)) and np.any(wide.mass[1] > 1.01 * found.mass[1])
 
     def test_without_a_unit_of_mass_ends_are_zero_or_infinite(self, random_structure):
@@ -208,8 +212,8 @@ class TestIntervals:
             (full, problem_of(full, KnownMass(full.mass))),
             (lumped, problem_of(lumped, LumpedMass([np.diag(lumped.mass)[:4][i::2].sum() for i in range(2)]))),
         ):
-            found = intervals(problem, truth, None)
-            assert determine(problem, truth, None).determined
+            found = intervals(problem.prepared, truth, None)
+            assert determine(problem.prepared, truth, None).determined
             assert np.array_equal(found.mass, [truth.mass[:4, :4]] * 2)
             assert np.array_equal(found.stiffness, [truth.stiffness[:4, :4]] * 2)
 
@@ -239,7 +243,7 @@ class TestIntervals:
         assert np.all(np.isfinite(totals.mass)) and totals.mass[1, 0, 1] > 0.1
         for word in ("force", "model"):
             mass, force = (FullMass(), True) if word == "force" else (LumpedMass(3.0), False)
-            closed = intervals(problem_of(truth, mass, force=force), truth, None)
+            closed = intervals(problem_of(truth, mass, force=force).prepared, truth, None)
             assert np.array_equal(closed.mass, [truth.mass[:4, :4]] * 2)
 
     @pytest.mark.parametrize("seed", range(2))
@@ -274,7 +278,8 @@ class TestIntervals:
         truth = Structure(np.diag([1.0, 1.0, 0.5]), K, [0.01, 0.02], n_base=1)
         problem = problem_of(truth, FullMass(total), force=True)
         assert any(
-            "the modal mass of mode 2 (20.13 Hz) is open" in s for s in determine(problem, truth, None).undetermined
+            "the modal mass of mode 2 (20.13 Hz) is open" in s
+            for s in determine(problem.prepared, truth, None).undetermined
         )
         found = check_ends(problem, truth)
         # M = [[1 + t, 1 - t], [1 - t, 1 + t]] / 2 with t >= 0, and 1 + t <= total.
@@ -297,7 +302,7 @@ class TestIntervals:
         clean, noisy = (sysid.simulate(weak, FREQ, force=True, noise=noise, rng=0) for noise in (0.0, 0.05))
         test = Measurement(FREQ, clean.base, clean.response, rigid_body=weak.rigid_body, force=noisy.force)
         problem = problem_of(weak, FullMass(), test=test)
-        verdict = determine(problem, weak, None)
+        verdict = determine(problem.prepared, weak, None)
         assert any(s.startswith("the modal mass of mode 2") for s in verdict.undetermined)
         found = check_ends(problem, weak)
         rest = weak.rigid_body_mass - weak.effective_masses[[0, 2]].sum(axis=0)
@@ -329,7 +334,7 @@ class TestIntervals:
         check_samples(truth, found, rng, draw=draw)
         # Modes that are told apart by their damping have a smaller cone.
         apart = Structure(M, K, [0.02, 0.04, 0.01, 0.01], n_base=2)
-        fewer = intervals(problem_of(apart, FullMass(totals)), apart, None)
+        fewer = intervals(problem_of(apart, FullMass(totals)).prepared, apart, None)
         assert np.all(fewer.mass[1] <= found.mass[1] * (1 + 1e-7)) and np.any(fewer.mass[1] < 0.99 * found.mass[1])
 
     def test_modes_at_one_pole_with_a_force_in_one_direction(self, random_blocks):
@@ -373,14 +378,14 @@ class TestIntervals:
         truth = Structure(M, K, [0.01, 0.02, 0.015], n_base=2, recovery=R, rigid_body=R @ G)
         stiffness = SpectralStiffness(truth.natural_frequencies, max_frequency=100.0)
         weighed = problem_of(truth, FullMass(), force=True, stiffness=stiffness)
-        verdict = determine(weighed, truth, None)
+        verdict = determine(weighed.prepared, truth, None)
         assert not verdict.determined and verdict.closed_by
         (sentence,) = verdict.undetermined
         assert "3 modes stand out for 4 sensors" in sentence and sentence.endswith("determine, completely")
-        assert np.array_equal(intervals(weighed, truth, None).mass, [truth.mass[:3, :3]] * 2)
+        assert np.array_equal(intervals(weighed.prepared, truth, None).mass, [truth.mass[:3, :3]] * 2)
         stated = problem_of(truth, FullMass(9.0), stiffness=stiffness)
-        assert np.any(np.isinf(intervals(stated, truth, None).mass))
-        sentences = determine(stated, truth, None).undetermined
+        assert np.any(np.isinf(intervals(stated.prepared, truth, None).mass))
+        sentences = determine(stated.prepared, truth, None).undetermined
         assert any(s.endswith("up to the modal masses") for s in sentences)
         # What the physical total of each direction bounds is no matter of sensors.
         physical = problem_of(

@@ -27,9 +27,9 @@ def right():
 
 def test_right_records_are_missed_by_their_noise_and_nothing_is_said_to_change(right):
     it = identified(right)
-    (miss,) = misses_of(it.problem, it.structure, it.x)
+    (miss,) = misses_of(it.problem.prepared, it.structure, it.x)
     assert it.success and 0.9 < miss.times < 1.1
-    assert changing(it.problem) == ()
+    assert changing(it.problem.prepared) == ()
 
 
 def test_what_is_missed_of_stated_noise_is_the_residual_over_it():
@@ -38,7 +38,7 @@ def test_what_is_missed_of_stated_noise_is_the_residual_over_it():
     test = sysid.simulate(truth, np.linspace(1, 12, 300), noise=0.02, force=True, rng=0)
     wrong = np.diag([1.0, 1.0, 0.0])
     it = sysid.identify(sysid.Problem(test, mass=wrong), rng=0)
-    accelerations, force = misses_of(it.problem, it.structure, it.x)
+    accelerations, force = misses_of(it.problem.prepared, it.structure, it.x)
     std = np.broadcast_to(test.response_std, test.response.shape)
     share = np.linalg.norm(std) / np.linalg.norm(test.relative)
     assert accelerations.times == pytest.approx(it.residual / share, rel=1e-12) and not accelerations.at_least
@@ -59,7 +59,7 @@ def test_spikes_are_not_counted_as_what_the_model_misses():
     spoiled = test.response.copy()
     spoiled[0, 1, [60, 200]] += 40 * np.abs(spoiled[0, 1]).mean()
     problem = sysid.Problem(dataclasses.replace(test, response=spoiled), mass=sysid.FullMass())
-    (miss,) = misses_of(problem, truth, problem.values(truth))
+    (miss,) = misses_of(problem.prepared, truth, problem.values(truth))
     assert problem.measurement.residual(truth) > 0.1 and 0.9 < miss.times < 1.1
 
 
@@ -92,7 +92,7 @@ def test_hum_far_from_all_modes_is_no_error_of_a_model():
     records, floors = noisy(rng, base, answer(base))
     hum = 0.3 * np.sin(2 * np.pi * 16.667 * np.arange(base.size) / RATE)
     it = identified(as_test((records, floors + hum)))
-    (miss,) = misses_of(it.problem, it.structure, it.x)
+    (miss,) = misses_of(it.problem.prepared, it.structure, it.x)
     assert it.success and 0.9 < miss.times < 2.0
 
 

@@ -8,6 +8,7 @@ import sysid
 from sysid.assessment.determination import determine, intervals
 from sysid.assessment.sensitivity import directions_in_words, sensitivity
 from sysid.assessment.uncertainty import uncertainty
+from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.problem.slopes import response_slopes, rows_of_test, slopes_of
 from sysid.search import local
 
@@ -118,7 +119,7 @@ def test_rows_of_a_test_are_weighted_residuals_and_their_central_differences(by_
     problem, x = general(by_ratios, recovery=recovery)
     test = problem.measurement
     slopes = slopes_of(problem.formulation.matrices, x, test)
-    accelerations, forces = rows_of_test(test, slopes, x.size)
+    accelerations, forces = rows_of_test(ModalEstimate.of_lines(test), slopes, x.size)
 
     def left(predict, record):
         def residual(y):
@@ -158,13 +159,13 @@ def test_a_chain_without_a_weight_leaves_its_common_scale_open():
     np.testing.assert_allclose(direction / direction[0], 1.0, rtol=1e-6)
     (words,) = directions_in_words(problem.variables, TRUTH, known.unit, known.unseen)
     assert words in ("m +1 %, k +1 %, c +1 %", "m -1 %, k -1 %, c -1 %")
-    decided = determine(problem, problem.structure(TRUTH), TRUTH)
+    decided = determine(problem.prepared, problem.structure(TRUTH), TRUTH)
     assert not decided.determined
     assert "8 of 9 directions" in decided.undetermined[0]
-    uncertain = uncertainty(problem, problem.structure(TRUTH), TRUTH)
+    uncertain = uncertainty(problem.prepared, problem.structure(TRUTH), TRUTH)
     assert all(np.all(np.isnan(std)) for std in uncertain.variables.values())
     assert np.all(np.isfinite(uncertain.natural_frequencies))
-    ends = intervals(problem, problem.structure(TRUTH), TRUTH)
+    ends = intervals(problem.prepared, problem.structure(TRUTH), TRUTH)
     assert np.all(np.isinf(np.diagonal(ends.mass[1])))
     assert not np.any(np.diagonal(ends.mass[0]))
 
@@ -185,7 +186,7 @@ def test_one_number_with_a_unit_of_mass_closes_the_scale(build):
     assert known.rank == 9 - constrained
     assert known.unseen.shape[1] == 0
     assert known.free.shape == (9, 9 - constrained)
-    assert determine(problem, problem.structure(TRUTH), TRUTH).determined
+    assert determine(problem.prepared, problem.structure(TRUTH), TRUTH).determined
 
 
 def test_the_base_force_closes_the_scale():
@@ -199,8 +200,8 @@ def test_an_inequality_closes_nothing_that_the_records_leave(limit):
     known = sensitivity(problem.formulation, TRUTH)
     assert known.rank == 8
     assert known.free.shape == (9, 9)
-    assert not determine(problem, problem.structure(TRUTH), TRUTH).determined
-    assert problem.keeps_constraints(TRUTH / 2)
+    assert not determine(problem.prepared, problem.structure(TRUTH), TRUTH).determined
+    assert problem.prepared.keeps_constraints(TRUTH / 2)
     assert problem.objective(TRUTH / 2) < 1e-10
 
 
@@ -223,9 +224,9 @@ def test_two_unknowns_of_which_only_the_sum_counts_are_one_null_direction():
     moved = known.unit * known.unseen[:, 0]
     np.testing.assert_allclose(moved[0], -moved[1], rtol=1e-6)
     # Nobody needs a and b: their sum, and so the matrices, are fixed.
-    decided = determine(problem, problem.structure(x), x)
+    decided = determine(problem.prepared, problem.structure(x), x)
     assert decided.determined
-    uncertain = uncertainty(problem, problem.structure(x), x)
+    uncertain = uncertainty(problem.prepared, problem.structure(x), x)
     assert np.isnan(uncertain.variables["a"])
     assert np.all(np.isfinite(uncertain.stiffness))
 
@@ -241,7 +242,7 @@ def test_a_further_test_adds_what_it_sees():
         residuals=[sysid.FurtherTest(second, mass=ca.diag(m) + added, stiffness=chain(k), damping=chain(c))],
     )  # fmt: skip
     assert sensitivity(problem.formulation, TRUTH).rank == 9
-    assert determine(problem, problem.structure(TRUTH), TRUTH).determined
+    assert determine(problem.prepared, problem.structure(TRUTH), TRUTH).determined
 
 
 def test_an_own_misfit_has_its_own_jacobian():
@@ -278,7 +279,7 @@ DRAWS = 60
 def drawn(problem_of, truth, x, noise=0.01, force=False):
     """Fits to `DRAWS` records of `truth` with noise: unknowns, and the structures that they make."""
     problems = [problem_of(sysid.simulate(truth, FREQ, noise=noise, force=force, rng=i)) for i in range(DRAWS)]
-    answers = np.array([local.solve(problem, x).x for problem in problems])
+    answers = np.array([local.solve(problem.prepared, x).x for problem in problems])
     return answers, [problems[0].structure(answer) for answer in answers]
 
 
@@ -322,8 +323,8 @@ def test_standard_deviations_are_those_of_draws(kind):
     x = np.concatenate([MASSES_2, SPRINGS_2, DAMPERS_2 if by_force else [0.02, 0.04]])
     answers, structures = drawn(problem_of, truth, x, force=by_force)
     problem = problem_of(sysid.simulate(truth, FREQ, noise=0.01, force=by_force, rng=1000))
-    x = local.solve(problem, x).x
-    uncertain = uncertainty(problem, problem.structure(x), x)
+    x = local.solve(problem.prepared, x).x
+    uncertain = uncertainty(problem.prepared, problem.structure(x), x)
     same(
         np.concatenate([np.ravel(uncertain.variables[name]) for name in ("m", "k", "c" if by_force else "z")]), answers
     )
@@ -360,7 +361,7 @@ def test_twice_the_noise_is_twice_the_deviation():
             )
         )  # fmt: skip
 
-    once, twice = (uncertainty(p, p.structure(x), x) for p in map(stated, (1.0, 2.0)))
+    once, twice = (uncertainty(p.prepared, p.structure(x), x) for p in map(stated, (1.0, 2.0)))
     for name in "mkc":
         np.testing.assert_allclose(twice.variables[name], 2 * once.variables[name], rtol=1e-9)
 

@@ -144,7 +144,7 @@ class TestAgainstTheDenseJacobian:
             if random_base
             else sysid.simulate(truth, FREQ, noise=0.01, force=True, rng=1)
         )
-        u = uncertainty(problem_of(truth, test), truth, None)
+        u = uncertainty(problem_of(truth, test).prepared, truth, None)
         dense = Dense(truth, test)
         covariance = dense.covariance()
         expected = dense.stds(covariance)
@@ -172,7 +172,7 @@ class TestAgainstTheDenseJacobian:
         rng = np.random.default_rng(5)
         truth = random_structure(rng, 4, 2)
         test = shaken(truth, rng, force=False) if random_base else sysid.simulate(truth, FREQ, noise=0.01, rng=1)
-        u = uncertainty(problem_of(truth, test), truth, None)
+        u = uncertainty(problem_of(truth, test).prepared, truth, None)
         expected = Dense(truth, test).stds(Dense(truth, test).covariance())
         check(u, expected, ("natural_frequencies", "damping_ratios"))
         for name in set(NAMES) - {"natural_frequencies", "damping_ratios"}:
@@ -185,7 +185,7 @@ class TestAgainstTheDenseJacobian:
         truth = random_structure(np.random.default_rng(6), 3, 2)
         test = sysid.simulate(truth, FREQ, noise=0.01, force=force, rng=1)
         u, dense, lines = (
-            uncertainty(problem_of(truth, test), truth, None),
+            uncertainty(problem_of(truth, test).prepared, truth, None),
             Dense(truth, test),
             np.array([3.0, 17.0, 40.0]),
         )
@@ -209,7 +209,7 @@ class TestAgainstTheDenseJacobian:
         if not separable:
             std, force_std = std * rng.uniform(0.3, 3, shape), force_std * rng.uniform(0.3, 3, push)
         test = dataclasses.replace(clean, response_std=std, force_std=force_std)
-        u, dense = uncertainty(problem_of(truth, test), truth, None), Dense(truth, test)
+        u, dense = uncertainty(problem_of(truth, test).prepared, truth, None), Dense(truth, test)
         weights = []
         for part in (std, force_std):
             log = np.log(part)
@@ -227,7 +227,7 @@ class TestAgainstTheDenseJacobian:
         test = sysid.simulate(truth, FREQ, noise=0.01, force=True, rng=1)
         model = FullMass(healing=healing)
         total = model.total(problem_of(truth, test).geometry, truth.mass)
-        u = uncertainty(problem_of(truth, test, FullMass(total, healing=healing)), truth, None)
+        u = uncertainty(problem_of(truth, test, FullMass(total, healing=healing)).prepared, truth, None)
         dense = Dense(truth, test)
         geometry, G = problem_of(truth, test).geometry, truth.rigid_body
 
@@ -259,7 +259,7 @@ class TestAgainstTheDenseJacobian:
         unknowns[at + 3 : at + 6, at + 3] = omega / 2 / z
         unknowns[at + 3 : at + 6, at + 4] = 1 / (2 * omega) / z
         tangent = np.delete(unknowns, at + 5, axis=1)
-        u = uncertainty(problem, truth, None)
+        u = uncertainty(problem.prepared, truth, None)
         check(u, dense.stds(dense.covariance(tangent=tangent)), FREE, rtol=1e-5)
 
 
@@ -292,7 +292,7 @@ class TestOtherSensorsThanModes:
         full = random_structure(np.random.default_rng(10), 5, 2)
         truth = with_modes(full, keep, sensors, rows)
         test = sysid.simulate(truth, FREQ, noise=0.01, force=True, rng=1)
-        u = uncertainty(problem_of(truth, test), truth, None)
+        u = uncertainty(problem_of(truth, test).prepared, truth, None)
         dense = Dense(truth, test, rows)
         expected = dense.stds(dense.covariance())
         check(u, expected, FREE, rtol=1e-5)
@@ -304,7 +304,9 @@ class TestOtherSensorsThanModes:
             full.mass, full.stiffness, full.damping_ratios, n_base=2, recovery=0.5 * np.eye(4) + 0.1,
             rigid_body=full.rigid_body,
         )  # fmt: skip
-        u = uncertainty(problem_of(truth, sysid.simulate(truth, FREQ, noise=0.01, force=True, rng=1)), truth, None)
+        u = uncertainty(
+            problem_of(truth, sysid.simulate(truth, FREQ, noise=0.01, force=True, rng=1)).prepared, truth, None
+        )
         assert np.all(np.isnan(u.mass)) and np.all(np.isfinite(u.mode_shapes)) and np.all(np.isfinite(u.participation))
 
 
@@ -319,7 +321,9 @@ class TestWhatTheDataDoNotShow:
 
     def test_a_mode_that_the_base_does_not_move(self):
         truth = self.symmetric_pair()
-        u = uncertainty(problem_of(truth, sysid.simulate(truth, FREQ, noise=0.01, force=True, rng=1)), truth, None)
+        u = uncertainty(
+            problem_of(truth, sysid.simulate(truth, FREQ, noise=0.01, force=True, rng=1)).prepared, truth, None
+        )
         for name in ("natural_frequencies", "damping_ratios", "participation", "effective_masses"):
             value = getattr(u, name)
             assert np.all(np.isfinite(value[0])) and np.all(np.isnan(value[1])), name
@@ -334,7 +338,7 @@ class TestWhatTheDataDoNotShow:
         """Two oscillators, one on either base direction: zeros between them are no knowledge of the matrix."""
         K = np.diag([4e3, 9e3])
         truth = Structure(np.diag([1.0, 2, 0, 0]), np.block([[K, -K], [-K, K]]), [0.01, 0.02], n_base=2)
-        u = uncertainty(problem_of(truth, sysid.simulate(truth, FREQ, noise=0.01, rng=1)), truth, None)
+        u = uncertainty(problem_of(truth, sysid.simulate(truth, FREQ, noise=0.01, rng=1)).prepared, truth, None)
         for matrix in (u.mass, u.stiffness, u.damping):
             assert np.all(np.isnan(matrix))
 
@@ -347,20 +351,22 @@ class TestWhatTheDataDoNotShow:
             FREQ, mix(unit.base), mix(unit.response), rigid_body=truth.rigid_body, force=mix(unit.force),
             response_std=0.01, force_std=0.01,
         )  # fmt: skip
-        u = uncertainty(problem_of(truth, test), truth, None)
+        u = uncertainty(problem_of(truth, test).prepared, truth, None)
         assert np.all(np.isfinite(u.natural_frequencies)) and np.all(np.isfinite(u.mass))
         assert np.all(np.isnan(u.rigid_body_mass))
         blind = dataclasses.replace(test, force=None, force_std=None)
-        v = uncertainty(problem_of(truth, blind), truth, None)
+        v = uncertainty(problem_of(truth, blind).prepared, truth, None)
         assert np.all(np.isfinite(v.natural_frequencies)) and np.all(np.isnan(v.transmissibility(FREQ[10:12])))
 
     def test_too_few_lines(self, random_structure):
         truth = random_structure(np.random.default_rng(12), 4, 1)
         few = np.array([truth.natural_frequencies[0], truth.natural_frequencies[2]])
         test = sysid.simulate(truth, few, force=True)
-        u = uncertainty(problem_of(truth, test), truth, None)
+        u = uncertainty(problem_of(truth, test).prepared, truth, None)
         assert np.isnan(u.inflation) and np.all(np.isnan(u.mass)) and np.all(np.isnan(u.natural_frequencies))
-        stated = uncertainty(problem_of(truth, dataclasses.replace(test, response_std=0.1, force_std=0.1)), truth, None)
+        stated = uncertainty(
+            problem_of(truth, dataclasses.replace(test, response_std=0.1, force_std=0.1)).prepared, truth, None
+        )
         assert stated.inflation == 1.0 and np.all(np.isnan(stated.mass))
 
     def test_repeated_frequencies_are_the_limit_of_close_ones(self, random_blocks):
@@ -369,7 +375,7 @@ class TestWhatTheDataDoNotShow:
             M, K, _ = random_blocks(np.random.default_rng(13), 3, 2, frequencies=[10.0, 10.0 * (1 + apart), 25.0])
             truths.append(Structure(M, K, [0.02, 0.02, 0.01], n_base=2))
         tests = [sysid.simulate(truth, FREQ, noise=0.01, force=True, rng=1) for truth in truths]
-        one, close = (uncertainty(problem_of(t, test), t, None) for t, test in zip(truths, tests, strict=True))
+        one, close = (uncertainty(problem_of(t, test).prepared, t, None) for t, test in zip(truths, tests, strict=True))
         expected = Dense(truths[1], tests[1]).stds(Dense(truths[1], tests[1]).covariance())
         for name in ("mass", "stiffness"):
             np.testing.assert_allclose(getattr(close, name), expected[name], rtol=1e-4)
@@ -414,12 +420,12 @@ def test_monte_carlo(random_structure):
     dense = Dense(truth, clean)
     noise = dense.noise()[:, None]
     inverse = np.linalg.pinv(dense.jacobian(dense.records) / noise) / noise.T
-    expected = uncertainty(problem_of(truth, clean), truth, None)
+    expected = uncertainty(problem_of(truth, clean).prepared, truth, None)
     found, hits = {name: [] for name in NAMES}, {name: [] for name in NAMES}
     for _ in range(200):
         test = noisy(truth, clean, rng)
         fit = assembled(dense, refit(dense, inverse, test), truth.rigid_body)
-        u = uncertainty(problem_of(truth, test), fit, None)
+        u = uncertainty(problem_of(truth, test).prepared, fit, None)
         assert u.inflation == 1.0
         for name in NAMES:
             value, true = (getattr(s, name) for s in (fit, truth))
@@ -440,7 +446,7 @@ class TestNoiseLevel:
         truth = random_structure(np.random.default_rng(18), 4, 2)
         test = sysid.simulate(truth, np.linspace(2, 66, 300), noise=0.01, force=True, rng=3)
         changed = {name: factor and getattr(test, name) * factor for name, factor in stated.items()}
-        return uncertainty(problem_of(truth, dataclasses.replace(test, **changed)), truth, None)
+        return uncertainty(problem_of(truth, dataclasses.replace(test, **changed)).prepared, truth, None)
 
     def test_unstated_it_is_the_misfit(self, random_structure):
         u = self.case(random_structure)
@@ -460,14 +466,16 @@ class TestNoiseLevel:
 
     def test_no_noise_at_all(self, random_structure):
         truth = random_structure(np.random.default_rng(18), 4, 2)
-        u = uncertainty(problem_of(truth, sysid.simulate(truth, FREQ, force=True)), truth, None)
+        u = uncertainty(problem_of(truth, sysid.simulate(truth, FREQ, force=True)).prepared, truth, None)
         assert np.all(u.natural_frequencies < 1e-10 * truth.natural_frequencies)
         assert np.all(np.isfinite(u.stiffness)) and np.all(u.mass < 1e-9)
 
     def test_no_damping(self, random_structure):
         """A ratio of zero is known as well as any other."""
         truth = random_structure(np.random.default_rng(18), 3, 1, ratios=[0.0, 0.02, 0.01])
-        u = uncertainty(problem_of(truth, sysid.simulate(truth, FREQ, noise=0.01, force=True, rng=1)), truth, None)
+        u = uncertainty(
+            problem_of(truth, sysid.simulate(truth, FREQ, noise=0.01, force=True, rng=1)).prepared, truth, None
+        )
         assert np.all(u.damping_ratios > 0) and np.all(np.isfinite(u.damping))
         low, high = u.interval("damping_ratios")
         assert low[0] < 0 < high[0] and np.all(low[1:] > 0)
@@ -477,7 +485,9 @@ class TestInterval:
     @pytest.fixture
     def u(self, random_structure):
         truth = random_structure(np.random.default_rng(19), 3, 2)
-        return uncertainty(problem_of(truth, sysid.simulate(truth, FREQ, noise=0.03, force=True, rng=1)), truth, None)
+        return uncertainty(
+            problem_of(truth, sysid.simulate(truth, FREQ, noise=0.03, force=True, rng=1)).prepared, truth, None
+        )
 
     def test_ends(self, u):
         z = scipy.stats.norm.ppf(0.95)

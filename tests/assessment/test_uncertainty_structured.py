@@ -9,7 +9,9 @@ import pytest
 import sysid
 from sysid import LumpedMass, SpectralStiffness, Structure
 from sysid.assessment.uncertainty import uncertainty
-from sysid.measurement.whole import Gains, ModalEstimate, NoiseLevels
+from sysid.measurement.whole import NoiseLevels
+from sysid.modal_analysis.modal_estimate import Gains, ModalEstimate
+from sysid.problem.prepared import PreparedProblem
 
 
 @pytest.fixture(autouse=True)
@@ -84,7 +86,7 @@ class TestStructuredModels:
             np.random.default_rng(14), "lumped", n=4, d=1, force=force, total=not force, noise=0.01
         )
         expected = self.lumped_unknowns(problem, truth, total=not force)
-        u = uncertainty(problem, truth, problem.values(truth))
+        u = uncertainty(problem.prepared, truth, problem.values(truth))
         check(u, expected, self.NAMES, rtol=1e-5)
         assert np.all(np.isfinite(u.mass)) and np.all(u.mass[np.tril_indices(4, -1)] < 1e-9 * u.mass[0, 0])
 
@@ -92,7 +94,7 @@ class TestStructuredModels:
     def test_without_any_mass_the_scale_is_open(self, random_case, stiffness):
         """Frequencies and what no common scale changes stay known."""
         truth, problem = random_case(np.random.default_rng(15), "lumped", stiffness, n=4, d=1, total=False, noise=0.01)
-        u = uncertainty(problem, truth, problem.values(truth))
+        u = uncertainty(problem.prepared, truth, problem.values(truth))
         assert np.all(np.isnan(np.diag(u.mass))) and np.all(np.isnan(np.diag(u.stiffness)))
         assert np.all(np.isnan(np.diag(u.damping))) and np.all(np.isnan(u.participation))
         assert np.all(np.isnan(u.mode_shapes)) and np.all(np.isnan(u.rigid_body_mass))
@@ -119,7 +121,7 @@ class TestStructuredModels:
             np.random.default_rng(16), mass, stiffness, damping, n=3, d=2, force=force, total=total, noise=0.01
         )
         expected = by_unknowns(problem, truth, problem.values(truth), problem.structure, self.NAMES)
-        u = uncertainty(problem, truth, problem.values(truth))
+        u = uncertainty(problem.prepared, truth, problem.values(truth))
         names = [name for name in self.NAMES if mass != "known" or name != "mass"]
         check(u, expected, names, rtol=1e-4)
         if mass == "known":
@@ -135,18 +137,19 @@ def test_where_damping_is_a_matrix_the_scatter_of_modes_of_whole_records_does_no
     k, c = sysid.Variable("k", lower=1e3, upper=4e3), sysid.Variable("c", 3, lower=-10, upper=10)
     size = 2 * 2 + 2 + 2 + 2 + 1
     modes = ModalEstimate(
-        truth.mode_shapes, truth.participation, 2 * np.pi * truth.natural_frequencies, truth.damping_ratios,
+        test, test, truth.mode_shapes, truth.participation, 2 * np.pi * truth.natural_frequencies, truth.damping_ratios,
         truth.rigid_body_mass, np.eye(size), NoiseLevels([0.1], [0.1]), 4.0, np.ones(1),
         Gains(np.zeros(2), np.ones(2), 100, np.zeros((size, 2)), np.zeros((2, 1)), np.zeros(2)), scatter=np.eye(size),
     )  # fmt: skip
     found = []
-    for modal in (None, modes):
+    for modal in (ModalEstimate.of_lines(test), modes):
         problem = sysid.Problem(
-            dataclasses.replace(test, modal=modal), mass=np.diag([5.0, 4.0]), stiffness=k * K[:2, :2] / 2000,
+            test, mass=np.diag([5.0, 4.0]), stiffness=k * K[:2, :2] / 2000,
             damping=[[c[0], c[1]], [c[1], c[2]]],
         )  # fmt: skip
         at = {"k": 2000.0, "c[0]": 9.0, "c[1]": -2.0, "c[2]": 3.0}
-        found.append(uncertainty(problem, truth, np.array([at[label] for label in problem.formulation.labels])))
+        prepared = PreparedProblem(problem, [modal])
+        found.append(uncertainty(prepared, truth, np.array([at[label] for label in problem.formulation.labels])))
     plain, beside = found
     assert plain.inflation == pytest.approx(3.0, rel=0.1)
     assert beside.inflation == pytest.approx(plain.inflation, rel=1e-12)
@@ -165,7 +168,7 @@ def test_repeated_frequencies_of_a_structured_model_are_the_limit_of_close_ones(
         given = sysid.KnownMass(M) if mass == "known" else LumpedMass(9.0)
         stiffness = SpectralStiffness(truth.natural_frequencies)
         problem = sysid.Problem(test, mass=given, stiffness=stiffness)
-        return uncertainty(problem, truth, problem.values(truth))
+        return uncertainty(problem.prepared, truth, problem.values(truth))
 
     one, close = stds(0.0), stds(2e-5)
     for name in ("natural_frequencies", "damping_ratios", "stiffness", "damping"):

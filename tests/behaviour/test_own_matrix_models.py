@@ -105,7 +105,7 @@ def test_the_modal_strategy_says_why_it_does_not_apply():
 def test_the_local_phase_ends_at_the_truth_from_nearby():
     problem = by_models(measured())
     x = problem.values(truth())
-    answer = local.solve(problem, x * np.linspace(0.97, 1.03, x.size))
+    answer = local.solve(problem.prepared, x * np.linspace(0.97, 1.03, x.size))
     assert answer.success
     np.testing.assert_allclose(answer.x, x, rtol=1e-6)
 

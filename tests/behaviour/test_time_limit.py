@@ -157,14 +157,14 @@ def test_a_run_of_ipopt_ends_at_the_deadline_though_its_graphs_were_made_before(
     problem = chain(2)
     monitor = IterationMonitor(None, 30.0)
     monitor.listener = lambda iteration, objective: setattr(monitor, "deadline", -np.inf)
-    end = fit_in_matrices(problem, problem.formulation.guess, monitor, 50)
+    end = fit_in_matrices(problem.prepared, problem.formulation.guess, monitor, 50)
     assert monitor.taken == 1
     assert end.status == "Maximum_WallTime_Exceeded"
 
 
 def test_a_clock_beside_the_objective_changes_no_bit(random_case):
     problem = free(random_case, 3)
-    objective = SwarmObjective(problem, (), problem.formulation.stiffness.spectrum)
+    objective = SwarmObjective(problem.prepared, (), problem.formulation.stiffness.spectrum)
     rows = np.random.default_rng(1).uniform(problem.lower, problem.upper, (600, problem.n_variables))
     clocked = in_time(objective, len, Session([], DeferredInterrupt(), 1e6), 256)
     np.testing.assert_array_equal(clocked(rows), objective(rows))

@@ -121,11 +121,11 @@ def test_a_chain_whose_total_nobody_knows_is_open_to_a_common_factor_and_to_noth
     assert known.unseen.shape[1] == 1
     moved = known.unit * known.unseen[:, 0] / x
     np.testing.assert_allclose(moved / moved[0], 1.0, atol=1e-6)
-    told = determine(problem, problem.structure(x), x)
+    told = determine(problem.prepared, problem.structure(x), x)
     assert not told.determined
     # With the total, and nothing else, it is determined.
     whole = own["problem"]()
-    assert determine(whole, whole.structure(x), x).determined
+    assert determine(whole.prepared, whole.structure(x), x).determined
 
 
 def test_a_branched_structure_with_no_mass_known_is_open_likewise():

@@ -41,7 +41,7 @@ def test_every_strategy_has_a_row_and_the_one_that_refuses_its_own_reason(compar
     assert list(results) == ["modal", "continuation", "swarm", "hpso-ls"]
     assert results["modal"].status is results["swarm"].status is Status.FIT
     assert results["continuation"].status is Status.REFUSED
-    assert results["continuation"].message == sysid.Continuation().refusal(two_masses(), None)
+    assert results["continuation"].message == sysid.Continuation().refusal(two_masses().prepared, None)
     assert compared.success
     assert not compared.interrupted
 

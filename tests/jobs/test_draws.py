@@ -46,7 +46,7 @@ def test_noise_has_the_stated_size_about_what_the_structure_predicts(result):
     test, left = problem.measurement, []
     predicted = test.response - test.relative + test.predict(problem.structure(x))
     for seed in range(20):
-        noise = drawn(problem, x, np.random.SeedSequence(seed)).measurement.response - predicted
+        noise = drawn(problem.prepared, x, np.random.SeedSequence(seed)).measurement.response - predicted
         left.append(np.sum(np.abs(noise / test.response_std) ** 2))
     freedom = test.response.size  # of |e|²/std², whose mean is 1 and variance 1
     assert abs(np.mean(left) - freedom) < 4 * np.sqrt(freedom / 20)
@@ -56,7 +56,7 @@ def test_noise_has_the_stated_size_about_what_the_structure_predicts(result):
 def test_noise_that_is_not_stated_has_the_size_of_the_misfit(result):
     test = replace(result.problem.measurement, response_std=None)
     problem = replace(result.problem, measurement=test)
-    again = drawn(problem, result.x, np.random.SeedSequence(0)).measurement
+    again = drawn(problem.prepared, result.x, np.random.SeedSequence(0)).measurement
     misfit = np.linalg.norm(test.relative - test.predict(result.structure))
     noise = np.linalg.norm(again.relative - again.predict(result.structure))
     assert noise == pytest.approx(misfit, rel=4 / np.sqrt(2 * test.response.size))
@@ -69,7 +69,7 @@ def test_further_tests_and_values_known_to_some_accuracy_are_drawn_too(result):
     known = sysid.Prior(k, 4.0, std=0.5)
     further = sysid.FurtherTest(test, mass=M, stiffness=K, damping=C)
     problem = sysid.Problem(test, mass=M, stiffness=K, damping=C, residuals=[known, further], goal=0.3)
-    draws = [drawn(problem, np.array([5.0]), np.random.SeedSequence(seed)) for seed in range(200)]
+    draws = [drawn(problem.prepared, np.array([5.0]), np.random.SeedSequence(seed)) for seed in range(200)]
     values = [draw.residuals[0].value.item() for draw in draws]
     assert np.mean(values) == pytest.approx(5.0, abs=4 * 0.5 / np.sqrt(200))
     assert np.std(values) == pytest.approx(0.5, rel=4 / np.sqrt(400))
@@ -84,7 +84,7 @@ def test_what_has_no_known_noise_cannot_be_drawn(result, own):
     stated = {"misfit": k - 3.0} if own == "misfit" else {"residuals": [k - 3.0]}
     problem = replace(result.problem, stiffness=np.eye(2) * ca.MX(1e5) * k, **stated)
     with pytest.raises(sysid.InputError, match="draws of noise need records"):
-        drawn(problem, np.array([3.0]), np.random.SeedSequence(0))
+        drawn(problem.prepared, np.array([3.0]), np.random.SeedSequence(0))
 
 
 def test_noise_is_raised_as_the_linear_uncertainty_is_where_it_is_stated_too_small(result):
@@ -93,7 +93,7 @@ def test_noise_is_raised_as_the_linear_uncertainty_is_where_it_is_stated_too_sma
     small = replace(result.problem, measurement=replace(test, response_std=test.response_std / 4))
     assert sysid.identify(small, rng=0).uncertainty.inflation == pytest.approx(4, rel=0.15)
     predicted = test.response - test.relative + test.predict(result.structure)
-    noise = drawn(small, result.x, np.random.SeedSequence(0)).measurement.response - predicted
+    noise = drawn(small.prepared, result.x, np.random.SeedSequence(0)).measurement.response - predicted
     assert np.sqrt(np.mean(np.abs(noise / test.response_std) ** 2)) == pytest.approx(1, rel=0.2)
 
 

@@ -388,11 +388,11 @@ def test_ends_at_one_point_are_one_minimum(recipe):
 
     near = [3e5 * (1 + 1e-5), 2e5]
     ends = [end(0, SPRINGS, 1e-9), end(1, [9e5, 2e4], 0.3), end(2, near, 2e-9), end(3, [], np.nan)]
-    first, second = distinct(problem, ends)
+    first, second = distinct(problem.prepared, ends)
     assert ([r.index for r in first.results], first.residual) == ([0, 2], 1e-9)
     assert ([r.index for r in second.results], second.residual) == ([1], 0.3)
     assert as_good([first, second]) == [first]
-    alike = distinct(problem, [end(0, SPRINGS, 0.01), end(1, [2e5, 3e5], 0.010001)])
+    alike = distinct(problem.prepared, [end(0, SPRINGS, 0.01), end(1, [2e5, 3e5], 0.010001)])
     assert len(as_good(alike)) == 2
 
 
@@ -405,7 +405,7 @@ def test_an_unknown_that_is_zero_but_for_round_off_makes_no_further_minimum(reci
 
     def apart(one, other):
         ends = [JobResult(i, 0, True, "", np.array(x), 1e-9) for i, x in enumerate((one, other))]
-        return len(distinct(problem, ends)) == 2
+        return len(distinct(problem.prepared, ends)) == 2
 
     assert not apart([-4.4e-9, 2e5], [4.1e-9, 2e5])
     assert apart([0.0, 2e5], [1.0, 2e5])
@@ -425,7 +425,7 @@ def test_shares_of_one_mass_by_any_scale_are_one_minimum():
         JobResult(i, 0, True, "", np.array([*share, 1e3, 1e3, 0.01, 0.01]), residual)
         for i, (share, residual) in enumerate(zip(shares, residuals, strict=True))
     ]
-    first, second = distinct(problem, ends)
+    first, second = distinct(problem.prepared, ends)
     assert ([end.index for end in first.results], first.best.index) == ([0, 1], 0)
     assert [end.index for end in second.results] == [2]
 
@@ -433,7 +433,7 @@ def test_shares_of_one_mass_by_any_scale_are_one_minimum():
 def test_the_picture_of_starts_that_agree_has_ticks_that_differ(recipe):
     ends = [JobResult(i, 0, True, "", np.array(SPRINGS), 0.01234 * (1 + 1e-9 * i)) for i in range(3)]
     problem = sysid.catalogue.build(replace(recipe, start=None))
-    ax = sysid.plot.minima(distinct(problem, ends)).axes[0]
+    ax = sysid.plot.minima(distinct(problem.prepared, ends)).axes[0]
     low, high = ax.get_ylim()
     shown = [tick for tick in ax.get_yticks() if low <= tick <= high]
     assert len({ax.yaxis.get_major_formatter()(tick) for tick in shown}) == len(shown) > 0

@@ -400,7 +400,7 @@ def test_noise_moves_a_part_of_the_records_by_its_stated_deviations(ratio):
 def _from_truth(made):
     """The fit by gradients from the truth, and its judgement."""
     session = Session([], DeferredInterrupt())
-    answer = descend(made, as_unknowns(made, np.concatenate([SPRINGS, DAMPERS])), [], session)
+    answer = descend(made.prepared, as_unknowns(made.prepared, np.concatenate([SPRINGS, DAMPERS])), [], session)
     end = Outcome(made.structure(answer.x), answer.x, "local phase", answer.success, answer.message, History(), None)
     return judge(made, end, "from the truth", 0, session)
 

@@ -88,12 +88,12 @@ def storeys():
 
 def test_continuation_finds_the_truth_of_four_storeys_from_twenty_random_starts():
     problem = storeys()
-    steps, session = smoothed_tests(problem).steps, Session([], DeferredInterrupt())
+    steps, session = smoothed_tests(problem.prepared).steps, Session([], DeferredInterrupt())
     assert [step[0].shift for step in steps] == sorted((step[0].shift for step in steps), reverse=True)
     rng = np.random.default_rng(0)
     truth = np.concatenate([SPRINGS, 1.5e-4 * SPRINGS])
     starts = problem.lower * (problem.upper / problem.lower) ** rng.random((20, 8))
-    ends = np.array([descend(problem, x, steps, session).x for x in starts])
+    ends = np.array([descend(problem.prepared, x, steps, session).x for x in starts])
     np.testing.assert_allclose(ends, np.broadcast_to(truth, ends.shape), rtol=1e-6)
 
 
@@ -110,4 +110,4 @@ def test_a_problem_with_its_own_misfit_has_no_tests_to_smooth():
     test = storeys().measurement
     K = chain(k)
     problem = sysid.Problem(test, mass=np.diag(MASSES), stiffness=K, damping=1e-4 * K, misfit=k / 1e5 - 0.5)
-    assert smoothed_tests(problem) is None
+    assert smoothed_tests(problem.prepared) is None

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from sysid.measurement.whole import Gains, ModalEstimate, NoiseLevels
+import sysid
+from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.modal_estimate import (
+    Gains,
+    ModalEstimate,
     above_modes,
     independent_rows,
     index_of,
@@ -31,16 +34,16 @@ def _estimate(d: int, share: float, seed: int = 1) -> ModalEstimate:
     size = n * m + m * d + 2 * m + d * (d + 1) // 2
     root = r.normal(size=(size + 5, size))
     gamma = 3 * r.normal(size=(m, d))
+    test = sysid.Measurement([1.0, 2.0], np.ones((1, d, 2)), np.ones((1, n, 2)), rigid_body=np.eye(d)[np.arange(n) % d])
     return ModalEstimate(
-        r.normal(size=(n, m)), gamma, np.array([10.0, 25.0, 40.0]), np.array([0.01, 0.02, 0.03]),
+        test, test, r.normal(size=(n, m)), gamma, np.array([10.0, 25.0, 40.0]), np.array([0.01, 0.02, 0.03]),
         share * gamma.T @ gamma, 1e3 * root.T @ root, NoiseLevels(np.ones(n), np.ones(d), np.ones(d)), 1.0,
         np.ones(1), Gains(np.zeros(n), np.ones(n), 1000, np.zeros((size, n)), np.zeros((n, d)), np.zeros(n)),
     )  # fmt: skip
 
 
 def _own(estimate: ModalEstimate) -> Array:
-    modes = Modes(estimate.phi, estimate.gamma, estimate.omega, estimate.ratios)
-    return theta_of(modes, estimate.rigid, index_of(estimate))
+    return theta_of(estimate.modes, estimate.rigid, index_of(estimate))
 
 
 @pytest.mark.parametrize("d", [1, 2, 3])

@@ -63,7 +63,7 @@ def test_noise_that_rises_over_the_band_is_found_and_told() -> None:
         SETTING.sample_rate, rigid_body=np.ones((4, 1)), band=SETTING.lines,
     )  # fmt: skip
     result = sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), rng=0)
-    modal = result.measurement.modal
+    modal = result.modal[0]
     assert modal is not None
     ratios = {one.channel: one.largest / one.least for one in modal.varying}
     # The base too: what it holds was first told beside wrong levels of the others.

@@ -9,11 +9,11 @@ import pytest
 import scipy.signal
 
 import sysid
+from sysid.modal_analysis.fit import estimate
 from sysid.modal_analysis.record_fit import RecordFit, record_modes, refitted
 from sysid.modal_analysis.record_more import with_further_modes
 from sysid.modal_analysis.record_spread import blocks_of, scatter_over_blocks
 from sysid.modal_analysis.record_spurious import without_spurious_modes
-from sysid.modal_analysis.whole_records import estimate
 from sysid.structure.structure import Array
 
 RATE, SAMPLES, FINE, STEADY = 50.0, 3000, 8, 30.0  # Hz, of records; samples; finer steps; s of a steady sine
@@ -130,8 +130,8 @@ def test_a_scatter_over_blocks_holds_the_misfit_whatever_levels_were_stated() ->
     stated = []
     for level in (0.01, 0.004):
         result = sysid.identify(sysid.Problem(_measured(*_uneven(2), level), mass=sysid.FullMass()), rng=0)
-        assert result.measurement.modal is not None
-        assert result.measurement.modal.scatter is not None
+        assert result.modal[0] is not None
+        assert result.modal[0].scatter is not None
         stated.append(result.uncertainty.natural_frequencies)
     assert stated[1] == pytest.approx(stated[0], rel=0.02)
 

@@ -51,8 +51,8 @@ def test_a_band_of_one_sensor_with_three_times_the_noise_is_told() -> None:
     # White noise of this sensor has 1 % of its rms; sqrt(8) times that beside it makes three times the level.
     response[1] += np.sqrt(8) * 0.01 * np.sqrt(np.mean(response[1] ** 2)) * np.fft.irfft(more, response.shape[1])
     result = fitted(Records(records.base, response, records.force, records.sample_rate))
-    assert result.measurement.modal is not None
-    worst = result.measurement.modal.excess[0]
+    assert result.modal[0] is not None
+    worst = result.modal[0].excess[0]
     assert (worst.channel, worst.run) == (1, 0)
     assert 3.8 < worst.low < worst.high < 6.3
     assert worst.factor == pytest.approx(3.0 / np.sqrt(1 + 8 * 2 / 19), rel=0.2)  # of its level over all 19 Hz

@@ -49,9 +49,9 @@ def test_numbers_that_stand_alone_are_told_among_those_of_their_run(structure):
     bases = [at_rest(motion(rng, seconds=n / 4))[None] for n in (60, 50)]
     runs = [(base, of_lines(structure, base) + 0.005 * rng.standard_normal((2, base.shape[1])), None) for base in bases]
     test = sysid.Measurement.from_time(runs, RATE, rigid_body=np.ones((2, 1)), estimator="spectra", band=(0.5, 20.0))
-    assert sysid.Problem(test, mass=sysid.FullMass()).outliers(structure, None) == []
+    assert sysid.Problem(test, mass=sysid.FullMass()).prepared.outliers(structure, None) == []
     wrong = sysid.Structure(M * 1.05, K, np.array([0.01, 0.02]), n_base=1)
-    assert sysid.Problem(test, mass=sysid.FullMass()).outliers(wrong, None) == []
+    assert sysid.Problem(test, mass=sysid.FullMass()).prepared.outliers(wrong, None) == []
 
 
 @pytest.mark.parametrize("estimator", ["spectra", "records"])

@@ -92,7 +92,11 @@ def test_a_problem_of_them(geometry_of):
     assert problem.objective(x) < 1e-10
     assert problem.formulation.labels[:4] == ("density 1", "density 2", "ground spring", "ring spring")
     assert problem.unknowns == (("mass", 2), ("stiffness", 2), ("damping", 3))
-    assert (problem.free_modes, problem.unit_mass, problem.formulation.refinable) == (False, False, False)
+    assert (problem.prepared.free_modes, problem.prepared.unit_mass, problem.formulation.refinable) == (
+        False,
+        False,
+        False,
+    )
     # What moves with the base at the guess, the middle of the densities.
     rigid = np.vstack([G, [[1.0]]])
     expected = rigid.T @ (5000 * forms.sum(axis=0)) @ rigid
@@ -191,7 +195,7 @@ class Diagonal:
 def test_masses_in_kilograms_are_not_normalised_to_one():
     """A model without a total of its own has the size of its unknowns, here that of the guess."""
     problem = problem_of(mass=Diagonal())
-    assert not problem.unit_mass
+    assert not problem.prepared.unit_mass
     np.testing.assert_allclose(problem.totals, [9.0])
-    assert problem_of(mass=sysid.LumpedMass()).unit_mass
+    assert problem_of(mass=sysid.LumpedMass()).prepared.unit_mass
     np.testing.assert_allclose(problem_of(mass=sysid.LumpedMass()).totals, [1.0])

@@ -7,6 +7,7 @@ import scipy.linalg
 
 import sysid
 from sysid import ChainStiffness, InputError, SpectralStiffness
+from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.models.geometry import FACTOR_FLOOR, Geometry
 from sysid.models.model import MassBlocks, stiffness_blocks
 from sysid.models.spectrum import Refinement
@@ -234,14 +235,14 @@ class TestStated:
 
     def test_without_frequencies_the_poles_of_the_records_are(self, random_structure):
         s = random_structure(np.random.default_rng(0), n=3, d=1, frequencies=[5.0, 9.0, 16.0])
-        geometry = Geometry(sysid.simulate(s, np.linspace(2, 20, 200)))
+        geometry = Geometry(ModalEstimate.of_lines(sysid.simulate(s, np.linspace(2, 20, 200))))
         spectrum = SpectralStiffness().stated(geometry).spectrum
         np.testing.assert_allclose(spectrum, 2 * np.pi * np.array([5, 9, 16]), rtol=1e-6)
         assert SpectralStiffness().limit(geometry) == pytest.approx(2 * np.pi * 16, rel=1e-6)
 
     def test_with_fewer_modes_than_sensors_the_last_line_is_the_limit(self, random_structure):
         s = random_structure(np.random.default_rng(0), n=3, d=1, frequencies=[5.0, 9.0, 300.0])
-        geometry = Geometry(sysid.simulate(s, np.linspace(2, 20, 200)))
+        geometry = Geometry(ModalEstimate.of_lines(sysid.simulate(s, np.linspace(2, 20, 200))))
         assert SpectralStiffness().targets(geometry).size < 3
         assert SpectralStiffness().limit(geometry) == pytest.approx(2 * np.pi * 20)
         assert SpectralStiffness(max_frequency=400.0).limit(geometry) == pytest.approx(2 * np.pi * 400)

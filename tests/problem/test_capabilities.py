@@ -206,7 +206,7 @@ class TestTotals:
     )
     def test_without_a_force(self, mass, unit, totals):
         problem = sysid.Problem(TEST, mass=mass(), stiffness=sysid.SpectralStiffness(FREQUENCIES))
-        assert problem.unit_mass is unit
+        assert problem.prepared.unit_mass is unit
         np.testing.assert_allclose(problem.totals, totals)
 
     def test_entries_and_the_rigid_body_mass(self):
@@ -215,9 +215,9 @@ class TestTotals:
         problem = sysid.Problem(TEST, mass=sysid.FullMass(known=known), stiffness=sysid.SpectralStiffness(FREQUENCIES))
         expected = np.full((3, 4), np.nan)
         expected[0, 1] = expected[1, 0] = 0.2
-        np.testing.assert_array_equal(problem.known_mass, expected)
-        assert problem.rigid_total is None
+        np.testing.assert_array_equal(problem.prepared.known_mass, expected)
+        assert problem.prepared.rigid_total is None
         whole = sysid.FullMass([[7.0]], healing="rigid_body")
         problem = sysid.Problem(TEST, mass=whole, stiffness=sysid.SpectralStiffness(FREQUENCIES))
-        np.testing.assert_array_equal(problem.rigid_total, [[7.0]])
-        assert np.all(np.isnan(problem.known_mass))
+        np.testing.assert_array_equal(problem.prepared.rigid_total, [[7.0]])
+        assert np.all(np.isnan(problem.prepared.known_mass))

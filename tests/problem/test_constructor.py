@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.models import geometry
+from sysid.modal_analysis import modal_estimate
 from sysid.problem import formulation, given
 from sysid.swarm import sampling
 
@@ -67,7 +67,7 @@ def calls(monkeypatch):
 
         monkeypatch.setattr(module, name, called)
 
-    counted(geometry, "find_poles")
+    counted(modal_estimate, "find_poles")
     counted(formulation, "noise_level")
     counted(given, "weighed_mass")
     counted(ca, "nlpsol")
@@ -149,14 +149,14 @@ def test_no_graph_is_built_of_a_large_full_mass(monkeypatch, beside):
     assert f.guess.shape == made.lower.shape == (made.n_variables,)
     assert f.constraints.lower.size == len(f.priors) == len(given.get("constraints", ()))
     assert dict(made.unknowns)["mass"] == 63 * 64 // 2
-    assert made.keeps_constraints(f.guess)
+    assert made.prepared.keeps_constraints(f.guess)
     # The sampling of each entry takes some operations; a product of matrices would take 60 times as many.
     assert max(operations) < 30 * made.n_variables
 
 
 def test_the_geometry_before_a_search_has_poles_and_weights_that_are_made_up(calls):
     made = sysid.Problem(WEIGHED, mass=sysid.FullMass())
-    before = made.geometry.unsearched()
+    before = made.declared.geometry
     np.testing.assert_array_equal(before.weighed, [1.0])
     assert before.poles.omega.shape == (3,)
     assert calls == []

@@ -449,5 +449,5 @@ def test_healing_that_leaves_the_box_is_put_back_into_it():
     problem = build(stiffness=chain(k), healing={k: 100 * k})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        x = SwarmObjective(problem).unknowns(np.full(3, 5e4))
+        x = SwarmObjective(problem.prepared).unknowns(np.full(3, 5e4))
     np.testing.assert_array_equal(x, 1e5)

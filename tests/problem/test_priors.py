@@ -69,8 +69,8 @@ TRUE = np.concatenate([MASS, SPRINGS, DAMPERS])
 
 def fitted(problem):
     """The unknowns that fit best, from the truth, and what is claimed of them: one fit in place of a search."""
-    x = local.solve(problem, TRUE).x
-    return x, uncertainty(problem, problem.structure(x), x)
+    x = local.solve(problem.prepared, TRUE).x
+    return x, uncertainty(problem.prepared, problem.structure(x), x)
 
 
 def test_a_search_ends_where_the_fit_from_the_truth_does():

@@ -113,7 +113,7 @@ def test_bits_do_not_depend_on_the_batch_or_the_threads(random_case, monkeypatch
     whole = problem.formulation.own_test.squared(rows)
     for threads in (1, 3):
         monkeypatch.setattr(batch_objective, "_THREADS", threads)
-        term = problem.formulate(problem.geometry).own_test
+        term = problem.prepared.formulate(problem.geometry).own_test
         np.testing.assert_array_equal(term.squared(rows), whole)
     for count in (1, 63, 64, 65, 127, 129, 200):
         np.testing.assert_array_equal(term.squared(rows[:count]), whole[:count])

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.measurement.whole import Gains, ModalEstimate, NoiseLevels
+from sysid.measurement.whole import NoiseLevels
+from sysid.modal_analysis.modal_estimate import Gains, ModalEstimate
 from sysid.problem.slopes import response_slopes, rows_of_test, slopes_of
 
 FREQ = np.linspace(1.0, 14.0, 12)
@@ -187,18 +188,17 @@ def with_modes_of_records(test, structure, rng):
     root = rng.normal(size=(size + 5, size))
     if test.force is None:
         root[:, n * m + m * d + 2 * m :] = 0.0  # nothing tells of the rigid-body mass
-    estimate = ModalEstimate(
-        near(structure.mode_shapes[:, WHOLE] * scale), near(structure.participation[WHOLE] / scale[:, None]),
+    return ModalEstimate(
+        test, test, near(structure.mode_shapes[:, WHOLE] * scale), near(structure.participation[WHOLE] / scale[:, None]),
         near(2 * np.pi * structure.natural_frequencies[WHOLE]), near(structure.damping_ratios[WHOLE]),
         structure.rigid_body_mass * 1.03, root.T @ root, NoiseLevels(np.ones(n), np.ones(d), np.ones(d)), 1.0,
         np.ones(test.n_runs), Gains(np.zeros(n), np.ones(n), 100, np.zeros((size, n)), np.zeros((n, d)), np.zeros(n)),
     )  # fmt: skip
-    return replace(test, modal=estimate)
 
 
-def off_the_modes(test, structure):
+def off_the_modes(own, structure):
     """Modal parameters of a structure less those of the records, in the scale of these where no force gives one."""
-    own = test.modal
+    test = own.records
     phi, gamma = structure.mode_shapes[:, WHOLE], structure.participation[WHOLE]
     scale = np.sum(gamma * own.gamma, axis=1) / np.sum(own.gamma**2, axis=1)
     if test.force is not None:
@@ -216,14 +216,15 @@ def off_the_modes(test, structure):
 def test_rows_of_whole_records_are_those_of_their_modes(kind, damping, force):
     """Products of the rows and of their derivatives are those of the modal parameters' information."""
     problem, x = case(kind, damping, force=force)
-    test = with_modes_of_records(problem.measurement, problem.structure(x), np.random.default_rng(3))
+    modal = with_modes_of_records(problem.measurement, problem.structure(x), np.random.default_rng(3))
+    test = modal.records
     slopes = slopes_of(problem.formulation.matrices, x, test)
-    (rows,) = rows_of_test(test, slopes, x.size, share=0.7, as_stated=True)
-    off = lambda x: off_the_modes(test, problem.structure(x))  # noqa: E731
+    (rows,) = rows_of_test(modal, slopes, x.size, share=0.7, as_stated=True)
+    off = lambda x: off_the_modes(modal, problem.structure(x))  # noqa: E731
     expected = np.column_stack([off(x), differences(lambda x: [off(x)], x)[0] * np.abs(x)])
     made = np.column_stack([rows.residuals, rows.jacobian * np.abs(x)])
     weight = 0.7 / np.linalg.norm(test.relative / test.response_std)
-    gram = weight**2 * expected.T @ test.modal.information @ expected
+    gram = weight**2 * expected.T @ modal.information @ expected
     np.testing.assert_allclose(made.T @ made, gram, atol=1e-7 * np.abs(gram).max())
     np.testing.assert_allclose(rows.std, weight / np.sqrt(2), rtol=1e-9)
 
@@ -244,7 +245,7 @@ def test_deviations_of_whole_records_grow_with_what_is_left_beyond_the_stated_no
     relative = test.predict(structure) + times * 0.01 * draw(*shapes[1])
     force = test.predict_force(structure) + times * 0.2 * draw(*shapes[0])
     test = replace(test, response=relative + np.einsum("sd,rdf->rsf", G, base), force=force)
-    test = with_modes_of_records(test, structure, rng)
+    modal = with_modes_of_records(test, structure, rng)
     slopes = slopes_of(problem.formulation.matrices, x, test)
-    (found,), (stated,) = (rows_of_test(test, slopes, 1, as_stated=flag) for flag in (False, True))
+    (found,), (stated,) = (rows_of_test(modal, slopes, 1, as_stated=flag) for flag in (False, True))
     np.testing.assert_allclose(found.std / stated.std, times, rtol=0.08)

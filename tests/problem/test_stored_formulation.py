@@ -192,7 +192,7 @@ def test_saved_again_it_is_the_same_again(pair, tmp_path):
 def test_the_swarm_sees_the_same_cost(pair):
     before, after = (side.problem for side in pair[:2])
     rows = np.random.default_rng(0).uniform(before.lower, before.upper, (20, before.n_variables))
-    np.testing.assert_allclose(SwarmObjective(after)(rows), SwarmObjective(before)(rows), rtol=1e-9)
+    np.testing.assert_allclose(SwarmObjective(after.prepared)(rows), SwarmObjective(before.prepared)(rows), rtol=1e-9)
 
 
 def test_the_swarms_coordinates_are_the_same(pair):

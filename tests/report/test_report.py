@@ -111,7 +111,7 @@ def test_what_is_open_and_what_speaks_against_the_answer_stand_apart(complete):
 
 
 def test_a_model_that_does_not_fit_opens_with_why_and_without_intervals(complete):
-    level = noise_level(complete.problem.screened.measurement, complete.structure)
+    level = noise_level(complete.fitted.records, complete.structure)
     reasons = ("are they in Hz?", "it softens", "its gains")
     failed = complete.with_findings(Finding("residual", Severity.CONTRADICTS, one) for one in reasons)
     right, wrong = (opening.opening(it, level) for it in (complete, failed))
@@ -279,7 +279,7 @@ def test_what_is_not_determined_stands_with_its_range_and_a_mark(modal, truth, n
 
 def test_a_total_mass_that_is_open_is_called_one_of_many(modal, truth, no_pictures):
     it = modal(force=False, mass=sysid.FullMass(np.trace(truth.mass)))
-    assert not it.problem.unit_mass and np.isnan(it.uncertainty.rigid_body_mass).all()
+    assert not it.problem.prepared.unit_mass and np.isnan(it.uncertainty.rigid_body_mass).all()
     assert "one of many Total mass M_rb" in Page(report.render(it)).text
 
 

@@ -139,7 +139,7 @@ def test_a_prior_of_something_else_counts_in_the_objective_of_a_modal_fit():
     test = measured()
     offset = sysid.Variable("offset", lower=0.0, upper=1.0)
     problem = sysid.Problem(test, mass=sysid.FullMass(3.0), residuals=[sysid.Prior(offset, 0.4, std=0.1)])
-    assert problem.free_modes
+    assert problem.prepared.free_modes
     x = np.concatenate([problem.values(floors())[:-1], [0.6]])
     it = stood_for(problem, floors(), x)
     # Two standard deviations off, each as much as the noise of one number of the records.

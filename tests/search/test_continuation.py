@@ -135,7 +135,7 @@ def test_ends_of_other_starts_that_explain_the_data_as_well_are_alternatives_onc
         (problem.objective(np.array([k])), LocalResult(np.array([k]), True, "", np.zeros(0)))
         for k in (COUPLING, -COUPLING, 0.5 * COUPLING, -COUPLING * (1 + 1e-9), COUPLING * (1 - 1e-9))
     ]
-    found = _alternatives(problem, np.array([COUPLING]), ends[0][0], ends)
+    found = _alternatives(problem.prepared, np.array([COUPLING]), ends[0][0], ends)
     assert [other.item() for other in found] == [-COUPLING]
 
 
@@ -152,7 +152,7 @@ def test_the_floor_of_several_tests_is_about_what_the_truth_leaves():
     """Free residues at the poles of the data take little of the noise of hundreds of numbers with them."""
     problem = two_tests()
     truth = np.concatenate([SPRINGS, DAMPERS])
-    assert smoothed_tests(problem).floor == pytest.approx(problem.objective(truth), rel=0.1)
+    assert smoothed_tests(problem.prepared).floor == pytest.approx(problem.objective(truth), rel=0.1)
 
 
 def test_what_residuals_of_the_users_leave_does_not_make_a_fit_of_the_tests_worse():
@@ -162,7 +162,7 @@ def test_what_residuals_of_the_users_leave_does_not_make_a_fit_of_the_tests_wors
     with DeferredInterrupt() as interrupt:
         outcome = sysid.Continuation(starts=1).run(problem, Session([], interrupt), truth)
     np.testing.assert_allclose(outcome.x, truth, rtol=0.01)
-    assert problem.objective(outcome.x) > 5 * smoothed_tests(problem).floor
+    assert problem.objective(outcome.x) > 5 * smoothed_tests(problem.prepared).floor
     assert outcome.good
 
 
@@ -173,7 +173,7 @@ def test_starts_are_unanimous_where_three_end_at_one_fit_of_sorts():
     truth, soft = np.concatenate([SPRINGS, DAMPERS]), np.concatenate([SPRINGS / 9, DAMPERS])
     assert problem.residual(truth) < 0.02 and problem.residual(soft) > 0.5
     with DeferredInterrupt() as interrupt:
-        run = _Run(problem, Session([], interrupt))
+        run = _Run(problem.prepared, Session([], interrupt))
     for ends, joined, unanimous in (
         ([truth, truth, truth], 0, True), ([truth], 2, True), ([truth, truth], 0, False),
         ([truth, truth, 1.1 * truth], 0, False), ([soft, soft, soft], 0, False),
@@ -189,7 +189,7 @@ def test_the_best_end_keeps_the_constraints_even_where_one_that_breaks_them_fits
     truth, kept = np.concatenate([SPRINGS, DAMPERS]), np.array([1.8e4, 1.6e4, *DAMPERS])
     ends = [(problem.objective(x), LocalResult(x, True, "", np.zeros(1))) for x in (truth, kept)]
     assert ends[0][0] < ends[1][0]
-    np.testing.assert_array_equal(_best(problem, ends)[1].x, kept)
+    np.testing.assert_array_equal(_best(problem.prepared, ends)[1].x, kept)
 
 
 def test_as_good_as_another_is_what_chance_explains_in_one_of_a_thousand():
@@ -197,7 +197,7 @@ def test_as_good_as_another_is_what_chance_explains_in_one_of_a_thousand():
     problem = two_tests()
     numbers, p = 2 * 2 * 2 * FREQ.size, 4  # real numbers of two tests of two sensors
     expected = 0.03 * np.sqrt(1 + chi2.isf(1e-3, p) / (numbers - p))
-    assert as_good_as(problem, 0.03) == pytest.approx(expected, rel=1e-12)
+    assert as_good_as(problem.prepared, 0.03) == pytest.approx(expected, rel=1e-12)
 
 
 def test_distances_are_of_the_size_of_an_unknown_or_of_its_range():
@@ -211,7 +211,7 @@ def test_distances_are_of_the_size_of_an_unknown_or_of_its_range():
         ([0.5, 100.5], [0.4, 100.5], 0.1 / 0.4), ([0.001, 100.5], [0.0, 100.5], 0.001 / 0.004),
         ([0.5, 100.5], [0.5, 100.2], 0.3), ([0.5, 100.5], [0.5, 100.5], 0.0),
     ):  # fmt: skip
-        assert apart(problem, np.array(x), np.array(other)) == pytest.approx(far, rel=1e-9)
+        assert apart(problem.prepared, np.array(x), np.array(other)) == pytest.approx(far, rel=1e-9)
 
 
 def test_starts_left_out_for_want_of_time_are_told(monkeypatch):

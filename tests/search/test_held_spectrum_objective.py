@@ -56,7 +56,7 @@ def problem(base="unit", *, healing="trace", total=True, rigid_body=G, given=N, 
 
 
 def objective(made):
-    return SwarmObjective(made, spectrum=made.formulation.stiffness.spectrum)
+    return SwarmObjective(made.prepared, spectrum=made.formulation.stiffness.spectrum)
 
 
 def particles(made, count, seed=0):

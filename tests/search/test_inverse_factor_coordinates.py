@@ -67,7 +67,7 @@ def test_the_transform_of_a_skew_symmetric_matrix_is_a_rotation():
 
 def test_the_error_at_the_truth_is_zero_and_elsewhere_the_problems_objective(case):
     _, problem, y, psi = case
-    error = InverseFactorError(problem)
+    error = InverseFactorError(problem.prepared)
     assert float(error.gradient(y, psi)[0]) < 1e-20
     other = perturbed(problem, np.random.default_rng(0))
     objective = problem.objective(other)
@@ -99,7 +99,7 @@ def test_a_massless_base_begins_with_a_little_mass(random_case):
 
 def test_gradient_and_exact_hessian_agree_with_differences_at_random_points(case):
     _, problem, y, psi = case
-    error, rng, h = InverseFactorError(problem), np.random.default_rng(1), 1e-5
+    error, rng, h = InverseFactorError(problem.prepared), np.random.default_rng(1), 1e-5
     for _ in range(3):
         at = y + 0.05 * rng.standard_normal(y.size)
         along = rng.standard_normal(y.size)
@@ -119,7 +119,7 @@ def central(v, h):
 def test_totals_are_those_of_the_structures_mass_and_zero_at_the_truth(random_case, kind):
     """Tr M over a direction's sensors and its base row, or the diagonal of [G; I]' M [G; I], over what is stated."""
     truth, problem = random_case(np.random.default_rng(5), kind, n=4, d=2, force=True)
-    error, d = InverseFactorError(problem), truth.n_base
+    error, d = InverseFactorError(problem.prepared), truth.n_base
     other, _ = random_case(np.random.default_rng(6), kind, n=4, d=2, force=True)
     assert not np.allclose(other.mass, truth.mass)
     for structure in (truth, other):
@@ -138,7 +138,7 @@ def test_totals_are_those_of_the_structures_mass_and_zero_at_the_truth(random_ca
 def test_with_noise_stated_totals_are_met_and_the_fit_is_better_than_the_truth(random_case, kind, force):
     truth, problem = random_case(np.random.default_rng(8), kind, n=4, d=2, force=force, noise=0.01)
     start = perturbed(problem, np.random.default_rng(9), 0.1)
-    end = local.solve(problem, start, coordinates="cholesky")
+    end = local.solve(problem.prepared, start, coordinates="cholesky")
     assert end.success, end.message
     total = total_of(problem.geometry, problem.structure(end.x).mass, kind)
     np.testing.assert_allclose(total, problem.mass.total_mass, rtol=1e-9)
@@ -152,7 +152,7 @@ def test_without_force_and_total_masses_are_scaled_and_the_response_is_kept(rand
     """1 kg a direction, of the kind that the mass model is healed by: its unknowns stand for what was fitted."""
     _, problem = random_case(np.random.default_rng(8), kind, n=4, d=2, total=False, noise=0.01)
     start = perturbed(problem, np.random.default_rng(9), 0.1)
-    end = local.solve(problem, start, coordinates=coordinates)
+    end = local.solve(problem.prepared, start, coordinates=coordinates)
     assert end.success, end.message
     assert end.curve[-1] == pytest.approx(problem.objective(end.x), rel=1e-6)
 
@@ -161,7 +161,7 @@ def test_from_near_the_truth_it_ends_at_an_exact_fit(case):
     truth, problem, *_ = case
     start = perturbed(problem, np.random.default_rng(2), 0.05)
     before = problem.objective(start)
-    end = local.solve(problem, start, coordinates="cholesky")
+    end = local.solve(problem.prepared, start, coordinates="cholesky")
     assert end.success, end.message
     assert problem.objective(end.x) < 1e-7 < 1e-2 < before
     found = problem.structure(end.x)
@@ -175,7 +175,7 @@ def test_the_plain_entries_find_the_truth_of_a_small_structure(random_case):
     truth, problem = random_case(np.random.default_rng(4), n=3, d=1)
     x = problem.values(truth)
     start = np.clip(x * np.random.default_rng(5).uniform(0.6, 1.4, x.size), problem.lower, problem.upper)
-    end = local.solve(problem, start, coordinates="entries", max_iterations=60)
+    end = local.solve(problem.prepared, start, coordinates="entries", max_iterations=60)
     assert end.success, end.message
     assert problem.objective(end.x) < 1e-7
 
@@ -187,7 +187,7 @@ def test_proportional_damping_ends_where_it_is_said_to(random_case, coordinates,
     _, problem = random_case(np.random.default_rng(7), damping="proportional", n=n, d=1)
     start = np.clip(problem.values(problem.reference), problem.lower, problem.upper)
     start[problem.formulation.parts.damping] *= 0.9
-    end = local.solve(problem, start, coordinates=coordinates)
+    end = local.solve(problem.prepared, start, coordinates=coordinates)
     assert end.success, end.message
     assert problem.objective(end.x) < 1e-6
     damping = problem.formulation.parts.damping
@@ -218,11 +218,11 @@ def test_a_status_stays_with_the_point_that_it_was_given_for(rounds):
     """A further round that solves but ends worse vouches for nothing."""
     problem, x, ending = rounds
     ending((0.5, "Maximum_Iterations_Exceeded"), (9.0, "Solve_Succeeded"))
-    end = local.solve(problem, x, coordinates="cholesky")
+    end = local.solve(problem.prepared, x, coordinates="cholesky")
     assert not end.success
     assert "Maximum_Iterations_Exceeded" in end.message
     ending((9.0, "Solve_Succeeded"))
-    end = local.solve(problem, x, coordinates="cholesky")
+    end = local.solve(problem.prepared, x, coordinates="cholesky")
     assert not end.success
     assert "above the start" in end.message
 
@@ -231,15 +231,15 @@ def test_rounds_follow_while_the_limit_alone_ends_them_and_the_objective_falls(r
     problem, x, ending = rounds
     limit = "Maximum_Iterations_Exceeded"
     limits = ending((0.9, limit), (0.899, limit), (0.5, "Solve_Succeeded"))
-    assert local.solve(problem, x, coordinates="cholesky").success
+    assert local.solve(problem.prepared, x, coordinates="cholesky").success
     assert limits == [150, 150, 150]
     limits = ending((0.9, limit), (0.9, limit), (0.5, "Solve_Succeeded"))
-    assert not local.solve(problem, x, coordinates="cholesky").success  # it no longer falls
+    assert not local.solve(problem.prepared, x, coordinates="cholesky").success  # it no longer falls
     limits = ending((0.9, "Restoration_Failed"), (0.5, "Solve_Succeeded"))
-    assert "Restoration_Failed" in local.solve(problem, x, coordinates="cholesky").message
+    assert "Restoration_Failed" in local.solve(problem.prepared, x, coordinates="cholesky").message
     assert limits == [150]
     limits = ending((0.9, limit), (0.8, limit), (0.7, "Solve_Succeeded"))
-    assert not local.solve(problem, x, coordinates="cholesky", max_iterations=200).success
+    assert not local.solve(problem.prepared, x, coordinates="cholesky", max_iterations=200).success
     assert limits == [150, 50]
 
 
@@ -256,7 +256,9 @@ def test_channels_and_lines_weigh_as_in_the_objective(random_case):
     other = perturbed(problem, rng)
     at = column_of(noisy, noisy.structure(other))
     assert noisy.objective(other) != pytest.approx(problem.objective(other), rel=1e-2)
-    assert float(InverseFactorError(noisy).gradient(*at)[0]) == pytest.approx(noisy.objective(other) ** 2, rel=1e-9)
+    assert float(InverseFactorError(noisy.prepared).gradient(*at)[0]) == pytest.approx(
+        noisy.objective(other) ** 2, rel=1e-9
+    )
 
 
 def test_derivatives_by_the_programs_unknowns_agree_with_differences(random_case):
@@ -267,7 +269,7 @@ def test_derivatives_by_the_programs_unknowns_agree_with_differences(random_case
     v = z.variable("v", np.zeros(y.size))
     rows = ca.vertcat(ca.sumsqr(v), ca.sin(v[0]) * v[1])
     z.constrain(rows)
-    made = room._derivatives(z, ca.DM(y) + v + v**2, InverseFactorError(problem), psi)
+    made = room._derivatives(z, ca.DM(y) + v + v**2, InverseFactorError(problem.prepared), psi)
     rng, h = np.random.default_rng(1), 1e-5
     at, along, multipliers = 0.05 * rng.standard_normal(y.size), rng.standard_normal(y.size), np.array([300.0, -700.0])
     constraint = ca.Function("g", [v], [ca.jacobian(rows, v).T @ ca.DM(multipliers)])
@@ -310,9 +312,9 @@ def test_an_end_on_the_limit_says_how_much_chi_squared_is_left(random_case):
     """Beside what a fit that goes on gains: in units of what it leaves for each degree of freedom."""
     _, problem = random_case(np.random.default_rng(8), "trace", n=3, d=2, force=True, total=False, noise=0.01)
     start = perturbed(problem, np.random.default_rng(9), 0.02)
-    solved = local.solve(problem, start, coordinates="cholesky")
+    solved = local.solve(problem.prepared, start, coordinates="cholesky")
     taken = solved.curve.size
-    short = local.solve(problem, start, coordinates="cholesky", max_iterations=taken // 2)
+    short = local.solve(problem.prepared, start, coordinates="cholesky", max_iterations=taken // 2)
     assert not short.success
     told = [float(word) for word in short.message.split("about ")[1].split(" chi²")[0].split(" of ")]
     before, after = (problem.objective(end.x) ** 2 for end in (short, solved))

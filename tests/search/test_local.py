@@ -35,7 +35,7 @@ def refined(problem, x):
 
 def random_start(rng, problem):
     """A random candidate of the swarm with the measured spectrum."""
-    objective = SwarmObjective(problem)
+    objective = SwarmObjective(problem.prepared)
     for row in rng.uniform(problem.lower, problem.upper, (50, problem.n_variables)):
         if np.isfinite(objective(row[None])[0]):
             return refined(problem, objective.unknowns(row))
@@ -88,7 +88,7 @@ def test_from_random_starts_most_searches_end_at_the_truth_of_a_noise_free_test(
     for n, seed in [*itertools.product((4,), range(10)), (5, 0), (6, 0)]:
         rng = np.random.default_rng([seed, n])
         _, problem = random_case(rng, mass, "spectral", damping, n=n)
-        answer = local.solve(problem, random_start(rng, problem), max_iterations=300)
+        answer = local.solve(problem.prepared, random_start(rng, problem), max_iterations=300)
         residuals.append(sound(problem, answer))
     found, exact = LEAST["full" if mass in ("trace", "rigid_body") else "structured", damping]
     assert sum(r < 1e-6 for r in residuals) >= found, residuals
@@ -104,7 +104,9 @@ def test_a_local_minimum_of_the_residues_is_seen_and_left(random_case, mass):
         rng = np.random.default_rng([seed, 4])
         _, problem = random_case(rng, mass, "spectral", "modal", n=4)
         seen = []
-        answer = local.solve(problem, random_start(rng, problem), monitor=lambda *args, to=seen: to.append(args))
+        answer = local.solve(
+            problem.prepared, random_start(rng, problem), monitor=lambda *args, to=seen: to.append(args)
+        )
         assert [iteration for iteration, _ in seen] == list(range(answer.curve.size))
         np.testing.assert_array_equal([residual for _, residual in seen], answer.curve)
         residual = sound(problem, answer)
@@ -121,7 +123,7 @@ def test_from_near_the_truth_every_search_of_a_spectral_stiffness_ends_there(ran
     for seed in range(2):
         rng = np.random.default_rng([seed, 4])
         truth, problem = random_case(rng, mass, "spectral", damping, n=4, force=force)
-        answer = local.solve(problem, near(rng, problem, truth, 0.05), max_iterations=300)
+        answer = local.solve(problem.prepared, near(rng, problem, truth, 0.05), max_iterations=300)
         assert sound(problem, answer) < 1e-8
         if force:
             assert problem.measurement.force_residual(problem.structure(answer.x)) < 1e-8
@@ -134,7 +136,7 @@ def test_from_near_the_truth_every_search_of_a_chain_ends_there(random_case, mas
     for seed in range(2):
         rng = np.random.default_rng([seed, 4])
         truth, problem = random_case(rng, mass, "chain", damping, n=4)
-        answer = local.solve(problem, near(rng, problem, truth, 0.01), max_iterations=200)
+        answer = local.solve(problem.prepared, near(rng, problem, truth, 0.01), max_iterations=200)
         assert sound(problem, answer) < goal
 
 
@@ -146,7 +148,7 @@ def test_records_that_want_negative_damping_end_on_the_bound_and_say_so(random_c
     truth, problem = random_case(rng, mass, "spectral", "proportional", n=4)
     mirrored = dataclasses.replace(problem.measurement, response=problem.measurement.response.conj())
     problem = dataclasses.replace(problem, measurement=mirrored, reference=None)
-    answer = local.solve(problem, near(rng, problem, truth, 0.01), max_iterations=60)
+    answer = local.solve(problem.prepared, near(rng, problem, truth, 0.01), max_iterations=60)
     assert "rayleigh" in answer.message
     assert np.all(answer.x[problem.formulation.parts.damping] >= 0)
     assert np.all(problem.structure(answer.x).damping_ratios >= 0)
@@ -157,7 +159,7 @@ def test_a_determined_problem_gives_the_true_matrices(random_case, seed):
     rng = np.random.default_rng(seed)
     for mass, force in (("rigid_body", True), ("lumped", False), ("known", False)):
         truth, problem = random_case(rng, mass, n=4, force=force)
-        answer = local.solve(problem, near(rng, problem, truth, 0.05))
+        answer = local.solve(problem.prepared, near(rng, problem, truth, 0.05))
         structure = problem.structure(answer.x)
         for name in ("mass", "stiffness", "damping"):
             a, b = getattr(structure, name)[:4, :4], getattr(truth, name)[:4, :4]
@@ -171,7 +173,7 @@ def test_a_stated_total_is_kept_where_the_force_says_otherwise(random_case, heal
     truth, problem = random_case(rng, healing, n=4, force=True)
     stated = problem.totals * [1.05, 0.97]
     problem = dataclasses.replace(problem, mass=FullMass(stated, healing=healing))
-    answer = local.solve(problem, random_start(rng, problem))
+    answer = local.solve(problem.prepared, random_start(rng, problem))
     structure = problem.structure(answer.x)
     np.testing.assert_allclose(problem.mass.total(problem.geometry, structure.mass), stated, rtol=1e-9)
     assert problem.measurement.force_residual(structure) > 1e-4  # the two cannot both be right
@@ -182,7 +184,7 @@ def test_a_stated_total_is_kept_where_the_force_says_otherwise(random_case, heal
 def test_a_total_that_is_not_stated_is_the_forces(random_case, healing):
     rng = np.random.default_rng(0)
     truth, problem = random_case(rng, healing, n=4, force=True, total=False)
-    answer = local.solve(problem, near(rng, problem, truth, 0.05))
+    answer = local.solve(problem.prepared, near(rng, problem, truth, 0.05))
     structure = problem.structure(answer.x)
     np.testing.assert_allclose(structure.rigid_body_mass, truth.rigid_body_mass, rtol=1e-6, atol=1e-6)
 
@@ -197,7 +199,7 @@ def test_a_given_frequency_that_is_20_percent_wrong_is_said(random_case, mass, f
     given = np.sort(given)
     stiffness = SpectralStiffness(given, max_frequency=1.3 * given[-1])
     wrong = dataclasses.replace(problem, stiffness=stiffness)
-    answer = local.solve(wrong, near(rng, problem, truth, 0.02))
+    answer = local.solve(wrong.prepared, near(rng, problem, truth, 0.02))
     assert "ended on a bound" in answer.message
     assert f"frequency {1 + list(given).index(truth.natural_frequencies[0] * factor)} ({side})" in answer.message
     assert problem.measurement.residual(problem.structure(answer.x)) > 1e-3
@@ -207,14 +209,14 @@ def test_a_damping_ratio_outside_its_bounds_is_said(random_case):
     rng = np.random.default_rng(0)
     truth, problem = random_case(rng, "rigid_body", n=4)
     narrow = dataclasses.replace(problem, damping=sysid.ModalDamping(0.04, 0.05))
-    answer = local.solve(narrow, near(rng, problem, truth, 0.02), max_iterations=150)
+    answer = local.solve(narrow.prepared, near(rng, problem, truth, 0.02), max_iterations=150)
     assert "damping ratio 1 (lower)" in answer.message
 
 
 def test_a_solution_inside_says_nothing_of_bounds(random_case):
     rng = np.random.default_rng(0)
     truth, problem = random_case(rng, "rigid_body", n=4)
-    answer = local.solve(problem, near(rng, problem, truth, 0.05))
+    answer = local.solve(problem.prepared, near(rng, problem, truth, 0.05))
     assert answer.success
     assert "bound" not in answer.message
 
@@ -231,7 +233,7 @@ def test_what_noise_free_records_hardly_show_is_found_too():
     test = sysid.simulate(truth, np.geomspace(2.0, 20.0, 200))
     problem = sysid.Problem(test, mass=mass, stiffness=chain(spring), damping=chain(damper))
     start = true * [1.0, 1.0, 1.0, 1.0, 1.5, 1.0]
-    answer = local.solve(problem, start)
+    answer = local.solve(problem.prepared, start)
     assert answer.success
     np.testing.assert_allclose(answer.x, true, rtol=1e-6)
 
@@ -274,7 +276,7 @@ class TestStarts:
         monkeypatch.setattr(
             "sysid.search.modal_coordinates._linear_starts", lambda test, best, first: iter([first, first])
         )
-        end = fit_in_modes(problem, problem.values(truth), IterationMonitor(None, None), 1)
+        end = fit_in_modes(problem.prepared, problem.values(truth), IterationMonitor(None, None), 1)
         assert not ends
         assert (end.objective, end.status) == (0.3, "end 0.3")
         assert "best of 3 starts" in end.remark
@@ -332,7 +334,7 @@ class TestControl:
 
     def test_the_curve_starts_at_the_start_and_ends_at_the_answer(self, start):
         problem, x = start
-        answer = local.solve(problem, x)
+        answer = local.solve(problem.prepared, x)
         residual = lambda at: problem.measurement.residual(problem.structure(at))  # noqa: E731
         assert answer.curve.ndim == 1
         # Shapes follow from the rest, so the first iterate already has better ones than its start.
@@ -343,7 +345,7 @@ class TestControl:
 
     def test_its_bits_repeat(self, start):
         problem, x = start
-        first, again = local.solve(problem, x), local.solve(problem, x)
+        first, again = local.solve(problem.prepared, x), local.solve(problem.prepared, x)
         np.testing.assert_array_equal(first.x, again.x)
         np.testing.assert_array_equal(first.curve, again.curve)
 
@@ -351,7 +353,7 @@ class TestControl:
     def test_a_spent_budget_is_no_success_and_is_said(self, random_case, mass):
         rng = np.random.default_rng(1)
         _, problem = random_case(rng, mass, n=4)
-        answer = local.solve(problem, random_start(rng, problem), max_iterations=1)
+        answer = local.solve(problem.prepared, random_start(rng, problem), max_iterations=1)
         assert not answer.success
         assert "Maximum_Iterations_Exceeded" in answer.message
         if mass == "lumped":
@@ -371,7 +373,7 @@ class TestControl:
             if iteration == 4:
                 raise StopIteration
 
-        answer = local.solve(problem, random_start(rng, problem), monitor=monitor)
+        answer = local.solve(problem.prepared, random_start(rng, problem), monitor=monitor)
         assert [iteration for iteration, _ in seen] == [0, 1, 2, 3, 4]
         np.testing.assert_array_equal([residual for _, residual in seen], answer.curve)
         assert not answer.success
@@ -381,7 +383,10 @@ class TestControl:
 
     def test_what_the_monitor_returns_changes_nothing(self, start):
         problem, x = start
-        quiet, answer = local.solve(problem, x), local.solve(problem, x, monitor=lambda iteration, residual: True)
+        quiet, answer = (
+            local.solve(problem.prepared, x),
+            local.solve(problem.prepared, x, monitor=lambda iteration, residual: True),
+        )
         np.testing.assert_array_equal(quiet.x, answer.x)
         assert answer.stopped is None
 
@@ -395,7 +400,7 @@ class TestControl:
             if iteration == at:
                 raise mine
 
-        answer = local.solve(problem, x, monitor=monitor)
+        answer = local.solve(problem.prepared, x, monitor=monitor)
         assert answer.stopped is mine
         assert not answer.success
         assert answer.message.startswith("IPOPT: stopped")
@@ -410,7 +415,7 @@ class TestControl:
             time.sleep(0.05)
 
         begun = time.perf_counter()
-        answer = local.solve(problem, x, max_time=0.1, monitor=monitor)
+        answer = local.solve(problem.prepared, x, max_time=0.1, monitor=monitor)
         assert not answer.success
         assert "Maximum_WallTime_Exceeded" in answer.message
         assert time.perf_counter() - begun < 5

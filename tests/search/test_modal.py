@@ -352,7 +352,9 @@ def test_the_motions_of_modes_that_nearly_share_a_pole_are_judged_not_their_shap
     noise = 0.003 * np.abs(motion).mean() * complex_noise(np.random.default_rng(0), motion.shape)
     base = np.ones((1, 1, 600), dtype=complex)
     test = sysid.Measurement(freq, base, (1 + motion + noise)[None], rigid_body=np.ones((3, 1)))
-    chosen = degrees_of_freedom(sysid.Problem(test, mass=sysid.FullMass(1.0)), Modes(phi, gamma, omega, ratios), None)
+    chosen = degrees_of_freedom(
+        sysid.Problem(test, mass=sysid.FullMass(1.0)).prepared, Modes(phi, gamma, omega, ratios), None
+    )
     shapes = np.linalg.svd(phi / np.linalg.norm(phi, axis=0), compute_uv=False)
     assert shapes[-1] < 1e-3 * shapes[0]
     assert (chosen.sensors.size, chosen.modes.size) == ((2, 1) if alike else (3, 0))
@@ -370,5 +372,5 @@ def test_many_sensors_that_all_modes_move_alike_are_one_motion_whatever_noise_ad
     phi = np.linalg.lstsq(np.hstack([gain.real, gain.imag]).T, np.hstack([motion.real, motion.imag]).T, rcond=None)[0].T
     test = sysid.Measurement(freq, np.ones((1, 1, 300), complex), (1 + motion)[None], rigid_body=np.ones((n, 1)))
     modes = Modes(phi, np.ones((m, 1)), omega, ratios)
-    chosen = degrees_of_freedom(sysid.Problem(test, mass=sysid.FullMass(1.0)), modes, None)
+    chosen = degrees_of_freedom(sysid.Problem(test, mass=sysid.FullMass(1.0)).prepared, modes, None)
     assert (chosen.sensors.size, chosen.modes.size) == (1, m - 1)

@@ -139,7 +139,7 @@ def test_a_lumped_structure_is_its_own_nearest_lumped_one(random_orthogonal, see
     problem = Problem(simulate(truth, lines(truth)), mass=mass, stiffness=given)
     t = 10 ** rng.uniform(-1, 1, 6)
     modes = rescaled(truth, t)
-    found = nearest_lumped(problem, np.linalg.inv(modes.phi), modes.gamma, truth.rigid_body, groups)
+    found = nearest_lumped(problem.prepared, np.linalg.inv(modes.phi), modes.gamma, truth.rigid_body, groups)
     # No modal mass is let below a tenth of an equal share.
     np.testing.assert_allclose(found, t, rtol=1e-7)
 
@@ -149,7 +149,7 @@ def test_any_structure_has_a_nearest_lumped_one_with_all_its_modes(random_struct
         truth = random_structure(np.random.default_rng(seed), n=5, d=2)
         given = sysid.SpectralStiffness(truth.natural_frequencies)
         problem = Problem(simulate(truth, lines(truth)), mass=FullMass(10.0), stiffness=given)
-        t = nearest_lumped(problem, *known_pieces(truth), problem.geometry.directions[:5])
+        t = nearest_lumped(problem.prepared, *known_pieces(truth), problem.geometry.directions[:5])
         assert np.all(t > 0)
         P = known_pieces(truth)[0]
         assert np.linalg.eigvalsh((P.T * t) @ P)[0] > 0
@@ -166,7 +166,7 @@ def test_totals_are_met_by_one_factor_and_the_base(random_structure, seed, total
     problem = Problem(simulate(truth, lines(truth)), mass=FullMass(total, healing=healing), stiffness=given)
     P, gamma, G = known_pieces(truth)
     remainder = np.array([[2.0, 0.9], [0.9, 1.0]])
-    t, left = to_stated_totals(problem, P, gamma, G, problem.geometry.directions[:5], remainder)
+    t, left = to_stated_totals(problem.prepared, P, gamma, G, problem.geometry.directions[:5], remainder)
     assert 0 < t <= 1
     M_SS, coupling = t * P.T @ P, t * (P.T @ gamma - P.T @ P @ G)
     delta = np.sqrt(t) * (gamma - P @ G)
@@ -189,7 +189,7 @@ class TestStatedTotals:
         totals = model.total(self.problem(truth, model).geometry, truth.mass)
         problem = self.problem(truth, FullMass(totals, healing=healing))
         pieces = truth.mode_shapes, truth.participation, truth.rigid_body_mass
-        ties = stated_totals(problem)
+        ties = stated_totals(problem.prepared)
         symbols = [ca.MX.sym("piece", *piece.shape) for piece in pieces]
         off = ca.Function("ties", symbols, [ca.vertcat(*ties(*symbols))])
         np.testing.assert_allclose(np.asarray(off(*pieces)), 0.0, atol=1e-12)
@@ -201,9 +201,9 @@ class TestStatedTotals:
 
     def test_there_are_none_without_a_force_or_a_total(self, random_structure):
         truth = random_structure(np.random.default_rng(2), n=4, d=2)
-        assert stated_totals(self.problem(truth, FullMass(9.0), force=False)) is None
-        assert stated_totals(self.problem(truth, FullMass())) is None
-        assert stated_totals(self.problem(truth, KnownMass(truth.mass))) is None
+        assert stated_totals(self.problem(truth, FullMass(9.0), force=False).prepared) is None
+        assert stated_totals(self.problem(truth, FullMass()).prepared) is None
+        assert stated_totals(self.problem(truth, KnownMass(truth.mass)).prepared) is None
 
 
 @pytest.mark.parametrize("healing", ["trace", "rigid_body"])
@@ -216,7 +216,7 @@ def test_a_total_that_is_not_stated_is_what_known_masses_make(random_structure, 
     problem = Problem(simulate(small, lines(small)), mass=FullMass(known=known, healing=healing))
     P, gamma, G = known_pieces(small)
     groups = problem.geometry.directions[:3]
-    t, remainder = to_stated_totals(problem, P, gamma, G, groups, np.eye(2), scaled=True)
+    t, remainder = to_stated_totals(problem.prepared, P, gamma, G, groups, np.eye(2), scaled=True)
     assert t == 1.0
     M_SS, M_S0 = P.T @ P, P.T @ gamma - P.T @ P @ G
     whole = np.block([[M_SS, M_S0], [M_S0.T, (gamma - P @ G).T @ (gamma - P @ G) + remainder]])
@@ -240,7 +240,7 @@ def test_a_total_is_held_where_the_force_weighs_it_and_the_records_allow_it(rand
     modes = rescaled(truth, np.ones(3))
     left = weighted_error(test, truth)
     first = ModalFit(modes, truth.rigid_body_mass, left, left, "Solve_Succeeded", "")
-    found = held_to_totals(problem, first, IterationMonitor(None, None), 100)
+    found = held_to_totals(problem.prepared, first, IterationMonitor(None, None), 100)
     assert (found is not None) is held
     if found is not None:
         assert found.rigid[0, 0] == pytest.approx(total, rel=1e-9)

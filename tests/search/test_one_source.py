@@ -107,7 +107,7 @@ CHANGES = {
 def costs_of(made, particles):
     """The swarm's objective of candidates, checked against IPOPT's rows."""
     spectrum = made.formulation.stiffness.spectrum if made.formulation.refinable else None
-    objective = SwarmObjective(made, spectrum=spectrum)
+    objective = SwarmObjective(made.prepared, spectrum=spectrum)
     assert (objective._held is None) == (spectrum is None)
     costs = objective(particles)
     np.testing.assert_allclose(costs, by_rows(made, objective, particles), rtol=1e-9)

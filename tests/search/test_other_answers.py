@@ -57,7 +57,7 @@ def test_the_exchange_gives_the_same_transmissibility():
 
 
 def test_differences_at_complex_frequencies_vanish_there_and_nowhere_about():
-    same = SameResponse(problem(), X)
+    same = SameResponse(problem().prepared, X)
     at, off = same(np.array([exchanged(X), 1.01 * X]))
     assert np.abs(at).max() < 1e-12
     assert np.abs(off).max() > 1e-4
@@ -67,7 +67,7 @@ def test_responses_are_those_of_direct_solves_also_with_ratios():
     """Against modes, by hand: sum of phi gamma s² / (s² + 2 zeta w s + w²), less its sign."""
     posed = problem(ratios=True)
     x, moved = np.array([*SPRINGS, 0.01, 0.02]), np.array([2.2e4, 1.4e4, 0.013, 0.017])
-    same = SameResponse(posed, x)
+    same = SameResponse(posed.prepared, x)
     (term,) = same.terms
     records = []
     for at in (x, moved):
@@ -92,7 +92,7 @@ def test_a_difference_in_any_direction_in_which_the_base_moves_is_seen(base):
     posed = sysid.Problem(test, mass=np.diag([2.0, 3.0, 0, 0]), stiffness=ca.diag(k), damping=[0.01, 0.02])
     x = np.array([900.0, 2500.0])
     for i in range(2):
-        (off,) = SameResponse(posed, x)(np.where(np.arange(2) == i, 1.2 * x, x)[None])
+        (off,) = SameResponse(posed.prepared, x)(np.where(np.arange(2) == i, 1.2 * x, x)[None])
         assert np.linalg.norm(off) > 0.01
 
 
@@ -115,7 +115,7 @@ def test_differences_do_not_depend_on_the_point_of_the_base_that_motions_are_rel
 
     x = np.array([2.0, 3.0, 0.4, 900.0, 2500.0])
     points = x * rng.uniform(0.8, 1.2, (4, x.size))
-    one, other = (SameResponse(posed(by), x)(points) for by in (0 * A, A))
+    one, other = (SameResponse(posed(by).prepared, x)(points) for by in (0 * A, A))
     assert np.linalg.norm(one) > 0.1
     np.testing.assert_allclose(other, one, atol=1e-9)
 
@@ -126,7 +126,7 @@ def test_another_answer_keeps_the_constraints():
     for constraints, explains in ((lambda k, c: [], True), (lambda k, c: [k[0] <= 2 * k[1]], False)):
         posed = problem(constraints=constraints)
         assert posed.objective(other) == pytest.approx(posed.objective(X), rel=1e-6)
-        assert other_answers._explains(posed, other, posed.objective(X)) is explains
+        assert other_answers._explains(posed.prepared, other, posed.objective(X)) is explains
 
 
 @pytest.mark.parametrize("seed", SEEDS_MISSED_BEFORE)
@@ -149,16 +149,18 @@ def test_nobody_accuses_unique_answers():
 
 
 def test_no_time_is_lost_where_the_equations_are_linear(monkeypatch):
-    assert other_answers.is_unique_if_rank_is_full(problem((0, 1)))
-    assert other_answers.is_unique_if_rank_is_full(problem((0, 1), ratios=True))
-    assert not other_answers.is_unique_if_rank_is_full(problem((1,)))
+    assert other_answers.is_unique_if_rank_is_full(problem((0, 1)).prepared)
+    assert other_answers.is_unique_if_rank_is_full(problem((0, 1), ratios=True).prepared)
+    assert not other_answers.is_unique_if_rank_is_full(problem((1,)).prepared)
     monkeypatch.setattr(other_answers, "SameResponse", None)
     assert sysid.identify(problem((0, 1)), rng=0).determined
 
 
 def test_a_broken_constraint_is_a_difference_too():
     """The exchanged chain has the same response; beside it counts by how much it breaks what the first one keeps."""
-    free, held = (SameResponse(problem(constraints=c), X) for c in (lambda k, c: [], lambda k, c: [k[0] <= 2 * k[1]]))
+    free, held = (
+        SameResponse(problem(constraints=c).prepared, X) for c in (lambda k, c: [], lambda k, c: [k[0] <= 2 * k[1]])
+    )
     (alike,), (broken,) = free(exchanged(X)[None]), held(exchanged(X)[None])
     assert np.linalg.norm(alike) < 1e-12
     assert np.linalg.norm(broken) > 1.0  # in units of what counts as broken at all
@@ -179,7 +181,7 @@ def test_nothing_but_records_and_equations_that_are_linear_leaves_one_answer(dam
     again = sysid.Problem(
         posed.measurement, mass=posed.mass, stiffness=posed.stiffness, damping=damping(z), residuals=residuals(z)
     )
-    assert other_answers.is_unique_if_rank_is_full(again) is unique
+    assert other_answers.is_unique_if_rank_is_full(again.prepared) is unique
 
 
 def test_structures_are_apart_by_the_entry_of_any_matrix_that_differs_most():

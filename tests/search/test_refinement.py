@@ -213,7 +213,7 @@ class TestEveryCandidate:
 
 def made(problem, tally, session=None):
     spectrum = problem.formulation.stiffness.spectrum
-    return Refiner(problem, "leaders", spectrum, session or Session([], DeferredInterrupt()), tally), tally
+    return Refiner(problem.prepared, "leaders", spectrum, session or Session([], DeferredInterrupt()), tally), tally
 
 
 def middle(problem):

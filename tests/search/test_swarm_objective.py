@@ -48,7 +48,7 @@ def particles(problem, count, seed=0):
 @pytest.mark.parametrize("damping", ["states", "modes"])
 def test_the_cost_is_the_objective_the_unknowns_that_a_candidate_stands_for(damping, options):
     problem = make(damping, **options)
-    cost, rows = SwarmObjective(problem), particles(problem, 70)
+    cost, rows = SwarmObjective(problem.prepared), particles(problem, 70)
     expected = [problem.objective(cost.unknowns(s)) for s in rows]
     np.testing.assert_allclose(cost(rows), expected, rtol=1e-9)
 
@@ -63,12 +63,14 @@ def test_residuals_further_tests_and_an_own_misfit_count(damping):
     for build in ({"residuals": further}, {"misfit": lambda m, k, c: ca.vertcat(m - 1, c)}):
         problem = make(damping, **build)
         rows = particles(problem, 9)
-        np.testing.assert_allclose(SwarmObjective(problem)(rows), [problem.objective(s) for s in rows], rtol=1e-9)
+        np.testing.assert_allclose(
+            SwarmObjective(problem.prepared)(rows), [problem.objective(s) for s in rows], rtol=1e-9
+        )
 
 
 def test_sampling_is_on_the_logarithm_and_to_sampling_its_inverse():
     problem = make(log=True)
-    cost, rows = SwarmObjective(problem), particles(problem, 5)
+    cost, rows = SwarmObjective(problem.prepared), particles(problem, 5)
     for s in rows:
         x = cost.unknowns(s)
         share = (s[3:6] - 1e3) / (1e5 - 1e3)
@@ -79,7 +81,7 @@ def test_sampling_is_on_the_logarithm_and_to_sampling_its_inverse():
 
 def test_healing_meets_an_equality_and_stays_in_the_box():
     problem = make(healing=lambda m, k, c: {m: 6.0 * m / ca.sum1(m)}, constraints=lambda m, k, c: [ca.sum1(m) == 6.0])
-    cost, rows = SwarmObjective(problem), particles(problem, 40)
+    cost, rows = SwarmObjective(problem.prepared), particles(problem, 40)
     for s, value in zip(rows, cost(rows), strict=True):
         x = cost.unknowns(s)
         np.testing.assert_array_equal(x[3:], s[3:])
@@ -95,7 +97,7 @@ def test_whatever_keeps_the_constraints_comes_before_what_breaks_them_and_less_b
     kept, less, more = (base + np.eye(9)[0] * step for step in (0.0, 1.1, 1.5))
     poor = base.copy()
     poor[3:6] = 1.0e3  # keeps them, and explains nothing
-    costs = SwarmObjective(problem)(np.array([kept, poor, less, more]))
+    costs = SwarmObjective(problem.prepared)(np.array([kept, poor, less, more]))
     np.testing.assert_allclose(costs[:2], [problem.objective(kept), problem.objective(poor)], rtol=1e-9)
     assert costs[:2].max() < costs[2] < costs[3]
 
@@ -103,7 +105,7 @@ def test_whatever_keeps_the_constraints_comes_before_what_breaks_them_and_less_b
 def test_an_inequality_lets_through_what_is_at_its_bound():
     problem = make(constraints=lambda m, k, c: [m[0] <= m[1]])
     at = np.array([2.0, 2.0, 2.0, 5e4, 5e4, 5e4, 0.1, 0.1, 0.1])
-    np.testing.assert_allclose(SwarmObjective(problem)(at[None]), problem.objective(at), rtol=1e-9)
+    np.testing.assert_allclose(SwarmObjective(problem.prepared)(at[None]), problem.objective(at), rtol=1e-9)
 
 
 @pytest.mark.filterwarnings("ignore:invalid")
@@ -112,7 +114,7 @@ def test_a_constraint_that_is_no_number_is_not_kept():
     kept = np.array([1.5, 2.5, 2.0, 5e4, 5e4, 5e4, 0.1, 0.1, 0.1])
     nowhere = kept.copy()
     nowhere[0] = 0.6
-    costs = SwarmObjective(problem)(np.array([kept, nowhere]))
+    costs = SwarmObjective(problem.prepared)(np.array([kept, nowhere]))
     assert costs[0] < 10
     assert not costs[1] < costs[0] + 1e3
 
@@ -135,7 +137,7 @@ def test_a_candidate_without_a_mass_matrix_is_no_number_and_leaves_the_others_al
     good = np.array([2e4, 2e4, 2e4, 0.0, 0.1, *([0.01] * (problem.n_variables - 5))])
     bad = good.copy()
     bad[4] = 2.9
-    costs = SwarmObjective(problem)(np.array([good, bad, good]))
+    costs = SwarmObjective(problem.prepared)(np.array([good, bad, good]))
     np.testing.assert_array_equal(np.isnan(costs), [False, True, False])
     np.testing.assert_allclose(costs[[0, 2]], problem.objective(good), rtol=1e-9)
 
@@ -152,7 +154,7 @@ def test_a_candidate_without_a_stiffness_matrix_is_no_number(damping):
     bad = np.array([2e4, 2e4, 2e4, 4e4, 0.1, *([0.01] * (problem.n_variables - 5))])
     with pytest.raises(sysid.InputError):
         problem.structure(bad)
-    assert np.isnan(SwarmObjective(problem)(bad[None])[0])
+    assert np.isnan(SwarmObjective(problem.prepared)(bad[None])[0])
 
 
 @pytest.mark.parametrize("damping", ["states", "modes"])
@@ -171,7 +173,7 @@ def test_a_candidate_whose_base_is_lighter_than_its_coupling_is_no_number(dampin
     order = [problem.formulation.labels.index(name) for name in ("base", "c[0]", "c[1]", "c[2]")]
     rows = np.empty((2, 4))
     rows[:, order] = np.array([[0.99 * least, 0.1, 0.1, 0.1], [1.01 * least, 0.1, 0.1, 0.1]])
-    costs = SwarmObjective(problem)(rows)
+    costs = SwarmObjective(problem.prepared)(rows)
     with pytest.raises(sysid.InputError):
         problem.structure(rows[0])
     assert np.isnan(costs[0])
@@ -185,7 +187,7 @@ def test_a_candidate_whose_damping_feeds_energy_in_is_no_number():
         sysid.simulate(truth(), FREQ), mass=np.diag([3.0, 2, 1]), stiffness=chain(ca.DM([2e4, 1.5e4, 1e4])),
         damping=chain(ca.vertcat(5.0, 5.0, c)),
     )  # fmt: skip
-    costs = SwarmObjective(problem)(np.array([[2.0], [-2.0]]))
+    costs = SwarmObjective(problem.prepared)(np.array([[2.0], [-2.0]]))
     with pytest.raises(sysid.InputError):
         problem.structure(np.array([-2.0]))
     assert np.isnan(costs[1])
@@ -195,13 +197,13 @@ def test_a_candidate_whose_damping_feeds_energy_in_is_no_number():
 @pytest.mark.parametrize("damping", ["states", "modes"])
 def test_bits_do_not_depend_on_who_else_is_in_the_batch(damping):
     problem = make(damping, force=True, constraints=lambda m, k, c: [m[0] <= m[1]])
-    cost, rows = SwarmObjective(problem), particles(problem, 150)
+    cost, rows = SwarmObjective(problem.prepared), particles(problem, 150)
     whole = cost(rows)
     for cuts in ([1, 2, 66], [64], [149], [17, 130]):
         np.testing.assert_array_equal(np.concatenate([cost(part) for part in np.split(rows, cuts)]), whole)
     order = np.random.default_rng(1).permutation(len(rows))
     np.testing.assert_array_equal(cost(rows[order]), whole[order])
-    np.testing.assert_array_equal(SwarmObjective(problem)(rows), whole)
+    np.testing.assert_array_equal(SwarmObjective(problem.prepared)(rows), whole)
 
 
 def critically_damped():
@@ -222,7 +224,7 @@ CRITICAL = np.array([1.0, 2.0, 16.0, 16.0, 1.0, 1.0])
 
 def test_a_defective_candidate_changes_the_bits_of_no_other():
     problem = critically_damped()
-    cost, rows = SwarmObjective(problem), particles(problem, 12)
+    cost, rows = SwarmObjective(problem.prepared), particles(problem, 12)
     alone = cost(rows)
     together = cost(np.array([*rows[:5], CRITICAL, *rows[5:]]))
     np.testing.assert_array_equal(np.delete(together, 5), alone)
@@ -230,4 +232,4 @@ def test_a_defective_candidate_changes_the_bits_of_no_other():
 
 def test_a_defective_candidate_has_its_misfit():
     problem = critically_damped()
-    np.testing.assert_allclose(SwarmObjective(problem)(CRITICAL[None]), problem.objective(CRITICAL), rtol=1e-5)
+    np.testing.assert_allclose(SwarmObjective(problem.prepared)(CRITICAL[None]), problem.objective(CRITICAL), rtol=1e-5)

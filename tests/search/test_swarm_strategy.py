@@ -62,7 +62,9 @@ def searched_from(problem, monkeypatch, ends, goal=1e-3, start=1 + 1e-5):
     from sysid.search import swarm
     from sysid.search.session import DeferredInterrupt, Session
 
-    search = swarm._Search(dataclasses.replace(problem, goal=goal), sysid.Swarm(), Session([], DeferredInterrupt()))
+    search = swarm._Search(
+        dataclasses.replace(problem, goal=goal).prepared, sysid.Swarm(), Session([], DeferredInterrupt())
+    )
     truth, (at, solved) = problem.values(problem.reference), ends
     search.x = truth * start
     answer = swarm.local.LocalResult(truth * at, solved, "IPOPT: as it ended", np.array([1.0]))

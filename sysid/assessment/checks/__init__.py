@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from sysid.assessment.checks.against_records import records_of_fit
-from sysid.assessment.checks.bounds import keeping_bounds, on_a_bound, pressed_bounds
+from sysid.assessment.checks.bounds import bounds_explain, keeping_bounds, on_a_bound, pressed_bounds
 from sysid.assessment.checks.changing import changing_frequencies
-from sysid.assessment.checks.context import Check, Context
+from sysid.assessment.checks.context import Check, Context, Ended
+from sysid.assessment.checks.exchanged import exchanged_sensors
 from sysid.assessment.checks.gains import assumed_totals
 from sysid.assessment.checks.goal import missed_goal
 from sysid.assessment.checks.limits import lines_left_out, search_boxes, unfitted_records
@@ -24,7 +25,8 @@ from sysid.assessment.checks.stated_values import missed_values
 from sysid.assessment.checks.wrong_records import wrong_records
 from sysid.errors import refuse
 from sysid.finding import Finding, Severity
-from sysid.problem.problem import Problem
+from sysid.problem.prepared import PreparedProblem
+from sysid.problem.stated import StatedProblem
 
 CHECKS: tuple[Check, ...] = (
     wrong_records,
@@ -62,7 +64,7 @@ def run(context: Context, checks: Iterable[Check] = CHECKS) -> list[Finding]:
     return context.found
 
 
-def check_records(problem: Problem) -> tuple[Finding, ...]:
+def check_records(problem: StatedProblem) -> tuple[Finding, ...]:
     """Mistakes that records show before a search, the worst first.
 
     Raises
@@ -70,6 +72,12 @@ def check_records(problem: Problem) -> tuple[Finding, ...]:
     InputError
         Where one is blocking, so that a search would be in vain.
     """
-    found = tuple(run(Context(problem)))
+    found = tuple(run(Context(PreparedProblem(problem))))  # of which nothing is prepared that no check asks for
     refuse(*((one.severity is Severity.BLOCKING, str(one)) for one in found))
     return found
+
+
+def mistakes_of_poor_fit(problem: PreparedProblem, end: Ended) -> tuple[Finding, ...]:
+    """Sensors that were swapped, where that explains what a search leaves, so that no other would do better."""
+    pressed = bounds_explain(problem, end.structure, end.x)  # what they leave may look like swapped sensors
+    return exchanged_sensors(problem, end.structure, wholly=pressed)

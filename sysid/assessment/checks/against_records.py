@@ -15,6 +15,7 @@ from sysid.finding import Finding, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.spectra import of_run
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
+from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.residues import Records, ResidueFit, beyond_chance
 from sysid.modal_analysis.response import columns
 from sysid.problem.formulation import Formulation
@@ -35,16 +36,15 @@ def records_of_fit(context: Context) -> Iterator[Finding]:
         return
     problem, end = context.problem.screened, context.end
     formulation, changing = problem.formulation, context.has("changing")
-    tests = [(problem.measurement, end.structure)] if formulation.fits_records else []
-    if end.x is not None:
-        tests += [(term.test, term.matrices.structure(end.x, term.test)) for term in formulation.further_tests]
-    for i, (test, its) in enumerate(tests, start=1):
-        found = [one for one in _of_records(formulation, test, its, changing) if one not in context.found]
-        yield from found if len(tests) == 1 else [one.of_test(i) for one in found]
+    fits = problem.fits(end.structure, end.x)
+    for i, (modal, its) in enumerate(fits, start=1):
+        found = [one for one in _of_records(formulation, modal, its, changing) if one not in context.found]
+        yield from found if len(fits) == 1 else [one.of_test(i) for one in found]
 
 
-def _of_records(formulation: Formulation, test: Measurement, structure: Structure, changing: bool) -> list[Finding]:
+def _of_records(formulation: Formulation, modal: ModalEstimate, structure: Structure, changing: bool) -> list[Finding]:
     """Signs in the records of one test that a structure is not theirs."""
+    test = modal.records
     records, poles = Records(test), distinct_poles(structure)
     leaks = list(leakage(test, structure)) if test.averaged else []
     velocity = not structure.modal_damping
@@ -53,25 +53,26 @@ def _of_records(formulation: Formulation, test: Measurement, structure: Structur
     free = records.fit(*poles, velocity=velocity)
     misses, rigid = list(_misfit(formulation, test, structure, records, free)), []
     if not changing:
-        rigid = list(_rigid(test, records, free))
-    gains = [] if rigid or changing else list(wrong_gains(test, gain_errors(test, structure)))
-    found = [*_at_rest(test), *leaks, *misses, *force_misfit(formulation, test, structure), *rigid, *gains]
+        rigid = list(_rigid(modal, records, free))
+    gains = [] if rigid or changing else list(wrong_gains(test, gain_errors(modal, structure)))
+    found = [*_at_rest(modal), *leaks, *misses, *force_misfit(formulation, test, structure), *rigid, *gains]
     # Beside what those say, quadrature and likeness mean nothing.
     if structure.modal_damping and not (leaks or rigid or gains or changing):
         found += _damping(records, poles, free)
     if not found:  # spectra of unknown origin, whose misfit nothing else explains
         found = leaks = list(leakage(test, structure))
     if not (leaks or misses or rigid):
-        found += _twins(test, structure)
+        found += _twins(modal, structure)
     return found
 
 
-def _at_rest(test: Measurement) -> Iterator[Finding]:
+def _at_rest(modal: ModalEstimate) -> Iterator[Finding]:
     """Whether runs of whole records are at rest at both ends where it is stated."""
-    for run in () if test.modal is None else test.modal.in_motion:
+    runs = modal.records.n_runs
+    for run in modal.in_motion:
         yield Finding(
             "in motion", Severity.CONTRADICTS,
-            f"the records{of_run(run, test.n_runs)} are stated to begin and end at rest (at_rest), but show the free "
+            f"the records{of_run(run, runs)} are stated to begin and end at rest (at_rest), but show the free "
             "vibration of a structure that was in motion at one end",
             "leave the statement out for this run, so that its transients are fitted", run=run + 1,
         )  # fmt: skip
@@ -109,10 +110,11 @@ def _misfit(
         )  # fmt: skip
 
 
-def _rigid(test: Measurement, records: Records, free: ResidueFit) -> Iterator[Finding]:
+def _rigid(modal: ModalEstimate, records: Records, free: ResidueFit) -> Iterator[Finding]:
     """Whether sensors move in a constant proportion to the base beside their modes: then rigid_body is wrong."""
-    if test.modal is not None:  # beside the noise of the base, which biases what follows
-        moved, chi2 = test.modal.gain.rigid.copy(), test.modal.gain.rigid_chi2
+    test = modal.records
+    if modal.has_modes:  # beside the noise of the base, which biases what follows
+        moved, chi2 = modal.gain.rigid.copy(), modal.gain.rigid_chi2
     else:
         found = _along_the_base(test, records, free)
         if found is None:
@@ -167,10 +169,11 @@ def _damping(records: Records, poles: tuple[Array, Array], free: ResidueFit) -> 
         )  # fmt: skip
 
 
-def _twins(test: Measurement, structure: Structure) -> Iterator[Finding]:
+def _twins(modal: ModalEstimate, structure: Structure) -> Iterator[Finding]:
     """Sensors whose motions differ by no more than noise does, line by line."""
+    test = modal.records
     lines, names = np.concatenate(test.own_lines), test.sensor_names
-    moves, noise = columns(test.relative)[:, lines], _own_noise(test)
+    moves, noise = columns(test.relative)[:, lines], _own_noise(modal)
     left = moves - columns(test.predict(structure))[:, lines]
     gram = (moves @ moves.conj().T).real
     size, most = np.diag(gram), beyond_chance(2 * moves.shape[1]) / (2 * moves.shape[1])
@@ -192,14 +195,15 @@ def _twins(test: Measurement, structure: Structure) -> Iterator[Finding]:
             )  # fmt: skip
 
 
-def _own_noise(test: Measurement) -> Array | None:
+def _own_noise(modal: ModalEstimate) -> Array | None:
     """Variance of the sensors' own noise, (n_sensors, runs * n_freq); None where it is neither stated nor found.
 
     Of whole records without the base's noise, which sensors in one motion share.
     """
-    if test.modal is not None:
-        levels = np.broadcast_to(test.modal.noise.response, (test.n_runs, test.n_sensors))
-        by_run = max(test.modal.reduced, 1.0) * test.modal.density[:, None] * levels**2
+    test = modal.records
+    if modal.noise is not None:
+        levels = np.broadcast_to(modal.noise.response, (test.n_runs, test.n_sensors))
+        by_run = max(modal.reduced, 1.0) * modal.density[:, None] * levels**2
         return np.repeat(by_run.T, test.freq.size, axis=1)
     if test.response_std is not None:
         return columns(np.broadcast_to(test.response_std, test.response.shape) + 0j).real ** 2

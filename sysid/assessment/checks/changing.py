@@ -15,9 +15,10 @@ from sysid.finding import Finding, Severity
 from sysid.measurement.in_time import levels_are_known
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
+from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.stretches import Stretch, stretches_of
 from sysid.modal_analysis.transients import without_transients_of
-from sysid.problem.problem import Problem
+from sysid.problem.prepared import PreparedProblem
 from sysid.structure.structure import Array
 
 _MOVED = 0.1  # half-power widths, by which the frequency of a mode changes at least
@@ -140,9 +141,9 @@ def changing_frequencies(context: Context) -> Iterator[Finding]:
     if not context.is_judged or context.named:
         return
     structure, modal = context.end.structure, context.modal
-    unfitted = [without_transients_of(test, structure) for test in context.problem.validation]
+    unfitted = [without_transients_of(test, structure) for test in context.problem.stated.validation]
     missed = [miss for test in unfitted for miss in misses_of_test(test, structure)]
-    uneven = modal is not None and bool(modal.scatter is not None or modal.excess)
+    uneven = bool(modal.scatter is not None or modal.excess)
     if not (uneven or any(miss.times > BEYOND for miss in (*context.misses, *missed))):
         return
     try:
@@ -152,12 +153,12 @@ def changing_frequencies(context: Context) -> Iterator[Finding]:
         yield Finding("changes not judged", context.weight, why)
 
 
-def changing(problem: Problem, severity: Severity = Severity.CONTRADICTS) -> tuple[Finding, ...]:
+def changing(problem: PreparedProblem, severity: Severity = Severity.CONTRADICTS) -> tuple[Finding, ...]:
     """The mode whose frequency changes most between stretches of all records; none where none does.
 
     Parameters
     ----------
-    problem : Problem
+    problem : PreparedProblem
         Tests that were never fitted are looked at too, where the levels of all are known.
     """
     found = changes(problem)
@@ -175,14 +176,17 @@ def changing(problem: Problem, severity: Severity = Severity.CONTRADICTS) -> tup
     return (Finding("changing", severity, sentence, remedy, numbers=numbers),)
 
 
-def changes(problem: Problem) -> list[Change]:
+def changes(problem: PreparedProblem) -> list[Change]:
     """Modes whose frequencies change between stretches of all records, by more than noise makes of them."""
     if not problem.formulation.fits_records:
         return []
-    scaled = levels_are_known(problem.measurement)
-    unfitted = [(i, test) for i, test in enumerate(problem.validation, start=1) if scaled and levels_are_known(test)]
-    tests = [(0, problem.measurement), *unfitted]
-    every = _modes(problem.screened.measurement)
+    given = problem.stated.measurement
+    scaled = levels_are_known(given)
+    unfitted = [
+        (i, test) for i, test in enumerate(problem.stated.validation, start=1) if scaled and levels_are_known(test)
+    ]
+    tests = [(0, given), *unfitted]
+    every = _modes(problem.screened.modal[0])
     if every is None:
         return []
     modes, apart = every.joined(_CLOSE * every.omega), every.joined(2 * every.ratios * every.omega)
@@ -231,13 +235,12 @@ class Poles(NamedTuple):
         return Poles(omega, ratios, self.shapes[:, [group[0] for group in groups]])
 
 
-def _modes(test: Measurement) -> Poles | None:
+def _modes(modal: ModalEstimate) -> Poles | None:
     """Poles of a test; None where it shows none."""
-    modal = test.modal
-    if modal is not None:
+    if modal.has_modes:
         omega, ratios, shapes = modal.omega, modal.ratios, modal.phi
     else:
-        poles = PolesAndResidues.of(test)
+        poles = PolesAndResidues.of(modal.records)
         if poles is None:
             return None
         omega, ratios, shapes = poles.omega, poles.ratios, poles.residues.reshape(poles.omega.size, -1).T

@@ -9,9 +9,8 @@ from typing import Any, Protocol
 
 from sysid.assessment.checks.noise_multiples import Miss, misses_of
 from sysid.finding import Finding, Severity, contradicting
-from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.problem.problem import Problem
+from sysid.problem.prepared import PreparedProblem
 from sysid.structure.structure import Array, Structure
 
 
@@ -53,8 +52,8 @@ class Context:
 
     Attributes
     ----------
-    problem : Problem
-        As the user stated it.
+    problem : PreparedProblem
+        With what its records tell of the modes, which nothing asks before a search.
     outcome : Outcome or None
         None before a search.
     cut_short : bool
@@ -63,15 +62,15 @@ class Context:
         Of the checks before, which may explain what a later one would tell.
     """
 
-    problem: Problem
+    problem: PreparedProblem
     outcome: Ended | None = None
     cut_short: bool = False
     found: list[Finding] = field(default_factory=list)
 
-    @cached_property
-    def modal(self) -> ModalEstimate | None:
-        """Modes of whole records, fitted with their transients; None of other records."""
-        return self.problem.screened.measurement.modal
+    @property
+    def modal(self) -> ModalEstimate:
+        """What the problem's own records tell of the modes."""
+        return self.problem.modal[0]
 
     @property
     def end(self) -> Ended:
@@ -109,10 +108,10 @@ class Context:
     @cached_property
     def residual(self) -> float:
         """Relative residual of the accelerations, or of the user's own misfit."""
-        records, end = self.problem.screened, self.end
-        if end.x is None or self.problem.free_modes:
-            return records.measurement.residual(end.structure)
-        return records.residual(end.x)
+        problem, end = self.problem, self.end
+        if end.x is None or problem.free_modes:
+            return problem.screened.measurement.residual(end.structure)
+        return problem.residual(end.x)
 
     @cached_property
     def misses(self) -> list[Miss]:
@@ -123,12 +122,12 @@ class Context:
     @property
     def weight(self) -> Severity:
         """Severity of an error of the model: a stated goal that is met accepts it."""
-        goal = self.problem.goal
+        goal = self.problem.stated.goal
         return Severity.CAUTION if goal is not None and self.residual <= goal else Severity.CONTRADICTS
 
     @cached_property
-    def fits(self) -> list[tuple[int, Measurement, Structure]]:
-        """Number, from 1, and records of each test that is fitted, and the structure as it was in it."""
+    def fits(self) -> list[tuple[int, ModalEstimate, Structure]]:
+        """Number, from 1, and modal estimate of each test that is fitted, and the structure as it was in it."""
         problem, end = self.problem, self.end
         pairs = problem.fits(end.structure, end.x)
         return [(i, *pair) for i, pair in enumerate(pairs, start=problem.first_test)]

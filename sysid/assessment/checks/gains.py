@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from sysid.assessment.checks.context import Context
 from sysid.finding import Finding, Severity
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.residues import Records, ResidueFit
 from sysid.modal_analysis.response import gain_slopes
-from sysid.problem.problem import Problem
+from sysid.problem.prepared import PreparedProblem
 from sysid.structure.structure import Array, Structure
 
 _CHANCE = 1e-3  # that any sensor of a right test is accused
@@ -83,7 +84,7 @@ class GainErrors:
         return one if np.all(np.abs(error - one) < _ALIKE * std) else None
 
 
-def gain_errors(test: Measurement, structure: Structure) -> GainErrors:
+def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
     """What the constant terms of a test say of its sensors' gains, at the poles of the structure that was fitted to it.
 
     Each is estimated twice, beside the modes alone and beside a part that grows as w² too. The first is the more
@@ -91,8 +92,8 @@ def gain_errors(test: Measurement, structure: Structure) -> GainErrors:
     one that is then known better is taken. A record's own misfit is its noise, line by line, and lines that share it
     are counted as such; noise that is stated larger counts as stated.
     """
-    if test.modal is not None:
-        gain = test.modal.gain
+    test, gain = modal.records, modal.gain
+    if modal.has_modes:
         moved = np.any(test.rigid_body, axis=1)
         error, std = np.where(moved, gain.error, np.nan), np.where(moved, gain.std, np.nan)
         return GainErrors(error, std, np.nan_to_num(_beyond(error, std)), gain.freedom)
@@ -145,7 +146,7 @@ def wrong_gains(test: Measurement, errors: GainErrors) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def assumed(problem: Problem) -> Iterator[Finding]:
+def assumed(problem: PreparedProblem) -> Iterator[Finding]:
     """Gains on which masses rest and that no record can show to be wrong."""
     test, mass = problem.measurement, problem.formulation.mass
     if mass.entries is not None and np.all(np.isfinite(mass.entries)):
@@ -171,7 +172,7 @@ def assumed_totals(context: Context) -> Iterator[Finding]:
     yield from () if context.outcome is None else taken_at_sensors(context.problem)
 
 
-def taken_at_sensors(problem: Problem) -> Iterator[Finding]:
+def taken_at_sensors(problem: PreparedProblem) -> Iterator[Finding]:
     """What a stated total of a lumped mass assumes, which accelerations cannot contradict."""
     totals, geometry = problem.formulation.mass.totals, problem.geometry
     if totals is None or totals.kind != "sensors" or problem.measurement.force is not None:  # which contradicts

@@ -23,9 +23,9 @@ def missed_goal(context: Context) -> Iterator[Finding]:
     end, problem = context.outcome, context.problem
     if end is None:
         return
-    if end.x is not None and end.success and not problem.screened.keeps_constraints(end.x):
+    if end.x is not None and end.success and not problem.keeps_constraints(end.x):
         yield Finding("constraint", Severity.CONTRADICTS, "a constraint does not hold")
-    goal, residual = problem.goal, context.residual
+    goal, residual = problem.stated.goal, context.residual
     if goal is not None and residual > goal:
         told = f"the residual {residual:.3g} is above the goal {goal:.3g}"
         yield Finding("goal", Severity.CONTRADICTS, told, numbers={"residual": residual, "goal": goal})

@@ -78,7 +78,7 @@ def mistakes_of(test: Measurement, terms: DirectTerms | None) -> list[Finding]:
 
 def _conjugated(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
     """Whether the conjugates of the spectra are those of modes, and the spectra are not."""
-    if test.whole is not None:
+    if test.is_whole:
         return
     force = None if test.force is None else test.force.conj()
     other = direct_terms(replace(test, base=test.base.conj(), response=test.response.conj(), force=force))
@@ -102,7 +102,7 @@ def _late(test: Measurement, terms: DirectTerms) -> tuple[list[Finding], DirectT
             break
         first = found if first is None else first
         total += found
-        if test.whole is not None:  # a record turned by its spectrum begins with its end
+        if test.is_whole:  # a record turned by its spectrum begins with its end
             break
         turn = np.exp(2j * np.pi * total[:, None] * test.freq)
         mended = direct_terms(replace(test, response=test.response * turn))

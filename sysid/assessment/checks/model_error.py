@@ -23,7 +23,9 @@ _CUT = (
 
 def beyond_noise(context: Context) -> Iterator[Finding]:
     """The model misses the records by more than their noise."""
-    if context.outcome is None or (context.problem.goal is not None and (context.named or not context.is_judged)):
+    if context.outcome is None or (
+        context.problem.stated.goal is not None and (context.named or not context.is_judged)
+    ):
         return
     for miss in context.misses:
         if miss.times > BEYOND:
@@ -39,7 +41,7 @@ def unpredicted_tests(context: Context) -> Iterator[Finding]:
     """A test that was not fitted is predicted worse than by a rigid body."""
     if not context.is_judged or context.named:
         return
-    for i, test in enumerate(context.problem.validation, start=1):
+    for i, test in enumerate(context.problem.stated.validation, start=1):
         residual = without_transients_of(test, context.end.structure).residual(context.end.structure)
         if residual > 1.0:
             yield Finding(
@@ -55,8 +57,8 @@ def other_levels(context: Context) -> Iterator[Finding]:
     problem = context.problem
     if context.outcome is None or not problem.formulation.fits_records:
         return
-    fitted = peaks(problem.measurement)
-    for i, test in enumerate(problem.validation, start=1):
+    fitted = peaks(problem.stated.measurement)
+    for i, test in enumerate(problem.stated.validation, start=1):
         own = peaks(test)
         if not (fitted and own):
             continue

@@ -6,23 +6,21 @@ from collections.abc import Iterator
 
 from sysid.assessment.checks.context import Context
 from sysid.finding import Finding, Severity
-from sysid.measurement.measurement import Measurement
 from sysid.measurement.spectra import of_run
+from sysid.modal_analysis.modal_estimate import ModalEstimate
 
 _TOLD = 3  # channels
 
 
 def noise_of_records(context: Context) -> Iterator[Finding]:
     """Noise of whole records that is not white or not told, and what a fit leaves beside it."""
-    for _, test, _ in () if context.outcome is None else context.fits:
-        yield from noise_findings(test)
+    for _, modal, _ in () if context.outcome is None else context.fits:
+        yield from noise_findings(modal)
 
 
-def noise_findings(test: Measurement) -> Iterator[Finding]:
+def noise_findings(modal: ModalEstimate) -> Iterator[Finding]:
     """Where the noise of whole records, their transients taken off, is not white, and what the fit leaves beside it."""
-    modal = test.modal
-    if modal is None:
-        return
+    test = modal.records
     axes = test.base_axes or ()
     names = [*test.sensor_names]
     names += [f"force {axis}" for axis in axes] if test.force is not None else []

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from sysid.measurement.in_time import cut_in_motion, quiet_levels
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.outliers import Outlier
-from sysid.problem.problem import Problem
-from sysid.problem.terms import FurtherTest
+from sysid.problem.prepared import PreparedProblem
 from sysid.structure.structure import Array, ComplexArray, Structure
 
 BEYOND = 3.0  # times the noise, from which a model is not within it
@@ -55,75 +55,72 @@ class Record(NamedTuple):
     """Of the noise at each line; None where it is neither stated nor found."""
 
 
-def misses_of(problem: Problem, structure: Structure, x: Array | None) -> list[Miss]:
+def misses_of(problem: PreparedProblem, structure: Structure, x: Array | None) -> list[Miss]:
     """What the structure misses of accelerations and base force of each test that is fitted.
 
     Records whose noise is neither stated nor to be found are left out; numbers that stand alone are not counted.
 
     Parameters
     ----------
-    problem : Problem
+    problem : PreparedProblem
     structure : Structure
     x : (n_variables,) or None
         The unknowns that stand for it.
     """
     misses = list(_misses(problem, structure, x, []))
-    if problem.loss == "squares" and any(miss.times > BEYOND for miss in misses):  # spikes may be all there is
+    if problem.stated.loss == "squares" and any(miss.times > BEYOND for miss in misses):  # spikes may be all there is
         return list(_misses(problem, structure, x, problem.outliers(structure, x)))
     return misses
 
 
-def _misses(problem: Problem, structure: Structure, x: Array | None, alone: list[Outlier]) -> Iterator[Miss]:
-    given = [problem.measurement] if problem.formulation.fits_records else []
-    given += [term.measurement for term in problem.residuals if isinstance(term, FurtherTest)]
+def _misses(problem: PreparedProblem, structure: Structure, x: Array | None, alone: list[Outlier]) -> Iterator[Miss]:
     fits = problem.screened.fits(structure, x)
-    for i, (raw, (test, its)) in enumerate(zip(given, fits, strict=False), start=problem.first_test):
-        of = "" if len(fits) == 1 else f" of test {i}"
-        for record in _records(test, raw, its):
+    for i, (modal, its) in enumerate(fits, start=problem.first_test):
+        of, test = "" if len(fits) == 1 else f" of test {i}", modal.records
+        for record in _records(modal, its):
             for one in alone:
                 if one.test == i and one.channel in record.channels:
                     at = int(np.argmin(np.abs(test.freq - one.freq)))
                     record.left[one.run - 1, record.channels.index(one.channel), at] = 0.0
-            found = raw.whole is not None and raw.whole.noise is None
-            yield from _miss(record._replace(name=record.name + of), test, found, _near_modes(test, its))
+            yield from _miss(record._replace(name=record.name + of), test, modal.found_noise, _near_modes(modal, its))
 
 
-def _records(test: Measurement, raw: Measurement, structure: Structure) -> Iterator[Record]:
-    """Records of a test without its transients; `raw` is the test with them."""
+def _records(modal: ModalEstimate, structure: Structure) -> Iterator[Record]:
+    """Records of a test without its transients."""
+    test, noise = modal.records, modal.noise
     left = test.relative - test.predict(structure)
-    quiet = _quiet_base(test, raw)
-    noise = None if test.modal is None else test.modal.noise
+    quiet = _quiet_base(modal)
     std = test.response_std
     if std is not None and quiet is not None and noise is not None:
-        std = _bounded(test, std, noise.response, left, quiet)
+        std = _bounded(modal, std, noise.response, left, quiet)
     yield Record("the accelerations", test.sensor_names, test.relative, left, None if std is None else std**2)
     if test.force is not None:
         axes = tuple(f"force {axis}" for axis in test.base_axes or ())
         left, std = test.force - test.predict_force(structure), test.force_std
         if std is not None and quiet is not None and noise is not None and noise.force is not None:
-            std = _bounded(test, std, noise.force, left, quiet)
+            std = _bounded(modal, std, noise.force, left, quiet)
         yield Record(_FORCE, axes, test.force, left, None if std is None else std**2)
 
 
-def _quiet_base(test: Measurement, raw: Measurement) -> Array | None:
+def _quiet_base(modal: ModalEstimate) -> Array | None:
     """Share of the base's level that its quietest parts hold, (runs,), where levels were found; else None.
 
     Levels are found with modes of constant poles: what these leave at the peaks passes for noise of the base.
     """
-    if test.modal is None or raw.whole is None or raw.whole.noise is not None or test.modal.varying:
+    if modal.noise is None or not modal.found_noise or modal.varying:
         return None
-    quiet = quiet_levels(raw)
-    return None if quiet is None else np.minimum(quiet.base / test.modal.noise.base, 1.0).max(axis=1)
+    quiet = quiet_levels(modal.given)
+    return None if quiet is None else np.minimum(quiet.base / modal.noise.base, 1.0).max(axis=1)
 
 
-def _bounded(test: Measurement, std: Array, level: Array, left: ComplexArray, passed: Array) -> Array:
+def _bounded(modal: ModalEstimate, std: Array, level: Array, left: ComplexArray, passed: Array) -> Array:
     """Deviations (runs, channels, n_freq) of which a channel's own is at most what quiet lines hold of what is left.
 
     Hum and error of a model raise the level that was found. Of the base's share of the noise, `passed` is left, or less
     where quiet lines hold less.
     """
-    assert test.modal is not None
-    own = np.minimum(std**2, (test.modal.density[:, None] * np.broadcast_to(level, std.shape[:2]) ** 2)[..., None])
+    test = modal.records
+    own = np.minimum(std**2, (modal.density[:, None] * np.broadcast_to(level, std.shape[:2]) ** 2)[..., None])
     base, share = std**2 - own, passed**2
     quiet = _quiet(left, np.ones(left.shape), test.own_lines)
     if quiet is not None:
@@ -133,12 +130,11 @@ def _bounded(test: Measurement, std: Array, level: Array, left: ComplexArray, pa
     return np.asarray(np.sqrt(own + share[:, None, None] * base))
 
 
-def _near_modes(test: Measurement, structure: Structure) -> NDArray[np.bool_]:
-    """Lines near a mode of a structure or of whole records, (n_freq,)."""
-    f, ratio = structure.natural_frequencies, structure.damping_ratios
-    if test.modal is not None:
-        f = np.concatenate([f, test.modal.omega / (2 * np.pi)])
-        ratio = np.concatenate([ratio, test.modal.ratios])
+def _near_modes(modal: ModalEstimate, structure: Structure) -> NDArray[np.bool_]:
+    """Lines near a mode of a structure or of its records, (n_freq,)."""
+    test = modal.records
+    f = np.concatenate([structure.natural_frequencies, modal.omega / (2 * np.pi)])
+    ratio = np.concatenate([structure.damping_ratios, modal.ratios])
     reach = np.maximum(2 * _NEAR * ratio * f, _NEAR * np.median(np.diff(test.freq))) if test.freq.size > 1 else np.inf
     return np.asarray(np.any(np.abs(test.freq - f[:, None]) < np.broadcast_to(reach, f.shape)[:, None], axis=0))
 
@@ -203,5 +199,6 @@ def noise_at_most(test: Measurement, left: ComplexArray) -> Array | None:
 
 def misses_of_test(test: Measurement, structure: Structure) -> list[Miss]:
     """What a structure misses of a test that was not fitted."""
-    near = _near_modes(test, structure)
-    return [miss for record in _records(test, test, structure) for miss in _miss(record, test, False, near)]
+    modal = ModalEstimate.of_lines(test)
+    near = _near_modes(modal, structure)
+    return [miss for record in _records(modal, structure) for miss in _miss(record, test, False, near)]

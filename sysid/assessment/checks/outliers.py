@@ -16,7 +16,7 @@ def numbers_far_off(context: Context) -> Iterator[Finding]:
         return
     end, problem = context.outcome, context.problem
     remedy = ""
-    if problem.loss == "squares":
+    if problem.stated.loss == "squares":
         what, remedy = (
             ", while the lines beside them fit",
             ("if they are spikes or drop-outs, state Problem(..., loss='huber'), or leave these lines out"),
@@ -29,15 +29,16 @@ def numbers_far_off(context: Context) -> Iterator[Finding]:
             "the beginning"
         )
     every = problem.outliers(end.structure, end.x)
-    for i, test, _ in context.fits:
+    for i, modal, _ in context.fits:
         found = [one for one in every if one.test == i]
         if not found:
             continue
+        numbers = modal.records.numbers
         which = "the records" if len(context.fits) == 1 else f"test {i}"
         channels = ", ".join(f"{name} {count}" for name, count in Counter(one.channel for one in found).most_common(4))
         yield Finding(
             "outliers", Severity.NOTE,
-            f"{len(found)} of {test.numbers} numbers of {which} are up to {found[0].size:.3g} deviations from the fit "
+            f"{len(found)} of {numbers} numbers of {which} are up to {found[0].size:.3g} deviations from the fit "
             f"({found[0].channel} at {found[0].freq:.5g} Hz; by channel {channels}){what}",
             remedy, run=found[0].run, channel=found[0].channel,
             numbers={

@@ -21,7 +21,7 @@ def missed_values(context: Context) -> Iterator[Finding]:
     if context.outcome is not None and not context.has("bounds"):
         yield from (one for one in context.outcome.findings if one.kind == "stated masses")
     if not context.is_explained and context.end.x is not None:
-        formulation, x = context.problem.screened.formulation, context.end.x
+        formulation, x = context.problem.formulation, context.end.x
         yield from _priors(formulation, x)
         yield from (one for term in formulation.beside for one in term.findings(x))
 

@@ -18,7 +18,7 @@ from sysid.modal_analysis.direct_terms import DirectTerms, direct_terms
 from sysid.modal_analysis.poles_of_test import poles_of_test
 from sysid.problem.feasibility import points_of
 from sysid.problem.formulation import Formulation
-from sysid.problem.problem import Problem
+from sysid.problem.stated import StatedProblem
 from sysid.problem.terms import FurtherTest
 from sysid.structure.structure import Array, Structure
 
@@ -47,8 +47,8 @@ def wrong_records(context: Context) -> Iterator[Finding]:
     if context.outcome is not None:
         yield from context.named
         return
-    problem = context.problem
-    declared = problem.formulate(problem.unsearched)
+    problem = context.problem.stated
+    declared = problem.declared
     tests = [problem.measurement] if problem.misfit is None else []
     tests += [given.measurement for given in problem.residuals if isinstance(given, FurtherTest)]
     for i, test in enumerate(tests, start=1):
@@ -58,14 +58,14 @@ def wrong_records(context: Context) -> Iterator[Finding]:
             yield one if len(tests) == 1 else one.of_test(i)
 
 
-def _of_test(problem: Problem, declared: Formulation, test: Measurement, *, own: bool) -> list[Finding]:
+def _of_test(problem: StatedProblem, declared: Formulation, test: Measurement, *, own: bool) -> list[Finding]:
     try:
         terms = direct_terms(test)
         found = mistakes_of(test, terms)
-        if found and terms is not None and terms.misfit <= CONJUGATED and test.whole is None:
+        if found and terms is not None and terms.misfit <= CONJUGATED and not test.is_whole:
             # Of records cut in motion, transients that were left in look like delays and gains.
             test = as_whole(test)
-            if test.whole is not None:
+            if test.is_whole:
                 terms = direct_terms(test)
                 found = mistakes_of(test, terms)
         if own and not found and terms is not None:
@@ -118,7 +118,7 @@ def _masses(declared: Formulation) -> tuple[Array, Array] | None:
     return (np.min(found, axis=0), np.max(found, axis=0)) if found else None
 
 
-def _of_frequencies(problem: Problem, declared: Formulation, test: Measurement) -> Iterator[Finding]:
+def _of_frequencies(problem: StatedProblem, declared: Formulation, test: Measurement) -> Iterator[Finding]:
     """Whether lines are in rad/s, as frequencies that are stated, or that the bounds allow, show."""
     stated = getattr(problem.stiffness, "natural_frequencies", None)
     if declared.stiffness.free and stated is None:
@@ -164,7 +164,7 @@ def _structures(declared: Formulation) -> list[Structure]:
     made = []
     for x in points:
         try:
-            made.append(declared.matrices.structure(x, declared.measurement))
+            made.append(declared.matrices.structure(x, declared.own_test.test))
         except InputError:  # no structure there
             continue
     return made

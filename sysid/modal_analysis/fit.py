@@ -1,4 +1,4 @@
-"""Whole records without their transients, and what they tell of the modes: poles, fit and noise."""
+"""Fit of the modes of a test, with transients and noise of whole records: the estimate that all else starts from."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
-from sysid.measurement.whole import ModalEstimate
 from sysid.modal_analysis.excitation import steady_sine
+from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.record_fit import Monitor, RecordFit, on_all_lines, record_modes, refitted, without, worth
 from sysid.modal_analysis.record_gains import gain_errors_of
@@ -138,21 +138,29 @@ def _at_lines(test: Measurement, parts: list[list[NDArray[Any]]]) -> NDArray[Any
     return out
 
 
-def without_transients(test: Measurement, *, monitor: Monitor | None = None) -> Measurement:
-    """The records as they would be at rest at both ends, their noise stated, and what they tell of the modes.
+def fit_modes(test: Measurement, *, monitor: Monitor | None = None) -> ModalEstimate:
+    """What a test tells of its modes: of whole records with their transients and noise; other lines stand as given.
 
     Parameters
     ----------
     test : Measurement
-        Of whole records; any other is given back as it is.
     monitor : callable, optional
         As in `find_poles`.
+
+    Raises
+    ------
+    InputError
+        As `whole_fit` does.
     """
     if test.whole is None:
-        return test
+        return ModalEstimate.of_lines(test)
     with one_thread():  # the same bits on any number of processors, and many times faster where others use them too
-        fit = whole_fit(test, monitor=monitor)
-    model, p = fit.model, fit.parameters
+        return estimate(whole_fit(test, monitor=monitor))
+
+
+def without_transients(fit: RecordFit) -> Measurement:
+    """The records as they would be at rest at both ends, with their noise stated."""
+    test, model, p = fit.test, fit.model, fit.parameters
     free: list[list[ComplexArray]] = [[] for _ in range(test.n_runs)]
     for chunk in model.chunks(p):
         predicted = np.einsum("cdl,dl->cl", chunk.H, chunk.run.base)
@@ -161,7 +169,7 @@ def without_transients(test: Measurement, *, monitor: Monitor | None = None) -> 
     n = test.n_sensors
     std, force_std = deviations(fit)
     return replace(
-        test, whole=None, modal=estimate(fit), response=test.response - taken[:, :n], response_std=std,
+        test, whole=None, response=test.response - taken[:, :n], response_std=std,
         force=None if test.force is None else test.force - taken[:, n:], force_std=force_std,
     )  # fmt: skip
 
@@ -178,6 +186,7 @@ def estimate(fit: RecordFit) -> ModalEstimate:
         index.log_omega.start + order, index.log_ratios.start + order, index.rigid,
     ])  # fmt: skip
     return ModalEstimate(
+        fit.test, without_transients(fit),
         modes.phi[:, order], modes.gamma[order], modes.omega[order], modes.ratios[order], p.rigid,
         A[np.ix_(at, at)], fit.noise, fit.reduced, fit.model.whole.density, replace(gain, moves=gain.moves[at]),
         None if B is None else B[np.ix_(at, at)], fit.settled,

@@ -1,0 +1,302 @@
+"""A problem as it is searched: its records with what they tell of the modes, and the least-squares problem of both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sysid.errors import InputError
+from sysid.files.tree import check
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.fit import fit_modes
+from sysid.modal_analysis.modal_estimate import ModalEstimate
+from sysid.modal_analysis.outliers import Outlier, outliers, predicted, pseudo_values, screened
+from sysid.modal_analysis.vector_fitting import Poles
+from sysid.models.geometry import Geometry
+from sysid.models.unknowns import Unknown
+from sysid.problem.feasibility import HELD, LOOSE, check_constraints, check_matrices, points_of, scale_of
+from sysid.problem.formulation import Formulation
+from sysid.problem.given import MATRICES, geometry_of, rough_mass
+from sysid.problem.stated import StatedProblem
+from sysid.structure.structure import Array, Structure
+
+Monitor = Callable[[int, float], object]
+
+
+class PreparedProblem:
+    """What a user stated, and the modal estimate of each test that is fitted: what strategies search and checks judge.
+
+    Parameters
+    ----------
+    stated : StatedProblem
+    modal : sequence of ModalEstimate, optional
+        Of each of its tests, the problem's own first; found when first asked for where none are given.
+    in_squares : bool
+        Whether squares are fitted, whatever loss is stated.
+    """
+
+    def __init__(self, stated: StatedProblem, modal: Sequence[ModalEstimate] = (), *, in_squares: bool = False) -> None:
+        self.stated, self.in_squares = stated, in_squares or stated.loss == "squares"
+        if modal:
+            self.modal = tuple(modal)
+
+    @classmethod
+    def of(cls, stated: StatedProblem, monitor: Monitor | None = None) -> PreparedProblem:
+        """Find all that the records tell before any search: modes, noise, poles and weights where they are needed.
+
+        Parameters
+        ----------
+        stated : StatedProblem
+        monitor : callable, optional
+            Called with (iteration, relative residual) while poles are looked for; what it raises passes through.
+        """
+        problem = cls(stated, [fit_modes(test, monitor=monitor) for test in stated.tests])
+        problem.screened = problem._screened(monitor)
+        geometry, formulation = problem.geometry, problem.formulation
+        geometry.monitor = formulation.monitor = monitor
+        try:
+            _ = formulation.unknowns
+            if not formulation.free_modes:
+                _ = formulation.terms
+        finally:
+            geometry.monitor = formulation.monitor = None
+        return problem
+
+    @cached_property
+    def modal(self) -> tuple[ModalEstimate, ...]:
+        """The modal estimate of each test that is fitted."""
+        return tuple(fit_modes(test) for test in self.stated.tests)
+
+    @cached_property
+    def screened(self) -> PreparedProblem:
+        """The same in squares: with Huber's loss without numbers that stand alone, else itself."""
+        return self._screened(None)
+
+    def _screened(self, monitor: Monitor | None) -> PreparedProblem:
+        if self.in_squares:
+            return self
+        modal = [replace(one, records=screened(one.records, monitor=monitor)) for one in self.modal]
+        return PreparedProblem(self.stated, modal, in_squares=True)
+
+    # -- records and where they are fitted ---------------------------------------------------------
+
+    @property
+    def measurement(self) -> Measurement:
+        """The problem's own test, as it is fitted: of whole records without their transients."""
+        return self.modal[0].records
+
+    def fits(self, structure: Structure, x: Array | None) -> list[tuple[ModalEstimate, Structure]]:
+        """Each test that is fitted, and what the structure was in it at an answer."""
+        formulation = self.formulation
+        own = [(self.modal[0], structure)] if formulation.fits_records else []
+        further = () if x is None else formulation.further_tests
+        return own + [
+            (modal, term.matrices.structure(x, modal.records))
+            for modal, term in zip(self.modal[1:], further, strict=False)
+            if x is not None
+        ]
+
+    @property
+    def first_test(self) -> int:
+        """Number of the first fitted test: 1 is the problem's own, 2 a further one beside a misfit of one's own."""
+        return 1 if self.formulation.fits_records else 2
+
+    def outliers(self, structure: Structure, x: Array | None) -> list[Outlier]:
+        """Numbers of the fitted records that are far from an answer: see `Identification.outliers`."""
+        alone, fits = self.in_squares, enumerate(self.fits(structure, x), start=self.first_test)
+        found = [outliers(modal.records, its, self.n_variables, alone=alone, number=i) for i, (modal, its) in fits]
+        return sorted((one for of_test in found for one in of_test), key=lambda one: -one.size)
+
+    def pseudo_values(self, structure: Structure, x: Array | None) -> PreparedProblem:
+        """The problem in squares, with pseudo-values about an answer in the place of its records.
+
+        See `sysid.modal_analysis.outliers`; poles that were found stay. What whole records tell of the modes is gone.
+        """
+        fits = [(modal.records, predicted(modal.records, its)) for modal, its in self.fits(structure, x)]
+        made = iter(pseudo_values(fits, self.n_variables))
+        own = next(made) if self.formulation.fits_records else self.measurement
+        other = self.of_lines((own, *made))
+        other.geometry.found = self.geometry.found
+        return other
+
+    def of_lines(self, tests: Iterable[Measurement]) -> PreparedProblem:
+        """The problem in squares with other tests, whose lines stand for themselves."""
+        return PreparedProblem(self.stated, [ModalEstimate.of_lines(test) for test in tests], in_squares=True)
+
+    # -- what is searched --------------------------------------------------------------------------
+
+    @cached_property
+    def geometry(self) -> Geometry:
+        """The geometry of the degrees of freedom, of the records in squares."""
+        if not self.in_squares:
+            return self.screened.geometry
+        stated = self.stated
+        weighed = None if self.measurement.force is None else self._weigh
+        return geometry_of(self.modal[0], stated.stiffness, stated.recovery, stated.rigid_body_dofs, weighed)
+
+    def _weigh(self) -> Array:
+        """Rough rigid-body mass of each base direction from the base force, (d,): it only places the search."""
+        spectrum = None
+        if self.stated.states_frequencies:
+            spectrum = self.stated.stiffness.stated(self.geometry).spectrum
+        return rough_mass(self.measurement, self.geometry, spectrum)
+
+    @cached_property
+    def formulation(self) -> Formulation:
+        """Matrices, terms and constraints as CasADi functions of the unknowns."""
+        return self.formulate(self.geometry) if self.in_squares else self.screened.formulation
+
+    def formulate(self, geometry: Geometry) -> Formulation:
+        """The same with another geometry."""
+        return self.stated.formulate(geometry, self.modal)
+
+    def check(self) -> None:
+        """Refuse what cannot be searched, before any search.
+
+        Raises
+        ------
+        InputError
+            Where no point of the search space makes a structure, no point keeps the constraints, or a model cannot be
+            stored.
+        """
+        formulation, site = self.formulation, self.stated.site
+        if not formulation.variables and formulation.free_modes:
+            return
+        points = points_of(formulation)
+        if not formulation.free_modes:  # with them every point makes a structure
+            check_matrices(formulation, points, self.measurement, site)
+        check(self.stated.as_given)  # before a search what could not be stored at its end
+        check_constraints(formulation, points, site)
+
+    @cached_property
+    def tolerance(self) -> Array:
+        """By how much a candidate of the swarm may break each row of the constraints, (rows,)."""
+        formulation = self.formulation
+        if not formulation.constraints.lower.size:
+            return np.zeros(0)
+        scale = scale_of(formulation, points_of(formulation))
+        return scale * np.where(formulation.constraints.equal, LOOSE, HELD)
+
+    @property
+    def variables(self) -> tuple[Unknown, ...]:
+        """All that is searched."""
+        return self.formulation.unknowns
+
+    @property
+    def poles(self) -> Poles | None:
+        """Poles found in the data, where the stiffness is free and states no frequencies."""
+        stated = self.formulation.stiffness
+        return self.geometry.poles if stated.spectrum is not None and not self.stated.states_frequencies else None
+
+    @property
+    def lower(self) -> Array:
+        """Lower bounds, (n_variables,)."""
+        return self.formulation.lower
+
+    @property
+    def upper(self) -> Array:
+        """Upper bounds, (n_variables,)."""
+        return self.formulation.upper
+
+    @property
+    def n_variables(self) -> int:
+        """Number of scalar unknowns (the paper's D)."""
+        return self.formulation.size
+
+    @property
+    def unknowns(self) -> tuple[tuple[str, int], ...]:
+        """Number of unknowns a matrix: the paper's Table 1, with the n·d entries of M_S0 that it leaves out.
+
+        Models count their own, a written matrix all variables that enter it.
+        """
+        sizes = {v.name: v.size for v in self.variables}
+        entering = {name: sum(sizes[v] for v in names) for name, names in self.formulation.members}
+        return tuple((dict.fromkeys(MATRICES, 0) | entering).items())
+
+    @property
+    def free_modes(self) -> bool:
+        """Whether mode shapes and participations are free: see `Formulation`."""
+        return self.formulation.free_modes
+
+    # -- masses that are stated --------------------------------------------------------------------
+
+    @cached_property
+    def totals(self) -> Array:
+        """Total mass in each base direction, (d,): stated, else weighed by the base force, else 1 kg.
+
+        Of a mass with a form of its own, what moves with the base at the guess.
+        """
+        stated, geometry = self.formulation.mass, self.geometry
+        if stated.totals is not None:
+            return stated.totals.by_direction
+        if self._leaves_total:
+            return geometry.totals(None)
+        M, M_S0, M_00, *_ = self.formulation.matrices.numbers(self.formulation.guess)
+        G = geometry.rigid_body
+        return np.diag(G.T @ M @ G + G.T @ M_S0 + M_S0.T @ G + M_00).copy()
+
+    @property
+    def unit_mass(self) -> bool:
+        """Whether no number with a unit of mass is given, so that masses are normalised to 1 kg a direction."""
+        told = self.measurement.force is not None or np.nansum(np.abs(self.known_mass)) > 0
+        return self._leaves_total and not told
+
+    @property
+    def _leaves_total(self) -> bool:
+        """Whether the mass model could state a total, and does not: any other mass has the size that it is given."""
+        return getattr(self.stated.mass, "total_mass", np.nan) is None
+
+    @property
+    def known_mass(self) -> Array:
+        """Entries of ``[M_SS, M_S0]`` that are stated, (n, n + d); NaN elsewhere."""
+        entries = self.formulation.mass.entries
+        n, d = self.geometry.n, self.geometry.d
+        return np.full((n, n + d), np.nan) if entries is None else entries
+
+    @property
+    def rigid_total(self) -> Array | None:
+        """Rigid-body mass (d, d) where all of it is stated, else None."""
+        return self.formulation.mass.rigid_total
+
+    # -- at one point ------------------------------------------------------------------------------
+
+    def structure(self, x: ArrayLike) -> Structure:
+        """The structure that the unknowns `x`, (n_variables,) in the variables' own units, stand for."""
+        values = np.asarray(x, dtype=float)
+        if values.shape != (self.n_variables,):
+            raise InputError(f"x has shape {values.shape}; this problem has ({self.n_variables},) unknowns")
+        return self.formulation.matrices.structure(values, self.measurement)
+
+    def values(self, structure: Structure) -> Array:
+        """Unknowns that stand for `structure`, (n_variables,); inverse of `structure` where the models can hold it."""
+        return self.formulation.values(structure)
+
+    def residual(self, x: Array) -> float:
+        """``‖predicted - measured‖ / ‖measured‖`` over all fitted tests: see `Formulation.residual`."""
+        return self.formulation.residual(x)
+
+    def objective(self, x: Array) -> float:
+        """What is minimised, at `x`: see `Formulation.objective`."""
+        return self.formulation.objective(x)
+
+    def keeps_constraints(self, x: Array) -> bool:
+        """Whether constraints hold, to round-off beside what they make over the search space."""
+        constraints = self.formulation.constraints
+        allowed = self.tolerance * np.where(constraints.equal, HELD / LOOSE, 1.0)
+        return bool(np.all(constraints.violation(x) <= allowed))
+
+    def rank_of(self, x: Array) -> tuple[bool, float]:
+        """By which answers are compared: constraints first, then the objective."""
+        objective = self.objective(x)
+        return not self.keeps_constraints(x), objective if np.isfinite(objective) else np.inf
+
+    def to_tree(self) -> dict[str, Any]:
+        """That of the stated problem, with the poles that were found where the same records show them again."""
+        given = all(one.records is one.given for one in self.screened.modal)
+        poles: Poles | None = vars(self.geometry).get("poles") if given else None
+        return {**self.stated.to_tree(), "poles": None if poles is None else asdict(poles)}
