@@ -154,19 +154,19 @@ class ModalEstimate:
         return Modes(self.phi, self.gamma, self.omega, self.ratios)
 
 
-def residual_of(estimate: ModalEstimate) -> float:
-    """Relative, weighted residual of the accelerations that the estimate's modes leave."""
+def residual_of(estimate: ModalEstimate, modes: Modes) -> float:
+    """Relative, weighted residual of the accelerations that modes leave."""
     test = estimate.records
-    q = gains(test.freq, estimate.omega, estimate.ratios) * np.einsum("md,rdf->rmf", estimate.gamma, test.base)
+    q = gains(test.freq, modes.omega, modes.ratios) * np.einsum("md,rdf->rmf", modes.gamma, test.base)
     weight, size = weights_of(test.relative, test.response_std)
-    left = weight * columns(test.relative - np.einsum("nm,rmf->rnf", estimate.phi, q))
+    left = weight * columns(test.relative - np.einsum("nm,rmf->rnf", modes.phi, q))
     return float(np.linalg.norm(left)) / size
 
 
 def poles_of(estimate: ModalEstimate, monitor: Callable[[int, float], object] | None = None) -> Poles:
     """Poles of the modes, or, where none were fitted, those that stand out of the lines: see `find_poles`."""
     if estimate.has_modes:
-        return Poles(estimate.omega, estimate.ratios, residual_of(estimate))
+        return Poles(estimate.omega, estimate.ratios, residual_of(estimate, estimate.modes))
     return find_poles(estimate.records, monitor=monitor)
 
 
@@ -227,6 +227,12 @@ def _scale_of(estimate: ModalEstimate, modes: Modes) -> Array:
     return factor
 
 
+def scale_in(estimate: ModalEstimate, gamma: ca.MX) -> ca.MX:
+    """Participations (m, d) over those of an estimate, (m, 1): accelerations leave the scale of a mode open."""
+    at = ca.DM(estimate.gamma)
+    return ca.sum2(gamma * at) / ca.sum2(at * at)
+
+
 def misfit_rows(
     estimate: ModalEstimate, phi: ca.MX, gamma: ca.MX, omega: ca.MX, ratios: ca.MX, rigid: ca.MX, *, weighed: bool
 ) -> ca.MX:
@@ -240,8 +246,7 @@ def misfit_rows(
         Whether a force was measured; without one each mode is brought to the scale of the estimate.
     """
     index, (n, m), d = index_of(estimate), estimate.phi.shape, estimate.gamma.shape[1]
-    at = ca.DM(estimate.gamma)
-    scale = ca.sum2(gamma * at) / ca.sum2(at * at)
+    scale = scale_in(estimate, gamma)
     if weighed:
         scale = ca.sign(scale)
     phi, gamma = phi * ca.repmat(scale.T, n, 1), gamma / ca.repmat(scale, 1, d)
@@ -260,65 +265,3 @@ def matched(estimate: ModalEstimate, omega: Array) -> NDArray[np.intp] | None:
         return None
     apart = np.abs(np.log(omega[None] / estimate.omega[:, None]))
     return np.asarray(linear_sum_assignment(apart)[1])
-
-
-def above_modes(estimate: ModalEstimate) -> tuple[Modes, Array]:
-    """The likeliest modes and rigid-body mass whose remainder, what no mode carries, is no negative mass.
-
-    Least squares over participations and a factor L of the remainder ``L L'``; all else follows them linearly.
-    """
-    from scipy.optimize import least_squares
-
-    index = index_of(estimate)
-    modes, rigid = estimate.modes, estimate.rigid
-    size = np.sqrt(np.maximum(np.diag(rigid), np.diag(modes.gamma.T @ modes.gamma)))
-    size[size == 0] = 1.0
-    scaled = lambda gamma: (rigid - gamma.T @ gamma) / np.outer(size, size)  # noqa: E731
-    lam, V = np.linalg.eigh(scaled(modes.gamma))
-    if lam[0] >= 0:
-        return modes, rigid
-    own = theta_of(modes, rigid, index)
-    mass = np.concatenate([np.arange(index.gamma.start, index.gamma.stop), index.rigid])
-    others = np.setdiff1d(np.arange(index.size), mass)
-    A = estimate.information
-    inverse = np.linalg.pinv(A[np.ix_(others, others)], rcond=_UNSEEN, hermitian=True)
-    follow = -inverse @ A[np.ix_(others, mass)]
-    unit = np.concatenate([np.tile(size, len(modes.gamma)), [size[i] * size[j] for i, j in index.pairs]])
-    inner = (A[np.ix_(mass, mass)] + A[np.ix_(mass, others)] @ follow) * np.outer(unit, unit)
-    values, turn = np.linalg.eigh((inner + inner.T) / 2)
-    R = np.sqrt(np.maximum(values, 0.0))[:, None] * turn.T
-    (m, d), lower = modes.gamma.shape, np.tril_indices(len(size))
-
-    def parts(z: Array) -> tuple[Array, Array]:
-        L = np.zeros((d, d))
-        L[lower] = z[m * d :]
-        return z[: m * d].reshape(m, d), L
-
-    def moved(z: Array) -> Array:
-        gamma, L = parts(z)
-        whole = gamma.T @ gamma + L @ L.T  # in units of `size`
-        corner = np.array([whole[i, j] for i, j in index.pairs])
-        return np.concatenate([gamma.ravel(), corner]) - own[mass] / unit
-
-    def slope(z: Array) -> Array:
-        gamma, L = parts(z)
-        J = np.zeros((m * d + len(index.pairs), z.size))
-        J[: m * d, : m * d] = np.eye(m * d)
-        for row, (i, j) in enumerate(index.pairs, start=m * d):
-            by_gamma = np.zeros((m, d))
-            by_gamma[:, i] += gamma[:, j]
-            by_gamma[:, j] += gamma[:, i]
-            by_L = np.zeros((d, d))
-            by_L[i] += L[j]
-            by_L[j] += L[i]
-            J[row] = np.concatenate([by_gamma.ravel(), by_L[lower]])
-        return R @ J
-
-    root = np.linalg.cholesky((V * np.maximum(lam, _BELOW * max(lam[-1], 1.0))) @ V.T)
-    start = np.concatenate([(modes.gamma / size).ravel(), root[lower]])
-    end = least_squares(lambda z: R @ moved(z), start, slope, xtol=1e-14, ftol=1e-14, gtol=1e-14, max_nfev=_STEPS)
-    theta, step = own.copy(), moved(end.x) * unit
-    theta[mass] += step
-    theta[others] += follow @ step
-    phi, gamma, log_omega, log_ratios, rigid = (part[..., 0] for part in index.split(theta[:, None]))
-    return Modes(phi, gamma, np.exp(log_omega), np.exp(log_ratios)), rigid

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from sysid.errors import InputError, SolverError, sequence, whole_number
 from sysid.finding import Finding
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.modal_estimate import above_modes, residual_of
+from sysid.modal_analysis.modal_estimate import residual_of
 from sysid.modal_analysis.modal_fit import ModalFit, Modes
 from sysid.modal_analysis.residues import ROUND_OFF, beyond_chance, line_correlation
 from sysid.modal_analysis.response import columns, gains, stacked, weighted_error, weights_of
@@ -228,9 +228,8 @@ def run_modal(problem: PreparedProblem, options: Modal, session: Session) -> Out
     success, message = end.status in SOLVED or end.residual <= EXACT, ended_in_words(end.status)
     message += f"; ended on a bound: {end.bounds}" * bool(end.bounds)
     modal = problem.modal[0]
-    if modal.has_modes:  # fitted with the transients, before
-        success = modal.settled
-        message = f"the fit of whole records {'settled' if success else 'did not settle: modes or noise still moved'}"
+    if modal.has_modes and not modal.settled:
+        success, message = False, f"{message}; the fit of whole records did not settle: modes or noise still moved"
     if monitor.is_over and end.residual > EXACT:
         success, message = False, f"{message}; the time was over before every further fit was tried"
     answer = LocalResult(np.zeros(0), success, message, np.array(monitor.curve), monitor.stopped)
@@ -345,9 +344,8 @@ def _as_estimated(problem: PreparedProblem, options: Modal) -> ModalFit:
             f"{modal.omega.size} modes stand out of the whole records, not the {options.modes} asked for: narrow "
             "the band, or take estimator='h1'"
         )
-    modes, rigid = (modal.modes, modal.rigid) if problem.measurement.force is None else above_modes(modal)
-    residual = residual_of(modal)
-    return ModalFit(modes, rigid, residual, residual, "Solve_Succeeded", "")
+    residual = residual_of(modal, modal.modes)
+    return ModalFit(modal.modes, modal.rigid, residual, residual, "not solved", "")
 
 
 def _modal_masses(problem: PreparedProblem, modes: Modes, chosen: DegreesOfFreedom) -> Array:

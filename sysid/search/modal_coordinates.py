@@ -23,7 +23,7 @@ from sysid.models.unknowns import lower_of, upper_of
 from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram
 from sysid.problem.matrices import assemble
 from sysid.problem.prepared import PreparedProblem
-from sysid.search.modal_program import fit_modes
+from sysid.search.modal_program import solve_modes
 from sysid.search.modal_scaling import positive_part, stated_totals, to_stated_totals
 from sysid.search.scaled_unknowns import add_unknowns
 from sysid.structure.structure import Array, Structure
@@ -49,8 +49,8 @@ def fit_in_modes(problem: PreparedProblem, x: Array, monitor: IterationMonitor, 
     first, test = modes_of(start), problem.measurement
 
     def attempt(modes: Modes) -> ModalFit:
-        return fit_modes(
-            test, modes, lambda z: spectrum_near(problem, start, modes, z), unit=np.sqrt(problem.totals),
+        return solve_modes(
+            problem.modal[0], modes, lambda z: spectrum_near(problem, start, modes, z), unit=np.sqrt(problem.totals),
             remainder=_remainder(start), ties=stated_totals(problem), monitor=monitor, max_iterations=max_iterations,
         )  # fmt: skip
 

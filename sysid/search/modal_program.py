@@ -1,9 +1,10 @@
 """The program in modal coordinates: participations, frequencies and damping ratios through IPOPT, shapes eliminated.
 
 Every answer in modal coordinates ends here, most of them after one to three iterations from an estimate. The residual
-is symbolic, its gradient CasADi's own. The Hessian is exact; its products of all lines are NumPy's (`SpectraModel`), as
-CasADi multiplies dense matrices many times slower. A measured base force is fitted jointly; it sets the scale of each
-mode.
+is symbolic, its gradient CasADi's own. Of spectra it is that of the lines; the Hessian is exact, and its products of
+all lines are NumPy's (`SpectraModel`), as CasADi multiplies dense matrices many times slower. Of whole records it is
+what the modes miss their estimate by, in units of its noise. A measured base force is fitted jointly; it sets the scale
+of each mode.
 """
 
 from __future__ import annotations
@@ -15,8 +16,16 @@ import numpy as np
 
 from sysid.errors import SolverError
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.modal_estimate import (
+    ModalEstimate,
+    factor_of,
+    index_of,
+    residual_of,
+    scale_in,
+    theta_of,
+)
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, Weights, held_gauge, separate_poles
-from sysid.modal_analysis.response import columns, modal_gains, modal_motion, parts_of, stacked
+from sysid.modal_analysis.response import columns, modal_gains, modal_motion, parts_of, stacked, weights_of_test
 from sysid.modal_analysis.spectra_model import RIDGE, SpectraModel, weights_at
 from sysid.nlp import EXACT, OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, NumpyFunction
 from sysid.structure.structure import Array
@@ -28,8 +37,8 @@ Spectrum = Callable[[NonlinearProgram], tuple[ca.MX, ca.MX]]
 Ties = Callable[[ca.MX, ca.MX, ca.MX], list[ca.MX]]
 
 
-def fit_modes(
-    test: Measurement,
+def solve_modes(
+    modal: ModalEstimate,
     first: Modes,
     spectrum: Spectrum,
     *,
@@ -44,7 +53,8 @@ def fit_modes(
 
     Parameters
     ----------
-    test : Measurement
+    modal : ModalEstimate
+        Of the test.
     first : Modes
         Where to start; shapes are not read.
     spectrum : callable
@@ -67,11 +77,11 @@ def fit_modes(
     ----------
     G. H. Golub, V. Pereyra, SIAM J. Numer. Anal. 10 (1973) 413-432; L. Kaufman, BIT 15 (1975) 49-57.
     """
-    z = NonlinearProgram()
-    (m, d), poles = first.gamma.shape, separate_poles(first)[0]
-    weights = weights_at(test, first.omega[poles], first.ratios[poles]) if weights is None else weights
+    z, test = NonlinearProgram(), modal.records
+    (m, d), by_lines = first.gamma.shape, modal.omega.size != first.omega.size
     weighed = test.force is not None
-    gauge, held = held_gauge(first, unit, weighed)
+    # The information of an estimate is of each of its modes apart.
+    gauge, held = held_gauge(first if by_lines else first._replace(omega=np.arange(float(m))), unit, weighed)
     low, high = np.full((m, d), -np.inf), np.full((m, d), np.inf)
     low[held], high[held] = gauge[held], gauge[held]
     gamma = z.variable("participation", gauge, low, high) @ ca.diag(ca.DM(unit))
@@ -83,14 +93,18 @@ def fit_modes(
         root = np.linalg.cholesky((vectors * np.maximum(lam, _LEAST_MASS * max(1.0, lam[-1]))) @ vectors.T)
         factor = ca.diag(ca.DM(unit)) @ lower_triangle(z.variable("base mass", triangle_entries(root)), d)
         rigid = rigid + factor @ factor.T
-    error = ModalResidual(test, weights, gamma, omega, ratios, rigid)
+    error: ModalResidual | EstimateResidual
+    if by_lines:
+        poles = separate_poles(first)[0]
+        weights = weights_at(test, first.omega[poles], first.ratios[poles]) if weights is None else weights
+        error = ModalResidual(test, weights, gamma, omega, ratios, rigid)
+    else:
+        error = EstimateResidual(modal, gamma, omega, ratios, rigid)
     if ties is not None:
         for tie in ties(error.phi, gamma, rigid):
             z.constrain(tie)
-    model = SpectraModel(test, weights, np.arange(m))
-    hessian = hessian_of(model)
-    best, status = z.minimize(error.value, monitor, max_iterations, _derivatives(z, error, hessian))
-    end = ca.Function("end", [z.z], [error.phi, gamma, omega, ratios, rigid, error.value, ca.norm_fro(error.left)])
+    best, status = z.minimize(error.value, monitor, max_iterations, error.derivatives(z))
+    end = ca.Function("end", [z.z], [error.phi, gamma, omega, ratios, rigid, error.value])
     try:
         values = [np.asarray(v) for v in end(best)]
         if not all(np.all(np.isfinite(v)) for v in values):
@@ -98,11 +112,10 @@ def fit_modes(
     except RuntimeError:  # of CasADi: the normal equations are singular
         raise SolverError(f"{m} modes move so much alike that no shapes can be told apart") from None
     modes = Modes(values[0], values[1], values[2].ravel(), values[3].ravel())
-    left = float(np.sqrt(values[5].item())), float(values[6].item())
-    counted = np.sqrt(model.chi2(model.with_best_shapes(modes, values[4]), model.levels))
-    if abs(counted - left[0]) > EXACT:
-        status = f"{status}, but the residual {left[0]:.6g} of its end is {counted:.6g} when counted anew"
-    return ModalFit(modes, values[4], *left, status, z.on_bounds(best), weights)
+    left, (counted, of_all, of_accelerations) = float(np.sqrt(values[5].item())), error.counted(modes, values[4])
+    if abs(counted - left) > EXACT:
+        status = f"{status}, but the residual {left:.6g} of its end is {counted:.6g} when counted anew"
+    return ModalFit(modes, values[4], of_all, of_accelerations, status, z.on_bounds(best), weights)
 
 
 class ModalResidual:
@@ -122,6 +135,7 @@ class ModalResidual:
     def __init__(
         self, test: Measurement, weights: Weights, gamma: ca.MX, omega: ca.MX, ratios: ca.MX, rigid: ca.MX
     ) -> None:
+        self.model = SpectraModel(test, weights, np.arange(omega.numel()))
         self.gamma, self.omega, self.ratios, self.rigid = gamma, omega, ratios, rigid
         gains = modal_gains(omega, ratios, test.freq)
         self.q = ca.horzcat(*modal_motion(test.base * weights.lines[:, None], gamma, gains))
@@ -167,6 +181,64 @@ class ModalResidual:
         d = self.rigid.size1()
         corner = [self.rigid[i, j] for i in range(d) for j in range(i, d)] if self.force_left is not None else []
         return ca.vertcat(ca.vec(self.gamma.T), ca.log(self.omega), ca.log(self.ratios), *corner)
+
+    def derivatives(self, z: NonlinearProgram) -> dict[str, ca.Function]:
+        """Gradient and Hessian by the unknowns of a program, in IPOPT's scale of the objective."""
+        return _derivatives(z, self, hessian_of(self.model))
+
+    def counted(self, modes: Modes, rigid: Array) -> tuple[float, float, float]:
+        """Root of the value by NumPy; what is left of all records, and of the accelerations alone."""
+        model = self.model
+        p = model.with_best_shapes(modes, rigid)
+        every, own = (np.sqrt(model.chi2(p, at)) for at in (model.levels, model.levels_of_accelerations))
+        return float(every), float(every), float(own)
+
+
+class EstimateResidual:
+    """What modes miss an estimate by, in units of its noise and of the records, the best shapes eliminated.
+
+    Half a chi-squared rises by ``|R (theta - estimate)|²``, with ``R' R`` the information; shapes enter it linearly.
+
+    Attributes
+    ----------
+    phi : (n, m)
+        The best shapes.
+    value :
+        The sum of squares.
+    """
+
+    def __init__(self, modal: ModalEstimate, gamma: ca.MX, omega: ca.MX, ratios: ca.MX, rigid: ca.MX) -> None:
+        test = modal.records
+        self.modal, index = modal, index_of(modal)
+        self.size = weights_of_test(test, weighted=True)[0][1]
+        factor = factor_of(modal) / self.size
+        theta, at = theta_of(modal.modes, modal.rigid, index), index.gamma.start
+        scale = scale_in(modal, gamma)
+        if test.force is not None:
+            scale = ca.sign(scale)
+        corner = [rigid[i, j] for i, j in index.pairs]
+        moved = ca.vertcat(ca.vec((gamma / ca.repmat(scale, 1, test.n_base)).T), ca.log(omega), ca.log(ratios), *corner)
+        off = moved - ca.DM(theta[at:])
+        U, s, vt = np.linalg.svd(factor[:, :at], full_matrices=False)
+        seen = s > RIDGE * s[0]
+        onto = U[:, seen].T @ factor[:, at:]
+        self.value = ca.sumsqr(ca.DM(np.linalg.qr(factor[:, at:] - U[:, seen] @ onto, mode="r")) @ off)
+        best = ca.DM(theta[:at]) - ca.DM((vt[seen].T / s[seen]) @ onto) @ off
+        self.phi = ca.reshape(best, *modal.phi.T.shape).T / ca.repmat(scale.T, test.n_sensors, 1)
+
+    def derivatives(self, z: NonlinearProgram) -> None:
+        """None of its own: CasADi's are as fast."""
+
+    def counted(self, modes: Modes, rigid: Array) -> tuple[float, float, float]:
+        """Root of the value by NumPy; what is left of all records, and of the accelerations alone."""
+        modal, index = self.modal, index_of(self.modal)
+        scale = np.sum(modes.gamma * modal.gamma, axis=1) / np.sum(modal.gamma**2, axis=1)
+        if modal.records.force is not None:
+            scale = np.sign(scale)
+        scaled = modes._replace(phi=modes.phi * scale, gamma=modes.gamma / scale[:, None])
+        off = theta_of(scaled, rigid, index) - theta_of(modal.modes, modal.rigid, index)
+        risen = float(np.linalg.norm(factor_of(modal) @ off)) / self.size
+        return risen, float(np.hypot(risen, residual_of(modal, modal.modes))), residual_of(modal, modes)
 
 
 def _times(one: ca.MX, other: ca.MX) -> ca.MX:

@@ -27,7 +27,7 @@ from sysid.models.spectrum import SOLVED
 from sysid.models.unknowns import lower_of, upper_of
 from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram
 from sysid.problem.prepared import PreparedProblem
-from sysid.search.modal_program import Spectrum, Ties, fit_modes
+from sysid.search.modal_program import Spectrum, Ties, solve_modes
 from sysid.search.modal_scaling import stated_totals
 from sysid.search.strategy import DoesNotApplyError
 from sysid.structure.structure import Array
@@ -224,7 +224,7 @@ def held_to_totals(
 def ended(problem: PreparedProblem, estimate: ModalFit, monitor: IterationMonitor, max_iterations: int) -> ModalFit:
     """Where IPOPT ends from an estimate, with damping ratios within their bounds and no negative mass.
 
-    The estimate itself where nobody wants to wait for it, or where it is one of whole records and within the bounds.
+    The estimate itself where nobody wants to wait for it.
 
     Raises
     ------
@@ -232,7 +232,7 @@ def ended(problem: PreparedProblem, estimate: ModalFit, monitor: IterationMonito
         Where modes move so much alike that no shapes can be told apart.
     """
     within = _within_bounds(problem, estimate)
-    if monitor.is_over or monitor.stopped is not None or (within and estimate.weights is None):
+    if monitor.is_over or monitor.stopped is not None:
         return estimate
     try:
         # Bounds that nothing presses on would cost iterations, as IPOPT begins away from them.
@@ -262,8 +262,8 @@ def _again(
     modes = end.modes
     first, pole = separate_poles(modes)
     unit, bounds = np.sqrt(problem.totals), damping_bounds(problem) if bounded else (0.0, np.inf)
-    return fit_modes(
-        problem.measurement, modes, _free_spectrum(modes.omega[first], modes.ratios[first], pole, *bounds), unit=unit,
+    return solve_modes(
+        problem.modal[0], modes, _free_spectrum(modes.omega[first], modes.ratios[first], pole, *bounds), unit=unit,
         remainder=end.rigid - modes.gamma.T @ modes.gamma, ties=ties, weights=end.weights, monitor=monitor,
         max_iterations=max_iterations,
     )  # fmt: skip
