@@ -136,6 +136,7 @@ class ModalResidual:
         self, test: Measurement, weights: Weights, gamma: ca.MX, omega: ca.MX, ratios: ca.MX, rigid: ca.MX
     ) -> None:
         self.model = SpectraModel(test, weights, np.arange(omega.numel()))
+        self.hessian = hessian_of(self.model)  # CasADi keeps no reference to it
         self.gamma, self.omega, self.ratios, self.rigid = gamma, omega, ratios, rigid
         gains = modal_gains(omega, ratios, test.freq)
         self.q = ca.horzcat(*modal_motion(test.base * weights.lines[:, None], gamma, gains))
@@ -184,7 +185,7 @@ class ModalResidual:
 
     def derivatives(self, z: NonlinearProgram) -> dict[str, ca.Function]:
         """Gradient and Hessian by the unknowns of a program, in IPOPT's scale of the objective."""
-        return _derivatives(z, self, hessian_of(self.model))
+        return _derivatives(z, self, self.hessian)
 
     def counted(self, modes: Modes, rigid: Array) -> tuple[float, float, float]:
         """Root of the value by NumPy; what is left of all records, and of the accelerations alone."""

@@ -189,7 +189,8 @@ def with_modes_of_records(test, structure, rng):
     if test.force is None:
         root[:, n * m + m * d + 2 * m :] = 0.0  # nothing tells of the rigid-body mass
     return ModalEstimate(
-        test, test, near(structure.mode_shapes[:, WHOLE] * scale), near(structure.participation[WHOLE] / scale[:, None]),
+        test, test,
+        near(structure.mode_shapes[:, WHOLE] * scale), near(structure.participation[WHOLE] / scale[:, None]),
         near(2 * np.pi * structure.natural_frequencies[WHOLE]), near(structure.damping_ratios[WHOLE]),
         structure.rigid_body_mass * 1.03, root.T @ root, NoiseLevels(np.ones(n), np.ones(d), np.ones(d)), 1.0,
         np.ones(test.n_runs), Gains(np.zeros(n), np.ones(n), 100, np.zeros((size, n)), np.zeros((n, d)), np.zeros(n)),

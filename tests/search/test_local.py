@@ -272,7 +272,7 @@ class TestStarts:
         ends = [
             ModalFit(modes_of(truth), truth.rigid_body_mass, left, left, f"end {left}", "") for left in (0.5, 0.3, 0.4)
         ]
-        monkeypatch.setattr("sysid.search.modal_coordinates.fit_modes", lambda *args, **options: ends.pop(0))
+        monkeypatch.setattr("sysid.search.modal_coordinates.solve_modes", lambda *args, **options: ends.pop(0))
         monkeypatch.setattr(
             "sysid.search.modal_coordinates._linear_starts", lambda test, best, first: iter([first, first])
         )

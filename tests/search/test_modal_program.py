@@ -8,11 +8,12 @@ import pytest
 
 from sysid import Measurement, Structure
 from sysid.measurement.measurement import unit_runs
+from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import Modes, held_gauge, rank_one, separate_poles
 from sysid.modal_analysis.spectra_model import SpectraModel, fit_spectra, weights_at
 from sysid.models.spectrum import SOLVED
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram
-from sysid.search.modal_program import ModalResidual, _derivatives, fit_modes, hessian_of
+from sysid.search.modal_program import ModalResidual, _derivatives, hessian_of, solve_modes
 from sysid.structure.triangular import lower_triangle, triangle_entries
 
 
@@ -200,8 +201,9 @@ def fitted(test, first, *, monitor=None):
     assert found.status == "settled"
     apart, pole = separate_poles(found.modes)
     of_poles = relative_spectrum(found.modes.omega[apart], found.modes.ratios[apart])
-    return fit_modes(
-        test, found.modes, lambda z: tuple(value[pole.tolist()] for value in of_poles(z)), unit=unit,
+    return solve_modes(
+        ModalEstimate.of_lines(test), found.modes,
+        lambda z: tuple(value[pole.tolist()] for value in of_poles(z)), unit=unit,
         remainder=found.rigid - found.modes.gamma.T @ found.modes.gamma, weights=found.weights, monitor=monitor,
     )  # fmt: skip
 
@@ -247,8 +249,9 @@ class TestFit:
         first = modes_of(structure)._replace(gamma=rng.normal(size=(4, 2)))
         # One participation of each mode is held in units of `unit`, the one that was largest.
         unit = np.linalg.norm(first.gamma) / np.sqrt(8)
-        end = fit_modes(
-            trial(rng, structure), first, relative_spectrum(first.omega, first.ratios), unit=np.full(2, unit),
+        end = solve_modes(
+            ModalEstimate.of_lines(trial(rng, structure)), first,
+            relative_spectrum(first.omega, first.ratios), unit=np.full(2, unit),
             remainder=unit**2 * np.eye(2), monitor=IterationMonitor(None, None),
         )  # fmt: skip
         largest = np.argmax(np.abs(first.gamma), axis=1)
