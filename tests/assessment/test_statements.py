@@ -123,7 +123,7 @@ def test_a_wrong_total_is_told_against_the_force():
 @pytest.fixture
 def gains_as_stated(monkeypatch):
     """No error of a gain among what is not known, which chance adds to one of two fits."""
-    shown = lambda test, structure: SimpleNamespace(possible=np.zeros(test.n_sensors))  # noqa: E731
+    shown = lambda modal, structure: SimpleNamespace(possible=np.zeros(modal.records.n_sensors))  # noqa: E731
     monkeypatch.setattr("sysid.assessment.uncertainty.gain_errors", shown)
 
 

@@ -17,7 +17,7 @@ from sysid.problem.prepared import PreparedProblem
 @pytest.fixture(autouse=True)
 def gains_as_stated(monkeypatch):
     """No error of a gain among what is not known, which chance would add in some of these draws."""
-    shown = lambda test, structure: SimpleNamespace(possible=np.zeros(test.n_sensors))  # noqa: E731
+    shown = lambda modal, structure: SimpleNamespace(possible=np.zeros(modal.records.n_sensors))  # noqa: E731
     monkeypatch.setattr("sysid.assessment.uncertainty.gain_errors", shown)
 
 

@@ -105,7 +105,7 @@ def test_the_answer_has_the_least_huber_loss(strategy):
 
 def test_two_tests_and_a_known_value_count_by_their_noise(tmp_path, monkeypatch):
     # No error of a gain among what is not known, which chance adds here: deviations are compared with those of noise.
-    shown = lambda test, structure: SimpleNamespace(possible=np.zeros(test.n_sensors))  # noqa: E731
+    shown = lambda modal, structure: SimpleNamespace(possible=np.zeros(modal.records.n_sensors))  # noqa: E731
     monkeypatch.setattr("sysid.assessment.uncertainty.gain_errors", shown)
     rng = np.random.default_rng(5)
     tests = measured(rng), measured(rng, noise=0.03)

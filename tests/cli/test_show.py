@@ -83,7 +83,7 @@ CASES = {
 def test_rank_condition_and_null_space_are_those_of_finite_differences_and_of_counting(random_case, name):
     make, counted = CASES[name]
     problem = make(random_case)
-    text, point = show(problem, name), _point(problem.prepared)
+    text, point = show(problem, name), _point(problem.prepared, problem)
     J = differences(problem, point.x, point.known.unit)
     s = np.linalg.svd(J, compute_uv=False)
     assert told(text) == (counted, problem.n_variables)
@@ -187,7 +187,7 @@ def test_models_are_told_by_name_and_an_unstated_guess_by_its_place(random_case)
 def test_constraints_take_directions_away_at_a_point_that_keeps_them():
     total = MASSES.sum()
     problem = chain(constraints=lambda m, k: [ca.sum1(m) == total, k[1] <= k[0]], m=[8.0, 8.0, 8.0], k=[7e3] * 3)
-    text, point = show(problem, "chain"), _point(problem.prepared)
+    text, point = show(problem, "chain"), _point(problem.prepared, problem)
     assert "moved to where the constraints hold" in text
     m, k = point.x[:3], point.x[3:6]
     assert m.sum() == pytest.approx(total, rel=1e-8)
@@ -204,7 +204,7 @@ def test_a_guess_on_a_symmetry_is_called_special():
     branches = np.array([[1.0, 0.0, 0.0, -1.0], [-1.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 1.0, 0.0]])
     total = {"constraints": lambda m, k: [ca.sum1(m) == 9.0], "stretch": branches}
     alike = chain(m=[5, 2, 2], k=[9e3, 2e3, 2e3], c=[9.0, 2.0, 2.0], **total)
-    text, point = show(alike, "branches"), _point(alike.prepared)
+    text, point = show(alike, "branches"), _point(alike.prepared, alike)
     assert told(text) == (7, 8)
     assert "this point is special" in text
     assert "at another point of the search space the records see 8 directions" in " ".join(text.split())

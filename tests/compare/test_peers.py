@@ -32,7 +32,7 @@ def a_session(max_time=None, seed=0, listeners=()):
 
 @pytest.fixture(scope="module")
 def landscape():
-    return peers.Landscape.of(two_masses(), a_session())
+    return peers.Landscape.of(two_masses().prepared, a_session())
 
 
 class Bowl:
@@ -77,7 +77,7 @@ def test_what_is_searched_is_the_objective_of_the_refined_structure(landscape):
 def test_without_a_stated_spectrum_nothing_is_refined_and_peaks_are_widened_as_the_swarms(landscape):
     assert landscape.steps == []
     chain = two_masses(sysid.LumpedMass(3.0), stiffness=sysid.ChainStiffness(4e2, 4e4))
-    other = peers.Landscape.of(chain, a_session())
+    other = peers.Landscape.of(chain.prepared, a_session())
     assert len(other.steps) == 4
     x = np.full(chain.n_variables, 0.5)
     assert other.objective.refined(x) is x

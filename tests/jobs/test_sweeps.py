@@ -115,7 +115,7 @@ def test_each_part_of_exact_records_gives_the_truth_and_predicts_the_rest(change
     result = sysid.identify(change.of(whole), rng=0)
     np.testing.assert_allclose(result.values["spring"], SPRINGS, rtol=1e-6)
     np.testing.assert_allclose(result.values["damper"], DAMPERS, rtol=1e-5)
-    assert change.predicted(whole, result) < 1e-6
+    assert change.predicted(whole.prepared, result) < 1e-6
 
 
 def test_what_is_predicted_is_the_residual_of_what_was_left_out(result):
@@ -129,8 +129,8 @@ def test_what_is_predicted_is_the_residual_of_what_was_left_out(result):
         (WithoutSensor(1), np.s_[:, 1]),
     ):
         expected = np.linalg.norm(left[part]) / np.linalg.norm(size[part])
-        assert change.predicted(whole, result) == pytest.approx(expected, rel=1e-12)
-    assert np.isnan(Band(0.0, 20.0).predicted(whole, result))  # nothing is outside
+        assert change.predicted(whole.prepared, result) == pytest.approx(expected, rel=1e-12)
+    assert np.isnan(Band(0.0, 20.0).predicted(whole.prepared, result))  # nothing is outside
 
 
 def spoiled(*, data=None, rng=0):
@@ -155,7 +155,7 @@ def test_spikes_are_not_to_be_predicted_under_hubers_loss(result, tmp_path):
     file = tmp_path / "spikes.py"
     file.write_text(MODULE.format(folder=__file__.rpartition("/")[0]).replace("problem", "spoiled as problem"))
     (end,) = submit(sysid.Recipe(str(file), start=tuple(result.x)), changes=[WithoutRun(1)])
-    assert end.score.predicted == pytest.approx(WithoutRun(1).predicted(problem(), result), rel=0.05)
+    assert end.score.predicted == pytest.approx(WithoutRun(1).predicted(problem().prepared, result), rel=0.05)
 
 
 def test_a_variant_with_hubers_loss_has_the_same_further_tests(result, tmp_path):
@@ -173,7 +173,7 @@ def test_full_matrices_are_those_of_the_other_sensors_and_do_not_predict_the_one
     result = sysid.identify(WithoutSensor(0).of(whole), rng=0)
     np.testing.assert_allclose(result.structure.natural_frequencies, truth().natural_frequencies, rtol=1e-2)
     assert result.structure.mode_shapes.shape[0] == 1
-    assert np.isnan(WithoutSensor(0).predicted(whole, result))
+    assert np.isnan(WithoutSensor(0).predicted(whole.prepared, result))
 
 
 def test_described_sensors_may_be_left_out_of_a_lumped_mass():
@@ -402,7 +402,7 @@ def _from_truth(made):
     session = Session([], DeferredInterrupt())
     answer = descend(made.prepared, as_unknowns(made.prepared, np.concatenate([SPRINGS, DAMPERS])), [], session)
     end = Outcome(made.structure(answer.x), answer.x, "local phase", answer.success, answer.message, History(), None)
-    return judge(made, end, "from the truth", 0, session)
+    return judge(made, made.prepared, end, "from the truth", 0, session)
 
 
 def test_so_many_modes_are_those_that_the_records_need_most():

@@ -34,7 +34,7 @@ def judged(problem, **values):
     x = np.concatenate([np.ravel(values[unknown.name]) for unknown in problem.formulation.unknowns])
     end = Outcome(problem.structure(x), x, "made by hand", True, "", sysid.History())
     with DeferredInterrupt() as interrupt:
-        return judge(problem, end, "from the truth", 0, Session([], interrupt))
+        return judge(problem, problem.prepared, end, "from the truth", 0, Session([], interrupt))
 
 
 @pytest.fixture

@@ -233,12 +233,12 @@ def test_what_is_determined_without_a_force_is_told_to_rest_on_what_is_stated():
     )
     np.testing.assert_allclose(twice.structure.stiffness, 2 * right.structure.stiffness, rtol=1e-6, atol=1e-6)
     unforced, assumed = "No force was measured: they are as right as", "assumed: all of the stated 6 kg"
-    assert right.determined and unforced in verdict(right.prepared)
-    assert twice.determined and unforced in verdict(twice.prepared)
-    assert of_force.determined and unforced not in verdict(of_force.prepared)
+    assert right.determined and unforced in verdict(right)
+    assert twice.determined and unforced in verdict(twice)
+    assert of_force.determined and unforced not in verdict(of_force)
     further = sysid.FurtherTest(forced, mass=M, stiffness=K[:2, :2], damping=np.eye(2))
     both = sysid.Problem(test, mass=sysid.LumpedMass(3.0), residuals=[further])
-    assert unforced not in verdict(dataclasses.replace(right, problem=both).prepared)
+    assert unforced not in verdict(dataclasses.replace(right, problem=both))
     assert any(told.startswith(assumed) for told in statements(twice, ""))
     assert not any(told.startswith("assumed: ") for told in statements(of_force, ""))
 

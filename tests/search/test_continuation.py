@@ -160,7 +160,7 @@ def test_what_residuals_of_the_users_leave_does_not_make_a_fit_of_the_tests_wors
     problem = two_tests(residuals=lambda k: [sysid.Prior(k[0], SPRINGS[0] + off, 10.0) for off in (-2e3, 2e3)])
     truth = np.concatenate([SPRINGS, DAMPERS])
     with DeferredInterrupt() as interrupt:
-        outcome = sysid.Continuation(starts=1).run(problem, Session([], interrupt), truth)
+        outcome = sysid.Continuation(starts=1).run(problem.prepared, Session([], interrupt), truth)
     np.testing.assert_allclose(outcome.x, truth, rtol=0.01)
     assert problem.objective(outcome.x) > 5 * smoothed_tests(problem.prepared).floor
     assert outcome.good
