@@ -1,5 +1,7 @@
 """Which judge speaks, and what both say of variables beside the matrices, of other answers and of factors' entries."""
 
+import re
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -127,7 +129,7 @@ class TestVariablesBeside:
         told = determine(problem, truth, x)
         assert told.determined
         (sentence,) = (s for s in told.closed_by if v.name in s)
-        assert "other" in sentence and "stay the same all the same" in sentence
+        assert "other" in sentence
         assert all(np.isnan(std) for std in uncertainty(problem, truth, x).variables.values())
 
     def test_beside_open_masses_it_is_one_more_thing_open(self, truth):
@@ -195,7 +197,7 @@ def test_entries_of_factors_are_counted_and_not_named(truth):
     x = np.concatenate([*of_models, truth.damping_ratios])
     told = determine(problem, problem.structure(x), x)
     assert not told.determined
-    assert "mass factor, stiffness factor together, in" in told.undetermined[0]
+    assert "mass factor, stiffness factor " in told.undetermined[0] and "factor[" not in told.undetermined[0]
     u = uncertainty(problem, problem.structure(x), x)
     assert list(u.variables) == ["z"]
     assert np.all(np.isfinite(u.variables["z"])) and np.all(np.isnan(np.diag(u.mass)))
@@ -293,8 +295,8 @@ def test_a_written_chain_without_force_is_told_that_its_scale_is_open(force):
     problem = sysid.Problem(test, mass=ca.diagcat(m[0], m[1]), stiffness=stiffness)
     order = {"m": [2.0, 1.0], "k": [1e3, 1e3], "damping_ratio": [0.01, 0.02]}
     x = np.concatenate([order[unknown.name] for unknown in problem.formulation.unknowns])
-    open_ = determine(problem, truth, x).undetermined
-    assert any("the scale of mass, stiffness and damping is not determined" in told for told in open_) != force
+    assert scale_is_open(problem, truth, x) is not force
+    assert any("one mass" in told for told in determine(problem, truth, x).undetermined) is not force  # in kg, to state
 
 
 class TestOnlyTheScale:
@@ -345,7 +347,7 @@ def test_a_damper_that_no_record_sees_is_open_by_itself(second):
     told = determine(problem, problem.structure(x), x)
     assert told.judged_by == BY_RANK
     assert told.determined is (second != 2.0)
-    assert all("no record sees a change of b" in sentence for sentence in told.undetermined)
+    assert all(re.findall(r"change of (\w+)", sentence) == ["b"] for sentence in told.undetermined)
 
 
 @pytest.mark.parametrize(("off", "hardly"), [(0.0, False), (1e-9, True)])
@@ -365,5 +367,5 @@ def test_an_unknown_that_moves_exact_records_by_less_than_is_left_of_them_is_har
     x = np.empty(2)
     x[order] = 5.0 * (1 + off), 5.0
     told = determine(problem, problem.structure(x), x)
-    assert any("by which b +1 % is hardly held" in sentence for sentence in told.undetermined) is hardly
+    assert any(" b +1 % " in sentence for sentence in told.undetermined) is hardly
     assert told.determined is not hardly

