@@ -50,18 +50,18 @@ class TestAuto:
         assert result.residual < 1e-10
 
     @pytest.mark.parametrize(
-        ("stiffness", "damping", "strategy", "reason"),
+        ("stiffness", "damping", "strategy", "own"),
         [
-            ("chain", "modal", "continuation", "stiffness has a form of its own"),
-            ("spectral", "proportional", "swarm", "damping has a form of its own"),
+            ("chain", "modal", "continuation", "stiffness"),
+            ("spectral", "proportional", "swarm", "damping"),
         ],
     )
-    def test_another_where_a_model_has_a_form_of_its_own(self, random_case, stiffness, damping, strategy, reason):
+    def test_another_where_a_model_has_a_form_of_its_own(self, random_case, stiffness, damping, strategy, own):
         _, problem = random_case(np.random.default_rng(1), "lumped", stiffness, damping, n=3, d=1)
         result = self.at_once(problem)
         assert result.strategy == strategy
-        assert strategy_of(result) == f"strategy '{strategy}': the {reason}"
-        with pytest.raises(InputError, match="'modal' needs a free stiffness .SpectralStiffness. and ModalDamping"):
+        assert strategy_of(result).startswith(f"strategy '{strategy}': the {own} ")
+        with pytest.raises(InputError, match=f"'modal' needs .* the {own} has"):
             identify(problem, strategy="modal")
 
     def test_swarm_with_a_start(self, case):
@@ -101,7 +101,7 @@ class TestAuto:
 
         for kind in (sysid.Modal, sysid.Continuation, Swarm):
             monkeypatch.setattr(kind, "run", run)
-        with pytest.raises(InputError, match="modal is refused; nor does the swarm: swarm is refused") as caught:
+        with pytest.raises(InputError, match="modal is refused; .*: swarm is refused") as caught:
             identify(problem, rng=0)
         assert not isinstance(caught.value, DoesNotApplyError)
 

@@ -177,7 +177,7 @@ def test_what_there_is_no_time_for_is_left_out_after_the_first_rows():
 
 def test_a_swarm_that_cannot_begin_in_time_does_not(random_case):
     problem = free(random_case, 3)
-    with pytest.raises(sysid.SolverError, match="before it had a single candidate"):
+    with pytest.raises(sysid.SolverError, match="single candidate"):
         sysid.identify(problem, strategy=sysid.Swarm(n_particles=10**9), rng=0, max_time=5.0)
 
 

@@ -327,7 +327,7 @@ class TestLedger:
         monkeypatch.setattr(sqlite3, "connect", lambda path: opened.append(connect(path)) or opened[-1])
         submit(recipe, out=tmp_path)
         (tmp_path / "jobs.sqlite").write_text("no ledger" * 200)
-        with pytest.raises(sysid.InputError, match="not a database"):
+        with pytest.raises(sysid.InputError, match=r"jobs\.sqlite .* database"):
             submit(recipe, out=tmp_path)
         assert len(opened) == 2
         for file in opened:
@@ -336,10 +336,10 @@ class TestLedger:
 
     def test_a_folder_that_cannot_be_one_is_told(self, recipe, tmp_path):
         (tmp_path / "taken").write_text("a file")
-        with pytest.raises(sysid.InputError, match=r"taken.*cannot be used"):
+        with pytest.raises(sysid.InputError, match=r"taken.* used"):
             submit(recipe, out=tmp_path / "taken")
         (tmp_path / "jobs.sqlite").write_text("no ledger" * 200)
-        with pytest.raises(sysid.InputError, match=r"jobs\.sqlite cannot be used: file is not a database"):
+        with pytest.raises(sysid.InputError, match=r"jobs\.sqlite .* database"):
             submit(recipe, out=tmp_path)
 
     @pytest.mark.parametrize(
@@ -356,7 +356,7 @@ class TestLedger:
         with contextlib.closing(sqlite3.connect(tmp_path / "jobs.sqlite")) as file, file:
             file.execute(schema)
         before = (tmp_path / "jobs.sqlite").read_bytes()
-        with pytest.raises(sysid.InputError, match=r"jobs\.sqlite is no ledger of jobs of this sysid"):
+        with pytest.raises(sysid.InputError, match=r"jobs\.sqlite .* ledger"):
             submit(recipe, out=tmp_path)
         assert (tmp_path / "jobs.sqlite").read_bytes() == before
 
@@ -364,7 +364,7 @@ class TestLedger:
         list(submit(recipe, out=tmp_path))
         with contextlib.closing(sqlite3.connect(tmp_path / "jobs.sqlite")) as file, file:
             file.execute("CREATE TRIGGER t AFTER INSERT ON results BEGIN DELETE FROM results; END")
-        with pytest.raises(sysid.InputError, match="is no ledger of jobs"):
+        with pytest.raises(sysid.InputError, match="no ledger"):
             submit(recipe, out=tmp_path)
 
     @pytest.mark.parametrize(

@@ -193,8 +193,8 @@ def test_described_sensors_may_be_left_out_of_a_lumped_mass():
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (WithoutRun(2), r"there is no run 3 \(run=2, counted from 0\): the test has 2"),
-        (WithoutSensor(5), r"there is no sensor 6 \(sensor=5, counted from 0\): the test has 2"),
+        (WithoutRun(2), r"no run 3 \(run=2, counted from 0\): the test has 2"),
+        (WithoutSensor(5), r"no sensor 6 \(sensor=5, counted from 0\): the test has 2"),
         (Band(20.0, 30.0), "no line between 20 and 30 Hz"),
     ],
 )
@@ -348,9 +348,7 @@ def test_without_the_one_run_along_an_axis_its_modes_cannot_be_found():
     full = problem(full=True)
     assert WithoutRun(0).of(full).measurement.n_runs == 1
     tower = sysid.catalogue.build(sysid.Recipe("cantilever_tower", parameters={"elements": 2, "force": False}))
-    with pytest.raises(
-        InputError, match="without run 2 the base does not move in every direction: modes that this run"
-    ):
+    with pytest.raises(InputError, match="without run 2 "):
         WithoutRun(1).of(tower)
 
 
@@ -416,9 +414,9 @@ def test_so_many_modes_are_those_that_the_records_need_most():
         found = sysid.identify(Modes(count).of(tower), strategy=sysid.Modal(modes=count), rng=0)
         expected = poles.omega[best] / (2 * np.pi)
         np.testing.assert_allclose(found.structure.natural_frequencies, expected, rtol=0.02)
-    with pytest.raises(InputError, match="4 modes stand out of the noise, fewer than the 5 asked for"):
+    with pytest.raises(InputError, match="4 modes .* fewer .* 5 "):
         sysid.identify(tower, strategy=sysid.Modal(modes=5), rng=0)
-    with pytest.raises(InputError, match="open only where mass and stiffness are free"):
+    with pytest.raises(InputError, match="open only"):
         Modes(2).of(problem())
 
 

@@ -361,7 +361,7 @@ def test_a_band_that_is_not_known_leaves_a_gap(unit):
 def test_what_is_not_there_is_refused(unit):
     with pytest.raises(sysid.InputError, match="sensor 'nose' is unknown"):
         plot.transmissibility(unit, sensor="nose")
-    with pytest.raises(sysid.InputError, match="run 2 is out of range: there are 2, counted from 0"):
+    with pytest.raises(sysid.InputError, match="run 2 .* 2, .* 0"):
         plot.transmissibility(unit, run=2)
     silent = dataclasses.replace(unit.measurement, force=None, force_std=None)
     with pytest.raises(sysid.InputError, match="no base force"):
