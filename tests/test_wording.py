@@ -198,6 +198,7 @@ ALIKE = "other mass and stiffness matrices answer identically"
 UNIT = "no number with a unit of mass is given: masses are normalised to 1 kg in each base direction"
 CASES = {
     "gain": lambda: identified(replace(TEST, response=TEST.response * [[1.0], [1.02]])),
+    "low gain": lambda: identified(replace(TEST, response=TEST.response * [[1.0], [0.9956]])),
     "goal": lambda: identified(sysid.simulate(TRUTH, LINES, noise=0.01, rng=0), goal=1e-4),
     "force": lambda: identified(FORCED),
     "nothing": lambda: identified(TEST),
@@ -219,6 +220,12 @@ FOUND = [
         lambda of: f"sensor 2 reads 2 % high against the base (standard deviation {100 * of['std']:.1g} %): M_SS, K_SS "
         "and C are wrong in its row and column; calibrate it and divide its record by 1.0200, or correct its row of "
         "rigid_body",
+    ),
+    (
+        "low gain", "gain",
+        lambda of: f"sensor 2 reads 0.44 % low against the base (standard deviation {100 * of['std']:.1g} %): M_SS, "
+        "K_SS and C are wrong in its row and column; calibrate it and divide its record by 0.9956, or correct its row "
+        "of rigid_body",
     ),
     ("goal", "goal", lambda of: f"the residual {of['residual']:.3g} is above the goal 0.0001"),
     (

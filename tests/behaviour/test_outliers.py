@@ -98,7 +98,9 @@ def test_the_answer_has_the_least_huber_loss(strategy):
     np.testing.assert_array_less(np.abs(found - by_scipy(test)) / std, 1e-3)  # where rounds count as settled
     assert result.success and result.determined
     assert np.all(np.abs(found - [*SPRINGS, *DAMPERS]) < 3.5 * std)
-    assert result.of_kind("outliers")[0].sentence in " ".join(result.summary().split())
+    (far,) = result.of_kind("outliers", severity="note")
+    assert "count little" in far.sentence and not far.remedy and far.sentence in " ".join(result.summary().split())
+    assert any("settled" in one.sentence for one in result.of_kind("search"))
     assert [phase.name for phase in result.history.phases][-1] == "Huber's loss"
 
 

@@ -82,10 +82,8 @@ def test_what_a_kill_left_of_writing_the_state_goes_with_it(stopped, files):
 def test_the_problem_may_be_said_again_and_must_be_the_same(stopped, complaint):
     again = ["run", "pair.py", "--strategy", "swarm", "--resume", "out"]
     assert cli.main([*again, "--seed", "2"]) == 2
-    assert runs_in(complaint()) == [
-        ("pair.py", "swarm", "0"),
-        ("pair.py", "swarm", "2"),
-    ]  # the one there, the one asked for
+    there, asked = ("pair.py", "swarm", "0"), ("pair.py", "swarm", "2")
+    assert runs_in(complaint()) == [there, asked]
     assert cli.main(again) == 0
 
 
