@@ -361,7 +361,7 @@ def test_a_file_that_is_not_there_or_not_a_file(here):
     (here / "test.h5").write_text(CHAIN)
     assert refused("./test.h5").startswith("problem test.h5: ") and " .py;" in refused("./test.h5")
     (here / "folder.py").mkdir()
-    assert refused("folder.py") == "problem folder.py is not a file"
+    assert refused("folder.py").startswith("problem folder.py is ")
     assert os.strerror(errno.ENAMETOOLONG) in refused("x" * 5000 + ".py")
     assert "unknown" in refused("x" * 5000)
 

@@ -103,6 +103,9 @@ REFUSED = {
         lambda: errors.needed("nowhere", "uff", "shake.unv"),
         "shake.unv needs the package nowhere: python -m pip install 'structural-sysid[uff]'",
     ),
+    "a folder for a module": (
+        lambda: (Path("folder.py").mkdir(), catalogue.build(Recipe("folder.py"))), "problem folder.py is not a file",
+    ),
     "no module": (
         lambda: catalogue.build(Recipe("nowhere.py")),
         f"problem nowhere.py cannot be read: {os.strerror(errno.ENOENT)}",
@@ -280,15 +283,21 @@ JUDGED = [
         "structure",
     ),
     (
-        "force", ("gain", "contradicts"),
+        "force", [("gain", "contradicts")],
         "a fit, but something speaks against this model, so that its matrices may be wrong",
         "deal with what speaks against this model, in the order given: correct it, or measure again",
     ),
     (
-        "force", ("residual", "contradicts"), "these matrices do not explain the records as they should",
+        "force", [("residual", "contradicts")], "these matrices do not explain the records as they should",
         "deal with what speaks against it, in the order given",
     ),
-    ("force", ("noise", "caution"), "some entries of the matrices are not known well enough", None),
+    ("force", [("noise", "caution")], "some entries of the matrices are not known well enough", None),
+    (
+        "force", [("residual", "contradicts"), ("changing", "contradicts")],
+        "these matrices do not explain the records as they should",
+        "fit by itself a run in which structure and level of motion stay the same, at the level of interest: 'sysid "
+        "read RUN.csv --out one.h5', then 'sysid run one.h5'",
+    ),
     (
         "goal", (), "these matrices do not explain the records as they should",
         "put right what is named first; a goal below the noise of the records cannot be reached",
@@ -300,8 +309,7 @@ JUDGED = [
 def test_a_judgement_says_what_it_means_and_what_to_do_first(case, found, means, step):
     it = answer(case)
     if found:
-        kind, severity = found
-        it = it.with_findings([Finding(kind, Severity(severity), "-")])
+        it = it.with_findings([Finding(kind, Severity(severity), "-") for kind, severity in found])
     assert verdict(it) == means
     assert next_steps(it)[:1] == ([] if step is None else [step])
 

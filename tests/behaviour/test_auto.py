@@ -68,7 +68,7 @@ class TestAuto:
         truth, problem = case
         result = self.at_once(problem, start=truth)
         assert result.strategy == "swarm"
-        assert strategy_of(result) == "strategy 'swarm': a start was given"
+        assert strategy_of(result).startswith("strategy 'swarm': ") and "start" in strategy_of(result)
 
     @pytest.mark.parametrize("mass", ["lumped", "known"])
     def test_swarm_where_a_structured_mass_has_other_than_one_mode_a_sensor(self, random_case, mass):

@@ -12,11 +12,14 @@ import pytest
 
 import sysid
 from sysid.cli import main as cli
+from sysid.cli.starting import NOTHING_SAVED
 from sysid.report import report
 from sysid.results import storage
 from sysid.search.deadline import TimeIsOver, within
 from sysid.search.session import DeferredInterrupt
 from sysid.search.swarm_objective import SwarmObjective
+
+NOTHING = f"sysid: {NOTHING_SAVED}\n"
 
 
 def test_a_doubtful_fit_ends_with_one_and_the_same_word_everywhere(here, beside_progress, module, no_pictures):
@@ -130,7 +133,7 @@ def test_ctrl_c_before_any_candidate_writes_nothing(here, complaint, files, monk
 
     monkeypatch.setattr(cli, "identify", identify)
     assert cli.main(["run", "pair.py"]) == 130
-    assert complaint() == "sysid: interrupted; nothing was saved\n"
+    assert complaint() == NOTHING
     assert files(here) == {"pair.py"}
 
 
@@ -203,7 +206,7 @@ def test_the_signal_before_any_candidate_writes_nothing(here, files, interruptib
         assert running.stdout.readline() == "here\n"
         running.send_signal(signal.SIGINT)
         _, error = running.communicate(timeout=60)
-    assert error == "sysid: interrupted; nothing was saved\n"
+    assert error == NOTHING
     assert running.returncode == 130
     assert files(here) == {"pair.py"}
 
@@ -219,7 +222,7 @@ def test_the_signal_while_python_imports_is_one_line_of_the_command_alone(here, 
     for given in (["-m", "sysid", "list"], ["bin/sysid", "list"]):
         with interruptible(*given, cwd=here, env={**os.environ, "PYTHONPATH": paths}) as running:
             _, error = running.communicate(timeout=60)
-        assert (error, running.returncode) == ("sysid: interrupted; nothing was saved\n", 130)
+        assert (error, running.returncode) == (NOTHING, 130)
     with interruptible("-c", "import sysid", cwd=here, env={**os.environ, "PYTHONPATH": paths}) as running:
         _, error = running.communicate(timeout=60)
     assert error.endswith("KeyboardInterrupt\n")
@@ -242,7 +245,7 @@ def test_a_third_ctrl_c_acts_at_once_and_what_it_breaks_is_no_error_of_ours(
     monkeypatch.setattr(SwarmObjective, "__call__", judge)
     assert cli.main(["run", "pair.py", "--strategy", "swarm"]) == 130
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    assert complaint() == "sysid: interrupted; nothing was saved\n"
+    assert complaint() == NOTHING
     assert files(here) == {"pair.py"}
 
 

@@ -121,9 +121,7 @@ def test_doctor_tells_what_is_missing_with_the_command_that_installs_it(capsys, 
     assert extras["control"].endswith(how_to_install("control"))
     stated.append("scipy>=99")
     assert cli.main(["doctor"]) == 2
-    assert capsys.readouterr().err == (
-        "sysid: these packages are missing or too old: python -m pip install 'scipy>=99'\n"
-    )
+    assert capsys.readouterr().err.endswith(" python -m pip install 'scipy>=99'\n")
     stated.pop()
     monkeypatch.setattr(doctor, "linear_solvers", list)
     assert cli.main(["doctor"]) == 2
@@ -154,4 +152,4 @@ def test_a_missing_extra_is_one_line_with_the_command_that_installs_it(
     (here / "shake.unv").write_text("    -1\n    58\n    -1\n")
     monkeypatch.setitem(sys.modules, package, None)
     assert cli.main([str(pair) if word == "RESULT" else word for word in words]) == 2
-    assert complaint().endswith(f"needs the package {package}: python -m pip install 'structural-sysid[{extra}]'\n")
+    assert complaint().endswith(f" {package}: {how_to_install(extra)}\n")

@@ -432,7 +432,7 @@ def test_jobs_go_on_from_the_ledger_with_their_scores(recipe, result, tmp_path):
     changes = [None, WithoutRun(0), WithoutRun(9)]
     ends = list(submit(recipe, changes=changes, out=tmp_path))
     assert [end.success for end in ends] == [True, True, False]
-    assert ends[2].message == "there is no run 10 (run=9, counted from 0): the test has 2" and not ends[2].has_result
+    assert " run 10 (run=9, " in ends[2].message and not ends[2].has_result
     assert ends[0].residual == result.residual
     np.testing.assert_equal(asdict(ends[0].score), asdict(scored(result)))  # NaN too
     again = list(submit(recipe, changes=changes[:2], out=tmp_path, executor=lambda: pytest.fail("computed again")))
