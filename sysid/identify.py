@@ -24,7 +24,7 @@ from sysid.results.stated_masses import with_stated_masses
 from sysid.search.auto import InTurn, check_strategy, choose
 from sysid.search.journal import Journal
 from sysid.search.robust import check, settled
-from sysid.search.session import DeferredInterrupt, Progress, Session, Stop
+from sysid.search.session import DeferredInterrupt, Progress, Session, Stop, seed_of
 from sysid.search.strategy import DoesNotApplyError, NoStrategyError, Strategy
 from sysid.structure.structure import Structure
 
@@ -81,7 +81,7 @@ def identify(
     Identification
         Also where Ctrl-C stopped the search, with `interrupted` set.
     """
-    seed, random = _seed(rng)
+    seed, random = seed_of(rng)
     instance("problem", problem, Problem)
     check_strategy(strategy)
     if not isinstance(start, Structure | None):
@@ -107,8 +107,8 @@ def identify(
         with _telling_why(session, named, prepared):
             chosen, why = choose(strategy, prepared, start)
             check(prepared, chosen)
-            mistakes = lambda end: mistakes_of_poor_fit(prepared.screened, end)  # noqa: E731
-            in_turn = InTurn(prepared.screened, session, start, mistakes, follow=strategy == "auto" and not named)
+            follow = strategy == "auto" and not named
+            in_turn = InTurn(prepared.screened, session, start, mistakes_of_poor_fit, follow=follow)
             outcome, why = in_turn.run(chosen, why)
             outcome = settled(prepared, outcome, chosen, session)
             outcome = with_stated_masses(prepared.screened, outcome, session)
@@ -146,14 +146,3 @@ def _telling_why(
         if named and isinstance(error, InputError):
             raise InputError("; ".join(map(str, (*named, error)))) from error
         raise
-
-
-def _seed(rng: int | np.random.Generator | None) -> tuple[int, np.random.SeedSequence]:
-    """A seed to report, and the random source that it makes."""
-    if isinstance(rng, np.random.Generator):
-        seed = int(rng.integers(2**63))
-    elif rng is None:
-        seed = int(np.random.SeedSequence().generate_state(1, np.uint64)[0] >> 1)
-    else:
-        seed = whole_number("rng", rng, at_least=0)
-    return seed, np.random.SeedSequence(seed)

@@ -290,28 +290,23 @@ class Measurement:
 
     def at(self, keep: NDArray[np.bool_]) -> Measurement:
         """The lines where `keep`, (n_freq,), is true."""
-        given = {name: getattr(self, name) for name in _RECORDS}
-        lines: Any = {name: record[..., keep] for name, record in given.items() if record is not None}
+        lines: Any = {name: getattr(self, name)[..., keep] for name in _RECORDS if getattr(self, name) is not None}
         return replace(self, **lines)
 
     def of_runs(self, keep: NDArray[np.bool_]) -> Measurement:
         """The runs where `keep`, (runs,), is true, at their own lines."""
-        given = {name: getattr(self, name) for name in _RECORDS if name != "freq"}
-        runs: Any = {name: record[keep] for name, record in given.items() if record is not None}
-        some = replace(self, whole=None if self.whole is None else self.whole.of_runs(keep), **runs)
+        runs: Any = {name: getattr(self, name)[keep] for name in _RECORDS[1:] if getattr(self, name) is not None}
+        some = replace(self, whole=self.whole and self.whole.of_runs(keep), **runs)
         return some.at(np.any(some.own_lines, axis=0))
 
     def of_sensors(self, keep: NDArray[np.bool_]) -> Measurement:
         """The sensors where `keep`, (n_sensors,), is true."""
-        std, described = self.response_std, self.sensors
+        std, described, whole = self.response_std, self.sensors, self.whole
         return replace(
-            self,
-            response=self.response[:, keep],
-            rigid_body=self.rigid_body[keep],
-            response_std=None if std is None else std[:, keep],
-            whole=None if self.whole is None else self.whole.of_sensors(keep),
-            sensors=None if described is None else tuple(one for one, own in zip(described, keep, strict=True) if own),
-        )
+            self, response=self.response[:, keep], rigid_body=self.rigid_body[keep],
+            response_std=None if std is None else std[:, keep], whole=whole and whole.of_sensors(keep),
+            sensors=None if described is None else tuple(described[i] for i in np.flatnonzero(keep)),
+        )  # fmt: skip
 
     @classmethod
     def from_frf(

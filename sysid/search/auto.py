@@ -62,14 +62,14 @@ class InTurn:
     session : Session
     start : array_like, Structure or None
     mistakes : callable
-        Of a poor outcome the mistakes that explain it, so that no other strategy would do better.
+        Of the problem and a poor outcome the mistakes that explain it, so that no other strategy would do better.
     follow : bool
         Whether others may follow.
     """
 
     def __init__(
         self, problem: PreparedProblem, session: Session, start: Start,
-        mistakes: Callable[[Outcome], tuple[Finding, ...]], *, follow: bool,
+        mistakes: Callable[[PreparedProblem, Outcome], tuple[Finding, ...]], *, follow: bool,
     ) -> None:  # fmt: skip
         self.problem, self.session, self.start = problem, session, start
         self.mistakes, self.follow = mistakes, follow
@@ -85,7 +85,7 @@ class InTurn:
                 raise
             return self._instead(chosen, error)
         if not outcome.good and outcome.stopped is None and session.time_for_more:
-            named = self.mistakes(outcome)
+            named = self.mistakes(self.problem, outcome)
             if named:
                 return replace(outcome, findings=(*outcome.findings, *named)), why
         after = self._after(chosen) if self.follow and not (outcome.good or outcome.unanimous) else None

@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from sysid.errors import whole_number
 from sysid.nlp import suffices
 from sysid.search.journal import Journal
 from sysid.structure.structure import Array
@@ -223,3 +224,14 @@ def in_time(
         )
 
     return function if session.max_time is None else of_rows
+
+
+def seed_of(rng: int | np.random.Generator | None) -> tuple[int, np.random.SeedSequence]:
+    """A seed to report, and the random source that it makes."""
+    if isinstance(rng, np.random.Generator):
+        seed = int(rng.integers(2**63))
+    elif rng is None:
+        seed = int(np.random.SeedSequence().generate_state(1, np.uint64)[0] >> 1)
+    else:
+        seed = whole_number("rng", rng, at_least=0)
+    return seed, np.random.SeedSequence(seed)

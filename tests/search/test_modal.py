@@ -1,13 +1,18 @@
 """Strategy "modal": no swarm, no frequencies; checked against structures that are known."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 import sysid
+from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.models.damping import ProportionalDamping
+from sysid.problem.prepared import PreparedProblem
 from sysid.search import modal_program
 from sysid.search.modal import degrees_of_freedom
+from sysid.search.session import DeferredInterrupt, Session
 
 
 def structure(seed, n, d):
@@ -374,3 +379,23 @@ def test_many_sensors_that_all_modes_move_alike_are_one_motion_whatever_noise_ad
     modes = Modes(phi, np.ones((m, 1)), omega, ratios)
     chosen = degrees_of_freedom(sysid.Problem(test, mass=sysid.FullMass(1.0)).prepared, modes, None)
     assert (chosen.sensors.size, chosen.modes.size) == (1, m - 1)
+
+
+@pytest.mark.parametrize("settled", [True, False])
+def test_an_estimate_that_did_not_settle_is_no_success(random_structure, settled):
+    """Its modes are the answer all the same: IPOPT ends where it begins."""
+    truth = random_structure(np.random.default_rng(9), n=3, d=1)
+    test = sysid.simulate(truth, np.linspace(1.0, 60.0, 200), force=True, noise=0.01, rng=0)
+    size = 3 * 3 + 3 + 3 + 3 + 1
+    estimate = dataclasses.replace(
+        ModalEstimate.of_lines(test), phi=truth.mode_shapes, gamma=truth.participation,
+        omega=2 * np.pi * truth.natural_frequencies, ratios=truth.damping_ratios, rigid=truth.rigid_body_mass,
+        information=1e6 * np.eye(size), settled=settled,
+    )  # fmt: skip
+    prepared = PreparedProblem(sysid.Problem(test, mass=sysid.FullMass()), [estimate])
+    with DeferredInterrupt() as interrupt:
+        outcome = sysid.Modal().run(prepared, Session([], interrupt), None)
+    assert outcome.success is settled
+    assert "Solve_Succeeded" in outcome.message
+    np.testing.assert_allclose(outcome.structure.natural_frequencies, truth.natural_frequencies, rtol=1e-9)
+    np.testing.assert_allclose(outcome.structure.mass, truth.mass, rtol=1e-6, atol=1e-8 * truth.mass.max())
