@@ -15,7 +15,7 @@ from sysid.assessment.checks.changing import changing
 from sysid.errors import InputError, SolverError, finite_array, function, instance, number, path_of, whole_number
 from sysid.finding import Finding
 from sysid.nlp import one_thread
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.results.checkpoint import Checkpoint, identity
 from sysid.results.identification import Identification
@@ -119,10 +119,10 @@ def identify(
     return result
 
 
-def prepare(problem: Problem, session: Session) -> PreparedProblem:
+def prepare(problem: Problem, session: Session) -> Prepared:
     """Fit modes, find noise, poles and weights, and refuse what cannot be searched, under the session's clock."""
     try:
-        prepared = PreparedProblem.of(problem, session.preparing)
+        prepared = Prepared.of(problem, session.preparing)
         prepared.check()
     except Stop as stop:
         raise SolverError(f"{stop}: nothing is identified") from None
@@ -130,9 +130,7 @@ def prepare(problem: Problem, session: Session) -> PreparedProblem:
 
 
 @contextlib.contextmanager
-def _telling_why(
-    session: Session, named: tuple[Finding, ...], prepared: PreparedProblem | None = None
-) -> Iterator[None]:
+def _telling_why(session: Session, named: tuple[Finding, ...], prepared: Prepared | None = None) -> Iterator[None]:
     """Tell of a search that came to nothing what mistakes explain it."""
     try:
         yield

@@ -24,17 +24,15 @@ CEILINGS = {
     # press and damping of any size (350), IPOPT's refinement of each leader (310), and the inverse factor with the
     # swarm on the models' own expressions (317), and findings with kind, channel and numbers in the place of sentences,
     # by checks that share one context (600), a page of half the size and time (140),
-    # and one model of modes for spectra and whole records, its shapes eliminated with exact second derivatives (530).
-    "lines": 41_604,
+    # and one model of modes for spectra and whole records, its shapes eliminated with exact second derivatives (530);
+    # what is stated apart from what is prepared of it, and whole records that end in IPOPT (340).
+    "lines": 41_950,
     # What was counted when these counts began; the modes once, in the open, brings them down.
-    "branches": 78.8,
-    "files": 254,
-    "main": 241,
-    "modal": 67,
-    "fits": 36,
+    "branches": 78.0,
+    "files": 257,
     "constants": 465,
     "shared": 45,
-    "everyday": 385,
+    "everyday": 386,
 }
 
 # The counting is a benchmark, which prints the same figures; `sysid` itself is not imported from the checkout.

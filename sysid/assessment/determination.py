@@ -29,7 +29,7 @@ from sysid.finding import Finding, Severity, cautions
 from sysid.models.unknowns import scales_of, split
 from sysid.nlp import EXACT
 from sysid.problem.formulation import Formulation
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.slopes import Slopes, slopes_of
 from sysid.structure.structure import Array, Structure
 
@@ -94,14 +94,12 @@ class Intervals:
     stiffness: Array
 
 
-def determine(
-    problem: PreparedProblem, structure: Structure, x: Array | None, rivals: Sequence[Array] = ()
-) -> Determination:
+def determine(problem: Prepared, structure: Structure, x: Array | None, rivals: Sequence[Array] = ()) -> Determination:
     """Whether records, constraints and stated models fix every entry of M_SS, K_SS and C.
 
     Parameters
     ----------
-    problem : PreparedProblem
+    problem : Prepared
     structure : Structure
         The answer.
     x : (n_variables,) or None
@@ -138,7 +136,7 @@ def _fixed(sentences: Sequence[str]) -> tuple[Finding, ...]:
     return tuple(Finding("fixed", Severity.NOTE, sentence) for sentence in sentences)
 
 
-def intervals(problem: PreparedProblem, structure: Structure, x: Array | None) -> Intervals:
+def intervals(problem: Prepared, structure: Structure, x: Array | None) -> Intervals:
     """Extremes of M_SS and K_SS over what the data leave open, entry by entry; parameters as in `determine`.
 
     To first order where the cone does not speak: no end is followed along a null direction until a bound stops it, so
@@ -155,12 +153,12 @@ def intervals(problem: PreparedProblem, structure: Structure, x: Array | None) -
     return Intervals(*ends)
 
 
-def open_masses(problem: PreparedProblem, structure: Structure) -> list[int]:
+def open_masses(problem: Prepared, structure: Structure) -> list[int]:
     """Modes, counted from 0, whose modal mass neither records nor stated models fix; none where no cone tells."""
     return modal_mass_cone.open_modes(problem, structure) if modal_mass_cone.speaks(problem.formulation) else []
 
 
-def scale_is_open(problem: PreparedProblem, structure: Structure, x: Array | None) -> bool:
+def scale_is_open(problem: Prepared, structure: Structure, x: Array | None) -> bool:
     """Whether one factor common to mass, stiffness and damping is all that is open; parameters as in `determine`."""
     if modal_mass_cone.speaks(problem.formulation):
         return modal_mass_cone.scale_is_open(problem, structure)
@@ -172,9 +170,7 @@ def scale_is_open(problem: PreparedProblem, structure: Structure, x: Array | Non
 # -- by the rank of the Jacobian -----------------------------------------------------------------
 
 
-def _about(
-    problem: PreparedProblem, structure: Structure, x: Array | None
-) -> tuple[Formulation, Array, Slopes, Sensitivity]:
+def _about(problem: Prepared, structure: Structure, x: Array | None) -> tuple[Formulation, Array, Slopes, Sensitivity]:
     """Formulation and unknowns with all totals, derivatives of the matrices, and the sensitivity to the unknowns."""
     if x is None:
         raise InputError(
@@ -185,9 +181,7 @@ def _about(
     return formulation, x, slopes, sensitivity(formulation, x, slopes)
 
 
-def _by_rank(
-    problem: PreparedProblem, structure: Structure, x: Array | None
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _by_rank(problem: Prepared, structure: Structure, x: Array | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What fixes the matrices, and what is left open, in sentences."""
     formulation, x, slopes, known = _about(problem, structure, x)
     count, rank = known.free.shape[1], known.rank
@@ -279,9 +273,7 @@ def _open_outside(formulation: Formulation, x: Array | None) -> Iterator[str]:
         yield f"no term sees a change of {'; nor of '.join(words)}; {_SAME_MATRICES}"
 
 
-def _others(
-    problem: PreparedProblem, structure: Structure, x: Array | None, rivals: Sequence[Array]
-) -> Iterator[Finding]:
+def _others(problem: Prepared, structure: Structure, x: Array | None, rivals: Sequence[Array]) -> Iterator[Finding]:
     """Other answers whose matrices are others."""
     if x is None:
         return
@@ -297,7 +289,7 @@ def _others(
             yield Finding("other answers", Severity.CAUTION, sentence, numbers=numbers)
 
 
-def _other_matrices(problem: PreparedProblem, mine: Structure, x: Array, other: Array) -> bool:
+def _other_matrices(problem: Prepared, mine: Structure, x: Array, other: Array) -> bool:
     """Whether other unknowns stand for other matrices, beyond what noise leaves open, and not for the same ones."""
     try:
         its = problem.structure(other)
@@ -314,7 +306,7 @@ def _other_matrices(problem: PreparedProblem, mine: Structure, x: Array, other: 
     )
 
 
-def _stds(problem: PreparedProblem, structure: Structure, x: Array) -> tuple[Array, ...]:
+def _stds(problem: Prepared, structure: Structure, x: Array) -> tuple[Array, ...]:
     """Standard deviations of M_SS, K_SS and C by the noise; zeros where they take minutes or nothing tells them."""
     try:
         if structure.mode_shapes.size <= LARGE:

@@ -23,7 +23,7 @@ from sysid.modal_analysis.response import columns, gains
 from sysid.models.geometry import Geometry
 from sysid.models.model import Stated
 from sysid.problem.formulation import Formulation
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, ComplexArray, Structure
 
 UNIT_MASS = "no number with a unit of mass is given: masses are normalised to 1 kg in each base direction"
@@ -49,7 +49,7 @@ def speaks(formulation: Formulation) -> bool:
     return told and formulation.by_ratios and formulation.geometry.at_sensors and formulation.test_alone
 
 
-def verdict(problem: PreparedProblem, structure: Structure) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def verdict(problem: Prepared, structure: Structure) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What closes the modal masses of `structure`, and what is left open, in sentences.
 
     What counts as seen is judged against the misfit that the structure leaves: a mode whose share of
@@ -113,22 +113,22 @@ def _what_is_open(structure: Structure, free: list[int], common: bool) -> str:
     return f"{', '.join(others)} and {last} are open" if others else f"{last} is open"
 
 
-def open_modes(problem: PreparedProblem, structure: Structure) -> list[int]:
+def open_modes(problem: Prepared, structure: Structure) -> list[int]:
     """Modes, counted from 0, whose modal mass neither the records nor the stated models fix."""
     return _open_modes(_known(problem, structure, problem.measurement.residual(structure)))[0]
 
 
-def scale_is_open(problem: PreparedProblem, structure: Structure) -> bool:
+def scale_is_open(problem: Prepared, structure: Structure) -> bool:
     """Whether one scale of mass, stiffness and damping is open, and nothing else."""
     return _open_modes(_known(problem, structure, problem.measurement.residual(structure)))[1]
 
 
-def ends(problem: PreparedProblem, structure: Structure) -> tuple[Array, Array]:
+def ends(problem: Prepared, structure: Structure) -> tuple[Array, Array]:
     """How far each entry of M_SS and K_SS may go over the modal-mass cone.
 
     Parameters
     ----------
-    problem : PreparedProblem
+    problem : Prepared
     structure : Structure
         A member of the cone, and one that the models of `problem` can hold: what is known is taken to be equal to what
         it has, so that misfit closes nothing. Its poles, residues and mode shapes are kept, also the shape of a mode
@@ -193,7 +193,7 @@ class _Known(NamedTuple):
     sentence: str
 
 
-def _known(problem: PreparedProblem, structure: Structure, misfit: float) -> _Known:
+def _known(problem: Prepared, structure: Structure, misfit: float) -> _Known:
     clusters = _clusters(structure, misfit)
     weighed = _weighed(problem.modal[0], structure, clusters)
     return _Known(clusters, weighed, *_model_equations(problem, structure, unknowns(clusters)))
@@ -211,7 +211,7 @@ def _open_modes(known: _Known) -> tuple[list[int], bool]:
     return free, bool(common) and sum(map(len, known.clusters)) > 1
 
 
-def _cone(problem: PreparedProblem, structure: Structure, known: _Known) -> Cone:
+def _cone(problem: Prepared, structure: Structure, known: _Known) -> Cone:
     """The modal-mass cone, with the bounds that a total mass or a rigid-body mass puts on it."""
     totals, n = problem.formulation.mass.totals, structure.n
     visible = sum((W @ (W.T @ structure.participation) for W in _moved(structure, known.clusters)), np.zeros((n, 1)))
@@ -373,7 +373,7 @@ def _seen(test: Measurement, structure: Structure, cluster: list[int], rows: Arr
 
 
 def _unseen(
-    problem: PreparedProblem, structure: Structure, misfit: float, responses: _Record, free: list[int]
+    problem: Prepared, structure: Structure, misfit: float, responses: _Record, free: list[int]
 ) -> Iterator[str]:
     """What the records do not show, in sentences; a mode needs no force of its own where what is stated fixes it."""
     test = problem.measurement
@@ -429,7 +429,7 @@ def _clusters(structure: Structure, misfit: float) -> list[list[int]]:
     return [part.tolist() for part in np.split(np.arange(structure.n), np.flatnonzero(apart) + 1)]
 
 
-def _model_equations(problem: PreparedProblem, structure: Structure, pairs: Pairs) -> tuple[Array, Array | None, str]:
+def _model_equations(problem: Prepared, structure: Structure, pairs: Pairs) -> tuple[Array, Array | None, str]:
     """What the stated models add: `_Known.equations`, `signs` and `sentence`."""
     nothing = np.zeros((0, len(pairs)))
     if not structure.at_sensors:

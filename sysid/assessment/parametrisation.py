@@ -12,11 +12,11 @@ from sysid.assessment.information import Parametrisation
 from sysid.modal_analysis.modal_fit import Index, Modes
 from sysid.models.geometry import Geometry
 from sysid.models.unknowns import scales_of
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, Structure
 
 
-def parametrisation(problem: PreparedProblem, structure: Structure, modes: Modes, index: Index) -> Parametrisation:
+def parametrisation(problem: Prepared, structure: Structure, modes: Modes, index: Index) -> Parametrisation:
     """Theta itself, less what the damping model and stated totals tie."""
     test, (phi, gamma, _, _) = problem.measurement, modes
     d = gamma.shape[1]
@@ -41,7 +41,7 @@ def parametrisation(problem: PreparedProblem, structure: Structure, modes: Modes
 
 
 def _with_ratios_tied(
-    problem: PreparedProblem, structure: Structure, modes: Modes, index: Index, free: Parametrisation
+    problem: Prepared, structure: Structure, modes: Modes, index: Index, free: Parametrisation
 ) -> Parametrisation:
     """The same with log zeta a function of log w and of the damping's own unknowns, which come last."""
     omega, ratios, formulation = modes.omega, modes.ratios, problem.formulation
@@ -60,7 +60,7 @@ def _with_ratios_tied(
     return Parametrisation(slope, unit, np.pad(free.gauge, ((0, at.size), (0, 0))))
 
 
-def _tied_masses(problem: PreparedProblem, modes: Modes, index: Index) -> Iterator[tuple[int, Array]]:
+def _tied_masses(problem: Prepared, modes: Modes, index: Index) -> Iterator[tuple[int, Array]]:
     """Entries of M_rb that a stated total mass ties, and how they follow theta, (size of theta,)."""
     totals, geometry, (phi, gamma, _, _) = problem.formulation.mass.totals, problem.geometry, modes
     if totals is None or problem.formulation.mass.weighs:  # there they are statistics

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sysid.models.unknowns import Unknown, scales_of, split
 from sysid.problem.formulation import Formulation
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.slopes import Rows, Slopes, stacked_rows
 from sysid.structure.structure import Array, Structure
 
@@ -103,7 +103,7 @@ def of_outside(formulation: Formulation, x: Array) -> Sensitivity:
     return _judged(formulation, x, rows, formulation.outside)
 
 
-def with_totals(problem: PreparedProblem, structure: Structure, x: Array) -> tuple[Formulation, Array]:
+def with_totals(problem: Prepared, structure: Structure, x: Array) -> tuple[Formulation, Array]:
     """The formulation and its unknowns; with total masses among them where nobody stated these, so that none is known.
 
     Without them a mass that is normalised to 1 kg would count as weighed.

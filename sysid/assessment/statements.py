@@ -18,7 +18,7 @@ from sysid.assessment.information import Index
 from sysid.assessment.parametrisation import gauge_of, slope_of_drawn_mass
 from sysid.modal_analysis.modal_estimate import theta_of
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, Structure
 
 _STEPS = 40
@@ -51,7 +51,7 @@ class Statements(NamedTuple):
         return Statements(self.entries[kept[:e]], self.totals[kept[e:]], self.kind, *(a[kept] for a in self[3:]))
 
 
-def statements_of(problem: PreparedProblem, structure: Structure) -> Statements | None:
+def statements_of(problem: Prepared, structure: Structure) -> Statements | None:
     """The statements that are adjusted together with the records; None where there are none."""
     mass, geometry, test = problem.formulation.mass, problem.geometry, problem.measurement
     if not (mass.weighs and problem.free_modes and structure.at_sensors):
@@ -79,7 +79,7 @@ def statements_of(problem: PreparedProblem, structure: Structure) -> Statements 
     return Statements(entries, totals, kind, values, stds, scale)
 
 
-def made(problem: PreparedProblem, stated: Statements, theta: Array, index: Index) -> tuple[Array, Array]:
+def made(problem: Prepared, stated: Statements, theta: Array, index: Index) -> tuple[Array, Array]:
     """What modal parameters make of the statements, (r,), and its slopes, (r, size of theta); in units of `scale`.
 
     With P the inverse of Phi the entries are those of ``M_SS = P' P`` and ``M_S0 = P' (Gamma - P G)``.
@@ -120,7 +120,7 @@ class Adjusted(NamedTuple):
     holds: bool
 
 
-def adjust(problem: PreparedProblem, stated: Statements, theta: Array, index: Index, normals: Array) -> Adjusted:
+def adjust(problem: Prepared, stated: Statements, theta: Array, index: Index, normals: Array) -> Adjusted:
     """Adjust modal parameters to statements by Gauss-Newton steps.
 
     Parameters
@@ -164,7 +164,7 @@ def adjust(problem: PreparedProblem, stated: Statements, theta: Array, index: In
 
 
 def conditioned(
-    problem: PreparedProblem, structure: Structure, modes: Modes, index: Index, normals: Array, unseen: Array,
+    problem: Prepared, structure: Structure, modes: Modes, index: Index, normals: Array, unseen: Array,
     shifts: Array,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Moves of theta that records and statements together leave: of a standard normal each, unseen, and shifts.

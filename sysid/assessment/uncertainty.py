@@ -36,7 +36,7 @@ from sysid.modal_analysis.modal_fit import Index, Modes
 from sysid.modal_analysis.response import columns, weights_of_test
 from sysid.models.unknowns import by_name, split
 from sysid.problem.formulation import Formulation
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.slopes import Slopes, rows_of_test, slopes_of
 from sysid.structure.structure import Array, Structure, check_frequencies
 
@@ -174,12 +174,12 @@ class Uncertainty:
         return self._spectra.base_force(check_frequencies(freq, increasing=False))
 
 
-def uncertainty(problem: PreparedProblem, structure: Structure, x: Array | None) -> Uncertainty:
+def uncertainty(problem: Prepared, structure: Structure, x: Array | None) -> Uncertainty:
     """Standard deviations of everything that was identified.
 
     Parameters
     ----------
-    problem : PreparedProblem
+    problem : Prepared
         The standard deviations that its measurement states are the noise; where none are stated, the misfit that
         `structure` leaves is.
     structure : Structure
@@ -203,7 +203,7 @@ def uncertainty(problem: PreparedProblem, structure: Structure, x: Array | None)
     return _by_unknowns(problem, structure, problem.values(structure) if x is None else x)
 
 
-def _by_modes(problem: PreparedProblem, structure: Structure, x: Array | None) -> Uncertainty:
+def _by_modes(problem: Prepared, structure: Structure, x: Array | None) -> Uncertainty:
     """Standard deviations where the modal parameters are free, from their Fisher information."""
     test = problem.measurement
     modes, index, inflation, normals, unseen, shifts = moves_by_records(problem, structure, gains=True)
@@ -229,7 +229,7 @@ def _by_modes(problem: PreparedProblem, structure: Structure, x: Array | None) -
 
 
 def moves_by_records(
-    problem: PreparedProblem, structure: Structure, *, gains: bool = False
+    problem: Prepared, structure: Structure, *, gains: bool = False
 ) -> tuple[Modes, Index, float, Array, Array, Array]:
     """Modes, index, inflation, and moves of theta that the records leave: of a standard normal each, and unseen.
 
@@ -261,7 +261,7 @@ def moves_by_records(
     return modes, index, inflation, (1.0 if np.isnan(inflation) else inflation) * normals, unseen, shifts
 
 
-def _by_unknowns(problem: PreparedProblem, structure: Structure, x: Array) -> Uncertainty:
+def _by_unknowns(problem: Prepared, structure: Structure, x: Array) -> Uncertainty:
     """Standard deviations from the Jacobian of all that is fitted, in the problem's unknowns."""
     test, modes = problem.measurement, modes_of(structure)
     formulation, x = with_totals(problem, structure, x)
@@ -314,7 +314,7 @@ def _with_gains(formulation: Formulation, x: Array, slopes: Slopes, known: Sensi
 
 
 def _with_unknowns(
-    found: Uncertainty, problem: PreparedProblem, formulation: Formulation, x: Array, known: Sensitivity
+    found: Uncertainty, problem: Prepared, formulation: Formulation, x: Array, known: Sensitivity
 ) -> Uncertainty:
     """Add the unknowns that mean something by themselves, and their covariance where all do."""
     unknowns, names = formulation.unknowns, {unknown.name for unknown in problem.variables}
@@ -344,7 +344,7 @@ def modes_of(structure: Structure) -> Modes:
 
 
 def _quantities(
-    problem: PreparedProblem, structure: Structure, modes: Modes, moves: Perturbations, inflation: float,
+    problem: Prepared, structure: Structure, modes: Modes, moves: Perturbations, inflation: float,
     matrices: Sequence[Array], by_gain: Array,
 ) -> Uncertainty:  # fmt: skip
     """Standard deviations of all quantities from the perturbations; `matrices` are those of M_SS, K_SS and C.

@@ -167,8 +167,7 @@ def _run_in(folder: Path, options: argparse.Namespace, out: Output) -> int:
     checkpoint = Checkpoint(folder / UNFINISHED, unfinished.with_source(search, files, folder))
     if options.fresh:
         checkpoint.remove()
-    test = problem.measurement
-    formulation = problem.declared
+    test, formulation = problem.measurement, problem.declared
     if search.refine_by is not None and not formulation.refinable:
         raise InputError(
             f"--refine-by {search.refine_by}: the stiffness of this problem has a form of its own, whose frequencies "

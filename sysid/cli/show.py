@@ -23,7 +23,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.models.unknowns import Unknown, scales_of, slices_of
 from sysid.nlp import quiet_options
 from sysid.problem.feasibility import HELD, LOOSE, points_of
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.problem.slopes import Slopes, slopes_of
 from sysid.results.summary import counted
@@ -140,7 +140,7 @@ def _variable(v: Unknown, declared: str) -> list[str]:
     return [v.title, shape, v.unit or "-", _range(v.lower), _range(v.upper), guess, scale, declared]
 
 
-def _unknowns(problem: PreparedProblem) -> Iterator[str]:
+def _unknowns(problem: Prepared) -> Iterator[str]:
     """Variables by matrix; a model counts its own, a written matrix all that enter it."""
     formulation = problem.formulation
     told, counts = {v.name: f"{v.title} ({v.size})" for v in formulation.unknowns}, dict(problem.unknowns)
@@ -169,7 +169,7 @@ class _Point:
     in_box: bool = False  # a point of the search space, the guess or another
 
 
-def _point(problem: PreparedProblem, stated: Problem) -> _Point:
+def _point(problem: Prepared, stated: Problem) -> _Point:
     """The point at which the data are judged: the reference, what the modal strategy finds, or a guess."""
     sentences: tuple[str, ...] = ()
     found = _at_reference(problem)
@@ -178,7 +178,7 @@ def _point(problem: PreparedProblem, stated: Problem) -> _Point:
     return found or _at_guess(problem, sentences)
 
 
-def _at_guess(problem: PreparedProblem, sentences: tuple[str, ...]) -> _Point:
+def _at_guess(problem: Prepared, sentences: tuple[str, ...]) -> _Point:
     """The guess, else the first of some points of the search space at which there are derivatives."""
     # A free stiffness has all its frequencies equal in the middle of its search space.
     free = problem.formulation.stiffness.free
@@ -194,7 +194,7 @@ def _at_guess(problem: PreparedProblem, sentences: tuple[str, ...]) -> _Point:
     return replace(point, sentences=sentences, at_guess=guess is not None, in_box=True)
 
 
-def _first_judged(problem: PreparedProblem, names: Sequence[str], start: int) -> _Point | None:
+def _first_judged(problem: Prepared, names: Sequence[str], start: int) -> _Point | None:
     """The first of the named points of the search space, from `start` on, at which there are derivatives."""
     for x, where in list(zip(points_of(problem.formulation), names, strict=False))[start:]:
         with contextlib.suppress(InputError, np.linalg.LinAlgError):
@@ -202,7 +202,7 @@ def _first_judged(problem: PreparedProblem, names: Sequence[str], start: int) ->
     return None
 
 
-def _feasible(problem: PreparedProblem, x: Array, where: str) -> tuple[Array, str]:
+def _feasible(problem: Prepared, x: Array, where: str) -> tuple[Array, str]:
     """The point next to `x` that keeps the constraints, clear of inequalities where it can be, and where that is."""
     constraints = problem.formulation.constraints
     # What each makes over the search space.
@@ -225,7 +225,7 @@ def _feasible(problem: PreparedProblem, x: Array, where: str) -> tuple[Array, st
     return x, f"{where}, where the constraints do not hold"
 
 
-def _judged(problem: PreparedProblem, x: Array, where: str) -> _Point:
+def _judged(problem: Prepared, x: Array, where: str) -> _Point:
     with np.errstate(all="ignore"):  # what is not finite is passed over
         slopes = slopes_of(problem.formulation.matrices, x, problem.measurement)
         known = sensitivity(problem.formulation, x, slopes, as_stated=True)
@@ -234,7 +234,7 @@ def _judged(problem: PreparedProblem, x: Array, where: str) -> _Point:
     return _Point(x, slopes, known, where)
 
 
-def _at_reference(problem: PreparedProblem) -> _Point | None:
+def _at_reference(problem: Prepared) -> _Point | None:
     """The reference, where there is one that the models can hold or come near."""
     truth = problem.stated.reference
     if truth is None or not (truth.at_sensors and problem.geometry.at_sensors):
@@ -261,7 +261,7 @@ def _sizes(matrix: Array) -> Array:
     return np.outer(root, root)
 
 
-def _at_modes(problem: PreparedProblem, stated: Problem) -> tuple[_Point | None, tuple[str, ...]]:
+def _at_modes(problem: Prepared, stated: Problem) -> tuple[_Point | None, tuple[str, ...]]:
     """What the modal strategy finds in the data; only sentences where it has other degrees of freedom."""
     try:
         found = identify(stated, strategy="modal", rng=0)
@@ -277,7 +277,7 @@ def _at_modes(problem: PreparedProblem, stated: Problem) -> tuple[_Point | None,
 # -- what the data determine --------------------------------------------------------------------
 
 
-def _at(problem: PreparedProblem, point: _Point) -> Iterator[str]:
+def _at(problem: Prepared, point: _Point) -> Iterator[str]:
     """Values, units and expected errors; rank; what is not seen, and what is seen least."""
     known, count = point.known, point.x.size
     noise = "the stated noise" if _all_stated(problem) else f"{100 * _NOISE:g} % noise"
@@ -306,7 +306,7 @@ def _at(problem: PreparedProblem, point: _Point) -> Iterator[str]:
     yield from (f"  - {sentence}" for sentence in point.sentences)
 
 
-def _values(problem: PreparedProblem, point: _Point, moves: Array, noise: str) -> Iterator[str]:
+def _values(problem: Prepared, point: _Point, moves: Array, noise: str) -> Iterator[str]:
     """A line a variable: the largest error of its entries stands for all."""
     known, x = point.known, point.x
     std = np.linalg.norm(moves, axis=1)
@@ -324,7 +324,7 @@ def _values(problem: PreparedProblem, point: _Point, moves: Array, noise: str) -
     yield from _table(rows)
 
 
-def _coordinates(problem: PreparedProblem) -> Iterator[str]:
+def _coordinates(problem: Prepared) -> Iterator[str]:
     """What IPOPT has in the place of these unknowns, or beside them."""
     formulation = problem.formulation
     if problem.free_modes:
@@ -337,7 +337,7 @@ def _coordinates(problem: PreparedProblem) -> Iterator[str]:
         yield f"IPOPT has mode shapes and frequencies as further unknowns{held}, as damping is by ratios"
 
 
-def _unseen(problem: PreparedProblem, point: _Point) -> Iterator[str]:
+def _unseen(problem: Prepared, point: _Point) -> Iterator[str]:
     """The null directions: what they change, and the shortest in words."""
     known, x = point.known, point.x
     words = sorted(directions_in_words(problem.variables, x, known.unit, known.unseen), key=len)
@@ -379,7 +379,7 @@ def _moved_matrices(point: _Point) -> tuple[int, int]:
     return rank, int(np.linalg.matrix_rank(np.concatenate([own, base]), tol=_SAME)) - rank
 
 
-def _seen_least(problem: PreparedProblem, point: _Point, moves: Array, noise: str) -> str:
+def _seen_least(problem: Prepared, point: _Point, moves: Array, noise: str) -> str:
     """The direction of the largest variance, in units."""
     known = point.known
     U, s, _ = np.linalg.svd(moves / known.unit[:, None], full_matrices=False)
@@ -388,7 +388,7 @@ def _seen_least(problem: PreparedProblem, point: _Point, moves: Array, noise: st
     return f"  - seen least: {words}; its standard deviation at {noise} is {size:.3g} times that"
 
 
-def _moves(problem: PreparedProblem, point: _Point) -> Array:
+def _moves(problem: Prepared, point: _Point) -> Array:
     """Moves of x that one standard normal of noise each makes, (p, rank); of 1 % noise where none is stated."""
     formulation, known = problem.formulation, point.known
     if not formulation.fits_records:
@@ -402,7 +402,7 @@ def _moves(problem: PreparedProblem, point: _Point) -> Array:
     return sensitivity(noisy.formulation, point.x, point.slopes, as_stated=True).normals
 
 
-def _all_stated(problem: PreparedProblem) -> bool:
+def _all_stated(problem: Prepared) -> bool:
     """Whether every record that is fitted states its noise."""
     formulation = problem.formulation
     return formulation.fits_records and all(_noise_is_stated(term.test) for term in formulation.tests)

@@ -13,7 +13,7 @@ import numpy as np
 
 from sysid.compare.method_result import MethodResult, Recorder, Status, errors_of, status_of
 from sysid.errors import InputError, SolverError, how_to_install
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.terms import TestTerm
 from sysid.results.judgement import verdict_of
 from sysid.search.continuation import descend
@@ -49,18 +49,18 @@ class Landscape:
 
     Attributes
     ----------
-    problem : PreparedProblem
+    problem : Prepared
     objective : SwarmObjective
     steps : list of tuple of TestTerm
         Tests with widened peaks for the local phase, where the swarm takes them.
     """
 
-    problem: PreparedProblem
+    problem: Prepared
     objective: SwarmObjective
     steps: list[tuple[TestTerm, ...]]
 
     @classmethod
-    def of(cls, problem: PreparedProblem, session: Session) -> Landscape:
+    def of(cls, problem: Prepared, session: Session) -> Landscape:
         """The objective and the steps that the strategy "swarm" takes for a problem; both compiled."""
         objective, steps = Swarm().searched(problem, session)
         objective(problem.formulation.box[0][None])

@@ -13,7 +13,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.residues import independent
 from sysid.modal_analysis.transients import without_transients_of
 from sysid.models.stiffness import SpectralStiffness
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification
 
@@ -43,7 +43,7 @@ class Band:
         """The problem with these lines alone."""
         return _on(problem, problem.measurement.in_band(self.low, self.high))
 
-    def predicted(self, problem: PreparedProblem, result: Identification) -> float:
+    def predicted(self, problem: Prepared, result: Identification) -> float:
         """Relative residual of the lines outside; NaN where there are none, or mass and stiffness are free.
 
         Free matrices are those of the modes inside.
@@ -86,7 +86,7 @@ class WithoutRun:
             )
         return _on(problem, test.of_runs(kept))
 
-    def predicted(self, problem: PreparedProblem, result: Identification) -> float:
+    def predicted(self, problem: Prepared, result: Identification) -> float:
         """Relative residual of the run that was left out."""
         test = problem.measurement
         left_out = test.of_runs(~_all_but(self.run, test.n_runs, "run"))
@@ -131,7 +131,7 @@ class WithoutSensor:
         recovery = np.eye(test.n_sensors) if own else np.asarray(problem.recovery)
         return _on(problem, other, recovery=recovery[kept], rigid_body_dofs=G)
 
-    def predicted(self, problem: PreparedProblem, result: Identification) -> float:
+    def predicted(self, problem: Prepared, result: Identification) -> float:
         """Relative residual of the sensor that was left out; NaN where the structure does not tell its motion."""
         if problem.free_modes or result.x is None:
             return np.nan
@@ -165,7 +165,7 @@ class Modes:
             raise InputError("the number of modes is open only where mass and stiffness are free")
         return replace(problem, goal=None, reference=None)
 
-    def predicted(self, problem: PreparedProblem, result: Identification) -> None:
+    def predicted(self, problem: Prepared, result: Identification) -> None:
         """Nothing is left out: the validation tests are what is predicted."""
 
 

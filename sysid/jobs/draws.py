@@ -11,13 +11,13 @@ from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.misfit import inflation_of, misfits_of, records_of
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.stated import StatedProblem
 from sysid.problem.terms import FurtherTest, Prior
 from sysid.structure.structure import Array, ComplexArray, Structure
 
 
-def drawn(problem: PreparedProblem, x: Array, random: np.random.SeedSequence) -> StatedProblem:
+def drawn(problem: Prepared, x: Array, random: np.random.SeedSequence) -> StatedProblem:
     """The problem with records simulated from the structure of `x` in the place of the measured ones.
 
     Their noise has the stated standard deviations, raised as the linear uncertainty is where the misfit is larger, else

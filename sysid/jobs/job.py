@@ -15,7 +15,7 @@ from sysid.jobs.changes import Change, Modes
 from sysid.jobs.draws import drawn
 from sysid.jobs.score import Score, scored
 from sysid.nlp import one_thread
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.results.identification import Identification, Recipe
@@ -178,7 +178,7 @@ def _refined(job: Job, session: Session) -> JobResult:
         if job.draw:
             # Noise of the size that counts: there are no outliers in it, so that squares are as good.
             fitted = problem if problem.in_squares else problem.pseudo_values(problem.structure(x), x)
-            problem = PreparedProblem(drawn(fitted, x, np.random.SeedSequence(job.seed)))
+            problem = Prepared(drawn(fitted, x, np.random.SeedSequence(job.seed)))
     else:
         found = random_starts(problem, 1, np.random.SeedSequence(job.seed))
         if not found:
@@ -191,7 +191,7 @@ def _refined(job: Job, session: Session) -> JobResult:
     return JobResult(job.index, job.seed, verdict.success, verdict.message, end.x, problem.residual(end.x))
 
 
-def _descended(problem: PreparedProblem, x: Array, steps: list[tuple[TestTerm, ...]], session: Session) -> Outcome:
+def _descended(problem: Prepared, x: Array, steps: list[tuple[TestTerm, ...]], session: Session) -> Outcome:
     """Where the local phase ends from `x`."""
     answer = descend(problem.screened, x, steps, session)
     if answer.stopped is not None:

@@ -10,7 +10,7 @@ import numpy as np
 from sysid.assessment.sensitivity import meaningful
 from sysid.jobs.job import JobResult
 from sysid.nlp import EXACT
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.search.continuation import apart
 from sysid.structure.structure import Structure
 
@@ -43,7 +43,7 @@ class Minimum:
         return self.best.residual
 
 
-def distinct(problem: PreparedProblem, results: Iterable[JobResult]) -> list[Minimum]:
+def distinct(problem: Prepared, results: Iterable[JobResult]) -> list[Minimum]:
     """Minima that the jobs of one problem ended in, the least residual first; jobs without a result are left out.
 
     Ends are of one minimum where the matrices agree, and all unknowns that mean something by themselves: of shares of a

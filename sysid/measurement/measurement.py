@@ -281,11 +281,9 @@ class Measurement:
     def in_band(self, low: float, high: float) -> Measurement:
         """The lines from `low` to `high` Hz, both included."""
         low, high = number("the lower end of the band", low), number("the upper end of the band", high)
-        keep = (self.freq >= low) & (self.freq <= high)
+        keep, ends = (self.freq >= low) & (self.freq <= high), f"{self.freq[0]:g} to {self.freq[-1]:g} Hz"
         if not np.any(keep):
-            raise InputError(
-                f"no line between {low:g} and {high:g} Hz; the record has {self.freq[0]:g} to {self.freq[-1]:g} Hz"
-            )
+            raise InputError(f"no line between {low:g} and {high:g} Hz; the record has {ends}")
         return self.at(keep)
 
     def at(self, keep: NDArray[np.bool_]) -> Measurement:
@@ -301,11 +299,11 @@ class Measurement:
 
     def of_sensors(self, keep: NDArray[np.bool_]) -> Measurement:
         """The sensors where `keep`, (n_sensors,), is true."""
-        std, described, whole = self.response_std, self.sensors, self.whole
+        std, sensors, whole = self.response_std, self.sensors, self.whole
         return replace(
             self, response=self.response[:, keep], rigid_body=self.rigid_body[keep],
             response_std=None if std is None else std[:, keep], whole=whole and whole.of_sensors(keep),
-            sensors=None if described is None else tuple(described[i] for i in np.flatnonzero(keep)),
+            sensors=sensors and tuple(sensors[i] for i in np.flatnonzero(keep)),
         )  # fmt: skip
 
     @classmethod

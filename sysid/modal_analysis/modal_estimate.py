@@ -163,7 +163,7 @@ def residual_of(estimate: ModalEstimate, modes: Modes) -> float:
     return float(np.linalg.norm(left)) / size
 
 
-def poles_of(estimate: ModalEstimate, monitor: Callable[[int, float], object] | None = None) -> Poles:
+def estimated_poles(estimate: ModalEstimate, monitor: Callable[[int, float], object] | None = None) -> Poles:
     """Poles of the modes, or, where none were fitted, those that stand out of the lines: see `find_poles`."""
     if estimate.has_modes:
         return Poles(estimate.omega, estimate.ratios, residual_of(estimate, estimate.modes))

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, finite_array, refuse, shown
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.modal_estimate import ModalEstimate, poles_of
+from sysid.modal_analysis.modal_estimate import ModalEstimate, estimated_poles
 from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.unknowns import Unknown
@@ -88,7 +88,7 @@ class Geometry:
     @cached_property
     def poles(self) -> Poles:
         """Poles that stand out of the records."""
-        return poles_of(self.modal, self.monitor)
+        return estimated_poles(self.modal, self.monitor)
 
     @cached_property
     def pole_ratios(self) -> Array:

@@ -28,7 +28,7 @@ from sysid.structure.structure import Array, Structure
 Monitor = Callable[[int, float], object]
 
 
-class PreparedProblem:
+class Prepared:
     """What a user stated, and the modal estimate of each test that is fitted: what strategies search and checks judge.
 
     Parameters
@@ -46,7 +46,7 @@ class PreparedProblem:
             self.modal = tuple(modal)
 
     @classmethod
-    def of(cls, stated: StatedProblem, monitor: Monitor | None = None) -> PreparedProblem:
+    def of(cls, stated: StatedProblem, monitor: Monitor | None = None) -> Prepared:
         """Find all that the records tell before any search: modes, noise, poles and weights where they are needed.
 
         Parameters
@@ -73,15 +73,15 @@ class PreparedProblem:
         return tuple(fit_modes(test) for test in self.stated.tests)
 
     @cached_property
-    def screened(self) -> PreparedProblem:
+    def screened(self) -> Prepared:
         """The same in squares: with Huber's loss without numbers that stand alone, else itself."""
         return self._screened(None)
 
-    def _screened(self, monitor: Monitor | None) -> PreparedProblem:
+    def _screened(self, monitor: Monitor | None) -> Prepared:
         if self.in_squares:
             return self
         modal = [replace(one, records=screened(one.records, monitor=monitor)) for one in self.modal]
-        return PreparedProblem(self.stated, modal, in_squares=True)
+        return Prepared(self.stated, modal, in_squares=True)
 
     # -- records and where they are fitted ---------------------------------------------------------
 
@@ -112,7 +112,7 @@ class PreparedProblem:
         found = [outliers(modal.records, its, self.n_variables, alone=alone, number=i) for i, (modal, its) in fits]
         return sorted((one for of_test in found for one in of_test), key=lambda one: -one.size)
 
-    def pseudo_values(self, structure: Structure, x: Array | None) -> PreparedProblem:
+    def pseudo_values(self, structure: Structure, x: Array | None) -> Prepared:
         """The problem in squares, with pseudo-values about an answer in the place of its records.
 
         See `sysid.modal_analysis.outliers`; poles that were found stay. What whole records tell of the modes is gone.
@@ -124,9 +124,9 @@ class PreparedProblem:
         other.geometry.found = self.geometry.found
         return other
 
-    def of_lines(self, tests: Iterable[Measurement]) -> PreparedProblem:
+    def of_lines(self, tests: Iterable[Measurement]) -> Prepared:
         """The problem in squares with other tests, whose lines stand for themselves."""
-        return PreparedProblem(self.stated, [ModalEstimate.of_lines(test) for test in tests], in_squares=True)
+        return Prepared(self.stated, [ModalEstimate.of_lines(test) for test in tests], in_squares=True)
 
     # -- what is searched --------------------------------------------------------------------------
 

@@ -14,7 +14,7 @@ from sysid.models.geometry import Geometry
 from sysid.models.unknowns import Unknown
 from sysid.problem import stored
 from sysid.problem.formulation import Formulation
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.stated import StatedProblem
 from sysid.structure.structure import Array, Structure
 
@@ -108,9 +108,9 @@ class Problem(StatedProblem):
         return problem
 
     @cached_property
-    def prepared(self) -> PreparedProblem:
+    def prepared(self) -> Prepared:
         """The problem with what its records tell of the modes, where that is asked for outside an identification."""
-        return PreparedProblem(self)
+        return Prepared(self)
 
     @property
     def geometry(self) -> Geometry:
@@ -154,16 +154,16 @@ class Problem(StatedProblem):
 
     @property
     def unknowns(self) -> tuple[tuple[str, int], ...]:
-        """Number of unknowns a matrix: see `PreparedProblem.unknowns`."""
+        """Number of unknowns a matrix: see `Prepared.unknowns`."""
         return self.prepared.unknowns
 
     @property
     def totals(self) -> Array:
-        """Total mass in each base direction, (d,): see `PreparedProblem.totals`."""
+        """Total mass in each base direction, (d,): see `Prepared.totals`."""
         return self.prepared.totals
 
     def check(self) -> None:
-        """Refuse what cannot be searched, before any search: see `PreparedProblem.check`."""
+        """Refuse what cannot be searched, before any search: see `Prepared.check`."""
         self.prepared.check()
 
     def structure(self, x: ArrayLike) -> Structure:

@@ -29,7 +29,7 @@ from sysid.modal_analysis.outliers import Outlier, screened
 from sysid.modal_analysis.response import weighted_error
 from sysid.modal_analysis.transients import without_transients_of
 from sysid.models.unknowns import by_name
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.problem.stated import StatedProblem
 from sysid.results.records import PartOfProblem, Records
@@ -68,7 +68,7 @@ class Answer:
         The search was stopped by Ctrl-C, and this is the best until then.
     hurried : bool
         For want of time summaries leave out what is not computed yet; not stored.
-    prepared : PreparedProblem
+    prepared : Prepared
         The problem with what its records tell of the modes; found when it is first asked for where it is not given, and
         not stored.
     """
@@ -82,7 +82,7 @@ class Answer:
     findings: tuple[Finding, ...]
     interrupted: bool = False
     hurried: bool = field(default=False, kw_only=True)
-    prepared: PreparedProblem = field(default=None, kw_only=True)  # type: ignore[assignment] # filled below
+    prepared: Prepared = field(default=None, kw_only=True)  # type: ignore[assignment] # filled below
 
     def __post_init__(self) -> None:
         if isinstance(self.problem, PartOfProblem):  # as it comes of a file: `problem` then tells what is missing

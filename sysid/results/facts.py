@@ -11,7 +11,7 @@ from sysid.assessment.checks.gains import taken_at_sensors
 from sysid.models.mass import LumpedMass
 from sysid.models.unknowns import Unknown
 from sysid.problem.given import MATRICES
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.terms import FurtherTest
 from sysid.structure.structure import Array
 
@@ -98,7 +98,7 @@ class Facts(NamedTuple):
         return cls(**{name: tree[name] for name in cls._fields} | lists | {"unknowns": unknowns})
 
 
-def facts_of(problem: PreparedProblem, x: Array | None) -> Facts:
+def facts_of(problem: Prepared, x: Array | None) -> Facts:
     """The facts of a problem and of its unknowns at an answer."""
     formulation, test = problem.formulation, problem.measurement
     further = [one.measurement.force is None for one in problem.stated.residuals if isinstance(one, FurtherTest)]
@@ -135,7 +135,7 @@ def facts_of(problem: PreparedProblem, x: Array | None) -> Facts:
     )
 
 
-def reported_unknowns(problem: PreparedProblem, *, damping_ratios: bool = False) -> tuple[Unknown, ...]:
+def reported_unknowns(problem: Prepared, *, damping_ratios: bool = False) -> tuple[Unknown, ...]:
     """Unknowns that mean something by themselves: those of models with a form of their own, and variables, fixed too.
 
     The entries of a free matrix's factor are none, nor are shares of which only the ratios count. Free damping ratios
@@ -147,7 +147,7 @@ def reported_unknowns(problem: PreparedProblem, *, damping_ratios: bool = False)
     return (*(v for v in of_models if not v.relative), *formulation.variables)
 
 
-def _models(problem: PreparedProblem) -> Iterator[tuple[str, str]]:
+def _models(problem: Prepared) -> Iterator[tuple[str, str]]:
     """A matrix each: its model, and what that states; or that it is written in variables or numbers."""
     formulation, counts = problem.formulation, dict(problem.unknowns)
     stated = (formulation.mass, formulation.stiffness, formulation.damping)
@@ -157,7 +157,7 @@ def _models(problem: PreparedProblem) -> Iterator[tuple[str, str]]:
         yield name, "; ".join(filter(None, (kind, total, known.sentence)))
 
 
-def _stated_rigid_body(problem: PreparedProblem) -> Array:
+def _stated_rigid_body(problem: Prepared) -> Array:
     totals, d = problem.formulation.mass.totals, problem.measurement.n_base
     if totals is None or totals.kind != "rigid_body":
         return np.zeros((d, d), dtype=bool)

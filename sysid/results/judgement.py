@@ -16,7 +16,7 @@ from sysid.assessment.sensitivity import blocks_of
 from sysid.assessment.uncertainty import LARGE
 from sysid.finding import Finding, Severity, cautions, contradicting, is_fit, weightiest_first
 from sysid.nlp import EXACT
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification
 from sysid.search.deadline import TimeIsOver, within
@@ -39,9 +39,7 @@ class Verdict(NamedTuple):
     message: str
 
 
-def judge(
-    problem: Problem, prepared: PreparedProblem, end: Outcome, why: str, seed: int, session: Session
-) -> Identification:
+def judge(problem: Problem, prepared: Prepared, end: Outcome, why: str, seed: int, session: Session) -> Identification:
     """Judge where a search ended: `why` tells why its strategy was taken, the session has its log and clock."""
     context = Context(prepared, end, session.cut_short)
     verdict = _verdict(context)
@@ -82,7 +80,7 @@ def judge(
         return it.with_findings((_NOT_JUDGED,))
 
 
-def verdict_of(problem: PreparedProblem, end: Outcome) -> Verdict:
+def verdict_of(problem: Prepared, end: Outcome) -> Verdict:
     """Whether where a search ended is a fit."""
     return _verdict(Context(problem, end))
 

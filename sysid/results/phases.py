@@ -8,7 +8,7 @@ import numpy as np
 
 from sysid.assessment.sensitivity import blocks_of
 from sysid.errors import InputError
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.search.strategy import History, Phase
 from sysid.structure.structure import Array, Structure
 
@@ -24,7 +24,7 @@ class Searched(Protocol):
     """A result, as far as its phases go."""
 
     @property
-    def prepared(self) -> PreparedProblem:
+    def prepared(self) -> Prepared:
         """What was identified."""
 
     @property

@@ -15,7 +15,7 @@ from sysid.finding import Finding, Severity
 from sysid.modal_analysis.modal_estimate import theta_of
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.problem.matrices import assemble
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.search.deadline import TimeIsOver, within
 from sysid.search.modal import objective_of
 from sysid.search.modal_scaling import to_stated_totals
@@ -29,7 +29,7 @@ _TOLD = 4
 _ROUND_OFF = 1e-8  # of the records: what counts as noise where there is none
 
 
-def with_stated_masses(problem: PreparedProblem, end: Outcome, session: Session) -> Outcome:
+def with_stated_masses(problem: Prepared, end: Outcome, session: Session) -> Outcome:
     """The fit adjusted to records and statements together, told of statements that contradict the rest."""
     if end.stopped is not None or statements_of(problem, end.structure) is None:
         return end
@@ -41,7 +41,7 @@ def with_stated_masses(problem: PreparedProblem, end: Outcome, session: Session)
         return replace(end, success=False, message=f"{end.message}; {late}")
 
 
-def _adjusted(problem: PreparedProblem, end: Outcome) -> Outcome:
+def _adjusted(problem: Prepared, end: Outcome) -> Outcome:
     first = end.structure
     stated = statements_of(problem, first)
     assert stated is not None
@@ -69,7 +69,7 @@ def _adjusted(problem: PreparedProblem, end: Outcome) -> Outcome:
     return replace(end, structure=structure, x=x, history=history, findings=(*end.findings, *said))
 
 
-def _structure(problem: PreparedProblem, first: Structure, before: Array, after: Array, index: Index) -> Structure:
+def _structure(problem: Prepared, first: Structure, before: Array, after: Array, index: Index) -> Structure:
     """The structure of adjusted modal parameters; what was repeated in the first stays so."""
     phi, gamma, log_omega, log_ratios, rigid = (part[..., 0] for part in index.split(after[:, None]))
     _, _, own_omega, own_ratios, _ = (part[..., 0] for part in index.split(before[:, None]))
@@ -96,7 +96,7 @@ def _structure(problem: PreparedProblem, first: Structure, before: Array, after:
 
 
 def _contradictions(
-    problem: PreparedProblem, stated: Statements, best: Adjusted, theta: Array, index: Index, normals: Array
+    problem: Prepared, stated: Statements, best: Adjusted, theta: Array, index: Index, normals: Array
 ) -> Iterator[Finding]:
     """Whether statements and records disagree beyond chance, and which statements explain it."""
     numbers = _numbers(problem, index)
@@ -137,7 +137,7 @@ def _contradictions(
     yield Finding("stated masses", Severity.CONTRADICTS, unexplained, numbers={"chance": chance})
 
 
-def _common_factor(problem: PreparedProblem, stated: Statements, theta: Array, index: Index, normals: Array) -> float:
+def _common_factor(problem: Prepared, stated: Statements, theta: Array, index: Index, normals: Array) -> float:
     """By what all statements would be wrong in common, by what a base force weighs; zero where none was measured."""
     if problem.measurement.force is None:
         return 0.0
@@ -148,7 +148,7 @@ def _common_factor(problem: PreparedProblem, stated: Statements, theta: Array, i
     return float(given @ weight @ values / (given @ weight @ given))
 
 
-def _in_words(problem: PreparedProblem, stated: Statements, row: int, value: float, off: float) -> str:
+def _in_words(problem: Prepared, stated: Statements, row: int, value: float, off: float) -> str:
     test, n = problem.measurement, problem.geometry.n
     axes = test.base_axes or [f"base direction {i + 1}" for i in range(test.n_base)]
     given = stated.values[row]
@@ -166,7 +166,7 @@ def _in_words(problem: PreparedProblem, stated: Statements, row: int, value: flo
     )
 
 
-def _numbers(problem: PreparedProblem, index: Index) -> float:
+def _numbers(problem: Prepared, index: Index) -> float:
     """Degrees of freedom of the records' own noise; infinite where it is stated."""
     test = problem.measurement
     if test.response_std is not None and (test.force is None or test.force_std is not None):

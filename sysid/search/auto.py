@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, SolverError
 from sysid.finding import Finding
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.search.continuation import Continuation
 from sysid.search.modal import Modal
 from sysid.search.session import Session
@@ -35,7 +35,7 @@ def check_strategy(strategy: str | Strategy) -> None:
         raise InputError(f"strategy {strategy!r} is unknown; give one of {NAMES}")
 
 
-def choose(strategy: str | Strategy, problem: PreparedProblem, start: Start) -> tuple[Strategy, str]:
+def choose(strategy: str | Strategy, problem: Prepared, start: Start) -> tuple[Strategy, str]:
     """The strategy that is taken, and why it is."""
     check_strategy(strategy)
     if not isinstance(strategy, str):
@@ -57,7 +57,7 @@ class InTurn:
 
     Parameters
     ----------
-    problem : PreparedProblem
+    problem : Prepared
         In squares.
     session : Session
     start : array_like, Structure or None
@@ -68,8 +68,8 @@ class InTurn:
     """
 
     def __init__(
-        self, problem: PreparedProblem, session: Session, start: Start,
-        mistakes: Callable[[PreparedProblem, Outcome], tuple[Finding, ...]], *, follow: bool,
+        self, problem: Prepared, session: Session, start: Start,
+        mistakes: Callable[[Prepared, Outcome], tuple[Finding, ...]], *, follow: bool,
     ) -> None:  # fmt: skip
         self.problem, self.session, self.start = problem, session, start
         self.mistakes, self.follow = mistakes, follow

@@ -15,7 +15,7 @@ from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.nlp import EXACT
 from sysid.problem.feasibility import latin_hypercube
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.terms import TestTerm
 from sysid.search import local
 from sysid.search.local import Coordinates, LocalResult
@@ -61,7 +61,7 @@ class Continuation:
     def __post_init__(self) -> None:
         whole_number("Continuation: starts", self.starts, at_least=1)
 
-    def refusal(self, problem: PreparedProblem, start: ArrayLike | Structure | None) -> str | None:
+    def refusal(self, problem: Prepared, start: ArrayLike | Structure | None) -> str | None:
         """Why "auto" does not take it: poles and residues make the matrices, or entries of a free mass are stated."""
         formulation = problem.formulation
         if formulation.mass.weighs or (formulation.mass.free and problem.rigid_total is not None):
@@ -71,12 +71,12 @@ class Continuation:
             return "neither mass nor stiffness has a form of its own"
         return None
 
-    def run(self, problem: PreparedProblem, session: Session, start: ArrayLike | Structure | None) -> Outcome:
+    def run(self, problem: Prepared, session: Session, start: ArrayLike | Structure | None) -> Outcome:
         """Search from several starts: the best end."""
         return _Run(problem, session).outcome(self.starts, start)
 
 
-def smoothed_tests(problem: PreparedProblem, monitor: Callable[[int, float], object] | None = None) -> _Smoother | None:
+def smoothed_tests(problem: Prepared, monitor: Callable[[int, float], object] | None = None) -> _Smoother | None:
     """What stands for each fitted test at complex frequencies; None where one shows no poles, or none is fitted."""
     if not problem.formulation.fits_records:
         return None
@@ -114,7 +114,7 @@ class _Smoother:
 
 
 def smooth_fit(
-    problem: PreparedProblem, x: Array, steps: list[tuple[TestTerm, ...]], session: Session,
+    problem: Prepared, x: Array, steps: list[tuple[TestTerm, ...]], session: Session,
     monitor: Callable[[int, float], object],
 ) -> LocalResult | None:  # fmt: skip
     """Fit every step from where the one before ended, while there is time; None without steps."""
@@ -139,7 +139,7 @@ def smooth_fit(
 
 
 def descend(
-    problem: PreparedProblem,
+    problem: Prepared,
     x: Array,
     steps: list[tuple[TestTerm, ...]],
     session: Session,
@@ -157,7 +157,7 @@ def descend(
 class _Run:
     """Searches from several starts: where they ended so far."""
 
-    def __init__(self, problem: PreparedProblem, session: Session) -> None:
+    def __init__(self, problem: Prepared, session: Session) -> None:
         self.problem, self.session = problem, session
         self.smoother = smoothed_tests(problem, session.preparing)
         self.steps = [] if self.smoother is None else self.smoother.steps
@@ -253,7 +253,7 @@ class _Run:
         return all(same) and len(same) + self.joined >= _AGREE and self.problem.residual(best.x) < _OF_SORTS
 
 
-def _best(problem: PreparedProblem, ends: list[tuple[float, LocalResult]]) -> tuple[float, LocalResult, Structure]:
+def _best(problem: Prepared, ends: list[tuple[float, LocalResult]]) -> tuple[float, LocalResult, Structure]:
     """The end with the least objective that is a structure."""
     wrong: InputError | None = None
 
@@ -271,7 +271,7 @@ def _best(problem: PreparedProblem, ends: list[tuple[float, LocalResult]]) -> tu
     )
 
 
-def random_starts(problem: PreparedProblem, count: int, random: np.random.SeedSequence) -> list[Array]:
+def random_starts(problem: Prepared, count: int, random: np.random.SeedSequence) -> list[Array]:
     """Points spread over the search space as the swarm's are, of those that stand for a structure."""
     if count < 1:
         return []
@@ -279,7 +279,7 @@ def random_starts(problem: PreparedProblem, count: int, random: np.random.SeedSe
     return list(islice((x for x in points if _is_structure(problem, x)), count))
 
 
-def _is_structure(problem: PreparedProblem, x: Array) -> bool:
+def _is_structure(problem: Prepared, x: Array) -> bool:
     try:
         problem.structure(x)
     except InputError:
@@ -287,7 +287,7 @@ def _is_structure(problem: PreparedProblem, x: Array) -> bool:
     return True
 
 
-def _objective_at(problem: PreparedProblem, x: Array) -> float:
+def _objective_at(problem: Prepared, x: Array) -> float:
     """NaN where modes are needed and `x` is no structure."""
     try:
         return problem.objective(x)
@@ -295,9 +295,7 @@ def _objective_at(problem: PreparedProblem, x: Array) -> float:
         return float("nan")
 
 
-def _alternatives(
-    problem: PreparedProblem, x: Array, objective: float, ends: list[tuple[float, LocalResult]]
-) -> list[Array]:
+def _alternatives(problem: Prepared, x: Array, objective: float, ends: list[tuple[float, LocalResult]]) -> list[Array]:
     """Other ends that explain the data as well."""
     most = as_good_as(problem, objective)
     found: list[Array] = []
@@ -308,7 +306,7 @@ def _alternatives(
     return found
 
 
-def as_good_as(problem: PreparedProblem, objective: float) -> float:
+def as_good_as(problem: Prepared, objective: float) -> float:
     """The most that another answer leaves where it explains the data as well as one that leaves `objective`."""
     from scipy.special import gammainccinv
 
@@ -318,7 +316,7 @@ def as_good_as(problem: PreparedProblem, objective: float) -> float:
     return max(objective * float(np.sqrt(1 + 2 * gammainccinv(size / 2, _CHANCE) / max(numbers - size, 1))), EXACT)
 
 
-def apart(problem: PreparedProblem, x: Array, other: Array) -> float:
+def apart(problem: Prepared, x: Array, other: Array) -> float:
     """Largest difference of two sets of unknowns, of their size or, where that is less, of the search space.
 
     An unknown that may be zero has at least a thousandth of its range as its size.

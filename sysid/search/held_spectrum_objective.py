@@ -22,7 +22,7 @@ from sysid.modal_analysis.gain_series import GainSeries, SummedRecord
 from sysid.modal_analysis.response import records_of, weights_of, weights_of_test
 from sysid.problem.batch import CHUNK, Batch, expanded
 from sysid.problem.batch_modes import BatchModes, batch_modes
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.terms import Term, TestTerm
 from sysid.structure.structure import Array
 
@@ -37,7 +37,7 @@ _NARROWEST_RANGE, _WIDEST_RANGE = 1.01, 1e4  # of a ratio, upper over lower: the
 
 
 def held_spectrum_objective(
-    problem: PreparedProblem, term: Term, spectrum: Array | None, unknowns: ca.Function
+    problem: Prepared, term: Term, spectrum: Array | None, unknowns: ca.Function
 ) -> HeldSpectrumObjective | None:
     """The fast objective of the problem's own test; None where it does not apply.
 
@@ -64,7 +64,7 @@ class HeldSpectrumObjective:
 
     Parameters
     ----------
-    problem : PreparedProblem
+    problem : Prepared
     term : TestTerm
         The problem's own test, or one in its place.
     spectrum : (n,), rad/s
@@ -77,7 +77,7 @@ class HeldSpectrumObjective:
 
     def __init__(
         self,
-        problem: PreparedProblem,
+        problem: Prepared,
         term: TestTerm,
         spectrum: Array,
         expansion: ca.Function,
@@ -157,7 +157,7 @@ def chunk_ends(count: int, size: int) -> list[int]:
     return [*ends, _STEP * math.ceil(count / _STEP)]
 
 
-def _range_of_ratios(problem: PreparedProblem, expansion: Batch) -> tuple[Array, Array]:
+def _range_of_ratios(problem: Prepared, expansion: Batch) -> tuple[Array, Array]:
     """Least and largest damping ratios (n,) that a swarm's box gives, of its ends and of draws between them.
 
     Exact where ratios rise with every coordinate; elsewhere candidates beyond are left to the sum over lines.

@@ -27,7 +27,7 @@ from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.response import records_of, weights_of_test
 from sysid.models.spectrum import SOLVED
 from sysid.nlp import EXACT, OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, not_begun
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.search.modal_coordinates import End, modes_of, spectrum_near, unknowns_of
 from sysid.search.modal_scaling import stated_totals
 from sysid.structure.structure import Array, Structure
@@ -41,7 +41,7 @@ _LEAST_MASS = 1e-6  # of the rigid-body mass; the least base mass that a fit sta
 _FLAT = 1e-10  # of the largest curvature; along less the objective does not change
 
 
-def fit_in_inverse_factor(problem: PreparedProblem, x: Array, monitor: IterationMonitor, max_iterations: int) -> End:
+def fit_in_inverse_factor(problem: Prepared, x: Array, monitor: IterationMonitor, max_iterations: int) -> End:
     """Minimise the objective of a problem with free modes, from the unknowns `x`.
 
     Where the monitor's deadline would pass while the graph of the Hessian is made, nothing is begun.
@@ -109,7 +109,7 @@ class InverseFactorError:
 
     Parameters
     ----------
-    problem : PreparedProblem
+    problem : Prepared
         With free modes.
 
     Attributes
@@ -127,7 +127,7 @@ class InverseFactorError:
         zero where it is met; no rows where nothing is stated.
     """
 
-    def __init__(self, problem: PreparedProblem) -> None:
+    def __init__(self, problem: Prepared) -> None:
         test, n, d = problem.measurement, problem.geometry.n, problem.geometry.d
         weighed = test.force is not None
         self.sizes = (n * (n + 1) // 2, n * d, weighed * d * (d + 1) // 2, n * (n - 1) // 2, 2 * n)
@@ -168,7 +168,7 @@ def _matrices(factors: list[ca.MX] | list[ca.SX], n: int, d: int) -> tuple[ca.MX
     return lower_triangle(R, n), ca.reshape(P, n, d), lower_triangle(N, d) if N.numel() else type(N)(d, d)
 
 
-def _totals(problem: PreparedProblem, sizes: tuple[int, ...]) -> ca.Function:
+def _totals(problem: Prepared, sizes: tuple[int, ...]) -> ca.Function:
     """Stated totals as functions of the entries of R, P and N; L by forward substitution where they need it."""
     factors = [ca.SX.sym("part", size) for size in sizes]
     R, P, N = _matrices(factors, problem.geometry.n, problem.geometry.d)
@@ -203,9 +203,7 @@ def cayley(S: ca.MX) -> ca.MX:
     return ca.solve(unit + S, unit - S)
 
 
-def _fit_about(
-    problem: PreparedProblem, x: Array, error: InverseFactorError, monitor: IterationMonitor, limit: int
-) -> End:
+def _fit_about(problem: Prepared, x: Array, error: InverseFactorError, monitor: IterationMonitor, limit: int) -> End:
     """IPOPT from the unknowns `x`, with their Psi_0, in at most `limit` iterations; then again with totals held."""
     structure = problem.structure(x)
     start, n = coordinates_of(structure), structure.n
@@ -269,9 +267,7 @@ def _derivatives(z: NonlinearProgram, y: ca.MX, error: InverseFactorError, psi_0
     }  # fmt: skip
 
 
-def _left_in_words(
-    problem: PreparedProblem, z: NonlinearProgram, derivatives: dict[str, ca.Function], at: Array
-) -> str:
+def _left_in_words(problem: Prepared, z: NonlinearProgram, derivatives: dict[str, ca.Function], at: Array) -> str:
     """How much chi² an end that is no solution leaves to gain: half the Newton decrement, beside what is left in all.
 
     What a fit leaves in all counts as one for each degree of freedom, as noise of its size does.

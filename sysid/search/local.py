@@ -11,7 +11,7 @@ import numpy as np
 
 from sysid.models.spectrum import SOLVED
 from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram, ended_in_words
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.terms import TestTerm
 from sysid.search.inverse_factor_coordinates import fit_in_inverse_factor
 from sysid.search.matrix_coordinates import fit_in_matrices
@@ -50,7 +50,7 @@ class LocalResult:
 
 
 def solve(
-    problem: PreparedProblem,
+    problem: Prepared,
     x: Array,
     *,
     max_iterations: int = 500,
@@ -63,7 +63,7 @@ def solve(
 
     Parameters
     ----------
-    problem : PreparedProblem
+    problem : Prepared
     x : ndarray, shape (n_variables,)
     max_iterations : int
         Of each attempt.
@@ -87,7 +87,7 @@ def solve(
     return _result(fit_apart(problem, fit(problem, x, watched, max_iterations), watched, max_iterations), watched)
 
 
-def solve_or_read(problem: PreparedProblem, x: Array, session: Session, **settings: Any) -> LocalResult:
+def solve_or_read(problem: Prepared, x: Array, session: Session, **settings: Any) -> LocalResult:
     """`solve`, or its end where the session's journal has it from an earlier run."""
     part = session.journal.part("local phase")
     if part.found is not None:
@@ -100,7 +100,7 @@ def solve_or_read(problem: PreparedProblem, x: Array, session: Session, **settin
     return result
 
 
-def fit_apart(problem: PreparedProblem, end: End, monitor: IterationMonitor, max_iterations: int = 500) -> End:
+def fit_apart(problem: Prepared, end: End, monitor: IterationMonitor, max_iterations: int = 500) -> End:
     """The same end with the unknowns that enter no matrix fitted to the terms and constraints that they enter.
 
     Where modes are free nothing connects them with the others.

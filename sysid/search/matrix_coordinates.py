@@ -19,7 +19,7 @@ from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, not_b
 from sysid.problem.feasibility import HELD, LOOSE
 from sysid.problem.formulation import Formulation
 from sysid.problem.matrices import assemble
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.terms import ModeSymbols, Term, TestTerm
 from sysid.search.modal_coordinates import End, frequencies
 from sysid.search.scaled_unknowns import add_unknowns
@@ -32,7 +32,7 @@ _SECONDS, _POWER = 2.4, 4.6  # likewise, that those of 12 modes take, and how th
 
 
 def fit_in_matrices(
-    problem: PreparedProblem,
+    problem: Prepared,
     x: Array,
     monitor: IterationMonitor,
     max_iterations: int,
@@ -86,7 +86,7 @@ def needs_modes(formulation: Formulation) -> bool:
     return formulation.fits_records and formulation.matrices.by_ratios
 
 
-def _add_constraints(problem: PreparedProblem, unknowns: ca.MX, z: NonlinearProgram) -> None:
+def _add_constraints(problem: Prepared, unknowns: ca.MX, z: NonlinearProgram) -> None:
     """The problem's constraints, in units of what each makes over the search space."""
     constraints = problem.formulation.constraints
     unit = problem.tolerance / np.where(constraints.equal, LOOSE, HELD)
@@ -94,9 +94,7 @@ def _add_constraints(problem: PreparedProblem, unknowns: ca.MX, z: NonlinearProg
         z.constrain(constraints.function(unknowns) / ca.DM(unit), constraints.lower / unit, constraints.upper / unit)
 
 
-def _add_modes(
-    problem: PreparedProblem, unknowns: ca.MX, start: Structure, z: NonlinearProgram, *, tied: bool
-) -> ModeSymbols:
+def _add_modes(problem: Prepared, unknowns: ca.MX, start: Structure, z: NonlinearProgram, *, tied: bool) -> ModeSymbols:
     """Mode shapes and frequencies as new unknowns, bound to the mass and, where they are `tied`, to the stiffness."""
     formulation = problem.formulation
     n = start.n
@@ -111,7 +109,7 @@ def _add_modes(
     return ModeSymbols(inverse.T @ psi, omega)
 
 
-def _in_order(problem: PreparedProblem, x: Array, shapes: Array, omega: Array, *, tied: bool) -> Array:
+def _in_order(problem: Prepared, x: Array, shapes: Array, omega: Array, *, tied: bool) -> Array:
     """Unknowns with modes in ascending order, and a stiffness that is not `tied` to them made of these modes."""
     formulation, order = problem.formulation, np.argsort(omega)
     if formulation.damping.free:

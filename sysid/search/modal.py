@@ -28,7 +28,7 @@ from sysid.models.spectrum import SOLVED
 from sysid.models.stiffness import FREQUENCY_WINDOW
 from sysid.nlp import EXACT, IterationMonitor, ended_in_words
 from sysid.problem.matrices import assemble
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.search.local import LocalResult, fit_apart, solve
 from sysid.search.modal_coordinates import End
 from sysid.search.modal_scaling import nearest_lumped, of_known_mass, to_stated_totals
@@ -71,7 +71,7 @@ class Modal:
             if not isinstance(sensor, str):
                 whole_number("Modal: a sensor", sensor, at_least=0)
 
-    def refusal(self, problem: PreparedProblem, start: ArrayLike | Structure | None) -> str | None:
+    def refusal(self, problem: Prepared, start: ArrayLike | Structure | None) -> str | None:
         """Why poles and residues do not make the matrices, or a start that it would not read."""
         formulation = problem.formulation
         if not formulation.test_alone or formulation.healed or not formulation.geometry.at_sensors:
@@ -86,7 +86,7 @@ class Modal:
             return "the damping has a form of its own"
         return None if start is None else "a start was given"
 
-    def run(self, problem: PreparedProblem, session: Session, start: ArrayLike | Structure | None) -> Outcome:
+    def run(self, problem: Prepared, session: Session, start: ArrayLike | Structure | None) -> Outcome:
         """Modes from the data, and the structure that they make; a start is not read."""
         refusal = self.refusal(problem, None)
         if refusal:
@@ -113,7 +113,7 @@ class DegreesOfFreedom:
     modes: Integers
 
 
-def degrees_of_freedom(problem: PreparedProblem, modes: Modes, stated: Sequence[str | int] | None) -> DegreesOfFreedom:
+def degrees_of_freedom(problem: Prepared, modes: Modes, stated: Sequence[str | int] | None) -> DegreesOfFreedom:
     """Sensors, and modal coordinates where they do not suffice, whose motions tell all modes' apart.
 
     Sensors by a pivoted QR of the mode shapes, each mode in units of its own size, so that the chosen rows are
@@ -173,9 +173,7 @@ def _by_name(test: Measurement, stated: Sequence[str | int]) -> Integers:
     return np.sort(np.array(chosen, dtype=int))
 
 
-def build(
-    problem: PreparedProblem, modes: Modes, remainder: Array, chosen: DegreesOfFreedom, *, to_totals: bool
-) -> Structure:
+def build(problem: Prepared, modes: Modes, remainder: Array, chosen: DegreesOfFreedom, *, to_totals: bool) -> Structure:
     """Structure of a modal model; `remainder` (d, d) is the rigid-body mass that no mode carries.
 
     With `to_totals` all modal masses take one factor, and the remainder what is left, so that stated totals are met.
@@ -209,7 +207,7 @@ def build(
     )
 
 
-def run_modal(problem: PreparedProblem, options: Modal, session: Session) -> Outcome:
+def run_modal(problem: Prepared, options: Modal, session: Session) -> Outcome:
     """Modes from the data, and the structure that they make."""
     monitor = IterationMonitor(session.reporter("local phase"), session.left)
     try:
@@ -258,7 +256,7 @@ def run_modal(problem: PreparedProblem, options: Modal, session: Session) -> Out
 
 
 def _in_unknowns(
-    problem: PreparedProblem, structure: Structure, end: LocalResult, monitor: IterationMonitor, session: Session
+    problem: Prepared, structure: Structure, end: LocalResult, monitor: IterationMonitor, session: Session
 ) -> tuple[Structure, LocalResult]:
     """The unknowns that stand for a structure; a mass that is not free is fitted as it stands from there."""
     if problem.free_modes:
@@ -274,7 +272,7 @@ def _in_unknowns(
     return problem.structure(answer.x), replace(answer, curve=np.concatenate([end.curve, answer.curve]))
 
 
-def objective_of(problem: PreparedProblem, structure: Structure, x: Array | None) -> float:
+def objective_of(problem: Prepared, structure: Structure, x: Array | None) -> float:
     """What the fit leaves; where modes are free from the structure alone, without any graph of the matrices."""
     if x is not None and not problem.free_modes:
         return problem.objective(x)
@@ -282,14 +280,14 @@ def objective_of(problem: PreparedProblem, structure: Structure, x: Array | None
     return own if x is None else float(np.linalg.norm([own, *(term.error(x) for term in problem.formulation.beside)]))
 
 
-def _coordinates(problem: PreparedProblem, chosen: DegreesOfFreedom) -> list[str]:
+def _coordinates(problem: Prepared, chosen: DegreesOfFreedom) -> list[str]:
     """What the degrees of freedom are, in words."""
     names = problem.measurement.sensor_names
     return [names[i] for i in chosen.sensors] + [f"the coordinate of mode {k + 1}" for k in chosen.modes]
 
 
 def modal_structure(
-    problem: PreparedProblem, options: Modal, monitor: IterationMonitor
+    problem: Prepared, options: Modal, monitor: IterationMonitor
 ) -> tuple[Structure, ModalFit, DegreesOfFreedom, Poles]:
     """Structure that the data suggest without any search, and how it was fitted.
 
@@ -330,13 +328,13 @@ def modal_structure(
         ) from None
 
 
-def _fitted(problem: PreparedProblem, poles: Poles, options: Modal, monitor: IterationMonitor) -> ModalFit:
+def _fitted(problem: Prepared, poles: Poles, options: Modal, monitor: IterationMonitor) -> ModalFit:
     """Modes fitted to the lines, from poles close by."""
     fit = ModeFit(problem.measurement, poles, np.sqrt(problem.totals), monitor, options.max_iterations)
     return fit.best() if options.modes is None else fit.of_strongest(options.modes)
 
 
-def _as_estimated(problem: PreparedProblem, options: Modal) -> ModalFit:
+def _as_estimated(problem: Prepared, options: Modal) -> ModalFit:
     """The modes that were fitted with the transients of whole records."""
     modal = problem.modal[0]
     if options.modes not in (None, modal.omega.size):
@@ -348,7 +346,7 @@ def _as_estimated(problem: PreparedProblem, options: Modal) -> ModalFit:
     return ModalFit(modal.modes, modal.rigid, residual, residual, "not solved", "")
 
 
-def _modal_masses(problem: PreparedProblem, modes: Modes, chosen: DegreesOfFreedom) -> Array:
+def _modal_masses(problem: Prepared, modes: Modes, chosen: DegreesOfFreedom) -> Array:
     """Modal masses that what is stated of the mass makes likely, (m,)."""
     geometry, k = problem.geometry, chosen.modes.size
     P = np.linalg.inv(np.vstack([modes.phi[chosen.sensors], np.eye(modes.omega.size)[chosen.modes]]))
@@ -362,7 +360,7 @@ def _modal_masses(problem: PreparedProblem, modes: Modes, chosen: DegreesOfFreed
     return nearest_lumped(problem, P, modes.gamma, G, groups, known if ours else None)
 
 
-def held_by_model(problem: PreparedProblem, structure: Structure) -> Array:
+def held_by_model(problem: Prepared, structure: Structure) -> Array:
     """Unknowns (n_variables,) of a lumped or known mass that are nearest to a modal model.
 
     Its mass, its poles, and the orthogonal shapes nearest to its own.
@@ -381,7 +379,7 @@ def held_by_model(problem: PreparedProblem, structure: Structure) -> Array:
     return x
 
 
-def poles_of(problem: PreparedProblem) -> Poles:
+def poles_of(problem: Prepared) -> Poles:
     """Poles of the data; for stated frequencies theirs, with others looked for where the model is said to have more."""
     if problem.poles is not None:
         return problem.poles

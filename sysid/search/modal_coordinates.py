@@ -22,7 +22,7 @@ from sysid.models.stiffness import FREQUENCY_WINDOW
 from sysid.models.unknowns import lower_of, upper_of
 from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram
 from sysid.problem.matrices import assemble
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.search.modal_program import solve_modes
 from sysid.search.modal_scaling import positive_part, stated_totals, to_stated_totals
 from sysid.search.scaled_unknowns import add_unknowns
@@ -43,7 +43,7 @@ class End(NamedTuple):
     remark: str = ""
 
 
-def fit_in_modes(problem: PreparedProblem, x: Array, monitor: IterationMonitor, max_iterations: int) -> End:
+def fit_in_modes(problem: Prepared, x: Array, monitor: IterationMonitor, max_iterations: int) -> End:
     """Minimise the objective of a problem with free modes, from the structure of `x`."""
     start = problem.structure(x)
     first, test = modes_of(start), problem.measurement
@@ -86,9 +86,7 @@ def modes_of(structure: Structure) -> Modes:
     return Modes(structure.mode_shapes, structure.participation, omega, structure.damping_ratios)
 
 
-def frequencies(
-    problem: PreparedProblem, start: Array, z: NonlinearProgram, *, near: bool = True
-) -> tuple[ca.MX, Array]:
+def frequencies(problem: Prepared, start: Array, z: NonlinearProgram, *, near: bool = True) -> tuple[ca.MX, Array]:
     """Circular frequencies as new unknowns, and what they are relative to, rad/s; held `near` those that were given."""
     center, window = start.copy(), np.full(start.size, np.log(_OPEN_WINDOW))
     spectrum = problem.formulation.stiffness.spectrum
@@ -98,9 +96,7 @@ def frequencies(
     return ca.DM(center) * ca.exp(z.variable("frequency", shift, -window, window)), center
 
 
-def spectrum_near(
-    problem: PreparedProblem, structure: Structure, start: Modes, z: NonlinearProgram
-) -> tuple[ca.MX, ca.MX]:
+def spectrum_near(problem: Prepared, structure: Structure, start: Modes, z: NonlinearProgram) -> tuple[ca.MX, ca.MX]:
     """Circular frequencies and damping ratios as expressions of new unknowns: log w near what is stated, log zeta."""
     formulation = problem.formulation
     omega, _ = frequencies(problem, start.omega, z)
@@ -114,7 +110,7 @@ def spectrum_near(
     return omega, formulation.ratios(add_unknowns(z, unknowns, guess), omega)
 
 
-def unknowns_of(problem: PreparedProblem, modes: Modes, rigid: Array, start: Structure, x: Array) -> Array:
+def unknowns_of(problem: Prepared, modes: Modes, rigid: Array, start: Structure, x: Array) -> Array:
     """The problem's unknowns of a fit that began at a structure, its modes one by one; what enters no matrix as in `x`.
 
     Frequencies may have changed places. The damping is put inside its search space. `rigid` (d, d), the rigid-body

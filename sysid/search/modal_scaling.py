@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.search.modal_program import Ties
 from sysid.structure.structure import Array
 from sysid.structure.triangular import lower_entries
@@ -22,7 +22,7 @@ _SHARE = 1e-3  # of the largest share of a mode in a total; a smaller one would 
 _LEAST = 0.5  # of an equal share of the mass, that each mode keeps where nothing tells modal masses
 
 
-def stated_totals(problem: PreparedProblem) -> Ties | None:
+def stated_totals(problem: Prepared) -> Ties | None:
     """Equalities that hold the stated total mass of a free mass where the base force would set another."""
     geometry, mass, totals = problem.geometry, problem.formulation.mass, problem.totals
     if problem.measurement.force is None or not mass.free or mass.totals is None:
@@ -48,7 +48,7 @@ def stated_totals(problem: PreparedProblem) -> Ties | None:
 
 
 def to_stated_totals(
-    problem: PreparedProblem, P: Array, gamma: Array, G: Array, groups: Array, remainder: Array, *, scaled: bool = False
+    problem: Prepared, P: Array, gamma: Array, G: Array, groups: Array, remainder: Array, *, scaled: bool = False
 ) -> tuple[float, Array]:
     """Common modal-mass factor t and base remainder (d, d) with which a full mass has the stated totals.
 
@@ -98,7 +98,7 @@ def positive_part(matrix: Array) -> Array:
 
 
 def nearest_lumped(
-    problem: PreparedProblem, P: Array, gamma: Array, G: Array, groups: Array, known: Array | None = None
+    problem: Prepared, P: Array, gamma: Array, G: Array, groups: Array, known: Array | None = None
 ) -> Array:
     """Modal masses (m,) whose mass matrix is nearest to a lumped, uncoupled one with the stated totals.
 

@@ -26,7 +26,7 @@ from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.spectrum import SOLVED
 from sysid.models.unknowns import lower_of, upper_of
 from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.search.modal_program import Spectrum, Ties, solve_modes
 from sysid.search.modal_scaling import stated_totals
 from sysid.search.strategy import DoesNotApplyError
@@ -206,9 +206,7 @@ def _ascending(fit: ModalFit) -> ModalFit:
     return replace(fit, modes=Modes(end.phi[:, order], end.gamma[order], end.omega[order], end.ratios[order]))
 
 
-def held_to_totals(
-    problem: PreparedProblem, end: ModalFit, monitor: IterationMonitor, max_iterations: int
-) -> ModalFit | None:
+def held_to_totals(problem: Prepared, end: ModalFit, monitor: IterationMonitor, max_iterations: int) -> ModalFit | None:
     """The same fit with stated totals held, where what the base force weighs agrees with them; else None."""
     ties, modes = stated_totals(problem), end.modes
     if ties is None or monitor.is_over:
@@ -221,7 +219,7 @@ def held_to_totals(
     return held if agrees and held.status in SOLVED else None
 
 
-def ended(problem: PreparedProblem, estimate: ModalFit, monitor: IterationMonitor, max_iterations: int) -> ModalFit:
+def ended(problem: Prepared, estimate: ModalFit, monitor: IterationMonitor, max_iterations: int) -> ModalFit:
     """Where IPOPT ends from an estimate, with damping ratios within their bounds and no negative mass.
 
     The estimate itself where nobody wants to wait for it.
@@ -242,20 +240,20 @@ def ended(problem: PreparedProblem, estimate: ModalFit, monitor: IterationMonito
         raise DoesNotApplyError(f"{error}: use fewer modes, Modal(modes=), or narrow the band") from None
 
 
-def _within_bounds(problem: PreparedProblem, end: ModalFit) -> bool:
+def _within_bounds(problem: Prepared, end: ModalFit) -> bool:
     """Whether all damping ratios are within the problem's bounds."""
     low, high = damping_bounds(problem)
     return bool(np.all((end.modes.ratios >= low) & (end.modes.ratios <= high)))
 
 
-def damping_bounds(problem: PreparedProblem) -> tuple[float, float]:
+def damping_bounds(problem: Prepared) -> tuple[float, float]:
     """Bounds of the free damping ratios of a problem, those of all modes alike."""
     unknowns = problem.formulation.of_models[2]
     return float(lower_of(unknowns).min()), float(upper_of(unknowns).max())
 
 
 def _again(
-    problem: PreparedProblem, end: ModalFit, monitor: IterationMonitor, max_iterations: int, ties: Ties | None = None,
+    problem: Prepared, end: ModalFit, monitor: IterationMonitor, max_iterations: int, ties: Ties | None = None,
     *, bounded: bool = True,
 ) -> ModalFit:  # fmt: skip
     """A fit from where another ended, with ties, and damping ratios within the problem's bounds."""

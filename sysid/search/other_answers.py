@@ -17,7 +17,7 @@ import numpy as np
 
 from sysid.errors import InputError
 from sysid.finding import Finding, Severity
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.terms import ExpressionTerm
 from sysid.search import local
 from sysid.search.batch_least_squares import LeastSquares
@@ -41,7 +41,7 @@ _SEED = 0x6F74686572  # a source of its own, so that no other phase draws other 
 _NOT_LOOKED_FOR = "whether another structure explains the data as well was not looked for to its end: {}"
 
 
-def is_unique_if_rank_is_full(problem: PreparedProblem) -> bool:
+def is_unique_if_rank_is_full(problem: Prepared) -> bool:
     """Whether an answer that small changes cannot replace has no other one far from it either.
 
     Where all degrees of freedom are measured and the matrices are linear in the unknowns, so are the equations of
@@ -56,7 +56,7 @@ def is_unique_if_rank_is_full(problem: PreparedProblem) -> bool:
     return all(ca.is_linear(ca.densify(part), x) for part in (M, M_S0, M_00, K, C, ratios))
 
 
-def with_other_answers(problem: PreparedProblem, end: Outcome, session: Session) -> Outcome:
+def with_other_answers(problem: Prepared, end: Outcome, session: Session) -> Outcome:
     """The outcome with another answer among its alternatives if one is found, or told that it was not looked for.
 
     The search ends with the first one. It is not begun where none can be, or where unknowns are too many for it.
@@ -85,7 +85,7 @@ def _unfinished(end: Outcome, why: str) -> Outcome:
     )
 
 
-def _number_of_starts(problem: PreparedProblem) -> int:
+def _number_of_starts(problem: Prepared) -> int:
     """As many as a step of all of them has time for; it depends on no clock, so that the bits do not."""
     formulation, n = problem.formulation, problem.geometry.n
     rows = sum(term.function.numel_out(0) for term in formulation.beside if isinstance(term, ExpressionTerm))
@@ -93,7 +93,7 @@ def _number_of_starts(problem: PreparedProblem) -> int:
     return min(int(_SECONDS / ((1 + formulation.size) * (responses + _ROW * rows))), _MOST_STARTS)
 
 
-def _first(problem: PreparedProblem, x: Array, session: Session, starts: int) -> Array | None:
+def _first(problem: Prepared, x: Array, session: Session, starts: int) -> Array | None:
     """The first other answer that is found."""
     objective = problem.objective(x)
     tried = [problem.structure(x)]
@@ -111,7 +111,7 @@ def _first(problem: PreparedProblem, x: Array, session: Session, starts: int) ->
     return None
 
 
-def _candidates(problem: PreparedProblem, x: Array, session: Session, objective: float, starts: int) -> Iterator[Array]:
+def _candidates(problem: Prepared, x: Array, session: Session, objective: float, starts: int) -> Iterator[Array]:
     """Points of the answer's response as they are found, then those whose response differs by less than the misfit."""
     same, box = SameResponse(problem, x), _Box(problem)
     search = LeastSquares(lambda points: same(box.unknowns(points)), box.starts(session, starts))
@@ -132,7 +132,7 @@ def _candidates(problem: PreparedProblem, x: Array, session: Session, objective:
 class _Box:
     """The unit box of the coordinates in which points are drawn, and the unknowns."""
 
-    def __init__(self, problem: PreparedProblem) -> None:
+    def __init__(self, problem: Prepared) -> None:
         formulation = problem.formulation
         self.lower, upper = formulation.box
         self.width = upper - self.lower
@@ -149,7 +149,7 @@ class _Box:
         return latin_hypercube(count, self.lower.size, np.random.default_rng(source))
 
 
-def _fit(problem: PreparedProblem, x: Array, session: Session) -> Array:
+def _fit(problem: Prepared, x: Array, session: Session) -> Array:
     """The records fitted from a point."""
     monitor = session.reporter("other answers")
     try:
@@ -161,12 +161,12 @@ def _fit(problem: PreparedProblem, x: Array, session: Session) -> Array:
     return end.x
 
 
-def _explains(problem: PreparedProblem, x: Array, objective: float) -> bool:
+def _explains(problem: Prepared, x: Array, objective: float) -> bool:
     """Whether unknowns of a structure explain the data as well as those that leave `objective`."""
     return problem.keeps_constraints(x) and problem.objective(x) <= as_good_as(problem, objective)
 
 
-def _structure_of(problem: PreparedProblem, x: Array) -> Structure | None:
+def _structure_of(problem: Prepared, x: Array) -> Structure | None:
     """None where the unknowns stand for none."""
     try:
         return problem.structure(x)

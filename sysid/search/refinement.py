@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sysid.models.spectrum import spectrum_error
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.search.session import Session
 from sysid.structure.structure import Array
 from sysid.structure.triangular import triangle
@@ -64,7 +64,7 @@ class Refiner:
 
     Parameters
     ----------
-    problem : PreparedProblem
+    problem : Prepared
     by : {"closed-form", "ipopt", "leaders"}
     spectrum : (m,), rad/s
     session : Session
@@ -73,7 +73,7 @@ class Refiner:
         Takes the counts.
     """
 
-    def __init__(self, problem: PreparedProblem, by: RefineBy, spectrum: Array, session: Session, tally: Tally) -> None:
+    def __init__(self, problem: Prepared, by: RefineBy, spectrum: Array, session: Session, tally: Tally) -> None:
         self.problem, self.by, self.spectrum, self.session, self.tally = problem, by, spectrum, session, tally
         self._part, self._with_spectrum = problem.formulation.parts.stiffness, problem.formulation.with_spectrum
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from sysid.errors import InputError, SolverError
 from sysid.modal_analysis.outliers import HUBER, loss, predicted, whitened
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.search.local import solve
 from sysid.search.modal import Modal, objective_of
 from sysid.search.session import Session, Stop
@@ -22,14 +22,14 @@ _FARTHEST = 64.0  # times a step
 _EXACT = 1e-10  # of the records: predictions that move by less stay, whatever the noise
 
 
-def settled(problem: PreparedProblem, end: Outcome, strategy: Strategy, session: Session) -> Outcome:
+def settled(problem: Prepared, end: Outcome, strategy: Strategy, session: Session) -> Outcome:
     """Where Huber's loss is least, from the answer to the screened records.
 
     The modal strategy fits each round anew; after all others the local phase goes on from the last unknowns.
 
     Parameters
     ----------
-    problem : PreparedProblem
+    problem : Prepared
     end : Outcome
         Of a search in ``problem.screened``.
     strategy : Strategy
@@ -62,7 +62,7 @@ def settled(problem: PreparedProblem, end: Outcome, strategy: Strategy, session:
     return end.with_note(told) if moved < _NEAR else _cut_short(end, told)
 
 
-def check(problem: PreparedProblem, strategy: Strategy) -> None:
+def check(problem: Prepared, strategy: Strategy) -> None:
     """Refuse settings that leave nothing to go on from.
 
     Raises
@@ -74,7 +74,7 @@ def check(problem: PreparedProblem, strategy: Strategy) -> None:
         raise InputError("loss='huber' is fitted by the local phase, and Swarm(local=None) has none")
 
 
-def _with_round(problem: PreparedProblem, end: Outcome, again: Outcome, session: Session) -> Outcome:
+def _with_round(problem: Prepared, end: Outcome, again: Outcome, session: Session) -> Outcome:
     """A round's answer, with all that ran before it in its history; objectives are of the screened records."""
     left = objective_of(problem, again.structure, again.x)
     curve = np.concatenate([end.history.local_curve, again.history.local_curve])
@@ -90,7 +90,7 @@ def _cut_short(end: Outcome, why: str, stopped: BaseException | None = None) -> 
     return replace(end, success=False, message=f"{end.message}; {why}", stopped=stopped)
 
 
-def _fitted(problem: PreparedProblem, end: Outcome, strategy: Strategy, session: Session) -> Outcome:
+def _fitted(problem: Prepared, end: Outcome, strategy: Strategy, session: Session) -> Outcome:
     """The answer to pseudo-values, from the last one."""
     if end.strategy == Modal.name:
         return (strategy if isinstance(strategy, Modal) else Modal()).run(problem, session, None)
@@ -105,7 +105,7 @@ def _fitted(problem: PreparedProblem, end: Outcome, strategy: Strategy, session:
     )  # fmt: skip
 
 
-def _farther(problem: PreparedProblem, before: Outcome, after: Outcome) -> Outcome:
+def _farther(problem: Prepared, before: Outcome, after: Outcome) -> Outcome:
     """The answer, or one farther along its step, as far as the loss falls while steps double.
 
     Where most of what tells an unknown is still far off, each number pulls as little as an outlier.
@@ -138,7 +138,7 @@ def _farther(problem: PreparedProblem, before: Outcome, after: Outcome) -> Outco
     return after
 
 
-def _moved(problem: PreparedProblem, before: Outcome, after: Outcome) -> float:
+def _moved(problem: Prepared, before: Outcome, after: Outcome) -> float:
     """Distance of two answers by what they make of the records, in standard deviations of an unknown; 0 where exact."""
     squares = change = size = 0.0
     fits = zip(problem.fits(before.structure, before.x), problem.fits(after.structure, after.x), strict=True)

@@ -12,7 +12,7 @@ import numpy as np
 
 from sysid.modal_analysis.response import columns
 from sysid.problem.batch import Batch, expanded, in_chunks
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.terms import ExpressionTerm, TestTerm
 from sysid.structure.structure import Array, ComplexArray
 
@@ -30,12 +30,12 @@ class SameResponse:
 
     Parameters
     ----------
-    problem : PreparedProblem
+    problem : Prepared
     x : (size,)
         The answer.
     """
 
-    def __init__(self, problem: PreparedProblem, x: Array) -> None:
+    def __init__(self, problem: Prepared, x: Array) -> None:
         formulation = problem.formulation
         self.terms = [_Response(term, x) for term in formulation.tests]
         further = [term for term in formulation.beside if isinstance(term, ExpressionTerm)]

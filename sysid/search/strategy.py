@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, finite_array
 from sysid.finding import Finding, Severity
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.search.session import Session
 from sysid.structure.structure import Array, Structure
 
@@ -187,10 +187,10 @@ class Strategy(Protocol):
     def name(self) -> str:
         """As ``strategy=`` and results call it."""
 
-    def refusal(self, problem: PreparedProblem, start: ArrayLike | Structure | None) -> str | None:
+    def refusal(self, problem: Prepared, start: ArrayLike | Structure | None) -> str | None:
         """Why "auto" does not take it for a problem; None where it does."""
 
-    def run(self, problem: PreparedProblem, session: Session, start: ArrayLike | Structure | None) -> Outcome:
+    def run(self, problem: Prepared, session: Session, start: ArrayLike | Structure | None) -> Outcome:
         """Search.
 
         Raises
@@ -210,7 +210,7 @@ class NoStrategyError(InputError):
     """No strategy applies to a problem."""
 
 
-def as_unknowns(problem: PreparedProblem, start: ArrayLike | Structure) -> Array:
+def as_unknowns(problem: Prepared, start: ArrayLike | Structure) -> Array:
     """Unknowns of a start that the user gave."""
     if isinstance(start, Structure):
         geometry = problem.geometry

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from sysid.errors import SolverError, choice, flag, instance, number, text, whole_number
 from sysid.modal_analysis.response import error_of_accelerations
 from sysid.nlp import EXACT
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.terms import TestTerm
 from sysid.search import local
 from sysid.search.continuation import descend, smoothed_tests
@@ -143,7 +143,7 @@ class Swarm:
             **{"settings": SwarmSettings(), "local": "cholesky", "name": "hpso-ls", "refine_by": "leaders", **changes}
         )
 
-    def refusal(self, problem: PreparedProblem, start: ArrayLike | Structure | None) -> str | None:
+    def refusal(self, problem: Prepared, start: ArrayLike | Structure | None) -> str | None:
         """Why it cannot search a problem: what healing cannot meet, or more modes than degrees of freedom."""
         mass = problem.formulation.mass
         if mass.weighs or (mass.free and problem.rigid_total is not None):
@@ -160,7 +160,7 @@ class Swarm:
             "one a sensor: narrow the band, or use strategy 'modal'"
         )
 
-    def searched(self, problem: PreparedProblem, session: Session) -> tuple[SwarmObjective, list[tuple[TestTerm, ...]]]:
+    def searched(self, problem: Prepared, session: Session) -> tuple[SwarmObjective, list[tuple[TestTerm, ...]]]:
         """What the swarm minimises, and the tests with widened peaks, if any, through which the local phase goes."""
         formulation = problem.formulation
         smoother = None if formulation.refinable else smoothed_tests(problem, session.preparing)
@@ -169,7 +169,7 @@ class Swarm:
         spectrum = formulation.stiffness.spectrum if self.refine and formulation.refinable else None
         return SwarmObjective(problem, steps[0] if steps else (), spectrum), steps
 
-    def run(self, problem: PreparedProblem, session: Session, start: ArrayLike | Structure | None) -> Outcome:
+    def run(self, problem: Prepared, session: Session, start: ArrayLike | Structure | None) -> Outcome:
         """Search, and again from another swarm while there is no good fit; the best.
 
         Raises
@@ -219,7 +219,7 @@ class Swarm:
 class _Search:
     """One swarm and its local phase: the best so far and its history."""
 
-    def __init__(self, problem: PreparedProblem, options: Swarm, session: Session) -> None:
+    def __init__(self, problem: Prepared, options: Swarm, session: Session) -> None:
         self.problem, self.options, self.session = problem, options, session
         self.x: Array | None = None
         self.tally = Tally()

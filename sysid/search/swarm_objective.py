@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from sysid.problem.batch import Batch, expanded
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.terms import TestTerm
 from sysid.search.held_spectrum_objective import held_spectrum_objective
 from sysid.search.matrix_coordinates import terms_with
@@ -25,7 +25,7 @@ class SwarmObjective:
 
     Parameters
     ----------
-    problem : PreparedProblem
+    problem : Prepared
         Its healing is applied.
     smoothed : sequence of TestTerm
         In the place of the problem's tests, in their order.
@@ -34,9 +34,7 @@ class SwarmObjective:
         closed form).
     """
 
-    def __init__(
-        self, problem: PreparedProblem, smoothed: Sequence[TestTerm] = (), spectrum: Array | None = None
-    ) -> None:
+    def __init__(self, problem: Prepared, smoothed: Sequence[TestTerm] = (), spectrum: Array | None = None) -> None:
         self.problem, self.spectrum = problem, spectrum
         self.terms = terms_with(problem.formulation, smoothed)
         formulation = problem.formulation

@@ -11,7 +11,7 @@ from sysid import LumpedMass, SpectralStiffness, Structure
 from sysid.assessment.uncertainty import uncertainty
 from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.modal_estimate import Gains, ModalEstimate
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 
 
 @pytest.fixture(autouse=True)
@@ -148,7 +148,7 @@ def test_where_damping_is_a_matrix_the_scatter_of_modes_of_whole_records_does_no
             damping=[[c[0], c[1]], [c[1], c[2]]],
         )  # fmt: skip
         at = {"k": 2000.0, "c[0]": 9.0, "c[1]": -2.0, "c[2]": 3.0}
-        prepared = PreparedProblem(problem, [modal])
+        prepared = Prepared(problem, [modal])
         found.append(uncertainty(prepared, truth, np.array([at[label] for label in problem.formulation.labels])))
     plain, beside = found
     assert plain.inflation == pytest.approx(3.0, rel=0.1)

@@ -53,7 +53,7 @@ def test_deviations_are_those_of_least_squares_in_the_base_directions_themselves
     omega, ratios = 2 * np.pi * np.array([3.0, 7.0, 12.0]), np.array([0.01, 0.015, 0.02])
     noise = rng.standard_normal((3, 4, freq.size)) + 1j * rng.standard_normal((3, 4, freq.size))
     records = Records(Measurement(freq, base, noise, rigid_body=np.zeros((4, 2))))
-    found = _fitted(records.prepared, omega, ratios)
+    found = _fitted(records, omega, ratios)
     w = 2 * np.pi * freq
     g = w**2 / (omega[:, None] ** 2 - w**2 + 2j * (ratios * omega)[:, None] * w)
     functions = [np.ones_like(w), 1j * w, w**2, *g, *(1j * w * g)]

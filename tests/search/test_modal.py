@@ -9,7 +9,7 @@ import sysid
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.models.damping import ProportionalDamping
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.search import modal_program
 from sysid.search.modal import degrees_of_freedom
 from sysid.search.session import DeferredInterrupt, Session
@@ -392,7 +392,7 @@ def test_an_estimate_that_did_not_settle_is_no_success(random_structure, settled
         omega=2 * np.pi * truth.natural_frequencies, ratios=truth.damping_ratios, rigid=truth.rigid_body_mass,
         information=1e6 * np.eye(size), settled=settled,
     )  # fmt: skip
-    prepared = PreparedProblem(sysid.Problem(test, mass=sysid.FullMass()), [estimate])
+    prepared = Prepared(sysid.Problem(test, mass=sysid.FullMass()), [estimate])
     with DeferredInterrupt() as interrupt:
         outcome = sysid.Modal().run(prepared, Session([], interrupt), None)
     assert outcome.success is settled

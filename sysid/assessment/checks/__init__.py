@@ -25,7 +25,7 @@ from sysid.assessment.checks.stated_values import missed_values
 from sysid.assessment.checks.wrong_records import wrong_records
 from sysid.errors import refuse
 from sysid.finding import Finding, Severity
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.stated import StatedProblem
 
 CHECKS: tuple[Check, ...] = (
@@ -72,12 +72,12 @@ def check_records(problem: StatedProblem) -> tuple[Finding, ...]:
     InputError
         Where one is blocking, so that a search would be in vain.
     """
-    found = tuple(run(Context(PreparedProblem(problem))))  # of which nothing is prepared that no check asks for
+    found = tuple(run(Context(Prepared(problem))))  # of which nothing is prepared that no check asks for
     refuse(*((one.severity is Severity.BLOCKING, str(one)) for one in found))
     return found
 
 
-def mistakes_of_poor_fit(problem: PreparedProblem, end: Ended) -> tuple[Finding, ...]:
+def mistakes_of_poor_fit(problem: Prepared, end: Ended) -> tuple[Finding, ...]:
     """Sensors that were swapped, where that explains what a search leaves, so that no other would do better."""
     pressed = bounds_explain(problem, end.structure, end.x)  # what they leave may look like swapped sensors
     return exchanged_sensors(problem, end.structure, wholly=pressed)

@@ -17,7 +17,7 @@ from sysid.models.stiffness import FREQUENCY_WINDOW
 from sysid.models.unknowns import scales_of, split
 from sysid.nlp import EXACT
 from sysid.problem.formulation import Formulation
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.problem.slopes import stacked_rows
 from sysid.structure.structure import Array, Structure
 
@@ -65,12 +65,12 @@ def sides_of(lower: Array, upper: Array, values: Array, relative: ArrayLike = Fa
     return np.select([low, high], ["lower", "upper"], "")
 
 
-def on_bounds(problem: PreparedProblem, structure: Structure, x: Array | None) -> list[OnBound]:
+def on_bounds(problem: Prepared, structure: Structure, x: Array | None) -> list[OnBound]:
     """Unknowns that end on bounds which the search kept: those of models, variables, and stated frequencies.
 
     Parameters
     ----------
-    problem : PreparedProblem
+    problem : Prepared
     structure : Structure
         The answer.
     x : (n_variables,) or None
@@ -107,7 +107,7 @@ def _ratios_alone(formulation: Formulation, structure: Structure) -> Array:
     return at
 
 
-def _on_windows(problem: PreparedProblem, structure: Structure) -> Iterator[OnBound]:
+def _on_windows(problem: Prepared, structure: Structure) -> Iterator[OnBound]:
     """Natural frequencies on the edge of what a stated one may be wrong by."""
     stated = problem.formulation.stiffness.spectrum
     given = np.zeros(0) if stated is None else stated
@@ -191,12 +191,12 @@ class Pressure(NamedTuple):
         return self.significant and self.share >= _SHARE
 
 
-def bounds_explain(problem: PreparedProblem, structure: Structure, x: Array | None) -> bool:
+def bounds_explain(problem: Prepared, structure: Structure, x: Array | None) -> bool:
     """Whether bounds on which unknowns end are a cause of the misfit."""
     return pressure(problem, structure, x, on_bounds(problem, structure, x)).explains
 
 
-def pressure(problem: PreparedProblem, structure: Structure, x: Array | None, found: Sequence[OnBound]) -> Pressure:
+def pressure(problem: Prepared, structure: Structure, x: Array | None, found: Sequence[OnBound]) -> Pressure:
     """How much of the misfit unknowns on bounds would take away.
 
     The squared misfit less that of the linear least squares about x: with all unknowns free, over those with the ones
@@ -204,7 +204,7 @@ def pressure(problem: PreparedProblem, structure: Structure, x: Array | None, fo
 
     Parameters
     ----------
-    problem : PreparedProblem
+    problem : Prepared
     structure : Structure
     x : (n_variables,) or None
         The answer.
@@ -232,7 +232,7 @@ def _explained(J: Array, residuals: Array) -> float:
     return float(np.sum((U[:, s > _NONE * s.max(initial=0.0)].T @ residuals) ** 2))
 
 
-def _of_poles(problem: PreparedProblem, structure: Structure, count: int) -> Pressure:
+def _of_poles(problem: Prepared, structure: Structure, count: int) -> Pressure:
     """The same of modes with free shapes, by `count` unknowns on bounds; none where no pole stands out of the data."""
     if not problem.geometry.pole_ratios.size:
         return Pressure(0.0, significant=False)

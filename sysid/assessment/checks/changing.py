@@ -18,7 +18,7 @@ from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.stretches import Stretch, stretches_of
 from sysid.modal_analysis.transients import without_transients_of
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array
 
 _MOVED = 0.1  # half-power widths, by which the frequency of a mode changes at least
@@ -153,12 +153,12 @@ def changing_frequencies(context: Context) -> Iterator[Finding]:
         yield Finding("changes not judged", context.weight, why)
 
 
-def changing(problem: PreparedProblem, severity: Severity = Severity.CONTRADICTS) -> tuple[Finding, ...]:
+def changing(problem: Prepared, severity: Severity = Severity.CONTRADICTS) -> tuple[Finding, ...]:
     """The mode whose frequency changes most between stretches of all records; none where none does.
 
     Parameters
     ----------
-    problem : PreparedProblem
+    problem : Prepared
         Tests that were never fitted are looked at too, where the levels of all are known.
     """
     found = changes(problem)
@@ -176,7 +176,7 @@ def changing(problem: PreparedProblem, severity: Severity = Severity.CONTRADICTS
     return (Finding("changing", severity, sentence, remedy, numbers=numbers),)
 
 
-def changes(problem: PreparedProblem) -> list[Change]:
+def changes(problem: Prepared) -> list[Change]:
     """Modes whose frequencies change between stretches of all records, by more than noise makes of them."""
     if not problem.formulation.fits_records:
         return []

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 from sysid.assessment.checks.noise_multiples import Miss, misses_of
 from sysid.finding import Finding, Severity, contradicting
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, Structure
 
 
@@ -52,7 +52,7 @@ class Context:
 
     Attributes
     ----------
-    problem : PreparedProblem
+    problem : Prepared
         With what its records tell of the modes, which nothing asks before a search.
     outcome : Outcome or None
         None before a search.
@@ -62,7 +62,7 @@ class Context:
         Of the checks before, which may explain what a later one would tell.
     """
 
-    problem: PreparedProblem
+    problem: Prepared
     outcome: Ended | None = None
     cut_short: bool = False
     found: list[Finding] = field(default_factory=list)

@@ -17,7 +17,7 @@ from sysid.finding import Finding, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.poles_of_test import poles_of_test
 from sysid.modal_analysis.residues import linear_residues
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, Structure
 
 _BETTER = 0.3  # of the residual of the records as they are; what they leave with two sensors swapped
@@ -28,12 +28,12 @@ _STEPS = 40
 _FREQUENCY, _DAMPING = 5.0, 0.1  # weights of errors of log w and log zeta; residues are relative to all of them
 
 
-def exchanged_sensors(problem: PreparedProblem, structure: Structure, *, wholly: bool = False) -> tuple[Finding, ...]:
+def exchanged_sensors(problem: Prepared, structure: Structure, *, wholly: bool = False) -> tuple[Finding, ...]:
     """Two sensors that stand in each other's place; none where the model cannot tell.
 
     Parameters
     ----------
-    problem : PreparedProblem
+    problem : Prepared
     structure : Structure
         The best fit to the records as they are.
     wholly : bool
@@ -73,7 +73,7 @@ def _alike(test: Measurement) -> Iterator[tuple[int, int]]:
             yield i, j
 
 
-def _residual_of(problem: PreparedProblem, omega: Array, ratios: Array, pair: tuple[int, int]) -> float:
+def _residual_of(problem: Prepared, omega: Array, ratios: Array, pair: tuple[int, int]) -> float:
     """Relative residual of the records with two sensors exchanged, fitted by poles and residues alone."""
     from scipy.optimize import least_squares
 

@@ -21,7 +21,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.residues import Records, ResidueFit
 from sysid.modal_analysis.response import gain_slopes
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, Structure
 
 _CHANCE = 1e-3  # that any sensor of a right test is accused
@@ -146,7 +146,7 @@ def wrong_gains(test: Measurement, errors: GainErrors) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def assumed(problem: PreparedProblem) -> Iterator[Finding]:
+def assumed(problem: Prepared) -> Iterator[Finding]:
     """Gains on which masses rest and that no record can show to be wrong."""
     test, mass = problem.measurement, problem.formulation.mass
     if mass.entries is not None and np.all(np.isfinite(mass.entries)):
@@ -172,7 +172,7 @@ def assumed_totals(context: Context) -> Iterator[Finding]:
     yield from () if context.outcome is None else taken_at_sensors(context.problem)
 
 
-def taken_at_sensors(problem: PreparedProblem) -> Iterator[Finding]:
+def taken_at_sensors(problem: Prepared) -> Iterator[Finding]:
     """What a stated total of a lumped mass assumes, which accelerations cannot contradict."""
     totals, geometry = problem.formulation.mass.totals, problem.geometry
     if totals is None or totals.kind != "sensors" or problem.measurement.force is not None:  # which contradicts

@@ -13,7 +13,7 @@ from sysid.measurement.in_time import cut_in_motion, quiet_levels
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.outliers import Outlier
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, ComplexArray, Structure
 
 BEYOND = 3.0  # times the noise, from which a model is not within it
@@ -55,14 +55,14 @@ class Record(NamedTuple):
     """Of the noise at each line; None where it is neither stated nor found."""
 
 
-def misses_of(problem: PreparedProblem, structure: Structure, x: Array | None) -> list[Miss]:
+def misses_of(problem: Prepared, structure: Structure, x: Array | None) -> list[Miss]:
     """What the structure misses of accelerations and base force of each test that is fitted.
 
     Records whose noise is neither stated nor to be found are left out; numbers that stand alone are not counted.
 
     Parameters
     ----------
-    problem : PreparedProblem
+    problem : Prepared
     structure : Structure
     x : (n_variables,) or None
         The unknowns that stand for it.
@@ -73,7 +73,7 @@ def misses_of(problem: PreparedProblem, structure: Structure, x: Array | None) -
     return misses
 
 
-def _misses(problem: PreparedProblem, structure: Structure, x: Array | None, alone: list[Outlier]) -> Iterator[Miss]:
+def _misses(problem: Prepared, structure: Structure, x: Array | None, alone: list[Outlier]) -> Iterator[Miss]:
     fits = problem.screened.fits(structure, x)
     for i, (modal, its) in enumerate(fits, start=problem.first_test):
         of, test = "" if len(fits) == 1 else f" of test {i}", modal.records

@@ -15,7 +15,7 @@ from sysid.modal_analysis.residues import Records, force_residual_left
 from sysid.modal_analysis.response import weighed_mass, weighed_mass_std
 from sysid.models.mass import total_of
 from sysid.problem.formulation import Formulation
-from sysid.problem.prepared import PreparedProblem
+from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Structure
 
 ROUND_OFF = 1e-8  # of the records: what counts as noise where there is none
@@ -33,7 +33,7 @@ def stated_masses(context: Context) -> Iterator[Finding]:
     yield from force_misfit(problem.formulation, problem.measurement, structure)
 
 
-def _stated_mass(problem: PreparedProblem, structure: Structure) -> Iterator[Finding]:
+def _stated_mass(problem: Prepared, structure: Structure) -> Iterator[Finding]:
     """What the base force weighs, where a stated mass says otherwise."""
     test, stated = problem.measurement, problem.formulation.mass
     whole = stated.totals is not None or np.all(np.isfinite(problem.known_mass))
@@ -55,7 +55,7 @@ def _stated_mass(problem: PreparedProblem, structure: Structure) -> Iterator[Fin
         )  # fmt: skip
 
 
-def _known_entries(problem: PreparedProblem, structure: Structure) -> Iterator[Finding]:
+def _known_entries(problem: Prepared, structure: Structure) -> Iterator[Finding]:
     """Whether known entries are used, and leave the base what is left of the total."""
     geometry, mass = problem.geometry, problem.formulation.mass
     if not mass.free or mass.entries is None:
@@ -73,7 +73,7 @@ def _known_entries(problem: PreparedProblem, structure: Structure) -> Iterator[F
             yield Finding("known entries", Severity.CONTRADICTS, more)
 
 
-def _lumped_total(problem: PreparedProblem, structure: Structure) -> Iterator[Finding]:
+def _lumped_total(problem: Prepared, structure: Structure) -> Iterator[Finding]:
     """Whether the total of a lumped mass, a sum over the sensors of a direction, is what moves in that direction."""
     totals, geometry = problem.formulation.mass.totals, problem.geometry
     if totals is None or totals.kind != "sensors":
