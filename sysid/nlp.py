@@ -16,8 +16,7 @@ from threadpoolctl import OpenBLASController, register, threadpool_limits
 Array = NDArray[np.floating[Any]]
 
 OBJECTIVE_SCALE = 1e3  # lifts a residual of 1e-8 above IPOPT's tolerance
-EXACT = 1e-8  # a relative residual that needs no second look
-_TOLERANCE = 1e-9  # of IPOPT
+_TOLERANCE = 1e-9  # of IPOPT, of constraints too
 _ENDED = {
     "Solve_Succeeded": "the solver ended as it should",
     "Solved_To_Acceptable_Level": "the solver ended near enough to its optimum",
@@ -25,7 +24,6 @@ _ENDED = {
     "Maximum_WallTime_Exceeded": "the solver ran out of time",
     "Infeasible_Problem_Detected": "the solver found no point that keeps the constraints",
 }
-_ROUND_OFF = 1e-11  # of constraints
 _LOADED = 3.0  # times the seconds of an idle processor that work may take on a machine that does other things too
 _GRACE = 0.4  # s, by which work may end late
 _LATE = "Maximum_WallTime_Exceeded"  # IPOPT's word, which does not count the making of the graphs
@@ -230,7 +228,7 @@ class NonlinearProgram:
         while np.all((at >= lower) & (at <= upper)):
             r, J, c, A = (np.asarray(part) for part in function(at))
             r, c = r.ravel(), c.ravel()
-            over = np.concatenate([below - c, c - above, [_ROUND_OFF]]).max()
+            over = np.concatenate([below - c, c - above, [_TOLERANCE]]).max()
             if not (np.linalg.norm(r) < left / 2 and over <= violated):
                 break
             best, left, violated = at, float(np.linalg.norm(r)), over

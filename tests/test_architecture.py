@@ -28,7 +28,7 @@ CEILINGS = {
     "lines": 41_604,
     # What was counted when these counts began; the modes once, in the open, brings them down.
     "branches": 78.8,
-    "files": 254,
+    "files": 255,
     "main": 241,
     "modal": 67,
     "fits": 36,

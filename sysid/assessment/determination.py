@@ -27,14 +27,13 @@ from sysid.assessment.uncertainty import LARGE, uncertainty
 from sysid.errors import InputError
 from sysid.finding import Finding, Severity, cautions
 from sysid.models.unknowns import scales_of, split
-from sysid.nlp import EXACT
 from sysid.problem.formulation import Formulation
 from sysid.problem.problem import Problem
 from sysid.problem.slopes import Slopes, slopes_of
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import EXACT, NEGLIGIBLE
 
 _LOOSE = 1e-2  # of an unknown, by which what is left of exact records may move it
-_MOVED = 1e-6  # of the root of two diagonals, by which an unseen step of order one must change an entry to count
 _OTHER = 1e-3  # of an unknown, or of the root of two diagonals: what differs by less is the same
 _BEYOND = 5.0  # standard deviations by which an entry of another structure must differ: noise hardly moves one so far
 _TOLD = 4  # unknowns of another answer, told
@@ -218,7 +217,7 @@ def _by_name(formulation: Formulation, directions: Array) -> tuple[Array, Array]
     """The same space (size, count) by directions of unknowns that mean something by themselves, and the others."""
     without = directions[~meaningful(formulation)]
     lam, turn = np.linalg.eigh(without.T @ without)
-    return directions @ turn[:, lam < _MOVED**2], directions @ turn[:, lam >= _MOVED**2]
+    return directions @ turn[:, lam < NEGLIGIBLE**2], directions @ turn[:, lam >= NEGLIGIBLE**2]
 
 
 def _moving(pairs: list[tuple[Array, Array]], unit: Array, directions: Array) -> Array:
@@ -229,14 +228,14 @@ def _moving(pairs: list[tuple[Array, Array]], unit: Array, directions: Array) ->
         for matrix, slope in pairs
     ]
     lam, turn = np.linalg.eigh(sum(change.T @ change for change in moved))
-    return directions @ turn[:, lam >= _MOVED**2]
+    return directions @ turn[:, lam >= NEGLIGIBLE**2]
 
 
 def _factors_in_words(formulation: Formulation, directions: Array) -> Iterator[str]:
     """Directions that move entries of factors or shares, which nobody gave: what takes part, and how many there are."""
     count = directions.shape[1]
     if count:
-        moved = split(formulation.unknowns, np.abs(directions).max(axis=1) > _MOVED)
+        moved = split(formulation.unknowns, np.abs(directions).max(axis=1) > NEGLIGIBLE)
         titles = [unknown.title for unknown, part in zip(formulation.unknowns, moved, strict=True) if np.any(part)]
         yield f"{', '.join(titles)} together, in {count} {'way' if count == 1 else 'ways'}"
 
@@ -250,14 +249,14 @@ def _scale_is_open(pairs: list[tuple[Array, Array]], known: Sensitivity) -> bool
         (slope @ steps).reshape(-1, steps.shape[1]) / size for (_, slope), size in zip(pairs, sizes, strict=True)
     ])  # fmt: skip
     left = common - moved @ np.linalg.lstsq(moved, common)[0]
-    return bool(np.linalg.norm(left) < _MOVED * np.linalg.norm(common))
+    return bool(np.linalg.norm(left) < NEGLIGIBLE * np.linalg.norm(common))
 
 
 def _open_entries(matrix: Array, slope: Array, known: Sensitivity) -> Array:
     """Which entries (n, n) of a matrix something unseen moves."""
     size = np.sqrt(np.abs(np.diag(matrix)))
     moved = np.abs(slope @ (known.unit[:, None] * known.unseen)).max(axis=-1, initial=0.0)
-    return moved > _MOVED * np.outer(size, size)
+    return moved > NEGLIGIBLE * np.outer(size, size)
 
 
 # -- of what else was found, and of variables beside ---------------------------------------------

@@ -21,10 +21,10 @@ from sysid.jobs.job import JobResult
 from sysid.jobs.ledger import FILE_NAME as LEDGER
 from sysid.jobs.minima import Minimum, as_good, distinct
 from sysid.jobs.submit import submit
-from sysid.nlp import EXACT
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification, Recipe, load
 from sysid.results.summary import counted
+from sysid.structure.thresholds import EXACT
 
 _SHOWN = 12  # minima in the table
 _STARTS = 16

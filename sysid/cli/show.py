@@ -28,15 +28,13 @@ from sysid.problem.slopes import Slopes, slopes_of
 from sysid.problem.terms import FurtherTest
 from sysid.results.summary import counted
 from sysid.structure.structure import Array, ComplexArray, Structure
+from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF
 
 _WIDTH = 120
 _NOISE = 0.01  # of a record's rms, where no noise is stated
 _SHORTEST = 3  # null directions that are told in full where there are more
 _TRIED = 20  # points of the search space looked at for one that makes a structure
-_SAME = 1e-6  # of the root of two diagonals: matrices that differ by less are the same
 _ROOM = 1e-3  # of a constraint's scale, by which the point stays clear of inequalities
-_HELD = 1e-9  # of it, to which the point keeps equalities
-_TOUCHED = 1e-6  # of its unit, by which an unseen step of order one moves an unknown that it leaves open
 
 
 def show(problem: Problem, name: str) -> str:
@@ -82,7 +80,7 @@ def figures(problem: Problem, name: str) -> dict[str, Any]:
         "unknowns": problem.n_variables,
         "variables": [
             {"name": v.title, "unit": v.unit, "lower": np.min(v.lower), "upper": np.max(v.upper),
-             "values": point.x[part].tolist(), "unseen": bool(np.any(np.abs(known.unseen[part]) > _TOUCHED))}
+             "values": point.x[part].tolist(), "unseen": bool(np.any(np.abs(known.unseen[part]) > NEGLIGIBLE))}
             for v, part in members
         ],
         "point": point.where,
@@ -208,7 +206,7 @@ def _feasible(problem: Problem, x: Array, where: str) -> tuple[Array, str]:
     lower, upper = constraints.lower / scale, constraints.upper / scale
     room = np.where(constraints.equal, 0.0, _ROOM)
     at = constraints.at(x) / scale
-    if np.all((at <= upper - np.where(constraints.equal, -_HELD, _ROOM)) & (at >= lower - _HELD)):
+    if np.all((at <= upper - np.where(constraints.equal, -ROUND_OFF, _ROOM)) & (at >= lower - ROUND_OFF)):
         return x, where
     unit = scales_of(problem.variables, x)
     t = ca.MX.sym("t", x.size)
@@ -250,7 +248,7 @@ def _at_reference(problem: Problem) -> _Point | None:
 
 def _differ(a: Structure, b: Structure) -> bool:
     pairs = ((a.mass, b.mass), (a.stiffness, b.stiffness), (a.damping, b.damping))
-    return any(np.any(np.abs(A - B) > _SAME * (_sizes(A) + np.abs(A).max() * _SAME)) for A, B in pairs)
+    return any(np.any(np.abs(A - B) > NEGLIGIBLE * (_sizes(A) + np.abs(A).max() * NEGLIGIBLE)) for A, B in pairs)
 
 
 def _sizes(matrix: Array) -> Array:
@@ -308,7 +306,7 @@ def _values(problem: Problem, point: _Point, moves: Array, noise: str) -> Iterat
     """A line a variable: the largest error of its entries stands for all."""
     known, x = point.known, point.x
     std = np.linalg.norm(moves, axis=1)
-    open_ = np.linalg.norm(known.unseen, axis=1) > _TOUCHED
+    open_ = np.linalg.norm(known.unseen, axis=1) > NEGLIGIBLE
     relative = std / np.where(np.abs(x) > 1e-3 * known.unit, np.abs(x), np.nan)
     rows = [["variable", "value", "unit of IPOPT", f"standard deviation at {noise}"]]
     for v, part in zip(problem.variables, slices_of(problem.variables), strict=True):
@@ -373,8 +371,8 @@ def _moved_matrices(point: _Point) -> tuple[int, int]:
     rigid = np.sqrt(np.abs(np.diag(s.structure.rigid_body_mass)))
     push = moved(s.d_push, np.sqrt(np.diag(M))[:, None] * rigid)
     base = np.concatenate([push, moved(s.d_rigid, np.outer(rigid, rigid))])
-    rank = int(np.linalg.matrix_rank(own, tol=_SAME))
-    return rank, int(np.linalg.matrix_rank(np.concatenate([own, base]), tol=_SAME)) - rank
+    rank = int(np.linalg.matrix_rank(own, tol=NEGLIGIBLE))
+    return rank, int(np.linalg.matrix_rank(np.concatenate([own, base]), tol=NEGLIGIBLE)) - rank
 
 
 def _seen_least(problem: Problem, point: _Point, moves: Array, noise: str) -> str:

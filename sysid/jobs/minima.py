@@ -9,13 +9,12 @@ import numpy as np
 
 from sysid.assessment.sensitivity import meaningful
 from sysid.jobs.job import JobResult
-from sysid.nlp import EXACT
 from sysid.problem.problem import Problem
 from sysid.search.continuation import apart
 from sysid.structure.structure import Structure
+from sysid.structure.thresholds import EXACT, NEGLIGIBLE
 
 _ONE = 1e-3  # of an unknown's or a matrix's size: ends nearer to each other are one minimum
-_ROUND_OFF = 1e-6  # relative difference of residuals of one minimum that says nothing
 _ALIKE = 1e-3  # relative difference of residuals up to which minima fit alike
 
 
@@ -34,7 +33,7 @@ class Minimum:
     @property
     def best(self) -> JobResult:
         """The end with the least residual; among those that differ by round-off the first by index."""
-        least = max((1 + _ROUND_OFF) * min(result.residual for result in self.results), EXACT)
+        least = max((1 + NEGLIGIBLE) * min(result.residual for result in self.results), EXACT)
         return next(result for result in self.results if result.residual <= least)
 
     @property

@@ -14,9 +14,9 @@ from sysid.jobs.quantities import FREQUENCY, RATIO, label, labelled, quantities
 from sysid.measurement.noise import raised
 from sysid.modal_analysis import outliers
 from sysid.modal_analysis.residues import unit_columns
-from sysid.nlp import EXACT
 from sysid.results.identification import Identification
 from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import EXACT
 
 _LEAST = 0.01  # least variance of a step, as a share of the part's own
 _SAME = 0.1  # relative distance of frequencies up to which a mode is looked for

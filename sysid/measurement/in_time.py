@@ -11,9 +11,9 @@ import scipy
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels, WholeRecords
 from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import NEGLIGIBLE
 
 _SAMPLES = 2.5  # a period of the highest line, where the sample rate is not known
-_EVEN = 1e-6  # of the highest line, by which lines are off multiples of their distance at most
 _BLOCKS = 32  # of a run, of which the quietest tell its noise ..
 _LINES = 32  # .. with so many lines to a block at least
 _QUIET = 0.1
@@ -114,7 +114,9 @@ def as_whole(test: Measurement) -> Measurement:
         return test
     freq = [test.freq[lines] for lines in own]
     spacing = np.array([float(np.min(np.diff(lines))) for lines in freq])
-    if any(np.max(np.abs(f / df - np.round(f / df))) > _EVEN * f[-1] / df for f, df in zip(freq, spacing, strict=True)):
+    if any(
+        np.max(np.abs(f / df - np.round(f / df))) > NEGLIGIBLE * f[-1] / df for f, df in zip(freq, spacing, strict=True)
+    ):
         return test
     if test.sample_rate is None:
         n = int(scipy.fft.next_fast_len(int(np.ceil(_SAMPLES * test.freq[-1] / spacing[0]))))

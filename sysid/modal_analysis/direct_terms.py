@@ -20,6 +20,7 @@ from sysid.modal_analysis.residues import Records, beyond_chance, unit_columns
 from sysid.modal_analysis.vector_fitting import RAZOR
 from sysid.nlp import one_thread
 from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import ROUND_OFF
 
 _SPARE, _MOST = 6, 40  # poles beyond one a sensor; all of them
 _CHANNELS = 12  # principal ones, by which the poles are looked for
@@ -28,8 +29,6 @@ _STEPS = 8
 _GUESS = 0.01  # damping ratio
 _MODE = 0.3  # largest damping ratio of a pole that is kept; what has more answers like a term without poles
 _OUTSIDE = 1.5  # times the last line, up to where poles are kept; what lies below the first shows by its tail
-_ROUND_OFF = 1e-9  # of the records: what counts as noise where there is none
-_DEPENDENT = 1e-11  # of the largest singular value of the functions
 _FAR = 6.0  # medians of the errors of a channel, from which a line holds a spike
 _SCREENINGS = 3  # times that lines with spikes are left out
 _FEW = 0.25  # of the lines
@@ -162,15 +161,15 @@ def _fitted(records: Records, omega: Array, ratios: Array) -> _Fit:
     Q, R = np.linalg.qr(functions)
     answered = Q.T @ records.data
     left = records.data - Q @ answered
-    inverse = np.linalg.pinv(R, rcond=_DEPENDENT) / size[:, None]
+    inverse = np.linalg.pinv(R, rcond=ROUND_OFF) / size[:, None]
     beta, known = inverse @ answered, direct.shape[1]
     freedom = max(len(left) - functions.shape[1], 1)
-    level = np.maximum(np.linalg.norm(left, axis=0), _ROUND_OFF * np.linalg.norm(records.data, axis=0))
+    level = np.maximum(np.linalg.norm(left, axis=0), ROUND_OFF * np.linalg.norm(records.data, axis=0))
     tail = records.basis((records.freq[0] / records.freq)[None] ** 2 + 0j, records.driven)
     beyond = np.linalg.qr(tail - Q @ (Q.T @ tail))[0]
-    noise = records.noise(left, functions.shape[1] * left.shape[1], least=_ROUND_OFF)
+    noise = records.noise(left, functions.shape[1] * left.shape[1])
     gained = float(np.sum((beyond.T @ left) ** 2))
-    shared = noise / records.variance(float(np.sum(left**2)), functions.shape[1] * left.shape[1], least=_ROUND_OFF)
+    shared = noise / records.variance(float(np.sum(left**2)), functions.shape[1] * left.shape[1])
     turn = np.array([1.0, 1 / (2 * np.pi * records.freq[-1])])[:, None, None]
     of_terms = lambda x: x.reshape(3, records.driven, -1)[:2]  # noqa: E731
     of_modes = beta[known:].reshape(omega.size, -1, beta.shape[1])[:, : records.driven]
@@ -188,7 +187,7 @@ def _spikes(records: Records, left: Array) -> NDArray[np.bool_]:
     """Lines (n_freq,) at which a fit leaves a number far off those of its run; none where these are many."""
     size = np.hypot(*left.reshape(2, -1, left.shape[1]))
     level = np.stack([np.median(size[records.run == run], axis=0) for run in range(len(records.blocks))])
-    level = np.maximum(level, _ROUND_OFF * np.sqrt(records.size / records.data.size))
+    level = np.maximum(level, ROUND_OFF * np.sqrt(records.size / records.data.size))
     far = records.largest(np.any(size > _FAR * level[records.run], axis=1)) > 0
     return far if np.count_nonzero(far) < _FEW * far.size else np.zeros_like(far)
 

@@ -11,8 +11,8 @@ from sysid.measurement.whole import ModalEstimate
 from sysid.modal_analysis.modal_fit import Index, Modes
 from sysid.modal_analysis.response import columns, gains, weights_of
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import round_off
 
-_UNSEEN = 1e-12  # of the largest eigenvalue of the scaled information: round-off
 _STEPS = 200
 _BELOW = 1e-3  # of the rigid-body mass; the least remainder to begin with, as a factor of zero has no slope
 
@@ -39,7 +39,7 @@ def factor_of(estimate: ModalEstimate) -> Array:
     size = np.sqrt(np.maximum(np.diag(A), 0.0))
     seen = size > 0
     lam, V = np.linalg.eigh(A[np.ix_(seen, seen)] / np.outer(size[seen], size[seen]))
-    known = lam > _UNSEEN * lam[-1]
+    known = lam > round_off(len(A)) * lam[-1]
     factor = np.zeros((int(known.sum()), size.size))
     factor[:, seen] = (V[:, known] * np.sqrt(lam[known])).T * size[seen]
     return factor
@@ -138,7 +138,7 @@ def above_modes(estimate: ModalEstimate) -> tuple[Modes, Array]:
     mass = np.concatenate([np.arange(index.gamma.start, index.gamma.stop), index.rigid])
     others = np.setdiff1d(np.arange(index.size), mass)
     A = estimate.information
-    inverse = np.linalg.pinv(A[np.ix_(others, others)], rcond=_UNSEEN, hermitian=True)
+    inverse = np.linalg.pinv(A[np.ix_(others, others)], rcond=round_off(len(A)), hermitian=True)
     follow = -inverse @ A[np.ix_(others, mass)]
     unit = np.concatenate([np.tile(size, len(modes.gamma)), [size[i] * size[j] for i, j in index.pairs]])
     inner = (A[np.ix_(mass, mass)] + A[np.ix_(mass, others)] @ follow) * np.outer(unit, unit)

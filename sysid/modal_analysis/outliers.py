@@ -47,6 +47,7 @@ from sysid.modal_analysis.residues import Records, beyond_chance
 from sysid.modal_analysis.response import gains
 from sysid.modal_analysis.vector_fitting import Monitor, poles_from, poles_of_any_damping
 from sysid.structure.structure import Array, ComplexArray, Structure
+from sysid.structure.thresholds import ROUND_OFF
 
 HUBER = "Huber's loss"  # the phase of its rounds
 TUNING = 1.06147  # c, in units of sqrt(E|e|²): 95 % efficient where the noise is normal
@@ -56,7 +57,6 @@ _CERTAIN = 10.0  # the same, where noise that differs from line to line must not
 _ONE_LINE = 4.0  # times its next line, that a pole's highest one may reach without being doubted
 _ONE_CHANNEL = 0.9  # of the power at that line, in one channel: no motion of a structure
 _NARROW = 0.5  # of the distance of lines; poles of less half-width show at one line too
-_FLOOR = 1e-9  # of a record's rms: what counts as noise where there is none
 _SUSPECT = 1.2  # times the variance that is stated, up to which the noise may be as stated
 _MEDIAN = 0.4549  # of the square of a standard normal number
 _LEAST_LINES = 5  # with fewer, no number has neighbours enough
@@ -119,7 +119,7 @@ def whitened(test: Measurement, made: Sequence[ComplexArray], unknowns: int) -> 
     left = max(1 - unknowns / (2 * test.numbers), 0.5)
     squares, stds = [], []
     for record, misfit, stated in found:
-        least = _FLOOR * float(np.sqrt(np.mean(np.abs(of_own(record)) ** 2)))
+        least = ROUND_OFF * float(np.sqrt(np.mean(np.abs(of_own(record)) ** 2)))
         robust = np.sqrt(np.median(np.abs(of_own(misfit)) ** 2) / np.log(2) / left) if stated is None else stated
         stds.append(np.broadcast_to(np.maximum(robust, least), record.shape))
         if stated is not None:

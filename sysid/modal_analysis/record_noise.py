@@ -14,10 +14,10 @@ import numpy as np
 from sysid.modal_analysis.record_colour import designs
 from sysid.modal_analysis.record_model import Parameters, RecordModel
 from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import NEGLIGIBLE
 
 _ENOUGH = 8000  # lines, of all runs together: more of them tell a level no better than the fit needs
 _STEPS = 30
-_VAGUE = 1e-6  # information on a logarithm that counts as none
 _SETTLED = 1e-4  # of a level's logarithm
 VANISHING = 1e-5  # of a channel's rms: least noise; what the model leaves of folding can show below it
 NO_NOISE = 2 * VANISHING  # levels at the least, which the fit's own numbers raise a little, are no noise
@@ -65,7 +65,7 @@ def level_deviations(model: RecordModel, p: Parameters, levels: Array) -> Array:
         rows, every = list(D), np.concatenate(list(D.values()))
         x = np.linalg.lstsq(every, np.log(levels[rows]).ravel(), rcond=None)[0]
         fisher = _likelihood([part for part in parts if part.piece in D], D, x)[2]
-        inverse = np.linalg.inv(fisher + _VAGUE * np.eye(x.size))
+        inverse = np.linalg.inv(fisher + NEGLIGIBLE * np.eye(x.size))
         mean = np.mean(list(D.values()), axis=0)
         out.append(np.sqrt(np.einsum("ci,ij,cj->c", mean, inverse, mean)) / 2)
     return np.array(out)

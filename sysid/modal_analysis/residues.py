@@ -14,13 +14,11 @@ from sysid.measurement.measurement import Measurement
 from sysid.measurement.noise import separable
 from sysid.modal_analysis.response import columns, gains, gains_with_velocity, stacked
 from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF
 
 _DEVIATIONS = 12.0  # of the chi-squared law, by which a squared error must fall to mean something
-ROUND_OFF = 1e-11  # of the records: what counts as noise where there is none
-_LARGE = 1e-6  # of the squared records: a squared error so large follows to ten digits as the difference of two squares
 _LAGS = range(4)  # distances of lines that may share their noise; none: their power
 _CHANCE = 3e-7  # that white noise is taken for noise that neighbouring lines share
-_DEPENDENT = 1e-9  # of the largest singular value of the base records
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +77,7 @@ class ResidueFit:
     @property
     def _is_large(self) -> bool:
         """Whether round-off in differences of squares does not matter to what is left, which need not be formed."""
-        return self._difference > _LARGE * self.size
+        return self._difference > NEGLIGIBLE * self.size
 
     @property
     def gain(self) -> Array:
@@ -394,7 +392,7 @@ def independent(base: ComplexArray) -> Array:
     """
     flat, size = unit_columns(stacked(columns(base)))
     left, s, _ = np.linalg.svd(flat.T, full_matrices=False)
-    return left[:, s > _DEPENDENT * s[0]] / size[:, None]
+    return left[:, s > ROUND_OFF * s[0]] / size[:, None]
 
 
 def independent_inputs(test: Measurement) -> tuple[Array, int]:

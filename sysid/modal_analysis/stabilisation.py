@@ -31,7 +31,6 @@ _MOST_MODES = 100  # the highest order by default
 _MOST_ORDERS = 40  # rows of the diagram: where there would be more, each is further from the next
 _GAP = 0.1  # of the half circle, free at either end: a polynomial fits a smooth function badly up to where it wraps
 _WIDER = 5  # powers by which numerators reach beyond the denominator at either end: all that modes outside the band add
-_ROUND_OFF = 1e-14
 _SPANNED = 1e-4  # least singular value of the base's motion against its largest: less makes no FRF
 
 
@@ -213,7 +212,7 @@ def _poles(system: Array, d: int) -> tuple[ComplexArray, Array]:
     Participations are turned to be as real as can be. With the lowest coefficient fixed to the identity, poles that
     fit noise come out unstable (|z| > 1) and can be recognised.
     """
-    A = np.linalg.lstsq(system[:, d:], -system[:, :d], rcond=_ROUND_OFF)[0].reshape(-1, d, d)
+    A = np.linalg.lstsq(system[:, d:], -system[:, :d], rcond=None)[0].reshape(-1, d, d)
     size = d * len(A)
     # The reversed polynomial y^p + A_1 y^(p-1) + ..., y = 1/z, transposed: its vectors are the rows u with u A(z) = 0.
     companion = np.eye(size, k=-d)
@@ -238,7 +237,7 @@ def _shapes(freq: Array, H: ComplexArray, frequency: Array, ratio: Array, partic
         design[j, :, m + j] = 1.0
         design[j, :, m + d + j] = (freq / freq[-1]) ** 2
     basis, _ = unit_columns(stacked(design.reshape(d * freq.size, -1).T))
-    answer: Array = np.linalg.lstsq(basis, stacked(H.reshape(len(H), -1)), rcond=_ROUND_OFF)[0][:m]
+    answer: Array = np.linalg.lstsq(basis, stacked(H.reshape(len(H), -1)), rcond=None)[0][:m]
     return answer.T
 
 

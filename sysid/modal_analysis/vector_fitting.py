@@ -17,17 +17,16 @@ import numpy as np
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.relocation import relocate
-from sysid.modal_analysis.residues import ROUND_OFF, Records, ResidueFit, SubsetFits, beyond_chance
+from sysid.modal_analysis.residues import Records, ResidueFit, SubsetFits, beyond_chance
 from sysid.modal_analysis.response import gain_slopes, gains
 from sysid.nlp import one_thread
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF, round_off
 
 _SPARE = 6  # poles beyond those expected: without spare ones noise moves true poles
 _MANY = 100  # sensors: more of them are not taken to show a mode each unless the channels do
 _RELOCATIONS = 6
 _STEPS = 100
-_SETTLED = 1e-6  # fall of the squared error, relative, at which poles are polished: far below what noise moves it by
-_EXACT = 1e-13  # relative residual that no further step betters
 _FAR = 100.0  # times the error that may be, from which moving other poles too does not save a pole less
 _GUESS = 0.01  # damping ratio to begin with
 RAZOR = 0.02  # of the distance of lines; half the width of a peak that answers for one bad line, not for a mode
@@ -215,7 +214,7 @@ def _relocated(records: Records, count: int, progress: _Progress) -> tuple[Array
         omega, ratios = relocate(records, channels, omega, ratios, progress.tell)
         before, error = error, records.fit(omega, ratios).squared_error
         progress.step(error)
-        if error < _EXACT**2 * records.size or error > 0.97 * before:
+        if error < round_off(omega.size) ** 2 * records.size or error > 0.97 * before:
             break
     # A pole of a structure with other than classical damping needs its velocity too, or more poles would replace it.
     return _prune(records, omega, ratios, progress, velocity=True)
@@ -357,14 +356,14 @@ def _polish(
     error, H, slope = _projected(records, p, velocity)
     for _ in range(_STEPS):
         progress.step(error)
-        if error < _EXACT**2 * records.size:
+        if error < round_off(omega.size) ** 2 * records.size:
             break
         step = np.linalg.solve(H + damping * np.diag(np.diag(H)), slope)
         trial = p + np.clip(step, -0.5, 0.5)
         trial[m:] = np.clip(trial[m:], np.log(1e-6), np.log(0.99))
         lower, *model = _projected(records, trial, velocity)
         if lower < error:
-            done = error - lower < _SETTLED * error
+            done = error - lower < NEGLIGIBLE * error
             p, error, (H, slope), damping = trial, lower, model, max(damping / 10, 1e-12)
             if done:
                 break

@@ -16,10 +16,10 @@ from sysid.models.geometry import FACTOR_FLOOR, Geometry, check_sane, check_tota
 from sysid.models.model import FactoredMass, MassBlocks, Stated, Totals, Written, constant
 from sysid.models.unknowns import Unknown
 from sysid.structure.structure import Array, Structure, lowest_eigenvalue
+from sysid.structure.thresholds import ROUND_OFF
 from sysid.structure.triangular import lower_triangle, triangle_entries
 
 _ROW_EXPECTATION = 1.0  # the paper's c
-_ROUND_OFF = 1e-12  # of the largest entry of G: a matrix that was solved for has no exact zeros
 _NEWTON_STEPS = 20  # for the coupled scales of the rigid-body healing; quadratic from a good start
 
 
@@ -384,7 +384,7 @@ def _rigid_parts(geometry: Geometry) -> tuple[Array, bool]:
     rigid = np.vstack([geometry.rigid_body, np.eye(d)])
     shares = np.where(groups < 0, 1 / d, groups == np.arange(d)[:, None])
     across = np.where(groups != np.arange(d)[:, None], rigid.T, 0.0)
-    return shares * rigid.T[:, None], bool(np.abs(across).max() > _ROUND_OFF * np.abs(rigid).max())
+    return shares * rigid.T[:, None], bool(np.abs(across).max() > ROUND_OFF * np.abs(rigid).max())
 
 
 def _rigid_body_scales(factor: ca.SX, geometry: Geometry, totals: ca.SX | Array) -> list[ca.SX]:

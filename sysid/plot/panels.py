@@ -25,6 +25,7 @@ from sysid.plot.canvas import (
 from sysid.results.identification import Identification
 from sysid.results.summary import DEVIATES
 from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import ROUND_OFF
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,7 +39,6 @@ _OUTLIER: dict[str, Any] = {
     "zorder": 4,
 }  # fmt: skip
 _VISIBLE = 2e-3  # of the magnitude: a narrower band hides behind the curve
-_ROUND_OFF = 1e-10  # of the largest channel: below it a response is arithmetic, not motion
 _COLUMNS = 3
 _WIDTHS = {2: 11.2, 3: 12.0}  # of a figure, in, by the number of columns
 _DENSE = 800  # lines beyond which curves are drawn thinner
@@ -127,7 +127,7 @@ def _channel(
     """A channel of which `words` name the record, what it is for unit runs, and what it is for others."""
     name, per_base, spectrum = words
     title = f"{name}, {run_names(test)[run]}"
-    negligible = bool(np.abs(measured).max() <= _ROUND_OFF * largest)
+    negligible = bool(np.abs(measured).max() <= ROUND_OFF * largest)
     if test.has_unit_runs:
         ones = np.ones_like(measured)
         return Channel(

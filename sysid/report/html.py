@@ -12,13 +12,13 @@ import numpy as np
 
 from sysid.errors import shown_plainly
 from sysid.plot.canvas import to_png
+from sysid.structure.thresholds import ROUND_OFF
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from sysid.structure.structure import Array
 
-ROUND_OFF = 1e-12
 _WIDE = 11  # columns beyond which a table is printed smaller
 _BLOCK = 10  # columns of a matrix that stand beside each other, on paper too
 

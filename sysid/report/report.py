@@ -26,7 +26,7 @@ from sysid.report.html import (
     table,
     text,
 )
-from sysid.report.matrices import CHOSEN, ONE_OF_MANY, SAME, Lines, half_widths, matrices, plain, stated
+from sysid.report.matrices import CHOSEN, ONE_OF_MANY, Lines, half_widths, matrices, plain, stated
 from sysid.report.noise_level import NoiseLevel, noise_level, share_of_noise
 from sysid.report.opening import opening, rounded, trust
 from sysid.results.gain_table import gains_of_sensors
@@ -49,6 +49,7 @@ from sysid.results.summary import (
 from sysid.results.unknowns_table import rows_of, stated_values
 from sysid.results.version import __version__
 from sysid.structure.structure import Array, ComplexArray, Structure
+from sysid.structure.thresholds import ROUND_OFF
 
 FILE_NAME = "report.html"
 _SUFFIXES = (".html", ".htm")
@@ -483,4 +484,4 @@ def _difference(value: float, reference: float) -> str:
     if not reference:
         return "–"
     share = value / reference - 1
-    return f"{100 * share:+.2g}" if abs(share) > SAME else "0"
+    return f"{100 * share:+.2g}" if abs(share) > ROUND_OFF else "0"

@@ -22,11 +22,11 @@ from sysid.search.modal_scaling import to_stated_totals
 from sysid.search.session import Session
 from sysid.search.strategy import Outcome
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import EXACT
 
 _CHANCE = 1e-3  # that statements that are right are called contradictory
 _ALIKE = 2.0  # deviations, by which statements that explain it as well as the best are told
 _TOLD = 4
-_ROUND_OFF = 1e-8  # of the records: what counts as noise where there is none
 
 
 def with_stated_masses(problem: Problem, end: Outcome, session: Session) -> Outcome:
@@ -47,7 +47,7 @@ def _adjusted(problem: Problem, end: Outcome) -> Outcome:
     assert stated is not None
     modes, index, _, normals, *_ = moves_by_records(problem, first)
     if problem.measurement.response_std is None:
-        least = _ROUND_OFF / max(problem.measurement.residual(first), np.finfo(float).eps)
+        least = EXACT / max(problem.measurement.residual(first), np.finfo(float).eps)
         normals = normals * max(1.0, least)
     theta = theta_of(modes, first.rigid_body_mass, index)
     best = adjust(problem, stated, theta, index, normals)

@@ -18,6 +18,7 @@ from sysid.results.noise_table import NOISE_COLUMNS, noise_of_channels
 from sysid.results.phases import COLUMNS, seconds_in_words
 from sysid.results.unknowns_table import MANY, rows_of, stated_values
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import ROUND_OFF
 
 _SCALE = (
     "one number in kg is enough: state the mass of what the sensors stand for (sysid run test.h5 --lumped --mass KG; "
@@ -35,7 +36,6 @@ JUDGEMENTS: dict[Judgement, str] = {  # as screen, page and files write them
 }  # fmt: skip
 _AS_STATED = ". No force was measured: they are as right as the mass or stiffness that is stated"
 DEVIATES = 1.96  # standard deviations on either side of 95 % of a normal law
-_ROUND_OFF = 1e-10  # of a value: what is no noise of an instrument
 _WIDTH = 120
 _FIRST = 2  # sentences beside the verdict; the others follow the tables
 _NEAR = 0.5  # relative residual, up to which a fit may be called near enough
@@ -203,7 +203,7 @@ def half_width(std: float, value: float) -> str:
     """Half of the 95 % interval about `value`; "open" where it is not known, 0 where it is round-off."""
     if not np.isfinite(std):
         return "open"
-    return f"{DEVIATES * std:.2g}" if std > _ROUND_OFF * abs(value) else "0"
+    return f"{DEVIATES * std:.2g}" if std > ROUND_OFF * abs(value) else "0"
 
 
 def known_half_width(std: float, value: float, sign: str) -> str:

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, SolverError, whole_number
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
-from sysid.nlp import EXACT
 from sysid.problem.feasibility import latin_hypercube
 from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
@@ -21,6 +20,7 @@ from sysid.search.local import Coordinates, LocalResult
 from sysid.search.session import Session, Stop
 from sysid.search.strategy import History, Outcome, Phase, as_unknowns, search_note
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import EXACT
 
 SHIFTS = (0.5, 0.2, 0.08, 0.03, 0.01)  # of the geometric mean of the natural frequencies
 _DRAWN = 20  # points looked at for each that is a structure

@@ -25,13 +25,11 @@ from sysid.problem.batch_modes import BatchModes, batch_modes
 from sysid.problem.problem import Problem
 from sysid.problem.terms import Term, TestTerm
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import NEGLIGIBLE
 
 _MOST = 65_000  # coordinates a chunk: fewer take more calls of NumPy for each, and more leave a processor's cache
 _STEP = 16  # the last chunk is filled up to a multiple of it, because NumPy sums a candidate alone in another order
 _MOST_THREADS = 8
-# Relative squared error below which lines are summed: the difference of large numbers that stands for it has lost
-# half of its digits at 1e-12.
-_LEAST = 1e-6
 _DRAWS = 254  # candidates beside the corners of the box, from which the range of damping ratios is read
 _NARROWEST_RANGE, _WIDEST_RANGE = 1.01, 1e4  # of a ratio, upper over lower: the series of a wider one would be long
 
@@ -96,8 +94,9 @@ class HeldSpectrumObjective:
             summed = SummedRecord(record, test.base, *weights, seen, self._series, static=bool(self._records))
             self._records.append((summed, scale**2))
             sizes.append((weights_of(record, std)[1], scale))
-        # A record that weighs more than the accelerations loses its digits earlier.
-        self._least = _LEAST * max(1.0, *(weighed**2 / scale**2 for weighed, scale in sizes))
+        # Where less than this is left, lines are summed: the difference of large numbers that stands for the square has
+        # lost half of its digits there. A record that weighs more than the accelerations loses its digits earlier.
+        self._least = NEGLIGIBLE * max(1.0, *(weighed**2 / scale**2 for weighed, scale in sizes))
         self._pool = ThreadPoolExecutor(workers)
         self._expansions: SimpleQueue[Batch] = SimpleQueue()  # one a thread
         for _ in range(workers):

@@ -20,17 +20,17 @@ from sysid.modal_analysis.modal_fit import ModalFit, Modes, rank_one
 from sysid.modal_analysis.residues import linear_residues
 from sysid.models.stiffness import FREQUENCY_WINDOW
 from sysid.models.unknowns import lower_of, upper_of
-from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram
+from sysid.nlp import IterationMonitor, NonlinearProgram
 from sysid.problem.matrices import assemble
 from sysid.problem.problem import Problem
 from sysid.search.modal_program import fit_modes
 from sysid.search.modal_scaling import positive_part, stated_totals, to_stated_totals
 from sysid.search.scaled_unknowns import add_unknowns
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import EXACT, NEGLIGIBLE
 
 _OPEN_WINDOW = 20.0  # factor either way for a frequency that nobody gave
 _SUSPECT = 1.05  # a residual so many times that of free residues at the same poles is a local minimum
-_LEAST_SHAPE = 1e-6  # of the largest singular value of the shapes, below which M_SS would be no mass matrix
 
 
 class End(NamedTuple):
@@ -154,4 +154,4 @@ def _remainder(structure: Structure) -> Array:
 def _regular_inverse(phi: Array) -> Array:
     """Inverse of the shapes; where a bad fit has made some alike or next to nothing, of near ones that are not."""
     u, s, vt = np.linalg.svd(phi)
-    return (vt.T / np.maximum(s, _LEAST_SHAPE * s[0])) @ u.T
+    return (vt.T / np.maximum(s, NEGLIGIBLE * s[0])) @ u.T

@@ -25,12 +25,13 @@ from sysid.modal_analysis.spectra_model import fit_spectra
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.spectrum import SOLVED
 from sysid.models.unknowns import lower_of, upper_of
-from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram
+from sysid.nlp import IterationMonitor, NonlinearProgram
 from sysid.problem.problem import Problem
 from sysid.search.modal_program import Spectrum, Ties, fit_modes
 from sysid.search.modal_scaling import stated_totals
 from sysid.search.strategy import DoesNotApplyError
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import EXACT
 
 Integers = NDArray[np.intp]
 

@@ -26,6 +26,7 @@ from sysid.search.same_response import LINES, SameResponse
 from sysid.search.session import Session, Stop
 from sysid.search.strategy import Outcome
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import NEGLIGIBLE
 from sysid.swarm.sampling import latin_hypercube
 
 _MOST_STARTS, _FEWEST_STARTS = 64, 4
@@ -34,7 +35,6 @@ _ENOUGH = 0.6  # of the starts that have come to the response: the others are no
 _SECONDS = 0.06  # of a processor, that a step of all starts may take
 _LINE, _CUBE = 1.5e-6, 5e-9  # s of a processor, that a line of a candidate takes, and a cube of degrees of freedom more
 _ROW = 1e-6  # likewise, a row of what the user states beside the records or in their place
-_SAME = 1e-6  # relative difference of responses that counts as none
 _TRIED = 4  # structures of nearly the same response, fitted to the records
 _APART = 0.01  # of the root of two diagonal entries, by which an entry of another structure's matrices differs
 _SEED = 0x6F74686572  # a source of its own, so that no other phase draws other numbers
@@ -121,7 +121,7 @@ def _candidates(problem: Problem, x: Array, session: Session, objective: float, 
         if session.is_over or np.all(search.idle) or np.mean(given) > _ENOUGH:
             break
         search.step()
-        new = (search.left < _SAME) & ~given
+        new = (search.left < NEGLIGIBLE) & ~given
         search.idle |= new
         given |= new
         yield from (box.unknowns(search.points[i : i + 1])[0] for i in np.flatnonzero(new))

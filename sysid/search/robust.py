@@ -15,11 +15,11 @@ from sysid.search.session import Session, Stop
 from sysid.search.strategy import History, Outcome, Phase, Strategy
 from sysid.search.swarm import Swarm
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import ROUND_OFF
 
 _ROUNDS = 40
 _SETTLED, _NEAR = 2e-3, 0.05  # standard deviations of the unknowns, root mean square: is settled, is as good
 _FARTHEST = 64.0  # times a step
-_EXACT = 1e-10  # of the records: predictions that move by less stay, whatever the noise
 
 
 def settled(problem: Problem, end: Outcome, strategy: Strategy, session: Session) -> Outcome:
@@ -147,4 +147,4 @@ def _moved(problem: Problem, before: Outcome, after: Outcome) -> float:
             squares += 2 * float(np.sum(np.abs((a - b) / std) ** 2))
             change += float(np.sum(np.abs(a - b) ** 2))
             size += float(np.sum(np.abs(b) ** 2))
-    return 0.0 if change <= _EXACT**2 * size else float(np.sqrt(squares / problem.n_variables))
+    return 0.0 if change <= ROUND_OFF**2 * size else float(np.sqrt(squares / problem.n_variables))

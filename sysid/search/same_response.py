@@ -15,11 +15,11 @@ from sysid.problem.batch import Batch, expanded, in_chunks
 from sysid.problem.problem import Problem
 from sysid.problem.terms import ExpressionTerm, TestTerm
 from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import NEGLIGIBLE
 
 SHIFT = 0.3  # of the geometric mean of the natural frequencies
 _BEYOND = 1.3  # times the highest frequency: how far the lines reach
 LINES = 4  # a degree of freedom: twice as many numbers as a response has coefficients
-_MOVING = 1e-6  # of the largest: a direction in which the base moves at all
 
 
 class SameResponse:
@@ -71,7 +71,7 @@ class _Response:
         self.s = SHIFT * float(np.exp(np.log(omega).mean())) + 1j * lines
         base = columns(term.test.base)
         directions, size, _ = np.linalg.svd(np.hstack([base.real, base.imag]), full_matrices=False)
-        self.inputs = directions[:, size > _MOVING * size[0]]
+        self.inputs = directions[:, size > NEGLIGIBLE * size[0]]
         self.with_force = term.test.force is not None
         symbol, n = ca.MX.sym("x", x.size), structure.n
         self._expand = Batch(

@@ -14,11 +14,12 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from sysid.structure.thresholds import ROUND_OFF
+
 Array = NDArray[np.floating[Any]]
 
 _DEGREE = 11  # of the spline
 _BLOCK = 1024  # samples whose rows are reduced together
-_DECAYED = 1e-12  # free vibration below this share of its first acceleration explains nothing more
 
 
 class ModalModel(NamedTuple):
@@ -71,7 +72,7 @@ def fitted_state(modes: ModalModel, shapes: Array, residual: Array, sample_rate:
             row = row @ transition
         equations = np.column_stack([rows.reshape(-1, scale.size), block.ravel()])
         reduced = np.linalg.qr(np.vstack([reduced, equations]), mode="r")
-        if np.linalg.norm(row) <= _DECAYED * size:
+        if np.linalg.norm(row) <= ROUND_OFF * size:
             break
     # Of motion that no sensor sees the least is taken: none.
     state = np.linalg.lstsq(reduced[:, :-1], reduced[:, -1], rcond=1e-10)[0] / scale

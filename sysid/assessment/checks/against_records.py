@@ -10,7 +10,7 @@ import numpy as np
 from sysid.assessment.checks.context import Context
 from sysid.assessment.checks.gains import distinct_poles, gain_errors, wrong_gains
 from sysid.assessment.checks.leakage import leakage
-from sysid.assessment.checks.stated_mass import MISFIT, ROUND_OFF, force_misfit
+from sysid.assessment.checks.stated_mass import MISFIT, force_misfit
 from sysid.finding import Finding, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.spectra import of_run
@@ -19,11 +19,11 @@ from sysid.modal_analysis.residues import Records, ResidueFit, beyond_chance
 from sysid.modal_analysis.response import columns
 from sysid.problem.formulation import Formulation
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import EXACT
 
 _ALIKE = 0.5  # of the power of a motion; another that differs by more, noise included, is not the same
 _NEIGHBOURS = 11  # lines that tell the noise about one, where it is not stated
 _SEEN = 3.0  # times the noise, the least motion that two sensors can share
-_EQUAL = 1e-9  # of a sensor's motion: what counts as noise where there is none
 _LINES = 2  # times the free residues: fewer numbers than these tell nothing beside noise
 _MIMICKED = 1e-2  # of a constant; less of it is left where a mode far below the lines answers like one
 _GAIN = 0.03  # of the base's motion; smaller errors of a sensor's gain are usual
@@ -87,7 +87,7 @@ def _misfit(
     left = Records(replace(test, response=test.response - test.predict(structure)))
     misfit = float(np.sqrt(left.size / records.size))
     misses = f"{model} misses {100 * misfit:.3g} % of the accelerations"
-    possible = max(float(np.sqrt(free.squared_error / records.size)), ROUND_OFF)
+    possible = max(float(np.sqrt(free.squared_error / records.size)), EXACT)
     if misfit > MISFIT * possible:
         yield Finding(
             "misfit", Severity.CONTRADICTS,
@@ -99,7 +99,7 @@ def _misfit(
     poles = None if formulation.free_modes else PolesAndResidues.of(test)
     if poles is None:
         return
-    possible = max(poles.of_accelerations, ROUND_OFF)
+    possible = max(poles.of_accelerations, EXACT)
     if misfit > MISFIT * possible:
         yield Finding(
             "misfit", Severity.CONTRADICTS,
@@ -145,7 +145,7 @@ def _along_the_base(test: Measurement, records: Records, free: ResidueFit) -> tu
     along = Q.T @ free.left
     left = free.left - Q @ along
     gained = np.sum(along**2, axis=0).reshape(-1, test.n_sensors).sum(axis=0)
-    noise = records.noise(left, free.residues.size + along.size, least=ROUND_OFF)
+    noise = records.noise(left, free.residues.size + along.size, least=EXACT)
     return records.by_sensor(np.linalg.solve(R, along)[None])[0], gained / noise
 
 
@@ -155,7 +155,7 @@ def _damping(records: Records, poles: tuple[Array, Array], free: ResidueFit) -> 
         return
     both = records.fit(*poles, velocity=True)
     extra = poles[0].size * records.n_base * records.n_sensors
-    noise = records.noise(both.left, 2 * extra, least=ROUND_OFF)
+    noise = records.noise(both.left, 2 * extra, least=EXACT)
     gained = free.squared_error - both.squared_error
     if gained > noise * beyond_chance(extra):
         share = float(np.sqrt(gained / records.size))
@@ -179,7 +179,7 @@ def _twins(test: Measurement, structure: Structure) -> Iterator[Finding]:
         if size[i] + size[j] - 2 * abs(gram[i, j]) > _ALIKE * smaller or smaller == 0:
             continue
         each = _smooth(np.abs(left[i] - sign * left[j]) ** 2) if noise is None else (noise[i] + noise[j])[lines]
-        both = each + (_EQUAL**2 * (size[i] + size[j])) / lines.sum()
+        both = each + (EXACT**2 * (size[i] + size[j])) / lines.sum()
         apart = np.mean(np.abs(moves[i] - sign * moves[j]) ** 2 / both)
         if apart <= most and np.mean(np.abs(moves[[i, j]]) ** 2 / both, axis=1).min() > _SEEN**2:
             # A fit of fewer modes than there are leaves all that would tell its sensors apart.

@@ -22,6 +22,7 @@ from sysid.modal_analysis.residues import Records, ResidueFit
 from sysid.modal_analysis.response import gain_slopes
 from sysid.problem.problem import Problem
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import EXACT, NEGLIGIBLE, ROUND_OFF
 
 _CHANCE = 1e-3  # that any sensor of a right test is accused
 _SUSPECT = 2.5  # deviations of the noise, beyond which what a gain is off by counts among what is not known
@@ -30,12 +31,9 @@ _WITHIN = 2.0  # deviations of a gain: what the records leave open
 _MOVED = 3.0  # stated deviations of M_SS, from which an assumption is told
 _LEAST = 2e-3  # of a gain; smaller errors are usual
 _MIMICKED = 1e-2  # of a constant; less of it is left where a mode far below the lines answers like one
-_EXACT = 1e-8  # of the records: what counts as noise where there is none
 _BESIDE = 0.1  # of the largest error: what it leaves of itself on other sensors, as poles follow it
 _ALIKE = 3.0  # standard deviations by which errors of gains may differ and still be the base's one
 _TOLD = 3  # sensors
-_SAME_POLE = 1e-6  # relative distance of poles that count as one
-_DEPENDENT = 1e-10  # of the largest eigenvalue: changes of poles that do not show
 _BLOCKS = (8, 16, 32, 64)  # of lines, within which they may share their error
 _LINES = 2  # times the free residues: fewer numbers than these tell nothing beside noise
 
@@ -125,7 +123,7 @@ def distinct_poles(structure: Structure) -> tuple[Array, Array]:
     """Distinct poles, rad/s and ratios."""
     omega = 2 * np.pi * structure.natural_frequencies
     poles = omega * (1 + 1j * structure.damping_ratios)
-    first = np.concatenate([[True], np.abs(np.diff(poles)) > _SAME_POLE * omega[1:]])
+    first = np.concatenate([[True], np.abs(np.diff(poles)) > NEGLIGIBLE * omega[1:]])
     return omega[first], structure.damping_ratios[first]
 
 
@@ -246,7 +244,7 @@ def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, o
     across = by_sensor(moved * by(slopes.T @ column))
     products = (slopes.T @ slopes).reshape(*moved.shape[:2] * 2)
     together = np.einsum("kic,kilj,ljc->kl", moved, products, moved, optimize=True)
-    inverse = np.linalg.pinv(together, rcond=_DEPENDENT, hermitian=True)
+    inverse = np.linalg.pinv(together, rcond=ROUND_OFF, hermitian=True)
     pull = np.einsum("kic,kic->k", moved, by(slopes.T @ beside))
     normal = np.linalg.inv(np.diag(size) - across.T @ inverse @ across)
     error = normal @ (by_sensor(column * beside) - across.T @ (inverse @ pull))
@@ -257,7 +255,7 @@ def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, o
     by_line = by_sensor((of_lines.real + of_lines.imag)[..., None, :])
     variance = np.array([_variance(own) for own in np.moveaxis(by_line, -1, 0)]) / size
     noise = by_sensor(left**2) / max((len(left) - Q.shape[1]) * each - 1, 1)
-    noise = np.maximum(noise, _EXACT**2 * records.size / left.size)
+    noise = np.maximum(noise, EXACT**2 * records.size / left.size)
     if test.response_std is not None and np.any(test.response_std > 0):
         stated = 0.5  # half of a complex number's variance, in units of what is stated
         # What a model misses is no noise, and pulls constants along: beyond the stated noise it counts twice.
