@@ -104,7 +104,7 @@ TRIED = (
         "numbers = 2 * sum(test.numbers for test in tests)", "numbers = sum(test.numbers for test in tests)",
         "test_continuation::test_as_good_as_another_is_what_chance_explains_in_one_of_a_thousand"),
     Mutant("K06", "half the chi-squared that chance may leave of another answer",
-        "1 + 2 * gammainccinv(size / 2, _CHANCE)", "1 + gammainccinv(size / 2, _CHANCE)",
+        "1 + beyond_chance(size) / max", "1 + beyond_chance(size) / 2 / max",
         "test_continuation::test_as_good_as_another_is_what_chance_explains_in_one_of_a_thousand"),
     Mutant("K07", "unknowns about zero compared by nothing but their own size",
         "np.where(problem.lower * problem.upper > 0, np.finfo(float).tiny, _SMALL * width)",

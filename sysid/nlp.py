@@ -13,6 +13,8 @@ import scipy
 from numpy.typing import NDArray
 from threadpoolctl import OpenBLASController, register, threadpool_limits
 
+from sysid.errors import listed
+
 Array = NDArray[np.floating[Any]]
 
 OBJECTIVE_SCALE = 1e3  # lifts a residual of 1e-8 above IPOPT's tolerance
@@ -248,10 +250,7 @@ class NonlinearProgram:
         for name, label, is_low, is_high in zip(self.names, self.labels, low & free, high & free, strict=True):
             if is_low or is_high:
                 ended.setdefault(name, []).append(f"{label} ({'lower' if is_low else 'upper'})")
-        return "; ".join(
-            f"{name}{','.join(which[:4])}" + (f" and {len(which) - 4} more" if len(which) > 4 else "")
-            for name, which in ended.items()
-        )
+        return "; ".join(f"{name}{listed(which, ',')}" for name, which in ended.items())
 
 
 class IterationMonitor:

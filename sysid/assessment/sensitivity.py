@@ -12,14 +12,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from sysid.errors import listed
 from sysid.models.unknowns import Unknown, scales_of, split
 from sysid.problem.formulation import Formulation
 from sysid.problem.problem import Problem
 from sysid.problem.slopes import Rows, Slopes, stacked_rows
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF
-
-_TERMS = 8  # of a direction, told
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,8 +206,7 @@ def directions_in_words(unknowns: Sequence[Unknown], x: Array, unit: Array, dire
                 terms.append(f"{unknown.title} {told[0]}")
                 continue
             terms += [f"{unknown.labels[j]} {told[j]}" for j in np.flatnonzero(np.abs(share) > NEGLIGIBLE)]
-        rest = len(terms) - _TERMS
-        sentences.append(", ".join(terms[:_TERMS]) + (f" and {rest} more" if rest > 0 else ""))
+        sentences.append(listed(terms))
     return sentences
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from sysid.assessment.determination import determine
 from sysid.assessment.sensitivity import Sensitivity, directions_in_words, sensitivity
-from sysid.errors import InputError, SysidError
+from sysid.errors import InputError, SysidError, listed
 from sysid.identify import choose, identify
 from sysid.measurement.measurement import Measurement
 from sysid.models.unknowns import Unknown, scales_of, slices_of
@@ -26,11 +26,10 @@ from sysid.problem.feasibility import HELD, LOOSE, points_of
 from sysid.problem.problem import Problem
 from sysid.problem.slopes import Slopes, slopes_of
 from sysid.problem.terms import FurtherTest
-from sysid.results.summary import counted
+from sysid.results.summary import WIDTH, counted
 from sysid.structure.structure import Array, ComplexArray, Structure
 from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF
 
-_WIDTH = 120
 _NOISE = 0.01  # of a record's rms, where no noise is stated
 _SHORTEST = 3  # null directions that are told in full where there are more
 _TRIED = 20  # points of the search space looked at for one that makes a structure
@@ -110,12 +109,11 @@ def _test(problem: Problem, name: str) -> Iterator[str]:
 
 def _records(test: Measurement) -> str:
     names = test.sensor_names
-    sensors = ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
     force = "no base force" if test.force is None else "with base force"
     noise = "noise stated" if _noise_is_stated(test) else "no noise stated"
     runs, axes = counted(test.n_runs, "run"), " ".join(test.base_axes or ())
     return (
-        f"{counted(len(names), 'sensor')} ({sensors}), base moving along {axes}, {runs}, "
+        f"{counted(len(names), 'sensor')} ({listed(names)}), base moving along {axes}, {runs}, "
         f"{test.lines_in_words}, {force}, {noise}"
     )
 
@@ -441,4 +439,4 @@ def _table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
 def _folded(line: str) -> str:
     """Fold a long line at the width of a terminal, the rest indented."""
     indent = " " * (len(line) - len(line.lstrip()) + 4)
-    return textwrap.fill(line, _WIDTH, subsequent_indent=indent, break_on_hyphens=False)
+    return textwrap.fill(line, WIDTH, subsequent_indent=indent, break_on_hyphens=False)

@@ -18,6 +18,7 @@ from sysid.results.identification import Identification
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import EXACT
 
+DECISIVE = 10.0  # difference of AIC or BIC
 _LEAST = 0.01  # least variance of a step, as a share of the part's own
 _SAME = 0.1  # relative distance of frequencies up to which a mode is looked for
 _ALIKE = 0.4  # least MAC of one mode; two that turn in their plane, as a symmetric tower's may, keep half

@@ -16,20 +16,18 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.excitation import steady_sine
 from sysid.modal_analysis.record_poles import few_lines, rough_deviations
 from sysid.modal_analysis.relocation import relocate
-from sysid.modal_analysis.residues import Records, beyond_chance, unit_columns
-from sysid.modal_analysis.vector_fitting import RAZOR
+from sysid.modal_analysis.residues import Records, unit_columns
+from sysid.modal_analysis.vector_fitting import GUESS, RAZOR
 from sysid.nlp import one_thread
 from sysid.structure.structure import Array, ComplexArray
-from sysid.structure.thresholds import ROUND_OFF
+from sysid.structure.thresholds import CANDIDATES, ROUND_OFF, beyond_chance, largest_modulus
 
 _SPARE, _MOST = 6, 40  # poles beyond one a sensor; all of them
 _CHANNELS = 12  # principal ones, by which the poles are looked for
 _FIRST_CHANNELS = 4  # of them, in the first half of the steps, which are the quicker for it
 _STEPS = 8
-_GUESS = 0.01  # damping ratio
 _MODE = 0.3  # largest damping ratio of a pole that is kept; what has more answers like a term without poles
 _OUTSIDE = 1.5  # times the last line, up to where poles are kept; what lies below the first shows by its tail
-_FAR = 6.0  # medians of the errors of a channel, from which a line holds a spike
 _SCREENINGS = 3  # times that lines with spikes are left out
 _FEW = 0.25  # of the lines
 _LINES = 3  # real numbers of a channel for each function, at least
@@ -123,7 +121,7 @@ def _poles(records: Records) -> tuple[Array, Array] | None:
     count = min(records.n_sensors + _SPARE, _MOST, room)
     if count < 1:
         return None
-    omega, ratios = np.geomspace(lines[0], lines[-1], count), np.full(count, _GUESS)
+    omega, ratios = np.geomspace(lines[0], lines[-1], count), np.full(count, GUESS)
     first, every = records.principal(_FIRST_CHANNELS), records.principal(_CHANNELS)
     direct = _without_poles(records.freq)
     for step in range(_STEPS):
@@ -177,7 +175,7 @@ def _fitted(records: Records, omega: Array, ratios: Array) -> _Fit:
         turn * _by_sensor(records, of_terms(beta[:known])),
         turn * _deviations(records, of_terms(inverse[:known]), level * np.sqrt(shared / freedom)),
         _by_sensor(records, of_modes.sum(axis=0, keepdims=True))[0],
-        gained > noise * beyond_chance(beyond.shape[1] * left.shape[1]),
+        gained > noise * beyond_chance(beyond.shape[1] * left.shape[1], CANDIDATES),
         float(np.linalg.norm(left) / np.sqrt(records.size)),
         _spikes(records, left),
     )  # fmt: skip
@@ -188,7 +186,8 @@ def _spikes(records: Records, left: Array) -> NDArray[np.bool_]:
     size = np.hypot(*left.reshape(2, -1, left.shape[1]))
     level = np.stack([np.median(size[records.run == run], axis=0) for run in range(len(records.blocks))])
     level = np.maximum(level, ROUND_OFF * np.sqrt(records.size / records.data.size))
-    far = records.largest(np.any(size > _FAR * level[records.run], axis=1)) > 0
+    spike = largest_modulus(CANDIDATES) / np.sqrt(np.log(2))  # medians of the modulus of noise
+    far = records.largest(np.any(size > spike * level[records.run], axis=1)) > 0
     return far if np.count_nonzero(far) < _FEW * far.size else np.zeros_like(far)
 
 

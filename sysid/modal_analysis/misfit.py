@@ -12,11 +12,10 @@ from sysid.measurement.noise import separable
 from sysid.modal_analysis.residues import line_correlation
 from sysid.modal_analysis.response import columns, stacked
 from sysid.structure.structure import Array, ComplexArray, Structure
-from sysid.structure.thresholds import EPSILON
+from sysid.structure.thresholds import EPSILON, beyond_chance
 
-_SUSPECT = 1.2  # reduced chi-squared above which the stated noise does not explain the misfit, unless chance does:
+SUSPECT = 1.2  # reduced chi-squared above which the stated noise does not explain the misfit, unless chance does:
 _FAR_BELOW = 0.1  # reduced chi-squared of a misfit, as of round-off, that tells nothing of the noise
-_DEVIATIONS = 4.0  # its least excess above one, in standard deviations of the chi-squared law
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +87,7 @@ def inflation_of(test: Measurement, records: list[Record], unknowns: int) -> flo
     scattered = test.modal if test.modal is not None and test.modal.scatter is not None else None
     if scattered is not None:
         reduced /= max(scattered.reduced, 1.0)
-    beyond = reduced if reduced > max(_SUSPECT, 1 + _DEVIATIONS * np.sqrt(2 / freedom)) else 1.0
+    beyond = reduced if reduced > max(SUSPECT, beyond_chance(freedom) / freedom) else 1.0
     if scattered is not None:
         return float(np.sqrt(beyond))
     error = np.concatenate([(r.misfit / r.std).reshape(-1, test.n_runs, test.freq.size) for r in records])

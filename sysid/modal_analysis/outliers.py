@@ -43,21 +43,20 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
-from sysid.modal_analysis.residues import Records, beyond_chance
+from sysid.modal_analysis.misfit import SUSPECT
+from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.response import gains
 from sysid.modal_analysis.vector_fitting import Monitor, poles_from, poles_of_any_damping
 from sysid.structure.structure import Array, ComplexArray, Structure
-from sysid.structure.thresholds import ROUND_OFF
+from sysid.structure.thresholds import CANDIDATES, ROUND_OFF, beyond_chance, largest_modulus
 
 HUBER = "Huber's loss"  # the phase of its rounds
 TUNING = 1.06147  # c, in units of sqrt(E|e|²): 95 % efficient where the noise is normal
-_FAR = 5.0  # deviations, beyond which one number in 10^10 is chance
 _BESIDE = 5.0  # times the numbers beside it: as much as a wrong pole leaves of a peak one line wide
 _CERTAIN = 10.0  # the same, where noise that differs from line to line must not be taken for outliers
 _ONE_LINE = 4.0  # times its next line, that a pole's highest one may reach without being doubted
 _ONE_CHANNEL = 0.9  # of the power at that line, in one channel: no motion of a structure
 _NARROW = 0.5  # of the distance of lines; poles of less half-width show at one line too
-_SUSPECT = 1.2  # times the variance that is stated, up to which the noise may be as stated
 _MEDIAN = 0.4549  # of the square of a standard normal number
 _LEAST_LINES = 5  # with fewer, no number has neighbours enough
 _UNDAMPED, _TINY = 1e-9, np.finfo(float).tiny
@@ -125,9 +124,7 @@ def whitened(test: Measurement, made: Sequence[ComplexArray], unknowns: int) -> 
         if stated is not None:
             squares.append(np.abs(of_own(misfit / stds[-1])) ** 2)
     # Without a jump, at which rounds of a fit would turn to and fro.
-    more = (
-        np.sqrt(max(1.0, float(np.median(np.concatenate(squares))) / np.log(2) / left / _SUSPECT)) if squares else 1.0
-    )
+    more = np.sqrt(max(1.0, float(np.median(np.concatenate(squares))) / np.log(2) / left / SUSPECT)) if squares else 1.0
     stds = [std if stated is None else more * std for std, (*_, stated) in zip(stds, found, strict=True)]
     return [Whitened(misfit / std, std, test.own_lines) for std, (_, misfit, _) in zip(stds, found, strict=True)]
 
@@ -225,7 +222,7 @@ def _beyond_neighbours(part: Whitened, *, times: float, known: Flags | None = No
         near_by[:, here, here - first] = np.inf
         beside = np.sort(near_by, axis=-1)[..., 2]  # of four the last but one: another outlier may be among them
         its = size[run][:, own]
-        flags[run][:, own] = (its > _FAR) & (its > times * beside)
+        flags[run][:, own] = (its > largest_modulus(CANDIDATES)) & (its > times * beside)
     return flags
 
 
@@ -413,7 +410,7 @@ def _is_one_number(test: Measurement, records: Records, omega: Array, ratios: Ar
     if omega.size > 1:
         left = others.fit(np.delete(omega, k), np.delete(ratios, k), velocity=True).squared_error
     noise = float(np.median(every.left**2)) / _MEDIAN
-    return left - every.squared_error < noise * beyond_chance(every.residues[k].size + 2)
+    return left - every.squared_error < noise * beyond_chance(every.residues[k].size + 2, CANDIDATES)
 
 
 def _heights(freq: Array, omega: Array, ratios: Array) -> Array:
@@ -433,7 +430,9 @@ def outliers(
     omega, ratios = 2 * np.pi * structure.natural_frequencies, structure.damping_ratios
     first, found = 0, []
     for part in whitened(test, predicted(test, structure), unknowns):
-        far = stand_alone(part, test.freq, omega, ratios, times=_CERTAIN) if alone else np.abs(part.u) > _FAR
+        far = np.abs(part.u) > largest_modulus(CANDIDATES)
+        if alone:
+            far = stand_alone(part, test.freq, omega, ratios, times=_CERTAIN)
         for run, channel, line in np.argwhere(far).tolist():
             size = float(np.abs(part.u[run, channel, line]))
             found.append(Outlier(number, run + 1, names[first + channel], float(test.freq[line]), size))

@@ -16,14 +16,13 @@ from sysid.modal_analysis.record_model import Parameters, RecordModel
 from sysid.modal_analysis.response import gains
 from sysid.modal_analysis.vector_fitting import DAMPED, RAZOR
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import CANDIDATES, beyond_chance
 
-_WORTH = 25.0  # in units of ``e' S^-1 e``: a mode whose absence raises it by less is noise (chi-squared of 50)
 _RATIOS = (0.004, 0.012, 0.036)  # damping ratios that are tried
 _STEP = 1.0  # of a candidate's damping ratio, from one frequency to the next
 _REACH = 15.0  # half-power widths about a candidate, of lines that are looked at
 _PROMISING = 0.7  # of what a mode must be worth, that a few steps show
 _FINE = 16  # lines in a half-power width that tell the mean covariance there
-_CHANCE = 12.0  # by which the best of many candidates exceeds what noise makes of one
 
 
 def with_further_modes(fit: RecordFit, *, some: Measurement | None = None, monitor: Monitor | None = None) -> RecordFit:
@@ -53,9 +52,9 @@ def no_modes(fit: RecordFit) -> NDArray[np.bool_]:
 
 
 def least_worth(model: RecordModel) -> float:
-    """What a mode must lower ``e' S^-1 e`` by: more than noise makes of the likeliest residue of rank one."""
+    """What a mode must lower ``e' S^-1 e`` by: more than noise makes of a residue of rank one and a pole, anywhere."""
     inputs = model.d + 2 * len(model.moving)
-    return max(_WORTH, float((np.sqrt(model.channels) + np.sqrt(inputs)) ** 2 / 2 + _CHANCE))
+    return beyond_chance(model.channels + inputs + 1, CANDIDATES) / 2
 
 
 def _candidate(fit: RecordFit, least: float) -> Parameters | None:

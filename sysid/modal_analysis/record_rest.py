@@ -11,9 +11,7 @@ from sysid.modal_analysis.record_fit import RecordFit, half_inverse, refitted, u
 from sysid.modal_analysis.record_model import Parameters, RecordModel
 from sysid.modal_analysis.record_spread import uneven
 from sysid.structure.structure import Array
-from sysid.structure.thresholds import ROUND_OFF
-
-LEVEL = 1e-3  # of false alarms, of all runs together
+from sysid.structure.thresholds import FALSE_ALARM, ROUND_OFF
 
 
 def runs_in_motion(fit: RecordFit) -> tuple[int, ...]:
@@ -28,7 +26,7 @@ def runs_in_motion(fit: RecordFit) -> tuple[int, ...]:
     for run in stated:
         moving, p = _moving(fit, (run,))
         chi2, freedom = _score(moving, p)
-        if scipy.special.chdtrc(freedom, chi2) < LEVEL / len(stated):
+        if scipy.special.chdtrc(freedom, chi2) < FALSE_ALARM / len(stated):
             found.append(run)
     if not found:
         return ()

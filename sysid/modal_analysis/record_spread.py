@@ -11,16 +11,17 @@ which is too wide: a block may hold most of what tells a mode.
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from sysid.modal_analysis.record_fit import RecordFit, half_inverse, unit_diagonal
 from sysid.modal_analysis.record_model import Chunk, Run
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import FALSE_ALARM, beyond_chance
 
 _WIDTHS = 3.0  # half-power widths that a block is long
 _LEAST = 4  # lines of a block
 _SHIFTS = 4  # partitions, each begun a part of a block later: where blocks begin must not matter
-_CHANCE = 5.0  # standard deviations by which the power of what is left may differ between blocks
 _TAKEN = 0.98  # share of the information, at most, that is taken to be a block's
 
 
@@ -71,15 +72,19 @@ def scatter_over_blocks(fit: RecordFit) -> Array:
 
 
 def uneven(fit: RecordFit, mean: float = 1.0) -> bool:
-    """Whether the power of what is left differs between blocks of lines, and from its mean, by more than chance."""
+    """Whether the power of what is left differs between blocks of lines, and from its mean, by more than chance.
+
+    In all blocks together, or rises above it in one.
+    """
     model, c = fit.model, fit.model.channels
-    off = []
+    off, rare = [], []
     powers: list[list[Array]] = [[] for _ in model.runs]
     for chunk in model.chunks(fit.parameters):
         powers[chunk.run.piece].append(chunk.weighed(fit.levels).power)
     for run, parts in zip(model.runs, powers, strict=True):
         power = np.concatenate(parts)
         for lines in blocks_of(run, fit, 0.0):
-            off.append((np.sum(power[lines]) / mean - c * lines.size) / np.sqrt(c * lines.size))
-    z = np.array(off)
-    return bool(np.sum(z**2) > z.size + _CHANCE * np.sqrt(2 * z.size) or np.max(z) > 2 * _CHANCE)
+            held, numbers = np.sum(power[lines]) / mean, c * lines.size
+            off.append((held - numbers) / np.sqrt(numbers))
+            rare.append(scipy.special.gammaincc(numbers, held))
+    return bool(np.sum(np.square(off)) > beyond_chance(len(off), 2) or min(rare) < FALSE_ALARM / (2 * len(rare)))

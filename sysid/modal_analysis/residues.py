@@ -14,11 +14,9 @@ from sysid.measurement.measurement import Measurement
 from sysid.measurement.noise import separable
 from sysid.modal_analysis.response import columns, gains, gains_with_velocity, stacked
 from sysid.structure.structure import Array, ComplexArray
-from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF
+from sysid.structure.thresholds import CANDIDATES, NEGLIGIBLE, ROUND_OFF, beyond_chance
 
-_DEVIATIONS = 12.0  # of the chi-squared law, by which a squared error must fall to mean something
 _LAGS = range(4)  # distances of lines that may share their noise; none: their power
-_CHANCE = 3e-7  # that white noise is taken for noise that neighbouring lines share
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +101,7 @@ class ResidueFit:
         """
         s = np.linalg.svd(self.whitened.reshape(len(self.whitened), -1, n_sensors), compute_uv=False)
         # Unknowns of a further mode, at most.
-        needed = np.count_nonzero(s**2 > noise * beyond_chance(n_sensors + n_base), axis=1)
+        needed = np.count_nonzero(s**2 > noise * beyond_chance(n_sensors + n_base, CANDIDATES), axis=1)
         return np.clip(needed, 1, min(n_sensors, n_base))
 
 
@@ -328,11 +326,6 @@ def _least_squares(X: Array, data: Array, m: int, size: float) -> ResidueFit:
     return ResidueFit(Q, beta, inverse.reshape(m, beta.shape[1], -1), data, y, size)
 
 
-def beyond_chance(freedom: float) -> float:
-    """Squared size, in units of the noise's variance, that so many numbers of noise alone do not reach."""
-    return float(freedom + _DEVIATIONS * np.sqrt(2 * freedom))
-
-
 def line_correlation(error: ComplexArray, unknowns: int = 0) -> float:
     """Factor by which errors weigh more on smooth functions of frequency as neighbouring lines share them.
 
@@ -374,7 +367,7 @@ def _correlation_factor(
     if lines.max(initial=0) <= 2 * len(_LAGS) - 2 or not np.any(moved):
         return 1.0
     share = unknowns / max(2 * channels * lines[moved].sum() - unknowns, 1)
-    chance = scipy.special.chdtri(2 * moved.sum(), _CHANCE) / 2
+    chance = beyond_chance(2 * moved.sum(), CANDIDATES) / 2
     factor = 1.0
     for sums, level in zip(np.abs(products[1:, moved]) / power[moved], variance[1:, moved], strict=True):
         beyond = np.maximum(sums - share, 0) ** 2

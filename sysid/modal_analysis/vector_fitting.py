@@ -17,18 +17,18 @@ import numpy as np
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.relocation import relocate
-from sysid.modal_analysis.residues import Records, ResidueFit, SubsetFits, beyond_chance
+from sysid.modal_analysis.residues import Records, ResidueFit, SubsetFits
 from sysid.modal_analysis.response import gain_slopes, gains
 from sysid.nlp import one_thread
 from sysid.structure.structure import Array
-from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF, round_off
+from sysid.structure.thresholds import CANDIDATES, NEGLIGIBLE, ROUND_OFF, beyond_chance, round_off
 
 _SPARE = 6  # poles beyond those expected: without spare ones noise moves true poles
 _MANY = 100  # sensors: more of them are not taken to show a mode each unless the channels do
 _RELOCATIONS = 6
 _STEPS = 100
 _FAR = 100.0  # times the error that may be, from which moving other poles too does not save a pole less
-_GUESS = 0.01  # damping ratio to begin with
+GUESS = 0.01  # damping ratio to begin with
 RAZOR = 0.02  # of the distance of lines; half the width of a peak that answers for one bad line, not for a mode
 DAMPED = 0.5  # a pole with more damping than this is no mode of a structure
 _EDGE = 10.0  # times their ends, how far outside the lines a mode may lie: it answers for all that are there
@@ -140,7 +140,7 @@ def poles_near(test: Measurement, omega: Array, window: float, *, monitor: Monit
     """
     records = Records(test)
     distinct = np.unique(omega)
-    found, ratios = _polish(records, distinct, np.full(distinct.size, _GUESS), _Progress(monitor, records))
+    found, ratios = _polish(records, distinct, np.full(distinct.size, GUESS), _Progress(monitor, records))
     off = np.abs(np.log(found / distinct))
     fit = records.fit(found, ratios)
     # By its place, or by what the fit would lose without it.
@@ -206,7 +206,7 @@ def _most_poles(records: Records) -> int:
 def _relocated(records: Records, count: int, progress: _Progress) -> tuple[Array, Array]:
     """Poles that earn their place, from `count` that are spread over the lines, before they are polished."""
     lines = 2 * np.pi * records.freq[records.freq > 0]
-    omega, ratios = np.geomspace(lines[0], lines[-1], count), np.full(count, _GUESS)
+    omega, ratios = np.geomspace(lines[0], lines[-1], count), np.full(count, GUESS)
     progress.tell()
     channels = records.principal(count)
     error = np.inf
@@ -316,7 +316,7 @@ def _in_order(records: Records, omega: Array, ratios: Array) -> Poles:
 
 def _least_gain(fit: ResidueFit) -> float:
     """What a pole must lower the squared error by to earn its place, in units of the noise's variance."""
-    return beyond_chance(fit.residues[0].size + 2)  # real parameters that come with a pole
+    return beyond_chance(fit.residues[0].size + 2, CANDIDATES)  # real parameters that come with a pole
 
 
 def _noise(records: Records, fit: ResidueFit, m: int) -> float:
@@ -340,7 +340,7 @@ def _prune(
         worth, squared_error = subsets.worth(kept)
         progress.step(squared_error)
         least = int(np.argmin(worth))
-        if worth[least] > beyond_chance(subsets.per_pole):
+        if worth[least] > beyond_chance(subsets.per_pole, CANDIDATES):
             break
         kept = np.delete(kept, least)
     return omega[kept], ratios[kept]

@@ -23,9 +23,8 @@ from sysid.plot.canvas import (
     positive,
 )  # fmt: skip
 from sysid.results.identification import Identification
-from sysid.results.summary import DEVIATES
 from sysid.structure.structure import Array, ComplexArray
-from sysid.structure.thresholds import ROUND_OFF
+from sysid.structure.thresholds import LIKELY, ROUND_OFF
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -211,7 +210,7 @@ def draw(axes: Any, channel: Channel) -> None:
     off = np.isin(freq, channel.outliers)
     if np.any(off):
         magnitude.plot(freq[off], positive(size[off]), **_OUTLIER)
-    reach = DEVIATES * channel.std
+    reach = LIKELY * channel.std
     if np.any(reach > _VISIBLE * modelled):
         # The magnitude strays no further than the complex value; to zero, a logarithmic axis cannot follow.
         ends = np.maximum(modelled - reach, 1e-3 * modelled), modelled + reach

@@ -20,8 +20,8 @@ from sysid.report.html import text
 from sysid.report.noise_level import NoiseLevel
 from sysid.report.still import Channel, curve_sheet, degrees, mode_still, room_of_modes
 from sysid.results.identification import Identification
-from sysid.results.summary import DEVIATES
 from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import LIKELY
 
 _FINE, _ROUGH = 1e-3, 1e-2  # relative steps of sizes, and of differences, which are noise
 _DEGREES = 0.5  # steps of phases
@@ -185,7 +185,7 @@ def _half_widths(std: Array, test: Measurement) -> NDArray[Any]:
 
     Errors of different directions may add up whatever their phases: the sum is never too small.
     """
-    return np.asarray(DEVIATES * np.einsum("cdf,rdf->rcf", std, np.abs(test.base)))
+    return np.asarray(LIKELY * np.einsum("cdf,rdf->rcf", std, np.abs(test.base)))
 
 
 def _recorded(it: Identification, test: Measurement) -> Measurement | None:

@@ -20,13 +20,12 @@ from sysid.search.local import Coordinates, LocalResult
 from sysid.search.session import Session, Stop
 from sysid.search.strategy import History, Outcome, Phase, as_unknowns, search_note
 from sysid.structure.structure import Array, Structure
-from sysid.structure.thresholds import EXACT
+from sysid.structure.thresholds import EXACT, beyond_chance
 
 SHIFTS = (0.5, 0.2, 0.08, 0.03, 0.01)  # of the geometric mean of the natural frequencies
 _DRAWN = 20  # points looked at for each that is a structure
 _STEPS = 60  # iterations of a fit on the way
 _NEAR = 1.1  # times the misfit of free residues at the poles of the data: what a structure may leave
-_CHANCE = 1e-3  # that noise alone makes the misfit of one of two answers so much larger
 _APART = 0.01  # of an unknown's size, from which two solutions are two ...
 _TOGETHER = 1e-3  # ... and up to which two ways are one
 _AGREE = 3  # starts that end at one structure, from which it is no local minimum among others ..
@@ -303,12 +302,10 @@ def _alternatives(problem: Problem, x: Array, objective: float, ends: list[tuple
 
 def as_good_as(problem: Problem, objective: float) -> float:
     """The most that another answer leaves where it explains the data as well as one that leaves `objective`."""
-    from scipy.special import gammainccinv
-
     tests = [term.test for term in problem.formulation.tests]
     numbers = 2 * sum(test.numbers for test in tests)
     size = problem.n_variables
-    return max(objective * float(np.sqrt(1 + 2 * gammainccinv(size / 2, _CHANCE) / max(numbers - size, 1))), EXACT)
+    return max(objective * float(np.sqrt(1 + beyond_chance(size) / max(numbers - size, 1))), EXACT)
 
 
 def apart(problem: Problem, x: Array, other: Array) -> float:

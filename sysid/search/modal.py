@@ -21,7 +21,7 @@ from sysid.finding import Finding
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import above_modes, residual_of
 from sysid.modal_analysis.modal_fit import ModalFit, Modes
-from sysid.modal_analysis.residues import beyond_chance, line_correlation
+from sysid.modal_analysis.residues import line_correlation
 from sysid.modal_analysis.response import columns, gains, stacked, weighted_error, weights_of
 from sysid.modal_analysis.vector_fitting import Poles, find_poles, poles_near
 from sysid.models.spectrum import SOLVED
@@ -36,7 +36,7 @@ from sysid.search.mode_fit import Integers, ModeFit, ended, held_to_totals
 from sysid.search.session import Session, Stop
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, search_note
 from sysid.structure.structure import Array, Structure
-from sysid.structure.thresholds import EXACT, NEGLIGIBLE, ROUND_OFF
+from sysid.structure.thresholds import CANDIDATES, EXACT, NEGLIGIBLE, ROUND_OFF, beyond_chance
 
 _PLAIN = "; noise of the base and transients look like modes in plain spectra: take whole records (estimator='records')"
 
@@ -154,7 +154,7 @@ def _independent_sensors(test: Measurement, modes: Modes) -> int:
     variance = max(variance * shared, ROUND_OFF**2)
     s = np.linalg.svd(stacked(weight * columns(motion) / size), compute_uv=False)[: min(n, m)]
     beyond = np.cumsum(s[::-1] ** 2)[::-1]
-    chance = np.array([beyond_chance((n - r) * (m - r)) for r in range(s.size)])
+    chance = np.array([beyond_chance((n - r) * (m - r), CANDIDATES) for r in range(s.size)])
     moving = 1 + np.max(np.flatnonzero(beyond > variance * chance), initial=-1)
     shapes = np.linalg.svd(modes.phi / np.linalg.norm(modes.phi, axis=0), compute_uv=False)
     return int(min(moving, np.count_nonzero(shapes > NEGLIGIBLE * shapes[0])))

@@ -17,7 +17,6 @@ from sysid.modal_analysis.residues import (
     Records,
     ResidueFit,
     SubsetFits,
-    beyond_chance,
     independent,
     linear_residues,
 )  # fmt: skip
@@ -31,7 +30,7 @@ from sysid.search.modal_program import Spectrum, Ties, fit_modes
 from sysid.search.modal_scaling import stated_totals
 from sysid.search.strategy import DoesNotApplyError
 from sysid.structure.structure import Array
-from sysid.structure.thresholds import EXACT
+from sysid.structure.thresholds import CANDIDATES, EXACT, beyond_chance
 
 Integers = NDArray[np.intp]
 
@@ -85,13 +84,13 @@ class ModeFit:
         excess = best.of_accelerations**2 * records.size - free.squared_error
         ranks = free.ranks(noise, n, d)
         # An exact fit lacks nothing; round-off in residues of poles that nearly coincide would ask for more modes.
-        lacks = best.of_accelerations > EXACT and excess > noise * beyond_chance(m * (n - 1) * (d - 1))
+        lacks = best.of_accelerations > EXACT and excess > noise * beyond_chance(m * (n - 1) * (d - 1), CANDIDATES)
         wanting = lacks or ranks.sum() < best.modes.omega.size
         if self._goes_on and wanting and np.any(ranks > 1):
             other = self._grown(self._with(ranks), ranks)
             more = other.modes.omega.size - best.modes.omega.size
             gained = (best.of_accelerations**2 - other.of_accelerations**2) * records.size / noise
-            if gained > np.sign(more) * beyond_chance(abs(more) * (n + d)):
+            if gained > np.sign(more) * beyond_chance(abs(more) * (n + d), CANDIDATES):
                 best = other
         return _ascending(best)
 
@@ -157,7 +156,7 @@ class ModeFit:
             again = self._with(more)
             gained = (best.of_accelerations**2 - again.of_accelerations**2) * self.records.size
             noise = self._free(again, more)[1]
-            if gained < beyond_chance(self.test.n_sensors + self.test.n_base) * noise:
+            if gained < beyond_chance(self.test.n_sensors + self.test.n_base, CANDIDATES) * noise:
                 break
             best, multiplicity = again, more
         return best
@@ -176,7 +175,7 @@ class ModeFit:
         free, noise = self._free(best, multiplicity)
         freedom = float(np.sum((n - multiplicity) * (d - multiplicity)))
         excess = best.of_accelerations**2 * self.records.size - free.squared_error
-        if excess < noise * beyond_chance(freedom):
+        if excess < noise * beyond_chance(freedom, CANDIDATES):
             return None
         s = np.linalg.svd(free.whitened.reshape(multiplicity.size, -1, n), compute_uv=False)
         left = np.array([np.sum(row[r:] ** 2) for row, r in zip(s, multiplicity, strict=True)])

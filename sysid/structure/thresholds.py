@@ -8,16 +8,51 @@ Round-off and the same are told apart by size, each limit relative to what is co
 `EXACT`                 the root of it in one sum: a residual whose square is lost in a sum of squares
 `NEGLIGIBLE`            results of iterations, which end there; parts of a whole that are none
 ======================  ===================================================================================
+
+Chance is told by one rate of false alarms, shared by all that are looked at together (Bonferroni), and by the degrees
+of freedom: `beyond_chance` for sums of squares, `most_deviations` for one number, `largest_modulus` for a complex one.
 """
 
 from __future__ import annotations
+
+import math
+
+import scipy.special
 
 EPSILON = 2.0**-52  # distance from 1 to the next number
 ROUND_OFF = 1e-9  # relative error of what came through several decompositions: a number below it is zero
 EXACT = 1e-8  # relative residual, or asymmetry, of what is exact
 NEGLIGIBLE = 1e-6  # relative difference up to which two results are one; relative size of a part that counts as none
 
+FALSE_ALARM = 1e-3  # chance that one check accuses a right test of anything
+CANDIDATES = 1_000_000  # of a search, at most, none of which noise alone may bring through: poles at all lines
+COVERAGE = 0.95  # of intervals
+LIKELY = float(scipy.special.ndtri((1 + COVERAGE) / 2))  # standard deviations on either side that have this coverage
+
 
 def round_off(terms: int) -> float:
     """Relative error of one sum, or of the eigenvalues and singular values of a matrix, of so many terms."""
     return 10 * terms * EPSILON
+
+
+def beyond_chance(freedom: float, at_once: int = 1) -> float:
+    """Sum of squares of so many numbers of noise, in units of its variance, that chance does not reach.
+
+    Parameters
+    ----------
+    freedom : float
+        Degrees of freedom; zero where there is nothing to sum.
+    at_once : int
+        How many such sums are looked at, of which chance may let none through.
+    """
+    return float(scipy.special.chdtri(freedom, FALSE_ALARM / at_once)) if freedom > 0 else 0.0
+
+
+def most_deviations(at_once: int = 1) -> float:
+    """Standard deviations, either way, that none of so many numbers of noise is off by."""
+    return math.sqrt(beyond_chance(1, at_once))
+
+
+def largest_modulus(at_once: int = 1) -> float:
+    """Modulus that none of so many complex numbers of noise reaches, in units of ``sqrt(E|e|²)``."""
+    return math.sqrt(beyond_chance(2, at_once) / 2)

@@ -8,24 +8,22 @@ from dataclasses import replace
 import numpy as np
 
 from sysid.assessment.checks.context import Context
-from sysid.assessment.checks.gains import distinct_poles, gain_errors, wrong_gains
+from sysid.assessment.checks.gains import MIMICKED, NUMBERS_A_RESIDUE, distinct_poles, gain_errors, wrong_gains
 from sysid.assessment.checks.leakage import leakage
 from sysid.assessment.checks.stated_mass import MISFIT, force_misfit
-from sysid.finding import Finding, Severity
+from sysid.finding import MOST_OF_A_KIND, Finding, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.spectra import of_run
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
-from sysid.modal_analysis.residues import Records, ResidueFit, beyond_chance
+from sysid.modal_analysis.residues import Records, ResidueFit
 from sysid.modal_analysis.response import columns
 from sysid.problem.formulation import Formulation
 from sysid.structure.structure import Array, Structure
-from sysid.structure.thresholds import EXACT
+from sysid.structure.thresholds import CANDIDATES, EXACT, beyond_chance
 
 _ALIKE = 0.5  # of the power of a motion; another that differs by more, noise included, is not the same
 _NEIGHBOURS = 11  # lines that tell the noise about one, where it is not stated
 _SEEN = 3.0  # times the noise, the least motion that two sensors can share
-_LINES = 2  # times the free residues: fewer numbers than these tell nothing beside noise
-_MIMICKED = 1e-2  # of a constant; less of it is left where a mode far below the lines answers like one
 _GAIN = 0.03  # of the base's motion; smaller errors of a sensor's gain are usual
 
 
@@ -48,7 +46,7 @@ def _of_records(formulation: Formulation, test: Measurement, structure: Structur
     records, poles = Records(test), distinct_poles(structure)
     leaks = list(leakage(test, structure)) if test.averaged else []
     velocity = not structure.modal_damping
-    if records.data.shape[0] <= _LINES * poles[0].size * records.n_base * (2 if velocity else 1):
+    if records.data.shape[0] <= NUMBERS_A_RESIDUE * poles[0].size * records.n_base * (2 if velocity else 1):
         return leaks
     free = records.fit(*poles, velocity=velocity)
     misses, rigid = list(_misfit(formulation, test, structure, records, free)), []
@@ -121,8 +119,8 @@ def _rigid(test: Measurement, records: Records, free: ResidueFit) -> Iterator[Fi
     reach = np.abs(test.rigid_body).max(axis=0)
     moved /= np.where(reach > 0, reach, np.inf)
     most, size = np.abs(moved).argmax(axis=1), np.abs(moved).max(axis=1)
-    wrong = np.flatnonzero((chi2 > beyond_chance(test.n_base)) & (size > _GAIN))
-    for i in wrong[np.argsort(-size[wrong])][:3]:
+    wrong = np.flatnonzero((chi2 > beyond_chance(test.n_base, CANDIDATES)) & (size > _GAIN))
+    for i in wrong[np.argsort(-size[wrong])][:MOST_OF_A_KIND]:
         yield Finding(
             "rigid motion", Severity.CONTRADICTS,
             f"{test.sensor_names[i]} moves with the base beside its modes and what rigid_body says, by "
@@ -139,7 +137,7 @@ def _along_the_base(test: Measurement, records: Records, free: ResidueFit) -> tu
     """
     ones = records.basis(np.ones((1, test.freq.size), dtype=complex))
     extra = ones - free.Q @ (free.Q.T @ ones)
-    if np.linalg.norm(extra) < _MIMICKED * np.linalg.norm(ones):
+    if np.linalg.norm(extra) < MIMICKED * np.linalg.norm(ones):
         return None
     Q, R = np.linalg.qr(extra)
     along = Q.T @ free.left
@@ -157,7 +155,7 @@ def _damping(records: Records, poles: tuple[Array, Array], free: ResidueFit) -> 
     extra = poles[0].size * records.n_base * records.n_sensors
     noise = records.noise(both.left, 2 * extra, least=EXACT)
     gained = free.squared_error - both.squared_error
-    if gained > noise * beyond_chance(extra):
+    if gained > noise * beyond_chance(extra, CANDIDATES):
         share = float(np.sqrt(gained / records.size))
         yield Finding(
             "damping", Severity.CONTRADICTS,
@@ -173,7 +171,7 @@ def _twins(test: Measurement, structure: Structure) -> Iterator[Finding]:
     moves, noise = columns(test.relative)[:, lines], _own_noise(test)
     left = moves - columns(test.predict(structure))[:, lines]
     gram = (moves @ moves.conj().T).real
-    size, most = np.diag(gram), beyond_chance(2 * moves.shape[1]) / (2 * moves.shape[1])
+    size, most = np.diag(gram), beyond_chance(2 * moves.shape[1], CANDIDATES) / (2 * moves.shape[1])
     for i, j in zip(*np.tril_indices(test.n_sensors, -1), strict=True):
         sign, smaller = np.sign(gram[i, j]), min(size[i], size[j])
         if size[i] + size[j] - 2 * abs(gram[i, j]) > _ALIKE * smaller or smaller == 0:

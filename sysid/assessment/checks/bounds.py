@@ -11,19 +11,19 @@ from numpy.typing import ArrayLike, NDArray
 from sysid.assessment.checks.context import Context
 from sysid.assessment.checks.gains import distinct_poles
 from sysid.assessment.sensitivity import left_by_constraints, rows_of
+from sysid.errors import listed
 from sysid.finding import Finding, Severity, contradicting
-from sysid.modal_analysis.residues import Records, beyond_chance
+from sysid.modal_analysis.residues import Records
 from sysid.models.stiffness import FREQUENCY_WINDOW
 from sysid.models.unknowns import scales_of, split
 from sysid.problem.formulation import Formulation
 from sysid.problem.problem import Problem
 from sysid.problem.slopes import stacked_rows
 from sysid.structure.structure import Array, Structure
-from sysid.structure.thresholds import EXACT, NEGLIGIBLE, ROUND_OFF
+from sysid.structure.thresholds import CANDIDATES, EXACT, NEGLIGIBLE, ROUND_OFF, beyond_chance
 
 _CLOSE = 1e-4  # .. and, where the range spans decades, of the bound itself
 _SHARE = 0.25  # of the squared misfit: bounds that explain less, to first order, are not its cause
-_TOLD = 8  # unknowns, and entries of each
 
 
 class OnBound(NamedTuple):
@@ -122,15 +122,8 @@ def bounds_in_words(found: Sequence[OnBound]) -> str:
     groups: dict[tuple[str, str, str], list[str]] = {}
     for one in found:
         groups.setdefault((one.name, one.side, one.bound), []).append(one.entry)
-    words = [
-        f"{name}{','.join(entries[:_TOLD])}{_more(len(entries))} ({side}, {bound})"
-        for (name, side, bound), entries in groups.items()
-    ]
-    return ", ".join(words[:_TOLD]) + _more(len(words))
-
-
-def _more(count: int) -> str:
-    return f" and {count - _TOLD} more" * (count > _TOLD)
+    words = [f"{name}{listed(entries, ',')} ({side}, {bound})" for (name, side, bound), entries in groups.items()]
+    return listed(words)
 
 
 def keeping_bounds(context: Context) -> Iterator[Finding]:
@@ -220,7 +213,7 @@ def pressure(problem: Problem, structure: Structure, x: Array | None, found: Seq
     _, s, Vt = np.linalg.svd(free[places])
     held = free @ Vt[np.count_nonzero(s > ROUND_OFF) :].T  # what moves no unknown on a bound
     gained = _explained(J @ free, rows.residuals) - _explained(J @ held, rows.residuals)
-    least = max(float(np.mean(rows.std**2)) * beyond_chance(len(places)), EXACT**2)
+    least = max(float(np.mean(rows.std**2)) * beyond_chance(len(places), CANDIDATES), EXACT**2)
     return Pressure(gained / max(float(np.sum(rows.residuals**2)), EXACT**2), significant=gained > least)
 
 
@@ -237,5 +230,5 @@ def _of_poles(problem: Problem, structure: Structure, count: int) -> Pressure:
     records, poles = Records(problem.measurement), problem.geometry.poles
     own, exact = records.fit(*distinct_poles(structure)), EXACT**2 * records.size
     gained = own.squared_error - poles.residual**2 * records.size
-    least = max(records.noise(own.left, own.residues.size) * beyond_chance(count), exact)
+    least = max(records.noise(own.left, own.residues.size) * beyond_chance(count, CANDIDATES), exact)
     return Pressure(gained / max(own.squared_error, exact), significant=bool(gained > least))

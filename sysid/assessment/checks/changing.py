@@ -19,15 +19,13 @@ from sysid.modal_analysis.stretches import Stretch, stretches_of
 from sysid.modal_analysis.transients import without_transients_of
 from sysid.problem.problem import Problem
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import COVERAGE, FALSE_ALARM, most_deviations
 
 _MOVED = 0.1  # half-power widths, by which the frequency of a mode changes at least
 _KNOWN = 1.0  # the same, to which it is known in a stretch that counts
-_SURE = 5.0  # standard deviations of a change between two stretches
 _EXPLAINED = 0.7  # of the squares that constant poles leave: poles that change leave no more
 _SHOWN = 0.03  # of the largest level of a mode, at which it shows
 _ENOUGH = 5  # stretches that tell a trend
-_TREND = 0.03  # chance of such an order of frequencies by level
-_SURE_TREND = 1e-3  # the same, where it counts as a sign
 _SIGNS = 2  # of three, that tell a change
 _OF_RUNS = 0.15  # of the variance of frequencies, that is left within runs where runs differ
 _CLOSE = 0.06  # of their frequency, within which modes ..
@@ -74,8 +72,8 @@ class Change:
         std = np.array([one.std for one in self.seen])
         change = np.abs(self.frequency[:, None] - self.frequency)
         moved = change > _MOVED * self.width
-        differ = bool(np.any(moved & (change > _SURE * np.hypot(std[:, None], std))))
-        return bool(np.any(moved)) and explained + differ + (self.trend_of(_SURE_TREND) != 0) >= _SIGNS
+        differ = bool(np.any(moved & (change > most_deviations(change.size) * np.hypot(std[:, None], std))))
+        return bool(np.any(moved)) and explained + differ + (self.trend_of(FALSE_ALARM) != 0) >= _SIGNS
 
     @property
     def size(self) -> float:
@@ -85,7 +83,7 @@ class Change:
     @cached_property
     def trend(self) -> float:
         """Rank correlation of frequency and level; zero where chance or time make as large a one."""
-        return self.trend_of(_TREND)
+        return self.trend_of(1 - COVERAGE)
 
     def trend_of(self, chance: float) -> float:
         """The same, where chance makes as large a one no more often than stated."""

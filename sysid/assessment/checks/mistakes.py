@@ -13,17 +13,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sysid.files.units import STANDARD_GRAVITY
 from sysid.finding import Finding, Kind, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.direct_terms import DirectTerms, direct_terms
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import CANDIDATES, most_deviations
 
 CONJUGATED = 0.3  # relative misfit, beyond which modes explain the records at most as conjugated ones
 _MENDED = 0.3  # of the misfit; what a mended record may leave
 _GROSS = 0.15  # of a sensor's rigid-body motion: smaller errors of gains are told by what was fitted
-_CHANCE = 3.0  # standard deviations that a factor may be off by
 _ALONE = 0.05  # of the same of the other sensors, where one alone has another gain
-_SURE = 6.0  # standard deviations
 _ONE_SURE = 10.0  # the same of the delay of one sensor, whose deviation is not known so well
 _SHOWN = 0.1  # of a sensor's rigid-body motion; it is not known where the standard deviation is larger
 _LIKE = 0.04  # by how much a factor may differ from that of two units
@@ -35,10 +35,9 @@ _MOST = 1.5  # rad at the last line; the largest one
 _ALIKE = 0.2  # of a delay, by which sensors on one clock may differ
 _NO_WORSE = 1.02  # times the misfit before, that records on one clock may have
 _ROUNDS = 3  # of taking a delay off
-GRAVITY = 9.80665
 _UNITS = (  # what sensors over base are multiplied by, in words, and the units with the smaller and the larger numbers
-    (GRAVITY, "9.81", "g", "m/s²"),
-    (1 / GRAVITY, "9.81", "g", "m/s²"),
+    (STANDARD_GRAVITY, "9.81", "g", "m/s²"),
+    (1 / STANDARD_GRAVITY, "9.81", "g", "m/s²"),
     (1000.0, "1,000", "m/s²", "mm/s²"),
     (1 / 1000.0, "1,000", "m/s²", "mm/s²"),
 )
@@ -146,8 +145,8 @@ def _delays(test: Measurement, terms: DirectTerms) -> Array | None:
     if np.any(np.abs(delay[off]) > _MOST / (2 * np.pi * test.freq[-1])):  # the first terms of a series do not tell it
         return None
     out = np.zeros(test.n_sensors)
-    if np.all(np.abs(delay - mean) < np.maximum(_SURE * error, _ALIKE * abs(mean))):
-        if abs(mean) < max(_SURE / np.sqrt(np.sum(error**-2)), least):
+    if np.all(np.abs(delay - mean) < np.maximum(most_deviations(CANDIDATES) * error, _ALIKE * abs(mean))):
+        if abs(mean) < max(most_deviations(CANDIDATES) / np.sqrt(np.sum(error**-2)), least):
             return None
         out[known] = mean
     elif np.count_nonzero(off) == 1 and known.size > 2:
@@ -181,7 +180,7 @@ class _Motion:
         """Which rows are recorded as these say, but for what is usual and for chance."""
         size = np.linalg.norm(stated, axis=1, keepdims=True)
         off = np.abs(self.recorded - stated)
-        return np.asarray(np.all(off < np.maximum(within * size, _SURE * self.std), axis=1))
+        return np.asarray(np.all(off < np.maximum(within * size, most_deviations(CANDIDATES) * self.std), axis=1))
 
 
 def _of_motion(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
@@ -320,7 +319,9 @@ def _of_sensors(test: Measurement, motion: _Motion, right: NDArray[np.bool_]) ->
         alone = wrong.size == 1 and np.count_nonzero(motion.agree(motion.stated, _ALONE)) == right.size - 1
         if agree[i] and (alone or any(abs(value / own - 1) < _LIKE for own in _CLEAR)):
             carried = np.sum(motion.modal[i] * motion.stated[i]) / np.sum(motion.stated[i] ** 2)
-            value = next((u[0] for u in _UNITS if abs(value - u[0]) < min(_CHANCE * std, _GROSS * u[0])), value)
+            value = next(
+                (u[0] for u in _UNITS if abs(value - u[0]) < min(most_deviations() * std, _GROSS * u[0])), value
+            )
             yield from _of_sensor(test.sensor_names[motion.sensors[i]], float(value), float(carried))
 
 
@@ -361,7 +362,7 @@ def _of_force(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
     if terms.mass is None or terms.mass_std is None or terms.modal_mass is None:
         return
     weighed, std, modal = (np.diag(it) for it in (terms.mass, terms.mass_std, terms.modal_mass))
-    against = np.flatnonzero((weighed < -_SURE * std) & (modal < 0))
+    against = np.flatnonzero((weighed < -most_deviations(CANDIDATES) * std) & (modal < 0))
     if against.size:
         assert test.base_axes is not None
         masses = ", ".join(f"{weighed[i]:.4g}" for i in against)

@@ -9,8 +9,9 @@ import numpy as np
 
 from sysid.assessment.checks.context import Context
 from sysid.assessment.checks.leakage import unresolved
-from sysid.assessment.checks.mistakes import CONJUGATED, GRAVITY, is_gross, mistakes_of
+from sysid.assessment.checks.mistakes import CONJUGATED, is_gross, mistakes_of
 from sysid.errors import InputError
+from sysid.files.units import POUND, STANDARD_GRAVITY
 from sysid.finding import Finding, Severity
 from sysid.measurement.in_time import as_whole
 from sysid.measurement.measurement import Measurement
@@ -21,20 +22,23 @@ from sysid.problem.formulation import Formulation
 from sysid.problem.problem import Problem
 from sysid.problem.terms import FurtherTest
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import CANDIDATES, most_deviations
 
 _BEYOND = 1.5  # times what the model allows, from which records contradict it
 _WITHIN = 1.15  # times the same, up to which mended records agree
 _CORNERS = 6  # unknowns whose bounds are combined
-_SURE = 6.0  # standard deviations of a weighed mass
 _MODAL = 0.4  # of the mended mass, that the modes between the lines carry at least
-_LBF = 4.4482216
 _FACTORS = (  # of the weighed mass over the right one, and what they are in words
     (1e-3, "1,000", "the base force is in kN, not N"),
     (1e3, "1,000", "the base force is in N, and was taken for kN"),
-    (GRAVITY, "9.81", "base and sensors are in g, not m/s² (or the base force is in N, and was taken for kgf)"),
-    (1 / GRAVITY, "9.81", "the base force is in kgf, not N"),
-    (1 / _LBF, "4.448", "the base force is in lbf, not N"),
-    (_LBF, "4.448", "the base force is in N, and was taken for lbf"),
+    (
+        STANDARD_GRAVITY,
+        "9.81",
+        "base and sensors are in g, not m/s² (or the base force is in N, and was taken for kgf)",
+    ),
+    (1 / STANDARD_GRAVITY, "9.81", "the base force is in kgf, not N"),
+    (1 / POUND, "4.448", "the base force is in lbf, not N"),
+    (POUND, "4.448", "the base force is in N, and was taken for lbf"),
 )
 
 
@@ -84,7 +88,7 @@ def _of_mass(declared: Formulation, test: Measurement, terms: DirectTerms) -> It
         return
     low, high = (part[test.translational] for part in allowed)
     weighed, std, modal = (np.diag(it)[test.translational] for it in (terms.mass, terms.mass_std, terms.modal_mass))
-    known = (weighed > _SURE * std) & np.isfinite(low) & (high > 0)
+    known = (weighed > most_deviations(CANDIDATES) * std) & np.isfinite(low) & (high > 0)
     if not np.any(known):
         return
     low, high, weighed, modal = low[known], high[known], weighed[known], modal[known]
