@@ -23,7 +23,7 @@ from sysid.models.model import Stated
 from sysid.problem.formulation import Formulation
 from sysid.problem.problem import Problem
 from sysid.structure.structure import Array, ComplexArray, Structure
-from sysid.structure.thresholds import EPSILON, NEGLIGIBLE, ROUND_OFF
+from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF
 
 UNIT_MASS = "no number with a unit of mass is given: masses are normalised to 1 kg in each base direction"
 _UNRESOLVED = 20.0  # misfits, in parts of the half-power half-width, by which resolved poles differ
@@ -157,7 +157,7 @@ def _entries(cone: Cone, rows: Array, own: Array) -> Array:
         values, _ = cone.largest(np.concatenate([-functions, functions]))
         values = values.reshape(2, -1)
         largest = np.where(np.isfinite(values), np.abs(values), 1.0).max(axis=0)
-        values = np.where(np.abs(values) < NEGLIGIBLE * largest + EPSILON, 0.0, values) * size[i] * size[j]
+        values = np.where(np.abs(values) < NEGLIGIBLE * largest + ROUND_OFF, 0.0, values) * size[i] * size[j]
         ends[0, i, j] = ends[0, j, i] = np.minimum(-values[0], own[i, j])
         ends[1, i, j] = ends[1, j, i] = np.maximum(values[1], own[i, j])
     return ends

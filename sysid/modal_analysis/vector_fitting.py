@@ -214,7 +214,7 @@ def _relocated(records: Records, count: int, progress: _Progress) -> tuple[Array
         omega, ratios = relocate(records, channels, omega, ratios, progress.tell)
         before, error = error, records.fit(omega, ratios).squared_error
         progress.step(error)
-        if error < round_off(omega.size) ** 2 * records.size or error > 0.97 * before:
+        if error < round_off(len(records.data)) ** 2 * records.size or error > 0.97 * before:
             break
     # A pole of a structure with other than classical damping needs its velocity too, or more poles would replace it.
     return _prune(records, omega, ratios, progress, velocity=True)
@@ -356,7 +356,7 @@ def _polish(
     error, H, slope = _projected(records, p, velocity)
     for _ in range(_STEPS):
         progress.step(error)
-        if error < round_off(omega.size) ** 2 * records.size:
+        if error < round_off(len(records.data)) ** 2 * records.size:
             break
         step = np.linalg.solve(H + damping * np.diag(np.diag(H)), slope)
         trial = p + np.clip(step, -0.5, 0.5)
