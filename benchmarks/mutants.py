@@ -233,7 +233,7 @@ NOTICED = (
     Mutant("E09", "plotted band for unit base motion", "np.sum(band * np.abs(test.base[run]), axis=0)",
         "np.sum(band, axis=0)", "test_plot"),
     Mutant("F02", "candidates that break constraints not penalised",
-        "np.where(broken > 0, _WORST * (1 + broken), np.minimum(objective, _WORST))", "np.minimum(objective, _WORST)",
+        "np.where(broken > 0, WORST * (1 + broken), np.minimum(objective, WORST))", "np.minimum(objective, WORST)",
         "test_swarm_objective"),
     Mutant("F03", "success above the goal", "if goal is not None and residual > goal:", "if False:", "test_identify"),
     Mutant("F06", "leaders never refined by IPOPT",

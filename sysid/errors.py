@@ -75,7 +75,7 @@ def shown(value: Any) -> str:
 def listed(words: Sequence[str], between: str = ", ") -> str:
     """Words in a message, and how many more there are beyond the first few."""
     more = len(words) - MOST_LISTED
-    return between.join(words[:MOST_LISTED]) + (f" and {more} more" if more > 0 else "")
+    return between.join(words[:MOST_LISTED]) + f" and {more} more" * (more > 0)
 
 
 def number(

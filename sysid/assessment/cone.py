@@ -23,8 +23,6 @@ from sysid.structure.thresholds import EXACT, NEGLIGIBLE, ROUND_OFF, round_off
 
 Pairs = list[tuple[int, int]]
 
-_CENTRED = 1e-4  # squared Newton decrement at which a point counts as one of the central path
-
 
 def unknowns(clusters: Sequence[list[int]]) -> Pairs:
     """Entries of T on and above its diagonal, cluster by cluster."""
@@ -372,7 +370,7 @@ def _centred(pull: Array, room: _Room, z: Array) -> Array:
         # The Hessian is root' root; near a corner only its triangular factor has a condition to compute with.
         triangle = np.linalg.qr(root, mode="r")
         half = np.linalg.solve(np.swapaxes(triangle, 1, 2), (pull + gradient)[:, :, None])
-        if np.sum(half**2, axis=1).max() < _CENTRED:
+        if np.sum(half**2, axis=1).max() < 1e-4:  # squared Newton decrement: near enough to the central path
             return z
         step = np.linalg.solve(triangle, half)[:, :, 0]
         rates = spread(step)

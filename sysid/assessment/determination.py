@@ -31,10 +31,9 @@ from sysid.problem.formulation import Formulation
 from sysid.problem.problem import Problem
 from sysid.problem.slopes import Slopes, slopes_of
 from sysid.structure.structure import Array, Structure
-from sysid.structure.thresholds import EXACT, NEGLIGIBLE, most_deviations
+from sysid.structure.thresholds import EXACT, NEGLIGIBLE, SAME_ANSWER, most_deviations
 
 _LOOSE = 1e-2  # of an unknown, by which what is left of exact records may move it
-_OTHER = 1e-3  # of an unknown, or of the root of two diagonals: what differs by less is the same
 _SAME_MATRICES = "mass, stiffness and damping stay the same all the same"
 _NO_SCALE = (
     "without a base force or a known mass the scale of mass, stiffness and damping is not determined: give the force, "
@@ -278,7 +277,7 @@ def _others(problem: Problem, structure: Structure, x: Array | None, rivals: Seq
     unit, named, labels = scales_of(formulation.unknowns, x), meaningful(formulation), formulation.labels
     for other in rivals:
         off = np.where(named, np.abs(other - x) / unit, 0.0)
-        far = [j for j in np.argsort(-off, kind="stable")[:MOST_LISTED] if off[j] > _OTHER]
+        far = [j for j in np.argsort(-off, kind="stable")[:MOST_LISTED] if off[j] > SAME_ANSWER]
         told = ", ".join(f"{labels[j]} = {other[j]:.4g} in place of {x[j]:.4g}" for j in sorted(far))
         if _other_matrices(problem, structure, x, other):
             sentence = ": ".join(filter(None, ("another structure explains the data as well", told)))
@@ -294,12 +293,12 @@ def _other_matrices(problem: Problem, mine: Structure, x: Array, other: Array) -
         return False
     sizes = [np.sqrt(np.abs(np.diag(a))) + np.finfo(float).tiny for a in blocks_of(mine)]
     pairs = list(zip(blocks_of(mine), blocks_of(its), sizes, strict=True))
-    if all(np.all(np.abs(a - b) <= _OTHER * np.outer(size, size)) for a, b, size in pairs):
+    if all(np.all(np.abs(a - b) <= SAME_ANSWER * np.outer(size, size)) for a, b, size in pairs):
         return False
     stds = _stds(problem, mine, x)
     far = most_deviations(sum(std.size for std in stds))
     return any(
-        np.any(np.abs(a - b) > np.fmax(_OTHER * np.outer(size, size), far * std))  # NaN where something is open
+        np.any(np.abs(a - b) > np.fmax(SAME_ANSWER * np.outer(size, size), far * std))  # NaN where something is open
         for (a, b, size), std in zip(pairs, stds, strict=True)
     )
 

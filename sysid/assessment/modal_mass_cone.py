@@ -31,7 +31,6 @@ _CLEAR = 3.0  # misfits above which a mode's share of the responses is seen
 _AS_STATED = 1.2  # times the stated noise, to which a misfit may be noise alone
 _RESOLVED = 10.0  # standard deviations of a mode's amplitude at which it is known, to a tenth
 _GAIN = 5e-3  # of the base's motion; a smaller error of a sensor's gain is not told from a mode below the lines
-_AT_ONCE = 100  # entries whose ends are sought together: enough for speed, few enough for memory
 
 
 def speaks(formulation: Formulation) -> bool:
@@ -145,13 +144,13 @@ def ends(problem: Problem, structure: Structure) -> tuple[Array, Array]:
     return _entries(cone, P, mass), _entries(cone, P * omega, stiffness)
 
 
-def _entries(cone: Cone, rows: Array, own: Array) -> Array:
-    """Ends of the entries of ``rows' T rows``, (2, n, n); `own` is its value for T = I."""
+def _entries(cone: Cone, rows: Array, own: Array, at_once: int = 100) -> Array:
+    """Ends of the entries of ``rows' T rows``, (2, n, n), so many at once; `own` is its value for T = I."""
     size = np.linalg.norm(rows, axis=0)
     unit = (rows / size).T
     ends = np.empty((2, *own.shape))
     upper = np.array(np.triu_indices(len(own)))
-    for i, j in np.array_split(upper, -(-upper.shape[1] // _AT_ONCE), axis=1):
+    for i, j in np.array_split(upper, -(-upper.shape[1] // at_once), axis=1):
         functions = unit[i][:, :, None] * unit[j][:, None, :]
         functions = (functions + np.swapaxes(functions, 1, 2)) / 2
         values, _ = cone.largest(np.concatenate([-functions, functions]))

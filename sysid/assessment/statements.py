@@ -22,7 +22,6 @@ from sysid.problem.problem import Problem
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EPSILON, EXACT, ROUND_OFF, round_off
 
-_STEPS = 40
 _LONGEST = 0.5  # of a step: of the logarithm of a mode's scale, or of a shape's length
 _WIDE = 5.0  # standard deviation of the logarithm of a mode's scale that nothing sets
 
@@ -117,8 +116,10 @@ class Adjusted(NamedTuple):
     holds: bool
 
 
-def adjust(problem: Problem, stated: Statements, theta: Array, index: Index, normals: Array) -> Adjusted:
-    """Adjust modal parameters to statements by Gauss-Newton steps.
+def adjust(
+    problem: Problem, stated: Statements, theta: Array, index: Index, normals: Array, steps: int = 40
+) -> Adjusted:
+    """Adjust modal parameters to statements by Gauss-Newton steps, so many at most.
 
     Parameters
     ----------
@@ -133,13 +134,13 @@ def adjust(problem: Problem, stated: Statements, theta: Array, index: Index, nor
     if not wanted.size:
         return Adjusted(theta, 0.0, 0, holds=True)
     at, a, b = theta, np.zeros(k), np.zeros(0 if weighed else m)
-    for step in range(_STEPS):
+    for step in range(steps):
         values, slopes = made(problem, stated, at, index)
         F, U = slopes @ _rescaled(normals, b, index), slopes @ _gauge(at, index, weighed)
         system = np.hstack([F, _WIDE * U, np.diag(std)])
         # Shapes of modes that almost share a pole turn too easily for steps to settle: then these only meet what is
         # exact.
-        settling = step >= _STEPS // 2
+        settling = step >= steps // 2
         gap = np.where(std > 0, 0.0, wanted - values) if settling else wanted - values + F @ a + U @ b
         y = np.linalg.lstsq(system, gap, rcond=None)[0]
         step_a, step_b = y[:k], _WIDE * y[k : k + b.size]

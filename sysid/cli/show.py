@@ -18,6 +18,7 @@ import numpy as np
 from sysid.assessment.determination import determine
 from sysid.assessment.sensitivity import Sensitivity, directions_in_words, sensitivity
 from sysid.errors import InputError, SysidError, listed
+from sysid.finding import MOST_OF_A_KIND
 from sysid.identify import choose, identify
 from sysid.measurement.measurement import Measurement
 from sysid.models.unknowns import Unknown, scales_of, slices_of
@@ -27,12 +28,11 @@ from sysid.problem.problem import Problem
 from sysid.problem.slopes import Slopes, slopes_of
 from sysid.problem.terms import FurtherTest
 from sysid.results.summary import WIDTH, counted
+from sysid.search.continuation import DRAWN
 from sysid.structure.structure import Array, ComplexArray, Structure
 from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF
 
 _NOISE = 0.01  # of a record's rms, where no noise is stated
-_SHORTEST = 3  # null directions that are told in full where there are more
-_TRIED = 20  # points of the search space looked at for one that makes a structure
 _ROOM = 1e-3  # of a constraint's scale, by which the point stays clear of inequalities
 
 
@@ -177,12 +177,12 @@ def _at_guess(problem: Problem, sentences: tuple[str, ...]) -> _Point:
     # A free stiffness has all its frequencies equal in the middle of its search space.
     free = problem.formulation.stiffness.free
     why = "as the guess has all frequencies equal" if free else "as the guess makes no structure with derivatives"
-    names = ["the guess", *[f"a point of the search space, {why}"] * (_TRIED - 1)]
+    names = ["the guess", *[f"a point of the search space, {why}"] * (DRAWN - 1)]
     guess = _first_judged(problem, names[:1], free)
     point = guess or _first_judged(problem, names, 1)
     if point is None:
         raise InputError(
-            f"neither the guess nor any of {_TRIED - 1} points of the search space makes a structure with finite "
+            f"neither the guess nor any of {DRAWN - 1} points of the search space makes a structure with finite "
             "derivatives: state a guess, or tighter bounds"
         )
     return replace(point, sentences=sentences, at_guess=guess is not None, in_box=True)
@@ -344,10 +344,10 @@ def _unseen(problem: Problem, point: _Point) -> Iterator[str]:
     )
     changed = "; ".join(sentence for number, sentence in kinds if number)
     yield f"  - no record sees {counted(len(words), 'direction')}: {changed}"
-    more = f" (the {_SHORTEST} shortest of {len(words)})" if len(words) > _SHORTEST else ""
+    more = f" (the {MOST_OF_A_KIND} shortest of {len(words)})" if len(words) > MOST_OF_A_KIND else ""
     yield f"  - unseen{more}:"
-    yield from (f"      {word}" for word in words[:_SHORTEST])
-    other = _first_judged(problem, ["another point of the search space"] * _TRIED, 1) if point.at_guess else None
+    yield from (f"      {word}" for word in words[:MOST_OF_A_KIND])
+    other = _first_judged(problem, ["another point of the search space"] * DRAWN, 1) if point.at_guess else None
     if other is not None and other.known.rank > known.rank:
         yield (
             "  - this point is special, by a symmetry for instance: at another point of the search space the records "

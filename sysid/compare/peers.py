@@ -29,7 +29,6 @@ HOW_TO_INSTALL = how_to_install("benchmark")
 
 _SHARE = 2 / 3  # of the time, that a search may take before its local phase: as the swarm's
 _WORST = 1e30  # an objective in the place of what is not a number: above that of any broken constraint
-_SIGMA = 0.3  # of the search space: where CMA-ES starts from its middle
 
 Evaluate = Callable[[Array], Array]  # points of the unit cube (k, size) to objectives (k,)
 
@@ -186,7 +185,7 @@ def _cma_es(evaluate: Evaluate, size: int, rng: np.random.Generator) -> None:
 
     run = cma.CMAEvolutionStrategy(
         np.full(size, 0.5),
-        _SIGMA,
+        0.3,  # of the search space, from its middle
         # "seed": not a number leaves NumPy's global source alone.
         {"bounds": [0, 1], "seed": np.nan, "randn": lambda *s: rng.standard_normal(s), "verbose": -9},
     )

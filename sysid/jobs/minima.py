@@ -12,10 +12,7 @@ from sysid.jobs.job import JobResult
 from sysid.problem.problem import Problem
 from sysid.search.continuation import apart
 from sysid.structure.structure import Structure
-from sysid.structure.thresholds import EXACT, NEGLIGIBLE
-
-_ONE = 1e-3  # of an unknown's or a matrix's size: ends nearer to each other are one minimum
-_ALIKE = 1e-3  # relative difference of residuals up to which minima fit alike
+from sysid.structure.thresholds import EXACT, NEGLIGIBLE, SAME_ANSWER
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +52,7 @@ def distinct(problem: Problem, results: Iterable[JobResult]) -> list[Minimum]:
         structure = problem.structure(result.x)
         for first, group in groups:
             x = np.where(named, result.x, group[0].x)
-            if apart(problem, x, group[0].x) < _ONE and _matrices_apart(structure, first) < _ONE:
+            if apart(problem, x, group[0].x) < SAME_ANSWER and _matrices_apart(structure, first) < SAME_ANSWER:
                 group.append(result)
                 break
         else:
@@ -76,5 +73,5 @@ def _matrices_apart(one: Structure, other: Structure) -> float:
 
 def as_good(minima: list[Minimum]) -> list[Minimum]:
     """Minima that fit as well as the best one, it included."""
-    most = max((1 + _ALIKE) * minima[0].residual, EXACT) if minima else np.nan
+    most = max((1 + SAME_ANSWER) * minima[0].residual, EXACT) if minima else np.nan
     return [minimum for minimum in minima if minimum.residual <= most]

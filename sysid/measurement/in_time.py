@@ -13,7 +13,6 @@ from sysid.measurement.whole import NoiseLevels, WholeRecords
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import NEGLIGIBLE
 
-_SAMPLES = 2.5  # a period of the highest line, where the sample rate is not known
 _BLOCKS = 32  # of a run, of which the quietest tell its noise ..
 _LINES = 32  # .. with so many lines to a block at least
 _QUIET = 0.1
@@ -119,7 +118,8 @@ def as_whole(test: Measurement) -> Measurement:
     ):
         return test
     if test.sample_rate is None:
-        n = int(scipy.fft.next_fast_len(int(np.ceil(_SAMPLES * test.freq[-1] / spacing[0]))))
+        # A period of the highest line, where the sample rate is not known.
+        n = int(scipy.fft.next_fast_len(int(np.ceil(2.5 * test.freq[-1] / spacing[0]))))
         samples, rate = [n] * test.n_runs, n * float(spacing[0])
     else:
         samples, rate = np.round(test.sample_rate / spacing).astype(int).tolist(), test.sample_rate

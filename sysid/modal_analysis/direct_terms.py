@@ -23,14 +23,9 @@ from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import CANDIDATES, ROUND_OFF, beyond_chance, largest_modulus
 
 _SPARE, _MOST = 6, 40  # poles beyond one a sensor; all of them
-_CHANNELS = 12  # principal ones, by which the poles are looked for
-_FIRST_CHANNELS = 4  # of them, in the first half of the steps, which are the quicker for it
-_STEPS = 8
 _MODE = 0.3  # largest damping ratio of a pole that is kept; what has more answers like a term without poles
 _OUTSIDE = 1.5  # times the last line, up to where poles are kept; what lies below the first shows by its tail
-_SCREENINGS = 3  # times that lines with spikes are left out
 _FEW = 0.25  # of the lines
-_LINES = 3  # real numbers of a channel for each function, at least
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +82,7 @@ def direct_terms(test: Measurement) -> DirectTerms | None:
         if found is None:
             return None
         misfit = found[2].misfit
-        for _ in range(_SCREENINGS):
+        for _ in range(3):  # times that lines with spikes are left out
             spikes = found[2].spikes
             if not spikes.any():
                 break
@@ -113,19 +108,22 @@ def _of_accelerations(still: Measurement) -> tuple[Array, Array, _Fit] | None:
     return None if poles is None else (*poles, _fitted(records, *poles))
 
 
-def _poles(records: Records) -> tuple[Array, Array] | None:
-    """Poles of the records beside terms without them; none is removed for explaining no more than noise."""
+def _poles(records: Records, steps: int = 8) -> tuple[Array, Array] | None:
+    """Poles of the records beside terms without them; none is removed for explaining no more than noise.
+
+    They are looked for in the principal channels, the first half of the steps in few of them, which is quicker.
+    """
     lines = 2 * np.pi * records.freq[records.freq > 0]
     inputs = records.base.shape[0]
-    room = (records.data.shape[0] // _LINES // inputs - 3) // 2
+    room = (records.data.shape[0] // 3 // inputs - 3) // 2  # three real numbers of a channel for each function
     count = min(records.n_sensors + _SPARE, _MOST, room)
     if count < 1:
         return None
     omega, ratios = np.geomspace(lines[0], lines[-1], count), np.full(count, GUESS)
-    first, every = records.principal(_FIRST_CHANNELS), records.principal(_CHANNELS)
+    first, every = records.principal(4), records.principal(12)
     direct = _without_poles(records.freq)
-    for step in range(_STEPS):
-        omega, ratios = relocate(records, first if 2 * step < _STEPS else every, omega, ratios, lambda: None, direct)
+    for step in range(steps):
+        omega, ratios = relocate(records, first if 2 * step < steps else every, omega, ratios, lambda: None, direct)
     kept = (omega > lines[0]) & (omega < _OUTSIDE * lines[-1]) & (ratios < _MODE)
     kept &= ratios * omega > RAZOR * np.interp(omega, lines, np.gradient(lines))  # else it answers for one bad line
     return (omega[kept], ratios[kept]) if np.any(kept) else None

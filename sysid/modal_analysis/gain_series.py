@@ -13,7 +13,6 @@ from sysid.modal_analysis.response import gains
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF
 
-_TERMS_MORE = 4  # than the asymptotic rate of the series asks for
 # Candidates whose gains are made at once: those of more leave a processor's cache before they are used. Products of all
 # candidates have this size, because BLAS rounds differently where the size differs.
 _BLOCK = 64
@@ -87,7 +86,8 @@ def terms_needed(ratio: float, tolerance: float) -> int:
     >>> terms_needed(10.0, 1e-8), terms_needed(100.0, 1e-8)
     (21, 33)
     """
-    return int(np.ceil(np.log(1 / tolerance) / np.arcsinh(np.pi / np.log(ratio)))) + _TERMS_MORE
+    rate = np.arcsinh(np.pi / np.log(ratio))  # asymptotic: up to four terms more are needed
+    return int(np.ceil(np.log(1 / tolerance) / rate)) + 4
 
 
 class SummedRecord:

@@ -39,6 +39,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
@@ -56,8 +57,6 @@ _BESIDE = 5.0  # times the numbers beside it: as much as a wrong pole leaves of 
 _CERTAIN = 10.0  # the same, where noise that differs from line to line must not be taken for outliers
 _ONE_LINE = 4.0  # times its next line, that a pole's highest one may reach without being doubted
 _ONE_CHANNEL = 0.9  # of the power at that line, in one channel: no motion of a structure
-_NARROW = 0.5  # of the distance of lines; poles of less half-width show at one line too
-_MEDIAN = 0.4549  # of the square of a standard normal number
 _LEAST_LINES = 5  # with fewer, no number has neighbours enough
 _UNDAMPED, _TINY = 1e-9, np.finfo(float).tiny
 _ROUNDS, _BOUNDED, _FREED = 8, 3, 8
@@ -65,8 +64,6 @@ _BEHIND = 2.0  # times the numbers beside it, from which a number need not pull:
 _PASSES, _STEPS = 4, 12  # after absorbed outliers; of weights
 _DECIDES = 0.18  # leverage of a line, of at most 1
 _NEAR_TOP = 0.3  # of a mode's height, from which it is missed at a line
-_OTHERS = 3  # numbers more than modes, at least, to compare with
-_HALVINGS = 60  # of the error of a scale's logarithm, at least
 
 Flags = NDArray[np.bool_]
 
@@ -159,7 +156,7 @@ def deviance(misfit: ComplexArray) -> float:
     """
     size = np.abs(misfit)
     scale = float(np.sqrt(np.mean(size**2)))
-    for _ in range(_HALVINGS):
+    for _ in range(60):  # each halves the error of the logarithm at least
         scale = float(np.sqrt(np.mean(np.minimum(size, TUNING * scale) * size)))
     of_scale = 2 * np.log(scale) + np.log1p(np.exp(-(TUNING**2)) / (2 * TUNING**2))
     return float(2 * (loss(misfit / scale) + size.size * (of_scale - 1)))
@@ -232,7 +229,7 @@ def _in_doubt(freq: Array, omega: Array, ratios: Array) -> Flags:
         return np.ones(freq.size, dtype=bool)
     lines = 2 * np.pi * freq
     distance = np.interp(omega, lines, np.gradient(lines))
-    narrow = ratios * omega < _NARROW * distance
+    narrow = ratios * omega < distance / 2  # poles that show at one line too
     doubted: Flags = np.any(np.abs(lines - omega[narrow, None]) < 1.5 * distance[narrow, None], axis=0)
     return doubted
 
@@ -333,7 +330,7 @@ def _unlike_others(misfit: ComplexArray, shown: ComplexArray) -> tuple[Flags, Co
     """
     flags: Flags = np.zeros(misfit.size, dtype=bool)
     left = misfit
-    while np.count_nonzero(~flags) > shown.shape[1] + _OTHERS:
+    while np.count_nonzero(~flags) > shown.shape[1] + 3:  # too few to compare with
         farthest, size, left_by = -1, _CERTAIN, left
         for j in np.flatnonzero(~flags):
             others = ~flags
@@ -409,7 +406,7 @@ def _is_one_number(test: Measurement, records: Records, omega: Array, ratios: Ar
     left = others.size  # where it is the only pole
     if omega.size > 1:
         left = others.fit(np.delete(omega, k), np.delete(ratios, k), velocity=True).squared_error
-    noise = float(np.median(every.left**2)) / _MEDIAN
+    noise = float(np.median(every.left**2)) / scipy.special.chdtri(1, 0.5)  # that of a squared normal number
     return left - every.squared_error < noise * beyond_chance(every.residues[k].size + 2, CANDIDATES)
 
 

@@ -19,10 +19,8 @@ from sysid.structure.structure import Array
 from sysid.structure.thresholds import CANDIDATES, beyond_chance
 
 _RATIOS = (0.004, 0.012, 0.036)  # damping ratios that are tried
-_STEP = 1.0  # of a candidate's damping ratio, from one frequency to the next
 _REACH = 15.0  # half-power widths about a candidate, of lines that are looked at
 _PROMISING = 0.7  # of what a mode must be worth, that a few steps show
-_FINE = 16  # lines in a half-power width that tell the mean covariance there
 
 
 def with_further_modes(fit: RecordFit, *, some: Measurement | None = None, monitor: Monitor | None = None) -> RecordFit:
@@ -65,7 +63,7 @@ def _candidate(fit: RecordFit, least: float) -> Parameters | None:
     errors = [chunk.weighed_errors(fit.levels) for chunk in model.chunks(p)]
     for ratio in _RATIOS:
         ends = 2 * np.pi * fit.test.freq[[0, -1]]
-        count = int(np.log(ends[1] / ends[0]) / (_STEP * ratio)) + 2
+        count = int(np.log(ends[1] / ends[0]) / ratio) + 2
         for omega in np.geomspace(ends[0], ends[1], count):
             gradient, S, U, power = np.zeros((c, inputs)), np.zeros((c, c)), np.zeros((inputs, inputs)), 0.0
             for w, inputs_there, seen, inverse in errors:
@@ -75,7 +73,8 @@ def _candidate(fit: RecordFit, least: float) -> Parameters | None:
                 g = gains(w[near] / (2 * np.pi), np.array([omega]), np.array([ratio]))[0]
                 moved = g * inputs_there[:, near]
                 gradient += (seen[:, near] @ moved.conj().T).real
-                step = max(1, (near.stop - near.start) // int(2 * _REACH * _FINE))
+                # So many in a half-power width tell the mean covariance.
+                step = max(1, (near.stop - near.start) // int(2 * _REACH * 16))
                 strength = step * np.abs(g[::step]) ** 2
                 S += np.einsum("cel,l->ce", inverse[:, :, near][:, :, ::step], strength).real
                 U += (moved @ moved.conj().T).real

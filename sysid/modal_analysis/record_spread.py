@@ -19,19 +19,16 @@ from sysid.modal_analysis.record_model import Chunk, Run
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import FALSE_ALARM, beyond_chance
 
-_WIDTHS = 3.0  # half-power widths that a block is long
-_LEAST = 4  # lines of a block
-_SHIFTS = 4  # partitions, each begun a part of a block later: where blocks begin must not matter
 _TAKEN = 0.98  # share of the information, at most, that is taken to be a block's
 
 
-def blocks_of(run: Run, fit: RecordFit, shift: float) -> list[NDArray[np.intp]]:
-    """Lines of a run in blocks."""
+def blocks_of(run: Run, fit: RecordFit, shift: float, widths: float = 3.0, least: int = 4) -> list[NDArray[np.intp]]:
+    """Lines of a run in blocks of so many half-power widths, of some lines at least; the first begins at a `shift`."""
     modes = fit.parameters.modes
     order = np.argsort(modes.omega)
-    width = np.interp(run.w, modes.omega[order], 2 * _WIDTHS * (modes.ratios * modes.omega)[order])
+    width = np.interp(run.w, modes.omega[order], 2 * widths * (modes.ratios * modes.omega)[order])
     spacing = np.gradient(run.w)
-    at = np.cumsum(spacing / np.maximum(width, _LEAST * spacing)) + shift
+    at = np.cumsum(spacing / np.maximum(width, least * spacing)) + shift
     cuts = np.flatnonzero(np.diff(np.floor(at))) + 1
     return np.split(np.arange(run.w.size), cuts)
 
@@ -45,14 +42,14 @@ def scatter(fit: RecordFit) -> Array | None:
     return scatter_over_blocks(fit) if uneven(fit, 2 * fit.chi2 / fit.model.numbers) else None
 
 
-def scatter_over_blocks(fit: RecordFit) -> Array:
-    """The same, whatever is left."""
+def scatter_over_blocks(fit: RecordFit, partitions: int = 4) -> Array:
+    """The same, whatever is left, over partitions that begin later each: where blocks begin must not matter."""
     model, p = fit.model, fit.parameters
     N, size = unit_diagonal(fit.normal)
     half = half_inverse(N, 1e-12)
     meat = np.zeros((half.shape[1],) * 2)
     columns = [Chunk(model, p, run.at(slice(0, 1))).columns() for run in model.runs]
-    for shift in np.arange(_SHIFTS) / _SHIFTS:
+    for shift in np.arange(partitions) / partitions:
         for run, own in zip(model.runs, columns, strict=True):
             at = size[own.unknowns]
             for lines in blocks_of(run, fit, shift):
@@ -61,7 +58,7 @@ def scatter_over_blocks(fit: RecordFit) -> Array:
                 inner = half[own.unknowns].T @ (made.normal / np.outer(at, at)) @ half[own.unknowns]
                 taken, turn = np.linalg.eigh(inner)
                 grown = turn @ ((turn.T @ score) / np.sqrt(1 - np.clip(taken, 0.0, _TAKEN)))
-                meat += np.outer(grown, grown) / _SHIFTS
+                meat += np.outer(grown, grown) / partitions
     # In moves of all unknowns, of which those of `Index` are kept: A^-1 B A^-1 is that of the moves.
     kept = model.kept
     moved = (half @ meat @ half.T)[:kept, :kept] / np.outer(size[:kept], size[:kept])

@@ -28,7 +28,6 @@ _SAME_FREQUENCY, _SAME_RATIO, _SAME_SHAPE = 0.01, 0.05, 0.98
 _DAMPED = 0.2  # a pole with more damping than this is not shown
 _EDGE = 0.05  # how far outside the lines a pole may lie, as a fraction of their ends
 _MOST_MODES = 100  # the highest order by default
-_MOST_ORDERS = 40  # rows of the diagram: where there would be more, each is further from the next
 _GAP = 0.1  # of the half circle, free at either end: a polynomial fits a smooth function badly up to where it wraps
 _WIDER = 5  # powers by which numerators reach beyond the denominator at either end: all that modes outside the band add
 _SPANNED = 1e-4  # least singular value of the base's motion against its largest: less makes no FRF
@@ -180,7 +179,8 @@ def _degrees(shape: tuple[int, ...], max_order: int | None) -> NDArray[np.intege
     top = min(2 * n + 10, _MOST_MODES, carried) if max_order is None else max_order
     degrees = np.unique(2 * np.arange(2, top + 1) // d)
     degrees = degrees[degrees * d >= 4]
-    degrees = degrees[:: -max(1, -(-degrees.size // _MOST_ORDERS))][::-1]
+    # At most so many rows of the diagram: further from each other where there would be more.
+    degrees = degrees[:: -max(1, -(-degrees.size // 40))][::-1]
     if degrees.size == 0:
         raise InputError(
             f"no stabilisation diagram: {lines} lines of {n} sensors and order {top} give no model of two modes or more"

@@ -25,8 +25,6 @@ from sysid.structure.thresholds import CANDIDATES, NEGLIGIBLE, ROUND_OFF, beyond
 
 _SPARE = 6  # poles beyond those expected: without spare ones noise moves true poles
 _MANY = 100  # sensors: more of them are not taken to show a mode each unless the channels do
-_RELOCATIONS = 6
-_STEPS = 100
 _FAR = 100.0  # times the error that may be, from which moving other poles too does not save a pole less
 GUESS = 0.01  # damping ratio to begin with
 RAZOR = 0.02  # of the distance of lines; half the width of a peak that answers for one bad line, not for a mode
@@ -203,14 +201,17 @@ def _most_poles(records: Records) -> int:
     return min((int(np.count_nonzero(records.freq)) - 1) // 2, (len(records.data) - 1) // inputs)
 
 
-def _relocated(records: Records, count: int, progress: _Progress) -> tuple[Array, Array]:
-    """Poles that earn their place, from `count` that are spread over the lines, before they are polished."""
+def _relocated(records: Records, count: int, progress: _Progress, rounds: int = 6) -> tuple[Array, Array]:
+    """Poles that earn their place, from `count` that are spread over the lines, before they are polished.
+
+    Some `rounds` at most: each moves all of them.
+    """
     lines = 2 * np.pi * records.freq[records.freq > 0]
     omega, ratios = np.geomspace(lines[0], lines[-1], count), np.full(count, GUESS)
     progress.tell()
     channels = records.principal(count)
     error = np.inf
-    for _ in range(_RELOCATIONS):
+    for _ in range(rounds):
         omega, ratios = relocate(records, channels, omega, ratios, progress.tell)
         before, error = error, records.fit(omega, ratios).squared_error
         progress.step(error)
@@ -347,14 +348,14 @@ def _prune(
 
 
 def _polish(
-    records: Records, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False
+    records: Records, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False, steps: int = 100
 ) -> tuple[Array, Array]:
-    """Variable projection: Levenberg-Marquardt steps over (log w, log zeta), the residues eliminated."""
+    """Variable projection: Levenberg-Marquardt `steps` at most over (log w, log zeta), the residues eliminated."""
     m = omega.size
     p = np.log(np.concatenate([omega, ratios]))
     damping = 1e-3
     error, H, slope = _projected(records, p, velocity)
-    for _ in range(_STEPS):
+    for _ in range(steps):
         progress.step(error)
         if error < round_off(len(records.data)) ** 2 * records.size:
             break

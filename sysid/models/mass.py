@@ -19,11 +19,8 @@ from sysid.structure.structure import Array, Structure, lowest_eigenvalue
 from sysid.structure.thresholds import ROUND_OFF
 from sysid.structure.triangular import lower_triangle, triangle_entries
 
-_ROW_EXPECTATION = 1.0  # the paper's c
-_NEWTON_STEPS = 20  # for the coupled scales of the rigid-body healing; quadratic from a good start
 
-
-def sampling_exponent(k: int, c: float = _ROW_EXPECTATION) -> float:
+def sampling_exponent(k: int, c: float = 1.0) -> float:
     """Exponent alpha of eq. 18 for a row of k entries (eq. 20, with its misprinted 2 mended to 4).
 
     It is the root of eq. 19, ``∫_{-1}^{1} y² dx = c / k``: every row of the Cholesky factor then has the
@@ -411,6 +408,6 @@ def _rigid_body_scales(factor: ca.SX, geometry: Geometry, totals: ca.SX | Array)
     # One scale for all is where a mass with the right totals starts, and stays.
     uniform = ca.sqrt(d / sum(ca.sum1(ca.sum2(gram)) for gram in grams))
     given, log_scale = ca.horzcat(*grams), ca.repmat(ca.log(uniform), d, 1)
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(20):  # quadratic from a good start
         log_scale = step(log_scale, given)
     return ca.vertsplit(ca.if_else(error(log_scale, given) < 1e-10, ca.exp(log_scale), np.nan))

@@ -37,10 +37,7 @@ _OUTLIER: dict[str, Any] = {
     "color": INK, "linestyle": "none", "marker": "x", "markersize": 4, "markeredgewidth": 0.9, "label": "outlier",
     "zorder": 4,
 }  # fmt: skip
-_VISIBLE = 2e-3  # of the magnitude: a narrower band hides behind the curve
-_COLUMNS = 3
 _WIDTHS = {2: 11.2, 3: 12.0}  # of a figure, in, by the number of columns
-_DENSE = 800  # lines beyond which curves are drawn thinner
 
 
 class Channel(NamedTuple):
@@ -165,7 +162,7 @@ def panels(channels: Sequence[Channel], *, alone: float = 6.4) -> Figure:
     """Magnitude above phase, a column a channel, at most three columns; `alone` is the width of one, in."""
     from matplotlib.ticker import NullLocator
 
-    columns = min(len(channels), _COLUMNS)
+    columns = min(len(channels), 3)
     blocks = -(-len(channels) // columns)
     width, height = _WIDTHS.get(columns, alone), 3.5 * blocks + 0.25
     figure = new_figure(width, height, layout=None)  # as regular as these panels are, and three times as fast
@@ -201,7 +198,7 @@ def draw(axes: Any, channel: Channel) -> None:
     freq, measured, identified = channel.freq, channel.measured, channel.identified
     magnitude = axes[0]
     # Whole-record spectra have thousands of lines, which at full width would hide each other.
-    thin = {"linewidth": 0.7} if freq.size > _DENSE else {}
+    thin = {"linewidth": 0.7} if freq.size > 800 else {}
     shown, answered = MEASURED | thin, IDENTIFIED | thin
     size, modelled, error = np.abs(measured), np.abs(identified), np.abs(identified - measured)
     lines = broken(freq, channel.gaps)
@@ -211,7 +208,7 @@ def draw(axes: Any, channel: Channel) -> None:
     if np.any(off):
         magnitude.plot(freq[off], positive(size[off]), **_OUTLIER)
     reach = LIKELY * channel.std
-    if np.any(reach > _VISIBLE * modelled):
+    if np.any(reach > 2e-3 * modelled):  # a narrower band hides behind the curve
         # The magnitude strays no further than the complex value; to zero, a logarithmic axis cannot follow.
         ends = np.maximum(modelled - reach, 1e-3 * modelled), modelled + reach
         magnitude.fill_between(lines, *(broken(end, channel.gaps) for end in ends), **_BAND)

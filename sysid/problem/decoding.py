@@ -171,14 +171,11 @@ class _Reader:
         operations.check_library("interpolant", tree["kind"], tuple(operations.INTERPOLANTS))
         sizes, numbers = _whole(tree["code"]), _numbers(tree)
         ends = np.cumsum([0, *sizes])
-        if not sizes or min(sizes) < 2 or len(sizes) > _MOST_AXES or len(numbers) < ends[-1]:
+        if not sizes or min(sizes) < 2 or len(sizes) > operations.MOST_AXES or len(numbers) < ends[-1]:
             raise ValueError("no grid of an interpolant")
         grid = [numbers[a:b] for a, b in pairwise(ends)]
         function = ca.interpolant(name, tree["kind"], grid, numbers[ends[-1] :])
         return _Called(function, 4.0 ** len(sizes) * function.nnz_out())
-
-
-_MOST_AXES = 10
 
 
 class _Matrices:

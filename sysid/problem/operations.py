@@ -15,6 +15,7 @@ import numpy as np
 from sysid.errors import InputError
 
 # Limits of what a file can ask for: many times what a problem of some hundred degrees of freedom takes.
+MOST_AXES = 10  # of the grid of an interpolant
 MOST_OPERATIONS = 3_000_000
 MOST_ENTRIES = 10_000_000  # of one matrix, zeros too: 80 MB
 MOST_STORED = 30_000_000  # of all patterns of matrices together

@@ -25,8 +25,6 @@ from sysid.structure.thresholds import LIKELY
 
 _FINE, _ROUGH = 1e-3, 1e-2  # relative steps of sizes, and of differences, which are noise
 _DEGREES = 0.5  # steps of phases
-_GROUPS = 5  # of seven bits, at most in a number
-_SHOWN = 0.18  # of the structure's size: the largest motion of a mode shape
 
 
 @cache
@@ -93,7 +91,8 @@ def _modes(it: Identification, points: Array, motion: Array) -> dict[str, Any]:
     shapes = []
     for k in range(it.structure.n):
         shape = np.vstack([np.zeros((1, 3)), motion @ it.structure.mode_shapes[:, k]])
-        shape *= _SHOWN * np.ptp(points, axis=0).max() / np.abs(shape).max()
+        # The largest motion is a share of the structure's size.
+        shape *= 0.18 * np.ptp(points, axis=0).max() / np.abs(shape).max()
         shapes.append(shape.round(6).tolist())
     names = [
         f"mode {k}: {f:.4g} Hz" + f", damping {100 * ratio:.3g} %" * bool(np.isfinite(ratio))
@@ -225,7 +224,7 @@ def _steps(values: Array) -> str:
     """
     moves = np.diff(np.rint(values).astype(np.int64), prepend=0)
     whole = np.where(moves < 0, -2 * moves - 1, 2 * moves)
-    groups = whole[:, None] >> (7 * np.arange(_GROUPS))
+    groups = whole[:, None] >> (7 * np.arange(5))  # 32 bits and more
     follows = groups[:, 1:] > 0
     bytes_ = (groups & 127).astype(np.uint8)
     bytes_[:, :-1] |= np.where(follows, 128, 0).astype(np.uint8)

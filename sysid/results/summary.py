@@ -18,7 +18,7 @@ from sysid.results.noise_table import NOISE_COLUMNS, noise_of_channels
 from sysid.results.phases import COLUMNS, seconds_in_words
 from sysid.results.unknowns_table import MANY, rows_of, stated_values
 from sysid.structure.structure import Array
-from sysid.structure.thresholds import LIKELY, ROUND_OFF
+from sysid.structure.thresholds import LIKELY, ROUND_OFF, UNEXPLAINED
 
 _SCALE = (
     "one number in kg is enough: state the mass of what the sensors stand for (sysid run test.h5 --lumped --mass KG; "
@@ -37,7 +37,6 @@ JUDGEMENTS: dict[Judgement, str] = {  # as screen, page and files write them
 _AS_STATED = ". No force was measured: they are as right as the mass or stiffness that is stated"
 WIDTH = 120  # letters in a line
 FIRST = 2  # sentences beside the verdict; the others follow the tables
-_NEAR = 0.5  # relative residual, up to which a fit may be called near enough
 _FORCE = 3.0  # times the residual of the accelerations, from which that of the force is the larger concern
 _MISSING = 0.5  # % of the rigid-body mass
 _OF_A_FIT = ", which holds for a model that fits: this one does not"
@@ -192,7 +191,7 @@ def _towards_a_fit(it: Answer) -> list[str]:
             "'sysid read RUN.csv --out one.h5', then 'sysid run one.h5'" + one_by_one * (it.measurement.n_runs > 1)
         ]
     # A goal is of accelerations: it takes no force for explained.
-    if it.residual > _NEAR or (it.force_residual or 0.0) > _FORCE * it.residual:
+    if it.residual > UNEXPLAINED or (it.force_residual or 0.0) > _FORCE * it.residual:
         return steps
     enough = f"{np.ceil(100 * it.residual) / 100:.2g}"
     return [*steps, f"if a fit as near as this one will do, say so: goal={enough} (sysid run test.h5 --goal {enough})"]

@@ -20,21 +20,15 @@ from sysid.search.local import Coordinates, LocalResult
 from sysid.search.session import Session, Stop
 from sysid.search.strategy import History, Outcome, Phase, as_unknowns, search_note
 from sysid.structure.structure import Array, Structure
-from sysid.structure.thresholds import EXACT, beyond_chance
+from sysid.structure.thresholds import EXACT, OTHER_ANSWER, SAME_ANSWER, UNEXPLAINED, beyond_chance
 
 SHIFTS = (0.5, 0.2, 0.08, 0.03, 0.01)  # of the geometric mean of the natural frequencies
-_DRAWN = 20  # points looked at for each that is a structure
-_STEPS = 60  # iterations of a fit on the way
+DRAWN = 20  # points looked at for each that is a structure
 _NEAR = 1.1  # times the misfit of free residues at the poles of the data: what a structure may leave
-_APART = 0.01  # of an unknown's size, from which two solutions are two ...
-_TOGETHER = 1e-3  # ... and up to which two ways are one
-_AGREE = 3  # starts that end at one structure, from which it is no local minimum among others ..
-_OF_SORTS = 0.5  # .. where its relative residual is not larger: there peaks are not those of the records
 _LEFT_OUT = (
     "{} of {} starts were left out for want of time: whether they end at another structure that explains the data as "
     "well is not known"
 )
-_SMALL = 1e-3  # of its range: the least size of an unknown that may be zero
 
 
 @dataclass(frozen=True)
@@ -113,9 +107,9 @@ class _Smoother:
 
 def smooth_fit(
     problem: Problem, x: Array, steps: list[tuple[TestTerm, ...]], session: Session,
-    monitor: Callable[[int, float], object],
+    monitor: Callable[[int, float], object], most: int = 60,
 ) -> LocalResult | None:  # fmt: skip
-    """Fit every step from where the one before ended, while there is time; None without steps."""
+    """Fit every step from where the one before ended, while there is time, `most` iterations each; None without any."""
     curve: list[float] = []
     answer = None
     for step in steps:
@@ -124,7 +118,7 @@ def smooth_fit(
         taken = len(curve)
         listener = lambda i, objective, taken=taken: monitor(taken + i, objective)  # noqa: E731
         try:
-            new = local.solve_or_read(problem, x, session, max_iterations=_STEPS, monitor=listener, smoothed=step)
+            new = local.solve_or_read(problem, x, session, max_iterations=most, monitor=listener, smoothed=step)
         except InputError:  # modes are needed, and this is no structure
             break
         curve += new.curve.tolist()
@@ -208,7 +202,7 @@ class _Run:
         try:
             way = smooth_fit(problem, x, self.steps, session, session.reporter("continuation"))
             if way is not None and way.stopped is None:
-                if any(apart(problem, way.x, other) < _TOGETHER for other in self.ways):
+                if any(apart(problem, way.x, other) < SAME_ANSWER for other in self.ways):
                     session.log("another start comes the same way")
                     self.joined += 1
                     return
@@ -242,9 +236,9 @@ class _Run:
         return float(np.sqrt(max(objective**2 - own, 0.0))) <= max(_NEAR * self.smoother.floor, EXACT)
 
     def _unanimous(self, best: LocalResult) -> bool:
-        """Whether all of several starts ended at the best end, at a fit of sorts: only a wrong model leaves more."""
-        same = [apart(self.problem, best.x, answer.x) < _APART for _, answer in self.ends]
-        return all(same) and len(same) + self.joined >= _AGREE and self.problem.residual(best.x) < _OF_SORTS
+        """Whether three starts or more all ended at the best end, at a fit of sorts: only a wrong model leaves more."""
+        same = [apart(self.problem, best.x, answer.x) < OTHER_ANSWER for _, answer in self.ends]
+        return all(same) and len(same) + self.joined >= 3 and self.problem.residual(best.x) < UNEXPLAINED
 
 
 def _best(problem: Problem, ends: list[tuple[float, LocalResult]]) -> tuple[float, LocalResult, Structure]:
@@ -269,7 +263,7 @@ def random_starts(problem: Problem, count: int, random: np.random.SeedSequence) 
     """Points spread over the search space as the swarm's are, of those that stand for a structure."""
     if count < 1:
         return []
-    points = latin_hypercube(problem.formulation, _DRAWN * count, np.random.default_rng(random))
+    points = latin_hypercube(problem.formulation, DRAWN * count, np.random.default_rng(random))
     return list(islice((x for x in points if _is_structure(problem, x)), count))
 
 
@@ -295,7 +289,7 @@ def _alternatives(problem: Problem, x: Array, objective: float, ends: list[tuple
     found: list[Array] = []
     for other, answer in ends:
         good = np.isfinite(other) and other <= most
-        if good and all(apart(problem, answer.x, known) > _APART for known in (x, *found)):
+        if good and all(apart(problem, answer.x, known) > OTHER_ANSWER for known in (x, *found)):
             found.append(answer.x)
     return found
 
@@ -314,5 +308,5 @@ def apart(problem: Problem, x: Array, other: Array) -> float:
     An unknown that may be zero has at least a thousandth of its range as its size.
     """
     width = np.where(problem.upper > problem.lower, problem.upper - problem.lower, 1.0)
-    least = np.where(problem.lower * problem.upper > 0, np.finfo(float).tiny, _SMALL * width)
+    least = np.where(problem.lower * problem.upper > 0, np.finfo(float).tiny, SAME_ANSWER * width)
     return float(np.max(np.abs(x - other) / np.minimum(width, np.maximum(np.abs(other), least))))

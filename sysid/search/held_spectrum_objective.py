@@ -29,8 +29,6 @@ from sysid.structure.thresholds import NEGLIGIBLE
 
 _MOST = 65_000  # coordinates a chunk: fewer take more calls of NumPy for each, and more leave a processor's cache
 _STEP = 16  # the last chunk is filled up to a multiple of it, because NumPy sums a candidate alone in another order
-_MOST_THREADS = 8
-_DRAWS = 254  # candidates beside the corners of the box, from which the range of damping ratios is read
 _NARROWEST_RANGE, _WIDEST_RANGE = 1.01, 1e4  # of a ratio, upper over lower: the series of a wider one would be long
 
 
@@ -82,7 +80,7 @@ class HeldSpectrumObjective:
         threads: int | None = None,
     ) -> None:
         test = term.test
-        batch, workers = Batch(expansion), threads or min(os.cpu_count() or 1, _MOST_THREADS)
+        batch, workers = Batch(expansion), threads or min(os.cpu_count() or 1, 8)
         self.expansion, self._share = expansion, term.weight**2
         self._series = GainSeries(test.freq, np.sort(spectrum), *_range_of_ratios(problem, batch), shift=term.shift)
         recovery = term.matrices.recovery, np.eye(problem.geometry.d)
@@ -156,13 +154,13 @@ def chunk_ends(count: int, size: int) -> list[int]:
     return [*ends, _STEP * math.ceil(count / _STEP)]
 
 
-def _range_of_ratios(problem: Problem, expansion: Batch) -> tuple[Array, Array]:
-    """Least and largest damping ratios (n,) that a swarm's box gives, of its ends and of draws between them.
+def _range_of_ratios(problem: Problem, expansion: Batch, count: int = 256) -> tuple[Array, Array]:
+    """Least and largest damping ratios (n,) of so many candidates: the ends of a swarm's box and draws between them.
 
     Exact where ratios rise with every coordinate; elsewhere candidates beyond are left to the sum over lines.
     """
     lower, upper = problem.formulation.box
-    draws = np.random.default_rng(0).uniform(lower, upper, (_DRAWS, problem.n_variables))
+    draws = np.random.default_rng(0).uniform(lower, upper, (count - 2, problem.n_variables))
     ratios = expansion(np.vstack([lower, upper, draws]))[0][..., 0]
     lowest, highest = np.fmin.reduce(ratios), np.fmax.reduce(ratios)
     highest = np.where(highest > 0, highest, 1.0)  # no ratio of a structure: all goes by lines

@@ -36,7 +36,6 @@ from sysid.structure.triangular import lower_triangle, triangle_entries
 
 _ROUND = 150  # iterations, after which Psi_0 is taken anew
 _LIMIT = "Maximum_Iterations_Exceeded"  # IPOPT's word for a round that was not long enough
-_LEAST_TIME = 1.0  # s, that a round is worth beginning with
 _SECONDS, _POWER = 0.2, 4.7  # of a processor, that the graphs of 10 modes take, and how that grows with the modes
 
 
@@ -57,7 +56,7 @@ def fit_in_inverse_factor(problem: Problem, x: Array, monitor: IterationMonitor,
         # A status belongs to the point that it was given for; that of the first round tells why where none is better.
         if end.objective <= best.objective or best is first:
             best = end
-        over = monitor.stopped is not None or monitor.left < _LEAST_TIME
+        over = monitor.stopped is not None or monitor.left < 1.0  # s, that a round is worth beginning with
         if end.status != _LIMIT or best.objective <= EXACT or not falls or over:
             break
     if best.objective > first.objective:

@@ -17,13 +17,11 @@ from sysid.search.swarm import Swarm
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import ROUND_OFF
 
-_ROUNDS = 40
 _SETTLED, _NEAR = 2e-3, 0.05  # standard deviations of the unknowns, root mean square: is settled, is as good
-_FARTHEST = 64.0  # times a step
 
 
-def settled(problem: Problem, end: Outcome, strategy: Strategy, session: Session) -> Outcome:
-    """Where Huber's loss is least, from the answer to the screened records.
+def settled(problem: Problem, end: Outcome, strategy: Strategy, session: Session, rounds: int = 40) -> Outcome:
+    """Where Huber's loss is least, in so many rounds at most, from the answer to the screened records.
 
     The modal strategy fits each round anew; after all others the local phase goes on from the last unknowns.
 
@@ -39,7 +37,7 @@ def settled(problem: Problem, end: Outcome, strategy: Strategy, session: Session
     if problem.loss == "squares" or end.stopped is not None:
         return end
     moved, fitted = np.inf, problem.pseudo_values(end.structure, end.x)
-    for number in range(1, _ROUNDS + 1):
+    for number in range(1, rounds + 1):
         try:
             again = _fitted(fitted, end, strategy, session)
             if again.stopped is not None:
@@ -123,7 +121,7 @@ def _farther(problem: Problem, before: Outcome, after: Outcome) -> Outcome:
         return found
 
     best, step, times = left(after.x, after.structure), after.x - before.x, 2.0
-    while times <= _FARTHEST:
+    while times <= 64.0:  # steps that are doubled
         x = np.clip(before.x + times * step, np.minimum(problem.lower, after.x), np.maximum(problem.upper, after.x))
         try:
             structure = problem.structure(x)

@@ -21,7 +21,7 @@ from sysid.search.modal_coordinates import fits_worse_than_free_residues, modes_
 from sysid.search.refinement import RefineBy, Refiner, Tally
 from sysid.search.session import Session, Stop, in_time
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, as_unknowns, search_note
-from sysid.search.swarm_objective import SwarmObjective
+from sysid.search.swarm_objective import WORST, SwarmObjective
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EXACT, NEGLIGIBLE
 from sysid.swarm import SwarmProgress, SwarmSettings, minimize_swarm
@@ -33,7 +33,6 @@ _IDLE = (
 )
 _TRAPPED = "that is a local minimum, as free residues at these poles fit clearly better"
 _MANY, _FEW = 256, 1  # candidates between two looks at the clock; few where IPOPT refines each
-_UNSEEN = 1e6  # in the place of the objective of candidates that there is no time for
 _SAMPLE = 1.6e-7  # s of a processor, that a coordinate of a particle of the first sample takes
 _DOUBTFUL = 0.1  # objective above which a problem without free modes is searched again
 _OWN_FORM = "hpso-ls searched the model's own unknowns, by the published swarm first, then through IPOPT"
@@ -335,7 +334,7 @@ class _Search:
         def evaluate(rows: Array) -> Array:
             return objective(refiner.rows(rows) if refiner is not None and slow and repair is None else rows)
 
-        return in_time(evaluate, lambda rows: np.full(len(rows), _UNSEEN), session, at_once), repair
+        return in_time(evaluate, lambda rows: np.full(len(rows), WORST), session, at_once), repair
 
     def _check_time(self) -> None:
         """Stop where the time cannot suffice for the first sample."""

@@ -16,6 +16,7 @@ of freedom: `beyond_chance` for sums of squares, `most_deviations` for one numbe
 from __future__ import annotations
 
 import math
+import sys
 
 import scipy.special
 
@@ -24,8 +25,14 @@ ROUND_OFF = 1e-9  # relative error of what came through several decompositions: 
 EXACT = 1e-8  # relative residual, or asymmetry, of what is exact
 NEGLIGIBLE = 1e-6  # relative difference up to which two results are one; relative size of a part that counts as none
 
+UNEXPLAINED = 0.5  # relative residual above which a model explains nothing of the records
+SAME_ANSWER = 1e-3  # of an unknown's or a matrix's size: answers nearer to each other are one
+OTHER_ANSWER = 1e-2  # of the same, from which two answers are two
+
 FALSE_ALARM = 1e-3  # chance that one check accuses a right test of anything
-CANDIDATES = 1_000_000  # of a search, at most, none of which noise alone may bring through: poles at all lines
+CANDIDATES = (
+    100_000  # of a search, at most, of which noise alone may bring none through: poles at all lines, of any damping
+)
 COVERAGE = 0.95  # of intervals
 LIKELY = float(scipy.special.ndtri((1 + COVERAGE) / 2))  # standard deviations on either side that have this coverage
 
@@ -41,11 +48,12 @@ def beyond_chance(freedom: float, at_once: int = 1) -> float:
     Parameters
     ----------
     freedom : float
-        Degrees of freedom; zero where there is nothing to sum.
+        Degrees of freedom, or zero.
     at_once : int
         How many such sums are looked at, of which chance may let none through.
     """
-    return float(scipy.special.chdtri(freedom, FALSE_ALARM / at_once)) if freedom > 0 else 0.0
+    least = sys.float_info.min  # for nothing to sum, of which the sum is zero
+    return float(scipy.special.chdtri(max(freedom, least), FALSE_ALARM / max(at_once, 1)))
 
 
 def most_deviations(at_once: int = 1) -> float:

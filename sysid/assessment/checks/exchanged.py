@@ -23,8 +23,6 @@ from sysid.structure.structure import Array, Structure
 _BETTER = 0.3  # of the residual of the records as they are; what they leave with two sensors swapped
 _WHOLLY = 1.05  # of what free residues leave: nothing else is wrong then
 _CLEARLY = 2.0  # times the least residual, that the next best exchange leaves
-_PAIRS = 15  # at most: those of six sensors
-_STEPS = 40
 _FREQUENCY, _DAMPING = 5.0, 0.1  # weights of errors of log w and log zeta; residues are relative to all of them
 
 
@@ -42,7 +40,7 @@ def exchanged_sensors(problem: Problem, structure: Structure, *, wholly: bool = 
     formulation, test = problem.formulation, problem.measurement
     told = formulation.fits_records and not formulation.stiffness.free and structure.n == test.n_sensors
     pairs = list(_alike(test))
-    if not told or not 0 < len(pairs) <= _PAIRS:
+    if not told or not 0 < len(pairs) <= 15:  # those of six sensors
         return ()
     try:
         omega, ratios = poles_of_test(test)
@@ -99,5 +97,5 @@ def _residual_of(problem: Problem, omega: Array, ratios: Array, pair: tuple[int,
 
     low, high = to(lower), to(upper)
     start = np.clip(to(formulation.guess), low, high)
-    end = least_squares(errors, start, bounds=(low - 1e-9, high + 1e-9), x_scale=high - low + 1e-12, max_nfev=_STEPS)
+    end = least_squares(errors, start, bounds=(low - 1e-9, high + 1e-9), x_scale=high - low + 1e-12, max_nfev=40)
     return test.residual(formulation.matrices.structure(back(end.x), test))

@@ -23,18 +23,15 @@ from sysid.structure.thresholds import CANDIDATES, most_deviations
 CONJUGATED = 0.3  # relative misfit, beyond which modes explain the records at most as conjugated ones
 _MENDED = 0.3  # of the misfit; what a mended record may leave
 _GROSS = 0.15  # of a sensor's rigid-body motion: smaller errors of gains are told by what was fitted
-_ALONE = 0.05  # of the same of the other sensors, where one alone has another gain
 _ONE_SURE = 10.0  # the same of the delay of one sensor, whose deviation is not known so well
-_SHOWN = 0.1  # of a sensor's rigid-body motion; it is not known where the standard deviation is larger
-_LIKE = 0.04  # by how much a factor may differ from that of two units
-_NONE = 0.1  # of a sensor's rigid-body motion; as good as none
+_LIKE = 0.04  # by how much a factor may differ from that of two units, and other sensors where one alone is wrong
+_NONE = 0.1  # of a sensor's rigid-body motion; as good as none, or not known where the standard deviation is larger
 _CARRIED = 0.5  # of the rigid-body motion, that modes between the lines carry: there is no other below them
 _TURN = 0.03  # rad at the last line; the least delay that is told
 _LARGE_TURN = 0.3  # rad there, from which no fit is worth a search
 _MOST = 1.5  # rad at the last line; the largest one
 _ALIKE = 0.2  # of a delay, by which sensors on one clock may differ
 _NO_WORSE = 1.02  # times the misfit before, that records on one clock may have
-_ROUNDS = 3  # of taking a delay off
 _UNITS = (  # what sensors over base are multiplied by, in words, and the units with the smaller and the larger numbers
     (STANDARD_GRAVITY, "9.81", "g", "m/s²"),
     (1 / STANDARD_GRAVITY, "9.81", "g", "m/s²"),
@@ -95,7 +92,7 @@ def _late(test: Measurement, terms: DirectTerms) -> tuple[list[Finding], DirectT
     """Sensors whose records are late against the base's, and the terms of the records without that delay."""
     total = np.zeros(test.n_sensors)
     first: Array | None = None
-    for _ in range(_ROUNDS):
+    for _ in range(3):  # times that a delay is taken off
         found = _delays(test, terms)
         if found is None:
             break
@@ -132,7 +129,7 @@ def _delays(test: Measurement, terms: DirectTerms) -> Array | None:
     c, slope, std = terms.rigid / reach, terms.slope / reach, terms.slope_std / reach
     size = np.sum(c**2, axis=1)
     stated = np.sum((test.rigid_body / reach) ** 2, axis=1)
-    told = np.sum((terms.rigid_std / reach) ** 2, axis=1) < _SHOWN**2 * np.maximum(size, stated)
+    told = np.sum((terms.rigid_std / reach) ** 2, axis=1) < _NONE**2 * np.maximum(size, stated)
     known = np.flatnonzero((stated > 0) & (size > _NONE**2 * stated) & told)
     if not known.size:
         return None
@@ -189,7 +186,7 @@ def _of_motion(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
     G, c, std = test.rigid_body / reach, terms.rigid / reach, terms.rigid_std / reach
     size = np.linalg.norm(G, axis=1)
     gain = np.maximum(np.linalg.norm(c, axis=1) / np.where(size > 0, size, 1.0), 1.0)
-    known = np.flatnonzero((size > 0) & (np.linalg.norm(std, axis=1) < _SHOWN * size * gain))
+    known = np.flatnonzero((size > 0) & (np.linalg.norm(std, axis=1) < _NONE * size * gain))
     motion = _Motion(known, G[known], c[known], std[known], (terms.modal / reach)[known])
     right = motion.agree(motion.stated)
     if known.size == 0 or np.all(right):
@@ -316,7 +313,7 @@ def _of_sensors(test: Measurement, motion: _Motion, right: NDArray[np.bool_]) ->
     agree = motion.agree(scaled)
     for i, value, std in zip(wrong, factor, error, strict=True):
         # Modes far below the lines move some sensors more than others, but not one alone.
-        alone = wrong.size == 1 and np.count_nonzero(motion.agree(motion.stated, _ALONE)) == right.size - 1
+        alone = wrong.size == 1 and np.count_nonzero(motion.agree(motion.stated, _LIKE)) == right.size - 1
         if agree[i] and (alone or any(abs(value / own - 1) < _LIKE for own in _CLEAR)):
             carried = np.sum(motion.modal[i] * motion.stated[i]) / np.sum(motion.stated[i] ** 2)
             value = next(

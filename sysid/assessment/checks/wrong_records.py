@@ -26,7 +26,6 @@ from sysid.structure.thresholds import CANDIDATES, most_deviations
 
 _BEYOND = 1.5  # times what the model allows, from which records contradict it
 _WITHIN = 1.15  # times the same, up to which mended records agree
-_CORNERS = 6  # unknowns whose bounds are combined
 _MODAL = 0.4  # of the mended mass, that the modes between the lines carry at least
 _FACTORS = (  # of the weighed mass over the right one, and what they are in words
     (1e-3, "1,000", "the base force is in kN, not N"),
@@ -162,7 +161,7 @@ def _structures(declared: Formulation) -> list[Structure]:
     unknowns, lower, upper = declared.unknowns, declared.lower, declared.upper
     ends = np.cumsum([unknown.size for unknown in unknowns])
     points = list(points_of(declared))
-    if len(unknowns) <= _CORNERS:
+    if len(unknowns) <= 6:  # more bounds make too many corners
         for choice in product((False, True), repeat=len(unknowns)):
             points.append(np.where(np.repeat(choice, np.diff(ends, prepend=0)), upper, lower))
     made = []
