@@ -201,7 +201,7 @@ NOTICED = (
     Mutant("D01", "status of the local phase ignored", "success = end.status in SOLVED or end.objective <= EXACT",
         "success = True", "test_local::TestControl"),
     Mutant("D02", "a local minimum of the residues never left",
-        "if ended.of_accelerations <= _SUSPECT * min(possible for _, _, possible in fits):", "if True:", "test_local"),
+        "if ended.of_accelerations <= FREE * min(possible for _, _, possible in fits):", "if True:", "test_local"),
     Mutant("D04", "weight of a further test ignored",
         "weight = 1.0 if build.replaced else build.noise() / build.noise_of(self.measurement)",
         "weight = 1.0", "test_priors::test_tests_count_by_their_noise"),

@@ -27,7 +27,7 @@ _ENDED = {
     "Infeasible_Problem_Detected": "the solver found no point that keeps the constraints",
 }
 _LOADED = 3.0  # times the seconds of an idle processor that work may take on a machine that does other things too
-_GRACE = 0.4  # s, by which work may end late
+GRACE = 0.4  # s, by which work may end late: what each of the last steps has, however late it begins
 _LATE = "Maximum_WallTime_Exceeded"  # IPOPT's word, which does not count the making of the graphs
 
 
@@ -38,7 +38,7 @@ def ended_in_words(status: str) -> str:
 
 def suffices(left: float, seconds: float) -> bool:
     """Whether the time that is `left` is enough for work that takes about so many seconds of a processor."""
-    return _LOADED * seconds < left + _GRACE
+    return _LOADED * seconds < left + GRACE
 
 
 def not_begun(seconds: float) -> str:

@@ -32,7 +32,6 @@ CEILINGS = {
     "main": 241,
     "modal": 67,
     "fits": 36,
-    "constants": 465,
     "shared": 45,
     "everyday": 385,
     "prose": 143,

@@ -27,7 +27,6 @@ from sysid.structure.thresholds import EPSILON
 PACKAGES = ("pymoo", "cma")  # of the extra "benchmark"
 HOW_TO_INSTALL = how_to_install("benchmark")
 
-_SHARE = 2 / 3  # of the time, that a search may take before its local phase: as the swarm's
 _WORST = 1e30  # an objective in the place of what is not a number: above that of any broken constraint
 
 Evaluate = Callable[[Array], Array]  # points of the unit cube (k, size) to objectives (k,)
@@ -93,7 +92,7 @@ class Evaluator:
             self.best, self.s = float(values[least]), rows[least]
         self.count += len(rows)
         self.curve.append((self.session.seconds, self.best))
-        late = self.session.max_time is not None and self.session.seconds > _SHARE * self.session.max_time
+        late = self.session.max_time is not None and self.session.seconds > 2 / 3 * self.session.max_time  # as a swarm
         if late or self.count >= self.most:
             raise Spent
         return values

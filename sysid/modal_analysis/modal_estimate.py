@@ -13,7 +13,6 @@ from sysid.modal_analysis.response import columns, gains, weights_of
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import round_off
 
-_STEPS = 200
 _BELOW = 1e-3  # of the rigid-body mass; the least remainder to begin with, as a factor of zero has no slope
 
 
@@ -173,7 +172,7 @@ def above_modes(estimate: ModalEstimate) -> tuple[Modes, Array]:
 
     root = np.linalg.cholesky((V * np.maximum(lam, _BELOW * max(lam[-1], 1.0))) @ V.T)
     start = np.concatenate([(modes.gamma / size).ravel(), root[lower]])
-    end = least_squares(lambda z: R @ moved(z), start, slope, xtol=1e-14, ftol=1e-14, gtol=1e-14, max_nfev=_STEPS)
+    end = least_squares(lambda z: R @ moved(z), start, slope, xtol=1e-14, ftol=1e-14, gtol=1e-14, max_nfev=200)
     theta, step = own.copy(), moved(end.x) * unit
     theta[mass] += step
     theta[others] += follow @ step

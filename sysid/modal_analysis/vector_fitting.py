@@ -30,7 +30,7 @@ GUESS = 0.01  # damping ratio to begin with
 RAZOR = 0.02  # of the distance of lines; half the width of a peak that answers for one bad line, not for a mode
 DAMPED = 0.5  # a pole with more damping than this is no mode of a structure
 _EDGE = 10.0  # times their ends, how far outside the lines a mode may lie: it answers for all that are there
-_BESIDE = 0.1  # how far outside the lines a mode alone may lie, as a fraction of their ends
+BESIDE = 0.1  # how far outside the lines a mode alone may lie, as a fraction of their ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +111,7 @@ def _find(records: Records, progress: _Progress) -> Poles:
         n = records.freq.size
         raise InputError(f"{n} lines are too few to look for {count} poles: state natural_frequencies or add lines")
     lines = 2 * np.pi * records.freq
-    if not np.any((omega > (1 - _BESIDE) * lines[0]) & (omega < (1 + _BESIDE) * lines[-1])):
+    if not np.any((omega > (1 - BESIDE) * lines[0]) & (omega < (1 + BESIDE) * lines[-1])):
         raise InputError(
             "no mode stands out of the noise between these lines: state natural_frequencies or widen them, unless base "
             "and sensors are in different units (g and m/s²) or the spectra follow exp(-iwt) (take the conjugate)"

@@ -24,7 +24,6 @@ from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import LIKELY
 
 _FINE, _ROUGH = 1e-3, 1e-2  # relative steps of sizes, and of differences, which are noise
-_DEGREES = 0.5  # steps of phases
 
 
 @cache
@@ -154,7 +153,7 @@ def _told(runs: list[Channel]) -> dict[str, Any]:
     first = runs[0]
     found: dict[str, Any] = {"name": first.name, "words": first.words, "unit": first.unit}
     for name in ("measured", "identified"):
-        found[name] = [[_sizes(np.abs(own)), _steps(degrees(own) / _DEGREES)] for own in _of(runs, name)]
+        found[name] = [[_sizes(np.abs(own)), _steps(2 * degrees(own))] for own in _of(runs, name)]
     found["left"] = [_sizes(np.abs(run.measured[0] - run.identified[0]), _ROUGH) for run in runs]
     for name in ("noise", "band", "recorded"):
         if getattr(first, name) is not None:

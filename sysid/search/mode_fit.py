@@ -30,11 +30,10 @@ from sysid.search.modal_program import Spectrum, Ties, fit_modes
 from sysid.search.modal_scaling import stated_totals
 from sysid.search.strategy import DoesNotApplyError
 from sysid.structure.structure import Array
-from sysid.structure.thresholds import CANDIDATES, EXACT, beyond_chance
+from sysid.structure.thresholds import AS_GOOD, CANDIDATES, EXACT, beyond_chance
 
 Integers = NDArray[np.intp]
 
-_AS_GOOD = 1.02  # times the residual without it, that a stated total may leave
 _SECONDS = 8e-9  # of a processor, for a line and the square of its slopes
 _AGREES = 0.01  # relative; a stated total that the base force weighs within this is held in the fit
 
@@ -215,7 +214,7 @@ def held_to_totals(problem: Problem, end: ModalFit, monitor: IterationMonitor, m
     if np.any(np.abs(np.asarray(off)) > _AGREES):
         return None
     held = _again(problem, end, monitor, max_iterations, ties)
-    agrees = held.residual <= _AS_GOOD * end.residual + EXACT
+    agrees = held.residual <= AS_GOOD * end.residual + EXACT
     return held if agrees and held.status in SOLVED else None
 
 

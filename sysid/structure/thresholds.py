@@ -17,8 +17,9 @@ from __future__ import annotations
 
 import math
 import sys
+from statistics import NormalDist
 
-import scipy.special
+import scipy
 
 EPSILON = 2.0**-52  # distance from 1 to the next number
 ROUND_OFF = 1e-9  # relative error of what came through several decompositions: a number below it is zero
@@ -26,15 +27,15 @@ EXACT = 1e-8  # relative residual, or asymmetry, of what is exact
 NEGLIGIBLE = 1e-6  # relative difference up to which two results are one; relative size of a part that counts as none
 
 UNEXPLAINED = 0.5  # relative residual above which a model explains nothing of the records
+AS_GOOD = 1.02  # times the misfit of another fit, up to which a fit is as good
+FREE = 1.05  # times what free residues leave at the same poles, up to which a fit is where it can be
 SAME_ANSWER = 1e-3  # of an unknown's or a matrix's size: answers nearer to each other are one
 OTHER_ANSWER = 1e-2  # of the same, from which two answers are two
 
 FALSE_ALARM = 1e-3  # chance that one check accuses a right test of anything
-CANDIDATES = (
-    100_000  # of a search, at most, of which noise alone may bring none through: poles at all lines, of any damping
-)
+CANDIDATES = 100_000  # of a search, at most, of which noise may bring none through: poles at all lines, of any damping
 COVERAGE = 0.95  # of intervals
-LIKELY = float(scipy.special.ndtri((1 + COVERAGE) / 2))  # standard deviations on either side that have this coverage
+LIKELY = NormalDist().inv_cdf((1 + COVERAGE) / 2)  # standard deviations on either side that have this coverage
 
 
 def round_off(terms: int) -> float:

@@ -22,7 +22,6 @@ from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import CANDIDATES, EXACT, beyond_chance
 
 _ALIKE = 0.5  # of the power of a motion; another that differs by more, noise included, is not the same
-_NEIGHBOURS = 11  # lines that tell the noise about one, where it is not stated
 _SEEN = 3.0  # times the noise, the least motion that two sensors can share
 _GAIN = 0.03  # of the base's motion; smaller errors of a sensor's gain are usual
 
@@ -204,8 +203,8 @@ def _own_noise(test: Measurement) -> Array | None:
     return None
 
 
-def _smooth(power: Array) -> Array:
-    """Mean of each line's power and that of its neighbours."""
+def _smooth(power: Array, lines: int = 11) -> Array:
+    """Mean of each line's power and that of its neighbours, so many lines in all."""
     from scipy.ndimage import uniform_filter1d
 
-    return np.asarray(uniform_filter1d(power, _NEIGHBOURS, mode="nearest"))
+    return np.asarray(uniform_filter1d(power, lines, mode="nearest"))

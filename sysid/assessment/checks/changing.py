@@ -25,7 +25,6 @@ from sysid.structure.thresholds import COVERAGE, FALSE_ALARM, most_deviations
 _MOVED = 0.1  # half-power widths, by which the frequency of a mode changes at least
 _EXPLAINED = 0.7  # of the squares that constant poles leave: poles that change leave no more
 _SHOWN = 0.03  # of the largest level of a mode, at which it shows
-_ENOUGH = 5  # stretches that tell a trend
 _OF_RUNS = 0.15  # of the variance of frequencies, that is left within runs where runs differ
 _CLOSE = 0.06  # of their frequency, within which modes ..
 _LEAST_RATIO = 1e-4
@@ -87,7 +86,7 @@ class Change:
         """The same, where chance makes as large a one no more often than stated."""
         from scipy.stats import spearmanr
 
-        if len(self.seen) < _ENOUGH:
+        if len(self.seen) < 5:  # fewer stretches tell no trend
             return 0.0
         found = spearmanr([one.level for one in self.seen], self.frequency)
         in_time = abs(spearmanr(np.arange(len(self.seen)), self.frequency).statistic)

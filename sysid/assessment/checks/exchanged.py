@@ -12,6 +12,7 @@ from itertools import combinations
 
 import numpy as np
 
+from sysid.assessment.checks.mistakes import MENDED
 from sysid.errors import InputError
 from sysid.finding import Finding, Severity
 from sysid.measurement.measurement import Measurement
@@ -19,9 +20,8 @@ from sysid.modal_analysis.poles_of_test import poles_of_test
 from sysid.modal_analysis.residues import linear_residues
 from sysid.problem.problem import Problem
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import FREE
 
-_BETTER = 0.3  # of the residual of the records as they are; what they leave with two sensors swapped
-_WHOLLY = 1.05  # of what free residues leave: nothing else is wrong then
 _CLEARLY = 2.0  # times the least residual, that the next best exchange leaves
 _FREQUENCY, _DAMPING = 5.0, 0.1  # weights of errors of log w and log zeta; residues are relative to all of them
 
@@ -51,7 +51,7 @@ def exchanged_sensors(problem: Problem, structure: Structure, *, wholly: bool = 
     found.sort()
     (least, (i, j)), others = found[0], [residual for residual, _ in found[1:]]
     own = test.residual(structure)
-    if least > _BETTER * own or (others and others[0] < _CLEARLY * least) or (wholly and least > _WHOLLY * floor):
+    if least > MENDED * own or (others and others[0] < _CLEARLY * least) or (wholly and least > FREE * floor):
         return ()
     names = test.sensor_names
     swapped = Finding(

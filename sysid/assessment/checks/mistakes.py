@@ -18,10 +18,10 @@ from sysid.finding import Finding, Kind, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.direct_terms import DirectTerms, direct_terms
 from sysid.structure.structure import Array
-from sysid.structure.thresholds import CANDIDATES, most_deviations
+from sysid.structure.thresholds import AS_GOOD, CANDIDATES, most_deviations
 
 CONJUGATED = 0.3  # relative misfit, beyond which modes explain the records at most as conjugated ones
-_MENDED = 0.3  # of the misfit; what a mended record may leave
+MENDED = 0.3  # of the misfit; what a mended record may leave
 _GROSS = 0.15  # of a sensor's rigid-body motion: smaller errors of gains are told by what was fitted
 _ONE_SURE = 10.0  # the same of the delay of one sensor, whose deviation is not known so well
 _LIKE = 0.04  # by how much a factor may differ from that of two units, and other sensors where one alone is wrong
@@ -31,7 +31,6 @@ _TURN = 0.03  # rad at the last line; the least delay that is told
 _LARGE_TURN = 0.3  # rad there, from which no fit is worth a search
 _MOST = 1.5  # rad at the last line; the largest one
 _ALIKE = 0.2  # of a delay, by which sensors on one clock may differ
-_NO_WORSE = 1.02  # times the misfit before, that records on one clock may have
 _UNITS = (  # what sensors over base are multiplied by, in words, and the units with the smaller and the larger numbers
     (STANDARD_GRAVITY, "9.81", "g", "m/s²"),
     (1 / STANDARD_GRAVITY, "9.81", "g", "m/s²"),
@@ -78,7 +77,7 @@ def _conjugated(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
         return
     force = None if test.force is None else test.force.conj()
     other = direct_terms(replace(test, base=test.base.conj(), response=test.response.conj(), force=force))
-    if other is not None and other.misfit < _MENDED * terms.misfit:
+    if other is not None and other.misfit < MENDED * terms.misfit:
         yield Finding(
             "conjugated spectra", Severity.BLOCKING,
             "the spectra follow exp(-i w t): modes that decay leave "
@@ -102,7 +101,7 @@ def _late(test: Measurement, terms: DirectTerms) -> tuple[list[Finding], DirectT
             break
         turn = np.exp(2j * np.pi * total[:, None] * test.freq)
         mended = direct_terms(replace(test, response=test.response * turn))
-        if mended is None or mended.misfit > _NO_WORSE * terms.misfit:
+        if mended is None or mended.misfit > AS_GOOD * terms.misfit:
             return [], terms
         terms = mended
     if first is None:

@@ -10,6 +10,7 @@ import numpy as np
 from sysid.assessment.checks.context import Context
 from sysid.assessment.checks.leakage import unresolved
 from sysid.assessment.checks.mistakes import CONJUGATED, is_gross, mistakes_of
+from sysid.assessment.checks.stated_mass import MISFIT
 from sysid.errors import InputError
 from sysid.files.units import POUND, STANDARD_GRAVITY
 from sysid.finding import Finding, Severity
@@ -24,7 +25,6 @@ from sysid.problem.terms import FurtherTest
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import CANDIDATES, most_deviations
 
-_BEYOND = 1.5  # times what the model allows, from which records contradict it
 _WITHIN = 1.15  # times the same, up to which mended records agree
 _MODAL = 0.4  # of the mended mass, that the modes between the lines carry at least
 _FACTORS = (  # of the weighed mass over the right one, and what they are in words
@@ -91,7 +91,7 @@ def _of_mass(declared: Formulation, test: Measurement, terms: DirectTerms) -> It
     if not np.any(known):
         return
     low, high, weighed, modal = low[known], high[known], weighed[known], modal[known]
-    if np.any((weighed > low / _BEYOND) & (weighed < high * _BEYOND)):
+    if np.any((weighed > low / MISFIT) & (weighed < high * MISFIT)):
         return
     for factor, told, words in _FACTORS:
         # What no mode carries may be a fixture, of whatever mass.
@@ -137,7 +137,7 @@ def _of_frequencies(problem: Problem, declared: Formulation, test: Measurement) 
         low, high = np.min(made, axis=0), np.max(made, axis=0)
         what = "the bounds of the model allow first natural frequencies"
     inside = lambda f: bool(low[0] / _WITHIN < f[0] < high[0] * _WITHIN and f[-1] < high[-1] * _WITHIN)  # noqa: E731
-    if stated is not None and found[0] < low[0] / _BEYOND and inside(2 * np.pi * found):
+    if stated is not None and found[0] < low[0] / MISFIT and inside(2 * np.pi * found):
         yield Finding(
             "frequencies in rad/s", Severity.BLOCKING,
             f"the stated natural frequencies are in rad/s, not Hz: {', '.join(f'{f:.4g}' for f in low[:4])} Hz are "
@@ -146,7 +146,7 @@ def _of_frequencies(problem: Problem, declared: Formulation, test: Measurement) 
             "divide what is stated by 2 pi", numbers={"stated": float(low[0]), "found": float(found[0])},
         )  # fmt: skip
     mended = found / (2 * np.pi)
-    if found[0] > _BEYOND * high[0] and inside(mended):
+    if found[0] > MISFIT * high[0] and inside(mended):
         span = f"{low[0]:.4g}" if stated is not None else f"of {low[0]:.4g} to {high[0]:.4g}"
         yield Finding(
             "frequencies in rad/s", Severity.BLOCKING,
