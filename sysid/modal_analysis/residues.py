@@ -367,7 +367,8 @@ def _correlation_factor(
     if lines.max(initial=0) <= 2 * len(_LAGS) - 2 or not np.any(moved):
         return 1.0
     share = unknowns / max(2 * channels * lines[moved].sum() - unknowns, 1)
-    chance = beyond_chance(2 * moved.sum(), len(_LAGS) - 1) / 2
+    fits = 100  # of one search, each with its own errors
+    chance = beyond_chance(2 * moved.sum(), fits * (len(_LAGS) - 1)) / 2
     factor = 1.0
     for sums, level in zip(np.abs(products[1:, moved]) / power[moved], variance[1:, moved], strict=True):
         beyond = np.maximum(sums - share, 0) ** 2

@@ -33,7 +33,7 @@ SAME_ANSWER = 1e-3  # of an unknown's or a matrix's size: answers nearer to each
 OTHER_ANSWER = 1e-2  # of the same, from which two answers are two
 
 FALSE_ALARM = 1e-3  # chance that one check accuses a right test of anything
-CANDIDATES = 100_000  # of a search, at most, of which noise may bring none through: poles at all lines, of any damping
+CANDIDATES = 10**9  # that the fits of one search look at, at most: poles of any frequency and damping, lines, channels
 COVERAGE = 0.95  # of intervals
 LIKELY = NormalDist().inv_cdf((1 + COVERAGE) / 2)  # standard deviations on either side that have this coverage
 
