@@ -1,6 +1,9 @@
 """Problem modules are found where the rules say, and every mistake in one is told with its place."""
 
 import ast
+import errno
+import os
+import re
 import signal
 import sys
 from importlib.machinery import EXTENSION_SUFFIXES
@@ -90,7 +93,7 @@ def test_a_path_an_own_problem_a_dotted_module_and_the_order_among_them(here, mo
     (here / "problems" / "shear_building.py").write_text("raise SystemExit('it ran')\n")
     assert catalogue.build(Recipe("shear_building")).geometry.n > 2
     typed, remark = catalogue.typed("shear_building")
-    assert Path(typed) == Path("problems/shear_building.py") and "hides the bundled problem shear_building" in remark
+    assert Path(typed) == Path("problems/shear_building.py") and typed in remark and "bundled" in remark
     assert "it ran" in refused(typed)
     assert [entry.bundled for entry in catalogue.entries() if entry.name == "shear_building"] == [False]
     assert catalogue.typed("chain") == ("chain", "")
@@ -146,9 +149,10 @@ def test_a_module_may_define_dataclasses_under_postponed_annotations(here):
 
 def test_a_module_does_not_inherit_this_packages_future_imports(here):
     (here / "eager.py").write_text(
-        "def f(x: 1 + 1):\n    pass\n\ndef problem(*, data=None, rng=0):\n    return f.__annotations__['x'] * 1.0\n"
+        "def f(x: 1 + 1):\n    pass\n\n"
+        "def problem(*, data=None, rng=0):\n    raise ValueError(f.__annotations__['x'])\n"
     )
-    assert "gives a float" in refused("eager.py")
+    assert refused("eager.py").endswith("ValueError: 2")  # the sum, not the text of it
 
 
 @pytest.mark.parametrize(
@@ -240,15 +244,14 @@ def test_a_variable_that_enters_nothing_is_refused_with_its_line(here):
     module = here / "written.py"
     module.write_text(WRITTEN.replace("CONSTRAINT", "k[1] <= k[0]"))
     message = refused("written.py")
-    assert "written.py: variable 'factor' (written.py, line 10) enters no matrix, residual or constraint" in message
-    assert "'mass'" not in message  # fixed, and used
+    assert re.findall(r"'(\w+)' \((.*?)\)", message) == [("factor", "written.py, line 10")]  # 'mass' is fixed, and used
     module.write_text(WRITTEN.replace("CONSTRAINT", "k[1] <= f * k[0]"))
     assert [v.name for v in catalogue.build(Recipe("written.py")).variables[1:]] == ["spring", "factor"]
 
 
 def test_what_cannot_be_searched_is_refused_when_it_is_built(here):
     (here / "written.py").write_text(WRITTEN.replace("CONSTRAINT", "f * k[0] >= 3e5"))
-    assert "no point within the bounds satisfies constraint 1" in refused("written.py")
+    assert "constraint 1" in refused("written.py")
 
 
 def test_ctrl_c_inside_a_module_is_no_mistake_of_the_module(here, monkeypatch, ctrl_c):
@@ -344,26 +347,26 @@ def test_an_unknown_name_lists_the_known_ones_and_the_closest(here):
     (here / "problems").mkdir()
     (here / "problems" / "my_tower.py").write_text(CHAIN)
     message = refused("my_towr")
-    assert "did you mean 'my_tower'?" in message
+    assert re.findall(r"'(\w+)'\?", message) == ["my_tower"]
     for entry in catalogue.entries():
         assert entry.name in message
-    assert "did you mean" not in refused("zzz")
+    assert "?" not in refused("zzz")
     assert "module is ''" in refused("")
     assert "unknown" in refused("..")
 
 
 def test_a_file_that_is_not_there_or_not_a_file(here):
-    assert "nowhere.py cannot be read: No such file" in refused("nowhere.py")
-    assert "No such file" in refused("some/where/chain.py")
+    for name in ("nowhere.py", "some/where/chain.py"):
+        assert name in refused(name) and os.strerror(errno.ENOENT) in refused(name)
     (here / "test.h5").write_text(CHAIN)
-    assert "problem test.h5: the name of a problem module ends in .py" in refused("./test.h5")
+    assert refused("./test.h5").startswith("problem test.h5: ") and " .py;" in refused("./test.h5")
     (here / "folder.py").mkdir()
-    assert refused("folder.py") == "problem folder.py is not a file"
-    assert "cannot be read" in refused("x" * 5000 + ".py")
+    assert refused("folder.py").startswith("problem folder.py is ")
+    assert os.strerror(errno.ENAMETOOLONG) in refused("x" * 5000 + ".py")
     assert "unknown" in refused("x" * 5000)
 
 
 def test_data_that_is_not_there_is_refused_before_the_module_runs(here):
     (here / "loud.py").write_text("raise RuntimeError('ran')\n")
-    assert "data 'nowhere': there is no such file or folder" in refused("loud.py", data="nowhere")
+    assert refused("loud.py", data="nowhere").startswith("data 'nowhere': ")
     assert "data is ''" in refused("loud.py", data="")

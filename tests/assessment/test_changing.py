@@ -75,7 +75,7 @@ def test_runs_of_different_structures_are_told_with_the_frequencies_of_each():
     (near,) = [k for k, f in enumerate(frequencies(SPRINGS)) if abs(numbers(told.partition("(")[2])[-2] / f - 1) < 0.02]
     both = frequencies(SPRINGS)[near] * np.array([1, np.sqrt(factor)])
     np.testing.assert_allclose(numbers(told)[-2:], both, rtol=0.003)
-    assert "Hz in run 1 at" in told and "Hz in run 2 at" in told
+    assert re.findall(r"Hz in run (\d)", told) == ["1", "2"]
 
 
 def test_a_drift_along_a_record_is_told_with_when_and_what():

@@ -6,7 +6,7 @@ from scipy.optimize import linprog
 
 import sysid
 from sysid import FullMass, KnownMass, LumpedMass, Measurement, SpectralStiffness, Structure
-from sysid.assessment.determination import determine, intervals
+from sysid.assessment.determination import determine, intervals, open_masses
 from sysid.assessment.modal_mass_cone import _cone, _known
 from sysid.problem.problem import Problem
 
@@ -273,9 +273,9 @@ class TestIntervals:
         K = np.block([[K_SS, -K_SS @ G], [-(K_SS @ G).T, G.T @ K_SS @ G]])
         truth = Structure(np.diag([1.0, 1.0, 0.5]), K, [0.01, 0.02], n_base=1)
         problem = problem_of(truth, FullMass(total), force=True)
-        assert any(
-            "the modal mass of mode 2 (20.13 Hz) is open" in s for s in determine(problem, truth, None).undetermined
-        )
+        assert open_masses(problem, truth) == [1]
+        second = f"mode 2 ({np.sqrt(k + 2 * c) / (2 * np.pi):.4g} Hz)"
+        assert any(second in sentence for sentence in determine(problem, truth, None).undetermined)
         found = check_ends(problem, truth)
         # M = [[1 + t, 1 - t], [1 - t, 1 + t]] / 2 with t >= 0, and 1 + t <= total.
         most = np.inf if total is None else total - 1
@@ -298,7 +298,7 @@ class TestIntervals:
         test = Measurement(FREQ, clean.base, clean.response, rigid_body=weak.rigid_body, force=noisy.force)
         problem = problem_of(weak, FullMass(), test=test)
         verdict = determine(problem, weak, None)
-        assert any(s.startswith("the modal mass of mode 2") for s in verdict.undetermined)
+        assert any("mode 2 (" in s and "modal mass" in s for s in verdict.undetermined)
         found = check_ends(problem, weak)
         rest = weak.rigid_body_mass - weak.effective_masses[[0, 2]].sum(axis=0)
         most = 1 / (push[1] @ np.linalg.solve(rest, push[1]))
@@ -376,12 +376,12 @@ class TestIntervals:
         verdict = determine(weighed, truth, None)
         assert not verdict.determined and verdict.closed_by
         (sentence,) = verdict.undetermined
-        assert "3 modes stand out for 4 sensors" in sentence and sentence.endswith("determine, completely")
+        assert "3 modes" in sentence and "4 sensors" in sentence and sentence.endswith(" completely")
         assert np.array_equal(intervals(weighed, truth, None).mass, [truth.mass[:3, :3]] * 2)
         stated = problem_of(truth, FullMass(9.0), stiffness=stiffness)
         assert np.any(np.isinf(intervals(stated, truth, None).mass))
         sentences = determine(stated, truth, None).undetermined
-        assert any(s.endswith("up to the modal masses") for s in sentences)
+        assert any(s.endswith(" modal masses") for s in sentences)
         # What the physical total of each direction bounds is no matter of sensors.
         physical = problem_of(
             truth, FullMass(np.diag(truth.rigid_body_mass), healing="rigid_body"), stiffness=stiffness

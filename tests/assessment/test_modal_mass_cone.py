@@ -1,6 +1,7 @@
 """What the data determine: members of the modal-mass cone, and the verdict on stated models."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -219,7 +220,8 @@ def test_a_mode_too_faint_for_the_force_is_weighed_by_a_lumped_mass():
     full, lumped = (sysid.identify(Problem(test, mass=model), rng=0) for model in (FullMass(), LumpedMass()))
     assert not full.determined and any("mode 2" in sentence for sentence in full.undetermined)
     assert lumped.determined, lumped.undetermined
-    assert "the measured base force weighs 1 of 2 modes that the base moves" in lumped.closed_by
+    (weighed,) = [sentence for sentence in lumped.closed_by if "base force" in sentence]
+    assert re.findall(r"\d+", weighed) == ["1", "2"]  # of so many modes
     off = np.diag(lumped.structure.mass)[:2] - mass
     assert np.all(np.abs(off) < 5 * np.diag(lumped.uncertainty.mass))
     assert np.all(np.diag(lumped.uncertainty.mass) < 0.05 * mass)

@@ -98,8 +98,9 @@ def test_the_answer_has_the_least_huber_loss(strategy):
     np.testing.assert_array_less(np.abs(found - by_scipy(test)) / std, 1e-3)  # where rounds count as settled
     assert result.success and result.determined
     assert np.all(np.abs(found - [*SPRINGS, *DAMPERS]) < 3.5 * std)
-    assert "Huber's loss settled after" in result.summary()
-    assert "they count little, by Huber's loss" in " ".join(result.summary().split())
+    (far,) = result.of_kind("outliers", severity="note")
+    assert "count little" in far.sentence and not far.remedy and far.sentence in " ".join(result.summary().split())
+    assert any("settled" in one.sentence for one in result.of_kind("search"))
     assert [phase.name for phase in result.history.phases][-1] == "Huber's loss"
 
 
@@ -164,7 +165,7 @@ def test_clean_records_give_the_answer_of_least_squares_nearly():
     std, wider = (np.concatenate(list(it.uncertainty.variables.values())) for it in (squares, huber))
     assert np.all(np.abs(huber.x - squares.x) < 0.8 * std)
     np.testing.assert_allclose(wider / std, 1 / np.sqrt(0.95), rtol=0.06)  # by its efficiency
-    assert "deviations from the fit" not in squares.summary() + huber.summary()
+    assert not squares.of_kind("outliers") and not huber.of_kind("outliers")
 
 
 def test_a_wrong_model_is_doubted_as_it_is_by_squares():
@@ -198,13 +199,13 @@ def test_a_callback_stops_a_round_of_the_loss_and_its_mistakes_are_not_swallowed
 
 def test_what_cannot_be_is_refused():
     test = measured(np.random.default_rng(0))
-    with pytest.raises(sysid.InputError, match="loss = 'l1' is unknown; give one of 'squares', 'huber'"):
+    with pytest.raises(sysid.InputError, match="loss = 'l1' .* 'squares', 'huber'"):
         two_floors(test, loss="l1")
-    with pytest.raises(sysid.InputError, match="loss='huber' is of records"):
+    with pytest.raises(sysid.InputError, match="loss='huber' "):
         two_floors(test, loss="huber", misfit=sysid.Variable("a", lower=0, upper=1) - 0.5)
     with pytest.raises(sysid.InputError, match=r"Swarm\(local=None\) has none"):
         sysid.identify(two_floors(test, loss="huber"), strategy=sysid.Swarm(local=None), rng=0)
     from sysid.compare.comparison import compare
 
-    with pytest.raises(sysid.InputError, match="compare minimises squares"):
+    with pytest.raises(sysid.InputError, match="compare minimises"):
         compare(two_floors(test, loss="huber"))

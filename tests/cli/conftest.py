@@ -77,6 +77,12 @@ def complaint(beside_progress):
 
 
 @pytest.fixture
+def commands():
+    """Give a function that reads from a text the commands of ours that it quotes: lists of arguments."""
+    return lambda text: [words.split() for words in re.findall(r"'sysid (.+?)'", text)]
+
+
+@pytest.fixture
 def files():
     """Give a function that names everything in a folder."""
     return lambda folder: {str(path.relative_to(folder)) for path in folder.rglob("*")}

@@ -7,6 +7,7 @@ import pytest
 
 from sysid.cli import main as cli
 from sysid.compare import comparison, peers
+from sysid.errors import how_to_install
 
 MODULE = Path(__file__).with_name("pair_problem.py").read_text()
 PNG = b"\x89PNG"
@@ -30,7 +31,7 @@ def test_a_line_a_method_then_one_table_and_one_picture(here, capsys):
     out, error = capsys.readouterr()
     lines = out.splitlines()
     assert lines[0].startswith("pair.py: ")
-    assert "python -m pip install 'structural-sysid[benchmark]'" in lines[1]
+    assert how_to_install("benchmark") in lines[1]
     assert "no reference" in lines[2]
     assert [line.partition(":")[0] for line in error.splitlines()] == ["modal", "continuation", "swarm", "hpso-ls"]
     assert lines[4].split() == ["method", "before", "after", "evaluations", "seconds", "status"]

@@ -1,6 +1,7 @@
 """``sysid run --refine-by``: which strategies take it, what is refused, and what is told of leaders."""
 
 import json
+import re
 
 import pytest
 
@@ -61,13 +62,16 @@ def test_leaders_are_told_on_every_way_out(asked, here, capsys):
 @pytest.mark.parametrize("strategy", ["auto", "modal", "continuation"])
 def test_other_strategies_refuse_it(here, complaint, files, strategy):
     assert cli.main(["run", "pair.py", "--out", "out", "--strategy", strategy, "--refine-by", "leaders"]) == 2
-    assert f"--refine-by is of the strategies 'swarm' and 'hpso-ls', and the strategy is '{strategy}'" in complaint()
+    error = complaint()
+    assert error.startswith("sysid: --refine-by ")
+    assert re.findall(r"'([\w-]+)'", error) == ["swarm", "hpso-ls", strategy]  # those that take it, and this one
     assert not (here / "out").exists()
 
 
 def test_a_problem_without_a_spectrum_of_its_own_refuses_it(here, complaint):
     assert cli.main(["run", "shear_building", "--out", "out", "--strategy", "swarm", "--refine-by", "ipopt"]) == 2
-    assert "--refine-by ipopt: the stiffness of this problem has a form of its own" in complaint()
+    error = complaint()
+    assert error.startswith("sysid: --refine-by ipopt: ") and "stiffness" in error
 
 
 def test_a_word_that_is_no_way_is_refused(here, complaint):
@@ -93,6 +97,6 @@ def test_a_run_that_goes_on_keeps_its_way(here, monkeypatch, no_pictures, capsys
     asked = [*RUN, "--refine-by", "leaders"]
     assert cli.main(asked) == 130
     assert cli.main([*RUN[:2], "--resume", "out", "--strategy", "hpso-ls", "--refine-by", "ipopt"]) == 2
-    assert "strategy hpso-ls refined by leaders, seed 0, not of" in capsys.readouterr().err
+    assert re.findall(r"refined by (\w+)", capsys.readouterr().err) == ["leaders", "ipopt"]
     assert cli.main([*RUN[:2], "--resume", "out"]) in (0, 1)
     assert strategies == [sysid.Swarm.published(refine_by="leaders")] * 2

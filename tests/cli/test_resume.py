@@ -1,5 +1,6 @@
 """``sysid run --resume`` and ``--fresh``: what a folder with an unfinished run allows, and what is said of it."""
 
+import re
 import signal
 
 import pytest
@@ -12,7 +13,7 @@ RUN = ["run", "pair.py", "--strategy", "swarm", "--out", "out"]
 
 
 @pytest.fixture
-def stopped(here, monkeypatch, no_pictures, capsys):
+def stopped(here, monkeypatch, no_pictures, capsys, commands):
     """Leave a run of pair.py that Ctrl-C ended in iteration 3 of its swarm; its folder."""
     original = sysid.identify
 
@@ -26,8 +27,13 @@ def stopped(here, monkeypatch, no_pictures, capsys):
     with monkeypatch.context() as patch:
         patch.setattr(cli, "identify", identify)
         assert cli.main(RUN) == 130
-    assert "interrupted; the best so far is in out; 'sysid run pair.py --resume out' goes on" in capsys.readouterr().err
+    assert commands(capsys.readouterr().err) == [["run", "pair.py", "--resume", "out"]]
     return here / "out"
+
+
+def runs_in(text):
+    """Module, strategy and seed of each run that a text tells of."""
+    return re.findall(r"([\w.]+), strategy ([\w-]+), seed (\d+)", text)
 
 
 def test_a_resumed_run_ends_as_one_that_was_not_stopped(stopped, capsys, files):
@@ -41,14 +47,14 @@ def test_a_resumed_run_ends_as_one_that_was_not_stopped(stopped, capsys, files):
     assert resumed.recipe == whole.recipe
 
 
-def test_without_a_word_on_the_unfinished_run_nothing_is_done(stopped, complaint, files):
+def test_without_a_word_on_the_unfinished_run_nothing_is_done(stopped, complaint, commands, files):
     before, state = files(stopped), (stopped / FILE_NAME).read_bytes()
     assert cli.main(RUN) == 2
     error = complaint()
-    assert "out holds an unfinished run of this problem: 'sysid run pair.py --resume out' goes on with it" in error
-    assert "--fresh begins anew" in error
+    assert commands(error) == [["run", "pair.py", "--resume", "out"]]
+    assert "--fresh" in error and "seed" not in error  # it is the one that is asked for
     assert cli.main([*RUN, "--seed", "1"]) == 2
-    assert "an unfinished run of pair.py, strategy swarm, seed 0: " in complaint()
+    assert runs_in(complaint()) == [("pair.py", "swarm", "0")]
     assert files(stopped) == before
     assert (stopped / FILE_NAME).read_bytes() == state
 
@@ -76,9 +82,8 @@ def test_what_a_kill_left_of_writing_the_state_goes_with_it(stopped, files):
 def test_the_problem_may_be_said_again_and_must_be_the_same(stopped, complaint):
     again = ["run", "pair.py", "--strategy", "swarm", "--resume", "out"]
     assert cli.main([*again, "--seed", "2"]) == 2
-    assert "out holds an unfinished run of pair.py, strategy swarm, seed 0, not of pair.py, strategy swarm, seed 2" in (
-        complaint()
-    )
+    there, asked = ("pair.py", "swarm", "0"), ("pair.py", "swarm", "2")
+    assert runs_in(complaint()) == [there, asked]
     assert cli.main(again) == 0
 
 
@@ -87,8 +92,8 @@ def test_a_module_that_was_changed_gives_no_mixture(stopped, complaint, here):
     (here / "pair.py").write_text((here / "pair.py").read_text().replace("[0.01, 0.02]", "[0.01, 0.03]"))
     assert cli.main(["run", "pair.py", "--resume", "out"]) == 2
     error = complaint()
-    assert "out holds an unfinished run of pair.py, strategy swarm, seed 0, and since it began its module or" in error
-    assert "with --out out --fresh to begin anew" in error
+    assert runs_in(error) == [("pair.py", "swarm", "0")]
+    assert "edited" in error and "--out out --fresh" in error
     assert (stopped / FILE_NAME).read_bytes() == state
     assert cli.main([*RUN, "--fresh"]) == 0
 
@@ -115,7 +120,7 @@ class TestAModelOfTheUsersOwn:
     def test_its_edit_is_told_and_undone_the_run_goes_on(self, stopped, complaint, here, capsys):
         (here / "own.py").write_text(OWN.replace("return y", "return 2 * y"))
         assert cli.main(["run", "--resume", "out", "--trust"]) == 2
-        assert "its module or what this imports from beside itself was edited" in complaint()
+        assert "edited" in complaint()
         (here / "own.py").write_text(OWN)
         assert cli.main(["run", "--resume", "out", "--trust"]) == 0
         assert capsys.readouterr().out.startswith("going on with pair.py")
@@ -135,7 +140,7 @@ def test_a_module_that_the_state_names_runs_where_the_user_names_or_trusts_it(st
     module.write_text("raise SystemExit('it ran')\n")
     assert cli.main(["run", "--resume", "out"]) == 2
     error = complaint()
-    assert f"unfinished.h5 names the problem module {module}, whose code would run" in error
+    assert FILE_NAME in error and f" {module}, " in error
     assert "say --trust" in error and "sysid run MODULE.py --resume out" in error
     assert cli.main(["run", "--resume", "out", "--trust"]) == 2
     assert "pair.py, line 1: SystemExit: it ran" in complaint()
@@ -147,10 +152,10 @@ def test_a_module_that_the_state_names_runs_where_the_user_names_or_trusts_it(st
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        (["--fresh"], "--resume and --fresh exclude each other"),
-        (["--out", "x"], "--resume and --out exclude each other"),
-        (["--seed", "3"], "--resume takes --seed, --strategy, --refine-by, --data and --set from the run in out"),
-        (["--set", "n=3"], "--resume takes --seed, --strategy, --refine-by, --data and --set from the run in out"),
+        (["--fresh"], "--resume and --fresh "),
+        (["--out", "x"], "--resume and --out "),
+        (["--seed", "3"], "--resume takes --seed, --strategy, --refine-by, --data and --set "),
+        (["--set", "n=3"], "--resume takes --seed, --strategy, --refine-by, --data and --set "),
     ],
 )
 def test_what_does_not_go_together_is_told(stopped, complaint, more, said):
@@ -158,13 +163,15 @@ def test_what_does_not_go_together_is_told(stopped, complaint, more, said):
     assert said in complaint()
 
 
-def test_where_nothing_is_unfinished_it_begins_anew_or_asks_for_the_problem(here, complaint, capsys, no_pictures):
+def test_where_nothing_is_unfinished_it_begins_anew_or_asks_for_the_problem(
+    here, complaint, commands, capsys, no_pictures
+):
     assert cli.main(["run", "--resume", "out"]) == 2
-    assert "no unfinished run in out: 'sysid run PROBLEM --resume out' begins one there" in complaint()
+    assert commands(complaint()) == [["run", "PROBLEM", "--resume", "out"]]
     assert cli.main(["run"]) == 2
     assert "PROBLEM is missing" in complaint()
     assert cli.main(["run", "pair.py", "--resume", "out"]) == 0
-    assert capsys.readouterr().out.startswith("no unfinished run in out: it begins anew\n")
+    assert capsys.readouterr().out.startswith("no unfinished ")
     assert (here / "out/result.h5").is_file()
 
 
@@ -173,15 +180,18 @@ def test_a_run_that_had_reached_nothing_begins_anew_and_says_so(stopped, capsys,
     tree = Checkpoint(stopped / FILE_NAME).read()
     monkeypatch.setattr(Checkpoint, "read", lambda self: {**tree, "entries": {}})
     assert cli.main(["run", "pair.py", "--resume", "out"]) == 0
-    assert capsys.readouterr().out.startswith("pair.py, strategy swarm, seed 0 had reached nothing: it begins anew\n")
+    first = capsys.readouterr().out.splitlines()[0]
+    assert runs_in(first) == [("pair.py", "swarm", "0")] and "begins anew" in first
 
 
 def test_a_damaged_state_is_told_and_fresh_leads_on(stopped, complaint):
     (stopped / FILE_NAME).write_bytes((stopped / FILE_NAME).read_bytes()[:700])
     assert cli.main(["run", "--resume", "out"]) == 2
-    assert "out/unfinished.h5 cannot be read: it is damaged" in complaint()
+    error = complaint()
+    assert error.startswith(f"sysid: out/{FILE_NAME} ") and "damaged" in error
     assert cli.main(RUN) == 2
-    assert "out holds an unfinished run that is damaged" in complaint()
+    error = complaint()
+    assert "damaged" in error and "--fresh" in error
     assert cli.main([*RUN, "--fresh"]) == 0
 
 
@@ -196,7 +206,7 @@ def test_while_a_process_runs_another_is_refused_and_once_it_is_killed_that_one_
             if line.startswith("swarm"):
                 break
         assert cli.main(["run", "pair.py", "--strategy", "swarm", "--out", "out", "--fresh"]) == 2
-        assert f"out is in use by another run (process {running.pid} on " in complaint()
+        assert f"(process {running.pid} on " in complaint()
         running.send_signal(signal.SIGKILL)
     assert running.wait() == -signal.SIGKILL
     assert (here / "out" / FILE_NAME).is_file()

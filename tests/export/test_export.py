@@ -1,6 +1,7 @@
 """Exported files keep the numbers, say what is open, and are written whole or not at all."""
 
 import csv
+import re
 import sys
 from dataclasses import replace
 
@@ -129,15 +130,15 @@ def test_a_file_says_what_the_data_leave_open(result, tmp_path, ending):
 def test_what_speaks_against_an_answer_and_what_is_open_stand_under_their_own_words(result, tmp_path, ending):
     doubted = replace(result.with_findings([CHANGING, OPEN]), interrupted=True)
     text = sysid.export(doubted, tmp_path / f"m.{ending}").read_text(encoding="utf-8")
-    assert "judgement: the search was interrupted" in text and "DOUBTFUL" in text
     assert text.count(f"against: {CHANGING}") == 1 and f"open: {CHANGING}" not in text
     assert text.count(f"open: {OPEN}") == 1
     judged = worth(doubted)
+    assert f"judgement: {judged}; " in re.sub(r"[\s$]+", " ", text) and "DOUBTFUL" in judged
     assert "interrupted" in judged and judged.endswith("see 'against' and 'open'")
 
 
 def test_an_unknown_ending_is_told_with_those_that_exist(result, tmp_path):
-    with pytest.raises(sysid.InputError, match=r"no format has the ending '\.doc'; there are \.csv"):
+    with pytest.raises(sysid.InputError, match=r"'\.doc'; .* \.csv"):
         sysid.export(result, tmp_path / "m.doc")
     assert not list(tmp_path.iterdir())
 

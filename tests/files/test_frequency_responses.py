@@ -1,5 +1,7 @@
 """Frequency responses of every form and file give the same transmissibility and apparent mass, or are asked for."""
 
+import re
+
 import h5py
 import laboratory
 import numpy as np
@@ -118,7 +120,7 @@ def test_each_reference_is_a_run_with_its_own_base_motion(tmp_path):
         np.testing.assert_allclose(response, (H * B)[::-1], rtol=1e-12)
     for sensor in sensors[:3]:
         sensor["name"] += " of s1"
-    with pytest.raises(sysid.InputError, match=r"a\.npz: per unit of s1 the function of 'h3' is missing.*same name"):
+    with pytest.raises(sysid.InputError, match=r"a\.npz: .* s1 .*'h3' is missing.*same name"):
         reading.gather(tmp_path / "a.npz", {"convention": "exp(+iwt)", "sensor": sensors})
 
 
@@ -141,7 +143,7 @@ def test_a_universal_file_tells_axes_positions_units_and_the_sign_of_its_referen
         assert {row.unit for row in test.table} == {"mm/s² / mm/s²"}
     signed[0]["axis"] = "x"
     test = reading.gather(tmp_path / "a.uff", {**said, "sensor": signed})
-    assert "the file says axis -x, the description x" in test.remarks[0]
+    assert re.findall(r" (-?x),", test.remarks[0]) == ["-x", "x"]  # of the file, and of the description
 
 
 @pytest.mark.parametrize(
@@ -196,7 +198,7 @@ def test_frequencies_are_in_the_unit_that_the_file_states_or_told_to_be_in_hz(tm
         test = reading.gather(tmp_path / file, said | sensors)
         np.testing.assert_allclose(test.freq, FREQ, rtol=1e-14)
         assert len(test.remarks) == remarks
-    assert "frequencies have no unit, and are taken as Hz" in test.remarks[0]
+    assert "no unit" in test.remarks[0] and "Hz" in test.remarks[0]
 
 
 @pytest.mark.parametrize("said", [{"frf": "FRF"}, {"convention": "+"}])
@@ -216,7 +218,7 @@ def test_the_sign_of_the_base_force_is_told_by_its_power(tmp_path, sign, axis, w
         {"column": "F", "role": "force", "axis": axis, "unit": "kg"},
     ]
     test = reading.gather(tmp_path / "a.npz", {"base_axes": "x", "sensor": sensors})
-    assert f"the base force {words} power" in test.remarks[0]
+    assert f" {words} power" in test.remarks[0]
     np.testing.assert_allclose(test.runs[0][2][0], F * (-1 if words == "takes" else 1))
 
 

@@ -40,7 +40,7 @@ def test_three_weighed_floors_close_the_cone(coupling):
     known = with_entries(*((i, i, m) for i, m in enumerate(MASSES)))
     result = identify(Problem(simulate(truth, FREQ), mass=FullMass(known=known)), strategy="modal")
     assert result.determined, result.undetermined
-    assert result.closed_by == ("3 entries of the mass matrix stated to be known",)
+    assert [one.sentence[:10] for one in result.of_kind("fixed")] == ["3 entries "]
     np.testing.assert_allclose(result.structure.mass[:3, :3], truth.mass[:3, :3], rtol=1e-8, atol=1e-7)
     np.testing.assert_allclose(result.structure.stiffness[:3, :3], truth.stiffness[:3, :3], rtol=1e-8, atol=1e-3)
 
@@ -67,7 +67,7 @@ def test_known_coupling_to_the_base_closes_the_cone(random_structure):
 def test_no_coupling_to_the_base_says_nothing_where_the_data_show_that_there_is_none():
     known = with_entries((0, 3, 0.0), (1, 3, 0.0), (2, 3, 0.0), shape=(3, 4))
     result = identify(Problem(simulate(building(), FREQ), mass=FullMass(known=known)), strategy="modal")
-    assert any("all modal masses" in one.sentence for one in result.of_kind("open"))
+    assert result.of_kind("open") and result.open_masses == (0, 1, 2)
 
 
 def test_what_known_masses_leave_uncertain_is_what_scatters():

@@ -16,6 +16,7 @@ import sysid
 from sysid.finding import Finding, Severity
 from sysid.report import opening, report
 from sysid.report.html import aligned
+from sysid.report.matrices import CHOSEN, ONE_OF_MANY
 from sysid.report.noise_level import noise_level
 
 FREQ = np.linspace(1.0, 40.0, 30)
@@ -158,8 +159,8 @@ def test_what_is_absent_leaves_no_section(plain, no_pictures):
         "Poles in the data", "Modal assurance criterion", "Effective masses", "How it was found",
     ]  # fmt: skip
     assert "normalised to 1 kg" in page.text and "convergence" not in page.alts
-    assert "No fit" in page.text and "The mass matrix is known." in page.text
-    assert "Stopped before its end" in page.text and "AutoMAC" not in page.text and "no reference is known" in page.text
+    assert "No fit" in page.text and all(f"{one.sentence[1:]}." in page.text for one in plain.findings)
+    assert "Stopped before" in page.text and "AutoMAC" not in page.text and "no reference" in page.text
 
 
 def test_mode_shapes_without_positions_are_a_table(plain, no_pictures):
@@ -173,19 +174,19 @@ def test_mode_shapes_without_positions_are_a_table(plain, no_pictures):
 
 
 def test_captions_tell_what_is_in_the_pictures(complete, plain, page, no_pictures):
-    assert "Left: poles of models of rising order" in page and "short dashes: each mode of the reference" in page
-    assert "Only the last phase" not in page and "Errors are those of the reference" in page
+    assert "rising order" in page and "short dashes" in page
+    assert "last phase" not in page and "Errors" in report._convergence(complete)
     # One run cannot move the base in two directions, so that no FRF and no pole follows.
     test = plain.measurement
     one = dataclasses.replace(test, base=test.base[:1], response=test.response[:1])
     problem = sysid.Problem(one, mass=sysid.FullMass(), stiffness=plain.problem.stiffness)
     other = dataclasses.replace(plain, problem=problem, strategy="continuation")
-    assert "Left: the largest singular value; why it is without poles" in report._poles(other)
+    assert "without poles" in report._poles(other) and "rising order" not in report._poles(other)
     assert "dashes" not in report._effective_masses(other)
     assert report._convergence(other) == ""  # no search is told
     searched = dataclasses.replace(other, history=complete.history)
     told = report._convergence(searched)
-    assert "Only the last phase" in told and "Errors" not in told
+    assert "last phase" in told and "Errors" not in told
 
 
 def test_a_stated_mass_is_not_called_normalised(page):
@@ -274,13 +275,13 @@ def test_what_is_not_determined_stands_with_its_range_and_a_mark(modal, truth, n
             assert table[i + 1][j + 1].split("|")[1:] == [f"{low} to", high]
     assert not any("|" in cell for row in square[2] for cell in row)  # no half-widths about one choice
     assert page.words.count("one of many") == 5  # matrices; pictures are left out here
-    assert page.text.count("one of many as the modal masses were chosen") == 2
+    assert page.text.count(f"{ONE_OF_MANY} {CHOSEN}") == 2
 
 
 def test_a_total_mass_that_is_open_is_called_one_of_many(modal, truth, no_pictures):
     it = modal(force=False, mass=sysid.FullMass(np.trace(truth.mass)))
     assert not it.problem.unit_mass and np.isnan(it.uncertainty.rigid_body_mass).all()
-    assert "one of many Total mass M_rb" in Page(report.render(it)).text
+    assert f"{ONE_OF_MANY} Total mass M_rb" in Page(report.render(it)).text
 
 
 @pytest.mark.parametrize(
@@ -316,8 +317,8 @@ def test_matrices_carry_the_names_of_their_degrees_of_freedom(modal, truth, no_p
     names = it.degrees_of_freedom
     assert names[:2] == ("low", "tip") and names[2].startswith("coordinate of mode ")
     assert [table[0][1:] for table in page.tables].count(list(names)) == 3
-    assert "3 degrees of freedom from 2 sensors" in page.text
-    assert "one of many as" not in page.text  # the force weighs all modes
+    assert "3 degrees" in page.text and "2 sensors" in page.text
+    assert CHOSEN not in page.text  # the force weighs all modes
 
 
 def test_convergence_tells_only_what_ran(modal, complete, plain, no_pictures):
@@ -347,7 +348,7 @@ def test_a_large_structure_is_told_without_what_takes_long(modal, monkeypatch, n
     page = Page(report.render(it))
     assert not {"uncertainty", "_intervals"} & set(vars(it))
     assert page.tables[1][0][1:3] == ["frequency [Hz]", "damping [%]"] and "±" not in page.text
-    assert "How far the entries may go is in the result's mass_interval" in page.text
+    assert "mass_interval" in page.text
 
 
 @pytest.mark.parametrize("factor", [1e-6, 1e6])
@@ -394,10 +395,10 @@ def test_residual_and_objective_of_all_tests_stand_on_top(written, no_pictures):
     page = Page(report.render(written))
     top = page.text[: page.text.index("Unknowns of the search")]
     own, second = written.residuals
-    assert f"Relative residual {written.residual:.3e} over 2 tests (test by test {own:.3e}, {second:.3e})" in top
-    assert f"{100 * written.residual:.3g} % of the accelerations" in page.tables[0][-1][1]
+    assert f"residual {written.residual:.3e} over 2 tests (" in top and f" {own:.3e}, {second:.3e})" in top
+    assert page.tables[0][-1][1].startswith(f"{100 * written.residual:.3g} % ")
     assert f"Objective {written.objective:.3e}" in top
-    assert f"Relative residual {second:.4g}; the structure as it was then" in page.text
+    assert f"residual {second:.4g};" in page.text
 
 
 def test_what_each_matrix_was_stated_to_be_is_told(written, complete, no_pictures):
@@ -417,4 +418,4 @@ def test_a_misfit_of_the_users_is_named_as_what_was_fitted(written, no_pictures)
         misfit=c / 100 - 1,
     )  # fmt: skip
     own = dataclasses.replace(written, problem=problem)
-    assert "of the misfit that the problem states" in Page(report.render(own)).text
+    assert "misfit" in report._how(own) and "misfit" not in report._how(written)

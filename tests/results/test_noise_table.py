@@ -10,6 +10,7 @@ from scipy import signal
 import sysid
 from sysid.report.report import render
 from sysid.results.noise_table import noise_of_channels
+from sysid.results.summary import noise_source
 
 
 @pytest.fixture(scope="module")
@@ -56,8 +57,10 @@ def test_shares_are_those_at_the_lines_and_runs_that_differ_are_told():
 
 
 def test_summary_figures_and_report_tell_it(answer):
-    summary = answer.summary()
-    assert "noise as stated" in summary and "force x" in summary
+    summary, source = answer.summary(), noise_source(answer)
+    assert source == "as stated"
+    assert f"noise {source}" in summary and "force x" in summary
     figures = json.loads(json.dumps(answer.to_dict()))["noise"]
     assert [one["channel"] for one in figures] == ["sensor 1", "base x", "force x"]
-    assert "Noise of each channel, as stated" in render(answer)
+    section = render(answer).partition(">Noise</h2>")[2].partition("<h2")[0]
+    assert source in section and all(one["channel"] in section for one in figures)

@@ -11,7 +11,7 @@ from scipy.stats import norm
 import sysid
 from sysid.export.content import statements
 from sysid.finding import Finding, Severity
-from sysid.results.summary import verdict
+from sysid.results.summary import next_steps, verdict
 
 FREQ = np.linspace(3.0, 120.0, 60)
 
@@ -38,6 +38,18 @@ def rows(it):
     return [line.split() for line in table.splitlines()]
 
 
+def rigid_masses(it):
+    """Direction, mark of one of many, value and half-width of each rigid-body mass in the summary."""
+    (line,) = [line for line in it.summary().splitlines() if line.startswith("rigid-body mass")]
+    return re.findall(r"(\w+) (~?)([\d.]+)(?: \+- (\S+))? kg", line)
+
+
+def ranges(it):
+    """How far the diagonal entries may go, in the summary, as multiples: least and most of M_SS and of K_SS."""
+    told = " ".join(it.summary().split()).partition("diagonal entries")[2]
+    return {matrix: (least, most) for least, most, matrix in re.findall(r"(\S+) to (\S+) .*?(M_SS|K_SS)", told)}
+
+
 def half(std):
     return f"{norm.ppf(0.975) * std:.2g}"
 
@@ -53,8 +65,8 @@ def test_the_table_of_modes_has_half_of_each_95_percent_interval(modal):
             mass, std = percent[i] * s.effective_masses[k, i, i], percent[i] * u.effective_masses[k, i, i]
             assert row[5 + 2 * i : 7 + 2 * i] == [f"{mass:.1f}", half(std)]
     assert "~" not in it.summary()
-    mass = s.rigid_body_mass[0, 0]
-    assert f"rigid-body mass x {mass:.6g} +- {half(u.rigid_body_mass[0, 0])} kg" in it.summary()
+    masses, std = np.diag(s.rigid_body_mass), np.diag(u.rigid_body_mass)
+    assert rigid_masses(it) == [("xy"[i], "", f"{masses[i]:.6g}", half(std[i])) for i in range(2)]
 
 
 def test_no_noise_leaves_a_half_width_of_zero(modal):
@@ -65,29 +77,28 @@ def test_no_noise_leaves_a_half_width_of_zero(modal):
 def test_masses_that_are_one_choice_are_marked_and_their_range_is_told(modal, truth):
     it = modal(force=False, mass=sysid.FullMass(np.diag(truth.rigid_body_mass), healing="rigid_body"))
     assert all(cell.startswith("~") for row in rows(it)[1:4] for cell in row[5:])
-    told = []
-    for matrix, (lower, upper) in (
-        (it.structure.mass[:3, :3], it.mass_interval),
-        (it.structure.stiffness[:3, :3], it.stiffness_interval),
+    told = {}
+    for name, matrix, (lower, upper) in (
+        ("M_SS", it.structure.mass[:3, :3], it.mass_interval),
+        ("K_SS", it.structure.stiffness[:3, :3], it.stiffness_interval),
     ):
         share = np.array([np.diag(end) / np.diag(matrix) for end in (lower, upper)])
-        told.append(f"{abs(share.min()):.3g} to {share.max():.3g} times those of this")
-    text = " ".join(it.summary().split())
-    assert f"over all these models the diagonal entries are {told[0]} M_SS, {told[1]} K_SS" in text
+        told[name] = f"{abs(share.min()):.3g}", f"{share.max():.3g}"
+    assert ranges(it) == told
 
 
 def test_ranges_that_would_take_time_are_not_computed_and_the_summary_says_so(modal, monkeypatch):
     monkeypatch.setattr("sysid.results.answer._DOFS_AT_ONCE", 2)
     it = modal(force=False)
-    text = " ".join(it.summary().split())
-    assert "_intervals" not in vars(it) and "is not computed here: Identification.mass_interval" in text
+    text = it.summary()
+    assert "_intervals" not in vars(it) and "Identification.mass_interval" in text and not ranges(it)
     assert it.mass_interval.shape == (2, 3, 3)
-    assert "over all these models the diagonal entries are" in " ".join(it.summary().split())
+    assert set(ranges(it)) == {"M_SS", "K_SS"} and "Identification.mass_interval" not in it.summary()
 
 
 def test_a_range_without_an_end_is_no_number(modal):
-    text = " ".join(modal(force=False).summary().split())
-    assert "entries are 0 to any number of times those of this M_SS" in text and "inf" not in text
+    it = modal(force=False)
+    assert ranges(it)["M_SS"] == ("0", "any") and "inf" not in it.summary()
 
 
 def test_no_line_is_wider_than_120_columns(random_structure):
@@ -160,27 +171,33 @@ def test_the_figures_are_json_with_null_for_what_is_open(modal, truth):
 
 def test_the_judgement_stands_first_with_what_speaks_against_it_and_the_next_step(modal):
     it = modal(force=True)
-    assert it.summary().startswith("Determined: data and stated model leave one mass and one stiffness matrix.\n  - ")
+    assert it.summary().startswith(f"Determined: {verdict(it)}.\n  - ")
     against = ("the structure softens", "the model misses the records", "a gain is wrong")
     kinds = ("changing", "beyond noise", "gain")
     contradict = [Finding(kind, Severity.CONTRADICTS, told) for kind, told in zip(kinds, against, strict=True)]
     failed = it.with_findings([*contradict, Finding("open", Severity.CAUTION, "mode 2 is open")])
     lines = failed.summary().splitlines()
-    assert lines[0] == "No fit: these matrices do not explain the records as they should. Fitted: 2 runs."
-    assert [line[4:] for line in lines[1:3]] == list(against[:2]) and lines[3].startswith("  > fit by itself a run")
+    assert lines[0] == f"No fit: {verdict(failed)}. Fitted: 2 runs."
+    assert [line[4:] for line in lines[1:3]] == list(against[:2]) and lines[3].startswith("  > ")
+    first, *_ = next_steps(failed)  # of records whose frequencies change
+    assert "one.h5" in first and first in " ".join(failed.summary().split())
     besides = lines[lines.index("besides:") :]
     assert [line[4:] for line in besides[1:3]] == ["a gain is wrong", "mode 2 is open"]
     assert besides[-1] == f"search: {it.message}" and it.message
-    assert "explain the data" not in failed.summary() and "this one does not; mass" in failed.summary()
+    assert not ranges(failed)  # of models that explain the data
+    notes = [line for one in (it, failed) for line in one.summary().splitlines() if line.startswith("+- half")]
+    assert ["does not;" in note for note in notes] == [False, True]  # intervals hold for a model that fits
     goal = np.ceil(100 * it.residual) / 100
-    assert f"goal={goal:.2g} (sysid run test.h5 --goal {goal:.2g})" in failed.summary()
+    assert f" goal={goal:.2g} " in failed.summary() and f" --goal {goal:.2g})" in failed.summary()
     assert it.with_findings([contradict[2]]).summary().startswith("Doubtful: a fit, but ")
 
 
 def test_masses_without_a_unit_are_marked_and_a_gain_moves_none_of_them(modal):
     it = modal(force=False)
     assert it.problem.unit_mass
-    assert f"rigid-body mass x ~{it.structure.rigid_body_mass[0, 0]:.6g} kg" in it.summary()
+    assert [masses[:3] for masses in rigid_masses(it)] == [
+        (axis, "~", f"{mass:.6g}") for axis, mass in zip("xy", np.diag(it.structure.rigid_body_mass), strict=True)
+    ]
     assert np.isnan(it.gain_worth).all()
     (head,) = [i for i, line in enumerate(it.summary().splitlines()) if line.startswith("gain against the base")]
     assert [line.split()[-1] for line in it.summary().splitlines()[head + 1 : head + 4]] == ["-"] * 3
@@ -194,7 +211,7 @@ def test_masses_of_a_lumped_model_are_told_and_what_no_mode_moves(mass):
     it = sysid.identify(sysid.Problem(test, mass=mass), rng=0)
     text, std = " ".join(it.summary().split()), np.diag(it.uncertainty.mass)
     told = [f"sensor {i + 1} {it.structure.mass[i, i]:.5g} +- {half(std[i])} kg" for i in range(2)]
-    assert (f"masses at the sensors (diagonal of M_SS): {', '.join(told)}" in text) is (ring == 0)
+    assert (f": {', '.join(told)}" in text) is (ring == 0)
     missing = re.findall("of the rigid-body mass, (.*?) % in x is in none of these modes", text)
     np.testing.assert_allclose([float(share) for share in missing], [100 / 6] * bool(ring), rtol=0.03)
 
@@ -208,13 +225,15 @@ def test_one_open_factor_is_closed_by_a_total_and_what_a_total_takes_for_granted
         for mass in (sysid.LumpedMass(), sysid.FullMass(), sysid.LumpedMass(3.0))
     )
     assert scale.scale_is_open and not every.scale_is_open and not stated.scale_is_open
-    assert "one common factor" in scale.summary() and "any number of times" not in scale.summary()
-    assert "any number of times" in every.summary()
-    granted = "all of the stated 3 kg is taken to sit at the sensors"
-    assert stated.determined and any(granted in str(note) for note in stated.notes)
+    assert "common factor" in scale.summary() and not ranges(scale)
+    assert ranges(every)["M_SS"] == ("0", "any")
+    (granted,) = stated.of_kind("assumed total", severity="note")
+    assert stated.determined and "3 kg" in granted.sentence
     forced = sysid.simulate(truth, lines, noise=0.01, force=True, rng=0)
     weighed = sysid.identify(sysid.Problem(forced, mass=sysid.LumpedMass(4.0)), rng=0)
-    assert "4 kg in the base directions, but the base force weighs 3" in weighed.confidence[0]
+    against = weighed.findings[0]
+    assert against.kind == "stated mass" and against.numbers["stated 1"] == pytest.approx(4.0)
+    assert against.numbers["weighed 1"] == pytest.approx(3.0, rel=0.1)  # by the modes of a model with 4 kg
     assert not weighed.of_kind("assumed total")
 
 
@@ -248,7 +267,7 @@ def test_the_step_that_closes_a_common_factor_is_one_number_in_kg(random_case, m
     """Effective masses in %, of which a common factor makes nothing, are then known."""
     _, problem = random_case(np.random.default_rng(5), "lumped", n=3, d=1, total=False)
     it = sysid.identify(dataclasses.replace(problem, mass=mass), strategy="modal")
-    told = " ".join(it.summary().split())
-    assert ("one number in kg is enough: state the mass of what the sensors stand for" in told) is scale
-    assert ("a total mass alone only bounds it" in told) is not scale
+    (step,) = next_steps(it)
+    assert it.scale_is_open is scale and step in " ".join(it.summary().split())
+    assert ("one number" in step, "total mass" in step) == (scale, not scale)
     assert any("~" in cell for row in rows(it)[1:4] for cell in row) is not scale

@@ -1,5 +1,6 @@
 """Eigenvalue refinement in a swarm: in closed form, by IPOPT for every candidate, and by both for its leaders."""
 
+import re
 from collections import Counter
 
 import numpy as np
@@ -143,9 +144,8 @@ class TestLeaders:
         result = search(problem)
         tried, won, statuses = counts(result.history)
         assert (won, statuses) == (0, {"Restoration_Failed": tried})
-        assert f"{tried} leaders of the swarm, 0 better than the closed form (Restoration_Failed {tried})" in (
-            result.history.refinement_in_words
-        )
+        told = result.history.refinement_in_words
+        assert re.findall(r"\d+", told) == [str(tried), "0", str(tried)] and f"(Restoration_Failed {tried})" in told
         np.testing.assert_allclose(
             result.structure.natural_frequencies, problem.reference.natural_frequencies, rtol=1e-8
         )

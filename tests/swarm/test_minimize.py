@@ -154,7 +154,7 @@ def test_a_missed_target_is_no_success_and_the_message_says_so():
     result = minimize_swarm(flat, SQUARE, rng=0, target=1.0, max_iterations=5)
     assert result.reason is StopReason.MAX_ITERATIONS
     assert not result.success
-    assert "target 1.0 was not reached" in result.message
+    assert "target 1.0" in result.message and "not reached" in result.message
 
 
 def test_stall_stops_after_so_many_iterations_without_a_fall():
@@ -162,7 +162,7 @@ def test_stall_stops_after_so_many_iterations_without_a_fall():
     assert result.reason is StopReason.STALL
     assert result.success
     assert result.nit == 13
-    assert "refine x locally" in result.message
+    assert "refine x" in result.message
 
 
 def test_a_stall_is_counted_from_the_last_fall():
@@ -268,8 +268,7 @@ def test_no_finite_cost_is_no_success_and_the_message_says_what_to_do():
     assert not result.success
     assert result.fun == np.inf
     assert result.n_nan == result.nfev == 50
-    assert "None of the 50 costs was finite" in result.message
-    assert "narrow the bounds" in result.message
+    assert "50 costs" in result.message and "bounds" in result.message
 
 
 def test_a_search_without_finite_costs_stalls():

@@ -1,0 +1,364 @@
+"""Wording: what users read is made once here and compared whole; all other tests ask for facts.
+
+Figures in a sentence are those that the test states, or those of the finding's `numbers`.
+"""
+
+import errno
+import functools
+import os
+import socket
+from argparse import Namespace
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sysid
+from sysid import FullMass, InputError, LumpedMass, Problem, Recipe, SpectralStiffness, catalogue, errors
+from sysid.cli import main as cli
+from sysid.cli import trust, unfinished
+from sysid.cli.files import alone_in
+from sysid.files import reading
+from sysid.finding import Finding, Severity
+from sysid.results.checkpoint import Begun
+from sysid.results.summary import next_steps, verdict
+from sysid.swarm import minimize_swarm
+
+K = 1e3 * np.array([[2.0, -1.0, -1.0], [-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
+TRUTH = sysid.Structure(np.diag([2.0, 1.0, 0.0]), K, [0.01, 0.02], n_base=1)
+LINES = np.linspace(1.0, 9.0, 60)
+TEST, FORCED = (sysid.simulate(TRUTH, LINES, force=force) for force in (False, True))
+
+MODULE = """import numpy as np
+import sysid
+
+def problem(*, data=None, rng=0):
+    K = 1e3 * np.array([[2.0, -1.0, -1.0], [-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
+    truth = sysid.Structure(np.diag([2.0, 1.0, 0.0]), K, [0.01, 0.02], n_base=1)
+    factor, idle = (sysid.Variable(name, lower=0.5, upper=2.0) for name in ("factor", "idle"))
+    test = sysid.simulate(truth, np.linspace(1.0, 9.0, 60))
+    return sysid.Problem(test, mass=factor * np.diag([2.0, 1.0]), stiffness=K[:2, :2])
+"""
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """Work in an empty folder but for a problem module and a file that is none."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("idle.py", "test.h5"):
+        Path(name).write_text(MODULE, encoding="utf-8")
+
+
+def in_use():
+    """Take a folder of results twice."""
+    Path("out").mkdir()
+    with alone_in(Path("out"), "wait for its end"), alone_in(Path("out"), "wait for its end"):
+        pass
+
+
+def impossible():
+    """Check a problem whose constraint no point keeps."""
+    m = sysid.Variable("m", lower=1.0, upper=2.0)
+    Problem(TEST, mass=m * np.eye(2), stiffness=K[:2, :2], constraints=[m >= 3.0]).check()
+
+
+LINE = impossible.__code__.co_firstlineno
+
+
+def own_damping():
+    """Ask for the modal strategy where the damping has a form of its own."""
+    damping = sysid.ProportionalDamping((0.0, 1.0), (0.0, 0.1))
+    sysid.identify(Problem(TEST, mass=FullMass(), damping=damping), strategy="modal")
+
+
+def begun(strategy="swarm", **given):
+    return Begun(Recipe("pair.py"), strategy, 0, **given)
+
+
+def identified(test, mass=None, **given):
+    return sysid.identify(Problem(test, mass=mass or FullMass(), **given), rng=0)
+
+
+REFUSED = {
+    "a number": (
+        lambda: errors.number("goal", -1, "a number above 0", above=0), "goal = -1: a number above 0 is needed",
+    ),
+    "a whole number": (lambda: errors.whole_number("starts", 0, at_least=1), "starts is 0; give 1 or above."),
+    "a fraction": (
+        lambda: errors.whole_number("starts", 1.5, at_least=1), "starts is 1.5; give a whole number, 1 or above.",
+    ),
+    "a word": (
+        lambda: errors.choice("frf", "FRF", ("relative", "transmissibility")),
+        "frf = 'FRF' is unknown; give one of 'relative', 'transmissibility'",
+    ),
+    "a hole": (
+        lambda: errors.finite_array("start", [1.0, np.nan]),
+        "start holds NaN or infinite entries (1 of 2, the first at index (1,))",
+    ),
+    "a text of numbers": (
+        lambda: errors.numbers("start", ["one"]), "start is not an array of real numbers: ['one']",
+    ),
+    "an extra": (
+        lambda: errors.needed("nowhere", "uff", "shake.unv"),
+        "shake.unv needs the package nowhere: python -m pip install 'structural-sysid[uff]'",
+    ),
+    "a folder for a module": (
+        lambda: (Path("folder.py").mkdir(), catalogue.build(Recipe("folder.py"))), "problem folder.py is not a file",
+    ),
+    "no module": (
+        lambda: catalogue.build(Recipe("nowhere.py")),
+        f"problem nowhere.py cannot be read: {os.strerror(errno.ENOENT)}",
+    ),
+    "a test for a module": (
+        lambda: catalogue.build(Recipe("./test.h5")),
+        "problem test.h5: the name of a problem module ends in .py; a test that 'sysid read' wrote is run by "
+        "'sysid run TEST.h5'",
+    ),
+    "no data": (
+        lambda: catalogue.build(Recipe("idle.py", "nowhere")),
+        "data 'nowhere': there is no such file or folder; where a result names it, put it there, or work in the folder "
+        "that the result was made in",
+    ),
+    "an idle variable": (
+        lambda: catalogue.build(Recipe("idle.py")),
+        "idle.py: variable 'idle' (idle.py, line 7) enters no matrix, residual or constraint: use it, or take it out",
+    ),
+    "a constraint": (
+        impossible,
+        f"no point within the bounds satisfies constraint 1, written in 'm' ({__file__}, line {LINE + 2}) (problem at "
+        f"{__file__}, line {LINE + 3}): widen the bounds of these variables, or correct the relation",
+    ),
+    "a strategy": (
+        own_damping,
+        "strategy 'modal' needs a free stiffness (SpectralStiffness) and ModalDamping, and the damping has a form of "
+        "its own; 'auto' chooses another strategy",
+    ),
+    "an untrusted module": (
+        lambda: trust.check(Recipe("idle.py"), Path("out/result.h5"), "--module FILE.py", Namespace(trust=False)),
+        "out/result.h5 names the problem module {here}/idle.py, whose code would run: say --trust where you know what "
+        "stands in it, or name the module yourself: --module FILE.py",
+    ),
+    "a module that is gone": (
+        lambda: trust.check(Recipe("gone.py"), Path("out/result.h5"), "--module FILE.py", Namespace(trust=False)),
+        "out/result.h5 names the problem module {here}/gone.py, which is not here: get it, and name it: "
+        "--module FILE.py",
+    ),
+    "an edited module": (
+        lambda: unfinished.with_source(begun(source="of another text"), [Path("idle.py")], Path("out")),
+        "out holds an unfinished run of pair.py, strategy swarm, seed 0, and since it began its module or what this "
+        "imports from beside itself was edited: give the problem with --out out --fresh to begin anew, or undo the "
+        "edit",
+    ),
+    "a strategy without refinement": (
+        lambda: unfinished.strategy_of(begun("modal", refine_by="leaders")),
+        "--refine-by is of the strategies 'swarm' and 'hpso-ls', and the strategy is 'modal': leave it out, or give "
+        "--strategy swarm or hpso-ls",
+    ),
+    "a folder in use": (
+        in_use, f"folder of results out is in use by another run (process {os.getpid()} on {{host}}): wait for its end",
+    ),
+    "a base the other way round": (
+        lambda: identified(replace(TEST, base=-TEST.base)),
+        "the sign of the base is reversed, or that of all sensors: beside their modes all move against the base; "
+        "change the sign of the base's record",
+    ),
+    "rad/s": (
+        lambda: identified(TEST, stiffness=SpectralStiffness(2 * np.pi * TRUTH.natural_frequencies)),
+        "the stated natural frequencies are in rad/s, not Hz: {:.4g}, {:.4g} Hz are stated, the records have modes "
+        "at {:.4g}, {:.4g} Hz, and a factor of 2 pi = 6.283 lies between; divide what is stated by 2 pi".format(
+            *2 * np.pi * TRUTH.natural_frequencies, *TRUTH.natural_frequencies
+        ),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_refused_is_told_with_the_place_and_the_remedy(here, tmp_path, name):
+    made, sentence = REFUSED[name]
+    with pytest.raises(InputError) as refused:
+        made()
+    assert str(refused.value) == sentence.format(here=tmp_path, host=socket.gethostname())
+
+
+COMMANDS = {
+    "run": "PROBLEM is missing (see 'sysid run --help')",
+    "run --resume out": "no unfinished run in out: 'sysid run PROBLEM --resume out' begins one there, and goes on with "
+    "it where there is one",
+    "run idle.py --resume out --fresh": "--resume and --fresh exclude each other",
+    "run shear_building --goal 0.1": "--mass, --lumped, --band and --goal are for a test that 'sysid read' wrote",
+    "show shear_building --seed 1 --set rng=1": "parameter 'rng' is set twice; parameters of this module: noise=0.0",
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_mistake_on_the_command_line_is_one_line(here, capsys, command):
+    assert cli.main(command.split()) == 2
+    assert capsys.readouterr() == ("", f"sysid: {COMMANDS[command]}\n")
+
+
+ALIKE = "other mass and stiffness matrices answer identically"
+UNIT = "no number with a unit of mass is given: masses are normalised to 1 kg in each base direction"
+CASES = {
+    "gain": lambda: identified(replace(TEST, response=TEST.response * [[1.0], [1.02]])),
+    "low gain": lambda: identified(replace(TEST, response=TEST.response * [[1.0], [0.9956]])),
+    "goal": lambda: identified(sysid.simulate(TRUTH, LINES, noise=0.01, rng=0), goal=1e-4),
+    "force": lambda: identified(FORCED),
+    "nothing": lambda: identified(TEST),
+    "lumped": lambda: identified(TEST, LumpedMass()),
+    "total": lambda: identified(TEST, LumpedMass(3.0)),
+    "wrong total": lambda: identified(FORCED, LumpedMass(4.0)),
+}
+
+
+@functools.cache
+def answer(name):
+    """Identify a case where it is first asked for."""
+    return CASES[name]()
+
+
+FOUND = [
+    (
+        "gain", "gain",
+        lambda of: f"sensor 2 reads 2 % high against the base (standard deviation {100 * of['std']:.1g} %): M_SS, K_SS "
+        "and C are wrong in its row and column; calibrate it and divide its record by 1.0200, or correct its row of "
+        "rigid_body",
+    ),
+    (
+        "low gain", "gain",
+        lambda of: f"sensor 2 reads 0.44 % low against the base (standard deviation {100 * of['std']:.1g} %): M_SS, "
+        "K_SS and C are wrong in its row and column; calibrate it and divide its record by 0.9956, or correct its row "
+        "of rigid_body",
+    ),
+    ("goal", "goal", lambda of: f"the residual {of['residual']:.3g} is above the goal 0.0001"),
+    (
+        "wrong total", "stated mass",
+        lambda of: "the stated mass makes 4 kg in the base directions, but the base force weighs "
+        f"{of['weighed 1']:.4g} kg; one of them, or the unit of the force, is wrong; the force weighs an adapter or "
+        "base plate on its cells too",
+    ),
+    (
+        "total", "assumed total",
+        lambda of: "all of the stated 3 kg is taken to sit at the sensors. Mass that moves with the table, such as an "
+        "adapter or a base ring, must not be in it: no record can show it, and M, K and C are in proportion to it",
+    ),
+    ("total", "fixed", lambda of: "the mass is stated to be lumped on the sensors, with its total given"),
+    (
+        "force", "assumed force gain",
+        lambda of: "no record can show whether the gain of the base force is right. M, K and C are in proportion to "
+        "it: an error of 1 % in it makes 1 % in them",
+    ),
+    ("force", "fixed", lambda of: "the measured base force weighs each mode that the base moves"),
+    ("nothing", "open", lambda of: f"all modal masses are open: {ALIKE}"),
+    (
+        "lumped", "open",
+        lambda of: f"mass, stiffness and damping are known up to one common factor: {ALIKE}, within what is stated",
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("case", "kind", "sentence"), FOUND, ids=[f"{case}: {kind}" for case, kind, _ in FOUND])
+def test_a_finding_says_what_was_found_and_what_to_do(case, kind, sentence):
+    first, *more = answer(case).of_kind(kind)
+    assert str(first) == sentence(first.numbers)
+    assert [str(one) for one in more] == [UNIT] * (kind == "open")
+
+
+JUDGED = [
+    ("force", (), "data and stated model leave one mass and one stiffness matrix", None),
+    (
+        "total", (), "data and stated model leave one mass and one stiffness matrix. No force was measured: they are "
+        "as right as the mass or stiffness that is stated", None,
+    ),
+    (
+        "nothing", (), "other models explain the data as well",
+        "measure the force between table and structure; or state what is known of the mass, where it is true: that all "
+        "of it sits at the sensors (sysid run test.h5 --lumped --mass KG; LumpedMass(KG)), or single masses "
+        "(FullMass(known=...)); a total mass alone only bounds it",
+    ),
+    (
+        "lumped", (), "other models explain the data as well",
+        "one number in kg is enough: state the mass of what the sensors stand for (sysid run test.h5 --lumped --mass "
+        "KG; in Python LumpedMass(KG), or one unknown of a written mass), or measure the force between table and "
+        "structure",
+    ),
+    (
+        "force", [("gain", "contradicts")],
+        "a fit, but something speaks against this model, so that its matrices may be wrong",
+        "deal with what speaks against this model, in the order given: correct it, or measure again",
+    ),
+    (
+        "force", [("residual", "contradicts")], "these matrices do not explain the records as they should",
+        "deal with what speaks against it, in the order given",
+    ),
+    ("force", [("noise", "caution")], "some entries of the matrices are not known well enough", None),
+    (
+        "force", [("residual", "contradicts"), ("changing", "contradicts")],
+        "these matrices do not explain the records as they should",
+        "fit by itself a run in which structure and level of motion stay the same, at the level of interest: 'sysid "
+        "read RUN.csv --out one.h5', then 'sysid run one.h5'",
+    ),
+    (
+        "goal", (), "these matrices do not explain the records as they should",
+        "put right what is named first; a goal below the noise of the records cannot be reached",
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("case", "found", "means", "step"), JUDGED)
+def test_a_judgement_says_what_it_means_and_what_to_do_first(case, found, means, step):
+    it = answer(case)
+    if found:
+        it = it.with_findings([Finding(kind, Severity(severity), "-") for kind, severity in found])
+    assert verdict(it) == means
+    assert next_steps(it)[:1] == ([] if step is None else [step])
+
+
+SWARMS = [
+    (
+        {"max_iterations": 5, "target": 0.5}, 1.0,
+        "Spent max_iterations = 5: if the history still falls, raise it, or refine x locally. The target 0.5 was not "
+        "reached; the best cost is 1.",
+    ),
+    (
+        {"stall_iterations": 3}, 1.0,
+        "The best cost has not fallen by more than {stall} of itself in 3 iterations: refine x locally, or start again "
+        "with another rng or more particles.",
+    ),
+    (
+        {"max_iterations": 2}, np.nan,
+        "None of the {nfev} costs was finite: evaluate fun at a point that should work, and narrow the bounds to where "
+        "it is defined.",
+    ),
+    ({"target": 2.0}, 1.0, "Reached the target 2.0."),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("given", "cost", "sentence"), SWARMS)
+def test_a_swarm_says_why_it_ended_and_what_to_do(given, cost, sentence):
+    result = minimize_swarm(lambda rows: np.full(len(rows), cost), [(-1.0, 1.0)] * 2, rng=0, **given)
+    assert result.message == sentence.format(nfev=result.nfev, stall=1e-8)
+
+
+def test_leaders_that_ipopt_refined_are_counted_in_a_sentence():
+    ended = {"refinement_statuses": (("Restoration_Failed", 1), ("Solve_Succeeded", 2))}
+    assert sysid.History(**ended, leaders_tried=3, leaders_won=1).refinement_in_words == (
+        "IPOPT refined 3 leaders of the swarm, 1 better than the closed form (Restoration_Failed 1, Solve_Succeeded 2)"
+    )
+    assert sysid.History(**ended).refinement_in_words == (
+        "IPOPT refined 3 candidates (Restoration_Failed 1, Solve_Succeeded 2)"
+    )
+    assert sysid.History().refinement_in_words == ""
+
+
+def test_what_a_file_leaves_open_is_remarked(here):
+    Path("run.csv").write_text("time,table,top\ns,m/s²,m/s²\n0.0,1,2\n0.1,2,1\n0.2,0,1\n0.3,1", encoding="utf-8")
+    np.savez("frf.npz", w=LINES, h1=TEST.response[0, 0])
+    base, top = ({"column": name, "role": role, "axis": "x"} for name, role in (("table", "base"), ("top", "response")))
+    assert reading.gather(Path("run.csv"), {"sensor": [base, top]}).remarks == (
+        "run.csv: line 6, the last, is cut short and left out",
+    )
+    said = {"base_axes": "x", "frf": "transmissibility", "frequency": "w", "convention": "exp(+iwt)"}
+    assert reading.gather(Path("frf.npz"), said | {"sensor": [top | {"column": "h1"}]}).remarks == (
+        "frf.npz: array 'w': frequencies have no unit, and are taken as Hz", "spectra follow exp(+iwt), as stated",
+    )  # fmt: skip
