@@ -43,7 +43,7 @@ def round_off(terms: int) -> float:
     return 10 * terms * EPSILON
 
 
-def beyond_chance(freedom: float, at_once: int = 1) -> float:
+def beyond_chance(freedom: float, at_once: int = 1, chance: float = FALSE_ALARM) -> float:
     """Sum of squares of so many numbers of noise, in units of its variance, that chance does not reach.
 
     Parameters
@@ -52,14 +52,16 @@ def beyond_chance(freedom: float, at_once: int = 1) -> float:
         Degrees of freedom, or zero.
     at_once : int
         How many such sums are looked at, of which chance may let none through.
+    chance : float
+        That one of them is larger all the same.
     """
     least = sys.float_info.min  # for nothing to sum, of which the sum is zero
-    return float(scipy.special.chdtri(max(freedom, least), FALSE_ALARM / max(at_once, 1)))
+    return float(scipy.special.chdtri(max(freedom, least), chance / max(at_once, 1)))
 
 
-def most_deviations(at_once: int = 1) -> float:
+def most_deviations(at_once: int = 1, chance: float = FALSE_ALARM) -> float:
     """Standard deviations, either way, that none of so many numbers of noise is off by."""
-    return math.sqrt(beyond_chance(1, at_once))
+    return math.sqrt(beyond_chance(1, at_once, chance))
 
 
 def largest_modulus(at_once: int = 1) -> float:

@@ -22,7 +22,7 @@ from sysid.modal_analysis.residues import Records, ResidueFit
 from sysid.modal_analysis.response import gain_slopes
 from sysid.problem.problem import Problem
 from sysid.structure.structure import Array, Structure
-from sysid.structure.thresholds import EXACT, FALSE_ALARM, LIKELY, NEGLIGIBLE, ROUND_OFF, most_deviations
+from sysid.structure.thresholds import COVERAGE, EXACT, FALSE_ALARM, LIKELY, NEGLIGIBLE, ROUND_OFF, most_deviations
 
 _UNSHOWN = 2.0  # %: the error that a gain may have where no record shows it
 _LEAST = 2e-3  # of a gain; smaller errors are usual
@@ -109,8 +109,9 @@ def gain_errors(test: Measurement, structure: Structure) -> GainErrors:
 
 
 def _beyond(error: Array, std: Array) -> Array:
-    """What chance does not explain of errors with these deviations."""
-    return np.sqrt(np.maximum(error**2 - (LIKELY * std) ** 2, 0.0))
+    """What chance does not explain of errors with these deviations, in 95 % of right tests none of any sensor."""
+    likely = most_deviations(2 * error.size, 1 - COVERAGE)  # of two estimates each
+    return np.sqrt(np.maximum(error**2 - (likely * std) ** 2, 0.0))
 
 
 def distinct_poles(structure: Structure) -> tuple[Array, Array]:
