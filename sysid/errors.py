@@ -29,6 +29,8 @@ from numpy.typing import ArrayLike, NDArray
 # Marks that turn the direction of writing: by them a name may look like another one.
 _TURNING = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
 
+MOST_LISTED = 8  # of many alike, that a message names
+
 RandomSource = int | np.random.Generator | np.random.SeedSequence | None
 
 
@@ -68,6 +70,12 @@ def shown(value: Any) -> str:
     """A value in a message, which stays one line."""
     words = " ".join(repr(value).split())
     return words if len(words) < 80 else f"{words[:77]}..."
+
+
+def listed(words: Sequence[str], between: str = ", ") -> str:
+    """Words in a message, and how many more there are beyond the first few."""
+    more = len(words) - MOST_LISTED
+    return between.join(words[:MOST_LISTED]) + f" and {more} more" * (more > 0)
 
 
 def number(

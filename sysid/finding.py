@@ -47,6 +47,9 @@ class Severity(StrEnum):
     NOTE = "note"
 
 
+MOST_OF_A_KIND = 3  # findings that one check makes of one kind
+
+
 class Finding(NamedTuple):
     """One fact that a check found.
 

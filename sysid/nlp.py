@@ -13,11 +13,12 @@ import scipy
 from numpy.typing import NDArray
 from threadpoolctl import OpenBLASController, register, threadpool_limits
 
+from sysid.errors import listed
+
 Array = NDArray[np.floating[Any]]
 
 OBJECTIVE_SCALE = 1e3  # lifts a residual of 1e-8 above IPOPT's tolerance
-EXACT = 1e-8  # a relative residual that needs no second look
-_TOLERANCE = 1e-9  # of IPOPT
+_TOLERANCE = 1e-9  # of IPOPT, of constraints too
 _ENDED = {
     "Solve_Succeeded": "the solver ended as it should",
     "Solved_To_Acceptable_Level": "the solver ended near enough to its optimum",
@@ -25,9 +26,8 @@ _ENDED = {
     "Maximum_WallTime_Exceeded": "the solver ran out of time",
     "Infeasible_Problem_Detected": "the solver found no point that keeps the constraints",
 }
-_ROUND_OFF = 1e-11  # of constraints
 _LOADED = 3.0  # times the seconds of an idle processor that work may take on a machine that does other things too
-_GRACE = 0.4  # s, by which work may end late
+GRACE = 0.4  # s, by which work may end late: what each of the last steps has, however late it begins
 _LATE = "Maximum_WallTime_Exceeded"  # IPOPT's word, which does not count the making of the graphs
 
 
@@ -38,7 +38,7 @@ def ended_in_words(status: str) -> str:
 
 def suffices(left: float, seconds: float) -> bool:
     """Whether the time that is `left` is enough for work that takes about so many seconds of a processor."""
-    return _LOADED * seconds < left + _GRACE
+    return _LOADED * seconds < left + GRACE
 
 
 def not_begun(seconds: float) -> str:
@@ -230,7 +230,7 @@ class NonlinearProgram:
         while np.all((at >= lower) & (at <= upper)):
             r, J, c, A = (np.asarray(part) for part in function(at))
             r, c = r.ravel(), c.ravel()
-            over = np.concatenate([below - c, c - above, [_ROUND_OFF]]).max()
+            over = np.concatenate([below - c, c - above, [_TOLERANCE]]).max()
             if not (np.linalg.norm(r) < left / 2 and over <= violated):
                 break
             best, left, violated = at, float(np.linalg.norm(r)), over
@@ -250,10 +250,7 @@ class NonlinearProgram:
         for name, label, is_low, is_high in zip(self.names, self.labels, low & free, high & free, strict=True):
             if is_low or is_high:
                 ended.setdefault(name, []).append(f"{label} ({'lower' if is_low else 'upper'})")
-        return "; ".join(
-            f"{name}{','.join(which[:4])}" + (f" and {len(which) - 4} more" if len(which) > 4 else "")
-            for name, which in ended.items()
-        )
+        return "; ".join(f"{name}{listed(which, ',')}" for name, which in ended.items())
 
 
 class IterationMonitor:

@@ -26,13 +26,12 @@ CEILINGS = {
     # by checks that share one context (600), a page of half the size and time (140),
     # and one model of modes for spectra and whole records, its shapes eliminated with exact second derivatives (530);
     # what is stated apart from what is prepared of it, and whole records that end in IPOPT (340).
-    "lines": 41_950,
+    "lines": 41_872,
     # What was counted when these counts began; the modes once, in the open, brings them down.
     "branches": 78.0,
-    "files": 257,
-    "constants": 465,
+    "files": 258,
     "shared": 45,
-    "everyday": 386,
+    "everyday": 375,
 }
 
 # The counting is a benchmark, which prints the same figures; `sysid` itself is not imported from the checkout.

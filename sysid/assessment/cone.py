@@ -19,16 +19,9 @@ import scipy
 from numpy.typing import NDArray
 
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import EXACT, NEGLIGIBLE, ROUND_OFF, round_off
 
 Pairs = list[tuple[int, int]]
-
-_RANK_TOLERANCE = 1e-7
-_UNLIMITED = 1e-13  # of the strongest limit's weight: directions with less of it are taken as not limited
-_ZERO = 1e-9  # coefficients of functions below it, which are scaled to order one, are round-off
-_GAP = 1e-8  # of a function's range: what the barrier may leave
-_CENTRED = 1e-4  # squared Newton decrement at which a point counts as one of the central path
-_FAR = 1e6  # where members end that neither a limit nor the function holds
-_OPENED = 1e-9  # by which the barrier opens a limit that leaves it no room
 
 
 def unknowns(clusters: Sequence[list[int]]) -> Pairs:
@@ -50,7 +43,7 @@ def forms(left: Array, right: Array, pairs: Pairs) -> Array:
 def null_space(system: Array) -> Array:
     """Directions of the unknowns that the equations leave open, one a row, orthonormal."""
     _, s, vt = np.linalg.svd(system)
-    return vt[np.count_nonzero(s > _RANK_TOLERANCE) :]
+    return vt[np.count_nonzero(s > NEGLIGIBLE) :]
 
 
 class Affine(NamedTuple):
@@ -146,7 +139,7 @@ class Cone:
             return [(np.eye(len(c)), np.zeros((len(c), 0))) for c in self.clusters]
         weight = sum((W @ W.T for W in (*self.fixed, *self.traces, *self.matrices)), np.zeros((self.n, self.n)))
         spectra = [np.linalg.eigh(weight[np.ix_(c, c)]) for c in self.clusters]
-        least = _UNLIMITED * max(lam.max() for lam, _ in spectra)
+        least = round_off(len(spectra)) * max(lam.max() for lam, _ in spectra)
         return [(V[:, lam > least] / np.sqrt(lam[lam > least]), V[:, lam <= least]) for lam, V in spectra]
 
     @cached_property
@@ -192,7 +185,7 @@ class Cone:
         values : (q,)
             Infinite where the function has no bound.
         members : (q, n, n)
-            T that attain them (the barrier's to `_GAP` of the function's range); NaN where they are infinite.
+            T that attain them (the barrier's to `EXACT` of the function's range); NaN where they are infinite.
 
         Raises
         ------
@@ -231,9 +224,9 @@ class Cone:
             lam, V = np.linalg.eigh(free.T @ C @ free)
             unit = bound / np.where(np.linalg.norm(bound, axis=0) > 0, np.linalg.norm(bound, axis=0), 1.0)
             coupling = np.swapaxes(V, 1, 2) @ (free.T @ C @ bound)
-            touched = np.abs(np.swapaxes(V, 1, 2) @ (free.T @ C @ unit)).max(axis=2, initial=0.0) > _ZERO
-            finite &= ~np.any((lam > _ZERO) | ((lam > -_ZERO) & touched), axis=1)
-            falling = lam < -_ZERO
+            touched = np.abs(np.swapaxes(V, 1, 2) @ (free.T @ C @ unit)).max(axis=2, initial=0.0) > ROUND_OFF
+            finite &= ~np.any((lam > ROUND_OFF) | ((lam > -ROUND_OFF) & touched), axis=1)
+            falling = lam < -ROUND_OFF
             response = coupling * np.where(falling, -1 / np.where(falling, lam, 1.0), 0.0)[:, :, None]
             followers.append(bound + free @ (V @ response))
         return followers, finite
@@ -247,7 +240,7 @@ class Cone:
             _programme(c, escape, np.zeros(len(escape)), box=1.0) @ c / max(1.0, np.abs(c).max())
             for c in coefficients @ self.region.open.T
         ]
-        return np.array(gains) <= _ZERO
+        return np.array(gains) <= ROUND_OFF
 
     @cached_property
     def _escape(self) -> Array | None:
@@ -263,7 +256,7 @@ class Cone:
         escape = np.vstack(rows)
         total = escape[: len(region.signs)].sum(axis=0)
         farthest = _programme(total, escape, np.zeros(len(escape)), box=1.0) @ total
-        return escape if farthest > _RANK_TOLERANCE else None
+        return escape if farthest > NEGLIGIBLE else None
 
     def _best(self, coefficients: Array) -> Array:
         """Unknowns at which bounded functions are largest, (q, m)."""
@@ -271,10 +264,10 @@ class Cone:
         if self._escape is not None:
             # Neither a limit nor the function itself need hold what the function does not feel.
             away = -np.sum([sign.slopes for sign in region.signs], axis=0)
-            region = region._replace(limits=[*region.limits, Affine(np.full((1, 1), _FAR), away)])
+            region = region._replace(limits=[*region.limits, Affine(np.full((1, 1), 1 / NEGLIGIBLE), away)])
         best = np.tile(region.start, (len(coefficients), 1))
         slopes = coefficients @ region.open.T
-        moving = np.abs(slopes).max(axis=1, initial=0.0) > _ZERO * np.abs(coefficients).max(axis=1, initial=0.0)
+        moving = np.abs(slopes).max(axis=1, initial=0.0) > ROUND_OFF * np.abs(coefficients).max(axis=1, initial=0.0)
         if not np.any(moving):
             return best
         if not self.fixed and self.signs is None and len(region.limits) == 1 and len(region.limits[0].at_start) == 1:
@@ -304,10 +297,10 @@ def _varying(at_start: Array, slopes: Array) -> Affine:
     """The same condition on the directions that vary: what is constant acts through its Schur complement."""
     size = len(at_start)
     U, s, _ = np.linalg.svd(slopes.reshape(size, -1))
-    rank = int(np.count_nonzero(s > _ZERO))
+    rank = int(np.count_nonzero(s > ROUND_OFF))
     V, W = U[:, :rank], U[:, rank:]
     tie = V.T @ at_start @ W
-    constant = V.T @ at_start @ V - tie @ np.linalg.pinv(W.T @ at_start @ W, rcond=_ZERO, hermitian=True) @ tie.T
+    constant = V.T @ at_start @ V - tie @ np.linalg.pinv(W.T @ at_start @ W, rcond=ROUND_OFF, hermitian=True) @ tie.T
     return Affine(constant, np.einsum("ia,ijk,jb->abk", V, slopes, V))
 
 
@@ -341,7 +334,7 @@ def _room(region: Region) -> _Room:
     inside = max(starts, key=lambda z: float(least(region.limits, z)))
     parts = [*region.signs]
     for p in region.limits:
-        parts.append(Affine(p.at_start + max(0.0, _OPENED - least([p], inside)) * np.eye(len(p.at_start)), p.slopes))
+        parts.append(Affine(p.at_start + max(0.0, ROUND_OFF - least([p], inside)) * np.eye(len(p.at_start)), p.slopes))
     return _Room(*_rows(parts, inside.size), [p for p in parts if len(p.at_start) > 1], inside)
 
 
@@ -352,7 +345,7 @@ def _rows(parts: Sequence[Affine], k: int) -> tuple[Array, Array]:
 
 
 def _barrier(functions: Array, room: _Room) -> Array:
-    """The z at which each of the functions, (q, k), is largest, to `_GAP` of its range."""
+    """The z at which each of the functions, (q, k), is largest, to `EXACT` of its range."""
     nowhere = np.zeros((1, functions.shape[1]))
     centre = _centred(nowhere, room, room.inside[None])
     _, root, _ = _derivatives(room, centre)
@@ -364,7 +357,7 @@ def _barrier(functions: Array, room: _Room) -> Array:
     z = np.repeat(centre, len(functions), axis=0)
     order = len(room.rows) + sum(len(block.at_start) for block in room.blocks)
     weight = 1.0
-    while order > _GAP * weight:  # the gap on the central path is order / weight
+    while order > EXACT * weight:  # the gap on the central path is order / weight
         weight *= 8
         z = _centred(weight * scaled, room, z)
     return z
@@ -377,7 +370,7 @@ def _centred(pull: Array, room: _Room, z: Array) -> Array:
         # The Hessian is root' root; near a corner only its triangular factor has a condition to compute with.
         triangle = np.linalg.qr(root, mode="r")
         half = np.linalg.solve(np.swapaxes(triangle, 1, 2), (pull + gradient)[:, :, None])
-        if np.sum(half**2, axis=1).max() < _CENTRED:
+        if np.sum(half**2, axis=1).max() < 1e-4:  # squared Newton decrement: near enough to the central path
             return z
         step = np.linalg.solve(triangle, half)[:, :, 0]
         rates = spread(step)

@@ -24,20 +24,16 @@ from sysid.assessment.sensitivity import (
     with_totals,
 )  # fmt: skip
 from sysid.assessment.uncertainty import LARGE, uncertainty
-from sysid.errors import InputError
+from sysid.errors import MOST_LISTED, InputError
 from sysid.finding import Finding, Severity, cautions
 from sysid.models.unknowns import scales_of, split
-from sysid.nlp import EXACT
 from sysid.problem.formulation import Formulation
 from sysid.problem.prepared import Prepared
 from sysid.problem.slopes import Slopes, slopes_of
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import EXACT, NEGLIGIBLE, SAME_ANSWER, most_deviations
 
 _LOOSE = 1e-2  # of an unknown, by which what is left of exact records may move it
-_MOVED = 1e-6  # of the root of two diagonals, by which an unseen step of order one must change an entry to count
-_OTHER = 1e-3  # of an unknown, or of the root of two diagonals: what differs by less is the same
-_BEYOND = 5.0  # standard deviations by which an entry of another structure must differ: noise hardly moves one so far
-_TOLD = 4  # unknowns of another answer, told
 _SAME_MATRICES = "mass, stiffness and damping stay the same all the same"
 _NO_SCALE = (
     "without a base force or a known mass the scale of mass, stiffness and damping is not determined: give the force, "
@@ -218,7 +214,7 @@ def _by_name(formulation: Formulation, directions: Array) -> tuple[Array, Array]
     """The same space (size, count) by directions of unknowns that mean something by themselves, and the others."""
     without = directions[~meaningful(formulation)]
     lam, turn = np.linalg.eigh(without.T @ without)
-    return directions @ turn[:, lam < _MOVED**2], directions @ turn[:, lam >= _MOVED**2]
+    return directions @ turn[:, lam < NEGLIGIBLE**2], directions @ turn[:, lam >= NEGLIGIBLE**2]
 
 
 def _moving(pairs: list[tuple[Array, Array]], unit: Array, directions: Array) -> Array:
@@ -229,14 +225,14 @@ def _moving(pairs: list[tuple[Array, Array]], unit: Array, directions: Array) ->
         for matrix, slope in pairs
     ]
     lam, turn = np.linalg.eigh(sum(change.T @ change for change in moved))
-    return directions @ turn[:, lam >= _MOVED**2]
+    return directions @ turn[:, lam >= NEGLIGIBLE**2]
 
 
 def _factors_in_words(formulation: Formulation, directions: Array) -> Iterator[str]:
     """Directions that move entries of factors or shares, which nobody gave: what takes part, and how many there are."""
     count = directions.shape[1]
     if count:
-        moved = split(formulation.unknowns, np.abs(directions).max(axis=1) > _MOVED)
+        moved = split(formulation.unknowns, np.abs(directions).max(axis=1) > NEGLIGIBLE)
         titles = [unknown.title for unknown, part in zip(formulation.unknowns, moved, strict=True) if np.any(part)]
         yield f"{', '.join(titles)} together, in {count} {'way' if count == 1 else 'ways'}"
 
@@ -250,14 +246,14 @@ def _scale_is_open(pairs: list[tuple[Array, Array]], known: Sensitivity) -> bool
         (slope @ steps).reshape(-1, steps.shape[1]) / size for (_, slope), size in zip(pairs, sizes, strict=True)
     ])  # fmt: skip
     left = common - moved @ np.linalg.lstsq(moved, common)[0]
-    return bool(np.linalg.norm(left) < _MOVED * np.linalg.norm(common))
+    return bool(np.linalg.norm(left) < NEGLIGIBLE * np.linalg.norm(common))
 
 
 def _open_entries(matrix: Array, slope: Array, known: Sensitivity) -> Array:
     """Which entries (n, n) of a matrix something unseen moves."""
     size = np.sqrt(np.abs(np.diag(matrix)))
     moved = np.abs(slope @ (known.unit[:, None] * known.unseen)).max(axis=-1, initial=0.0)
-    return moved > _MOVED * np.outer(size, size)
+    return moved > NEGLIGIBLE * np.outer(size, size)
 
 
 # -- of what else was found, and of variables beside ---------------------------------------------
@@ -281,7 +277,7 @@ def _others(problem: Prepared, structure: Structure, x: Array | None, rivals: Se
     unit, named, labels = scales_of(formulation.unknowns, x), meaningful(formulation), formulation.labels
     for other in rivals:
         off = np.where(named, np.abs(other - x) / unit, 0.0)
-        far = [j for j in np.argsort(-off, kind="stable")[:_TOLD] if off[j] > _OTHER]
+        far = [j for j in np.argsort(-off, kind="stable")[:MOST_LISTED] if off[j] > SAME_ANSWER]
         told = ", ".join(f"{labels[j]} = {other[j]:.4g} in place of {x[j]:.4g}" for j in sorted(far))
         if _other_matrices(problem, structure, x, other):
             sentence = ": ".join(filter(None, ("another structure explains the data as well", told)))
@@ -297,11 +293,12 @@ def _other_matrices(problem: Prepared, mine: Structure, x: Array, other: Array) 
         return False
     sizes = [np.sqrt(np.abs(np.diag(a))) + np.finfo(float).tiny for a in blocks_of(mine)]
     pairs = list(zip(blocks_of(mine), blocks_of(its), sizes, strict=True))
-    if all(np.all(np.abs(a - b) <= _OTHER * np.outer(size, size)) for a, b, size in pairs):
+    if all(np.all(np.abs(a - b) <= SAME_ANSWER * np.outer(size, size)) for a, b, size in pairs):
         return False
     stds = _stds(problem, mine, x)
+    far = most_deviations(sum(std.size for std in stds))
     return any(
-        np.any(np.abs(a - b) > np.fmax(_OTHER * np.outer(size, size), _BEYOND * std))  # NaN where something is open
+        np.any(np.abs(a - b) > np.fmax(SAME_ANSWER * np.outer(size, size), far * std))  # NaN where something is open
         for (a, b, size), std in zip(pairs, stds, strict=True)
     )
 

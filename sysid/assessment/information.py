@@ -20,8 +20,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Index, Modes, force_columns, mode_of_slopes
 from sysid.modal_analysis.response import columns, motion_and_slopes
 from sysid.structure.structure import Array, ComplexArray
-
-_UNSEEN = 1e-10  # of the strongest parameter's part in the records: below it there is round-off only
+from sysid.structure.thresholds import ROUND_OFF
 
 
 def spectra_of(test: Measurement, modes: Modes) -> ComplexArray:
@@ -88,7 +87,7 @@ def spread(A: Array, B: Array | None, path: Parametrisation) -> tuple[Array, Arr
     slope, unit, gauge = scipy.sparse.csr_array(path.slope), path.unit, path.gauge  # mostly an identity
     A = slope.T @ A @ slope
     size = np.sqrt(np.maximum(np.diag(A), 0.0))
-    seen = size * unit > _UNSEEN * np.max(size * unit)
+    seen = size * unit > ROUND_OFF * np.max(size * unit)
     # The gauge of a mode whose shape is not seen is no direction beside that shape.
     gauge = gauge[:, np.linalg.norm(gauge[~seen] / unit[~seen, None], axis=0) < 0.5]
     fixed = gauge[seen] * size[seen, None]

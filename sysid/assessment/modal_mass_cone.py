@@ -25,19 +25,14 @@ from sysid.models.model import Stated
 from sysid.problem.formulation import Formulation
 from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, ComplexArray, Structure
+from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF
 
 UNIT_MASS = "no number with a unit of mass is given: masses are normalised to 1 kg in each base direction"
-_SAME_POLE = 1e-6  # relative distance of poles that count as one even without a misfit
 _UNRESOLVED = 20.0  # misfits, in parts of the half-power half-width, by which resolved poles differ
 _CLEAR = 3.0  # misfits above which a mode's share of the responses is seen
 _AS_STATED = 1.2  # times the stated noise, to which a misfit may be noise alone
 _RESOLVED = 10.0  # standard deviations of a mode's amplitude at which it is known, to a tenth
 _GAIN = 5e-3  # of the base's motion; a smaller error of a sensor's gain is not told from a mode below the lines
-_QUIET = 1e-9  # of a channel's own size: noise below it is round-off
-_INVISIBLE = 1e-6  # of the strongest mode's participation
-_NOTHING = 5e-7  # of an entry's range: ends below it are zero
-_ROUND_OFF = 1e-13
-_AT_ONCE = 100  # entries whose ends are sought together: enough for speed, few enough for memory
 
 
 def speaks(formulation: Formulation) -> bool:
@@ -151,19 +146,19 @@ def ends(problem: Prepared, structure: Structure) -> tuple[Array, Array]:
     return _entries(cone, P, mass), _entries(cone, P * omega, stiffness)
 
 
-def _entries(cone: Cone, rows: Array, own: Array) -> Array:
-    """Ends of the entries of ``rows' T rows``, (2, n, n); `own` is its value for T = I."""
+def _entries(cone: Cone, rows: Array, own: Array, at_once: int = 100) -> Array:
+    """Ends of the entries of ``rows' T rows``, (2, n, n), so many at once; `own` is its value for T = I."""
     size = np.linalg.norm(rows, axis=0)
     unit = (rows / size).T
     ends = np.empty((2, *own.shape))
     upper = np.array(np.triu_indices(len(own)))
-    for i, j in np.array_split(upper, -(-upper.shape[1] // _AT_ONCE), axis=1):
+    for i, j in np.array_split(upper, -(-upper.shape[1] // at_once), axis=1):
         functions = unit[i][:, :, None] * unit[j][:, None, :]
         functions = (functions + np.swapaxes(functions, 1, 2)) / 2
         values, _ = cone.largest(np.concatenate([-functions, functions]))
         values = values.reshape(2, -1)
         largest = np.where(np.isfinite(values), np.abs(values), 1.0).max(axis=0)
-        values = np.where(np.abs(values) < _NOTHING * largest + _ROUND_OFF, 0.0, values) * size[i] * size[j]
+        values = np.where(np.abs(values) < NEGLIGIBLE * largest + ROUND_OFF, 0.0, values) * size[i] * size[j]
         ends[0, i, j] = ends[0, j, i] = np.minimum(-values[0], own[i, j])
         ends[1, i, j] = ends[1, j, i] = np.maximum(values[1], own[i, j])
     return ends
@@ -258,7 +253,7 @@ def _moved(structure: Structure, clusters: list[list[int]]) -> list[Array]:
     moved: list[Array] = []
     for cluster in clusters:
         U, s, _ = np.linalg.svd(gamma[cluster], full_matrices=False)
-        W = np.zeros((structure.n, np.count_nonzero(s > _INVISIBLE * strongest)))
+        W = np.zeros((structure.n, np.count_nonzero(s > NEGLIGIBLE * strongest)))
         W[cluster] = U[:, : W.shape[1]]
         moved.append(W)
     return moved
@@ -316,7 +311,7 @@ def _record(record: ComplexArray, predicted: ComplexArray, std: Array | None, ti
     rms = lambda x: np.sqrt(np.mean(np.abs(x) ** 2, axis=(0, 2)))[:, None]  # noqa: E731
     noise = rms(record - predicted) if std is None else rms(std)
     own = rms(record)
-    weight = 1 / np.maximum(noise, _QUIET * np.where(own > 0, own, own.max()))
+    weight = 1 / np.maximum(noise, ROUND_OFF * np.where(own > 0, own, own.max()))
     size = float(np.linalg.norm(record * weight))
     misfit = float(np.linalg.norm((record - predicted) * weight)) / size
     level = times * misfit
@@ -393,7 +388,7 @@ def _unseen(
     for k in range(structure.n):
         f, push = structure.natural_frequencies[k], structure.participation[[k]]
         (share,) = _shares(test, structure, k, structure.mode_shapes[:, [k]], push, responses)
-        if share < _INVISIBLE:
+        if share < NEGLIGIBLE:
             yield f"{_mode(structure, k)} is not moved by the base: nothing in these data tells its mass"
         elif share < responses.level:
             yield (
@@ -425,7 +420,7 @@ def _clusters(structure: Structure, misfit: float) -> list[list[int]]:
     """Modes that the misfit cannot tell apart: of them only the sum of the residues is seen."""
     poles = structure.natural_frequencies * (1 + 1j * structure.damping_ratios)
     widths = min(_UNRESOLVED * misfit, 1.0) * structure.damping_ratios * structure.natural_frequencies
-    apart = np.abs(np.diff(poles)) >= np.maximum(_SAME_POLE * np.abs(poles), widths)[1:]
+    apart = np.abs(np.diff(poles)) >= np.maximum(NEGLIGIBLE * np.abs(poles), widths)[1:]
     return [part.tolist() for part in np.split(np.arange(structure.n), np.flatnonzero(apart) + 1)]
 
 

@@ -17,8 +17,7 @@ from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.response import gains, gains_and_slopes
 from sysid.problem.slopes import Slopes, response_slopes
 from sysid.structure.structure import Array, Structure
-
-_MOVED = 1e-6  # of a quantity's size, by which an unseen move of order one must change it to count
+from sysid.structure.thresholds import NEGLIGIBLE
 
 
 def std_of(change: NDArray[np.inexact[Any]], normals: int, size: ArrayLike) -> Array:
@@ -28,7 +27,7 @@ def std_of(change: NDArray[np.inexact[Any]], normals: int, size: ArrayLike) -> A
     """
     std = np.linalg.norm(change[..., :normals], axis=-1)
     unseen = np.abs(change[..., normals:]).max(axis=-1, initial=0.0)
-    return np.where(unseen > _MOVED * np.asarray(size), np.nan, std)
+    return np.where(unseen > NEGLIGIBLE * np.asarray(size), np.nan, std)
 
 
 class Perturbations(NamedTuple):
@@ -50,7 +49,7 @@ class Perturbations(NamedTuple):
         weight, seen, unseen = np.vstack(factors), change[:, : self.normals], change[:, self.normals :]
         variance = np.sum(weight.conj() * ((seen @ seen.T) @ weight), axis=0).real
         moved = np.abs(unseen.T @ weight).max(axis=0, initial=0.0)
-        return np.where(moved > _MOVED * size, np.nan, np.sqrt(np.maximum(variance, 0.0)))
+        return np.where(moved > NEGLIGIBLE * size, np.nan, np.sqrt(np.maximum(variance, 0.0)))
 
 
 @dataclass(frozen=True, eq=False)

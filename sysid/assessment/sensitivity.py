@@ -12,16 +12,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from sysid.errors import listed
 from sysid.models.unknowns import Unknown, scales_of, split
 from sysid.problem.formulation import Formulation
 from sysid.problem.prepared import Prepared
 from sysid.problem.slopes import Rows, Slopes, stacked_rows
 from sysid.structure.structure import Array, Structure
-
-_NULL = 1e-9  # of the largest singular value of the Jacobian, in units of the unknowns: what no record sees
-_SMALL = 1e-6  # of a unit: what is not told of a direction
-_TERMS = 8  # of a direction, told
-_ACTIVE = 1e-6  # of its scale: how near its bound an inequality counts as active
+from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +147,7 @@ def _judged(formulation: Formulation, x: Array, rows: list[Rows], part: NDArray[
     free = left_by_constraints(formulation, x, unit, J, part)
     J = J @ free
     U, s, Vt = np.linalg.svd(J, full_matrices=len(J) < J.shape[1])
-    rank, V = _rank(s, _NULL), Vt.T
+    rank, V = _rank(s, ROUND_OFF), Vt.T
     s = np.concatenate([s, np.zeros(J.shape[1] - s.size)])
     # x = unit V (1/s) U' e: each column of U carries the noise of its rows.
     mixed = (U[:, :rank].T * std**2) @ U[:, :rank]
@@ -177,9 +174,9 @@ def left_by_constraints(
     free = _null_space(rows[equal])
     if np.all(equal):
         return free
-    unseen = free @ _null_space(records @ free, _NULL)
-    at_bound = np.logical_not(equal) & (np.abs(at - constraints.upper) < _ACTIVE * size)
-    pressed = at_bound & (np.abs(rows @ unseen).max(axis=1, initial=0.0) < _SMALL)
+    unseen = free @ _null_space(records @ free, ROUND_OFF)
+    at_bound = np.logical_not(equal) & (np.abs(at - constraints.upper) < NEGLIGIBLE * size)
+    pressed = at_bound & (np.abs(rows @ unseen).max(axis=1, initial=0.0) < NEGLIGIBLE)
     return _null_space(rows[equal | pressed])
 
 
@@ -205,12 +202,11 @@ def directions_in_words(unknowns: Sequence[Unknown], x: Array, unit: Array, dire
                 f"{100 * step / abs(at):+.3g} %" if abs(at) > 1e-3 * size else f"{step:+.3g}"
                 for step, at, size in zip(moved, value, large, strict=True)
             ]
-            if len(set(told)) == 1 and abs(share[0]) > _SMALL:
+            if len(set(told)) == 1 and abs(share[0]) > NEGLIGIBLE:
                 terms.append(f"{unknown.title} {told[0]}")
                 continue
-            terms += [f"{unknown.labels[j]} {told[j]}" for j in np.flatnonzero(np.abs(share) > _SMALL)]
-        rest = len(terms) - _TERMS
-        sentences.append(", ".join(terms[:_TERMS]) + (f" and {rest} more" if rest > 0 else ""))
+            terms += [f"{unknown.labels[j]} {told[j]}" for j in np.flatnonzero(np.abs(share) > NEGLIGIBLE)]
+        sentences.append(listed(terms))
     return sentences
 
 

@@ -20,14 +20,10 @@ from sysid.modal_analysis.modal_estimate import theta_of
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import EPSILON, EXACT, ROUND_OFF, round_off
 
-_STEPS = 40
 _LONGEST = 0.5  # of a step: of the logarithm of a mode's scale, or of a shape's length
-_SETTLED = 1e-11  # relative, of a step
-_MET = 1e-8  # relative: an exact statement that holds so far does
 _WIDE = 5.0  # standard deviation of the logarithm of a mode's scale that nothing sets
-_DEPENDENT = 1e-13  # of the largest singular value
-_OPEN = 1e-9  # of the largest effect of a scale: what statements feel less, they leave open
 
 
 class Statements(NamedTuple):
@@ -120,8 +116,10 @@ class Adjusted(NamedTuple):
     holds: bool
 
 
-def adjust(problem: Prepared, stated: Statements, theta: Array, index: Index, normals: Array) -> Adjusted:
-    """Adjust modal parameters to statements by Gauss-Newton steps.
+def adjust(
+    problem: Prepared, stated: Statements, theta: Array, index: Index, normals: Array, steps: int = 40
+) -> Adjusted:
+    """Adjust modal parameters to statements by Gauss-Newton steps, so many at most.
 
     Parameters
     ----------
@@ -136,15 +134,15 @@ def adjust(problem: Prepared, stated: Statements, theta: Array, index: Index, no
     if not wanted.size:
         return Adjusted(theta, 0.0, 0, holds=True)
     at, a, b = theta, np.zeros(k), np.zeros(0 if weighed else m)
-    for step in range(_STEPS):
+    for step in range(steps):
         values, slopes = made(problem, stated, at, index)
         F, U = slopes @ _rescaled(normals, b, index), slopes @ _gauge(at, index, weighed)
         system = np.hstack([F, _WIDE * U, np.diag(std)])
         # Shapes of modes that almost share a pole turn too easily for steps to settle: then these only meet what is
         # exact.
-        settling = step >= _STEPS // 2
+        settling = step >= steps // 2
         gap = np.where(std > 0, 0.0, wanted - values) if settling else wanted - values + F @ a + U @ b
-        y = np.linalg.lstsq(system, gap, rcond=_DEPENDENT)[0]
+        y = np.linalg.lstsq(system, gap, rcond=None)[0]
         step_a, step_b = y[:k], _WIDE * y[k : k + b.size]
         if not settling:
             step_a, step_b = step_a - a, step_b - b
@@ -154,13 +152,13 @@ def adjust(problem: Prepared, stated: Statements, theta: Array, index: Index, no
         part = min(1.0, _LONGEST / long) if long > 0 else 1.0
         a, b = a + part * step_a, b + part * step_b
         at = _rescaled((theta + normals @ a)[:, None], b, index)[:, 0]
-        if long < _SETTLED:
+        if long < ROUND_OFF:
             break
     left = wanted - made(problem, stated, at, index)[0]
     e = np.where(std > 0, left / np.where(std > 0, std, 1.0), 0.0)
     spread = np.linalg.svd(_whitened(F, std) @ U, compute_uv=False) if U.size else np.zeros(0)
     freedom = wanted.size - int(np.count_nonzero(spread > 1.0))
-    return Adjusted(at, float(a @ a + e @ e), freedom, bool(np.all(np.abs(left[std == 0]) < _MET)))
+    return Adjusted(at, float(a @ a + e @ e), freedom, bool(np.all(np.abs(left[std == 0]) < EXACT)))
 
 
 def conditioned(
@@ -186,12 +184,12 @@ def conditioned(
     U = C @ gauge
     F = np.hstack([C @ normals, np.diag(std)[:, std > 0]])
     left, s, _ = np.linalg.svd(U) if U.size else (np.eye(std.size), np.zeros(0), None)
-    rank = int(np.count_nonzero(s > _OPEN * s.max(initial=0.0)))
+    rank = int(np.count_nonzero(s > ROUND_OFF * s.max(initial=0.0)))
     checks = left[:, rank:].T @ F  # statements that no scale can meet
-    back = np.linalg.pinv(U, rcond=_OPEN) if U.size else np.zeros((0, std.size))
+    back = np.linalg.pinv(U, rcond=ROUND_OFF) if U.size else np.zeros((0, std.size))
     own = np.hstack([normals, np.zeros((index.size, F.shape[1] - normals.shape[1]))]) - gauge @ (back @ F)
     turn, s, vt = np.linalg.svd(checks, full_matrices=False)
-    seen = s > _DEPENDENT * s.max(initial=0.0)
+    seen = s > round_off(s.size) * s.max(initial=0.0)
     known = vt[seen]
     # A shift is taken for noise as far as noise explains by how much the statements are missed.
     missed = (turn[:, seen] / s[seen]).T @ (left[:, rank:].T @ (C @ shifts))
@@ -221,4 +219,4 @@ def _rescaled(theta: Array, scale: Array, index: Index) -> Array:
 def _whitened(F: Array, std: Array) -> Array:
     """Inverse square root of the covariance of statements less what the records make of them."""
     lam, V = np.linalg.eigh(F @ F.T + np.diag(std**2))
-    return (V / np.sqrt(np.maximum(lam, _DEPENDENT**2 * max(lam[-1], np.finfo(float).tiny)))).T
+    return (V / np.sqrt(np.maximum(lam, EPSILON**2 * max(lam[-1], np.finfo(float).tiny)))).T

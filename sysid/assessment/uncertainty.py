@@ -39,10 +39,9 @@ from sysid.problem.formulation import Formulation
 from sysid.problem.prepared import Prepared
 from sysid.problem.slopes import Slopes, rows_of_test, slopes_of
 from sysid.structure.structure import Array, Structure, check_frequencies
+from sysid.structure.thresholds import NEGLIGIBLE
 
 LARGE = 4000  # entries of the mode shapes, beyond which the covariance takes minutes and gigabytes
-_SAME = 1e-6  # relative distance that is put between repeated frequencies
-_LEAST_RATIO = 1e-8  # a damping ratio of zero has no logarithm
 
 _POSITIVE = ("natural_frequencies", "damping_ratios")
 _MATRICES = ("mass", "stiffness", "damping")
@@ -338,8 +337,8 @@ def modes_of(structure: Structure) -> Modes:
     """
     omega = 2 * np.pi * structure.natural_frequencies
     for k in range(1, omega.size):
-        omega[k] = max(omega[k], omega[k - 1] * (1 + _SAME))
-    ratios = np.maximum(structure.damping_ratios, _LEAST_RATIO)
+        omega[k] = max(omega[k], omega[k - 1] * (1 + NEGLIGIBLE))
+    ratios = np.maximum(structure.damping_ratios, NEGLIGIBLE)
     return Modes(structure.mode_shapes, structure.participation, omega, ratios)
 
 

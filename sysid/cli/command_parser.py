@@ -9,7 +9,6 @@ from typing import Any, NoReturn
 
 from sysid.errors import InputError
 
-_WIDTH = 79
 JSON, QUIET = "--json", "--quiet"
 
 
@@ -41,7 +40,7 @@ def adder(parser: argparse.ArgumentParser) -> Callable[..., argparse.ArgumentPar
         command: Any = commands.add_parser(
             name,
             help=summary,
-            description=textwrap.fill(description or f"{summary[0].upper()}{summary[1:]}.", _WIDTH),
+            description=textwrap.fill(description or f"{summary[0].upper()}{summary[1:]}.", 79),
             epilog=epilog(examples, more),
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,

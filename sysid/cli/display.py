@@ -14,9 +14,6 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-_PLAIN_EVERY = 5.0  # s between lines where the display is no terminal
-_HELD = 1.0  # s, for which lines of the poles are held back: a mistake that is found by then is told alone
-
 
 def display_on(out: Output) -> _LiveTable | _Lines:
     """Display of progress: a table that updates in a terminal, elsewhere a line at times."""
@@ -55,9 +52,10 @@ class _Lines:
         if begins:
             self._print()
         self._phase, self._pending = progress.phase, progress
-        if begins or progress.seconds - self._printed >= _PLAIN_EVERY:
+        if begins or progress.seconds - self._printed >= 5.0:  # s
             self._print()
-        if progress.phase != "poles" or progress.seconds >= _HELD:
+        # Lines of the poles are held back for a second: a mistake that is found by then is told alone.
+        if progress.phase != "poles" or progress.seconds >= 1.0:
             self._release()
 
     def _print(self) -> None:

@@ -40,7 +40,7 @@ from sysid.results.version import __version__
 from sysid.search.auto import NAMED
 from sysid.search.deadline import TimeIsOver, within
 from sysid.search.refinement import RefineBy
-from sysid.search.session import LEAST, DeferredInterrupt
+from sysid.search.session import GRACE, DeferredInterrupt
 
 _LOG = "sysid-error.log"
 _SUMMARY = "summary.json"
@@ -184,7 +184,7 @@ def _run_in(folder: Path, options: argparse.Namespace, out: Output) -> int:
     with DeferredInterrupt(patience=None) as late:
         with display_on(out) as display:
             result = identify(
-                problem, strategy=strategy, rng=search.seed, max_time=left(LEAST), progress=display,
+                problem, strategy=strategy, rng=search.seed, max_time=left(GRACE), progress=display,
                 checkpoint=checkpoint,
             )  # fmt: skip
         result = replace(result, recipe=recipe)
@@ -193,7 +193,7 @@ def _run_in(folder: Path, options: argparse.Namespace, out: Output) -> int:
         except InputError as error:
             failed = error
     try:
-        words, figures = _told(result, left(LEAST))
+        words, figures = _told(result, left(GRACE))
         out.write(f"\n{words}\n\n")
         out.answer(result=figures)
         out.flush()

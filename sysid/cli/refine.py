@@ -21,13 +21,10 @@ from sysid.jobs.job import JobResult
 from sysid.jobs.ledger import FILE_NAME as LEDGER
 from sysid.jobs.minima import Minimum, as_good, distinct
 from sysid.jobs.submit import submit
-from sysid.nlp import EXACT
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification, Recipe, load
 from sysid.results.summary import counted
-
-_SHOWN = 12  # minima in the table
-_STARTS = 16
+from sysid.structure.thresholds import EXACT
 
 
 def run(options: argparse.Namespace, out: Output) -> int:
@@ -56,7 +53,7 @@ def _run_in(folder: Path, result: Identification, recipe: Recipe, options: argpa
         titles, told = [f"draw {i:4d}" for i in range(options.draws)], "draw{s} of noise, each fitted from the result"
         jobs = submit(_started(recipe, source), draws=options.draws, executor=executor, out=folder)
     else:
-        count = options.starts or _STARTS
+        count = options.starts or 16
         titles, told = [f"start {i:4d}" for i in range(count)], "start{s}, the first at the result"
         jobs = submit(_started(recipe, source), starts=count, executor=executor, out=folder)
     out.write(f"{recipe.title}: {len(titles)} {told.format(s='' if len(titles) == 1 else 's')}\n")
@@ -101,14 +98,14 @@ def _ends(jobs: Generator[JobResult, None, None], titles: Sequence[str], out: Ou
     return sorted(ends, key=lambda one: one.index), interrupted
 
 
-def table(minima: list[Minimum], starts: int) -> str:
-    """The minima, how often each was reached, and what they say together."""
+def table(minima: list[Minimum], starts: int, most: int = 12) -> str:
+    """The minima, `most` of them, how often each was reached, and what they say together."""
     lines = ["minimum    residual  reached  a fit  best start"]
-    for i, minimum in enumerate(minima[:_SHOWN]):
+    for i, minimum in enumerate(minima[:most]):
         best, fit = minimum.best, "yes" if minimum.best.success else "no"
         lines.append(f"{i + 1:7d}  {best.residual:10.4e}  {len(minimum.results):7d}  {fit:5s}  {best.index:10d}")
-    if len(minima) > _SHOWN:
-        lines.append(f"and {len(minima) - _SHOWN} more")
+    if len(minima) > most:
+        lines.append(f"and {len(minima) - most} more")
     without = starts - sum(len(minimum.results) for minimum in minima)
     lines += [f"{counted(without, 'start')} without a result"] if without else []
     alike = len(as_good(minima))

@@ -17,7 +17,8 @@ import numpy as np
 
 from sysid.assessment.determination import determine
 from sysid.assessment.sensitivity import Sensitivity, directions_in_words, sensitivity
-from sysid.errors import InputError, SysidError
+from sysid.errors import InputError, SysidError, listed
+from sysid.finding import MOST_OF_A_KIND
 from sysid.identify import identify
 from sysid.measurement.measurement import Measurement
 from sysid.models.unknowns import Unknown, scales_of, slices_of
@@ -26,18 +27,14 @@ from sysid.problem.feasibility import HELD, LOOSE, points_of
 from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.problem.slopes import Slopes, slopes_of
-from sysid.results.summary import counted
+from sysid.results.summary import WIDTH, counted
 from sysid.search.auto import choose
+from sysid.search.continuation import DRAWN
 from sysid.structure.structure import Array, ComplexArray, Structure
+from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF
 
-_WIDTH = 120
 _NOISE = 0.01  # of a record's rms, where no noise is stated
-_SHORTEST = 3  # null directions that are told in full where there are more
-_TRIED = 20  # points of the search space looked at for one that makes a structure
-_SAME = 1e-6  # of the root of two diagonals: matrices that differ by less are the same
 _ROOM = 1e-3  # of a constraint's scale, by which the point stays clear of inequalities
-_HELD = 1e-9  # of it, to which the point keeps equalities
-_TOUCHED = 1e-6  # of its unit, by which an unseen step of order one moves an unknown that it leaves open
 
 
 def show(problem: Problem, name: str) -> str:
@@ -84,7 +81,7 @@ def figures(problem: Problem, name: str) -> dict[str, Any]:
         "unknowns": problem.n_variables,
         "variables": [
             {"name": v.title, "unit": v.unit, "lower": np.min(v.lower), "upper": np.max(v.upper),
-             "values": point.x[part].tolist(), "unseen": bool(np.any(np.abs(known.unseen[part]) > _TOUCHED))}
+             "values": point.x[part].tolist(), "unseen": bool(np.any(np.abs(known.unseen[part]) > NEGLIGIBLE))}
             for v, part in members
         ],
         "point": point.where,
@@ -114,12 +111,11 @@ def _test(problem: Problem, name: str) -> Iterator[str]:
 
 def _records(test: Measurement) -> str:
     names = test.sensor_names
-    sensors = ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
     force = "no base force" if test.force is None else "with base force"
     noise = "noise stated" if _noise_is_stated(test) else "no noise stated"
     runs, axes = counted(test.n_runs, "run"), " ".join(test.base_axes or ())
     return (
-        f"{counted(len(names), 'sensor')} ({sensors}), base moving along {axes}, {runs}, "
+        f"{counted(len(names), 'sensor')} ({listed(names)}), base moving along {axes}, {runs}, "
         f"{test.lines_in_words}, {force}, {noise}"
     )
 
@@ -183,12 +179,12 @@ def _at_guess(problem: Prepared, sentences: tuple[str, ...]) -> _Point:
     # A free stiffness has all its frequencies equal in the middle of its search space.
     free = problem.formulation.stiffness.free
     why = "as the guess has all frequencies equal" if free else "as the guess makes no structure with derivatives"
-    names = ["the guess", *[f"a point of the search space, {why}"] * (_TRIED - 1)]
+    names = ["the guess", *[f"a point of the search space, {why}"] * (DRAWN - 1)]
     guess = _first_judged(problem, names[:1], free)
     point = guess or _first_judged(problem, names, 1)
     if point is None:
         raise InputError(
-            f"neither the guess nor any of {_TRIED - 1} points of the search space makes a structure with finite "
+            f"neither the guess nor any of {DRAWN - 1} points of the search space makes a structure with finite "
             "derivatives: state a guess, or tighter bounds"
         )
     return replace(point, sentences=sentences, at_guess=guess is not None, in_box=True)
@@ -210,7 +206,7 @@ def _feasible(problem: Prepared, x: Array, where: str) -> tuple[Array, str]:
     lower, upper = constraints.lower / scale, constraints.upper / scale
     room = np.where(constraints.equal, 0.0, _ROOM)
     at = constraints.at(x) / scale
-    if np.all((at <= upper - np.where(constraints.equal, -_HELD, _ROOM)) & (at >= lower - _HELD)):
+    if np.all((at <= upper - np.where(constraints.equal, -ROUND_OFF, _ROOM)) & (at >= lower - ROUND_OFF)):
         return x, where
     unit = scales_of(problem.variables, x)
     t = ca.MX.sym("t", x.size)
@@ -252,7 +248,7 @@ def _at_reference(problem: Prepared) -> _Point | None:
 
 def _differ(a: Structure, b: Structure) -> bool:
     pairs = ((a.mass, b.mass), (a.stiffness, b.stiffness), (a.damping, b.damping))
-    return any(np.any(np.abs(A - B) > _SAME * (_sizes(A) + np.abs(A).max() * _SAME)) for A, B in pairs)
+    return any(np.any(np.abs(A - B) > NEGLIGIBLE * (_sizes(A) + np.abs(A).max() * NEGLIGIBLE)) for A, B in pairs)
 
 
 def _sizes(matrix: Array) -> Array:
@@ -310,7 +306,7 @@ def _values(problem: Prepared, point: _Point, moves: Array, noise: str) -> Itera
     """A line a variable: the largest error of its entries stands for all."""
     known, x = point.known, point.x
     std = np.linalg.norm(moves, axis=1)
-    open_ = np.linalg.norm(known.unseen, axis=1) > _TOUCHED
+    open_ = np.linalg.norm(known.unseen, axis=1) > NEGLIGIBLE
     relative = std / np.where(np.abs(x) > 1e-3 * known.unit, np.abs(x), np.nan)
     rows = [["variable", "value", "unit of IPOPT", f"standard deviation at {noise}"]]
     for v, part in zip(problem.variables, slices_of(problem.variables), strict=True):
@@ -350,10 +346,10 @@ def _unseen(problem: Prepared, point: _Point) -> Iterator[str]:
     )
     changed = "; ".join(sentence for number, sentence in kinds if number)
     yield f"  - no record sees {counted(len(words), 'direction')}: {changed}"
-    more = f" (the {_SHORTEST} shortest of {len(words)})" if len(words) > _SHORTEST else ""
+    more = f" (the {MOST_OF_A_KIND} shortest of {len(words)})" if len(words) > MOST_OF_A_KIND else ""
     yield f"  - unseen{more}:"
-    yield from (f"      {word}" for word in words[:_SHORTEST])
-    other = _first_judged(problem, ["another point of the search space"] * _TRIED, 1) if point.at_guess else None
+    yield from (f"      {word}" for word in words[:MOST_OF_A_KIND])
+    other = _first_judged(problem, ["another point of the search space"] * DRAWN, 1) if point.at_guess else None
     if other is not None and other.known.rank > known.rank:
         yield (
             "  - this point is special, by a symmetry for instance: at another point of the search space the records "
@@ -375,8 +371,8 @@ def _moved_matrices(point: _Point) -> tuple[int, int]:
     rigid = np.sqrt(np.abs(np.diag(s.structure.rigid_body_mass)))
     push = moved(s.d_push, np.sqrt(np.diag(M))[:, None] * rigid)
     base = np.concatenate([push, moved(s.d_rigid, np.outer(rigid, rigid))])
-    rank = int(np.linalg.matrix_rank(own, tol=_SAME))
-    return rank, int(np.linalg.matrix_rank(np.concatenate([own, base]), tol=_SAME)) - rank
+    rank = int(np.linalg.matrix_rank(own, tol=NEGLIGIBLE))
+    return rank, int(np.linalg.matrix_rank(np.concatenate([own, base]), tol=NEGLIGIBLE)) - rank
 
 
 def _seen_least(problem: Prepared, point: _Point, moves: Array, noise: str) -> str:
@@ -441,4 +437,4 @@ def _table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
 def _folded(line: str) -> str:
     """Fold a long line at the width of a terminal, the rest indented."""
     indent = " " * (len(line) - len(line.lstrip()) + 4)
-    return textwrap.fill(line, _WIDTH, subsequent_indent=indent, break_on_hyphens=False)
+    return textwrap.fill(line, WIDTH, subsequent_indent=indent, break_on_hyphens=False)

@@ -17,15 +17,13 @@ from sysid.cli.output import Output
 from sysid.errors import InputError
 from sysid.jobs.changes import Band, Change, Modes, WithoutRun, WithoutSensor
 from sysid.jobs.job import JobResult
-from sysid.jobs.score import Compared, Move, moves, scored
+from sysid.jobs.score import DECISIVE, Compared, Move, moves, scored
 from sysid.problem.problem import Problem
 from sysid.problem.terms import FurtherTest
 from sysid.results.identification import Identification, Recipe
+from sysid.results.summary import WIDTH
 from sysid.search.modal import poles_of
-
-_FAR = 3.0  # standard deviations of a step, beyond which it counts as far
-_DECISIVE = 10.0  # difference of AIC or BIC
-_WIDTH = 120
+from sysid.structure.thresholds import FALSE_ALARM, most_deviations
 
 
 @dataclass(frozen=True)
@@ -182,7 +180,7 @@ def _fits(rows: Sequence[Compared], part: bool) -> list[str]:
     """Whether each is a fit; of models of the same records "worse" where another fits better, decisively."""
     figures = np.array([(row.score.deviance, row.score.aic, row.score.bic) for row in rows])
     fits = [row.success for row in rows]
-    beaten = [not part and np.any(np.all(figures[fits] + _DECISIVE <= own, axis=1)) for own in figures]
+    beaten = [not part and np.any(np.all(figures[fits] + DECISIVE <= own, axis=1)) for own in figures]
     return ["no" if not fit else "worse" if worse else "yes" for fit, worse in zip(fits, beaten, strict=True)]
 
 
@@ -220,16 +218,18 @@ def _notes(rows: Sequence[Compared], part: bool) -> Iterator[str]:
         notes[0] += "; worse: another one fits better, by AIC and BIC decisively"
         notes += ["predicted: relative residual of the validation tests"] * predicted
         notes += [
-            f"AIC, BIC: above the least; {_DECISIVE:g} and more is decisive",
+            f"AIC, BIC: above the least; {DECISIVE:g} and more is decisive",
             "farthest: of frequencies, damping ratios and unknowns of one name, the step from the first row that is "
             "largest in standard deviations (std), the larger of both rows at the noise that the better fit leaves",
         ]
     for note in notes:
-        yield from textwrap.wrap(note, _WIDTH)
+        yield from textwrap.wrap(note, WIDTH)
     steps = [step for row in rows if row.success for step in row.moves if np.isfinite(step.deviations)]
     if steps and part:
-        far = sum(abs(step.deviations) > _FAR for step in steps)
-        told = f"{far} of {len(steps)} steps of fits are beyond {_FAR:g} std; noise alone makes 0.3 %"
+        reach = most_deviations()
+        far = sum(abs(step.deviations) > reach for step in steps)
+        chance = f"noise alone makes {100 * FALSE_ALARM:g} %"
+        told = f"{far} of {len(steps)} steps of fits are beyond {reach:.2g} std; {chance}"
         yield told + (": more than noise moves them" if far > max(1, 0.01 * len(steps)) else "")
 
 

@@ -22,14 +22,12 @@ from sysid.search.strategy import History, Outcome
 from sysid.search.swarm import Swarm
 from sysid.search.swarm_objective import SwarmObjective
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import EPSILON
 
 PACKAGES = ("pymoo", "cma")  # of the extra "benchmark"
 HOW_TO_INSTALL = how_to_install("benchmark")
 
-_SHARE = 2 / 3  # of the time, that a search may take before its local phase: as the swarm's
 _WORST = 1e30  # an objective in the place of what is not a number: above that of any broken constraint
-_STEP = 1e-7  # of the search space, for differences
-_SIGMA = 0.3  # of the search space: where CMA-ES starts from its middle
 
 Evaluate = Callable[[Array], Array]  # points of the unit cube (k, size) to objectives (k,)
 
@@ -94,7 +92,7 @@ class Evaluator:
             self.best, self.s = float(values[least]), rows[least]
         self.count += len(rows)
         self.curve.append((self.session.seconds, self.best))
-        late = self.session.max_time is not None and self.session.seconds > _SHARE * self.session.max_time
+        late = self.session.max_time is not None and self.session.seconds > 2 / 3 * self.session.max_time  # as a swarm
         if late or self.count >= self.most:
             raise Spent
         return values
@@ -186,7 +184,7 @@ def _cma_es(evaluate: Evaluate, size: int, rng: np.random.Generator) -> None:
 
     run = cma.CMAEvolutionStrategy(
         np.full(size, 0.5),
-        _SIGMA,
+        0.3,  # of the search space, from its middle
         # "seed": not a number leaves NumPy's global source alone.
         {"bounds": [0, 1], "seed": np.nan, "randn": lambda *s: rng.standard_normal(s), "verbose": -9},
     )
@@ -211,7 +209,7 @@ def _l_bfgs_b(evaluate: Evaluate, size: int, rng: np.random.Generator) -> None:
     from scipy.stats import qmc
 
     def slope(point: Array) -> tuple[float, Array]:
-        steps = np.where(point > 0.5, -_STEP, _STEP)  # into the cube
+        steps = np.where(point > 0.5, -1, 1) * EPSILON**0.5  # into the cube
         values = evaluate(np.vstack([point, point + np.diag(steps)]))
         return float(values[0]), (values[1:] - values[0]) / steps
 

@@ -12,8 +12,7 @@ import numpy as np
 from sysid.compare.comparison import Comparison
 from sysid.compare.method_result import MATRICES, MethodResult, Status
 from sysid.results.phases import seconds_in_words
-
-_WIDTH = 120
+from sysid.results.summary import WIDTH
 
 
 def text(comparison: Comparison) -> str:
@@ -89,7 +88,7 @@ def _notes(comparison: Comparison) -> Iterator[str]:
 
 def _folded(words: str, mark: str) -> list[str]:
     indent = " " * (len(mark) or 2)
-    return textwrap.wrap(words, _WIDTH, initial_indent=mark, subsequent_indent=indent, break_on_hyphens=False)
+    return textwrap.wrap(words, WIDTH, initial_indent=mark, subsequent_indent=indent, break_on_hyphens=False)
 
 
 def _number(value: float, form: str) -> str:

@@ -13,7 +13,6 @@ from sysid.structure.structure import Array
 
 PRECISION = "10 significant digits: what 16 characters, the widest field of bulk data, hold beside sign and exponent"
 BASE, FIRST_MODE, FIRST_SENSOR = 1, 1_001, 100_001  # identification numbers of points
-_LEAST = 1e-90  # a larger negative exponent has no room in a field
 _SYMMETRIC, _RECTANGULAR = 6, 2
 
 Point = tuple[int, int]  # its number and component
@@ -62,7 +61,8 @@ def _matrix(name: str, matrix: Array, rows: Sequence[Point], columns: Sequence[P
     yield f"DMIG    {name:<8}{0:>8}{form:>8}{2:>8}{0:>8}{'':16}{width:>8}".rstrip()
     for j, (point, component) in enumerate(columns):
         first = j if form == _SYMMETRIC else 0
-        entries = [i for i in range(first, len(rows)) if abs(matrix[i, j]) > _LEAST]
+        # A larger negative exponent has no room in a field.
+        entries = [i for i in range(first, len(rows)) if abs(matrix[i, j]) > 1e-90]
         if not entries:
             continue
         yield f"DMIG*   {name:<16}{point:>16}{component:>16}"

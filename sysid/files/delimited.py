@@ -17,7 +17,6 @@ from sysid.files.recording import Column, Recording
 from sysid.files.spectral import part_of
 from sysid.structure.structure import Array
 
-_LOOKED_AT = 200  # lines from which the delimiter is told
 _IN_BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\[\]]*)[\])]\s*$")
 _BLANKS = re.compile(r"[ \t]+")
 _DIGITS = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
@@ -104,10 +103,10 @@ def _text(path: Path) -> str:
         return content.decode("latin-1")
 
 
-def _form(lines: list[str], path: Path) -> tuple[_Form, int]:
-    """Delimiter, decimal sign and number of fields by which most lines from the middle on are numbers."""
+def _form(lines: list[str], path: Path, looked_at: int = 200) -> tuple[_Form, int]:
+    """Delimiter, decimal sign and number of fields by which most of some lines from the middle on are numbers."""
     filled = [line for line in lines if line.strip()]
-    middle = filled[len(filled) // 3 :][:_LOOKED_AT]
+    middle = filled[len(filled) // 3 :][:looked_at]
     best, score = None, (0, 0)
     for delimiter, comma in product(";\t,| ", (False, True)):
         if comma and delimiter == ",":

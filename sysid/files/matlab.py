@@ -15,7 +15,6 @@ from pathlib import Path
 from sysid.errors import InputError
 from sysid.files.allowance import Allowance
 
-_HEADER = 128  # bytes
 _INT32, _MATRIX, _COMPRESSED = 5, 14, 15  # types of elements
 _SPARSE, _OPAQUE = 5, 17  # classes of matrices: of a size that is not stored; without one
 _COMPLEX = 0x800
@@ -39,7 +38,7 @@ def check(path: Path) -> None:
             _check_count(repr(name), math.prod(shape) * (kind != "sparse"), content.nbytes)
         return
     order = {b"IM": "<", b"MI": ">"}[bytes(content[126:128])]
-    _check_elements(content[_HEADER:], order, Allowance(content.nbytes), 0)
+    _check_elements(content[128:], order, Allowance(content.nbytes), 0)  # behind the header
 
 
 def _check_elements(content: memoryview, order: str, allowance: Allowance, depth: int) -> None:

@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.errors import InputError, refuse
+from sysid.errors import InputError, listed, refuse
 from sysid.structure.structure import Array
-
-_SHOWN = 12  # columns in a message
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,11 +97,9 @@ class Recording:
 
     def in_words(self) -> str:
         """How many columns there are, and what they are called."""
-        told = ", ".join(map(repr, self.names[:_SHOWN]))
-        more = f" and {len(self.names) - _SHOWN} more" if len(self.names) > _SHOWN else ""
         left_out = "".join(f" ({remark})" for remark in self.remarks[:1])
         plural = "s" * (len(self.names) != 1)
-        return f"it has {len(self.names)} column{plural}, {told}{more}{left_out}"
+        return f"it has {len(self.names)} column{plural}, {listed([*map(repr, self.names)])}{left_out}"
 
 
 def check_finite(column: Column, path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import NamedTuple
 
@@ -26,7 +27,6 @@ SI = {
 
 _LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": INCH, "ft": 12 * INCH}
 _FORCES = {"N": 1.0, "mN": 1e-3, "kN": 1e3, "MN": 1e6, "lbf": POUND, "kip": 1e3 * POUND}
-_DEGREE = 3.141592653589793 / 180
 
 UNITS: dict[str, Unit] = {
     **{name: Unit("displacement", size) for name, size in _LENGTHS.items()},
@@ -39,11 +39,11 @@ UNITS: dict[str, Unit] = {
     **{name: Unit("force", size) for name, size in _FORCES.items()},
     **{f"{name}m": Unit("moment", size) for name, size in _FORCES.items() if name.endswith("N")},
     "rad/s2": Unit("angular acceleration", 1.0),
-    "deg/s2": Unit("angular acceleration", _DEGREE),
+    "deg/s2": Unit("angular acceleration", math.radians(1)),
     "s": Unit("time", 1.0),
     "ms": Unit("time", 1e-3),
     "us": Unit("time", 1e-6),
-    "deg": Unit("angle", _DEGREE),
+    "deg": Unit("angle", math.radians(1)),
     "rad": Unit("angle", 1.0),
     "Hz": Unit("frequency", 1.0),
     "kHz": Unit("frequency", 1e3),

@@ -9,14 +9,10 @@ import numpy as np
 
 from sysid.assessment.sensitivity import meaningful
 from sysid.jobs.job import JobResult
-from sysid.nlp import EXACT
 from sysid.problem.prepared import Prepared
 from sysid.search.continuation import apart
 from sysid.structure.structure import Structure
-
-_ONE = 1e-3  # of an unknown's or a matrix's size: ends nearer to each other are one minimum
-_ROUND_OFF = 1e-6  # relative difference of residuals of one minimum that says nothing
-_ALIKE = 1e-3  # relative difference of residuals up to which minima fit alike
+from sysid.structure.thresholds import EXACT, NEGLIGIBLE, SAME_ANSWER
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +30,7 @@ class Minimum:
     @property
     def best(self) -> JobResult:
         """The end with the least residual; among those that differ by round-off the first by index."""
-        least = max((1 + _ROUND_OFF) * min(result.residual for result in self.results), EXACT)
+        least = max((1 + NEGLIGIBLE) * min(result.residual for result in self.results), EXACT)
         return next(result for result in self.results if result.residual <= least)
 
     @property
@@ -56,7 +52,7 @@ def distinct(problem: Prepared, results: Iterable[JobResult]) -> list[Minimum]:
         structure = problem.structure(result.x)
         for first, group in groups:
             x = np.where(named, result.x, group[0].x)
-            if apart(problem, x, group[0].x) < _ONE and _matrices_apart(structure, first) < _ONE:
+            if apart(problem, x, group[0].x) < SAME_ANSWER and _matrices_apart(structure, first) < SAME_ANSWER:
                 group.append(result)
                 break
         else:
@@ -77,5 +73,5 @@ def _matrices_apart(one: Structure, other: Structure) -> float:
 
 def as_good(minima: list[Minimum]) -> list[Minimum]:
     """Minima that fit as well as the best one, it included."""
-    most = max((1 + _ALIKE) * minima[0].residual, EXACT) if minima else np.nan
+    most = max((1 + SAME_ANSWER) * minima[0].residual, EXACT) if minima else np.nan
     return [minimum for minimum in minima if minimum.residual <= most]

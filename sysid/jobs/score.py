@@ -14,14 +14,14 @@ from sysid.jobs.quantities import FREQUENCY, RATIO, label, labelled, quantities
 from sysid.measurement.noise import raised
 from sysid.modal_analysis import outliers
 from sysid.modal_analysis.residues import unit_columns
-from sysid.nlp import EXACT
 from sysid.results.identification import Identification
 from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import EXACT
 
+DECISIVE = 10.0  # difference of AIC or BIC
 _LEAST = 0.01  # least variance of a step, as a share of the part's own
 _SAME = 0.1  # relative distance of frequencies up to which a mode is looked for
 _ALIKE = 0.4  # least MAC of one mode; two that turn in their plane, as a symmetric tower's may, keep half
-_NONE = 2.0  # costs of a pair that is none, above those of any that is one
 
 
 @dataclass(frozen=True)
@@ -219,9 +219,10 @@ def _nearest(own: Score, other: Score) -> list[tuple[int, int]]:
     if own.shapes and len(own.shapes) == len(other.shapes):
         one, two = (unit_columns(np.array(score.shapes))[0] for score in (own, other))
         mac = (one.T @ two) ** 2
-    cost = np.where((apart < 1) & (mac >= _ALIKE), apart**2 + 1 - mac, _NONE)
+    none = 2.0  # the cost of a pair that is none: above that of any that is one
+    cost = np.where((apart < 1) & (mac >= _ALIKE), apart**2 + 1 - mac, none)
     return [
-        (int(i), int(j)) for i, j in zip(*scipy.optimize.linear_sum_assignment(cost), strict=True) if cost[i, j] < _NONE
+        (int(i), int(j)) for i, j in zip(*scipy.optimize.linear_sum_assignment(cost), strict=True) if cost[i, j] < none
     ]
 
 

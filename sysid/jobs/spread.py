@@ -11,8 +11,7 @@ from sysid.errors import InputError
 from sysid.jobs.job import JobResult
 from sysid.jobs.quantities import labelled, quantities
 from sysid.results.identification import Identification
-
-_LINEAR = 1.96  # standard deviations either way that hold 95 % of a normal distribution
+from sysid.structure.thresholds import LIKELY
 
 
 @dataclass(frozen=True)
@@ -62,6 +61,6 @@ def spreads(result: Identification, ends: Sequence[JobResult]) -> list[Spread]:
     made = []
     for name, value in quantities(result).items():
         off, std = np.array([draw[name] for draw in draws]) - value, stds.get(name, np.nan)
-        inside = float(np.mean(np.abs(off) <= _LINEAR * std)) if np.isfinite(std) else np.nan
+        inside = float(np.mean(np.abs(off) <= LIKELY * std)) if np.isfinite(std) else np.nan
         made.append(Spread(name, value, std, float(np.sqrt(np.mean(off**2))), inside))
     return made

@@ -11,14 +11,9 @@ import scipy
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels, WholeRecords
 from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import NEGLIGIBLE
 
-_SAMPLES = 2.5  # a period of the highest line, where the sample rate is not known
-_EVEN = 1e-6  # of the highest line, by which lines are off multiples of their distance at most
-_BLOCKS = 32  # of a run, of which the quietest tell its noise ..
-_LINES = 32  # .. with so many lines to a block at least
-_QUIET = 0.1
-_ENDS = 64  # of a run, that is looked at on either side ..
-_AT_REST = 0.1  # .. and holds no more of its mean square where it is at rest
+_LINES = 32  # in a part of a run whose noise is told, at least
 
 
 class RunInTime(NamedTuple):
@@ -71,14 +66,17 @@ def peaks(test: Measurement) -> list[float]:
     return [float(np.abs(run.response - test.rigid_body @ run.base).max()) for run in in_time(test)]
 
 
-def cut_in_motion(test: Measurement) -> bool:
-    """Whether plain spectra are those of records that neither begin nor end at rest."""
+def cut_in_motion(test: Measurement, parts: int = 64, at_rest: float = 0.1) -> bool:
+    """Whether plain spectra are those of records that neither begin nor end at rest.
+
+    At rest the first or last of so many `parts` of a run holds no more than this share of its mean square.
+    """
     if test.sample_rate is None:
         return False
     for run in in_time(test):
         power = np.sum((run.response - test.rigid_body @ run.base) ** 2, axis=0)
-        ends = max(1, power.size // _ENDS)
-        if max(power[:ends].mean(), power[-ends:].mean()) > _AT_REST * power.mean():
+        ends = max(1, power.size // parts)
+        if max(power[:ends].mean(), power[-ends:].mean()) > at_rest * power.mean():
             return True
     return False
 
@@ -98,10 +96,13 @@ def quiet_levels(test: Measurement) -> NoiseLevels | None:
     return NoiseLevels(response, base, np.array(forces) if forces else None)
 
 
-def _quietest(run: RunInTime, records: Array) -> Array:
-    """Deviations of a sample of white noise up to half the rate that holds as much, (channels,)."""
-    blocks = np.array_split(records**2, min(_BLOCKS, run.lines // _LINES), axis=1)
-    power = np.quantile([block.mean(axis=1) for block in blocks], _QUIET, axis=0)
+def _quietest(run: RunInTime, records: Array, most: int = 32, share: float = 0.1) -> Array:
+    """Deviations of a sample of white noise up to half the rate that holds as much, (channels,).
+
+    As much as the quietest `share` of the parts of a run, `most` at most.
+    """
+    blocks = np.array_split(records**2, min(most, run.lines // _LINES), axis=1)
+    power = np.quantile([block.mean(axis=1) for block in blocks], share, axis=0)
     return np.asarray(np.sqrt(power * records.shape[1] / (2 * run.lines)))
 
 
@@ -114,10 +115,13 @@ def as_whole(test: Measurement) -> Measurement:
         return test
     freq = [test.freq[lines] for lines in own]
     spacing = np.array([float(np.min(np.diff(lines))) for lines in freq])
-    if any(np.max(np.abs(f / df - np.round(f / df))) > _EVEN * f[-1] / df for f, df in zip(freq, spacing, strict=True)):
+    if any(
+        np.max(np.abs(f / df - np.round(f / df))) > NEGLIGIBLE * f[-1] / df for f, df in zip(freq, spacing, strict=True)
+    ):
         return test
     if test.sample_rate is None:
-        n = int(scipy.fft.next_fast_len(int(np.ceil(_SAMPLES * test.freq[-1] / spacing[0]))))
+        # A period of the highest line, where the sample rate is not known.
+        n = int(scipy.fft.next_fast_len(int(np.ceil(2.5 * test.freq[-1] / spacing[0]))))
         samples, rate = [n] * test.n_runs, n * float(spacing[0])
     else:
         samples, rate = np.round(test.sample_rate / spacing).astype(int).tolist(), test.sample_rate

@@ -8,10 +8,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError, finite_array, numbers
+from sysid.errors import InputError, finite_array, listed, numbers
 from sysid.structure.structure import Array
-
-_RANGES = 4  # of lines that are told
 
 Missing = Literal["refuse", "drop"]
 
@@ -62,9 +60,8 @@ def in_words(holes: tuple[tuple[str, Array], ...], freq: Array) -> str:
     told = []
     for name, at in holes:
         parts = np.split(at, np.flatnonzero(np.diff(np.searchsorted(freq, at))) + 1)
-        ranges = [f"{p[0]:.5g}" if p.size == 1 else f"{p[0]:.5g} to {p[-1]:.5g}" for p in parts[:_RANGES]]
-        more = f" and {len(parts) - _RANGES} more ranges" if len(parts) > _RANGES else ""
-        told.append(f"{name} at {', '.join(ranges)} Hz{more}")
+        ranges = [f"{p[0]:.5g}" if p.size == 1 else f"{p[0]:.5g} to {p[-1]:.5g}" for p in parts]
+        told.append(f"{name} at {listed(ranges)} Hz")
     return "; ".join(told)
 
 

@@ -11,9 +11,9 @@ from sysid.errors import InputError, finite_array, sequence
 from sysid.measurement.spectra import Run, check_runs
 from sysid.measurement.whole import NoiseLevels
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import NEGLIGIBLE
 
 _FEWEST_LINES = 50  # a deviation known to 7 %
-_LEAST = 1e-6  # of the median standard deviation; smaller ones are raised to it, so that no sample dominates
 
 
 def levels_at_rest(
@@ -98,4 +98,4 @@ def raised(std: Array | None) -> Array | None:
     """Stated deviations as fits weigh by them, the smallest raised; None where none is stated, or none above zero."""
     if std is None or not np.any(std > 0):
         return None
-    return np.maximum(std, _LEAST * np.median(std[std > 0]))
+    return np.maximum(std, NEGLIGIBLE * np.median(std[std > 0]))

@@ -19,9 +19,8 @@ from sysid.modal_analysis.response import columns, gains_with_velocity, weights_
 from sysid.modal_analysis.vector_fitting import Monitor, poles_of_any_damping
 from sysid.structure.structure import Array, ComplexArray
 
-_LINES = 80
 _LEAST = 1e-5  # least level of noise; a smaller one would leave priors no weight
-_BEYOND = 0.3  # of the lowest and of the highest frequency, how far the lines reach
+BEYOND = 0.3  # of the lowest and of the highest frequency, how far the lines reach
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,11 +99,14 @@ class PolesAndResidues:
             parts.append(self.force[1 + modes] + 1j * self.force[1 + self.omega.size + modes])
         return np.einsum("ksd,rd->krs", np.concatenate(parts, axis=1), base)
 
-    def smoothed(self, test: Measurement, share: float) -> Smoothed:
-        """The test with a shift of this share of its mean frequency, one run for each independent base motion."""
+    def smoothed(self, test: Measurement, share: float, lines: int = 80) -> Smoothed:
+        """The test, at so many lines, with a shift of this share of its mean frequency.
+
+        It has one run for each independent base motion.
+        """
         shift = share * float(np.exp(np.log(self.omega).mean()))
         ends = self.omega[[0, -1]] / (2 * np.pi)
-        freq = np.linspace(max((1 - _BEYOND) * ends[0], 1e-3 * ends[1]), (1 + _BEYOND) * ends[1], _LINES)
+        freq = np.linspace(max((1 - BEYOND) * ends[0], 1e-3 * ends[1]), (1 + BEYOND) * ends[1], lines)
         base = np.repeat(self.inputs.T[:, :, None], freq.size, axis=2).astype(complex)
         relative, force = self.records(freq, base, shift)
         absolute = relative + np.einsum("sd,rdf->rsf", test.rigid_body, base)

@@ -16,24 +16,16 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.excitation import steady_sine
 from sysid.modal_analysis.record_poles import few_lines, rough_deviations
 from sysid.modal_analysis.relocation import relocate
-from sysid.modal_analysis.residues import Records, beyond_chance, unit_columns
-from sysid.modal_analysis.vector_fitting import RAZOR
+from sysid.modal_analysis.residues import Records, unit_columns
+from sysid.modal_analysis.vector_fitting import GUESS, RAZOR
 from sysid.nlp import one_thread
 from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import CANDIDATES, ROUND_OFF, beyond_chance, largest_modulus
 
 _SPARE, _MOST = 6, 40  # poles beyond one a sensor; all of them
-_CHANNELS = 12  # principal ones, by which the poles are looked for
-_FIRST_CHANNELS = 4  # of them, in the first half of the steps, which are the quicker for it
-_STEPS = 8
-_GUESS = 0.01  # damping ratio
 _MODE = 0.3  # largest damping ratio of a pole that is kept; what has more answers like a term without poles
 _OUTSIDE = 1.5  # times the last line, up to where poles are kept; what lies below the first shows by its tail
-_ROUND_OFF = 1e-9  # of the records: what counts as noise where there is none
-_DEPENDENT = 1e-11  # of the largest singular value of the functions
-_FAR = 6.0  # medians of the errors of a channel, from which a line holds a spike
-_SCREENINGS = 3  # times that lines with spikes are left out
 _FEW = 0.25  # of the lines
-_LINES = 3  # real numbers of a channel for each function, at least
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +82,7 @@ def direct_terms(test: Measurement) -> DirectTerms | None:
         if found is None:
             return None
         misfit = found[2].misfit
-        for _ in range(_SCREENINGS):
+        for _ in range(3):  # times that lines with spikes are left out
             spikes = found[2].spikes
             if not spikes.any():
                 break
@@ -116,19 +108,22 @@ def _of_accelerations(still: Measurement) -> tuple[Array, Array, _Fit] | None:
     return None if poles is None else (*poles, _fitted(records, *poles))
 
 
-def _poles(records: Records) -> tuple[Array, Array] | None:
-    """Poles of the records beside terms without them; none is removed for explaining no more than noise."""
+def _poles(records: Records, steps: int = 8) -> tuple[Array, Array] | None:
+    """Poles of the records beside terms without them; none is removed for explaining no more than noise.
+
+    They are looked for in the principal channels, the first half of the steps in few of them, which is quicker.
+    """
     lines = 2 * np.pi * records.freq[records.freq > 0]
     inputs = records.base.shape[0]
-    room = (records.data.shape[0] // _LINES // inputs - 3) // 2
+    room = (records.data.shape[0] // 3 // inputs - 3) // 2  # three real numbers of a channel for each function
     count = min(records.n_sensors + _SPARE, _MOST, room)
     if count < 1:
         return None
-    omega, ratios = np.geomspace(lines[0], lines[-1], count), np.full(count, _GUESS)
-    first, every = records.principal(_FIRST_CHANNELS), records.principal(_CHANNELS)
+    omega, ratios = np.geomspace(lines[0], lines[-1], count), np.full(count, GUESS)
+    first, every = records.principal(4), records.principal(12)
     direct = _without_poles(records.freq)
-    for step in range(_STEPS):
-        omega, ratios = relocate(records, first if 2 * step < _STEPS else every, omega, ratios, lambda: None, direct)
+    for step in range(steps):
+        omega, ratios = relocate(records, first if 2 * step < steps else every, omega, ratios, lambda: None, direct)
     kept = (omega > lines[0]) & (omega < _OUTSIDE * lines[-1]) & (ratios < _MODE)
     kept &= ratios * omega > RAZOR * np.interp(omega, lines, np.gradient(lines))  # else it answers for one bad line
     return (omega[kept], ratios[kept]) if np.any(kept) else None
@@ -162,15 +157,15 @@ def _fitted(records: Records, omega: Array, ratios: Array) -> _Fit:
     Q, R = np.linalg.qr(functions)
     answered = Q.T @ records.data
     left = records.data - Q @ answered
-    inverse = np.linalg.pinv(R, rcond=_DEPENDENT) / size[:, None]
+    inverse = np.linalg.pinv(R, rcond=ROUND_OFF) / size[:, None]
     beta, known = inverse @ answered, direct.shape[1]
     freedom = max(len(left) - functions.shape[1], 1)
-    level = np.maximum(np.linalg.norm(left, axis=0), _ROUND_OFF * np.linalg.norm(records.data, axis=0))
+    level = np.maximum(np.linalg.norm(left, axis=0), ROUND_OFF * np.linalg.norm(records.data, axis=0))
     tail = records.basis((records.freq[0] / records.freq)[None] ** 2 + 0j, records.driven)
     beyond = np.linalg.qr(tail - Q @ (Q.T @ tail))[0]
-    noise = records.noise(left, functions.shape[1] * left.shape[1], least=_ROUND_OFF)
+    noise = records.noise(left, functions.shape[1] * left.shape[1])
     gained = float(np.sum((beyond.T @ left) ** 2))
-    shared = noise / records.variance(float(np.sum(left**2)), functions.shape[1] * left.shape[1], least=_ROUND_OFF)
+    shared = noise / records.variance(float(np.sum(left**2)), functions.shape[1] * left.shape[1])
     turn = np.array([1.0, 1 / (2 * np.pi * records.freq[-1])])[:, None, None]
     of_terms = lambda x: x.reshape(3, records.driven, -1)[:2]  # noqa: E731
     of_modes = beta[known:].reshape(omega.size, -1, beta.shape[1])[:, : records.driven]
@@ -178,7 +173,7 @@ def _fitted(records: Records, omega: Array, ratios: Array) -> _Fit:
         turn * _by_sensor(records, of_terms(beta[:known])),
         turn * _deviations(records, of_terms(inverse[:known]), level * np.sqrt(shared / freedom)),
         _by_sensor(records, of_modes.sum(axis=0, keepdims=True))[0],
-        gained > noise * beyond_chance(beyond.shape[1] * left.shape[1]),
+        gained > noise * beyond_chance(beyond.shape[1] * left.shape[1], CANDIDATES),
         float(np.linalg.norm(left) / np.sqrt(records.size)),
         _spikes(records, left),
     )  # fmt: skip
@@ -188,8 +183,9 @@ def _spikes(records: Records, left: Array) -> NDArray[np.bool_]:
     """Lines (n_freq,) at which a fit leaves a number far off those of its run; none where these are many."""
     size = np.hypot(*left.reshape(2, -1, left.shape[1]))
     level = np.stack([np.median(size[records.run == run], axis=0) for run in range(len(records.blocks))])
-    level = np.maximum(level, _ROUND_OFF * np.sqrt(records.size / records.data.size))
-    far = records.largest(np.any(size > _FAR * level[records.run], axis=1)) > 0
+    level = np.maximum(level, ROUND_OFF * np.sqrt(records.size / records.data.size))
+    spike = largest_modulus(CANDIDATES) / np.sqrt(np.log(2))  # medians of the modulus of noise
+    far = records.largest(np.any(size > spike * level[records.run], axis=1)) > 0
     return far if np.count_nonzero(far) < _FEW * far.size else np.zeros_like(far)
 
 

@@ -6,19 +6,19 @@ import numpy as np
 
 from sysid.measurement.measurement import Measurement
 
-_BESIDE = 3  # lines on either side of the largest, over which a sine that is cut within a cycle spreads most
-_ALL = 0.9  # share of the power
-_FEW = 0.1  # share of the lines, at most, that these are
 
+def steady_sine(test: Measurement, beside: int = 3, share: float = 0.9, few: float = 0.1) -> str | None:
+    """What whole records of a steady sine lack, in a sentence; None where the base moves at more than one frequency.
 
-def steady_sine(test: Measurement) -> str | None:
-    """What whole records of a steady sine lack, in a sentence; None where the base moves at more than one frequency."""
+    Of a sine that is cut within a cycle the largest line and those `beside` it hold this `share` of the power; they
+    must be `few`, a share of all.
+    """
     found = []
     for base, own in zip(test.base, test.own_lines, strict=True):
         freq, power = test.freq[own], np.sum(np.abs(base[:, own]) ** 2, axis=0)
         peak = int(np.argmax(power))
-        near = power[max(peak - _BESIDE, 0) : peak + _BESIDE + 1]
-        if near.sum() < _ALL * power.sum() or near.size > _FEW * power.size:
+        near = power[max(peak - beside, 0) : peak + beside + 1]
+        if near.sum() < share * power.sum() or near.size > few * power.size:
             return None
         found.append(float(freq[peak]))
     at = ", ".join(f"{f:.4g}" for f in sorted(set(found)))

@@ -11,13 +11,11 @@ import numpy as np
 
 from sysid.modal_analysis.response import gains
 from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF
 
-_TERMS_MORE = 4  # than the asymptotic rate of the series asks for
-_RANK = 1e-6  # of the largest singular value: directions of the gains below it are left out
 # Candidates whose gains are made at once: those of more leave a processor's cache before they are used. Products of all
 # candidates have this size, because BLAS rounds differently where the size differs.
 _BLOCK = 64
-_ALIKE = 1e-12  # up to which two base motions count as proportional at all lines
 
 
 class GainSeries:
@@ -88,7 +86,8 @@ def terms_needed(ratio: float, tolerance: float) -> int:
     >>> terms_needed(10.0, 1e-8), terms_needed(100.0, 1e-8)
     (21, 33)
     """
-    return int(np.ceil(np.log(1 / tolerance) / np.arcsinh(np.pi / np.log(ratio)))) + _TERMS_MORE
+    rate = np.arcsinh(np.pi / np.log(ratio))  # asymptotic: up to four terms more are needed
+    return int(np.ceil(np.log(1 / tolerance) / rate)) + 4
 
 
 class SummedRecord:
@@ -213,7 +212,7 @@ class _Proportional:
 
     def __init__(self, ratios: Array, power: Array, functions: ComplexArray) -> None:
         self._ratios = ratios
-        self.coordinates = _orthonormal(functions * np.sqrt(power), _RANK)[0]
+        self.coordinates = _orthonormal(functions * np.sqrt(power), NEGLIGIBLE)[0]
 
     def products(self, loads: Array, gains_of: Array) -> Array:
         """(count, m, m) from loads (count, m, d) and coordinates of the gains (count, m, rank)."""
@@ -236,8 +235,8 @@ class _Correlated:
 
     def __init__(self, spectrum: ComplexArray, gains_of: ComplexArray, static: int) -> None:
         root = np.sqrt(np.einsum("ddf->f", spectrum).real)
-        parts = [_orthonormal(functions * root, _RANK**1.5) for functions in gains_of]
-        parts += [_orthonormal(root[None] + 0j, _RANK)] * min(static, 1)
+        parts = [_orthonormal(functions * root, ROUND_OFF) for functions in gains_of]
+        parts += [_orthonormal(root[None] + 0j, NEGLIGIBLE)] * min(static, 1)
         rank = max(coordinates.shape[1] for coordinates, _ in parts)
         padded = [np.pad(part, ((0, 0), (0, rank - part.shape[1]))) for part, _ in parts]
         self.coordinates = np.concatenate(padded)
@@ -271,7 +270,7 @@ def _inner_products(spectrum: ComplexArray, gains_of: ComplexArray, static: int)
     """
     power = np.einsum("ddf->f", spectrum).real
     ratios = spectrum.sum(axis=2).real / power.sum()
-    if np.abs(spectrum - ratios[..., None] * power).max() < _ALIKE * power.max():
+    if np.abs(spectrum - ratios[..., None] * power).max() < ROUND_OFF * power.max():
         return _Proportional(ratios, power, _functions(gains_of, static))
     return _Correlated(spectrum, gains_of, static)
 

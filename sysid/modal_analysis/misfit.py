@@ -12,11 +12,10 @@ from sysid.measurement.noise import separable
 from sysid.modal_analysis.residues import line_correlation
 from sysid.modal_analysis.response import columns, stacked
 from sysid.structure.structure import Array, ComplexArray, Structure
+from sysid.structure.thresholds import EPSILON, beyond_chance
 
-_EXACT = 1e-14  # of a record's rms: what counts as noise where there is none
-_SUSPECT = 1.2  # reduced chi-squared above which the stated noise does not explain the misfit, unless chance does:
+SUSPECT = 1.2  # reduced chi-squared above which the stated noise does not explain the misfit, unless chance does:
 _FAR_BELOW = 0.1  # reduced chi-squared of a misfit, as of round-off, that tells nothing of the noise
-_DEVIATIONS = 4.0  # its least excess above one, in standard deviations of the chi-squared law
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +57,7 @@ def misfits_of(test: Measurement, structure: Structure, unknowns: int) -> list[t
     for record, stated, misfit in parts:
         numbers = lines * record.shape[1]
         noise = np.sqrt(np.sum(np.abs(misfit) ** 2) / numbers / left) if stated is None else stated
-        least = _EXACT * np.sqrt(np.sum(np.abs(record) ** 2) / numbers)
+        least = EPSILON * np.sqrt(np.sum(np.abs(record) ** 2) / numbers)
         made.append((misfit, np.broadcast_to(np.maximum(noise, least), record.shape)))
     return made
 
@@ -88,7 +87,7 @@ def inflation_of(test: Measurement, records: list[Record], unknowns: int, scatte
         return 1.0
     if scattered is not None:
         reduced /= scattered
-    beyond = reduced if reduced > max(_SUSPECT, 1 + _DEVIATIONS * np.sqrt(2 / freedom)) else 1.0
+    beyond = reduced if reduced > max(SUSPECT, beyond_chance(freedom) / freedom) else 1.0
     if scattered is not None:
         return float(np.sqrt(beyond))
     error = np.concatenate([(r.misfit / r.std).reshape(-1, test.n_runs, test.freq.size) for r in records])

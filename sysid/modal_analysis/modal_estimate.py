@@ -16,10 +16,7 @@ from sysid.modal_analysis.modal_fit import Index, Modes
 from sysid.modal_analysis.response import columns, gains, weights_of
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.structure.structure import Array
-
-_UNSEEN = 1e-12  # of the largest eigenvalue of the scaled information: round-off
-_STEPS = 200
-_BELOW = 1e-3  # of the rigid-body mass; the least remainder to begin with, as a factor of zero has no slope
+from sysid.structure.thresholds import round_off
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +179,7 @@ def factor_of(estimate: ModalEstimate) -> Array:
     size = np.sqrt(np.maximum(np.diag(A), 0.0))
     seen = size > 0
     lam, V = np.linalg.eigh(A[np.ix_(seen, seen)] / np.outer(size[seen], size[seen]))
-    known = lam > _UNSEEN * lam[-1]
+    known = lam > round_off(len(A)) * lam[-1]
     factor = np.zeros((int(known.sum()), size.size))
     factor[:, seen] = (V[:, known] * np.sqrt(lam[known])).T * size[seen]
     return factor

@@ -23,8 +23,6 @@ from sysid.modal_analysis.modal_fit import Index, Modes
 from sysid.modal_analysis.response import gains, motion_and_slopes, real_times
 from sysid.structure.structure import Array, ComplexArray
 
-_AT_ONCE = 4096  # lines whose derivatives are held in memory together
-
 
 class Run(NamedTuple):
     """Spectra of one run: lines (L,), rad/s; base (d, L); outputs (c, L); `density` of `WholeRecords`; its number."""
@@ -116,11 +114,11 @@ class SpectralModel:
         """What the traces of a channel are multiples of, (traces, L)."""
         return np.zeros((0, freq.size), complex)
 
-    def parts(self) -> Iterator[Run]:
-        """Lines of all runs, some thousand at a time."""
+    def parts(self, at_once: int = 4096) -> Iterator[Run]:
+        """Lines of all runs, as many at once as memory holds derivatives of."""
         for run in self.runs:
-            for at in range(0, run.w.size, _AT_ONCE):
-                yield run.at(slice(at, at + _AT_ONCE))
+            for at in range(0, run.w.size, at_once):
+                yield run.at(slice(at, at + at_once))
 
     def chunks(self, p: Parameters) -> Iterator[Lines]:
         """The same at given parameters."""

@@ -39,26 +39,24 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
-from sysid.modal_analysis.residues import Records, beyond_chance
+from sysid.modal_analysis.misfit import SUSPECT
+from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.response import gains
 from sysid.modal_analysis.vector_fitting import Monitor, poles_from, poles_of_any_damping
 from sysid.structure.structure import Array, ComplexArray, Structure
+from sysid.structure.thresholds import CANDIDATES, ROUND_OFF, beyond_chance, largest_modulus
 
 HUBER = "Huber's loss"  # the phase of its rounds
 TUNING = 1.06147  # c, in units of sqrt(E|e|²): 95 % efficient where the noise is normal
-_FAR = 5.0  # deviations, beyond which one number in 10^10 is chance
 _BESIDE = 5.0  # times the numbers beside it: as much as a wrong pole leaves of a peak one line wide
 _CERTAIN = 10.0  # the same, where noise that differs from line to line must not be taken for outliers
 _ONE_LINE = 4.0  # times its next line, that a pole's highest one may reach without being doubted
 _ONE_CHANNEL = 0.9  # of the power at that line, in one channel: no motion of a structure
-_NARROW = 0.5  # of the distance of lines; poles of less half-width show at one line too
-_FLOOR = 1e-9  # of a record's rms: what counts as noise where there is none
-_SUSPECT = 1.2  # times the variance that is stated, up to which the noise may be as stated
-_MEDIAN = 0.4549  # of the square of a standard normal number
 _LEAST_LINES = 5  # with fewer, no number has neighbours enough
 _UNDAMPED, _TINY = 1e-9, np.finfo(float).tiny
 _ROUNDS, _BOUNDED, _FREED = 8, 3, 8
@@ -66,8 +64,6 @@ _BEHIND = 2.0  # times the numbers beside it, from which a number need not pull:
 _PASSES, _STEPS = 4, 12  # after absorbed outliers; of weights
 _DECIDES = 0.18  # leverage of a line, of at most 1
 _NEAR_TOP = 0.3  # of a mode's height, from which it is missed at a line
-_OTHERS = 3  # numbers more than modes, at least, to compare with
-_HALVINGS = 60  # of the error of a scale's logarithm, at least
 
 Flags = NDArray[np.bool_]
 
@@ -119,15 +115,13 @@ def whitened(test: Measurement, made: Sequence[ComplexArray], unknowns: int) -> 
     left = max(1 - unknowns / (2 * test.numbers), 0.5)
     squares, stds = [], []
     for record, misfit, stated in found:
-        least = _FLOOR * float(np.sqrt(np.mean(np.abs(of_own(record)) ** 2)))
+        least = ROUND_OFF * float(np.sqrt(np.mean(np.abs(of_own(record)) ** 2)))
         robust = np.sqrt(np.median(np.abs(of_own(misfit)) ** 2) / np.log(2) / left) if stated is None else stated
         stds.append(np.broadcast_to(np.maximum(robust, least), record.shape))
         if stated is not None:
             squares.append(np.abs(of_own(misfit / stds[-1])) ** 2)
     # Without a jump, at which rounds of a fit would turn to and fro.
-    more = (
-        np.sqrt(max(1.0, float(np.median(np.concatenate(squares))) / np.log(2) / left / _SUSPECT)) if squares else 1.0
-    )
+    more = np.sqrt(max(1.0, float(np.median(np.concatenate(squares))) / np.log(2) / left / SUSPECT)) if squares else 1.0
     stds = [std if stated is None else more * std for std, (*_, stated) in zip(stds, found, strict=True)]
     return [Whitened(misfit / std, std, test.own_lines) for std, (_, misfit, _) in zip(stds, found, strict=True)]
 
@@ -162,7 +156,7 @@ def deviance(misfit: ComplexArray) -> float:
     """
     size = np.abs(misfit)
     scale = float(np.sqrt(np.mean(size**2)))
-    for _ in range(_HALVINGS):
+    for _ in range(60):  # each halves the error of the logarithm at least
         scale = float(np.sqrt(np.mean(np.minimum(size, TUNING * scale) * size)))
     of_scale = 2 * np.log(scale) + np.log1p(np.exp(-(TUNING**2)) / (2 * TUNING**2))
     return float(2 * (loss(misfit / scale) + size.size * (of_scale - 1)))
@@ -225,7 +219,7 @@ def _beyond_neighbours(part: Whitened, *, times: float, known: Flags | None = No
         near_by[:, here, here - first] = np.inf
         beside = np.sort(near_by, axis=-1)[..., 2]  # of four the last but one: another outlier may be among them
         its = size[run][:, own]
-        flags[run][:, own] = (its > _FAR) & (its > times * beside)
+        flags[run][:, own] = (its > largest_modulus(CANDIDATES)) & (its > times * beside)
     return flags
 
 
@@ -235,7 +229,7 @@ def _in_doubt(freq: Array, omega: Array, ratios: Array) -> Flags:
         return np.ones(freq.size, dtype=bool)
     lines = 2 * np.pi * freq
     distance = np.interp(omega, lines, np.gradient(lines))
-    narrow = ratios * omega < _NARROW * distance
+    narrow = ratios * omega < distance / 2  # poles that show at one line too
     doubted: Flags = np.any(np.abs(lines - omega[narrow, None]) < 1.5 * distance[narrow, None], axis=0)
     return doubted
 
@@ -336,7 +330,7 @@ def _unlike_others(misfit: ComplexArray, shown: ComplexArray) -> tuple[Flags, Co
     """
     flags: Flags = np.zeros(misfit.size, dtype=bool)
     left = misfit
-    while np.count_nonzero(~flags) > shown.shape[1] + _OTHERS:
+    while np.count_nonzero(~flags) > shown.shape[1] + 3:  # too few to compare with
         farthest, size, left_by = -1, _CERTAIN, left
         for j in np.flatnonzero(~flags):
             others = ~flags
@@ -412,8 +406,8 @@ def _is_one_number(test: Measurement, records: Records, omega: Array, ratios: Ar
     left = others.size  # where it is the only pole
     if omega.size > 1:
         left = others.fit(np.delete(omega, k), np.delete(ratios, k), velocity=True).squared_error
-    noise = float(np.median(every.left**2)) / _MEDIAN
-    return left - every.squared_error < noise * beyond_chance(every.residues[k].size + 2)
+    noise = float(np.median(every.left**2)) / scipy.special.chdtri(1, 0.5)  # that of a squared normal number
+    return left - every.squared_error < noise * beyond_chance(every.residues[k].size + 2, CANDIDATES)
 
 
 def _heights(freq: Array, omega: Array, ratios: Array) -> Array:
@@ -433,7 +427,9 @@ def outliers(
     omega, ratios = 2 * np.pi * structure.natural_frequencies, structure.damping_ratios
     first, found = 0, []
     for part in whitened(test, predicted(test, structure), unknowns):
-        far = stand_alone(part, test.freq, omega, ratios, times=_CERTAIN) if alone else np.abs(part.u) > _FAR
+        far = np.abs(part.u) > largest_modulus(CANDIDATES)
+        if alone:
+            far = stand_alone(part, test.freq, omega, ratios, times=_CERTAIN)
         for run, channel, line in np.argwhere(far).tolist():
             size = float(np.abs(part.u[run, channel, line]))
             found.append(Outlier(number, run + 1, names[first + channel], float(test.freq[line]), size))

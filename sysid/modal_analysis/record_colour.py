@@ -8,17 +8,15 @@ from numpy.typing import NDArray
 from sysid.structure.structure import Array
 
 KNOTS = 5  # frequencies at which a level is a number of its own, evenly in the root of frequency
-_PIECES = 20  # stretches of lines with one level each, that of the straight line in their middle
-_LEAST = 4  # lines of a stretch
 
 
-def pieces(w: Array) -> list[slice]:
-    """Stretches of the lines of a run, (L,), rad/s."""
+def pieces(w: Array, most: int = 20, lines: int = 4) -> list[slice]:
+    """Stretches of the lines of a run, (L,), rad/s, `most` at most and of so many lines at least: of one level each."""
     root = np.sqrt(w)
-    bounds = np.unique(np.searchsorted(root, np.linspace(root[0], root[-1], _PIECES + 1)[1:-1]))
+    bounds = np.unique(np.searchsorted(root, np.linspace(root[0], root[-1], most + 1)[1:-1]))
     cuts = [0]
     for bound in bounds:
-        if bound - cuts[-1] >= _LEAST and w.size - bound >= _LEAST:
+        if bound - cuts[-1] >= lines and w.size - bound >= lines:
             cuts.append(int(bound))
     return [slice(a, b) for a, b in zip(cuts, [*cuts[1:], w.size], strict=True)]
 

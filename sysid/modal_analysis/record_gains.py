@@ -8,8 +8,7 @@ import scipy
 from sysid.modal_analysis.modal_estimate import Gains
 from sysid.modal_analysis.record_fit import RecordFit, half_inverse, unit_diagonal
 from sysid.structure.structure import Array
-
-_SEEN = 1e-10  # of the largest eigenvalue of the scaled information; less is round-off
+from sysid.structure.thresholds import ROUND_OFF
 
 
 def gain_errors_of(fit: RecordFit) -> Gains:
@@ -26,7 +25,7 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     gradient = along.T @ made.gradient / size
 
     def estimate(count: int) -> tuple[Array, Array]:
-        half = half_inverse(normal[:count, :count], _SEEN)
+        half = half_inverse(normal[:count, :count], ROUND_OFF)
         step = half @ (half.T @ gradient[:count])
         std = np.sqrt(beyond / 2) * np.linalg.norm(half, axis=1)
         return step[at : at + n] / size[at : at + n], std[at : at + n] / size[at : at + n]
@@ -36,7 +35,7 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     better = plain_std < std
     # A sensor that reads too much records `1 + error` times all its motion, transients included: its rows of what is
     # linear in it take the factor, and G u beside them pulls the fit.
-    half = half_inverse(normal[:at, :at], _SEEN)
+    half = half_inverse(normal[:at, :at], ROUND_OFF)
     pulled = half @ (half.T @ normal[:at, at : at + n]) / size[:at, None] * size[at : at + n]
     moves = np.zeros((fit.model.index.size, n))
     moves[: fit.model.kept] = pulled[: fit.model.kept]
@@ -53,9 +52,9 @@ def _rigid(fit: RecordFit, beyond: float) -> tuple[Array, Array]:
     made, (n, d), at = fit.equations, fit.test.rigid_body.shape, fit.model.size
     count = at + n * d
     normal, size = unit_diagonal(made.normal[:count, :count])
-    half = half_inverse(normal, _SEEN)
+    half = half_inverse(normal, ROUND_OFF)
     step = (half @ (half.T @ (made.gradient[:count] / size)))[at:].reshape(n, d)
     own = half[at:].reshape(n, d, -1)
     covariance = beyond / 2 * own @ own.swapaxes(1, 2)
-    chi2 = np.einsum("ni,nij,nj->n", step, np.linalg.pinv(covariance, rcond=_SEEN, hermitian=True), step)
+    chi2 = np.einsum("ni,nij,nj->n", step, np.linalg.pinv(covariance, rcond=ROUND_OFF, hermitian=True), step)
     return step / size[at:].reshape(n, d), chi2

@@ -16,14 +16,11 @@ from sysid.modal_analysis.record_model import Parameters, RecordModel
 from sysid.modal_analysis.response import gains
 from sysid.modal_analysis.vector_fitting import DAMPED, RAZOR
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import CANDIDATES, beyond_chance
 
-_WORTH = 25.0  # in units of ``e' S^-1 e``: a mode whose absence raises it by less is noise (chi-squared of 50)
 _RATIOS = (0.004, 0.012, 0.036)  # damping ratios that are tried
-_STEP = 1.0  # of a candidate's damping ratio, from one frequency to the next
 _REACH = 15.0  # half-power widths about a candidate, of lines that are looked at
 _PROMISING = 0.7  # of what a mode must be worth, that a few steps show
-_FINE = 16  # lines in a half-power width that tell the mean covariance there
-_CHANCE = 12.0  # by which the best of many candidates exceeds what noise makes of one
 
 
 def with_further_modes(fit: RecordFit, *, some: Measurement | None = None, monitor: Monitor | None = None) -> RecordFit:
@@ -53,9 +50,9 @@ def no_modes(fit: RecordFit) -> NDArray[np.bool_]:
 
 
 def least_worth(model: RecordModel) -> float:
-    """What a mode must lower ``e' S^-1 e`` by: more than noise makes of the likeliest residue of rank one."""
+    """What a mode must lower ``e' S^-1 e`` by: more than noise makes of a residue of rank one and a pole, anywhere."""
     inputs = model.d + 2 * len(model.moving)
-    return max(_WORTH, float((np.sqrt(model.channels) + np.sqrt(inputs)) ** 2 / 2 + _CHANCE))
+    return beyond_chance(model.channels + inputs + 1, CANDIDATES) / 2
 
 
 def _candidate(fit: RecordFit, least: float) -> Parameters | None:
@@ -66,7 +63,7 @@ def _candidate(fit: RecordFit, least: float) -> Parameters | None:
     errors = [chunk.weighed_errors(fit.levels) for chunk in model.chunks(p)]
     for ratio in _RATIOS:
         ends = 2 * np.pi * fit.test.freq[[0, -1]]
-        count = int(np.log(ends[1] / ends[0]) / (_STEP * ratio)) + 2
+        count = int(np.log(ends[1] / ends[0]) / ratio) + 2
         for omega in np.geomspace(ends[0], ends[1], count):
             gradient, S, U, power = np.zeros((c, inputs)), np.zeros((c, c)), np.zeros((inputs, inputs)), 0.0
             for w, inputs_there, seen, inverse in errors:
@@ -76,7 +73,8 @@ def _candidate(fit: RecordFit, least: float) -> Parameters | None:
                 g = gains(w[near] / (2 * np.pi), np.array([omega]), np.array([ratio]))[0]
                 moved = g * inputs_there[:, near]
                 gradient += (seen[:, near] @ moved.conj().T).real
-                step = max(1, (near.stop - near.start) // int(2 * _REACH * _FINE))
+                # So many in a half-power width tell the mean covariance.
+                step = max(1, (near.stop - near.start) // int(2 * _REACH * 16))
                 strength = step * np.abs(g[::step]) ** 2
                 S += np.einsum("cel,l->ce", inverse[:, :, near][:, :, ::step], strength).real
                 U += (moved @ moved.conj().T).real

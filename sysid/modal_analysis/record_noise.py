@@ -14,10 +14,8 @@ import numpy as np
 from sysid.modal_analysis.record_colour import designs
 from sysid.modal_analysis.record_model import Parameters, RecordModel
 from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import NEGLIGIBLE
 
-_ENOUGH = 8000  # lines, of all runs together: more of them tell a level no better than the fit needs
-_STEPS = 30
-_VAGUE = 1e-6  # information on a logarithm that counts as none
 _SETTLED = 1e-4  # of a level's logarithm
 VANISHING = 1e-5  # of a channel's rms: least noise; what the model leaves of folding can show below it
 NO_NOISE = 2 * VANISHING  # levels at the least, which the fit's own numbers raise a little, are no noise
@@ -40,7 +38,7 @@ def likeliest_levels(model: RecordModel, p: Parameters, levels: Array, unknowns:
         Of the fit, which took a part of the noise with it.
     """
     lines = sum(run.w.size for run in model.runs)
-    thin = model.thinned(max(1, -(-lines // _ENOUGH)))
+    thin = model.thinned(max(1, -(-lines // 8000)))  # more lines tell a level no better than the fit needs
     parts = _parts(thin, p)
     least = floors(model)
     share = np.median(levels / least, axis=1, keepdims=True)
@@ -65,7 +63,7 @@ def level_deviations(model: RecordModel, p: Parameters, levels: Array) -> Array:
         rows, every = list(D), np.concatenate(list(D.values()))
         x = np.linalg.lstsq(every, np.log(levels[rows]).ravel(), rcond=None)[0]
         fisher = _likelihood([part for part in parts if part.piece in D], D, x)[2]
-        inverse = np.linalg.inv(fisher + _VAGUE * np.eye(x.size))
+        inverse = np.linalg.inv(fisher + NEGLIGIBLE * np.eye(x.size))
         mean = np.mean(list(D.values()), axis=0)
         out.append(np.sqrt(np.einsum("ci,ij,cj->c", mean, inverse, mean)) / 2)
     return np.array(out)
@@ -102,7 +100,7 @@ def _of_run(parts: list[Part], D: dict[int, Array], levels: Array, least: Array)
     lowest = np.min(np.where(every > 0, np.log(least).ravel()[:, None], np.inf), axis=0)
     x = np.maximum(x, lowest)
     value, score, fisher = _likelihood(parts, D, x)
-    for _ in range(_STEPS):
+    for _ in range(30):
         size = np.sqrt(np.diag(fisher))
         step = np.linalg.solve(fisher / np.outer(size, size) + 1e-6 * np.eye(size.size), score / size) / size
         step = np.clip(step, -2.0, 2.0)

@@ -12,20 +12,16 @@ from numpy.typing import NDArray
 from sysid.measurement.measurement import Measurement
 from sysid.structure.structure import Array
 
-_WIDTH = 5  # lines over which powers are smoothed
-_A_WIDTH = 6  # lines kept in a half-power width ..
-_DAMPING = 0.005  # .. of this damping ratio
 
+def few_lines(test: Measurement, a_width: int = 6, ratio: float = 0.005) -> NDArray[np.bool_]:
+    """Lines that tell the modes where there are many, the last too, (n_freq,).
 
-def few_lines(test: Measurement) -> NDArray[np.bool_]:
-    """Lines that tell the modes where there are many: `_A_WIDTH` in a half-power width, the last too, (n_freq,).
-
-    All of them where that would not save half.
+    So many in a half-power width of a mode of this damping ratio; all of them where that would not save half.
     """
     keep = np.zeros(test.freq.size, bool)
     for own in test.own_lines:
         lines = np.flatnonzero(own)
-        step = np.gradient(test.freq[lines]) / test.freq[lines] * _A_WIDTH / (2 * _DAMPING)
+        step = np.gradient(test.freq[lines]) / test.freq[lines] * a_width / (2 * ratio)
         at = np.floor(np.cumsum(np.minimum(step, 1.0)))
         keep[lines[np.append(np.flatnonzero(np.diff(at, prepend=-1.0) > 0), -1)]] = True
     return keep if 2 * np.count_nonzero(keep) < keep.size else np.ones_like(keep)
@@ -45,9 +41,9 @@ def rough_deviations(test: Measurement) -> Array:
     return np.sqrt(own + gain * np.sum(mean(test.base)))
 
 
-def _smooth(power: Array) -> Array:
-    """Means over neighbouring lines; fewer at the ends."""
-    kernel = np.ones(_WIDTH)
+def _smooth(power: Array, width: int = 5) -> Array:
+    """Means over so many neighbouring lines; fewer at the ends."""
+    kernel = np.ones(width)
     count = np.convolve(np.ones(power.shape[-1]), kernel, mode="same")
     flat = power.reshape(-1, power.shape[-1])
     return np.array([np.convolve(row, kernel, mode="same") / count for row in flat]).reshape(power.shape)

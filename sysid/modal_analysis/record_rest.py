@@ -11,9 +11,7 @@ from sysid.modal_analysis.record_fit import RecordFit, half_inverse, refitted, u
 from sysid.modal_analysis.record_model import Parameters, RecordModel
 from sysid.modal_analysis.record_spread import uneven
 from sysid.structure.structure import Array
-
-LEVEL = 1e-3  # of false alarms, of all runs together
-_SEEN = 1e-9  # of the largest eigenvalue of the scaled normal matrix: directions that the lines tell
+from sysid.structure.thresholds import FALSE_ALARM, ROUND_OFF
 
 
 def runs_in_motion(fit: RecordFit) -> tuple[int, ...]:
@@ -28,7 +26,7 @@ def runs_in_motion(fit: RecordFit) -> tuple[int, ...]:
     for run in stated:
         moving, p = _moving(fit, (run,))
         chi2, freedom = _score(moving, p)
-        if scipy.special.chdtrc(freedom, chi2) < LEVEL / len(stated):
+        if scipy.special.chdtrc(freedom, chi2) < FALSE_ALARM / len(stated):
             found.append(run)
     if not found:
         return ()
@@ -59,10 +57,10 @@ def _score(fit: RecordFit, p: Parameters) -> tuple[float, int]:
     ends = np.zeros(p.ends.shape, bool)
     ends[:, np.all(p.ends == 0, axis=0)] = True
     added[model.kept : model.kept + model.n_ends] = ends.ravel()
-    half = half_inverse(N[np.ix_(~added, ~added)], _SEEN)
+    half = half_inverse(N[np.ix_(~added, ~added)], ROUND_OFF)
     across = half.T @ N[np.ix_(~added, added)]
     left = gradient[added] - across.T @ (half.T @ gradient[~added])
     lam, V = np.linalg.eigh(N[np.ix_(added, added)] - across.T @ across)
-    seen = lam > _SEEN
+    seen = lam > ROUND_OFF
     # The score has half the normal matrix for its covariance.
     return float(2 * np.sum((V[:, seen].T @ left) ** 2 / lam[seen])), int(np.count_nonzero(seen))

@@ -11,26 +11,24 @@ which is too wide: a block may hold most of what tells a mode.
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from sysid.modal_analysis.record_fit import RecordFit, half_inverse, unit_diagonal
 from sysid.modal_analysis.record_model import Chunk, Run
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import FALSE_ALARM, beyond_chance
 
-_WIDTHS = 3.0  # half-power widths that a block is long
-_LEAST = 4  # lines of a block
-_SHIFTS = 4  # partitions, each begun a part of a block later: where blocks begin must not matter
-_CHANCE = 5.0  # standard deviations by which the power of what is left may differ between blocks
 _TAKEN = 0.98  # share of the information, at most, that is taken to be a block's
 
 
-def blocks_of(run: Run, fit: RecordFit, shift: float) -> list[NDArray[np.intp]]:
-    """Lines of a run in blocks."""
+def blocks_of(run: Run, fit: RecordFit, shift: float, widths: float = 3.0, least: int = 4) -> list[NDArray[np.intp]]:
+    """Lines of a run in blocks of so many half-power widths, of some lines at least; the first begins at a `shift`."""
     modes = fit.parameters.modes
     order = np.argsort(modes.omega)
-    width = np.interp(run.w, modes.omega[order], 2 * _WIDTHS * (modes.ratios * modes.omega)[order])
+    width = np.interp(run.w, modes.omega[order], 2 * widths * (modes.ratios * modes.omega)[order])
     spacing = np.gradient(run.w)
-    at = np.cumsum(spacing / np.maximum(width, _LEAST * spacing)) + shift
+    at = np.cumsum(spacing / np.maximum(width, least * spacing)) + shift
     cuts = np.flatnonzero(np.diff(np.floor(at))) + 1
     return np.split(np.arange(run.w.size), cuts)
 
@@ -44,14 +42,14 @@ def scatter(fit: RecordFit) -> Array | None:
     return scatter_over_blocks(fit) if uneven(fit, 2 * fit.chi2 / fit.model.numbers) else None
 
 
-def scatter_over_blocks(fit: RecordFit) -> Array:
-    """The same, whatever is left."""
+def scatter_over_blocks(fit: RecordFit, partitions: int = 4) -> Array:
+    """The same, whatever is left, over partitions that begin later each: where blocks begin must not matter."""
     model, p = fit.model, fit.parameters
     N, size = unit_diagonal(fit.normal)
     half = half_inverse(N, 1e-12)
     meat = np.zeros((half.shape[1],) * 2)
     columns = [Chunk(model, p, run.at(slice(0, 1))).columns() for run in model.runs]
-    for shift in np.arange(_SHIFTS) / _SHIFTS:
+    for shift in np.arange(partitions) / partitions:
         for run, own in zip(model.runs, columns, strict=True):
             at = size[own.unknowns]
             for lines in blocks_of(run, fit, shift):
@@ -60,7 +58,7 @@ def scatter_over_blocks(fit: RecordFit) -> Array:
                 inner = half[own.unknowns].T @ (made.normal / np.outer(at, at)) @ half[own.unknowns]
                 taken, turn = np.linalg.eigh(inner)
                 grown = turn @ ((turn.T @ score) / np.sqrt(1 - np.clip(taken, 0.0, _TAKEN)))
-                meat += np.outer(grown, grown) / _SHIFTS
+                meat += np.outer(grown, grown) / partitions
     # In moves of all unknowns, of which those of `Index` are kept: A^-1 B A^-1 is that of the moves.
     kept = model.kept
     moved = (half @ meat @ half.T)[:kept, :kept] / np.outer(size[:kept], size[:kept])
@@ -71,15 +69,19 @@ def scatter_over_blocks(fit: RecordFit) -> Array:
 
 
 def uneven(fit: RecordFit, mean: float = 1.0) -> bool:
-    """Whether the power of what is left differs between blocks of lines, and from its mean, by more than chance."""
+    """Whether the power of what is left differs between blocks of lines, and from its mean, by more than chance.
+
+    In all blocks together, or rises above it in one.
+    """
     model, c = fit.model, fit.model.channels
-    off = []
+    off, rare = [], []
     powers: list[list[Array]] = [[] for _ in model.runs]
     for chunk in model.chunks(fit.parameters):
         powers[chunk.run.piece].append(chunk.weighed(fit.levels).power)
     for run, parts in zip(model.runs, powers, strict=True):
         power = np.concatenate(parts)
         for lines in blocks_of(run, fit, 0.0):
-            off.append((np.sum(power[lines]) / mean - c * lines.size) / np.sqrt(c * lines.size))
-    z = np.array(off)
-    return bool(np.sum(z**2) > z.size + _CHANCE * np.sqrt(2 * z.size) or np.max(z) > 2 * _CHANCE)
+            held, numbers = np.sum(power[lines]) / mean, c * lines.size
+            off.append((held - numbers) / np.sqrt(numbers))
+            rare.append(scipy.special.gammaincc(numbers, held))
+    return bool(np.sum(np.square(off)) > beyond_chance(len(off), 2) or min(rare) < FALSE_ALARM / (2 * len(rare)))

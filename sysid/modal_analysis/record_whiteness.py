@@ -18,8 +18,8 @@ from sysid.modal_analysis.modal_estimate import Excess
 from sysid.modal_analysis.record_fit import RecordFit
 from sysid.modal_analysis.record_noise import NO_NOISE
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import FALSE_ALARM
 
-LEVEL = 1e-3  # of false alarms, of all channels, runs and bands together
 _FEWEST = 8  # lines of a band
 
 
@@ -94,6 +94,6 @@ def most_unlikely(power: Array, bands: int) -> tuple[int, int, float] | None:
         weight = size * (ratio - 1 - np.log(np.maximum(ratio, 1e-300)))  # Chernoff's bound
         weight[ratio <= 1] = 0.0
         at = int(np.argmax(weight))
-        if (best is None or weight[at] > best[2]) and scipy.special.gammaincc(size, held[at]) < LEVEL / bands:
+        if (best is None or weight[at] > best[2]) and scipy.special.gammaincc(size, held[at]) < FALSE_ALARM / bands:
             best = int(first[at]), int(first[at] + size), float(weight[at])
     return best

@@ -12,8 +12,8 @@ import numpy as np
 from sysid.modal_analysis.residues import Records, unit_columns
 from sysid.modal_analysis.response import gains_with_velocity, stacked
 from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import EXACT
 
-_SHARE = 1e-8  # of noise in squares, below which they have not eight digits of it
 _FEW = 8  # channels, for which factors take no longer than squares that round-off may refuse
 
 Blocks = list[tuple[ComplexArray, ComplexArray, ComplexArray]]  # of each: `Records.principal`
@@ -89,7 +89,7 @@ def _rows_by_squares(
             answered = Q.T @ np.vstack([a * real - b * imaginary, a * imaginary + b * real])
             G -= answered.T @ answered
     values, vectors = np.linalg.eigh(G)
-    if values[0] < _SHARE:
+    if values[0] < EXACT:
         return None
     return np.sqrt(values)[:, None] * (vectors.T @ triangle)
 

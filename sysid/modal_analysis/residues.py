@@ -14,13 +14,9 @@ from sysid.measurement.measurement import Measurement
 from sysid.measurement.noise import separable
 from sysid.modal_analysis.response import columns, gains, gains_with_velocity, stacked
 from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import CANDIDATES, NEGLIGIBLE, ROUND_OFF, beyond_chance
 
-_DEVIATIONS = 12.0  # of the chi-squared law, by which a squared error must fall to mean something
-ROUND_OFF = 1e-11  # of the records: what counts as noise where there is none
-_LARGE = 1e-6  # of the squared records: a squared error so large follows to ten digits as the difference of two squares
 _LAGS = range(4)  # distances of lines that may share their noise; none: their power
-_CHANCE = 3e-7  # that white noise is taken for noise that neighbouring lines share
-_DEPENDENT = 1e-9  # of the largest singular value of the base records
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +75,7 @@ class ResidueFit:
     @property
     def _is_large(self) -> bool:
         """Whether round-off in differences of squares does not matter to what is left, which need not be formed."""
-        return self._difference > _LARGE * self.size
+        return self._difference > NEGLIGIBLE * self.size
 
     @property
     def gain(self) -> Array:
@@ -105,7 +101,7 @@ class ResidueFit:
         """
         s = np.linalg.svd(self.whitened.reshape(len(self.whitened), -1, n_sensors), compute_uv=False)
         # Unknowns of a further mode, at most.
-        needed = np.count_nonzero(s**2 > noise * beyond_chance(n_sensors + n_base), axis=1)
+        needed = np.count_nonzero(s**2 > noise * beyond_chance(n_sensors + n_base, CANDIDATES), axis=1)
         return np.clip(needed, 1, min(n_sensors, n_base))
 
 
@@ -330,11 +326,6 @@ def _least_squares(X: Array, data: Array, m: int, size: float) -> ResidueFit:
     return ResidueFit(Q, beta, inverse.reshape(m, beta.shape[1], -1), data, y, size)
 
 
-def beyond_chance(freedom: float) -> float:
-    """Squared size, in units of the noise's variance, that so many numbers of noise alone do not reach."""
-    return float(freedom + _DEVIATIONS * np.sqrt(2 * freedom))
-
-
 def line_correlation(error: ComplexArray, unknowns: int = 0) -> float:
     """Factor by which errors weigh more on smooth functions of frequency as neighbouring lines share them.
 
@@ -376,7 +367,8 @@ def _correlation_factor(
     if lines.max(initial=0) <= 2 * len(_LAGS) - 2 or not np.any(moved):
         return 1.0
     share = unknowns / max(2 * channels * lines[moved].sum() - unknowns, 1)
-    chance = scipy.special.chdtri(2 * moved.sum(), _CHANCE) / 2
+    fits = 100  # of one search, each with its own errors
+    chance = beyond_chance(2 * moved.sum(), fits * (len(_LAGS) - 1)) / 2
     factor = 1.0
     for sums, level in zip(np.abs(products[1:, moved]) / power[moved], variance[1:, moved], strict=True):
         beyond = np.maximum(sums - share, 0) ** 2
@@ -394,7 +386,7 @@ def independent(base: ComplexArray) -> Array:
     """
     flat, size = unit_columns(stacked(columns(base)))
     left, s, _ = np.linalg.svd(flat.T, full_matrices=False)
-    return left[:, s > _DEPENDENT * s[0]] / size[:, None]
+    return left[:, s > ROUND_OFF * s[0]] / size[:, None]
 
 
 def independent_inputs(test: Measurement) -> tuple[Array, int]:

@@ -29,12 +29,11 @@ from sysid.modal_analysis.modal_fit import (
 from sysid.modal_analysis.modal_model import Lines, Parameters, Run, Shift, SpectralModel, dots
 from sysid.modal_analysis.residues import force_residual_left, linear_residues
 from sysid.modal_analysis.response import motion_curvature, real_times
-from sysid.nlp import EXACT, OBJECTIVE_SCALE, IterationMonitor
+from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import EXACT, ROUND_OFF, round_off
 
-RIDGE = 1e-14  # of the modes' size: keeps shapes finite where two modes become one, and changes them by less than noise
 _SETTLED = EXACT**1.5  # of the sum of squares: a fall that is promised, at which the fit stands still
-_LEAST_MISFIT = 1e-9  # relative; records that fit better than this weigh alike
 
 
 def weights_at(test: Measurement, omega: Array, ratios: Array) -> Weights:
@@ -57,8 +56,8 @@ def weights_at(test: Measurement, omega: Array, ratios: Array) -> Weights:
     if test.response_std is not None and test.force_std is not None:
         return Weights(sensors, line, of_force / size, force_line)
     force_size = float(np.linalg.norm(test.force * of_force[:, None] * force_line[:, None]))
-    left = max(linear_residues(test, omega, ratios)[1], _LEAST_MISFIT)
-    force_left = max(force_residual_left(test, omega, ratios), _LEAST_MISFIT)
+    left = max(linear_residues(test, omega, ratios)[1], ROUND_OFF)
+    force_left = max(force_residual_left(test, omega, ratios), ROUND_OFF)
     weight = left / force_left * float(np.sqrt(test.force.size / test.relative.size)) / force_size
     return Weights(sensors, line, weight * of_force, force_line)
 
@@ -248,7 +247,7 @@ def _inverse(gram: Array) -> Array:
     """Inverse of the Gram matrix of the modes' motions, which may be next to singular."""
     size = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
     lam, V = np.linalg.eigh(gram / np.outer(size, size))
-    half = V / np.sqrt(np.maximum(lam, 0.0) + RIDGE) / size[:, None]
+    half = V / np.sqrt(np.maximum(lam, 0.0) + round_off(lam.size)) / size[:, None]
     return np.asarray(half @ half.T)
 
 

@@ -21,17 +21,14 @@ from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.residues import unit_columns
 from sysid.modal_analysis.response import gains, stacked
+from sysid.modal_analysis.vector_fitting import BESIDE
 from sysid.structure.structure import Array, ComplexArray
 
 LEVELS = ("new", "frequency", "frequency, damping", "frequency, damping, shape")  # what is stable
 _SAME_FREQUENCY, _SAME_RATIO, _SAME_SHAPE = 0.01, 0.05, 0.98
 _DAMPED = 0.2  # a pole with more damping than this is not shown
-_EDGE = 0.05  # how far outside the lines a pole may lie, as a fraction of their ends
-_MOST_MODES = 100  # the highest order by default
-_MOST_ORDERS = 40  # rows of the diagram: where there would be more, each is further from the next
 _GAP = 0.1  # of the half circle, free at either end: a polynomial fits a smooth function badly up to where it wraps
 _WIDER = 5  # powers by which numerators reach beyond the denominator at either end: all that modes outside the band add
-_ROUND_OFF = 1e-14
 _SPANNED = 1e-4  # least singular value of the base's motion against its largest: less makes no FRF
 
 
@@ -106,7 +103,7 @@ def stabilisation(test: Measurement, *, max_order: int | None = None) -> Stabili
         z, participation = _poles(system[:size, :size], d)  # triangular: zeros below
         frequency = freq[0] * np.exp((np.angle(z) - start) / step)
         decay = -np.log(np.abs(z)) / step  # of log w_k, hence arcsin zeta_k
-        inside = (frequency > (1 - _EDGE) * freq[0]) & (frequency < (1 + _EDGE) * freq[-1])
+        inside = (frequency > (1 - BESIDE) * freq[0]) & (frequency < (1 + BESIDE) * freq[-1])
         shown = np.flatnonzero(inside & (decay > 0) & (decay < np.arcsin(_DAMPED)))
         shown = shown[np.argsort(frequency[shown])]
         frequency, ratio = frequency[shown], np.sin(decay[shown])
@@ -178,10 +175,11 @@ def _degrees(shape: tuple[int, ...], max_order: int | None) -> NDArray[np.intege
     carried = d * (max(lines - 1 - 2 * _WIDER, 0) * n // (n + d)) // 2  # two equations an unknown
     if max_order is not None and max_order > carried:
         raise InputError(f"max_order = {max_order}: {lines} lines of {n} sensors carry at most {carried} modes")
-    top = min(2 * n + 10, _MOST_MODES, carried) if max_order is None else max_order
+    top = min(2 * n + 10, 100, carried) if max_order is None else max_order
     degrees = np.unique(2 * np.arange(2, top + 1) // d)
     degrees = degrees[degrees * d >= 4]
-    degrees = degrees[:: -max(1, -(-degrees.size // _MOST_ORDERS))][::-1]
+    # At most so many rows of the diagram: further from each other where there would be more.
+    degrees = degrees[:: -max(1, -(-degrees.size // 40))][::-1]
     if degrees.size == 0:
         raise InputError(
             f"no stabilisation diagram: {lines} lines of {n} sensors and order {top} give no model of two modes or more"
@@ -213,7 +211,7 @@ def _poles(system: Array, d: int) -> tuple[ComplexArray, Array]:
     Participations are turned to be as real as can be. With the lowest coefficient fixed to the identity, poles that
     fit noise come out unstable (|z| > 1) and can be recognised.
     """
-    A = np.linalg.lstsq(system[:, d:], -system[:, :d], rcond=_ROUND_OFF)[0].reshape(-1, d, d)
+    A = np.linalg.lstsq(system[:, d:], -system[:, :d], rcond=None)[0].reshape(-1, d, d)
     size = d * len(A)
     # The reversed polynomial y^p + A_1 y^(p-1) + ..., y = 1/z, transposed: its vectors are the rows u with u A(z) = 0.
     companion = np.eye(size, k=-d)
@@ -238,7 +236,7 @@ def _shapes(freq: Array, H: ComplexArray, frequency: Array, ratio: Array, partic
         design[j, :, m + j] = 1.0
         design[j, :, m + d + j] = (freq / freq[-1]) ** 2
     basis, _ = unit_columns(stacked(design.reshape(d * freq.size, -1).T))
-    answer: Array = np.linalg.lstsq(basis, stacked(H.reshape(len(H), -1)), rcond=_ROUND_OFF)[0][:m]
+    answer: Array = np.linalg.lstsq(basis, stacked(H.reshape(len(H), -1)), rcond=None)[0][:m]
     return answer.T
 
 

@@ -18,13 +18,9 @@ from sysid.measurement.whole import NoiseLevels, WholeRecords
 from sysid.modal_analysis.record_fit import RecordFit, record_modes, with_poles_of
 from sysid.structure.structure import Array
 
-_MOST = 12  # stretches of a run
 _PERIODS = 25  # of the lowest mode, that a stretch holds at least
-_EDGE = 2  # lines of a stretch at each end of the band, which what lies beyond it reaches
 _LEAST = 1e-3  # of the sensor that moves most: how much of the motion of one that hardly moves counts in full
 _FEWEST = 8  # lines of a stretch for each mode
-_ABOUT = 12  # lines about a mode, of which ..
-_ABSORBED = 2  # .. its pole and transients explain so many
 
 
 class Stretch(NamedTuple):
@@ -108,12 +104,13 @@ def _stretch(piece: Piece, every: RecordFit, test: Measurement) -> Stretch:
     return Stretch(piece.number, piece.start, piece.end, f, std, _levels(own), _left(own), _left(held))
 
 
-def _noise_at_peaks(fit: RecordFit) -> Array:
+def _noise_at_peaks(fit: RecordFit, about: int = 12, explained: int = 2) -> Array:
     """What noise there is about each mode, over the levels, (m,): that of the base is larger there than elsewhere.
 
     Each line counts by what it tells of the frequency of the mode: the power of the response's slope in it. The few
     lines at a peak may leave nothing beside poles and transients: what the base's noise makes there is told by lines
-    about it too, each by how much of that noise the sensors show; a model that errs errs at few of them.
+    `about` it too, of which a pole and transients have `explained` some, each by how much of that noise the sensors
+    show; a model that errs errs at few of them.
     """
     modes, parts = fit.parameters.modes, []
     for chunk in fit.model.chunks(fit.parameters):
@@ -125,9 +122,9 @@ def _noise_at_peaks(fit: RecordFit) -> Array:
     weight = np.array(slopes) / np.maximum(np.sum(slopes, axis=1, keepdims=True), np.finfo(float).tiny)
     of_base = []
     for omega in modes.omega:
-        near = np.argsort(np.abs(w - omega))[:_ABOUT]
+        near = np.argsort(np.abs(w - omega))[:about]
         typical = np.median(left[near] / passed[near]) / np.log(2)  # the mean of a chi-squared of two degrees
-        of_base.append(typical * near.size / max(near.size - _ABSORBED, 1))
+        of_base.append(typical * near.size / max(near.size - explained, 1))
     return np.maximum(weight @ left * fit.model.numbers / fit.freedom, np.array(of_base) * (weight @ passed))
 
 
@@ -146,12 +143,12 @@ def _levels(fit: RecordFit) -> Array:
     return np.asarray(np.sqrt(2 * power) * whole.sample_rate / whole.samples[0] * np.abs(modes.phi).max(axis=0))
 
 
-def _pieces(runs: list[RunInTime], shortest: float) -> list[Piece]:
-    """Stretches of the runs of a test, each of `shortest` seconds or longer."""
+def _pieces(runs: list[RunInTime], shortest: float, most: int = 12) -> list[Piece]:
+    """Stretches of the runs of a test, each of `shortest` seconds or longer, `most` of a run."""
     made = []
     for number, run in enumerate(runs):
         n = run.base.shape[1]
-        count = int(np.clip(n / run.rate / shortest, 1, _MOST))
+        count = int(np.clip(n / run.rate / shortest, 1, most))
         for i in range(count):
             part = slice(i * (n // count), (i + 1) * (n // count))
             records = Run(run.base[:, part], run.response[:, part], None)
@@ -159,11 +156,16 @@ def _pieces(runs: list[RunInTime], shortest: float) -> list[Piece]:
     return made
 
 
-def _as_test(test: Measurement, pieces: list[Piece], rate: float, noise: NoiseLevels) -> Measurement | None:
-    """Stretches as the runs of a test of whole records, within the band of theirs; None where that holds no line."""
+def _as_test(
+    test: Measurement, pieces: list[Piece], rate: float, noise: NoiseLevels, ends: int = 2
+) -> Measurement | None:
+    """Stretches as the runs of a test of whole records, within the band of theirs; None where that holds no line.
+
+    At the ends of the band some lines of theirs are left out: what lies beyond it reaches them.
+    """
     freq, base, response, _ = spectra.whole_record([piece.records for piece in pieces], rate)
     samples = tuple(piece.records.base.shape[1] for piece in pieces)
-    margin = _EDGE * rate / min(samples)
+    margin = ends * rate / min(samples)
     inside = (freq >= test.freq[0] + margin) & (freq <= test.freq[-1] - margin)
     if not np.any(inside):
         return None

@@ -17,23 +17,20 @@ import numpy as np
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.relocation import relocate
-from sysid.modal_analysis.residues import ROUND_OFF, Records, ResidueFit, SubsetFits, beyond_chance
+from sysid.modal_analysis.residues import Records, ResidueFit, SubsetFits
 from sysid.modal_analysis.response import gain_slopes, gains
 from sysid.nlp import one_thread
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import CANDIDATES, NEGLIGIBLE, ROUND_OFF, beyond_chance, round_off
 
 _SPARE = 6  # poles beyond those expected: without spare ones noise moves true poles
 _MANY = 100  # sensors: more of them are not taken to show a mode each unless the channels do
-_RELOCATIONS = 6
-_STEPS = 100
-_SETTLED = 1e-6  # fall of the squared error, relative, at which poles are polished: far below what noise moves it by
-_EXACT = 1e-13  # relative residual that no further step betters
 _FAR = 100.0  # times the error that may be, from which moving other poles too does not save a pole less
-_GUESS = 0.01  # damping ratio to begin with
+GUESS = 0.01  # damping ratio to begin with
 RAZOR = 0.02  # of the distance of lines; half the width of a peak that answers for one bad line, not for a mode
 DAMPED = 0.5  # a pole with more damping than this is no mode of a structure
 _EDGE = 10.0  # times their ends, how far outside the lines a mode may lie: it answers for all that are there
-_BESIDE = 0.1  # how far outside the lines a mode alone may lie, as a fraction of their ends
+BESIDE = 0.1  # how far outside the lines a mode alone may lie, as a fraction of their ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +111,7 @@ def _find(records: Records, progress: _Progress) -> Poles:
         n = records.freq.size
         raise InputError(f"{n} lines are too few to look for {count} poles: state natural_frequencies or add lines")
     lines = 2 * np.pi * records.freq
-    if not np.any((omega > (1 - _BESIDE) * lines[0]) & (omega < (1 + _BESIDE) * lines[-1])):
+    if not np.any((omega > (1 - BESIDE) * lines[0]) & (omega < (1 + BESIDE) * lines[-1])):
         raise InputError(
             "no mode stands out of the noise between these lines: state natural_frequencies or widen them, unless base "
             "and sensors are in different units (g and m/s²) or the spectra follow exp(-iwt) (take the conjugate)"
@@ -141,7 +138,7 @@ def poles_near(test: Measurement, omega: Array, window: float, *, monitor: Monit
     """
     records = Records(test)
     distinct = np.unique(omega)
-    found, ratios = _polish(records, distinct, np.full(distinct.size, _GUESS), _Progress(monitor, records))
+    found, ratios = _polish(records, distinct, np.full(distinct.size, GUESS), _Progress(monitor, records))
     off = np.abs(np.log(found / distinct))
     fit = records.fit(found, ratios)
     # By its place, or by what the fit would lose without it.
@@ -204,18 +201,21 @@ def _most_poles(records: Records) -> int:
     return min((int(np.count_nonzero(records.freq)) - 1) // 2, (len(records.data) - 1) // inputs)
 
 
-def _relocated(records: Records, count: int, progress: _Progress) -> tuple[Array, Array]:
-    """Poles that earn their place, from `count` that are spread over the lines, before they are polished."""
+def _relocated(records: Records, count: int, progress: _Progress, rounds: int = 6) -> tuple[Array, Array]:
+    """Poles that earn their place, from `count` that are spread over the lines, before they are polished.
+
+    Some `rounds` at most: each moves all of them.
+    """
     lines = 2 * np.pi * records.freq[records.freq > 0]
-    omega, ratios = np.geomspace(lines[0], lines[-1], count), np.full(count, _GUESS)
+    omega, ratios = np.geomspace(lines[0], lines[-1], count), np.full(count, GUESS)
     progress.tell()
     channels = records.principal(count)
     error = np.inf
-    for _ in range(_RELOCATIONS):
+    for _ in range(rounds):
         omega, ratios = relocate(records, channels, omega, ratios, progress.tell)
         before, error = error, records.fit(omega, ratios).squared_error
         progress.step(error)
-        if error < _EXACT**2 * records.size or error > 0.97 * before:
+        if error < round_off(len(records.data)) ** 2 * records.size or error > 0.97 * before:
             break
     # A pole of a structure with other than classical damping needs its velocity too, or more poles would replace it.
     return _prune(records, omega, ratios, progress, velocity=True)
@@ -317,7 +317,7 @@ def _in_order(records: Records, omega: Array, ratios: Array) -> Poles:
 
 def _least_gain(fit: ResidueFit) -> float:
     """What a pole must lower the squared error by to earn its place, in units of the noise's variance."""
-    return beyond_chance(fit.residues[0].size + 2)  # real parameters that come with a pole
+    return beyond_chance(fit.residues[0].size + 2, CANDIDATES)  # real parameters that come with a pole
 
 
 def _noise(records: Records, fit: ResidueFit, m: int) -> float:
@@ -341,30 +341,30 @@ def _prune(
         worth, squared_error = subsets.worth(kept)
         progress.step(squared_error)
         least = int(np.argmin(worth))
-        if worth[least] > beyond_chance(subsets.per_pole):
+        if worth[least] > beyond_chance(subsets.per_pole, CANDIDATES):
             break
         kept = np.delete(kept, least)
     return omega[kept], ratios[kept]
 
 
 def _polish(
-    records: Records, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False
+    records: Records, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False, steps: int = 100
 ) -> tuple[Array, Array]:
-    """Variable projection: Levenberg-Marquardt steps over (log w, log zeta), the residues eliminated."""
+    """Variable projection: Levenberg-Marquardt `steps` at most over (log w, log zeta), the residues eliminated."""
     m = omega.size
     p = np.log(np.concatenate([omega, ratios]))
     damping = 1e-3
     error, H, slope = _projected(records, p, velocity)
-    for _ in range(_STEPS):
+    for _ in range(steps):
         progress.step(error)
-        if error < _EXACT**2 * records.size:
+        if error < round_off(len(records.data)) ** 2 * records.size:
             break
         step = np.linalg.solve(H + damping * np.diag(np.diag(H)), slope)
         trial = p + np.clip(step, -0.5, 0.5)
         trial[m:] = np.clip(trial[m:], np.log(1e-6), np.log(0.99))
         lower, *model = _projected(records, trial, velocity)
         if lower < error:
-            done = error - lower < _SETTLED * error
+            done = error - lower < NEGLIGIBLE * error
             p, error, (H, slope), damping = trial, lower, model, max(damping / 10, 1e-12)
             if done:
                 break

@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from sysid.errors import InputError, finite_array, refuse
+from sysid.errors import InputError, finite_array, listed, refuse
 from sysid.models.unknowns import Variable, expression_of, refuse_complex, user_site, variable_of
 from sysid.structure.structure import Array
 
@@ -102,8 +102,7 @@ def written_in(expression: ca.MX, lead: str = "; it is") -> str:
     found = [v for v in map(variable_of, ca.symvar(expression)) if v is not None]
     if not found:
         return ""
-    named = ", ".join(f"{v.name!r} ({v.declared})" for v in found[:6])
-    return f"{lead} written in {named}" + (f" and {len(found) - 6} more" if len(found) > 6 else "")
+    return f"{lead} written in " + listed([f"{v.name!r} ({v.declared})" for v in found])
 
 
 def at_point(name: str, expression: ca.MX, share: float | None) -> Array:

@@ -16,14 +16,11 @@ from sysid.models.geometry import FACTOR_FLOOR, Geometry, check_sane, check_tota
 from sysid.models.model import FactoredMass, MassBlocks, Stated, Totals, Written, constant
 from sysid.models.unknowns import Unknown
 from sysid.structure.structure import Array, Structure, lowest_eigenvalue
+from sysid.structure.thresholds import ROUND_OFF
 from sysid.structure.triangular import lower_triangle, triangle_entries
 
-_ROW_EXPECTATION = 1.0  # the paper's c
-_ROUND_OFF = 1e-12  # of the largest entry of G: a matrix that was solved for has no exact zeros
-_NEWTON_STEPS = 20  # for the coupled scales of the rigid-body healing; quadratic from a good start
 
-
-def sampling_exponent(k: int, c: float = _ROW_EXPECTATION) -> float:
+def sampling_exponent(k: int, c: float = 1.0) -> float:
     """Exponent alpha of eq. 18 for a row of k entries (eq. 20, with its misprinted 2 mended to 4).
 
     It is the root of eq. 19, ``∫_{-1}^{1} y² dx = c / k``: every row of the Cholesky factor then has the
@@ -384,7 +381,7 @@ def _rigid_parts(geometry: Geometry) -> tuple[Array, bool]:
     rigid = np.vstack([geometry.rigid_body, np.eye(d)])
     shares = np.where(groups < 0, 1 / d, groups == np.arange(d)[:, None])
     across = np.where(groups != np.arange(d)[:, None], rigid.T, 0.0)
-    return shares * rigid.T[:, None], bool(np.abs(across).max() > _ROUND_OFF * np.abs(rigid).max())
+    return shares * rigid.T[:, None], bool(np.abs(across).max() > ROUND_OFF * np.abs(rigid).max())
 
 
 def _rigid_body_scales(factor: ca.SX, geometry: Geometry, totals: ca.SX | Array) -> list[ca.SX]:
@@ -411,6 +408,6 @@ def _rigid_body_scales(factor: ca.SX, geometry: Geometry, totals: ca.SX | Array)
     # One scale for all is where a mass with the right totals starts, and stays.
     uniform = ca.sqrt(d / sum(ca.sum1(ca.sum2(gram)) for gram in grams))
     given, log_scale = ca.horzcat(*grams), ca.repmat(ca.log(uniform), d, 1)
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(20):  # quadratic from a good start
         log_scale = step(log_scale, given)
     return ca.vertsplit(ca.if_else(error(log_scale, given) < 1e-10, ca.exp(log_scale), np.nan))

@@ -16,12 +16,10 @@ import numpy as np
 from sysid.errors import InputError
 from sysid.nlp import quiet_options
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import EXACT, NEGLIGIBLE, round_off
 from sysid.structure.triangular import triangle, triangle_entries
 
 SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")  # IPOPT's statuses that count as success
-_REACHED = 1e-8  # relative error of an eigenvalue up to which it counts as the target
-_LEAST = 1e-6  # diagonal entry of L_H over the highest target: a singular L_H has no slope towards a regular one
-_APART = 1e-12  # eigenvalues over the highest one, that count as apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,10 +89,10 @@ def by_ipopt(factor: Array, targets: Array, max_time: float | None = None) -> Re
     distance = SpectrumDistance(n, targets / scale)
     rows, columns = np.tril_indices(n)
     solver, start = Solver(distance, max_time), triangle_entries(factor) / scale
-    x, status = solver.minimum(start, np.where(rows == columns, _LEAST, -np.inf))
+    x, status = solver.minimum(start, np.where(rows == columns, NEGLIGIBLE, -np.inf))
     refined = triangle(x, n) * scale
     answer = Refinement(refined, spectrum_error(refined, targets), status in SOLVED, status)
-    return answer if answer.error < _REACHED else replace(answer, success=False, status=f"{status}, spectrum missed")
+    return answer if answer.error < EXACT else replace(answer, success=False, status=f"{status}, spectrum missed")
 
 
 class SpectrumDistance:
@@ -149,7 +147,7 @@ class SpectrumDistance:
         factor, lam, psi = self._decompose(x)
         slope, bend = self._bend * lam + self._slope, self._bend
         apart = lam[:, None] - lam
-        least = _APART * lam[-1]  # two that coincide and differ in their targets: a kink, very bent
+        least = round_off(lam.size) * lam[-1]  # two that coincide and differ in their targets: a kink, very bent
         apart = np.where(np.abs(apart) < least, np.copysign(least, apart), apart)
         divided = np.where(self._alike, bend, (slope[:, None] - slope) / apart)
         sides = psi[self.rows][:, :, None] * (factor.T @ psi)[self.columns][:, None, :]

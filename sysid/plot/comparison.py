@@ -13,14 +13,13 @@ from sysid.compare.comparison import Comparison
 from sysid.compare.method_result import MethodResult
 from sysid.plot.canvas import COLOURS, FAINT, INK, dress, new_figure, plain_log
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import EPSILON
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SHAPES = {"M": ("o", "full", 7), "K": ("s", "none", 9), "C": ("^", "full", 5)}  # marker, filling, size
 _TINTS = (*COLOURS[:4], INK, *COLOURS[4:], FAINT)  # a colour a method
-_LEAST = 1e-16  # what is below is drawn there
-_SOONEST = 1e-2  # s, likewise
 _HOLLOW: dict[str, Any] = {"marker": "o", "markerfacecolor": "white", "markersize": 5.5, "linestyle": "none"}
 
 
@@ -79,8 +78,8 @@ def _draw(ax: Any, result: MethodResult, colour: str) -> None:
 
 
 def _shown(points: ArrayLike) -> Array:
-    """Times and values (2, k) of points (k, 2), none below what a logarithmic axis shows."""
-    return np.maximum(np.reshape(points, (-1, 2)), [_SOONEST, _LEAST]).T
+    """Times and values (2, k) of points (k, 2), none below what a logarithmic axis shows: 10 ms, and round-off."""
+    return np.maximum(np.reshape(points, (-1, 2)), [1e-2, EPSILON]).T
 
 
 def _draw_errors(ax: Any, shown: Sequence[MethodResult]) -> None:

@@ -9,12 +9,12 @@ import numpy as np
 
 from sysid.jobs.spread import Spread
 from sysid.plot.canvas import COLOURS, FAINT, dress, new_figure
+from sysid.structure.thresholds import LIKELY
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _ROW, _MARGIN = 0.22, 1.3  # inches
-_LIKELY = 1.96  # standard deviations of a standard deviation, either way
 
 
 def draws(found: Sequence[Spread], count: int, title: str = "") -> Figure:
@@ -37,7 +37,7 @@ def draws(found: Sequence[Spread], count: int, title: str = "") -> Figure:
     ax = figure.subplots()
     rows = np.arange(len(shown))
     ratios = [spread.ratio for spread in shown]
-    chance = _LIKELY / np.sqrt(2 * count)
+    chance = LIKELY / np.sqrt(2 * count)
     ax.axvspan(1 - chance, 1 + chance, color=FAINT, alpha=0.25, linewidth=0, label=f"chance of {count} draws, 95 %")
     ax.axvline(1.0, color=FAINT, linewidth=0.9)
     ax.plot(ratios, rows, "o", color=COLOURS[0], markersize=5)

@@ -9,11 +9,10 @@ import numpy as np
 
 from sysid.jobs.minima import Minimum
 from sysid.plot.canvas import COLOURS, FAINT, dress, new_figure, plain_log
+from sysid.structure.thresholds import EPSILON
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-_LEAST = 1e-16  # what is below is drawn there
 
 
 def minima(found: Sequence[Minimum], title: str = "", *, goal: float | None = None) -> Figure:
@@ -37,7 +36,7 @@ def minima(found: Sequence[Minimum], title: str = "", *, goal: float | None = No
     ax = figure.subplots()
     begun = 0
     for i, minimum in enumerate(found):
-        left = np.maximum(sorted(result.residual for result in minimum.results), _LEAST)
+        left = np.maximum(sorted(result.residual for result in minimum.results), EPSILON)
         named = i < len(COLOURS)
         times = f"reached {len(left)} time{'s' if len(left) > 1 else ''}"
         label = f"{i + 1}: {minimum.residual:.4e}, {times}" if named else "others" if i == len(COLOURS) else None

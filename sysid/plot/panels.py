@@ -23,8 +23,8 @@ from sysid.plot.canvas import (
     positive,
 )  # fmt: skip
 from sysid.results.identification import Identification
-from sysid.results.summary import DEVIATES
 from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import LIKELY, ROUND_OFF
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,11 +37,7 @@ _OUTLIER: dict[str, Any] = {
     "color": INK, "linestyle": "none", "marker": "x", "markersize": 4, "markeredgewidth": 0.9, "label": "outlier",
     "zorder": 4,
 }  # fmt: skip
-_VISIBLE = 2e-3  # of the magnitude: a narrower band hides behind the curve
-_ROUND_OFF = 1e-10  # of the largest channel: below it a response is arithmetic, not motion
-_COLUMNS = 3
 _WIDTHS = {2: 11.2, 3: 12.0}  # of a figure, in, by the number of columns
-_DENSE = 800  # lines beyond which curves are drawn thinner
 
 
 class Channel(NamedTuple):
@@ -127,7 +123,7 @@ def _channel(
     """A channel of which `words` name the record, what it is for unit runs, and what it is for others."""
     name, per_base, spectrum = words
     title = f"{name}, {run_names(test)[run]}"
-    negligible = bool(np.abs(measured).max() <= _ROUND_OFF * largest)
+    negligible = bool(np.abs(measured).max() <= ROUND_OFF * largest)
     if test.has_unit_runs:
         ones = np.ones_like(measured)
         return Channel(
@@ -166,7 +162,7 @@ def panels(channels: Sequence[Channel], *, alone: float = 6.4) -> Figure:
     """Magnitude above phase, a column a channel, at most three columns; `alone` is the width of one, in."""
     from matplotlib.ticker import NullLocator
 
-    columns = min(len(channels), _COLUMNS)
+    columns = min(len(channels), 3)
     blocks = -(-len(channels) // columns)
     width, height = _WIDTHS.get(columns, alone), 3.5 * blocks + 0.25
     figure = new_figure(width, height, layout=None)  # as regular as these panels are, and three times as fast
@@ -202,7 +198,7 @@ def draw(axes: Any, channel: Channel) -> None:
     freq, measured, identified = channel.freq, channel.measured, channel.identified
     magnitude = axes[0]
     # Whole-record spectra have thousands of lines, which at full width would hide each other.
-    thin = {"linewidth": 0.7} if freq.size > _DENSE else {}
+    thin = {"linewidth": 0.7} if freq.size > 800 else {}
     shown, answered = MEASURED | thin, IDENTIFIED | thin
     size, modelled, error = np.abs(measured), np.abs(identified), np.abs(identified - measured)
     lines = broken(freq, channel.gaps)
@@ -211,8 +207,8 @@ def draw(axes: Any, channel: Channel) -> None:
     off = np.isin(freq, channel.outliers)
     if np.any(off):
         magnitude.plot(freq[off], positive(size[off]), **_OUTLIER)
-    reach = DEVIATES * channel.std
-    if np.any(reach > _VISIBLE * modelled):
+    reach = LIKELY * channel.std
+    if np.any(reach > 2e-3 * modelled):  # a narrower band hides behind the curve
         # The magnitude strays no further than the complex value; to zero, a logarithmic axis cannot follow.
         ends = np.maximum(modelled - reach, 1e-3 * modelled), modelled + reach
         magnitude.fill_between(lines, *(broken(end, channel.gaps) for end in ends), **_BAND)

@@ -49,9 +49,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_MAX_NUMBERS = 12  # modes up to which a MAC's cells carry their numbers
-_MAX_SHAPES = 6
-
 
 def transmissibility(
     identification: Identification,
@@ -231,7 +228,7 @@ def mac(identification: Identification, ax: Axes | None = None) -> Any:
     shown, ax = new_axes(ax, side + 0.6, side)
     image = ax.imshow(values, cmap="Blues", vmin=0, vmax=1, origin="lower")
     count_cells(ax, values.shape)
-    if max(values.shape) <= _MAX_NUMBERS:
+    if max(values.shape) <= 12:  # more cells have no room for numbers
         size = 8 if max(values.shape) <= 6 else 6
         for i, j in np.argwhere(values >= 0.005):
             colour = "white" if values[i, j] > 0.55 else INK
@@ -318,10 +315,11 @@ def mode_shapes(identification: Identification, modes: Sequence[int] | None = No
     """
     points, motion, sticks = stick_model(identification.measurement)
     structure = identification.structure
-    chosen = range(1, min(structure.n, _MAX_SHAPES) + 1) if modes is None else modes
+    columns = 6
+    chosen = range(1, min(structure.n, columns) + 1) if modes is None else modes
     if any(not 1 <= k <= structure.n for k in chosen):
         raise InputError(f"modes {list(chosen)}: this structure has modes 1 to {structure.n}")
-    columns = min(len(chosen), 6)
+    columns = min(len(chosen), columns)
     rows = -(-len(chosen) // columns)
     figure = new_figure(max(1.9 * columns, 3.0), 2.7 * rows)
     extent = np.ptp(points, axis=0)

@@ -7,16 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sysid.jobs.score import Compared, Move, Score
+from sysid.jobs.score import DECISIVE, Compared, Move, Score
 from sysid.plot.canvas import COLOURS, FAINT, dress, new_figure, plain_log, positive
+from sysid.structure.thresholds import LIKELY
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _ROW, _MARGIN = 0.28, 1.5  # inches
-_LIKELY = 1.96  # standard deviations either way that hold 95 % of a normal distribution
 _TICKS = (3.0, 10.0, 100.0, 1000.0, 1e4, 1e6)  # standard deviations; to the first the axis is linear
-_DECISIVE = 10.0  # difference of AIC or BIC
 
 
 def sweep(rows: Sequence[Compared], title: str = "", *, part: bool) -> Figure:
@@ -70,7 +69,7 @@ def _draw_moves(ax: Any, steps: Sequence[Sequence[Move]]) -> None:
         values = [step.deviations if known else 100 * step.relative for step in row]
         ax.plot(values, np.full(len(values), at), "|", color=COLOURS[0], markersize=9, label="" if at else "a quantity")
     if known:
-        ax.axvspan(-_LIKELY, _LIKELY, color=FAINT, alpha=0.25, linewidth=0, label="noise alone, 95 %")
+        ax.axvspan(-LIKELY, LIKELY, color=FAINT, alpha=0.25, linewidth=0, label="noise alone, 95 %")
         ax.set_xscale("symlog", linthresh=_TICKS[0], linscale=1.0)
         ticks = [tick for tick in _TICKS if tick <= 2 * max(sizes)]
         ax.set_xticks([*(-tick for tick in reversed(ticks)), 0, *ticks])
@@ -93,6 +92,6 @@ def _draw_criteria(ax: Any, scores: Sequence[Score]) -> None:
         if np.any(np.isfinite(values)):
             at = np.arange(len(values))
             ax.plot(values - np.nanmin(values), at, marker, color=colour, fillstyle="none", label=name.upper())
-    ax.axvspan(0, _DECISIVE, color=FAINT, alpha=0.25, linewidth=0, label="no decisive difference")
-    ax.set_xscale("symlog", linthresh=_DECISIVE)
-    dress(ax, "AIC and BIC above the least", f"difference, logarithmic beyond {_DECISIVE:g} [–]", "")
+    ax.axvspan(0, DECISIVE, color=FAINT, alpha=0.25, linewidth=0, label="no decisive difference")
+    ax.set_xscale("symlog", linthresh=DECISIVE)
+    dress(ax, "AIC and BIC above the least", f"difference, logarithmic beyond {DECISIVE:g} [–]", "")

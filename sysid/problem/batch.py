@@ -12,8 +12,6 @@ from sysid.structure.structure import Array
 
 CHUNK = 64  # candidates a call by lines: fixed, so that the bits do not depend on the swarm's size
 _IN_STEP = 128  # candidates that go in step: with more, the virtual machine's memory leaves a processor's cache
-_GAP = 8  # numbers between the entries of a chunk, which a power of two would put in the same lines of a cache
-_MOST_INSTRUCTIONS = 50_000  # of a function that is replayed, which takes some ten microseconds each to set up
 
 
 class Batch:
@@ -65,7 +63,8 @@ class Batch:
         if not self._in_step:
             memory = [np.zeros((self._chunk, *matrix.shape[::-1])) for matrix in matrices]
             return [array.swapaxes(1, 2) for array in memory], memory
-        places = [np.zeros((*matrix.shape, self._chunk + _GAP))[..., : self._chunk] for matrix in matrices]
+        # A power of two between entries would put them in the same lines of a cache.
+        places = [np.zeros((*matrix.shape, self._chunk + 8))[..., : self._chunk] for matrix in matrices]
         entries = [place[i, j] for place, matrix in zip(places, matrices, strict=True)
                    for i, j in zip(*matrix.get_triplet(), strict=True)]  # fmt: skip
         return [np.moveaxis(place, -1, 0) for place in places], entries
@@ -130,7 +129,8 @@ def _without_zeros(function: ca.Function) -> ca.Function:
 
 def _is_scalar(function: ca.Function) -> bool:
     """Whether a function is all scalar operations, and not too many to be replayed."""
-    if not function.is_a("SXFunction") or function.n_instructions() > _MOST_INSTRUCTIONS:
+    # Each instruction takes some ten microseconds to set up.
+    if not function.is_a("SXFunction") or function.n_instructions() > 50_000:
         return False
     return all(function.instruction_id(k) != ca.OP_CALL for k in range(function.n_instructions()))
 

@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.structure.structure import Array
-
-ROUND_OFF = 1e-9  # of the largest entry
+from sysid.structure.thresholds import ROUND_OFF
 
 
 class BatchModes(NamedTuple):

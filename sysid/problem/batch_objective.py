@@ -9,10 +9,11 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.response import columns, residual, weights_of_test
 from sysid.models.spectrum import replace_spectrum
 from sysid.problem.batch import Batch, expanded, in_chunks
-from sysid.problem.batch_modes import ROUND_OFF, batch_modes, least
+from sysid.problem.batch_modes import batch_modes, least
 from sysid.problem.batch_response import by_states
 from sysid.problem.matrices import Matrices
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import ROUND_OFF
 
 _THREADS = 2  # of CasADi's own; the bits do not depend on it
 

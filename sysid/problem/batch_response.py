@@ -12,10 +12,7 @@ import contextlib
 import numpy as np
 
 from sysid.structure.structure import Array, ComplexArray
-
-# Condition of the eigenvectors of a state matrix, its rows scaled, that costs their response nine digits. Structures
-# have some hundreds; it rises without bound where eigenvectors fall together, as at critical damping.
-_ILL_CONDITIONED = 1e6
+from sysid.structure.thresholds import EPSILON, ROUND_OFF
 
 
 def by_states(M: Array, K: Array, C: Array, B: Array, freq: Array, shift: float) -> ComplexArray:
@@ -38,7 +35,9 @@ def by_states(M: Array, K: Array, C: Array, B: Array, freq: Array, shift: float)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         poles = s**2 / (s - lam[:, :, None])
         response = np.einsum("pik,pkd,pkf->pidf", vectors[:, :n], strength, poles, optimize=True)
-        ill = ~(_squared_condition(vectors, inverse) < _ILL_CONDITIONED**2)
+        # Structures have some hundreds; the condition of the eigenvectors of a state matrix, its rows scaled, rises
+        # without bound where they fall together, as at critical damping.
+        ill = ~(_squared_condition(vectors, inverse) < (ROUND_OFF / EPSILON) ** 2)
     if np.any(ill):
         response[ill] = by_lines(M[ill], K[ill], C[ill], B[ill], freq, shift)
     return response

@@ -43,7 +43,7 @@ def decode(tree: Tree, symbols: Sequence[ca.MX]) -> list[ca.MX]:
             reader.add(function)
         made = reader.matrices(last, symbols)
         # Its memory: what one evaluation keeps at a time.
-        limited("memory of one evaluation", ca.Function("whole", list(symbols), made).sz_w(), operations.MOST_MEMORY)
+        limited("memory of one evaluation", ca.Function("whole", list(symbols), made).sz_w(), operations.LIMITS.memory)
     except InputError:
         raise
     except Exception as error:  # whatever CasADi and Python say of wrong numbers
@@ -89,7 +89,7 @@ class _Reader:
     def count_operation(self, name: str) -> None:
         self.place = f" at operation {self._operations} ({name!r})"
         self._operations += 1
-        limited("the number of operations", self._operations, operations.MOST_OPERATIONS)
+        limited("the number of operations", self._operations, operations.LIMITS.operations)
 
     def count_pattern(self, pattern: ca.Sparsity) -> None:
         """Patterns are kept once by CasADi, however many matrices have them."""
@@ -97,7 +97,7 @@ class _Reader:
         if key not in self._known:
             self._known.add(key)
             self._stored += pattern.nnz()
-            limited("the size of all patterns", self._stored, operations.MOST_STORED)
+            limited("the size of all patterns", self._stored, operations.LIMITS.stored)
 
     def pattern(self, number: int) -> ca.Sparsity:
         return _at(self.patterns, number)
@@ -144,7 +144,7 @@ class _Reader:
             else:
                 values.append(_entrywise(ca.SX, operation, arguments))
             at += 1 + count
-        limited("the size of a matrix", len(values), operations.MOST_ENTRIES)
+        limited("the size of a matrix", len(values), operations.LIMITS.entries)
         outputs, ends = _whole(tree["outputs"]), list[ca.SX]()
         at = 1 + outputs[0]
         for pattern in map(self.pattern, outputs[1:at]):
@@ -158,8 +158,8 @@ class _Reader:
         one = _at(self.called, number)
         f = one.function
         sizes = [f.numel_in(i) for i in range(f.n_in())] + [f.numel_out(i) for i in range(f.n_out())]
-        limited("the size of a matrix", max(sizes, default=1) * count, operations.MOST_ENTRIES)
-        limited("the work of one evaluation", one.work * count, operations.MOST_WORK)
+        limited("the size of a matrix", max(sizes, default=1) * count, operations.LIMITS.entries)
+        limited("the work of one evaluation", one.work * count, operations.LIMITS.work)
         return _Called(f.map(count), one.work * count)
 
     def _switch(self, tree: Tree, name: str) -> _Called:
@@ -171,14 +171,11 @@ class _Reader:
         operations.check_library("interpolant", tree["kind"], tuple(operations.INTERPOLANTS))
         sizes, numbers = _whole(tree["code"]), _numbers(tree)
         ends = np.cumsum([0, *sizes])
-        if not sizes or min(sizes) < 2 or len(sizes) > _MOST_AXES or len(numbers) < ends[-1]:
+        if not sizes or min(sizes) < 2 or len(sizes) > operations.LIMITS.axes or len(numbers) < ends[-1]:
             raise ValueError("no grid of an interpolant")
         grid = [numbers[a:b] for a, b in pairwise(ends)]
         function = ca.interpolant(name, tree["kind"], grid, numbers[ends[-1] :])
         return _Called(function, 4.0 ** len(sizes) * function.nnz_out())
-
-
-_MOST_AXES = 10
 
 
 class _Matrices:
@@ -201,14 +198,14 @@ class _Matrices:
             arguments = [_at(self.values, number) for number in numbers]
             made = self._made(name, arguments, parameters)
             for value in made:
-                limited("the size of a matrix", value.numel(), operations.MOST_ENTRIES)
+                limited("the size of a matrix", value.numel(), operations.LIMITS.entries)
                 self._reader.count_pattern(value.sparsity())
                 self._add_work(value.nnz())
             self.values += made
 
     def _add_work(self, work: float) -> None:
         self.work += work
-        limited("the work of one evaluation", self.work, operations.MOST_WORK)
+        limited("the work of one evaluation", self.work, operations.LIMITS.work)
 
     def _made(self, name: str, arguments: list[ca.MX], parameters: list[int]) -> Sequence[ca.MX]:
         if name in operations.WITHOUT_PARAMETERS:
@@ -259,7 +256,7 @@ class _Matrices:
         elif name.startswith("solve"):
             n = max(rows)
             entries, work = n**2, n**2 * (n + max(columns[0], 1))
-        limited("the size of a matrix", entries, operations.MOST_ENTRIES)
+        limited("the size of a matrix", entries, operations.LIMITS.entries)
         self._add_work(work)
 
     def _const(self, arguments: list[ca.MX], parameters: list[int]) -> list[ca.MX]:
@@ -314,8 +311,8 @@ def _patterns(numbers: list[int]) -> Iterator[ca.Sparsity]:
         rows, columns, dense = numbers[at : at + 3]
         if rows < 0 or columns < 0:
             raise ValueError("a matrix has a negative size")
-        limited("the size of a matrix", rows * columns, operations.MOST_ENTRIES)
-        limited("the size of a matrix", max(rows, columns), operations.MOST_ENTRIES)
+        limited("the size of a matrix", rows * columns, operations.LIMITS.entries)
+        limited("the size of a matrix", max(rows, columns), operations.LIMITS.entries)
         at += 3
         if dense:
             yield ca.Sparsity.dense(rows, columns)
@@ -361,7 +358,7 @@ def _places(parameters: Sequence[int]) -> list[int]:
     if parameters[0] == 0:
         return list(parameters[1:])
     first, step, count = _exactly(3, parameters[1:])
-    limited("the size of a matrix", count, operations.MOST_ENTRIES)
+    limited("the size of a matrix", count, operations.LIMITS.entries)
     return [first + step * i for i in range(count)]
 
 

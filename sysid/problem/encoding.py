@@ -30,7 +30,6 @@ from sysid.structure.structure import Array
 
 _NAMES = {operations.casadi_number(name): name for name in (*operations.NAMES, "input", "output")}
 _CLASSES = {kind: name for name, kind in operations.INTERPOLANTS.items()}
-_TRIED = 200  # points at which interpolants are compared
 
 
 class NotStorableError(InputError):
@@ -341,12 +340,12 @@ def _add_interpolant(writer: _Writer, function: ca.Function, inputs: Sequence[ca
     writer.add(kind, inputs, [], [len(axis) for axis in grid], numbers)
 
 
-def _same_values(one: ca.Function, other: ca.Function, grid: Sequence[Sequence[float]]) -> bool:
-    """Whether two interpolants are the same to the bit all over their grid, and beyond its ends."""
-    share = np.random.default_rng(0).uniform(-0.1, 1.1, (len(grid), _TRIED))
+def _same_values(one: ca.Function, other: ca.Function, grid: Sequence[Sequence[float]], points: int = 200) -> bool:
+    """Whether two interpolants are the same to the bit at points all over their grid, and beyond its ends."""
+    share = np.random.default_rng(0).uniform(-0.1, 1.1, (len(grid), points))
     ends = np.array([(axis[0], axis[-1]) for axis in grid])
-    points = ca.DM(ends[:, :1] + share * np.diff(ends, axis=1))
-    return one.size_in(0) == other.size_in(0) and _same_bits(one.map(_TRIED)(points), other.map(_TRIED)(points))
+    at = ca.DM(ends[:, :1] + share * np.diff(ends, axis=1))
+    return one.size_in(0) == other.size_in(0) and _same_bits(one.map(points)(at), other.map(points)(at))
 
 
 def _add_sx(writer: _Writer, function: ca.Function, inputs: Sequence[ca.Sparsity]) -> None:

@@ -13,15 +13,13 @@ from sysid.problem.formulation import Formulation
 from sysid.structure.structure import Array
 from sysid.swarm import sampling
 
-_POINTS = 128  # of the search space, looked at
-_STARTS = 8  # of the search for a point that satisfies the constraints
 HELD = 1e-6  # of a constraint's scale: what counts as satisfied
 LOOSE = 1e-2  # likewise for the swarm, which meets no equality exactly
 
 
-def points_of(formulation: Formulation) -> Array:
+def points_of(formulation: Formulation, count: int = 128) -> Array:
     """The guess, and points spread over the search space, (count, size)."""
-    return np.array([formulation.guess, *latin_hypercube(formulation, _POINTS - 1, np.random.default_rng(0))])
+    return np.array([formulation.guess, *latin_hypercube(formulation, count - 1, np.random.default_rng(0))])
 
 
 def latin_hypercube(formulation: Formulation, count: int, rng: np.random.Generator) -> list[Array]:
@@ -81,7 +79,7 @@ def check_constraints(formulation: Formulation, points: Array, site: str) -> Non
     broken = np.array([constraints.violation(x) for x in points]) / scale
     order = np.argsort(np.sum(np.where(np.isfinite(broken), broken, np.inf) ** 2, axis=1))
     best, at = np.full(scale.size, np.inf), np.inf
-    for x in points[order[:_STARTS]]:
+    for x in points[order[:8]]:  # those that break them least
         left = _nearest(formulation, x, scale)
         if left.max(initial=0.0) < at:
             best, at = left, left.max(initial=0.0)

@@ -6,6 +6,7 @@ A file can ask for these alone. Files name them in words; CasADi's numbers for t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,12 +15,35 @@ import numpy as np
 
 from sysid.errors import InputError
 
-# Limits of what a file can ask for: many times what a problem of some hundred degrees of freedom takes.
-MOST_OPERATIONS = 3_000_000
-MOST_ENTRIES = 10_000_000  # of one matrix, zeros too: 80 MB
-MOST_STORED = 30_000_000  # of all patterns of matrices together
-MOST_WORK = 3_000_000_000  # multiplications in one evaluation: some seconds
-MOST_MEMORY = 50_000_000  # numbers that one evaluation keeps at a time: 400 MB
+
+@dataclass(frozen=True)
+class FileLimits:
+    """The most that a file can ask for: many times what a problem of some hundred degrees of freedom takes.
+
+    Attributes
+    ----------
+    operations : int
+    axes : int
+        Of the grid of an interpolant.
+    entries : int
+        Of one matrix, zeros too: 80 MB.
+    stored : int
+        Of all patterns of matrices together.
+    work : int
+        Multiplications in one evaluation: some seconds.
+    memory : int
+        Numbers that one evaluation keeps at a time: 400 MB.
+    """
+
+    operations: int = 3_000_000
+    axes: int = 10
+    entries: int = 10_000_000
+    stored: int = 30_000_000
+    work: int = 3_000_000_000
+    memory: int = 50_000_000
+
+
+LIMITS = FileLimits()
 
 # Each entry by itself, with the names of CasADi's constants.
 UNARY = (

@@ -19,8 +19,7 @@ from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.response import weights_of_test
 from sysid.problem.matrices import Matrices
 from sysid.structure.structure import Array, ComplexArray, Structure
-
-_SAME = 1e-9  # relative distance of squared frequencies that count as one
+from sysid.structure.thresholds import ROUND_OFF
 
 
 class Slopes(NamedTuple):
@@ -77,7 +76,7 @@ def slopes_of(matrices: Matrices, x: Array, test: Measurement, omega: Array | No
     by_stiffness = np.einsum("il,ijc,jk->lkc", phi, dK, phi, optimize=True)
     moved = by_stiffness - lam[:, None] * by_mass  # column k of phi_l' (dK - lam_k dM) phi_k
     gap = lam[None] - lam[:, None]
-    apart = np.abs(gap) > _SAME * lam.max()
+    apart = np.abs(gap) > ROUND_OFF * lam.max()
     # Modes of one frequency, and each mode itself, stay normalised to unit mass.
     turn = np.where(apart[:, :, None], moved / np.where(apart, gap, 1.0)[:, :, None], -by_mass / 2)
     k = np.arange(n)

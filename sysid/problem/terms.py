@@ -28,8 +28,7 @@ from sysid.problem.given import MATRICES, as_models, geometry_of
 from sysid.problem.matrices import Blocks, Matrices, blocks_of
 from sysid.problem.slopes import Rows, Slopes, rows_of_test, slopes_of, stacked_rows
 from sysid.structure.structure import Array
-
-_FAR = 4.0  # standard deviations from a stated value, beyond which something is wrong
+from sysid.structure.thresholds import most_deviations
 
 
 class ModeSymbols(NamedTuple):
@@ -233,7 +232,7 @@ class ExpressionTerm:
                 numbers={name: float(off)},
             )
             for name, off in zip(self.labels, self.numbers(x) if self.labels else (), strict=True)
-            if abs(off) > _FAR
+            if abs(off) > most_deviations(len(self.labels))
         ]
 
 

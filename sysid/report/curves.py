@@ -20,13 +20,10 @@ from sysid.report.html import text
 from sysid.report.noise_level import NoiseLevel
 from sysid.report.still import Channel, curve_sheet, degrees, mode_still, room_of_modes
 from sysid.results.identification import Identification
-from sysid.results.summary import DEVIATES
 from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import LIKELY
 
 _FINE, _ROUGH = 1e-3, 1e-2  # relative steps of sizes, and of differences, which are noise
-_DEGREES = 0.5  # steps of phases
-_GROUPS = 5  # of seven bits, at most in a number
-_SHOWN = 0.18  # of the structure's size: the largest motion of a mode shape
 
 
 @cache
@@ -93,7 +90,8 @@ def _modes(it: Identification, points: Array, motion: Array) -> dict[str, Any]:
     shapes = []
     for k in range(it.structure.n):
         shape = np.vstack([np.zeros((1, 3)), motion @ it.structure.mode_shapes[:, k]])
-        shape *= _SHOWN * np.ptp(points, axis=0).max() / np.abs(shape).max()
+        # The largest motion is a share of the structure's size.
+        shape *= 0.18 * np.ptp(points, axis=0).max() / np.abs(shape).max()
         shapes.append(shape.round(6).tolist())
     names = [
         f"mode {k}: {f:.4g} Hz" + f", damping {100 * ratio:.3g} %" * bool(np.isfinite(ratio))
@@ -155,7 +153,7 @@ def _told(runs: list[Channel]) -> dict[str, Any]:
     first = runs[0]
     found: dict[str, Any] = {"name": first.name, "words": first.words, "unit": first.unit}
     for name in ("measured", "identified"):
-        found[name] = [[_sizes(np.abs(own)), _steps(degrees(own) / _DEGREES)] for own in _of(runs, name)]
+        found[name] = [[_sizes(np.abs(own)), _steps(2 * degrees(own))] for own in _of(runs, name)]
     found["left"] = [_sizes(np.abs(run.measured[0] - run.identified[0]), _ROUGH) for run in runs]
     for name in ("noise", "band", "recorded"):
         if getattr(first, name) is not None:
@@ -185,7 +183,7 @@ def _half_widths(std: Array, test: Measurement) -> NDArray[Any]:
 
     Errors of different directions may add up whatever their phases: the sum is never too small.
     """
-    return np.asarray(DEVIATES * np.einsum("cdf,rdf->rcf", std, np.abs(test.base)))
+    return np.asarray(LIKELY * np.einsum("cdf,rdf->rcf", std, np.abs(test.base)))
 
 
 def _recorded(it: Identification, test: Measurement) -> Measurement | None:
@@ -225,7 +223,7 @@ def _steps(values: Array) -> str:
     """
     moves = np.diff(np.rint(values).astype(np.int64), prepend=0)
     whole = np.where(moves < 0, -2 * moves - 1, 2 * moves)
-    groups = whole[:, None] >> (7 * np.arange(_GROUPS))
+    groups = whole[:, None] >> (7 * np.arange(5))  # 32 bits and more
     follows = groups[:, 1:] > 0
     bytes_ = (groups & 127).astype(np.uint8)
     bytes_[:, :-1] |= np.where(follows, 128, 0).astype(np.uint8)

@@ -12,15 +12,13 @@ import numpy as np
 
 from sysid.errors import shown_plainly
 from sysid.plot.canvas import to_png
+from sysid.structure.thresholds import ROUND_OFF
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from sysid.structure.structure import Array
 
-ROUND_OFF = 1e-12
-_WIDE = 11  # columns beyond which a table is printed smaller
-_BLOCK = 10  # columns of a matrix that stand beside each other, on paper too
 
 STYLE = """
 :root { color-scheme: light dark; --paper: #fff; --ink: #1f2430; --soft: #5a6472; --line: #dde2e7; --fill: #f1f4f6;
@@ -176,7 +174,7 @@ def table(
 
     Cells are plain, or a `Cell`; `label` stands in grey before the caption.
     """
-    kind = _class("words" if words else "wide" if len(head) > _WIDE else "")
+    kind = _class("words" if words else "wide" if len(head) > 11 else "")  # of many columns: printed smaller
     names = "".join(f'<th scope="col">{text(cell)}</th>' for cell in head)
     body = "".join("<tr>" + "".join(f"<td>{_cell(cell)}</td>" for cell in row) + "</tr>" for row in rows)
     top = f"<thead><tr>{names}</tr></thead>" if any(head) else ""
@@ -204,7 +202,8 @@ def matrix(
         for line, under in zip(values, below or no_lines(values.shape), strict=True)
     ]
     parts, count = [], len(columns)
-    for block in np.array_split(np.arange(count), max(1, -(-count // _BLOCK))):
+    # Ten columns stand beside each other, on paper too.
+    for block in np.array_split(np.arange(count), max(1, -(-count // 10))):
         first, last = block[0], block[-1] + 1
         cells = [[name, *line[first:last]] for name, line in zip(rows, lines, strict=True)]
         which = f"; columns {first + 1} to {last} of {count}" * (block.size < count)

@@ -12,10 +12,10 @@ from sysid.report.html import matrix, no_lines, number, paragraph, picture
 from sysid.results.identification import Identification
 from sysid.results.summary import half_width
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import ROUND_OFF
 
 ONE_OF_MANY, CHOSEN = "one of many", "as the modal masses were chosen"
 _NO_FIT = "of a model that does not fit"
-SAME = 1e-9  # of a value: a smaller difference is round-off
 _ENDS_ELSEWHERE = " How far the entries may go is in the result's mass_interval and stiffness_interval."
 _ENDS_BELOW = (
     " Below an entry of M_SS and K_SS: from where to where it goes in the models that explain the data and hold what "
@@ -105,7 +105,7 @@ def stated(it: Identification) -> Array:
 def _ranges(ends: Array, otherwise: Lines) -> Lines:
     """Lines below the entries of a matrix: both ends of their range (2, n, n), or `otherwise` where they are one."""
     lines = [list(line) for line in otherwise]
-    for i, j in np.argwhere(~np.isclose(ends[0], ends[1], rtol=SAME, atol=0.0)):
+    for i, j in np.argwhere(~np.isclose(ends[0], ends[1], rtol=ROUND_OFF, atol=0.0)):
         least, most = (number(end, 3) for end in ends[:, i, j])
         bounded = np.isfinite(ends[:, i, j])
         told = {

@@ -11,15 +11,15 @@ from sysid.report.matrices import stated
 from sysid.report.noise_level import NoiseLevel, share_of_all_noise
 from sysid.results.deck_masses import deck_masses
 from sysid.results.identification import Identification
-from sysid.results.summary import DEVIATES, JUDGEMENTS, counted, fitted_in_words, half_width, next_steps, verdict
+from sysid.results.summary import FIRST, JUDGEMENTS, counted, fitted_in_words, half_width, next_steps, verdict
 from sysid.results.unknowns_table import rows_of
+from sysid.structure.thresholds import LIKELY
 
 _COLOUR = {"determined": "good", "one of many": "warn", "doubtful": "warn", "no fit": "bad"}
 _HOLDS = (
     "frequencies, damping ratios and responses to base motion hold whichever of these models is taken; mass, stiffness "
     "and damping matrices are one choice"
 )
-_MOST_AGAINST = 2  # sentences in the opening; all of them follow
 _MOST_MODES, _MOST_UNKNOWNS = 4, 5  # whose figures stand in the opening; all of them follow
 
 
@@ -62,7 +62,7 @@ def _subject(it: Identification) -> str:
 
 def _reasons(it: Identification) -> str:
     """HTML of what speaks against the answer most."""
-    return bullets(sentence(str(one)) for one in it.contradictions[:_MOST_AGAINST])
+    return bullets(sentence(str(one)) for one in it.contradictions[:FIRST])
 
 
 def _steps(it: Identification) -> list[str]:
@@ -145,8 +145,8 @@ def rounded(value: float, std: float, digits: int = 4) -> tuple[str, str]:
     width = half_width(std, value)
     if width in ("open", "0"):
         return number(value, digits), width
-    places = int(np.clip(1 - np.floor(np.log10(DEVIATES * std)), 0, 9))
-    return f"{value + 0.0:.{places}f}", f"{DEVIATES * std:.{places}f}"
+    places = int(np.clip(1 - np.floor(np.log10(LIKELY * std)), 0, 9))
+    return f"{value + 0.0:.{places}f}", f"{LIKELY * std:.{places}f}"
 
 
 def _with_interval(it: Identification, value: float, std: float, unit: str) -> str:

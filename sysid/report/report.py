@@ -26,7 +26,7 @@ from sysid.report.html import (
     table,
     text,
 )
-from sysid.report.matrices import CHOSEN, ONE_OF_MANY, SAME, Lines, half_widths, matrices, plain, stated
+from sysid.report.matrices import CHOSEN, ONE_OF_MANY, Lines, half_widths, matrices, plain, stated
 from sysid.report.noise_level import NoiseLevel, noise_level, share_of_noise
 from sysid.report.opening import opening, rounded, trust
 from sysid.results.gain_table import gains_of_sensors
@@ -49,6 +49,7 @@ from sysid.results.summary import (
 from sysid.results.unknowns_table import rows_of, stated_values
 from sysid.results.version import __version__
 from sysid.structure.structure import Array, ComplexArray, Structure
+from sysid.structure.thresholds import ROUND_OFF
 
 FILE_NAME = "report.html"
 _SUFFIXES = (".html", ".htm")
@@ -71,8 +72,6 @@ _WIDENED = (
     "themselves; what the phases leave of these stands below."
 )
 _NORMALISED = "~ normalised, one of many"
-_FALL = 0.9  # of the objective that a search began with, below which its curve is drawn
-_MOST_OUTLIERS = 10  # that are told one by one
 
 
 class Scores(NamedTuple):
@@ -306,7 +305,7 @@ def _gains(it: Identification) -> str:
 def _outliers(it: Identification) -> str:
     """The numbers that are farthest from the fit."""
     found = it.outliers
-    rows = [(o.test, o.run, o.channel, number(o.freq, 6), number(o.size, 3)) for o in found[:_MOST_OUTLIERS]]
+    rows = [(o.test, o.run, o.channel, number(o.freq, 6), number(o.size, 3)) for o in found[:10]]
     more = len(found) - len(rows)
     all_of_them = "summary.json and Identification.outliers hold all of them"
     caption = "Numbers of the records that are farthest from the fit; test 1 is the problem's own."
@@ -409,7 +408,7 @@ def _convergence(it: Identification) -> str:
 def _falls(it: Identification) -> bool:
     """Whether there is a search to be seen: a swarm's, or one whose objective fell by more than a tenth."""
     local = it.history.local_curve
-    return bool(it.history.swarm_curve.size or (local.size > 1 and local[-1] < _FALL * local[0]))
+    return bool(it.history.swarm_curve.size or (local.size > 1 and local[-1] < 0.9 * local[0]))
 
 
 def _mac(it: Identification) -> str:
@@ -483,4 +482,4 @@ def _difference(value: float, reference: float) -> str:
     if not reference:
         return "–"
     share = value / reference - 1
-    return f"{100 * share:+.2g}" if abs(share) > SAME else "0"
+    return f"{100 * share:+.2g}" if abs(share) > ROUND_OFF else "0"

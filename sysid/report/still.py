@@ -14,13 +14,9 @@ from sysid.structure.structure import Array, ComplexArray
 _WIDTH, _LEFT, _RIGHT = 360, 48, 8  # pixels
 _TITLE, _HEIGHTS, _BELOW = 18, (86, 46, 68), 30  # pixels above each panel, of each, and below the last
 _APART, _ABOVE = 34.0, 16.0  # pixels between ticks at least: of frequencies, and of an axis upwards
-_MARGIN = 1.3  # of the largest and smallest value of a logarithmic axis
-_WIDE = 8.0  # last over first line from which frequencies stand on a logarithmic axis
 _LOWEST, _HIGHEST = -270.0, 90.0  # degrees: the step of a resonance, 0 to -180, is not cut
 _TITLED = ' class="title"'
 _FINE = 2  # steps of a curve in a pixel
-_COLUMN = 4  # such steps, in which of a difference, which is noise, the least and the largest are drawn
-_ROUNDS = 3  # in which a curve loses points that it does not need: it then stays within so many steps of all of them
 _AT_REST = "rest"
 _MODE_WIDTH, _MODE_HEIGHT = 210, 260  # pixels
 _ANGLE = np.deg2rad(30.0)  # about the vertical, from which a mode shape is seen
@@ -89,7 +85,8 @@ def curve_sheet(name: str, freq: Array, channel: Channel, run: int, gaps: ArrayL
 
     No curve is joined at `gaps`, lines before which others were left out.
     """
-    across = _Axis(freq[0], freq[-1], _LEFT, _WIDTH - _RIGHT, bool(freq[0] > 0 and freq[-1] > _WIDE * freq[0]))
+    logarithmic = bool(freq[0] > 0 and freq[-1] > 8 * freq[0])
+    across = _Axis(freq[0], freq[-1], _LEFT, _WIDTH - _RIGHT, logarithmic)
     drawn, bottom = [], 0
     for panel, height in zip(_panels(channel, run), _HEIGHTS, strict=True):
         top = bottom + _TITLE
@@ -202,7 +199,8 @@ def _drawn(panel: _Panel, across: _Axis, up: _Axis, x: Array, gaps: ArrayLike) -
     paths = {}
     for kind, values in panel.curves.items():
         seen = np.where((values < up.low) | (values > up.high), np.nan, values) if kind == "band" else values
-        paths[kind] = _path(x, up(seen), jump, gaps, _COLUMN if kind == "left" else 1)
+        # Of a difference, which is noise, the least and the largest in four steps are drawn.
+        paths[kind] = _path(x, up(seen), jump, gaps, 4 if kind == "left" else 1)
     drawn = "".join(f'<path class="{kind}" d="{path}"/>' for kind, path in paths.items())
     parts.append(f'<g transform="scale({1 / _FINE:g})">{drawn}</g>')
     if not any(paths.values()):
@@ -211,7 +209,7 @@ def _drawn(panel: _Panel, across: _Axis, up: _Axis, x: Array, gaps: ArrayLike) -
     return "".join(parts)
 
 
-def _upward(panel: _Panel, bottom: float, top: float) -> _Axis:
+def _upward(panel: _Panel, bottom: float, top: float, margin: float = 1.3) -> _Axis:
     """Axis of phases; or the logarithmic one of all curves but intervals, which may leave it."""
     if not panel.decades:
         return _Axis(_LOWEST, _HIGHEST, bottom, top, False)
@@ -219,7 +217,7 @@ def _upward(panel: _Panel, bottom: float, top: float) -> _Axis:
     values = values[np.isfinite(values) & (values > 0)]
     high = float(values.max(initial=0.0)) or 1.0
     low = max(float(values.min(initial=high)), high / 10.0**panel.decades)
-    return _Axis(low / _MARGIN, high * _MARGIN, bottom, top, True)
+    return _Axis(low / margin, high * margin, bottom, top, True)
 
 
 def _log_ticks(low: float, high: float, room: float) -> list[float]:
@@ -247,8 +245,11 @@ def _segment(x: Array, y: Array, column: int) -> str:
     return f"M{at[0, 0]} {at[0, 1]}" + ("l" + " ".join(map(str, steps)).replace(" -", "-") if steps else "h1")
 
 
-def _thinned(x: NDArray[np.intp], y: NDArray[np.intp]) -> NDArray[np.intp]:
-    """The lowest and the highest point over each place, (points, 2), without those on the line of their neighbours."""
+def _thinned(x: NDArray[np.intp], y: NDArray[np.intp], rounds: int = 3) -> NDArray[np.intp]:
+    """The lowest and the highest point over each place, (points, 2), without those on the line of their neighbours.
+
+    In each round a curve loses points that it does not need, and stays within a step of where it was.
+    """
     starts = np.flatnonzero(np.concatenate([[True], x[1:] != x[:-1]]))
     low, high = np.minimum.reduceat(y, starts), np.maximum.reduceat(y, starts)
     rising = np.abs(y[starts] - low) <= np.abs(y[starts] - high)
@@ -260,7 +261,7 @@ def _thinned(x: NDArray[np.intp], y: NDArray[np.intp]) -> NDArray[np.intp]:
         return at
     level = (at[1:-1, 1] == at[:-2, 1]) & (at[1:-1, 1] == at[2:, 1])
     at = at[np.concatenate([[True], ~level, [True]])]
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         at = at[_bends(at)]
     return at
 

@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.results.answer import Answer
-
-_EXACT = 1e-8  # deviation of a gain: round-off
+from sysid.structure.thresholds import EXACT
 
 
 class SensorGain(NamedTuple):
@@ -29,7 +28,7 @@ def gains_of_sensors(it: Answer) -> tuple[SensorGain, ...]:
         return ()
     found, names = it.gains, it.measurement.sensor_names
     shown = np.isfinite(found.error)
-    worth = np.where(np.nan_to_num(found.std) > _EXACT, it.gain_worth, np.nan)  # without noise M has no deviation
+    worth = np.where(np.nan_to_num(found.std) > EXACT, it.gain_worth, np.nan)  # without noise M has no deviation
     return tuple(
         SensorGain(names[i], 1 + float(found.error[i]), float(found.std[i]), float(worth[i]))
         for i in np.flatnonzero(shown)

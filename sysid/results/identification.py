@@ -27,6 +27,7 @@ from sysid.results.summary import summary
 from sysid.results.version import __version__
 from sysid.search.strategy import History
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import NEGLIGIBLE
 
 # Fields that are texts, numbers or arrays themselves.
 _PLAIN = (
@@ -371,14 +372,13 @@ def _check_unknowns(result: Identification, x: Array, problem: Problem) -> None:
     made = problem.structure(x)
     for name in ("mass", "stiffness"):
         one, other = getattr(made, name), getattr(result.structure, name)
-        if one.shape != other.shape or not np.allclose(one, other, rtol=_SAME, atol=_SAME * np.abs(other).max()):
+        if one.shape != other.shape or not np.allclose(
+            one, other, rtol=NEGLIGIBLE, atol=NEGLIGIBLE * np.abs(other).max()
+        ):
             raise InputError(
                 f"the unknowns of the result stand for another {name} matrix in the problem that was given: it is not "
                 "made as it was for the identification"
             )
-
-
-_SAME = 1e-6  # relative, of matrices made of the same numbers in another version of a program
 
 
 def _in_words(unknowns: list[tuple[str, tuple[int, ...]]]) -> str:

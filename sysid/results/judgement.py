@@ -15,7 +15,6 @@ from sysid.assessment.determination import BY_RANK, determine
 from sysid.assessment.sensitivity import blocks_of
 from sysid.assessment.uncertainty import LARGE
 from sysid.finding import Finding, Severity, cautions, contradicting, is_fit, weightiest_first
-from sysid.nlp import EXACT
 from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.results.identification import Identification
@@ -23,6 +22,7 @@ from sysid.search.deadline import TimeIsOver, within
 from sysid.search.other_answers import with_other_answers
 from sysid.search.session import Session
 from sysid.search.strategy import Outcome
+from sysid.structure.thresholds import EXACT
 
 _KNOWN = 0.1  # of the root of two diagonal entries; an entry with a larger standard deviation is not known
 _NOT_JUDGED = Finding(

@@ -15,7 +15,6 @@ from sysid.results.storage import missing_folders, remove_empty
 
 FILE_NAME = ".sysid.lock"
 
-_TRIES = 100  # each fails only where a folder is taken away in the microseconds between two calls
 
 if sys.platform == "win32":
     import msvcrt
@@ -110,8 +109,11 @@ def _acquired(lock: Path) -> tuple[int, Path]:
         os.close(file)
 
 
-def _opened(lock: Path, tries: int = _TRIES) -> int:
-    """The file, made with its folders; again where the process before takes its folders away in between."""
+def _opened(lock: Path, tries: int = 100) -> int:
+    """The file, made with its folders; again where the process before takes its folders away in between.
+
+    A try fails only where that happens in the microseconds between two calls.
+    """
     try:
         lock.parent.mkdir(parents=True, exist_ok=True)
         return os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)

@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sysid.assessment.checks.model_error import LEVEL
 from sysid.results.answer import Answer
-
-_ALIKE = 1.2  # ratio of the levels of runs, up to which they are told as one
 
 
 class ChannelNoise(NamedTuple):
@@ -27,7 +26,7 @@ class ChannelNoise(NamedTuple):
     def told(self) -> str:
         """The level; of runs that differ, the least and the most."""
         least, most = self.runs
-        return f"{self.level:.3g}" if most < _ALIKE * least else f"{least:.3g} to {most:.3g}"
+        return f"{self.level:.3g}" if most < LEVEL * least else f"{least:.3g} to {most:.3g}"
 
 
 NOISE_COLUMNS = "of a sample", "unit", "at the lines, % of rms"

@@ -10,7 +10,7 @@ import numpy as np
 from sysid.assessment.information import Index
 from sysid.assessment.statements import Adjusted, Statements, adjust, made, statements_of
 from sysid.assessment.uncertainty import moves_by_records
-from sysid.errors import InputError
+from sysid.errors import InputError, listed
 from sysid.finding import Finding, Severity
 from sysid.modal_analysis.modal_estimate import theta_of
 from sysid.modal_analysis.modal_fit import Modes
@@ -22,11 +22,7 @@ from sysid.search.modal_scaling import to_stated_totals
 from sysid.search.session import Session
 from sysid.search.strategy import Outcome
 from sysid.structure.structure import Array, Structure
-
-_CHANCE = 1e-3  # that statements that are right are called contradictory
-_ALIKE = 2.0  # deviations, by which statements that explain it as well as the best are told
-_TOLD = 4
-_ROUND_OFF = 1e-8  # of the records: what counts as noise where there is none
+from sysid.structure.thresholds import EXACT, FALSE_ALARM, LIKELY
 
 
 def with_stated_masses(problem: Prepared, end: Outcome, session: Session) -> Outcome:
@@ -47,7 +43,7 @@ def _adjusted(problem: Prepared, end: Outcome) -> Outcome:
     assert stated is not None
     modes, index, _, normals, *_ = moves_by_records(problem, first)
     if problem.measurement.response_std is None:
-        least = _ROUND_OFF / max(problem.measurement.residual(first), np.finfo(float).eps)
+        least = EXACT / max(problem.measurement.residual(first), np.finfo(float).eps)
         normals = normals * max(1.0, least)
     theta = theta_of(modes, first.rigid_body_mass, index)
     best = adjust(problem, stated, theta, index, normals)
@@ -100,14 +96,14 @@ def _contradictions(
 ) -> Iterator[Finding]:
     """Whether statements and records disagree beyond chance, and which statements explain it."""
     numbers = _numbers(problem, index)
-    if _chance(best, numbers) >= _CHANCE:
+    if _chance(best, numbers) >= FALSE_ALARM:
         return
     chance = _chance(best, numbers)
     told = f"the stated masses cannot all be met together with the records (chance {chance:.1g})"
     explained: list[tuple[float, tuple[float, float], str]] = []
     for row in range(stated.values.size):
         without = adjust(problem, stated.without(row), theta, index, normals)
-        if without.freedom == best.freedom or _chance(without, numbers) < _CHANCE:
+        if without.freedom == best.freedom or _chance(without, numbers) < FALSE_ALARM:
             continue
         value = (made(problem, stated, without.theta, index)[0] * stated.scale)[row]
         off = np.sqrt(max(best.misfit - without.misfit, 0.0))
@@ -115,9 +111,9 @@ def _contradictions(
         explained.append((off, both, _in_words(problem, stated, row, value, off)))
     if explained:
         explained.sort(key=lambda one: -one[0])
-        near = [words for off, _, words in explained if off**2 > explained[0][0] ** 2 - _ALIKE**2]
+        near = [words for off, _, words in explained if off**2 > explained[0][0] ** 2 - LIKELY**2]
         yield Finding(
-            "stated masses", Severity.CONTRADICTS, f"{told}: {'; or '.join(near[:_TOLD])}",
+            "stated masses", Severity.CONTRADICTS, f"{told}: {listed(near, '; or ')}",
             numbers={
                 "chance": chance, "deviations": float(explained[0][0]), "stated": explained[0][1][0],
                 "by the records": explained[0][1][1], "statements": float(len(near)),
@@ -127,7 +123,7 @@ def _contradictions(
     factor = _common_factor(problem, stated, theta, index, normals)
     if factor > 0:
         scaled = stated._replace(values=factor * stated.values, std=factor * stated.std)
-        if _chance(adjust(problem, scaled, theta, index, normals), numbers) >= _CHANCE:
+        if _chance(adjust(problem, scaled, theta, index, normals), numbers) >= FALSE_ALARM:
             yield Finding(
                 "stated masses", Severity.CONTRADICTS, f"{told}; all of them would be met {factor:.4g} times as large",
                 "is a unit or the force's gain wrong?", numbers={"chance": chance, "factor": factor},

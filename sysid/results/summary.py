@@ -18,6 +18,7 @@ from sysid.results.noise_table import NOISE_COLUMNS, noise_of_channels
 from sysid.results.phases import COLUMNS, seconds_in_words
 from sysid.results.unknowns_table import MANY, rows_of, stated_values
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import LIKELY, ROUND_OFF, UNEXPLAINED
 
 _SCALE = (
     "one number in kg is enough: state the mass of what the sensors stand for (sysid run test.h5 --lumped --mass KG; "
@@ -34,11 +35,8 @@ JUDGEMENTS: dict[Judgement, str] = {  # as screen, page and files write them
     "determined": "Determined", "one of many": "One of many", "doubtful": "Doubtful", "no fit": "No fit",
 }  # fmt: skip
 _AS_STATED = ". No force was measured: they are as right as the mass or stiffness that is stated"
-DEVIATES = 1.96  # standard deviations on either side of 95 % of a normal law
-_ROUND_OFF = 1e-10  # of a value: what is no noise of an instrument
-_WIDTH = 120
-_FIRST = 2  # sentences beside the verdict; the others follow the tables
-_NEAR = 0.5  # relative residual, up to which a fit may be called near enough
+WIDTH = 120  # letters in a line
+FIRST = 2  # sentences beside the verdict; the others follow the tables
 _FORCE = 3.0  # times the residual of the accelerations, from which that of the force is the larger concern
 _MISSING = 0.5  # % of the rigid-body mass
 _OF_A_FIT = ", which holds for a model that fits: this one does not"
@@ -51,7 +49,7 @@ def summary(it: Answer) -> str:
     told = it.undetermined or it.closed_by
     lines = [
         f"{JUDGEMENTS[it.judgement]}: {verdict(it)}." + ("" if it.success else f" Fitted: {fitted_in_words(it)}."),
-        *(f"  - {sentence}" for sentence in told[:_FIRST]),
+        *(f"  - {sentence}" for sentence in told[:FIRST]),
         *(f"  > {step}" for step in next_steps(it)),
         "",
         *_mode_table(it),
@@ -78,7 +76,7 @@ def summary(it: Answer) -> str:
     for i, test in enumerate(it.validation, start=1):
         lines.append(f"test {i} of {len(records.validation)} never fitted: relative residual {test.residual(s):.3e}")
     lines += [*_noise(it), *_gains(it)]
-    further_told = [f"  - {sentence}" for sentence in told[_FIRST:]]
+    further_told = [f"  - {sentence}" for sentence in told[FIRST:]]
     if it.judgement == "one of many" and not it.hurried and it.open_masses:
         further_told += _ranges(it)
     lines += ["besides:"] * bool(further_told) + further_told
@@ -193,7 +191,7 @@ def _towards_a_fit(it: Answer) -> list[str]:
             "'sysid read RUN.csv --out one.h5', then 'sysid run one.h5'" + one_by_one * (it.measurement.n_runs > 1)
         ]
     # A goal is of accelerations: it takes no force for explained.
-    if it.residual > _NEAR or (it.force_residual or 0.0) > _FORCE * it.residual:
+    if it.residual > UNEXPLAINED or (it.force_residual or 0.0) > _FORCE * it.residual:
         return steps
     enough = f"{np.ceil(100 * it.residual) / 100:.2g}"
     return [*steps, f"if a fit as near as this one will do, say so: goal={enough} (sysid run test.h5 --goal {enough})"]
@@ -203,7 +201,7 @@ def half_width(std: float, value: float) -> str:
     """Half of the 95 % interval about `value`; "open" where it is not known, 0 where it is round-off."""
     if not np.isfinite(std):
         return "open"
-    return f"{DEVIATES * std:.2g}" if std > _ROUND_OFF * abs(value) else "0"
+    return f"{LIKELY * std:.2g}" if std > ROUND_OFF * abs(value) else "0"
 
 
 def known_half_width(std: float, value: float, sign: str) -> str:
@@ -257,7 +255,7 @@ def _mode_table(it: Answer) -> list[str]:
     mass_widths = [["+-", *(half_width(value, 100.0) for value in own), ""] for own in std.T]
     both = [column for pair in zip(masses, mass_widths, strict=True) for column in pair]
     lines = _aligned(columns + both)
-    if not np.any(np.isfinite(std)) or len(lines[0]) > _WIDTH:
+    if not np.any(np.isfinite(std)) or len(lines[0]) > WIDTH:
         lines = _aligned(columns + masses)
     notes = [] if u is None else ["+- half of the 95 % interval" + _OF_A_FIT * (not it.success)]
     notes.append("mass: effective, in % of the rigid-body mass")
@@ -339,7 +337,7 @@ def _ranges(it: Answer) -> Iterator[str]:
 
 def _folded(line: str) -> str:
     """Fold a long line at the width of a terminal, the rest indented."""
-    if len(line) <= _WIDTH:
+    if len(line) <= WIDTH:
         return line
     indent = "    " if line.startswith(("  - ", "  > ")) else "  "
-    return textwrap.fill(line, _WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+    return textwrap.fill(line, WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import EPSILON
 
-_STEP = 1e-6  # of a unit, for differences: what they lose only slows the last steps where the least is zero
 _FIRST, _LEAST, _MOST = 1e-2, 1e-12, 1e8  # damping of a step, in squared singular values
 _LESS, _MORE = 0.2, 5.0  # its change after a step that was taken, and after one that was not
 
@@ -73,7 +73,8 @@ class LeastSquares:
     def _slopes(self, x: Array, r: Array) -> Array:
         """Jacobians (count, m, p) by differences towards the middle of the box."""
         count, p = x.shape
-        h = np.where(x > 0.5, -_STEP, _STEP)
+        step = EPSILON**0.5  # of a unit; what differences lose only slows the last steps where the least is zero
+        h = np.where(x > 0.5, -step, step)
         moved = x[:, None, :] + h[:, :, None] * np.eye(p)
         values = self.rows(moved.reshape(count * p, p)).reshape(count, p, -1)
         J = (values - r[:, None, :]) / h[:, :, None]

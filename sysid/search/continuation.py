@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from sysid.errors import InputError, SolverError, whole_number
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.nlp import EXACT
 from sysid.problem.feasibility import latin_hypercube
 from sysid.problem.prepared import Prepared
 from sysid.problem.terms import TestTerm
@@ -22,21 +21,15 @@ from sysid.search.local import Coordinates, LocalResult
 from sysid.search.session import Session, Stop
 from sysid.search.strategy import History, Outcome, Phase, as_unknowns, search_note
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import EXACT, OTHER_ANSWER, SAME_ANSWER, UNEXPLAINED, beyond_chance
 
 SHIFTS = (0.5, 0.2, 0.08, 0.03, 0.01)  # of the geometric mean of the natural frequencies
-_DRAWN = 20  # points looked at for each that is a structure
-_STEPS = 60  # iterations of a fit on the way
+DRAWN = 20  # points looked at for each that is a structure
 _NEAR = 1.1  # times the misfit of free residues at the poles of the data: what a structure may leave
-_CHANCE = 1e-3  # that noise alone makes the misfit of one of two answers so much larger
-_APART = 0.01  # of an unknown's size, from which two solutions are two ...
-_TOGETHER = 1e-3  # ... and up to which two ways are one
-_AGREE = 3  # starts that end at one structure, from which it is no local minimum among others ..
-_OF_SORTS = 0.5  # .. where its relative residual is not larger: there peaks are not those of the records
 _LEFT_OUT = (
     "{} of {} starts were left out for want of time: whether they end at another structure that explains the data as "
     "well is not known"
 )
-_SMALL = 1e-3  # of its range: the least size of an unknown that may be zero
 
 
 @dataclass(frozen=True)
@@ -115,9 +108,9 @@ class _Smoother:
 
 def smooth_fit(
     problem: Prepared, x: Array, steps: list[tuple[TestTerm, ...]], session: Session,
-    monitor: Callable[[int, float], object],
+    monitor: Callable[[int, float], object], most: int = 60,
 ) -> LocalResult | None:  # fmt: skip
-    """Fit every step from where the one before ended, while there is time; None without steps."""
+    """Fit every step from where the one before ended, while there is time, `most` iterations each; None without any."""
     curve: list[float] = []
     answer = None
     for step in steps:
@@ -126,7 +119,7 @@ def smooth_fit(
         taken = len(curve)
         listener = lambda i, objective, taken=taken: monitor(taken + i, objective)  # noqa: E731
         try:
-            new = local.solve_or_read(problem, x, session, max_iterations=_STEPS, monitor=listener, smoothed=step)
+            new = local.solve_or_read(problem, x, session, max_iterations=most, monitor=listener, smoothed=step)
         except InputError:  # modes are needed, and this is no structure
             break
         curve += new.curve.tolist()
@@ -214,7 +207,7 @@ class _Run:
         try:
             way = smooth_fit(problem, x, self.steps, session, session.reporter("continuation"))
             if way is not None and way.stopped is None:
-                if any(apart(problem, way.x, other) < _TOGETHER for other in self.ways):
+                if any(apart(problem, way.x, other) < SAME_ANSWER for other in self.ways):
                     session.log("another start comes the same way")
                     self.joined += 1
                     return
@@ -248,9 +241,9 @@ class _Run:
         return float(np.sqrt(max(objective**2 - own, 0.0))) <= max(_NEAR * self.smoother.floor, EXACT)
 
     def _unanimous(self, best: LocalResult) -> bool:
-        """Whether all of several starts ended at the best end, at a fit of sorts: only a wrong model leaves more."""
-        same = [apart(self.problem, best.x, answer.x) < _APART for _, answer in self.ends]
-        return all(same) and len(same) + self.joined >= _AGREE and self.problem.residual(best.x) < _OF_SORTS
+        """Whether three starts or more all ended at the best end, at a fit of sorts: only a wrong model leaves more."""
+        same = [apart(self.problem, best.x, answer.x) < OTHER_ANSWER for _, answer in self.ends]
+        return all(same) and len(same) + self.joined >= 3 and self.problem.residual(best.x) < UNEXPLAINED
 
 
 def _best(problem: Prepared, ends: list[tuple[float, LocalResult]]) -> tuple[float, LocalResult, Structure]:
@@ -275,7 +268,7 @@ def random_starts(problem: Prepared, count: int, random: np.random.SeedSequence)
     """Points spread over the search space as the swarm's are, of those that stand for a structure."""
     if count < 1:
         return []
-    points = latin_hypercube(problem.formulation, _DRAWN * count, np.random.default_rng(random))
+    points = latin_hypercube(problem.formulation, DRAWN * count, np.random.default_rng(random))
     return list(islice((x for x in points if _is_structure(problem, x)), count))
 
 
@@ -301,19 +294,17 @@ def _alternatives(problem: Prepared, x: Array, objective: float, ends: list[tupl
     found: list[Array] = []
     for other, answer in ends:
         good = np.isfinite(other) and other <= most
-        if good and all(apart(problem, answer.x, known) > _APART for known in (x, *found)):
+        if good and all(apart(problem, answer.x, known) > OTHER_ANSWER for known in (x, *found)):
             found.append(answer.x)
     return found
 
 
 def as_good_as(problem: Prepared, objective: float) -> float:
     """The most that another answer leaves where it explains the data as well as one that leaves `objective`."""
-    from scipy.special import gammainccinv
-
     tests = [term.test for term in problem.formulation.tests]
     numbers = 2 * sum(test.numbers for test in tests)
     size = problem.n_variables
-    return max(objective * float(np.sqrt(1 + 2 * gammainccinv(size / 2, _CHANCE) / max(numbers - size, 1))), EXACT)
+    return max(objective * float(np.sqrt(1 + beyond_chance(size) / max(numbers - size, 1))), EXACT)
 
 
 def apart(problem: Prepared, x: Array, other: Array) -> float:
@@ -322,5 +313,5 @@ def apart(problem: Prepared, x: Array, other: Array) -> float:
     An unknown that may be zero has at least a thousandth of its range as its size.
     """
     width = np.where(problem.upper > problem.lower, problem.upper - problem.lower, 1.0)
-    least = np.where(problem.lower * problem.upper > 0, np.finfo(float).tiny, _SMALL * width)
+    least = np.where(problem.lower * problem.upper > 0, np.finfo(float).tiny, SAME_ANSWER * width)
     return float(np.max(np.abs(x - other) / np.minimum(width, np.maximum(np.abs(other), least))))

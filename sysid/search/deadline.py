@@ -9,9 +9,6 @@ import time
 from collections.abc import Iterator
 from typing import NoReturn
 
-_AGAIN = 1.0  # s between further attempts, as compiled code and __del__ lose an exception that strikes inside them
-_AT_ONCE = 1e-6  # s; zero would set no alarm
-
 
 class TimeIsOver(BaseException):  # no library's ``except Exception`` must take it
     """The time is over."""
@@ -31,7 +28,8 @@ def within(seconds: float | None) -> Iterator[None]:
         yield
         return
     begun, before = time.perf_counter(), signal.signal(signal.SIGALRM, _raise)
-    other, again = signal.setitimer(signal.ITIMER_REAL, seconds, _AGAIN)
+    # Again every second: compiled code and __del__ lose an exception that strikes inside them.
+    other, again = signal.setitimer(signal.ITIMER_REAL, seconds, 1.0)
     try:
         yield
     except Exception as error:  # compiled code makes another one of ours
@@ -44,7 +42,8 @@ def within(seconds: float | None) -> Iterator[None]:
         finally:  # the alarm may have come just before
             signal.signal(signal.SIGALRM, before)
             if other > 0:
-                signal.setitimer(signal.ITIMER_REAL, max(other - (time.perf_counter() - begun), _AT_ONCE), again)
+                # Zero would set no alarm.
+                signal.setitimer(signal.ITIMER_REAL, max(other - (time.perf_counter() - begun), 1e-6), again)
 
 
 def _raise(number: int, frame: object) -> NoReturn:

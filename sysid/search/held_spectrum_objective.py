@@ -25,14 +25,10 @@ from sysid.problem.batch_modes import BatchModes, batch_modes
 from sysid.problem.prepared import Prepared
 from sysid.problem.terms import Term, TestTerm
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import NEGLIGIBLE
 
 _MOST = 65_000  # coordinates a chunk: fewer take more calls of NumPy for each, and more leave a processor's cache
 _STEP = 16  # the last chunk is filled up to a multiple of it, because NumPy sums a candidate alone in another order
-_MOST_THREADS = 8
-# Relative squared error below which lines are summed: the difference of large numbers that stands for it has lost
-# half of its digits at 1e-12.
-_LEAST = 1e-6
-_DRAWS = 254  # candidates beside the corners of the box, from which the range of damping ratios is read
 _NARROWEST_RANGE, _WIDEST_RANGE = 1.01, 1e4  # of a ratio, upper over lower: the series of a wider one would be long
 
 
@@ -84,7 +80,7 @@ class HeldSpectrumObjective:
         threads: int | None = None,
     ) -> None:
         test = term.test
-        batch, workers = Batch(expansion), threads or min(os.cpu_count() or 1, _MOST_THREADS)
+        batch, workers = Batch(expansion), threads or min(os.cpu_count() or 1, 8)
         self.expansion, self._share = expansion, term.weight**2
         self._series = GainSeries(test.freq, np.sort(spectrum), *_range_of_ratios(problem, batch), shift=term.shift)
         recovery = term.matrices.recovery, np.eye(problem.geometry.d)
@@ -96,8 +92,9 @@ class HeldSpectrumObjective:
             summed = SummedRecord(record, test.base, *weights, seen, self._series, static=bool(self._records))
             self._records.append((summed, scale**2))
             sizes.append((weights_of(record, std)[1], scale))
-        # A record that weighs more than the accelerations loses its digits earlier.
-        self._least = _LEAST * max(1.0, *(weighed**2 / scale**2 for weighed, scale in sizes))
+        # Where less than this is left, lines are summed: the difference of large numbers that stands for the square has
+        # lost half of its digits there. A record that weighs more than the accelerations loses its digits earlier.
+        self._least = NEGLIGIBLE * max(1.0, *(weighed**2 / scale**2 for weighed, scale in sizes))
         self._pool = ThreadPoolExecutor(workers)
         self._expansions: SimpleQueue[Batch] = SimpleQueue()  # one a thread
         for _ in range(workers):
@@ -157,13 +154,13 @@ def chunk_ends(count: int, size: int) -> list[int]:
     return [*ends, _STEP * math.ceil(count / _STEP)]
 
 
-def _range_of_ratios(problem: Prepared, expansion: Batch) -> tuple[Array, Array]:
-    """Least and largest damping ratios (n,) that a swarm's box gives, of its ends and of draws between them.
+def _range_of_ratios(problem: Prepared, expansion: Batch, count: int = 256) -> tuple[Array, Array]:
+    """Least and largest damping ratios (n,) of so many candidates: the ends of a swarm's box and draws between them.
 
     Exact where ratios rise with every coordinate; elsewhere candidates beyond are left to the sum over lines.
     """
     lower, upper = problem.formulation.box
-    draws = np.random.default_rng(0).uniform(lower, upper, (_DRAWS, problem.n_variables))
+    draws = np.random.default_rng(0).uniform(lower, upper, (count - 2, problem.n_variables))
     ratios = expansion(np.vstack([lower, upper, draws]))[0][..., 0]
     lowest, highest = np.fmin.reduce(ratios), np.fmax.reduce(ratios)
     highest = np.where(highest > 0, highest, 1.0)  # no ratio of a structure: all goes by lines

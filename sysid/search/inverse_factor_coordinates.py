@@ -26,19 +26,17 @@ from sysid.modal_analysis.modal_error import ModalError
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.response import records_of, weights_of_test
 from sysid.models.spectrum import SOLVED
-from sysid.nlp import EXACT, OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, not_begun
+from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, not_begun
 from sysid.problem.prepared import Prepared
 from sysid.search.modal_coordinates import End, modes_of, spectrum_near, unknowns_of
 from sysid.search.modal_scaling import stated_totals
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import EXACT, NEGLIGIBLE, ROUND_OFF
 from sysid.structure.triangular import lower_triangle, triangle_entries
 
 _ROUND = 150  # iterations, after which Psi_0 is taken anew
 _LIMIT = "Maximum_Iterations_Exceeded"  # IPOPT's word for a round that was not long enough
-_LEAST_TIME = 1.0  # s, that a round is worth beginning with
 _SECONDS, _POWER = 0.2, 4.7  # of a processor, that the graphs of 10 modes take, and how that grows with the modes
-_LEAST_MASS = 1e-6  # of the rigid-body mass; the least base mass that a fit starts with
-_FLAT = 1e-10  # of the largest curvature; along less the objective does not change
 
 
 def fit_in_inverse_factor(problem: Prepared, x: Array, monitor: IterationMonitor, max_iterations: int) -> End:
@@ -58,7 +56,7 @@ def fit_in_inverse_factor(problem: Prepared, x: Array, monitor: IterationMonitor
         # A status belongs to the point that it was given for; that of the first round tells why where none is better.
         if end.objective <= best.objective or best is first:
             best = end
-        over = monitor.stopped is not None or monitor.left < _LEAST_TIME
+        over = monitor.stopped is not None or monitor.left < 1.0  # s, that a round is worth beginning with
         if end.status != _LIMIT or best.objective <= EXACT or not falls or over:
             break
     if best.objective > first.objective:
@@ -96,7 +94,7 @@ def coordinates_of(structure: Structure) -> Coordinates:
     P = L.T @ G + R @ M_S0
     size = np.sqrt(np.diag(structure.rigid_body_mass))
     lam, vectors = np.linalg.eigh((structure.rigid_body_mass - P.T @ P) / np.outer(size, size))
-    root = np.linalg.cholesky((vectors * np.maximum(lam, _LEAST_MASS)) @ vectors.T)
+    root = np.linalg.cholesky((vectors * np.maximum(lam, NEGLIGIBLE)) @ vectors.T)
     first, _, last = np.linalg.svd(L.T @ structure.normal_modes)
     return Coordinates(np.tril(R), P, size[:, None] * root, first @ last)
 
@@ -296,5 +294,5 @@ def half_newton_decrement(z: NonlinearProgram, derivatives: dict[str, ca.Functio
     along = scipy.linalg.null_space(A) if len(A) else np.eye(g.size)
     curvature, vectors = np.linalg.eigh(along.T @ H @ along)
     slopes, size = vectors.T @ (along.T @ g), np.abs(curvature)
-    bent = size > _FLAT * size.max()
+    bent = size > ROUND_OFF * size.max()
     return float(value.item()), float(np.sum(slopes[bent] ** 2 / size[bent]) / 2)

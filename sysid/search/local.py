@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from sysid.models.spectrum import SOLVED
-from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram, ended_in_words
+from sysid.nlp import IterationMonitor, NonlinearProgram, ended_in_words
 from sysid.problem.prepared import Prepared
 from sysid.problem.terms import TestTerm
 from sysid.search.inverse_factor_coordinates import fit_in_inverse_factor
@@ -19,6 +19,7 @@ from sysid.search.modal_coordinates import End, fit_in_modes
 from sysid.search.scaled_unknowns import add_unknowns
 from sysid.search.session import Session
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import EXACT
 
 Coordinates = Literal["modal", "cholesky", "entries"]
 

@@ -24,9 +24,9 @@ from sysid.problem.terms import ModeSymbols, Term, TestTerm
 from sysid.search.modal_coordinates import End, frequencies
 from sysid.search.scaled_unknowns import add_unknowns
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import NEGLIGIBLE
 from sysid.structure.triangular import lower_entries
 
-_NEARLY_EXACT = 1e-6  # an objective so small tells of records without noise
 _JACOBIAN = 6e-7  # s of a processor, that the graph of a Jacobian takes for a row and the square of an unknown
 _SECONDS, _POWER = 2.4, 4.6  # likewise, that those of 12 modes take, and how that grows with the modes
 
@@ -62,7 +62,7 @@ def fit_in_matrices(
     best, status = z.minimize(ca.sumsqr(rows), monitor, max_iterations, derivatives, acceptable=1e2 if modal else 1e3)
     symbols = (modes.shapes, modes.omega) if modes else (ca.MX(0, 1), ca.MX(0, 1))
     end = ca.Function("end", [z.z], [unknowns, *symbols, ca.norm_2(rows)])
-    if not smoothed and status in SOLVED and 0 < float(end(best)[-1]) < _NEARLY_EXACT and not monitor.is_over:
+    if not smoothed and status in SOLVED and 0 < float(end(best)[-1]) < NEGLIGIBLE and not monitor.is_over:
         best = z.finished(rows, best)
     ended, shapes, omega, objective = (np.asarray(value) for value in end(best))
     ended = ended.ravel()

@@ -21,12 +21,12 @@ from sysid.finding import Finding
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import residual_of
 from sysid.modal_analysis.modal_fit import ModalFit, Modes
-from sysid.modal_analysis.residues import ROUND_OFF, beyond_chance, line_correlation
+from sysid.modal_analysis.residues import line_correlation
 from sysid.modal_analysis.response import columns, gains, stacked, weighted_error, weights_of
 from sysid.modal_analysis.vector_fitting import Poles, find_poles, poles_near
 from sysid.models.spectrum import SOLVED
 from sysid.models.stiffness import FREQUENCY_WINDOW
-from sysid.nlp import EXACT, IterationMonitor, ended_in_words
+from sysid.nlp import IterationMonitor, ended_in_words
 from sysid.problem.matrices import assemble
 from sysid.problem.prepared import Prepared
 from sysid.search.local import LocalResult, fit_apart, solve
@@ -36,8 +36,8 @@ from sysid.search.mode_fit import Integers, ModeFit, ended, held_to_totals
 from sysid.search.session import Session, Stop
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, search_note
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import CANDIDATES, EXACT, NEGLIGIBLE, ROUND_OFF, beyond_chance
 
-_DEPENDENT = 1e-6  # of the largest singular value of the shapes: below, sensors move alike in all modes
 _PLAIN = "; noise of the base and transients look like modes in plain spectra: take whole records (estimator='records')"
 
 
@@ -124,7 +124,7 @@ def degrees_of_freedom(problem: Prepared, modes: Modes, stated: Sequence[str | i
     rank = _independent_sensors(problem.measurement, modes)
     if stated is not None:
         sensors = _by_name(problem.measurement, stated)
-        if sensors.size > m or np.linalg.svd(shapes[sensors], compute_uv=False)[-1] < _DEPENDENT:
+        if sensors.size > m or np.linalg.svd(shapes[sensors], compute_uv=False)[-1] < NEGLIGIBLE:
             raise InputError(
                 f"{sensors.size} sensors are stated as degrees of freedom, but the {m} modes do not tell them apart "
                 f"(at most {rank} move independently)"
@@ -154,10 +154,10 @@ def _independent_sensors(test: Measurement, modes: Modes) -> int:
     variance = max(variance * shared, ROUND_OFF**2)
     s = np.linalg.svd(stacked(weight * columns(motion) / size), compute_uv=False)[: min(n, m)]
     beyond = np.cumsum(s[::-1] ** 2)[::-1]
-    chance = np.array([beyond_chance((n - r) * (m - r)) for r in range(s.size)])
+    chance = np.array([beyond_chance((n - r) * (m - r), CANDIDATES) for r in range(s.size)])
     moving = 1 + np.max(np.flatnonzero(beyond > variance * chance), initial=-1)
     shapes = np.linalg.svd(modes.phi / np.linalg.norm(modes.phi, axis=0), compute_uv=False)
-    return int(min(moving, np.count_nonzero(shapes > _DEPENDENT * shapes[0])))
+    return int(min(moving, np.count_nonzero(shapes > NEGLIGIBLE * shapes[0])))
 
 
 def _by_name(test: Measurement, stated: Sequence[str | int]) -> Integers:

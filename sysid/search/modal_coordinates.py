@@ -20,17 +20,16 @@ from sysid.modal_analysis.modal_fit import ModalFit, Modes, rank_one
 from sysid.modal_analysis.residues import linear_residues
 from sysid.models.stiffness import FREQUENCY_WINDOW
 from sysid.models.unknowns import lower_of, upper_of
-from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram
+from sysid.nlp import IterationMonitor, NonlinearProgram
 from sysid.problem.matrices import assemble
 from sysid.problem.prepared import Prepared
 from sysid.search.modal_program import solve_modes
 from sysid.search.modal_scaling import positive_part, stated_totals, to_stated_totals
 from sysid.search.scaled_unknowns import add_unknowns
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import EXACT, FREE, NEGLIGIBLE
 
 _OPEN_WINDOW = 20.0  # factor either way for a frequency that nobody gave
-_SUSPECT = 1.05  # a residual so many times that of free residues at the same poles is a local minimum
-_LEAST_SHAPE = 1e-6  # of the largest singular value of the shapes, below which M_SS would be no mass matrix
 
 
 class End(NamedTuple):
@@ -69,7 +68,7 @@ def fit_in_modes(problem: Prepared, x: Array, monitor: IterationMonitor, max_ite
 def _linear_starts(test: Measurement, ended: ModalFit, first: Modes) -> Iterator[Modes]:
     """New starts where free residues fit clearly better than what was reached: at its poles, then at the first ones."""
     fits = [(poles, *linear_residues(test, poles.omega, poles.ratios)) for poles in (ended.modes, first)]
-    if ended.of_accelerations <= _SUSPECT * min(possible for _, _, possible in fits):
+    if ended.of_accelerations <= FREE * min(possible for _, _, possible in fits):
         return
     for poles, residues, _ in fits:
         yield rank_one(residues, poles.omega, poles.ratios, np.linalg.norm(poles.phi, axis=0))
@@ -77,7 +76,7 @@ def _linear_starts(test: Measurement, ended: ModalFit, first: Modes) -> Iterator
 
 def fits_worse_than_free_residues(test: Measurement, modes: Modes, error: float) -> bool:
     """Whether a relative error of the accelerations is clearly above what free residues leave: a local minimum."""
-    return error > max(EXACT, _SUSPECT * linear_residues(test, modes.omega, modes.ratios)[1])
+    return error > max(EXACT, FREE * linear_residues(test, modes.omega, modes.ratios)[1])
 
 
 def modes_of(structure: Structure) -> Modes:
@@ -154,4 +153,4 @@ def _remainder(structure: Structure) -> Array:
 def _regular_inverse(phi: Array) -> Array:
     """Inverse of the shapes; where a bad fit has made some alike or next to nothing, of near ones that are not."""
     u, s, vt = np.linalg.svd(phi)
-    return (vt.T / np.maximum(s, _LEAST_SHAPE * s[0])) @ u.T
+    return (vt.T / np.maximum(s, NEGLIGIBLE * s[0])) @ u.T

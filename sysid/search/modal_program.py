@@ -26,12 +26,11 @@ from sysid.modal_analysis.modal_estimate import (
 )
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, Weights, held_gauge, separate_poles
 from sysid.modal_analysis.response import columns, modal_gains, modal_motion, parts_of, stacked, weights_of_test
-from sysid.modal_analysis.spectra_model import RIDGE, SpectraModel, weights_at
-from sysid.nlp import EXACT, OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, NumpyFunction
+from sysid.modal_analysis.spectra_model import SpectraModel, weights_at
+from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, NumpyFunction
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import EXACT, NEGLIGIBLE, round_off
 from sysid.structure.triangular import lower_triangle, triangle_entries
-
-_LEAST_MASS = 1e-6  # of the rigid-body mass; the least remainder that a fit starts with
 
 Spectrum = Callable[[NonlinearProgram], tuple[ca.MX, ca.MX]]
 Ties = Callable[[ca.MX, ca.MX, ca.MX], list[ca.MX]]
@@ -90,7 +89,7 @@ def solve_modes(
     if weighed:
         lam, vectors = np.linalg.eigh(remainder / np.outer(unit, unit))
         # A factor of zero has no slope.
-        root = np.linalg.cholesky((vectors * np.maximum(lam, _LEAST_MASS * max(1.0, lam[-1]))) @ vectors.T)
+        root = np.linalg.cholesky((vectors * np.maximum(lam, NEGLIGIBLE * max(1.0, lam[-1]))) @ vectors.T)
         factor = ca.diag(ca.DM(unit)) @ lower_triangle(z.variable("base mass", triangle_entries(root)), d)
         rigid = rigid + factor @ factor.T
     error: ModalResidual | EstimateResidual
@@ -145,7 +144,7 @@ class ModalResidual:
         scale = ca.sqrt(ca.sum2(self.q**2))
         scaled = self.q / ca.repmat(scale, 1, self.q.size2())
         # The ridge keeps the system regular where two modes become one; it changes shapes by less than their error.
-        normal = _times(scaled, scaled.T) + RIDGE * ca.DM.eye(scaled.size1())
+        normal = _times(scaled, scaled.T) + round_off(scaled.size1()) * ca.DM.eye(scaled.size1())
         shapes = ca.solve(normal, _times(scaled, ca.DM(target).T)) / ca.repmat(scale, 1, test.n_sensors)
         self.shapes = shapes.T  # of weighted sensors
         self.left = ca.DM(target) - _times(self.shapes, self.q)
@@ -221,7 +220,7 @@ class EstimateResidual:
         moved = ca.vertcat(ca.vec((gamma / ca.repmat(scale, 1, test.n_base)).T), ca.log(omega), ca.log(ratios), *corner)
         off = moved - ca.DM(theta[at:])
         U, s, vt = np.linalg.svd(factor[:, :at], full_matrices=False)
-        seen = s > RIDGE * s[0]
+        seen = s > round_off(s.size) * s[0]
         onto = U[:, seen].T @ factor[:, at:]
         self.value = ca.sumsqr(ca.DM(np.linalg.qr(factor[:, at:] - U[:, seen] @ onto, mode="r")) @ off)
         best = ca.DM(theta[:at]) - ca.DM((vt[seen].T / s[seen]) @ onto) @ off

@@ -17,8 +17,7 @@ from sysid.structure.structure import Array
 from sysid.structure.triangular import lower_entries
 
 _HELD = 1e5  # weight of known entries beside what is only likely
-_SPARE = 1e-3  # least share of a total mass that is left to the base
-_SHARE = 1e-3  # of the largest share of a mode in a total; a smaller one would make its modal mass beyond measure
+_LEAST_SHARE = 1e-3  # of a total mass: the least that is left to the base, or to a mode beside the largest
 _LEAST = 0.5  # of an equal share of the mass, that each mode keeps where nothing tells modal masses
 
 
@@ -67,7 +66,7 @@ def to_stated_totals(
         Whether known masses set the modal masses already, so that t is one; a total that is not stated, or
         less than they make, is then what they make.
     """
-    spare = 0.0 if problem.measurement.force is not None else _SPARE  # a force tells what the base has
+    spare = 0.0 if problem.measurement.force is not None else _LEAST_SHARE  # a force tells what the base has
     if problem.rigid_total is not None:
         size = np.sqrt(problem.totals)
         own, total = ((part / np.outer(size, size)) for part in (gamma.T @ gamma, problem.rigid_total))
@@ -135,7 +134,7 @@ def nearest_lumped(
     size = np.maximum(np.linalg.norm(rows, axis=0), np.finfo(float).tiny)
     # No modal mass vanishes, or M_SS would be singular: each keeps a share of what it could be by itself.
     share = np.max([row / total for row, total in told], axis=0)
-    least = _LEAST / m * size / np.maximum(share, _SHARE * share.max())
+    least = _LEAST / m * size / np.maximum(share, _LEAST_SHARE * share.max())
     return np.maximum(lsq_linear(rows / size, wanted, (least, np.inf), tol=1e-14).x, least) / size
 
 

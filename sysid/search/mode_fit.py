@@ -17,7 +17,6 @@ from sysid.modal_analysis.residues import (
     Records,
     ResidueFit,
     SubsetFits,
-    beyond_chance,
     independent,
     linear_residues,
 )  # fmt: skip
@@ -25,16 +24,16 @@ from sysid.modal_analysis.spectra_model import fit_spectra
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.spectrum import SOLVED
 from sysid.models.unknowns import lower_of, upper_of
-from sysid.nlp import EXACT, IterationMonitor, NonlinearProgram
+from sysid.nlp import IterationMonitor, NonlinearProgram
 from sysid.problem.prepared import Prepared
 from sysid.search.modal_program import Spectrum, Ties, solve_modes
 from sysid.search.modal_scaling import stated_totals
 from sysid.search.strategy import DoesNotApplyError
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import AS_GOOD, CANDIDATES, EXACT, beyond_chance
 
 Integers = NDArray[np.intp]
 
-_AS_GOOD = 1.02  # times the residual without it, that a stated total may leave
 _SECONDS = 8e-9  # of a processor, for a line and the square of its slopes
 _AGREES = 0.01  # relative; a stated total that the base force weighs within this is held in the fit
 
@@ -84,13 +83,13 @@ class ModeFit:
         excess = best.of_accelerations**2 * records.size - free.squared_error
         ranks = free.ranks(noise, n, d)
         # An exact fit lacks nothing; round-off in residues of poles that nearly coincide would ask for more modes.
-        lacks = best.of_accelerations > EXACT and excess > noise * beyond_chance(m * (n - 1) * (d - 1))
+        lacks = best.of_accelerations > EXACT and excess > noise * beyond_chance(m * (n - 1) * (d - 1), CANDIDATES)
         wanting = lacks or ranks.sum() < best.modes.omega.size
         if self._goes_on and wanting and np.any(ranks > 1):
             other = self._grown(self._with(ranks), ranks)
             more = other.modes.omega.size - best.modes.omega.size
             gained = (best.of_accelerations**2 - other.of_accelerations**2) * records.size / noise
-            if gained > np.sign(more) * beyond_chance(abs(more) * (n + d)):
+            if gained > np.sign(more) * beyond_chance(abs(more) * (n + d), CANDIDATES):
                 best = other
         return _ascending(best)
 
@@ -156,7 +155,7 @@ class ModeFit:
             again = self._with(more)
             gained = (best.of_accelerations**2 - again.of_accelerations**2) * self.records.size
             noise = self._free(again, more)[1]
-            if gained < beyond_chance(self.test.n_sensors + self.test.n_base) * noise:
+            if gained < beyond_chance(self.test.n_sensors + self.test.n_base, CANDIDATES) * noise:
                 break
             best, multiplicity = again, more
         return best
@@ -175,7 +174,7 @@ class ModeFit:
         free, noise = self._free(best, multiplicity)
         freedom = float(np.sum((n - multiplicity) * (d - multiplicity)))
         excess = best.of_accelerations**2 * self.records.size - free.squared_error
-        if excess < noise * beyond_chance(freedom):
+        if excess < noise * beyond_chance(freedom, CANDIDATES):
             return None
         s = np.linalg.svd(free.whitened.reshape(multiplicity.size, -1, n), compute_uv=False)
         left = np.array([np.sum(row[r:] ** 2) for row, r in zip(s, multiplicity, strict=True)])
@@ -215,7 +214,7 @@ def held_to_totals(problem: Prepared, end: ModalFit, monitor: IterationMonitor, 
     if np.any(np.abs(np.asarray(off)) > _AGREES):
         return None
     held = _again(problem, end, monitor, max_iterations, ties)
-    agrees = held.residual <= _AS_GOOD * end.residual + EXACT
+    agrees = held.residual <= AS_GOOD * end.residual + EXACT
     return held if agrees and held.status in SOLVED else None
 
 

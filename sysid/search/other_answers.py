@@ -26,18 +26,14 @@ from sysid.search.same_response import LINES, SameResponse
 from sysid.search.session import Session, Stop
 from sysid.search.strategy import Outcome
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import NEGLIGIBLE, OTHER_ANSWER
 from sysid.swarm.sampling import latin_hypercube
 
 _MOST_STARTS, _FEWEST_STARTS = 64, 4
-_STEPS = 60
 _ENOUGH = 0.6  # of the starts that have come to the response: the others are not waited for
 _SECONDS = 0.06  # of a processor, that a step of all starts may take
 _LINE, _CUBE = 1.5e-6, 5e-9  # s of a processor, that a line of a candidate takes, and a cube of degrees of freedom more
 _ROW = 1e-6  # likewise, a row of what the user states beside the records or in their place
-_SAME = 1e-6  # relative difference of responses that counts as none
-_TRIED = 4  # structures of nearly the same response, fitted to the records
-_APART = 0.01  # of the root of two diagonal entries, by which an entry of another structure's matrices differs
-_SEED = 0x6F74686572  # a source of its own, so that no other phase draws other numbers
 _NOT_LOOKED_FOR = "whether another structure explains the data as well was not looked for to its end: {}"
 
 
@@ -93,35 +89,38 @@ def _number_of_starts(problem: Prepared) -> int:
     return min(int(_SECONDS / ((1 + formulation.size) * (responses + _ROW * rows))), _MOST_STARTS)
 
 
-def _first(problem: Prepared, x: Array, session: Session, starts: int) -> Array | None:
-    """The first other answer that is found."""
+def _first(problem: Prepared, x: Array, session: Session, starts: int, most: int = 4) -> Array | None:
+    """The first other answer that is found, of `most` structures that are fitted to the records."""
     objective = problem.objective(x)
     tried = [problem.structure(x)]
     for point in _candidates(problem, x, session, objective, starts):
-        if len(tried) > _TRIED or session.is_over:
+        if len(tried) > most or session.is_over:
             return None
         structure = _structure_of(problem, point)
-        if structure is None or any(_matrices_apart(structure, known) <= _APART for known in tried):
+        if structure is None or any(_matrices_apart(structure, known) <= OTHER_ANSWER for known in tried):
             continue
         tried.append(structure)
         end = _fit(problem, point, session)
         fitted = _structure_of(problem, end)
-        if fitted is not None and _matrices_apart(fitted, tried[0]) > _APART and _explains(problem, end, objective):
+        other = fitted is not None and _matrices_apart(fitted, tried[0]) > OTHER_ANSWER
+        if other and _explains(problem, end, objective):
             return end
     return None
 
 
-def _candidates(problem: Prepared, x: Array, session: Session, objective: float, starts: int) -> Iterator[Array]:
+def _candidates(
+    problem: Prepared, x: Array, session: Session, objective: float, starts: int, steps: int = 60
+) -> Iterator[Array]:
     """Points of the answer's response as they are found, then those whose response differs by less than the misfit."""
     same, box = SameResponse(problem, x), _Box(problem)
     search = LeastSquares(lambda points: same(box.unknowns(points)), box.starts(session, starts))
     given = np.zeros(starts, dtype=bool)
-    for step in range(_STEPS):
-        session.report("other answers", step, _STEPS, objective)
+    for step in range(steps):
+        session.report("other answers", step, steps, objective)
         if session.is_over or np.all(search.idle) or np.mean(given) > _ENOUGH:
             break
         search.step()
-        new = (search.left < _SAME) & ~given
+        new = (search.left < NEGLIGIBLE) & ~given
         search.idle |= new
         given |= new
         yield from (box.unknowns(search.points[i : i + 1])[0] for i in np.flatnonzero(new))
@@ -145,7 +144,8 @@ class _Box:
 
     def starts(self, session: Session, count: int) -> Array:
         """A Latin hypercube."""
-        source = np.random.SeedSequence(session.random.entropy, spawn_key=(*session.random.spawn_key, _SEED))
+        # A source of its own, so that no other phase draws other numbers.
+        source = np.random.SeedSequence(session.random.entropy, spawn_key=(*session.random.spawn_key, 0x6F74686572))
         return latin_hypercube(count, self.lower.size, np.random.default_rng(source))
 
 

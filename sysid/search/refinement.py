@@ -13,11 +13,10 @@ from sysid.models.spectrum import spectrum_error
 from sysid.problem.prepared import Prepared
 from sysid.search.session import Session
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import ROUND_OFF
 from sysid.structure.triangular import triangle
 
 RefineBy = Literal["closed-form", "ipopt", "leaders"]
-
-_ROUND_OFF = 1e-9  # relative; objectives that are nearer to each other are one
 
 
 @dataclass
@@ -103,11 +102,11 @@ class Refiner:
             closed = self._refined(row[None], by_solver=False)[0]
             rows = np.clip(np.concatenate([closed, solved]), *self.problem.formulation.box)
             of_closed, of_solved = objective(rows)
-            if of_solved < (1 - _ROUND_OFF) * np.fmin(of_closed, cost):
+            if of_solved < (1 - ROUND_OFF) * np.fmin(of_closed, cost):
                 self.tally.won += 1
                 return rows[1], float(of_solved)
             # The leader's objective is the closed form's already, unless a bound cut that off.
-            return (rows[0], min(float(of_closed), cost)) if of_closed <= (1 + _ROUND_OFF) * cost else (row, cost)
+            return (rows[0], min(float(of_closed), cost)) if of_closed <= (1 + ROUND_OFF) * cost else (row, cost)
 
         return refine
 

@@ -15,15 +15,13 @@ from sysid.search.session import Session, Stop
 from sysid.search.strategy import History, Outcome, Phase, Strategy
 from sysid.search.swarm import Swarm
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import ROUND_OFF
 
-_ROUNDS = 40
 _SETTLED, _NEAR = 2e-3, 0.05  # standard deviations of the unknowns, root mean square: is settled, is as good
-_FARTHEST = 64.0  # times a step
-_EXACT = 1e-10  # of the records: predictions that move by less stay, whatever the noise
 
 
-def settled(problem: Prepared, end: Outcome, strategy: Strategy, session: Session) -> Outcome:
-    """Where Huber's loss is least, from the answer to the screened records.
+def settled(problem: Prepared, end: Outcome, strategy: Strategy, session: Session, rounds: int = 40) -> Outcome:
+    """Where Huber's loss is least, in so many rounds at most, from the answer to the screened records.
 
     The modal strategy fits each round anew; after all others the local phase goes on from the last unknowns.
 
@@ -39,7 +37,7 @@ def settled(problem: Prepared, end: Outcome, strategy: Strategy, session: Sessio
     if problem.in_squares or end.stopped is not None:
         return end
     moved, fitted = np.inf, problem.pseudo_values(end.structure, end.x)
-    for number in range(1, _ROUNDS + 1):
+    for number in range(1, rounds + 1):
         try:
             again = _fitted(fitted, end, strategy, session)
             if again.stopped is not None:
@@ -125,7 +123,7 @@ def _farther(problem: Prepared, before: Outcome, after: Outcome) -> Outcome:
         return found
 
     best, step, times = left(after.x, after.structure), after.x - before.x, 2.0
-    while times <= _FARTHEST:
+    while times <= 64.0:  # steps that are doubled
         x = np.clip(before.x + times * step, np.minimum(problem.lower, after.x), np.maximum(problem.upper, after.x))
         try:
             structure = problem.structure(x)
@@ -150,4 +148,4 @@ def _moved(problem: Prepared, before: Outcome, after: Outcome) -> float:
             squares += 2 * float(np.sum(np.abs((a - b) / std) ** 2))
             change += float(np.sum(np.abs(a - b) ** 2))
             size += float(np.sum(np.abs(b) ** 2))
-    return 0.0 if change <= _EXACT**2 * size else float(np.sqrt(squares / problem.n_variables))
+    return 0.0 if change <= ROUND_OFF**2 * size else float(np.sqrt(squares / problem.n_variables))

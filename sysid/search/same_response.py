@@ -10,16 +10,16 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
+from sysid.modal_analysis.complex_frequency import BEYOND
 from sysid.modal_analysis.response import columns
 from sysid.problem.batch import Batch, expanded, in_chunks
 from sysid.problem.prepared import Prepared
 from sysid.problem.terms import ExpressionTerm, TestTerm
 from sysid.structure.structure import Array, ComplexArray
+from sysid.structure.thresholds import NEGLIGIBLE
 
 SHIFT = 0.3  # of the geometric mean of the natural frequencies
-_BEYOND = 1.3  # times the highest frequency: how far the lines reach
 LINES = 4  # a degree of freedom: twice as many numbers as a response has coefficients
-_MOVING = 1e-6  # of the largest: a direction in which the base moves at all
 
 
 class SameResponse:
@@ -67,11 +67,11 @@ class _Response:
         matrices = self.matrices = term.matrices
         structure = matrices.structure(x, term.test)
         omega = 2 * np.pi * structure.natural_frequencies
-        lines = np.linspace(0.0, _BEYOND * omega[-1], LINES * omega.size + 1)[1:]
+        lines = np.linspace(0.0, (1 + BEYOND) * omega[-1], LINES * omega.size + 1)[1:]
         self.s = SHIFT * float(np.exp(np.log(omega).mean())) + 1j * lines
         base = columns(term.test.base)
         directions, size, _ = np.linalg.svd(np.hstack([base.real, base.imag]), full_matrices=False)
-        self.inputs = directions[:, size > _MOVING * size[0]]
+        self.inputs = directions[:, size > NEGLIGIBLE * size[0]]
         self.with_force = term.test.force is not None
         symbol, n = ca.MX.sym("x", x.size), structure.n
         self._expand = Batch(

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from sysid.errors import whole_number
-from sysid.nlp import suffices
+from sysid.nlp import GRACE, suffices
 from sysid.search.journal import Journal
 from sysid.structure.structure import Array
 
@@ -45,9 +45,6 @@ class Progress:
 
     def __str__(self) -> str:
         return f"{self.phase:12s}  iteration {self.iteration:4d}  objective {self.objective:.3e}  {self.seconds:6.1f} s"
-
-
-LEAST = 0.4  # s, that each of the last steps has, however late it begins
 
 
 class DeferredInterrupt:
@@ -152,8 +149,8 @@ class Session:
 
     @property
     def left(self) -> float | None:
-        """Seconds that are left, at least `LEAST`; None without a limit."""
-        return None if self.max_time is None else max(self.max_time - self.seconds, LEAST)
+        """Seconds that are left, at least `GRACE`; None without a limit."""
+        return None if self.max_time is None else max(self.max_time - self.seconds, GRACE)
 
     @property
     def is_over(self) -> bool:

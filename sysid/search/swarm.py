@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from sysid.errors import SolverError, choice, flag, instance, number, text, whole_number
 from sysid.modal_analysis.response import error_of_accelerations
-from sysid.nlp import EXACT
 from sysid.problem.prepared import Prepared
 from sysid.problem.terms import TestTerm
 from sysid.search import local
@@ -22,8 +21,9 @@ from sysid.search.modal_coordinates import fits_worse_than_free_residues, modes_
 from sysid.search.refinement import RefineBy, Refiner, Tally
 from sysid.search.session import Session, Stop, in_time
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, as_unknowns, search_note
-from sysid.search.swarm_objective import SwarmObjective
+from sysid.search.swarm_objective import WORST, SwarmObjective
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import EXACT, NEGLIGIBLE
 from sysid.swarm import SwarmProgress, SwarmSettings, minimize_swarm
 
 _SETTINGS = SwarmSettings(inertia_b1=0.8, inertia_b2=0.5, acceleration_lower=0.5, acceleration_sum=3.0, guides=3)
@@ -33,10 +33,8 @@ _IDLE = (
 )
 _TRAPPED = "that is a local minimum, as free residues at these poles fit clearly better"
 _MANY, _FEW = 256, 1  # candidates between two looks at the clock; few where IPOPT refines each
-_UNSEEN = 1e6  # in the place of the objective of candidates that there is no time for
 _SAMPLE = 1.6e-7  # s of a processor, that a coordinate of a particle of the first sample takes
 _DOUBTFUL = 0.1  # objective above which a problem without free modes is searched again
-_ALIKE = 1e-6  # relative; objectives that differ by no more are of one answer
 _OWN_FORM = "hpso-ls searched the model's own unknowns, by the published swarm first, then through IPOPT"
 
 
@@ -258,7 +256,7 @@ class _Search:
     def beats(self, other: _Search) -> bool:
         """Whether it ended better, by constraints, then by objective; of two alike, what a solver vouches for."""
         ours, theirs = self.problem.rank_of(self.found), self.problem.rank_of(other.found)
-        if self.success != other.success and ours[0] == theirs[0] and np.isclose(ours[1], theirs[1], rtol=_ALIKE):
+        if self.success != other.success and ours[0] == theirs[0] and np.isclose(ours[1], theirs[1], rtol=NEGLIGIBLE):
             return self.success
         return ours < theirs
 
@@ -336,7 +334,7 @@ class _Search:
         def evaluate(rows: Array) -> Array:
             return objective(refiner.rows(rows) if refiner is not None and slow and repair is None else rows)
 
-        return in_time(evaluate, lambda rows: np.full(len(rows), _UNSEEN), session, at_once), repair
+        return in_time(evaluate, lambda rows: np.full(len(rows), WORST), session, at_once), repair
 
     def _check_time(self) -> None:
         """Stop where the time cannot suffice for the first sample."""
@@ -392,7 +390,7 @@ class _Search:
         self.success, self.message = answer.success, answer.message
         better = self.problem.rank_of(answer.x) < self.problem.rank_of(self.found)
         # A start that is a solution already can only end beside itself by round-off.
-        alike = answer.success and after <= max((1 + _ALIKE) * before, EXACT)
+        alike = answer.success and after <= max((1 + NEGLIGIBLE) * before, EXACT)
         if better or (alike and self.problem.keeps_constraints(answer.x)):
             self.x = answer.x
         else:

@@ -14,7 +14,7 @@ from sysid.search.held_spectrum_objective import held_spectrum_objective
 from sysid.search.matrix_coordinates import terms_with
 from sysid.structure.structure import Array
 
-_WORST = 1e6  # an objective that no candidate passes that keeps the constraints
+WORST = 1e6  # an objective that no candidate passes that keeps the constraints
 
 
 class SwarmObjective:
@@ -59,7 +59,7 @@ class SwarmObjective:
         over = np.array([constraints.violation(row) for row in x]) / self.problem.tolerance
         over = np.where(np.isfinite(over), over, np.inf)
         broken = np.sum(np.where(over > 1, over, 0.0), axis=1)
-        return np.where(broken > 0, _WORST * (1 + broken), np.minimum(objective, _WORST))
+        return np.where(broken > 0, WORST * (1 + broken), np.minimum(objective, WORST))
 
     def _x(self, particles: Array) -> Array:
         """Unknowns of each row, (n_particles, n_variables)."""

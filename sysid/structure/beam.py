@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sysid.errors import InputError
 from sysid.structure.axes import unit_vector
+from sysid.structure.thresholds import NEGLIGIBLE
 
 Array = NDArray[np.float64]
 Scalar = Any
@@ -42,8 +43,6 @@ _MASS = {
     ),
     "lumped": (np.eye(2) / 2, np.diag([1 / 2, 1 / 78, 1 / 2, 1 / 78])),
 }
-
-_PARALLEL = 1e-6  # sine of the smallest angle between a beam and its orientation vector
 
 
 def stiffness_patterns(length: float) -> Array:
@@ -119,7 +118,7 @@ def local_axes(start: Array, end: Array, orientation: ArrayLike, label: str) -> 
     x = along / length
     z = np.cross(x, unit_vector(orientation, f"the orientation of {label}"))
     sine = float(np.linalg.norm(z))
-    if sine < _PARALLEL:
+    if sine < NEGLIGIBLE:
         raise InputError(f"the orientation of {label} is parallel to the beam; it must point out of its axis")
     z = z / sine
     return length, np.stack([x, np.cross(z, x), z])

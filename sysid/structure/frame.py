@@ -42,11 +42,10 @@ from sysid.structure.beam import (
     symmetric,
 )
 from sysid.structure.structure import Structure, shaped_array
+from sysid.structure.thresholds import EXACT
 
 SensorAxis = tuple[int, str | ArrayLike]
 """Node of a sensor and its axis: a vector (3,), or a string such as "x", "-y", "rz"."""
-
-_FULL_RANK = 1e-8  # M's error grows with the square of the condition of the mode shapes: no more than 1/sqrt(eps)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -436,7 +435,7 @@ def _modal(mass: Matrix, stiffness: Matrix, S: Array) -> tuple[Array, Array]:
         raise InputError(f"the frame has fewer than {n} modes with mass; take fewer sensors")
     seen = S @ (shapes / np.sqrt(inverse))  # mass-normalised
     singular = np.linalg.svd(seen, compute_uv=False)
-    if singular[-1] <= _FULL_RANK * singular[0]:
+    if singular[-1] <= EXACT * singular[0]:
         raise InputError(f'the sensors do not tell the {n} lowest modes apart; move one, or use condensation="static"')
     back = np.linalg.inv(seen)
     return (shapes / np.sqrt(inverse)) @ back, symmetric(back.T @ np.diag(1 / inverse) @ back)

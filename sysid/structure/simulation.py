@@ -14,11 +14,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-Array = NDArray[np.floating[Any]]
+from sysid.structure.thresholds import ROUND_OFF
 
-_DEGREE = 11  # of the spline
-_BLOCK = 1024  # samples whose rows are reduced together
-_DECAYED = 1e-12  # free vibration below this share of its first acceleration explains nothing more
+Array = NDArray[np.floating[Any]]
 
 
 class ModalModel(NamedTuple):
@@ -63,15 +61,16 @@ def fitted_state(modes: ModalModel, shapes: Array, residual: Array, sample_rate:
     transition = transition * (scale[:, None] / scale)
     size = np.linalg.norm(row)
     reduced: Any = np.zeros((0, scale.size + 1))
-    for begin in range(0, residual.shape[1], _BLOCK):
-        block = residual[:, begin : begin + _BLOCK].T
+    at_once = 1024  # samples whose rows are reduced together
+    for begin in range(0, residual.shape[1], at_once):
+        block = residual[:, begin : begin + at_once].T
         rows = np.empty((*block.shape, scale.size))
         for i in range(len(block)):
             rows[i] = row
             row = row @ transition
         equations = np.column_stack([rows.reshape(-1, scale.size), block.ravel()])
         reduced = np.linalg.qr(np.vstack([reduced, equations]), mode="r")
-        if np.linalg.norm(row) <= _DECAYED * size:
+        if np.linalg.norm(row) <= ROUND_OFF * size:
             break
     # Of motion that no sensor sees the least is taken: none.
     state = np.linalg.lstsq(reduced[:, :-1], reduced[:, -1], rcond=1e-10)[0] / scale
@@ -91,12 +90,12 @@ def _step(modes: ModalModel, step: float, degree: int) -> tuple[Array, Array]:
     return exponential[:size, :size], np.moveaxis(exponential[:size, size:].reshape(size, -1, d), 1, 0)
 
 
-def _spline_derivatives(base: Array) -> Array:
+def _spline_derivatives(base: Array, degree: int = 11) -> Array:
     """Natural spline at the beginning of each step, its derivatives by steps: (degree + 1, d, n_samples - 1)."""
     from scipy.interpolate import make_interp_spline
 
     samples = base.shape[1]
-    m = min(_DEGREE // 2 + 1, samples)
+    m = min(degree // 2 + 1, samples)
     still = [(order, np.zeros(len(base))) for order in range(m, 2 * m - 1)]  # at both ends
     spline = make_interp_spline(np.arange(samples), base.T, k=2 * m - 1, bc_type=(still, still))
     return np.stack([spline(np.arange(samples - 1), nu=order).T for order in range(2 * m)])

@@ -13,14 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 from sysid.errors import InputError, finite_array, number, refuse, whole_number
 from sysid.structure.sensor import checked_sensors, sensors_from_tree, sensors_to_tree
 from sysid.structure.simulation import ModalModel, fitted_state, modal_accelerations
+from sysid.structure.thresholds import EXACT
 
 if TYPE_CHECKING:
     from scipy.signal import StateSpace
 
 Array = NDArray[np.floating[Any]]
 ComplexArray = NDArray[np.complexfloating[Any]]
-
-_TOLERANCE = 1e-8  # relative; looser than round-off in a condensation, tighter than any instrument
 
 
 @dataclass(frozen=True, eq=False)
@@ -386,7 +385,7 @@ class Structure:
         for name, matrix in (("mass", self.mass), ("stiffness", self.stiffness)):
             _check_positive_definite(f"the structure's block of {name} ({n} x {n})", matrix[:n, :n])
         lowest = lowest_eigenvalue(self.mass)
-        if lowest < -_TOLERANCE:
+        if lowest < -EXACT:
             raise InputError(
                 f"mass is not positive semidefinite: its lowest eigenvalue is {lowest:.3g} of its diagonal; "
                 "the base rows need M_00 >= M_S0' M_SS^-1 M_S0"
@@ -421,7 +420,7 @@ class Structure:
             assert matrix is not None
             self.damping = _symmetric("damping_matrix", matrix, n)
             modal = self.normal_modes.T @ self.damping @ self.normal_modes
-            if np.linalg.eigvalsh(modal)[0] < -_TOLERANCE * np.abs(modal).max():
+            if np.linalg.eigvalsh(modal)[0] < -EXACT * np.abs(modal).max():
                 raise InputError("damping_matrix is not positive semidefinite: the structure would feed energy in")
             self.damping_ratios = np.diag(modal) / (2 * self._omega)
         self._modal_damping_matrix: Array = modal
@@ -471,7 +470,7 @@ def _symmetric(name: str, value: ArrayLike, size: int | str) -> Array:
     array = shaped_array(name, value, size, size)
     scale = np.sqrt(np.abs(np.diag(array)))
     asymmetry = np.abs(array - array.T)
-    if np.any(asymmetry > _TOLERANCE * np.outer(scale, scale) + 1e-12 * np.max(np.abs(array), initial=0.0)):
+    if np.any(asymmetry > EXACT * np.outer(scale, scale) + 1e-12 * np.max(np.abs(array), initial=0.0)):
         i, j = np.unravel_index(int(np.argmax(asymmetry)), array.shape)
         raise InputError(
             f"{name} is not symmetric: [{i}, {j}] is {array[i, j]:.6g} and [{j}, {i}] is {array[j, i]:.6g}"

@@ -301,11 +301,11 @@ class TestOneListForEveryProblem:
         assert told(1.0, -1.0, 2.0) == []
         (alone,) = told(4.5, 0.0, 0.0)
         assert alone.kind == "stated value" and alone.numbers == pytest.approx({"k[0]": 4.5})
-        # The chi-squared law of 3: a sum of squares of 21.1 is exceeded by chance in one of 10 000.
-        assert told(2.6, 2.6, 2.6) == []
-        (together,) = told(2.7, -2.7, 2.7)
+        # The chi-squared law of 3: a sum of squares of 16.3 is exceeded by chance in one of 1 000.
+        assert told(2.3, 2.3, 2.3) == []
+        (together,) = told(2.4, -2.4, 2.4)
         assert together.kind == "stated values"
-        assert together.numbers == pytest.approx({"k[0]": 2.7, "k[1]": -2.7, "k[2]": 2.7})
+        assert together.numbers == pytest.approx({"k[0]": 2.4, "k[1]": -2.4, "k[2]": 2.4})
 
     def test_of_a_misfit_of_the_users_own_the_records_are_not_checked(self):
         truth = modal_twin(building())

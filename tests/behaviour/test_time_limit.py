@@ -14,11 +14,11 @@ import pytest
 
 import sysid
 from sysid.finding import Finding, Severity
-from sysid.nlp import IterationMonitor
+from sysid.nlp import GRACE, IterationMonitor
 from sysid.results.answer import Answer
 from sysid.search.deadline import TimeIsOver, within
 from sysid.search.matrix_coordinates import fit_in_matrices
-from sysid.search.session import LEAST, DeferredInterrupt, Session, in_time
+from sysid.search.session import DeferredInterrupt, Session, in_time
 from sysid.search.swarm_objective import SwarmObjective
 
 posix = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
@@ -141,7 +141,7 @@ def test_the_session_counts_what_is_left():
     assert session(None, 99.0).allows(1e9)
     assert not session(None, 99.0).is_over
     assert session(10.0, 4.0).left == pytest.approx(6.0, abs=0.1)
-    assert session(10.0, 11.0).left == LEAST
+    assert session(10.0, 11.0).left == GRACE
     assert session(10.0, 11.0).is_over
     # Three times the seconds, as others may work on the machine, and 0.4 s late at most.
     assert session(10.0, 4.0).allows(2.1)

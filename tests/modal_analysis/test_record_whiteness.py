@@ -10,7 +10,8 @@ from benchmarks.records.simulated import Records, four_storeys
 from sysid.measurement.whole import WholeRecords
 from sysid.modal_analysis.record_fit import record_modes, refitted
 from sysid.modal_analysis.record_varying import untold_levels
-from sysid.modal_analysis.record_whiteness import LEVEL, most_unlikely
+from sysid.modal_analysis.record_whiteness import most_unlikely
+from sysid.structure.thresholds import FALSE_ALARM
 
 SETTING = four_storeys()
 
@@ -33,7 +34,7 @@ def test_one_in_a_thousand_white_draws_is_accused() -> None:
     rng = np.random.default_rng(3)
     bands = 6 * sum(400 // (size // 2) - 1 for size in (8, 16, 32, 64, 128, 256)) + 6
     alarms = sum(any(most_unlikely(row, bands) for row in rng.exponential(size=(6, 400))) for _ in range(1000))
-    assert LEVEL == 1e-3
+    assert FALSE_ALARM == 1e-3
     assert alarms < 7
 
 

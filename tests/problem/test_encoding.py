@@ -279,7 +279,7 @@ TOO_MUCH = {
 @pytest.mark.parametrize("name", TOO_MUCH)
 def test_a_file_that_asks_for_too_large_a_matrix_is_refused_before_it_is_made(name, monkeypatch):
     names, code = TOO_MUCH[name]
-    monkeypatch.setattr(operations, "MOST_ENTRIES", 10_000)
+    monkeypatch.setattr(operations, "LIMITS", operations.FileLimits(entries=10_000))
     with pytest.raises(sysid.InputError, match="too much: .* a matrix"):
         decode(edited(tree_of(ca.sin(X)), code, tuple(names)), SYMBOLS)
 
@@ -316,14 +316,14 @@ def test_a_number_for_all_entries_is_kept_once(value, as_written):
 
 
 def test_a_list_of_too_many_operations_is_refused(monkeypatch):
-    monkeypatch.setattr(operations, "MOST_OPERATIONS", 5)
+    monkeypatch.setattr(operations, "LIMITS", operations.FileLimits(operations=5))
     with pytest.raises(sysid.InputError, match="too much: .* operations is 6, .* 5 "):
         decode(edited(tree_of(ca.sin(X)), [0, 1, 0, 0] * 6), SYMBOLS)
 
 
 def test_an_evaluation_that_needs_too_much_memory_is_refused(monkeypatch):
     tree = tree_of(ca.kron(A, A) @ ca.kron(A, A))
-    monkeypatch.setattr(operations, "MOST_MEMORY", 50)
+    monkeypatch.setattr(operations, "LIMITS", operations.FileLimits(memory=50))
     with pytest.raises(sysid.InputError, match="too much: memory "):
         decode(tree, SYMBOLS)
 

@@ -8,25 +8,22 @@ from dataclasses import replace
 import numpy as np
 
 from sysid.assessment.checks.context import Context
-from sysid.assessment.checks.gains import distinct_poles, gain_errors, wrong_gains
+from sysid.assessment.checks.gains import MIMICKED, NUMBERS_A_RESIDUE, distinct_poles, gain_errors, wrong_gains
 from sysid.assessment.checks.leakage import leakage
-from sysid.assessment.checks.stated_mass import MISFIT, ROUND_OFF, force_misfit
-from sysid.finding import Finding, Severity
+from sysid.assessment.checks.stated_mass import MISFIT, force_misfit
+from sysid.finding import MOST_OF_A_KIND, Finding, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.spectra import of_run
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.modal_analysis.residues import Records, ResidueFit, beyond_chance
+from sysid.modal_analysis.residues import Records, ResidueFit
 from sysid.modal_analysis.response import columns
 from sysid.problem.formulation import Formulation
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import CANDIDATES, EXACT, beyond_chance
 
 _ALIKE = 0.5  # of the power of a motion; another that differs by more, noise included, is not the same
-_NEIGHBOURS = 11  # lines that tell the noise about one, where it is not stated
 _SEEN = 3.0  # times the noise, the least motion that two sensors can share
-_EQUAL = 1e-9  # of a sensor's motion: what counts as noise where there is none
-_LINES = 2  # times the free residues: fewer numbers than these tell nothing beside noise
-_MIMICKED = 1e-2  # of a constant; less of it is left where a mode far below the lines answers like one
 _GAIN = 0.03  # of the base's motion; smaller errors of a sensor's gain are usual
 
 
@@ -48,7 +45,7 @@ def _of_records(formulation: Formulation, modal: ModalEstimate, structure: Struc
     records, poles = Records(test), distinct_poles(structure)
     leaks = list(leakage(test, structure)) if test.averaged else []
     velocity = not structure.modal_damping
-    if records.data.shape[0] <= _LINES * poles[0].size * records.n_base * (2 if velocity else 1):
+    if records.data.shape[0] <= NUMBERS_A_RESIDUE * poles[0].size * records.n_base * (2 if velocity else 1):
         return leaks
     free = records.fit(*poles, velocity=velocity)
     misses, rigid = list(_misfit(formulation, test, structure, records, free)), []
@@ -88,7 +85,7 @@ def _misfit(
     left = Records(replace(test, response=test.response - test.predict(structure)))
     misfit = float(np.sqrt(left.size / records.size))
     misses = f"{model} misses {100 * misfit:.3g} % of the accelerations"
-    possible = max(float(np.sqrt(free.squared_error / records.size)), ROUND_OFF)
+    possible = max(float(np.sqrt(free.squared_error / records.size)), EXACT)
     if misfit > MISFIT * possible:
         yield Finding(
             "misfit", Severity.CONTRADICTS,
@@ -100,7 +97,7 @@ def _misfit(
     poles = None if formulation.free_modes else PolesAndResidues.of(test)
     if poles is None:
         return
-    possible = max(poles.of_accelerations, ROUND_OFF)
+    possible = max(poles.of_accelerations, EXACT)
     if misfit > MISFIT * possible:
         yield Finding(
             "misfit", Severity.CONTRADICTS,
@@ -123,8 +120,8 @@ def _rigid(modal: ModalEstimate, records: Records, free: ResidueFit) -> Iterator
     reach = np.abs(test.rigid_body).max(axis=0)
     moved /= np.where(reach > 0, reach, np.inf)
     most, size = np.abs(moved).argmax(axis=1), np.abs(moved).max(axis=1)
-    wrong = np.flatnonzero((chi2 > beyond_chance(test.n_base)) & (size > _GAIN))
-    for i in wrong[np.argsort(-size[wrong])][:3]:
+    wrong = np.flatnonzero((chi2 > beyond_chance(test.n_base, CANDIDATES)) & (size > _GAIN))
+    for i in wrong[np.argsort(-size[wrong])][:MOST_OF_A_KIND]:
         yield Finding(
             "rigid motion", Severity.CONTRADICTS,
             f"{test.sensor_names[i]} moves with the base beside its modes and what rigid_body says, by "
@@ -141,13 +138,13 @@ def _along_the_base(test: Measurement, records: Records, free: ResidueFit) -> tu
     """
     ones = records.basis(np.ones((1, test.freq.size), dtype=complex))
     extra = ones - free.Q @ (free.Q.T @ ones)
-    if np.linalg.norm(extra) < _MIMICKED * np.linalg.norm(ones):
+    if np.linalg.norm(extra) < MIMICKED * np.linalg.norm(ones):
         return None
     Q, R = np.linalg.qr(extra)
     along = Q.T @ free.left
     left = free.left - Q @ along
     gained = np.sum(along**2, axis=0).reshape(-1, test.n_sensors).sum(axis=0)
-    noise = records.noise(left, free.residues.size + along.size, least=ROUND_OFF)
+    noise = records.noise(left, free.residues.size + along.size, least=EXACT)
     return records.by_sensor(np.linalg.solve(R, along)[None])[0], gained / noise
 
 
@@ -157,9 +154,9 @@ def _damping(records: Records, poles: tuple[Array, Array], free: ResidueFit) -> 
         return
     both = records.fit(*poles, velocity=True)
     extra = poles[0].size * records.n_base * records.n_sensors
-    noise = records.noise(both.left, 2 * extra, least=ROUND_OFF)
+    noise = records.noise(both.left, 2 * extra, least=EXACT)
     gained = free.squared_error - both.squared_error
-    if gained > noise * beyond_chance(extra):
+    if gained > noise * beyond_chance(extra, CANDIDATES):
         share = float(np.sqrt(gained / records.size))
         yield Finding(
             "damping", Severity.CONTRADICTS,
@@ -176,13 +173,13 @@ def _twins(modal: ModalEstimate, structure: Structure) -> Iterator[Finding]:
     moves, noise = columns(test.relative)[:, lines], _own_noise(modal)
     left = moves - columns(test.predict(structure))[:, lines]
     gram = (moves @ moves.conj().T).real
-    size, most = np.diag(gram), beyond_chance(2 * moves.shape[1]) / (2 * moves.shape[1])
+    size, most = np.diag(gram), beyond_chance(2 * moves.shape[1], CANDIDATES) / (2 * moves.shape[1])
     for i, j in zip(*np.tril_indices(test.n_sensors, -1), strict=True):
         sign, smaller = np.sign(gram[i, j]), min(size[i], size[j])
         if size[i] + size[j] - 2 * abs(gram[i, j]) > _ALIKE * smaller or smaller == 0:
             continue
         each = _smooth(np.abs(left[i] - sign * left[j]) ** 2) if noise is None else (noise[i] + noise[j])[lines]
-        both = each + (_EQUAL**2 * (size[i] + size[j])) / lines.sum()
+        both = each + (EXACT**2 * (size[i] + size[j])) / lines.sum()
         apart = np.mean(np.abs(moves[i] - sign * moves[j]) ** 2 / both)
         if apart <= most and np.mean(np.abs(moves[[i, j]]) ** 2 / both, axis=1).min() > _SEEN**2:
             # A fit of fewer modes than there are leaves all that would tell its sensors apart.
@@ -210,8 +207,8 @@ def _own_noise(modal: ModalEstimate) -> Array | None:
     return None
 
 
-def _smooth(power: Array) -> Array:
-    """Mean of each line's power and that of its neighbours."""
+def _smooth(power: Array, lines: int = 11) -> Array:
+    """Mean of each line's power and that of its neighbours, so many lines in all."""
     from scipy.ndimage import uniform_filter1d
 
-    return np.asarray(uniform_filter1d(power, _NEIGHBOURS, mode="nearest"))
+    return np.asarray(uniform_filter1d(power, lines, mode="nearest"))

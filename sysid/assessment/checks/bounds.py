@@ -11,21 +11,19 @@ from numpy.typing import ArrayLike, NDArray
 from sysid.assessment.checks.context import Context
 from sysid.assessment.checks.gains import distinct_poles
 from sysid.assessment.sensitivity import left_by_constraints, rows_of
+from sysid.errors import listed
 from sysid.finding import Finding, Severity, contradicting
-from sysid.modal_analysis.residues import Records, beyond_chance
+from sysid.modal_analysis.residues import Records
 from sysid.models.stiffness import FREQUENCY_WINDOW
 from sysid.models.unknowns import scales_of, split
-from sysid.nlp import EXACT
 from sysid.problem.formulation import Formulation
 from sysid.problem.prepared import Prepared
 from sysid.problem.slopes import stacked_rows
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import CANDIDATES, EXACT, NEGLIGIBLE, ROUND_OFF, beyond_chance
 
-_NEAR = 1e-6  # of an unknown's range: nearer than that it rests on the bound ..
 _CLOSE = 1e-4  # .. and, where the range spans decades, of the bound itself
 _SHARE = 0.25  # of the squared misfit: bounds that explain less, to first order, are not its cause
-_TOLD = 8  # unknowns, and entries of each
-_NONE = 1e-9  # of the largest singular value
 
 
 class OnBound(NamedTuple):
@@ -58,7 +56,7 @@ def sides_of(lower: Array, upper: Array, values: Array, relative: ArrayLike = Fa
     A `relative` one, of an unknown whose ratios alone count, is in units of the largest of that unknown, and rests on a
     positive lower bound or on none.
     """
-    span, any_scale = _NEAR * (upper - lower), np.asarray(relative)
+    span, any_scale = NEGLIGIBLE * (upper - lower), np.asarray(relative)
     near = [np.where(end == 0, span, np.minimum(span, _CLOSE * np.abs(end))) for end in (lower, upper)]
     low = (values - lower < near[0]) & ((lower > 0) | ~any_scale)
     high = (upper - values < near[1]) & ~any_scale
@@ -113,7 +111,7 @@ def _on_windows(problem: Prepared, structure: Structure) -> Iterator[OnBound]:
     given = np.zeros(0) if stated is None else stated
     found, window = structure.natural_frequencies[: given.size], np.log1p(FREQUENCY_WINDOW)
     off = np.log(2 * np.pi * found / given[: found.size])
-    for i in np.flatnonzero(np.abs(np.abs(off) - window) < _NEAR * window):
+    for i in np.flatnonzero(np.abs(np.abs(off) - window) < NEGLIGIBLE * window):
         edge = f"{found[i]:.5g} Hz, {100 * FREQUENCY_WINDOW:g} % from the one stated or found in the data"
         side = ("lower", "upper")[int(off[i] > 0)]
         yield OnBound("natural frequency", f" {i + 1}", side, edge, type(problem.stated.stiffness).__name__, -1)
@@ -124,15 +122,8 @@ def bounds_in_words(found: Sequence[OnBound]) -> str:
     groups: dict[tuple[str, str, str], list[str]] = {}
     for one in found:
         groups.setdefault((one.name, one.side, one.bound), []).append(one.entry)
-    words = [
-        f"{name}{','.join(entries[:_TOLD])}{_more(len(entries))} ({side}, {bound})"
-        for (name, side, bound), entries in groups.items()
-    ]
-    return ", ".join(words[:_TOLD]) + _more(len(words))
-
-
-def _more(count: int) -> str:
-    return f" and {count - _TOLD} more" * (count > _TOLD)
+    words = [f"{name}{listed(entries, ',')} ({side}, {bound})" for (name, side, bound), entries in groups.items()]
+    return listed(words)
 
 
 def keeping_bounds(context: Context) -> Iterator[Finding]:
@@ -220,16 +211,16 @@ def pressure(problem: Prepared, structure: Structure, x: Array | None, found: Se
     J = rows.jacobian * unit
     free = left_by_constraints(formulation, x, unit, J, np.full(x.size, True))
     _, s, Vt = np.linalg.svd(free[places])
-    held = free @ Vt[np.count_nonzero(s > _NONE) :].T  # what moves no unknown on a bound
+    held = free @ Vt[np.count_nonzero(s > ROUND_OFF) :].T  # what moves no unknown on a bound
     gained = _explained(J @ free, rows.residuals) - _explained(J @ held, rows.residuals)
-    least = max(float(np.mean(rows.std**2)) * beyond_chance(len(places)), EXACT**2)
+    least = max(float(np.mean(rows.std**2)) * beyond_chance(len(places), CANDIDATES), EXACT**2)
     return Pressure(gained / max(float(np.sum(rows.residuals**2)), EXACT**2), significant=gained > least)
 
 
 def _explained(J: Array, residuals: Array) -> float:
     """Squares of the residuals that the columns of J explain."""
     U, s, _ = np.linalg.svd(J, full_matrices=False)
-    return float(np.sum((U[:, s > _NONE * s.max(initial=0.0)].T @ residuals) ** 2))
+    return float(np.sum((U[:, s > ROUND_OFF * s.max(initial=0.0)].T @ residuals) ** 2))
 
 
 def _of_poles(problem: Prepared, structure: Structure, count: int) -> Pressure:
@@ -239,5 +230,5 @@ def _of_poles(problem: Prepared, structure: Structure, count: int) -> Pressure:
     records, poles = Records(problem.measurement), problem.geometry.poles
     own, exact = records.fit(*distinct_poles(structure)), EXACT**2 * records.size
     gained = own.squared_error - poles.residual**2 * records.size
-    least = max(records.noise(own.left, own.residues.size) * beyond_chance(count), exact)
+    least = max(records.noise(own.left, own.residues.size) * beyond_chance(count, CANDIDATES), exact)
     return Pressure(gained / max(own.squared_error, exact), significant=bool(gained > least))

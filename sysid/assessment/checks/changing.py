@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.assessment.checks.context import Context
+from sysid.assessment.checks.leakage import ONE_SHAPE
 from sysid.assessment.checks.noise_multiples import BEYOND, misses_of_test
 from sysid.errors import InputError
 from sysid.finding import Finding, Severity
@@ -20,19 +21,13 @@ from sysid.modal_analysis.stretches import Stretch, stretches_of
 from sysid.modal_analysis.transients import without_transients_of
 from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import COVERAGE, FALSE_ALARM, most_deviations
 
 _MOVED = 0.1  # half-power widths, by which the frequency of a mode changes at least
-_KNOWN = 1.0  # the same, to which it is known in a stretch that counts
-_SURE = 5.0  # standard deviations of a change between two stretches
 _EXPLAINED = 0.7  # of the squares that constant poles leave: poles that change leave no more
 _SHOWN = 0.03  # of the largest level of a mode, at which it shows
-_ENOUGH = 5  # stretches that tell a trend
-_TREND = 0.03  # chance of such an order of frequencies by level
-_SURE_TREND = 1e-3  # the same, where it counts as a sign
-_SIGNS = 2  # of three, that tell a change
 _OF_RUNS = 0.15  # of the variance of frequencies, that is left within runs where runs differ
 _CLOSE = 0.06  # of their frequency, within which modes ..
-_ONE_SHAPE = 0.9  # .. of one shape (modal assurance criterion) may be one that changes
 _LEAST_RATIO = 1e-4
 
 
@@ -75,8 +70,8 @@ class Change:
         std = np.array([one.std for one in self.seen])
         change = np.abs(self.frequency[:, None] - self.frequency)
         moved = change > _MOVED * self.width
-        differ = bool(np.any(moved & (change > _SURE * np.hypot(std[:, None], std))))
-        return bool(np.any(moved)) and explained + differ + (self.trend_of(_SURE_TREND) != 0) >= _SIGNS
+        differ = bool(np.any(moved & (change > most_deviations(change.size) * np.hypot(std[:, None], std))))
+        return bool(np.any(moved)) and explained + differ + (self.trend_of(FALSE_ALARM) != 0) >= 2
 
     @property
     def size(self) -> float:
@@ -86,13 +81,13 @@ class Change:
     @cached_property
     def trend(self) -> float:
         """Rank correlation of frequency and level; zero where chance or time make as large a one."""
-        return self.trend_of(_TREND)
+        return self.trend_of(1 - COVERAGE)
 
     def trend_of(self, chance: float) -> float:
         """The same, where chance makes as large a one no more often than stated."""
         from scipy.stats import spearmanr
 
-        if len(self.seen) < _ENOUGH:
+        if len(self.seen) < 5:  # fewer stretches tell no trend
             return 0.0
         found = spearmanr([one.level for one in self.seen], self.frequency)
         in_time = abs(spearmanr(np.arange(len(self.seen)), self.frequency).statistic)
@@ -224,7 +219,7 @@ class Poles(NamedTuple):
             like = [
                 group
                 for group in near
-                if len(self.shapes) > 1 and (self.shapes[:, group[0]] @ self.shapes[:, k]) ** 2 > _ONE_SHAPE
+                if len(self.shapes) > 1 and (self.shapes[:, group[0]] @ self.shapes[:, k]) ** 2 > ONE_SHAPE
             ]
             if like:
                 like[-1].append(k)
@@ -256,7 +251,7 @@ def _seen(stretches: list[Stretch], k: int, width: float, number: int, test: Mea
     for one in stretches:
         run = f"run {one.run + 1}" if test.n_runs > 1 else "the record"
         record = run if number == 0 else f"{run} of unfitted test {number}"
-        if one.std[k] < _KNOWN * width and one.left <= one.left_by_all:
+        if one.std[k] < width and one.left <= one.left_by_all:
             part = f"{one.start:.3g} to {one.end:.3g} s"
             made.append(Seen(record, part, float(one.frequency[k]), float(one.std[k]), float(one.level[k])))
     return made

@@ -12,6 +12,7 @@ from itertools import combinations
 
 import numpy as np
 
+from sysid.assessment.checks.mistakes import MENDED
 from sysid.errors import InputError
 from sysid.finding import Finding, Severity
 from sysid.measurement.measurement import Measurement
@@ -19,12 +20,9 @@ from sysid.modal_analysis.poles_of_test import poles_of_test
 from sysid.modal_analysis.residues import linear_residues
 from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import FREE
 
-_BETTER = 0.3  # of the residual of the records as they are; what they leave with two sensors swapped
-_WHOLLY = 1.05  # of what free residues leave: nothing else is wrong then
 _CLEARLY = 2.0  # times the least residual, that the next best exchange leaves
-_PAIRS = 15  # at most: those of six sensors
-_STEPS = 40
 _FREQUENCY, _DAMPING = 5.0, 0.1  # weights of errors of log w and log zeta; residues are relative to all of them
 
 
@@ -42,7 +40,7 @@ def exchanged_sensors(problem: Prepared, structure: Structure, *, wholly: bool =
     formulation, test = problem.formulation, problem.measurement
     told = formulation.fits_records and not formulation.stiffness.free and structure.n == test.n_sensors
     pairs = list(_alike(test))
-    if not told or not 0 < len(pairs) <= _PAIRS:
+    if not told or not 0 < len(pairs) <= 15:  # those of six sensors
         return ()
     try:
         omega, ratios = poles_of_test(test)
@@ -53,7 +51,7 @@ def exchanged_sensors(problem: Prepared, structure: Structure, *, wholly: bool =
     found.sort()
     (least, (i, j)), others = found[0], [residual for residual, _ in found[1:]]
     own = test.residual(structure)
-    if least > _BETTER * own or (others and others[0] < _CLEARLY * least) or (wholly and least > _WHOLLY * floor):
+    if least > MENDED * own or (others and others[0] < _CLEARLY * least) or (wholly and least > FREE * floor):
         return ()
     names = test.sensor_names
     swapped = Finding(
@@ -99,5 +97,5 @@ def _residual_of(problem: Prepared, omega: Array, ratios: Array, pair: tuple[int
 
     low, high = to(lower), to(upper)
     start = np.clip(to(formulation.guess), low, high)
-    end = least_squares(errors, start, bounds=(low - 1e-9, high + 1e-9), x_scale=high - low + 1e-12, max_nfev=_STEPS)
+    end = least_squares(errors, start, bounds=(low - 1e-9, high + 1e-9), x_scale=high - low + 1e-12, max_nfev=40)
     return test.residual(formulation.matrices.structure(back(end.x), test))

@@ -16,29 +16,21 @@ import scipy
 from numpy.typing import NDArray
 
 from sysid.assessment.checks.context import Context
-from sysid.finding import Finding, Severity
+from sysid.finding import MOST_OF_A_KIND, Finding, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.residues import Records, ResidueFit
 from sysid.modal_analysis.response import gain_slopes
 from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import COVERAGE, EXACT, FALSE_ALARM, LIKELY, NEGLIGIBLE, ROUND_OFF, most_deviations
 
-_CHANCE = 1e-3  # that any sensor of a right test is accused
-_SUSPECT = 2.5  # deviations of the noise, beyond which what a gain is off by counts among what is not known
 _UNSHOWN = 2.0  # %: the error that a gain may have where no record shows it
-_WITHIN = 2.0  # deviations of a gain: what the records leave open
-_MOVED = 3.0  # stated deviations of M_SS, from which an assumption is told
 _LEAST = 2e-3  # of a gain; smaller errors are usual
-_MIMICKED = 1e-2  # of a constant; less of it is left where a mode far below the lines answers like one
-_EXACT = 1e-8  # of the records: what counts as noise where there is none
+MIMICKED = 1e-2  # of a constant; less of it is left where a mode far below the lines answers like one
 _BESIDE = 0.1  # of the largest error: what it leaves of itself on other sensors, as poles follow it
-_ALIKE = 3.0  # standard deviations by which errors of gains may differ and still be the base's one
-_TOLD = 3  # sensors
-_SAME_POLE = 1e-6  # relative distance of poles that count as one
-_DEPENDENT = 1e-10  # of the largest eigenvalue: changes of poles that do not show
 _BLOCKS = (8, 16, 32, 64)  # of lines, within which they may share their error
-_LINES = 2  # times the free residues: fewer numbers than these tell nothing beside noise
+NUMBERS_A_RESIDUE = 2  # times the free residues: fewer numbers than these tell nothing beside noise
 
 Estimate = tuple[Array, Array, Array]
 
@@ -70,18 +62,18 @@ class GainErrors:
         off = np.where(shown, np.abs(self.error) / np.where(shown, self.std, 1.0), 0.0)
         chance = 2 * scipy.special.stdtr(self.freedom, -off) * np.count_nonzero(shown)
         size = np.abs(np.nan_to_num(self.error))
-        found = np.flatnonzero((chance < _CHANCE) & (size > max(_LEAST, _BESIDE * size.max())))
+        found = np.flatnonzero((chance < FALSE_ALARM) & (size > max(_LEAST, _BESIDE * size.max())))
         return found[np.argsort(-off[found])]
 
     @property
     def of_base(self) -> float | None:
         """The one error that explains those of all sensors, where three or more show one: then it is the base's."""
         shown = np.isfinite(self.error)
-        if np.count_nonzero(shown) < _TOLD or not self.wrong.size:
+        if np.count_nonzero(shown) < 3 or not self.wrong.size:
             return None
         error, std = self.error[shown], self.std[shown]
         one = float(np.average(error, weights=std**-2))
-        return one if np.all(np.abs(error - one) < _ALIKE * std) else None
+        return one if np.all(np.abs(error - one) < most_deviations(error.size) * std) else None
 
 
 def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
@@ -99,7 +91,7 @@ def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
         return GainErrors(error, std, np.nan_to_num(_beyond(error, std)), gain.freedom)
     records, poles, velocity = Records(test), distinct_poles(structure), not structure.modal_damping
     count = poles[0].size * test.n_base * (2 if velocity else 1)
-    if records.data.shape[0] <= _LINES * (count + 2 * test.n_base):
+    if records.data.shape[0] <= NUMBERS_A_RESIDUE * (count + 2 * test.n_base):
         unknown = np.full(test.n_sensors, np.nan)
         return GainErrors(unknown, unknown, np.zeros(test.n_sensors), 1)
     free = records.fit(*poles, velocity=velocity)
@@ -118,15 +110,16 @@ def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
 
 
 def _beyond(error: Array, std: Array) -> Array:
-    """What chance does not explain of errors with these deviations."""
-    return np.sqrt(np.maximum(error**2 - (_SUSPECT * std) ** 2, 0.0))
+    """What chance does not explain of errors with these deviations, in 95 % of right tests none of any sensor."""
+    likely = most_deviations(2 * error.size, 1 - COVERAGE)  # of two estimates each
+    return np.sqrt(np.maximum(error**2 - (likely * std) ** 2, 0.0))
 
 
 def distinct_poles(structure: Structure) -> tuple[Array, Array]:
     """Distinct poles, rad/s and ratios."""
     omega = 2 * np.pi * structure.natural_frequencies
     poles = omega * (1 + 1j * structure.damping_ratios)
-    first = np.concatenate([[True], np.abs(np.diff(poles)) > _SAME_POLE * omega[1:]])
+    first = np.concatenate([[True], np.abs(np.diff(poles)) > NEGLIGIBLE * omega[1:]])
     return omega[first], structure.damping_ratios[first]
 
 
@@ -134,7 +127,7 @@ def wrong_gains(test: Measurement, errors: GainErrors) -> Iterator[Finding]:
     """Sensors whose gain is wrong, the worst first."""
     base = errors.of_base
     alike = "" if base is None else f", or the base {-100 * base:+.2g} %, as all sensors show the same error"
-    for i in errors.wrong[:_TOLD]:
+    for i in errors.wrong[:MOST_OF_A_KIND]:
         error, name = float(errors.error[i]), test.sensor_names[i]
         numbers = {"gain": 1 + error, "std": float(errors.std[i])} | ({} if base is None else {"base": 1 - base})
         yield Finding(
@@ -210,13 +203,13 @@ def rests_on(test: Measurement, errors: GainErrors, worth: Array) -> Iterator[Fi
     """Gains that M_SS rests on more closely than the records show them; none is accused.
 
     `worth` (n_sensors,): deviations that an error of 1 % moves M_SS by. The records leave a gain open to its estimate
-    and two deviations on either side. Where an error within that would move M_SS by more than `_MOVED` of its stated
-    deviations, which hold for right gains, that the gain is right is an assumption that matters.
+    and its interval on either side. Where an error within that would move M_SS by more than noise does, which holds for
+    right gains, that the gain is right is an assumption that matters.
     """
     for i in np.flatnonzero(np.any(test.rigid_body, axis=1)):
-        size, open_ = 100 * abs(errors.error[i]), 100 * _WITHIN * errors.std[i]
+        size, open_ = 100 * abs(errors.error[i]), 100 * LIKELY * errors.std[i]
         reach = size + open_ if np.isfinite(errors.error[i]) else _UNSHOWN
-        if worth[i] * reach > _MOVED:
+        if worth[i] * reach > most_deviations():
             shown = f"{1 + errors.error[i]:.4f} ± {open_ / 100:.1g}" if np.isfinite(errors.error[i]) else "not shown"
             yield Finding(
                 "gain not shown", Severity.NOTE,
@@ -239,7 +232,7 @@ def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, o
     extra, slopes = _less(Q, ones), _less(Q, slopes)
     column = extra @ rigid
     size = by_sensor(column**2)
-    shown = size > _MIMICKED**2 * by_sensor((ones @ rigid) ** 2)
+    shown = size > MIMICKED**2 * by_sensor((ones @ rigid) ** 2)
     column *= np.tile(shown, each)
     size[~shown] = 1.0
     moved = np.tile(free.residues, (2, 1, 1))[: slopes.shape[1] // ones.shape[1]]  # (2 m, inputs, channels)
@@ -247,7 +240,7 @@ def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, o
     across = by_sensor(moved * by(slopes.T @ column))
     products = (slopes.T @ slopes).reshape(*moved.shape[:2] * 2)
     together = np.einsum("kic,kilj,ljc->kl", moved, products, moved, optimize=True)
-    inverse = np.linalg.pinv(together, rcond=_DEPENDENT, hermitian=True)
+    inverse = np.linalg.pinv(together, rcond=ROUND_OFF, hermitian=True)
     pull = np.einsum("kic,kic->k", moved, by(slopes.T @ beside))
     normal = np.linalg.inv(np.diag(size) - across.T @ inverse @ across)
     error = normal @ (by_sensor(column * beside) - across.T @ (inverse @ pull))
@@ -258,7 +251,7 @@ def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, o
     by_line = by_sensor((of_lines.real + of_lines.imag)[..., None, :])
     variance = np.array([_variance(own) for own in np.moveaxis(by_line, -1, 0)]) / size
     noise = by_sensor(left**2) / max((len(left) - Q.shape[1]) * each - 1, 1)
-    noise = np.maximum(noise, _EXACT**2 * records.size / left.size)
+    noise = np.maximum(noise, EXACT**2 * records.size / left.size)
     if test.response_std is not None and np.any(test.response_std > 0):
         stated = 0.5  # half of a complex number's variance, in units of what is stated
         # What a model misses is no noise, and pulls constants along: beyond the stated noise it counts twice.

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 from sysid.assessment.checks.context import Context
 from sysid.finding import Finding, Severity
+from sysid.structure.thresholds import UNEXPLAINED
 
-_NO_FIT = 0.5  # relative residual above which nothing is explained
 _CONVENTIONS = (
     "are the frequencies in Hz, the responses absolute and complex with exp(+iwt), the axes and signs of rigid_body "
     "right, the bounds wide enough?"
@@ -29,7 +29,7 @@ def missed_goal(context: Context) -> Iterator[Finding]:
     if goal is not None and residual > goal:
         told = f"the residual {residual:.3g} is above the goal {goal:.3g}"
         yield Finding("goal", Severity.CONTRADICTS, told, numbers={"residual": residual, "goal": goal})
-    if goal is None and residual > _NO_FIT and end.stopped is None and (end.success or not context.cut_short):
+    if goal is None and residual > UNEXPLAINED and end.stopped is None and (end.success or not context.cut_short):
         scaled = problem.unit_mass and not problem.formulation.stiffness.free
         told, why = f"the residual {residual:.3g} is no fit", _SCALE if scaled else _CONVENTIONS
         yield Finding("residual", Severity.CONTRADICTS, told, why, numbers={"residual": residual})

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from sysid.finding import Finding, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import NEGLIGIBLE
 
+ONE_SHAPE = 0.9  # modal assurance criterion, from which two modes have one shape
 _FEWEST = 8.0  # lines in a half-power width; a Hann window then takes 2 % off a peak, and more with fewer
 _RESOLVED = 2.5  # distances of lines; narrower peaks are mostly the window's
 _TWICE = 2.0  # distances of lines, within which a peak that was smeared over them is taken for two modes
-_SAME_SHAPE = 0.95  # modal assurance criterion
 _MISSED = 3.0  # times the relative misfit elsewhere, beyond which spectra of unknown origin show a peak flattened
-_NEAR = 1.5  # half-power widths about a peak ..
-_AT_LEAST = 1.5  # .. or distances of lines
+_NEAR = 1.5  # half-power widths, or distances of lines, about a peak
 
 
 class Peaks(NamedTuple):
@@ -114,7 +114,7 @@ def _found_twice(peaks: Peaks, coarse: NDArray[np.bool_], structure: Structure) 
     groups: list[list[int]] = []
     for i, j in pairwise(range(peaks.number.size)):
         near = peaks.frequency[j] - peaks.frequency[i] < _TWICE * peaks.spacing[i]
-        if not (near and coarse[i] and coarse[j] and _mac(structure, *peaks.number[[i, j]] - 1) > _SAME_SHAPE):
+        if not (near and coarse[i] and coarse[j] and _mac(structure, *peaks.number[[i, j]] - 1) > ONE_SHAPE):
             continue
         if groups and groups[-1][-1] == i:
             groups[-1].append(j)
@@ -136,12 +136,12 @@ def _missed(test: Measurement, structure: Structure, frequency: float, width: fl
     itself that is not what modes make of it stands out.
     """
     distance = np.gradient(test.freq)
-    near = np.abs(test.freq - frequency) < np.maximum(_NEAR * width, _AT_LEAST * distance)
+    near = np.abs(test.freq - frequency) < _NEAR * np.maximum(width, distance)
     if not np.any(near) or np.all(near):
         return None
     left = test.relative - test.predict(structure)
     share = lambda at: float(np.linalg.norm(left[..., at]) / np.linalg.norm(test.relative[..., at]))  # noqa: E731
     there, elsewhere = share(near), share(~near)
-    if there < _MISSED * elsewhere or there < 1e-6:
+    if there < _MISSED * elsewhere or there < NEGLIGIBLE:
         return None
     return f", and the fit misses {100 * there:.3g} % of the response there ({100 * elsewhere:.3g} % elsewhere)"

@@ -13,32 +13,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sysid.files.units import STANDARD_GRAVITY
 from sysid.finding import Finding, Kind, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.direct_terms import DirectTerms, direct_terms
 from sysid.structure.structure import Array
+from sysid.structure.thresholds import AS_GOOD, CANDIDATES, most_deviations
 
 CONJUGATED = 0.3  # relative misfit, beyond which modes explain the records at most as conjugated ones
-_MENDED = 0.3  # of the misfit; what a mended record may leave
+MENDED = 0.3  # of the misfit; what a mended record may leave
 _GROSS = 0.15  # of a sensor's rigid-body motion: smaller errors of gains are told by what was fitted
-_CHANCE = 3.0  # standard deviations that a factor may be off by
-_ALONE = 0.05  # of the same of the other sensors, where one alone has another gain
-_SURE = 6.0  # standard deviations
 _ONE_SURE = 10.0  # the same of the delay of one sensor, whose deviation is not known so well
-_SHOWN = 0.1  # of a sensor's rigid-body motion; it is not known where the standard deviation is larger
-_LIKE = 0.04  # by how much a factor may differ from that of two units
-_NONE = 0.1  # of a sensor's rigid-body motion; as good as none
+_LIKE = 0.04  # by how much a factor may differ from that of two units, and other sensors where one alone is wrong
+_NONE = 0.1  # of a sensor's rigid-body motion; as good as none, or not known where the standard deviation is larger
 _CARRIED = 0.5  # of the rigid-body motion, that modes between the lines carry: there is no other below them
 _TURN = 0.03  # rad at the last line; the least delay that is told
 _LARGE_TURN = 0.3  # rad there, from which no fit is worth a search
 _MOST = 1.5  # rad at the last line; the largest one
 _ALIKE = 0.2  # of a delay, by which sensors on one clock may differ
-_NO_WORSE = 1.02  # times the misfit before, that records on one clock may have
-_ROUNDS = 3  # of taking a delay off
-GRAVITY = 9.80665
 _UNITS = (  # what sensors over base are multiplied by, in words, and the units with the smaller and the larger numbers
-    (GRAVITY, "9.81", "g", "m/s²"),
-    (1 / GRAVITY, "9.81", "g", "m/s²"),
+    (STANDARD_GRAVITY, "9.81", "g", "m/s²"),
+    (1 / STANDARD_GRAVITY, "9.81", "g", "m/s²"),
     (1000.0, "1,000", "m/s²", "mm/s²"),
     (1 / 1000.0, "1,000", "m/s²", "mm/s²"),
 )
@@ -82,7 +77,7 @@ def _conjugated(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
         return
     force = None if test.force is None else test.force.conj()
     other = direct_terms(replace(test, base=test.base.conj(), response=test.response.conj(), force=force))
-    if other is not None and other.misfit < _MENDED * terms.misfit:
+    if other is not None and other.misfit < MENDED * terms.misfit:
         yield Finding(
             "conjugated spectra", Severity.BLOCKING,
             "the spectra follow exp(-i w t): modes that decay leave "
@@ -96,7 +91,7 @@ def _late(test: Measurement, terms: DirectTerms) -> tuple[list[Finding], DirectT
     """Sensors whose records are late against the base's, and the terms of the records without that delay."""
     total = np.zeros(test.n_sensors)
     first: Array | None = None
-    for _ in range(_ROUNDS):
+    for _ in range(3):  # times that a delay is taken off
         found = _delays(test, terms)
         if found is None:
             break
@@ -106,7 +101,7 @@ def _late(test: Measurement, terms: DirectTerms) -> tuple[list[Finding], DirectT
             break
         turn = np.exp(2j * np.pi * total[:, None] * test.freq)
         mended = direct_terms(replace(test, response=test.response * turn))
-        if mended is None or mended.misfit > _NO_WORSE * terms.misfit:
+        if mended is None or mended.misfit > AS_GOOD * terms.misfit:
             return [], terms
         terms = mended
     if first is None:
@@ -133,7 +128,7 @@ def _delays(test: Measurement, terms: DirectTerms) -> Array | None:
     c, slope, std = terms.rigid / reach, terms.slope / reach, terms.slope_std / reach
     size = np.sum(c**2, axis=1)
     stated = np.sum((test.rigid_body / reach) ** 2, axis=1)
-    told = np.sum((terms.rigid_std / reach) ** 2, axis=1) < _SHOWN**2 * np.maximum(size, stated)
+    told = np.sum((terms.rigid_std / reach) ** 2, axis=1) < _NONE**2 * np.maximum(size, stated)
     known = np.flatnonzero((stated > 0) & (size > _NONE**2 * stated) & told)
     if not known.size:
         return None
@@ -146,8 +141,8 @@ def _delays(test: Measurement, terms: DirectTerms) -> Array | None:
     if np.any(np.abs(delay[off]) > _MOST / (2 * np.pi * test.freq[-1])):  # the first terms of a series do not tell it
         return None
     out = np.zeros(test.n_sensors)
-    if np.all(np.abs(delay - mean) < np.maximum(_SURE * error, _ALIKE * abs(mean))):
-        if abs(mean) < max(_SURE / np.sqrt(np.sum(error**-2)), least):
+    if np.all(np.abs(delay - mean) < np.maximum(most_deviations(CANDIDATES) * error, _ALIKE * abs(mean))):
+        if abs(mean) < max(most_deviations(CANDIDATES) / np.sqrt(np.sum(error**-2)), least):
             return None
         out[known] = mean
     elif np.count_nonzero(off) == 1 and known.size > 2:
@@ -181,7 +176,7 @@ class _Motion:
         """Which rows are recorded as these say, but for what is usual and for chance."""
         size = np.linalg.norm(stated, axis=1, keepdims=True)
         off = np.abs(self.recorded - stated)
-        return np.asarray(np.all(off < np.maximum(within * size, _SURE * self.std), axis=1))
+        return np.asarray(np.all(off < np.maximum(within * size, most_deviations(CANDIDATES) * self.std), axis=1))
 
 
 def _of_motion(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
@@ -190,7 +185,7 @@ def _of_motion(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
     G, c, std = test.rigid_body / reach, terms.rigid / reach, terms.rigid_std / reach
     size = np.linalg.norm(G, axis=1)
     gain = np.maximum(np.linalg.norm(c, axis=1) / np.where(size > 0, size, 1.0), 1.0)
-    known = np.flatnonzero((size > 0) & (np.linalg.norm(std, axis=1) < _SHOWN * size * gain))
+    known = np.flatnonzero((size > 0) & (np.linalg.norm(std, axis=1) < _NONE * size * gain))
     motion = _Motion(known, G[known], c[known], std[known], (terms.modal / reach)[known])
     right = motion.agree(motion.stated)
     if known.size == 0 or np.all(right):
@@ -317,10 +312,12 @@ def _of_sensors(test: Measurement, motion: _Motion, right: NDArray[np.bool_]) ->
     agree = motion.agree(scaled)
     for i, value, std in zip(wrong, factor, error, strict=True):
         # Modes far below the lines move some sensors more than others, but not one alone.
-        alone = wrong.size == 1 and np.count_nonzero(motion.agree(motion.stated, _ALONE)) == right.size - 1
+        alone = wrong.size == 1 and np.count_nonzero(motion.agree(motion.stated, _LIKE)) == right.size - 1
         if agree[i] and (alone or any(abs(value / own - 1) < _LIKE for own in _CLEAR)):
             carried = np.sum(motion.modal[i] * motion.stated[i]) / np.sum(motion.stated[i] ** 2)
-            value = next((u[0] for u in _UNITS if abs(value - u[0]) < min(_CHANCE * std, _GROSS * u[0])), value)
+            value = next(
+                (u[0] for u in _UNITS if abs(value - u[0]) < min(most_deviations() * std, _GROSS * u[0])), value
+            )
             yield from _of_sensor(test.sensor_names[motion.sensors[i]], float(value), float(carried))
 
 
@@ -361,7 +358,7 @@ def _of_force(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
     if terms.mass is None or terms.mass_std is None or terms.modal_mass is None:
         return
     weighed, std, modal = (np.diag(it) for it in (terms.mass, terms.mass_std, terms.modal_mass))
-    against = np.flatnonzero((weighed < -_SURE * std) & (modal < 0))
+    against = np.flatnonzero((weighed < -most_deviations(CANDIDATES) * std) & (modal < 0))
     if against.size:
         assert test.base_axes is not None
         masses = ", ".join(f"{weighed[i]:.4g}" for i in against)

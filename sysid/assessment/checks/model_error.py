@@ -14,7 +14,7 @@ from sysid.finding import Finding, Severity
 from sysid.measurement.in_time import peaks
 from sysid.modal_analysis.transients import without_transients_of
 
-_LEVEL = 1.25  # times the fitted levels, beyond which another is outside
+LEVEL = 1.25  # times the fitted levels, beyond which another is outside
 _CUT = (
     "these are plain spectra of records that move at their ends, which hold transients too: take whole records "
     "(from_time's estimator='records')"
@@ -62,7 +62,7 @@ def other_levels(context: Context) -> Iterator[Finding]:
         own = peaks(test)
         if not (fitted and own):
             continue
-        if max(own) > _LEVEL * max(fitted) or max(own) < min(fitted) / _LEVEL:
+        if max(own) > LEVEL * max(fitted) or max(own) < min(fitted) / LEVEL:
             span = f"{max(fitted):.3g}" if len(fitted) == 1 else f"{min(fitted):.3g} to {max(fitted):.3g}"
             yield Finding(
                 "level", Severity.NOTE,

@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from sysid.assessment.checks.context import Context
-from sysid.finding import Finding, Severity
+from sysid.finding import MOST_OF_A_KIND, Finding, Severity
 from sysid.measurement.spectra import of_run
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-
-_TOLD = 3  # channels
 
 
 def noise_of_records(context: Context) -> Iterator[Finding]:
@@ -43,7 +41,7 @@ def noise_findings(modal: ModalEstimate) -> Iterator[Finding]:
             run=run + 1, channel=names[channel],
         )  # fmt: skip
     source = "intervals are by its scatter" if modal.scatter is not None else "intervals are as if it were white"
-    for excess in modal.excess[:_TOLD]:
+    for excess in modal.excess[:MOST_OF_A_KIND]:
         yield Finding(
             "noise left", Severity.NOTE,
             f"what the fit leaves in {name(excess)} is {excess.factor:.2g} times the noise level between "

@@ -18,9 +18,6 @@ from sysid.structure.structure import Array, ComplexArray, Structure
 
 BEYOND = 3.0  # times the noise, from which a model is not within it
 _UNKNOWN = 0.1  # relative residual, up to which spectra without a stated noise may hold as much of it at some lines
-_BLOCK = 16  # lines of a block ..
-_BLOCKS = 8  # .. of which there are so many at least, that tell the noise by the quietest quarter
-_QUIET = 0.25
 _NEAR = 5.0  # half-power widths, or distances of lines, about a mode
 _TRACE = 1e-4  # of the records; smaller ones are no noise of an instrument
 
@@ -165,17 +162,19 @@ def _miss(record: Record, test: Measurement, found: bool, near: NDArray[np.bool_
         yield Miss(times, bounded, record.name, missed / size, times > BEYOND and cut_in_motion(test))
 
 
-def _quiet(left: ComplexArray, variance: Array, own: NDArray[np.bool_]) -> Array | None:
-    """What the quietest quarter of the blocks of lines holds, over the variance, (runs, channels); None with few."""
+def _quiet(
+    left: ComplexArray, variance: Array, own: NDArray[np.bool_], size: int = 16, least: int = 8, share: float = 0.25
+) -> Array | None:
+    """What the quietest `share` of blocks of lines holds, over the variance, (runs, channels); None with few blocks."""
     out = np.ones(left.shape[:2])
-    mean = float(scipy.special.gammaincinv(_BLOCK, _QUIET)) / _BLOCK
+    mean = float(scipy.special.gammaincinv(size, share)) / size
     for run, lines in enumerate(own):
         power = np.abs(left[run][:, lines]) ** 2 / variance[run][:, lines]
-        blocks = power.shape[1] // _BLOCK
-        if blocks < _BLOCKS:
+        blocks = power.shape[1] // size
+        if blocks < least:
             return None
-        held = power[:, : blocks * _BLOCK].reshape(len(power), blocks, _BLOCK).mean(axis=2)
-        out[run] = np.minimum(np.quantile(held, _QUIET, axis=1) / mean, power.mean(axis=1))
+        held = power[:, : blocks * size].reshape(len(power), blocks, size).mean(axis=2)
+        out[run] = np.minimum(np.quantile(held, share, axis=1) / mean, power.mean(axis=1))
     return out
 
 

@@ -17,10 +17,9 @@ from sysid.models.mass import total_of
 from sysid.problem.formulation import Formulation
 from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Structure
+from sysid.structure.thresholds import EXACT, NEGLIGIBLE, most_deviations
 
-ROUND_OFF = 1e-8  # of the records: what counts as noise where there is none
 MISFIT = 1.5  # times what free residues leave, beyond which a force is not what the modes make of it
-FAR = 4.0  # standard deviations by which a mass, or another value, may differ from a stated one
 
 
 def stated_masses(context: Context) -> Iterator[Finding]:
@@ -41,7 +40,8 @@ def _stated_mass(problem: Prepared, structure: Structure) -> Iterator[Finding]:
         return
     poles = distinct_poles(structure)
     weighed, own = np.diag(weighed_mass(test, *poles)), np.diag(structure.rigid_body_mass)
-    noise = FAR * weighed_mass_std(test, *poles) / own  # a direction beside a rotation may be weighed worse
+    # A direction beside a rotation may be weighed worse.
+    noise = most_deviations(test.n_base) * weighed_mass_std(test, *poles) / own
     usual = max(0.01, 3 * force_residual_left(test, *poles) / np.sqrt(test.freq.size))
     if np.any(np.abs(weighed / own - 1) >= np.maximum(usual, noise)):
         given, told = (", ".join(f"{m:.4g}" for m in masses) for masses in (own, weighed))
@@ -67,7 +67,7 @@ def _known_entries(problem: Prepared, structure: Structure) -> Iterator[Finding]
     if mass.totals is not None and problem.measurement.force is None:
         makes = total_of(geometry, structure.mass, mass.totals.kind)
         std = mass.totals.std_by_direction
-        if np.any(makes > problem.totals * (1 + 1e-6) + FAR * std):
+        if np.any(makes > problem.totals * (1 + NEGLIGIBLE) + most_deviations(std.size) * std):
             given, told = (", ".join(f"{m:.4g}" for m in masses) for masses in (problem.totals, makes))
             more = f"the known entries of the mass make {told} kg or more, and {given} kg are stated in all"
             yield Finding("known entries", Severity.CONTRADICTS, more)
@@ -105,8 +105,8 @@ def force_misfit(formulation: Formulation, test: Measurement, structure: Structu
     # Both misfits in units of the stated noise: what is left at a noisy peak speaks against nothing.
     left = replace(test, force=test.force - test.predict_force(structure))
     misfit = float(np.sqrt(Records(left, force=True).size / Records(test, force=True).size))
-    possible = max(force_residual_left(test, *distinct_poles(structure)), ROUND_OFF)
-    if misfit > max(MISFIT * possible, 1e-6):
+    possible = max(force_residual_left(test, *distinct_poles(structure)), EXACT)
+    if misfit > max(MISFIT * possible, NEGLIGIBLE):
         yield Finding(
             "force misfit", Severity.CONTRADICTS,
             f"the base force misses what the modes of the accelerations make of it by {100 * misfit:.3g} % "

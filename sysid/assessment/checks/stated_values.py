@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-import scipy
 
 from sysid.assessment.checks.context import Context
-from sysid.assessment.checks.stated_mass import FAR
 from sysid.finding import Finding, Severity
 from sysid.problem.formulation import Formulation
 from sysid.structure.structure import Array
-
-_CHANCE = 1e-4  # that errors as stated are so large together
+from sysid.structure.thresholds import beyond_chance
 
 
 def missed_values(context: Context) -> Iterator[Finding]:
@@ -30,7 +27,7 @@ def _priors(formulation: Formulation, x: Array) -> Iterator[Finding]:
     """Values that are stated as known, where errors as stated do not miss them all so far."""
     names = [name for term in formulation.priors for name in term.labels]
     off = np.concatenate([np.zeros(0), *(term.numbers(x) for term in formulation.priors)])
-    if np.sum(off**2) > scipy.special.chdtri(max(off.size, 1), _CHANCE) and np.all(np.abs(off) <= FAR):
+    if np.sum(off**2) > beyond_chance(off.size) and not any(term.findings(x) for term in formulation.priors):
         told = ", ".join(f"{name} by {z:+.2g}" for name, z in zip(names, off, strict=True))
         yield Finding(
             "stated values", Severity.CONTRADICTS,

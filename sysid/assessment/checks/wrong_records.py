@@ -9,8 +9,10 @@ import numpy as np
 
 from sysid.assessment.checks.context import Context
 from sysid.assessment.checks.leakage import unresolved
-from sysid.assessment.checks.mistakes import CONJUGATED, GRAVITY, is_gross, mistakes_of
+from sysid.assessment.checks.mistakes import CONJUGATED, is_gross, mistakes_of
+from sysid.assessment.checks.stated_mass import MISFIT
 from sysid.errors import InputError
+from sysid.files.units import POUND, STANDARD_GRAVITY
 from sysid.finding import Finding, Severity
 from sysid.measurement.in_time import as_whole
 from sysid.measurement.measurement import Measurement
@@ -21,20 +23,21 @@ from sysid.problem.formulation import Formulation
 from sysid.problem.stated import StatedProblem
 from sysid.problem.terms import FurtherTest
 from sysid.structure.structure import Array, Structure
+from sysid.structure.thresholds import CANDIDATES, most_deviations
 
-_BEYOND = 1.5  # times what the model allows, from which records contradict it
 _WITHIN = 1.15  # times the same, up to which mended records agree
-_CORNERS = 6  # unknowns whose bounds are combined
-_SURE = 6.0  # standard deviations of a weighed mass
 _MODAL = 0.4  # of the mended mass, that the modes between the lines carry at least
-_LBF = 4.4482216
 _FACTORS = (  # of the weighed mass over the right one, and what they are in words
     (1e-3, "1,000", "the base force is in kN, not N"),
     (1e3, "1,000", "the base force is in N, and was taken for kN"),
-    (GRAVITY, "9.81", "base and sensors are in g, not m/s² (or the base force is in N, and was taken for kgf)"),
-    (1 / GRAVITY, "9.81", "the base force is in kgf, not N"),
-    (1 / _LBF, "4.448", "the base force is in lbf, not N"),
-    (_LBF, "4.448", "the base force is in N, and was taken for lbf"),
+    (
+        STANDARD_GRAVITY,
+        "9.81",
+        "base and sensors are in g, not m/s² (or the base force is in N, and was taken for kgf)",
+    ),
+    (1 / STANDARD_GRAVITY, "9.81", "the base force is in kgf, not N"),
+    (1 / POUND, "4.448", "the base force is in lbf, not N"),
+    (POUND, "4.448", "the base force is in N, and was taken for lbf"),
 )
 
 
@@ -84,11 +87,11 @@ def _of_mass(declared: Formulation, test: Measurement, terms: DirectTerms) -> It
         return
     low, high = (part[test.translational] for part in allowed)
     weighed, std, modal = (np.diag(it)[test.translational] for it in (terms.mass, terms.mass_std, terms.modal_mass))
-    known = (weighed > _SURE * std) & np.isfinite(low) & (high > 0)
+    known = (weighed > most_deviations(CANDIDATES) * std) & np.isfinite(low) & (high > 0)
     if not np.any(known):
         return
     low, high, weighed, modal = low[known], high[known], weighed[known], modal[known]
-    if np.any((weighed > low / _BEYOND) & (weighed < high * _BEYOND)):
+    if np.any((weighed > low / MISFIT) & (weighed < high * MISFIT)):
         return
     for factor, told, words in _FACTORS:
         # What no mode carries may be a fixture, of whatever mass.
@@ -134,7 +137,7 @@ def _of_frequencies(problem: StatedProblem, declared: Formulation, test: Measure
         low, high = np.min(made, axis=0), np.max(made, axis=0)
         what = "the bounds of the model allow first natural frequencies"
     inside = lambda f: bool(low[0] / _WITHIN < f[0] < high[0] * _WITHIN and f[-1] < high[-1] * _WITHIN)  # noqa: E731
-    if stated is not None and found[0] < low[0] / _BEYOND and inside(2 * np.pi * found):
+    if stated is not None and found[0] < low[0] / MISFIT and inside(2 * np.pi * found):
         yield Finding(
             "frequencies in rad/s", Severity.BLOCKING,
             f"the stated natural frequencies are in rad/s, not Hz: {', '.join(f'{f:.4g}' for f in low[:4])} Hz are "
@@ -143,7 +146,7 @@ def _of_frequencies(problem: StatedProblem, declared: Formulation, test: Measure
             "divide what is stated by 2 pi", numbers={"stated": float(low[0]), "found": float(found[0])},
         )  # fmt: skip
     mended = found / (2 * np.pi)
-    if found[0] > _BEYOND * high[0] and inside(mended):
+    if found[0] > MISFIT * high[0] and inside(mended):
         span = f"{low[0]:.4g}" if stated is not None else f"of {low[0]:.4g} to {high[0]:.4g}"
         yield Finding(
             "frequencies in rad/s", Severity.BLOCKING,
@@ -158,7 +161,7 @@ def _structures(declared: Formulation) -> list[Structure]:
     unknowns, lower, upper = declared.unknowns, declared.lower, declared.upper
     ends = np.cumsum([unknown.size for unknown in unknowns])
     points = list(points_of(declared))
-    if len(unknowns) <= _CORNERS:
+    if len(unknowns) <= 6:  # more bounds make too many corners
         for choice in product((False, True), repeat=len(unknowns)):
             points.append(np.where(np.repeat(choice, np.diff(ends, prepend=0)), upper, lower))
     made = []
