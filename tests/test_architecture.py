@@ -25,7 +25,7 @@ CEILINGS = {
     # swarm on the models' own expressions (317), and findings with kind, channel and numbers in the place of sentences,
     # by checks that share one context (600), a page of half the size and time (140),
     # and one model of modes for spectra and whole records, its shapes eliminated with exact second derivatives (530).
-    "lines": 41_604,
+    "lines": 41_534,
     # What was counted when these counts began; the modes once, in the open, brings them down.
     "branches": 78.8,
     "files": 255,
