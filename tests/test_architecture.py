@@ -35,6 +35,7 @@ CEILINGS = {
     "constants": 465,
     "shared": 45,
     "everyday": 385,
+    "prose": 61,
 }
 
 # The counting is a benchmark, which prints the same figures; `sysid` itself is not imported from the checkout.
