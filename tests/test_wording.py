@@ -1,4 +1,4 @@
-"""Wording: what users read is made once here and compared whole; all other tests ask for facts.
+"""Wording: messages that are made cheaply are compared whole here; where one stands here, other tests ask for facts.
 
 Figures in a sentence are those that the test states, or those of the finding's `numbers`.
 """

@@ -1,4 +1,4 @@
-"""Findings as data: a closed list of kinds, the order of weight, the four words of judgement, and the text of one."""
+"""Findings as data: a closed list of kinds, the order of weight, the four words of judgement, and how one is worded."""
 
 import ast
 import inspect

@@ -102,7 +102,7 @@ def test_a_sign_is_the_first_sentence_and_refused_where_the_model_has_a_form():
     first = result.findings[0]
     assert (first.kind, first.channel) == ("sign", "storey 2") and result.confidence[0] == str(first)
     assert result.judgement in ("doubtful", "no fit")
-    with pytest.raises(InputError, match="sign of storey 2 "):
+    with pytest.raises(InputError, match="the sign of storey 2 is reversed"):
         identify(problem("chain", test), rng=0)
 
 

@@ -1,4 +1,4 @@
-"""Standard deviations and intervals against dense finite-difference Jacobians, Monte Carlo, and closed forms."""
+"""Standard deviations against dense finite-difference Jacobians, Monte Carlo, and closed forms."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -9,7 +9,7 @@ import scipy.linalg
 import scipy.stats
 
 import sysid
-from sysid import FullMass, InputError, Measurement, Problem, SpectralStiffness, Structure
+from sysid import FullMass, Measurement, Problem, SpectralStiffness, Structure
 from sysid.assessment.uncertainty import uncertainty
 
 FREQ = np.linspace(2, 66, 90)
@@ -479,43 +479,3 @@ class TestNoiseLevel:
         assert np.all(u.damping_ratios > 0) and np.all(np.isfinite(u.damping))
         low, high = u.interval("damping_ratios")
         assert low[0] < 0 < high[0] and np.all(low[1:] > 0)
-
-
-class TestInterval:
-    @pytest.fixture
-    def u(self, random_structure):
-        truth = random_structure(np.random.default_rng(19), 3, 2)
-        return uncertainty(
-            problem_of(truth, sysid.simulate(truth, FREQ, noise=0.03, force=True, rng=1)).prepared, truth, None
-        )
-
-    def test_ends(self, u):
-        z = scipy.stats.norm.ppf(0.95)
-        off = u.interval("stiffness", 0.9)
-        K, s = u.structure.stiffness[:3, :3], u.stiffness
-        np.testing.assert_allclose(off[1, 0, 1], K[0, 1] + z * s[0, 1])
-        np.testing.assert_allclose(np.log(off[:, 2, 2] / K[2, 2]), [-z * s[2, 2] / K[2, 2], z * s[2, 2] / K[2, 2]])
-        f = u.interval("natural_frequencies", 0.9)
-        np.testing.assert_allclose(np.sqrt(f[0] * f[1]), u.structure.natural_frequencies)
-        p, e = u.interval("participation", 0.9), u.interval("effective_masses", 0.9)
-        crossing = (p[0] < 0) & (p[1] > 0)
-        squares = np.sort(p**2, axis=0)
-        for i in range(2):
-            np.testing.assert_allclose(e[1, :, i, i], squares[1, :, i])
-            np.testing.assert_allclose(e[0, :, i, i], np.where(crossing[:, i], 0, squares[0, :, i]))
-        assert u.interval("mode_shapes").shape == (2, 3, 3) and np.all(u.interval("mass")[0][np.eye(3, dtype=bool)] > 0)
-
-    def test_what_is_hardly_known_stays_positive(self, u):
-        vague = dataclasses.replace(u, mass=1e6 * u.mass)
-        low, high = vague.interval("mass")
-        own = np.eye(3, dtype=bool)
-        assert np.all(low[own] >= 0) and np.all(high[own] > 1e3 * u.structure.mass[:3, :3][own])
-
-    def test_mistakes(self, u):
-        with pytest.raises(InputError, match="'masses'"):
-            u.interval("masses")
-        with pytest.raises(InputError, match="level = 95"):
-            u.interval("mass", 95)
-
-    def test_repr(self, u):
-        assert "masses known" in repr(u)

@@ -89,7 +89,7 @@ def test_a_repeated_pole_among_weak_modes_is_found_without_noise(random_structur
 def test_a_dead_load_cell_is_named(random_structure):
     truth = random_structure(np.random.default_rng(0), 4, 2)
     test = simulate(truth, np.geomspace(1.0, 1.5 * truth.natural_frequencies[-1], 300), force=True)
-    with pytest.raises(InputError, match="force .* in y"):
+    with pytest.raises(InputError, match="force is zero in y"):
         Problem(replace(test, force=test.force * np.array([1.0, 0.0])[None, :, None]), mass=FullMass())
 
 
@@ -116,7 +116,7 @@ def test_relative_accelerations_are_told_from_absolute_ones(random_structure, se
     f = truth.natural_frequencies
     test = simulate(truth, np.geomspace(0.4 * f[0], 1.3 * f[-1], 500))
     wrong = replace(test, response=test.relative)
-    with pytest.raises(InputError, match="not absolute"):
+    with pytest.raises(InputError, match="responses are relative to the base, not absolute"):
         identify(Problem(wrong, mass=FullMass(10.0)), strategy="modal")
 
 

@@ -199,13 +199,13 @@ def test_a_callback_stops_a_round_of_the_loss_and_its_mistakes_are_not_swallowed
 
 def test_what_cannot_be_is_refused():
     test = measured(np.random.default_rng(0))
-    with pytest.raises(sysid.InputError, match="loss = 'l1' .* 'squares', 'huber'"):
+    with pytest.raises(sysid.InputError, match="loss = 'l1' is unknown; give one of 'squares', 'huber'"):
         two_floors(test, loss="l1")
-    with pytest.raises(sysid.InputError, match="loss='huber' "):
+    with pytest.raises(sysid.InputError, match="loss='huber' is of records"):
         two_floors(test, loss="huber", misfit=sysid.Variable("a", lower=0, upper=1) - 0.5)
     with pytest.raises(sysid.InputError, match=r"Swarm\(local=None\) has none"):
         sysid.identify(two_floors(test, loss="huber"), strategy=sysid.Swarm(local=None), rng=0)
     from sysid.compare.comparison import compare
 
-    with pytest.raises(sysid.InputError, match="compare minimises"):
+    with pytest.raises(sysid.InputError, match="compare minimises squares"):
         compare(two_floors(test, loss="huber"))

@@ -114,7 +114,7 @@ def test_a_start_may_be_a_structure():
     result = sysid.identify(by_models(measured()), rng=0, start=truth(), strategy=sysid.Continuation(starts=1))
     assert result.residual < 1e-7
     other = sysid.Structure(truth().mass + np.diag([1.0, 0, 0, 0, 0]), truth().stiffness, RATIOS, n_base=1)
-    with pytest.raises(sysid.InputError, match="not made"):
+    with pytest.raises(sysid.InputError, match="not made of these components"):
         sysid.identify(by_models(measured()), start=other)
 
 

@@ -278,7 +278,7 @@ def test_sensors_along_their_rows_are_taken_whatever_the_direction_of_the_base()
 def test_the_right_arguments_are_right(name):
     make, right = CASES[name]
     if name == "load":
-        with pytest.raises(sysid.InputError, match=r"no result .*nowhere\.h5"):
+        with pytest.raises(sysid.InputError, match=r"no result at nowhere\.h5"):
             make(**right)
     else:
         make(**right)

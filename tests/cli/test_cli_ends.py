@@ -92,8 +92,7 @@ def test_the_log_goes_to_the_temporary_folder_where_the_current_one_cannot_be_wr
     (elsewhere / "sysid-error.log").unlink()
     (elsewhere / "sysid-error.log").mkdir()
     assert cli.main(["run", "pair.py"]) == 70
-    error = complaint()
-    assert "a bug" in error and "no log" in error and "sysid-error.log" not in error
+    assert "no log file could be written" in complaint()
 
 
 def test_a_report_that_fails_takes_no_result_away(here, capsys, monkeypatch):
@@ -121,7 +120,8 @@ def test_an_interrupted_search_saves_the_best_so_far_and_ends_with_130(
     monkeypatch.setattr(cli, "identify", identify)
     assert cli.main(["run", "pair.py", "--strategy", "swarm"]) == 130
     error = complaint()
-    assert "best" in error and commands(error) == [["run", "pair.py", "--resume", "results/pair"]]
+    assert "the best so far is in results/pair" in error
+    assert commands(error) == [["run", "pair.py", "--resume", "results/pair"]]
     assert sysid.load(here / "results/pair").interrupted
     assert json.loads((here / "results/pair/summary.json").read_text())["success"] is False
     assert (here / "results/pair/report.html").exists()
@@ -161,8 +161,7 @@ def test_ctrl_c_while_saving_says_that_files_are_missing(here, complaint, files,
 
     monkeypatch.setattr(report, "write_report", write)
     assert cli.main(["run", "pair.py"]) == 130
-    error = complaint()
-    assert "not every" in error and "results/pair" in error
+    assert "not every file is in results/pair" in complaint()
     assert not [name for name in files(here) if name.endswith(".tmp")]
 
 
@@ -267,8 +266,7 @@ def test_ctrl_c_after_the_search_loses_nothing(here, complaint, files, monkeypat
     monkeypatch.setattr(owner, name, struck)
     assert cli.main(["run", "pair.py"]) == 130
     ended = place == "report" and times > 2
-    error = complaint()
-    assert "results/pair" in error and ("not every" in error) is ended
+    assert ("not every file" if ended else "the result is in results/pair") in complaint()
     written = files(here / "results/pair")
     assert written == {"result.h5", "summary.json"} | (set() if ended else {"report.html"})
     assert sysid.load(here / "results/pair").success

@@ -23,12 +23,12 @@ def state(folder):
 @pytest.mark.parametrize(
     ("arguments", "remedy"),
     [
-        (["run", "pair.py", "--out", "{folder}"], "--out DIR"),
-        (["run", "pair.py", "--out", "{folder}", "--fresh"], "--out DIR"),
-        (["run", "--resume", "{folder}"], "its end"),
-        (["refine", "{folder}", "--trust", "--out", "{folder}"], "--out DIR"),
-        (["report", "{folder}"], "report itself"),
-        (["report", "{folder}/result.h5"], "report itself"),
+        (["run", "pair.py", "--out", "{folder}"], "wait for its end, or write elsewhere with --out DIR"),
+        (["run", "pair.py", "--out", "{folder}", "--fresh"], "wait for its end, or write elsewhere with --out DIR"),
+        (["run", "--resume", "{folder}"], "wait for its end"),
+        (["refine", "{folder}", "--trust", "--out", "{folder}"], "wait for its end, or write elsewhere with --out DIR"),
+        (["report", "{folder}"], "it writes its report itself"),
+        (["report", "{folder}/result.h5"], "it writes its report itself"),
     ],
 )
 def test_a_folder_in_use_is_left_alone(here, in_use, complaint, arguments, remedy):

@@ -138,7 +138,7 @@ def test_what_speaks_against_an_answer_and_what_is_open_stand_under_their_own_wo
 
 
 def test_an_unknown_ending_is_told_with_those_that_exist(result, tmp_path):
-    with pytest.raises(sysid.InputError, match=r"'\.doc'; .* \.csv"):
+    with pytest.raises(sysid.InputError, match=r"no format has the ending '\.doc'; there are \.csv"):
         sysid.export(result, tmp_path / "m.doc")
     assert not list(tmp_path.iterdir())
 

@@ -120,7 +120,7 @@ def test_each_reference_is_a_run_with_its_own_base_motion(tmp_path):
         np.testing.assert_allclose(response, (H * B)[::-1], rtol=1e-12)
     for sensor in sensors[:3]:
         sensor["name"] += " of s1"
-    with pytest.raises(sysid.InputError, match=r"a\.npz: .* s1 .*'h3' is missing.*same name"):
+    with pytest.raises(sysid.InputError, match=r"a\.npz: per unit of s1 the function of 'h3' is missing.*same name"):
         reading.gather(tmp_path / "a.npz", {"convention": "exp(+iwt)", "sensor": sensors})
 
 
@@ -218,7 +218,7 @@ def test_the_sign_of_the_base_force_is_told_by_its_power(tmp_path, sign, axis, w
         {"column": "F", "role": "force", "axis": axis, "unit": "kg"},
     ]
     test = reading.gather(tmp_path / "a.npz", {"base_axes": "x", "sensor": sensors})
-    assert f" {words} power" in test.remarks[0]
+    assert f"the base force {words} power" in test.remarks[0]
     np.testing.assert_allclose(test.runs[0][2][0], F * (-1 if words == "takes" else 1))
 
 

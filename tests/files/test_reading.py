@@ -190,7 +190,7 @@ def test_binary_sets_are_whole_whatever_their_number_or_cut_short(tmp_path, sens
     said = {**UNIVERSAL, "sensor": UNIVERSAL["sensor"][:sensors]}
     np.testing.assert_allclose(reading.gather(path, said).runs[0][1], H[:sensors], rtol=4e-16)
     path.write_bytes(path.read_bytes()[:-3000])
-    with pytest.raises(sysid.InputError, match=rf"a\.uff .* cut short: .* number {1 + sensors},"):
+    with pytest.raises(sysid.InputError, match=rf"a\.uff is cut short: its last set, number {1 + sensors}"):
         reading.gather(path, said)
 
 
@@ -216,7 +216,7 @@ def test_a_broken_universal_file_is_told_in_words(tmp_path, change, words):
 
 def test_functions_of_no_stated_form_are_asked_for(tmp_path):
     np.savez(tmp_path / "a.npz", freq=FREQ, H=H, F=F)
-    with pytest.raises(sysid.InputError, match=r"a.npz.*receptance, mobility, accelerance"):
+    with pytest.raises(sysid.InputError, match=r"a.npz.*receptance, mobility, accelerance or transmissibility"):
         sysid.read(tmp_path / "a.npz", {**MATRIX, "frf": ""})
 
 
@@ -260,7 +260,7 @@ def test_what_a_library_raises_of_a_foreign_file_is_one_line(tmp_path, monkeypat
 
     monkeypatch.setitem(reading._READERS, ".npz", fails)
     (tmp_path / "a.npz").write_bytes(b"x")
-    with pytest.raises(sysid.InputError, match=r"a\.npz .* \(of a library\).*Export it"):
+    with pytest.raises(sysid.InputError, match=r"a\.npz cannot be read \(of a library\).*Export it again"):
         reading.gather(tmp_path / "a.npz", MATRIX)
 
 
@@ -275,9 +275,9 @@ def test_files_of_one_sensor_each_are_joined_to_runs_by_their_folders(tmp_path):
     test = reading.gather(paths, {"join": True, "sensor": sensors})
     for (base, response, _), sign in zip(test.runs, (1, -1), strict=True):
         assert np.array_equal([base[0], response[0]], sign * si[:2])
-    with pytest.raises(sysid.InputError, match=r"a\.csv .* column 'b', which .*b\.csv.*--join"):
+    with pytest.raises(sysid.InputError, match=r"a\.csv has no column 'b', which .*b\.csv.*--join"):
         reading.gather(paths[:2], {"sensor": sensors[1:]})
     late = (time + 0.5, si[1])
     np.savetxt(paths[1], np.array(late).T, fmt="%.17g", delimiter=";", header="time [s];acc", comments="")
-    with pytest.raises(sysid.InputError, match=r"b\.csv.*sample 1 .* 0.5 s, .*a\.csv at 0 s.*sysid\.resample"):
+    with pytest.raises(sysid.InputError, match=r"b\.csv.*sample 1 is at 0.5 s, that of a\.csv at 0 s.*sysid\.resample"):
         reading.gather(paths[:2], {"join": True, "sensor": sensors})

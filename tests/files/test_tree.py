@@ -80,7 +80,7 @@ def test_each_single_byte_counts():
     for at in (*range(600), *range(600, len(image), 50)):
         broken = bytearray(image)
         broken[at] ^= 1 << (at % 8)
-        with pytest.raises(sysid.InputError, match="is damaged"):
+        with pytest.raises(sysid.InputError, match="it is damaged"):
             from_bytes(bytes(broken))
 
 
@@ -89,13 +89,13 @@ def test_each_single_byte_counts():
     [lambda b: b[:-1], lambda b: b[:513], lambda b: b[:300], lambda b: b"", lambda b: b + b"\0", lambda b: b + b],
 )
 def test_each_missing_or_added_byte_counts(change):
-    with pytest.raises(sysid.InputError, match="is damaged"):
+    with pytest.raises(sysid.InputError, match="it is damaged"):
         from_bytes(change(to_bytes({"x": 1.0}, 3)))
 
 
 @pytest.mark.parametrize("name", ["", ".", "a/b", "[]", 3, "a\0b"])
 def test_what_is_no_name_is_refused(name):
-    with pytest.raises(sysid.InputError, match="/branch: .* no name"):
+    with pytest.raises(sysid.InputError, match="/branch: .* is no name"):
         check({"branch": {name: 1}})
 
 
@@ -103,7 +103,7 @@ def test_what_is_no_name_is_refused(name):
     "value", [object(), {1.0}, (1, 2), np.array(["a"]), np.array([None]), b"bytes", 1j], ids=lambda v: type(v).__name__
 )
 def test_what_cannot_be_stored_is_refused_where_it_stands(value):
-    with pytest.raises(sysid.InputError, match=r"^/list/1/x: .* stored"):
+    with pytest.raises(sysid.InputError, match=r"^/list/1/x: a \w+ cannot be stored"):
         to_bytes({"list": [0, {"x": value}]}, 3)
 
 

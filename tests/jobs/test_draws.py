@@ -83,7 +83,7 @@ def test_what_has_no_known_noise_cannot_be_drawn(result, own):
     k = sysid.Variable("k", lower=1.0, upper=9.0)
     stated = {"misfit": k - 3.0} if own == "misfit" else {"residuals": [k - 3.0]}
     problem = replace(result.problem, stiffness=np.eye(2) * ca.MX(1e5) * k, **stated)
-    with pytest.raises(sysid.InputError, match="need records"):
+    with pytest.raises(sysid.InputError, match="draws of noise need records"):
         drawn(problem.prepared, np.array([3.0]), np.random.SeedSequence(0))
 
 
@@ -120,7 +120,7 @@ def test_spreads_are_root_mean_squares_about_the_answer(result):
     assert (one.name, one.value, one.inside) == ("spring 1", pytest.approx(result.x[0]), 0.5)
     assert one.drawn == pytest.approx(np.sqrt(5) * one.std, rel=1e-6)
     assert (other.drawn, other.inside) == (0.0, 1.0)
-    with pytest.raises(sysid.InputError, match="1 of 2 draws"):
+    with pytest.raises(sysid.InputError, match="1 of 2 draws have a result"):
         spreads(result, ends[1:])
 
 

@@ -97,7 +97,7 @@ def test_one_and_true_make_two_problems_in_one_worker(recipe, tmp_path):
 def test_a_job_without_a_structure_to_start_from_says_so(recipe):
     result = next(submit(replace(recipe, start=[1.0, 2.0, 3.0])))
     assert not result.success and result.x.size == 0 and np.isnan(result.residual)
-    assert "start" in result.message and "(3,)" in result.message
+    assert "start has shape (3,)" in result.message
 
 
 @pytest.mark.parametrize(
@@ -141,7 +141,7 @@ def test_a_pool_whose_worker_dies_is_built_again_and_only_the_task_to_blame_is_l
     answers = list(each(eval, tasks, processes(1), lambda task, why: (task, why)))
     assert [answer for answer in answers if isinstance(answer, int)] == [1, 3, 4]
     ((task, why),) = [answer for answer in answers if isinstance(answer, tuple)]
-    assert task == DIES and "died" in why
+    assert task == DIES and "its worker died" in why
 
 
 def test_workers_of_one_maker_start_once_and_have_one_thread_and_those_given_up_end():
@@ -191,7 +191,7 @@ class Cancelling(Executor):
 def test_tasks_that_an_executor_cancels_are_submitted_again_to_a_new_one_and_else_lost(monkeypatch):
     monkeypatch.setattr(Cancelling, "made", 0)
     lost = list(each(eval, ["1", "2"], Cancelling(), lambda task, why: why))
-    assert len(lost) == 2 and all("cancelled" in why for why in lost)
+    assert len(lost) == 2 and all("it was cancelled" in why for why in lost)
     monkeypatch.setattr(Cancelling, "made", 0)
     assert sorted(each(eval, ["1", "2"], Cancelling, lambda task, why: why)) == [1, 2]
 
@@ -327,7 +327,7 @@ class TestLedger:
         monkeypatch.setattr(sqlite3, "connect", lambda path: opened.append(connect(path)) or opened[-1])
         submit(recipe, out=tmp_path)
         (tmp_path / "jobs.sqlite").write_text("no ledger" * 200)
-        with pytest.raises(sysid.InputError, match=r"jobs\.sqlite .* database"):
+        with pytest.raises(sysid.InputError, match="not a database"):
             submit(recipe, out=tmp_path)
         assert len(opened) == 2
         for file in opened:
@@ -336,10 +336,10 @@ class TestLedger:
 
     def test_a_folder_that_cannot_be_one_is_told(self, recipe, tmp_path):
         (tmp_path / "taken").write_text("a file")
-        with pytest.raises(sysid.InputError, match=r"taken.* used"):
+        with pytest.raises(sysid.InputError, match=r"taken.*cannot be used"):
             submit(recipe, out=tmp_path / "taken")
         (tmp_path / "jobs.sqlite").write_text("no ledger" * 200)
-        with pytest.raises(sysid.InputError, match=r"jobs\.sqlite .* database"):
+        with pytest.raises(sysid.InputError, match=r"jobs\.sqlite cannot be used: file is not a database"):
             submit(recipe, out=tmp_path)
 
     @pytest.mark.parametrize(
@@ -356,7 +356,7 @@ class TestLedger:
         with contextlib.closing(sqlite3.connect(tmp_path / "jobs.sqlite")) as file, file:
             file.execute(schema)
         before = (tmp_path / "jobs.sqlite").read_bytes()
-        with pytest.raises(sysid.InputError, match=r"jobs\.sqlite .* ledger"):
+        with pytest.raises(sysid.InputError, match=r"jobs\.sqlite is no ledger of jobs of this sysid"):
             submit(recipe, out=tmp_path)
         assert (tmp_path / "jobs.sqlite").read_bytes() == before
 
@@ -364,7 +364,7 @@ class TestLedger:
         list(submit(recipe, out=tmp_path))
         with contextlib.closing(sqlite3.connect(tmp_path / "jobs.sqlite")) as file, file:
             file.execute("CREATE TRIGGER t AFTER INSERT ON results BEGIN DELETE FROM results; END")
-        with pytest.raises(sysid.InputError, match="no ledger"):
+        with pytest.raises(sysid.InputError, match="is no ledger of jobs"):
             submit(recipe, out=tmp_path)
 
     @pytest.mark.parametrize(

@@ -193,8 +193,8 @@ def test_described_sensors_may_be_left_out_of_a_lumped_mass():
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (WithoutRun(2), r"no run 3 \(run=2, counted from 0\): the test has 2"),
-        (WithoutSensor(5), r"no sensor 6 \(sensor=5, counted from 0\): the test has 2"),
+        (WithoutRun(2), r"there is no run 3 \(run=2, counted from 0\): the test has 2"),
+        (WithoutSensor(5), r"there is no sensor 6 \(sensor=5, counted from 0\): the test has 2"),
         (Band(20.0, 30.0), "no line between 20 and 30 Hz"),
     ],
 )
@@ -348,7 +348,9 @@ def test_without_the_one_run_along_an_axis_its_modes_cannot_be_found():
     full = problem(full=True)
     assert WithoutRun(0).of(full).measurement.n_runs == 1
     tower = sysid.catalogue.build(sysid.Recipe("cantilever_tower", parameters={"elements": 2, "force": False}))
-    with pytest.raises(InputError, match="without run 2 "):
+    with pytest.raises(
+        InputError, match="without run 2 the base does not move in every direction: modes that this run"
+    ):
         WithoutRun(1).of(tower)
 
 
@@ -363,7 +365,7 @@ def test_a_line_of_as_many_numbers_as_unknowns_is_no_fit(result, tmp_path):
     file.write_text(MODULE.format(folder=__file__.rpartition("/")[0]).replace("problem", "one_run as problem"))
     (end,) = submit(sysid.Recipe(str(file), start=tuple(result.x)), changes=[Band(0.5, 0.51)])
     assert not end.success and end.has_result
-    assert "4 numbers" in end.message and "5 parameters" in end.message
+    assert "4 numbers of the records do not suffice for 5 parameters" in end.message
 
 
 def test_steps_of_exact_records_have_no_deviations():
@@ -414,9 +416,9 @@ def test_so_many_modes_are_those_that_the_records_need_most():
         found = sysid.identify(Modes(count).of(tower), strategy=sysid.Modal(modes=count), rng=0)
         expected = poles.omega[best] / (2 * np.pi)
         np.testing.assert_allclose(found.structure.natural_frequencies, expected, rtol=0.02)
-    with pytest.raises(InputError, match="4 modes .* fewer .* 5 "):
+    with pytest.raises(InputError, match="4 modes stand out of the noise, fewer than the 5 asked for"):
         sysid.identify(tower, strategy=sysid.Modal(modes=5), rng=0)
-    with pytest.raises(InputError, match="open only"):
+    with pytest.raises(InputError, match="open only where mass and stiffness are free"):
         Modes(2).of(problem())
 
 
@@ -432,7 +434,7 @@ def test_jobs_go_on_from_the_ledger_with_their_scores(recipe, result, tmp_path):
     changes = [None, WithoutRun(0), WithoutRun(9)]
     ends = list(submit(recipe, changes=changes, out=tmp_path))
     assert [end.success for end in ends] == [True, True, False]
-    assert " run 10 (run=9, " in ends[2].message and not ends[2].has_result
+    assert ends[2].message == "there is no run 10 (run=9, counted from 0): the test has 2" and not ends[2].has_result
     assert ends[0].residual == result.residual
     np.testing.assert_equal(asdict(ends[0].score), asdict(scored(result)))  # NaN too
     again = list(submit(recipe, changes=changes[:2], out=tmp_path, executor=lambda: pytest.fail("computed again")))
@@ -452,7 +454,7 @@ def test_changes_begin_at_the_unknowns_of_a_result(recipe, result, monkeypatch):
 def test_a_stated_strategy_is_taken_also_where_there_is_a_start(recipe, result):
     started = replace(recipe, start=tuple(result.x.tolist()))
     end = next(submit(started, changes=[WithoutRun(0)], strategy="modal"))
-    assert not end.has_result and "'modal' needs" in end.message
+    assert not end.has_result and "strategy 'modal' needs a free stiffness" in end.message
 
 
 def test_what_the_rest_does_not_tell_is_not_predicted(tmp_path):

@@ -64,10 +64,10 @@ def test_tapered_records_are_refused(rng, taper):
     base = rng.standard_normal(SAMPLES)
     absolute = response(base, 3.0, 0.02)
     measured(base, absolute)
-    with pytest.raises(sysid.InputError, match="^all channels, .*a fade"):
+    with pytest.raises(sysid.InputError, match="^all channels, the base's too.*a window or a fade was laid over the "):
         measured(base * taper, absolute * taper)
     both = [(base[None] * factor, absolute * factor, None) for factor in (1.0, taper)]
-    with pytest.raises(sysid.InputError, match="^all channels of run 2, "):
+    with pytest.raises(sysid.InputError, match="^all channels of run 2, the base's too"):
         sysid.Measurement.from_time(both, RATE, rigid_body=np.ones((2, 1)))
 
 
@@ -75,7 +75,7 @@ def test_zeros_after_the_record_are_refused_unless_the_run_is_at_rest(rng):
     base = rng.standard_normal(SAMPLES)
     absolute = response(base, 3.0, 0.02)
     padded = [np.concatenate([x, np.zeros((*x.shape[:-1], 500))], axis=-1) for x in (base, absolute)]
-    with pytest.raises(sysid.InputError, match="last 500 samples"):
+    with pytest.raises(sysid.InputError, match="the last 500 samples hold one value in every channel"):
         measured(*padded)
     measured(*padded, at_rest=True)
 

@@ -128,7 +128,7 @@ class TestRecords:
         for name in ("base", "response", "force", "relative", "response_std", "force_std"):
             np.testing.assert_array_equal(getattr(cut, name), getattr(test, name)[..., 1:4])
         assert (cut.base_axes, cut.sensors) == (("y", "x"), test.sensors)
-        with pytest.raises(InputError, match="no line .* 2.5 and 3.5 Hz"):
+        with pytest.raises(InputError, match="no line between 2.5 and 3.5 Hz"):
             test.in_band(2.5, 3.5)
 
     def test_names_of_sensors(self, records):
@@ -152,7 +152,7 @@ class TestRecords:
         ratio = np.linalg.norm(f - test.force) / np.linalg.norm(test.force)
         assert test.force_residual(s) == pytest.approx(ratio, rel=1e-12)
         assert dataclasses.replace(test, force=None, force_std=None).force_residual(s) is None
-        with pytest.raises(InputError, match="structure has"):
+        with pytest.raises(InputError, match="the structure has"):
             test.predict(random_structure(rng, n=3, d=2))
 
 
@@ -176,7 +176,7 @@ class TestBaseAxes:
         assert Measurement(**(records | {"rigid_body": G}), base_axes="x ry").base_axes == ("x", "ry")
 
     def test_refusals(self, records):
-        with pytest.raises(InputError, match="names 3 .* has 2"):
+        with pytest.raises(InputError, match="names 3 directions but base has 2"):
             Measurement(**records, base_axes="xyz")
         with pytest.raises(InputError, match="base_axes"):
             Measurement(**records, base_axes="xq")

@@ -263,7 +263,7 @@ class TestMistakes:
 
     def test_shapes(self):
         x, y, f = self.run()
-        with pytest.raises(InputError, match="runs has 0 entries"):
+        with pytest.raises(InputError, match="runs has 0 entries; give a list of .base"):
             self.read([])
         with pytest.raises(InputError, match="run 1 has 2 entries"):
             self.read([(x, y)])
@@ -275,9 +275,9 @@ class TestMistakes:
             self.read([(x, y, f[:1])])
         with pytest.raises(InputError, match="different lengths"):
             self.read([(x, y[:, 1:], f)])
-        with pytest.raises(InputError, match="some runs"):
+        with pytest.raises(InputError, match="some runs have a force"):
             self.read([(x, y, f), (x, y, None)])
-        with pytest.raises(InputError, match="run 1, base is .*real numbers"):
+        with pytest.raises(InputError, match="not an array of real numbers"):
             self.read([("x", y, f)])
 
     def test_estimators(self):
@@ -296,7 +296,7 @@ class TestMistakes:
             self.read([self.run()], estimator="h1", segment=300)
 
     def test_a_record_too_short_for_a_line(self):
-        with pytest.raises(InputError, match="spectral line"):
+        with pytest.raises(InputError, match="no spectral line"):
             self.read([self.run(1)])
 
 

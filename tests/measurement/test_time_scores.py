@@ -20,5 +20,5 @@ def test_scores_of_records_whose_scores_are_known():
 
 @pytest.mark.parametrize(("measured", "predicted"), [([[1.0, 2.0]], [[1.0]]), (np.ones((2, 0)), np.ones((2, 0)))])
 def test_shapes_that_cannot_be_compared_are_refused(measured, predicted):
-    with pytest.raises(sysid.InputError, match="both must"):
+    with pytest.raises(sysid.InputError, match="both must be"):
         sysid.time_scores(measured, predicted)

@@ -33,5 +33,5 @@ def test_a_force_of_the_wrong_sign_is_named(seed):
     moved = np.linalg.norm(modes.gamma, axis=1) > 0.2 * np.linalg.norm(modes.gamma)
     np.testing.assert_allclose(masses[moved], 1.0, rtol=0.1)  # participations are those of unit modal masses
     np.testing.assert_allclose(np.diag(rigid), np.diag(truth.rigid_body_mass), rtol=0.1)
-    with pytest.raises(sysid.InputError, match="negative masses"):
+    with pytest.raises(sysid.InputError, match="negative masses: check its sign"):
         weigh(dataclasses.replace(test, force=-test.force), modes)

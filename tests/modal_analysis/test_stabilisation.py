@@ -168,22 +168,22 @@ def test_runs_that_do_not_span_the_directions_are_refused(random_structure):
     freq = lines(truth)
     one = general_runs(truth, freq, 1, rng)
     for numbers in (stabilisation, cmif):
-        with pytest.raises(InputError, match="one run"):
+        with pytest.raises(InputError, match="the one run does not move the base in 2 independent directions"):
             numbers(one)
     double = Measurement(
         freq, np.repeat(one.base, 2, axis=0), np.repeat(one.response, 2, axis=0), rigid_body=one.rigid_body
     )
-    with pytest.raises(InputError, match="2 runs"):
+    with pytest.raises(InputError, match="the 2 runs do not move the base"):
         cmif(double)
 
 
 def test_orders_that_the_lines_do_not_carry_are_refused(random_structure):
     truth = random_structure(np.random.default_rng(7), 4, 2)
-    with pytest.raises(InputError, match="40 lines of 4 sensors .* 19 modes"):
+    with pytest.raises(InputError, match="40 lines of 4 sensors carry at most 19 modes"):
         stabilisation(simulate(truth, np.linspace(2, 70, 40)), max_order=20)
     assert stabilisation(simulate(truth, np.linspace(2, 70, 40)), max_order=19).order.max() == 19
     for freq in ([5.0], [0.0, 5.0, 10.0]):
-        with pytest.raises(InputError, match="stabilisation diagram"):
+        with pytest.raises(InputError, match="no stabilisation diagram"):
             stabilisation(simulate(truth, freq))
-    with pytest.raises(InputError, match="order 1 "):
+    with pytest.raises(InputError, match="order 1 give no model"):
         stabilisation(simulate(truth, np.linspace(2, 70, 40)), max_order=1)

@@ -68,7 +68,7 @@ def test_components_of_unknown_density_and_their_inverse(geometry_of):
     M = np.asarray(ca.densify(ca.Function("M", [y], [model.blocks(geometry, y)])([2700.0, 7800.0])))
     np.testing.assert_allclose(M, 2700 * forms[0] + 7800 * forms[1], rtol=1e-14)
     np.testing.assert_allclose(model.values(geometry, structure(M, ring(3))), [2700, 7800], rtol=1e-12)
-    with pytest.raises(sysid.InputError, match="not made"):
+    with pytest.raises(sysid.InputError, match="not made of these components"):
         model.values(geometry, structure(M + np.diag([0.1, 0, 0, 0]), ring(3)))
 
 

@@ -87,7 +87,7 @@ def test_a_model_without_a_tree_of_its_own_is_stored_by_its_attributes(tanks):
     back = model_from_tree(from_bytes(to_bytes(model_to_tree(given), 3))[0])
     assert type(back) is tanks.Ring and back.sectors == 12
     np.testing.assert_array_equal(back.stiffness, [2e4, 3e3])
-    with pytest.raises(sysid.InputError, match=r"Ring .* method to_tree"):
+    with pytest.raises(sysid.InputError, match=r"Ring cannot be stored: its class needs a method to_tree"):
         model_to_tree(tanks.Ring(object()))
 
 
@@ -102,7 +102,7 @@ def test_a_problem_stores_it_beside_expressions(tanks):
 @pytest.mark.parametrize("lost", ["nowhere_at_all:Tank", "tanks_of_mine:Cask", "tanks_of_mine:nothing", "os:system"])
 def test_a_class_that_is_missing_is_named_with_its_module(tanks, lost):
     module, name = lost.split(":")
-    with pytest.raises(sysid.InputError, match=f"class '{name}' .* '{module}'"):
+    with pytest.raises(sysid.InputError, match=f"a model is made of the class '{name}' of the module '{module}'"):
         model_from_tree({"kind": lost, "fields": {}})
 
 
@@ -110,7 +110,7 @@ def test_a_file_imports_no_module(tmp_path, monkeypatch):
     (tmp_path / "silent_tanks.py").write_text(OWN)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(sysid.InputError, match="'silent_tanks', .* itself"):
+    with pytest.raises(sysid.InputError, match="'silent_tanks', and a file imports no module by itself"):
         model_from_tree({"kind": "silent_tanks:Ring", "fields": {"sectors": 3, "stiffness": None}})
     assert "silent_tanks" not in sys.modules
 
@@ -127,7 +127,7 @@ def test_no_class_of_what_the_package_imports_is_taken_for_a_model():
     }
     assert "sysid.results.identification:Recipe" in alike  # it has the methods
     for kind in alike:
-        with pytest.raises(sysid.InputError, match="the class '"):
+        with pytest.raises(sysid.InputError, match="a model is made of the class"):
             model_from_tree({"kind": kind, "fields": {}})
 
 
@@ -167,7 +167,7 @@ def test_classes_of_a_problem_module_and_beside_it_are_stored_by_names_that_anot
         assert type(light) is private.Light and light.upper == 0.1
         assert type(ring) is private.Ring and ring.sectors == 3
         run_module(tmp_path / "two" / "light_house.py")
-        with pytest.raises(sysid.InputError, match="several modules .*'light_house'"):
+        with pytest.raises(sysid.InputError, match="Light stands in several modules named 'light_house'"):
             model_from_tree(trees[0])
     finally:
         for name in {*sys.modules} - before:
@@ -175,7 +175,7 @@ def test_classes_of_a_problem_module_and_beside_it_are_stored_by_names_that_anot
 
 
 def test_a_model_of_a_later_sysid_is_named():
-    with pytest.raises(sysid.InputError, match="'Foam' is unknown"):
+    with pytest.raises(sysid.InputError, match="model 'Foam' is unknown to this sysid"):
         model_from_tree({"kind": "Foam", "fields": {}})
 
 
@@ -183,13 +183,13 @@ def test_what_could_not_be_found_again_is_refused():
     class Inside(sysid.LumpedMass):
         pass
 
-    with pytest.raises(sysid.InputError, match="Inside .* function"):
+    with pytest.raises(sysid.InputError, match="Inside cannot be stored: its class stands inside a function"):
         model_to_tree(Inside(3.0))
-    with pytest.raises(sysid.InputError, match=r"object .* method to_tree"):
+    with pytest.raises(sysid.InputError, match=r"object cannot be stored: its class needs a method to_tree"):
         model_to_tree(object())
 
 
 def test_a_tree_of_the_users_own_that_holds_something_else_is_refused_early(tanks, monkeypatch):
     monkeypatch.setattr(tanks.Tank.Half, "to_tree", lambda self: {"when": object()})
-    with pytest.raises(sysid.InputError, match="/mass/fields/when: .* stored"):
+    with pytest.raises(sysid.InputError, match="/mass/fields/when: a object cannot be stored"):
         check(stored.to_tree({"mass": tanks.Tank.Half([]), "stiffness": np.eye(1), "damping": np.eye(1)}))

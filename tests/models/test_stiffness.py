@@ -204,7 +204,7 @@ class TestChain:
 
     def test_a_sensor_that_no_direction_moves(self, geometry_of):
         geometry = geometry_of([[1, 0], [0, 0], [0, 1]])
-        with pytest.raises(InputError, match="sensor 2 "):
+        with pytest.raises(InputError, match="sensor 2 is moved by no base direction"):
             mass_normalised(ChainStiffness(1.0, 2.0), geometry, np.ones(3), np.eye(3))
 
     def test_a_sensor_against_the_direction_turns_the_sign_of_its_coupling(self, geometry_of):
@@ -220,7 +220,7 @@ class TestChain:
     )
     def test_sensors_along_no_one_direction_are_refused(self, geometry_of, G, translates):
         geometry = geometry_of(G, translates)
-        with pytest.raises(InputError, match="each sensor"):
+        with pytest.raises(InputError, match="each sensor must point along one base direction"):
             ChainStiffness(1.0, 10.0).stated(geometry)
 
 
@@ -257,7 +257,7 @@ class TestStated:
         np.testing.assert_allclose(np.sum(stated.positive * K, axis=(1, 2)), k)
         assert not stated.free
         assert (stated.totals, stated.spectrum) == (None, None)
-        assert "chain" in stated.sentence
+        assert stated.sentence == "the stiffness is stated to be a chain"
 
     def test_written(self, geometry_of):
         stated = WrittenStiffness(np.eye(3)).stated(geometry_of(np.ones((3, 1))))
@@ -286,5 +286,5 @@ class TestWritten:
         for given in (self.K, self.whole(), held * self.K):
             assert WrittenStiffness(given).unknowns(geometry) == ()
             assert WrittenStiffness(given).values(geometry, structure).shape == (0,)
-        with pytest.raises(InputError, match="stiffness .* no inverse"):
+        with pytest.raises(InputError, match="stiffness written in expressions has no inverse"):
             WrittenStiffness(sysid.Variable("k", lower=0, upper=2) * self.K).values(geometry, structure)

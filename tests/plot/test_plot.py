@@ -282,7 +282,7 @@ def test_without_an_frf_the_pictures_of_the_modes_say_so(runs):
     (curve,) = behind.get_lines()
     np.testing.assert_allclose(curve.get_ydata(), np.linalg.norm(one.relative[0], axis=0))
     assert "new pole" not in lines(ax) and lines(ax)["identified mode"]
-    assert ax.texts[0].get_text().startswith("No poles") and "one run" in ax.texts[0].get_text().replace("\n", " ")
+    assert "No poles are shown: the one run does not move the base" in ax.texts[0].get_text().replace("\n", " ")
     ax = plot.cmif(alone).axes[0]
     np.testing.assert_allclose(lines(ax)["first"].get_ydata(), curve.get_ydata())
     assert ax.texts[0].get_text().startswith("Singular values of the runs' own spectra: the one run")
@@ -362,7 +362,7 @@ def test_a_band_that_is_not_known_leaves_a_gap(unit):
 def test_what_is_not_there_is_refused(unit):
     with pytest.raises(sysid.InputError, match="sensor 'nose' is unknown"):
         plot.transmissibility(unit, sensor="nose")
-    with pytest.raises(sysid.InputError, match="run 2 .* 2, .* 0"):
+    with pytest.raises(sysid.InputError, match="run 2 is out of range: there are 2, counted from 0"):
         plot.transmissibility(unit, run=2)
     silent = dataclasses.replace(unit.measurement, force=None, force_std=None)
     with pytest.raises(sysid.InputError, match="no base force"):

@@ -198,7 +198,7 @@ def edited(tree, code=None, names=None, **parts):
 
 @pytest.mark.parametrize("name", ["system", "external", "jit", "__class__", "", "input", "output", "monitor", "solve "])
 def test_an_operation_that_is_not_on_the_list_is_refused(name):
-    with pytest.raises(sysid.InputError, match="damaged .* operation 0"):
+    with pytest.raises(sysid.InputError, match="its expressions are damaged at operation 0"):
         decode(edited(tree_of(ca.sin(X)), names=(name,)), SYMBOLS)
 
 
@@ -206,14 +206,16 @@ def test_an_operation_that_is_not_on_the_list_is_refused(name):
 def test_a_linear_solver_that_is_not_on_the_list_is_not_loaded(solver, monkeypatch):
     tree = edited(tree_of(ca.solve(A, X)), names=(f"solve {solver}",))
     monkeypatch.setattr(ca, "Linsol", None)
-    with pytest.raises(sysid.InputError, match="none of qr, ldl"):
+    with pytest.raises(sysid.InputError, match="is none of qr, ldl"):
         decode(tree, SYMBOLS)
 
 
 def test_a_solver_that_this_casadi_lacks_is_named(monkeypatch):
     tree = tree_of(ca.solve(A, X, "ldl"))
     monkeypatch.setattr(operations, "has_library", lambda kind, name: name != "ldl")
-    with pytest.raises(sysid.InputError, match="need CasADi's ldl, "):
+    with pytest.raises(
+        sysid.InputError, match="they need CasADi's ldl, which this installation of CasADi does not have"
+    ):
         decode(tree, SYMBOLS)
 
 
@@ -225,7 +227,7 @@ def test_a_solver_that_this_casadi_lacks_is_named(monkeypatch):
     ],
 )  # fmt: skip
 def test_a_list_with_wrong_numbers_is_refused(code):
-    with pytest.raises(sysid.InputError, match="are damaged"):
+    with pytest.raises(sysid.InputError, match="its expressions are damaged"):
         decode(edited(tree_of(ca.sin(X)), code), SYMBOLS)
 
 
@@ -241,18 +243,18 @@ def test_a_pattern_that_is_none_is_refused(numbers):
     """CasADi 3.8 reads beyond its arrays in some of them."""
     tree = tree_of(ca.sin(X))
     tree["patterns"] = np.array(numbers)
-    with pytest.raises(sysid.InputError, match="are damaged"):
+    with pytest.raises(sysid.InputError, match="its expressions are damaged"):
         decode(tree, SYMBOLS)
 
 
 def test_numbers_of_another_type_are_refused():
     tree = tree_of(ca.sin(X) + 2.5)
     for wrong in ({"code": np.ones(4)}, {"numbers": np.array([1])}, {"outputs": np.ones((1, 1), int)}, {"kind": "jit"}):
-        with pytest.raises(sysid.InputError, match="are damaged"):
+        with pytest.raises(sysid.InputError, match="its expressions are damaged"):
             decode(edited(tree, **wrong), SYMBOLS)
     for missing in ("names", "patterns", "functions"):
         part = {name: value for name, value in tree.items() if name != missing}
-        with pytest.raises(sysid.InputError, match="are damaged"):
+        with pytest.raises(sysid.InputError, match="its expressions are damaged"):
             decode(part, SYMBOLS)
 
 
@@ -263,7 +265,7 @@ def test_sums_over_indices_of_two_sizes_are_refused():
     code = tree["functions"][-1]["code"].tolist()
     sizes = [i for i in range(len(code) - 2) if code[i : i + 3] == [2, 3, 3]]
     code[sizes[0] + 2] = 300
-    with pytest.raises(sysid.InputError, match="are damaged"):
+    with pytest.raises(sysid.InputError, match="its expressions are damaged"):
         decode(edited(tree, code), SYMBOLS)
 
 
@@ -280,7 +282,7 @@ TOO_MUCH = {
 def test_a_file_that_asks_for_too_large_a_matrix_is_refused_before_it_is_made(name, monkeypatch):
     names, code = TOO_MUCH[name]
     monkeypatch.setattr(operations, "LIMITS", operations.FileLimits(entries=10_000))
-    with pytest.raises(sysid.InputError, match="too much: .* a matrix"):
+    with pytest.raises(sysid.InputError, match="its expressions ask for too much: the size of a matrix"):
         decode(edited(tree_of(ca.sin(X)), code, tuple(names)), SYMBOLS)
 
 
@@ -288,7 +290,7 @@ def test_a_file_that_states_too_large_a_pattern_is_refused_before_it_is_made():
     tree = tree_of(ca.sin(X))
     for shape in ([10**6, 10**6, 1], [2**62, 2**62, 1], [10**9, 0, 1]):
         tree["patterns"] = np.array(shape)
-        with pytest.raises(sysid.InputError, match="too much: .* a matrix"):
+        with pytest.raises(sysid.InputError, match="its expressions ask for too much: the size of a matrix"):
             decode(tree, SYMBOLS)
 
 
@@ -302,7 +304,7 @@ def test_calls_in_calls_multiply_and_are_limited():
         twice = [1, 1, 0, 1, i, 1, 1, 1, 1, i]
         functions.append({**one, "code": np.array(twice), "outputs": np.array([2])})
     made = {"names": ("sin", "call"), "patterns": np.array([3, 1, 1]), "functions": functions}
-    with pytest.raises(sysid.InputError, match="too much: the work "):
+    with pytest.raises(sysid.InputError, match="ask for too much: the work of one evaluation"):
         decode(made, [X])
 
 
@@ -317,14 +319,14 @@ def test_a_number_for_all_entries_is_kept_once(value, as_written):
 
 def test_a_list_of_too_many_operations_is_refused(monkeypatch):
     monkeypatch.setattr(operations, "LIMITS", operations.FileLimits(operations=5))
-    with pytest.raises(sysid.InputError, match="too much: .* operations is 6, .* 5 "):
+    with pytest.raises(sysid.InputError, match="ask for too much: the number of operations is 6, at most 5 is read"):
         decode(edited(tree_of(ca.sin(X)), [0, 1, 0, 0] * 6), SYMBOLS)
 
 
 def test_an_evaluation_that_needs_too_much_memory_is_refused(monkeypatch):
     tree = tree_of(ca.kron(A, A) @ ca.kron(A, A))
     monkeypatch.setattr(operations, "LIMITS", operations.FileLimits(memory=50))
-    with pytest.raises(sysid.InputError, match="too much: memory "):
+    with pytest.raises(sysid.InputError, match="ask for too much: memory of one evaluation"):
         decode(tree, SYMBOLS)
 
 

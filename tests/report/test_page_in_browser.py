@@ -55,6 +55,6 @@ def test_whole_records_are_shown_with_their_transients_where_asked(random_struct
     test = sysid.Measurement.from_time([(base, noisy, None)], rate, rigid_body=np.ones((1, 1)), band=band)
     it = sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), rng=0)
     page = report.render(it)
-    assert "transients" in page
+    assert "their transients taken off" in page
     told = browser.measured(page, tmp_path, 768)
     assert told["errors"] == [] and told["used"]["checkbox"] == 1

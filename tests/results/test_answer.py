@@ -170,7 +170,7 @@ def test_an_open_scale_of_variables_is_one_of_many(closed):
     assert it.is_one_of_many is not closed
     assert it.open_masses == ()
     assert it.scale_is_open is not closed
-    assert "diagonal entries" not in it.summary()  # the rank tells of small changes only
+    assert "over all these models" not in it.summary()  # the rank tells of small changes only
 
 
 def test_judgement_and_confidence_say_first_what_weighs_most():

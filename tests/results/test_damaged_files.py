@@ -54,7 +54,7 @@ def test_each_of_300_damaged_files_is_refused(sound, kind, tmp_path, monkeypatch
     data, rng, path = sound.read_bytes(), np.random.default_rng(0), tmp_path / "damaged.h5"
     for _ in range(75):
         path.write_bytes(damaged(data, kind, rng))
-        with pytest.raises(sysid.InputError, match=r"damaged\.h5 .*is (damaged|not a result)"):
+        with pytest.raises(sysid.InputError, match=r"damaged\.h5 cannot be read: it is (damaged|not a result)"):
             sysid.load(path)
 
 
@@ -63,5 +63,5 @@ def test_a_file_without_its_head_is_no_old_one(sound, tmp_path):
     path = tmp_path / "headless.h5"
     for image in (sound.read_bytes()[512:], bytes(512) + sound.read_bytes()[512:]):
         path.write_bytes(image)
-        with pytest.raises(sysid.InputError, match=r"headless\.h5 .* read"):
+        with pytest.raises(sysid.InputError, match="cannot be read"):
             sysid.load(path)

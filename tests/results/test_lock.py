@@ -66,7 +66,7 @@ def other(place: Path, kind: str) -> subprocess.Popen:
 
 def test_a_second_one_is_refused_with_the_process_that_holds_it(place, kind):
     with hold(place):
-        with pytest.raises(InputError, match=rf"the folder .* \(process {os.getpid()} on .*wait"):
+        with pytest.raises(InputError, match=rf"the folder is in use by another run \(process {os.getpid()} on .*wait"):
             hold(place).__enter__()
         with pytest.raises(InputError):  # and refusing it takes nothing away
             hold(place).__enter__()
@@ -166,5 +166,5 @@ def test_of_many_at_once_never_two_hold_it(place, kind):
 @pytest.mark.skipif(os.geteuid() == 0 if hasattr(os, "geteuid") else True, reason="root may write everywhere")
 def test_a_folder_that_cannot_be_written_is_told(tmp_path):
     tmp_path.chmod(0o500)
-    with pytest.raises(InputError, match=f"the folder .*: {os.strerror(errno.EACCES)}"):
+    with pytest.raises(InputError, match=f"the folder cannot be written: {os.strerror(errno.EACCES)}"):
         hold(tmp_path / FILE_NAME).__enter__()

@@ -65,4 +65,4 @@ def test_summary_figures_and_report_tell_it(answer):
     figures = json.loads(json.dumps(answer.to_dict()))["noise"]
     assert [one["channel"] for one in figures] == ["sensor 1", "base x", "force x"]
     section = render(answer).partition(">Noise</h2>")[2].partition("<h2")[0]
-    assert source in section and all(one["channel"] in section for one in figures)
+    assert f"Noise of each channel, {source}" in section and all(one["channel"] in section for one in figures)

@@ -134,7 +134,7 @@ def assert_same(a: object, b: object, at: str = "result") -> None:
 @pytest.mark.parametrize("damping", DAMPINGS)
 def test_round_trip_is_exact_for_every_model(tmp_path, mass, stiffness, damping):
     if "known entries" in mass and (stiffness == "chain" or damping == "proportional"):
-        with pytest.raises(sysid.InputError, match="modal strategy"):
+        with pytest.raises(sysid.InputError, match="modal strategy only"):
             identification(mass, stiffness, damping)
         return
     original = identification(mass, stiffness, damping)
@@ -177,7 +177,7 @@ def test_a_path_to_write_is_a_file_by_its_ending_or_else_a_folder(tmp_path):
     assert storage.file_or_folder(str(tmp_path / "A.HDF5"), "result.h5", endings) == tmp_path / "A.HDF5"
     assert storage.file_or_folder(tmp_path / "run.v2", "result.h5", endings) == tmp_path / "run.v2" / "result.h5"
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(sysid.InputError, match=r"notes.txt .* ends in \.h5"):
+    with pytest.raises(sysid.InputError, match=r"notes.txt is some other file: give a name that ends in \.h5"):
         storage.file_or_folder(tmp_path / "notes.txt", "result.h5", endings)
 
 
@@ -239,7 +239,7 @@ def test_a_failure_while_writing_leaves_the_old_file_and_nothing_else(tmp_path, 
 
 
 def test_what_cannot_be_stored_leaves_nothing(tmp_path):
-    with pytest.raises(sysid.InputError, match="/strategy: .* stored"):
+    with pytest.raises(sysid.InputError, match="/strategy: a object cannot be stored"):
         identification(strategy=object()).save(tmp_path / "a.h5")
     assert not list(tmp_path.iterdir())
 
@@ -247,11 +247,11 @@ def test_what_cannot_be_stored_leaves_nothing(tmp_path):
 def test_each_wrong_file_gets_its_own_sentence(tmp_path):
     good = identification().save(tmp_path / "good.h5").read_bytes()
 
-    with pytest.raises(sysid.InputError, match=r"no result .*nowhere\.h5"):
+    with pytest.raises(sysid.InputError, match="no result at"):
         sysid.load(tmp_path / "nowhere.h5")
-    with pytest.raises(sysid.InputError, match=r"no result .*result\.h5"):
+    with pytest.raises(sysid.InputError, match=r"no result at .*result\.h5"):
         sysid.load(tmp_path)
-    with pytest.raises(sysid.InputError, match=f"x .*: {os.strerror(errno.ENAMETOOLONG)}"):
+    with pytest.raises(sysid.InputError, match=f"x cannot be read: {os.strerror(errno.ENAMETOOLONG)}"):
         sysid.load("x" * 5000)
     for name, content, sentence in (
         ("text.h5", b"not this", "it is not a result of sysid"),
@@ -264,11 +264,13 @@ def test_each_wrong_file_gets_its_own_sentence(tmp_path):
         ("earlier.h5", to_bytes({"content": "sysid identification"}, 4), "format 4, .*anew by 'sysid run PROBLEM'"),
     ):
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(sysid.InputError, match=f"{name} .* read: .*{sentence}"):
+        with pytest.raises(sysid.InputError, match=f"{name} cannot be read: .*{sentence}"):
             sysid.load(tmp_path / name)
     with h5py.File(tmp_path / "else.h5", "w") as file:
         file["data"] = [1, 2]
-    with pytest.raises(sysid.InputError, match=r"else\.h5 .* before format 3"):
+    with pytest.raises(
+        sysid.InputError, match=r"else\.h5 .*: it is no result of this sysid, but of one before format 3"
+    ):
         sysid.load(tmp_path / "else.h5")
 
 
@@ -290,7 +292,7 @@ def test_what_is_sound_but_makes_no_result_is_refused_with_its_name(tmp_path, ed
     tree, number = from_bytes(identification().save(tmp_path).read_bytes())
     edit(tree)
     (tmp_path / "edited.h5").write_bytes(to_bytes(tree, number))
-    with pytest.raises(sysid.InputError, match=rf"edited\.h5 .* read: .*({sentence})"):
+    with pytest.raises(sysid.InputError, match=rf"edited\.h5 cannot be read: .*({sentence})"):
         sysid.load(tmp_path / "edited.h5")
 
 
@@ -298,7 +300,7 @@ def test_a_file_that_was_edited_by_hand_is_refused(tmp_path):
     path = identification().save(tmp_path)
     with h5py.File(path, "r+") as file:
         file["problem/measurement/response"][...] *= 2
-    with pytest.raises(sysid.InputError, match=r"result\.h5 .* damaged"):
+    with pytest.raises(sysid.InputError, match=r"result\.h5 cannot be read: it is damaged"):
         sysid.load(path)
 
 
@@ -306,6 +308,6 @@ def test_a_place_that_cannot_be_written_gets_one_sentence(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(sysid.InputError, match=r"ends in \.h5"):
         identification().save(tmp_path / "notes.txt")
-    with pytest.raises(sysid.InputError, match=r"notes\.txt.* written"):
+    with pytest.raises(sysid.InputError, match="cannot be written"):
         identification().save(tmp_path / "notes.txt" / "a.h5")
     assert (tmp_path / "notes.txt").read_text() == "mine"

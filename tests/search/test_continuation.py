@@ -233,5 +233,5 @@ def test_time_over_before_there_is_any_structure_is_an_error_of_the_search(monke
     monkeypatch.setattr("sysid.search.continuation.smoothed_tests", over)
     _, _, K, C = springs_and_dampers()
     problem = sysid.Problem(measured(noise=0.01), mass=np.diag(MASS), stiffness=K, damping=C)
-    with pytest.raises(sysid.SolverError, match="time was"):
+    with pytest.raises(sysid.SolverError, match="the time was over: nothing is identified"):
         sysid.identify(problem, strategy="continuation", rng=0)

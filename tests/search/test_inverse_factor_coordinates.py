@@ -224,7 +224,7 @@ def test_a_status_stays_with_the_point_that_it_was_given_for(rounds):
     ending((9.0, "Solve_Succeeded"))
     end = local.solve(problem.prepared, x, coordinates="cholesky")
     assert not end.success
-    assert "above" in end.message
+    assert "above the start" in end.message
 
 
 def test_rounds_follow_while_the_limit_alone_ends_them_and_the_objective_falls(rounds):

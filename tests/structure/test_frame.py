@@ -479,7 +479,7 @@ def test_mistakes_in_a_condensation_are_named(sensors, choices, says):
 def test_a_part_that_hangs_on_nothing_is_a_mechanism():
     nodes = [*TWO_NODES, [0, 1, 0], [1, 1, 0]]
     frame = Frame(nodes, [*ONE, Beam(2, 3, section(), (0, 1, 1))])
-    with pytest.raises(InputError, match="mechanism: .* node 2"):
+    with pytest.raises(InputError, match="mechanism: no beams join node 2"):
         frame.condense([(1, "y")], base_nodes=[0])
     frame.condense([(1, "y")], base_nodes=[0, 2])
 
@@ -496,5 +496,5 @@ def test_a_structure_needs_numbers_and_geometry_needs_translations():
         frame.structure(FEW, 0.01, base_nodes=[0])
     with pytest.raises(InputError, match="modal"):
         frame.condense(FEW, base_nodes=[0], condensation="modal")
-    with pytest.raises(InputError, match="sensor 3 .* rotation"):
+    with pytest.raises(InputError, match="sensor 3 measures a rotation"):
         frame.sensor_geometry(FEW)

@@ -372,7 +372,7 @@ def test_the_best_is_replaced_by_a_point_of_the_same_cost_and_nothing_is_counted
 def test_the_best_is_not_replaced_between_ask_and_tell():
     swarm = run(ParticleSwarm(BOUNDS, rng=1), 3)
     swarm.ask()
-    with pytest.raises(RuntimeError, match="between ask"):
+    with pytest.raises(RuntimeError, match="between ask and tell"):
         swarm.replace_best(CENTRE, -7.0)
 
 
