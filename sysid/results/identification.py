@@ -267,7 +267,7 @@ class Identification(Answer):
             Where it is written without the expressions of its problem, of which one holds what cannot be stored.
         """
         tree = self.to_tree()
-        written, without = storage.write(tree, path), tree["problem"]["given"]["without"]
+        written, without = storage.write_tree(tree, path), tree["problem"]["given"]["without"]
         if without is not None and self.part is None:
             warnings.warn(
                 f"{written} is without the expressions of its problem, as {without} cannot be stored: to refine it, "
@@ -324,7 +324,7 @@ def load(path: str | Path, problem: Problem | None = None) -> Identification:
         Where there is no such file, or it is not a result of sysid, or damaged, or one of another format, or `problem`
         is another one; names the file.
     """
-    result = storage.read(path, Identification.from_tree)
+    result = storage.read_tree(path, Identification.from_tree)
     if problem is None:
         return result
     try:
