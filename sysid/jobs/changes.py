@@ -141,7 +141,7 @@ class WithoutSensor:
 
 
 @dataclass(frozen=True)
-class Modes:
+class NumberOfModes:
     """So many modes, where mass and stiffness are free: see `sysid.Modal`.
 
     Parameters
@@ -169,7 +169,7 @@ class Modes:
         """Nothing is left out: the validation tests are what is predicted."""
 
 
-Change = Band | WithoutRun | WithoutSensor | Modes
+Change = Band | WithoutRun | WithoutSensor | NumberOfModes
 
 
 def _on(problem: Problem, test: Measurement, **others: Any) -> Problem:
