@@ -12,6 +12,6 @@ def problem(*, data=None, rng=0, mass=None, lumped=False, band=None, goal=None, 
     if data is None:
         raise sysid.InputError("recorded_test needs a test: sysid run test.h5, with what 'sysid read' wrote")
     asked = {"band": band, "estimator": estimator, "at_rest": at_rest}
-    test = recorded_test.load_recorded_test(data).measurement(**{name: value for name, value in asked.items() if value is not None})
+    test = recorded_test.load(data).measurement(**{name: value for name, value in asked.items() if value is not None})
     masses = sysid.LumpedMass(mass) if lumped else sysid.FullMass(mass, healing="rigid_body")
     return sysid.Problem(test, mass=masses, goal=goal)

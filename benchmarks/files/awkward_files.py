@@ -65,7 +65,7 @@ def _fault(folder: Path, write: Callable[[Path], None], words: str) -> str:
     if not words:
         if status:
             return f"status {status}: {line}"
-        base, response, _ = recorded_test.load_recorded_test(target).runs[0]
+        base, response, _ = recorded_test.load(target).runs[0]
         n = min(base.shape[1], _SAMPLES)
         right = n > _SAMPLES - 3 and np.allclose(base[0, :n], _TABLE[:n]) and np.allclose(response[0, :n], _TOP[:n])
         return "" if right else "read, with other numbers"

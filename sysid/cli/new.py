@@ -85,7 +85,7 @@ def _templates(data: str | None) -> tuple[tuple[str, dict[str, str]], ...]:
     """Templates of a module and its test, of a test file where one is given, with what is filled in beside the name."""
     if data is None:
         return (_MODULE, {}), (_TEST, {})
-    test = recorded_test.load_recorded_test(data)
+    test = recorded_test.load(data)
     # In a comment, where a line feed would end it: `repr` spells that out, though a sensor has none in its name.
     sensors = "\n".join(f"#   {sensor.name!r}: {sensor.axis!r} at {sensor.position} m" for sensor in test.sensors)
     words = {"PATH": repr(str(Path(data))), "SENSORS": sensors, "AXES": " ".join(test.base_axes)}

@@ -112,7 +112,7 @@ def recipe(options: argparse.Namespace, made: Recipe) -> Recipe:
         refuse((asked, "--mass, --lumped, --band and --goal are for a test that 'sysid read' wrote"))
         return made
     refuse((made.data is not None, f"--data {made.data}: {made.module} is the data already"))
-    recorded_test.load_recorded_test(made.module)  # told before anything is made
+    recorded_test.load(made.module)  # told before anything is made
     extra: dict[str, Any] = {"lumped": True} if options.lumped else {}
     if options.mass is not None:
         extra["mass"] = options.mass[0] if len(options.mass) == 1 else options.mass

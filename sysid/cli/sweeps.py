@@ -88,7 +88,7 @@ def sweep_of(options: argparse.Namespace, result: Identification, recipe: Recipe
 
 def _orders(low: int, high: int, problem: Problem) -> tuple[tuple[Change, ...], str]:
     """Numbers of modes up to those that stand out of the noise, and what the jobs are."""
-    changes, told = tuple(NumberOfModes(count) for count in range(low, high + 1)), "identification{s}, each of so many modes"
+    changes, told = tuple(map(NumberOfModes, range(low, high + 1))), "identification{s}, each of so many modes"
     _check_possible(changes, problem)
     found = poles_of(problem.prepared.screened).omega.size
     if low > found:

@@ -11,7 +11,7 @@ import numpy as np
 from sysid.errors import InputError, refuse
 from sysid.files import units
 from sysid.files.description import Channel, Description
-from sysid.files.recorded_test import RecordedTest, ChannelRow, Run
+from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
 from sysid.files.recording import Column, Recording, check_finite, rate_of
 from sysid.files.spectral import TIME_NAMES
 from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row

@@ -162,7 +162,7 @@ class RecordedTest:
                     refuse((shape != (rows, n), f"{name} of a run is {shape}: ({rows}, {n}) is needed"))
 
 
-def load_recorded_test(path: str | Path) -> RecordedTest:
+def load(path: str | Path) -> RecordedTest:
     """Read a ``test.h5`` again.
 
     Raises

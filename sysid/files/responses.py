@@ -25,7 +25,7 @@ from sysid.files.assembly import (
     work_of_force,
 )
 from sysid.files.description import CONVENTIONS, Channel, Description
-from sysid.files.recorded_test import RecordedTest, ChannelRow, Run
+from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
 from sysid.files.recording import Column, Recording, check_finite
 from sysid.structure.axes import BASE_AXES, base_columns
 from sysid.structure.structure import Array, ComplexArray

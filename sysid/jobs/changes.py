@@ -152,7 +152,7 @@ class NumberOfModes:
     count: int
 
     def __post_init__(self) -> None:
-        whole_number("Modes: count", self.count, at_least=1)
+        whole_number("NumberOfModes: count", self.count, at_least=1)
 
     @property
     def title(self) -> str:

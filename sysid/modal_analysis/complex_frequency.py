@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.residues import StackedRecords, force_residues
+from sysid.modal_analysis.residues import Records, force_residues
 from sysid.modal_analysis.response import columns, gains_with_velocity, weights_of
 from sysid.modal_analysis.vector_fitting import Monitor, poles_of_any_damping
 from sysid.structure.structure import Array, ComplexArray
@@ -52,7 +52,7 @@ class PolesAndResidues:
     @classmethod
     def of(cls, test: Measurement, *, monitor: Monitor | None = None) -> PolesAndResidues | None:
         """Poles and residues of a test; None where no pole is found. The monitor is called as by `find_poles`."""
-        records = StackedRecords(test)
+        records = Records(test)
         omega, ratios = poles_of_any_damping(records, monitor=monitor)
         if omega.size == 0:
             return None
@@ -60,7 +60,7 @@ class PolesAndResidues:
         return cls.at(test, records, omega[order], ratios[order])
 
     @classmethod
-    def at(cls, test: Measurement, records: StackedRecords, omega: Array, ratios: Array) -> PolesAndResidues:
+    def at(cls, test: Measurement, records: Records, omega: Array, ratios: Array) -> PolesAndResidues:
         """Free residues of a test at given poles, (m,) each, ascending; `records` are those of its accelerations."""
         # Residues in quadrature too, where the lines suffice for them.
         many = records.data.shape[0] > 4 * omega.size * records.n_base

@@ -16,7 +16,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.excitation import steady_sine
 from sysid.modal_analysis.record_poles import few_lines, rough_deviations
 from sysid.modal_analysis.relocation import relocate
-from sysid.modal_analysis.residues import StackedRecords, unit_columns
+from sysid.modal_analysis.residues import Records, unit_columns
 from sysid.modal_analysis.vector_fitting import GUESS, RAZOR
 from sysid.nlp import one_thread
 from sysid.structure.structure import Array, ComplexArray
@@ -91,7 +91,7 @@ def direct_terms(test: Measurement) -> DirectTerms | None:
             if found is None:
                 return None
         omega, ratios, rigid = found
-        force = None if test.force is None else _fitted(StackedRecords(still, force=True), omega, ratios)
+        force = None if test.force is None else _fitted(Records(still, force=True), omega, ratios)
     (own, slope), (own_std, slope_std) = rigid.terms, rigid.std
     mass, mass_std, modal_mass = (None,) * 3 if force is None else (force.terms[0], force.std[0], force.modal)
     return DirectTerms(
@@ -101,14 +101,14 @@ def direct_terms(test: Measurement) -> DirectTerms | None:
 
 def _of_accelerations(still: Measurement) -> tuple[Array, Array, _Fit] | None:
     """Poles, and the fit on them; None where the base moves in too few directions, or no pole is found."""
-    records = StackedRecords(still)
+    records = Records(still)
     if not records.unit and records.driven < still.n_base:
         return None
     poles = _poles(records)
     return None if poles is None else (*poles, _fitted(records, *poles))
 
 
-def _poles(records: StackedRecords, steps: int = 8) -> tuple[Array, Array] | None:
+def _poles(records: Records, steps: int = 8) -> tuple[Array, Array] | None:
     """Poles of the records beside terms without them; none is removed for explaining no more than noise.
 
     They are looked for in the principal channels, the first half of the steps in few of them, which is quicker.
@@ -150,7 +150,7 @@ class _Fit:
     spikes: NDArray[np.bool_]
 
 
-def _fitted(records: StackedRecords, omega: Array, ratios: Array) -> _Fit:
+def _fitted(records: Records, omega: Array, ratios: Array) -> _Fit:
     """Linear least squares on given poles; the slopes per rad/s."""
     direct = records.basis(_without_poles(records.freq), records.driven)
     functions, size = unit_columns(np.hstack([direct, records.functions(omega, ratios, velocity=True)]))
@@ -179,7 +179,7 @@ def _fitted(records: StackedRecords, omega: Array, ratios: Array) -> _Fit:
     )  # fmt: skip
 
 
-def _spikes(records: StackedRecords, left: Array) -> NDArray[np.bool_]:
+def _spikes(records: Records, left: Array) -> NDArray[np.bool_]:
     """Lines (n_freq,) at which a fit leaves a number far off those of its run; none where these are many."""
     size = np.hypot(*left.reshape(2, -1, left.shape[1]))
     level = np.stack([np.median(size[records.run == run], axis=0) for run in range(len(records.blocks))])
@@ -189,7 +189,7 @@ def _spikes(records: StackedRecords, left: Array) -> NDArray[np.bool_]:
     return far if np.count_nonzero(far) < _FEW * far.size else np.zeros_like(far)
 
 
-def _by_sensor(records: StackedRecords, terms: Array) -> Array:
+def _by_sensor(records: Records, terms: Array) -> Array:
     """Coefficients (k, driven inputs, channels) in the test's own units, (k, n_sensors, d)."""
     plain = terms / records.channel
     if records.unit:
@@ -197,7 +197,7 @@ def _by_sensor(records: StackedRecords, terms: Array) -> Array:
     return np.einsum("kic,di->kcd", plain, _of_base(records))
 
 
-def _deviations(records: StackedRecords, rows: Array, level: Array) -> Array:
+def _deviations(records: Records, rows: Array, level: Array) -> Array:
     """Deviations of the coefficients that rows (k, driven inputs, r) make of r independent errors of each channel.
 
     Errors of the inputs, which are combinations of base directions, are not independent of one another.
@@ -208,7 +208,7 @@ def _deviations(records: StackedRecords, rows: Array, level: Array) -> Array:
     return np.asarray(of_base[:, None] * (level / records.channel)[:, None])
 
 
-def _of_base(records: StackedRecords) -> Array:
+def _of_base(records: Records) -> Array:
     """Combinations of the base directions (d, driven inputs) that the records were fitted on."""
     d = len(records.moving) - (records.base.shape[0] - records.driven)
     return records.moving[:d, : records.driven]

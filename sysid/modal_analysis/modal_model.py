@@ -24,7 +24,7 @@ from sysid.modal_analysis.response import gains, motion_and_slopes, real_times
 from sysid.structure.structure import Array, ComplexArray
 
 
-class RunSpectra(NamedTuple):
+class Run(NamedTuple):
     """Spectra of one run: lines (L,), rad/s; base (d, L); outputs (c, L); `density` of `WholeRecords`; its number."""
 
     w: Array
@@ -37,7 +37,7 @@ class RunSpectra(NamedTuple):
     piece: int
     """Row of the levels of noise: runs are cut where levels vary over the lines."""
 
-    def at(self, lines: Any) -> RunSpectra:
+    def at(self, lines: Any) -> Run:
         """Some of its lines."""
         return self._replace(
             w=self.w[lines], base=self.base[:, lines], outputs=self.outputs[:, lines], weight=self.weight[lines]
@@ -91,7 +91,7 @@ class SpectralModel:
         How many of the unknowns of `Index` there are: without a force the rigid-body mass is left out.
     """
 
-    def __init__(self, test: Measurement, m: int, runs: list[RunSpectra]) -> None:
+    def __init__(self, test: Measurement, m: int, runs: list[Run]) -> None:
         self.test, self.m, self.runs = test, m, runs
         self.n, self.d, self.force = test.n_sensors, test.n_base, test.force is not None
         self.channels = self.n + self.d * self.force
@@ -114,7 +114,7 @@ class SpectralModel:
         """What the traces of a channel are multiples of, (traces, L)."""
         return np.zeros((0, freq.size), complex)
 
-    def parts(self, at_once: int = 4096) -> Iterator[RunSpectra]:
+    def parts(self, at_once: int = 4096) -> Iterator[Run]:
         """Lines of all runs, as many at once as memory holds derivatives of."""
         for run in self.runs:
             for at in range(0, run.w.size, at_once):
@@ -132,7 +132,7 @@ class SpectralModel:
 class Lines:
     """Some lines of one run at given parameters."""
 
-    def __init__(self, model: SpectralModel, p: Parameters, run: RunSpectra) -> None:
+    def __init__(self, model: SpectralModel, p: Parameters, run: Run) -> None:
         self.model, self.p, self.run = model, p, run
         freq = run.w / (2 * np.pi)
         modes = p.modes

@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.misfit import SUSPECT
-from sysid.modal_analysis.residues import StackedRecords
+from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.response import gains
 from sysid.modal_analysis.vector_fitting import Monitor, poles_from, poles_of_any_damping
 from sysid.structure.structure import Array, ComplexArray, Structure
@@ -291,10 +291,10 @@ def _without_absorbed(
     recorded = clean.relative if clean.force is None else np.concatenate([clean.relative, clean.force], axis=1)
     off = np.zeros_like(recorded)
     here = np.arange(test.freq.size)
-    decide = StackedRecords(clean).leverage(fit.omega, fit.ratios) > _DECIDES
+    decide = Records(clean).leverage(fit.omega, fit.ratios) > _DECIDES
     for line in np.flatnonzero(decide | _in_doubt(test.freq, fit.omega, fit.ratios)).tolist():
         rest = clean.at(here != line)
-        records = StackedRecords(rest)
+        records = Records(rest)
         omega, ratios = poles_from(records, fit.omega, fit.ratios, monitor=monitor)
         if omega.size == 0:
             continue
@@ -371,7 +371,7 @@ def _bounded_fit(test: Measurement, fit: PolesAndResidues) -> list[ComplexArray]
             other = _replaced(test, made, [_beyond_neighbours(part, times=_BEHIND) for part in parts])
             if other is test:
                 return made
-        fit = PolesAndResidues.at(other, StackedRecords(other), fit.omega, fit.ratios)
+        fit = PolesAndResidues.at(other, Records(other), fit.omega, fit.ratios)
     return _made(fit, test.freq, test.base)
 
 
@@ -382,7 +382,7 @@ def _made(fit: PolesAndResidues, freq: Array, base: ComplexArray) -> list[Comple
 
 def _poles(test: Measurement, monitor: Monitor | None) -> PolesAndResidues | None:
     """Poles of a test but those that answer for one line only, and free residues at them; None where there are none."""
-    records = StackedRecords(test)
+    records = Records(test)
     omega, ratios = poles_of_any_damping(records, monitor=monitor)
     order = np.argsort(omega)
     omega, ratios = omega[order], ratios[order]
@@ -392,7 +392,7 @@ def _poles(test: Measurement, monitor: Monitor | None) -> PolesAndResidues | Non
     return PolesAndResidues.at(test, records, omega, ratios) if omega.size else None
 
 
-def _is_one_number(test: Measurement, records: StackedRecords, omega: Array, ratios: Array, k: int) -> bool:
+def _is_one_number(test: Measurement, records: Records, omega: Array, ratios: Array, k: int) -> bool:
     """Whether pole k, which stands at one line, shows there in one channel only, or explains nothing at other lines."""
     fit = PolesAndResidues.at(test, records, omega, ratios)
     highest = int(np.argmax(_heights(test.freq, omega[[k]], ratios[[k]])))
@@ -401,7 +401,7 @@ def _is_one_number(test: Measurement, records: StackedRecords, omega: Array, rat
     power = np.abs(shown / std) ** 2
     if power.size > 1 and power.max() > _ONE_CHANNEL * power.sum():
         return True
-    others = StackedRecords(test.at(np.arange(test.freq.size) != highest))
+    others = Records(test.at(np.arange(test.freq.size) != highest))
     every = others.fit(omega, ratios, velocity=True)
     left = others.size  # where it is the only pole
     if omega.size > 1:

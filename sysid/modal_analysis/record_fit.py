@@ -22,7 +22,7 @@ from sysid.modal_analysis.modal_masses import weigh
 from sysid.modal_analysis.record_colour import extra_numbers
 from sysid.modal_analysis.record_model import TRACES, HeldShapes, Parameters, RecordModel, Shift
 from sysid.modal_analysis.record_noise import floors, likeliest_levels
-from sysid.modal_analysis.residues import StackedRecords
+from sysid.modal_analysis.residues import Records
 from sysid.structure.structure import Array
 
 _SETTLED = 1e-3  # fall of the sum of squares, in units of the noise, at which the fit stands still
@@ -276,7 +276,7 @@ def _chi2(model: RecordModel, p: Parameters, levels: Array) -> float:
 
 def _first(test: Measurement, omega: Array, ratios: Array, *, repeated: bool) -> Parameters:
     """Rank-one modes nearest to free residues at given poles, one at each or `repeated`; with a force, its masses."""
-    records = StackedRecords(test)
+    records = Records(test)
     d, free = test.n_base, records.fit(omega, ratios)
     residues = records.by_sensor(free.residues)  # (m, n, d + 2 r)
     size = np.linalg.norm(np.concatenate(list(test.inputs), axis=-1), axis=1)

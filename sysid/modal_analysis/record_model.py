@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.modal_analysis.modal_model import Lines, Parameters, RunSpectra, Shift, SpectralModel, dots
+from sysid.modal_analysis.modal_model import Lines, Parameters, Run, Shift, SpectralModel, dots
 from sysid.modal_analysis.record_colour import pieces
 from sysid.modal_analysis.response import real_times
 from sysid.structure.structure import Array, ComplexArray
@@ -97,7 +97,7 @@ class RecordModel(SpectralModel):
         self.whole = test.whole
         outputs = test.response if test.force is None else np.concatenate([test.response, test.force], axis=1)
         runs = [
-            RunSpectra(
+            Run(
                 2 * np.pi * test.freq[own], test.base[r][:, own], outputs[r][:, own], float(self.whole.density[r]), r,
                 np.ones(np.count_nonzero(own)), r,
             )
@@ -228,7 +228,7 @@ class HeldShapes(RecordModel):
 class Chunk(Lines):
     """Some lines of one run at given parameters, with the columns of their Jacobian."""
 
-    def __init__(self, model: RecordModel, p: Parameters, run: RunSpectra) -> None:
+    def __init__(self, model: RecordModel, p: Parameters, run: Run) -> None:
         super().__init__(model, p, run)
         self.records = model
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sysid.modal_analysis.residues import StackedRecords, unit_columns
+from sysid.modal_analysis.residues import Records, unit_columns
 from sysid.modal_analysis.response import gains_with_velocity, stacked
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import EXACT
@@ -20,7 +20,7 @@ Blocks = list[tuple[ComplexArray, ComplexArray, ComplexArray]]  # of each: `Reco
 
 
 def relocate(
-    records: StackedRecords,
+    records: Records,
     blocks: Blocks,
     omega: Array,
     ratios: Array,

@@ -105,7 +105,7 @@ class ResidueFit:
         return np.clip(needed, 1, min(n_sensors, n_base))
 
 
-class StackedRecords:
+class Records:
     """Weighted relative accelerations of a test, or its base force; real parts above imaginary ones.
 
     Each record is ``sum over inputs of residue · gain · base``. Where each run moves the base in
@@ -248,7 +248,7 @@ class SubsetFits:
         Real parameters that come with a pole: residues, frequency and damping ratio.
     """
 
-    def __init__(self, records: StackedRecords, omega: Array, ratios: Array, *, velocity: bool = False) -> None:
+    def __init__(self, records: Records, omega: Array, ratios: Array, *, velocity: bool = False) -> None:
         X, _ = unit_columns(records.functions(omega, ratios, velocity=velocity))
         Q, R = np.linalg.qr(X)
         self.records, self.size = records, omega.size
@@ -427,7 +427,7 @@ def linear_residues(test: Measurement, omega: Array, ratios: Array) -> tuple[Arr
     residual : float
         Relative residual that they leave: no modal model with these poles has a smaller one.
     """
-    records = StackedRecords(test)
+    records = Records(test)
     fit = records.fit(omega, ratios)
     return records.by_sensor(fit.residues), float(np.sqrt(fit.squared_error / records.size))
 
@@ -446,7 +446,7 @@ def force_residues(test: Measurement, omega: Array, ratios: Array, *, velocity: 
         Of the base itself, of ``g_k`` and of ``s / w_k g_k`` (zero without `velocity`).
     residual : float
     """
-    records = StackedRecords(test, force=True)
+    records = Records(test, force=True)
     g = gains_with_velocity(test.freq, omega, ratios)[: 1 + velocity].reshape(-1, test.freq.size)
     basis, size = unit_columns(records.basis(np.concatenate([np.ones((1, test.freq.size)), g])))
     Q, R = np.linalg.qr(basis)

@@ -26,7 +26,7 @@ from sysid.modal_analysis.modal_fit import (
     separate_poles,
     slopes_of_modes,
 )
-from sysid.modal_analysis.modal_model import Lines, Parameters, RunSpectra, Shift, SpectralModel, dots
+from sysid.modal_analysis.modal_model import Lines, Parameters, Run, Shift, SpectralModel, dots
 from sysid.modal_analysis.residues import force_residual_left, linear_residues
 from sysid.modal_analysis.response import motion_curvature, real_times
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor
@@ -80,7 +80,7 @@ class SpectraModel(SpectralModel):
         outputs = test.response if test.force is None else np.concatenate([test.response, test.force], axis=1)
         every = [(weights.lines, 0)] + [(weights.force_lines, 1)] * (weights.force_lines is not weights.lines)
         runs = [
-            RunSpectra(2 * np.pi * test.freq, base * line, records * line, 1.0, number, np.ones(line.size), piece)
+            Run(2 * np.pi * test.freq, base * line, records * line, 1.0, number, np.ones(line.size), piece)
             for lines, piece in every
             for number, (base, records, line) in enumerate(zip(test.base, outputs, lines, strict=True))
         ]

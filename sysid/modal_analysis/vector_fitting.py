@@ -17,7 +17,7 @@ import numpy as np
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.relocation import relocate
-from sysid.modal_analysis.residues import StackedRecords, ResidueFit, SubsetFits
+from sysid.modal_analysis.residues import Records, ResidueFit, SubsetFits
 from sysid.modal_analysis.response import gain_slopes, gains
 from sysid.nlp import one_thread
 from sysid.structure.structure import Array
@@ -56,7 +56,7 @@ Monitor = Callable[[int, float], object]
 class _Progress:
     """Count of iterations and the relative residual so far, which a monitor is called with."""
 
-    def __init__(self, monitor: Monitor | None, records: StackedRecords) -> None:
+    def __init__(self, monitor: Monitor | None, records: Records) -> None:
         self.monitor: Monitor = monitor or (lambda iterations, residual: None)
         self.size = max(records.size, np.finfo(float).tiny)
         self.iterations, self.residual = 0, 1.0
@@ -94,11 +94,11 @@ def find_poles(test: Measurement, *, monitor: Monitor | None = None) -> Poles:
     1587-1592. G. H. Golub, V. Pereyra, SIAM J. Numer. Anal. 10 (1973) 413-432, with Kaufman's Jacobian (1975).
     """
     with one_thread():  # the same bits whatever else the machine does
-        records = StackedRecords(test)
+        records = Records(test)
         return _find(records, _Progress(monitor, records))
 
 
-def _find(records: StackedRecords, progress: _Progress) -> Poles:
+def _find(records: Records, progress: _Progress) -> Poles:
     wanted, most = _count(records, progress), _most_poles(records)
     # Where lines are few a spare pole or two must do.
     count = min(wanted, most) if most > wanted - _SPARE else wanted
@@ -136,7 +136,7 @@ def poles_near(test: Measurement, omega: Array, window: float, *, monitor: Monit
     InputError
         Where a stated frequency is not one of the data.
     """
-    records = StackedRecords(test)
+    records = Records(test)
     distinct = np.unique(omega)
     found, ratios = _polish(records, distinct, np.full(distinct.size, GUESS), _Progress(monitor, records))
     off = np.abs(np.log(found / distinct))
@@ -154,7 +154,7 @@ def poles_near(test: Measurement, omega: Array, window: float, *, monitor: Monit
     return _in_order(records, found, ratios)
 
 
-def _count(records: StackedRecords, progress: _Progress) -> int:
+def _count(records: Records, progress: _Progress) -> int:
     """How many poles to begin with."""
     progress.tell()
     sizes, _ = records.singular
@@ -164,7 +164,7 @@ def _count(records: StackedRecords, progress: _Progress) -> int:
     return max(min(records.n_sensors, max(2 * independent, _MANY)), independent) + _SPARE
 
 
-def poles_of_any_damping(records: StackedRecords, *, monitor: Monitor | None = None) -> tuple[Array, Array]:
+def poles_of_any_damping(records: Records, *, monitor: Monitor | None = None) -> tuple[Array, Array]:
     """Circular frequencies and damping ratios of poles with residues in quadrature beside the real ones.
 
     They serve to continue records off the lines: none is tried beside or between them, and none is merged. None at all
@@ -187,7 +187,7 @@ def poles_of_any_damping(records: StackedRecords, *, monitor: Monitor | None = N
     return np.empty(0), np.empty(0)
 
 
-def poles_from(records: StackedRecords, omega: Array, ratios: Array, *, monitor: Monitor | None = None) -> tuple[Array, Array]:
+def poles_from(records: Records, omega: Array, ratios: Array, *, monitor: Monitor | None = None) -> tuple[Array, Array]:
     """The same as `poles_of_any_damping` from poles close by, ascending."""
     with one_thread():
         omega, ratios = _settled(records, omega, ratios, _Progress(monitor, records), velocity=True)
@@ -195,13 +195,13 @@ def poles_from(records: StackedRecords, omega: Array, ratios: Array, *, monitor:
     return omega[order], ratios[order]
 
 
-def _most_poles(records: StackedRecords) -> int:
+def _most_poles(records: Records) -> int:
     """How many poles the lines determine, and the records residues of both kinds beside the motion at ends."""
     inputs = len(records.base) + records.driven
     return min((int(np.count_nonzero(records.freq)) - 1) // 2, (len(records.data) - 1) // inputs)
 
 
-def _relocated(records: StackedRecords, count: int, progress: _Progress, rounds: int = 6) -> tuple[Array, Array]:
+def _relocated(records: Records, count: int, progress: _Progress, rounds: int = 6) -> tuple[Array, Array]:
     """Poles that earn their place, from `count` that are spread over the lines, before they are polished.
 
     Some `rounds` at most: each moves all of them.
@@ -221,7 +221,7 @@ def _relocated(records: StackedRecords, count: int, progress: _Progress, rounds:
     return _prune(records, omega, ratios, progress, velocity=True)
 
 
-def _search(records: StackedRecords, count: int, progress: _Progress) -> tuple[Array, Array]:
+def _search(records: Records, count: int, progress: _Progress) -> tuple[Array, Array]:
     """Poles that stand out of the noise."""
     first = _relocated(records, count, progress)
     poles = _settled(records, *first, progress)
@@ -241,7 +241,7 @@ def _search(records: StackedRecords, count: int, progress: _Progress) -> tuple[A
     return poles
 
 
-def _criterion(records: StackedRecords, poles: tuple[Array, Array], *, velocity: bool) -> float:
+def _criterion(records: Records, poles: tuple[Array, Array], *, velocity: bool) -> float:
     """Schwarz's criterion of the fit on these poles: the lower, the better for the unknowns it takes."""
     fit = records.fit(*poles, velocity=velocity)
     unknowns = poles[0].size * (fit.residues[0].size + 2)
@@ -249,7 +249,7 @@ def _criterion(records: StackedRecords, poles: tuple[Array, Array], *, velocity:
     return float(records.data.size * np.log(error) + unknowns * np.log(records.data.size))
 
 
-def _merged(records: StackedRecords, omega: Array, ratios: Array, progress: _Progress) -> tuple[Array, Array]:
+def _merged(records: Records, omega: Array, ratios: Array, progress: _Progress) -> tuple[Array, Array]:
     """Poles without those that a neighbour replaces once it may move: close poles can exchange their residues."""
     order = np.argsort(omega)
     omega, ratios = omega[order], ratios[order]
@@ -269,7 +269,7 @@ def _merged(records: StackedRecords, omega: Array, ratios: Array, progress: _Pro
 
 
 def _settled(
-    records: StackedRecords, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False
+    records: Records, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False
 ) -> tuple[Array, Array]:
     """Poles polished, and pruned until all that stay earn their place."""
     size = omega.size + 1
@@ -280,7 +280,7 @@ def _settled(
     return omega, ratios
 
 
-def _with_another(records: StackedRecords, omega: Array, ratios: Array, progress: _Progress) -> tuple[Array, Array] | None:
+def _with_another(records: Records, omega: Array, ratios: Array, progress: _Progress) -> tuple[Array, Array] | None:
     """The poles and one more, settled; None where what they leave needs none.
 
     Candidates lie beside each pole, for two modes that share it, and between the poles. Damping that is not classical
@@ -309,7 +309,7 @@ def _with_another(records: StackedRecords, omega: Array, ratios: Array, progress
     return None
 
 
-def _in_order(records: StackedRecords, omega: Array, ratios: Array) -> Poles:
+def _in_order(records: Records, omega: Array, ratios: Array) -> Poles:
     order = np.argsort(omega)
     left = float(np.sqrt(records.fit(omega, ratios).squared_error / records.size))
     return Poles(omega[order], ratios[order], left)
@@ -320,13 +320,13 @@ def _least_gain(fit: ResidueFit) -> float:
     return beyond_chance(fit.residues[0].size + 2, CANDIDATES)  # real parameters that come with a pole
 
 
-def _noise(records: StackedRecords, fit: ResidueFit, m: int) -> float:
+def _noise(records: Records, fit: ResidueFit, m: int) -> float:
     """Variance of a record's real number about the fit of m poles."""
     return records.noise(fit.left, m * (fit.residues[0].size + 2))
 
 
 def _prune(
-    records: StackedRecords, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False
+    records: Records, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False
 ) -> tuple[Array, Array]:
     """Remove poles, the least useful first, until each that stays lowers the error by far more than noise would."""
     lines = 2 * np.pi * records.freq[records.freq > 0]
@@ -348,7 +348,7 @@ def _prune(
 
 
 def _polish(
-    records: StackedRecords, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False, steps: int = 100
+    records: Records, omega: Array, ratios: Array, progress: _Progress, *, velocity: bool = False, steps: int = 100
 ) -> tuple[Array, Array]:
     """Variable projection: Levenberg-Marquardt `steps` at most over (log w, log zeta), the residues eliminated."""
     m = omega.size
@@ -375,7 +375,7 @@ def _polish(
     return np.exp(p[:m]), np.exp(p[m:])
 
 
-def _projected(records: StackedRecords, p: Array, velocity: bool) -> tuple[float, Array, Array]:
+def _projected(records: Records, p: Array, velocity: bool) -> tuple[float, Array, Array]:
     """Squared error, Gauss-Newton matrix (2m, 2m) and descent direction of the projected problem at log poles `p`."""
     m = p.size // 2
     omega, ratios = np.exp(p[:m]), np.exp(p[m:])

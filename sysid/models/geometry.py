@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from sysid.errors import InputError, finite_array, refuse, shown
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate, estimated_poles
-from sysid.modal_analysis.residues import StackedRecords
+from sysid.modal_analysis.residues import Records
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.unknowns import Unknown
 from sysid.structure.structure import Array
@@ -106,7 +106,7 @@ class Geometry:
         """
         omega, test = self.poles.omega, self.test
         if omega.size < self.n and test.n_base > 1 and not self.modal.has_modes:
-            records = StackedRecords(test)
+            records = Records(test)
             free = records.fit(omega, self.poles.ratios)
             ranks = free.ranks(records.noise(free.left, free.residues.size), test.n_sensors, test.n_base)
             omega = np.repeat(omega, ranks) if ranks.sum() <= self.n else omega

@@ -12,7 +12,7 @@ from sysid.results.answer import Answer
 MANY = 60  # rows beyond which a terminal shows none
 
 
-class UnknownRow(NamedTuple):
+class Row(NamedTuple):
     """A scalar unknown; `std` is NaN where no record sees it, `side` the bound on which it rests, empty for none."""
 
     label: str
@@ -34,19 +34,19 @@ def stated_values(it: Answer) -> list[str]:
     return [f"{name} ends {z:+.2g} standard deviations from the value stated as known" for name, z in it.facts.misses]
 
 
-def rows_of(it: Answer) -> list[UnknownRow]:
+def rows_of(it: Answer) -> list[Row]:
     """A row a scalar unknown that was searched and means something by itself: see `sysid.results.facts`."""
     if it.x is None:
         return []
     u = it.quick_uncertainty
     known = {} if u is None else u.variables
-    rows: list[UnknownRow] = []
+    rows: list[Row] = []
     for unknown in (one for one in it.facts.unknowns if not (one.fixed or one.is_ratio)):
         values = np.ravel(it.values[unknown.name], order="F")
         std = np.ravel(known.get(unknown.name, np.full(unknown.shape, np.nan)), order="F").tolist()
         units = [unknown.unit] * unknown.size
         bounds = unknown.lower.tolist(), unknown.upper.tolist()
         rows += map(
-            UnknownRow, unknown.labels, values.tolist(), std, units, *bounds, sides_of(unknown.lower, unknown.upper, values)
+            Row, unknown.labels, values.tolist(), std, units, *bounds, sides_of(unknown.lower, unknown.upper, values)
         )
     return rows

@@ -14,7 +14,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import ModalFit, Modes, separate_poles
 from sysid.modal_analysis.modal_masses import weigh
 from sysid.modal_analysis.residues import (
-    StackedRecords,
+    Records,
     ResidueFit,
     SubsetFits,
     independent,
@@ -60,9 +60,9 @@ class ModeFit:
     max_iterations: int
 
     @cached_property
-    def records(self) -> StackedRecords:
+    def records(self) -> Records:
         """What residues are fitted to."""
-        return StackedRecords(self.test)
+        return Records(self.test)
 
     def best(self) -> ModalFit:
         """The fit, its modes in ascending order.

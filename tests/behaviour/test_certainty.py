@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import block_diag
 
 from sysid import FullMass, InputError, LumpedMass, Measurement, Problem, Structure, identify, simulate
-from sysid.modal_analysis.residues import StackedRecords, line_correlation
+from sysid.modal_analysis.residues import Records, line_correlation
 
 FREQ = np.linspace(2.0, 30.0, 500)
 
@@ -145,7 +145,7 @@ class TestLineCorrelation:
         omega, ratios = 2 * np.pi * np.linspace(2.0, freq[-1], poles), np.full(poles, 0.02)
         for _ in range(10):
             noise = rng.normal(size=(1, 12, lines)) + 1j * rng.normal(size=(1, 12, lines))
-            records = StackedRecords(Measurement(freq, np.ones((1, 1, lines)), 1 + noise, rigid_body=np.ones((12, 1))))
+            records = Records(Measurement(freq, np.ones((1, 1, lines)), 1 + noise, rigid_body=np.ones((12, 1))))
             fit = records.fit(omega, ratios, velocity=True)
             left = records.in_runs(fit.left).transpose(2, 0, 1)
             assert line_correlation(left, fit.residues.size) == 1.0
@@ -196,7 +196,7 @@ class TestLineCorrelation:
         for _ in range(60):
             noise = np.fft.rfft(rng.normal(size=(1, 4, 3000)), n=6000)[..., 150:1500]
             test = Measurement(freq, later[None, None], (1.0 + noise) * later, rigid_body=np.ones((4, 1)))
-            records = StackedRecords(test)
+            records = Records(test)
             fit = records.fit(omega, ratios)
             std = np.sqrt(records.noise(fit.left, fit.residues.size) * np.einsum("kir,kir->ki", fit.spread, fit.spread))
             off.append(fit.residues / std[..., None])

@@ -143,7 +143,7 @@ def test_the_test_file_gives_back_what_was_read(tmp_path):
     (tmp_path / "run.csv").write_text("\n".join(table()))
     test = reading.gather(tmp_path / "run.csv", SENSORS)
     (tmp_path / "test.h5").write_bytes(test.to_bytes())
-    again = recorded_test.load_recorded_test(tmp_path / "test.h5")
+    again = recorded_test.load(tmp_path / "test.h5")
     assert all(np.array_equal(a, b) for a, b in zip(test.runs[0], again.runs[0], strict=True))
     assert (again.sensors, again.table, again.sample_rate) == (test.sensors, test.table, test.sample_rate)
 

@@ -66,7 +66,7 @@ def test_each_command_reads_the_test_that_its_files_were_made_from(folder, capsy
     if "modal.unv" in line:
         universal()
     assert cli.main(["read", *shlex.split(line)]) == 0, capsys.readouterr().err
-    test = recorded_test.load_recorded_test("test.h5")
+    test = recorded_test.load("test.h5")
     for base, response, _ in test.runs:
         if test.freq is not None:
             np.testing.assert_allclose(test.freq, FREQ, rtol=1e-10)

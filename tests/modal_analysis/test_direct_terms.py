@@ -10,7 +10,7 @@ from benchmarks.records.simulated import coupled
 from benchmarks.records.trial import measurement
 from sysid import Measurement, simulate
 from sysid.modal_analysis.direct_terms import _fitted, direct_terms
-from sysid.modal_analysis.residues import StackedRecords
+from sysid.modal_analysis.residues import Records
 
 
 def lied(test):
@@ -52,7 +52,7 @@ def test_deviations_are_those_of_least_squares_in_the_base_directions_themselves
     base[:, 1] = np.where(freq < 8, 1.0, 0.2) * (0.9 * base[:, 0] + 0.4 * base[:, 1])
     omega, ratios = 2 * np.pi * np.array([3.0, 7.0, 12.0]), np.array([0.01, 0.015, 0.02])
     noise = rng.standard_normal((3, 4, freq.size)) + 1j * rng.standard_normal((3, 4, freq.size))
-    records = StackedRecords(Measurement(freq, base, noise, rigid_body=np.zeros((4, 2))))
+    records = Records(Measurement(freq, base, noise, rigid_body=np.zeros((4, 2))))
     found = _fitted(records, omega, ratios)
     w = 2 * np.pi * freq
     g = w**2 / (omega[:, None] ** 2 - w**2 + 2j * (ratios * omega)[:, None] * w)

@@ -5,7 +5,7 @@ import pytest
 
 from sysid import Measurement
 from sysid.measurement.measurement import unit_runs
-from sysid.modal_analysis.residues import StackedRecords, force_residual_left, independent, linear_residues
+from sysid.modal_analysis.residues import Records, force_residual_left, independent, linear_residues
 
 POLES = 2 * np.pi * np.array([5.0, 9.0, 9.4]), np.array([0.01, 0.02, 0.015])
 M = 3
@@ -65,7 +65,7 @@ def test_residues_are_those_of_weighted_least_squares(d, unit, weighted):
     rng = np.random.default_rng(d)
     std = deviations(rng, d if unit else 3, 4, 40) if weighted else None
     test = records(rng, unit=unit, d=d, std=std)
-    book = StackedRecords(test)
+    book = Records(test)
     assert book.unit is unit
     fit = book.fit(*POLES)
     expected, error = reference(test, *POLES)
@@ -82,7 +82,7 @@ def test_residues_are_those_of_weighted_least_squares(d, unit, weighted):
 def test_velocities_are_further_inputs(d, unit):
     rng = np.random.default_rng(d)
     test = records(rng, unit=unit, d=d, std=deviations(rng, d if unit else 3, 4, 40))
-    book = StackedRecords(test)
+    book = Records(test)
     fit = book.fit(*POLES, velocity=True)
     expected, error = reference(test, *POLES, velocity=True)
     # A unit run has one input a channel; else inputs are combinations of the directions, motions before velocities.
@@ -98,7 +98,7 @@ def test_velocities_are_further_inputs(d, unit):
 def test_gain_is_what_the_error_rises_by_without_a_pole(unit, velocity):
     rng = np.random.default_rng(5)
     test = records(rng, unit=unit, std=deviations(rng, 2 if unit else 3, 4, 40))
-    book, (omega, ratios) = StackedRecords(test), POLES
+    book, (omega, ratios) = Records(test), POLES
     fit = book.fit(omega, ratios, velocity=velocity)
     without = [
         book.fit(np.delete(omega, k), np.delete(ratios, k), velocity=velocity).squared_error for k in range(M)
@@ -110,7 +110,7 @@ def test_gain_is_what_the_error_rises_by_without_a_pole(unit, velocity):
 @pytest.mark.parametrize("unit", [False, True])
 def test_spread_is_the_scatter_of_the_residues(unit):
     """The inverse of the design's Gram matrix, pole by pole."""
-    book = StackedRecords(records(np.random.default_rng(11), unit=unit))
+    book = Records(records(np.random.default_rng(11), unit=unit))
     fit = book.fit(*POLES)
     X = book.basis(gains(book.freq, *POLES))
     scatter = np.linalg.inv(X.T @ X)
@@ -127,7 +127,7 @@ def test_one_pole_less_leaves_no_less_than_is_said(unit):
     residues = rng.normal(size=(M, 4, 2))
     exact = np.einsum("ksd,kf,rdf->rsf", residues, gains(test.freq, *POLES), test.base)
     response = exact + test.response - test.relative
-    book = StackedRecords(Measurement(test.freq, test.base, response, rigid_body=test.rigid_body))
+    book = Records(Measurement(test.freq, test.base, response, rigid_body=test.rigid_body))
     fit = book.fit(omega, ratios)
     for k in range(M):
         assert fit.rise_with_one_less(np.array([k])) == pytest.approx(fit.gain[k], rel=1e-9)
@@ -141,7 +141,7 @@ def test_one_pole_less_leaves_no_less_than_is_said(unit):
 def test_whitened_residues_of_white_noise_have_unit_variance():
     rng = np.random.default_rng(6)
     test = records(rng, unit=False, n=2000)
-    book = StackedRecords(test)
+    book = Records(test)
     book.data = rng.normal(size=book.data.shape)
     whitened = book.fit(*POLES).whitened
     for block in whitened:
@@ -150,7 +150,7 @@ def test_whitened_residues_of_white_noise_have_unit_variance():
 
 @pytest.mark.parametrize("unit", [False, True])
 def test_the_basis_is_orthonormal_and_what_is_left_is_orthogonal_to_it(unit):
-    book = StackedRecords(records(np.random.default_rng(7), unit=unit))
+    book = Records(records(np.random.default_rng(7), unit=unit))
     fit = book.fit(*POLES)
     np.testing.assert_allclose(fit.Q.T @ fit.Q, np.eye(fit.Q.shape[1]), atol=1e-12)
     np.testing.assert_allclose(fit.Q.T @ fit.left, 0.0, atol=1e-11)

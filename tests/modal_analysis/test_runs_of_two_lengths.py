@@ -7,7 +7,7 @@ import sysid
 from benchmarks.mistakes.changing import RATE, at_rest, motion, noisy, of_lines
 from sysid.modal_analysis.misfit import misfits_of
 from sysid.modal_analysis.outliers import whitened
-from sysid.modal_analysis.residues import StackedRecords
+from sysid.modal_analysis.residues import Records
 
 M, K = np.diag([2.0, 1.0, 0.0]), np.array([[3900.0, -1500, -2400], [-1500, 1500, 0], [-2400, 0, 2400]])
 LENGTHS = 600, 420
@@ -28,14 +28,14 @@ def noise():
 
 def test_numbers_are_those_of_each_run(noise):
     assert noise.numbers == 2 * sum(n // 2 for n in LENGTHS) < noise.response.size
-    assert StackedRecords(noise).data.shape == (2 * sum(n // 2 for n in LENGTHS), 2)
+    assert Records(noise).data.shape == (2 * sum(n // 2 for n in LENGTHS), 2)
 
 
 def test_noise_is_what_each_run_has_at_its_own_lines(noise, structure):
     """Of a sample of variance one the spectra, in m/s² s, have a mean square of N / rate² at each line."""
     lines = np.array([n // 2 for n in LENGTHS])
     true = float(lines @ LENGTHS) / lines.sum() / RATE**2
-    records = StackedRecords(noise)
+    records = Records(noise)
     assert records.noise(records.data, 0) == pytest.approx(true / 2, rel=0.1)  # a real number's
     ((_, std),) = misfits_of(noise, sysid.Structure(M, 1e9 * K, np.array([0.01, 0.02]), n_base=1), 0)
     assert std[0, 0, 0] ** 2 == pytest.approx(true, rel=0.1)

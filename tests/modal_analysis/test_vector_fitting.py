@@ -7,7 +7,7 @@ import sysid
 from sysid import InputError, Measurement, Problem, simulate
 from sysid.modal_analysis.complex_frequency import PolesAndResidues, noise_level
 from sysid.modal_analysis.relocation import relocate
-from sysid.modal_analysis.residues import StackedRecords, SubsetFits
+from sysid.modal_analysis.residues import Records, SubsetFits
 from sysid.modal_analysis.vector_fitting import find_poles, poles_near
 
 
@@ -205,7 +205,7 @@ def left_by(records, omega, ratios, velocity):
 def test_fits_on_subsets_are_least_squares_on_these_poles_alone(velocity):
     rng = np.random.default_rng(7)
     truth = structure(rng, 4, 2)
-    records = StackedRecords(broadband(truth, lines(truth, 30), 3, 0.05, rng))
+    records = Records(broadband(truth, lines(truth, 30), 3, 0.05, rng))
     omega = np.sort(2 * np.pi * np.concatenate([truth.natural_frequencies, 1.2 * truth.natural_frequencies]))
     ratios = rng.uniform(0.005, 0.05, omega.size)
     fits = SubsetFits(records, omega, ratios, velocity=velocity)
@@ -226,7 +226,7 @@ def test_a_step_of_vector_fitting_ends_at_the_zeros_of_the_function_that_all_unk
     """Residues of all channels and the coefficients of sigma in one system of equations."""
     rng = np.random.default_rng(8)
     truth = structure(rng, 3, 1)
-    records = StackedRecords(broadband(truth, lines(truth, 20), runs, noise, rng))
+    records = Records(broadband(truth, lines(truth, 20), runs, noise, rng))
     blocks = records.principal(9)
     omega, ratios = 2 * np.pi * truth.natural_frequencies * [0.98, 1.03, 0.99], np.full(3, 0.02)
 

@@ -16,7 +16,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.measurement.spectra import of_run
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.modal_analysis.residues import StackedRecords, ResidueFit
+from sysid.modal_analysis.residues import Records, ResidueFit
 from sysid.modal_analysis.response import columns
 from sysid.problem.formulation import Formulation
 from sysid.structure.structure import Array, Structure
@@ -42,7 +42,7 @@ def records_of_fit(context: Context) -> Iterator[Finding]:
 def _of_records(formulation: Formulation, modal: ModalEstimate, structure: Structure, changing: bool) -> list[Finding]:
     """Signs in the records of one test that a structure is not theirs."""
     test = modal.records
-    records, poles = StackedRecords(test), distinct_poles(structure)
+    records, poles = Records(test), distinct_poles(structure)
     leaks = list(leakage(test, structure)) if test.averaged else []
     velocity = not structure.modal_damping
     if records.data.shape[0] <= NUMBERS_A_RESIDUE * poles[0].size * records.n_base * (2 if velocity else 1):
@@ -76,13 +76,13 @@ def _at_rest(modal: ModalEstimate) -> Iterator[Finding]:
 
 
 def _misfit(
-    formulation: Formulation, test: Measurement, structure: Structure, records: StackedRecords, free: ResidueFit
+    formulation: Formulation, test: Measurement, structure: Structure, records: Records, free: ResidueFit
 ) -> Iterator[Finding]:
     """Whether the structure leaves clearly more of the accelerations than free residues, at its poles or the data's."""
     mass = formulation.mass
     stated = "the written model" if mass.entries is None else "the stated mass model"
     model = "the structure" if mass.free else stated
-    left = StackedRecords(replace(test, response=test.response - test.predict(structure)))
+    left = Records(replace(test, response=test.response - test.predict(structure)))
     misfit = float(np.sqrt(left.size / records.size))
     misses = f"{model} misses {100 * misfit:.3g} % of the accelerations"
     possible = max(float(np.sqrt(free.squared_error / records.size)), EXACT)
@@ -107,7 +107,7 @@ def _misfit(
         )  # fmt: skip
 
 
-def _rigid(modal: ModalEstimate, records: StackedRecords, free: ResidueFit) -> Iterator[Finding]:
+def _rigid(modal: ModalEstimate, records: Records, free: ResidueFit) -> Iterator[Finding]:
     """Whether sensors move in a constant proportion to the base beside their modes: then rigid_body is wrong."""
     test = modal.records
     if modal.has_modes:  # beside the noise of the base, which biases what follows
@@ -131,7 +131,7 @@ def _rigid(modal: ModalEstimate, records: StackedRecords, free: ResidueFit) -> I
         )  # fmt: skip
 
 
-def _along_the_base(test: Measurement, records: StackedRecords, free: ResidueFit) -> tuple[Array, Array] | None:
+def _along_the_base(test: Measurement, records: Records, free: ResidueFit) -> tuple[Array, Array] | None:
     """Share of the base's motion in what each sensor's modes leave, (n_sensors, d), and its chi-squared.
 
     None where modes answer for all of it.
@@ -148,7 +148,7 @@ def _along_the_base(test: Measurement, records: StackedRecords, free: ResidueFit
     return records.by_sensor(np.linalg.solve(R, along)[None])[0], gained / noise
 
 
-def _damping(records: StackedRecords, poles: tuple[Array, Array], free: ResidueFit) -> Iterator[Finding]:
+def _damping(records: Records, poles: tuple[Array, Array], free: ResidueFit) -> Iterator[Finding]:
     """Whether residues in quadrature, which normal modes have not, stand out: on the basis {g, i w g}."""
     if records.data.shape[0] <= 4 * poles[0].size * records.n_base:
         return

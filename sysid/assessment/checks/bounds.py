@@ -13,7 +13,7 @@ from sysid.assessment.checks.gains import distinct_poles
 from sysid.assessment.sensitivity import left_by_constraints, rows_of
 from sysid.errors import listed
 from sysid.finding import Finding, Severity, contradicting
-from sysid.modal_analysis.residues import StackedRecords
+from sysid.modal_analysis.residues import Records
 from sysid.models.stiffness import FREQUENCY_WINDOW
 from sysid.models.unknowns import scales_of, split
 from sysid.problem.formulation import Formulation
@@ -227,7 +227,7 @@ def _of_poles(problem: Prepared, structure: Structure, count: int) -> Pressure:
     """The same of modes with free shapes, by `count` unknowns on bounds; none where no pole stands out of the data."""
     if not problem.geometry.pole_ratios.size:
         return Pressure(0.0, significant=False)
-    records, poles = StackedRecords(problem.measurement), problem.geometry.poles
+    records, poles = Records(problem.measurement), problem.geometry.poles
     own, exact = records.fit(*distinct_poles(structure)), EXACT**2 * records.size
     gained = own.squared_error - poles.residual**2 * records.size
     least = max(records.noise(own.left, own.residues.size) * beyond_chance(count, CANDIDATES), exact)

@@ -19,7 +19,7 @@ from sysid.assessment.checks.context import Context
 from sysid.finding import MOST_OF_A_KIND, Finding, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.modal_analysis.residues import StackedRecords, ResidueFit
+from sysid.modal_analysis.residues import Records, ResidueFit
 from sysid.modal_analysis.response import gain_slopes
 from sysid.problem.prepared import Prepared
 from sysid.structure.structure import Array, Structure
@@ -89,7 +89,7 @@ def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
         moved = np.any(test.rigid_body, axis=1)
         error, std = np.where(moved, gain.error, np.nan), np.where(moved, gain.std, np.nan)
         return GainErrors(error, std, np.nan_to_num(_beyond(error, std)), gain.freedom)
-    records, poles, velocity = StackedRecords(test), distinct_poles(structure), not structure.modal_damping
+    records, poles, velocity = Records(test), distinct_poles(structure), not structure.modal_damping
     count = poles[0].size * test.n_base * (2 if velocity else 1)
     if records.data.shape[0] <= NUMBERS_A_RESIDUE * (count + 2 * test.n_base):
         unknown = np.full(test.n_sensors, np.nan)
@@ -221,7 +221,7 @@ def rests_on(test: Measurement, errors: GainErrors, worth: Array) -> Iterator[Fi
             )  # fmt: skip
 
 
-def _estimate(test: Measurement, records: StackedRecords, free: ResidueFit, Q: Array, ones: Array, slopes: Array) -> Estimate:
+def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, ones: Array, slopes: Array) -> Estimate:
     """Errors of the gains beside functions Q (rows, columns), their deviations, and these by the noise alone.
 
     The poles of `slopes` (rows, 2 m inputs) move with them, in a Gauss-Newton step: they were fitted without them.
@@ -266,7 +266,7 @@ def _less(Q: Array, columns: Array) -> Array:
     return columns - Q @ (Q.T @ columns)
 
 
-def _rigid_motion(test: Measurement, records: StackedRecords) -> Array:
+def _rigid_motion(test: Measurement, records: Records) -> Array:
     """The weighted records of sensors that move as G says, by the inputs of `records`, (inputs, channels)."""
     if records.unit:
         return test.rigid_body.T.reshape(1, -1) * records.channel

@@ -11,7 +11,7 @@ from sysid.assessment.checks.context import Context
 from sysid.assessment.checks.gains import distinct_poles
 from sysid.finding import Finding, Severity
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.residues import StackedRecords, force_residual_left
+from sysid.modal_analysis.residues import Records, force_residual_left
 from sysid.modal_analysis.response import weighed_mass, weighed_mass_std
 from sysid.models.mass import total_of
 from sysid.problem.formulation import Formulation
@@ -104,7 +104,7 @@ def force_misfit(formulation: Formulation, test: Measurement, structure: Structu
     )
     # Both misfits in units of the stated noise: what is left at a noisy peak speaks against nothing.
     left = replace(test, force=test.force - test.predict_force(structure))
-    misfit = float(np.sqrt(StackedRecords(left, force=True).size / StackedRecords(test, force=True).size))
+    misfit = float(np.sqrt(Records(left, force=True).size / Records(test, force=True).size))
     possible = max(force_residual_left(test, *distinct_poles(structure)), EXACT)
     if misfit > max(MISFIT * possible, NEGLIGIBLE):
         yield Finding(
