@@ -55,7 +55,7 @@ UNITS = ["ground", "floor_1", "floor_2", "floor_3"]
 
 def read(event):
     """Sample rate, Hz, ground (n,) and floors (3, n) along X, m/s²."""
-    records = [xsens_dot.read(Path(folder) / event / f"{unit}.csv") for unit in UNITS]
+    records = [xsens_dot.read_xsens_dot(Path(folder) / event / f"{unit}.csv") for unit in UNITS]
     time, channels = sysid.resample([(record.time, record.acceleration[:1]) for record in records])
     x = np.vstack(channels)
     x -= x.mean(axis=1, keepdims=True)

@@ -25,7 +25,7 @@ def event(folder, estimator="spectra"):
 
     What the model misses here is larger than noise, so that all lines count alike: no transients, no levels of noise.
     """
-    records = [xsens_dot.read(folder / f"{unit}.csv") for unit in UNITS]
+    records = [xsens_dot.read_xsens_dot(folder / f"{unit}.csv") for unit in UNITS]
     time, (ground, *floors) = sysid.resample([(record.time, record.acceleration[:1]) for record in records])
     # Gravity leaks into X by the tilt of each unit.
     centred = [x - x.mean() for x in (ground, *floors)]

@@ -73,7 +73,7 @@ def _attempts(folder: Path) -> dict[str, Attempt]:
         "results": of(result, lambda: sysid.load(file)),
         "states of unfinished searches": of(unfinished, Checkpoint(file).read),
         "ledgers of jobs": of(_ledger(folder), lambda: _ledger(folder), folder / LEDGER),
-        "CSV of inertial units": of(_xsens(), lambda: xsens_dot.read(file)),
+        "CSV of inertial units": of(_xsens(), lambda: xsens_dot.read_xsens_dot(file)),
         "the command line": _command,
     }
 

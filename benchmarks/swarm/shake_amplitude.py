@@ -200,6 +200,6 @@ def _predict(structure: sysid.Structure, test: sysid.Measurement, frequency: flo
 
 def _records(folder: Path, units: Sequence[str]) -> tuple[float, list[np.ndarray]]:
     """Sample rate, and X acceleration of some units on one clock, offsets removed: only these files are opened."""
-    raw = [xsens_dot.read(folder / f"{unit}.csv") for unit in units]
+    raw = [xsens_dot.read_xsens_dot(folder / f"{unit}.csv") for unit in units]
     time, samples = sysid.resample([(record.time, record.acceleration[0]) for record in raw])
     return 1 / (time[1] - time[0]), [x[0] - x[0].mean() for x in samples]

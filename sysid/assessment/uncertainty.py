@@ -30,7 +30,7 @@ from sysid.assessment.sensitivity import (
 )  # fmt: skip
 from sysid.assessment.statements import conditioned
 from sysid.errors import InputError
-from sysid.modal_analysis.misfit import inflation_of, records_of
+from sysid.modal_analysis.misfit import inflation_of, noise_records
 from sysid.modal_analysis.modal_estimate import independent_rows, information_about, shifts_about
 from sysid.modal_analysis.modal_fit import Index, Modes
 from sysid.modal_analysis.response import columns, weights_of_test
@@ -239,7 +239,7 @@ def moves_by_records(
     index = Index(structure.n_sensors, structure.n, structure.n_base)
     path = parametrisation(problem, structure, modes, index)
     unknowns = path.unit.size - path.gauge.shape[1]
-    records, B, spectra = records_of(test, structure, unknowns), None, None
+    records, B, spectra = noise_records(test, structure, unknowns), None, None
     if modal.has_modes:
         A, B = information_about(modal, modes)
     else:
@@ -273,7 +273,7 @@ def _by_unknowns(problem: Prepared, structure: Structure, x: Array) -> Uncertain
     scattered = problem.modal[0].scattered if structure.modal_damping else None  # as `rows_of_test` does
     inflation = 1.0
     if formulation.fits_records:
-        inflation = inflation_of(test, records_of(test, structure, x.size), x.size, scattered)
+        inflation = inflation_of(test, noise_records(test, structure, x.size), x.size, scattered)
     shapes = np.einsum("si,ikc->skc", structure.recovery, slopes.d_shapes)
     parts = (shapes, slopes.d_participation, slopes.d_log_omega, slopes.d_log_ratios, slopes.d_rigid)
     moves = Perturbations(count, *(part @ steps for part in parts))

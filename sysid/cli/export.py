@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sysid.cli.output import Output
 from sysid.cli.status import SUCCESS
-from sysid.cli.stored_result import add_arguments, read
+from sysid.cli.stored_result import add_arguments, read_result
 from sysid.export.content import worth
 from sysid.export.export import export, format_of, precision
 
@@ -17,7 +17,7 @@ def run(options: argparse.Namespace, out: Output) -> int:
     """Write the file, tell its precision, and warn where the matrices are not determined."""
     target = Path(options.file)
     form = format_of(target)  # a wrong ending is told before the result is read
-    result = read(options, out)
+    result = read_result(options, out)
     out.wrote(export(result, target))
     without = "" if form.deviations else "; without deviations, which .csv and .mat have"
     out.write(f"{form.name}; precision: {precision(target)}{without}\n")

@@ -124,7 +124,7 @@ def _list(options: argparse.Namespace, out: Output) -> int:
 def _new(options: argparse.Namespace, out: Output) -> int:
     from sysid.cli import new
 
-    module, test = new.write(options.name, data=options.data)
+    module, test = new.write_new_problem(options.name, data=options.data)
     out.wrote(module)
     out.wrote(test)
     out.write(
@@ -231,7 +231,7 @@ def _report(options: argparse.Namespace, out: Output) -> int:
     folder = source if source.is_dir() else source.parent
     # A run would write its result between reading the one there and writing its page.
     with alone_in(folder, "it writes its report itself") if folder.is_dir() else contextlib.nullcontext():
-        out.wrote(report.write_report(stored_result.read(options, out), folder / report.FILE_NAME))
+        out.wrote(report.write_report(stored_result.read_result(options, out), folder / report.FILE_NAME))
     return SUCCESS
 
 

@@ -15,7 +15,7 @@ from sysid.files import recorded_test
 from sysid.results.storage import atomically
 
 
-def write(name: str, folder: Path | None = None, *, data: str | None = None) -> tuple[Path, Path]:
+def write_new_problem(name: str, folder: Path | None = None, *, data: str | None = None) -> tuple[Path, Path]:
     """Write ``NAME.py`` and ``test_NAME.py``, both whole or neither, and never over what is there.
 
     Parameters

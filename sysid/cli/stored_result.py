@@ -24,7 +24,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     )
 
 
-def read(options: argparse.Namespace, out: Output) -> Identification:
+def read_result(options: argparse.Namespace, out: Output) -> Identification:
     """The result; its problem made anew where a module is named.
 
     Raises

@@ -15,7 +15,7 @@ from sysid.cli import trust
 from sysid.cli.files import png, table_as_csv, write_files
 from sysid.cli.output import Output
 from sysid.errors import InputError
-from sysid.jobs.changes import Band, Change, Modes, WithoutRun, WithoutSensor
+from sysid.jobs.changes import Band, Change, NumberOfModes, WithoutRun, WithoutSensor
 from sysid.jobs.job import JobResult
 from sysid.jobs.score import DECISIVE, Compared, Move, moves, scored
 from sysid.problem.problem import Problem
@@ -52,7 +52,7 @@ class Sweep:
     @property
     def of_parts(self) -> bool:
         """Whether each leaves some records out."""
-        return bool(self.changes) and not isinstance(self.changes[0], Modes)
+        return bool(self.changes) and not isinstance(self.changes[0], NumberOfModes)
 
 
 def sweep_of(options: argparse.Namespace, result: Identification, recipe: Recipe, out: Output) -> Sweep | None:
@@ -88,7 +88,7 @@ def sweep_of(options: argparse.Namespace, result: Identification, recipe: Recipe
 
 def _orders(low: int, high: int, problem: Problem) -> tuple[tuple[Change, ...], str]:
     """Numbers of modes up to those that stand out of the noise, and what the jobs are."""
-    changes, told = tuple(Modes(count) for count in range(low, high + 1)), "identification{s}, each of so many modes"
+    changes, told = tuple(map(NumberOfModes, range(low, high + 1))), "identification{s}, each of so many modes"
     _check_possible(changes, problem)
     found = poles_of(problem.prepared.screened).omega.size
     if low > found:

@@ -18,7 +18,7 @@ _SYMMETRIC, _RECTANGULAR = 6, 2
 Point = tuple[int, int]  # its number and component
 
 
-def write(it: Identification, path: Path) -> None:
+def write_dmig(it: Identification, path: Path) -> None:
     """Write points and the matrices MCB, KCB, BCB (mass, stiffness, viscous damping) and RCB (motion of the sensors).
 
     The base is grid point 1, components as its axes; modal coordinates are scalar points from 1001 on. RCB has the

@@ -73,7 +73,7 @@ def export(identification: Identification, path: str | Path) -> Path:
         needed(chosen.needs, chosen.extra, f"{target}: a {chosen.name}")
     module = importlib.import_module(f"sysid.export.{chosen.module}")
     with atomically(target) as temporary:
-        module.write(identification, temporary)
+        getattr(module, f"write_{chosen.module}")(identification, temporary)
     return target
 
 

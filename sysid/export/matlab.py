@@ -13,7 +13,7 @@ from sysid.results.identification import Identification
 PRECISION = "exact: the file holds the 8 bytes of each double-precision number"
 
 
-def write(it: Identification, path: Path) -> None:
+def write_matlab(it: Identification, path: Path) -> None:
     """Write M, K, C with deviations, modes, state space, names, and `about`: what the file says of itself, in lines.
 
     `G` (n_sensors, d): rigid-body motion of the sensors; `f_hz`, `zeta` (m, 1), `Phi` (n_sensors, m), `Gamma` (m, d):

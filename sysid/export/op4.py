@@ -16,7 +16,7 @@ PRECISION = "exact: the file holds the 8 bytes of each double-precision number"
 _WIDTH = 72
 
 
-def write(it: Identification, path: Path) -> None:
+def write_op4(it: Identification, path: Path) -> None:
     """Write M, K, C; MCB, KCB, CCB, RCB; DETERMND and NOTE.
 
     M, K and C have the structure's degrees of freedom first, those of the base last. MCB, KCB and CCB have those of the

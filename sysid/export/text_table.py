@@ -18,7 +18,7 @@ _EMPTY = (
 )
 
 
-def write(it: Identification, path: Path) -> None:
+def write_text_table(it: Identification, path: Path) -> None:
     """Write the table; what the file says of itself stands above it in lines that begin with "#".
 
     Rows and columns are counted from 1. Numbers are written in the fewest digits that give the same number again.

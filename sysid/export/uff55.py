@@ -18,7 +18,7 @@ _SI = f"{1.0:25.17E}".replace("E", "D") * 3
 _NORMAL_MODE, _STRUCTURAL, _DISPLACEMENT, _REAL = 2, 1, 8, 2
 
 
-def write(it: Identification, path: Path) -> None:
+def write_uff55(it: Identification, path: Path) -> None:
     """Write frequency, damping ratio and shape of each mode on the fixed base, mass-normalised (modal mass 1 kg).
 
     Sensors at one place are one node; its motion is the least one that its sensors' signals have in common. Where

@@ -11,7 +11,7 @@ import numpy as np
 from sysid.errors import InputError, refuse
 from sysid.files import units
 from sysid.files.description import Channel, Description
-from sysid.files.recorded_test import RecordedTest, Row, Run
+from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
 from sysid.files.recording import Column, Recording, check_finite, rate_of
 from sysid.files.spectral import TIME_NAMES
 from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
@@ -163,10 +163,10 @@ def _time_column(recording: Recording, said: Description) -> Column | None:
     return found[0] if len(found) == 1 and said.sample_rate is None else None
 
 
-def _records(recording: Recording, said: Description) -> tuple[list[Array], list[Row]]:
+def _records(recording: Recording, said: Description) -> tuple[list[Array], list[ChannelRow]]:
     """The record of each channel in SI units, and its row of the table."""
     records: list[Array] = []
-    rows: list[Row] = []
+    rows: list[ChannelRow] = []
     for channel in said.channels:
         column = recording.column(channel.column)
         check_finite(column, recording.path)
@@ -183,10 +183,10 @@ def _records(recording: Recording, said: Description) -> tuple[list[Array], list
     return records, rows
 
 
-def row_of(column: Column, channel: Channel, unit: str, factor: float, rms: float, recording: Recording) -> Row:
+def row_of(column: Column, channel: Channel, unit: str, factor: float, rms: float, recording: Recording) -> ChannelRow:
     """A row of the table of channels."""
     axis = channel.axis if isinstance(channel.axis, str) else " ".join(f"{part:g}" for part in channel.axis)
-    return Row(column.name, channel.name, channel.role, axis, unit, factor, rms, recording.path.name)
+    return ChannelRow(column.name, channel.name, channel.role, axis, unit, factor, rms, recording.path.name)
 
 
 def _factor(recording: Recording, column: Column, channel: Channel) -> tuple[float, str]:

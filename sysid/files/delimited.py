@@ -57,7 +57,7 @@ def _number(field: str) -> complex | None:
     return None
 
 
-def read(path: Path) -> Recording:
+def read_delimited(path: Path) -> Recording:
     """Columns of a text table; a last line that was cut short is left out, and said.
 
     Raises

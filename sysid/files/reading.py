@@ -92,9 +92,9 @@ def _recordings(file: Path) -> list[Recording]:
     ending = file.suffix.lower()
     _check_ending(file, ending)
     if ending in _UNIVERSAL:
-        return universal.read(file)
+        return universal.read_universal(file)
     if ending in _TEXT:
-        return [delimited.read(file)]
+        return [delimited.read_delimited(file)]
     if ending not in _READERS:
         known = ", ".join((*_TEXT, *_READERS, *_UNIVERSAL))
         raise InputError(f"{file}: the ending {ending!r} is not known; known are {known}")

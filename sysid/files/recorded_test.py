@@ -26,7 +26,7 @@ Run = tuple[Array, Array, Array | None]
 
 
 @dataclass(frozen=True)
-class Row:
+class ChannelRow:
     """One channel in the table of what was read.
 
     Attributes
@@ -80,7 +80,7 @@ class RecordedTest:
     origin: tuple[float, ...]
     sample_rate: float | None
     freq: Array | None
-    table: tuple[Row, ...]
+    table: tuple[ChannelRow, ...]
     remarks: tuple[str, ...] = ()
 
     def measurement(self, **options: Any) -> Measurement:
@@ -139,7 +139,7 @@ class RecordedTest:
     def from_tree(cls, tree: Tree) -> RecordedTest:
         """The test of the tree that a file holds."""
         runs = tuple((run["base"], run["response"], run["force"]) for run in tree["runs"])
-        table = tuple(Row(**row) for row in tree["table"])
+        table = tuple(ChannelRow(**row) for row in tree["table"])
         test = cls(
             runs, sensors_from_tree(tree["sensors"]) or (),
             tuple(BASE_AXES[column] for column in base_columns(tree["base_axes"])), tuple(tree["origin"].tolist()),

@@ -25,7 +25,7 @@ from sysid.files.assembly import (
     work_of_force,
 )
 from sysid.files.description import CONVENTIONS, Channel, Description
-from sysid.files.recorded_test import RecordedTest, Row, Run
+from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
 from sysid.files.recording import Column, Recording, check_finite
 from sysid.structure.axes import BASE_AXES, base_columns
 from sysid.structure.structure import Array, ComplexArray
@@ -79,7 +79,7 @@ def from_spectra(recordings: Sequence[Recording], said: Description) -> Recorded
 
 def _runs(
     recordings: Sequence[Recording], said: Description, axes: Sequence[str], freq: Array, conjugated: bool = False
-) -> tuple[list[Run], list[Row]]:
+) -> tuple[list[Run], list[ChannelRow]]:
     """A run for each reference of each recording."""
     runs, table = [], []
     for recording in recordings:
@@ -118,7 +118,7 @@ def _reference(column: Column, said: Description) -> str:
 
 def _run(
     recording: Recording, reference: str, said: Description, axes: Sequence[str], freq: Array, conjugated: bool
-) -> tuple[Run, list[Row]]:
+) -> tuple[Run, list[ChannelRow]]:
     """Base, responses and forces per unit of a reference, in the order of the sensors."""
     found = [
         (channel, column)
@@ -128,7 +128,7 @@ def _run(
     forms = [_form(recording, column, channel, said) for channel, column in found]
     lower = _denominator(forms, reference, recording)
     parts: dict[str, dict[str, ComplexArray]] = {"base": {}, "response": {}, "force": {}}
-    rows: list[Row] = []
+    rows: list[ChannelRow] = []
     for (channel, column), form in zip(found, forms, strict=True):
         check_finite(column, recording.path)
         values: Any = np.asarray(column.values, complex) * form.factor

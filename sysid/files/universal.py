@@ -37,7 +37,7 @@ _COUNT = re.compile(rb"[^\n]*\n {4}58[^\n]*\n(?:[^\n]*\n){6}[ \d]{10}([ \d]{10})
 _NO_LABEL = ("", "NONE")
 
 
-def read(path: Path) -> list[Recording]:
+def read_universal(path: Path) -> list[Recording]:
     """The recordings of a universal file: its time records, or its spectra, run by run.
 
     A load case is a run; a function without reference is told by its node and direction, as in ``12+X``.

@@ -37,7 +37,7 @@ class UnitRecord:
     rotation_rate: Array
 
 
-def read(path: str | Path) -> UnitRecord:
+def read_xsens_dot(path: str | Path) -> UnitRecord:
     """Read one unit's CSV file.
 
     The first row of a record holds zeros where accelerations should be, and is dropped.
@@ -91,7 +91,7 @@ def is_export(path: Path) -> bool:
 
 def together(paths: Sequence[Path]) -> Recording:
     """The units of one run, a file each, on one clock: columns such as ``ground.Acc_X``, without their means."""
-    records = [read(path) for path in paths]
+    records = [read_xsens_dot(path) for path in paths]
     time, found = resample([(record.time, record.acceleration) for record in records])
     columns = tuple(
         Column(f"{path.stem}.{name}", values - values.mean(), "m/s²", f"{path.stem}.{name}")

@@ -1,6 +1,6 @@
 """Jobs: many starts, draws, parts of a test or problems, in this process, a pool of processes or a cluster."""
 
-from sysid.jobs.changes import Band, Modes, WithoutRun, WithoutSensor
+from sysid.jobs.changes import Band, NumberOfModes, WithoutRun, WithoutSensor
 from sysid.jobs.engine import cluster, processes
 from sysid.jobs.job import JobResult
 from sysid.jobs.minima import Minimum, distinct
@@ -13,8 +13,8 @@ __all__ = [
     "Compared",
     "JobResult",
     "Minimum",
-    "Modes",
     "Move",
+    "NumberOfModes",
     "Score",
     "Spread",
     "WithoutRun",

@@ -141,7 +141,7 @@ class WithoutSensor:
 
 
 @dataclass(frozen=True)
-class Modes:
+class NumberOfModes:
     """So many modes, where mass and stiffness are free: see `sysid.Modal`.
 
     Parameters
@@ -152,7 +152,7 @@ class Modes:
     count: int
 
     def __post_init__(self) -> None:
-        whole_number("Modes: count", self.count, at_least=1)
+        whole_number("NumberOfModes: count", self.count, at_least=1)
 
     @property
     def title(self) -> str:
@@ -169,7 +169,7 @@ class Modes:
         """Nothing is left out: the validation tests are what is predicted."""
 
 
-Change = Band | WithoutRun | WithoutSensor | Modes
+Change = Band | WithoutRun | WithoutSensor | NumberOfModes
 
 
 def _on(problem: Problem, test: Measurement, **others: Any) -> Problem:

@@ -9,7 +9,7 @@ import numpy as np
 from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
-from sysid.modal_analysis.misfit import inflation_of, misfits_of, records_of
+from sysid.modal_analysis.misfit import inflation_of, misfits_of, noise_records
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.problem.prepared import Prepared
 from sysid.problem.stated import StatedProblem
@@ -66,7 +66,7 @@ def check_drawable(problem: StatedProblem) -> None:
 
 def _again(test: Measurement, structure: Structure, unknowns: int, rng: np.random.Generator) -> Measurement:
     """The test with the records that the structure makes, and noise of the same size."""
-    inflation = inflation_of(test, records_of(test, structure, unknowns), unknowns)
+    inflation = inflation_of(test, noise_records(test, structure, unknowns), unknowns)
     more = inflation if np.isfinite(inflation) else 1.0
     response, *force = [_noise(more * std, rng) - misfit for misfit, std in misfits_of(test, structure, unknowns)]
     other = replace(test, response=test.response + response)

@@ -11,7 +11,7 @@ from sysid import catalogue
 from sysid.assessment.sensitivity import sensitivity
 from sysid.errors import InputError, SolverError
 from sysid.identify import identify
-from sysid.jobs.changes import Change, Modes
+from sysid.jobs.changes import Change, NumberOfModes
 from sysid.jobs.draws import drawn
 from sysid.jobs.score import Score, scored
 from sysid.nlp import one_thread
@@ -143,7 +143,7 @@ def _identified(job: Job, session: Session) -> JobResult:
             changed, prepared, _descended(prepared, x, [], session), "from the result's unknowns", job.seed, session
         )
     else:
-        strategy = Modal(modes=job.change.count) if isinstance(job.change, Modes) else job.strategy
+        strategy = Modal(modes=job.change.count) if isinstance(job.change, NumberOfModes) else job.strategy
         result = identify(changed, strategy=strategy, rng=job.seed)
         if result.interrupted:
             raise KeyboardInterrupt

@@ -44,7 +44,7 @@ def submit(
     draws : int
         In the place of starts: fits of records that the structure at `Recipe.start` would have given, with noise of the
         size that was stated or found, drawn anew for each.
-    changes : sequence of Band, WithoutRun, WithoutSensor, Modes or None
+    changes : sequence of Band, WithoutRun, WithoutSensor, NumberOfModes or None
         In the place of starts: whole identifications of the problem as each changes it; None leaves it as it is.
     strategy : str
         Of whole identifications, as in `sysid.identify`; without changes the problem of each recipe is identified as it
@@ -86,7 +86,7 @@ def submit(
     if draws and (starts > 1 or any(one.start is None for one in recipes)):
         raise InputError("draws need Recipe.start, the unknowns that were identified, and exclude starts")
     if changes != ():
-        changes = sequence("changes", changes, "a list of Band, WithoutRun, WithoutSensor, Modes or None")
+        changes = sequence("changes", changes, "a list of Band, WithoutRun, WithoutSensor, NumberOfModes or None")
     by = _strategy(strategy, changes, starts > 1 or draws > 0)
     if isinstance(executor, Executor) or not (executor is None or callable(executor)):
         checked(executor)
@@ -109,9 +109,9 @@ def submit(
 
 def _strategy(strategy: str, changes: Sequence[Change | None], others: bool) -> str:
     """The strategy of whole identifications; empty where none are asked for."""
-    for change in changes:
-        if not isinstance(change, Change | None):
-            raise InputError(f"changes holds a {type(change).__name__}; give Band, WithoutRun, WithoutSensor or Modes")
+    wrong = [type(change).__name__ for change in changes if not isinstance(change, Change | None)]
+    if wrong:
+        raise InputError(f"changes holds a {wrong[0]}; give Band, WithoutRun, WithoutSensor or NumberOfModes")
     if others and (changes or strategy):
         raise InputError("changes and strategy stand for whole identifications, and exclude starts and draws")
     if strategy not in ("", "auto", *NAMED):

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from sysid.errors import InputError
-from sysid.measurement.spectra import Run, of_run
+from sysid.measurement.spectra import TimeRun, of_run
 from sysid.structure.structure import Array
 
 _STILL = 8  # samples of one value in every channel that count as padding where the structure moved just before
@@ -19,7 +19,7 @@ _RISE = 1.2  # from each stretch to the next, of base and of relative motion: tÂ
 _WHOLE_RISE = 25.0  # from the first stretch to the last; free decay makes it only at a damping of more than a tenth
 
 
-def check_cuts(runs: Sequence[Run], at_rest: Sequence[bool], rigid_body: Array) -> None:
+def check_cuts(runs: Sequence[TimeRun], at_rest: Sequence[bool], rigid_body: Array) -> None:
     """Refuse runs whose ends were made by a window or by padding; those stated to be at rest are right as they are.
 
     A taper on every channel is no base motion that the structure answered: its transients are not those of modes.
@@ -57,7 +57,7 @@ def check_cuts(runs: Sequence[Run], at_rest: Sequence[bool], rigid_body: Array) 
             )
 
 
-def padded(run: Run, rigid_body: Array) -> int:
+def padded(run: TimeRun, rigid_body: Array) -> int:
     """How many samples at the end hold one value in every channel, where the structure moved just before; else 0."""
     both = np.vstack([run.base, run.outputs])
     moves = np.flatnonzero(np.any(both != both[:, -1:], axis=0))
@@ -75,7 +75,7 @@ def padded(run: Run, rigid_body: Array) -> int:
     return still if moving else 0
 
 
-def tapered(run: Run, rigid_body: Array) -> bool:
+def tapered(run: TimeRun, rigid_body: Array) -> bool:
     """Whether all channels fall to zero towards both ends as a window does, period by period of the motion."""
     # With their means: what a window takes to zero are the values themselves.
     power = np.array([_pooled(run.base), _pooled(run.response - rigid_body @ run.base)])
@@ -93,7 +93,7 @@ def tapered(run: Run, rigid_body: Array) -> bool:
     return True
 
 
-def _relative(run: Run, rigid_body: Array) -> Array:
+def _relative(run: TimeRun, rigid_body: Array) -> Array:
     """Accelerations relative to the base without their means, (n_sensors, n)."""
     relative = run.response - rigid_body @ run.base
     return np.asarray(relative - relative.mean(axis=1, keepdims=True))

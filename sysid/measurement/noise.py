@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError, finite_array, sequence
-from sysid.measurement.spectra import Run, check_runs
+from sysid.measurement.spectra import TimeRun, check_runs
 from sysid.measurement.whole import NoiseLevels
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import NEGLIGIBLE
@@ -51,7 +51,7 @@ def levels_at_rest(
     return NoiseLevels(level[:n], level[n : n + d], None if records[0].force is None else level[n + d :])
 
 
-def _levels(runs: Sequence[Run], sample_rate: float, low: float, high: float) -> Array:
+def _levels(runs: Sequence[TimeRun], sample_rate: float, low: float, high: float) -> Array:
     """Deviations of a sample of responses, base and force, (channels,), by the lines from `low` to `high` Hz."""
     power, lines = np.zeros(0), 0
     for run in runs:

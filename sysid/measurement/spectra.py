@@ -13,7 +13,7 @@ from sysid.errors import InputError, finite_array, number, refuse, sequence, who
 from sysid.structure.structure import Array, ComplexArray
 
 
-class Run(NamedTuple):
+class TimeRun(NamedTuple):
     """One run in time: base (d, n), response (n_sensors, n), force (d, n) or None."""
 
     base: Array
@@ -55,7 +55,7 @@ def of_run(index: int, runs: int) -> str:
 
 def check_runs(
     runs: Sequence[tuple[ArrayLike, ArrayLike, ArrayLike | None]], sample_rate: float, shape: tuple[int, ...]
-) -> list[Run]:
+) -> list[TimeRun]:
     """Check time records against ``shape = (n_sensors, d)`` and each other."""
     number("sample_rate", sample_rate, "a positive number of samples a second", above=0)
     given = sequence("runs", runs, "a list of (base, response, force or None)")
@@ -71,7 +71,7 @@ def check_runs(
         lengths = {record.shape[1] for record in (base, response, force) if record is not None}
         if len(lengths) > 1:
             raise InputError(f"run {place}: its records have different lengths {sorted(lengths)}")
-        records.append(Run(base, response, force))
+        records.append(TimeRun(base, response, force))
     if len({run.force is None for run in records}) > 1:
         raise InputError("some runs have a force and some have none; give it for all or for none")
     return records
@@ -86,7 +86,7 @@ def directions(runs: Any) -> int:
 
 
 def whole_record(
-    runs: Sequence[Run], sample_rate: float
+    runs: Sequence[TimeRun], sample_rate: float
 ) -> tuple[Array, ComplexArray, ComplexArray, ComplexArray | None]:
     """Fourier transforms of whole records, without the zero line; m/s² s.
 
@@ -118,7 +118,7 @@ def whole_record(
     )
 
 
-def averaged(runs: Sequence[Run], sample_rate: float, *, kind: str, segment: int | None = None) -> Estimate:
+def averaged(runs: Sequence[TimeRun], sample_rate: float, *, kind: str, segment: int | None = None) -> Estimate:
     """H1 or H2 by Welch's method (Hann window, half overlap), several inputs at once.
 
     H1 solves ``S_yx = H S_xx`` for all base directions together; H2 is ``S_yy / S_xy``, for one

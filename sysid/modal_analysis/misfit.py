@@ -62,7 +62,7 @@ def misfits_of(test: Measurement, structure: Structure, unknowns: int) -> list[t
     return made
 
 
-def records_of(test: Measurement, structure: Structure, unknowns: int) -> list[Record]:
+def noise_records(test: Measurement, structure: Structure, unknowns: int) -> list[Record]:
     """Records of the responses and, where measured, of the force; inferred noise allows for the number of unknowns."""
     records = []
     for misfit, std in misfits_of(test, structure, unknowns):

@@ -69,8 +69,8 @@ def level_deviations(model: RecordModel, p: Parameters, levels: Array) -> Array:
     return np.array(out)
 
 
-def _parts(model: RecordModel, p: Parameters) -> list[Part]:
-    return [Part(chunk.error, chunk.H, chunk.run.density, chunk.run.piece) for chunk in model.chunks(p)]
+def _parts(model: RecordModel, p: Parameters) -> list[ErrorSpectra]:
+    return [ErrorSpectra(chunk.error, chunk.H, chunk.run.density, chunk.run.piece) for chunk in model.chunks(p)]
 
 
 def _designs(model: RecordModel, number: int, channels: int) -> dict[int, Array]:
@@ -83,7 +83,7 @@ def _designs(model: RecordModel, number: int, channels: int) -> dict[int, Array]
     return {run.piece: one for run, one in zip(runs, made, strict=True)}
 
 
-class Part(NamedTuple):
+class ErrorSpectra(NamedTuple):
     """Some lines: errors (c, L), what passes the base on (c, d, L), density and piece of `Run`."""
 
     error: ComplexArray
@@ -92,7 +92,7 @@ class Part(NamedTuple):
     piece: int
 
 
-def _of_run(parts: list[Part], D: dict[int, Array], levels: Array, least: Array) -> Array:
+def _of_run(parts: list[ErrorSpectra], D: dict[int, Array], levels: Array, least: Array) -> Array:
     """Variances of the pieces of one run, (pieces, c + d), with logarithms ``D x`` of a few numbers x."""
     every = np.concatenate(list(D.values()))
     x = np.linalg.lstsq(every, np.log(np.maximum(levels, least)).ravel(), rcond=None)[0]
@@ -118,7 +118,7 @@ def _of_run(parts: list[Part], D: dict[int, Array], levels: Array, least: Array)
     return np.asarray(np.exp(every @ x)).reshape(levels.shape)
 
 
-def _likelihood(parts: list[Part], D: dict[int, Array], x: Array) -> tuple[float, Array, Array]:
+def _likelihood(parts: list[ErrorSpectra], D: dict[int, Array], x: Array) -> tuple[float, Array, Array]:
     """Log-likelihood, and its score and Fisher information by the numbers of which variances are made."""
     value, score, fisher = 0.0, np.zeros(x.size), np.zeros((x.size, x.size))
     for error, H, density, piece in parts:

@@ -13,7 +13,7 @@ import numpy as np
 from sysid.measurement import spectra
 from sysid.measurement.in_time import RunInTime, in_time
 from sysid.measurement.measurement import Measurement
-from sysid.measurement.spectra import Run
+from sysid.measurement.spectra import TimeRun
 from sysid.measurement.whole import NoiseLevels, WholeRecords
 from sysid.modal_analysis.record_fit import RecordFit, record_modes, with_poles_of
 from sysid.structure.structure import Array
@@ -58,7 +58,7 @@ class Piece(NamedTuple):
     number: int
     start: float
     end: float
-    records: Run
+    records: TimeRun
 
 
 def stretches_of(test: Measurement, omega: Array, ratios: Array) -> list[Stretch]:
@@ -151,7 +151,7 @@ def _pieces(runs: list[RunInTime], shortest: float, most: int = 12) -> list[Piec
         count = int(np.clip(n / run.rate / shortest, 1, most))
         for i in range(count):
             part = slice(i * (n // count), (i + 1) * (n // count))
-            records = Run(run.base[:, part], run.response[:, part], None)
+            records = TimeRun(run.base[:, part], run.response[:, part], None)
             made.append(Piece(number, part.start / run.rate, part.stop / run.rate, records))
     return made
 

@@ -40,7 +40,7 @@ _OUTLIER: dict[str, Any] = {
 _WIDTHS = {2: 11.2, 3: 12.0}  # of a figure, in, by the number of columns
 
 
-class Channel(NamedTuple):
+class PlottedChannel(NamedTuple):
     """One record of a test and what the model answers: spectra (n_freq,), and the words for a picture."""
 
     freq: Array
@@ -65,7 +65,7 @@ def run_names(test: Measurement) -> tuple[str, ...]:
 
 def response_channel(
     identification: Identification, test: Measurement, sensor: int, run: int, *, band: ArrayLike | None = None
-) -> Channel:
+) -> PlottedChannel:
     """Response of one sensor in one run; `band`: std of the complex transmissibility, (n_sensors, d, n_freq)."""
     predicted = test.predict(identification.structure)[run, sensor] + test.rigid_body[sensor] @ test.base[run]
     unit = "–" if test.translational[run % test.n_base] else "m"
@@ -77,7 +77,7 @@ def response_channel(
 
 def force_channel(
     identification: Identification, test: Measurement, direction: int, run: int, *, band: ArrayLike | None = None
-) -> Channel:
+) -> PlottedChannel:
     """Base force in one direction in one run; `band`: std of the complex apparent mass, (d, d, n_freq)."""
     assert test.force is not None and test.base_axes is not None
     predicted = test.predict_force(identification.structure)[run, direction]
@@ -119,14 +119,14 @@ def _std(test: Measurement, run: int, band: Array) -> Array:
 def _channel(
     test: Measurement, measured: ComplexArray, predicted: ComplexArray, run: int, words: tuple[str, str, str],
     largest: float, std: Array,
-) -> Channel:  # fmt: skip
+) -> PlottedChannel:  # fmt: skip
     """A channel of which `words` name the record, what it is for unit runs, and what it is for others."""
     name, per_base, spectrum = words
     title = f"{name}, {run_names(test)[run]}"
     negligible = bool(np.abs(measured).max() <= ROUND_OFF * largest)
     if test.has_unit_runs:
         ones = np.ones_like(measured)
-        return Channel(
+        return PlottedChannel(
             test.freq, measured, predicted, ones, title, per_base, "phase [°]", negligible, std, np.zeros(0), test.gaps
         )
     moved = int(np.argmax(np.linalg.norm(test.base[run], axis=-1)))
@@ -135,7 +135,7 @@ def _channel(
     # The scale of a spectrum (a line, per Hz, one-sided) is the record's own affair.
     against = test.base[run, moved]
     own, gaps = lines_of(test, run)
-    return Channel(
+    return PlottedChannel(
         test.freq[own], measured[own], predicted[own], against[own], title, spectrum, phase, negligible, std[own],
         np.zeros(0), gaps,
     )  # fmt: skip
@@ -150,7 +150,7 @@ def lines_of(test: Measurement, run: int) -> tuple[NDArray[np.bool_], NDArray[np
     return own, np.concatenate([[0], np.cumsum(own)])[test.gaps]
 
 
-def place(ax: Axes | Sequence[Axes] | None, channel: Channel) -> Any:
+def place(ax: Axes | Sequence[Axes] | None, channel: PlottedChannel) -> Any:
     """Draw a channel into axes for magnitude and phase, which are given back; without them into a new figure."""
     if ax is None:
         return panels([channel])
@@ -158,7 +158,7 @@ def place(ax: Axes | Sequence[Axes] | None, channel: Channel) -> Any:
     return ax
 
 
-def panels(channels: Sequence[Channel], *, alone: float = 6.4) -> Figure:
+def panels(channels: Sequence[PlottedChannel], *, alone: float = 6.4) -> Figure:
     """Magnitude above phase, a column a channel, at most three columns; `alone` is the width of one, in."""
     from matplotlib.ticker import NullLocator
 
@@ -193,7 +193,7 @@ def key(axes: Iterable[Axes]) -> list[Any]:
     return [entries[label] for label in told if label in entries]
 
 
-def draw(axes: Any, channel: Channel) -> None:
+def draw(axes: Any, channel: PlottedChannel) -> None:
     """Draw magnitude into the first of `axes` and phase into the second, where there is one."""
     freq, measured, identified = channel.freq, channel.measured, channel.identified
     magnitude = axes[0]

@@ -40,7 +40,7 @@ class Constraints(NamedTuple):
         return np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0)
 
 
-class Row(NamedTuple):
+class ConstraintRow(NamedTuple):
     """A constraint ``lower <= expression <= 0``, an equality where `lower` is 0, and what messages call it."""
 
     expression: ca.MX
@@ -48,7 +48,7 @@ class Row(NamedTuple):
     source: str
 
 
-def row_of(number: int, value: Any) -> Row:
+def row_of(number: int, value: Any) -> ConstraintRow:
     """The row of a constraint that was given."""
     relation = expression_of(value)
     name = f"constraint {number}"
@@ -61,4 +61,4 @@ def row_of(number: int, value: Any) -> Row:
             f"k[0] <= k[1] or ca.sum1(m) == 9{written_in(relation) if isinstance(relation, ca.MX) else ''}"
         )
     row = column_of(name, relation.dep(0) - relation.dep(1))
-    return Row(row, lower, name + written_in(relation, ","))
+    return ConstraintRow(row, lower, name + written_in(relation, ","))

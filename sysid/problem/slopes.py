@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.misfit import inflation_of, records_of
+from sysid.modal_analysis.misfit import inflation_of, noise_records
 from sysid.modal_analysis.modal_estimate import ModalEstimate, independent_rows, index_of, matched, theta_of
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.response import weights_of_test
@@ -157,7 +157,7 @@ def rows_of_test(
         d_f = d_f + np.einsum("edc,rdf->erfc", s.d_rigid, u, optimize=True)
         parts.append(d_f.reshape(d_f.shape[0], -1, d_f.shape[-1]))
     rows: list[Rows] = []
-    records = records_of(test, s.structure, unknowns)
+    records = noise_records(test, s.structure, unknowns)
     inflation = 1.0 if as_stated else inflation_of(test, records, unknowns)
     for record, change, (weight, scale) in zip(records, parts, weights_of_test(test, weighted=True), strict=True):
         weights = share * weight / scale
@@ -202,7 +202,7 @@ def _rows_of_modes(
     factor, std = independent_rows(estimate)
     factor = weight * factor
     inflation = (
-        1.0 if as_stated else inflation_of(test, records_of(test, structure, unknowns), unknowns, estimate.scattered)
+        1.0 if as_stated else inflation_of(test, noise_records(test, structure, unknowns), unknowns, estimate.scattered)
     )
     std = weight * inflation * std
     return [Rows(factor @ off, factor @ slope, std)]

@@ -18,7 +18,7 @@ from sysid.plot.panels import lines_of, run_names
 from sysid.plot.plots import stick_model
 from sysid.report.html import text
 from sysid.report.noise_level import NoiseLevel
-from sysid.report.still import Channel, curve_sheet, degrees, mode_still, room_of_modes
+from sysid.report.still import ChannelSpectra, curve_sheet, degrees, mode_still, room_of_modes
 from sysid.results.identification import Identification
 from sysid.structure.structure import Array, ComplexArray
 from sysid.structure.thresholds import LIKELY
@@ -60,7 +60,7 @@ def curves(it: Identification, test: Measurement, level: NoiseLevel) -> str:
     )
 
 
-def _legend(channels: Sequence[Channel], *, at_most: bool) -> str:
+def _legend(channels: Sequence[ChannelSpectra], *, at_most: bool) -> str:
     """What each line is, of those that are drawn."""
     keys = {"measured": "measured", "identified": "identified", "left": "their difference"}
     if any(channel.noise is not None for channel in channels):
@@ -111,7 +111,7 @@ def _mode_stills(content: dict[str, Any]) -> str:
     return f'<div class="shapes">{"".join(drawn)}</div>'
 
 
-def _responses(it: Identification, test: Measurement, level: NoiseLevel) -> Iterator[Channel]:
+def _responses(it: Identification, test: Measurement, level: NoiseLevel) -> Iterator[ChannelSpectra]:
     own = test.has_unit_runs
     predicted = test.predict(it.structure) + np.einsum("sd,rdf->rsf", test.rigid_body, test.base)
     u = it.quick_uncertainty
@@ -122,14 +122,14 @@ def _responses(it: Identification, test: Measurement, level: NoiseLevel) -> Iter
         unit = "per unit base motion"
     for s, name in enumerate(test.sensor_names):
         turn = _against_base(test, test.rigid_body[s])
-        yield Channel(
+        yield ChannelSpectra(
             name, words, unit, turn * test.response[:, s], turn * predicted[:, s],
             _levels(noise, s, test), _levels(band, s, test),
             None if raw is None else np.abs(raw.response[:, s]),
         )  # fmt: skip
 
 
-def _forces(it: Identification, test: Measurement, level: NoiseLevel) -> Iterator[Channel]:
+def _forces(it: Identification, test: Measurement, level: NoiseLevel) -> Iterator[ChannelSpectra]:
     if test.force is None:
         return
     predicted, u = test.predict_force(it.structure), it.quick_uncertainty
@@ -142,13 +142,13 @@ def _forces(it: Identification, test: Measurement, level: NoiseLevel) -> Iterato
                 "per unit base motion" if test.has_unit_runs else "N or N m, scaled as given",
             )
         turn = _against_base(test, np.eye(test.n_base)[i])
-        yield Channel(
+        yield ChannelSpectra(
             f"base force {axis}", words, unit, turn * test.force[:, i], turn * predicted[:, i],
             _levels(level.force, i, test), _levels(band, i, test),
         )  # fmt: skip
 
 
-def _told(runs: list[Channel]) -> dict[str, Any]:
+def _told(runs: list[ChannelSpectra]) -> dict[str, Any]:
     """What the script draws of a channel, by its runs."""
     first = runs[0]
     found: dict[str, Any] = {"name": first.name, "words": first.words, "unit": first.unit}
@@ -162,7 +162,7 @@ def _told(runs: list[Channel]) -> dict[str, Any]:
     return found
 
 
-def _of(runs: list[Channel], name: str) -> list[NDArray[Any]]:
+def _of(runs: list[ChannelSpectra], name: str) -> list[NDArray[Any]]:
     """One of the spectra of a channel, run by run."""
     return [getattr(run, name)[0] for run in runs]
 

@@ -22,7 +22,7 @@ _MODE_WIDTH, _MODE_HEIGHT = 210, 260  # pixels
 _ANGLE = np.deg2rad(30.0)  # about the vertical, from which a mode shape is seen
 
 
-class Channel(NamedTuple):
+class ChannelSpectra(NamedTuple):
     """Spectra of one channel in all runs, each (runs, n_freq), in `unit`; None what is not known.
 
     `noise` is a standard deviation, `band` half of the 95 % interval of `identified`, `recorded` the magnitude with
@@ -38,10 +38,10 @@ class Channel(NamedTuple):
     band: Array | None
     recorded: Array | None = None
 
-    def at(self, run: int, lines: NDArray[np.bool_]) -> Channel:
+    def at(self, run: int, lines: NDArray[np.bool_]) -> ChannelSpectra:
         """At some lines of one run alone, (1, lines)."""
         of_run: Any = lambda part: part[[run]][:, lines] if isinstance(part, np.ndarray) else part  # noqa: E731
-        return Channel(*map(of_run, self))
+        return ChannelSpectra(*map(of_run, self))
 
 
 class _Axis(NamedTuple):
@@ -80,7 +80,7 @@ class _Panel(NamedTuple):
     decades: int
 
 
-def curve_sheet(name: str, freq: Array, channel: Channel, run: int, gaps: ArrayLike = ()) -> str:
+def curve_sheet(name: str, freq: Array, channel: ChannelSpectra, run: int, gaps: ArrayLike = ()) -> str:
     """One channel in one run: magnitude, phase, and what is left of it beside its noise.
 
     No curve is joined at `gaps`, lines before which others were left out.
@@ -101,7 +101,7 @@ def curve_sheet(name: str, freq: Array, channel: Channel, run: int, gaps: ArrayL
     return f'<div class="sheet"><p>{text(name)}</p>{image}</div>'
 
 
-def _panels(channel: Channel, run: int) -> tuple[_Panel, ...]:
+def _panels(channel: ChannelSpectra, run: int) -> tuple[_Panel, ...]:
     measured, identified = channel.measured[run], channel.identified[run]
     left, beside = {"left": np.abs(measured - identified)}, "difference"
     if channel.noise is not None:

@@ -32,7 +32,7 @@ from sysid.models.unknowns import by_name
 from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.problem.stated import StatedProblem
-from sysid.results.records import PartOfProblem, Records
+from sysid.results.records import PartOfProblem, StoredRecords
 from sysid.search.strategy import History
 from sysid.structure.structure import Array, ComplexArray, Structure
 
@@ -204,7 +204,7 @@ class Answer:
         return own if self.part.records.loss == "squares" else replace(own, records=screened(own.records))
 
     @property
-    def records(self) -> StatedProblem | Records:
+    def records(self) -> StatedProblem | StoredRecords:
         """What was recorded: the attributes of a problem that tell it, wherever they come from."""
         part = self.part
         return self.problem if part is None else part.records

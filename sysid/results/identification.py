@@ -22,7 +22,7 @@ from sysid.results import readings, storage
 from sysid.results.answer import Answer
 from sysid.results.gain_table import gains_of_sensors
 from sysid.results.noise_table import noise_of_channels
-from sysid.results.records import PartOfProblem, Records
+from sysid.results.records import PartOfProblem, StoredRecords
 from sysid.results.summary import summary
 from sysid.results.version import __version__
 from sysid.search.strategy import History
@@ -267,7 +267,7 @@ class Identification(Answer):
             Where it is written without the expressions of its problem, of which one holds what cannot be stored.
         """
         tree = self.to_tree()
-        written, without = storage.write(tree, path), tree["problem"]["given"]["without"]
+        written, without = storage.write_tree(tree, path), tree["problem"]["given"]["without"]
         if without is not None and self.part is None:
             warnings.warn(
                 f"{written} is without the expressions of its problem, as {without} cannot be stored: to refine it, "
@@ -324,7 +324,7 @@ def load(path: str | Path, problem: Problem | None = None) -> Identification:
         Where there is no such file, or it is not a result of sysid, or damaged, or one of another format, or `problem`
         is another one; names the file.
     """
-    result = storage.read(path, Identification.from_tree)
+    result = storage.read_tree(path, Identification.from_tree)
     if problem is None:
         return result
     try:
@@ -345,10 +345,10 @@ def _problem_from_tree(tree: dict[str, Any], structure: Structure) -> Any:
         module = "" if recipe is None else f" (the problem was made by {recipe['module']!r})"
         read = tree["readings"]
         attributes = readings.from_tree(read, structure)
-        return PartOfProblem(part, read, Records.from_tree(part), attributes, f"{error}{module}")
+        return PartOfProblem(part, read, StoredRecords.from_tree(part), attributes, f"{error}{module}")
 
 
-def _check_records(records: StatedProblem | Records, problem: Problem) -> None:
+def _check_records(records: StatedProblem | StoredRecords, problem: Problem) -> None:
     """Refuse a problem of other records."""
     for name in ("freq", "base", "response", "force"):
         own, other = getattr(records.measurement, name), getattr(problem.measurement, name)

@@ -10,7 +10,7 @@ from sysid.structure.structure import Structure
 
 
 @dataclass(frozen=True, eq=False)
-class Records:
+class StoredRecords:
     """The records of a problem without its matrices; the attributes are those of `Problem`."""
 
     measurement: Measurement
@@ -20,7 +20,7 @@ class Records:
     loss: str
 
     @classmethod
-    def from_tree(cls, tree: dict[str, Any]) -> Records:
+    def from_tree(cls, tree: dict[str, Any]) -> StoredRecords:
         """Give the records of a tree that `Problem.to_tree` made."""
         return cls(
             Measurement.from_tree(tree["measurement"]),
@@ -48,6 +48,6 @@ class PartOfProblem:
 
     tree: dict[str, Any]
     readings: dict[str, Any]
-    records: Records
+    records: StoredRecords
     attributes: dict[str, Any]
     without: str

@@ -39,7 +39,7 @@ _SUFFIXES = (".h5", ".hdf5")
 T = TypeVar("T")
 
 
-def write(tree: Tree, path: str | Path) -> Path:
+def write_tree(tree: Tree, path: str | Path) -> Path:
     """Write the tree of a result to an HDF5 file, whole or not at all; path and errors as in `Identification.save`."""
     target = file_or_folder(path, FILE_NAME, _SUFFIXES)
     # Built in memory: on a full disk HDF5 loses the error when it closes, or takes the process down.
@@ -49,7 +49,7 @@ def write(tree: Tree, path: str | Path) -> Path:
     return target
 
 
-def read(path: str | Path, build: Callable[[Tree], T]) -> T:
+def read_tree(path: str | Path, build: Callable[[Tree], T]) -> T:
     """What `build` makes of the tree that `write` wrote; path and errors as in `load`.
 
     What is wrong with `build`'s tree is an error of the file.

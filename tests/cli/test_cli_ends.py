@@ -253,7 +253,9 @@ def test_a_third_ctrl_c_acts_at_once_and_what_it_breaks_is_no_error_of_ours(
 @pytest.mark.parametrize("place", ["search", "save", "report"])
 def test_ctrl_c_after_the_search_loses_nothing(here, complaint, files, monkeypatch, no_pictures, place, times, ctrl_c):
     """As the search is done, while the result is written, and while the page is made (a third one ends that)."""
-    owner, name = {"search": (cli, "identify"), "save": (storage, "write"), "report": (report, "write_report")}[place]
+    owner, name = {"search": (cli, "identify"), "save": (storage, "write_tree"), "report": (report, "write_report")}[
+        place
+    ]
     original = getattr(owner, name)
 
     def struck(*arguments, **options):

@@ -40,7 +40,7 @@ def test_what_is_written_runs_from_the_command_line_in_seconds(here, capsys, bes
 
 
 def test_the_module_reads_like_the_bundled_ones(here):
-    module, test = new.write("my_tower")
+    module, test = new.write_new_problem("my_tower")
     for path in (module, test):
         text = path.read_text(encoding="utf-8")
         assert len(text.splitlines()) < 60
@@ -81,7 +81,7 @@ def test_both_files_or_neither(here, files, monkeypatch, failing):
 
     monkeypatch.setattr(os, "replace", fail)
     with pytest.raises(sysid.InputError, match=os.strerror(errno.ENOSPC)):
-        new.write("chain")
+        new.write_new_problem("chain")
     assert len(calls) == failing
     assert files(here) == set()
 
@@ -104,10 +104,10 @@ NAMES = {
 @pytest.mark.parametrize("name", NAMES)
 def test_a_name_that_python_cannot_import_is_refused_with_one_that_it_can(here, files, name):
     with pytest.raises(sysid.InputError, match=NAMES[name]) as refused:
-        new.write(name)
+        new.write_new_problem(name)
     assert files(here) == set()
     proposed = str(refused.value).rpartition("sysid new ")[2]
-    assert new.write(proposed)[0].exists()
+    assert new.write_new_problem(proposed)[0].exists()
 
 
 def test_a_name_too_long_for_the_disk_is_one_line(here, complaint, files):

@@ -48,7 +48,7 @@ def write(folder, content, encoding="utf-8"):
 @pytest.mark.parametrize("columns", [COLUMNS, COLUMNS[::-1], [*COLUMNS, "Mag_X"]])
 def test_what_was_written_is_read_in_si_units_without_the_first_row(tmp_path, record, encoding, preamble, columns):
     time, acceleration, rates = record
-    unit = xsens_dot.read(write(tmp_path, text(record, columns=columns, preamble=preamble), encoding))
+    unit = xsens_dot.read_xsens_dot(write(tmp_path, text(record, columns=columns, preamble=preamble), encoding))
     np.testing.assert_allclose(unit.time, time[1:] * 1e-6, rtol=1e-15)
     np.testing.assert_array_equal(unit.acceleration, acceleration[:, 1:])
     np.testing.assert_allclose(unit.rotation_rate, rates[:, 1:] * np.pi / 180, rtol=1e-14)
@@ -56,20 +56,20 @@ def test_what_was_written_is_read_in_si_units_without_the_first_row(tmp_path, re
 
 def test_a_path_may_be_a_string(tmp_path, record):
     file = write(tmp_path, text(record))
-    np.testing.assert_array_equal(xsens_dot.read(str(file)).time, xsens_dot.read(file).time)
+    np.testing.assert_array_equal(xsens_dot.read_xsens_dot(str(file)).time, xsens_dot.read_xsens_dot(file).time)
 
 
 def test_windows_line_ends(tmp_path, record):
-    plain = xsens_dot.read(write(tmp_path, text(record)))
+    plain = xsens_dot.read_xsens_dot(write(tmp_path, text(record)))
     file = tmp_path / "windows.csv"
     file.write_bytes(text(record).replace("\n", "\r\n").encode())
-    np.testing.assert_array_equal(xsens_dot.read(file).acceleration, plain.acceleration)
+    np.testing.assert_array_equal(xsens_dot.read_xsens_dot(file).acceleration, plain.acceleration)
 
 
 class TestMistakes:
     def refuse(self, file, match):
         with pytest.raises(InputError, match=match) as caught:
-            xsens_dot.read(file)
+            xsens_dot.read_xsens_dot(file)
         assert file.name in str(caught.value)
 
     def test_no_file(self, tmp_path):
@@ -126,7 +126,7 @@ def event(request):
     folder = (Path(given) if given else shared) / request.param
     if not folder.is_dir():
         pytest.skip("the records of the shake-table test are not here: set SYSID_DATA to the folder of both events")
-    return {unit: xsens_dot.read(folder / f"{unit}.csv") for unit in UNITS}
+    return {unit: xsens_dot.read_xsens_dot(folder / f"{unit}.csv") for unit in UNITS}
 
 
 def test_real_units_stand_upright_at_120_hz(event):

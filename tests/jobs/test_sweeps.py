@@ -15,7 +15,7 @@ import sysid
 from sysid.cli.output import Output
 from sysid.cli.sweeps import sweep_of
 from sysid.errors import InputError, SolverError
-from sysid.jobs import Band, Modes, Score, WithoutRun, WithoutSensor, moves, scored, submit
+from sysid.jobs import Band, NumberOfModes, Score, WithoutRun, WithoutSensor, moves, scored, submit
 from sysid.modal_analysis.residues import linear_residues
 from sysid.modal_analysis.vector_fitting import find_poles
 from sysid.results.judgement import judge
@@ -413,19 +413,19 @@ def test_so_many_modes_are_those_that_the_records_need_most():
     for count in (2, 3):
         subsets = [list(kept) for kept in combinations(range(4), count)]
         best = min(subsets, key=lambda kept: linear_residues(test, poles.omega[kept], poles.ratios[kept])[1])
-        found = sysid.identify(Modes(count).of(tower), strategy=sysid.Modal(modes=count), rng=0)
+        found = sysid.identify(NumberOfModes(count).of(tower), strategy=sysid.Modal(modes=count), rng=0)
         expected = poles.omega[best] / (2 * np.pi)
         np.testing.assert_allclose(found.structure.natural_frequencies, expected, rtol=0.02)
     with pytest.raises(InputError, match="4 modes stand out of the noise, fewer than the 5 asked for"):
         sysid.identify(tower, strategy=sysid.Modal(modes=5), rng=0)
     with pytest.raises(InputError, match="open only where mass and stiffness are free"):
-        Modes(2).of(problem())
+        NumberOfModes(2).of(problem())
 
 
 def test_a_job_of_so_many_modes_predicts_the_validation_tests(tmp_path):
     file = tmp_path / "full.py"
     file.write_text(MODULE.format(folder=__file__.rpartition("/")[0]).replace("problem\n", "problem as whole\n") + FULL)
-    one, two = submit(sysid.Recipe(str(file)), changes=[Modes(1), Modes(2)])
+    one, two = submit(sysid.Recipe(str(file)), changes=[NumberOfModes(1), NumberOfModes(2)])
     assert len(one.score.frequencies) == 1 and one.score.aic > two.score.aic + 100
     assert two.score.predicted < 0.03 < one.score.predicted < 1
 

@@ -184,7 +184,7 @@ class TestAveraged:
         runs = []
         for _ in range(2):
             x = white(rng, 2, 8000)
-            runs.append(spectra.Run(x, answer(h, x) + noise * white(rng, 2, 8000), None))
+            runs.append(spectra.TimeRun(x, answer(h, x) + noise * white(rng, 2, 8000), None))
         estimate = spectra.averaged(runs, RATE, kind="h1", segment=128)
         inner = estimate.coherence[:, 2:-2]
         assert estimate.coherence.shape == (2, 64)
@@ -203,7 +203,7 @@ class TestAveraged:
         _, S_xx = scipy.signal.welch(x, RATE, nperseg=200)
         np.testing.assert_allclose(test.freq, freq[1:], rtol=1e-12)
         np.testing.assert_allclose(test.response[0], (S_xy / S_xx)[:, 1:], rtol=1e-9, atol=1e-12)
-        estimate = spectra.averaged([spectra.Run(x, y, None)], RATE, kind="h1", segment=200)
+        estimate = spectra.averaged([spectra.TimeRun(x, y, None)], RATE, kind="h1", segment=200)
         _, coherence = scipy.signal.coherence(x, y, RATE, nperseg=200)
         np.testing.assert_allclose(estimate.coherence, coherence[:, 1:], rtol=1e-9, atol=1e-12)
         _, S_yy = scipy.signal.welch(y, RATE, nperseg=200)

@@ -9,7 +9,7 @@ from scipy.optimize import approx_fprime
 import sysid
 from benchmarks.records.simulated import four_storeys
 from sysid.modal_analysis.record_colour import KNOTS, designs, pieces
-from sysid.modal_analysis.record_noise import Part, _likelihood
+from sysid.modal_analysis.record_noise import ErrorSpectra, _likelihood
 
 SETTING = four_storeys()
 RISE = 5.0
@@ -43,7 +43,9 @@ def test_the_score_of_varying_levels_is_the_slope_of_the_likelihood() -> None:
     middles = np.array([5.0, 20.0, 60.0])
     D = dict(enumerate(designs(middles, (4.0, 64.0), np.array([False, True, True]))))
     z = rng.standard_normal((2, 3, 2, 2, 30))
-    parts = [Part(z[0, i, 0] + 1j * z[1, i, 0], (z[0, i, 1] + 1j * z[1, i, 1])[:, None], 0.7, i) for i in range(3)]
+    parts = [
+        ErrorSpectra(z[0, i, 0] + 1j * z[1, i, 0], (z[0, i, 1] + 1j * z[1, i, 1])[:, None], 0.7, i) for i in range(3)
+    ]
     x = 0.3 * rng.standard_normal(1 + 2 * KNOTS)
     slope = approx_fprime(x, lambda x: _likelihood(parts, D, x)[0], 1e-6)
     np.testing.assert_allclose(_likelihood(parts, D, x)[1], slope, rtol=1e-4, atol=1e-3)

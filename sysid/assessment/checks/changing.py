@@ -204,14 +204,14 @@ def changes(problem: Prepared) -> list[Change]:
     return found
 
 
-class Poles(NamedTuple):
+class ObservedPoles(NamedTuple):
     """Poles that records show: rad/s, damping ratios, (m,); unit shapes of all that they move, (.., m)."""
 
     omega: Array
     ratios: Array
     shapes: Array
 
-    def joined(self, reach: Array) -> Poles:
+    def joined(self, reach: Array) -> ObservedPoles:
         """Merge those of one shape within `reach`, rad/s, (m,): a fit makes several of one mode that changes."""
         groups: list[list[int]] = []
         for k, omega in enumerate(self.omega):
@@ -227,10 +227,10 @@ class Poles(NamedTuple):
                 groups.append([k])
         omega = np.array([self.omega[group].mean() for group in groups])
         ratios = np.array([self.ratios[group].max() for group in groups])
-        return Poles(omega, ratios, self.shapes[:, [group[0] for group in groups]])
+        return ObservedPoles(omega, ratios, self.shapes[:, [group[0] for group in groups]])
 
 
-def _modes(modal: ModalEstimate) -> Poles | None:
+def _modes(modal: ModalEstimate) -> ObservedPoles | None:
     """Poles of a test; None where it shows none."""
     if modal.has_modes:
         omega, ratios, shapes = modal.omega, modal.ratios, modal.phi
@@ -242,7 +242,7 @@ def _modes(modal: ModalEstimate) -> Poles | None:
     if not omega.size:
         return None
     shapes = shapes / np.maximum(np.linalg.norm(shapes, axis=0), np.finfo(float).tiny)
-    return Poles(omega, np.maximum(ratios, _LEAST_RATIO), shapes)
+    return ObservedPoles(omega, np.maximum(ratios, _LEAST_RATIO), shapes)
 
 
 def _seen(stretches: list[Stretch], k: int, width: float, number: int, test: Measurement) -> list[Seen]:

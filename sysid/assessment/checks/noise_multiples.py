@@ -41,7 +41,7 @@ class Miss(NamedTuple):
         return "its" if self.record.startswith(_FORCE) else "their"
 
 
-class Record(NamedTuple):
+class JudgedRecord(NamedTuple):
     """Accelerations or base force of a test, (runs, channels, n_freq), and what a structure leaves of them."""
 
     name: str
@@ -82,7 +82,7 @@ def _misses(problem: Prepared, structure: Structure, x: Array | None, alone: lis
             yield from _miss(record._replace(name=record.name + of), test, modal.found_noise, _near_modes(modal, its))
 
 
-def _records(modal: ModalEstimate, structure: Structure) -> Iterator[Record]:
+def _records(modal: ModalEstimate, structure: Structure) -> Iterator[JudgedRecord]:
     """Records of a test without its transients."""
     test, noise = modal.records, modal.noise
     left = test.relative - test.predict(structure)
@@ -90,13 +90,13 @@ def _records(modal: ModalEstimate, structure: Structure) -> Iterator[Record]:
     std = test.response_std
     if std is not None and quiet is not None and noise is not None:
         std = _bounded(modal, std, noise.response, left, quiet)
-    yield Record("the accelerations", test.sensor_names, test.relative, left, None if std is None else std**2)
+    yield JudgedRecord("the accelerations", test.sensor_names, test.relative, left, None if std is None else std**2)
     if test.force is not None:
         axes = tuple(f"force {axis}" for axis in test.base_axes or ())
         left, std = test.force - test.predict_force(structure), test.force_std
         if std is not None and quiet is not None and noise is not None and noise.force is not None:
             std = _bounded(modal, std, noise.force, left, quiet)
-        yield Record(_FORCE, axes, test.force, left, None if std is None else std**2)
+        yield JudgedRecord(_FORCE, axes, test.force, left, None if std is None else std**2)
 
 
 def _quiet_base(modal: ModalEstimate) -> Array | None:
@@ -136,7 +136,7 @@ def _near_modes(modal: ModalEstimate, structure: Structure) -> NDArray[np.bool_]
     return np.asarray(np.any(np.abs(test.freq - f[:, None]) < np.broadcast_to(reach, f.shape)[:, None], axis=0))
 
 
-def _miss(record: Record, test: Measurement, found: bool, near: NDArray[np.bool_]) -> Iterator[Miss]:
+def _miss(record: JudgedRecord, test: Measurement, found: bool, near: NDArray[np.bool_]) -> Iterator[Miss]:
     """What is left of one record in units of its noise; `found`: with the fit, so that it holds errors of the model.
 
     Of noise that is not stated, what stands out far from all modes is a part, such as hum.
