@@ -95,7 +95,8 @@ def direct_terms(test: Measurement) -> DirectTerms | None:
     (constant, slope), (constant_std, slope_std) = rigid.terms, rigid.std
     mass, mass_std, modal_mass = (None,) * 3 if force is None else (force.terms[0], force.std[0], force.modal)
     return DirectTerms(
-        constant, constant_std, slope, slope_std, rigid.modal, mass, mass_std, modal_mass, rigid.below, misfit, omega, ratios
+        constant, constant_std, slope, slope_std, rigid.modal, mass, mass_std, modal_mass, rigid.below, misfit, omega,
+        ratios,
     )  # fmt: skip
 
 

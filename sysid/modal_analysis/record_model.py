@@ -98,10 +98,10 @@ class RecordModel(SpectralModel):
         outputs = test.response if test.force is None else np.concatenate([test.response, test.force], axis=1)
         runs = [
             Run(
-                2 * np.pi * test.freq[run_lines], test.base[r][:, run_lines], outputs[r][:, run_lines], float(self.whole.density[r]), r,
-                np.ones(np.count_nonzero(run_lines)), r,
+                2 * np.pi * test.freq[mask], test.base[r][:, mask], outputs[r][:, mask], float(self.whole.density[r]),
+                r, np.ones(np.count_nonzero(mask)), r,
             )
-            for r, run_lines in enumerate(test.own_lines)
+            for r, mask in enumerate(test.own_lines)
         ]  # fmt: skip
         if self.whole.varying is not None:
             cut = [run.at(lines) for run in runs for lines in pieces(run.w)]
