@@ -16,7 +16,7 @@ from sysid.modal_analysis.record_model import Parameters, RecordModel
 from sysid.modal_analysis.response import gains
 from sysid.modal_analysis.vector_fitting import DAMPED, RAZOR
 from sysid.structure.structure import Array
-from sysid.structure.thresholds import CANDIDATES, beyond_chance
+from sysid.structure.thresholds import beyond_chance
 
 _RATIOS = (0.004, 0.012, 0.036)  # damping ratios that are tried
 _REACH = 15.0  # half-power widths about a candidate, of lines that are looked at
@@ -52,7 +52,7 @@ def no_modes(fit: RecordFit) -> NDArray[np.bool_]:
 def least_worth(model: RecordModel) -> float:
     """What a mode must lower ``e' S^-1 e`` by: more than noise makes of a residue of rank one and a pole, anywhere."""
     inputs = model.d + 2 * len(model.moving)
-    return beyond_chance(model.channels + inputs + 1, CANDIDATES) / 2
+    return beyond_chance(model.channels + inputs + 1, len(_RATIOS) * model.numbers) / 2
 
 
 def _candidate(fit: RecordFit, least: float) -> Parameters | None:

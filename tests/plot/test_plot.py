@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from scipy.stats import norm
 
 import sysid
 from sysid import plot
@@ -310,7 +311,7 @@ def test_a_band_is_the_interval_of_the_identified_magnitude(unit, runs):
         draw([ax], channel)
         edges = ax.collections[0].get_paths()[0].vertices
         size = np.abs(channel.identified)
-        for line, middle, reach in zip(FREQ, size, 1.96 * expected, strict=True):
+        for line, middle, reach in zip(FREQ, size, norm.ppf(0.975) * expected, strict=True):
             low, high = np.sort(edges[edges[:, 0] == line, 1])[[0, -1]]
             assert high == pytest.approx(middle + reach)
             assert low == pytest.approx(max(middle - reach, 1e-3 * middle))
@@ -342,7 +343,7 @@ def test_every_picture_of_responses_takes_a_band(unit):
         size = lines(shade)["identified"].get_ydata()
         top = shade.collections[0].get_paths()[0].vertices
         at = int(np.argmax(std))
-        assert top[top[:, 0] == FREQ[at], 1].max() == pytest.approx(size[at] + 1.96 * std[at])
+        assert top[top[:, 0] == FREQ[at], 1].max() == pytest.approx(size[at] + norm.ppf(0.975) * std[at])
     assert not plot.transmissibility(unit, sensor=1, run=1).axes[0].collections
     with pytest.raises(sysid.InputError, match=r"band has shape \(3, 2, 59\); .* are \(3, 2, 60\)"):
         plot.responses(unit, 0, band=of_responses[..., 1:])
