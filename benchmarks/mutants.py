@@ -103,8 +103,8 @@ MISSED = (
     Mutant("F11", "default of 1 iteration", "max_iterations: int = 150", "max_iterations: int = 1",
         "test_swarm_strategy"),
     Mutant("G01", "r and s one and the same draw", "to_global_best = self._rng.random(self._positions.shape)",
-        "to_global_best = np.divide(to_personal_best, self._personal_best - self._positions, "
-        "out=self._rng.random(self._positions.shape), where=self._personal_best != self._positions)",
+        "to_global_best = np.divide(to_personal_best, self._pbest - self._positions, "
+        "out=self._rng.random(self._positions.shape), where=self._pbest != self._positions)",
         "test_moves"),
     Mutant("G02", "inertia without its random number", "inertia_weight(kappa, rng.random(), settings",
         "inertia_weight(kappa, 0.5 + 0 * rng.random(), settings", "test_moves"),
@@ -168,7 +168,7 @@ NOTICED = (
     Mutant("B08", "candidate of elitist learning never accepted", "if cost < self.best_cost:", "if cost < -np.inf:",
         "test_particles"),
     Mutant("B09", "focusing distance to the mean position",
-        "focusing_change_rate(self._positions, self._personal_best[self._leader])",
+        "focusing_change_rate(self._positions, self._pbest[self._leader])",
         "focusing_change_rate(self._positions, self._positions.mean(axis=0))", "test_particles"),
     Mutant("B11", "elitist learning never narrows", "self.nit / self.horizon, settings", "0.0, settings",
         "test_particles"),
@@ -247,7 +247,7 @@ NOTICED = (
     Mutant("F08", "gradient steps of the swarm left out", "improve_every=options.gradient_every,", "improve_every=0,",
         "test_identify"),
     Mutant("G05", "social pull towards the first particle's best",
-        "return self._personal_best[self._leader]", "return self._personal_best[0]",
+        "return self._pbest[self._leader]", "return self._pbest[0]",
         "test_moves"),
     Mutant("H01", "deviations of a problem in expressions times 1.5",
         "inflation * (weights * record.std).ravel() / np.sqrt(2)",

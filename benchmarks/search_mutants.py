@@ -63,7 +63,7 @@ NOTICED = (
     Mutant("S02", "between exploitation and convergence, jumping out leads to convergence",
         "(_S2, _S3): (_S2, _S2, _S3, _S2)", "(_S2, _S3): (_S2, _S2, _S3, _S3)", "test_adaptation"),
     Mutant("S04", "elitist learning puts its candidate in the place of the worst own best",
-        "worst = int(np.argmax(self._costs))", "worst = int(np.argmax(self._personal_costs))",
+        "worst = int(np.argmax(self._costs))", "worst = int(np.argmax(self._pbest_costs))",
         "test_moves test_particles"),
     Mutant("S06", "horizon of a search of few evaluations too long",
         "min(max_iterations, max_evaluations // swarm.n_particles)",

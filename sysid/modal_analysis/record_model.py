@@ -249,7 +249,7 @@ class Chunk(Lines):
         model = self.records
         n, m, d, index = model.n, model.m, model.d, model.index
         k = np.arange(m)
-        shapes = self.output_shapes[channel]
+        shapes = self.shapes[channel]
         spectra = m + m * d + 2 * m + d + 2 * m * (self.at_ends is not None) + TRACES + d * model.gains
         C = np.zeros((model.size, spectra))
 

@@ -49,7 +49,7 @@ def worth_beyond_misfit(fit: RecordFit) -> Array:
     powers: list[list[Array]] = [[] for _ in model.runs]  # of what is left, of all modes, and of each, (2 + m, L)
     for chunk in model.chunks(p):
         pushed = p.modes.gamma @ chunk.run.base + chunk.pushed_by_ends
-        each = (chunk.output_shapes[:, :, None] * chunk.g * pushed).swapaxes(0, 1)  # (m, c, L)
+        each = (chunk.shapes[:, :, None] * chunk.g * pushed).swapaxes(0, 1)  # (m, c, L)
         moved_by = [None, each.sum(axis=0), *each]
         powers[chunk.run.piece].append(np.stack([chunk.weighed(fit.levels, one).power for one in moved_by]))
     whole = [np.concatenate(one, axis=1) for one in powers]

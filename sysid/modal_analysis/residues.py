@@ -134,12 +134,10 @@ class Records:
             self.channel = channel
         self.blocks = blocks
         # Whole records of other lengths have zeros at the lines of one another, which tell nothing.
-        lines_of_runs = [np.any(inputs != 0, axis=0) | np.any(records != 0, axis=0) for inputs, records in blocks]
-        self.run, self.line = np.nonzero(lines_of_runs)
-        self.base = np.concatenate(
-            [inputs[:, lines] for (inputs, _), lines in zip(blocks, lines_of_runs, strict=True)], axis=1
-        )
-        blocks_of_data = [records[:, lines] for (_, records), lines in zip(blocks, lines_of_runs, strict=True)]
+        used = [np.any(inputs != 0, axis=0) | np.any(records != 0, axis=0) for inputs, records in blocks]
+        self.run, self.line = np.nonzero(used)
+        self.base = np.concatenate([inputs[:, lines] for (inputs, _), lines in zip(blocks, used, strict=True)], axis=1)
+        blocks_of_data = [records[:, lines] for (_, records), lines in zip(blocks, used, strict=True)]
         self.data = stacked(np.concatenate(blocks_of_data, axis=1))
         self.size = float(np.sum(self.data**2))
 

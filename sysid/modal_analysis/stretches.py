@@ -91,20 +91,17 @@ def stretches_of(test: Measurement, omega: Array, ratios: Array) -> list[Stretch
 
 def _stretch(piece: Piece, every: RecordFit, test: Measurement) -> Stretch:
     """Poles of one stretch, with the shapes of all."""
-    free_fit, held = with_poles_of(every, test), with_poles_of(every, test, held=True)
-    modes, index, model = free_fit.parameters.modes, free_fit.model.index, free_fit.model
+    fit, held = with_poles_of(every, test), with_poles_of(every, test, held=True)
+    modes, index, model = fit.parameters.modes, fit.model.index, fit.model
     free = np.r_[index.log_omega, index.log_ratios, model.kept : model.size]
-    N = free_fit.normal[np.ix_(free, free)]
+    N = fit.normal[np.ix_(free, free)]
     unit = 1 / np.sqrt(np.maximum(np.diag(N), np.finfo(float).tiny))
     m, f = modes.omega.size, modes.omega / (2 * np.pi)
     variance = (
-        unit[:m] ** 2
-        * np.diag(np.linalg.pinv(N * np.outer(unit, unit), hermitian=True))[:m]
-        / 2
-        * _noise_at_peaks(free_fit)
+        unit[:m] ** 2 * np.diag(np.linalg.pinv(N * np.outer(unit, unit), hermitian=True))[:m] / 2 * _noise_at_peaks(fit)
     )
     std = f * np.sqrt(np.where(variance > 0, variance, np.inf))  # round-off, of a mode that shows nowhere
-    return Stretch(piece.number, piece.start, piece.end, f, std, _levels(free_fit), _left(free_fit), _left(held))
+    return Stretch(piece.number, piece.start, piece.end, f, std, _levels(fit), _left(fit), _left(held))
 
 
 def _noise_at_peaks(fit: RecordFit, about: int = 12, explained: int = 2) -> Array:

@@ -41,20 +41,16 @@ def decode(tree: Tree, symbols: Sequence[ca.MX]) -> list[ca.MX]:
         *called, last = tree["functions"]
         for function in called:
             reader.add(function)
-        expressions = reader.matrices(last, symbols)
+        parts = reader.matrices(last, symbols)
         # Its memory: what one evaluation keeps at a time.
-        limited(
-            "memory of one evaluation",
-            ca.Function("whole", list(symbols), expressions).sz_w(),
-            operations.LIMITS.memory,
-        )
+        limited("memory of one evaluation", ca.Function("whole", list(symbols), parts).sz_w(), operations.LIMITS.memory)
     except InputError:
         raise
     except Exception as error:  # whatever CasADi and Python say of wrong numbers
         at = "" if reader is None else reader.place
         lines = str(error).strip().splitlines() or [""]
         raise InputError(f"its expressions are damaged{at} ({type(error).__name__}: {lines[-1]})") from error
-    return expressions
+    return parts
 
 
 def limited(what: str, value: float, most: float) -> None:

@@ -207,11 +207,9 @@ class Formulation:
         """Whether anything that is fitted depends on an unknown of the damping alone; records always do."""
         if self.fits_records or self.further_tests:
             return True
-        *others, of_damping = ({symbol.__hash__() for symbol in group} for group in self._in_matrices)
-        of_damping = of_damping.difference(*others, (v.symbol.__hash__() for v in self.fixed))
-        return any(
-            symbol.__hash__() in of_damping for group in self._in_sources for e in group for symbol in ca.symvar(e)
-        )
+        *others, alone = ({symbol.__hash__() for symbol in group} for group in self._in_matrices)
+        alone = alone.difference(*others, (v.symbol.__hash__() for v in self.fixed))
+        return any(symbol.__hash__() in alone for group in self._in_sources for e in group for symbol in ca.symvar(e))
 
     @property
     def free_modes(self) -> bool:

@@ -78,10 +78,8 @@ class Modal:
             return "the problem is written in unknowns of its own"
         described = formulation.mass.free or formulation.mass.entries is not None
         if not formulation.stiffness.free:
-            has_form = formulation.parts.stiffness.stop > formulation.parts.stiffness.start
-            return (
-                "the stiffness has a form of its own" if has_form else "the problem is written in unknowns of its own"
-            )
+            form = formulation.parts.stiffness.stop > formulation.parts.stiffness.start
+            return "the stiffness has a form of its own" if form else "the problem is written in unknowns of its own"
         if not described:
             return "the problem is written in unknowns of its own"
         if not formulation.damping.free:
@@ -278,12 +276,8 @@ def objective_of(problem: Prepared, structure: Structure, x: Array | None) -> fl
     """What the fit leaves; where modes are free from the structure alone, without any graph of the matrices."""
     if x is not None and not problem.free_modes:
         return problem.objective(x)
-    of_records = weighted_error(problem.measurement, structure)
-    return (
-        of_records
-        if x is None
-        else float(np.linalg.norm([of_records, *(term.error(x) for term in problem.formulation.beside)]))
-    )
+    left = weighted_error(problem.measurement, structure)
+    return left if x is None else float(np.linalg.norm([left, *(term.error(x) for term in problem.formulation.beside)]))
 
 
 def _coordinates(problem: Prepared, chosen: DegreesOfFreedom) -> list[str]:
