@@ -60,9 +60,9 @@ def needed(package: str, extra: str, what: str) -> None:
 
 
 def refuse(*mistakes: tuple[Any, str]) -> None:
-    """Raise an `InputError` with the sentence of the first of ``(whether it was made, sentence)`` that was made."""
-    for made, sentence in mistakes:
-        if made:
+    """Raise an `InputError` with the sentence of the first of ``(applies, sentence)`` that applies."""
+    for applies, sentence in mistakes:
+        if applies:
             raise InputError(sentence)
 
 

@@ -42,16 +42,16 @@ def in_time(test: Measurement) -> list[RunInTime]:
     whole = as_whole(test).whole
     if whole is None:
         return []
-    rate, samples, made = whole.sample_rate, whole.samples, []
-    for run, (own, n) in enumerate(zip(test.own_lines, samples, strict=True)):
-        at = np.round(test.freq[own] * n / rate).astype(int)
+    rate, samples, recordings = whole.sample_rate, whole.samples, []
+    for run, (lines, n) in enumerate(zip(test.own_lines, samples, strict=True)):
+        at = np.round(test.freq[lines] * n / rate).astype(int)
         base, response, force = (
-            None if record is None else _of_lines(record[run][:, own] * rate, at, n)
+            None if record is None else _of_lines(record[run][:, lines] * rate, at, n)
             for record in (test.base, test.response, test.force)
         )
         assert base is not None and response is not None
-        made.append(RunInTime(base, response, force, rate, at.size))
-    return made
+        recordings.append(RunInTime(base, response, force, rate, at.size))
+    return recordings
 
 
 def levels_are_known(test: Measurement) -> bool:
@@ -110,10 +110,10 @@ def as_whole(test: Measurement) -> Measurement:
     """Spectra as those of whole records cut in motion; as they are where their lines cannot be such."""
     if test.whole is not None or test.averaged or test.has_unit_runs or test.freq.size < 2:
         return test
-    own = test.own_lines
-    if np.any(own.sum(axis=1) < 2) or (test.sample_rate is None and not np.all(own)):
+    lines_of_runs = test.own_lines
+    if np.any(lines_of_runs.sum(axis=1) < 2) or (test.sample_rate is None and not np.all(lines_of_runs)):
         return test
-    freq = [test.freq[lines] for lines in own]
+    freq = [test.freq[lines] for lines in lines_of_runs]
     spacing = np.array([float(np.min(np.diff(lines))) for lines in freq])
     if any(
         np.max(np.abs(f / df - np.round(f / df))) > NEGLIGIBLE * f[-1] / df for f, df in zip(freq, spacing, strict=True)

@@ -14,7 +14,7 @@ from sysid.measurement import spectra
 from sysid.measurement.cuts import check_cuts
 from sysid.measurement.missing import Missing, complete, named, present
 from sysid.measurement.noise import levels_at_rest
-from sysid.measurement.rigid_body import axis_vector, check_axes, told_by
+from sysid.measurement.rigid_body import axis_vector, check_axes, motion_of_sensors
 from sysid.measurement.whole import NoiseLevels, WholeRecords, check_options, per_run
 from sysid.structure.axes import BASE_AXES, base_columns
 from sysid.structure.sensor import Sensor, checked_sensors, sensors_from_tree, sensors_to_tree
@@ -147,7 +147,7 @@ class Measurement:
         axes = np.array([axis_vector(sensor.axis, sensor.name) for sensor in self.sensors])
         columns = self.rigid_body.T
         alike = np.array(
-            [[np.any(column) and np.allclose(own, column, atol=1e-6) for own in axes.T] for column in columns]
+            [[np.any(column) and np.allclose(axis, column, atol=1e-6) for axis in axes.T] for column in columns]
         )
         unique = np.all(alike.sum(axis=1) == 1) and np.all(alike.sum(axis=0) <= 1)
         return tuple(BASE_AXES[i] for i in np.argmax(alike, axis=1)) if unique else ()
@@ -467,7 +467,7 @@ def _motion(given: ArrayLike | None, sensors: Any, base_axes: Any, d: int) -> Ar
     described = checked_sensors(sensors)
     if described is None:
         raise InputError("rigid_body is missing: give it (sysid.rigid_body), or sensors=[sysid.Sensor(...), ...]")
-    return told_by(described, base_axes, d)
+    return motion_of_sensors(described, base_axes, d)
 
 
 def unit_runs(d: int, n_freq: int) -> ComplexArray:

@@ -35,8 +35,8 @@ def present(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, NDArray[np
     }
     keep = ~np.any(list(holes.values()), axis=0)
     if not np.any(keep):
-        told = ", ".join(f"{name} at {np.count_nonzero(hole)}" for name, hole in holes.items() if np.any(hole))
-        raise InputError(f"missing='drop' leaves no line: of {lines}, NaN stands in {told}")
+        counts = ", ".join(f"{name} at {np.count_nonzero(hole)}" for name, hole in holes.items() if np.any(hole))
+        raise InputError(f"missing='drop' leaves no line: of {lines}, NaN stands in {counts}")
     kept = {name: a[..., keep] if a.shape[-1:] == (lines,) else a for name, a in arrays.items()}
     return given | kept, {name: np.isnan(arrays[name]) for name, hole in holes.items() if np.any(hole)}
 
@@ -57,12 +57,12 @@ def named(
 
 def in_words(holes: tuple[tuple[str, Array], ...], freq: Array) -> str:
     """Which channels hold NaN and from where to where; what no line of `freq` parts is one range."""
-    told = []
+    phrases = []
     for name, at in holes:
         parts = np.split(at, np.flatnonzero(np.diff(np.searchsorted(freq, at))) + 1)
         ranges = [f"{p[0]:.5g}" if p.size == 1 else f"{p[0]:.5g} to {p[-1]:.5g}" for p in parts]
-        told.append(f"{name} at {listed(ranges)} Hz")
-    return "; ".join(told)
+        phrases.append(f"{name} at {listed(ranges)} Hz")
+    return "; ".join(phrases)
 
 
 def complete(name: str, value: ArrayLike, kind: type = float) -> NDArray[Any]:

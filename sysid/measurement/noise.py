@@ -62,8 +62,8 @@ def _levels(runs: Sequence[TimeRun], sample_rate: float, low: float, high: float
         unit = np.vander(np.linspace(-1.0, 1.0, n), 2)
         slopes = np.linalg.lstsq(unit, records.T, rcond=None)[0]
         spectra = np.fft.rfft(records - (unit @ slopes).T, axis=1)[:, keep]
-        own = np.sum(np.abs(spectra) ** 2, axis=1) / n
-        power, lines = (own if not power.size else power + own), lines + int(keep.sum())
+        run_power = np.sum(np.abs(spectra) ** 2, axis=1) / n
+        power, lines = (run_power if not power.size else power + run_power), lines + int(keep.sum())
     if lines < _FEWEST_LINES:
         raise InputError(
             f"the stretch at rest has {lines} lines in the band, too few for a level (at least {_FEWEST_LINES}): "

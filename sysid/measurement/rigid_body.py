@@ -100,7 +100,7 @@ def check_axes(sensors: Sequence[Sensor], rigid_body: Array, base_axes: Sequence
         )
 
 
-def told_by(sensors: Sequence[Sensor], base_axes: str | Sequence[str] | None, d: int) -> Array:
+def motion_of_sensors(sensors: Sequence[Sensor], base_axes: str | Sequence[str] | None, d: int) -> Array:
     """Motion of described sensors with a base that moves in d directions; these are told where they are in doubt.
 
     Three directions are x y z, one that of the sensors, all along one axis.

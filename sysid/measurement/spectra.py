@@ -97,11 +97,11 @@ def whole_record(
     freq (n_freq,), base (runs, d, n_freq), response (runs, n_sensors, n_freq), force or None
     """
     lengths = sorted({run.base.shape[1] for run in runs})
-    own = {n: np.arange(1, n // 2 + 1) / n for n in lengths}  # in cycles a sample
+    grids = {n: np.arange(1, n // 2 + 1) / n for n in lengths}  # in cycles a sample
     if lengths[0] < 2:
         raise InputError(f"a record of {lengths[0]} samples has no spectral line above zero")
-    lines = np.unique(np.round(np.concatenate(list(own.values())), 14))
-    at = {n: np.searchsorted(lines, np.round(freq, 14)) for n, freq in own.items()}
+    lines = np.unique(np.round(np.concatenate(list(grids.values())), 14))
+    at = {n: np.searchsorted(lines, np.round(freq, 14)) for n, freq in grids.items()}
 
     def transform(records: list[Array]) -> ComplexArray:
         out = np.zeros((len(records), len(records[0]), lines.size), complex)
@@ -242,7 +242,7 @@ def resample(
         for place, t in enumerate(clocks, start=1):
             if t.size < 60:
                 raise InputError(f"record {place}: {t.size} samples are too few to low-pass before resampling")
-        filters = [butter(8, 0.8 * rate / own, output="sos") for own in rates]
+        filters = [butter(8, 0.8 * rate / own_rate, output="sos") for own_rate in rates]
         samples = [sosfiltfilt(sos, x, axis=-1) for sos, x in zip(filters, samples, strict=True)]
     splines = [CubicSpline(t, x, axis=-1) for t, x in zip(clocks, samples, strict=True)]
     return time, [np.asarray(spline(np.minimum(time, spline.x[-1]))) for spline in splines]

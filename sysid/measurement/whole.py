@@ -63,7 +63,7 @@ class NoiseLevels:
             )
         )
         given = {"response": n_sensors, "base": d} | ({"force": d} if force else {})
-        made = {}
+        levels = {}
         for name, count in given.items():
             value = getattr(self, name)
             refuse((
@@ -71,8 +71,8 @@ class NoiseLevels:
                 f"noise of the {name} has shape {value.shape}: one number, ({count},), or a row of them a run, "
                 f"({runs}, {count})",
             ))  # fmt: skip
-            made[name] = np.broadcast_to(value, (runs, count) if value.ndim == 2 else (count,)).copy()
-        return NoiseLevels(**made)
+            levels[name] = np.broadcast_to(value, (runs, count) if value.ndim == 2 else (count,)).copy()
+        return NoiseLevels(**levels)
 
     @property
     def outputs(self) -> Array:

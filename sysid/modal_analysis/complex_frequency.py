@@ -71,13 +71,13 @@ class PolesAndResidues:
         # Directions that the base moves in, each counted by its size.
         weight = np.sum(np.abs(columns(test.base)) ** 2, axis=1, keepdims=True)
         directions = np.eye(test.n_base) if records.unit else np.linalg.qr(weight * records.moving)[0]
-        own = left = float(np.sqrt(fit.squared_error / records.size))
+        of_response = left = float(np.sqrt(fit.squared_error / records.size))
         force = None
         if test.force is not None:
             force, of_force = force_residues(test, omega, ratios, velocity=many)
-            left = float(np.hypot(own, force_share(test) * of_force))
+            left = float(np.hypot(of_response, force_share(test) * of_force))
         residues, quadrature = records.by_sensor(both[:, 0]), records.by_sensor(both[:, 1])
-        return cls(omega, ratios, residues, quadrature, force, directions, own, left)
+        return cls(omega, ratios, residues, quadrature, force, directions, of_response, left)
 
     def response(self, freq: Array, shift: float) -> ComplexArray:
         """Relative accelerations for unit base motion at ``s = shift + 2 pi i freq``, (n_sensors, d, n_freq)."""
@@ -92,7 +92,7 @@ class PolesAndResidues:
         functions = [np.ones((1, freq.size)), *gains_with_velocity(freq, self.omega, self.ratios, shift)]
         return relative, np.einsum("ked,kf,rdf->ref", self.force, np.concatenate(functions), base, optimize=True)
 
-    def shown(self, base: ComplexArray, modes: NDArray[np.intp]) -> ComplexArray:
+    def contributions(self, base: ComplexArray, modes: NDArray[np.intp]) -> ComplexArray:
         """How modes show in accelerations and force at base motion (runs, d), (modes, runs, n_sensors [+ d])."""
         parts = [self.residues[modes] + 1j * self.quadrature[modes]]
         if self.force is not None:

@@ -92,10 +92,10 @@ def direct_terms(test: Measurement) -> DirectTerms | None:
                 return None
         omega, ratios, rigid = found
         force = None if test.force is None else _fitted(Records(still, force=True), omega, ratios)
-    (own, slope), (own_std, slope_std) = rigid.terms, rigid.std
+    (const, slope), (const_std, slope_std) = rigid.terms, rigid.std
     mass, mass_std, modal_mass = (None,) * 3 if force is None else (force.terms[0], force.std[0], force.modal)
     return DirectTerms(
-        own, own_std, slope, slope_std, rigid.modal, mass, mass_std, modal_mass, rigid.below, misfit, omega, ratios
+        const, const_std, slope, slope_std, rigid.modal, mass, mass_std, modal_mass, rigid.below, misfit, omega, ratios
     )  # fmt: skip
 
 

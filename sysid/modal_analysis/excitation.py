@@ -14,8 +14,8 @@ def steady_sine(test: Measurement, beside: int = 3, share: float = 0.9, few: flo
     must be `few`, a share of all.
     """
     found = []
-    for base, own in zip(test.base, test.own_lines, strict=True):
-        freq, power = test.freq[own], np.sum(np.abs(base[:, own]) ** 2, axis=0)
+    for base, lines in zip(test.base, test.own_lines, strict=True):
+        freq, power = test.freq[lines], np.sum(np.abs(base[:, lines]) ** 2, axis=0)
         peak = int(np.argmax(power))
         near = power[max(peak - beside, 0) : peak + beside + 1]
         if near.sum() < share * power.sum() or near.size > few * power.size:

@@ -20,7 +20,7 @@ from sysid.modal_analysis.record_poles import few_lines, rough_deviations
 from sysid.modal_analysis.record_rest import runs_in_motion
 from sysid.modal_analysis.record_spread import scatter
 from sysid.modal_analysis.record_spurious import without_spurious_modes
-from sysid.modal_analysis.record_varying import untold_levels, varying_levels, with_varying_levels
+from sysid.modal_analysis.record_varying import unidentifiable_levels, varying_levels, with_varying_levels
 from sysid.modal_analysis.record_whiteness import excess_of
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.nlp import one_thread
@@ -38,10 +38,10 @@ def whole_fit(test: Measurement, *, monitor: Monitor | None = None) -> RecordFit
     try:
         fit = _white_fit(test, monitor)
     except (InputError, np.linalg.LinAlgError) as error:
-        told = steady_sine(test)
-        if told is None:
+        sentence = steady_sine(test)
+        if sentence is None:
             raise
-        raise InputError(told) from error
+        raise InputError(sentence) from error
     fit = with_varying_levels(fit, monitor=monitor)
     if fit.model.whole.varying is not None:  # where the level was too low, noise passed for modes
         fit = _pruned(fit, monitor)
@@ -119,12 +119,12 @@ def deviations(fit: RecordFit) -> tuple[Array, Array | None]:
     parts: list[list[Array]] = [[] for _ in range(test.n_runs)]
     c = model.channels
     for chunk in model.chunks(fit.parameters):
-        own = fit.levels[chunk.run.piece]
-        power = own[:c, None] + np.einsum("cdl,d->cl", np.abs(chunk.H) ** 2, own[c:])
+        variances = fit.levels[chunk.run.piece]
+        power = variances[:c, None] + np.einsum("cdl,d->cl", np.abs(chunk.H) ** 2, variances[c:])
         parts[chunk.run.number].append(np.sqrt(chunk.run.density * power))
     std = _at_lines(test, parts)
-    for run, own in zip(std, test.own_lines, strict=True):  # where a run has no line its weight is of no meaning
-        run[:, ~own] = np.median(run[:, own], axis=1, keepdims=True)
+    for run, lines in zip(std, test.own_lines, strict=True):  # where a run has no line its weight is of no meaning
+        run[:, ~lines] = np.median(run[:, lines], axis=1, keepdims=True)
     n = test.n_sensors
     return std[:, :n], std[:, n:] if model.force else None
 
@@ -133,8 +133,8 @@ def _at_lines(test: Measurement, parts: list[list[NDArray[Any]]]) -> NDArray[Any
     """Chunks of each run's own lines as (runs, channels, n_freq), zero at the lines of others."""
     joined = [np.concatenate(run, axis=1) for run in parts]
     out = np.zeros((test.n_runs, joined[0].shape[0], test.freq.size), joined[0].dtype)
-    for at, own, run in zip(out, test.own_lines, joined, strict=True):
-        at[:, own] = run
+    for at, lines, run in zip(out, test.own_lines, joined, strict=True):
+        at[:, lines] = run
     return out
 
 
@@ -190,5 +190,5 @@ def estimate(fit: RecordFit) -> ModalEstimate:
         modes.phi[:, order], modes.gamma[order], modes.omega[order], modes.ratios[order], p.rigid,
         A[np.ix_(at, at)], fit.noise, fit.reduced, fit.model.whole.density, replace(gain, moves=gain.moves[at]),
         None if B is None else B[np.ix_(at, at)], fit.settled,
-        excess_of(fit), varying_levels(fit), runs_in_motion(fit), untold_levels(fit),
+        excess_of(fit), varying_levels(fit), runs_in_motion(fit), unidentifiable_levels(fit),
     )  # fmt: skip

@@ -126,13 +126,13 @@ class SummedRecord:
     ) -> None:
         recovery, self._line = channel[:, None] * recovery, line
         self._metric = recovery.T @ recovery
-        made, u = channel[:, None] * line[:, None] * record, line[:, None] * base
-        self.size = float(np.sum(np.abs(made) ** 2))
+        weighted, u = channel[:, None] * line[:, None] * record, line[:, None] * base
+        self.size = float(np.sum(np.abs(weighted) ** 2))
         d, (n, terms, lines) = base.shape[1], series.basis.shape
         still = d if static else 0
         # Of all runs together; the gains are the same in each.
         spectrum = np.einsum("rdf,ref->def", u.conj(), u)
-        onto_base = recovery.T @ np.einsum("rcf,rdf->dcf", made, u.conj())
+        onto_base = recovery.T @ np.einsum("rcf,rdf->dcf", weighted, u.conj())
         overlap = (_functions(series.basis, still).conj() @ onto_base.reshape(-1, lines).T).real
         self._inner = _inner_products(spectrum, series.basis, still)
         coordinates, overlap = self._inner.coordinates[:, None], overlap[..., None]
@@ -171,8 +171,8 @@ class SummedRecord:
         """Inner products of the modes' accelerations over all lines, (count, m, m)."""
         count, m, _ = loads.shape
         loads, polynomials = _filled(loads, 0), _filled(polynomials, 2)
-        made = [self._inner.products(loads[at], self._gains_of(polynomials[..., at], m)) for at in _blocks(count)]
-        return np.concatenate(made)[:count]
+        products = [self._inner.products(loads[at], self._gains_of(polynomials[..., at], m)) for at in _blocks(count)]
+        return np.concatenate(products)[:count]
 
     def weighs_like(self, other: SummedRecord) -> bool:
         """Whether the lines of both have the same weights, so that `inner` is the same."""
@@ -181,10 +181,10 @@ class SummedRecord:
     def _gains_of(self, polynomials: Array, m: int) -> Array:
         """Coordinates of the gains of m modes, (count, m, rank)."""
         n, count = polynomials.shape[1:]
-        made = np.empty((m, count, self._gains.shape[2]))
-        np.matmul(polynomials.transpose(1, 2, 0), self._gains, out=made[:n])
-        made[n:] = self._static_gains
-        return made.swapaxes(0, 1)
+        coordinates = np.empty((m, count, self._gains.shape[2]))
+        np.matmul(polynomials.transpose(1, 2, 0), self._gains, out=coordinates[:n])
+        coordinates[n:] = self._static_gains
+        return coordinates.swapaxes(0, 1)
 
 
 def _blocks(count: int) -> list[slice]:

@@ -53,13 +53,13 @@ def misfits_of(test: Measurement, structure: Structure, unknowns: int) -> list[t
         parts.append((test.force, test.force_std, test.force - test.predict_force(structure)))
     lines = np.count_nonzero(test.own_lines)  # of all runs
     left = max(1 - unknowns / (2 * test.numbers), 0.5)
-    made: list[tuple[ComplexArray, Array]] = []
+    misfits: list[tuple[ComplexArray, Array]] = []
     for record, stated, misfit in parts:
         numbers = lines * record.shape[1]
         noise = np.sqrt(np.sum(np.abs(misfit) ** 2) / numbers / left) if stated is None else stated
         least = EPSILON * np.sqrt(np.sum(np.abs(record) ** 2) / numbers)
-        made.append((misfit, np.broadcast_to(np.maximum(noise, least), record.shape)))
-    return made
+        misfits.append((misfit, np.broadcast_to(np.maximum(noise, least), record.shape)))
+    return misfits
 
 
 def noise_records(test: Measurement, structure: Structure, unknowns: int) -> list[Record]:

@@ -249,9 +249,9 @@ def misfit_rows(
     phi, gamma = phi * ca.repmat(scale.T, n, 1), gamma / ca.repmat(scale, 1, d)
     corner = ca.vertcat(*(rigid[i, j] for i, j in index.pairs))
     theta = ca.vertcat(ca.vec(phi.T), ca.vec(gamma.T), ca.log(omega), ca.log(ratios), corner)
-    own = theta_of(estimate.modes, estimate.rigid, index)
-    assert theta.numel() == own.size and phi.shape == (n, m)
-    return ca.DM(factor_of(estimate)) @ (theta - ca.DM(own))
+    estimated = theta_of(estimate.modes, estimate.rigid, index)
+    assert theta.numel() == estimated.size and phi.shape == (n, m)
+    return ca.DM(factor_of(estimate)) @ (theta - ca.DM(estimated))
 
 
 def matched(estimate: ModalEstimate, omega: Array) -> NDArray[np.intp] | None:

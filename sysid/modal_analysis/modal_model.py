@@ -137,7 +137,7 @@ class Lines:
         freq = run.w / (2 * np.pi)
         modes = p.modes
         self.g = gains(freq, modes.omega, modes.ratios)
-        self.shown = modes.phi if not model.force else np.vstack([modes.phi, modes.gamma.T])  # (c, m)
+        self.shapes = modes.phi if not model.force else np.vstack([modes.phi, modes.gamma.T])  # (c, m)
         self.direct = model.test.rigid_body if not model.force else np.vstack([model.test.rigid_body, p.rigid])
         at = model.moving.get(run.number)
         self.at_ends = None if at is None else slice(2 * at, 2 * at + 2)
@@ -145,7 +145,7 @@ class Lines:
         self.pushed_by_ends = 0.0 if at is None else real_times(p.ends[:, self.at_ends], self.transients)  # (m, L)
         self.trace_spectra = model.trace_spectra(freq)
         self.motion = self.g * (real_times(modes.gamma, run.base) + self.pushed_by_ends)
-        predicted = real_times(self.shown, self.motion) + real_times(self.direct, run.base)
+        predicted = real_times(self.shapes, self.motion) + real_times(self.direct, run.base)
         if len(self.trace_spectra):
             predicted += real_times(p.traces[run.number], self.trace_spectra)
         self.error = run.outputs - predicted
@@ -154,12 +154,12 @@ class Lines:
     def H(self) -> ComplexArray:  # noqa: N802
         """From base to outputs, (c, d, L)."""
         pushed = (self.g[:, None] * self.p.modes.gamma[:, :, None]).reshape(len(self.g), -1)
-        return real_times(self.shown, pushed).reshape(len(self.direct), -1, self.run.w.size) + self.direct[:, :, None]
+        return real_times(self.shapes, pushed).reshape(len(self.direct), -1, self.run.w.size) + self.direct[:, :, None]
 
     def deviations(self, levels: Array) -> tuple[Array, Array]:
         """Inverse deviations of the outputs' own noise at a line, (c,), and deviations of the base's, (d,)."""
-        own, c = levels[self.run.piece] * self.run.density, self.model.channels
-        return 1 / np.sqrt(own[:c]), np.sqrt(own[c:])
+        variances, c = levels[self.run.piece] * self.run.density, self.model.channels
+        return 1 / np.sqrt(variances[:c]), np.sqrt(variances[c:])
 
     def _base_noise(self, levels: Array) -> tuple[ComplexArray, ComplexArray]:
         """What the noise of the base hides in units of the outputs' own, and its factor.
@@ -194,8 +194,8 @@ class Lines:
         e = scale[:, None] * (self.error if error is None else error)
         # What is likeliest of the base's noise, in its own units; what it makes of the errors is taken off them.
         noise = np.array([np.sum(part.conj() * e, axis=0) for part in V])
-        for part, own in zip(V, noise, strict=True):
-            e -= part * own
+        for part, v in zip(V, noise, strict=True):
+            e -= part * v
         for j in reversed(range(len(V))):
             for i in range(j + 1, len(V)):
                 noise[j] -= factor[i, j].conj() * noise[i]

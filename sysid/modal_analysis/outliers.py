@@ -71,17 +71,17 @@ Flags = NDArray[np.bool_]
 class Whitened(NamedTuple):
     """Misfit of a record in units of its noise, and these units, (runs, channels, n_freq).
 
-    `own` tells which lines are a run's own, (runs, n_freq).
+    `lines` are a run's own, (runs, n_freq).
     """
 
     u: ComplexArray
     std: Array
-    own: Flags
+    lines: Flags
 
     @property
     def numbers(self) -> ComplexArray:
         """Those of `u` at each run's own lines, one after the other."""
-        return at_own_lines(self.u, self.own)
+        return at_own_lines(self.u, self.lines)
 
 
 class Outlier(NamedTuple):
@@ -97,7 +97,7 @@ class Outlier(NamedTuple):
     size: float
 
 
-def whitened(test: Measurement, made: Sequence[ComplexArray], unknowns: int) -> list[Whitened]:
+def whitened(test: Measurement, fitted: Sequence[ComplexArray], unknowns: int) -> list[Whitened]:
     """Misfits of accelerations and, where measured, force, by stated deviations or a robust one of each record.
 
     The latter follows from the median of |u|², ln 2 for normal noise, and so does a factor of stated deviations that
@@ -105,30 +105,30 @@ def whitened(test: Measurement, made: Sequence[ComplexArray], unknowns: int) -> 
 
     Parameters
     ----------
-    made : sequence of (runs, channels, n_freq)
+    fitted : sequence of (runs, channels, n_freq)
         What a model makes of relative accelerations and of the force.
     """
-    found = [(test.response, test.relative - made[0], test.response_std)]
+    found = [(test.response, test.relative - fitted[0], test.response_std)]
     if test.force is not None:
-        found.append((test.force, test.force - made[1], test.force_std))
-    of_own = lambda record: at_own_lines(record, test.own_lines)  # noqa: E731
+        found.append((test.force, test.force - fitted[1], test.force_std))
+    numbers = lambda record: at_own_lines(record, test.own_lines)  # noqa: E731
     left = max(1 - unknowns / (2 * test.numbers), 0.5)
     squares, stds = [], []
     for record, misfit, stated in found:
-        least = ROUND_OFF * float(np.sqrt(np.mean(np.abs(of_own(record)) ** 2)))
-        robust = np.sqrt(np.median(np.abs(of_own(misfit)) ** 2) / np.log(2) / left) if stated is None else stated
+        least = ROUND_OFF * float(np.sqrt(np.mean(np.abs(numbers(record)) ** 2)))
+        robust = np.sqrt(np.median(np.abs(numbers(misfit)) ** 2) / np.log(2) / left) if stated is None else stated
         stds.append(np.broadcast_to(np.maximum(robust, least), record.shape))
         if stated is not None:
-            squares.append(np.abs(of_own(misfit / stds[-1])) ** 2)
+            squares.append(np.abs(numbers(misfit / stds[-1])) ** 2)
     # Without a jump, at which rounds of a fit would turn to and fro.
     more = np.sqrt(max(1.0, float(np.median(np.concatenate(squares))) / np.log(2) / left / SUSPECT)) if squares else 1.0
     stds = [std if stated is None else more * std for std, (*_, stated) in zip(stds, found, strict=True)]
     return [Whitened(misfit / std, std, test.own_lines) for std, (_, misfit, _) in zip(stds, found, strict=True)]
 
 
-def at_own_lines(record: ComplexArray, own: Flags) -> ComplexArray:
+def at_own_lines(record: ComplexArray, lines: Flags) -> ComplexArray:
     """Numbers of a record (runs, channels, n_freq) at each run's own lines (runs, n_freq), one after the other."""
-    return record.transpose(0, 2, 1)[own].ravel()
+    return record.transpose(0, 2, 1)[lines].ravel()
 
 
 def predicted(test: Measurement, structure: Structure) -> list[ComplexArray]:
@@ -168,7 +168,7 @@ def pseudo_values(fits: Sequence[tuple[Measurement, list[ComplexArray]]], unknow
     Least squares of them, repeated, end where Huber's loss is least, and their covariance is its own. All tests share
     one mean slope, so that they count by their noise alone.
     """
-    every = [(test, made, whitened(test, made, unknowns)) for test, made in fits]
+    every = [(test, fitted, whitened(test, fitted, unknowns)) for test, fitted in fits]
     u = np.concatenate([part.numbers for *_, parts in every for part in parts])
     w = weight(u)
     slopes = np.where(w < 1, w / 2, 1.0)
@@ -176,12 +176,12 @@ def pseudo_values(fits: Sequence[tuple[Measurement, list[ComplexArray]]], unknow
     spread = np.sqrt(np.mean(np.abs(w * u) ** 2) / max(1 - share, 0.5)) / slope
     spread *= 1 + share * np.var(slopes) / slope**2
     changed = []
-    for test, made, parts in every:
-        values = [f + part.std * weight(part.u) * part.u / slope for f, part in zip(made, parts, strict=True)]
+    for test, fitted, parts in every:
+        values = [f + part.std * weight(part.u) * part.u / slope for f, part in zip(fitted, parts, strict=True)]
         # As in squares, what is stated is raised where the records show more, and is never lowered.
         stated = test.response_std, test.force_std
         stds = [
-            part.std * (spread if own is None else max(spread, 1.0)) for part, own in zip(parts, stated, strict=False)
+            part.std * (spread if std is None else max(spread, 1.0)) for part, std in zip(parts, stated, strict=False)
         ]
         other = replace(test, response=test.response - test.relative + values[0], response_std=stds[0])
         changed.append(other if test.force is None else replace(other, force=values[1], force_std=stds[1]))
@@ -199,8 +199,8 @@ def stand_alone(
     not judged: its misfit stands alone too.
     """
     flags = _beyond_neighbours(part, times=times, known=known)
-    for run, own in enumerate(part.own):
-        flags[run][:, own] &= ~_in_doubt(freq[own], omega, ratios)
+    for run, lines in enumerate(part.lines):
+        flags[run][:, lines] &= ~_in_doubt(freq[lines], omega, ratios)
     return flags
 
 
@@ -209,17 +209,17 @@ def _beyond_neighbours(part: Whitened, *, times: float, known: Flags | None = No
     size = np.abs(part.u)
     others = size if known is None else np.where(known, 0.0, size)
     flags: Flags = np.zeros(size.shape, dtype=bool)
-    for run, own in enumerate(part.own):
-        n_freq = np.count_nonzero(own)
+    for run, lines in enumerate(part.lines):
+        n_freq = np.count_nonzero(lines)
         if n_freq < _LEAST_LINES:
             continue
         here = np.arange(n_freq)
         first = np.clip(here - 2, 0, n_freq - 5)
-        near_by = others[run][:, own][:, first[:, None] + np.arange(5)]
+        near_by = others[run][:, lines][:, first[:, None] + np.arange(5)]
         near_by[:, here, here - first] = np.inf
         beside = np.sort(near_by, axis=-1)[..., 2]  # of four the last but one: another outlier may be among them
-        its = size[run][:, own]
-        flags[run][:, own] = (its > largest_modulus(CANDIDATES)) & (its > times * beside)
+        its = size[run][:, lines]
+        flags[run][:, lines] = (its > largest_modulus(CANDIDATES)) & (its > times * beside)
     return flags
 
 
@@ -266,13 +266,13 @@ def _screened(test: Measurement, monitor: Monitor | None) -> tuple[Measurement, 
         fit = _poles(clean, monitor)
         if fit is None:
             break
-        made = _bounded_fit(test, fit)
-        parts, before = whitened(test, made, 2 * fit.omega.size), flags
+        fitted = _bounded_fit(test, fit)
+        parts, before = whitened(test, fitted, 2 * fit.omega.size), flags
         flags = [
             stand_alone(part, test.freq, fit.omega, fit.ratios, known=known)
             for part, known in zip(parts, before, strict=False)
         ]
-        clean = _replaced(test, made, flags)
+        clean = _replaced(test, fitted, flags)
         if clean is test or all(np.array_equal(now, then) for now, then in zip(flags, before, strict=False)):
             break
     return clean, fit
@@ -286,7 +286,7 @@ def _without_absorbed(
     Each line that decides a residue is left out, and predicted by poles of what is left of the `clean` records. What
     they miss there is alike in all channels and runs, a multiple of how each mode shows in them, but for outliers.
     """
-    parts = whitened(clean, _made(fit, test.freq, test.base), 2 * fit.omega.size)
+    parts = whitened(clean, _predicted(fit, test.freq, test.base), 2 * fit.omega.size)
     stds = np.concatenate([part.std for part in parts], axis=1)
     recorded = clean.relative if clean.force is None else np.concatenate([clean.relative, clean.force], axis=1)
     off = np.zeros_like(recorded)
@@ -300,12 +300,12 @@ def _without_absorbed(
             continue
         other = PolesAndResidues.at(rest, records, omega, ratios)
         base, std = test.base[:, :, [line]], stds[:, :, line]
-        made = np.concatenate(_made(other, test.freq[[line]], base), axis=1)
-        misfit = (recorded[:, :, line] - made[:, :, 0]) / std
+        fitted = np.concatenate(_predicted(other, test.freq[[line]], base), axis=1)
+        misfit = (recorded[:, :, line] - fitted[:, :, 0]) / std
         heights = _heights(test.freq, omega, ratios)
         near = np.flatnonzero(heights[:, line] > _NEAR_TOP * heights.max(axis=1))
-        shown = other.shown(base[:, :, 0], near) / std
-        flags, left = _unlike_others(misfit.ravel(), shown.reshape(near.size, std.size).T)
+        contributions = other.contributions(base[:, :, 0], near) / std
+        flags, left = _unlike_others(misfit.ravel(), contributions.reshape(near.size, std.size).T)
         off[:, :, line] = np.where(flags, left, 0.0).reshape(std.shape)
     # An outlier spoils what is made of the lines beside it: one in each record at a time.
     size = np.abs(off)
@@ -323,21 +323,21 @@ def _replaced(test: Measurement, values: Sequence[ComplexArray], flags: Sequence
     return changed if test.force is None else replace(changed, force=np.where(flags[1], values[1], test.force))
 
 
-def _unlike_others(misfit: ComplexArray, shown: ComplexArray) -> tuple[Flags, ComplexArray]:
-    """Which of the whitened misfits (N,) at a line are no multiple of modes `shown` (N, k), and what that leaves (N,).
+def _unlike_others(misfit: ComplexArray, contributions: ComplexArray) -> tuple[Flags, ComplexArray]:
+    """Which of the whitened misfits (N,) at a line are no multiple of `contributions` (N, k); what that leaves (N,).
 
     Each is compared with what all others suggest by Huber's loss, the farthest first.
     """
     flags: Flags = np.zeros(misfit.size, dtype=bool)
     left = misfit
-    while np.count_nonzero(~flags) > shown.shape[1] + 3:  # too few to compare with
+    while np.count_nonzero(~flags) > contributions.shape[1] + 3:  # too few to compare with
         farthest, size, left_by = -1, _CERTAIN, left
         for j in np.flatnonzero(~flags):
             others = ~flags
             others[j] = False
-            now = misfit - shown @ _robust(shown[others], misfit[others])
+            now = misfit - contributions @ _robust(contributions[others], misfit[others])
             scale = max(1.0, float(np.median(np.abs(now[others]))) / np.sqrt(np.log(2)))
-            spread = np.linalg.lstsq(shown[others].T, shown[j], rcond=None)[0]
+            spread = np.linalg.lstsq(contributions[others].T, contributions[j], rcond=None)[0]
             its = float(np.abs(now[j])) / (scale * float(np.hypot(1.0, np.linalg.norm(spread))))
             if its > size:
                 farthest, size, left_by = int(j), its, now
@@ -347,12 +347,12 @@ def _unlike_others(misfit: ComplexArray, shown: ComplexArray) -> tuple[Flags, Co
     return flags, left
 
 
-def _robust(shown: ComplexArray, misfit: ComplexArray) -> ComplexArray:
+def _robust(functions: ComplexArray, misfit: ComplexArray) -> ComplexArray:
     """Multiples (k,) of the columns that are nearest to a misfit by Huber's loss, with 1 in the place of `TUNING`."""
     root = np.ones(misfit.size)
     for _ in range(_STEPS):
-        many: ComplexArray = np.linalg.lstsq(shown * root[:, None], misfit * root, rcond=None)[0]
-        root = 1 / np.sqrt(np.maximum(np.abs(misfit - shown @ many), 1.0))
+        many: ComplexArray = np.linalg.lstsq(functions * root[:, None], misfit * root, rcond=None)[0]
+        root = 1 / np.sqrt(np.maximum(np.abs(misfit - functions @ many), 1.0))
     return many
 
 
@@ -363,19 +363,19 @@ def _bounded_fit(test: Measurement, fit: PolesAndResidues) -> list[ComplexArray]
     all: at the lines that decide a residue even a bounded pull moves all that is near.
     """
     for step in range(_BOUNDED + _FREED):
-        made = _made(fit, test.freq, test.base)
+        fitted = _predicted(fit, test.freq, test.base)
         if step < _BOUNDED:
-            other = pseudo_values([(test, made)], 2 * fit.omega.size)[0]
+            other = pseudo_values([(test, fitted)], 2 * fit.omega.size)[0]
         else:
-            parts = whitened(test, made, 2 * fit.omega.size)
-            other = _replaced(test, made, [_beyond_neighbours(part, times=_BEHIND) for part in parts])
+            parts = whitened(test, fitted, 2 * fit.omega.size)
+            other = _replaced(test, fitted, [_beyond_neighbours(part, times=_BEHIND) for part in parts])
             if other is test:
-                return made
+                return fitted
         fit = PolesAndResidues.at(other, Records(other), fit.omega, fit.ratios)
-    return _made(fit, test.freq, test.base)
+    return _predicted(fit, test.freq, test.base)
 
 
-def _made(fit: PolesAndResidues, freq: Array, base: ComplexArray) -> list[ComplexArray]:
+def _predicted(fit: PolesAndResidues, freq: Array, base: ComplexArray) -> list[ComplexArray]:
     """What poles and residues make of relative accelerations and, where it was measured, of the force."""
     return [part for part in fit.records(freq, base) if part is not None]
 
@@ -396,9 +396,9 @@ def _is_one_number(test: Measurement, records: Records, omega: Array, ratios: Ar
     """Whether pole k, which stands at one line, shows there in one channel only, or explains nothing at other lines."""
     fit = PolesAndResidues.at(test, records, omega, ratios)
     highest = int(np.argmax(_heights(test.freq, omega[[k]], ratios[[k]])))
-    shown = np.einsum("sd,rd->rs", fit.residues[k] + 1j * fit.quadrature[k], test.base[:, :, highest])
+    residue = np.einsum("sd,rd->rs", fit.residues[k] + 1j * fit.quadrature[k], test.base[:, :, highest])
     std = 1.0 if test.response_std is None else np.maximum(test.response_std[:, :, highest], _TINY)
-    power = np.abs(shown / std) ** 2
+    power = np.abs(residue / std) ** 2
     if power.size > 1 and power.max() > _ONE_CHANNEL * power.sum():
         return True
     others = Records(test.at(np.arange(test.freq.size) != highest))

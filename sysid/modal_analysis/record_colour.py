@@ -43,13 +43,13 @@ def designs(middles: Array, ends: tuple[float, float], varies: NDArray[np.bool_]
         return [np.eye(varies.size)] * middles.size
     shape = hats(middles, *ends)
     first = np.concatenate([[0], np.cumsum(np.where(varies, KNOTS, 1))])
-    made = []
+    matrices = []
     for row in shape:
         D = np.zeros((varies.size, first[-1]))
-        for channel, own in enumerate(varies):
-            D[channel, first[channel] : first[channel + 1]] = row if own else 1.0
-        made.append(D)
-    return made
+        for channel, varying in enumerate(varies):
+            D[channel, first[channel] : first[channel + 1]] = row if varying else 1.0
+        matrices.append(D)
+    return matrices
 
 
 def extra_numbers(varying: NDArray[np.bool_] | None) -> int:

@@ -105,10 +105,10 @@ class RecordFit:
         spread = 0.0
         for chunk in model.chunks(self.parameters):
             T = chunk.H
-            own = self.levels[chunk.run.piece]
-            inner = np.einsum("cil,cjl,c->lij", T.conj(), T, 1 / own[:c]) * own[c:]
+            variances = self.levels[chunk.run.piece]
+            inner = np.einsum("cil,cjl,c->lij", T.conj(), T, 1 / variances[:c]) * variances[c:]
             spread += float(np.sum(np.linalg.slogdet(inner + np.eye(inner.shape[1]))[1]))
-            spread += T.shape[-1] * float(np.sum(np.log(own[:c] * chunk.run.density)))
+            spread += T.shape[-1] * float(np.sum(np.log(variances[:c] * chunk.run.density)))
         return -spread - self.chi2
 
     def information(self) -> Array:
@@ -333,17 +333,17 @@ def worth(fit: RecordFit, normal: Array | None = None) -> Array:
     m, n, index = model.m, model.n, model.index
     out = np.zeros(m)
     for k in range(m):
-        own = index.phi.start + np.arange(n) * m + k
+        of_shape = index.phi.start + np.arange(n) * m + k
         # With its shape at zero neither participation, pole nor transient of a mode show.
         gone = np.concatenate([
             index.gamma.start + k * model.d + np.arange(model.d),
             [index.log_omega.start + k, index.log_ratios.start + k],
             model.kept + k * (model.n_ends // m) + np.arange(model.n_ends // m),
         ])  # fmt: skip
-        others = np.setdiff1d(np.arange(model.size), np.concatenate([own, gone]))
+        others = np.setdiff1d(np.arange(model.size), np.concatenate([of_shape, gone]))
         inner = scaled[np.ix_(others, others)] + 1e-10 * np.eye(others.size)
-        cross = scaled[np.ix_(others, own)]
-        left = scaled[np.ix_(own, own)] - cross.T @ np.linalg.solve(inner, cross)
-        phi = np.divide(p.modes.phi[:, k], unit[own], out=np.zeros(n), where=unit[own] > 0)
+        cross = scaled[np.ix_(others, of_shape)]
+        left = scaled[np.ix_(of_shape, of_shape)] - cross.T @ np.linalg.solve(inner, cross)
+        phi = np.divide(p.modes.phi[:, k], unit[of_shape], out=np.zeros(n), where=unit[of_shape] > 0)
         out[k] = phi @ left @ phi
     return out

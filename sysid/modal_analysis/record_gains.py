@@ -17,12 +17,12 @@ def gain_errors_of(fit: RecordFit) -> Gains:
     Once with that part and once without it: by how much the two differ counts among the errors of the second, and the
     better known of both is taken. Motion with the base in any of its directions is asked for without it.
     """
-    made, G = fit.equations, fit.test.rigid_body
+    equations, G = fit.equations, fit.test.rigid_body
     (n, d), at = G.shape, fit.model.size  # what is asked for comes behind all that was fitted
     beyond = max(fit.reduced, 1.0)
     along = scipy.linalg.block_diag(np.eye(at), scipy.linalg.block_diag(*G[:, :, None]), np.eye(n * d))
-    normal, size = unit_diagonal(along.T @ made.normal @ along)
-    gradient = along.T @ made.gradient / size
+    normal, size = unit_diagonal(along.T @ equations.normal @ along)
+    gradient = along.T @ equations.gradient / size
 
     def estimate(count: int) -> tuple[Array, Array]:
         half = half_inverse(normal[:count, :count], ROUND_OFF)
@@ -49,12 +49,12 @@ def gain_errors_of(fit: RecordFit) -> Gains:
 
 def _rigid(fit: RecordFit, beyond: float) -> tuple[Array, Array]:
     """Share of the base's motion in each sensor beside what G says, (n_sensors, d), and its chi-squared of each."""
-    made, (n, d), at = fit.equations, fit.test.rigid_body.shape, fit.model.size
+    equations, (n, d), at = fit.equations, fit.test.rigid_body.shape, fit.model.size
     count = at + n * d
-    normal, size = unit_diagonal(made.normal[:count, :count])
+    normal, size = unit_diagonal(equations.normal[:count, :count])
     half = half_inverse(normal, ROUND_OFF)
-    step = (half @ (half.T @ (made.gradient[:count] / size)))[at:].reshape(n, d)
-    own = half[at:].reshape(n, d, -1)
-    covariance = beyond / 2 * own @ own.swapaxes(1, 2)
+    step = (half @ (half.T @ (equations.gradient[:count] / size)))[at:].reshape(n, d)
+    inverse_rows = half[at:].reshape(n, d, -1)
+    covariance = beyond / 2 * inverse_rows @ inverse_rows.swapaxes(1, 2)
     chi2 = np.einsum("ni,nij,nj->n", step, np.linalg.pinv(covariance, rcond=ROUND_OFF, hermitian=True), step)
     return step / size[at:].reshape(n, d), chi2

@@ -98,10 +98,10 @@ class RecordModel(SpectralModel):
         outputs = test.response if test.force is None else np.concatenate([test.response, test.force], axis=1)
         runs = [
             Run(
-                2 * np.pi * test.freq[own], test.base[r][:, own], outputs[r][:, own], float(self.whole.density[r]), r,
-                np.ones(np.count_nonzero(own)), r,
+                2 * np.pi * test.freq[mask], test.base[r][:, mask], outputs[r][:, mask], float(self.whole.density[r]),
+                r, np.ones(np.count_nonzero(mask)), r,
             )
-            for r, own in enumerate(test.own_lines)
+            for r, mask in enumerate(test.own_lines)
         ]  # fmt: skip
         if self.whole.varying is not None:
             cut = [run.at(lines) for run in runs for lines in pieces(run.w)]
@@ -194,11 +194,11 @@ class RecordModel(SpectralModel):
                 columns = chunk.columns()
                 found[piece] = columns, chunk.deviations(levels)[0], of_chunk(chunk, levels, columns)
         for columns, scale, sums in found.values():
-            made, at = columns.products(sums, scale), columns.unknowns
-            if made.normal.size:
-                normal[np.ix_(at, at)] += made.normal
-            gradient[at] += made.gradient
-            chi2 += made.chi2
+            products, at = columns.products(sums, scale), columns.unknowns
+            if products.normal.size:
+                normal[np.ix_(at, at)] += products.normal
+            gradient[at] += products.gradient
+            chi2 += products.chi2
         return Shift(normal, gradient, chi2)
 
 
@@ -249,7 +249,7 @@ class Chunk(Lines):
         model = self.records
         n, m, d, index = model.n, model.m, model.d, model.index
         k = np.arange(m)
-        shown = self.shown[channel]
+        shapes = self.shapes[channel]
         spectra = m + m * d + 2 * m + d + 2 * m * (self.at_ends is not None) + TRACES + d * model.gains
         C = np.zeros((model.size, spectra))
 
@@ -264,18 +264,18 @@ class Chunk(Lines):
             for at, (a, b) in enumerate(index.pairs):
                 if channel - n in (a, b):
                     put(index.rigid[[at]], np.array([first[3] + (b if channel - n == a else a)]), np.ones(1))
-        put(index.gamma.start + np.arange(m * d), first[1] + np.arange(m * d), np.repeat(shown, d))
-        put(index.log_omega.start + k, first[2] + k, shown)
-        put(index.log_ratios.start + k, first[2] + m + k, shown)
+        put(index.gamma.start + np.arange(m * d), first[1] + np.arange(m * d), np.repeat(shapes, d))
+        put(index.log_omega.start + k, first[2] + k, shapes)
+        put(index.log_ratios.start + k, first[2] + m + k, shapes)
         last = first[4]
         if self.at_ends is not None:
             two = np.arange(2)
             runs = 2 * len(model.moving)
             row = model.kept + k[:, None] * runs + self.at_ends.start + two
-            put(row, last + 2 * k[:, None] + two, np.repeat(shown, 2).reshape(m, 2))
+            put(row, last + 2 * k[:, None] + two, np.repeat(shapes, 2).reshape(m, 2))
             last = last + 2 * m
-        own = model.kept + model.n_ends + (self.run.number * model.channels + channel) * TRACES
-        put(own + np.arange(TRACES), last + np.arange(TRACES), np.ones(TRACES))
+        first_trace = model.kept + model.n_ends + (self.run.number * model.channels + channel) * TRACES
+        put(first_trace + np.arange(TRACES), last + np.arange(TRACES), np.ones(TRACES))
         last = last + TRACES
         if model.gains:
             beside = np.arange(d)

@@ -79,8 +79,8 @@ def _designs(model: RecordModel, number: int, channels: int) -> dict[int, Array]
     varying = model.whole.varying
     varies = np.zeros(channels, bool) if varying is None else varying[number]
     ends = float(runs[0].w[0]), float(runs[-1].w[-1])
-    made = designs(np.array([np.mean(run.w) for run in runs]), ends, varies)
-    return {run.piece: one for run, one in zip(runs, made, strict=True)}
+    matrices = designs(np.array([np.mean(run.w) for run in runs]), ends, varies)
+    return {run.piece: one for run, one in zip(runs, matrices, strict=True)}
 
 
 class ErrorSpectra(NamedTuple):
@@ -131,9 +131,9 @@ def _likelihood(parts: list[ErrorSpectra], D: dict[int, Array], x: Array) -> tup
         TGT = np.einsum("lcd,lce->lde", T.conj(), GT)
         TGe = np.einsum("lcd,lc->ld", T.conj(), Ge)
         value -= float(np.sum(np.linalg.slogdet(S)[1]) + np.sum(np.einsum("lc,lc->l", e.conj(), Ge).real))
-        own = np.concatenate([np.abs(Ge) ** 2 - np.einsum("lcc->lc", G).real,
+        excess = np.concatenate([np.abs(Ge) ** 2 - np.einsum("lcc->lc", G).real,
                               np.abs(TGe) ** 2 - np.einsum("ldd->ld", TGT).real], axis=1)  # fmt: skip
-        score += D[piece].T @ (density * v * own.sum(axis=0))
+        score += D[piece].T @ (density * v * excess.sum(axis=0))
         between = np.sum(np.abs(GT) ** 2, axis=0)
         pairs = np.block([[np.sum(np.abs(G) ** 2, axis=0), between], [between.T, np.sum(np.abs(TGT) ** 2, axis=0)]])
         fisher += D[piece].T @ (density**2 * np.outer(v, v) * pairs) @ D[piece]

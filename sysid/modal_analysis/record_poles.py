@@ -19,8 +19,8 @@ def few_lines(test: Measurement, a_width: int = 6, ratio: float = 0.005) -> NDAr
     So many in a half-power width of a mode of this damping ratio; all of them where that would not save half.
     """
     keep = np.zeros(test.freq.size, bool)
-    for own in test.own_lines:
-        lines = np.flatnonzero(own)
+    for mask in test.own_lines:
+        lines = np.flatnonzero(mask)
         step = np.gradient(test.freq[lines]) / test.freq[lines] * a_width / (2 * ratio)
         at = np.floor(np.cumsum(np.minimum(step, 1.0)))
         keep[lines[np.append(np.flatnonzero(np.diff(at, prepend=-1.0) > 0), -1)]] = True
@@ -37,8 +37,8 @@ def rough_deviations(test: Measurement) -> Array:
     base, response = _smooth(power(test.base)), _smooth(power(test.response))
     base = np.sum(base, axis=1, keepdims=True)
     gain = response / np.where(base > 0, base, np.inf)
-    own = mean(test.response)[:, None]
-    return np.sqrt(own + gain * np.sum(mean(test.base)))
+    of_response = mean(test.response)[:, None]
+    return np.sqrt(of_response + gain * np.sum(mean(test.base)))
 
 
 def _smooth(power: Array, width: int = 5) -> Array:

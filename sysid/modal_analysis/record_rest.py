@@ -50,9 +50,9 @@ def _moving(fit: RecordFit, runs: tuple[int, ...]) -> tuple[RecordFit, Parameter
 def _score(fit: RecordFit, p: Parameters) -> tuple[float, int]:
     """Chi-squared of all that the unknowns could still explain, and its degrees of freedom beyond those of the fit."""
     model = RecordModel(fit.test, p.modes.omega.size)
-    made = model.normal_equations(p, fit.levels)
-    N, size = unit_diagonal(made.normal)
-    gradient = made.gradient / size
+    equations = model.normal_equations(p, fit.levels)
+    N, size = unit_diagonal(equations.normal)
+    gradient = equations.gradient / size
     added = np.zeros(model.size, bool)
     ends = np.zeros(p.ends.shape, bool)
     ends[:, np.all(p.ends == 0, axis=0)] = True

@@ -50,12 +50,12 @@ def scatter_over_blocks(fit: RecordFit, partitions: int = 4) -> Array:
     meat = np.zeros((half.shape[1],) * 2)
     columns = [Chunk(model, p, run.at(slice(0, 1))).columns() for run in model.runs]
     for shift in np.arange(partitions) / partitions:
-        for run, own in zip(model.runs, columns, strict=True):
-            at = size[own.unknowns]
+        for run, run_columns in zip(model.runs, columns, strict=True):
+            at = size[run_columns.unknowns]
             for lines in blocks_of(run, fit, shift):
-                made = Chunk(model, p, run.at(lines)).products(fit.levels, own)
-                score = half[own.unknowns].T @ (made.gradient / at)
-                inner = half[own.unknowns].T @ (made.normal / np.outer(at, at)) @ half[own.unknowns]
+                products = Chunk(model, p, run.at(lines)).products(fit.levels, run_columns)
+                score = half[run_columns.unknowns].T @ (products.gradient / at)
+                inner = half[run_columns.unknowns].T @ (products.normal / np.outer(at, at)) @ half[run_columns.unknowns]
                 taken, turn = np.linalg.eigh(inner)
                 grown = turn @ ((turn.T @ score) / np.sqrt(1 - np.clip(taken, 0.0, _TAKEN)))
                 meat += np.outer(grown, grown) / partitions

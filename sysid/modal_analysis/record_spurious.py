@@ -20,12 +20,12 @@ _MORE = 4.0  # times what a mode must be worth where noise alone is left
 
 def without_spurious_modes(fit: RecordFit, *, monitor: Monitor | None = None) -> RecordFit:
     """The fit without spurious modes, one after the other; as it is where what is left is white noise."""
-    begun = fit
+    first = fit
     while (least := _spurious(fit)) is not None:
         # From new residues, a few steps: two modes close together may have cancelled each other.
         modes = without(fit, least).modes
         fit = record_modes(fit.test, modes.omega, modes.ratios, monitor=monitor)
-    if fit is begun:
+    if fit is first:
         return fit
     return without_spurious_modes(refitted(fit, fit.parameters, monitor=monitor), monitor=monitor)
 
@@ -49,7 +49,7 @@ def worth_beyond_misfit(fit: RecordFit) -> Array:
     powers: list[list[Array]] = [[] for _ in model.runs]  # of what is left, of all modes, and of each, (2 + m, L)
     for chunk in model.chunks(p):
         pushed = p.modes.gamma @ chunk.run.base + chunk.pushed_by_ends
-        each = (chunk.shown[:, :, None] * chunk.g * pushed).swapaxes(0, 1)  # (m, c, L)
+        each = (chunk.shapes[:, :, None] * chunk.g * pushed).swapaxes(0, 1)  # (m, c, L)
         moved_by = [None, each.sum(axis=0), *each]
         powers[chunk.run.piece].append(np.stack([chunk.weighed(fit.levels, one).power for one in moved_by]))
     whole = [np.concatenate(one, axis=1) for one in powers]
@@ -61,13 +61,13 @@ def worth_beyond_misfit(fit: RecordFit) -> Array:
         for lines, power, motion in zip(blocks, left, moved, strict=True)
     ]
     value = worth(fit, model.weighed_by(weights).normal_equations(p, fit.levels).normal)
-    told = np.hstack(
+    sums = np.hstack(
         [
             [[np.sum((weight * mode)[part]) for part in lines] for mode in modes]
             for lines, weight, modes in zip(blocks, weights, parts, strict=True)
         ]
     )  # (m, blocks)
-    return np.asarray(value * (1 - told.max(axis=1) / told.sum(axis=1)))
+    return np.asarray(value * (1 - sums.max(axis=1) / sums.sum(axis=1)))
 
 
 def _by_block(blocks: list[NDArray[np.intp]], power: Array, channels: int) -> Array:

@@ -52,15 +52,15 @@ def varying_levels(fit: RecordFit) -> tuple[VaryingLevel, ...]:
     varying = fit.model.whole.varying
     if varying is None:
         return ()
-    made = []
+    found = []
     for number, channel in np.argwhere(varying):
         rows = [run.piece for run in fit.model.runs if run.number == number]
-        own = np.sqrt(fit.levels[rows, channel])
-        made.append(VaryingLevel(int(channel), int(number), float(own.min()), float(own.max())))
-    return tuple(made)
+        std = np.sqrt(fit.levels[rows, channel])
+        found.append(VaryingLevel(int(channel), int(number), float(std.min()), float(std.max())))
+    return tuple(found)
 
 
-def untold_levels(fit: RecordFit) -> tuple[tuple[int, int], ...]:
+def unidentifiable_levels(fit: RecordFit) -> tuple[tuple[int, int], ...]:
     """Run and channel of levels that were found and that the records do not determine; none where there is no noise."""
     assert fit.test.whole is not None
     outputs = fit.test.response if fit.test.force is None else np.concatenate([fit.test.response, fit.test.force], 1)

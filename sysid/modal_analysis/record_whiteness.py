@@ -30,8 +30,8 @@ def excess_of(fit: RecordFit) -> tuple[Excess, ...]:
     bands = sum(_count(power.shape[1]) * len(power) for power in powers)
     found: list[tuple[float, Excess]] = []
     levels = np.sqrt(fit.levels_of_runs)
-    for number, (own, power) in enumerate(zip(test.own_lines, powers, strict=True)):
-        freq, runs = test.freq[own], [run for run in model.runs if run.number == number]
+    for number, (lines, power) in enumerate(zip(test.own_lines, powers, strict=True)):
+        freq, runs = test.freq[lines], [run for run in model.runs if run.number == number]
         both = np.concatenate([np.vstack([run.outputs, run.base]) for run in runs], axis=1)
         size = np.sqrt(np.mean(np.abs(both) ** 2, axis=1) / runs[0].density)
         for channel in np.flatnonzero(levels[number] > NO_NOISE * size):
@@ -50,10 +50,10 @@ def noise_powers(fit: RecordFit) -> list[Array]:
     parts: list[list[Array]] = [[] for _ in range(fit.test.n_runs)]
     for chunk in fit.model.chunks(fit.parameters):
         _, _, seen, inverse = chunk.weighed_errors(fit.levels)
-        own = np.einsum("ccl->cl", inverse).real
+        of_outputs = np.einsum("ccl->cl", inverse).real
         base = np.einsum("cdl,cl->dl", chunk.H.conj(), seen)
         of_base = np.einsum("cdl,cel,edl->dl", chunk.H.conj(), inverse, chunk.H, optimize=True).real
-        both, size = np.abs(np.concatenate([seen, base])) ** 2, np.concatenate([own, of_base])
+        both, size = np.abs(np.concatenate([seen, base])) ** 2, np.concatenate([of_outputs, of_base])
         parts[chunk.run.number].append(both / np.where(size > 0, size, np.inf))
     return [np.concatenate(part, axis=1) for part in parts]
 

@@ -40,8 +40,8 @@ def relocate(
     bases = []
     for base, ends, _ in blocks:
         tell()
-        made = [(numerators[:, None] * base).reshape(-1, w.size), (g[:, None] * ends).reshape(-1, w.size)]
-        basis, _ = unit_columns(stacked(np.concatenate(made)))
+        functions = [(numerators[:, None] * base).reshape(-1, w.size), (g[:, None] * ends).reshape(-1, w.size)]
+        basis, _ = unit_columns(stacked(np.concatenate(functions)))
         bases.append(np.linalg.qr(basis)[0])
     few = sum(len(channels) for *_, channels in blocks) <= _FEW
     rows = None if few else _rows_by_squares(blocks, bases, sigma, tell)

@@ -134,11 +134,11 @@ class Records:
             self.channel = channel
         self.blocks = blocks
         # Whole records of other lengths have zeros at the lines of one another, which tell nothing.
-        own = [np.any(inputs != 0, axis=0) | np.any(records != 0, axis=0) for inputs, records in blocks]
-        self.run, self.line = np.nonzero(own)
-        self.base = np.concatenate([inputs[:, lines] for (inputs, _), lines in zip(blocks, own, strict=True)], axis=1)
-        shown = [records[:, lines] for (_, records), lines in zip(blocks, own, strict=True)]
-        self.data = stacked(np.concatenate(shown, axis=1))
+        used = [np.any(inputs != 0, axis=0) | np.any(records != 0, axis=0) for inputs, records in blocks]
+        self.run, self.line = np.nonzero(used)
+        self.base = np.concatenate([inputs[:, lines] for (inputs, _), lines in zip(blocks, used, strict=True)], axis=1)
+        blocks_of_data = [records[:, lines] for (_, records), lines in zip(blocks, used, strict=True)]
+        self.data = stacked(np.concatenate(blocks_of_data, axis=1))
         self.size = float(np.sum(self.data**2))
 
     def basis(self, gains: ComplexArray, inputs: int | None = None) -> Array:

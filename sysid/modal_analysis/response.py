@@ -98,15 +98,15 @@ def residual(
     u_re, u_im = parts_of(test.base)
     q_re, q_im = modal_motion(test.base, gamma, modal_gains(omega, ratios, test.freq, shift))
     a_re, a_im = parts_of(test.relative)
-    made = [(phi @ q_re - a_re, phi @ q_im - a_im)]
+    misfits = [(phi @ q_re - a_re, phi @ q_im - a_im)]
     if test.force is not None:
         f_re, f_im = parts_of(test.force)
-        made.append(
+        misfits.append(
             tuple(gamma.T @ q + rigid_body_mass @ u - f for q, u, f in ((q_re, u_re, f_re), (q_im, u_im, f_im)))
         )
     pieces = [
         ca.DM(weight / scale) * part
-        for parts, (weight, scale) in zip(made, weights_of_test(test, weighted=weighted), strict=True)
+        for parts, (weight, scale) in zip(misfits, weights_of_test(test, weighted=weighted), strict=True)
         for part in parts
     ]
     return ca.vertcat(*(ca.vec(ca.densify(piece)) for piece in pieces))
@@ -114,13 +114,13 @@ def residual(
 
 def weighted_error(test: Measurement, structure: Structure) -> float:
     """Norm of `residual` of a structure, its records weighed by stated noise."""
-    made = [(test.relative, test.predict(structure))]
+    pairs = [(test.relative, test.predict(structure))]
     if test.force is not None:
-        made.append((test.force, test.predict_force(structure)))
+        pairs.append((test.force, test.predict_force(structure)))
     weights = weights_of_test(test, weighted=True)
     rows = [
         np.linalg.norm(weight * columns(predicted - record)) / scale
-        for (record, predicted), (weight, scale) in zip(made, weights, strict=True)
+        for (record, predicted), (weight, scale) in zip(pairs, weights, strict=True)
     ]
     return float(np.linalg.norm(rows))
 

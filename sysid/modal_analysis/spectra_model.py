@@ -181,7 +181,7 @@ class SpectraModel(SpectralModel):
             cross[piece] += dots(spectra_there, weighed.seen)
             chi2 += float(np.sum(weighed.power))
             scale[piece] = chunk.deviations(levels)[0]
-            pull = real_times(chunk.shown.T, weighed.seen)
+            pull = real_times(chunk.shapes.T, weighed.seen)
             curvature += motion_curvature(
                 chunk.run.w / (2 * np.pi), modes.omega, modes.ratios, modes.gamma, chunk.run.base, pull
             )

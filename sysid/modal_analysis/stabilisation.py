@@ -104,11 +104,11 @@ def stabilisation(test: Measurement, *, max_order: int | None = None) -> Stabili
         frequency = freq[0] * np.exp((np.angle(z) - start) / step)
         decay = -np.log(np.abs(z)) / step  # of log w_k, hence arcsin zeta_k
         inside = (frequency > (1 - BESIDE) * freq[0]) & (frequency < (1 + BESIDE) * freq[-1])
-        shown = np.flatnonzero(inside & (decay > 0) & (decay < np.arcsin(_DAMPED)))
-        shown = shown[np.argsort(frequency[shown])]
-        frequency, ratio = frequency[shown], np.sin(decay[shown])
-        found = frequency, ratio, _shapes(freq, H, frequency, ratio, participation[shown])
-        rows.append((np.full(shown.size, degree * d // 2), frequency, ratio, _level(found, before)))
+        kept = np.flatnonzero(inside & (decay > 0) & (decay < np.arcsin(_DAMPED)))
+        kept = kept[np.argsort(frequency[kept])]
+        frequency, ratio = frequency[kept], np.sin(decay[kept])
+        found = frequency, ratio, _shapes(freq, H, frequency, ratio, participation[kept])
+        rows.append((np.full(kept.size, degree * d // 2), frequency, ratio, _level(found, before)))
         before = found
     order, frequency, ratio, level = (np.concatenate(column) for column in zip(*rows, strict=True))
     return Stabilisation(order.astype(int), frequency, ratio, level.astype(int))

@@ -91,17 +91,17 @@ def stretches_of(test: Measurement, omega: Array, ratios: Array) -> list[Stretch
 
 def _stretch(piece: Piece, every: RecordFit, test: Measurement) -> Stretch:
     """Poles of one stretch, with the shapes of all."""
-    own, held = with_poles_of(every, test), with_poles_of(every, test, held=True)
-    modes, index, model = own.parameters.modes, own.model.index, own.model
+    fit, held = with_poles_of(every, test), with_poles_of(every, test, held=True)
+    modes, index, model = fit.parameters.modes, fit.model.index, fit.model
     free = np.r_[index.log_omega, index.log_ratios, model.kept : model.size]
-    N = own.normal[np.ix_(free, free)]
+    N = fit.normal[np.ix_(free, free)]
     unit = 1 / np.sqrt(np.maximum(np.diag(N), np.finfo(float).tiny))
     m, f = modes.omega.size, modes.omega / (2 * np.pi)
     variance = (
-        unit[:m] ** 2 * np.diag(np.linalg.pinv(N * np.outer(unit, unit), hermitian=True))[:m] / 2 * _noise_at_peaks(own)
+        unit[:m] ** 2 * np.diag(np.linalg.pinv(N * np.outer(unit, unit), hermitian=True))[:m] / 2 * _noise_at_peaks(fit)
     )
     std = f * np.sqrt(np.where(variance > 0, variance, np.inf))  # round-off, of a mode that shows nowhere
-    return Stretch(piece.number, piece.start, piece.end, f, std, _levels(own), _left(own), _left(held))
+    return Stretch(piece.number, piece.start, piece.end, f, std, _levels(fit), _left(fit), _left(held))
 
 
 def _noise_at_peaks(fit: RecordFit, about: int = 12, explained: int = 2) -> Array:
@@ -115,8 +115,8 @@ def _noise_at_peaks(fit: RecordFit, about: int = 12, explained: int = 2) -> Arra
     modes, parts = fit.parameters.modes, []
     for chunk in fit.model.chunks(fit.parameters):
         slope = np.abs(chunk.g**2 * (modes.gamma @ chunk.run.base + chunk.pushed_by_ends)) ** 2
-        own, _ = chunk.deviations(fit.levels)
-        passed = np.sum(np.abs(chunk.H) ** 2 * (own**2)[:, None, None], axis=(0, 1))
+        inverse_std, _ = chunk.deviations(fit.levels)
+        passed = np.sum(np.abs(chunk.H) ** 2 * (inverse_std**2)[:, None, None], axis=(0, 1))
         parts.append(np.vstack([chunk.run.w, chunk.weighed(fit.levels).power, passed, slope]))
     w, left, passed, *slopes = np.concatenate(parts, axis=1)
     weight = np.array(slopes) / np.maximum(np.sum(slopes, axis=1, keepdims=True), np.finfo(float).tiny)
@@ -145,15 +145,15 @@ def _levels(fit: RecordFit) -> Array:
 
 def _pieces(runs: list[RunInTime], shortest: float, most: int = 12) -> list[Piece]:
     """Stretches of the runs of a test, each of `shortest` seconds or longer, `most` of a run."""
-    made = []
+    pieces = []
     for number, run in enumerate(runs):
         n = run.base.shape[1]
         count = int(np.clip(n / run.rate / shortest, 1, most))
         for i in range(count):
             part = slice(i * (n // count), (i + 1) * (n // count))
             records = TimeRun(run.base[:, part], run.response[:, part], None)
-            made.append(Piece(number, part.start / run.rate, part.stop / run.rate, records))
-    return made
+            pieces.append(Piece(number, part.start / run.rate, part.stop / run.rate, records))
+    return pieces
 
 
 def _as_test(

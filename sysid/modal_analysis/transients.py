@@ -27,36 +27,36 @@ def without_transients_of(test: Measurement, structure: Structure) -> Measuremen
     square, once = (w**2)[:, None, None], w[:, None, None]
     X = np.linalg.inv(-square * M + 1j * once * structure.damping + K)  # (L, n, n)
     both = np.concatenate([X, 1j * once * X], axis=2)
-    shown = structure.recovery @ both
+    transients = structure.recovery @ both
     if test.force is not None:
         push = M @ structure.rigid_body_dofs + structure.mass[:n, n:]
-        shown = np.concatenate([shown, push.T @ both], axis=1)
+        transients = np.concatenate([transients, push.T @ both], axis=1)
     left = test.response - np.einsum("sd,rdf->rsf", test.rigid_body, test.base) - test.predict(structure)
     if test.force is not None:
         left = np.concatenate([left, test.force - test.predict_force(structure)], axis=1)
     taken = np.zeros_like(left)
-    shown = np.moveaxis(shown, 0, -1)  # (c, 2 n, L)
-    for run, (own, rest) in enumerate(zip(test.own_lines, test.whole.at_rest, strict=True)):
-        of_ends = shown[:, :0] if rest else shown
-        taken[run][:, own] = _fitted(left[run][:, own], of_ends[..., own], w[own] / w[-1])
+    transients = np.moveaxis(transients, 0, -1)  # (c, 2 n, L)
+    for run, (lines, rest) in enumerate(zip(test.own_lines, test.whole.at_rest, strict=True)):
+        of_ends = transients[:, :0] if rest else transients
+        taken[run][:, lines] = _fitted(left[run][:, lines], of_ends[..., lines], w[lines] / w[-1])
     s = test.n_sensors
     force = None if test.force is None else test.force - taken[:, s:]
     return replace(test, whole=None, response=test.response - taken[:, :s], force=force)
 
 
-def _fitted(left: ComplexArray, shown: ComplexArray, unit: Array) -> ComplexArray:
+def _fitted(left: ComplexArray, transients: ComplexArray, unit: Array) -> ComplexArray:
     """The part of what is left (c, L) that transients (c, p, L) and traces of each channel explain."""
-    _, p, lines = shown.shape
+    _, p, lines = transients.shape
     traces = stacked(np.stack([np.ones(lines) + 0j, 1j * unit, -1j / unit]))  # (2 L, 3)
     Q = np.linalg.qr(traces)[0]
     size = np.linalg.norm(left, axis=1)
     size[size == 0] = 1.0
-    rows = np.array([stacked(part) for part in shown]) / size[:, None, None]  # (c, 2 L, p)
+    rows = np.array([stacked(part) for part in transients]) / size[:, None, None]  # (c, 2 L, p)
     wanted = stacked(left).T / size[:, None]  # (c, 2 L)
     plain_rows, plain = rows - Q @ (Q.T @ rows), wanted - (wanted @ Q) @ Q.T
     scale = np.linalg.norm(plain_rows, axis=(0, 1))
     scale[scale == 0] = 1.0
     x = np.linalg.lstsq((plain_rows / scale).reshape(plain.size, p), plain.ravel(), rcond=1e-10)[0] / scale
-    made = rows @ x
-    made = (made + (wanted - made) @ Q @ Q.T) * size[:, None]
-    return made[:, :lines] + 1j * made[:, lines:]
+    explained = rows @ x
+    explained = (explained + (wanted - explained) @ Q @ Q.T) * size[:, None]
+    return explained[:, :lines] + 1j * explained[:, lines:]

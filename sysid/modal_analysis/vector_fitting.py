@@ -292,9 +292,9 @@ def _with_another(records: Records, omega: Array, ratios: Array, progress: _Prog
     loss = np.concatenate([np.tile(ratios, 4), np.full(between.size, np.median(ratios))])
     plain = records.basis(gains(records.freq, at, loss))
     size = np.linalg.norm(plain, axis=0)
-    own, with_velocity = records.fit(omega, ratios), records.fit(omega, ratios, velocity=True)
-    least = _least_gain(own)
-    for fit, to_beat in ((with_velocity, np.inf), (own, with_velocity.squared_error)):
+    without_velocity, with_velocity = records.fit(omega, ratios), records.fit(omega, ratios, velocity=True)
+    least = _least_gain(without_velocity)
+    for fit, to_beat in ((with_velocity, np.inf), (without_velocity, with_velocity.squared_error)):
         progress.tell()
         trial = plain - fit.Q @ (fit.Q.T @ plain)
         left = np.linalg.norm(trial, axis=0)

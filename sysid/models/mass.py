@@ -395,9 +395,9 @@ def _rigid_body_scales(factor: ca.SX, geometry: Geometry, totals: ca.SX | Array)
     # Total i is |sum_a s_a row_a|² with row_a = (part of r_i in group a)' L; Gram matrices hold all.
     parts = [constant(part) @ factor for part in parts_of]
     grams = [part @ part.T / totals[i] for i, part in enumerate(parts)]
-    own = ca.vertcat(*(1 / ca.sqrt(gram[i, i]) for i, gram in enumerate(grams)))
+    uncoupled = ca.vertcat(*(1 / ca.sqrt(gram[i, i]) for i, gram in enumerate(grams)))
     if not coupled:
-        return ca.vertsplit(own)
+        return ca.vertsplit(uncoupled)
     z, q = ca.SX.sym("z", d), ca.SX.sym("q", d, d * d)
     # In logarithms scales stay positive and the equations are nearly linear; long steps are cut.
     s = ca.exp(z)

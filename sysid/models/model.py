@@ -123,9 +123,9 @@ class FactoredMass(MassBlocks):
     def of(cls, whole: Any, n: int) -> FactoredMass:
         """The blocks of a factor ``[[L, 0], [Z, L_00]]``, n the rows of L."""
         L, low, base = whole[:n, :n], whole[n:, :n], whole[n:, n:]
-        made = cls(L, L @ low.T, low @ low.T + base @ base.T)
-        made.whole = whole
-        return made
+        blocks = cls(L, L @ low.T, low @ low.T + base @ base.T)
+        blocks.whole = whole
+        return blocks
 
 
 class StiffnessBlocks(NamedTuple):
@@ -221,9 +221,9 @@ def mass_blocks(given: Any, geometry: Geometry) -> MassBlocks:
             check_shape("mass", part, shape)
         return given
     check_shape("mass", given, (n, n), (n + d, n + d))
-    own = given[:n, :n]
+    at_sensors = given[:n, :n]
     coupling, base = (given[:n, n:], given[n:, n:]) if given.shape[0] > n else (ca.DM(n, d), ca.DM(d, d))
-    return MassBlocks(cholesky(own), coupling, base, own)
+    return MassBlocks(cholesky(at_sensors), coupling, base, at_sensors)
 
 
 def stiffness_blocks(given: Any, factor: Any) -> StiffnessBlocks:

@@ -23,7 +23,7 @@ PROBLEM_MODULE = "_sysid_problem_"
 _PACKAGE = __name__.partition(".")[0]
 BESIDE = "__sysid_beside__"  # in such a module: the modules by name that it imported from beside itself
 
-_OWN: dict[str, Any] = {
+_PACKAGE_KINDS: dict[str, Any] = {
     kind.__name__: kind
     for kind in (
         FullMass, LumpedMass, KnownMass, SpectralStiffness, ChainStiffness, ModalDamping, ProportionalDamping,
@@ -55,8 +55,8 @@ def model_to_tree(model: Any) -> dict[str, Any]:
             f"a {kind.__name__} cannot be stored: its class stands inside a function ({kind.__qualname__}), where no "
             "other program finds it; move the class to the top of its module"
         )
-    own = _OWN.get(kind.__name__) is kind
-    name = kind.__name__ if own else f"{_public_name(kind.__module__)}:{kind.__qualname__}"
+    of_package = _PACKAGE_KINDS.get(kind.__name__) is kind
+    name = kind.__name__ if of_package else f"{_public_name(kind.__module__)}:{kind.__qualname__}"
     return {"kind": name, "fields": model.to_tree() if _has(kind, _TREE) else _attributes(model)}
 
 
@@ -85,9 +85,9 @@ def model_from_tree(tree: dict[str, Any]) -> Any:
         Where the class is not to be found; says which one, and in which module.
     """
     module, colon, name = str(tree["kind"]).rpartition(":")
-    if not colon and name not in _OWN:
+    if not colon and name not in _PACKAGE_KINDS:
         raise InputError(f"model {shown(name)} is unknown to this sysid: a later one is needed")
-    kind = _found(module, name) if colon else _OWN[name]
+    kind = _found(module, name) if colon else _PACKAGE_KINDS[name]
     if _has(kind, _TREE):
         return kind.from_tree(tree["fields"])
     model = object.__new__(kind)
@@ -121,11 +121,11 @@ def _found(module: str, name: str) -> Any:
 
 def _imported(name: str) -> Iterator[ModuleType]:
     """Modules of this name in this process, problem modules and what they imported from beside themselves too."""
-    for own, module in list(sys.modules.items()):
-        if own == name and name.partition(".")[0] not in (_PACKAGE, *sys.stdlib_module_names):
+    for key, module in list(sys.modules.items()):
+        if key == name and name.partition(".")[0] not in (_PACKAGE, *sys.stdlib_module_names):
             yield module
-        elif own.startswith(PROBLEM_MODULE):
-            if _public_name(own) == name:
+        elif key.startswith(PROBLEM_MODULE):
+            if _public_name(key) == name:
                 yield module
             beside = vars(module).get(BESIDE, {})
             if name in beside:

@@ -233,5 +233,5 @@ class _InNumbers(ca.Callback):
 def spectrum_error(factor: Array, targets: Array) -> float:
     """Largest relative difference of the lowest eigenvalues of ``L_H L_H'`` from the squared `targets`."""
     # Singular values, not eigenvalues of L L': full relative accuracy needs no squares.
-    own = np.sort(np.linalg.svd(factor, compute_uv=False))
-    return float(np.max(np.abs((own[: targets.size] / targets) ** 2 - 1)))
+    singular = np.sort(np.linalg.svd(factor, compute_uv=False))
+    return float(np.max(np.abs((singular[: targets.size] / targets) ** 2 - 1)))

@@ -338,7 +338,7 @@ class Variable(Unknown):
         raise InputError(f"variable {self.name!r} ({self.declared}): {what}")
 
     def _refuse_where(self, *mistakes: tuple[Any, str]) -> None:
-        refuse(*((made, f"variable {self.name!r} ({self.declared}): {what}") for made, what in mistakes))
+        refuse(*((applies, f"variable {self.name!r} ({self.declared}): {what}") for applies, what in mistakes))
 
     @property
     def title(self) -> str:

@@ -52,7 +52,7 @@ class Batch:
         """Memory of inputs and outputs, which CasADi reads and writes in place."""
         self._buffer, self._run = self._compiled.buffer()
         self._given, read = self._places(self._inputs)
-        self._made, written = self._places(self._outputs)
+        self._results, written = self._places(self._outputs)
         for i, memory in enumerate(read):
             self._buffer.set_arg(i, memory.data)
         for i, memory in enumerate(written):
@@ -79,8 +79,8 @@ class Batch:
                 place[: len(part)] = part.reshape(len(part), *place.shape[1:])
                 place[len(part) :] = place[len(part) - 1]  # the last one fills up the chunk
             self._run()
-            for output, made in zip(outputs, self._made, strict=True):
-                output[chunk] = made[: len(output[chunk])]
+            for output, result in zip(outputs, self._results, strict=True):
+                output[chunk] = result[: len(output[chunk])]
         return outputs
 
 
@@ -110,8 +110,8 @@ def elementwise(function: ca.Function, count: int) -> ca.Function:
         if operation == ca.OP_INPUT:
             work[write[0]] = inputs[read[0]][read[1]]
         elif operation == ca.OP_OUTPUT:
-            made = work[read[0]]
-            outputs[write[0]][write[1]] = made if made.numel() == count else ca.repmat(made, count)
+            value = work[read[0]]
+            outputs[write[0]][write[1]] = value if value.numel() == count else ca.repmat(value, count)
         elif operation == ca.OP_CONST:
             work[write[0]] = ca.MX(function.instruction_constant(k))
         elif len(read) == 1:

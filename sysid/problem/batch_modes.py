@@ -52,8 +52,8 @@ def batch_modes(H: Array, right: Array, rigid: Array, *base: Array) -> tuple[Arr
     if base:
         broken |= base_is_light(*base)
     lam[broken], psi[broken] = np.nan, np.nan
-    made = psi.swapaxes(1, 2) @ right
-    return lam, BatchModes(made[..., :n], made[..., n:], rigid)
+    projected = psi.swapaxes(1, 2) @ right
+    return lam, BatchModes(projected[..., :n], projected[..., n:], rigid)
 
 
 def base_is_light(low: Array, base: Array) -> Array:

@@ -102,7 +102,7 @@ class TestObjective:
         if test.force is not None:
             records.append((test.force, B.swapaxes(1, 2) @ a + rigid @ base))
         squared = np.zeros(count)
-        for (record, made), (weight, scale) in zip(records, weights_of_test(test, weighted=True), strict=True):
-            squared += np.sum(np.abs(weight * (made - columns(record))) ** 2, axis=(1, 2)) / scale**2
+        for (record, predicted), (weight, scale) in zip(records, weights_of_test(test, weighted=True), strict=True):
+            squared += np.sum(np.abs(weight * (predicted - columns(record))) ** 2, axis=(1, 2)) / scale**2
         squared[broken | light] = np.nan
         return squared

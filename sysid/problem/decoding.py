@@ -41,16 +41,16 @@ def decode(tree: Tree, symbols: Sequence[ca.MX]) -> list[ca.MX]:
         *called, last = tree["functions"]
         for function in called:
             reader.add(function)
-        made = reader.matrices(last, symbols)
+        parts = reader.matrices(last, symbols)
         # Its memory: what one evaluation keeps at a time.
-        limited("memory of one evaluation", ca.Function("whole", list(symbols), made).sz_w(), operations.LIMITS.memory)
+        limited("memory of one evaluation", ca.Function("whole", list(symbols), parts).sz_w(), operations.LIMITS.memory)
     except InputError:
         raise
     except Exception as error:  # whatever CasADi and Python say of wrong numbers
         at = "" if reader is None else reader.place
         lines = str(error).strip().splitlines() or [""]
         raise InputError(f"its expressions are damaged{at} ({type(error).__name__}: {lines[-1]})") from error
-    return made
+    return parts
 
 
 def limited(what: str, value: float, most: float) -> None:
@@ -120,9 +120,9 @@ class _Reader:
     def _outputs(self, tree: Tree, symbols: Sequence[ca.MX]) -> tuple[list[ca.MX], float]:
         if tree["kind"] != "mx" or [one.sparsity() for one in symbols] != self.inputs(tree):
             raise ValueError("other inputs than those of the function")
-        made = _Matrices(self, symbols, tree)
-        made.read(_whole(tree["code"]))
-        return [_at(made.values, number) for number in _whole(tree["outputs"])], made.work
+        matrices = _Matrices(self, symbols, tree)
+        matrices.read(_whole(tree["code"]))
+        return [_at(matrices.values, number) for number in _whole(tree["outputs"])], matrices.work
 
     def _mx(self, tree: Tree, name: str) -> _Called:
         symbols = [ca.MX.sym(f"x{i}", pattern) for i, pattern in enumerate(self.inputs(tree))]
@@ -196,18 +196,18 @@ class _Matrices:
             numbers, at = _counted(code, at + 1)
             parameters, at = _counted(code, at)
             arguments = [_at(self.values, number) for number in numbers]
-            made = self._made(name, arguments, parameters)
-            for value in made:
+            values = self._evaluated(name, arguments, parameters)
+            for value in values:
                 limited("the size of a matrix", value.numel(), operations.LIMITS.entries)
                 self._reader.count_pattern(value.sparsity())
                 self._add_work(value.nnz())
-            self.values += made
+            self.values += values
 
     def _add_work(self, work: float) -> None:
         self.work += work
         limited("the work of one evaluation", self.work, operations.LIMITS.work)
 
-    def _made(self, name: str, arguments: list[ca.MX], parameters: list[int]) -> Sequence[ca.MX]:
+    def _evaluated(self, name: str, arguments: list[ca.MX], parameters: list[int]) -> Sequence[ca.MX]:
         if name in operations.WITHOUT_PARAMETERS:
             _exactly(0, parameters)
         if name in operations.ENTRYWISE:  # of which no result is larger than the largest argument

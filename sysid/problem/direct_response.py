@@ -110,9 +110,9 @@ def relative_misfit(test: Measurement, motion: Motion, *, weighted: bool = False
     records = [(test.relative, Response(R @ a.real, R @ a.imag))]
     records += [] if test.force is None else [(test.force, f)]
     pieces: list[ca.MX] = []
-    for (record, made), (weight, scale) in zip(records, weights_of_test(test, weighted=weighted), strict=True):
+    for (record, predicted), (weight, scale) in zip(records, weights_of_test(test, weighted=weighted), strict=True):
         real, imag = parts_of(record)
-        pieces += [ca.DM(weight / scale) * part for part in (made.real - real, made.imag - imag)]
+        pieces += [ca.DM(weight / scale) * part for part in (predicted.real - real, predicted.imag - imag)]
     return ca.vertcat(*(ca.vec(ca.densify(piece)) for piece in pieces))
 
 

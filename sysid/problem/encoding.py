@@ -66,14 +66,14 @@ def encode(symbols: Sequence[ca.MX], expressions: Sequence[ca.MX], points: Seque
 
 
 def _differing(
-    symbols: Sequence[ca.MX], own: Sequence[ca.MX], again: Sequence[ca.MX], points: Sequence[Sequence[Array]]
+    symbols: Sequence[ca.MX], first: Sequence[ca.MX], again: Sequence[ca.MX], points: Sequence[Sequence[Array]]
 ) -> str:
     """In a word what of two lists of expressions is not the same; empty where all is."""
-    if [one.sparsity() for one in own] != [one.sparsity() for one in again]:
+    if [one.sparsity() for one in first] != [one.sparsity() for one in again]:
         return "patterns"
-    of_own, of_again = _with_slopes(symbols, own), _with_slopes(symbols, again)
+    of_first, of_again = _with_slopes(symbols, first), _with_slopes(symbols, again)
     for point in points:
-        for what, mine, other in zip(("values", "derivatives"), of_own(*point), of_again(*point), strict=True):
+        for what, mine, other in zip(("values", "derivatives"), of_first(*point), of_again(*point), strict=True):
             if mine.sparsity() != other.sparsity() or not _same_bits(mine, other):
                 return what
     return ""
@@ -151,11 +151,11 @@ class _Writer:
         elif kind == "SXFunction":
             _add_sx(self, function, inputs)
         elif kind == "Map":
-            made = function.info()
-            self.add("map", inputs, [], [self.function(made["f"]), made["n"]], [])
+            info = function.info()
+            self.add("map", inputs, [], [self.function(info["f"]), info["n"]], [])
         elif kind == "Switch":
-            made = function.info()
-            self.add("switch", inputs, [], [self.function(one) for one in (made["f_def"], *made["f"])], [])
+            info = function.info()
+            self.add("switch", inputs, [], [self.function(one) for one in (info["f_def"], *info["f"])], [])
         elif kind in _CLASSES:
             _add_interpolant(self, function, inputs)
         else:
@@ -168,8 +168,8 @@ class _Writer:
         matrices = _Matrices(self, len(symbols))
         values = matrices.operations(function, len(leaves))
         for join in joins:
-            told, parameters = matrices.described(join.name, join.node)
-            values.append(matrices.record(told, [values[i] for i in join.arguments], parameters, 1))
+            operation, parameters = matrices.described(join.name, join.node)
+            values.append(matrices.record(operation, [values[i] for i in join.arguments], parameters, 1))
         inputs = [symbol.sparsity() for symbol in symbols]
         self.add("mx", inputs, [values[i] for i in ends], matrices.code, matrices.numbers)
 
@@ -203,8 +203,8 @@ class _Matrices:
             elif name is None:
                 raise NotStorableError(f"the operation {operations.casadi_name(number)!r}")
             else:
-                told, parameters = self.described(name, function.instruction_MX(k))
-                first = self.record(told, [held[i] for i in source], parameters, len(target))
+                operation, parameters = self.described(name, function.instruction_MX(k))
+                first = self.record(operation, [held[i] for i in source], parameters, len(target))
                 held |= {place: first + i for i, place in enumerate(target) if place >= 0}
         return list(ends.values())
 
@@ -245,8 +245,8 @@ class _Matrices:
         return [many // few]
 
     def _einstein(self, node: ca.MX) -> list[int]:
-        told = node.info()
-        lists = [told[name] for name in ("dim_a", "dim_b", "dim_c", "a", "b", "c")]
+        info = node.info()
+        lists = [info[name] for name in ("dim_a", "dim_b", "dim_c", "a", "b", "c")]
         return [part for one in lists for part in (len(one), *one)]
 
     def _call(self, node: ca.MX) -> list[int]:
@@ -315,14 +315,14 @@ def _places(node: ca.MX) -> list[int]:
 def _solve_in_words(node: ca.MX) -> tuple[str, list[int]]:
     """The solver of a node, which CasADi tells in no other way than its text."""
     symbols = [ca.MX.sym("b", node.dep(0).sparsity()), ca.MX.sym("a", node.dep(1).sparsity())]
-    own = ca.Function("solve", symbols, ca.graph_substitute([node], [node.dep(0), node.dep(1)], symbols))
+    solve = ca.Function("solve", symbols, ca.graph_substitute([node], [node.dep(0), node.dep(1)], symbols))
     transposed = bool(node.info()["tr"])
     for solver in ("", *operations.SOLVERS):
         try:
             same = ca.Function("solve", symbols, [operations.solve(solver, *symbols, transposed=transposed)])
         except (ValueError, RuntimeError):
             continue
-        if same_text(own, same):
+        if same_text(solve, same):
             return f"solve {solver}".strip(), [int(transposed)]
     raise NotStorableError("the operation 'solve', by a linear solver with options or of another kind")
 

@@ -102,13 +102,13 @@ def _nearest(formulation: Formulation, start: Array, scale: Array) -> Array:
     solver = ca.nlpsol(
         "feasible", "ipopt", {"x": ca.vertcat(t, slack), "f": ca.sumsqr(slack), "g": g - slack}, quiet_options(200)
     )
-    begun = (start - lower) / width
+    first = (start - lower) / width
     answer = solver(
-        x0=np.concatenate([begun, np.zeros(scale.size)]), lbg=constraints.lower / scale, ubg=constraints.upper / scale,
-        lbx=np.concatenate([np.zeros(begun.size), np.full(scale.size, -np.inf)]),
+        x0=np.concatenate([first, np.zeros(scale.size)]), lbg=constraints.lower / scale, ubg=constraints.upper / scale,
+        lbx=np.concatenate([np.zeros(first.size), np.full(scale.size, -np.inf)]),
         ubx=np.concatenate([np.where(upper > lower, 1.0, 0.0), np.full(scale.size, np.inf)]),
     )  # fmt: skip
     # Whatever the status, what counts is the violation at the point that came, put inside the box.
-    found = np.clip(np.asarray(answer["x"]).ravel()[: begun.size], 0.0, 1.0)
+    found = np.clip(np.asarray(answer["x"]).ravel()[: first.size], 0.0, 1.0)
     broken = constraints.violation(lower + width * found) / scale
     return np.where(np.isfinite(broken), broken, np.inf)

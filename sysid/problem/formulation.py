@@ -207,9 +207,9 @@ class Formulation:
         """Whether anything that is fitted depends on an unknown of the damping alone; records always do."""
         if self.fits_records or self.further_tests:
             return True
-        *others, own = ({symbol.__hash__() for symbol in group} for group in self._in_matrices)
-        own = own.difference(*others, (v.symbol.__hash__() for v in self.fixed))
-        return any(symbol.__hash__() in own for group in self._in_sources for e in group for symbol in ca.symvar(e))
+        *others, alone = ({symbol.__hash__() for symbol in group} for group in self._in_matrices)
+        alone = alone.difference(*others, (v.symbol.__hash__() for v in self.fixed))
+        return any(symbol.__hash__() in alone for group in self._in_sources for e in group for symbol in ca.symvar(e))
 
     @property
     def free_modes(self) -> bool:
@@ -315,7 +315,7 @@ class Formulation:
     def members(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
         """Which unknowns enter each matrix, and residuals, misfit and constraints where there are any."""
         groups = zip(self._of_models, self._in_matrices, strict=True)
-        of = {name: [*own, *written] for name, (own, written) in zip(MATRICES, groups, strict=True)}
+        of = {name: [*modelled, *written] for name, (modelled, written) in zip(MATRICES, groups, strict=True)}
         for (name, source), expressions in zip(self.sources, self._in_sources, strict=True):
             kind = "misfit" if name == "misfit" else getattr(source, "kind", "residuals")
             of.setdefault(kind, []).extend(expressions)

@@ -198,9 +198,9 @@ def blocks_of(
     y_mass, y_stiffness, y_damping = (ca.vertcat(ca.MX(0, 1), *group) for group in symbols)
 
     *parts, whole = _evaluated(lambda y: _with_factor(mass_blocks(mass.blocks(geometry, y), geometry)), y_mass, ())
-    made = MassBlocks(*parts)
-    L = made.factor
-    of_mass = made._replace(factor=ca.tril(L), mass=L @ L.T if made.mass is None else made.mass)
+    M = MassBlocks(*parts)
+    L = M.factor
+    of_mass = M._replace(factor=ca.tril(L), mass=L @ L.T if M.mass is None else M.mass)
     K = StiffnessBlocks(
         *_evaluated(
             lambda y, *m: stiffness_blocks(stiffness.blocks(geometry, y, MassBlocks(*m)), m[0]), y_stiffness, of_mass
@@ -216,12 +216,12 @@ def blocks_of(
         ca.MX(0, 0) if part is None else check_shape("damping", part, shape)
         for part, shape in ((C, (n, n)), (ratios, (n, 1)))
     )
-    return Blocks(made, K, C, ratios, omega, ca.MX(0, 0) if whole is None else whole)
+    return Blocks(M, K, C, ratios, omega, ca.MX(0, 0) if whole is None else whole)
 
 
-def _with_factor(made: MassBlocks) -> tuple[Any, ...]:
+def _with_factor(blocks: MassBlocks) -> tuple[Any, ...]:
     """The blocks, and the factor of the whole mass where the model has one."""
-    return (*made, made.whole if isinstance(made, FactoredMass) else None)
+    return (*blocks, blocks.whole if isinstance(blocks, FactoredMass) else None)
 
 
 def _evaluated(expressions: Any, y: ca.MX, before: tuple[ca.MX, ...]) -> list[ca.MX | None]:
@@ -232,11 +232,11 @@ def _evaluated(expressions: Any, y: ca.MX, before: tuple[ca.MX, ...]) -> list[ca
     if not y.numel():
         return [None if part is None else ca.MX(part) for part in expressions(y, *before)]
     symbols = [ca.SX.sym("y", y.numel()), *(ca.SX.sym(f"b{i}", part.sparsity()) for i, part in enumerate(before))]
-    made = expressions(*symbols)
-    there = [i for i, part in enumerate(made) if part is not None]
-    function = ca.Function("model", symbols, [ca.densify(ca.SX(made[i])) for i in there])
+    parts = expressions(*symbols)
+    there = [i for i, part in enumerate(parts) if part is not None]
+    function = ca.Function("model", symbols, [ca.densify(ca.SX(parts[i])) for i in there])
     values = dict(zip(there, function.call([y, *before]), strict=True))
-    return [values.get(i) for i in range(len(made))]
+    return [values.get(i) for i in range(len(parts))]
 
 
 def symbols_in(
@@ -250,10 +250,10 @@ def symbols_in(
     given = {symbol.__hash__() for symbol in (*mass, *stiffness, omega)}
     found: list[list[ca.MX]] = []
     for model, unknowns, before in zip(models, of_models, ((), (mass,), (mass, stiffness)), strict=True):
-        made = [] if unknowns else [model.blocks(geometry, y, *before)]
-        if made and len(before) == 2 and hasattr(model, "ratios"):
-            made.append(model.ratios(geometry, y, omega))
-        parts = [part for block in made for part in (block if isinstance(block, tuple) else (block,))]
+        blocks = [] if unknowns else [model.blocks(geometry, y, *before)]
+        if blocks and len(before) == 2 and hasattr(model, "ratios"):
+            blocks.append(model.ratios(geometry, y, omega))
+        parts = [part for block in blocks for part in (block if isinstance(block, tuple) else (block,))]
         symbols = [symbol for part in parts if isinstance(part, ca.MX) for symbol in ca.symvar(part)]
         found.append([symbol for symbol in symbols if symbol.__hash__() not in given])
     return found

@@ -93,9 +93,9 @@ class Prepared:
     def fits(self, structure: Structure, x: Array | None) -> list[tuple[ModalEstimate, Structure]]:
         """Each test that is fitted, and what the structure was in it at an answer."""
         formulation = self.formulation
-        own = [(self.modal[0], structure)] if formulation.fits_records else []
+        fitted = [(self.modal[0], structure)] if formulation.fits_records else []
         further = () if x is None else formulation.further_tests
-        return own + [
+        return fitted + [
             (modal, term.matrices.structure(x, modal.records))
             for modal, term in zip(self.modal[1:], further, strict=False)
             if x is not None
@@ -118,9 +118,9 @@ class Prepared:
         See `sysid.modal_analysis.outliers`; poles that were found stay. What whole records tell of the modes is gone.
         """
         fits = [(modal.records, predicted(modal.records, its)) for modal, its in self.fits(structure, x)]
-        made = iter(pseudo_values(fits, self.n_variables))
-        own = next(made) if self.formulation.fits_records else self.measurement
-        other = self.of_lines((own, *made))
+        tests = iter(pseudo_values(fits, self.n_variables))
+        measurement = next(tests) if self.formulation.fits_records else self.measurement
+        other = self.of_lines((measurement, *tests))
         other.geometry.found = self.geometry.found
         return other
 
@@ -243,8 +243,8 @@ class Prepared:
     @property
     def unit_mass(self) -> bool:
         """Whether no number with a unit of mass is given, so that masses are normalised to 1 kg a direction."""
-        told = self.measurement.force is not None or np.nansum(np.abs(self.known_mass)) > 0
-        return self._leaves_total and not told
+        has_unit = self.measurement.force is not None or np.nansum(np.abs(self.known_mass)) > 0
+        return self._leaves_total and not has_unit
 
     @property
     def _leaves_total(self) -> bool:

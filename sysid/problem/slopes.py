@@ -196,8 +196,8 @@ def _rows_of_modes(
         d_phi.reshape(-1, d_phi.shape[-1]), d_gamma.reshape(-1, d_phi.shape[-1]), s.d_log_omega[chosen],
         s.d_log_ratios[chosen], corner,
     ])  # fmt: skip
-    own = estimate.modes
-    off = theta_of(modes, structure.rigid_body_mass, index) - theta_of(own, estimate.rigid, index)
+    estimated = estimate.modes
+    off = theta_of(modes, structure.rigid_body_mass, index) - theta_of(estimated, estimate.rigid, index)
     weight = share / weights_of_test(test, weighted=True)[0][1]
     factor, std = independent_rows(estimate)
     factor = weight * factor

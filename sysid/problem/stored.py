@@ -100,10 +100,10 @@ def needs_module(tree: Tree) -> bool:
     """Whether a tree that `to_tree` made does not hold all of a problem: expressions, or the class of a model."""
     models = [tree[name] for name in MATRICES] + [part.get("source") for part in tree["residuals"]]
     models += [part[name] for part in tree["residuals"] if part["kind"] == "test" for name in MATRICES]
-    return tree["without"] is not None or any(isinstance(one, dict) and _is_own(one) for one in models)
+    return tree["without"] is not None or any(isinstance(one, dict) and _is_user_class(one) for one in models)
 
 
-def _is_own(tree: Tree) -> bool:
+def _is_user_class(tree: Tree) -> bool:
     """Whether a model's class is one of the user's."""
     return ":" in tree.get("kind", "")
 
@@ -220,7 +220,7 @@ def _model_from_tree(tree: Tree) -> Any:
     try:
         return model_from_tree(tree)
     except InputError as error:
-        if _is_own(tree):
+        if _is_user_class(tree):
             raise NotRebuiltError(str(error)) from error
         raise
 

@@ -188,14 +188,14 @@ class _Run:
         success, message = best.success, best.message
         if self.stopped is not None:
             success, message = False, str(self.stopped) or "interrupted"
-        begun = _objective_at(problem, first)
+        initial = _objective_at(problem, first)
         phases = (
-            *((Phase("start", begun, first, self.begun, 1),) if np.isfinite(begun) else ()),
+            *((Phase("start", initial, first, self.begun, 1),) if np.isfinite(initial) else ()),
             Phase("local phase", objective, best.x, session.seconds, best.curve.size),
         )
         return Outcome(
             structure, best.x, Continuation.name, success, message,
-            History(start=begun, local=objective, local_curve=best.curve, phases=phases), self.stopped,
+            History(start=initial, local=objective, local_curve=best.curve, phases=phases), self.stopped,
             alternatives=tuple(_alternatives(problem, best.x, objective, self.ends)) if success else (),
             findings=(search_note(_LEFT_OUT.format(left_out, len(points))),) * bool(left_out),
             good=self._good(objective, best), unanimous=self._unanimous(best),
@@ -237,8 +237,8 @@ class _Run:
         if self.smoother is None:
             return best.success
         # What residuals of the user's own leave beside the tests has no floor of its own.
-        own = sum(term.error(best.x) ** 2 for term in problem.formulation.beside if not isinstance(term, TestTerm))
-        return float(np.sqrt(max(objective**2 - own, 0.0))) <= max(_NEAR * self.smoother.floor, EXACT)
+        of_terms = sum(term.error(best.x) ** 2 for term in problem.formulation.beside if not isinstance(term, TestTerm))
+        return float(np.sqrt(max(objective**2 - of_terms, 0.0))) <= max(_NEAR * self.smoother.floor, EXACT)
 
     def _unanimous(self, best: LocalResult) -> bool:
         """Whether three starts or more all ended at the best end, at a fit of sorts: only a wrong model leaves more."""

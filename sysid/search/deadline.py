@@ -27,13 +27,13 @@ def within(seconds: float | None) -> Iterator[None]:
     if seconds is None or not in_main_thread or not hasattr(signal, "setitimer"):
         yield
         return
-    begun, before = time.perf_counter(), signal.signal(signal.SIGALRM, _raise)
+    start, before = time.perf_counter(), signal.signal(signal.SIGALRM, _raise)
     # Again every second: compiled code and __del__ lose an exception that strikes inside them.
     other, again = signal.setitimer(signal.ITIMER_REAL, seconds, 1.0)
     try:
         yield
     except Exception as error:  # compiled code makes another one of ours
-        if time.perf_counter() < begun + seconds:
+        if time.perf_counter() < start + seconds:
             raise
         raise TimeIsOver from error
     finally:
@@ -43,7 +43,7 @@ def within(seconds: float | None) -> Iterator[None]:
             signal.signal(signal.SIGALRM, before)
             if other > 0:
                 # Zero would set no alarm.
-                signal.setitimer(signal.ITIMER_REAL, max(other - (time.perf_counter() - begun), 1e-6), again)
+                signal.setitimer(signal.ITIMER_REAL, max(other - (time.perf_counter() - start), 1e-6), again)
 
 
 def _raise(number: int, frame: object) -> NoReturn:

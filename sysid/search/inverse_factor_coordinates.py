@@ -151,8 +151,8 @@ class InverseFactorError:
             hessian += chain.T @ error.hessian(at) @ chain + ca.diagcat(bent, ca.MX(2 * n, 2 * n))
         parts, given = [*factors, skew, pole], ca.vertsplit(y, np.cumsum([0, *self.sizes]).tolist())
 
-        def function(name: str, *made: ca.MX) -> ca.Function:
-            inner = ca.Function(name, [*parts, psi_0], list(made))
+        def function(name: str, *outputs: ca.MX) -> ca.Function:
+            inner = ca.Function(name, [*parts, psi_0], list(outputs))
             return ca.Function(name, [y, psi_0], inner.call([*given, psi_0]))
 
         self.gradient, self.hessian = function("gradient", value, gradient), function("hessian", hessian)

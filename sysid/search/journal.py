@@ -71,10 +71,10 @@ class Journal:
         """Write what is not written."""
         if self._write is None or not self._unwritten:
             return
-        begun = time.perf_counter()
+        start = time.perf_counter()
         self._write(self.entries)
         self._written = time.perf_counter()
-        self._took, self._unwritten = self._written - begun, False
+        self._took, self._unwritten = self._written - start, False
 
 
 class Part:

@@ -110,9 +110,9 @@ def fit_apart(problem: Prepared, end: End, monitor: IterationMonitor, max_iterat
     at = formulation.parts.damping.stop
     if at == formulation.size or monitor.stopped is not None:
         return end
-    z, own = NonlinearProgram(), formulation.unknowns[sum(map(len, formulation.of_models)) :]
+    z, auxiliary = NonlinearProgram(), formulation.unknowns[sum(map(len, formulation.of_models)) :]
     start = np.clip(end.x[at:], formulation.lower[at:], formulation.upper[at:])
-    unknowns = ca.vertcat(ca.DM(end.x[:at]), add_unknowns(z, own, start))
+    unknowns = ca.vertcat(ca.DM(end.x[:at]), add_unknowns(z, auxiliary, start))
     constraints = formulation.constraints
     if constraints.lower.size:
         z.constrain(constraints.function(unknowns), constraints.lower, constraints.upper)

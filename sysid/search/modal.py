@@ -78,8 +78,8 @@ class Modal:
             return "the problem is written in unknowns of its own"
         described = formulation.mass.free or formulation.mass.entries is not None
         if not formulation.stiffness.free:
-            own = formulation.parts.stiffness.stop > formulation.parts.stiffness.start
-            return "the stiffness has a form of its own" if own else "the problem is written in unknowns of its own"
+            form = formulation.parts.stiffness.stop > formulation.parts.stiffness.start
+            return "the stiffness has a form of its own" if form else "the problem is written in unknowns of its own"
         if not described:
             return "the problem is written in unknowns of its own"
         if not formulation.damping.free:
@@ -276,8 +276,8 @@ def objective_of(problem: Prepared, structure: Structure, x: Array | None) -> fl
     """What the fit leaves; where modes are free from the structure alone, without any graph of the matrices."""
     if x is not None and not problem.free_modes:
         return problem.objective(x)
-    own = weighted_error(problem.measurement, structure)
-    return own if x is None else float(np.linalg.norm([own, *(term.error(x) for term in problem.formulation.beside)]))
+    left = weighted_error(problem.measurement, structure)
+    return left if x is None else float(np.linalg.norm([left, *(term.error(x) for term in problem.formulation.beside)]))
 
 
 def _coordinates(problem: Prepared, chosen: DegreesOfFreedom) -> list[str]:
@@ -393,8 +393,8 @@ def poles_of(problem: Prepared) -> Poles:
     found = find_poles(test)
     missed = np.array([w for w in stated if np.min(np.abs(np.log(found.omega / w))) > np.log1p(FREQUENCY_WINDOW)])
     if missed.size:
-        told, others = (", ".join(f"{w / (2 * np.pi):.5g}" for w in omega) for omega in (missed, found.omega))
+        missing, others = (", ".join(f"{w / (2 * np.pi):.5g}" for w in omega) for omega in (missed, found.omega))
         raise DoesNotApplyError(
-            f"of the stated natural frequencies {told} Hz does not stand out of the data; found are {others} Hz"
+            f"of the stated natural frequencies {missing} Hz does not stand out of the data; found are {others} Hz"
         )
     return found

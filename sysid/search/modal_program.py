@@ -190,8 +190,8 @@ class ModalResidual:
         """Root of the value by NumPy; what is left of all records, and of the accelerations alone."""
         model = self.model
         p = model.with_best_shapes(modes, rigid)
-        every, own = (np.sqrt(model.chi2(p, at)) for at in (model.levels, model.levels_of_accelerations))
-        return float(every), float(every), float(own)
+        every, of_accelerations = (np.sqrt(model.chi2(p, at)) for at in (model.levels, model.levels_of_accelerations))
+        return float(every), float(every), float(of_accelerations)
 
 
 class EstimateResidual:

@@ -40,8 +40,8 @@ def stated_totals(problem: Prepared) -> Ties | None:
         rows = ca.diag(P.T @ P)
         base = ca.diag(rigid - gamma.T @ gamma + delta.T @ delta)
         groups = geometry.directions[: geometry.n]
-        own = [ca.sum1(rows[np.flatnonzero(groups == i).tolist()]) for i in range(geometry.d)]
-        return [(own[i] + base[i]) / totals[i] - 1 for i in range(geometry.d)]
+        modal = [ca.sum1(rows[np.flatnonzero(groups == i).tolist()]) for i in range(geometry.d)]
+        return [(modal[i] + base[i]) / totals[i] - 1 for i in range(geometry.d)]
 
     return ties
 
@@ -69,9 +69,9 @@ def to_stated_totals(
     spare = 0.0 if problem.measurement.force is not None else _LEAST_SHARE  # a force tells what the base has
     if problem.rigid_total is not None:
         size = np.sqrt(problem.totals)
-        own, total = ((part / np.outer(size, size)) for part in (gamma.T @ gamma, problem.rigid_total))
-        t = 1.0 if scaled else min(1.0, (1 - spare) / float(scipy.linalg.eigvalsh(own, total)[-1]))
-        return t, positive_part(total - t * own) * np.outer(size, size)
+        modal, total = ((part / np.outer(size, size)) for part in (gamma.T @ gamma, problem.rigid_total))
+        t = 1.0 if scaled else min(1.0, (1 - spare) / float(scipy.linalg.eigvalsh(modal, total)[-1]))
+        return t, positive_part(total - t * modal) * np.outer(size, size)
     stated = problem.formulation.mass.totals
     # A mass that states no total is brought to totals of its kind all the same: 1 kg a direction, or known masses'.
     kind = getattr(problem.stated.mass, "healing", "trace") if stated is None else stated.kind
@@ -79,8 +79,8 @@ def to_stated_totals(
         used = np.sum(gamma**2, axis=0)
     else:
         rows = np.sum(P**2, axis=0)
-        own = [rows[groups == i].sum() for i in range(G.shape[1])]
-        used = np.array(own) + np.sum((gamma - P @ G) ** 2, axis=0)
+        modal = [rows[groups == i].sum() for i in range(G.shape[1])]
+        used = np.array(modal) + np.sum((gamma - P @ G) ** 2, axis=0)
     totals = problem.totals
     if scaled:
         totals = np.maximum(0.0 if stated is None else totals, (1 + spare) * used)
@@ -126,14 +126,14 @@ def nearest_lumped(
     totals = [(entries[i], values[i]) for i in scaled if values[i] > 0 and np.all(entries[i] >= 0)] or [
         (np.sum(P[:, groups == i] ** 2, axis=1), problem.totals[i]) for i in range(G.shape[1])
     ]
-    told = [(row, total) for row, total in totals if np.any(row > 0)] or [(np.sum(P**2, axis=1), 1.0)]
-    weight = max(total for _, total in told)
+    usable = [(row, total) for row, total in totals if np.any(row > 0)] or [(np.sum(P**2, axis=1), 1.0)]
+    weight = max(total for _, total in usable)
     held = _HELD * weight / np.where(values == 0, weight, np.abs(values))
-    rows = np.vstack([off, coupling, *(row[None] * weight / total for row, total in told), entries * held[:, None]])
-    wanted = np.concatenate([np.zeros(len(off) + len(coupling)), np.full(len(told), weight), values * held])
+    rows = np.vstack([off, coupling, *(row[None] * weight / total for row, total in usable), entries * held[:, None]])
+    wanted = np.concatenate([np.zeros(len(off) + len(coupling)), np.full(len(usable), weight), values * held])
     size = np.maximum(np.linalg.norm(rows, axis=0), np.finfo(float).tiny)
     # No modal mass vanishes, or M_SS would be singular: each keeps a share of what it could be by itself.
-    share = np.max([row / total for row, total in told], axis=0)
+    share = np.max([row / total for row, total in usable], axis=0)
     least = _LEAST / m * size / np.maximum(share, _LEAST_SHARE * share.max())
     return np.maximum(lsq_linear(rows / size, wanted, (least, np.inf), tol=1e-14).x, least) / size
 

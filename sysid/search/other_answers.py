@@ -61,8 +61,8 @@ def with_other_answers(problem: Prepared, end: Outcome, session: Session) -> Out
         return end
     starts = _number_of_starts(problem)
     if starts < _FEWEST_STARTS:
-        told = f"no other structure that explains the data as well was looked for: {problem.n_variables} unknowns"
-        return end.with_note(f"{told} in {problem.geometry.n} degrees of freedom take long")
+        sentence = f"no other structure that explains the data as well was looked for: {problem.n_variables} unknowns"
+        return end.with_note(f"{sentence} in {problem.geometry.n} degrees of freedom take long")
     fitted = problem if problem.in_squares else problem.pseudo_values(end.structure, end.x)
     try:
         found = _first(fitted, end.x, session, starts)

@@ -56,8 +56,8 @@ def settled(problem: Prepared, end: Outcome, strategy: Strategy, session: Sessio
             return end.with_note(f"Huber's loss settled after {number} rounds")
         if session.is_over:
             break
-    told = f"Huber's loss did not settle in {number} rounds: the last moved by {moved:.2g} deviations"
-    return end.with_note(told) if moved < _NEAR else _cut_short(end, told)
+    sentence = f"Huber's loss did not settle in {number} rounds: the last moved by {moved:.2g} deviations"
+    return end.with_note(sentence) if moved < _NEAR else _cut_short(end, sentence)
 
 
 def check(problem: Prepared, strategy: Strategy) -> None:
@@ -110,8 +110,8 @@ def _farther(problem: Prepared, before: Outcome, after: Outcome) -> Outcome:
     """
     assert before.x is not None and after.x is not None
     fits = problem.fits(after.structure, after.x)
-    made = [(modal.records, predicted(modal.records, its)) for modal, its in fits]
-    stds = [part.std for test, values in made for part in whitened(test, values, problem.n_variables)]
+    predictions = [(modal.records, predicted(modal.records, its)) for modal, its in fits]
+    stds = [part.std for test, values in predictions for part in whitened(test, values, problem.n_variables)]
 
     def left(x: Array, structure: Structure) -> float:
         found = 0.0

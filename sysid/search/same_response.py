@@ -82,13 +82,13 @@ class _Response:
         if matrices.by_ratios:
             self._ratios = Batch(expanded(ca.Function("ratios", [symbol, w], [matrices.ratio_function(symbol, w)])))
         self.scales = [np.ones((1, 1, 1, 1))] * (1 + self.with_force)
-        made = self._records(x[None])
-        self.scales = [np.linalg.norm(record, axis=(1, 3), keepdims=True) for record in made]
+        records = self._records(x[None])
+        self.scales = [np.linalg.norm(record, axis=(1, 3), keepdims=True) for record in records]
         self.weight = term.weight
 
     def __call__(self, points: Array) -> Array:
-        made = np.concatenate([record.reshape(len(points), -1) for record in self._records(points)], axis=1)
-        return self.weight * np.hstack([made.real, made.imag])
+        records = np.concatenate([record.reshape(len(points), -1) for record in self._records(points)], axis=1)
+        return self.weight * np.hstack([records.real, records.imag])
 
     def _records(self, points: Array) -> list[ComplexArray]:
         """Accelerations and, where measured, force for each input, (count, lines, channels, inputs) each."""

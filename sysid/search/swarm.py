@@ -35,7 +35,7 @@ _TRAPPED = "that is a local minimum, as free residues at these poles fit clearly
 _MANY, _FEW = 256, 1  # candidates between two looks at the clock; few where IPOPT refines each
 _SAMPLE = 1.6e-7  # s of a processor, that a coordinate of a particle of the first sample takes
 _DOUBTFUL = 0.1  # objective above which a problem without free modes is searched again
-_OWN_FORM = "hpso-ls searched the model's own unknowns, by the published swarm first, then through IPOPT"
+_PUBLISHED_FORM = "hpso-ls searched the model's own unknowns, by the published swarm first, then through IPOPT"
 
 
 @dataclass(frozen=True)
@@ -210,7 +210,7 @@ class Swarm:
         return Outcome(
             problem.structure(best.found), best.found, self.name, best.success, best.message, history, stopped,
             findings=(search_note(_IDLE),) * idle
-            + (search_note(_OWN_FORM),) * (self.local == "cholesky" and not problem.free_modes),
+            + (search_note(_PUBLISHED_FORM),) * (self.local == "cholesky" and not problem.free_modes),
         )  # fmt: skip
 
 

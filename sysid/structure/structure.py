@@ -426,18 +426,18 @@ class Structure:
         self._modal_damping_matrix: Array = modal
 
     def _sensor_rigid_body(self, given: ArrayLike | None, recovered: bool) -> Array:
-        own = self.recovery @ self.rigid_body_dofs
+        implied = self.recovery @ self.rigid_body_dofs
         if given is None:
-            return own
-        stated = shaped_array("rigid_body", given, *own.shape)
+            return implied
+        stated = shaped_array("rigid_body", given, *implied.shape)
         if recovered:
             return stated
-        worst = np.max(np.abs(stated - own))
-        if worst > 1e-6 * max(1.0, float(np.max(np.abs(own)))):
+        worst = np.max(np.abs(stated - implied))
+        if worst > 1e-6 * max(1.0, float(np.max(np.abs(implied)))):
             raise InputError(
                 f"rigid_body differs from -K_SS^-1 K_S0 by up to {worst:.3g}; leave it out, or check axes and signs"
             )
-        return own
+        return implied
 
 
 def check_frequencies(freq: ArrayLike, *, increasing: bool = True) -> Array:

@@ -229,9 +229,9 @@ def next_accelerations(
     -------
     c1, c2 : float
     """
-    towards_own, towards_best = _DIRECTION[state]
-    c1 = min(max(c1 + towards_own * step, lower), upper)
-    c2 = min(max(c2 + towards_best * step, lower), upper)
+    to_personal_best, to_global_best = _DIRECTION[state]
+    c1 = min(max(c1 + to_personal_best * step, lower), upper)
+    c2 = min(max(c2 + to_global_best * step, lower), upper)
     total = c1 + c2
     if total > largest_sum:
         c1, c2 = c1 * largest_sum / total, c2 * largest_sum / total

@@ -214,8 +214,8 @@ class _Search:
     led: FloatArray | None = None  # the last point that `on_leader` gave
 
     def snapshot(self) -> dict[str, Any]:
-        own = {name: getattr(self, name) for name in ("n_improved", "refined", "led")}
-        return {"swarm": self.swarm.to_tree(), **own}
+        counts = {name: getattr(self, name) for name in ("n_improved", "refined", "led")}
+        return {"swarm": self.swarm.to_tree(), **counts}
 
     def resume(self, snapshot: dict[str, Any]) -> None:
         self.swarm.resume(snapshot["swarm"])

@@ -141,8 +141,8 @@ class ParticleSwarm:
             self._positions[0] = self.box.to_unit(self.box.point(x0, "x0"))
         self._velocities = np.zeros_like(self._positions)
         self._costs = np.full(self.n_particles, np.inf)
-        self._own = self._positions.copy()
-        self._own_costs = np.full(self.n_particles, np.inf)
+        self._pbest = self._positions.copy()
+        self._pbest_costs = np.full(self.n_particles, np.inf)
         # The global best is the leader's own best.
         self._leader = 0
         self._candidate: FloatArray | None = None
@@ -251,16 +251,16 @@ class ParticleSwarm:
         self.nit += 1
 
         self._costs = values[: self.n_particles]
-        better = self._costs < self._own_costs
-        self._own[better] = self._positions[better]
-        self._own_costs[better] = self._costs[better]
+        better = self._costs < self._pbest_costs
+        self._pbest[better] = self._positions[better]
+        self._pbest_costs[better] = self._costs[better]
         # A particle that never met a finite cost has no best to be drawn back to.
-        blank = np.isinf(self._own_costs)
-        self._own[blank] = self._positions[blank]
-        first = int(np.argmin(self._own_costs))
-        if self._own_costs[first] < self.best_cost:
+        blank = np.isinf(self._pbest_costs)
+        self._pbest[blank] = self._positions[blank]
+        first = int(np.argmin(self._pbest_costs))
+        if self._pbest_costs[first] < self.best_cost:
             self._leader = first
-            self._best = (rows[first].copy(), float(self._own_costs[first]))
+            self._best = (rows[first].copy(), float(self._pbest_costs[first]))
         if self._candidate is not None:
             self._learn(self._candidate, rows[-1], float(values[-1]))
             self._candidate = None
@@ -366,7 +366,7 @@ class ParticleSwarm:
             upper=settings.acceleration_upper,
             largest_sum=settings.acceleration_sum,
         )
-        kappa = adaptation.focusing_change_rate(self._positions, self._own[self._leader])
+        kappa = adaptation.focusing_change_rate(self._positions, self._pbest[self._leader])
         self.inertia = adaptation.inertia_weight(kappa, rng.random(), settings.inertia_b1, settings.inertia_b2)
 
     def _elite(self) -> FloatArray:
@@ -375,7 +375,7 @@ class ParticleSwarm:
         sigma = adaptation.elitist_sigma(
             self.nit / self.horizon, settings.elitist_sigma_start, settings.elitist_sigma_end
         )
-        candidate: FloatArray = self._own[self._leader].copy()
+        candidate: FloatArray = self._pbest[self._leader].copy()
         i = self._rng.integers(candidate.size)
         candidate[i] = np.clip(candidate[i] + self._rng.normal(0.0, sigma), 0.0, 1.0)
         return candidate
@@ -384,20 +384,20 @@ class ParticleSwarm:
         """What the social term draws to: the global best (n_free,), or each particle's own mean, a row each."""
         count = self._settings.guides
         if count == 0:
-            return self._own[self._leader]
+            return self._pbest[self._leader]
         # A particle that never met a finite cost guides nobody.
-        most = min(math.ceil(self._settings.guide_share * self.n_particles), int(np.isfinite(self._own_costs).sum()))
-        best = np.argsort(self._own_costs, kind="stable")[:most]
-        means: FloatArray = self._own[best[self._rng.integers(most, size=(count, self.n_particles))]].mean(axis=0)
+        most = min(math.ceil(self._settings.guide_share * self.n_particles), int(np.isfinite(self._pbest_costs).sum()))
+        best = np.argsort(self._pbest_costs, kind="stable")[:most]
+        means: FloatArray = self._pbest[best[self._rng.integers(most, size=(count, self.n_particles))]].mean(axis=0)
         return means
 
     def _move(self) -> None:
         attractor = self._attractor()
-        towards_own = self._rng.random(self._positions.shape)
-        towards_own *= self._own - self._positions
-        towards_best = self._rng.random(self._positions.shape)
-        towards_best *= attractor - self._positions
-        velocities = self.inertia * self._velocities + self.cognitive * towards_own + self.social * towards_best
+        to_personal_best = self._rng.random(self._positions.shape)
+        to_personal_best *= self._pbest - self._positions
+        to_global_best = self._rng.random(self._positions.shape)
+        to_global_best *= attractor - self._positions
+        velocities = self.inertia * self._velocities + self.cognitive * to_personal_best + self.social * to_global_best
         np.clip(velocities, -self._settings.max_velocity, self._settings.max_velocity, out=velocities)
         positions = self._positions + velocities
         # Reversed rather than set to zero: with many variables, a swarm that loses its speed at the bounds stays there.
@@ -410,8 +410,8 @@ class ParticleSwarm:
         """Make a point the global best: position and own best of the leading particle."""
         self._positions[self._leader] = unit
         self._costs[self._leader] = cost
-        self._own[self._leader] = unit
-        self._own_costs[self._leader] = cost
+        self._pbest[self._leader] = unit
+        self._pbest_costs[self._leader] = cost
         self._best = (x.copy(), cost)
 
     def _learn(self, unit: FloatArray, x: FloatArray, cost: float) -> None:
@@ -423,9 +423,9 @@ class ParticleSwarm:
             self._positions[worst] = unit
             self._costs[worst] = cost
             # The particle of the highest present cost may have a lower own best, which it keeps.
-            if cost < self._own_costs[worst]:
-                self._own[worst] = unit
-                self._own_costs[worst] = cost
+            if cost < self._pbest_costs[worst]:
+                self._pbest[worst] = unit
+                self._pbest_costs[worst] = cost
 
 
 def _copied(array: FloatArray | None) -> FloatArray | None:

@@ -9,7 +9,7 @@ import sysid
 from benchmarks.records.simulated import Records, four_storeys
 from sysid.measurement.whole import WholeRecords
 from sysid.modal_analysis.record_fit import record_modes, refitted
-from sysid.modal_analysis.record_varying import untold_levels
+from sysid.modal_analysis.record_varying import unidentifiable_levels
 from sysid.modal_analysis.record_whiteness import most_unlikely
 from sysid.structure.thresholds import FALSE_ALARM
 
@@ -75,4 +75,4 @@ def test_levels_that_the_records_leave_open_are_told_only_where_there_is_noise(n
         rigid_body=np.ones((1, 1)), whole=WholeRecords((1000,), 50.0, (True,)),
     )  # fmt: skip
     fit = record_modes(test, np.array([wk]), np.array([ratio]))
-    assert bool(untold_levels(refitted(fit, fit.parameters))) == told
+    assert bool(unidentifiable_levels(refitted(fit, fit.parameters))) == told

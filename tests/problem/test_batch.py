@@ -53,7 +53,7 @@ def test_a_copy_has_memory_of_its_own():
     batch = Batch(scalar())
     expected = batch(ROWS[:3])
     copy(batch)(ROWS[100:])
-    for made, before in zip([np.array(place[:3]) for place in batch._made], expected, strict=True):
+    for made, before in zip([np.array(place[:3]) for place in batch._results], expected, strict=True):
         np.testing.assert_array_equal(made, before)
 
 
