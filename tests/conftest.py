@@ -39,6 +39,17 @@ def ctrl_c():
     signal.signal(signal.SIGINT, before)
 
 
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Leave the pictures of a report out, which take most of its time."""
+    from sysid.report import matrices, report
+
+    for room in (report, matrices):
+        monkeypatch.setattr(
+            room, "picture", lambda figure, alt, caption="", *, label="", **_: f"<p>{label} {caption}</p>"
+        )
+
+
 def _geometry(rng, n, d):
     """Rows [e', (r x e)'] of n sensors at random places along random axes, the first d columns."""
     r, e = rng.uniform(-1, 2, (n, 3)), rng.normal(size=(n, 3))

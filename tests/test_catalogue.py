@@ -93,7 +93,7 @@ def test_a_path_an_own_problem_a_dotted_module_and_the_order_among_them(here, mo
     (here / "problems" / "shear_building.py").write_text("raise SystemExit('it ran')\n")
     assert catalogue.build(Recipe("shear_building")).geometry.n > 2
     typed, remark = catalogue.typed("shear_building")
-    assert Path(typed) == Path("problems/shear_building.py") and "hides the bundled problem shear_building" in remark
+    assert Path(typed) == Path("problems/shear_building.py") and remark.startswith(f"{typed} ")
     assert "it ran" in refused(typed)
     assert [entry.bundled for entry in catalogue.entries() if entry.name == "shear_building"] == [False]
     assert catalogue.typed("chain") == ("chain", "")
@@ -350,7 +350,7 @@ def test_an_unknown_name_lists_the_known_ones_and_the_closest(here):
     assert re.findall(r"'(\w+)'\?", message) == ["my_tower"]
     for entry in catalogue.entries():
         assert entry.name in message
-    assert "did you mean" not in refused("zzz")
+    assert re.findall(r"'(\w+)'\?", refused("zzz")) == []
     assert "module is ''" in refused("")
     assert "unknown" in refused("..")
 

@@ -5,7 +5,10 @@ Figures in a sentence are those that the test states, or those of the finding's 
 
 import errno
 import functools
+import importlib.metadata
 import os
+import re
+import signal
 import socket
 from argparse import Namespace
 from dataclasses import replace
@@ -15,13 +18,32 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid import FullMass, InputError, LumpedMass, Problem, Recipe, SpectralStiffness, catalogue, errors
+from sysid import (
+    FullMass,
+    InputError,
+    KnownMass,
+    LumpedMass,
+    Measurement,
+    Problem,
+    Recipe,
+    SpectralStiffness,
+    catalogue,
+    errors,
+)
+from sysid.cli import doctor, draws, sweeps, trust, unfinished
 from sysid.cli import main as cli
-from sysid.cli import trust, unfinished
-from sysid.cli.files import alone_in
+from sysid.cli.files import alone_in, results_folder
+from sysid.cli.output import Output
+from sysid.compare import table
+from sysid.compare.comparison import Comparison
 from sysid.files import reading
+from sysid.files.assembly import work_of_force
 from sysid.finding import Finding, Severity
-from sysid.results.checkpoint import Begun
+from sysid.jobs import JobResult
+from sysid.nlp import not_begun
+from sysid.report import report
+from sysid.results.checkpoint import Begun, Checkpoint
+from sysid.results.storage import atomically
 from sysid.results.summary import next_steps, verdict
 from sysid.swarm import minimize_swarm
 
@@ -48,6 +70,12 @@ def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("idle.py", "test.h5"):
         Path(name).write_text(MODULE, encoding="utf-8")
+    Path("exact.py").write_text(
+        MODULE.replace("mass=factor * np.diag([2.0, 1.0]), stiffness=K[:2, :2]", "mass=truth.mass").replace(
+            "factor, idle =", "_ ="
+        ),
+        encoding="utf-8",
+    )
 
 
 def in_use():
@@ -70,6 +98,40 @@ def own_damping():
     """Ask for the modal strategy where the damping has a form of its own."""
     damping = sysid.ProportionalDamping((0.0, 1.0), (0.0, 0.1))
     sysid.identify(Problem(TEST, mass=FullMass(), damping=damping), strategy="modal")
+
+
+def outside_of_any_structure():
+    """Check a problem whose damping takes no energy anywhere."""
+    k = sysid.Variable("k", lower=1.0, upper=2.0)
+    Problem(TEST, mass=np.diag([2.0, 1.0]), stiffness=k * K[:2, :2], damping=-k * np.eye(2)).check()
+
+
+NOWHERE = outside_of_any_structure.__code__.co_firstlineno
+
+
+def locked():
+    """Ask for a folder of results where nobody may write."""
+    Path("there").mkdir()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "access", lambda *_: False)
+        results_folder("there/out", Path("out"))
+
+
+def full_disk():
+    """Write a file where no space is left."""
+    with atomically(Path("summary.json")):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def other_records():
+    """Read a result with a problem of other records."""
+    answer("force").save("result.h5")
+    sysid.load("result.h5", problem=Problem(replace(TEST, response=2 * TEST.response), mass=FullMass()))
+
+
+def other_noise():
+    """Refine a result whose module gives other records now."""
+    sweeps.check_own_records(answer("nothing"), Recipe("shear_building"))
 
 
 def begun(strategy="swarm", **given):
@@ -158,6 +220,33 @@ REFUSED = {
     "a folder in use": (
         in_use, f"folder of results out is in use by another run (process {os.getpid()} on {{host}}): wait for its end",
     ),
+    "a folder that nobody may write": (locked, "folder of results there/out: there cannot be written"),
+    "a full disk": (full_disk, f"summary.json cannot be written: {os.strerror(errno.ENOSPC)}"),
+    "a damaged state": (
+        lambda: (Path("state.h5").write_bytes(b"text"), Checkpoint(Path("state.h5")).read()),
+        "state.h5 cannot be read: it is damaged: its first 512 bytes are not those that were written; take another "
+        "copy of it, or run the problem again",
+    ),
+    "a problem of other records": (
+        other_records,
+        "result.h5: the problem that was given has other records than the result (response): give the problem of the "
+        "same test, with the same data and parameters",
+    ),
+    "a module of other records": (
+        other_noise,
+        "shear_building now gives other records than those of the result, as the module, its data or what it reads "
+        "has changed: identify them anew by 'sysid run'",
+    ),
+    "a start of another shape": (
+        lambda: sysid.identify(Problem(TEST, mass=FullMass()), start=[1.0, 2.0, 3.0]),
+        "start has shape (3,); (11,) finite unknowns, or a Structure, is needed",
+    ),
+    "matrices of no structure": (
+        outside_of_any_structure,
+        f"the matrices (problem at {__file__}, line {NOWHERE + 3}) are those of a structure nowhere, neither at the "
+        "guess (damping_matrix is not positive semidefinite: the structure would feed energy in) nor at any of 127 "
+        f"points of the search space; it is written in 'k' ({__file__}, line {NOWHERE + 2})",
+    ),
     "a base the other way round": (
         lambda: identified(replace(TEST, base=-TEST.base)),
         "the sign of the base is reversed, or that of all sensors: beside their modes all move against the base; "
@@ -179,6 +268,46 @@ def test_what_is_refused_is_told_with_the_place_and_the_remedy(here, tmp_path, n
     with pytest.raises(InputError) as refused:
         made()
     assert str(refused.value) == sentence.format(here=tmp_path, host=socket.gethostname())
+
+
+ENDED = {
+    "search": "interrupted; the best so far is in results/shear_building",
+    "pages": "interrupted while saving; the result is there, but not every file is in results/shear_building",
+    "afterwards": "interrupted; the result is in results/shear_building",
+}
+
+
+@pytest.mark.parametrize("struck", ENDED)
+def test_an_interrupted_run_says_what_is_left(here, capsys, monkeypatch, ctrl_c, struck):
+    """In the search, while the page is written, or once it is done."""
+
+    def identify(*_, **__):
+        if struck == "afterwards":
+            signal.raise_signal(signal.SIGINT)
+        return replace(answer("force"), interrupted=struck == "search")
+
+    def write_report(*_):
+        if struck == "pages":
+            raise KeyboardInterrupt
+        return Path("report.html")
+
+    monkeypatch.setattr(cli, "identify", identify)
+    monkeypatch.setattr(report, "write_report", write_report)
+    assert cli.main(["run", "shear_building", "--quiet"]) == 130
+    assert capsys.readouterr().err == f"sysid: {ENDED[struck]}\n"
+
+
+def test_an_error_of_sysid_without_a_log_says_so(here, capsys, monkeypatch):
+    def identify(*_, **__):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(cli, "identify", identify)
+    Path("sysid-error.log").mkdir()
+    monkeypatch.setattr("tempfile.gettempdir", lambda: "nowhere")
+    assert cli.main(["run", "shear_building", "--quiet"]) == 70
+    assert capsys.readouterr().err == (
+        "sysid: an error of sysid itself (RuntimeError: a bug); no log file could be written\n"
+    )
 
 
 COMMANDS = {
@@ -312,6 +441,109 @@ def test_a_judgement_says_what_it_means_and_what_to_do_first(case, found, means,
         it = it.with_findings([Finding(kind, Severity(severity), "-") for kind, severity in found])
     assert verdict(it) == means
     assert next_steps(it)[:1] == ([] if step is None else [step])
+
+
+def test_a_stated_frequency_that_no_mode_has_is_told():
+    """Where a fit from there ends is chance."""
+    stated = TRUTH.natural_frequencies * [1.0, 1.4]
+    with pytest.raises(InputError) as refused:
+        sysid.identify(Problem(TEST, mass=FullMass(), stiffness=SpectralStiffness(stated)), strategy="modal")
+    assert re.sub(r"ends at \S+ Hz", "ends at F Hz", str(refused.value)) == (
+        f"of the stated natural frequencies {stated[1]:.5g} Hz does not stand out of the data (a fit from there ends "
+        "at F Hz): the base may not move this mode"
+    )
+
+
+def test_a_summary_in_a_hurry_says_what_computes_the_rest():
+    lines = replace(answer("force"), hurried=True).summary().splitlines()
+    assert (
+        "uncertainty not computed, as the time was over: Identification.uncertainty and 'sysid report' compute it"
+        in (lines)
+    )
+    assert not_begun(70.0) == "not begun, as its derivatives take some 7e+01 s to set up: too little time"
+
+
+def test_a_summary_names_the_masses_of_a_lumped_model():
+    lines = answer("total").summary().splitlines()
+    assert "masses at the sensors (diagonal of M_SS): sensor 1 2 kg, sensor 2 1 kg" in lines
+
+
+def test_a_comparison_says_what_its_columns_are():
+    undamped = sysid.Structure(TRUTH.mass, TRUTH.stiffness, [0.0, 0.0], n_base=1)
+    noisy = sysid.simulate(TRUTH, LINES, noise=0.01, rng=0)
+    told = [
+        " ".join(table.text(Comparison(Problem(test, mass=FullMass(), reference=truth), 0, None, ())).split("\n")[1:])
+        for test, truth in ((TEST, None), (TEST, undamped), (noisy, TRUTH))
+    ]
+    before = "before, after: {} before and after the local phase{}"
+    assert [" ".join(words.split()) for words in told] == [
+        before.format("relative residual", ""),
+        before.format(
+            "relative residual",
+            "; M, K, C: error against the reference, which has no damping, so that C has no relative error",
+        ),
+        before.format(
+            "objective (all that is fitted, weighed by its stated noise)", "; M, K, C: error against the reference"
+        ),
+    ]
+
+
+def test_doctor_says_what_is_wrong(capsys, monkeypatch):
+    monkeypatch.setattr(doctor, "linear_solvers", list)
+    assert cli.main(["doctor"]) == 2
+    out, error = capsys.readouterr()
+    assert error == "sysid: IPOPT does not work: python -m pip install --force-reinstall casadi\n"
+    assert "matplotlib draws by its backend 'Agg'; report.html is written without a browser" in out.splitlines()
+
+    def requires(name):
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "requires", requires)
+    monkeypatch.setattr(doctor, "linear_solvers", lambda: ["mumps"])
+    assert cli.main(["doctor"]) == 0
+    assert capsys.readouterr().err == (
+        "sysid: warning: sysid is imported from its folder, not installed, so that what it needs is not known: "
+        "pip install it\n"
+    )
+
+
+def test_draws_say_why_there_is_no_spread(here, capsys):
+    it = answer("force")
+    ends = [JobResult(0, 0, True, "", it.x, 0.02), JobResult(1, 0, False, "lost", it.x[:0], np.nan)]
+    draws.tell(Path("out"), it, Recipe("pair.py"), ends, Output())
+    assert "1 of 2 draws ended in a fit; two are needed for a spread" in capsys.readouterr().out.splitlines()
+
+
+def test_exact_records_are_not_drawn(here, capsys):
+    folder = Path("out")
+    replace(identified(TEST, KnownMass(TRUTH.mass)), recipe=Recipe("exact.py")).save(folder / "result.h5")
+    assert cli.main(["refine", "out", "--draws", "3", "--trust"]) == 2
+    assert capsys.readouterr() == (
+        "", "sysid: out fits its records exactly: without noise there is nothing to draw\n"
+    )  # fmt: skip
+
+
+def test_an_own_problem_of_a_bundled_name_is_remarked(here):
+    Path("problems").mkdir()
+    Path("problems/shear_building.py").write_text("")
+    assert catalogue.typed("shear_building") == (
+        "problems/shear_building.py", "problems/shear_building.py hides the bundled problem shear_building: it is taken"
+    )  # fmt: skip
+
+
+def test_lines_and_the_power_of_a_force_are_told():
+    response = TEST.response.copy()
+    response[0, 1, 30:34] = np.nan
+    left = Measurement(LINES, TEST.base, response, rigid_body=TEST.rigid_body, missing="drop")
+    assert left.lines_in_words == "56 lines from 1 to 9 Hz (4 more hold NaN and are left out)"
+    runs = [(FORCED.base[0], FORCED.response[0], sign * FORCED.force[0]) for sign in (1, -1)]
+    assert [work_of_force([run], LINES) for run in runs] == [
+        ["the base force gives power to the structure, as the force of the table on it does"],
+        [
+            "the base force takes power from the structure: it seems to be the force of the structure on the table; "
+            'where it is, turn the axes of the load cells (axis = "-x" for "x")'
+        ],
+    ]
 
 
 SWARMS = [

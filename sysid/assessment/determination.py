@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.assessment import modal_mass_cone
+from sysid.assessment.modal_mass_cone import left_open
 from sysid.assessment.sensitivity import (
     Sensitivity,
     blocks_and_slopes,
@@ -116,16 +117,12 @@ def determine(problem: Prepared, structure: Structure, x: Array | None, rivals: 
         closed, open_ = modal_mass_cone.verdict(problem, structure)
         beside = tuple(_open_outside(problem.formulation, x))
         if open_:  # other answers are members of the cone
-            return Determination((*_open((*open_, *beside)), *_fixed(closed)), BY_CONE)
+            return Determination((*open_, *map(left_open, beside), *_fixed(closed)), BY_CONE)
         others = tuple(_others(problem, structure, x, rivals))
         return Determination((*others, *_fixed(closed if others else (*closed, *beside))), BY_CONE)
     closed, open_ = _by_rank(problem, structure, x)
-    found = (*_open(open_), *_others(problem, structure, x, rivals))
+    found = (*open_, *_others(problem, structure, x, rivals))
     return Determination(found or _fixed(closed), BY_RANK)
-
-
-def _open(sentences: Sequence[str]) -> tuple[Finding, ...]:
-    return tuple(Finding("open", Severity.CAUTION, sentence) for sentence in sentences)
 
 
 def _fixed(sentences: Sequence[str]) -> tuple[Finding, ...]:
@@ -177,25 +174,28 @@ def _about(problem: Prepared, structure: Structure, x: Array | None) -> tuple[Fo
     return formulation, x, slopes, sensitivity(formulation, x, slopes)
 
 
-def _by_rank(problem: Prepared, structure: Structure, x: Array | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """What fixes the matrices, and what is left open, in sentences."""
+def _by_rank(problem: Prepared, structure: Structure, x: Array | None) -> tuple[tuple[str, ...], tuple[Finding, ...]]:
+    """What fixes the matrices, in sentences, and what is left open."""
     formulation, x, slopes, known = _about(problem, structure, x)
     count, rank = known.free.shape[1], known.rank
     named, factors = _by_name(formulation, known.unseen)
     words = directions_in_words(formulation.unknowns, x, known.unit, named)
     seen = f"the records see {rank} of {count} directions of the {x.size} unknowns; no record sees a change of"
-    open_: list[str] = []
+    open_: list[Finding] = []
     pairs = blocks_and_slopes(structure, slopes)
     if any(np.any(_open_entries(*pair, known)) for pair in pairs):
         factors = _moving(pairs, known.unit, factors)
-        open_.append(f"{seen} {'; nor of '.join([*words, *_factors_in_words(formulation, factors)])}")
-        open_ += [modal_mass_cone.UNIT_MASS] if problem.unit_mass else []
+        sentence = f"{seen} {'; nor of '.join([*words, *_factors_in_words(formulation, factors)])}"
+        figures = {"seen": rank, "directions": count, "unknowns": x.size, "unnamed": factors.shape[1]}
+        open_.append(left_open(sentence, **figures))
+        open_ += [left_open(modal_mass_cone.UNIT_MASS)] if problem.unit_mass else []
         if problem.measurement.force is None and not problem.unit_mass and _scale_is_open(pairs, known):
-            open_.append(_NO_SCALE)
+            open_.append(left_open(_NO_SCALE))
     misfit = formulation.objective(x)
     if rank and misfit < EXACT and misfit > _LOOSE * known.singular_values[rank - 1]:
         (weakest,) = directions_in_words(formulation.unknowns, x, known.unit, known.seen[:, -1:])
-        open_.append(f"the search ended at {misfit:.2g} of the records, by which {weakest} is hardly held")
+        sentence = f"the search ended at {misfit:.2g} of the records, by which {weakest} is hardly held"
+        open_.append(left_open(sentence, misfit=misfit))
     if known.unseen.shape[1]:
         fixed = "the data and the written model fix mass, stiffness and damping"
         same = (f"{seen} {'; nor of '.join(words)}; {_SAME_MATRICES}",) if words else ()

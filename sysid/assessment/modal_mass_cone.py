@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.assessment.cone import Cone, Pairs, forms, null_space, unknowns
+from sysid.finding import Finding, Severity
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.modal_estimate import ModalEstimate
@@ -44,8 +45,13 @@ def speaks(formulation: Formulation) -> bool:
     return told and formulation.by_ratios and formulation.geometry.at_sensors and formulation.test_alone
 
 
-def verdict(problem: Prepared, structure: Structure) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """What closes the modal masses of `structure`, and what is left open, in sentences.
+def left_open(sentence: str, **numbers: float) -> Finding:
+    """A finding of something that is left open, and the figures in its sentence."""
+    return Finding("open", Severity.CAUTION, sentence, numbers=numbers)
+
+
+def verdict(problem: Prepared, structure: Structure) -> tuple[tuple[str, ...], tuple[Finding, ...]]:
+    """What closes the modal masses of `structure`, in sentences, and what is left open.
 
     What counts as seen is judged against the misfit that the structure leaves: a mode whose share of
     the records is not clearly above it, poles that it cannot tell apart, and base directions that
@@ -56,21 +62,24 @@ def verdict(problem: Prepared, structure: Structure) -> tuple[tuple[str, ...], t
     known = _known(problem, structure, misfit)
     free, common = _open_modes(known)
     responses = _responses(problem.modal[0], structure)
-    open_ = [*_unseen(problem, structure, misfit, responses, free), *_merged(known, test, structure, free, responses)]
+    open_ = [
+        *map(left_open, _unseen(problem, structure, misfit, responses, free)),
+        *_merged(known, test, structure, free, responses),
+    ]
     if free:
         bounded = ", within what is stated" if len(known.equations) else ""
-        open_.append(
-            f"{_what_is_open(structure, free, common)}: other mass and stiffness matrices answer identically{bounded}"
-        )
-        open_ += [UNIT_MASS] if problem.unit_mass else []
+        alike = f"other mass and stiffness matrices answer identically{bounded}"
+        open_.append(left_open(f"{_what_is_open(structure, free, common)}: {alike}"))
+        open_ += [left_open(UNIT_MASS)] if problem.unit_mass else []
     if not structure.at_sensors:
         how_far = "completely" if test.force is not None and not free else "up to the modal masses"
         alike = ", which do not all move independently" if structure.n == structure.n_sensors else ""
-        open_.append(
+        sentence = (
             f"{structure.n} modes stand out for {structure.n_sensors} sensors{alike}: the mass and stiffness matrices "
             "hold for the stated degrees of freedom only; the Craig-Bampton form (to_craig_bampton(), modal and base "
             f"coordinates) is what the data determine, {how_far}"
         )
+        open_.append(left_open(sentence, modes=structure.n, sensors=structure.n_sensors))
     closed = () if free else tuple(filter(None, (known.sentence, _weighed_in_words(known, test, structure))))
     return closed, tuple(open_)
 
@@ -87,15 +96,17 @@ def _weighed_in_words(known: _Known, test: Measurement, structure: Structure) ->
 
 def _merged(
     known: _Known, test: Measurement, structure: Structure, free: list[int], responses: _Record
-) -> Iterator[str]:
-    """Modes that cannot be distinguished, as far as something of them is open, in sentences."""
+) -> Iterator[Finding]:
+    """Modes that cannot be distinguished, as far as something of them is open."""
     for cluster in (cluster for cluster in known.clusters if len(cluster) > 1):
         names = " and ".join(_mode(structure, k) for k in cluster)
         seen = _seen(test, structure, cluster, structure.mode_shapes, responses).shape[1]
         if seen < len(cluster):
-            yield f"{names} are too close to be told apart, and the data show {seen or 'none'} of them only"
+            sentence = f"{names} are too close to be told apart, and the data show {seen or 'none'} of them only"
+            yield left_open(sentence, modes=len(cluster), seen=seen)
         elif not set(cluster).isdisjoint(free):
-            yield f"{names} are too close to be told apart: only the sum of their residues is known"
+            sentence = f"{names} are too close to be told apart: only the sum of their residues is known"
+            yield left_open(sentence, modes=len(cluster))
 
 
 def _what_is_open(structure: Structure, free: list[int], common: bool) -> str:

@@ -50,11 +50,17 @@ def test_poles_of_stretches_are_those_of_the_structure_within_their_deviations()
     assert all(one.left <= one.left_by_all for one in found)
 
 
+@pytest.fixture(scope="module")
+def softened():
+    """Records of a structure that softens: two of small motion, one of large motion."""
+    rng = np.random.default_rng(1)
+    bases = [size * motion(rng, 60.0) for size in (0.3, 0.3, 2.0)]
+    return [noisy(rng, base, answer(base, softening=100.0)) for base in bases]
+
+
 @pytest.mark.parametrize("estimator", ["records", "spectra"])
-def test_a_structure_that_softens_is_told_with_its_frequencies_at_the_ends(estimator):
-    rng, small, large = np.random.default_rng(1), 0.3, 2.0
-    bases = [size * motion(rng) for size in (small, large)]
-    fitted, unseen = (as_test(noisy(rng, base, answer(base, softening=100.0)), estimator=estimator) for base in bases)
+def test_a_structure_that_softens_is_told_with_its_frequencies_at_the_ends(softened, estimator):
+    fitted, unseen = (as_test(softened[i], estimator=estimator) for i in (0, 2))
     it = identified(fitted, validation=[unseen])
     (told,) = it.of_kind("changing")
     low, high = told.numbers["lowest"], told.numbers["highest"]
@@ -66,7 +72,7 @@ def test_a_structure_that_softens_is_told_with_its_frequencies_at_the_ends(estim
 
 def test_runs_of_different_structures_are_told_with_the_frequencies_of_each():
     rng, factor = np.random.default_rng(2), 0.93
-    first, second = motion(rng), motion(rng)
+    first, second = motion(rng, 40.0), motion(rng, 40.0)
     test = as_test(noisy(rng, first, answer(first)), noisy(rng, second, answer(second, lambda t: factor)))
     it = identified(test)
     assert it.judgement == "no fit" and not it.success
@@ -80,7 +86,7 @@ def test_runs_of_different_structures_are_told_with_the_frequencies_of_each():
 
 def test_a_drift_along_a_record_is_told_with_when_and_what():
     rng = np.random.default_rng(3)
-    base, factor = motion(rng), lambda t: 1 - 0.06 * t / SECONDS
+    base, factor = motion(rng, 40.0), lambda t: 1 - 0.04 * t / 40.0
     it = identified(as_test(noisy(rng, base, answer(base, factor))))
     told = it.of_kind("changing")[0].sentence
     spans = [(float(a) + float(b)) / 2 for a, b in re.findall(r"at ([\d.]+) to ([\d.]+) s", told)]
@@ -115,11 +121,9 @@ def test_a_base_direction_that_does_not_move_in_an_unfitted_test_is_no_error():
     assert changing(sysid.Problem(fitted, mass=sysid.FullMass(), validation=[unseen]).prepared) == ()
 
 
-def test_unfitted_tests_keep_their_numbers():
+def test_unfitted_tests_keep_their_numbers(softened):
     """Of two, spectra without a known unit and whole records, the second alone is looked at."""
-    rng = np.random.default_rng(1)
-    bases = [size * motion(rng) for size in (0.3, 0.3, 2.0)]
-    fitted, other, large = (as_test(noisy(rng, base, answer(base, softening=100.0))) for base in bases)
+    fitted, other, large = map(as_test, softened)
     given = sysid.Measurement(other.freq, other.base, other.response, rigid_body=other.rigid_body)
     problem = sysid.Problem(fitted, mass=sysid.FullMass(), validation=[given, large])
     records = {one.record for change in changes(problem.prepared) for one in change.seen}

@@ -135,8 +135,8 @@ class TestVariablesBeside:
         x = np.concatenate([problem.values(truth)[:-2], [0.4, 0.5]])
         told = determine(problem.prepared, truth, x)
         assert told.determined
-        (sentence,) = (s for s in told.closed_by if v.name in s)
-        assert "other" in sentence and "stay the same all the same" in sentence
+        (one,) = (one for one in told.findings if v.name in one.sentence)
+        assert one.kind == "fixed" and w.name in one.sentence
         assert all(np.isnan(std) for std in uncertainty(problem.prepared, truth, x).variables.values())
 
     def test_beside_open_masses_it_is_one_more_thing_open(self, truth):
@@ -206,9 +206,10 @@ def test_entries_of_factors_are_counted_and_not_named(truth):
     x = np.concatenate([*of_models, truth.damping_ratios])
     told = determine(problem.prepared, problem.structure(x), x)
     assert not told.determined
-    assert (
-        "mass factor, stiffness factor together, in" in told.undetermined[0] and "factor[" not in told.undetermined[0]
-    )
+    # Of the scales of three modes and M_00 the total mass, which is an unknown, is one.
+    open_ = cautions(told.findings)[0]
+    assert "total mass" in open_.sentence and 1 + open_.numbers["unnamed"] == 3 + truth.n_base
+    assert not any(label in open_.sentence for label in problem.formulation.labels if "factor" in label)
     u = uncertainty(problem.prepared, problem.structure(x), x)
     assert list(u.variables) == ["z"]
     assert np.all(np.isfinite(u.variables["z"])) and np.all(np.isnan(np.diag(u.mass)))
@@ -380,5 +381,6 @@ def test_an_unknown_that_moves_exact_records_by_less_than_is_left_of_them_is_har
     x = np.empty(2)
     x[order] = 5.0 * (1 + off), 5.0
     told = determine(problem.prepared, problem.structure(x), x)
-    assert any("by which b +1 % is hardly held" in sentence for sentence in told.undetermined) is hardly
+    assert [re.findall(r"(\w+) \+1 %", one.sentence) for one in cautions(told.findings)] == [["b"]] * hardly
+    assert [one.numbers["misfit"] < 1e-8 for one in cautions(told.findings)] == [True] * hardly
     assert told.determined is not hardly

@@ -8,6 +8,7 @@ import sysid
 from sysid import FullMass, KnownMass, LumpedMass, Measurement, SpectralStiffness, Structure
 from sysid.assessment.determination import determine, intervals, open_masses
 from sysid.assessment.modal_mass_cone import _cone, _known
+from sysid.finding import cautions
 from sysid.problem.problem import Problem
 
 FREQ = np.linspace(1, 70, 60)
@@ -379,8 +380,8 @@ class TestIntervals:
         weighed = problem_of(truth, FullMass(), force=True, stiffness=stiffness)
         verdict = determine(weighed.prepared, truth, None)
         assert not verdict.determined and verdict.closed_by
-        (sentence,) = verdict.undetermined
-        assert "3 modes stand out for 4 sensors" in sentence and sentence.endswith("determine, completely")
+        (open_,) = cautions(verdict.findings)
+        assert open_.numbers == {"modes": 3, "sensors": 4} and open_.sentence.endswith("determine, completely")
         assert np.array_equal(intervals(weighed.prepared, truth, None).mass, [truth.mass[:3, :3]] * 2)
         stated = problem_of(truth, FullMass(9.0), stiffness=stiffness)
         assert np.any(np.isinf(intervals(stated.prepared, truth, None).mass))

@@ -78,7 +78,7 @@ def test_records_in_time_are_those_that_were_given(right):
 
 def test_quiet_parts_tell_the_noise_of_a_record_that_was_at_rest_for_a_while():
     rng = np.random.default_rng(5)
-    base = motion(rng)
+    base = motion(rng, seconds=60)
     base[: base.size // 4] = 0.0
     records = noisy(rng, base, answer(base), share=0.1)
     levels = quiet_levels(as_test(records))
@@ -88,7 +88,7 @@ def test_quiet_parts_tell_the_noise_of_a_record_that_was_at_rest_for_a_while():
 
 def test_hum_far_from_all_modes_is_no_error_of_a_model():
     rng = np.random.default_rng(6)
-    base = motion(rng)
+    base = motion(rng, seconds=60)
     records, floors = noisy(rng, base, answer(base))
     hum = 0.3 * np.sin(2 * np.pi * 16.667 * np.arange(base.size) / RATE)
     it = identified(as_test((records, floors + hum)))
@@ -112,7 +112,7 @@ def test_levels_are_told_where_their_unit_is_known_and_runs_may_differ_in_length
 
 def test_plain_spectra_of_records_that_move_at_their_ends_are_told_to_be_such():
     rng = np.random.default_rng(8)
-    base = motion(rng)
+    base = motion(rng, seconds=60)
     test = as_test(noisy(rng, base, answer(base))).in_band(0.5, 12.0)
     cut = as_test(noisy(rng, base, answer(base)), estimator="spectra")
     rest = base * np.interp(np.arange(base.size) / RATE, [0, 10, 30, 40], [0, 1, 1, 0])

@@ -1,4 +1,8 @@
-"""Standard deviations against dense finite-difference Jacobians, Monte Carlo, and closed forms."""
+"""Standard deviations and intervals against dense finite-difference Jacobians and closed forms.
+
+What draws of noise say of them is the benchmark `modal.accuracy`, which CI runs in its reduced form: stated deviations
+over the Cramér-Rao bound's, chi-squared of the errors, and in full how many intervals hold the truth.
+"""
 
 import dataclasses
 from types import SimpleNamespace
@@ -380,65 +384,6 @@ class TestWhatTheDataDoNotShow:
         for name in ("mass", "stiffness"):
             np.testing.assert_allclose(getattr(close, name), expected[name], rtol=1e-4)
             np.testing.assert_allclose(getattr(one, name), expected[name], rtol=2e-2)
-
-
-def noisy(structure, clean, rng):
-    """Another draw of the noise that `clean` states."""
-    add = lambda x, s: x + s / np.sqrt(2) * (rng.standard_normal(x.shape) + 1j * rng.standard_normal(x.shape))  # noqa: E731
-    return dataclasses.replace(
-        clean, response=add(clean.response, clean.response_std), force=add(clean.force, clean.force_std)
-    )
-
-
-def refit(dense, inverse, test):
-    """Gauss-Newton with the weighted Jacobian of the truth, whose pseudo-inverse is given."""
-    measured = np.concatenate([test.relative.ravel(), test.force.ravel()])
-    measured = np.concatenate([measured.real, measured.imag])
-    theta = dense.at.copy()
-    for _ in range(12):
-        theta = theta + inverse @ (measured - dense.records(theta))
-    return theta
-
-
-def assembled(dense, theta, G):
-    phi, gamma, omega, zeta, rigid = dense.split(theta)
-    P = np.linalg.inv(phi)
-    M, K = P.T @ P, (P.T * omega**2) @ P
-    M_S0, K_S0 = P.T @ gamma - M @ G, -K @ G
-    M_00 = rigid - G.T @ M @ G - G.T @ M_S0 - M_S0.T @ G
-    full = np.block([[M, M_S0], [M_S0.T, M_00]])
-    return Structure(full, np.block([[K, K_S0], [K_S0.T, -G.T @ K_S0]]), zeta, n_base=G.shape[1])
-
-
-def test_monte_carlo(random_structure):
-    """Spread of 200 fits of noisy draws, and the share of 95 % intervals that hold the truth."""
-    rng = np.random.default_rng(17)
-    truth = random_structure(rng, 3, 2, ratios=[0.01, 0.02, 0.015], frequencies=[9.0, 21.0, 40.0])
-    bare = sysid.simulate(truth, FREQ, force=True)
-    stated = sysid.simulate(truth, FREQ, force=True, noise=0.01, rng=0)
-    clean = dataclasses.replace(bare, response_std=stated.response_std, force_std=stated.force_std)
-    dense = Dense(truth, clean)
-    noise = dense.noise()[:, None]
-    inverse = np.linalg.pinv(dense.jacobian(dense.records) / noise) / noise.T
-    expected = uncertainty(problem_of(truth, clean).prepared, truth, None)
-    found, hits = {name: [] for name in NAMES}, {name: [] for name in NAMES}
-    for _ in range(200):
-        test = noisy(truth, clean, rng)
-        fit = assembled(dense, refit(dense, inverse, test), truth.rigid_body)
-        u = uncertainty(problem_of(truth, test).prepared, fit, None)
-        assert u.inflation == 1.0
-        for name in NAMES:
-            value, true = (getattr(s, name) for s in (fit, truth))
-            if name in ("mass", "stiffness", "damping"):
-                value, true = value[:3, :3], true[:3, :3]
-            low, high = u.interval(name)
-            found[name].append(value)
-            hits[name].append(((low <= true) & (true <= high)).ravel())
-    for name in NAMES:
-        ratio = np.std(found[name], axis=0) / getattr(expected, name)
-        assert np.all(np.abs(ratio - 1) < 4 / np.sqrt(2 * 200)), name  # four standard deviations of a sample's
-        assert 0.90 < np.mean(hits[name]) < 0.99, name
-    assert 0.93 < np.mean(np.concatenate([np.concatenate(h) for h in hits.values()])) < 0.97
 
 
 class TestNoiseLevel:

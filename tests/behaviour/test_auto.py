@@ -90,8 +90,9 @@ class TestAuto:
         wrong = Problem(problem.measurement, mass=problem.mass, stiffness=sysid.SpectralStiffness(given))
         result = self.at_once(wrong)
         assert result.strategy == "swarm"
-        assert f"{given[2]:.5g} Hz does not stand out" in strategy_of(result)
-        assert "of the stated natural frequencies" in strategy_of(result)
+        with pytest.raises(InputError, match=f"{given[2]:.5g} Hz") as refused:
+            identify(wrong, strategy="modal")
+        assert strategy_of(result).endswith(f"the modal one does not apply ({refused.value})")
 
     def test_where_none_applies_one_error_tells_of_each(self, problem, monkeypatch):
         def run(strategy, *_):

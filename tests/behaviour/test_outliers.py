@@ -62,7 +62,7 @@ def by_scipy(*tests):
     return found * np.concatenate([SPRINGS, DAMPERS])
 
 
-def test_outliers_are_listed_by_test_run_channel_and_line(tmp_path):
+def test_outliers_are_listed_by_test_run_channel_and_line(tmp_path, no_pictures):
     """Those that were put in, of two tests: in Python, in summary.json and in the report."""
     tests = [sysid.simulate(TRUTH, FREQ, noise=0.01, rng=rng) for rng in (1, 2)]
     put = {(2, 1, "sensor 1", FREQ[100]): 80, (1, 1, "sensor 2", FREQ[20]): 60, (1, 1, "sensor 1", FREQ[90]): 40}

@@ -8,7 +8,7 @@ import pytest
 
 import sysid
 from sysid.cli.show import show
-from sysid.report import matrices, report
+from sysid.report import report
 from sysid.search import local
 
 with pytest.MonkeyPatch.context() as patch:
@@ -157,9 +157,7 @@ def test_a_prior_of_a_variable_that_enters_no_matrix_stands_apart():
     np.testing.assert_allclose(result.values["density"], DENSITIES, rtol=1e-5)
 
 
-def test_the_summary_and_the_report_have_their_unknowns(noisy, tmp_path, monkeypatch):
-    for room in (report, matrices):  # the pictures take longest, and hold no unknowns
-        monkeypatch.setattr(room, "picture", lambda figure, alt, caption="", **_: f"<p>{caption}</p>")
+def test_the_summary_and_the_report_have_their_unknowns(noisy, tmp_path, no_pictures):
     result = noisy[0]
     summary = result.summary()
     page = report.write_report(result, tmp_path / "report.html").read_text(encoding="utf-8")

@@ -33,7 +33,9 @@ def test_the_example_of_the_readme_is_determined(tmp_path, monkeypatch):
     assert (tmp_path / "two_floors.html").stat().st_size > 1e4
 
 
-def test_the_lines_of_the_readme_go_from_a_loggers_file_of_each_kind_to_an_export(tmp_path, monkeypatch, capsys):
+def test_the_lines_of_the_readme_go_from_a_loggers_file_of_each_kind_to_an_export(
+    tmp_path, monkeypatch, capsys, no_pictures
+):
     op4, pyuff = pytest.importorskip("pyyeti.nastran.op4"), pytest.importorskip("pyuff")
     monkeypatch.chdir(tmp_path)
     readme = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -1,5 +1,6 @@
 """Searches that were ended in their midst go on from their checkpoint, and end with the bits they would have had."""
 
+import functools
 import time
 
 import casadi as ca
@@ -12,6 +13,7 @@ from sysid.results.checkpoint import Checkpoint
 
 STRETCH = np.array([[1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]])
 SHORT = sysid.Swarm(max_iterations=12, restarts=1, n_particles=20)
+ENDS = [0.0, 0.5, 1.0]  # shares of a search after which it is killed
 
 
 class Killed(BaseException):
@@ -55,18 +57,24 @@ class Counted:
             raise Killed
 
 
+@pytest.fixture(scope="module")
+def uninterrupted():
+    """Give a function that searches the chain without noise by a strategy with seed 0: once for all tests."""
+    return functools.cache(lambda strategy: sysid.identify(chain(), strategy=strategy, rng=0))
+
+
 @pytest.mark.parametrize(
-    ("form", "strategy"),
-    [("chain", "continuation"), ("chain", SHORT), ("free", SHORT),
-     ("free", sysid.Swarm(12, local="cholesky", refine_by="leaders")),
-     ("chain", "auto"), ("free", "auto")],
+    ("form", "strategy", "shares"),
+    [("chain", "continuation", ENDS), ("chain", SHORT, ENDS), ("free", SHORT, ENDS),
+     ("free", sysid.Swarm(12, local="cholesky", refine_by="leaders"), ENDS),
+     ("chain", "auto", [0.5]), ("free", "auto", ENDS)],  # of the chain "auto" is continuation too
 )  # fmt: skip
-def test_killed_at_any_report_a_search_goes_on_to_the_same_bits(form, strategy, random_case, tmp_path):
+def test_killed_at_any_report_a_search_goes_on_to_the_same_bits(form, strategy, shares, random_case, tmp_path):
     problem = chain() if form == "chain" else free_modes(random_case)
     all_of_it = Counted()
     whole = sysid.identify(problem, strategy=strategy, rng=4, progress=all_of_it)
     fewer = []
-    for last in np.unique(np.linspace(1, all_of_it.count, 3, dtype=int)):
+    for last in np.unique([1 + int(share * (all_of_it.count - 1)) for share in shares]):
         checkpoint = Checkpoint(tmp_path / f"{last}.h5", every=0.0)
         with pytest.raises(Killed):
             sysid.identify(problem, strategy=strategy, rng=4, progress=Counted(last), checkpoint=checkpoint)
@@ -79,7 +87,7 @@ def test_killed_at_any_report_a_search_goes_on_to_the_same_bits(form, strategy, 
         assert fewer[-1] >= 10
 
 
-def test_ctrl_c_keeps_the_state_at_once_and_the_search_goes_on_from_there(tmp_path):
+def test_ctrl_c_keeps_the_state_at_once_and_the_search_goes_on_from_there(tmp_path, uninterrupted):
     def interrupt(progress):
         if (progress.phase, progress.iteration) == ("swarm", 7):
             raise KeyboardInterrupt
@@ -93,7 +101,7 @@ def test_ctrl_c_keeps_the_state_at_once_and_the_search_goes_on_from_there(tmp_pa
         problem, strategy=SHORT, rng=0, checkpoint=file, progress=lambda at: iterations.append((at.phase, at.iteration))
     )
     assert next(at for at in iterations if at[0] == "swarm") == ("swarm", 8)
-    assert bits(again) == bits(sysid.identify(problem, strategy=SHORT, rng=0))
+    assert bits(again) == bits(uninterrupted(SHORT))
 
 
 def test_a_search_that_fails_by_itself_is_not_unfinished(tmp_path, monkeypatch):
@@ -109,11 +117,11 @@ def test_a_search_that_fails_by_itself_is_not_unfinished(tmp_path, monkeypatch):
     assert not checkpoint.exists
 
 
-def test_no_failure_that_another_try_may_mend_takes_the_state_away(tmp_path, monkeypatch):
+def test_no_failure_that_another_try_may_mend_takes_the_state_away(tmp_path, monkeypatch, state):
     """A full disk at the start of the next run, and a time limit that leaves no time."""
     import sysid.results.checkpoint as module
 
-    file = unfinished(tmp_path / "state.h5")
+    file = unfinished(tmp_path / "state.h5", state)
     before = file.read_bytes()
 
     def full(path):
@@ -155,17 +163,24 @@ def test_a_search_that_had_no_candidate_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def unfinished(path):
-    """Leave a search of the chain after its fourth iteration."""
+@pytest.fixture(scope="module")
+def state(tmp_path_factory):
+    """What a search of the chain leaves that is killed after its fourth iteration."""
+    path = tmp_path_factory.mktemp("killed") / "state.h5"
     with pytest.raises(Killed):
         sysid.identify(
             chain(), strategy=SHORT, rng=0, callback=Counted(4, "swarm"), checkpoint=Checkpoint(path, every=0.0)
         )
+    return path.read_bytes()
+
+
+def unfinished(path, state):
+    path.write_bytes(state)
     return path
 
 
-def test_the_state_of_another_search_is_refused(tmp_path):
-    file = unfinished(tmp_path / "state.h5")
+def test_the_state_of_another_search_is_refused(tmp_path, state):
+    file = unfinished(tmp_path / "state.h5", state)
     before = file.read_bytes()
     others = [
         {"rng": 1}, {"strategy": "continuation"}, {"problem": chain(noise=0.01)}, {"max_evaluations": 500},
@@ -178,8 +193,8 @@ def test_the_state_of_another_search_is_refused(tmp_path):
     assert file.read_bytes() == before
 
 
-def test_a_damaged_state_is_refused_and_left(tmp_path):
-    file = unfinished(tmp_path / "state.h5")
+def test_a_damaged_state_is_refused_and_left(tmp_path, state):
+    file = unfinished(tmp_path / "state.h5", state)
     for image in (file.read_bytes()[:-1000], b"text", file.read_bytes()[:5000] + b"x" + file.read_bytes()[5001:]):
         file.write_bytes(image)
         with pytest.raises(sysid.InputError, match=r"state\.h5 cannot be read: it is damaged"):
@@ -187,16 +202,16 @@ def test_a_damaged_state_is_refused_and_left(tmp_path):
         assert file.read_bytes() == image
 
 
-def test_a_result_is_no_state_and_a_state_no_result(tmp_path):
-    file = unfinished(tmp_path / "state.h5")
+def test_a_result_is_no_state_and_a_state_no_result(tmp_path, state, uninterrupted):
+    file = unfinished(tmp_path / "state.h5", state)
     with pytest.raises(sysid.InputError, match="unfinished search"):
         sysid.load(file)
-    sysid.identify(chain(), rng=0).save(tmp_path / "result.h5")
+    uninterrupted(SHORT).save(tmp_path / "result.h5")
     with pytest.raises(sysid.InputError, match="is not the state of an unfinished search"):
         sysid.identify(chain(), rng=0, checkpoint=tmp_path / "result.h5")
 
 
-def test_a_state_that_cannot_be_written_any_more_ends_no_search(tmp_path, monkeypatch):
+def test_a_state_that_cannot_be_written_any_more_ends_no_search(tmp_path, monkeypatch, uninterrupted):
     """As on a disk that is full after the start: the last state that was written stays."""
     import sysid.results.checkpoint as module
     import sysid.search.journal as journal
@@ -215,7 +230,7 @@ def test_a_state_that_cannot_be_written_any_more_ends_no_search(tmp_path, monkey
     file = tmp_path / "state.h5"
     with pytest.warns(UserWarning, match="the search goes on, but its state is not kept: no space left"):
         result = sysid.identify(chain(), strategy=SHORT, rng=0, checkpoint=Checkpoint(file, every=0.0))
-    assert bits(result) == bits(sysid.identify(chain(), strategy=SHORT, rng=0))
+    assert bits(result) == bits(uninterrupted(SHORT))
     assert file.read_bytes() == writes[-1]
     assert from_bytes(writes[-1])[0]["entries"]["0"]["part"] == "swarm"
 

@@ -1,7 +1,6 @@
 """Bundled problems whose matrices have a form of their own: each finds its truth, and claims what physics lets it."""
 
 import dataclasses
-import re
 import runpy
 
 import casadi as ca
@@ -230,7 +229,7 @@ class TestEquivalentForces:
         s = result.structure
         assert result.success and not result.determined
         # w, zeta and residues of rank one are all that records see; the trace ties one unknown more.
-        seen, free, count = map(int, re.search(r"see (\d+) of (\d+) .* the (\d+) unk", result.undetermined[0]).groups())
+        seen, free, count = (result.open_findings[0].numbers[name] for name in ("seen", "directions", "unknowns"))
         assert (seen, free, count) == (2 * n + n * (n + d - 1), n * (n + 1) + n * d + n - 1, n * (n + 1) + n * d + n)
         assert free - seen == n - 1
         assert np.trace(blocks(s)[0]) == pytest.approx(np.trace(blocks(truth)[0]), rel=1e-8)

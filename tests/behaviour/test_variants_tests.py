@@ -88,9 +88,9 @@ def test_one_axis_leaves_open_what_it_does_not_move():
     assert np.isnan(std["gyration"])
     assert np.isfinite(std["alpha"]) and np.isfinite(std["beta"])
     np.testing.assert_allclose(result.values["k"][[1, 2, 4, 5]], [5e6, 5e6, 4e6, 4e6], rtol=1e-6)
-    open_ = next(told for told in result.undetermined if "no record sees" in told)
-    assert "see 6 of 9 directions" in open_
-    assert all(f"{name} +1 %" in open_ for name in ("gyration", "k[0]", "k[3]"))
+    (open_,) = (one for one in result.of_kind("open") if "seen" in one.numbers)
+    assert (open_.numbers["seen"], open_.numbers["directions"]) == (6, 9)
+    assert all(f"{name} +1 %" in open_.sentence for name in ("gyration", "k[0]", "k[3]"))
 
 
 def test_without_an_added_mass_the_scale_stays_open():
@@ -101,10 +101,10 @@ def test_without_an_added_mass_the_scale_stays_open():
     assert all(np.all(np.isnan(std)) for std in result.uncertainty.variables.values())
     scale = [result.values[v] / known[constant] for v, constant in TRUTHS["added_mass"].items()]
     np.testing.assert_allclose(scale, scale[0][0], rtol=1e-6)
-    open_, scale_open = result.undetermined
-    assert "scale" in scale_open
-    assert "see 8 of 9 directions" in open_
-    assert all(name in open_ for name in ("mass", "spring", "damper"))
+    open_, scale_open = result.open_findings
+    assert "scale" in scale_open.sentence and result.scale_is_open
+    assert (open_.numbers["seen"], open_.numbers["directions"]) == (8, 9)
+    assert all(name in open_.sentence for name in ("mass", "spring", "damper"))
 
 
 def test_without_the_force_the_scale_and_the_ring_stay_open():
@@ -116,7 +116,8 @@ def test_without_the_force_the_scale_and_the_ring_stay_open():
     std = result.uncertainty.variables
     assert np.all(np.isnan(std["mass"])) and np.all(np.isnan(std["spring"]))
     assert np.all(np.isfinite(std["damping_ratio"]))
-    assert any("see 11 of 13 directions" in told for told in result.undetermined)
+    (open_,) = (one for one in result.of_kind("open") if "seen" in one.numbers)
+    assert (open_.numbers["seen"], open_.numbers["directions"]) == (11, 13)
 
 
 def test_the_force_weighs_the_stack_and_the_ring():

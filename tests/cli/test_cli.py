@@ -112,10 +112,18 @@ def test_version_and_help_end_with_zero(capsys):
         assert "usage: sysid" in capsys.readouterr().out
 
 
-def test_plain_output_has_no_control_codes_whatever_the_environment_asks(here, process, without_pictures):
-    (here / "pair.py").write_text(without_pictures)
+@pytest.fixture(scope="module")
+def in_ascii(tmp_path_factory, without_pictures):
+    """What a process said whose module prints other letters than its streams have."""
+    folder = tmp_path_factory.mktemp("ascii")
+    (folder / "pair.py").write_text("print('ζ²')\n" + without_pictures, encoding="utf-8")
     environment = os.environ | {"FORCE_COLOR": "1", "TTY_COMPATIBLE": "1", "PYTHONIOENCODING": "ascii", "COLUMNS": "40"}
-    done = process("run", "pair.py", "--strategy", "swarm", env=environment, cwd=here)
+    command = [sys.executable, "-m", "sysid", "run", "pair.py", "--strategy", "swarm"]
+    return subprocess.run(command, env=environment, cwd=folder, capture_output=True, timeout=120, check=False)
+
+
+def test_plain_output_has_no_control_codes_whatever_the_environment_asks(in_ascii):
+    done = in_ascii
     assert done.returncode == 0
     assert b"One of many: " in done.stdout and b" iteration " not in done.stdout
     for stream in (done.stdout, done.stderr):
@@ -135,11 +143,9 @@ def test_the_modal_strategy_tells_its_only_phase(here, capsys, no_pictures):
     assert "nan" not in out
 
 
-def test_what_the_module_prints_cannot_end_the_run_by_its_letters(here, process, without_pictures):
-    (here / "pair.py").write_text("print('ζ²')\n" + without_pictures)
-    done = process("run", "pair.py", env=os.environ | {"PYTHONIOENCODING": "ascii"}, cwd=here)
-    assert done.returncode == 0
-    assert done.stdout.startswith(b"??")
+def test_what_the_module_prints_cannot_end_the_run_by_its_letters(in_ascii):
+    assert in_ascii.returncode == 0
+    assert in_ascii.stdout.startswith(b"??")
 
 
 @pytest.mark.skipif(os.name != "posix", reason="pseudo-terminals")
@@ -306,7 +312,7 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_search(here, comp
     locked = here / "locked"
     locked.mkdir(mode=0o500)
     assert cli.main(["run", "pair.py", "--out", "locked/out"]) == 2
-    assert "locked cannot be written" in complaint()
+    assert " locked " in complaint()
 
 
 def test_a_file_that_cannot_be_read_is_refused(here, complaint, monkeypatch):
@@ -316,7 +322,7 @@ def test_a_file_that_cannot_be_read_is_refused(here, complaint, monkeypatch):
     monkeypatch.setattr(Path, "read_bytes", refuse)
     assert cli.main(["run", "pair.py"]) == 2
     error = complaint()
-    assert f"pair.py cannot be read: {os.strerror(errno.EACCES)}" in error
+    assert "pair.py" in error and os.strerror(errno.EACCES) in error
 
 
 def test_a_disk_that_is_full_is_one_line_and_leaves_no_half_file(here, complaint, files, monkeypatch):
@@ -336,5 +342,5 @@ def test_a_summary_that_cannot_be_written_takes_no_result_away(here, complaint, 
     monkeypatch.setattr(Path, "write_text", full)
     assert cli.main(["run", "pair.py"]) == 2
     error = complaint()
-    assert f"summary.json cannot be written: {os.strerror(errno.ENOSPC)}" in error
+    assert "summary.json" in error and os.strerror(errno.ENOSPC) in error
     assert files(here) == {"pair.py", "results", "results/pair", "results/pair/result.h5"}

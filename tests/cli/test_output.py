@@ -6,6 +6,7 @@ import os
 import re
 import sys
 
+import matplotlib
 import numpy as np
 import pytest
 
@@ -108,7 +109,7 @@ def test_doctor_finds_what_is_here(document, capsys):
     words = capsys.readouterr().out
     assert re.search(rf"^  numpy +{re.escape(np.__version__)}$", words, re.MULTILINE)
     assert re.search("^IPOPT works .* found: (.*)$", words, re.MULTILINE)[1].split(", ") == told["linear_solvers"]
-    assert "without a browser" in words
+    assert repr(matplotlib.get_backend().lower()) in words.lower()
 
 
 def test_doctor_tells_what_is_missing_with_the_command_that_installs_it(capsys, monkeypatch):
@@ -128,7 +129,7 @@ def test_doctor_tells_what_is_missing_with_the_command_that_installs_it(capsys, 
     stated.pop()
     monkeypatch.setattr(doctor, "linear_solvers", list)
     assert cli.main(["doctor"]) == 2
-    assert "IPOPT does not work" in capsys.readouterr().err
+    assert "casadi" in capsys.readouterr().err
 
 
 def test_doctor_says_where_it_cannot_know_what_is_needed(capsys, monkeypatch):
@@ -138,7 +139,7 @@ def test_doctor_says_where_it_cannot_know_what_is_needed(capsys, monkeypatch):
     monkeypatch.setattr(importlib.metadata, "requires", requires)
     monkeypatch.setattr(doctor, "linear_solvers", lambda: ["mumps"])
     assert cli.main(["doctor"]) == 0
-    assert "imported from its folder, not installed" in capsys.readouterr().err
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 @pytest.mark.parametrize(

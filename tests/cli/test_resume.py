@@ -2,10 +2,12 @@
 
 import re
 import signal
+from pathlib import Path
 
 import pytest
 
 import sysid
+from sysid import InputError
 from sysid.cli import main as cli
 from sysid.results.checkpoint import FILE_NAME, Checkpoint
 
@@ -186,7 +188,9 @@ def test_a_run_that_had_reached_nothing_begins_anew_and_says_so(stopped, capsys,
 def test_a_damaged_state_is_told_and_fresh_leads_on(stopped, complaint):
     (stopped / FILE_NAME).write_bytes((stopped / FILE_NAME).read_bytes()[:700])
     assert cli.main(["run", "--resume", "out"]) == 2
-    assert "out/unfinished.h5 cannot be read: it is damaged" in complaint()
+    with pytest.raises(InputError) as damaged:
+        Checkpoint(Path("out", FILE_NAME)).read()
+    assert complaint() == f"sysid: {damaged.value}\n"
     assert cli.main(RUN) == 2
     error = complaint()
     assert "damaged" in error and "--fresh" in error

@@ -97,7 +97,9 @@ def test_one_and_true_make_two_problems_in_one_worker(recipe, tmp_path):
 def test_a_job_without_a_structure_to_start_from_says_so(recipe):
     result = next(submit(replace(recipe, start=[1.0, 2.0, 3.0])))
     assert not result.success and result.x.size == 0 and np.isnan(result.residual)
-    assert "start has shape (3,)" in result.message
+    with pytest.raises(sysid.InputError, match=r"\(3,\)") as refused:
+        sysid.identify(sysid.catalogue.build(replace(recipe, start=None)), start=[1.0, 2.0, 3.0])
+    assert result.message.endswith(str(refused.value))
 
 
 @pytest.mark.parametrize(

@@ -57,7 +57,7 @@ def test_numbers_that_stand_alone_are_told_among_those_of_their_run(structure):
 @pytest.mark.parametrize("estimator", ["spectra", "records"])
 def test_no_more_modes_stand_out_of_five_runs_than_there_are(structure, estimator):
     rng = np.random.default_rng(2)
-    bases = [at_rest(motion(rng, seconds=n)) for n in (30, 27, 25, 23, 20)]
+    bases = [at_rest(motion(rng, seconds=n)) for n in (15, 14, 12, 11, 10)]
     runs = []
     for base in bases:
         records, floors = noisy(rng, base, of_lines(structure, base[None]), 0.1)

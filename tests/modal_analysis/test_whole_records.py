@@ -105,9 +105,7 @@ def test_motion_with_the_base_is_judged_beside_its_noise(records, gain):
     truth = simulated.coupled_structure(rng, 4, 3, np.array([2.1, 3.4, 5.2, 9.0]))
     mixing = np.array([[1.0, 0.3, 0.2], [0.3, 1.0, 0.1], [0.98, 0.35, 0.2]])
     size = np.linalg.norm(mixing, axis=1)
-    motion = simulated.random_motion(
-        rng, 120.0, 40.0, (0.5, 15.0), correlation=mixing @ mixing.T / np.outer(size, size)
-    )
+    motion = simulated.random_motion(rng, 40.0, 40.0, (0.5, 15.0), correlation=mixing @ mixing.T / np.outer(size, size))
     run = simulated.Run.ringing(simulated.Modes.of(truth), motion, rng)
     noisy, _ = simulated.with_noise(run.records(), rng, 0.01)
     response = noisy.response.copy()

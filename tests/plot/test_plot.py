@@ -282,7 +282,9 @@ def test_without_an_frf_the_pictures_of_the_modes_say_so(runs):
     (curve,) = behind.get_lines()
     np.testing.assert_allclose(curve.get_ydata(), np.linalg.norm(one.relative[0], axis=0))
     assert "new pole" not in lines(ax) and lines(ax)["identified mode"]
-    assert "No poles are shown: the one run does not move the base" in ax.texts[0].get_text().replace("\n", " ")
+    with pytest.raises(sysid.InputError, match="the one run does not move the base") as refused:
+        stabilisation(one)
+    assert str(refused.value) in ax.texts[0].get_text().replace("\n", " ")
     ax = plot.cmif(alone).axes[0]
     np.testing.assert_allclose(lines(ax)["first"].get_ydata(), curve.get_ydata())
     assert ax.texts[0].get_text().startswith("Singular values of the runs' own spectra: the one run")

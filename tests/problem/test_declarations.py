@@ -279,7 +279,6 @@ def test_matrices_of_a_structure_nowhere_are_refused_before_a_search(mistake, wo
     problem = build(**{"stiffness": chain(k), **mistake(k)})
     with pytest.raises(sysid.InputError, match=words) as caught:
         problem.check()
-    assert "are those of a structure nowhere" in str(caught.value)
     assert "test_declarations.py, line " in str(caught.value)
 
 

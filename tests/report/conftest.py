@@ -7,7 +7,6 @@ import pytest
 
 import sysid
 from sysid.finding import Finding, Severity
-from sysid.report import matrices as _report_matrices
 from sysid.report import report
 
 FREQ = np.linspace(1.0, 40.0, 30)
@@ -94,12 +93,3 @@ def plain(truth):
         ),
         interrupted=True,
     )  # fmt: skip
-
-
-@pytest.fixture
-def no_pictures(monkeypatch):
-    """Leave the pictures out, which take most of the time."""
-    for room in (report, _report_matrices):
-        monkeypatch.setattr(
-            room, "picture", lambda figure, alt, caption="", *, label="", **_: f"<p>{label} {caption}</p>"
-        )

@@ -68,7 +68,7 @@ def test_each_phase_has_its_row_with_its_residual_and_errors(result):
     assert float(last["M, %"]) < 0.1 < 1 < float(dict(zip(COLUMNS, rows[1], strict=True))["M, %"])
 
 
-def test_summary_and_report_show_them(result):
+def test_summary_and_report_show_them(result, no_pictures):
     assert "after  objective" in result.summary()
     assert "1 - MAC" in result.summary()
     assert "1 - MAC" in render(result)
@@ -95,7 +95,7 @@ def test_seconds_are_neither_rounded_to_nothing_nor_written_with_a_power():
 
 
 @pytest.mark.parametrize(("restarts", "told"), [(0, None), (1, "1 further swarm"), (3, "3 further swarms")])
-def test_further_swarms_are_told_by_summary_and_report(result, restarts, told):
+def test_further_swarms_are_told_by_summary_and_report(result, restarts, told, no_pictures):
     searched = replace(result, history=replace(result.history, restarts=restarts))
     for page in (searched.summary(), render(searched)):
         assert "further swarm" not in page if told is None else f"{told} " in page.replace("\n", " ")

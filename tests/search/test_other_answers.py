@@ -47,6 +47,7 @@ def exchanged(x):
 
 
 X = np.concatenate([SPRINGS, DAMPERS])
+FROM_X = {"strategy": sysid.Continuation(starts=1), "start": X}  # what is looked for afterwards is the same
 
 
 def test_the_exchange_gives_the_same_transmissibility():
@@ -153,7 +154,7 @@ def test_no_time_is_lost_where_the_equations_are_linear(monkeypatch):
     assert other_answers.is_unique_if_rank_is_full(problem((0, 1), ratios=True).prepared)
     assert not other_answers.is_unique_if_rank_is_full(problem((1,)).prepared)
     monkeypatch.setattr(other_answers, "SameResponse", None)
-    assert sysid.identify(problem((0, 1)), rng=0).determined
+    assert sysid.identify(problem((0, 1)), rng=0, **FROM_X).determined
 
 
 def test_a_broken_constraint_is_a_difference_too():
@@ -204,7 +205,7 @@ def test_structures_are_apart_by_the_entry_of_any_matrix_that_differs_most():
 
 
 def test_the_same_seed_finds_the_same_bits():
-    one, two = (sysid.identify(problem(rng=2), rng=2, start=X) for _ in range(2))
+    one, two = (sysid.identify(problem(rng=2), rng=2, **FROM_X) for _ in range(2))
     assert one.undetermined == two.undetermined
     np.testing.assert_array_equal(one.x, two.x)
 
@@ -215,7 +216,7 @@ def test_ctrl_c_during_the_look_keeps_the_answer_and_says_so(ctrl_c):
         if progress.phase == "other answers":
             os.kill(os.getpid(), signal.SIGINT)
 
-    result = sysid.identify(problem(rng=2), rng=2, callback=interrupt)
+    result = sysid.identify(problem(rng=2), rng=2, **FROM_X, callback=interrupt)
     assert result.interrupted
     assert result.success
     assert not result.determined
@@ -229,7 +230,7 @@ def test_a_callback_may_stop_it():
         if progress.phase == "other answers":
             raise StopIteration
 
-    result = sysid.identify(problem(rng=2), rng=2, callback=stop)
+    result = sysid.identify(problem(rng=2), rng=2, **FROM_X, callback=stop)
     assert not result.determined
     (told,) = (*result.contradictions, *result.open_findings)
     assert told.kind == "other answers" and "callback" in told.sentence
@@ -245,14 +246,14 @@ def test_the_time_limit_ends_it(monkeypatch):
         return inner(posed, end, session)
 
     monkeypatch.setattr("sysid.results.judgement.with_other_answers", late)
-    result = sysid.identify(problem(rng=2), rng=2)
+    result = sysid.identify(problem(rng=2), rng=2, **FROM_X)
     (told,) = (*result.contradictions, *result.open_findings)
     assert told.kind == "other answers" and "time" in told.sentence
 
 
 def test_too_many_unknowns_are_a_remark(monkeypatch):
     monkeypatch.setattr(other_answers, "_FEWEST_STARTS", 65)
-    result = sysid.identify(problem(rng=2), rng=2)
+    result = sysid.identify(problem(rng=2), rng=2, **FROM_X)
     assert len(result.of_kind("search")) == 1
 
 
