@@ -40,7 +40,7 @@ print(result.residual, result.success)
 # %%
 recipe = replace(recipe, start=result.x)
 folder = Path(tempfile.mkdtemp())
-ends = list(sysid.jobs.submit(recipe, starts=12, out=folder))
+ends = list(sysid.jobs.submit(recipe, starts=8, out=folder))
 for end in ends:
     print(end.index, end.success, f"{end.residual:.2e}", end.message[:60])
 
@@ -49,7 +49,7 @@ for end in ends:
 #
 # Ends are one minimum where all unknowns agree to a thousandth of their size. A worse one that was reached often is a
 # warning for whoever starts at one point only; a second one that fits alike would mean that the data do not tell them
-# apart. `sysid refine results/NAME --starts 12` does all of this from the command line.
+# apart. `sysid refine results/NAME --starts 8` does all of this from the command line.
 
 # %%
 minima = sysid.jobs.distinct(problem, ends)
@@ -64,6 +64,6 @@ sysid.plot.minima(minima, "magnitude_only", goal=problem.goal)
 # Those that stand in the folder of the jobs are not computed again.
 
 # %%
-again = list(sysid.jobs.submit(recipe, starts=14, executor=sysid.jobs.processes(2), out=folder))
-assert all(np.array_equal(one.x, other.x) for one, other in zip(ends, again[:12], strict=True))
-print([end.index for end in again[12:]])
+again = list(sysid.jobs.submit(recipe, starts=10, executor=sysid.jobs.processes(2), out=folder))
+assert all(np.array_equal(one.x, other.x) for one, other in zip(ends, again[:8], strict=True))
+print([end.index for end in again[8:]])

@@ -456,16 +456,17 @@ def test_a_stated_frequency_that_no_mode_has_is_told():
 
 def test_a_summary_in_a_hurry_says_what_computes_the_rest():
     lines = replace(answer("force"), hurried=True).summary().splitlines()
-    assert (
+    assert [line for line in lines if line.startswith("uncertainty")] == [
         "uncertainty not computed, as the time was over: Identification.uncertainty and 'sysid report' compute it"
-        in (lines)
-    )
+    ]
     assert not_begun(70.0) == "not begun, as its derivatives take some 7e+01 s to set up: too little time"
 
 
 def test_a_summary_names_the_masses_of_a_lumped_model():
     lines = answer("total").summary().splitlines()
-    assert "masses at the sensors (diagonal of M_SS): sensor 1 2 kg, sensor 2 1 kg" in lines
+    assert [line for line in lines if line.startswith("masses")] == [
+        "masses at the sensors (diagonal of M_SS): sensor 1 2 kg, sensor 2 1 kg"
+    ]
 
 
 def test_a_comparison_says_what_its_columns_are():
@@ -493,7 +494,9 @@ def test_doctor_says_what_is_wrong(capsys, monkeypatch):
     assert cli.main(["doctor"]) == 2
     out, error = capsys.readouterr()
     assert error == "sysid: IPOPT does not work: python -m pip install --force-reinstall casadi\n"
-    assert "matplotlib draws by its backend 'Agg'; report.html is written without a browser" in out.splitlines()
+    assert [line for line in out.splitlines() if line.startswith("matplotlib")] == [
+        "matplotlib draws by its backend 'Agg'; report.html is written without a browser"
+    ]
 
     def requires(name):
         raise importlib.metadata.PackageNotFoundError(name)
@@ -511,7 +514,7 @@ def test_draws_say_why_there_is_no_spread(here, capsys):
     it = answer("force")
     ends = [JobResult(0, 0, True, "", it.x, 0.02), JobResult(1, 0, False, "lost", it.x[:0], np.nan)]
     draws.tell(Path("out"), it, Recipe("pair.py"), ends, Output())
-    assert "1 of 2 draws ended in a fit; two are needed for a spread" in capsys.readouterr().out.splitlines()
+    assert capsys.readouterr().out.splitlines()[1] == "1 of 2 draws ended in a fit; two are needed for a spread"
 
 
 def test_exact_records_are_not_drawn(here, capsys):

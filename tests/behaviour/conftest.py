@@ -26,3 +26,18 @@ def identified():
         return known[key]
 
     return result
+
+
+@pytest.fixture(scope="session")
+def identified_from_guess():
+    """Give a function that identifies a problem with noise from one start, and looks for no other answers.
+
+    Whether another structure explains the records as well is asked of the same problem without noise.
+    """
+
+    def result(problem, rng):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("sysid.results.judgement.with_other_answers", lambda problem, end, session: end)
+            return sysid.identify(problem, rng=rng, strategy=sysid.Continuation(starts=1))
+
+    return result

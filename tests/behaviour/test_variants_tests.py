@@ -47,7 +47,13 @@ def test_a_variant_is_short_and_takes_no_records(name):
 
 @pytest.mark.parametrize("name", TRUTHS)
 def test_without_noise_a_variant_is_identified_to_round_off(name, identified):
-    known, result = module(name), identified(name)
+    known = module(name)
+    if name == "six_springs":  # exact records are so at any lines: every eighth of 1369; with noise all are taken
+        problem = known["problem"](rng=0)
+        fewer = problem.measurement.at(np.arange(problem.measurement.freq.size) % 8 == 0)
+        result = sysid.identify(replace(problem, measurement=fewer), rng=0)
+    else:
+        result = identified(name)
     problem = result.problem
     assert result.success, result.message
     assert result.determined, result.undetermined
@@ -61,10 +67,10 @@ def test_without_noise_a_variant_is_identified_to_round_off(name, identified):
 
 
 @pytest.mark.parametrize("name", TRUTHS)
-def test_at_one_percent_noise_errors_are_within_what_is_claimed(name):
+def test_at_one_percent_noise_errors_are_within_what_is_claimed(name, identified_from_guess):
     known = module(name)
     problem = known["problem"](rng=3, noise=0.01)
-    result = sysid.identify(problem, rng=1, strategy=ONCE)  # from where others start is tried without noise
+    result = identified_from_guess(problem, rng=1)  # from where others start is tried without noise
     assert result.success, result.message
     assert result.determined, result.undetermined
     for variable, constant in TRUTHS[name].items():
@@ -139,7 +145,7 @@ def test_magnitudes_hold_no_phase_and_the_misfit_is_of_magnitudes():
 
 def test_the_swarm_finds_a_structure_from_magnitudes():
     known = module("magnitude_only")
-    result = sysid.identify(known["problem"](), rng=0, strategy="swarm")
+    result = sysid.identify(known["problem"](), rng=0, strategy=sysid.Swarm(max_iterations=20, restarts=0))
     assert result.success
     np.testing.assert_allclose(result.values["spring"], known["SPRINGS"], rtol=1e-6)
 
