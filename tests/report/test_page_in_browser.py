@@ -60,6 +60,6 @@ def test_whole_records_are_shown_with_their_transients_where_asked(random_struct
     test = sysid.Measurement.from_time([(base, noisy, None)], rate, rigid_body=np.ones((1, 1)), band=band)
     it = sysid.identify(sysid.Problem(test, mass=sysid.FullMass()), rng=0)
     page = report.render(it)
-    assert it.measurement.is_whole
+    assert it.records.measurement.is_whole
     told = browser.measured(page, tmp_path, 768)
     assert told["errors"] == [] and told["used"]["checkbox"] == 1

@@ -399,7 +399,7 @@ def test_residual_and_objective_of_all_tests_stand_on_top(written, no_pictures):
     top = page.text[: page.text.index("Unknowns of the search")]
     own, second = written.residuals
     assert f"Relative residual {residual_in_words(written)}" in top
-    assert re.findall(r"[\d.]+e-\d+|\d+", residual_in_words(written)) == [
+    assert re.findall(r"[\d.]+e[+-]\d+|\d+", residual_in_words(written)) == [
         f"{written.residual:.3e}", "2", f"{own:.3e}", f"{second:.3e}"
     ]  # fmt: skip
     assert page.tables[0][-1][1].startswith(f"{100 * written.residual:.3g} % ")
