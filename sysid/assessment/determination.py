@@ -166,9 +166,7 @@ def scale_is_open(problem: Prepared, structure: Structure, x: Array | None) -> b
 def _about(problem: Prepared, structure: Structure, x: Array | None) -> tuple[Formulation, Array, Slopes, Sensitivity]:
     """Formulation and unknowns with all totals, derivatives of the matrices, and the sensitivity to the unknowns."""
     if x is None:
-        raise InputError(
-            "the rank of the Jacobian is taken at the unknowns of the problem: give x beside the structure"
-        )
+        raise InputError("the rank of the Jacobian is taken at the problem's unknowns: give x beside the structure")
     formulation, x = with_totals(problem, structure, x)
     slopes = slopes_of(formulation.matrices, x, problem.measurement)
     return formulation, x, slopes, sensitivity(formulation, x, slopes)
@@ -186,8 +184,7 @@ def _by_rank(problem: Prepared, structure: Structure, x: Array | None) -> tuple[
     if any(np.any(_open_entries(*pair, known)) for pair in pairs):
         factors = _moving(pairs, known.unit, factors)
         sentence = f"{seen} {'; nor of '.join([*words, *_factors_in_words(formulation, factors)])}"
-        figures = {"seen": rank, "directions": count, "unknowns": x.size, "unnamed": factors.shape[1]}
-        open_.append(left_open(sentence, **figures))
+        open_.append(left_open(sentence, seen=rank, directions=count, unknowns=x.size, unnamed=factors.shape[1]))
         open_ += [left_open(modal_mass_cone.UNIT_MASS)] if problem.unit_mass else []
         if problem.measurement.force is None and not problem.unit_mass and _scale_is_open(pairs, known):
             open_.append(left_open(_NO_SCALE))

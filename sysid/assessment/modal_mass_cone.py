@@ -62,10 +62,8 @@ def verdict(problem: Prepared, structure: Structure) -> tuple[tuple[str, ...], t
     known = _known(problem, structure, misfit)
     free, common = _open_modes(known)
     responses = _responses(problem.modal[0], structure)
-    open_ = [
-        *map(left_open, _unseen(problem, structure, misfit, responses, free)),
-        *_merged(known, test, structure, free, responses),
-    ]
+    told = [*_unseen(problem, structure, misfit, responses, free), *_merged(known, test, structure, free, responses)]
+    open_ = list(map(left_open, told))
     if free:
         bounded = ", within what is stated" if len(known.equations) else ""
         alike = f"other mass and stiffness matrices answer identically{bounded}"
@@ -96,17 +94,15 @@ def _weighed_in_words(known: _Known, test: Measurement, structure: Structure) ->
 
 def _merged(
     known: _Known, test: Measurement, structure: Structure, free: list[int], responses: _Record
-) -> Iterator[Finding]:
-    """Modes that cannot be distinguished, as far as something of them is open."""
+) -> Iterator[str]:
+    """Modes that cannot be distinguished, as far as something of them is open, in sentences."""
     for cluster in (cluster for cluster in known.clusters if len(cluster) > 1):
         names = " and ".join(_mode(structure, k) for k in cluster)
         seen = _seen(test, structure, cluster, structure.mode_shapes, responses).shape[1]
         if seen < len(cluster):
-            sentence = f"{names} are too close to be told apart, and the data show {seen or 'none'} of them only"
-            yield left_open(sentence, modes=len(cluster), seen=seen)
+            yield f"{names} are too close to be told apart, and the data show {seen or 'none'} of them only"
         elif not set(cluster).isdisjoint(free):
-            sentence = f"{names} are too close to be told apart: only the sum of their residues is known"
-            yield left_open(sentence, modes=len(cluster))
+            yield f"{names} are too close to be told apart: only the sum of their residues is known"
 
 
 def _what_is_open(structure: Structure, free: list[int], common: bool) -> str:
