@@ -134,8 +134,8 @@ def built(recipe: Recipe, *, check: bool = True) -> tuple[Problem, frozenset[Pat
     used = set(problem.declared.variables)
     idle = [variable for variable in declared()[before:] if variable not in used]
     if idle:
-        told = ", ".join(f"{variable.name!r} ({variable.declared})" for variable in idle)
-        raise InputError(f"{path}: variable {told} enters no matrix, residual or constraint: use it, or take it out")
+        names = ", ".join(f"{variable.name!r} ({variable.declared})" for variable in idle)
+        raise InputError(f"{path}: variable {names} enters no matrix, residual or constraint: use it, or take it out")
     if check:
         problem.check()
     return problem, frozenset({path.absolute(), *imported})
@@ -160,9 +160,9 @@ def parameters_in_words(problem: str) -> str:
 
 
 def _in_words(signature: inspect.Signature) -> str:
-    own = [value for name, value in signature.parameters.items() if name not in ("data", "rng")]
-    told = ", ".join(" ".join(str(value.replace(annotation=value.empty)).split()) for value in own)
-    return f"parameters of this module: {told or 'none'}"
+    parameters = [value for name, value in signature.parameters.items() if name not in ("data", "rng")]
+    listing = ", ".join(" ".join(str(value.replace(annotation=value.empty)).split()) for value in parameters)
+    return f"parameters of this module: {listing or 'none'}"
 
 
 def _function(name: str) -> tuple[Callable[..., object], Path]:
@@ -186,11 +186,11 @@ def file_of(name: str) -> Path | None:
 
 def typed(name: str) -> tuple[str, str]:
     """What a user means by a name at the command line, and a remark: the user's own problem hides a bundled one."""
-    own = None if _is_path(name) else _in_folder(own_folder(), name)
+    of_user = None if _is_path(name) else _in_folder(own_folder(), name)
     bundled = _in_folder(bundled_folder(), name)
-    if own is None or bundled is None or own.read_bytes() == bundled.read_bytes():  # the last in a checkout
+    if of_user is None or bundled is None or of_user.read_bytes() == bundled.read_bytes():  # the last in a checkout
         return name, ""
-    return str(own), f"{own} hides the bundled problem {name}: it is taken"
+    return str(of_user), f"{of_user} hides the bundled problem {name}: it is taken"
 
 
 def is_bundled(name: str) -> bool:

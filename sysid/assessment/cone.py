@@ -152,19 +152,19 @@ class Cone:
     def region(self) -> Region:
         """What the limited directions may do; the others follow (`_follow`)."""
         pairs, width = unknowns(self.groups), sum(map(len, self.groups))
-        scale, own = np.zeros((self.n, width)), np.zeros((width, width))
+        scale, at_identity = np.zeros((self.n, width)), np.zeros((width, width))
         for cluster, group, (bound, _) in zip(self.clusters, self.groups, self.bases, strict=True):
             inverse = np.linalg.pinv(bound)
             scale[np.ix_(cluster, group)] = bound
-            own[np.ix_(group, group)] = inverse @ inverse.T
-        start = np.array([own[pair] for pair in pairs])
+            at_identity[np.ix_(group, group)] = inverse @ inverse.T
+        start = np.array([at_identity[pair] for pair in pairs])
         of = lambda W: forms(scale.T @ W, scale.T @ W, pairs)  # noqa: E731
 
         rows = [np.zeros((0, len(pairs))), *(of(W)[np.triu_indices(W.shape[1])] for W in self.fixed)]
         if self.signs is None:
             open_ = null_space(np.vstack(rows))
             units = [np.eye(width)[:, group] for group in self.groups if group]
-            signs = [Affine(unit.T @ own @ unit, forms(unit, unit, pairs) @ open_.T) for unit in units]
+            signs = [Affine(unit.T @ at_identity @ unit, forms(unit, unit, pairs) @ open_.T) for unit in units]
         else:
             open_ = null_space(np.vstack([*rows, *self.equations]))
             signs = [Affine(np.eye(1), (row @ open_.T / (row @ start))[None, None]) for row in self.signs]

@@ -206,8 +206,8 @@ def _by_rank(problem: Prepared, structure: Structure, x: Array | None) -> tuple[
         (only, f"{only} of them by what is stated as known alone"),
         (x.size - count, f"{x.size - count} of them by constraints"),
     )
-    told = ", ".join(sentence for number, sentence in closed if number)
-    return (f"{told} about this answer; what is written as a number counts as exact",), tuple(open_)
+    fixing = ", ".join(sentence for number, sentence in closed if number)
+    return (f"{fixing} about this answer; what is written as a number counts as exact",), tuple(open_)
 
 
 def _by_name(formulation: Formulation, directions: Array) -> tuple[Array, Array]:
@@ -278,9 +278,9 @@ def _others(problem: Prepared, structure: Structure, x: Array | None, rivals: Se
     for other in rivals:
         off = np.where(named, np.abs(other - x) / unit, 0.0)
         far = [j for j in np.argsort(-off, kind="stable")[:MOST_LISTED] if off[j] > SAME_ANSWER]
-        told = ", ".join(f"{labels[j]} = {other[j]:.4g} in place of {x[j]:.4g}" for j in sorted(far))
+        values = ", ".join(f"{labels[j]} = {other[j]:.4g} in place of {x[j]:.4g}" for j in sorted(far))
         if _other_matrices(problem, structure, x, other):
-            sentence = ": ".join(filter(None, ("another structure explains the data as well", told)))
+            sentence = ": ".join(filter(None, ("another structure explains the data as well", values)))
             numbers = {labels[j]: float(other[j]) for j in sorted(far)}
             yield Finding("other answers", Severity.CAUTION, sentence, numbers=numbers)
 

@@ -40,8 +40,8 @@ def speaks(formulation: Formulation) -> bool:
 
     So it is where the records stand alone, damping is by ratios, and `Stated` tells all of mass and stiffness.
     """
-    told = all(stated.free or stated.entries is not None for stated in (formulation.mass, formulation.stiffness))
-    return told and formulation.by_ratios and formulation.geometry.at_sensors and formulation.test_alone
+    linear = all(stated.free or stated.entries is not None for stated in (formulation.mass, formulation.stiffness))
+    return linear and formulation.by_ratios and formulation.geometry.at_sensors and formulation.test_alone
 
 
 def verdict(problem: Prepared, structure: Structure) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -146,12 +146,12 @@ def ends(problem: Prepared, structure: Structure) -> tuple[Array, Array]:
     return _entries(cone, P, mass), _entries(cone, P * omega, stiffness)
 
 
-def _entries(cone: Cone, rows: Array, own: Array, at_once: int = 100) -> Array:
-    """Ends of the entries of ``rows' T rows``, (2, n, n), so many at once; `own` is its value for T = I."""
+def _entries(cone: Cone, rows: Array, at_identity: Array, at_once: int = 100) -> Array:
+    """Ends of the entries of ``rows' T rows``, (2, n, n), so many at once; `at_identity` is their value for T = I."""
     size = np.linalg.norm(rows, axis=0)
     unit = (rows / size).T
-    ends = np.empty((2, *own.shape))
-    upper = np.array(np.triu_indices(len(own)))
+    ends = np.empty((2, *at_identity.shape))
+    upper = np.array(np.triu_indices(len(at_identity)))
     for i, j in np.array_split(upper, -(-upper.shape[1] // at_once), axis=1):
         functions = unit[i][:, :, None] * unit[j][:, None, :]
         functions = (functions + np.swapaxes(functions, 1, 2)) / 2
@@ -159,8 +159,8 @@ def _entries(cone: Cone, rows: Array, own: Array, at_once: int = 100) -> Array:
         values = values.reshape(2, -1)
         largest = np.where(np.isfinite(values), np.abs(values), 1.0).max(axis=0)
         values = np.where(np.abs(values) < NEGLIGIBLE * largest + ROUND_OFF, 0.0, values) * size[i] * size[j]
-        ends[0, i, j] = ends[0, j, i] = np.minimum(-values[0], own[i, j])
-        ends[1, i, j] = ends[1, j, i] = np.maximum(values[1], own[i, j])
+        ends[0, i, j] = ends[0, j, i] = np.minimum(-values[0], at_identity[i, j])
+        ends[1, i, j] = ends[1, j, i] = np.maximum(values[1], at_identity[i, j])
     return ends
 
 
@@ -201,8 +201,8 @@ def _open_modes(known: _Known) -> tuple[list[int], bool]:
     null = null_space(np.vstack([known.equations, *rows]))
     taking_part = np.abs(null).max(axis=0, initial=0.0) > 1e-6
     free = sorted({k for pair, part in zip(pairs, taking_part, strict=True) if part for k in pair})
-    own = np.array([float(k == m) for k, m in pairs])  # T = I, which a common scale multiplies
-    common = len(null) == 1 and abs(null[0] @ own) > (1 - 1e-6) * np.linalg.norm(null[0]) * np.linalg.norm(own)
+    eye = np.array([float(k == m) for k, m in pairs])  # T = I, which a common scale multiplies
+    common = len(null) == 1 and abs(null[0] @ eye) > (1 - 1e-6) * np.linalg.norm(null[0]) * np.linalg.norm(eye)
     return free, bool(common) and sum(map(len, known.clusters)) > 1
 
 
@@ -236,11 +236,11 @@ def _at_most(weights: Array, total: float) -> Array:
 
 def _below(weights: Array, bound: Array) -> Array:
     """Weights W for ``W' T W <= I``, of ``weights' T weights <= bound``; what the structure has is never too much."""
-    own = weights.T @ weights
-    size = np.sqrt(np.maximum(np.diag(own), np.diag(bound)))
+    at_identity = weights.T @ weights
+    size = np.sqrt(np.maximum(np.diag(at_identity), np.diag(bound)))
     size = np.where(size > 0, size, 1.0)
-    lam, V = np.linalg.eigh((bound - own) / np.outer(size, size))
-    lam, V = np.linalg.eigh(own / np.outer(size, size) + (V * np.maximum(lam, 0.0)) @ V.T)
+    lam, V = np.linalg.eigh((bound - at_identity) / np.outer(size, size))
+    lam, V = np.linalg.eigh(at_identity / np.outer(size, size) + (V * np.maximum(lam, 0.0)) @ V.T)
     some = lam > 1e-12 * lam[-1]
     return weights / size @ V[:, some] / np.sqrt(lam[some])
 
@@ -310,8 +310,8 @@ def _record(record: ComplexArray, predicted: ComplexArray, std: Array | None, ti
     """
     rms = lambda x: np.sqrt(np.mean(np.abs(x) ** 2, axis=(0, 2)))[:, None]  # noqa: E731
     noise = rms(record - predicted) if std is None else rms(std)
-    own = rms(record)
-    weight = 1 / np.maximum(noise, ROUND_OFF * np.where(own > 0, own, own.max()))
+    sizes = rms(record)
+    weight = 1 / np.maximum(noise, ROUND_OFF * np.where(sizes > 0, sizes, sizes.max()))
     size = float(np.linalg.norm(record * weight))
     misfit = float(np.linalg.norm((record - predicted) * weight)) / size
     level = times * misfit
@@ -401,9 +401,9 @@ def _unseen(
                 f"{_mode(structure, k)} lies outside the lines ({test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz) and "
                 f"answers for all modes there{_like_rigid(test, structure, k)}"
             )
-        elif k in free and forces and (own := _shares(test, structure, k, push.T, push, forces)[0]) < forces.level:
+        elif k in free and forces and (part := _shares(test, structure, k, push.T, push, forces)[0]) < forces.level:
             yield (
-                f"the mass of {_mode(structure, k)} is not weighed: it makes {100 * own:.3g} % of the base force, and "
+                f"the mass of {_mode(structure, k)} is not weighed: it makes {100 * part:.3g} % of the base force, and "
                 f"what the fit misses ({100 * forces.misfit:.3g} % of the force) can look like a mode that makes up to "
                 f"{100 * forces.level:.3g} %"
             )
@@ -454,8 +454,8 @@ def _of_mass(
     rows = [entries[known[:, :n]], coupling[known[:, n:]]]
     if stated.totals is not None and stated.totals.kind == "sensors":
         for i in np.unique(geometry.directions[:n][geometry.directions[:n] >= 0]):
-            own = P[:, geometry.directions[:n] == i]
-            rows.append(np.einsum("iiu->u", forms(own, own, pairs))[None] / np.sum(own**2))
+            of_direction = P[:, geometry.directions[:n] == i]
+            rows.append(np.einsum("iiu->u", forms(of_direction, of_direction, pairs))[None] / np.sum(of_direction**2))
     diagonal = np.all(known[:, :n] | np.eye(n, dtype=bool))
     return rows, None if stated.free or not diagonal else np.einsum("iiu->iu", entries)
 

@@ -198,14 +198,14 @@ def directions_in_words(unknowns: Sequence[Unknown], x: Array, unit: Array, dire
         terms = []
         pieces = (split(unknowns, part) for part in (v, v * unit, x, unit))
         for unknown, share, moved, value, large in zip(unknowns, *pieces, strict=True):
-            told = [
+            steps = [
                 f"{100 * step / abs(at):+.3g} %" if abs(at) > 1e-3 * size else f"{step:+.3g}"
                 for step, at, size in zip(moved, value, large, strict=True)
             ]
-            if len(set(told)) == 1 and abs(share[0]) > NEGLIGIBLE:
-                terms.append(f"{unknown.title} {told[0]}")
+            if len(set(steps)) == 1 and abs(share[0]) > NEGLIGIBLE:
+                terms.append(f"{unknown.title} {steps[0]}")
                 continue
-            terms += [f"{unknown.labels[j]} {told[j]}" for j in np.flatnonzero(np.abs(share) > NEGLIGIBLE)]
+            terms += [f"{unknown.labels[j]} {steps[j]}" for j in np.flatnonzero(np.abs(share) > NEGLIGIBLE)]
         sentences.append(listed(terms))
     return sentences
 

@@ -97,8 +97,8 @@ def made(problem: Prepared, stated: Statements, theta: Array, index: Index) -> t
     for at, (i, j) in enumerate(stated.totals, start=len(stated.entries)):
         values[at] = rigid[i, j]
         if stated.kind == "trace":
-            delta, own = gamma[:, i] - P @ G[:, i], geometry.directions[:n] == i
-            values[at] += np.diag(M)[own].sum() - gamma[:, i] @ gamma[:, i] + delta @ delta
+            delta, in_direction = gamma[:, i] - P @ G[:, i], geometry.directions[:n] == i
+            values[at] += np.diag(M)[in_direction].sum() - gamma[:, i] @ gamma[:, i] + delta @ delta
             slopes[at] = -slope_of_drawn_mass(geometry, phi, gamma, index, i)
         slopes[at, index.rigid[index.pairs.index((i, j))]] += 1.0
     return values / stated.scale, slopes / stated.scale[:, None]
@@ -187,15 +187,15 @@ def conditioned(
     rank = int(np.count_nonzero(s > ROUND_OFF * s.max(initial=0.0)))
     checks = left[:, rank:].T @ F  # statements that no scale can meet
     back = np.linalg.pinv(U, rcond=ROUND_OFF) if U.size else np.zeros((0, std.size))
-    own = np.hstack([normals, np.zeros((index.size, F.shape[1] - normals.shape[1]))]) - gauge @ (back @ F)
+    conditional = np.hstack([normals, np.zeros((index.size, F.shape[1] - normals.shape[1]))]) - gauge @ (back @ F)
     turn, s, vt = np.linalg.svd(checks, full_matrices=False)
     seen = s > round_off(s.size) * s.max(initial=0.0)
     known = vt[seen]
     # A shift is taken for noise as far as noise explains by how much the statements are missed.
     missed = (turn[:, seen] / s[seen]).T @ (left[:, rank:].T @ (C @ shifts))
-    shifts = shifts - gauge @ (back @ (C @ shifts)) - (own @ known.T) @ missed
-    own = own - (own @ known.T) @ known
-    return own, unseen - gauge @ (back @ (C @ unseen)), shifts
+    shifts = shifts - gauge @ (back @ (C @ shifts)) - (conditional @ known.T) @ missed
+    conditional = conditional - (conditional @ known.T) @ known
+    return conditional, unseen - gauge @ (back @ (C @ unseen)), shifts
 
 
 def _gauge(theta: Array, index: Index, weighed: bool) -> Array:

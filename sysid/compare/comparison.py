@@ -67,8 +67,8 @@ class Comparison:
             }
             for result in self.results
         ]
-        told = {name: getattr(self, name) for name in ("seed", "max_time", "interrupted", "quantity")}
-        return {**told, "unknowns": self.problem.n_variables, "methods": rows}
+        settings = {name: getattr(self, name) for name in ("seed", "max_time", "interrupted", "quantity")}
+        return {**settings, "unknowns": self.problem.n_variables, "methods": rows}
 
 
 def compare(

@@ -72,11 +72,11 @@ class MethodResult:
     def to_dict(self) -> dict[str, Any]:
         """The row of the table, for CSV and JSON; the phases are not in it."""
         errors = {f"error_{name}_percent": value for name, value in zip(MATRICES, self.errors, strict=True)}
-        told = {name: getattr(self, name) for name in ("before", "after", "residual")}
+        figures = {name: getattr(self, name) for name in ("before", "after", "residual")}
         return {
             "method": self.name,
             "status": self.status.value,
-            **told,
+            **figures,
             **errors,
             "evaluations": self.evaluations,
             "seconds": self.seconds,

@@ -148,8 +148,8 @@ def recording(path: Path, named: dict[str, tuple[Any, str]]) -> Recording:
                 remarks.append(f"array {name!r} is taken as {len(lines)} records of {lines.shape[1]} samples")
     if not vectors:
         raise InputError(f"{path} holds no arrays of records: a vector of samples a channel is needed, or a matrix")
-    told = [size for name, size in flat.items() if is_abscissa(name)]
-    length = max(told or [one.size for one, _ in vectors.values()])
+    lengths = [size for name, size in flat.items() if is_abscissa(name)]
+    length = max(lengths or [one.size for one, _ in vectors.values()])
     other = [name for name, (one, _) in vectors.items() if one.size != length]
     remarks += [f"arrays of another length than {length} are left out: {', '.join(other[:8])}"] * bool(other)
     rate = next((value for name, value in scalars.items() if name.rpartition(".")[2].lower() in _RATES), None)

@@ -89,8 +89,8 @@ def completed(said: Description, recording: Recording) -> tuple[Description, lis
             )
         )
         other = column.axis and isinstance(axis, str) and axis.lstrip("+") != column.axis
-        told = f"the file says axis {column.axis}, the description {axis}, which is taken"
-        remarks += [f"{recording.path}, {column.place}: {told}"] * bool(other)
+        conflict = f"the file says axis {column.axis}, the description {axis}, which is taken"
+        remarks += [f"{recording.path}, {column.place}: {conflict}"] * bool(other)
         # Of several columns of a name one is told by its number, or by the reference.
         called = column.name if recording.names.count(column.name) == 1 else channel.column
         channels.append(replace(channel, column=called, axis=axis, position=channel.position or column.position))

@@ -126,9 +126,9 @@ class WithoutSensor:
         other = test.of_sensors(kept)
         if problem.declared.free_modes:
             return _on(problem, other, stiffness=_for_fewer(problem.stiffness, test.n_sensors - 1))
-        own = problem.recovery is None
-        G = test.rigid_body if own else problem.rigid_body_dofs
-        recovery = np.eye(test.n_sensors) if own else np.asarray(problem.recovery)
+        direct = problem.recovery is None
+        G = test.rigid_body if direct else problem.rigid_body_dofs
+        recovery = np.eye(test.n_sensors) if direct else np.asarray(problem.recovery)
         return _on(problem, other, recovery=recovery[kept], rigid_body_dofs=G)
 
     def predicted(self, problem: Prepared, result: Identification) -> float:

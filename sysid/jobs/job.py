@@ -172,8 +172,8 @@ def _predicted(problem: Problem, result: Identification, change: Change) -> floa
 def _refined(job: Job, session: Session) -> JobResult:
     bare = replace(job.recipe, start=None)
     problem = _built(bare, job.source).prepared
-    own = job.start == 0 and job.recipe.start is not None
-    if own:
+    from_recipe = job.start == 0 and job.recipe.start is not None
+    if from_recipe:
         x = as_unknowns(problem, np.array(job.recipe.start))
         if job.draw:
             # Noise of the size that counts: there are no outliers in it, so that squares are as good.
@@ -185,7 +185,7 @@ def _refined(job: Job, session: Session) -> JobResult:
             return without_result(job, "no point of the search space is a structure; state guesses that make one")
         x = found[0]
     # What ended a search needs no widened peaks.
-    end = _descended(problem, x, [] if own else _widened(bare, job.source), session)
+    end = _descended(problem, x, [] if from_recipe else _widened(bare, job.source), session)
     assert end.x is not None
     verdict = verdict_of(problem, end)
     return JobResult(job.index, job.seed, verdict.success, verdict.message, end.x, problem.residual(end.x))

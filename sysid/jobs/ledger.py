@@ -65,11 +65,11 @@ class Ledger:
             return None
         try:
             success, message, x, residual, score = json.loads(text)
-            told = None if score is None else Score(**score)
+            stored_score = None if score is None else Score(**score)
             unknowns = numbers("x", x)
             if not (isinstance(success, bool) and isinstance(message, str) and unknowns.ndim == 1):
                 return None
-            return JobResult(index, self._seeds[index], success, message, unknowns, float(residual), told)
+            return JobResult(index, self._seeds[index], success, message, unknowns, float(residual), stored_score)
         except (ValueError, TypeError, RecursionError):  # anybody can write a row with its right SHA-256
             return None
 
@@ -101,10 +101,10 @@ class Ledger:
         deny, allow = sqlite3.SQLITE_DENY, sqlite3.SQLITE_OK
         self._file.set_authorizer(lambda action, *_: deny if action in _FOREIGN else allow)
         self._file.execute("PRAGMA trusted_schema = OFF")
-        made = [sql for (sql,) in self._file.execute("SELECT sql FROM sqlite_master WHERE sql IS NOT NULL")]
-        if not made:
+        tables = [sql for (sql,) in self._file.execute("SELECT sql FROM sqlite_master WHERE sql IS NOT NULL")]
+        if not tables:
             self._file.execute(f"CREATE TABLE IF NOT EXISTS {_COLUMNS}")
-        elif made != [f"CREATE TABLE {_COLUMNS}"]:
+        elif tables != [f"CREATE TABLE {_COLUMNS}"]:
             raise InputError(f"{self.path} is no ledger of jobs of this sysid: take it away, or give another folder")
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:

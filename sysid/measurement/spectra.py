@@ -242,7 +242,7 @@ def resample(
         for place, t in enumerate(clocks, start=1):
             if t.size < 60:
                 raise InputError(f"record {place}: {t.size} samples are too few to low-pass before resampling")
-        filters = [butter(8, 0.8 * rate / own_rate, output="sos") for own_rate in rates]
+        filters = [butter(8, 0.8 * rate / record_rate, output="sos") for record_rate in rates]
         samples = [sosfiltfilt(sos, x, axis=-1) for sos, x in zip(filters, samples, strict=True)]
     splines = [CubicSpline(t, x, axis=-1) for t, x in zip(clocks, samples, strict=True)]
     return time, [np.asarray(spline(np.minimum(time, spline.x[-1]))) for spline in splines]

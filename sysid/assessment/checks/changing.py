@@ -96,10 +96,10 @@ class Change:
     def in_words(self) -> tuple[str, str]:
         """How the frequency changes, and what to do."""
         records = list(dict.fromkeys(one.record for one in self.seen))
-        own = {record: [one for one in self.seen if one.record == record] for record in records}
-        within = np.mean([np.var([one.frequency for one in part]) for part in own.values()])
+        by_record = {record: [one for one in self.seen if one.record == record] for record in records}
+        within = np.mean([np.var([one.frequency for one in part]) for part in by_record.values()])
         if len(records) > 1 and within < _OF_RUNS * np.var(self.frequency):
-            return self._by_record(own)
+            return self._by_record(by_record)
         if self.trend != 0.0:
             return self._by_level()
         low, high = self.seen[int(np.argmin(self.frequency))], self.seen[int(np.argmax(self.frequency))]
@@ -110,10 +110,10 @@ class Change:
             "fit a part in which it is",
         )
 
-    def _by_record(self, own: dict[str, list[Seen]]) -> tuple[str, str]:
-        means = {r: np.mean([(one.frequency, one.level) for one in part], axis=0) for r, part in own.items()}
-        told = ", ".join(f"{f:.4g} Hz in {record} at {self._motion(level)}" for record, (f, level) in means.items())
-        return f"differs from record to record ({told})", "fit them one by one, and find what changed between them"
+    def _by_record(self, of_records: dict[str, list[Seen]]) -> tuple[str, str]:
+        means = {r: np.mean([(one.frequency, one.level) for one in part], axis=0) for r, part in of_records.items()}
+        words = ", ".join(f"{f:.4g} Hz in {record} at {self._motion(level)}" for record, (f, level) in means.items())
+        return f"differs from record to record ({words})", "fit them one by one, and find what changed between them"
 
     def _by_level(self) -> tuple[str, str]:
         first, *_, last = sorted(self.seen, key=lambda one: one.level)
@@ -185,19 +185,19 @@ def changes(problem: Prepared) -> list[Change]:
     if every is None:
         return []
     modes, apart = every.joined(_CLOSE * every.omega), every.joined(2 * every.ratios * every.omega)
-    made = [stretches_of(test, modes.omega, modes.ratios) for _, test in tests]
+    stretches = [stretches_of(test, modes.omega, modes.ratios) for _, test in tests]
     # Modes of one shape that are close may be two, with constant poles that explain the records.
-    held = made
+    held = stretches
     if modes.omega.size < apart.omega.size:
         held = [stretches_of(test, apart.omega, apart.ratios) for _, test in tests]
     constant = sum(one.left_by_all**2 for part in held for one in part)
-    changing = sum(min(one.left, one.left_by_all) ** 2 for part in made for one in part)
+    changing = sum(min(one.left, one.left_by_all) ** 2 for part in stretches for one in part)
     if 0 < constant < changing:
         return []
     found = []
     for k, (f, ratio) in enumerate(zip(modes.omega / (2 * np.pi), modes.ratios, strict=True)):
         width = 2 * ratio * f
-        seen = [one for part, named in zip(made, tests, strict=True) for one in _seen(part, k, width, *named)]
+        seen = [one for part, named in zip(stretches, tests, strict=True) for one in _seen(part, k, width, *named)]
         change = Change(f, width, seen, scaled)
         if change.is_told(changing < _EXPLAINED * constant):
             found.append(change)
@@ -247,11 +247,11 @@ def _modes(modal: ModalEstimate) -> ObservedPoles | None:
 
 def _seen(stretches: list[Stretch], k: int, width: float, number: int, test: Measurement) -> list[Seen]:
     """A mode in the stretches of a test in which it is known; test 0 is the one that was fitted."""
-    made = []
+    seen = []
     for one in stretches:
         run = f"run {one.run + 1}" if test.n_runs > 1 else "the record"
         record = run if number == 0 else f"{run} of unfitted test {number}"
         if one.std[k] < width and one.left <= one.left_by_all:
             part = f"{one.start:.3g} to {one.end:.3g} s"
-            made.append(Seen(record, part, float(one.frequency[k]), float(one.std[k]), float(one.level[k])))
-    return made
+            seen.append(Seen(record, part, float(one.frequency[k]), float(one.std[k]), float(one.level[k])))
+    return seen

@@ -128,8 +128,8 @@ def _delays(test: Measurement, terms: DirectTerms) -> Array | None:
     c, slope, std = terms.rigid / reach, terms.slope / reach, terms.slope_std / reach
     size = np.sum(c**2, axis=1)
     stated = np.sum((test.rigid_body / reach) ** 2, axis=1)
-    told = np.sum((terms.rigid_std / reach) ** 2, axis=1) < _NONE**2 * np.maximum(size, stated)
-    known = np.flatnonzero((stated > 0) & (size > _NONE**2 * stated) & told)
+    precise = np.sum((terms.rigid_std / reach) ** 2, axis=1) < _NONE**2 * np.maximum(size, stated)
+    known = np.flatnonzero((stated > 0) & (size > _NONE**2 * stated) & precise)
     if not known.size:
         return None
     delay = -np.sum(slope * c, axis=1)[known] / size[known]
@@ -313,7 +313,7 @@ def _of_sensors(test: Measurement, motion: _Motion, right: NDArray[np.bool_]) ->
     for i, value, std in zip(wrong, factor, error, strict=True):
         # Modes far below the lines move some sensors more than others, but not one alone.
         alone = wrong.size == 1 and np.count_nonzero(motion.agree(motion.stated, _LIKE)) == right.size - 1
-        if agree[i] and (alone or any(abs(value / own - 1) < _LIKE for own in _CLEAR)):
+        if agree[i] and (alone or any(abs(value / ratio - 1) < _LIKE for ratio in _CLEAR)):
             carried = np.sum(motion.modal[i] * motion.stated[i]) / np.sum(motion.stated[i] ** 2)
             value = next(
                 (u[0] for u in _UNITS if abs(value - u[0]) < min(most_deviations() * std, _GROSS * u[0])), value
@@ -323,30 +323,30 @@ def _of_sensors(test: Measurement, motion: _Motion, right: NDArray[np.bool_]) ->
 
 def _of_sensor(name: str, factor: float, carried: float) -> Iterator[Finding]:
     """What a factor of one sensor alone means."""
-    shown = "beside its modes it moves with the base"
+    seen = "beside its modes it moves with the base"
     unit = next((one for one in _UNITS if abs(factor / one[0] - 1) < _LIKE), None)
     kind: Kind | None = None
     if abs(factor + 1) < _GROSS:
         kind, remedy = "sign", "change its sign"
-        sentence = f"the sign of {name} is reversed: {shown} by {factor:.3g} times what rigid_body says"
+        sentence = f"the sign of {name} is reversed: {seen} by {factor:.3g} times what rigid_body says"
     elif unit is not None:
         _, times, small, large = unit
         of_sensor, of_base = (small, large) if factor < 1 else (large, small)
         kind, remedy = "unit", "bring both to m/s²"
         sentence = (
-            f"{name} is in another unit than the base: {shown} by {factor:.4g} times what rigid_body says, a factor of "
+            f"{name} is in another unit than the base: {seen} by {factor:.4g} times what rigid_body says, a factor of "
             f"{times}, as of a sensor in {of_sensor} and a base in {of_base}"
         )
     elif abs(factor) < _NONE and carried > _CARRIED:
         kind, remedy = "relative responses", "add the base's acceleration to its record"
         sentence = (
-            f"{name} is relative to the base, where the other sensors are absolute: {shown} by {factor:.2g} times what "
+            f"{name} is relative to the base, where the other sensors are absolute: {seen} by {factor:.2g} times what "
             "rigid_body says"
         )
     elif factor >= _NONE:
         kind, remedy = "gain", f"divide its record by {factor:.3g}, or correct its row of rigid_body"
         sentence = (
-            f"the gain of {name} is {factor:.3g}: {shown} by so many times what rigid_body says, and the other sensors "
+            f"the gain of {name} is {factor:.3g}: {seen} by so many times what rigid_body says, and the other sensors "
             "as it says"
         )
     if kind is not None:

@@ -39,16 +39,16 @@ def _stated_mass(problem: Prepared, structure: Structure) -> Iterator[Finding]:
     if test.force is None or stated.weighs or not whole or not structure.modal_damping:
         return
     poles = distinct_poles(structure)
-    weighed, own = np.diag(weighed_mass(test, *poles)), np.diag(structure.rigid_body_mass)
+    weighed, expected = np.diag(weighed_mass(test, *poles)), np.diag(structure.rigid_body_mass)
     # A direction beside a rotation may be weighed worse.
-    noise = most_deviations(test.n_base) * weighed_mass_std(test, *poles) / own
+    noise = most_deviations(test.n_base) * weighed_mass_std(test, *poles) / expected
     usual = max(0.01, 3 * force_residual_left(test, *poles) / np.sqrt(test.freq.size))
-    if np.any(np.abs(weighed / own - 1) >= np.maximum(usual, noise)):
-        given, told = (", ".join(f"{m:.4g}" for m in masses) for masses in (own, weighed))
-        numbers = {f"stated {i + 1}": float(m) for i, m in enumerate(own)}
+    if np.any(np.abs(weighed / expected - 1) >= np.maximum(usual, noise)):
+        given, found = (", ".join(f"{m:.4g}" for m in masses) for masses in (expected, weighed))
+        numbers = {f"stated {i + 1}": float(m) for i, m in enumerate(expected)}
         yield Finding(
             "stated mass", Severity.CONTRADICTS,
-            f"the stated mass makes {given} kg in the base directions, but the base force weighs {told} kg",
+            f"the stated mass makes {given} kg in the base directions, but the base force weighs {found} kg",
             "one of them, or the unit of the force, is wrong; the force weighs an adapter or base plate on its cells "
             "too",
             numbers=numbers | {f"weighed {i + 1}": float(m) for i, m in enumerate(weighed)},
@@ -68,8 +68,8 @@ def _known_entries(problem: Prepared, structure: Structure) -> Iterator[Finding]
         makes = total_of(geometry, structure.mass, mass.totals.kind)
         std = mass.totals.std_by_direction
         if np.any(makes > problem.totals * (1 + NEGLIGIBLE) + most_deviations(std.size) * std):
-            given, told = (", ".join(f"{m:.4g}" for m in masses) for masses in (problem.totals, makes))
-            more = f"the known entries of the mass make {told} kg or more, and {given} kg are stated in all"
+            given, least = (", ".join(f"{m:.4g}" for m in masses) for masses in (problem.totals, makes))
+            more = f"the known entries of the mass make {least} kg or more, and {given} kg are stated in all"
             yield Finding("known entries", Severity.CONTRADICTS, more)
 
 

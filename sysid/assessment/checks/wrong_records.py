@@ -93,7 +93,7 @@ def _of_mass(declared: Formulation, test: Measurement, terms: DirectTerms) -> It
     low, high, weighed, modal = low[known], high[known], weighed[known], modal[known]
     if np.any((weighed > low / MISFIT) & (weighed < high * MISFIT)):
         return
-    for factor, told, words in _FACTORS:
+    for factor, label, words in _FACTORS:
         # What no mode carries may be a fixture, of whatever mass.
         mended, of_modes = weighed / factor, modal / factor
         agree = (mended > low / _WITHIN) & (mended < high * _WITHIN) & (of_modes > _MODAL * low)
@@ -102,7 +102,7 @@ def _of_mass(declared: Formulation, test: Measurement, terms: DirectTerms) -> It
             stated = ", ".join(f"{a:.4g}" if a == b else f"{a:.4g} to {b:.4g}" for a, b in zip(low, high, strict=True))
             yield Finding(
                 "force unit", Severity.BLOCKING,
-                f"the base force weighs {masses} kg where {stated} kg are stated, a factor of {told}: {words}",
+                f"the base force weighs {masses} kg where {stated} kg are stated, a factor of {label}: {words}",
                 numbers={"factor": factor},
             )  # fmt: skip
             return
@@ -131,10 +131,10 @@ def _of_frequencies(problem: StatedProblem, declared: Formulation, test: Measure
         low = high = np.atleast_1d(np.array(stated, dtype=float))
         what = "the stated natural frequencies are"
     else:
-        made = [s.natural_frequencies for s in _structures(declared)]
-        if not made:
+        frequencies = [s.natural_frequencies for s in _structures(declared)]
+        if not frequencies:
             return
-        low, high = np.min(made, axis=0), np.max(made, axis=0)
+        low, high = np.min(frequencies, axis=0), np.max(frequencies, axis=0)
         what = "the bounds of the model allow first natural frequencies"
     inside = lambda f: bool(low[0] / _WITHIN < f[0] < high[0] * _WITHIN and f[-1] < high[-1] * _WITHIN)  # noqa: E731
     if stated is not None and found[0] < low[0] / MISFIT and inside(2 * np.pi * found):
@@ -164,10 +164,10 @@ def _structures(declared: Formulation) -> list[Structure]:
     if len(unknowns) <= 6:  # more bounds make too many corners
         for choice in product((False, True), repeat=len(unknowns)):
             points.append(np.where(np.repeat(choice, np.diff(ends, prepend=0)), upper, lower))
-    made = []
+    structures = []
     for x in points:
         try:
-            made.append(declared.matrices.structure(x, declared.own_test.test))
+            structures.append(declared.matrices.structure(x, declared.own_test.test))
         except InputError:  # no structure there
             continue
-    return made
+    return structures
