@@ -113,8 +113,8 @@ def _list(options: argparse.Namespace, out: Output) -> int:
     entries = catalogue.entries()
     width = max((len(entry.name) for entry in entries), default=0)
     for entry in entries:
-        own = "" if entry.bundled else f"  ({entry.path})"
-        out.write(f"{entry.name:{width}}  {entry.description}{own}\n")
+        location = "" if entry.bundled else f"  ({entry.path})"
+        out.write(f"{entry.name:{width}}  {entry.description}{location}\n")
     if not entries:
         out.write("no problems found; a path to a module does as well: sysid run PATH\n")
     out.answer(problems=[{**vars(entry), "path": str(entry.path)} for entry in entries])
@@ -155,11 +155,11 @@ def _run(options: argparse.Namespace, out: Output) -> int:
 
 
 def _run_in(folder: Path, options: argparse.Namespace, out: Output) -> int:
-    begun = time.perf_counter()
+    start = time.perf_counter()
 
     def left(least: float) -> float | None:
         """Seconds that are left, at least so many; None without a limit."""
-        return None if options.max_time is None else max(options.max_time - (time.perf_counter() - begun), least)
+        return None if options.max_time is None else max(options.max_time - (time.perf_counter() - start), least)
 
     search = unfinished.begun(options, folder, out)
     recipe, strategy = search.recipe, unfinished.strategy_of(search)

@@ -105,14 +105,14 @@ def is_test(name: str | None) -> bool:
     return name is not None and name.endswith(".h5")
 
 
-def recipe(options: argparse.Namespace, made: Recipe) -> Recipe:
+def recipe(options: argparse.Namespace, given: Recipe) -> Recipe:
     """The recipe of a run of a test file: the bundled problem, with the test as its data."""
-    if not is_test(made.module):
+    if not is_test(given.module):
         asked = options.lumped or any(one is not None for one in (options.mass, options.band, options.goal))
         refuse((asked, "--mass, --lumped, --band and --goal are for a test that 'sysid read' wrote"))
-        return made
-    refuse((made.data is not None, f"--data {made.data}: {made.module} is the data already"))
-    recorded_test.load(made.module)  # told before anything is made
+        return given
+    refuse((given.data is not None, f"--data {given.data}: {given.module} is the data already"))
+    recorded_test.load(given.module)  # told before anything is made
     extra: dict[str, Any] = {"lumped": True} if options.lumped else {}
     if options.mass is not None:
         extra["mass"] = options.mass[0] if len(options.mass) == 1 else options.mass
@@ -120,7 +120,7 @@ def recipe(options: argparse.Namespace, made: Recipe) -> Recipe:
         extra["band"] = options.band
     if options.goal is not None:
         extra["goal"] = options.goal
-    return Recipe(MODULE, made.module, made.rng, {**made.parameters, **extra})
+    return Recipe(MODULE, given.module, given.rng, {**given.parameters, **extra})
 
 
 def add_options(command: argparse.ArgumentParser) -> None:

@@ -45,18 +45,18 @@ def _run_in(folder: Path, result: Identification, recipe: Recipe, options: argpa
     sweeps.check_own_records(result, recipe)
     sweep = sweeps.sweep_of(options, result, recipe, out)
     if sweep is not None:
-        titles, told = [*sweep.titles], sweep.told
+        titles, kind = [*sweep.titles], sweep.kind
         jobs = submit(sweep.recipes, changes=sweep.changes, strategy="auto", executor=executor, out=folder)
     elif options.draws is not None:
         if result.residual < EXACT:
             raise InputError(f"{source} fits its records exactly: without noise there is nothing to draw")
-        titles, told = [f"draw {i:4d}" for i in range(options.draws)], "draw{s} of noise, each fitted from the result"
+        titles, kind = [f"draw {i:4d}" for i in range(options.draws)], "draw{s} of noise, each fitted from the result"
         jobs = submit(_started(recipe, source), draws=options.draws, executor=executor, out=folder)
     else:
         count = options.starts or 16
-        titles, told = [f"start {i:4d}" for i in range(count)], "start{s}, the first at the result"
+        titles, kind = [f"start {i:4d}" for i in range(count)], "start{s}, the first at the result"
         jobs = submit(_started(recipe, source), starts=count, executor=executor, out=folder)
-    out.write(f"{recipe.title}: {len(titles)} {told.format(s='' if len(titles) == 1 else 's')}\n")
+    out.write(f"{recipe.title}: {len(titles)} {kind.format(s='' if len(titles) == 1 else 's')}\n")
     out.flush()
     try:
         ends, interrupted = _ends(jobs, titles, out)

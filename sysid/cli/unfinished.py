@@ -115,8 +115,8 @@ def _resumed(options: argparse.Namespace, folder: Path, out: Output) -> Begun:
 
 def _agreed(search: Begun, asked: Begun, whole: bool, folder: Path) -> Begun:
     """The unfinished run as it is asked for: `whole`, or by its module alone, which the user says again."""
-    own, its = (catalogue.short_name(one.recipe.module) for one in (asked, search))
-    if not whole and own == its:
+    wanted, its = (catalogue.short_name(one.recipe.module) for one in (asked, search))
+    if not whole and wanted == its:
         return replace(search, recipe=replace(search.recipe, module=asked.recipe.module))
     if asked != search:
         raise InputError(f"{folder} holds an unfinished run of {search}, not of {asked}")
@@ -125,8 +125,8 @@ def _agreed(search: Begun, asked: Begun, whole: bool, folder: Path) -> Begun:
 
 def _name(recipe: Recipe) -> str:
     """Name for the folder of results: the module's, of a test that is run without one the test's."""
-    own = recipe.module == read.MODULE and recipe.data is not None
-    return Path(recipe.data or "").stem if own else catalogue.short_name(recipe.module)
+    without_module = recipe.module == read.MODULE and recipe.data is not None
+    return Path(recipe.data or "").stem if without_module else catalogue.short_name(recipe.module)
 
 
 def _asked(options: argparse.Namespace, out: Output) -> Begun:

@@ -137,8 +137,8 @@ def number(value: float | None, digits: int = 4) -> str:
 
 def aligned(value: float | None) -> str:
     """Write a number of a column with three significant digits, zeros at its end too: 1.00 below 0.896."""
-    told = number(value, 3)
-    return told if "e" in told or told in ("–", "0") else f"{value:#.3g}".removesuffix(".")
+    digits = number(value, 3)
+    return digits if "e" in digits or digits in ("–", "0") else f"{value:#.3g}".removesuffix(".")
 
 
 def paragraph(value: object, kind: str = "") -> str:

@@ -108,10 +108,10 @@ def _ranges(ends: Array, otherwise: Lines) -> Lines:
     for i, j in np.argwhere(~np.isclose(ends[0], ends[1], rtol=ROUND_OFF, atol=0.0)):
         least, most = (number(end, 3) for end in ends[:, i, j])
         bounded = np.isfinite(ends[:, i, j])
-        told = {
+        words_of = {
             (True, True): (f"{least} to", most),
             (True, False): (f"from {least}",),
             (False, True): (f"to {most}",),
         }
-        lines[i][j] = told.get((bool(bounded[0]), bool(bounded[1])), ("any value",))
+        lines[i][j] = words_of.get((bool(bounded[0]), bool(bounded[1])), ("any value",))
     return lines

@@ -46,8 +46,8 @@ def share_of_noise(std: Array | None, records: ComplexArray) -> Array:
     if std is None:
         return np.full(records.shape[1], np.nan)
     size = np.linalg.norm(records, axis=(0, 2))
-    own = np.any(records != 0, axis=1, keepdims=True)
-    noise = np.sqrt(np.sum(np.where(own, std, 0.0) ** 2 * np.ones(records.shape), axis=(0, 2)))
+    recorded = np.any(records != 0, axis=1, keepdims=True)
+    noise = np.sqrt(np.sum(np.where(recorded, std, 0.0) ** 2 * np.ones(records.shape), axis=(0, 2)))
     return np.divide(noise, size, out=np.full_like(size, np.nan), where=size > 0)
 
 

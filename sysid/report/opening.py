@@ -43,7 +43,7 @@ def trust(it: Identification) -> str:
         ("What to measure or to do next", steps if len(steps) > 1 else ()),  # one alone stands in the opening
         ("To be known besides", [str(one) for one in it.notes]),
     ]
-    return "".join(f"<h3>{name}</h3>{bullets(map(sentence, told))}" for name, told in parts if told)
+    return "".join(f"<h3>{name}</h3>{bullets(map(sentence, sentences))}" for name, sentences in parts if sentences)
 
 
 def _subject(it: Identification) -> str:
@@ -52,12 +52,12 @@ def _subject(it: Identification) -> str:
     if n != test.n_sensors:
         of += f" from {test.n_sensors} sensors"
     records = "whole records, their transients taken off, " * it.records.measurement.is_whole
-    told = (
+    words = (
         f"Identified: mass, stiffness and damping matrices of {of}. From: {fitted_in_words(it)}, "
         f"{counted(d, 'base direction')} ({', '.join(test.base_axes or ())}), {records}{test.lines_in_words}, "
         f"{'with' if test.force is not None else 'without'} base force."
     )
-    return paragraph(told, "soft")
+    return paragraph(words, "soft")
 
 
 def _reasons(it: Identification) -> str:
@@ -92,8 +92,8 @@ def _masses(it: Identification) -> Iterator[tuple[str, str]]:
             yield f"{what}, {axis}", f"~{number(mass)} {unit}, normalised: no mass is stated, no force was measured"
             continue
         exact = known and half_width(deviation, mass) in ("open", "0")
-        told = f"{number(mass)} {unit}, as stated" if exact else _with_interval(it, mass, deviation, unit)
-        yield f"{what}, {axis}", told
+        words = f"{number(mass)} {unit}, as stated" if exact else _with_interval(it, mass, deviation, unit)
+        yield f"{what}, {axis}", words
 
 
 def _deck_masses(it: Identification) -> Iterator[tuple[str, str]]:
@@ -151,7 +151,7 @@ def rounded(value: float, std: float, digits: int = 4) -> tuple[str, str]:
 
 def _with_interval(it: Identification, value: float, std: float, unit: str) -> str:
     """A value with its interval; of a model that does not fit without one, as it leaves out what is missed."""
-    told, width = rounded(value, std if it.success or np.isnan(std) else 0.0)
+    words, width = rounded(value, std if it.success or np.isnan(std) else 0.0)
     if width == "open" and it.quick_uncertainty is not None:
-        return f"{told} {unit}, one of many: these data do not determine it"
-    return f"{told} {unit}" if width in ("open", "0") else f"{told} ± {width} {unit}"
+        return f"{words} {unit}, one of many: these data do not determine it"
+    return f"{words} {unit}" if width in ("open", "0") else f"{words} ± {width} {unit}"

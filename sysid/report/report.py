@@ -168,24 +168,24 @@ def _unknowns(it: Identification) -> str:
     if not rows:
         return ""
     head = ("unknown", "value", "±", "unit", "lower", "upper", "")
-    told = bullets(sentence(s) for s in stated_values(it))
-    return table(head, rows, "± is half of the 95 % interval that noise leaves; open: the data do not tell.") + told
+    values = bullets(sentence(s) for s in stated_values(it))
+    return table(head, rows, "± is half of the 95 % interval that noise leaves; open: the data do not tell.") + values
 
 
 def _modes(it: Identification) -> str:
     structure, reference, u = it.structure, it.records.reference, it.quick_uncertainty
     many, frequencies, percent = is_one_of_many(it), structure.natural_frequencies, 100 * it.identified_ratios
     widths = np.zeros((2, structure.n)) if u is None else np.array([u.natural_frequencies, 100 * u.damping_ratios])
-    told = [rounded(f, std, 6) for f, std in zip(frequencies, widths[0], strict=True)]
+    rounded_frequencies = [rounded(f, std, 6) for f, std in zip(frequencies, widths[0], strict=True)]
     damping = [rounded(ratio, std) for ratio, std in zip(percent, widths[1], strict=True)]
     columns: list[list[object]] = [
         ["mode", *range(1, structure.n + 1), "sum"],
-        ["frequency [Hz]", *(value for value, _ in told), ""],
+        ["frequency [Hz]", *(value for value, _ in rounded_frequencies), ""],
         ["damping [%]", *(value for value, _ in damping), ""],
     ]
     notes = ["Effective mass in % of the rigid-body mass of its base direction."]
     if u is not None:
-        columns.insert(2, ["±", *(width for _, width in told), ""])
+        columns.insert(2, ["±", *(width for _, width in rounded_frequencies), ""])
         columns.append(["±", *(width for _, width in damping), ""])
         notes.append("±: half of the 95 % interval that the noise of the records makes; 0 where it is round-off.")
         notes += ["It holds for a model that fits: this one does not."] * (not it.success)
@@ -231,20 +231,20 @@ def _rigid_body_mass(it: Identification) -> str:
     axes, turns = it.measurement.base_axes or (), ~it.measurement.translational
     rigid, reference = it.structure.rigid_body_mass, it.records.reference
     unit = "kg; kg m where one axis is a rotation, kg m² where both are" if turns.any() else "kg"
-    told, label, u = "", _NORMALISED * it.facts.unit_mass, it.quick_uncertainty
+    parts, label, u = "", _NORMALISED * it.facts.unit_mass, it.quick_uncertainty
     below: Lines = []
     if it.facts.unit_mass:
-        told = paragraph(
+        parts = paragraph(
             "No mass is stated and no base force was measured: the masses are normalised to 1 kg in each base "
             "direction. All mass, stiffness and damping entries carry this scale, which the data do not tell."
         )
     elif u is not None:
         below = half_widths(rigid, u.rigid_body_mass, stated(it))
         label = ONE_OF_MANY * bool(np.all(np.isnan(u.rigid_body_mass)) and not stated(it).any())
-    told += matrix(rigid, axes, axes, f"Total mass M_rb = [G; I]' M [G; I], {unit}.", below=below, label=label)
+    parts += matrix(rigid, axes, axes, f"Total mass M_rb = [G; I]' M [G; I], {unit}.", below=below, label=label)
     if reference is not None:
-        told += matrix(reference.rigid_body_mass, axes, axes, f"Of the reference, {unit}.")
-    return told
+        parts += matrix(reference.rigid_body_mass, axes, axes, f"Of the reference, {unit}.")
+    return parts
 
 
 def _responses(it: Identification, test: Measurement, level: NoiseLevel) -> str:
@@ -262,9 +262,9 @@ def _residuals(it: Identification, level: NoiseLevel) -> str:
     if test.force is not None:
         noise = share_of_noise(level.force, test.force)
         force = [*zip(test.base_axes or (), _score_of_force(it, test), noise, strict=True)]
-        channels += [(f"base force {axis}", 1 - score, own) for axis, score, own in force]
+        channels += [(f"base force {axis}", 1 - score, residual) for axis, score, residual in force]
     known = any(np.isfinite(noise) for *_, noise in channels)
-    rows = [(name, aligned(100 * own), *[aligned(100 * noise)] * known) for name, own, noise in channels]
+    rows = [(name, aligned(100 * residual), *[aligned(100 * noise)] * known) for name, residual, noise in channels]
     caption = (
         "What the fit leaves of each channel: ‖identified - measured‖ / ‖measured‖, of the accelerations relative "
     )
@@ -280,7 +280,7 @@ def _as_fitted(it: Identification, test: Measurement) -> Measurement:
 
 def _noise(it: Identification) -> str:
     """The noise of each channel of whole records."""
-    rows = [(one.channel, one.told, one.unit, aligned(one.percent)) for one in noise_of_channels(it)]
+    rows = [(one.channel, one.level_in_words, one.unit, aligned(one.percent)) for one in noise_of_channels(it)]
     caption = f"Noise of each channel, {noise_source(it)}: standard deviation of a sample in time, of noise up to half "
     caption += (
         "the sample rate (from least to most, where runs differ), and its share of what was recorded at the lines."
@@ -385,17 +385,17 @@ def _convergence(it: Identification) -> str:
         refined += f", within {history.refinement_error:.1e} (relative, ω²)"
     ran = it.phases
     swarm = f"{history.evaluations} candidates in {history.swarm_curve.size} iterations of the swarm; {refined}; "
-    told = swarm * bool(history.swarm_curve.size) + f"{counted(steps, 'local iteration')}, exact gradients"
+    note = swarm * bool(history.swarm_curve.size) + f"{counted(steps, 'local iteration')}, exact gradients"
     if it.records.reference is not None:
-        told += ". Errors are those of the reference: M_SS, K_SS and C in Frobenius norm"
+        note += ". Errors are those of the reference: M_SS, K_SS and C in Frobenius norm"
     alt = f"objective through {', '.join(row[0] for row in ran) or 'no search'}"
     caption = _LAST_PHASE * (it.strategy == "continuation")
     if history.swarm_curve.size and np.isnan(history.start):
         caption = _WIDENED
     parts = [picture(plot.convergence(it), alt, caption)] if _falls(it) else []
-    told_of = [k for k in range(len(COLUMNS)) if any(row[k] != "-" for row in ran)]  # of a reference only where it is
-    rows = [[row[k] for k in told_of] for row in ran]
-    parts.append(table([COLUMNS[k] for k in told_of], rows, f"{told}.", words=True))
+    columns = [k for k in range(len(COLUMNS)) if any(row[k] != "-" for row in ran)]  # of a reference only where it is
+    rows = [[row[k] for k in columns] for row in ran]
+    parts.append(table([COLUMNS[k] for k in columns], rows, f"{note}.", words=True))
     if history.restarts:
         again = f"{counted(history.restarts, 'further swarm')} followed, as the first ended at no solution that fits"
         parts.append(paragraph(f"{again}; {history.evaluations} candidates are those of all.", "soft"))

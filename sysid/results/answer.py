@@ -200,8 +200,8 @@ class Answer:
         """That of the problem's own test in squares: with Huber's loss without numbers that stand alone."""
         if self.part is None:
             return self.prepared.screened.modal[0]
-        own = self.modal[0]
-        return own if self.part.records.loss == "squares" else replace(own, records=screened(own.records))
+        first = self.modal[0]
+        return first if self.part.records.loss == "squares" else replace(first, records=screened(first.records))
 
     @property
     def records(self) -> StatedProblem | StoredRecords:

@@ -73,10 +73,10 @@ class Begun:
 
     def to_tree(self) -> Tree:
         """Give the fields by their names; `from_tree` takes them back."""
-        own = {
+        fields = {
             "strategy": self.strategy, "seed": str(self.seed), "refine_by": self.refine_by, "source": self.source,
         }  # fmt: skip
-        return {"recipe": self.recipe.to_tree(), **own}
+        return {"recipe": self.recipe.to_tree(), **fields}
 
     @classmethod
     def from_tree(cls, tree: Tree) -> Begun:
@@ -184,10 +184,10 @@ class Checkpoint:
                     "changed since; take it away, or give another file"
                 )
             entries = self._entries(tree)
-        begun = None if self.begun is None else self.begun.to_tree()
+        request = None if self.begun is None else self.begun.to_tree()
 
         def write(kept: Tree) -> None:
-            tree = {"content": _CONTENT, "search": search, "begun": begun, "entries": kept}
+            tree = {"content": _CONTENT, "search": search, "begun": request, "entries": kept}
             with atomically(self.path) as temporary:
                 temporary.write_bytes(to_bytes(tree, _FORMAT))
 

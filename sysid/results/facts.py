@@ -108,10 +108,10 @@ def facts_of(problem: Prepared, x: Array | None) -> Facts:
         if x is not None
         for name, z in zip(prior.labels, prior.numbers(x), strict=True)
     ]
-    told = {id(one) for one in reported_unknowns(problem)}
+    reported = {id(one) for one in reported_unknowns(problem)}
     unknowns = [
         ReportedUnknown(
-            one.name, one.unit, one.shape, one.labels, one.lower, one.upper, bool(one.fixed), id(one) not in told
+            one.name, one.unit, one.shape, one.labels, one.lower, one.upper, bool(one.fixed), id(one) not in reported
         )
         for one in reported_unknowns(problem, damping_ratios=True)
     ]

@@ -124,10 +124,10 @@ def _literal(name: str, text: Any) -> Any:
 def _option_in_words(name: str, value: Any) -> str:
     """What was said of a test that was read from files: "0.5-40 Hz"; another parameter as it was given."""
     parts = value if isinstance(value, list | tuple) else [value]
-    told = ("-" if name == "band" else " and ").join(str(part).removesuffix(".0") for part in parts)
+    said = ("-" if name == "band" else " and ").join(str(part).removesuffix(".0") for part in parts)
     words = {
-        "mass": f"{told} kg stated", "lumped": "lumped mass" if value else "full mass", "band": f"{told} Hz",
-        "goal": f"goal {told}",
+        "mass": f"{said} kg stated", "lumped": "lumped mass" if value else "full mass", "band": f"{said} Hz",
+        "goal": f"goal {said}",
     }  # fmt: skip
     return words.get(name, f"{name}={value!r}")
 
@@ -293,12 +293,12 @@ class Identification(Answer):
         _check_records(self.records, problem)
         if self.x is not None:
             _check_unknowns(self, self.x, problem)
-        own = {
+        kept = {
             field.name: getattr(self, field.name)
             for field in fields(self)
             if field.init and field.name not in ("problem", "prepared")
         }
-        return type(self)(**own, problem=problem)
+        return type(self)(**kept, problem=problem)
 
 
 def load(path: str | Path, problem: Problem | None = None) -> Identification:
@@ -351,8 +351,8 @@ def _problem_from_tree(tree: dict[str, Any], structure: Structure) -> Any:
 def _check_records(records: StatedProblem | StoredRecords, problem: Problem) -> None:
     """Refuse a problem of other records."""
     for name in ("freq", "base", "response", "force"):
-        own, other = getattr(records.measurement, name), getattr(problem.measurement, name)
-        if (own is None) != (other is None) or not np.array_equal(own, other):
+        ours, other = getattr(records.measurement, name), getattr(problem.measurement, name)
+        if (ours is None) != (other is None) or not np.array_equal(ours, other):
             raise InputError(
                 f"the problem that was given has other records than the result ({name}): give the problem of the same "
                 "test, with the same data and parameters"
@@ -361,17 +361,17 @@ def _check_records(records: StatedProblem | StoredRecords, problem: Problem) -> 
 
 def _check_unknowns(result: Identification, x: Array, problem: Problem) -> None:
     """Refuse a problem of other unknowns, or in which they stand for other matrices."""
-    own = [(unknown.name, unknown.shape) for unknown in problem.variables]
+    given = [(unknown.name, unknown.shape) for unknown in problem.variables]
     fixed = {unknown.name for unknown in problem.formulation.fixed}
     its = [(name, np.shape(value)) for name, value in result.values.items() if name not in fixed]
-    if own != its:
+    if given != its:
         raise InputError(
-            f"the problem that was given has other unknowns than the result: {_in_words(own)} instead of "
+            f"the problem that was given has other unknowns than the result: {_in_words(given)} instead of "
             f"{_in_words(its)}"
         )
-    made = problem.structure(x)
+    structure = problem.structure(x)
     for name in ("mass", "stiffness"):
-        one, other = getattr(made, name), getattr(result.structure, name)
+        one, other = getattr(structure, name), getattr(result.structure, name)
         if one.shape != other.shape or not np.allclose(
             one, other, rtol=NEGLIGIBLE, atol=NEGLIGIBLE * np.abs(other).max()
         ):

@@ -107,8 +107,8 @@ def _by_noise(it: Identification) -> Iterator[Finding]:
     if exact:
         return
     if it.structure.mode_shapes.size > LARGE:
-        told = "whether noise leaves each entry known was not judged, as that takes minutes: see uncertainty"
-        yield Finding("noise not judged", Severity.NOTE, told)
+        sentence = "whether noise leaves each entry known was not judged, as that takes minutes: see uncertainty"
+        yield Finding("noise not judged", Severity.NOTE, sentence)
         return
     u, open_ = it.uncertainty, False
     stds = (u.mass, u.stiffness, u.damping)
@@ -118,7 +118,7 @@ def _by_noise(it: Identification) -> Iterator[Finding]:
         largest = float(np.max(std / np.outer(size, size)))
         if not largest <= _KNOWN:
             up_to = "open" if np.isnan(largest) else f"with standard deviations up to {100 * largest:.2g} %"
-            told, open_ = f"noise leaves entries of {name} {up_to}", True
-            yield Finding("noise", Severity.CAUTION, told, numbers={"largest": largest})
+            sentence, open_ = f"noise leaves entries of {name} {up_to}", True
+            yield Finding("noise", Severity.CAUTION, sentence, numbers={"largest": largest})
     if not open_ and it.prepared.formulation.fits_records:
         yield from rests_on(it.measurement, it.gains, it.gain_worth)

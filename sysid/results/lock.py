@@ -162,7 +162,7 @@ def _own_record() -> str:
 
 def _is_alive(record: str) -> bool:
     """Whether the process of a record is there; one on another host is taken to be."""
-    host, pid, begun = record.split(" ")
+    host, pid, started = record.split(" ")
     if host != socket.gethostname():
         return True
     try:
@@ -171,7 +171,7 @@ def _is_alive(record: str) -> bool:
         return False
     except PermissionError:  # another user's
         pass
-    return _begun(int(pid)) == begun
+    return _begun(int(pid)) == started
 
 
 def _begun(pid: int) -> str:

@@ -56,9 +56,9 @@ def rows_of_phases(it: Searched) -> list[list[str]]:
 
 def errors(found: Structure, truth: Structure) -> Array:
     """Largest relative error of a frequency and largest 1 - MAC; relative errors of M_SS, K_SS and C: (5,)."""
-    own, other = found.mode_shapes, truth.mode_shapes
-    squares, others = (np.einsum("ik,ik->k", phi, phi) for phi in (own, other))  # zero for a shape that no sensor sees
-    mac = np.einsum("ik,ik->k", own, other) ** 2 / np.where(squares > 0, squares, 1) / np.where(others > 0, others, 1)
+    ours, other = found.mode_shapes, truth.mode_shapes
+    squares, others = (np.einsum("ik,ik->k", phi, phi) for phi in (ours, other))  # zero for a shape that no sensor sees
+    mac = np.einsum("ik,ik->k", ours, other) ** 2 / np.where(squares > 0, squares, 1) / np.where(others > 0, others, 1)
     return np.array([
         np.max(np.abs(found.natural_frequencies / truth.natural_frequencies - 1)),
         1 - mac.min(),

@@ -58,7 +58,7 @@ def from_tree(tree: Tree, structure: Structure) -> dict[str, Any]:
     structure : Structure
         The answer's.
     """
-    made = {
+    attributes = {
         "facts": Facts.from_tree(tree["facts"]),
         "residual": tree["residual"],
         "residuals": tuple(tree["residuals"].tolist()),
@@ -76,7 +76,7 @@ def from_tree(tree: Tree, structure: Structure) -> dict[str, Any]:
         "uncertainty": _if_given(lambda part: _uncertainty_from_tree(part, structure), tree["uncertainty"]),
         "_intervals": _if_given(lambda part: Intervals(**part), tree["intervals"]),
     }
-    return {name: value for name, value in made.items() if value is not None}
+    return {name: value for name, value in attributes.items() if value is not None}
 
 
 def _uncertainty_to_tree(u: Uncertainty) -> Tree:

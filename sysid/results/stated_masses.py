@@ -68,9 +68,9 @@ def _adjusted(problem: Prepared, end: Outcome) -> Outcome:
 def _structure(problem: Prepared, first: Structure, before: Array, after: Array, index: Index) -> Structure:
     """The structure of adjusted modal parameters; what was repeated in the first stays so."""
     phi, gamma, log_omega, log_ratios, rigid = (part[..., 0] for part in index.split(after[:, None]))
-    _, _, own_omega, own_ratios, _ = (part[..., 0] for part in index.split(before[:, None]))
-    omega = 2 * np.pi * first.natural_frequencies * np.exp(log_omega - own_omega)
-    ratios = first.damping_ratios * np.exp(log_ratios - own_ratios)
+    _, _, omega_before, ratios_before, _ = (part[..., 0] for part in index.split(before[:, None]))
+    omega = 2 * np.pi * first.natural_frequencies * np.exp(log_omega - omega_before)
+    ratios = first.damping_ratios * np.exp(log_ratios - ratios_before)
     order = np.argsort(omega, kind="stable")
     end = Modes(phi[:, order], gamma[order], omega[order], ratios[order])
     geometry, P, G = problem.geometry, np.linalg.inv(end.phi), problem.geometry.rigid_body
@@ -99,7 +99,7 @@ def _contradictions(
     if _chance(best, numbers) >= FALSE_ALARM:
         return
     chance = _chance(best, numbers)
-    told = f"the stated masses cannot all be met together with the records (chance {chance:.1g})"
+    found = f"the stated masses cannot all be met together with the records (chance {chance:.1g})"
     explained: list[tuple[float, tuple[float, float], str]] = []
     for row in range(stated.values.size):
         without = adjust(problem, stated.without(row), theta, index, normals)
@@ -113,7 +113,7 @@ def _contradictions(
         explained.sort(key=lambda one: -one[0])
         near = [words for off, _, words in explained if off**2 > explained[0][0] ** 2 - LIKELY**2]
         yield Finding(
-            "stated masses", Severity.CONTRADICTS, f"{told}: {listed(near, '; or ')}",
+            "stated masses", Severity.CONTRADICTS, f"{found}: {listed(near, '; or ')}",
             numbers={
                 "chance": chance, "deviations": float(explained[0][0]), "stated": explained[0][1][0],
                 "by the records": explained[0][1][1], "statements": float(len(near)),
@@ -125,11 +125,11 @@ def _contradictions(
         scaled = stated._replace(values=factor * stated.values, std=factor * stated.std)
         if _chance(adjust(problem, scaled, theta, index, normals), numbers) >= FALSE_ALARM:
             yield Finding(
-                "stated masses", Severity.CONTRADICTS, f"{told}; all of them would be met {factor:.4g} times as large",
+                "stated masses", Severity.CONTRADICTS, f"{found}; all of them would be met {factor:.4g} times as large",
                 "is a unit or the force's gain wrong?", numbers={"chance": chance, "factor": factor},
             )  # fmt: skip
             return
-    unexplained = f"{told}; no single one of them explains it"
+    unexplained = f"{found}; no single one of them explains it"
     yield Finding("stated masses", Severity.CONTRADICTS, unexplained, numbers={"chance": chance})
 
 
