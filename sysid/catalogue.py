@@ -60,7 +60,7 @@ def bundled_folder() -> Path:
     return inside if inside.is_dir() else package.parent / "problems"
 
 
-def own_folder() -> Path:
+def user_folder() -> Path:
     """Folder of the user's own problems: ``./problems``."""
     return Path("problems")
 
@@ -70,7 +70,7 @@ def entries() -> tuple[Entry, ...]:
 
     Modules are read, not imported.
     """
-    paths = {path.stem: path for folder in (bundled_folder(), own_folder()) for path in _modules(folder)}
+    paths = {path.stem: path for folder in (bundled_folder(), user_folder()) for path in _modules(folder)}
     home = bundled_folder().resolve()
     return tuple(
         Entry(name, path, path.resolve().parent == home, _first_line(path)) for name, path in sorted(paths.items())
@@ -181,12 +181,12 @@ def file_of(name: str) -> Path | None:
     """
     if _is_path(name):
         return Path(name)
-    return _in_folder(bundled_folder(), name) or _in_folder(own_folder(), name)
+    return _in_folder(bundled_folder(), name) or _in_folder(user_folder(), name)
 
 
 def typed(name: str) -> tuple[str, str]:
     """What a user means by a name at the command line, and a remark: the user's own problem hides a bundled one."""
-    of_user = None if _is_path(name) else _in_folder(own_folder(), name)
+    of_user = None if _is_path(name) else _in_folder(user_folder(), name)
     bundled = _in_folder(bundled_folder(), name)
     if of_user is None or bundled is None or of_user.read_bytes() == bundled.read_bytes():  # the last in a checkout
         return name, ""
@@ -334,10 +334,10 @@ def _telling_the_line(path: Path) -> Iterator[None]:
             raise InputError(f"{path}, line {error.lineno}: syntax error: {error.msg}") from None
         lines = [line for frame, line in traceback.walk_tb(error.__traceback__) if frame.f_code.co_filename == full]
         where = f"{path}, line {lines[-1]}" if lines else f"{path}"
-        raise InputError(f"{where}: {_in_own_words(error)}") from error
+        raise InputError(f"{where}: {_exception_in_words(error)}") from error
 
 
-def _in_own_words(error: BaseException) -> str:
+def _exception_in_words(error: BaseException) -> str:
     """What an exception of a module says; of what CasADi cannot do with expressions, what to write instead."""
     said = str(error)
     if "truth value of a numeric MX" in said:

@@ -41,7 +41,7 @@ def suffices(left: float, seconds: float) -> bool:
     return _LOADED * seconds < left + GRACE
 
 
-def not_begun(seconds: float) -> str:
+def time_too_short(seconds: float) -> str:
     """The status of a run whose graphs would have taken so many seconds, and the time did not allow them."""
     return f"not begun, as its derivatives take some {seconds:.1g} s to set up: too little time"
 

@@ -31,7 +31,6 @@ CEILINGS = {
     "branches": 78.0,
     "files": 258,
     "shared": 34,
-    "everyday": 221,
     "prose": 61,
 }
 

@@ -21,7 +21,7 @@ from sysid.cli import trust, unfinished
 from sysid.cli.files import alone_in
 from sysid.files import reading
 from sysid.finding import Finding, Severity
-from sysid.results.checkpoint import Begun
+from sysid.results.checkpoint import RunRequest
 from sysid.results.summary import next_steps, verdict
 from sysid.swarm import minimize_swarm
 
@@ -73,7 +73,7 @@ def own_damping():
 
 
 def begun(strategy="swarm", **given):
-    return Begun(Recipe("pair.py"), strategy, 0, **given)
+    return RunRequest(Recipe("pair.py"), strategy, 0, **given)
 
 
 def identified(test, mass=None, **given):

@@ -27,7 +27,7 @@ from benchmarks.line import Line, above, below
 from sysid import catalogue
 from sysid.cli.main import main
 from sysid.files import reading
-from sysid.results.checkpoint import Begun, Checkpoint
+from sysid.results.checkpoint import Checkpoint, RunRequest
 
 _SECONDS = 30  # of a processor, from which a command counts as one that hangs
 _MEGABYTES = 1500.0  # that a command may take, the package itself included
@@ -163,7 +163,7 @@ def _stopped(folder: Path) -> bytes:
     recipe = sysid.Recipe("physical_damping")
     problem, files = catalogue.built(recipe)
     path = folder / "unfinished.h5"
-    begun = Begun(recipe, "swarm", 0, catalogue.digest(files))
+    begun = RunRequest(recipe, "swarm", 0, catalogue.digest(files))
     with contextlib.suppress(sysid.SolverError):
         sysid.identify(problem, strategy="swarm", rng=0, callback=_stop, checkpoint=Checkpoint(path, begun, every=0.0))
     return path.read_bytes()

@@ -112,8 +112,8 @@ def determine(problem: Prepared, structure: Structure, x: Array | None, rivals: 
     InputError
         Where the rank of the Jacobian is asked for, and no x is given.
     """
-    if modal_mass_cone.speaks(problem.formulation):
-        closed, open_ = modal_mass_cone.verdict(problem, structure)
+    if modal_mass_cone.applies(problem.formulation):
+        closed, open_ = modal_mass_cone.closed_and_open(problem, structure)
         beside = tuple(_open_outside(problem.formulation, x))
         if open_:  # other answers are members of the cone
             return Determination((*_open((*open_, *beside)), *_fixed(closed)), BY_CONE)
@@ -138,7 +138,7 @@ def intervals(problem: Prepared, structure: Structure, x: Array | None) -> Inter
     To first order where the cone does not speak: no end is followed along a null direction until a bound stops it, so
     that it is infinite for an entry that something unseen moves.
     """
-    if modal_mass_cone.speaks(problem.formulation):
+    if modal_mass_cone.applies(problem.formulation):
         return Intervals(*modal_mass_cone.ends(problem, structure))
     _, _, slopes, known = _about(problem, structure, x)
     ends = []
@@ -151,13 +151,13 @@ def intervals(problem: Prepared, structure: Structure, x: Array | None) -> Inter
 
 def open_masses(problem: Prepared, structure: Structure) -> list[int]:
     """Modes, counted from 0, whose modal mass neither records nor stated models fix; none where no cone tells."""
-    return modal_mass_cone.open_modes(problem, structure) if modal_mass_cone.speaks(problem.formulation) else []
+    return modal_mass_cone.open_modes(problem, structure) if modal_mass_cone.applies(problem.formulation) else []
 
 
 def scale_is_open(problem: Prepared, structure: Structure, x: Array | None) -> bool:
     """Whether one factor common to mass, stiffness and damping is all that is open; parameters as in `determine`."""
-    if modal_mass_cone.speaks(problem.formulation):
-        return modal_mass_cone.scale_is_open(problem, structure)
+    if modal_mass_cone.applies(problem.formulation):
+        return modal_mass_cone.only_scale_is_open(problem, structure)
     _, _, slopes, known = _about(problem, structure, x)
     pairs = blocks_and_slopes(structure, slopes)
     return _moving(pairs, known.unit, known.unseen).shape[1] == 1 and _scale_is_open(pairs, known)

@@ -35,7 +35,7 @@ _RESOLVED = 10.0  # standard deviations of a mode's amplitude at which it is kno
 _GAIN = 5e-3  # of the base's motion; a smaller error of a sensor's gain is not told from a mode below the lines
 
 
-def speaks(formulation: Formulation) -> bool:
+def applies(formulation: Formulation) -> bool:
     """Whether the cone holds all models that explain the data, and what is stated of them.
 
     So it is where the records stand alone, damping is by ratios, and `Stated` tells all of mass and stiffness.
@@ -44,7 +44,7 @@ def speaks(formulation: Formulation) -> bool:
     return linear and formulation.by_ratios and formulation.geometry.at_sensors and formulation.test_alone
 
 
-def verdict(problem: Prepared, structure: Structure) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def closed_and_open(problem: Prepared, structure: Structure) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What closes the modal masses of `structure`, and what is left open, in sentences.
 
     What counts as seen is judged against the misfit that the structure leaves: a mode whose share of
@@ -113,7 +113,7 @@ def open_modes(problem: Prepared, structure: Structure) -> list[int]:
     return _open_modes(_known(problem, structure, problem.measurement.residual(structure)))[0]
 
 
-def scale_is_open(problem: Prepared, structure: Structure) -> bool:
+def only_scale_is_open(problem: Prepared, structure: Structure) -> bool:
     """Whether one scale of mass, stiffness and damping is open, and nothing else."""
     return _open_modes(_known(problem, structure, problem.measurement.residual(structure)))[1]
 

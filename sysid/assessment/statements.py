@@ -75,7 +75,7 @@ def statements_of(problem: Prepared, structure: Structure) -> Statements | None:
     return Statements(entries, totals, kind, values, stds, scale)
 
 
-def made(problem: Prepared, stated: Statements, theta: Array, index: Index) -> tuple[Array, Array]:
+def predict_statements(problem: Prepared, stated: Statements, theta: Array, index: Index) -> tuple[Array, Array]:
     """What modal parameters make of the statements, (r,), and its slopes, (r, size of theta); in units of `scale`.
 
     With P the inverse of Phi the entries are those of ``M_SS = P' P`` and ``M_S0 = P' (Gamma - P G)``.
@@ -135,7 +135,7 @@ def adjust(
         return Adjusted(theta, 0.0, 0, holds=True)
     at, a, b = theta, np.zeros(k), np.zeros(0 if weighed else m)
     for step in range(steps):
-        values, slopes = made(problem, stated, at, index)
+        values, slopes = predict_statements(problem, stated, at, index)
         F, U = slopes @ _rescaled(normals, b, index), slopes @ _gauge(at, index, weighed)
         system = np.hstack([F, _WIDE * U, np.diag(std)])
         # Shapes of modes that almost share a pole turn too easily for steps to settle: then these only meet what is
@@ -154,7 +154,7 @@ def adjust(
         at = _rescaled((theta + normals @ a)[:, None], b, index)[:, 0]
         if long < ROUND_OFF:
             break
-    left = wanted - made(problem, stated, at, index)[0]
+    left = wanted - predict_statements(problem, stated, at, index)[0]
     e = np.where(std > 0, left / np.where(std > 0, std, 1.0), 0.0)
     spread = np.linalg.svd(_whitened(F, std) @ U, compute_uv=False) if U.size else np.zeros(0)
     freedom = wanted.size - int(np.count_nonzero(spread > 1.0))
@@ -179,7 +179,7 @@ def conditioned(
         return normals, unseen, shifts
     theta = theta_of(modes, structure.rigid_body_mass, index)
     std = stated.std / stated.scale
-    _, C = made(problem, stated, theta, index)
+    _, C = predict_statements(problem, stated, theta, index)
     gauge = _gauge(theta, index, problem.measurement.force is not None)
     U = C @ gauge
     F = np.hstack([C @ normals, np.diag(std)[:, std > 0]])

@@ -161,7 +161,7 @@ def _run_in(folder: Path, options: argparse.Namespace, out: Output) -> int:
         """Seconds that are left, at least so many; None without a limit."""
         return None if options.max_time is None else max(options.max_time - (time.perf_counter() - start), least)
 
-    search = unfinished.begun(options, folder, out)
+    search = unfinished.requested_run(options, folder, out)
     recipe, strategy = search.recipe, unfinished.strategy_of(search)
     problem, files = catalogue.built(recipe, check=False)  # by the search, with its progress and under its clock
     checkpoint = Checkpoint(folder / UNFINISHED, unfinished.with_source(search, files, folder))
@@ -193,7 +193,7 @@ def _run_in(folder: Path, options: argparse.Namespace, out: Output) -> int:
         except InputError as error:
             failed = error
     try:
-        words, figures = _told(result, left(GRACE))
+        words, figures = _summary_and_figures(result, left(GRACE))
         out.write(f"\n{words}\n\n")
         out.answer(result=figures)
         out.flush()
@@ -458,7 +458,7 @@ def _save(result: Identification, folder: Path, checkpoint: Checkpoint) -> None:
         remove_empty(missing)  # where nothing could be written
 
 
-def _told(result: Identification, left: float | None) -> tuple[str, dict[str, Any]]:
+def _summary_and_figures(result: Identification, left: float | None) -> tuple[str, dict[str, Any]]:
     """Summary and figures of a result; without what takes more than the seconds that are `left`."""
     try:
         with within(left):

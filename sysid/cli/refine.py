@@ -42,7 +42,7 @@ def run(options: argparse.Namespace, out: Output) -> int:
 def _run_in(folder: Path, result: Identification, recipe: Recipe, options: argparse.Namespace, out: Output) -> int:
     source = Path(options.result)
     executor = _executor(options)
-    sweeps.check_own_records(result, recipe)
+    sweeps.check_same_records(result, recipe)
     sweep = sweeps.sweep_of(options, result, recipe, out)
     if sweep is not None:
         titles, kind = [*sweep.titles], sweep.kind

@@ -109,7 +109,7 @@ def _check_possible(changes: Sequence[Change], problem: Problem) -> None:
     raise refusals[0]
 
 
-def check_own_records(result: Identification, recipe: Recipe) -> None:
+def check_same_records(result: Identification, recipe: Recipe) -> None:
     """Refuse to compare a result with jobs of other records, as its module makes them now."""
     if not _same_records(result, catalogue.build(replace(recipe, start=None))):
         raise InputError(

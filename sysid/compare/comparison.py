@@ -158,10 +158,10 @@ def _strategy(
         return MethodResult(strategy.name, Status.REFUSED, str(error))
     except (InputError, SolverError) as error:
         return MethodResult(strategy.name, Status.FAILED, str(error))
-    return _own(strategy.name, result, recorder)
+    return _strategy_row(strategy.name, result, recorder)
 
 
-def _own(name: str, result: Identification, recorder: Recorder) -> MethodResult:
+def _strategy_row(name: str, result: Identification, recorder: Recorder) -> MethodResult:
     """The row of an identification."""
     history = result.history
     before = [value for value in (history.swarm, history.start) if np.isfinite(value)]

@@ -72,7 +72,7 @@ def gather(paths: str | Path | Sequence[str | Path], sensors: Any = None) -> Rec
     said = asked(sensors, files)
     if all(xsens_dot.is_export(file) for file in files):
         return assembly.in_time([xsens_dot.together(files)], said)  # a unit is a file
-    recordings = [recording for file in files for recording in _read_or_told(file)]
+    recordings = [recording for file in files for recording in _read_any(file)]
     if said.join:
         recordings = joined.by_folder(recordings, said)
     else:
@@ -140,7 +140,7 @@ def _check_one_each(recordings: Sequence[Recording], said: Description) -> None:
     )
 
 
-def _read_or_told(file: Path) -> list[Recording]:
+def _read_any(file: Path) -> list[Recording]:
     """The recordings of a file of any kind; what a library raises of a file that it cannot take is one line."""
     try:
         return _recordings(file)

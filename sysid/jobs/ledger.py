@@ -49,7 +49,7 @@ class Ledger:
 
     def results(self) -> dict[int, JobResult]:
         """What is there of the jobs, by index; a damaged one counts as none, with a warning."""
-        with self._told():
+        with self._sqlite_errors_named():
             rows = {row[0]: row[1:] for row in self._file.execute("SELECT job, result, sha256 FROM results")}
         wanted = {index: rows[key] for index, key in self._keys.items() if key in rows}
         found = {index: self._result(index, *row) for index, row in wanted.items()}
@@ -77,12 +77,12 @@ class Ledger:
         """Write a result; it is on the disk when this returns."""
         score = None if result.score is None else asdict(result.score)
         text = json.dumps([bool(result.success), result.message, result.x.tolist(), float(result.residual), score])
-        with self._told(), self._file:
+        with self._sqlite_errors_named(), self._file:
             row = (self._keys[result.index], text, _digest(text))
             self._file.execute("INSERT OR REPLACE INTO results VALUES (?, ?, ?)", row)
 
     def __enter__(self) -> Ledger:
-        with self._told():
+        with self._sqlite_errors_named():
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = sqlite3.connect(self.path)
             try:
@@ -111,7 +111,7 @@ class Ledger:
         self._file.close()
 
     @contextlib.contextmanager
-    def _told(self) -> Iterator[None]:
+    def _sqlite_errors_named(self) -> Iterator[None]:
         try:
             yield
         except (OSError, sqlite3.Error, UnicodeDecodeError) as error:  # the last where SQLite quotes a damaged name

@@ -258,15 +258,15 @@ def _noise(result: Identification) -> float:
     if test.response_std is not None:
         return 1.0
     return float(
-        np.mean(np.abs(outliers.at_own_lines(test.relative - test.predict(result.structure), test.own_lines)) ** 2)
+        np.mean(np.abs(outliers.numbers_at_lines(test.relative - test.predict(result.structure), test.own_lines)) ** 2)
     )
 
 
 def _over(misfit: ComplexArray, std: Array | None, lines: NDArray[np.bool_]) -> tuple[ComplexArray, float]:
     floored = raised(std)
     if floored is None:
-        return outliers.at_own_lines(misfit, lines), 0.0
-    return outliers.at_own_lines(misfit / floored, lines), float(np.sum(np.log(floored).transpose(0, 2, 1)[lines]))
+        return outliers.numbers_at_lines(misfit, lines), 0.0
+    return outliers.numbers_at_lines(misfit / floored, lines), float(np.sum(np.log(floored).transpose(0, 2, 1)[lines]))
 
 
 def _parameters(result: Identification) -> int:

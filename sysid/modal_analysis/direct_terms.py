@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.excitation import steady_sine
-from sysid.modal_analysis.record_poles import few_lines, rough_deviations
+from sysid.modal_analysis.record_poles import decimated_lines, rough_deviations
 from sysid.modal_analysis.relocation import relocate
 from sysid.modal_analysis.residues import Records, unit_columns
 from sysid.modal_analysis.vector_fitting import GUESS, RAZOR
@@ -74,7 +74,7 @@ def direct_terms(test: Measurement) -> DirectTerms | None:
     if test.whole is not None:
         if steady_sine(test) is not None:
             return None
-        test = test.at(few_lines(test))
+        test = test.at(decimated_lines(test))
         test = replace(test, response_std=rough_deviations(test), force_std=None)
     still = replace(test, rigid_body=np.zeros_like(test.rigid_body), sensors=None)
     with one_thread():

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from sysid.modal_analysis.modal_model import Parameters, Shift
+from sysid.modal_analysis.modal_model import NormalEquations, Parameters
 from sysid.structure.structure import Array
 
 _DAMPING = (1e-12, 1e-6, 1e6)  # of a scaled normal matrix: least, at first, and at which no step helps
@@ -32,7 +32,7 @@ class SumOfSquares:
     start: Array
     unpack: Callable[[Array], Parameters]
     chi2: Callable[[Parameters], float]
-    equations: Callable[[Parameters], Shift]
+    equations: Callable[[Parameters], NormalEquations]
 
 
 def minimise(

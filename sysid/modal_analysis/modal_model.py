@@ -47,12 +47,12 @@ class Run(NamedTuple):
 class Weighed(NamedTuple):
     """Errors by the inverse of their covariance: ``S^-1 e`` (c, L), ``e' S^-1 e`` (L,), the likeliest base (d, L)."""
 
-    seen: ComplexArray
+    whitened_residual: ComplexArray
     power: Array
     base: ComplexArray
 
 
-class Shift(NamedTuple):
+class NormalEquations(NamedTuple):
     """Products of the Jacobian with errors: ``Re J' S^-1 J`` (p, p), ``Re J' S^-1 e`` (p,) and ``e' S^-1 e``."""
 
     normal: Array
@@ -219,7 +219,7 @@ class Lines:
         ends = np.zeros((2 * len(self.model.moving), base.shape[1]), complex)
         if self.at_ends is not None:
             ends[self.at_ends] = self.transients
-        return self.run.w, np.concatenate([base, ends]), weighed.seen, inverse
+        return self.run.w, np.concatenate([base, ends]), weighed.whitened_residual, inverse
 
     def spectra(self, base: ComplexArray) -> ComplexArray:
         """What all columns of the Jacobian are made of, (spectra, L)."""

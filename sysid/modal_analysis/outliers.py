@@ -81,7 +81,7 @@ class Whitened(NamedTuple):
     @property
     def numbers(self) -> ComplexArray:
         """Those of `u` at each run's own lines, one after the other."""
-        return at_own_lines(self.u, self.lines)
+        return numbers_at_lines(self.u, self.lines)
 
 
 class Outlier(NamedTuple):
@@ -111,7 +111,7 @@ def whitened(test: Measurement, fitted: Sequence[ComplexArray], unknowns: int) -
     found = [(test.response, test.relative - fitted[0], test.response_std)]
     if test.force is not None:
         found.append((test.force, test.force - fitted[1], test.force_std))
-    numbers = lambda record: at_own_lines(record, test.own_lines)  # noqa: E731
+    numbers = lambda record: numbers_at_lines(record, test.own_lines)  # noqa: E731
     left = max(1 - unknowns / (2 * test.numbers), 0.5)
     squares, stds = [], []
     for record, misfit, stated in found:
@@ -126,7 +126,7 @@ def whitened(test: Measurement, fitted: Sequence[ComplexArray], unknowns: int) -
     return [Whitened(misfit / std, std, test.own_lines) for std, (_, misfit, _) in zip(stds, found, strict=True)]
 
 
-def at_own_lines(record: ComplexArray, lines: Flags) -> ComplexArray:
+def numbers_at_lines(record: ComplexArray, lines: Flags) -> ComplexArray:
     """Numbers of a record (runs, channels, n_freq) at each run's own lines (runs, n_freq), one after the other."""
     return record.transpose(0, 2, 1)[lines].ravel()
 

@@ -63,7 +63,7 @@ def _drawn(figure: Figure, dpi: float) -> NDArray[np.uint8]:
 
 
 @contextlib.contextmanager
-def own_style() -> Iterator[None]:
+def default_style() -> Iterator[None]:
     """Draw with matplotlib's own settings, whatever a problem module or the machine has set."""
     import matplotlib
 

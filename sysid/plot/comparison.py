@@ -66,18 +66,18 @@ def _draw(ax: Any, result: MethodResult, colour: str) -> None:
     for name, curve in result.phases:
         local = name == "local phase"
         if local and np.isfinite(last[1]):
-            ax.plot(*_shown(last), color=colour, zorder=4, **_HOLLOW)
+            ax.plot(*_clipped(last), color=colour, zorder=4, **_HOLLOW)
         if result.widened and name in ("local phase", "continuation"):
             continue
         line = np.vstack([last, curve]) if local else curve
-        ax.plot(*_shown(line), ":" if result.widened else "-", color=colour, linewidth=0.9 if local else 1.8)
+        ax.plot(*_clipped(line), ":" if result.widened else "-", color=colour, linewidth=0.9 if local else 1.8)
         last = [curve[-1, 0], result.before if result.widened else curve[-1, 1]]
     end = [result.seconds, result.after]
-    ax.plot(*_shown([last, end]), color=colour, linewidth=0.9)
-    ax.plot(*_shown(end), "o", color=colour, markeredgecolor="white", markersize=8, zorder=5, label=result.name)
+    ax.plot(*_clipped([last, end]), color=colour, linewidth=0.9)
+    ax.plot(*_clipped(end), "o", color=colour, markeredgecolor="white", markersize=8, zorder=5, label=result.name)
 
 
-def _shown(points: ArrayLike) -> Array:
+def _clipped(points: ArrayLike) -> Array:
     """Times and values (2, k) of points (k, 2), none below what a logarithmic axis shows: 10 ms, and round-off."""
     return np.maximum(np.reshape(points, (-1, 2)), [1e-2, EPSILON]).T
 
@@ -87,7 +87,7 @@ def _draw_errors(ax: Any, results: Sequence[MethodResult]) -> None:
     drawn = []
     for result, colour in zip(results, cycle(_TINTS)):
         for error, (marker, filling, size) in zip(result.errors, _SHAPES.values(), strict=True):
-            at = _shown([result.seconds, error])
+            at = _clipped([result.seconds, error])
             ax.plot(*at, marker, fillstyle=filling, color=colour, markersize=size)
             drawn.append(at[1, 0])
     for name, (marker, filling, size) in _SHAPES.items():

@@ -240,14 +240,14 @@ class Builder(NamedTuple):
     """What makes terms of what a user gives.
 
     ``function(name, expressions)`` is a CasADi function of x; ``matrices(blocks, geometry)`` are matrices of x;
-    ``own()`` are the problem's; ``noise()`` is the standard deviation of a number of the measurement's relative
-    residual, ``noise_of(test)`` of a further test's; ``modal_of(given)`` is the modal estimate of a further test;
-    ``replaced`` tells whether a misfit stands in the place of the measurement's.
+    ``problem_matrices()`` are the problem's; ``noise()`` is the standard deviation of a number of the measurement's
+    relative residual, ``noise_of(test)`` of a further test's; ``modal_of(given)`` is the modal estimate of a further
+    test; ``replaced`` tells whether a misfit stands in the place of the measurement's.
     """
 
     function: Callable[[str, Sequence[ca.MX]], ca.Function]
     matrices: Callable[[Blocks, Geometry], Matrices]
-    own: Callable[[], Matrices]
+    problem_matrices: Callable[[], Matrices]
     noise: Callable[[], float]
     modal_of: Callable[[FurtherTest], ModalEstimate]
     noise_of: Callable[[Measurement], float]

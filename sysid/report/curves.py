@@ -44,7 +44,7 @@ def curves(it: Identification, test: Measurement, level: NoiseLevel) -> str:
         "freq": [_packed(test.freq[at]) for at, _ in lines],
         "gaps": [gaps.tolist() for _, gaps in lines],
         "runs": runs,
-        "channels": list(map(_told, each)),
+        "channels": list(map(_channel_content, each)),
     }
     drawn = "".join(
         curve_sheet(f"{one.name}, {name}" if len(runs) > 1 else one.name, test.freq[at], one, 0, gaps)
@@ -148,7 +148,7 @@ def _forces(it: Identification, test: Measurement, level: NoiseLevel) -> Iterato
         )  # fmt: skip
 
 
-def _told(runs: list[ChannelSpectra]) -> dict[str, Any]:
+def _channel_content(runs: list[ChannelSpectra]) -> dict[str, Any]:
     """What the script draws of a channel, by its runs."""
     first = runs[0]
     found: dict[str, Any] = {"name": first.name, "words": first.words, "unit": first.unit}

@@ -10,7 +10,7 @@ import numpy as np
 
 from sysid import plot
 from sysid.measurement.measurement import Measurement
-from sysid.plot.canvas import own_style
+from sysid.plot.canvas import default_style
 from sysid.report.curves import curves, mode_shapes, script
 from sysid.report.html import (
     Cell,
@@ -58,7 +58,7 @@ _DRAWN_SHAPES = (
     "Motion relative to the base, which stands still, at the places of the sensors along their axes; grey: at rest. "
     "The largest motion is drawn alike in all modes."
 )
-_TOLD_SHAPES = (
+_SHAPES_CAPTION = (
     "Motion of each sensor relative to the base, the largest of each mode 1. Sensors with positions have their mode "
     "shapes drawn."
 )
@@ -115,7 +115,7 @@ def write_report(identification: Identification, path: str | Path) -> Path:
         Where the file cannot be written.
     """
     target = file_or_folder(path, FILE_NAME, _SUFFIXES)
-    with own_style():
+    with default_style():
         content = render(identification).encode("utf-8", "replace")
     with atomically(target) as temporary:
         temporary.write_bytes(content)
@@ -215,7 +215,7 @@ def _shapes(it: Identification) -> str:
     shapes = np.divide(shapes, largest, out=np.zeros_like(shapes), where=largest != 0)
     rows = [*it.measurement.sensor_names, "base"]
     columns = [f"mode {k}" for k in range(1, it.structure.n + 1)]
-    return matrix(np.vstack([shapes, np.zeros(it.structure.n)]), rows, columns, _TOLD_SHAPES)
+    return matrix(np.vstack([shapes, np.zeros(it.structure.n)]), rows, columns, _SHAPES_CAPTION)
 
 
 def _effective_mass_columns(it: Identification, many: Array) -> Iterator[list[object]]:

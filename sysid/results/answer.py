@@ -383,9 +383,9 @@ class Answer:
     @cached_property
     def is_one_of_many(self) -> bool:
         """Whether other matrices explain the same data within what was stated."""
-        from sysid.assessment.modal_mass_cone import speaks
+        from sysid.assessment.modal_mass_cone import applies
 
-        if speaks(self.prepared.formulation):
+        if applies(self.prepared.formulation):
             return bool(self.open_masses)
         ends = self._intervals
         return not (np.all(np.isfinite(ends.mass)) and np.all(np.isfinite(ends.stiffness)))

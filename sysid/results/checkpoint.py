@@ -43,7 +43,7 @@ _CONTENT, _FORMAT = "unfinished search", 1
 
 
 @dataclass(frozen=True)
-class Begun:
+class RunRequest:
     """How a command line began a search.
 
     Attributes
@@ -79,7 +79,7 @@ class Begun:
         return {"recipe": self.recipe.to_tree(), **fields}
 
     @classmethod
-    def from_tree(cls, tree: Tree) -> Begun:
+    def from_tree(cls, tree: Tree) -> RunRequest:
         """Give what `to_tree` made a tree of.
 
         Raises
@@ -106,14 +106,14 @@ class Checkpoint:
     Attributes
     ----------
     path : str or Path
-    begun : Begun, optional
+    request : RunRequest, optional
         Stands in the file for whoever is to go on.
     every : float
         s between two writings.
     """
 
     path: Path
-    begun: Begun | None = None
+    request: RunRequest | None = None
     every: float = field(default=EVERY, kw_only=True)
 
     def __post_init__(self) -> None:
@@ -184,7 +184,7 @@ class Checkpoint:
                     "changed since; take it away, or give another file"
                 )
             entries = self._entries(tree)
-        request = None if self.begun is None else self.begun.to_tree()
+        request = None if self.request is None else self.request.to_tree()
 
         def write(kept: Tree) -> None:
             tree = {"content": _CONTENT, "search": search, "begun": request, "entries": kept}

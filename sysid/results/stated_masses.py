@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sysid.assessment.information import Index
-from sysid.assessment.statements import Adjusted, Statements, adjust, made, statements_of
+from sysid.assessment.statements import Adjusted, Statements, adjust, predict_statements, statements_of
 from sysid.assessment.uncertainty import moves_by_records
 from sysid.errors import InputError, listed
 from sysid.finding import Finding, Severity
@@ -105,7 +105,7 @@ def _contradictions(
         without = adjust(problem, stated.without(row), theta, index, normals)
         if without.freedom == best.freedom or _chance(without, numbers) < FALSE_ALARM:
             continue
-        value = (made(problem, stated, without.theta, index)[0] * stated.scale)[row]
+        value = (predict_statements(problem, stated, without.theta, index)[0] * stated.scale)[row]
         off = np.sqrt(max(best.misfit - without.misfit, 0.0))
         both = (float(stated.values[row]), float(value))
         explained.append((off, both, _in_words(problem, stated, row, value, off)))
@@ -137,7 +137,7 @@ def _common_factor(problem: Prepared, stated: Statements, theta: Array, index: I
     """By what all statements would be wrong in common, by what a base force weighs; zero where none was measured."""
     if problem.measurement.force is None:
         return 0.0
-    values, slopes = made(problem, stated, theta, index)
+    values, slopes = predict_statements(problem, stated, theta, index)
     noise = slopes @ normals
     weight = np.linalg.pinv(noise @ noise.T, hermitian=True)
     given = stated.values / stated.scale

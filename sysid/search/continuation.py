@@ -158,7 +158,7 @@ class _Run:
         self.ways: list[Array] = []
         self.joined = 0  # starts whose way another one has come before
         self.stopped: BaseException | None = None
-        self.begun = session.seconds
+        self.start_time = session.seconds
         self.wrong: InputError | None = None
 
     def outcome(self, starts: int, start: ArrayLike | Structure | None) -> Outcome:
@@ -190,7 +190,7 @@ class _Run:
             success, message = False, str(self.stopped) or "interrupted"
         initial = _objective_at(problem, first)
         phases = (
-            *((Phase("start", initial, first, self.begun, 1),) if np.isfinite(initial) else ()),
+            *((Phase("start", initial, first, self.start_time, 1),) if np.isfinite(initial) else ()),
             Phase("local phase", objective, best.x, session.seconds, best.curve.size),
         )
         return Outcome(

@@ -26,7 +26,7 @@ from sysid.modal_analysis.modal_error import ModalError
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.response import records_of, weights_of_test
 from sysid.models.spectrum import SOLVED
-from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, not_begun
+from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, time_too_short
 from sysid.problem.prepared import Prepared
 from sysid.search.modal_coordinates import End, modes_of, spectrum_near, unknowns_of
 from sysid.search.modal_scaling import stated_totals
@@ -47,7 +47,7 @@ def fit_in_inverse_factor(problem: Prepared, x: Array, monitor: IterationMonitor
     first = best = End(x, problem.objective(x), "not begun", "")
     seconds = _SECONDS * (problem.geometry.n / 10) ** _POWER
     if not monitor.allows(seconds):
-        return first._replace(status=not_begun(seconds))
+        return first._replace(status=time_too_short(seconds))
     error, left = InverseFactorError(problem), max_iterations
     while left > 0:
         end = _fit_about(problem, best.x, error, monitor, min(_ROUND, left))

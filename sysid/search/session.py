@@ -137,7 +137,7 @@ class Session:
         self.listeners, self.interrupt, self.max_time = listeners, interrupt, max_time
         self.random = random or np.random.SeedSequence(0)
         self.max_evaluations = max_evaluations
-        self.begun = time.perf_counter()
+        self.start_time = time.perf_counter()
         self.lines: list[str] = []
         self.stop_asked: Stop | None = None  # by a callback, before there was anything to keep
         self.left_out = False  # a part of the search, for want of time
@@ -145,7 +145,7 @@ class Session:
     @property
     def seconds(self) -> float:
         """Seconds since the start."""
-        return time.perf_counter() - self.begun
+        return time.perf_counter() - self.start_time
 
     @property
     def left(self) -> float | None:

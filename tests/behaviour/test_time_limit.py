@@ -135,7 +135,7 @@ def test_a_summary_in_a_hurry_leaves_out_what_is_not_computed_and_calls_nothing_
 def test_the_session_counts_what_is_left():
     def session(max_time, seconds):
         made = Session([], DeferredInterrupt(), max_time)
-        made.begun -= seconds
+        made.start_time -= seconds
         return made
 
     assert session(None, 99.0).left is None

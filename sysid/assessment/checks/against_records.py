@@ -170,7 +170,7 @@ def _twins(modal: ModalEstimate, structure: Structure) -> Iterator[Finding]:
     """Sensors whose motions differ by no more than noise does, line by line."""
     test = modal.records
     lines, names = np.concatenate(test.own_lines), test.sensor_names
-    moves, noise = columns(test.relative)[:, lines], _own_noise(modal)
+    moves, noise = columns(test.relative)[:, lines], _noise_variance(modal)
     left = moves - columns(test.predict(structure))[:, lines]
     gram = (moves @ moves.conj().T).real
     size, most = np.diag(gram), beyond_chance(2 * moves.shape[1], CANDIDATES) / (2 * moves.shape[1])
@@ -192,7 +192,7 @@ def _twins(modal: ModalEstimate, structure: Structure) -> Iterator[Finding]:
             )  # fmt: skip
 
 
-def _own_noise(modal: ModalEstimate) -> Array | None:
+def _noise_variance(modal: ModalEstimate) -> Array | None:
     """Variance of the sensors' own noise, (n_sensors, runs * n_freq); None where it is neither stated nor found.
 
     Of whole records without the base's noise, which sensors in one motion share.

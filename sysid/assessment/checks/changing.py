@@ -25,7 +25,7 @@ from sysid.structure.thresholds import COVERAGE, FALSE_ALARM, most_deviations
 
 _MOVED = 0.1  # half-power widths, by which the frequency of a mode changes at least
 _EXPLAINED = 0.7  # of the squares that constant poles leave: poles that change leave no more
-_SHOWN = 0.03  # of the largest level of a mode, at which it shows
+_LEAST_LEVEL = 0.03  # of the largest level of a mode, at which it shows
 _OF_RUNS = 0.15  # of the variance of frequencies, that is left within runs where runs differ
 _CLOSE = 0.06  # of their frequency, within which modes ..
 _LEAST_RATIO = 1e-4
@@ -58,11 +58,11 @@ class Change:
     def __init__(self, mode: float, width: float, seen: list[Seen], scaled: bool) -> None:
         self.mode, self.width, self.scaled = mode, width, scaled
         largest = max((one.level for one in seen), default=0.0)
-        self.seen = [one for one in seen if one.level > _SHOWN * largest]
+        self.seen = [one for one in seen if one.level > _LEAST_LEVEL * largest]
         self.frequency = np.array([one.frequency for one in self.seen])
 
-    def is_told(self, explained: bool) -> bool:
-        """Whether it changes by a part of the width, with two signs of three.
+    def is_significant(self, explained: bool) -> bool:
+        """True where it changes by a part of the width, with two signs of three.
 
         Two stretches differ beyond what noise makes of them; the order by level is no chance; poles that change have
         `explained` the records, which they do little where the level changes within stretches.
@@ -199,7 +199,7 @@ def changes(problem: Prepared) -> list[Change]:
         width = 2 * ratio * f
         seen = [one for part, named in zip(stretches, tests, strict=True) for one in _seen(part, k, width, *named)]
         change = Change(f, width, seen, scaled)
-        if change.is_told(changing < _EXPLAINED * constant):
+        if change.is_significant(changing < _EXPLAINED * constant):
             found.append(change)
     return found
 

@@ -55,13 +55,13 @@ def wrong_records(context: Context) -> Iterator[Finding]:
     tests = [problem.measurement] if problem.misfit is None else []
     tests += [given.measurement for given in problem.residuals if isinstance(given, FurtherTest)]
     for i, test in enumerate(tests, start=1):
-        for mistake in _of_test(problem, declared, test, own=test is problem.measurement):
+        for mistake in _of_test(problem, declared, test, first=test is problem.measurement):
             in_vain = mistake.severity is Severity.BLOCKING or (is_gross(mistake) and not declared.free_modes)
             one = mistake._replace(severity=Severity.BLOCKING if in_vain else mistake.severity)
             yield one if len(tests) == 1 else one.of_test(i)
 
 
-def _of_test(problem: StatedProblem, declared: Formulation, test: Measurement, *, own: bool) -> list[Finding]:
+def _of_test(problem: StatedProblem, declared: Formulation, test: Measurement, *, first: bool) -> list[Finding]:
     try:
         terms = direct_terms(test)
         found = mistakes_of(test, terms)
@@ -71,7 +71,7 @@ def _of_test(problem: StatedProblem, declared: Formulation, test: Measurement, *
             if test.is_whole:
                 terms = direct_terms(test)
                 found = mistakes_of(test, terms)
-        if own and not found and terms is not None:
+        if first and not found and terms is not None:
             found = [*_of_mass(declared, test, terms), *_of_frequencies(problem, declared, test)]
         if not found and test.averaged:
             found = list(unresolved(test, *poles_of_test(test)))
