@@ -78,7 +78,7 @@ def listed(words: Sequence[str], between: str = ", ") -> str:
     return between.join(words[:MOST_LISTED]) + f" and {more} more" * (more > 0)
 
 
-def number(
+def as_float(
     name: str, value: Any, wanted: str = "a finite number", *, above: float = -math.inf, at_least: float = -math.inf,
     below: float = math.inf, finite: bool = True,
 ) -> float:  # fmt: skip

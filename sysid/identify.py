@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from sysid.assessment.checks import check_records, mistakes_of_poor_fit
 from sysid.assessment.checks.changing import changing
-from sysid.errors import InputError, SolverError, finite_array, function, instance, number, path_of, whole_number
+from sysid.errors import InputError, SolverError, as_float, finite_array, function, instance, path_of, whole_number
 from sysid.finding import Finding
 from sysid.nlp import one_thread
 from sysid.problem.prepared import Prepared
@@ -87,7 +87,7 @@ def identify(
     if not isinstance(start, Structure | None):
         start = finite_array("start", start)
     if max_time is not None:
-        max_time = number("max_time", max_time, "a positive number of seconds", above=0)
+        max_time = as_float("max_time", max_time, "a positive number of seconds", above=0)
     if max_evaluations is not None:
         max_evaluations = whole_number("max_evaluations", max_evaluations, at_least=1)
     for name, given in (("callback", callback), ("progress", progress)):

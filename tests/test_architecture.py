@@ -30,7 +30,6 @@ CEILINGS = {
     # What was counted when these counts began; the modes once, in the open, brings them down.
     "branches": 78.0,
     "files": 258,
-    "shared": 34,
     "prose": 61,
 }
 

@@ -82,7 +82,7 @@ def identified(test, mass=None, **given):
 
 REFUSED = {
     "a number": (
-        lambda: errors.number("goal", -1, "a number above 0", above=0), "goal = -1: a number above 0 is needed",
+        lambda: errors.as_float("goal", -1, "a number above 0", above=0), "goal = -1: a number above 0 is needed",
     ),
     "a whole number": (lambda: errors.whole_number("starts", 0, at_least=1), "starts is 0; give 1 or above."),
     "a fraction": (
@@ -135,12 +135,12 @@ REFUSED = {
         "its own; 'auto' chooses another strategy",
     ),
     "an untrusted module": (
-        lambda: trust.check(Recipe("idle.py"), Path("out/result.h5"), "--module FILE.py", Namespace(trust=False)),
+        lambda: trust.check_trust(Recipe("idle.py"), Path("out/result.h5"), "--module FILE.py", Namespace(trust=False)),
         "out/result.h5 names the problem module {here}/idle.py, whose code would run: say --trust where you know what "
         "stands in it, or name the module yourself: --module FILE.py",
     ),
     "a module that is gone": (
-        lambda: trust.check(Recipe("gone.py"), Path("out/result.h5"), "--module FILE.py", Namespace(trust=False)),
+        lambda: trust.check_trust(Recipe("gone.py"), Path("out/result.h5"), "--module FILE.py", Namespace(trust=False)),
         "out/result.h5 names the problem module {here}/gone.py, which is not here: get it, and name it: "
         "--module FILE.py",
     ),

@@ -15,12 +15,12 @@ from sysid.assessment import modal_mass_cone
 from sysid.assessment.sensitivity import (
     Sensitivity,
     blocks_and_slopes,
-    blocks_of,
     directions_in_words,
     meaningful,
     of_outside,
     outside_variables,
     sensitivity,
+    system_matrices,
     with_totals,
 )  # fmt: skip
 from sysid.assessment.uncertainty import LARGE, uncertainty
@@ -291,8 +291,8 @@ def _other_matrices(problem: Prepared, mine: Structure, x: Array, other: Array) 
         its = problem.structure(other)
     except InputError:  # of no structure
         return False
-    sizes = [np.sqrt(np.abs(np.diag(a))) + np.finfo(float).tiny for a in blocks_of(mine)]
-    pairs = list(zip(blocks_of(mine), blocks_of(its), sizes, strict=True))
+    sizes = [np.sqrt(np.abs(np.diag(a))) + np.finfo(float).tiny for a in system_matrices(mine)]
+    pairs = list(zip(system_matrices(mine), system_matrices(its), sizes, strict=True))
     if all(np.all(np.abs(a - b) <= SAME_ANSWER * np.outer(size, size)) for a, b, size in pairs):
         return False
     stds = _stds(problem, mine, x)
@@ -311,4 +311,4 @@ def _stds(problem: Prepared, structure: Structure, x: Array) -> tuple[Array, ...
             return u.mass, u.stiffness, u.damping
     except InputError:
         pass
-    return tuple(np.zeros_like(a) for a in blocks_of(structure))
+    return tuple(np.zeros_like(a) for a in system_matrices(structure))

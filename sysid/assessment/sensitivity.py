@@ -113,7 +113,7 @@ def with_totals(problem: Prepared, structure: Structure, x: Array) -> tuple[Form
     return problem.formulate(geometry), np.concatenate([of_mass, x[formulation.parts.mass.stop :]])
 
 
-def blocks_of(structure: Structure) -> tuple[Array, Array, Array]:
+def system_matrices(structure: Structure) -> tuple[Array, Array, Array]:
     """M_SS, K_SS and C, (n, n) each."""
     n = structure.n
     return structure.mass[:n, :n], structure.stiffness[:n, :n], structure.damping
@@ -121,7 +121,7 @@ def blocks_of(structure: Structure) -> tuple[Array, Array, Array]:
 
 def blocks_and_slopes(structure: Structure, slopes: Slopes) -> list[tuple[Array, Array]]:
     """M_SS, K_SS and C, (n, n), each with its derivatives by the unknowns, (n, n, p)."""
-    return list(zip(blocks_of(structure), (slopes.mass, slopes.stiffness, slopes.damping), strict=True))
+    return list(zip(system_matrices(structure), (slopes.mass, slopes.stiffness, slopes.damping), strict=True))
 
 
 def meaningful(formulation: Formulation) -> NDArray[np.bool_]:

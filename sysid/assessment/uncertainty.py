@@ -234,7 +234,7 @@ def moves_by_records(
 
     With `gains` also what an error of one of each sensor's gain makes of theta, in columns; none without it.
     """
-    modal, modes = problem.modal[0], modes_of(structure)
+    modal, modes = problem.modal[0], separated_modes(structure)
     test = modal.records
     index = Index(structure.n_sensors, structure.n, structure.n_base)
     path = parametrisation(problem, structure, modes, index)
@@ -262,7 +262,7 @@ def moves_by_records(
 
 def _by_unknowns(problem: Prepared, structure: Structure, x: Array) -> Uncertainty:
     """Standard deviations from the Jacobian of all that is fitted, in the problem's unknowns."""
-    test, modes = problem.measurement, modes_of(structure)
+    test, modes = problem.measurement, separated_modes(structure)
     formulation, x = with_totals(problem, structure, x)
     slopes = slopes_of(formulation.matrices, x, test, modes.omega)
     known = sensitivity(formulation, x, slopes)
@@ -329,7 +329,7 @@ def _with_unknowns(
     return replace(found, parameters=formulation.labels, covariance=covariance)
 
 
-def modes_of(structure: Structure) -> Modes:
+def separated_modes(structure: Structure) -> Modes:
     """The modal model, repeated frequencies a little apart.
 
     At one frequency the shapes are open to a rotation that no record sees and K_SS does not feel; a small distance

@@ -206,7 +206,7 @@ def _run_in(folder: Path, options: argparse.Namespace, out: Output) -> int:
         out.complain(f"interrupted while saving; the result is there, but not every file is in {folder}")
         return INTERRUPTED
     if late.asked or writing.asked or result.interrupted:
-        on = f"; '{unfinished.command(search, folder)}' goes on" if checkpoint.exists else ""
+        on = f"; '{unfinished.resuming_command(search, folder)}' goes on" if checkpoint.exists else ""
         out.complain(f"interrupted; the {'best so far' if result.interrupted else 'result'} is in {folder}{on}")
         return INTERRUPTED
     return SUCCESS if result.judgement in ("determined", "one of many") else NOT_REACHED
@@ -290,7 +290,7 @@ def _parser() -> argparse.ArgumentParser:
         summary="write report.html again, beside a result",
         examples=("sysid report results/cantilever_tower", "sysid report results/cantilever_tower/result.h5"),
     )
-    stored_result.add_arguments(report)
+    stored_result.add_result_arguments(report)
     report.set_defaults(command=_report)
 
     export.add(command)

@@ -92,7 +92,7 @@ def _said(options: argparse.Namespace) -> Any:
     given = {name: value for name, value in given.items() if value is not None}
     if options.sensor:
         given["sensor"] = [description.from_words(words) for words in options.sensor]
-    file = Path(options.sensors) if options.sensors else description.beside(Path(options.files[0]))
+    file = Path(options.sensors) if options.sensors else description.description_file(Path(options.files[0]))
     if options.sensor and options.sensors:
         raise InputError("--sensor and --sensors exclude each other")
     if file is None or options.sensor:

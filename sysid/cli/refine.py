@@ -63,12 +63,12 @@ def _run_in(folder: Path, result: Identification, recipe: Recipe, options: argpa
         if interrupted and not ends:
             pass  # there is nothing to tell
         elif sweep is not None:
-            sweeps.tell(folder, result, recipe, sweep, ends, out)
+            sweeps.report_sweep(folder, result, recipe, sweep, ends, out)
         elif options.draws is not None:
-            draws.tell(folder, result, recipe, ends, out)
+            draws.report_draws(folder, result, recipe, ends, out)
         else:
             minima = distinct(result.prepared, ends)
-            out.write(f"\n{table(minima, len(ends))}\n\n")
+            out.write(f"\n{minima_table(minima, len(ends))}\n\n")
             out.answer(minima=[_figures(minimum) for minimum in minima])
             _write(folder, recipe, ends, minima, result.problem, out)
         out.wrote(folder / LEDGER)
@@ -98,7 +98,7 @@ def _ends(jobs: Generator[JobResult, None, None], titles: Sequence[str], out: Ou
     return sorted(ends, key=lambda one: one.index), interrupted
 
 
-def table(minima: list[Minimum], starts: int, most: int = 12) -> str:
+def minima_table(minima: list[Minimum], starts: int, most: int = 12) -> str:
     """The minima, `most` of them, how often each was reached, and what they say together."""
     lines = ["minimum    residual  reached  a fit  best start"]
     for i, minimum in enumerate(minima[:most]):
@@ -138,7 +138,7 @@ def _recipe(result: Identification, options: argparse.Namespace, source: Path, o
     recipe = replace(result.recipe, start=None if x is None else tuple(x.tolist()))
     if options.module is not None:
         return replace(recipe, module=trust.typed_module(options.module, out))
-    trust.check(recipe, source, f"sysid refine {source} --module FILE.py", options)
+    trust.check_trust(recipe, source, f"sysid refine {source} --module FILE.py", options)
     return recipe
 
 

@@ -129,7 +129,7 @@ def _same_records(result: Identification, other: Problem) -> bool:
     return len(ours) == len(its) and all(np.array_equal(mine, one) for mine, one in pairs)
 
 
-def tell(
+def report_sweep(
     folder: Path, result: Identification, recipe: Recipe, sweep: Sweep, ends: Sequence[JobResult], out: Output
 ) -> None:
     """Print the table of all identifications, and write it, all moves and the picture."""
@@ -143,7 +143,7 @@ def tell(
             moved = moves(score, end.score, part=part)
             title = sweep.titles[end.index]
             rows.append(Compared(title, end.success, end.residual, end.message, end.score, moved))
-    out.write(f"\n{table(rows, part)}\n\n")
+    out.write(f"\n{comparison_table(rows, part)}\n\n")
     out.answer(identifications=[asdict(row) for row in rows])
     without = [(sweep.titles[end.index], end.message) for end in ends if end.score is None]
     drawn = png(picture, rows, recipe.title, part=part) if len(rows) > 1 else None
@@ -151,7 +151,7 @@ def tell(
     write_files(folder, {**tables, f"{sweep.name}.png": drawn}, out)
 
 
-def table(rows: Sequence[Compared], part: bool) -> str:
+def comparison_table(rows: Sequence[Compared], part: bool) -> str:
     """A line an identification, the result's own first; `part` where they are of parts of the records."""
     columns = [
         ("", [row.title for row in rows]),

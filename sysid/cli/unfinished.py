@@ -42,13 +42,13 @@ def requested_run(options: argparse.Namespace, folder: Path, out: Output) -> Run
     checkpoint = Checkpoint(folder / FILE_NAME)
     if checkpoint.exists and not options.fresh:
         raise InputError(
-            f"{folder} holds {_in_words(checkpoint, search)}: '{command(search, folder)}' goes on with it, "
+            f"{folder} holds {_in_words(checkpoint, search)}: '{resuming_command(search, folder)}' goes on with it, "
             "--fresh begins anew, --out DIR writes elsewhere"
         )
     return search
 
 
-def command(search: RunRequest, folder: Path) -> str:
+def resuming_command(search: RunRequest, folder: Path) -> str:
     """The command that goes on with a search; a module that is not of the package is named again."""
     module = search.recipe.module
     return f"sysid run {'' if catalogue.is_bundled(module) else f'{module} '}--resume {folder}"
@@ -106,7 +106,7 @@ def _resumed(options: argparse.Namespace, folder: Path, out: Output) -> RunReque
             raise InputError(
                 f"--resume takes --seed, --strategy, --refine-by, --data and --set from the run in {folder}: {search}"
             )
-        trust.check(search.recipe, checkpoint.path, f"sysid run MODULE.py --resume {folder}", options)
+        trust.check_trust(search.recipe, checkpoint.path, f"sysid run MODULE.py --resume {folder}", options)
     else:
         search = _agreed(search, asked, more or read.is_test(options.problem), folder)
     out.write(f"going on with {search}\n" if tree["entries"] else f"{search} had reached nothing: it begins anew\n")

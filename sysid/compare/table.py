@@ -15,7 +15,7 @@ from sysid.results.phases import seconds_in_words
 from sysid.results.summary import WIDTH
 
 
-def text(comparison: Comparison) -> str:
+def comparison_text(comparison: Comparison) -> str:
     """Table for a terminal: a line a method, below it what the columns are, and why a method is no fit."""
     results = comparison.results
     columns = [

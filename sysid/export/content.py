@@ -41,7 +41,7 @@ def names_of(it: Identification) -> tuple[str, ...]:
     return (*it.degrees_of_freedom, *(f"base {axis}" for axis in it.measurement.base_axes or ()))
 
 
-def unit(letter: str, row: bool | None, column: bool | None) -> str:
+def entry_unit(letter: str, row: bool | None, column: bool | None) -> str:
     """Unit of an entry of M, K or C by whether row and column are rotations; "" where one is not known."""
     return "" if row is None or column is None else _UNITS[letter][row + column]
 
@@ -69,7 +69,7 @@ _WORTH = {
 _INTERRUPTED = "the search was interrupted, these are the best matrices until then; "
 
 
-def worth(it: Identification) -> str:
+def reliability(it: Identification) -> str:
     """What the matrices are worth, in one line that names the statements which tell why."""
     parts = (("against", it.contradictions), ("open", it.open_findings))
     why = " and ".join(f"'{word}'" for word, findings in parts if findings)
@@ -82,7 +82,7 @@ def statements(it: Identification, precision: str) -> tuple[str, ...]:
     found = [
         f"written by sysid {__version__} on {datetime.now().astimezone().isoformat(timespec='seconds')}",
         f"problem: {it.recipe.title if it.recipe else 'of a script'}; strategy {it.strategy}; seed {it.seed}",
-        f"judgement: {worth(it)}; relative residual {it.residual:.3g}",
+        f"judgement: {reliability(it)}; relative residual {it.residual:.3g}",
         f"search: {it.message}",
         *(f"fixed by: {text}" for text in it.closed_by),
         *(f"assumed: {text}" for text in it.facts.assumed),

@@ -12,7 +12,7 @@ from sysid.errors import InputError, refuse
 from sysid.files import units
 from sysid.files.description import Channel, Description
 from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
-from sysid.files.recording import Column, Recording, check_finite, rate_of
+from sysid.files.recording import Column, Recording, check_column, rate_of
 from sysid.files.spectral import TIME_NAMES
 from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
 from sysid.structure.sensor import Sensor
@@ -22,7 +22,7 @@ _CLEAR_POWER = 0.5  # of the power of all lines, whatever its sign
 _TURNS = {True: ("angular acceleration",), False: ("acceleration",)}
 
 
-def in_time(recordings: Sequence[Recording], said: Description) -> RecordedTest:
+def assembled_in_time(recordings: Sequence[Recording], said: Description) -> RecordedTest:
     """The test of recordings in time, a run each.
 
     Raises
@@ -139,7 +139,7 @@ def _rate(recording: Recording, said: Description) -> float:
     known = units.find(column.unit) if column.unit else units.UNITS["s"]
     if known is None or known.quantity != "time":
         raise InputError(f"{recording.path}, {column.place}: time in {column.unit!r} is not understood: s, ms, us are")
-    check_finite(column, recording.path)
+    check_column(column, recording.path)
     rate = rate_of(np.real(column.values) * known.factor, recording.path, column.place)
     if said.sample_rate is not None and abs(rate / said.sample_rate - 1) > 0.01:
         raise InputError(
@@ -169,7 +169,7 @@ def _records(recording: Recording, said: Description) -> tuple[list[Array], list
     rows: list[ChannelRow] = []
     for channel in said.channels:
         column = recording.column(channel.column)
-        check_finite(column, recording.path)
+        check_column(column, recording.path)
         factor, unit = _factor(recording, column, channel)
         record = factor * np.real(column.values)
         rms = float(np.std(record))

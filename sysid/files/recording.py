@@ -102,7 +102,7 @@ class Recording:
         return f"it has {len(self.names)} column{plural}, {listed([*map(repr, self.names)])}{left_out}"
 
 
-def check_finite(column: Column, path: Path) -> None:
+def check_column(column: Column, path: Path) -> None:
     """Refuse a column with a number that is NaN or infinite, with its place."""
     bad = np.flatnonzero(~np.isfinite(column.values))
     if bad.size:

@@ -26,7 +26,7 @@ from sysid.files.assembly import (
 )
 from sysid.files.description import CONVENTIONS, Channel, Description
 from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
-from sysid.files.recording import Column, Recording, check_finite
+from sysid.files.recording import Column, Recording, check_column
 from sysid.structure.axes import BASE_AXES, base_columns
 from sysid.structure.structure import Array, ComplexArray
 
@@ -130,7 +130,7 @@ def _run(
     parts: dict[str, dict[str, ComplexArray]] = {"base": {}, "response": {}, "force": {}}
     rows: list[ChannelRow] = []
     for (channel, column), form in zip(found, forms, strict=True):
-        check_finite(column, recording.path)
+        check_column(column, recording.path)
         values: Any = np.asarray(column.values, complex) * form.factor
         values = (values.conj() if conjugated else values) * (2j * np.pi * freq) ** _ORDER.get(form.upper or lower, 0)
         parts[channel.role][channel.name] = values

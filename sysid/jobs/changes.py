@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.errors import InputError, number, whole_number
+from sysid.errors import InputError, as_float, whole_number
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.residues import independent
 from sysid.modal_analysis.transients import without_transients_of
@@ -31,8 +31,8 @@ class Band:
     high: float
 
     def __post_init__(self) -> None:
-        number("Band: low", self.low, "a frequency in Hz", at_least=0)
-        number("Band: high", self.high, f"a frequency in Hz above {self.low:g}", above=self.low)
+        as_float("Band: low", self.low, "a frequency in Hz", at_least=0)
+        as_float("Band: high", self.high, f"a frequency in Hz above {self.low:g}", above=self.low)
 
     @property
     def title(self) -> str:

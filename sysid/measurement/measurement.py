@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError, choice, finite_array, number, refuse, sequence, whole_number
+from sysid.errors import InputError, as_float, choice, finite_array, refuse, sequence, whole_number
 from sysid.measurement import spectra
 from sysid.measurement.cuts import check_cuts
 from sysid.measurement.missing import Missing, complete, named, present
@@ -280,7 +280,7 @@ class Measurement:
 
     def in_band(self, low: float, high: float) -> Measurement:
         """The lines from `low` to `high` Hz, both included."""
-        low, high = number("the lower end of the band", low), number("the upper end of the band", high)
+        low, high = as_float("the lower end of the band", low), as_float("the upper end of the band", high)
         keep, ends = (self.freq >= low) & (self.freq <= high), f"{self.freq[0]:g} to {self.freq[-1]:g} Hz"
         if not np.any(keep):
             raise InputError(f"no line between {low:g} and {high:g} Hz; the record has {ends}")

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.measurement import spectra
-from sysid.measurement.in_time import RunInTime, in_time
+from sysid.measurement.in_time import RunInTime, runs_in_time
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.spectra import TimeRun
 from sysid.measurement.whole import NoiseLevels, WholeRecords
@@ -71,7 +71,7 @@ def stretches_of(test: Measurement, omega: Array, ratios: Array) -> list[Stretch
     omega, ratios : (m,)
         Poles, rad/s and fractions, near which those of the stretches are.
     """
-    runs = in_time(test)
+    runs = runs_in_time(test)
     pieces = _pieces(runs, _PERIODS * 2 * np.pi / float(omega.min()))
     if len(pieces) < 2:
         return []

@@ -255,7 +255,7 @@ def _wrapped(freq: Array, degrees: Array, gaps: NDArray[np.intp]) -> tuple[Array
     return broken(freq, jumps), broken(degrees, jumps)
 
 
-def index_of(what: str, value: int | str, names: Sequence[str]) -> int:
+def named_index(what: str, value: int | str, names: Sequence[str]) -> int:
     """Index of a name or of a number, which may count from the end; `what` it is, for the message of an InputError."""
     if isinstance(value, str):
         if value not in names:
@@ -269,7 +269,7 @@ def index_of(what: str, value: int | str, names: Sequence[str]) -> int:
 def run_index(test: Measurement, run: int | str) -> int:
     """Index of a run by name or number; runs of unit base motion are called as the base axes."""
     names = (test.base_axes or ()) if test.has_unit_runs else run_names(test)
-    return index_of("run", run, names)
+    return named_index("run", run, names)
 
 
 def strongest(
@@ -277,7 +277,7 @@ def strongest(
 ) -> list[tuple[int, int]]:
     """Pairs (sensor, run) with the largest relative accelerations, of different sensors, the runs in turn."""
     energy = np.linalg.norm(test.relative, axis=-1)
-    free = list(range(test.n_sensors)) if sensor is None else [index_of("sensor", sensor, test.sensor_names)]
+    free = list(range(test.n_sensors)) if sensor is None else [named_index("sensor", sensor, test.sensor_names)]
     runs = range(test.n_runs) if run is None else [run_index(test, run)]
     chosen: list[tuple[int, int]] = []
     first = runs.index(max(runs, key=lambda r: energy[r, free].max()))

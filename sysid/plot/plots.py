@@ -32,8 +32,8 @@ from sysid.plot.modal_panels import draw_cmif, draw_stabilisation
 from sysid.plot.panels import (
     draw,
     force_channel,
-    index_of,
     key,
+    named_index,
     panels,
     place,
     response_channel,
@@ -106,7 +106,7 @@ def responses(
 ) -> Figure:
     """All runs of one sensor side by side; see `transmissibility`."""
     test = measurement or identification.measurement
-    s = index_of("sensor", sensor, test.sensor_names)
+    s = named_index("sensor", sensor, test.sensor_names)
     return panels([response_channel(identification, test, s, r, band=band) for r in range(test.n_runs)], alone=10.0)
 
 
@@ -140,7 +140,7 @@ def base_force(
     Figure, Axes or the sequence given
     """
     test = with_force(measurement or identification.measurement)
-    i = index_of("base direction", direction, test.base_axes or ())
+    i = named_index("base direction", direction, test.base_axes or ())
     r = int(np.argmax(np.linalg.norm(test.base[:, i], axis=-1))) if run is None else run_index(test, run)
     return place(ax, force_channel(identification, test, i, r, band=band))
 

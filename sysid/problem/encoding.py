@@ -319,7 +319,7 @@ def _solve_in_words(node: ca.MX) -> tuple[str, list[int]]:
     transposed = bool(node.info()["tr"])
     for solver in ("", *operations.SOLVERS):
         try:
-            same = ca.Function("solve", symbols, [operations.solve(solver, *symbols, transposed=transposed)])
+            same = ca.Function("solve", symbols, [operations.linear_solve(solver, *symbols, transposed=transposed)])
         except (ValueError, RuntimeError):
             continue
         if same_text(solve, same):

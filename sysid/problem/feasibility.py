@@ -19,10 +19,10 @@ LOOSE = 1e-2  # likewise for the swarm, which meets no equality exactly
 
 def points_of(formulation: Formulation, count: int = 128) -> Array:
     """The guess, and points spread over the search space, (count, size)."""
-    return np.array([formulation.guess, *latin_hypercube(formulation, count - 1, np.random.default_rng(0))])
+    return np.array([formulation.guess, *spread_points(formulation, count - 1, np.random.default_rng(0))])
 
 
-def latin_hypercube(formulation: Formulation, count: int, rng: np.random.Generator) -> list[Array]:
+def spread_points(formulation: Formulation, count: int, rng: np.random.Generator) -> list[Array]:
     """Points spread over the search space as the swarm's are."""
     unit = sampling.latin_hypercube(count, formulation.size, rng)
     low, high = formulation.box

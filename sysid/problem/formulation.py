@@ -24,7 +24,7 @@ from sysid.models.expressions import as_matrix, variables_of, written_in
 from sysid.models.geometry import Geometry
 from sysid.models.model import MatrixModel, Stated, ratios_of
 from sysid.models.unknowns import Unknown, Variable, box_of, lower_of, split, upper_of
-from sysid.problem.constraints import ConstraintRow, Constraints, row_of
+from sysid.problem.constraints import ConstraintRow, Constraints, constraint_row
 from sysid.problem.given import MATRICES
 from sysid.problem.matrices import Blocks, Matrices, blocks_of, symbols_in
 from sysid.problem.terms import Builder, ExpressionTerm, FurtherTest, Prior, Residual, Term, TermSource, TestTerm
@@ -381,7 +381,7 @@ class Formulation:
 
     @cached_property
     def _relations(self) -> list[ConstraintRow]:
-        return [row_of(i, constraint) for i, constraint in enumerate(self._constraints, start=1)]
+        return [constraint_row(i, constraint) for i, constraint in enumerate(self._constraints, start=1)]
 
     @cached_property
     def _of_models(self) -> list[list[ca.MX]]:

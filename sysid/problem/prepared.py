@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError
-from sysid.files.tree import check
+from sysid.files.tree import check_tree
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit import fit_modes
 from sysid.modal_analysis.modal_estimate import ModalEstimate
@@ -170,7 +170,7 @@ class Prepared:
         points = points_of(formulation)
         if not formulation.free_modes:  # with them every point makes a structure
             check_matrices(formulation, points, self.measurement, site)
-        check(self.stated.as_given)  # before a search what could not be stored at its end
+        check_tree(self.stated.as_given)  # before a search what could not be stored at its end
         check_constraints(formulation, points, site)
 
     @cached_property

@@ -16,7 +16,7 @@ from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.plot.panels import lines_of, run_names
 from sysid.plot.plots import stick_model
-from sysid.report.html import text
+from sysid.report.html import escaped
 from sysid.report.noise_level import NoiseLevel
 from sysid.report.still import ChannelSpectra, curve_sheet, degrees, mode_still, room_of_modes
 from sysid.results.identification import Identification
@@ -73,7 +73,7 @@ def _legend(channels: Sequence[ChannelSpectra], *, at_most: bool) -> str:
     return f'<p class="legend">{marks}</p>'
 
 
-def mode_shapes(it: Identification) -> str:
+def mode_shape_view(it: Identification) -> str:
     """Element of the mode shapes in space; nothing where the sensors have no positions."""
     try:
         points, motion, _ = stick_model(it.measurement)
@@ -234,6 +234,6 @@ def _steps(values: Array) -> str:
 def _element(kind: str, content: dict[str, Any], words: str, still: str) -> str:
     data = json.dumps(content, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c")
     return (
-        f'<figure class="{kind}" aria-label="{text(words)}">{still}<script type="application/json">{data}</script>'
+        f'<figure class="{kind}" aria-label="{escaped(words)}">{still}<script type="application/json">{data}</script>'
         "</figure>"
     )

@@ -27,7 +27,7 @@ class NoiseLevel(NamedTuple):
         return " at most" * self.at_most
 
 
-def noise_level(test: Measurement, structure: Structure) -> NoiseLevel:
+def noise_of_test(test: Measurement, structure: Structure) -> NoiseLevel:
     """The noise of a test: stated, found with the fit, or a bound by what `structure` leaves of it."""
     if test.response_std is not None:
         return NoiseLevel(test.response_std, test.force_std, False)

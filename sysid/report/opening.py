@@ -6,13 +6,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from sysid.report.html import bullets, number, paragraph, sentence, table, text
+from sysid.report.html import bullets, escaped, number, paragraph, sentence, table
 from sysid.report.matrices import stated
 from sysid.report.noise_level import NoiseLevel, share_of_all_noise
 from sysid.results.deck_masses import deck_masses
 from sysid.results.identification import Identification
 from sysid.results.summary import FIRST, JUDGEMENTS, counted, fitted_in_words, half_width, next_steps, verdict
-from sysid.results.unknowns_table import rows_of
+from sysid.results.unknowns_table import unknown_rows
 from sysid.structure.thresholds import LIKELY
 
 _COLOUR = {"determined": "good", "one of many": "warn", "doubtful": "warn", "no fit": "bad"}
@@ -26,8 +26,8 @@ _MOST_MODES, _MOST_UNKNOWNS = 4, 5  # whose figures stand in the opening; all of
 def opening(it: Identification, level: NoiseLevel) -> str:
     """HTML of what was identified, the judgement, the next thing to do, and the figures; `level` of the records."""
     word = "Stopped before its end: the best until then. " * it.interrupted + JUDGEMENTS[it.judgement]
-    judged = paragraph(sentence(verdict(it))) + _reasons(it) + f"<p><b>Next:</b> {text(_steps(it)[0])}</p>"
-    box = f'<div class="verdict {_COLOUR[it.judgement]}"><strong>{text(word)}</strong>{judged}</div>'
+    judged = paragraph(sentence(verdict(it))) + _reasons(it) + f"<p><b>Next:</b> {escaped(_steps(it)[0])}</p>"
+    box = f'<div class="verdict {_COLOUR[it.judgement]}"><strong>{escaped(word)}</strong>{judged}</div>'
     rows = [*_masses(it), *_deck_masses(it), *_unknowns(it), *_modes(it), *_fit(it, level)]
     return _subject(it) + box + table(["", ""], rows, words=True)
 
@@ -104,7 +104,7 @@ def _deck_masses(it: Identification) -> Iterator[tuple[str, str]]:
 
 def _unknowns(it: Identification) -> Iterator[tuple[str, str]]:
     """Unknowns with a meaning of their own, where they are few."""
-    rows = rows_of(it)
+    rows = unknown_rows(it)
     for row in rows if len(rows) <= _MOST_UNKNOWNS else ():
         yield row.label, _with_interval(it, row.value, row.std, row.unit).strip()
 

@@ -11,12 +11,13 @@ import numpy as np
 from sysid import plot
 from sysid.measurement.measurement import Measurement
 from sysid.plot.canvas import default_style
-from sysid.report.curves import curves, mode_shapes, script
+from sysid.report.curves import curves, mode_shape_view, script
 from sysid.report.html import (
     Cell,
     aligned,
     beside,
     bullets,
+    escaped,
     matrix,
     number,
     page,
@@ -24,10 +25,9 @@ from sysid.report.html import (
     picture,
     sentence,
     table,
-    text,
 )
-from sysid.report.matrices import CHOSEN, ONE_OF_MANY, Lines, half_widths, matrices, plain, stated
-from sysid.report.noise_level import NoiseLevel, noise_level, share_of_noise
+from sysid.report.matrices import CHOSEN, ONE_OF_MANY, Lines, half_widths, matrix_tables, stated, width_text
+from sysid.report.noise_level import NoiseLevel, noise_of_test, share_of_noise
 from sysid.report.opening import opening, rounded, trust
 from sysid.results.gain_table import gains_of_sensors
 from sysid.results.identification import Identification
@@ -46,7 +46,7 @@ from sysid.results.summary import (
     residual_in_words,
     tilde,
 )  # fmt: skip
-from sysid.results.unknowns_table import rows_of, stated_values
+from sysid.results.unknowns_table import stated_values, unknown_rows
 from sysid.results.version import __version__
 from sysid.structure.structure import Array, ComplexArray, Structure
 from sysid.structure.thresholds import ROUND_OFF
@@ -125,7 +125,7 @@ def write_report(identification: Identification, path: str | Path) -> Path:
 def render(identification: Identification) -> str:
     """Make the page, as a string."""
     it = identification
-    level = noise_level(it.fitted.records, it.structure)
+    level = noise_of_test(it.fitted.records, it.structure)
     return page(
         _title(it),
         opening(it, level),
@@ -138,7 +138,7 @@ def render(identification: Identification) -> str:
             ("Further tests", _further(it)),
             ("Total mass", _rigid_body_mass(it)),
             ("Unknowns", _unknowns(it)),
-            ("Matrices", matrices(it)),
+            ("Matrices", matrix_tables(it)),
             ("Noise", _noise(it)),
             ("Gains", _gains(it)),
             ("Outliers", _outliers(it)),
@@ -160,10 +160,10 @@ def _title(it: Identification) -> str:
 def _unknowns(it: Identification) -> str:
     rows = [
         (
-            row.label, number(row.value, 6), plain(half_width(row.std, row.value)), row.unit, number(row.lower),
+            row.label, number(row.value, 6), width_text(half_width(row.std, row.value)), row.unit, number(row.lower),
             number(row.upper), row.on_bound,
         )
-        for row in rows_of(it)
+        for row in unknown_rows(it)
     ]  # fmt: skip
     if not rows:
         return ""
@@ -207,7 +207,7 @@ def _modes(it: Identification) -> str:
 
 
 def _shapes(it: Identification) -> str:
-    drawn = mode_shapes(it)
+    drawn = mode_shape_view(it)
     if drawn:
         return paragraph(_DRAWN_SHAPES, "soft") + drawn
     shapes = it.structure.mode_shapes
@@ -339,7 +339,7 @@ def _validation(it: Identification) -> str:
             f"<h3>Test {i} of {len(it.records.validation)}: predicted, never fitted</h3>",
             paragraph(f"{_residual(test, it.structure)}."),
             _score_table(it, test),
-            _responses(it, test, noise_level(test, it.structure)),
+            _responses(it, test, noise_of_test(test, it.structure)),
         ]
     if parts:
         parts.append(
@@ -459,7 +459,7 @@ def _what_ran(it: Identification) -> str:
     facts += [[f"{name} model", words] for name, words in of_problem.models]
     facts.append(["sysid", __version__])
     counts = [*of_problem.counts, ("together", of_problem.n_variables)]
-    log = f"<h3>Log</h3><pre>{text(chr(10).join(it.history.log))}</pre>" if it.history.log else ""
+    log = f"<h3>Log</h3><pre>{escaped(chr(10).join(it.history.log))}</pre>" if it.history.log else ""
     return (
         table(["", ""], facts, words=True)
         + table(["matrix", "unknowns"], counts, "Unknowns of the search, matrix by matrix.")

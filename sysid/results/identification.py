@@ -224,7 +224,7 @@ class Identification(Answer):
         if self.part is not None:
             return {"problem": self.part.tree, "readings": self.part.readings}
         tree = self.prepared.to_tree()
-        return {"problem": tree, "readings": readings.to_tree(self) if needs_module(tree["given"]) else None}
+        return {"problem": tree, "readings": readings.answer_to_tree(self) if needs_module(tree["given"]) else None}
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Identification:
@@ -344,7 +344,7 @@ def _problem_from_tree(tree: dict[str, Any], structure: Structure) -> Any:
         recipe = tree["recipe"]
         module = "" if recipe is None else f" (the problem was made by {recipe['module']!r})"
         read = tree["readings"]
-        attributes = readings.from_tree(read, structure)
+        attributes = readings.answer_from_tree(read, structure)
         return PartOfProblem(part, read, StoredRecords.from_tree(part), attributes, f"{error}{module}")
 
 

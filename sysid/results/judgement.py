@@ -12,7 +12,7 @@ from sysid.assessment.checks import OF_THE_END, QUICK, run
 from sysid.assessment.checks.context import Context
 from sysid.assessment.checks.gains import assumed, rests_on
 from sysid.assessment.determination import BY_RANK, determine
-from sysid.assessment.sensitivity import blocks_of
+from sysid.assessment.sensitivity import system_matrices
 from sysid.assessment.uncertainty import LARGE
 from sysid.finding import Finding, Severity, cautions, contradicting, is_fit, weightiest_first
 from sysid.problem.prepared import Prepared
@@ -112,7 +112,7 @@ def _by_noise(it: Identification) -> Iterator[Finding]:
         return
     u, open_ = it.uncertainty, False
     stds = (u.mass, u.stiffness, u.damping)
-    for name, matrix, std in zip(("M_SS", "K_SS", "C"), blocks_of(it.structure), stds, strict=True):
+    for name, matrix, std in zip(("M_SS", "K_SS", "C"), system_matrices(it.structure), stds, strict=True):
         size = np.sqrt(np.diag(matrix))
         size[size == 0] = max(size.max(), np.finfo(float).tiny)  # a degree of freedom without a damper
         largest = float(np.max(std / np.outer(size, size)))

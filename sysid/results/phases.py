@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from sysid.assessment.sensitivity import blocks_of
+from sysid.assessment.sensitivity import system_matrices
 from sysid.errors import InputError
 from sysid.problem.prepared import Prepared
 from sysid.search.strategy import History, Phase
@@ -68,7 +68,7 @@ def errors(found: Structure, truth: Structure) -> Array:
 
 def matrix_errors(found: Structure, truth: Structure) -> tuple[float, ...]:
     """Relative errors of M_SS, K_SS and C in Frobenius norm; NaN of C where the truth has no damping."""
-    pairs = zip(blocks_of(found), blocks_of(truth), strict=True)
+    pairs = zip(system_matrices(found), system_matrices(truth), strict=True)
     return tuple(float(np.linalg.norm(a - b) / np.linalg.norm(b)) if np.any(b) else np.nan for a, b in pairs)
 
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 Tree = dict[str, Any]
 
 
-def to_tree(it: Answer) -> Tree:
+def answer_to_tree(it: Answer) -> Tree:
     """Give all that readers of a result ask of its problem; `from_tree` takes it back.
 
     Standard deviations and intervals where summaries compute them too; what no reader of this result asks, None.
@@ -48,7 +48,7 @@ def to_tree(it: Answer) -> Tree:
     }
 
 
-def from_tree(tree: Tree, structure: Structure) -> dict[str, Any]:
+def answer_from_tree(tree: Tree, structure: Structure) -> dict[str, Any]:
     """Give attributes of an `Answer` by their names, without those that were not computed.
 
     Parameters

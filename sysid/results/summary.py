@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.assessment.sensitivity import blocks_of
+from sysid.assessment.sensitivity import system_matrices
 from sysid.finding import Judgement
 from sysid.measurement.in_time import peaks
 from sysid.results.answer import Answer
@@ -16,7 +16,7 @@ from sysid.results.deck_masses import deck_masses
 from sysid.results.gain_table import gains_of_sensors
 from sysid.results.noise_table import NOISE_COLUMNS, noise_of_channels
 from sysid.results.phases import COLUMNS, seconds_in_words
-from sysid.results.unknowns_table import MANY, rows_of, stated_values
+from sysid.results.unknowns_table import MANY, stated_values, unknown_rows
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import LIKELY, ROUND_OFF, UNEXPLAINED
 
@@ -286,7 +286,7 @@ def _deck_masses(it: Answer) -> list[str]:
 
 def _unknowns(it: Answer) -> list[str]:
     """Table of the unknowns that mean something by themselves, where there are some and not too many."""
-    rows = rows_of(it)
+    rows = unknown_rows(it)
     if not 0 < len(rows) <= MANY:
         return []
     computed = it.quick_uncertainty is not None
@@ -324,7 +324,7 @@ def _ranges(it: Answer) -> Iterator[str]:
         yield f"  - {_RANGES_LEFT}"
         return
     words = []
-    M, K, _ = blocks_of(it.structure)
+    M, K, _ = system_matrices(it.structure)
     for name, matrix, (lower, upper) in (("M_SS", M, ends.mass), ("K_SS", K, ends.stiffness)):
         diagonal = np.diag(matrix)
         low, high = abs(float(np.min(np.diag(lower) / diagonal))), float(np.max(np.diag(upper) / diagonal))

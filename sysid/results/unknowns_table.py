@@ -34,7 +34,7 @@ def stated_values(it: Answer) -> list[str]:
     return [f"{name} ends {z:+.2g} standard deviations from the value stated as known" for name, z in it.facts.misses]
 
 
-def rows_of(it: Answer) -> list[Row]:
+def unknown_rows(it: Answer) -> list[Row]:
     """A row a scalar unknown that was searched and means something by itself: see `sysid.results.facts`."""
     if it.x is None:
         return []

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from sysid.errors import InputError, SolverError, whole_number
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.problem.feasibility import latin_hypercube
+from sysid.problem.feasibility import spread_points
 from sysid.problem.prepared import Prepared
 from sysid.problem.terms import TestTerm
 from sysid.search import local
@@ -268,7 +268,7 @@ def random_starts(problem: Prepared, count: int, random: np.random.SeedSequence)
     """Points spread over the search space as the swarm's are, of those that stand for a structure."""
     if count < 1:
         return []
-    points = latin_hypercube(problem.formulation, DRAWN * count, np.random.default_rng(random))
+    points = spread_points(problem.formulation, DRAWN * count, np.random.default_rng(random))
     return list(islice((x for x in points if _is_structure(problem, x)), count))
 
 

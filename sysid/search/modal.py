@@ -173,7 +173,9 @@ def _by_name(test: Measurement, stated: Sequence[str | int]) -> Integers:
     return np.sort(np.array(chosen, dtype=int))
 
 
-def build(problem: Prepared, modes: Modes, remainder: Array, chosen: DegreesOfFreedom, *, to_totals: bool) -> Structure:
+def structure_of_modes(
+    problem: Prepared, modes: Modes, remainder: Array, chosen: DegreesOfFreedom, *, to_totals: bool
+) -> Structure:
     """Structure of a modal model; `remainder` (d, d) is the rigid-body mass that no mode carries.
 
     With `to_totals` all modal masses take one factor, and the remainder what is left, so that stated totals are met.
@@ -320,7 +322,7 @@ def modal_structure(
     # A stated total is kept, even where the base force weighs another.
     unmet = mass.free and (test.force is None or (mass.totals is not None and held is None and not later))
     try:
-        return build(problem, modes, remainder, chosen, to_totals=unmet), end, chosen, poles
+        return structure_of_modes(problem, modes, remainder, chosen, to_totals=unmet), end, chosen, poles
     except InputError as error:
         raise DoesNotApplyError(
             "the modes found are too much alike at the sensors, as where a sign, gain or axis in rigid_body is "

@@ -9,7 +9,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import SolverError, choice, flag, instance, number, text, whole_number
+from sysid.errors import SolverError, as_float, choice, flag, instance, text, whole_number
 from sysid.modal_analysis.response import error_of_accelerations
 from sysid.problem.prepared import Prepared
 from sysid.problem.terms import TestTerm
@@ -119,7 +119,7 @@ class Swarm:
             value = getattr(self, field)
             if value is not None or field not in ("n_particles", "stall_iterations"):  # None has a meaning there
                 whole_number(f"Swarm: {field}", value, at_least=at_least)
-        number("Swarm: stall_tolerance", self.stall_tolerance, "a part of it, in [0, 1),", at_least=0, below=1)
+        as_float("Swarm: stall_tolerance", self.stall_tolerance, "a part of it, in [0, 1),", at_least=0, below=1)
         for field in ("refine", "write_back"):
             flag(f"Swarm: {field}", getattr(self, field))
         instance("Swarm: settings", self.settings, SwarmSettings)
