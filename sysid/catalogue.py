@@ -104,7 +104,7 @@ def build(recipe: Recipe) -> Problem:
 
 
 def built(recipe: Recipe, *, check: bool = True) -> tuple[Problem, frozenset[Path]]:
-    """What `build` gives, and the files it was made from: the module, and what that imported from beside itself.
+    """The problem that `build` gives, and the files it was made from: the module, and what that imported beside itself.
 
     Of a dotted module, which Python imports, the module alone. Without `check` a problem that cannot be searched is not
     refused, for which poles may be looked for: `identify` does it too.
@@ -185,7 +185,7 @@ def file_of(name: str) -> Path | None:
 
 
 def typed(name: str) -> tuple[str, str]:
-    """What a user means by a name at the command line, and a remark: the user's own problem hides a bundled one."""
+    """The module that a name at the command line means, and a remark: the user's own problem hides a bundled one."""
     of_user = None if _is_path(name) else _in_folder(user_folder(), name)
     bundled = _in_folder(bundled_folder(), name)
     if of_user is None or bundled is None or of_user.read_bytes() == bundled.read_bytes():  # the last in a checkout
@@ -194,7 +194,7 @@ def typed(name: str) -> tuple[str, str]:
 
 
 def is_bundled(name: str) -> bool:
-    """Whether a recipe's module is a problem that comes with the package."""
+    """True where a recipe's module is a problem that comes with the package."""
     return not _is_path(name) and _in_folder(bundled_folder(), name) is not None
 
 
@@ -338,7 +338,7 @@ def _telling_the_line(path: Path) -> Iterator[None]:
 
 
 def _exception_in_words(error: BaseException) -> str:
-    """What an exception of a module says; of what CasADi cannot do with expressions, what to write instead."""
+    """Message of an exception of a module; of what CasADi cannot do with expressions, what to write instead."""
     said = str(error)
     if "truth value of a numeric MX" in said:
         return NO_TRUTH
@@ -348,7 +348,7 @@ def _exception_in_words(error: BaseException) -> str:
 
 
 def _was_raised(interrupt: KeyboardInterrupt, file: str) -> bool:
-    """Whether a statement of a file raised it, and not Ctrl-C at some other instruction."""
+    """True where a statement of a file raised it, and not Ctrl-C at some other instruction."""
     last = interrupt.__traceback__
     assert last is not None
     while last.tb_next is not None:

@@ -150,7 +150,7 @@ class Cone:
 
     @cached_property
     def region(self) -> Region:
-        """What the limited directions may do; the others follow (`_follow`)."""
+        """Region of the limited directions; the others follow (`_follow`)."""
         pairs, width = unknowns(self.groups), sum(map(len, self.groups))
         scale, at_identity = np.zeros((self.n, width)), np.zeros((width, width))
         for cluster, group, (bound, _) in zip(self.clusters, self.groups, self.bases, strict=True):
@@ -211,7 +211,7 @@ class Cone:
         return values, members
 
     def _follow(self, functions: Array) -> tuple[list[Array], NDArray[np.bool_]]:
-        """How unlimited directions best follow the limited ones: ``T = Z t Z'``, Z (q, r, b) for each cluster.
+        """Best unlimited directions for the limited ones: ``T = Z t Z'``, Z (q, r, b) for each cluster.
 
         With U the unlimited directions, X their coupling to the limited ones and t the limited block, T_UU >= X' t X
         and nothing else: the supremum of the quadratic in X is finite where ``U' C U`` is negative semidefinite and
@@ -232,7 +232,7 @@ class Cone:
         return followers, finite
 
     def _bounded(self, coefficients: Array) -> NDArray[np.bool_]:
-        """Whether equations and limits keep each function from growing for ever, (q,)."""
+        """True where equations and limits keep each function from growing for ever, (q,)."""
         escape = self._escape
         if escape is None:
             return np.ones(len(coefficients), dtype=bool)

@@ -1,4 +1,4 @@
-"""What data and stated models determine of an answer, and how far the rest may go.
+"""Determination of an answer by data and stated models, and how far the rest may go.
 
 The modal-mass cone speaks where it holds all models that explain the data: exact, and of all of them at once. Elsewhere
 the rank of the exact Jacobian does: of small changes of the answer, to first order.
@@ -45,7 +45,7 @@ BY_RANK = "judged by the rank of the Jacobian, to first order about this answer"
 
 @dataclass(frozen=True)
 class Determination:
-    """Whether data and stated model fix every entry of M_SS, K_SS and C.
+    """Sentences on what data and stated model fix of M_SS, K_SS and C, and what they leave open.
 
     Attributes
     ----------
@@ -61,17 +61,17 @@ class Determination:
 
     @property
     def determined(self) -> bool:
-        """Whether nothing is left open."""
+        """True where nothing is left open."""
         return not cautions(self.findings)
 
     @property
     def closed_by(self) -> tuple[str, ...]:
-        """What fixes the matrices, in sentences."""
+        """Reasons that fix the matrices, in sentences."""
         return tuple(one.sentence for one in self.findings if one.kind == "fixed")
 
     @property
     def undetermined(self) -> tuple[str, ...]:
-        """What is left open, in sentences; empty where determined."""
+        """Sentences on what is left open; empty where determined."""
         return tuple(one.sentence for one in cautions(self.findings))
 
 
@@ -91,7 +91,7 @@ class Intervals:
 
 
 def determine(problem: Prepared, structure: Structure, x: Array | None, rivals: Sequence[Array] = ()) -> Determination:
-    """Whether records, constraints and stated models fix every entry of M_SS, K_SS and C.
+    """Find which entries of M_SS, K_SS and C records, constraints and stated models leave open.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def open_masses(problem: Prepared, structure: Structure) -> list[int]:
 
 
 def scale_is_open(problem: Prepared, structure: Structure, x: Array | None) -> bool:
-    """Whether one factor common to mass, stiffness and damping is all that is open; parameters as in `determine`."""
+    """True where one factor common to mass, stiffness and damping is all that is open; parameters as in `determine`."""
     if modal_mass_cone.applies(problem.formulation):
         return modal_mass_cone.only_scale_is_open(problem, structure)
     _, _, slopes, known = _about(problem, structure, x)
@@ -178,7 +178,7 @@ def _about(problem: Prepared, structure: Structure, x: Array | None) -> tuple[Fo
 
 
 def _by_rank(problem: Prepared, structure: Structure, x: Array | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """What fixes the matrices, and what is left open, in sentences."""
+    """Reasons that fix the matrices, and what is left open, in sentences."""
     formulation, x, slopes, known = _about(problem, structure, x)
     count, rank = known.free.shape[1], known.rank
     named, factors = _by_name(formulation, known.unseen)
@@ -238,7 +238,7 @@ def _factors_in_words(formulation: Formulation, directions: Array) -> Iterator[s
 
 
 def _scale_is_open(pairs: list[tuple[Array, Array]], known: Sensitivity) -> bool:
-    """Whether one factor for mass, stiffness and damping together is among what nothing sees."""
+    """True where one factor for mass, stiffness and damping together is among what nothing sees."""
     sizes = [max(np.abs(matrix).max(), np.finfo(float).tiny) for matrix, _ in pairs]
     common = np.concatenate([matrix.ravel() / size for (matrix, _), size in zip(pairs, sizes, strict=True)])
     steps = known.unit[:, None] * known.unseen
@@ -286,7 +286,7 @@ def _others(problem: Prepared, structure: Structure, x: Array | None, rivals: Se
 
 
 def _other_matrices(problem: Prepared, mine: Structure, x: Array, other: Array) -> bool:
-    """Whether other unknowns stand for other matrices, beyond what noise leaves open, and not for the same ones."""
+    """True where other unknowns stand for other matrices, beyond what noise leaves open, and not for the same ones."""
     try:
         its = problem.structure(other)
     except InputError:  # of no structure

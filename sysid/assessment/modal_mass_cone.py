@@ -1,4 +1,4 @@
-"""What the data determine: the modal-mass cone.
+"""The modal-mass cone: what the data determine of mass and stiffness.
 
 Base and response accelerations fix frequencies, damping ratios and rank-one residues, and nothing
 else. All models that explain them are ``M_SS = P' T P``, ``K_SS = P' W T W P``, ``M_S0 = P' T (Gamma - P G)``,
@@ -36,7 +36,7 @@ _GAIN = 5e-3  # of the base's motion; a smaller error of a sensor's gain is not 
 
 
 def applies(formulation: Formulation) -> bool:
-    """Whether the cone holds all models that explain the data, and what is stated of them.
+    """True where the cone holds all models that explain the data, and what is stated of them.
 
     So it is where the records stand alone, damping is by ratios, and `Stated` tells all of mass and stiffness.
     """
@@ -45,7 +45,7 @@ def applies(formulation: Formulation) -> bool:
 
 
 def closed_and_open(problem: Prepared, structure: Structure) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """What closes the modal masses of `structure`, and what is left open, in sentences.
+    """Reasons that close the modal masses of `structure`, and what is left open, in sentences.
 
     What counts as seen is judged against the misfit that the structure leaves: a mode whose share of
     the records is not clearly above it, poles that it cannot tell apart, and base directions that
@@ -114,12 +114,12 @@ def open_modes(problem: Prepared, structure: Structure) -> list[int]:
 
 
 def only_scale_is_open(problem: Prepared, structure: Structure) -> bool:
-    """Whether one scale of mass, stiffness and damping is open, and nothing else."""
+    """True where one scale of mass, stiffness and damping is open, and nothing else."""
     return _open_modes(_known(problem, structure, problem.measurement.residual(structure)))[1]
 
 
 def ends(problem: Prepared, structure: Structure) -> tuple[Array, Array]:
-    """How far each entry of M_SS and K_SS may go over the modal-mass cone.
+    """Ends of each entry of M_SS and K_SS over the modal-mass cone.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def _entries(cone: Cone, rows: Array, at_identity: Array, at_once: int = 100) ->
 
 
 class _Known(NamedTuple):
-    """What holds linear functions of T equal to what they are for T = I.
+    """Statements that hold linear functions of T equal to what they are for T = I.
 
     Attributes
     ----------
@@ -289,7 +289,7 @@ class _Record(NamedTuple):
 
 
 def _like_rigid(test: Measurement, structure: Structure, k: int) -> str:
-    """What else a mode below the lines may be: far above it, it moves sensors by a constant times the base's motion."""
+    """Another meaning of a mode below the lines: far above it, sensors move by a constant times the base's motion."""
     moved = -np.outer(structure.mode_shapes[:, k], structure.participation[k])
     reach = np.abs(test.rigid_body).max(axis=0)
     wrong = np.abs(moved) / np.where(reach > 0, reach, np.inf)
@@ -370,7 +370,7 @@ def _seen(test: Measurement, structure: Structure, cluster: list[int], rows: Arr
 def _unseen(
     problem: Prepared, structure: Structure, misfit: float, responses: _Record, free: list[int]
 ) -> Iterator[str]:
-    """What the records do not show, in sentences; a mode needs no force of its own where what is stated fixes it."""
+    """Sentences on what the records do not show; a mode needs no force of its own where what is stated fixes it."""
     test = problem.measurement
     base = columns(test.base)
     sizes = np.linalg.norm(base, axis=1, keepdims=True)
@@ -425,7 +425,7 @@ def _clusters(structure: Structure, misfit: float) -> list[list[int]]:
 
 
 def _model_equations(problem: Prepared, structure: Structure, pairs: Pairs) -> tuple[Array, Array | None, str]:
-    """What the stated models add: `_Known.equations`, `signs` and `sentence`."""
+    """Equations that the stated models add: `_Known.equations`, `signs` and `sentence`."""
     nothing = np.zeros((0, len(pairs)))
     if not structure.at_sensors:
         return nothing, None, ""

@@ -1,4 +1,4 @@
-"""How the modal parameters of a problem with free modes move with its unknowns, and what holds them beside records."""
+"""Slopes of modal parameters by the unknowns of a problem with free modes, and what holds them beside records."""
 
 from __future__ import annotations
 

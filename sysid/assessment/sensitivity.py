@@ -23,7 +23,7 @@ from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """What the data say about p unknowns about a point.
+    """Sensitivity of the data to p unknowns about a point.
 
     Attributes
     ----------
@@ -187,7 +187,7 @@ def _null_space(rows: Array, least: float = 1e-9) -> Array:
 
 
 def _rank(singular_values: Array, least: float) -> int:
-    """How many singular values are more than `least` of the largest."""
+    """Number of singular values that are more than `least` of the largest."""
     return int(np.count_nonzero(singular_values > least * singular_values.max(initial=np.finfo(float).tiny)))
 
 

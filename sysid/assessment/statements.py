@@ -27,7 +27,7 @@ _WIDE = 5.0  # standard deviation of the logarithm of a mode's scale that nothin
 
 
 class Statements(NamedTuple):
-    """What is stated of masses, one row each.
+    """Statements about masses, one row each.
 
     ``entries`` (e, 2) of ``[M_SS, M_S0]``; ``totals`` (t, 2) of the rigid-body mass, or of the traces where ``kind`` is
     "trace"; ``values``, ``std`` and ``scale`` (e + t,): kg, the last what is a large change.
@@ -76,7 +76,7 @@ def statements_of(problem: Prepared, structure: Structure) -> Statements | None:
 
 
 def predict_statements(problem: Prepared, stated: Statements, theta: Array, index: Index) -> tuple[Array, Array]:
-    """What modal parameters make of the statements, (r,), and its slopes, (r, size of theta); in units of `scale`.
+    """Statements as modal parameters predict them, (r,), and their slopes, (r, size of theta); in units of `scale`.
 
     With P the inverse of Phi the entries are those of ``M_SS = P' P`` and ``M_S0 = P' (Gamma - P G)``.
     """
@@ -199,7 +199,7 @@ def conditioned(
 
 
 def _gauge(theta: Array, index: Index, weighed: bool) -> Array:
-    """What the logarithm of each mode's scale moves, (size, m); nothing where a force sets it."""
+    """Moves of theta by the logarithm of each mode's scale, (size, m); nothing where a force sets it."""
     if weighed:
         return np.zeros((index.size, 0))
     phi, gamma, *_ = (part[..., 0] for part in index.split(theta[:, None]))

@@ -1,4 +1,4 @@
-"""What the commands share that write: whether a folder can be written, files, CSV and strict JSON."""
+"""Writing that commands share: whether a folder can be written, files, CSV and strict JSON."""
 
 from __future__ import annotations
 

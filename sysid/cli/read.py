@@ -84,7 +84,7 @@ def run(options: argparse.Namespace, out: Output) -> int:
 
 
 def _said(options: argparse.Namespace) -> Any:
-    """What the options say; over a TOML file where both do."""
+    """The description by the options; over a TOML file where both say something."""
     given: dict[str, Any] = {
         "sample_rate": options.rate, "time": options.time, "frequency": options.frequency, "join": options.join,
         "base_axes": options.base_axes, "frf": options.frf, "convention": options.convention,
@@ -101,7 +101,7 @@ def _said(options: argparse.Namespace) -> Any:
 
 
 def is_test(name: str | None) -> bool:
-    """Whether a problem is called by the file of a test."""
+    """True where a problem is called by the file of a test."""
     return name is not None and name.endswith(".h5")
 
 

@@ -128,7 +128,7 @@ def _figures(minimum: Minimum) -> dict[str, Any]:
 
 
 def _recipe(result: Identification, options: argparse.Namespace, source: Path, out: Output) -> Recipe:
-    """What the problem of a result was made from: by a module that the user names, or that may run."""
+    """The recipe of the problem of a result: by a module that the user names, or that may run."""
     if result.recipe is None:
         raise InputError(
             f"{source} was not made from a problem module, so that no worker could rebuild its problem: save the "

@@ -38,7 +38,7 @@ _ROOM = 1e-3  # of a constraint's scale, by which the point stays clear of inequ
 
 
 def show(problem: Problem, name: str) -> str:
-    """What a problem is, and what its data determine, in lines of at most 120 columns.
+    """Describe a problem, and what its data determine, in lines of at most 120 columns.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def show(problem: Problem, name: str) -> str:
 
 
 def figures(problem: Problem, name: str) -> dict[str, Any]:
-    """What `show` tells, for scripts: numbers, texts, and lists and dictionaries of them; errors as there."""
+    """Content of `show` for scripts: numbers, texts, and lists and dictionaries of them; errors as there."""
     problem.check()
     test, point = problem.measurement, _point(problem.prepared.screened, problem)
     known = point.known
@@ -258,7 +258,7 @@ def _sizes(matrix: Array) -> Array:
 
 
 def _at_modes(problem: Prepared, stated: Problem) -> tuple[_Point | None, tuple[str, ...]]:
-    """What the modal strategy finds in the data; only sentences where it has other degrees of freedom."""
+    """The modal strategy's answer to the data; only sentences where it has other degrees of freedom."""
     try:
         found = identify(stated, strategy="modal", rng=0)
     except SysidError:
@@ -321,7 +321,7 @@ def _values(problem: Prepared, point: _Point, moves: Array, noise: str) -> Itera
 
 
 def _coordinates(problem: Prepared) -> Iterator[str]:
-    """What IPOPT has in the place of these unknowns, or beside them."""
+    """Coordinates that IPOPT has in the place of these unknowns, or beside them."""
     formulation = problem.formulation
     if problem.free_modes:
         yield (
@@ -358,7 +358,7 @@ def _unseen(problem: Prepared, point: _Point) -> Iterator[str]:
 
 
 def _moved_matrices(point: _Point) -> tuple[int, int]:
-    """How many unseen directions move M_SS, K_SS or C; how many of the rest move the base's blocks."""
+    """Numbers of unseen directions that move M_SS, K_SS or C, and of the rest that move the base's blocks."""
     s, steps = point.slopes, point.known.unit[:, None] * point.known.unseen
     n = s.structure.n
     M, K, C = s.structure.mass[:n, :n], s.structure.stiffness[:n, :n], s.structure.damping
@@ -399,7 +399,7 @@ def _moves(problem: Prepared, point: _Point) -> Array:
 
 
 def _all_stated(problem: Prepared) -> bool:
-    """Whether every record that is fitted states its noise."""
+    """True where every record that is fitted states its noise."""
     formulation = problem.formulation
     return formulation.fits_records and all(_noise_is_stated(term.test) for term in formulation.tests)
 

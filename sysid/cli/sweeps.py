@@ -51,12 +51,12 @@ class Sweep:
 
     @property
     def of_parts(self) -> bool:
-        """Whether each leaves some records out."""
+        """True where each leaves some records out."""
         return bool(self.changes) and not isinstance(self.changes[0], NumberOfModes)
 
 
 def sweep_of(options: argparse.Namespace, result: Identification, recipe: Recipe, out: Output) -> Sweep | None:
-    """What the command line asks for; None where that is starts or draws."""
+    """The sweep that the command line asks for; None where that is starts or draws."""
     if options.variants:
         modules = [trust.typed_module(module, out) for module in options.variants]
         recipes = tuple(Recipe(module, recipe.data, recipe.rng) for module in modules)
@@ -119,7 +119,7 @@ def check_same_records(result: Identification, recipe: Recipe) -> None:
 
 
 def _same_records(result: Identification, other: Problem) -> bool:
-    """Whether a problem is of the result's records."""
+    """True where a problem is of the result's records."""
     ours, its = (
         [problem.measurement, *(one.measurement for one in problem.residuals if isinstance(one, FurtherTest))]
         for problem in (result.problem, other)
@@ -177,7 +177,7 @@ def comparison_table(rows: Sequence[Compared], part: bool) -> str:
 
 
 def _fits(rows: Sequence[Compared], part: bool) -> list[str]:
-    """Whether each is a fit; of models of the same records "worse" where another fits better, decisively."""
+    """A word a row, "yes" for a fit; of models of the same records "worse" where another fits better, decisively."""
     figures = np.array([(row.score.deviance, row.score.aic, row.score.bic) for row in rows])
     fits = [row.success for row in rows]
     beaten = [not part and np.any(np.all(figures[fits] + DECISIVE <= scores, axis=1)) for scores in figures]
@@ -186,12 +186,9 @@ def _fits(rows: Sequence[Compared], part: bool) -> list[str]:
 
 def criteria(rows: Sequence[Compared]) -> dict[str, list[float]]:
     """AIC and BIC of all rows above the least."""
-    above_least = {}
-    for name in ("aic", "bic"):
-        values = [getattr(row.score, name) for row in rows]
-        least = min((value for value in values if np.isfinite(value)), default=np.nan)
-        above_least[name.upper()] = [value - least for value in values]
-    return above_least
+    found = {name: [getattr(row.score, name) for row in rows] for name in ("aic", "bic")}
+    least = {name: min(filter(np.isfinite, values), default=np.nan) for name, values in found.items()}
+    return {name.upper(): [value - least[name] for value in values] for name, values in found.items()}
 
 
 def _farthest(steps: Sequence[Move]) -> str:
@@ -205,7 +202,7 @@ def _farthest(steps: Sequence[Move]) -> str:
 
 
 def _notes(rows: Sequence[Compared], part: bool) -> Iterator[str]:
-    """What the columns are, and what all rows say together."""
+    """Meaning of the columns, and what all rows say together."""
     notes = ["a fit: the search ended well, with a residual within the goal, or the noise where none is stated"]
     predicted = int(np.any(np.isfinite([row.score.predicted for row in rows])))
     if part:

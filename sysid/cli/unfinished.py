@@ -137,7 +137,7 @@ def _asked(options: argparse.Namespace, out: Output) -> RunRequest:
 
 
 def _in_words(checkpoint: Checkpoint, search: RunRequest) -> str:
-    """What stands in the file, as far as it can be read."""
+    """Content of the file, as far as it can be read."""
     try:
         tree = checkpoint.read()["begun"]
     except InputError:

@@ -45,14 +45,14 @@ class Comparison:
 
     @property
     def quantity(self) -> str:
-        """What is minimised: "residual" where the relative residual is all of it, else "objective"."""
+        """Quantity that is minimised: "residual" where the relative residual is all of it, else "objective"."""
         test = self.problem.measurement
         alone = test.response_std is None and test.force is None and len(self.problem.formulation.terms) == 1
         return "residual" if alone else "objective"
 
     @property
     def success(self) -> bool:
-        """Whether any method found a fit."""
+        """True where any method found a fit."""
         return any(result.status is Status.FIT for result in self.results)
 
     def to_dict(self) -> dict[str, Any]:

@@ -71,7 +71,7 @@ def _errors(comparison: Comparison) -> Iterator[tuple[str, list[str]]]:
 
 
 def _notes(comparison: Comparison) -> Iterator[str]:
-    """What the columns are, and the words of the methods that are no fit."""
+    """Meaning of the columns, and the words of the methods that are no fit."""
     what = {
         "residual": "relative residual",
         "objective": "objective (all that is fitted, weighed by its stated noise)",

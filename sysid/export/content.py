@@ -1,4 +1,4 @@
-"""What every exported file holds: the matrices on all degrees of freedom, their names and units, and what is open."""
+"""Content of every exported file: the matrices on all degrees of freedom, their names and units, and what is open."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def rotations_of(it: Identification) -> tuple[bool | None, ...]:
 
 
 def _records_rotation(it: Identification, sensor: int) -> bool:
-    """Whether a sensor is described as one of rotation."""
+    """True where a sensor is described as one of rotation."""
     sensors = it.measurement.sensors
     axis = "" if sensors is None else sensors[sensor].axis
     return isinstance(axis, str) and "r" in axis
@@ -70,7 +70,7 @@ _INTERRUPTED = "the search was interrupted, these are the best matrices until th
 
 
 def reliability(it: Identification) -> str:
-    """What the matrices are worth, in one line that names the statements which tell why."""
+    """Judgement of the matrices, in one line that names the statements which tell why."""
     parts = (("against", it.contradictions), ("open", it.open_findings))
     why = " and ".join(f"'{word}'" for word, findings in parts if findings)
     return _INTERRUPTED * it.interrupted + _WORTH[it.judgement] + (f"; see {why}" if why else "")

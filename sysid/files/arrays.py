@@ -92,7 +92,7 @@ def read_hdf5(path: Path) -> Recording:
 
 
 def _is_hdf5(path: Path) -> bool:
-    """Whether it is an HDF5 file, which begins behind 512 bytes of text in a MATLAB file of version 7.3."""
+    """True where it is an HDF5 file, which begins behind 512 bytes of text in a MATLAB file of version 7.3."""
     with path.open("rb") as file:
         begin = file.read(520)
     return _HDF5 in (begin[:8], begin[512:])
@@ -107,7 +107,7 @@ def _word(item: Any, name: str) -> str:
 
 
 def _is_numeric(dtype: Any) -> bool:
-    """Whether a data set holds numbers, each of the same few bytes."""
+    """True where a data set holds numbers, each of the same few bytes."""
     return dtype.kind in "buifcV" and not dtype.hasobject
 
 

@@ -60,7 +60,7 @@ def _spectra(runs: Sequence[Run], rate: float) -> tuple[list[Any], Array]:
 
 
 def undescribed(recording: Recording) -> str:
-    """What to say where nothing tells which column is which sensor."""
+    """Message where nothing tells which column is which sensor."""
     return (
         f"{recording.path}: which column is which sensor is not said; {recording.in_words()}. Say it in a TOML file "
         "(--sensors FILE.toml), or with --sensor COLUMN role=response axis=x position=0,0,3 unit=g for each; 'sysid "
@@ -213,7 +213,7 @@ def _factor(recording: Recording, column: Column, channel: Channel) -> tuple[flo
 
 
 def motions(channels: Sequence[Channel], axes: Sequence[str], origin: Sequence[float]) -> Array:
-    """What channels show of unit motions of the base in its directions, (channels, d)."""
+    """Readings of channels at unit motions of the base in its directions, (channels, d)."""
     points = np.array([channel.position or (0.0, 0.0, 0.0) for channel in channels])
     rows = rigid_motion(points, origin).reshape(len(points), 6, 6)
     ways = [sensor_row(channel.axis, channel.name) for channel in channels]
@@ -245,7 +245,7 @@ def total_force(
 
 
 def work_of_force(runs: Sequence[Run], freq: Array) -> list[str]:
-    """What the sign of the base force seems to be: the table's force gives a damped structure power at every line."""
+    """Remark on the sign of the base force: the table's force gives a damped structure power at every line."""
     moved = [(base, force) for base, _, force in runs if force is not None]
     power = [np.sum(np.real(force * np.conj(base / (2j * np.pi * freq))), axis=0) for base, force in moved]
     share = float(np.sum(power) / max(np.sum(np.abs(power)), np.finfo(float).tiny))

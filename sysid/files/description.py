@@ -34,7 +34,7 @@ position = [0.0, 0.0, 3.0]     # m
 
 @dataclass(frozen=True)
 class Channel:
-    """What is said of one column; `axis` and `position` are None where the file has to tell them."""
+    """Description of one column; `axis` and `position` are None where the file has to tell them."""
 
     column: str | int
     role: str
@@ -47,7 +47,7 @@ class Channel:
 
 @dataclass(frozen=True)
 class Description:
-    """What is said of a test's files.
+    """Description of a test's files.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What a file holds before it is known what measured it: named columns in time or over frequency."""
+"""Content of a file before it is known what measured it: named columns in time or over frequency."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class Recording:
         return found[0]
 
     def in_words(self) -> str:
-        """How many columns there are, and what they are called."""
+        """Number of columns, and what they are called."""
         left_out = "".join(f" ({remark})" for remark in self.remarks[:1])
         plural = "s" * (len(self.names) != 1)
         return f"it has {len(self.names)} column{plural}, {listed([*map(repr, self.names)])}{left_out}"

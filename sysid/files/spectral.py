@@ -60,7 +60,7 @@ def recognised(recording: Recording, said: Description) -> Recording:
 
 
 def is_abscissa(name: str) -> bool:
-    """Whether an array is named as time or frequency is."""
+    """True where an array is named as time or frequency is."""
     return name.rpartition(".")[2].lower() in {*TIME_NAMES, *_FREQUENCIES, "f"}
 
 

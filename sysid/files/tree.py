@@ -69,7 +69,7 @@ def to_bytes(tree: Tree, number: int) -> bytes:
 
 
 def is_tree(image: bytes) -> bool:
-    """Whether a file begins as `to_bytes` begins it."""
+    """True where a file begins as `to_bytes` begins it."""
     return image.startswith(_MAGIC)
 
 

@@ -1,4 +1,4 @@
-"""What a job identifies in the place of all modes of a whole test: a band, all runs or sensors but one, some modes."""
+"""Changes of what a job identifies: a band, all runs or sensors but one, some modes, in the place of all of a test."""
 
 from __future__ import annotations
 

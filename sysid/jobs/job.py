@@ -32,7 +32,7 @@ _BUILT = 4  # problems that a worker keeps
 
 @dataclass(frozen=True)
 class Job:
-    """What a worker needs.
+    """Description of a job for a worker.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class Job:
 
 @dataclass(frozen=True, eq=False)
 class JobResult:
-    """How a job ended.
+    """Result of a job.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class JobResult:
 
     @property
     def has_result(self) -> bool:
-        """Whether it came to anything, a fit or not."""
+        """True where it came to anything, a fit or not."""
         return self.x.size > 0 or self.score is not None
 
 
@@ -124,7 +124,7 @@ def run(job: Job) -> JobResult:
 
 
 def without_result(job: Job, why: str) -> JobResult:
-    """What stands for a job that came to nothing."""
+    """Result of a job that came to nothing."""
     return JobResult(job.index, job.seed, False, why, np.zeros(0), float("nan"))
 
 
@@ -157,7 +157,7 @@ def _identified(job: Job, session: Session) -> JobResult:
 
 
 def _predicted(problem: Problem, result: Identification, change: Change) -> float | None:
-    """What was left out, as the rest predicts it; NaN where the rest does not tell all that the whole test does."""
+    """Residual of what was left out, predicted by the rest; NaN where the rest does not tell all of the whole test."""
     x = result.x
     if x is not None and not problem.declared.free_modes:
         part, whole = (sensitivity(one.formulation, x, priors=False).rank for one in (result.problem, problem))

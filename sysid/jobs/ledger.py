@@ -48,7 +48,7 @@ class Ledger:
         self._seeds = {job.index: job.seed for job in jobs}
 
     def results(self) -> dict[int, JobResult]:
-        """What is there of the jobs, by index; a damaged one counts as none, with a warning."""
+        """Results of the jobs that are there, by index; a damaged one counts as none, with a warning."""
         with self._sqlite_errors_named():
             rows = {row[0]: row[1:] for row in self._file.execute("SELECT job, result, sha256 FROM results")}
         wanted = {index: rows[key] for index, key in self._keys.items() if key in rows}

@@ -1,4 +1,4 @@
-"""What of a whole identification is compared with others: figures of its fit, and how far its quantities moved."""
+"""Score of an identification for comparison with others: figures of its fit, and how far its quantities moved."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class Score:
 
 @dataclass(frozen=True)
 class Move:
-    """How far a quantity went.
+    """Change of a quantity.
 
     Attributes
     ----------
@@ -166,7 +166,7 @@ def scored(result: Identification, predicted: float | None = None) -> Score:
 
 
 def moves(first: Score, other: Score, *, part: bool) -> tuple[Move, ...]:
-    """How far frequencies, damping ratios and unknowns went from one result to another.
+    """Changes of frequencies, damping ratios and unknowns from one result to another.
 
     Modes go to those that are nearest together, within 10 % in frequency; where both have as many sensors, to those
     whose shapes are alike (MAC).

@@ -1,4 +1,4 @@
-"""What many draws of noise say of an answer's uncertainty, beside the linear one."""
+"""Spread of an answer over many draws of noise, beside the linear one."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ def runs_in_time(test: Measurement) -> list[RunInTime]:
 
 
 def levels_are_known(test: Measurement) -> bool:
-    """Whether the spectra have the unit of `from_time`, m/s² s: the scale of those that were given is free."""
+    """True where the spectra have the unit of `from_time`, m/s² s: the scale of those that were given is free."""
     return test.whole is not None or test.sample_rate is not None
 
 
@@ -67,7 +67,7 @@ def peaks(test: Measurement) -> list[float]:
 
 
 def cut_in_motion(test: Measurement, parts: int = 64, at_rest: float = 0.1) -> bool:
-    """Whether plain spectra are those of records that neither begin nor end at rest.
+    """True where plain spectra are those of records that neither begin nor end at rest.
 
     At rest the first or last of so many `parts` of a run holds no more than this share of its mean square.
     """
@@ -82,7 +82,7 @@ def cut_in_motion(test: Measurement, parts: int = 64, at_rest: float = 0.1) -> b
 
 
 def quiet_levels(test: Measurement) -> NoiseLevels | None:
-    """What the quietest parts of each run hold, as levels of noise, (runs, channels) each.
+    """Levels of noise of the quietest parts of each run, (runs, channels) each.
 
     Noise is no larger, and as large where all was at rest for a while. None where spectra are not those of whole
     records, or lines are too few.

@@ -78,7 +78,7 @@ def check_runs(
 
 
 def directions(runs: Any) -> int:
-    """How many directions the base has in the first run, as far as it can be told; `check_runs` looks closer."""
+    """Number of directions of the base in the first run, as far as it can be told; `check_runs` looks closer."""
     try:
         return int(np.atleast_2d(np.asarray(runs[0][0])).shape[0])
     except (TypeError, IndexError, KeyError, ValueError):

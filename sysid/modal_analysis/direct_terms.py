@@ -1,4 +1,4 @@
-"""What the absolute motion of the sensors is beside all modes: their rigid-body motion and their delay, as recorded.
+"""Absolute motion of the sensors beside all modes: their rigid-body motion and their delay, as recorded.
 
 Absolute accelerations are ``(G + sum of R_k g_k) u_0''``. With poles, residues and a term without poles free, that term
 tells what each sensor's row of G would have to be, whatever was stated of it. A record that is late by tau has

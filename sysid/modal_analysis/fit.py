@@ -81,7 +81,7 @@ def _fitted(test: Measurement, poles: Poles, monitor: Monitor | None) -> RecordF
 
 
 def _same_modes(modes: Modes, poles: Poles) -> bool:
-    """Whether there are as many, each pole within the half-power width of a mode, and each mode of a pole."""
+    """True where there are as many, each pole within the half-power width of a mode, and each mode of a pole."""
     if modes.omega.size != poles.omega.size:
         return False
     apart = np.abs(np.log(poles.omega / modes.omega[:, None])) / (2 * modes.ratios[:, None])
@@ -139,7 +139,7 @@ def _at_lines(test: Measurement, parts: list[list[NDArray[Any]]]) -> NDArray[Any
 
 
 def fit_modes(test: Measurement, *, monitor: Monitor | None = None) -> ModalEstimate:
-    """What a test tells of its modes: of whole records with their transients and noise; other lines stand as given.
+    """Estimate the modes of a test: of whole records with their transients and noise; other lines stand as given.
 
     Parameters
     ----------

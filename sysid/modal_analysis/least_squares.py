@@ -83,7 +83,7 @@ def minimise(
 
 
 def units_of(normal: Array) -> Array:
-    """What each unknown moves by to show as much as the noise; zero for one that shows nowhere, but for round-off."""
+    """Step of each unknown that shows as much as the noise; zero for one that shows nowhere, but for round-off."""
     known = np.diag(normal)
     return np.where(known > np.finfo(float).tiny, 1 / np.sqrt(np.maximum(known, np.finfo(float).tiny)), 0.0)
 

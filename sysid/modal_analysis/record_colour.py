@@ -28,7 +28,7 @@ def interpolation_matrix(middles: Array, first: float, last: float) -> Array:
 
 
 def designs(middles: Array, ends: tuple[float, float], varies: NDArray[np.bool_]) -> list[Array]:
-    """What the numbers of a run make of the logarithms of all levels, (channels, numbers) a stretch.
+    """Matrices from the numbers of a run to the logarithms of all levels, (channels, numbers) a stretch.
 
     Parameters
     ----------

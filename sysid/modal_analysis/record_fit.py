@@ -33,7 +33,7 @@ Monitor = Callable[[int, float], object]
 
 
 class Limits(NamedTuple):
-    """How far a fit goes at most: rounds of modes and levels in turn, steps of each round."""
+    """Limits of a fit: rounds of modes and levels in turn, steps of each round."""
 
     rounds: int
     steps: int
@@ -323,7 +323,7 @@ def without(fit: RecordFit, k: int) -> Parameters:
 
 
 def worth(fit: RecordFit, normal: Array | None = None) -> Array:
-    """What ``e' S^-1 e`` would about rise by without each mode, (m,): all else moves as far as it is free.
+    """Rise of ``e' S^-1 e``, about, without each mode, (m,): all else moves as far as it is free.
 
     With `normal` in place of the fit's ``Re J' S^-1 J``, as of lines that count for less.
     """

@@ -33,7 +33,7 @@ class Layer(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """How the columns of a run's Jacobian are made of its spectra, each the sum of its entries in all layers.
+    """Columns of a run's Jacobian by its spectra, each the sum of its entries in all layers.
 
     `unknowns` (k,) are those that show in this run. The first layer has an entry of each.
     """
@@ -118,7 +118,7 @@ class RecordModel(SpectralModel):
         return self.whole.transients(freq)
 
     def trace_spectra(self, freq: Array) -> ComplexArray:
-        """What the traces of a channel are multiples of, (TRACES, L)."""
+        """Spectra of which the traces of a channel are multiples, (TRACES, L)."""
         unit = freq / self.test.freq[-1]
         return np.stack([np.ones_like(unit) + 0j, 1j * unit, -1j / unit])
 
@@ -233,7 +233,7 @@ class Chunk(Lines):
         self.records = model
 
     def columns(self) -> Columns:
-        """How the columns of all channels are made of the spectra."""
+        """Columns of all channels by the spectra."""
         every = np.array([self.coefficients(channel) for channel in range(self.records.channels)])
         row, spectrum = np.nonzero(np.any(every != 0, axis=0))
         unknowns, starts, count = np.unique(row, return_index=True, return_counts=True)
@@ -245,7 +245,7 @@ class Chunk(Lines):
         return Columns(unknowns, layers)
 
     def coefficients(self, channel: int) -> Array:
-        """How the columns of a channel's Jacobian are made of the spectra, (p, spectra)."""
+        """Coefficients of the columns of a channel's Jacobian by the spectra, (p, spectra)."""
         model = self.records
         n, m, d, index = model.n, model.m, model.d, model.index
         k = np.arange(m)

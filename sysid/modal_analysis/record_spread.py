@@ -69,7 +69,7 @@ def scatter_over_blocks(fit: RecordFit, partitions: int = 4) -> Array:
 
 
 def uneven(fit: RecordFit, mean: float = 1.0) -> bool:
-    """Whether the power of what is left differs between blocks of lines, and from its mean, by more than chance.
+    """True where the power of what is left differs between blocks of lines, and from its mean, by more than chance.
 
     In all blocks together, or rises above it in one.
     """

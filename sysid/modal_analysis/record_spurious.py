@@ -71,5 +71,5 @@ def worth_beyond_misfit(fit: RecordFit) -> Array:
 
 
 def _by_block(blocks: list[NDArray[np.intp]], power: Array, channels: int) -> Array:
-    """What is left of a line in its block, in units of the noise, one at least, (L,)."""
+    """Misfit about a line in its block, in units of the noise, one at least, (L,)."""
     return np.concatenate([np.full(lines.size, max(1.0, power[lines].mean() / channels)) for lines in blocks])

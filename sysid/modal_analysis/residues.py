@@ -47,7 +47,7 @@ class ResidueFit:
 
     @cached_property
     def left(self) -> Array:
-        """What the poles leave of the records, (rows, channels)."""
+        """Records less the contributions of the poles, (rows, channels)."""
         return self.data - self.Q @ self.answered
 
     @cached_property
@@ -74,16 +74,16 @@ class ResidueFit:
 
     @property
     def _is_large(self) -> bool:
-        """Whether round-off in differences of squares does not matter to what is left, which need not be formed."""
+        """True where round-off in differences of squares does not matter to what is left, which need not be formed."""
         return self._difference > NEGLIGIBLE * self.size
 
     @property
     def gain(self) -> Array:
-        """What the squared error would rise by without each pole, (m,)."""
+        """Rise of the squared error without each pole, (m,)."""
         return np.sum(self.whitened**2, axis=(1, 2))
 
     def rise_with_one_less(self, poles: NDArray[np.intp]) -> float:
-        """What the squared error would at least rise by with one pole less for these, all others unchanged.
+        """Least rise of the squared error with one pole less for these, all others unchanged.
 
         A pole has one function of frequency for each input, whatever its frequency.
         """
@@ -265,7 +265,7 @@ class SubsetFits:
         self._quadratic = _lagged(lambda lag: _products(basis, basis, lag))
 
     def worth(self, kept: NDArray[np.intp]) -> tuple[Array, float]:
-        """What the squared error of the poles `kept` would rise by without each, over the noise, (len(kept),).
+        """Rise of the squared error of the poles `kept` without each, over the noise, (len(kept),).
 
         Returns
         -------

@@ -235,7 +235,7 @@ def _eliminated(
 
 
 def _is_definite(matrix: Array) -> bool:
-    """Whether a symmetric matrix has positive curvature in all directions, by more than round-off."""
+    """True where a symmetric matrix has positive curvature in all directions, by more than round-off."""
     size = np.diag(matrix)
     if np.any(size <= 0):
         return False

@@ -105,7 +105,7 @@ def _stretch(piece: Piece, every: RecordFit, test: Measurement) -> Stretch:
 
 
 def _noise_at_peaks(fit: RecordFit, about: int = 12, explained: int = 2) -> Array:
-    """What noise there is about each mode, over the levels, (m,): that of the base is larger there than elsewhere.
+    """Noise about each mode, over the levels, (m,): that of the base is larger there than elsewhere.
 
     Each line counts by what it tells of the frequency of the mode: the power of the response's slope in it. The few
     lines at a peak may leave nothing beside poles and transients: what the base's noise makes there is told by lines

@@ -228,7 +228,7 @@ def check_rigid(stiffness: ca.MX, rigid_body: Array) -> None:
 
 
 def _strains(K: Array, rigid_body: Array) -> bool:
-    """Whether a stiffness (n + d, n + d) holds a rigid structure to the ground."""
+    """True where a stiffness (n + d, n + d) holds a rigid structure to the ground."""
     n = len(rigid_body)
     return bool(np.abs(K[:, :n] @ rigid_body + K[:, n:]).max() > 1e-6 * np.abs(K).max())
 

@@ -24,7 +24,7 @@ _HOLLOW: dict[str, Any] = {"marker": "o", "markerfacecolor": "white", "markersiz
 
 
 def comparison(compared: Comparison, title: str = "") -> Figure:
-    """What each method had reached at which time: a line a method, the search thick and the local phase thin.
+    """Draw what each method had reached at which time: a line a method, the search thick and the local phase thin.
 
     A hollow marker is where the local phase begins, a filled one the end. Where peaks are widened on the way, the
     search is dotted, as its objective is of other records, and a straight line leads to the end. Below, where the truth

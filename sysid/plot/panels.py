@@ -57,7 +57,7 @@ class PlottedChannel(NamedTuple):
 
 
 def run_names(test: Measurement) -> tuple[str, ...]:
-    """What each run is called in a title: "base x" for unit runs, else "run 1"."""
+    """Names of the runs in a title: "base x" for unit runs, else "run 1"."""
     if test.has_unit_runs:
         return tuple(f"base {name}" for name in test.base_axes or ())
     return tuple(f"run {r + 1}" for r in range(test.n_runs))

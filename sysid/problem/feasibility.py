@@ -1,4 +1,4 @@
-"""Whether a problem can be searched at all: asked before anything runs."""
+"""Checks that a problem can be searched at all, before anything runs."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _positive(matrix: Array) -> bool:
 
 
 def scale_of(formulation: Formulation, points: Array) -> Array:
-    """How much each constraint varies over the search space, (rows,)."""
+    """Variation of each constraint over the search space, (rows,)."""
     values = np.array([formulation.constraints.at(x) for x in points])
     with np.errstate(invalid="ignore"):
         spread = np.nanmax(np.abs(np.where(np.isfinite(values), values, np.nan)), axis=0, initial=0.0)

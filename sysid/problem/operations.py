@@ -104,7 +104,7 @@ def casadi_name(number: int) -> str:
 
 
 def has_library(kind: str, name: str) -> bool:
-    """Whether a solver or an interpolant comes with CasADi: its library stands in CasADi's own folder."""
+    """True where a solver or an interpolant comes with CasADi: its library stands in CasADi's own folder."""
     return any(Path(ca.__file__).parent.glob(f"libcasadi_{kind}_{name}.*"))
 
 

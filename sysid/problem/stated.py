@@ -1,4 +1,4 @@
-"""What a user states of an identification problem: a measurement, its matrices, and what else is known."""
+"""Statements of a user about an identification problem: a measurement, its matrices, and what else is known."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ class StatedProblem:
 
     @property
     def states_frequencies(self) -> bool:
-        """Whether the stiffness states natural frequencies of its own, so that none are looked for."""
+        """True where the stiffness states natural frequencies of its own, so that none are looked for."""
         return getattr(self.stiffness, "natural_frequencies", None) is not None
 
     @cached_property

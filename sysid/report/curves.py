@@ -61,7 +61,7 @@ def curves(it: Identification, test: Measurement, level: NoiseLevel) -> str:
 
 
 def _legend(channels: Sequence[ChannelSpectra], *, at_most: bool) -> str:
-    """What each line is, of those that are drawn."""
+    """Legend of the lines that are drawn."""
     keys = {"measured": "measured", "identified": "identified", "left": "their difference"}
     if any(channel.noise is not None for channel in channels):
         keys["noise"] = f"noise{' at most, by the quietest lines' * at_most} (standard deviation)"
@@ -149,7 +149,7 @@ def _forces(it: Identification, test: Measurement, level: NoiseLevel) -> Iterato
 
 
 def _channel_content(runs: list[ChannelSpectra]) -> dict[str, Any]:
-    """What the script draws of a channel, by its runs."""
+    """Data of a channel for the script, by its runs."""
     first = runs[0]
     found: dict[str, Any] = {"name": first.name, "words": first.words, "unit": first.unit}
     for name in ("measured", "identified"):
@@ -168,7 +168,7 @@ def _of(runs: list[ChannelSpectra], name: str) -> list[NDArray[Any]]:
 
 
 def _against_base(test: Measurement, moves: Array) -> ComplexArray:
-    """What turns the phases of each run to those against one base direction, (runs, n_freq).
+    """Factor that turns the phases of each run to those against one base direction, (runs, n_freq).
 
     That which moves the channel most with it, by `moves`, (d,): a sensor's row of G.
     """

@@ -23,7 +23,7 @@ class NoiseLevel(NamedTuple):
 
     @property
     def bound(self) -> str:
-        """What stands behind a figure of it."""
+        """Sign that stands behind a figure of it."""
         return " at most" * self.at_most
 
 

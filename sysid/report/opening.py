@@ -66,7 +66,7 @@ def _reasons(it: Identification) -> str:
 
 
 def _steps(it: Identification) -> list[str]:
-    """What to do next, the first thing first."""
+    """Steps to do next, the first thing first."""
     steps = [sentence(step) for step in next_steps(it)]
     if steps:
         return steps

@@ -88,7 +88,7 @@ class Scores(NamedTuple):
 
 
 def scores(structure: Structure, test: Measurement) -> Scores:
-    """How well `structure` predicts a test, sensor by sensor; 1 is perfect."""
+    """Scores of a test as `structure` predicts it, sensor by sensor; 1 is perfect."""
     with_base = np.einsum("sd,rdf->rsf", test.rigid_body, test.base)
     predicted = test.predict(structure)
     absolute, rigid = (_score(moved, test.response) for moved in (predicted + with_base, with_base))
@@ -255,7 +255,7 @@ def _responses(it: Identification, test: Measurement, level: NoiseLevel) -> str:
 
 
 def _residuals(it: Identification, level: NoiseLevel) -> str:
-    """What the fit leaves of each channel, beside its noise."""
+    """Residual of each channel, beside its noise."""
     test = _as_fitted(it, it.measurement)
     left = [1 - score for score in scores(it.structure, test).relative]
     channels = [*zip(test.sensor_names, left, share_of_noise(level.response, test.relative), strict=True)]
@@ -406,7 +406,7 @@ def _convergence(it: Identification) -> str:
 
 
 def _falls(it: Identification) -> bool:
-    """Whether there is a search to be seen: a swarm's, or one whose objective fell by more than a tenth."""
+    """True where there is a search to be seen: a swarm's, or one whose objective fell by more than a tenth."""
     local = it.history.local_curve
     return bool(it.history.swarm_curve.size or (local.size > 1 and local[-1] < 0.9 * local[0]))
 
@@ -431,7 +431,7 @@ def _effective_masses(it: Identification) -> str:
 
 
 def _how(it: Identification) -> str:
-    """What was minimised and how it ended, in the words of the search."""
+    """Objective and end of the search, in its own words."""
     all_records = "over the relative accelerations of all runs, sensors and lines, unweighted"
     all_records += "; outliers that stand alone are left out" * (it.records.loss == "huber")
     of = all_records if it.residuals else "of the misfit that the problem states"

@@ -169,7 +169,7 @@ def room_of_modes(points: Array, shapes: Array) -> float:
 
 
 def _seen(points: Array, size: float) -> Array:
-    """What the eye sees of points, slightly from above: pixels to the right and down, (p, 2)."""
+    """Projection of points as seen slightly from above: pixels to the right and down, (p, 2)."""
     (x, y, z), c, s = points.T, np.cos(_ANGLE), np.sin(_ANGLE)
     right, down = c * x - s * y, 0.3 * (s * x + c * y) - 0.95 * z
     return np.column_stack([_MODE_WIDTH / 2 + size * right, (_MODE_HEIGHT + 30) / 2 + size * down])

@@ -44,7 +44,7 @@ _CONTENT, _FORMAT = "unfinished search", 1
 
 @dataclass(frozen=True)
 class RunRequest:
-    """How a command line began a search.
+    """Arguments with which a command line began a search.
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ class Checkpoint:
 
     @property
     def exists(self) -> bool:
-        """Whether there is an unfinished search."""
+        """True where there is an unfinished search."""
         return self.path.is_file()
 
     def read(self) -> Tree:

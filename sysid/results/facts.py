@@ -1,4 +1,4 @@
-"""What summary, report and export ask of a problem beside its records, as plain facts, which files can hold."""
+"""Facts of a problem beside its records that summary, report and export ask for, and that files can hold."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class ReportedUnknown(NamedTuple):
 
 
 class Facts(NamedTuple):
-    """What readers of a result ask of its problem.
+    """Facts of a problem for readers of a result.
 
     Attributes
     ----------

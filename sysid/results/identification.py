@@ -37,7 +37,7 @@ _PLAIN = (
 
 @dataclass(frozen=True)
 class Recipe:
-    """What rebuilds a problem elsewhere: its module and what was passed to ``problem()``.
+    """Recipe that rebuilds a problem elsewhere: its module and what was passed to ``problem()``.
 
     Attributes
     ----------
@@ -122,7 +122,7 @@ def _literal(name: str, text: Any) -> Any:
 
 
 def _option_in_words(name: str, value: Any) -> str:
-    """What was said of a test that was read from files: "0.5-40 Hz"; another parameter as it was given."""
+    """Option of a test that was read from files, in words: "0.5-40 Hz"; another parameter as it was given."""
     parts = value if isinstance(value, list | tuple) else [value]
     said = ("-" if name == "band" else " and ").join(str(part).removesuffix(".0") for part in parts)
     words = {
@@ -386,7 +386,7 @@ def _in_words(unknowns: list[tuple[str, tuple[int, ...]]]) -> str:
 
 
 def _is_plain(value: Any) -> bool:
-    """Whether a value can be written as text and read again, here and in JSON."""
+    """True where a value can be written as text and read again, here and in JSON."""
     try:
         json.dumps(value, allow_nan=False)
         return bool(ast.literal_eval(repr(value)) == value)
@@ -407,5 +407,5 @@ def _finite(numbers: Mapping[str, float]) -> dict[str, float | None]:
 
 
 def _if_given(convert: Callable[[Any], Any], value: Any) -> Any:
-    """What `convert` makes of a value; None where there is none."""
+    """Value by `convert`; None where there is none."""
     return None if value is None else convert(value)

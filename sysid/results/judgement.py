@@ -33,7 +33,7 @@ _NOT_JUDGED = Finding(
 
 
 class Verdict(NamedTuple):
-    """Whether where a search ended is a fit, and why not, with what the solver says."""
+    """Verdict on where a search ended: a fit or why not, with what the solver says."""
 
     success: bool
     message: str
@@ -81,7 +81,7 @@ def judge(problem: Problem, prepared: Prepared, end: Outcome, why: str, seed: in
 
 
 def verdict_of(problem: Prepared, end: Outcome) -> Verdict:
-    """Whether where a search ended is a fit."""
+    """Judge where a search ended: a fit or not."""
     return _verdict(Context(problem, end))
 
 

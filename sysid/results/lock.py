@@ -161,7 +161,7 @@ def _process_record() -> str:
 
 
 def _is_alive(record: str) -> bool:
-    """Whether the process of a record is there; one on another host is taken to be."""
+    """True where the process of a record is there; one on another host is taken to be."""
     host, pid, started = record.split(" ")
     if host != socket.gethostname():
         return True

@@ -1,4 +1,4 @@
-"""What each phase of a search left, in residual and, where the truth is known, in its modes and matrices."""
+"""Table of the phases of a search: residual and, where the truth is known, errors of modes and matrices."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class Searched(Protocol):
 
     @property
     def prepared(self) -> Prepared:
-        """What was identified."""
+        """The problem that was identified."""
 
     @property
     def history(self) -> History:
-        """How."""
+        """The history of its search."""
 
     @property
     def structure(self) -> Structure:

@@ -1,4 +1,4 @@
-"""What summary, report and export ask of a problem, as a tree: for files that do not hold all of their problem."""
+"""Tree of what summary, report and export ask of a problem: for files that do not hold all of their problem."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ def _structure(problem: Prepared, first: Structure, before: Array, after: Array,
 def _contradictions(
     problem: Prepared, stated: Statements, best: Adjusted, theta: Array, index: Index, normals: Array
 ) -> Iterator[Finding]:
-    """Whether statements and records disagree beyond chance, and which statements explain it."""
+    """Statements and records that disagree beyond chance, and which statements explain it."""
     numbers = _numbers(problem, index)
     if _chance(best, numbers) >= FALSE_ALARM:
         return

@@ -109,7 +109,7 @@ def _gains(it: Answer) -> list[str]:
 
 
 def noise_source(it: Answer) -> str:
-    """Whether levels of noise were stated or found."""
+    """Source of the levels of noise, in words: stated or found."""
     whole = it.records.measurement.whole
     return "as stated" if whole is not None and whole.noise is not None else "found with the fit"
 
@@ -124,7 +124,7 @@ def residual_in_words(it: Answer) -> str:
 
 
 def verdict(it: Answer) -> str:
-    """What the judgement means for this answer."""
+    """Meaning of the judgement for this answer."""
     match it.judgement:
         case "no fit":
             return "these matrices do not explain the records as they should"
@@ -152,7 +152,7 @@ def fitted_in_words(it: Answer) -> str:
 
 
 def next_steps(it: Answer) -> list[str]:
-    """What would close what is open, in sentences."""
+    """Steps that would close what is open, in sentences."""
     if it.determined or it.hurried or it.of_kind("not judged"):
         return []
     if not it.success:
@@ -178,7 +178,7 @@ def next_steps(it: Answer) -> list[str]:
 
 
 def _towards_a_fit(it: Answer) -> list[str]:
-    """What to do where there is no fit, the first thing first."""
+    """Steps towards a fit where there is none, the first thing first."""
     if it.interrupted:
         return ["let the search end: 'sysid run --resume FOLDER' goes on with one that the command line began"]
     if it.records.goal is not None:
@@ -264,7 +264,7 @@ def _mode_table(it: Answer) -> list[str]:
 
 
 def missing_mass(it: Answer) -> list[str]:
-    """What of the rigid-body mass is in none of the modes, in a sentence, where it is no round-off of a table."""
+    """Sentence on the rigid-body mass in none of the modes, where it is no round-off of a table."""
     missing, many = 100 - it.structure.effective_mass_percent.sum(axis=0), np.any(is_one_of_many(it), axis=0)
     shares = [
         f"{tilde(one)}{share:.3g} % in {axis}"
@@ -316,7 +316,7 @@ def _rigid_masses(it: Answer, axes: Sequence[str]) -> Iterator[str]:
 
 
 def _ranges(it: Answer) -> Iterator[str]:
-    """How far the diagonals may go, in one line, where something may move; where that takes time, what computes it."""
+    """Ranges of the diagonals, in one line, where something may move; where that takes time, what computes them."""
     if it.scale_is_open:
         return
     ends = it.intervals_at_once

@@ -30,7 +30,7 @@ class Row(NamedTuple):
 
 
 def stated_values(it: Answer) -> list[str]:
-    """How far each value that was stated as known is missed, in words."""
+    """Sentences on how far each value that was stated as known is missed."""
     return [f"{name} ends {z:+.2g} standard deviations from the value stated as known" for name, z in it.facts.misses]
 
 

@@ -70,7 +70,7 @@ class Continuation:
 
 
 def smoothed_tests(problem: Prepared, monitor: Callable[[int, float], object] | None = None) -> _Smoother | None:
-    """What stands for each fitted test at complex frequencies; None where one shows no poles, or none is fitted."""
+    """Fitted tests at complex frequencies; None where one shows no poles, or none is fitted."""
     if not problem.formulation.fits_records:
         return None
     terms = problem.formulation.tests
@@ -230,7 +230,7 @@ class _Run:
         self.stopped = answer.stopped
 
     def _good(self, objective: float, best: LocalResult) -> bool:
-        """Whether the data let a structure be hardly better."""
+        """True where the data let a structure be hardly better."""
         problem = self.problem
         if problem.stated.goal is not None:
             return problem.residual(best.x) <= problem.stated.goal
@@ -241,7 +241,7 @@ class _Run:
         return float(np.sqrt(max(objective**2 - of_terms, 0.0))) <= max(_NEAR * self.smoother.floor, EXACT)
 
     def _unanimous(self, best: LocalResult) -> bool:
-        """Whether three starts or more all ended at the best end, at a fit of sorts: only a wrong model leaves more."""
+        """True where three starts or more all ended at the best end, a fit of sorts: only a wrong model leaves more."""
         same = [apart(self.problem, best.x, answer.x) < OTHER_ANSWER for _, answer in self.ends]
         return all(same) and len(same) + self.joined >= 3 and self.problem.residual(best.x) < UNEXPLAINED
 

@@ -266,7 +266,7 @@ def _derivatives(z: NonlinearProgram, y: ca.MX, error: InverseFactorError, psi_0
 
 
 def _left_in_words(problem: Prepared, z: NonlinearProgram, derivatives: dict[str, ca.Function], at: Array) -> str:
-    """How much chi² an end that is no solution leaves to gain: half the Newton decrement, beside what is left in all.
+    """Gain in chi² that an end that is no solution leaves: half the Newton decrement, beside what is left in all.
 
     What a fit leaves in all counts as one for each degree of freedom, as noise of its size does.
     """

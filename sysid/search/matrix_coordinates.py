@@ -82,7 +82,7 @@ def terms_with(formulation: Formulation, smoothed: Sequence[TestTerm]) -> list[T
 
 
 def needs_modes(formulation: Formulation) -> bool:
-    """Whether modes are further unknowns: damping by ratios has no direct solve."""
+    """True where modes are further unknowns: damping by ratios has no direct solve."""
     return formulation.fits_records and formulation.matrices.by_ratios
 
 

@@ -99,7 +99,7 @@ class Modal:
 
 @dataclass(frozen=True, eq=False)
 class DegreesOfFreedom:
-    """What the degrees of freedom of a modal model are.
+    """Degrees of freedom of a modal model.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ def degrees_of_freedom(problem: Prepared, modes: Modes, stated: Sequence[str | i
 
 
 def _independent_sensors(test: Measurement, modes: Modes) -> int:
-    """How many combinations of sensors move in the modes by more than noise would make of them.
+    """Number of combinations of sensors that move in the modes by more than noise would make of them.
 
     Motions are judged, not shapes: two modes that nearly share a pole have shapes that are uncertain and nearly
     parallel, while their sum and their difference in the records are well known. Of r combinations the sum of all
@@ -275,7 +275,7 @@ def _in_unknowns(
 
 
 def objective_of(problem: Prepared, structure: Structure, x: Array | None) -> float:
-    """What the fit leaves; where modes are free from the structure alone, without any graph of the matrices."""
+    """Objective at an answer; where modes are free from the structure alone, without any graph of the matrices."""
     if x is not None and not problem.free_modes:
         return problem.objective(x)
     left = weighted_error(problem.measurement, structure)
@@ -283,7 +283,7 @@ def objective_of(problem: Prepared, structure: Structure, x: Array | None) -> fl
 
 
 def _coordinates(problem: Prepared, chosen: DegreesOfFreedom) -> list[str]:
-    """What the degrees of freedom are, in words."""
+    """Degrees of freedom, in words."""
     names = problem.measurement.sensor_names
     return [names[i] for i in chosen.sensors] + [f"the coordinate of mode {k + 1}" for k in chosen.modes]
 

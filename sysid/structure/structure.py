@@ -193,7 +193,7 @@ class Structure:
 
     @property
     def at_sensors(self) -> bool:
-        """Whether the degrees of freedom are the sensors, one each and in their order."""
+        """True where the degrees of freedom are the sensors, one each and in their order."""
         return self.n == self.n_sensors and np.array_equal(self.recovery, np.eye(self.n))
 
     @property

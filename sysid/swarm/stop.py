@@ -52,7 +52,7 @@ class StopRules:
         as_float("stall_tolerance", self.stall_tolerance, "a part of the cost, in [0, 1),", at_least=0, below=1)
 
     def room_for(self, n_rows: int, nfev: int) -> bool:
-        """Whether `n_rows` more rows may be evaluated after `nfev`."""
+        """True where `n_rows` more rows may be evaluated after `nfev`."""
         return self.max_evaluations is None or nfev + n_rows <= self.max_evaluations
 
     def reason(self, swarm: ParticleSwarm, seconds: float) -> StopReason | None:
@@ -100,7 +100,7 @@ class StopRules:
 
 
 def stalled(history: list[float], iterations: int, tolerance: float) -> bool:
-    """Whether the best cost fell by no more than `tolerance` times itself over the last `iterations`."""
+    """True where the best cost fell by no more than `tolerance` times itself over the last `iterations`."""
     if len(history) <= iterations:
         return False
     before, now = history[-1 - iterations], history[-1]

@@ -64,7 +64,7 @@ def _of_records(formulation: Formulation, modal: ModalEstimate, structure: Struc
 
 
 def _at_rest(modal: ModalEstimate) -> Iterator[Finding]:
-    """Whether runs of whole records are at rest at both ends where it is stated."""
+    """Runs of whole records are not at rest at both ends, where it is stated."""
     runs = modal.records.n_runs
     for run in modal.in_motion:
         yield Finding(
@@ -78,7 +78,7 @@ def _at_rest(modal: ModalEstimate) -> Iterator[Finding]:
 def _misfit(
     formulation: Formulation, test: Measurement, structure: Structure, records: Records, free: ResidueFit
 ) -> Iterator[Finding]:
-    """Whether the structure leaves clearly more of the accelerations than free residues, at its poles or the data's."""
+    """The structure leaves clearly more of the accelerations than free residues, at its poles or the data's."""
     mass = formulation.mass
     stated = "the written model" if mass.entries is None else "the stated mass model"
     model = "the structure" if mass.free else stated
@@ -108,7 +108,7 @@ def _misfit(
 
 
 def _rigid(modal: ModalEstimate, records: Records, free: ResidueFit) -> Iterator[Finding]:
-    """Whether sensors move in a constant proportion to the base beside their modes: then rigid_body is wrong."""
+    """Sensors move in a constant proportion to the base beside their modes: then rigid_body is wrong."""
     test = modal.records
     if modal.has_modes:  # beside the noise of the base, which biases what follows
         moved, chi2 = modal.gain.rigid.copy(), modal.gain.rigid_chi2
@@ -149,7 +149,7 @@ def _along_the_base(test: Measurement, records: Records, free: ResidueFit) -> tu
 
 
 def _damping(records: Records, poles: tuple[Array, Array], free: ResidueFit) -> Iterator[Finding]:
-    """Whether residues in quadrature, which normal modes have not, stand out: on the basis {g, i w g}."""
+    """Residues in quadrature, which normal modes have not, stand out: on the basis {g, i w g}."""
     if records.data.shape[0] <= 4 * poles[0].size * records.n_base:
         return
     both = records.fit(*poles, velocity=True)

@@ -168,7 +168,7 @@ def _pressing(found: Sequence[OnBound], press: Pressure) -> Finding:
 
 
 class Pressure(NamedTuple):
-    """What is gained, to first order, if unknowns on bounds may pass them.
+    """The gain, to first order, if unknowns on bounds may pass them.
 
     ``share`` is that of the squared misfit; ``significant`` that noise does not gain as much by chance.
     """
@@ -178,17 +178,17 @@ class Pressure(NamedTuple):
 
     @property
     def explains(self) -> bool:
-        """Whether the bounds are a cause of the misfit."""
+        """True where the bounds are a cause of the misfit."""
         return self.significant and self.share >= _SHARE
 
 
 def bounds_explain(problem: Prepared, structure: Structure, x: Array | None) -> bool:
-    """Whether bounds on which unknowns end are a cause of the misfit."""
+    """True where bounds on which unknowns end are a cause of the misfit."""
     return pressure(problem, structure, x, on_bounds(problem, structure, x)).explains
 
 
 def pressure(problem: Prepared, structure: Structure, x: Array | None, found: Sequence[OnBound]) -> Pressure:
-    """How much of the misfit unknowns on bounds would take away.
+    """The part of the misfit that unknowns on bounds would take away.
 
     The squared misfit less that of the linear least squares about x: with all unknowns free, over those with the ones
     on bounds held. Where modes are free the misfit of free residues, at the structure's poles over those at the data's.

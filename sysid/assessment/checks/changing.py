@@ -94,7 +94,7 @@ class Change:
         return float(found.statistic) if found.pvalue < chance and abs(found.statistic) > in_time else 0.0
 
     def in_words(self) -> tuple[str, str]:
-        """How the frequency changes, and what to do."""
+        """The way in which the frequency changes, and what to do."""
         records = list(dict.fromkeys(one.record for one in self.seen))
         by_record = {record: [one for one in self.seen if one.record == record] for record in records}
         within = np.mean([np.var([one.frequency for one in part]) for part in by_record.values()])

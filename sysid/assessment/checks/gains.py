@@ -77,7 +77,7 @@ class GainErrors:
 
 
 def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
-    """What the constant terms of a test say of its sensors' gains, at the poles of the structure that was fitted to it.
+    """Errors of sensors' gains by the constant terms of a test, at the poles of the structure that was fitted to it.
 
     Each is estimated twice, beside the modes alone and beside a part that grows as w² too. The first is the more
     exact, but right only where no mode lies above the lines: by how much the two differ counts among its errors. The
@@ -110,7 +110,7 @@ def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
 
 
 def _beyond(error: Array, std: Array) -> Array:
-    """What chance does not explain of errors with these deviations, in 95 % of right tests none of any sensor."""
+    """The part of errors with these deviations beyond chance, in 95 % of right tests none of any sensor."""
     likely = most_deviations(2 * error.size, 1 - COVERAGE)  # of two estimates each
     return np.sqrt(np.maximum(error**2 - (likely * std) ** 2, 0.0))
 
@@ -166,7 +166,7 @@ def assumed_totals(context: Context) -> Iterator[Finding]:
 
 
 def taken_at_sensors(problem: Prepared) -> Iterator[Finding]:
-    """What a stated total of a lumped mass assumes, which accelerations cannot contradict."""
+    """The assumption of a stated total of a lumped mass, which accelerations cannot contradict."""
     totals, geometry = problem.formulation.mass.totals, problem.geometry
     if totals is None or totals.kind != "sensors" or problem.measurement.force is not None:  # which contradicts
         return

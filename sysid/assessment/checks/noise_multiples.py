@@ -53,7 +53,7 @@ class JudgedRecord(NamedTuple):
 
 
 def misses_of(problem: Prepared, structure: Structure, x: Array | None) -> list[Miss]:
-    """What the structure misses of accelerations and base force of each test that is fitted.
+    """Misfit of the structure to accelerations and base force of each test that is fitted.
 
     Records whose noise is neither stated nor to be found are left out; numbers that stand alone are not counted.
 
@@ -137,7 +137,7 @@ def _near_modes(modal: ModalEstimate, structure: Structure) -> NDArray[np.bool_]
 
 
 def _miss(record: JudgedRecord, test: Measurement, found: bool, near: NDArray[np.bool_]) -> Iterator[Miss]:
-    """What is left of one record in units of its noise; `found`: with the fit, so that it holds errors of the model.
+    """Misfit to one record in units of its noise; `found`: with the fit, so that it holds errors of the model.
 
     Of noise that is not stated, what stands out far from all modes is a part, such as hum.
     """
@@ -165,7 +165,7 @@ def _miss(record: JudgedRecord, test: Measurement, found: bool, near: NDArray[np
 def _quiet(
     left: ComplexArray, variance: Array, in_run: NDArray[np.bool_], size: int = 16, least: int = 8, share: float = 0.25
 ) -> Array | None:
-    """What the quietest `share` of blocks of lines holds, over the variance, (runs, channels); None with few blocks."""
+    """Power over the variance in the quietest `share` of blocks of lines, (runs, channels); None with few blocks."""
     out = np.ones(left.shape[:2])
     mean = float(scipy.special.gammaincinv(size, share)) / size
     for run, lines in enumerate(in_run):
@@ -197,7 +197,7 @@ def noise_at_most(test: Measurement, left: ComplexArray) -> Array | None:
 
 
 def misses_of_test(test: Measurement, structure: Structure) -> list[Miss]:
-    """What a structure misses of a test that was not fitted."""
+    """Misfit of a structure to a test that was not fitted."""
     modal = ModalEstimate.of_lines(test)
     near = _near_modes(modal, structure)
     return [miss for record in _records(modal, structure) for miss in _miss(record, test, False, near)]

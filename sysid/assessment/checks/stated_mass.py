@@ -33,7 +33,7 @@ def stated_masses(context: Context) -> Iterator[Finding]:
 
 
 def _stated_mass(problem: Prepared, structure: Structure) -> Iterator[Finding]:
-    """What the base force weighs, where a stated mass says otherwise."""
+    """The base force weighs another mass than the stated one."""
     test, stated = problem.measurement, problem.formulation.mass
     whole = stated.totals is not None or np.all(np.isfinite(problem.known_mass))
     if test.force is None or stated.weighs or not whole or not structure.modal_damping:
@@ -56,7 +56,7 @@ def _stated_mass(problem: Prepared, structure: Structure) -> Iterator[Finding]:
 
 
 def _known_entries(problem: Prepared, structure: Structure) -> Iterator[Finding]:
-    """Whether known entries are used, and leave the base what is left of the total."""
+    """Known entries of the mass are not used, or are more than the stated total."""
     geometry, mass = problem.geometry, problem.formulation.mass
     if not mass.free or mass.entries is None:
         return
@@ -74,7 +74,7 @@ def _known_entries(problem: Prepared, structure: Structure) -> Iterator[Finding]
 
 
 def _lumped_total(problem: Prepared, structure: Structure) -> Iterator[Finding]:
-    """Whether the total of a lumped mass, a sum over the sensors of a direction, is what moves in that direction."""
+    """The total of a lumped mass, a sum over the sensors of a direction, is not what moves in that direction."""
     totals, geometry = problem.formulation.mass.totals, problem.geometry
     if totals is None or totals.kind != "sensors":
         return
@@ -91,7 +91,7 @@ def _lumped_total(problem: Prepared, structure: Structure) -> Iterator[Finding]:
 
 
 def force_misfit(formulation: Formulation, test: Measurement, structure: Structure) -> Iterator[Finding]:
-    """Whether the base force is that of the modes that the accelerations show."""
+    """The base force is not that of the modes that the accelerations show."""
     if test.force is None:
         return
     entries, n = formulation.mass.entries, formulation.geometry.n

@@ -1,4 +1,4 @@
-"""What is wrong with records, or between them and what is stated, as it is told before a search."""
+"""Mistakes in records, or between them and what is stated, named before a search."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def _of_test(problem: StatedProblem, declared: Formulation, test: Measurement, *
 
 
 def _of_mass(declared: Formulation, test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
-    """Whether the base force weighs what is stated by a factor of two units."""
+    """The base force weighs what is stated but for a factor of two units."""
     allowed = None if terms.mass is None or terms.below else _masses(declared)
     if allowed is None or terms.mass is None or terms.modal_mass is None or terms.mass_std is None:
         return
@@ -122,7 +122,7 @@ def _masses(declared: Formulation) -> tuple[Array, Array] | None:
 
 
 def _of_frequencies(problem: StatedProblem, declared: Formulation, test: Measurement) -> Iterator[Finding]:
-    """Whether lines are in rad/s, as frequencies that are stated, or that the bounds allow, show."""
+    """Lines are in rad/s, as frequencies that are stated, or that the bounds allow, show."""
     stated = getattr(problem.stiffness, "natural_frequencies", None)
     if declared.stiffness.free and stated is None:
         return
