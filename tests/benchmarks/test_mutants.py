@@ -44,7 +44,7 @@ def test_code_is_found_whatever_its_white_space(mutants, tmp_path, text, count):
     [
         ("no such = code(anywhere)", "test_moves", "occurs 0 times"),
         ("import numpy as np", "test_moves", r"occurs \d+ times"),
-        ("towards_best *= attractor - self._positions", "test_moves test_of_nothing", "not all files"),
+        ("to_global_best *= attractor - self._positions", "test_moves test_of_nothing", "not all files"),
     ],
 )
 def test_what_is_not_found_is_not_noticed(mutants, code, tests, detail):
