@@ -39,7 +39,7 @@ _UNFIT = (
     AssertionError,
     NotImplementedError,
 )
-_CONTENT, _FORMAT = "unfinished search", 1
+_CONTENT, _FORMAT = "unfinished search", 2
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from .settings import SwarmSettings
 FloatArray = NDArray[np.float64]
 
 # What changes while the swarm moves: arrays over its particles, or none, and numbers.
-_ARRAYS = ("positions", "velocities", "costs", "own", "own_costs", "candidate", "asked")
+_ARRAYS = ("positions", "velocities", "costs", "pbest", "pbest_costs", "candidate", "asked")
 _NUMBERS = ("nit", "nfev", "n_nan", "horizon", "inertia", "cognitive", "social")
 
 

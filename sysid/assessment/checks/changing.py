@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.assessment.checks.context import Context
-from sysid.assessment.checks.leakage import ONE_SHAPE
 from sysid.assessment.checks.noise_multiples import BEYOND, misses_of_test
 from sysid.errors import InputError
 from sysid.finding import Finding, Severity
@@ -28,6 +27,7 @@ _EXPLAINED = 0.7  # of the squares that constant poles leave: poles that change 
 _LEAST_LEVEL = 0.03  # of the largest level of a mode, at which it shows
 _OF_RUNS = 0.15  # of the variance of frequencies, that is left within runs where runs differ
 _CLOSE = 0.06  # of their frequency, within which modes ..
+_ONE_SHAPE = 0.9  # .. of one shape (modal assurance criterion) may be one that changes
 _LEAST_RATIO = 1e-4
 
 
@@ -219,7 +219,7 @@ class ObservedPoles(NamedTuple):
             like = [
                 group
                 for group in near
-                if len(self.shapes) > 1 and (self.shapes[:, group[0]] @ self.shapes[:, k]) ** 2 > ONE_SHAPE
+                if len(self.shapes) > 1 and (self.shapes[:, group[0]] @ self.shapes[:, k]) ** 2 > _ONE_SHAPE
             ]
             if like:
                 like[-1].append(k)

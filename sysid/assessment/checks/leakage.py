@@ -14,7 +14,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import NEGLIGIBLE
 
-ONE_SHAPE = 0.9  # modal assurance criterion, from which two modes have one shape
+_SAME_SHAPE = 0.95  # modal assurance criterion
 _FEWEST = 8.0  # lines in a half-power width; a Hann window then takes 2 % off a peak, and more with fewer
 _RESOLVED = 2.5  # distances of lines; narrower peaks are mostly the window's
 _TWICE = 2.0  # distances of lines, within which a peak that was smeared over them is taken for two modes
@@ -114,7 +114,7 @@ def _found_twice(peaks: Peaks, coarse: NDArray[np.bool_], structure: Structure) 
     groups: list[list[int]] = []
     for i, j in pairwise(range(peaks.number.size)):
         near = peaks.frequency[j] - peaks.frequency[i] < _TWICE * peaks.spacing[i]
-        if not (near and coarse[i] and coarse[j] and _mac(structure, *peaks.number[[i, j]] - 1) > ONE_SHAPE):
+        if not (near and coarse[i] and coarse[j] and _mac(structure, *peaks.number[[i, j]] - 1) > _SAME_SHAPE):
             continue
         if groups and groups[-1][-1] == i:
             groups[-1].append(j)
