@@ -34,7 +34,7 @@ SECONDS = 900.0  # that the tests of one change may take
 
 @dataclass(frozen=True)
 class Result:
-    """What came of a change.
+    """Outcome of a change.
 
     Attributes
     ----------

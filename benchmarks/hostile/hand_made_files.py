@@ -226,7 +226,7 @@ class _Known:
         return traces, faults, most
 
     def _fault(self, command: tuple[str, ...], status: int, said: str, place: Path) -> str:
-        """What is wrong with the end of a command; "" where nothing is."""
+        """Fault in the end of a command; "" where there is none."""
         told = said.splitlines()
         if _leaks(said):
             return f"it tells what it must not: {said!r}"
@@ -245,14 +245,14 @@ class _Known:
 
 
 def _numbers(path: Path) -> bytes:
-    """What an answer says in numbers."""
+    """Numbers of an answer."""
     with warnings.catch_warnings(action="ignore"):
         structure = sysid.load(path).structure
     return b"".join(np.asarray(part).tobytes() for part in (structure.mass, structure.stiffness, structure.damping))
 
 
 def _leaks(text: str) -> bool:
-    """Whether control characters or the bytes of another file stand in a text."""
+    """True where control characters or the bytes of another file stand in a text."""
     return bool(_CONTROL.search(text)) or SECRET.decode() in text
 
 
