@@ -199,7 +199,7 @@ class TestOtherAnswers:
 
 
 def test_entries_of_factors_are_counted_and_not_named(truth):
-    """What is known of a ratio leaves the cone to the rank; the scale of each mode is open, and M_00."""
+    """Knowledge of a ratio leaves the cone to the rank; the scale of each mode is open, and M_00."""
     ratios = Variable("z", 3, lower=0.001, upper=0.1, guess=truth.damping_ratios)
     problem = free(truth, damping=ratios, residuals=[Prior(ratios[0], 0.02, 0.001)])
     of_models = [model.values(problem.geometry, truth) for model in problem.models[:2]]

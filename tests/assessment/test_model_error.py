@@ -1,4 +1,4 @@
-"""What a model misses is told in units of the noise; quiet parts and lines of records bound that noise."""
+"""Misses of a model are told in units of the noise; quiet parts and lines of records bound that noise."""
 
 import dataclasses
 

@@ -32,7 +32,7 @@ with lock.alone(Path(sys.argv[1]), "the folder", "wait"):
 
 
 def without_locks(file):
-    """What a file system says that has none."""
+    """Error of a file system that has no locks."""
     raise OSError(errno.ENOSYS, "no locks")
 
 
