@@ -74,7 +74,7 @@ def judge(problem: Problem, prepared: Prepared, end: Outcome, why: str, seed: in
     )
     try:
         with within(session.left):
-            more = tuple(_by_noise(it))
+            more = tuple(_check_precision(it))
             return it.with_findings(more) if more else it
     except TimeIsOver:
         return it.with_findings((_NOT_JUDGED,))
@@ -93,7 +93,7 @@ def _verdict(context: Context) -> Verdict:
     return Verdict(is_fit(found), "; ".join((*wrong, end.message) if end.success else (end.message, *wrong)))
 
 
-def _by_noise(it: Identification) -> Iterator[Finding]:
+def _check_precision(it: Identification) -> Iterator[Finding]:
     """Entries that noise leaves open though they are fixed without it, and gains that what is determined rests on.
 
     Null directions of exact records are closed by their noise, and show as large standard deviations only.

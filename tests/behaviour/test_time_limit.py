@@ -94,7 +94,7 @@ def test_a_model_of_its_own_is_no_exception(seconds_of):
     "name",
     [
         "sysid.results.judgement.determine", "sysid.assessment.checks.against_records.gain_errors",
-        "sysid.results.judgement._by_noise",
+        "sysid.results.judgement._check_precision",
     ],
 )  # fmt: skip
 def test_a_judgement_that_takes_too_long_is_given_up_and_determines_nothing(random_case, monkeypatch, name):
