@@ -25,7 +25,7 @@ Tree = dict[str, Any]
 
 
 def answer_to_tree(it: Answer) -> Tree:
-    """Give all that readers of a result ask of its problem; `from_tree` takes it back.
+    """Give all that readers of a result ask of its problem; `answer_from_tree` takes it back.
 
     Standard deviations and intervals where summaries compute them too; what no reader of this result asks, None.
     """
@@ -54,7 +54,7 @@ def answer_from_tree(tree: Tree, structure: Structure) -> dict[str, Any]:
     Parameters
     ----------
     tree : dict
-        What `to_tree` made.
+        What `answer_to_tree` made.
     structure : Structure
         The answer's.
     """
