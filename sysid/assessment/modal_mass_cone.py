@@ -4,8 +4,8 @@ Base and response accelerations fix frequencies, damping ratios and rank-one res
 else. All models that explain them are ``M_SS = P' T P``, ``K_SS = P' W T W P``, ``M_S0 = P' T (Gamma - P G)``,
 with ``T = diag(t)``, one modal mass t_k > 0 a mode (P the inverse of the mode shapes, W the circular frequencies),
 and a positive definite block of T for modes at one pole. What a measured force or a stated model adds is linear in T:
-its rank tells what stays open (`closed_and_open`), and how far that may go is a convex problem (`ends`). Both hold for all
-models at once.
+its rank tells what stays open (`closed_and_open`), and how far that may go is a convex problem (`ends`). Both hold
+for all models at once.
 """
 
 from __future__ import annotations
