@@ -22,7 +22,7 @@ def lines(reduced: bool) -> Iterator[Line]:
     rng = np.random.default_rng(21)
     with tempfile.TemporaryDirectory() as folder:
         problem = catalogue.build(
-            sysid.Recipe("cantilever_tower", parameters={"elements": 3, "noise": 0.0, "force": False}).prepared
+            sysid.Recipe("cantilever_tower", parameters={"elements": 3, "noise": 0.0, "force": False})
         )
         sound = sysid.identify(problem, rng=0).save(folder)
         data, tree = sound.read_bytes(), repr(sysid.load(sound).to_tree())

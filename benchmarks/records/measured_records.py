@@ -11,6 +11,7 @@ import sysid
 from benchmarks.line import Line
 from benchmarks.problem_modules import load_module
 from benchmarks.swarm.shake_table import ABSENT, EVENTS, records_folder
+from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.record_fit import RecordFit, record_modes, refitted, unit_diagonal
 
 WITHIN = 1.5
@@ -38,7 +39,7 @@ def _deviations(name: str, test: sysid.Measurement, shifts: int) -> Iterator[Lin
     close = found.size == len(MODES) and bool(np.all(np.abs(found / MODES - 1) < NEAR))
     shown = " / ".join(f"{f:.3f}" for f in found)
     yield Line(f"{name}: frequencies found, Hz", shown, " / ".join(map(str, MODES)) + f" within {NEAR:.0%}", close)
-    variance, plain = _jackknife(_fit(test, result.measurement), shifts)
+    variance, plain = _jackknife(_fit(test, result.modal[0]), shifts)
     wide = np.sqrt(plain)
     ratios = wide * result.uncertainty.natural_frequencies / np.sqrt(variance)
     met = bool(np.all((ratios <= WITHIN) & (ratios >= 1 / WITHIN)))
@@ -72,10 +73,8 @@ def _jackknife(fit: RecordFit, shifts: int) -> tuple[np.ndarray, np.ndarray]:
     return variance, plain
 
 
-def _fit(test: sysid.Measurement, at_rest: sysid.Measurement) -> RecordFit:
+def _fit(test: sysid.Measurement, found: ModalEstimate) -> RecordFit:
     """The fit of all lines, from the modes that were found."""
-    found = at_rest.modal
-    assert found is not None
     fit = record_modes(test, found.omega, found.ratios)
     return refitted(fit, fit.parameters)
 

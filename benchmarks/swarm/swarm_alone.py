@@ -77,7 +77,7 @@ def _rival(task: tuple[str, int, int, int]) -> tuple[float, float]:
         with contextlib.suppress(Spent):
             search(evaluator, problem.n_variables, np.random.default_rng(seed))
         start = landscape.objective.refined(landscape.objective.unknowns(evaluator.s))
-        return evaluator.best, problem.objective(local.solve(problem.prepared, start).x)
+        return evaluator.best, problem.objective(local.solve(problem, start).x)
 
 
 def _landscape(elements: int, session: Session) -> Landscape:
