@@ -1,4 +1,4 @@
-"""Whether the package keeps to its shape: imports one way, few tests of types, few branches, short functions.
+"""Counts of the package's shape: imports one way, few tests of types, few branches, short functions.
 
 Everything is counted on the syntax trees of ``sysid/``; nothing is imported. ``tests/test_architecture.py`` holds the
 same counts. Each function says what it counts, so that other commits can be counted alike. On cfd962a, which had no

@@ -34,7 +34,7 @@ SECONDS = 900.0  # that the tests of one change may take
 
 @dataclass(frozen=True)
 class Result:
-    """What came of a change.
+    """Outcome of a change.
 
     Attributes
     ----------
@@ -190,8 +190,8 @@ NOTICED = (
         "return SUCCESS if result.success else NOT_REACHED", "test_cli_ends"),
     Mutant("C07", "matrices that noise leaves open called determined", "if not largest <= _KNOWN:", "if False:",
         "test_certainty"),
-    Mutant("C08", "upper ends of the masses 1 % too high", "np.maximum(values[1], own[i, j])",
-        "np.maximum(values[1], own[i, j]) * 1.01", "test_intervals"),
+    Mutant("C08", "upper ends of the masses 1 % too high", "np.maximum(values[1], at_identity[i, j])",
+        "np.maximum(values[1], at_identity[i, j]) * 1.01", "test_intervals"),
     Mutant("C09", "twin sensors never told", "if apart <= most and np.mean(", "if False and np.mean(", "test_checks"),
     Mutant("C10", "a stated mass that the force contradicts never told", "max(0.01, 3 * force_residual_left",
         "max(np.inf, 3 * force_residual_left", "test_checks"),

@@ -24,7 +24,7 @@ class Worker:
         )  # fmt: skip
 
     def __call__(self, case: object) -> float:
-        """What the process answers to a case.
+        """Answer of the process to a case.
 
         Raises
         ------
@@ -47,7 +47,7 @@ class Worker:
 
 
 def unpacked(folder: Path) -> bool:
-    """Whether the commit could be written to a folder."""
+    """True where the commit could be written to a folder."""
     archive = folder / "archive.tar"
     command = ["git", "archive", "--output", str(archive), COMMIT]
     try:

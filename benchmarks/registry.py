@@ -36,7 +36,7 @@ class Benchmark:
 
     @property
     def name(self) -> str:
-        """What it is called by; unique among all benchmarks and groups."""
+        """Name of the benchmark; unique among all benchmarks and groups."""
         return self.module.rpartition(".")[2]
 
     @property

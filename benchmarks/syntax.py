@@ -42,7 +42,7 @@ class Module:
 
     @property
     def package(self) -> str:
-        """What relative imports start from."""
+        """Package that relative imports start from."""
         return self.name if self.path.endswith("__init__.py") else self.name.rpartition(".")[0]
 
     def place(self, node: ast.AST) -> str:

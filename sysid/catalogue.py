@@ -60,7 +60,7 @@ def bundled_folder() -> Path:
     return inside if inside.is_dir() else package.parent / "problems"
 
 
-def own_folder() -> Path:
+def user_folder() -> Path:
     """Folder of the user's own problems: ``./problems``."""
     return Path("problems")
 
@@ -70,7 +70,7 @@ def entries() -> tuple[Entry, ...]:
 
     Modules are read, not imported.
     """
-    paths = {path.stem: path for folder in (bundled_folder(), own_folder()) for path in _modules(folder)}
+    paths = {path.stem: path for folder in (bundled_folder(), user_folder()) for path in _modules(folder)}
     home = bundled_folder().resolve()
     return tuple(
         Entry(name, path, path.resolve().parent == home, _first_line(path)) for name, path in sorted(paths.items())
@@ -104,7 +104,7 @@ def build(recipe: Recipe) -> Problem:
 
 
 def built(recipe: Recipe, *, check: bool = True) -> tuple[Problem, frozenset[Path]]:
-    """What `build` gives, and the files it was made from: the module, and what that imported from beside itself.
+    """The problem that `build` gives, and the files it was made from: the module, and what that imported beside itself.
 
     Of a dotted module, which Python imports, the module alone. Without `check` a problem that cannot be searched is not
     refused, for which poles may be looked for: `identify` does it too.
@@ -134,8 +134,8 @@ def built(recipe: Recipe, *, check: bool = True) -> tuple[Problem, frozenset[Pat
     used = set(problem.declared.variables)
     idle = [variable for variable in declared()[before:] if variable not in used]
     if idle:
-        told = ", ".join(f"{variable.name!r} ({variable.declared})" for variable in idle)
-        raise InputError(f"{path}: variable {told} enters no matrix, residual or constraint: use it, or take it out")
+        names = ", ".join(f"{variable.name!r} ({variable.declared})" for variable in idle)
+        raise InputError(f"{path}: variable {names} enters no matrix, residual or constraint: use it, or take it out")
     if check:
         problem.check()
     return problem, frozenset({path.absolute(), *imported})
@@ -160,9 +160,9 @@ def parameters_in_words(problem: str) -> str:
 
 
 def _in_words(signature: inspect.Signature) -> str:
-    own = [value for name, value in signature.parameters.items() if name not in ("data", "rng")]
-    told = ", ".join(" ".join(str(value.replace(annotation=value.empty)).split()) for value in own)
-    return f"parameters of this module: {told or 'none'}"
+    parameters = [value for name, value in signature.parameters.items() if name not in ("data", "rng")]
+    listing = ", ".join(" ".join(str(value.replace(annotation=value.empty)).split()) for value in parameters)
+    return f"parameters of this module: {listing or 'none'}"
 
 
 def _function(name: str) -> tuple[Callable[..., object], Path]:
@@ -181,20 +181,20 @@ def file_of(name: str) -> Path | None:
     """
     if _is_path(name):
         return Path(name)
-    return _in_folder(bundled_folder(), name) or _in_folder(own_folder(), name)
+    return _in_folder(bundled_folder(), name) or _in_folder(user_folder(), name)
 
 
 def typed(name: str) -> tuple[str, str]:
-    """What a user means by a name at the command line, and a remark: the user's own problem hides a bundled one."""
-    own = None if _is_path(name) else _in_folder(own_folder(), name)
+    """The module that a name at the command line means, and a remark: the user's own problem hides a bundled one."""
+    of_user = None if _is_path(name) else _in_folder(user_folder(), name)
     bundled = _in_folder(bundled_folder(), name)
-    if own is None or bundled is None or own.read_bytes() == bundled.read_bytes():  # the last in a checkout
+    if of_user is None or bundled is None or of_user.read_bytes() == bundled.read_bytes():  # the last in a checkout
         return name, ""
-    return str(own), f"{own} hides the bundled problem {name}: it is taken"
+    return str(of_user), f"{of_user} hides the bundled problem {name}: it is taken"
 
 
 def is_bundled(name: str) -> bool:
-    """Whether a recipe's module is a problem that comes with the package."""
+    """True where a recipe's module is a problem that comes with the package."""
     return not _is_path(name) and _in_folder(bundled_folder(), name) is not None
 
 
@@ -334,11 +334,11 @@ def _telling_the_line(path: Path) -> Iterator[None]:
             raise InputError(f"{path}, line {error.lineno}: syntax error: {error.msg}") from None
         lines = [line for frame, line in traceback.walk_tb(error.__traceback__) if frame.f_code.co_filename == full]
         where = f"{path}, line {lines[-1]}" if lines else f"{path}"
-        raise InputError(f"{where}: {_in_own_words(error)}") from error
+        raise InputError(f"{where}: {_exception_in_words(error)}") from error
 
 
-def _in_own_words(error: BaseException) -> str:
-    """What an exception of a module says; of what CasADi cannot do with expressions, what to write instead."""
+def _exception_in_words(error: BaseException) -> str:
+    """Message of an exception of a module; of what CasADi cannot do with expressions, what to write instead."""
     said = str(error)
     if "truth value of a numeric MX" in said:
         return NO_TRUTH
@@ -348,7 +348,7 @@ def _in_own_words(error: BaseException) -> str:
 
 
 def _was_raised(interrupt: KeyboardInterrupt, file: str) -> bool:
-    """Whether a statement of a file raised it, and not Ctrl-C at some other instruction."""
+    """True where a statement of a file raised it, and not Ctrl-C at some other instruction."""
     last = interrupt.__traceback__
     assert last is not None
     while last.tb_next is not None:

@@ -1,4 +1,4 @@
-"""What can go wrong, as a tree, and the checks of arguments that all rooms share.
+"""Exceptions, as a tree, and the checks of arguments that all rooms share.
 
 ::
 
@@ -78,7 +78,7 @@ def listed(words: Sequence[str], between: str = ", ") -> str:
     return between.join(words[:MOST_LISTED]) + f" and {more} more" * (more > 0)
 
 
-def number(
+def as_float(
     name: str, value: Any, wanted: str = "a finite number", *, above: float = -math.inf, at_least: float = -math.inf,
     below: float = math.inf, finite: bool = True,
 ) -> float:  # fmt: skip
@@ -122,7 +122,7 @@ def printable(name: str, value: str) -> str:
 
 
 def is_control(letter: str) -> bool:
-    """Whether a letter ends a line, commands a terminal, or turns the direction of what follows."""
+    """True where a letter ends a line, commands a terminal, or turns the direction of what follows."""
     return unicodedata.category(letter) in ("Cc", "Zl", "Zp") or unicodedata.bidirectional(letter) in _TURNING
 
 
@@ -210,7 +210,7 @@ def numbers(name: str, value: ArrayLike, kind: type = float) -> NDArray[Any]:
 
 
 def _is_masked(value: Any) -> bool:
-    """Whether an array, or one in lists of arrays, has masked entries."""
+    """True where an array, or one in lists of arrays, has masked entries."""
     if isinstance(value, list | tuple):
         return any(_is_masked(part) for part in value)
     return isinstance(value, np.ma.MaskedArray) and bool(np.ma.is_masked(value))

@@ -120,12 +120,12 @@ def cautions(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 def is_fit(findings: Iterable[Finding]) -> bool:
-    """Whether none of the findings says that the search ended without a fit."""
+    """True where none of the findings says that the search ended without a fit."""
     return not any(one.kind in _NO_FIT for one in contradicting(findings))
 
 
 def judgement_of(findings: Iterable[Finding]) -> Judgement:
-    """What findings make of an answer, in a word."""
+    """Judgement of an answer by its findings, in a word."""
     every = tuple(findings)
     if not is_fit(every):
         return "no fit"

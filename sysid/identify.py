@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from sysid.assessment.checks import check_records, mistakes_of_poor_fit
 from sysid.assessment.checks.changing import changing
-from sysid.errors import InputError, SolverError, finite_array, function, instance, number, path_of, whole_number
+from sysid.errors import InputError, SolverError, as_float, finite_array, function, instance, path_of, whole_number
 from sysid.finding import Finding
 from sysid.nlp import one_thread
 from sysid.problem.prepared import Prepared
@@ -21,9 +21,9 @@ from sysid.results.checkpoint import Checkpoint, identity
 from sysid.results.identification import Identification
 from sysid.results.judgement import judge
 from sysid.results.stated_masses import with_stated_masses
+from sysid.search import robust
 from sysid.search.auto import InTurn, check_strategy, choose
 from sysid.search.journal import Journal
-from sysid.search.robust import check, settled
 from sysid.search.session import DeferredInterrupt, Progress, Session, Stop, seed_of
 from sysid.search.strategy import DoesNotApplyError, NoStrategyError, Strategy
 from sysid.structure.structure import Structure
@@ -87,7 +87,7 @@ def identify(
     if not isinstance(start, Structure | None):
         start = finite_array("start", start)
     if max_time is not None:
-        max_time = number("max_time", max_time, "a positive number of seconds", above=0)
+        max_time = as_float("max_time", max_time, "a positive number of seconds", above=0)
     if max_evaluations is not None:
         max_evaluations = whole_number("max_evaluations", max_evaluations, at_least=1)
     for name, given in (("callback", callback), ("progress", progress)):
@@ -106,11 +106,11 @@ def identify(
             prepared = prepare(problem, session)
         with _telling_why(session, named, prepared):
             chosen, why = choose(strategy, prepared, start)
-            check(prepared, chosen)
+            robust.check_local_phase(prepared, chosen)
             follow = strategy == "auto" and not named
             in_turn = InTurn(prepared.screened, session, start, mistakes_of_poor_fit, follow=follow)
             outcome, why = in_turn.run(chosen, why)
-            outcome = settled(prepared, outcome, chosen, session)
+            outcome = robust.fit(prepared, outcome, chosen, session)
             outcome = with_stated_masses(prepared.screened, outcome, session)
         outcome = replace(outcome, findings=(*named, *outcome.findings))
         result = judge(problem, prepared, outcome, f"strategy {why}", seed, session)

@@ -32,16 +32,16 @@ _LATE = "Maximum_WallTime_Exceeded"  # IPOPT's word, which does not count the ma
 
 
 def ended_in_words(status: str) -> str:
-    """How IPOPT ended: its status, and what that means."""
+    """IPOPT's status, and what that means."""
     return f"IPOPT: {status}" + (f" ({_ENDED[status]})" if status in _ENDED else "")
 
 
 def suffices(left: float, seconds: float) -> bool:
-    """Whether the time that is `left` is enough for work that takes about so many seconds of a processor."""
+    """True where the time that is `left` is enough for work that takes about so many seconds of a processor."""
     return _LOADED * seconds < left + GRACE
 
 
-def not_begun(seconds: float) -> str:
+def time_too_short(seconds: float) -> str:
     """The status of a run whose graphs would have taken so many seconds, and the time did not allow them."""
     return f"not begun, as its derivatives take some {seconds:.1g} s to set up: too little time"
 
@@ -254,7 +254,7 @@ class NonlinearProgram:
 
 
 class IterationMonitor:
-    """What happens between the iterations of all runs of IPOPT: the curve, the listener, and its wish to stop.
+    """Monitor of the iterations of all runs of IPOPT: the curve, the listener, and its wish to stop.
 
     Parameters
     ----------
@@ -278,11 +278,11 @@ class IterationMonitor:
 
     @property
     def is_over(self) -> bool:
-        """Whether the deadline has passed."""
+        """True where the deadline has passed."""
         return self.left <= 0
 
     def allows(self, seconds: float) -> bool:
-        """Whether work that cannot be stopped, and takes about so many seconds of a processor, may begin."""
+        """True where work that cannot be stopped, and takes about so many seconds of a processor, may begin."""
         return suffices(self.left, seconds)
 
     @property
@@ -291,7 +291,7 @@ class IterationMonitor:
         return len(self.curve)
 
     def callback(self, start: Array, n_constraints: int) -> ca.Callback:
-        """What `nlpsol` calls after each iteration."""
+        """The callback that `nlpsol` calls after each iteration."""
         self.z = start
         return _IterationCallback(self, start.size, n_constraints)
 

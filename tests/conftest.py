@@ -153,7 +153,7 @@ def _case(rng, mass="trace", stiffness="spectral", damping="modal", *, n=4, d=2,
 
 
 def _geometry_of(G, translational=None, weighed=None):
-    """What models see of a test whose sensors move by `G` (n_sensors, d) with the base; all directions translate."""
+    """Geometry of a test whose sensors move by `G` (n_sensors, d) with the base; all directions translate."""
     G = np.asarray(G, dtype=float)
     sensors, d = G.shape
     moves, turns = iter(["x", "y", "z"]), iter(["rx", "ry", "rz"])

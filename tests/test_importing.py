@@ -12,7 +12,7 @@ _LOADED_WHERE_USED = {
 
 
 def told_by_fresh_python(code: str, **environment: str) -> object:
-    """What a new process prints, as JSON."""
+    """Output of a new process, as JSON."""
     ran = subprocess.run(
         [sys.executable, "-c", code], check=True, capture_output=True, text=True, env=os.environ | environment
     )

@@ -40,9 +40,9 @@ from sysid.files import reading
 from sysid.files.assembly import work_of_force
 from sysid.finding import Finding, Severity
 from sysid.jobs import JobResult
-from sysid.nlp import not_begun
+from sysid.nlp import time_too_short
 from sysid.report import report
-from sysid.results.checkpoint import Begun, Checkpoint
+from sysid.results.checkpoint import Checkpoint, RunRequest
 from sysid.results.storage import atomically
 from sysid.results.summary import next_steps, verdict
 from sysid.swarm import minimize_swarm
@@ -131,11 +131,11 @@ def other_records():
 
 def other_noise():
     """Refine a result whose module gives other records now."""
-    sweeps.check_own_records(answer("nothing"), Recipe("shear_building"))
+    sweeps.check_same_records(answer("nothing"), Recipe("shear_building"))
 
 
 def begun(strategy="swarm", **given):
-    return Begun(Recipe("pair.py"), strategy, 0, **given)
+    return RunRequest(Recipe("pair.py"), strategy, 0, **given)
 
 
 def identified(test, mass=None, **given):
@@ -144,7 +144,7 @@ def identified(test, mass=None, **given):
 
 REFUSED = {
     "a number": (
-        lambda: errors.number("goal", -1, "a number above 0", above=0), "goal = -1: a number above 0 is needed",
+        lambda: errors.as_float("goal", -1, "a number above 0", above=0), "goal = -1: a number above 0 is needed",
     ),
     "a whole number": (lambda: errors.whole_number("starts", 0, at_least=1), "starts is 0; give 1 or above."),
     "a fraction": (
@@ -197,12 +197,12 @@ REFUSED = {
         "its own; 'auto' chooses another strategy",
     ),
     "an untrusted module": (
-        lambda: trust.check(Recipe("idle.py"), Path("out/result.h5"), "--module FILE.py", Namespace(trust=False)),
+        lambda: trust.check_trust(Recipe("idle.py"), Path("out/result.h5"), "--module FILE.py", Namespace(trust=False)),
         "out/result.h5 names the problem module {here}/idle.py, whose code would run: say --trust where you know what "
         "stands in it, or name the module yourself: --module FILE.py",
     ),
     "a module that is gone": (
-        lambda: trust.check(Recipe("gone.py"), Path("out/result.h5"), "--module FILE.py", Namespace(trust=False)),
+        lambda: trust.check_trust(Recipe("gone.py"), Path("out/result.h5"), "--module FILE.py", Namespace(trust=False)),
         "out/result.h5 names the problem module {here}/gone.py, which is not here: get it, and name it: "
         "--module FILE.py",
     ),
@@ -459,7 +459,7 @@ def test_a_summary_in_a_hurry_says_what_computes_the_rest():
     assert [line for line in lines if line.startswith("uncertainty")] == [
         "uncertainty not computed, as the time was over: Identification.uncertainty and 'sysid report' compute it"
     ]
-    assert not_begun(70.0) == "not begun, as its derivatives take some 7e+01 s to set up: too little time"
+    assert time_too_short(70.0) == "not begun, as its derivatives take some 7e+01 s to set up: too little time"
 
 
 def test_a_summary_names_the_masses_of_a_lumped_model():
@@ -473,7 +473,11 @@ def test_a_comparison_says_what_its_columns_are():
     undamped = sysid.Structure(TRUTH.mass, TRUTH.stiffness, [0.0, 0.0], n_base=1)
     noisy = sysid.simulate(TRUTH, LINES, noise=0.01, rng=0)
     told = [
-        " ".join(table.text(Comparison(Problem(test, mass=FullMass(), reference=truth), 0, None, ())).split("\n")[1:])
+        " ".join(
+            table.comparison_text(Comparison(Problem(test, mass=FullMass(), reference=truth), 0, None, ())).split("\n")[
+                1:
+            ]
+        )
         for test, truth in ((TEST, None), (TEST, undamped), (noisy, TRUTH))
     ]
     before = "before, after: {} before and after the local phase{}"
@@ -513,7 +517,7 @@ def test_doctor_says_what_is_wrong(capsys, monkeypatch):
 def test_draws_say_why_there_is_no_spread(here, capsys):
     it = answer("force")
     ends = [JobResult(0, 0, True, "", it.x, 0.02), JobResult(1, 0, False, "lost", it.x[:0], np.nan)]
-    draws.tell(Path("out"), it, Recipe("pair.py"), ends, Output())
+    draws.report_draws(Path("out"), it, Recipe("pair.py"), ends, Output())
     assert capsys.readouterr().out.splitlines()[1] == "1 of 2 draws ended in a fit; two are needed for a spread"
 
 

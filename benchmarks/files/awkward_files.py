@@ -52,7 +52,7 @@ def lines(reduced: bool) -> Iterator[Line]:
 
 
 def _fault(folder: Path, write: Callable[[Path], None], words: str) -> str:
-    """What is wrong with how a case ends, "" where nothing is."""
+    """Fault in the end of a case, "" where there is none."""
     (folder / "sensors.toml").write_text(_TOML, encoding="utf-8")
     write(folder)
     files = sorted(str(path) for path in folder.iterdir() if path.suffix != ".toml")

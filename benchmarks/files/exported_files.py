@@ -107,7 +107,7 @@ def _dmig(it: sysid.Identification, where: Path) -> tuple[float, float]:
 
 
 def _by_pynastran(it: sysid.Identification, where: Path) -> Iterator[Line]:
-    """What pyNastran reads, in the environment whose Python SYSID_PYNASTRAN names."""
+    """Matrices that pyNastran reads, in the environment whose Python SYSID_PYNASTRAN names."""
     python = os.environ.get("SYSID_PYNASTRAN")
     if not python or importlib.util.find_spec("pyyeti") is None:
         yield Line("OP4 and DMIG by pyNastran", "SYSID_PYNASTRAN names no Python with it, or pyyeti is missing")

@@ -33,7 +33,7 @@ CHANCE = 1e-3  # that so few of a few structures are called determined, where 95
 
 
 class End(NamedTuple):
-    """How one identification ended: its verdict, and whether the records can tell all entries within 1 %."""
+    """End of one identification: its verdict, and whether the records can tell all entries within 1 %."""
 
     verdict: str
     known: bool
@@ -59,7 +59,7 @@ def lines(reduced: bool) -> Iterator[Line]:
 
 
 def _share(case: str, ends: list[End], least: float) -> Line:
-    """How many are determined of those that the records tell."""
+    """Share of determined answers among those that the records tell."""
     known = [end for end in ends if end.known]
     share = sum(end.verdict in ("right", "wrong") for end in known) / max(len(known), 1)
     return above(
@@ -164,7 +164,7 @@ def _size(matrix: np.ndarray) -> np.ndarray:
 
 
 def _records_tell(truth: sysid.Structure, test: sysid.Measurement) -> bool:
-    """Whether no entry of M_SS, K_SS and C has a Cramér-Rao deviation above a hundredth of its size."""
+    """True where no entry of M_SS, K_SS and C has a Cramér-Rao deviation above a hundredth of its size."""
     try:
         bound = cramer_rao(truth, test)
     except np.linalg.LinAlgError:  # modes that the records cannot tell apart

@@ -27,7 +27,7 @@ from benchmarks.line import Line, above, below
 from sysid import catalogue
 from sysid.cli.main import main
 from sysid.files import reading
-from sysid.results.checkpoint import Begun, Checkpoint
+from sysid.results.checkpoint import Checkpoint, RunRequest
 
 _SECONDS = 30  # of a processor, from which a command counts as one that hangs
 _MEGABYTES = 1500.0  # that a command may take, the package itself included
@@ -163,7 +163,7 @@ def _stopped(folder: Path) -> bytes:
     recipe = sysid.Recipe("physical_damping")
     problem, files = catalogue.built(recipe)
     path = folder / "unfinished.h5"
-    begun = Begun(recipe, "swarm", 0, catalogue.digest(files))
+    begun = RunRequest(recipe, "swarm", 0, catalogue.digest(files))
     with contextlib.suppress(sysid.SolverError):
         sysid.identify(problem, strategy="swarm", rng=0, callback=_stop, checkpoint=Checkpoint(path, begun, every=0.0))
     return path.read_bytes()
@@ -226,7 +226,7 @@ class _Known:
         return traces, faults, most
 
     def _fault(self, command: tuple[str, ...], status: int, said: str, place: Path) -> str:
-        """What is wrong with the end of a command; "" where nothing is."""
+        """Fault in the end of a command; "" where there is none."""
         told = said.splitlines()
         if _leaks(said):
             return f"it tells what it must not: {said!r}"
@@ -245,14 +245,14 @@ class _Known:
 
 
 def _numbers(path: Path) -> bytes:
-    """What an answer says in numbers."""
+    """Numbers of an answer."""
     with warnings.catch_warnings(action="ignore"):
         structure = sysid.load(path).structure
     return b"".join(np.asarray(part).tobytes() for part in (structure.mass, structure.stiffness, structure.damping))
 
 
 def _leaks(text: str) -> bool:
-    """Whether control characters or the bytes of another file stand in a text."""
+    """True where control characters or the bytes of another file stand in a text."""
     return bool(_CONTROL.search(text)) or SECRET.decode() in text
 
 

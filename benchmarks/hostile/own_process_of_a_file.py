@@ -1,4 +1,4 @@
-"""What a process does to a stored result: writes one of a problem, reads one, or times it. A script of its own.
+"""Process that writes a stored result of a problem, reads one, or times it. A script of its own.
 
 It stands alone, so that the sysid of an earlier commit runs it too: ``python THIS read PATH`` and the like print JSON.
 """
@@ -48,7 +48,7 @@ def results_of(source: Path, searched: bool) -> list:
 
 
 def _not_searched() -> tuple:
-    """What a result tells beside its answer where nothing was searched; an earlier commit told it in other fields."""
+    """Fields of a result beside its answer where nothing was searched; an earlier commit told them in other fields."""
     if any(field.name == "findings" for field in dataclasses.fields(sysid.Identification)):
         from sysid.finding import Finding, Severity
 

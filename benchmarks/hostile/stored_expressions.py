@@ -87,7 +87,7 @@ def _code(page: str, first: str) -> str:
 
 
 def _run(place: Path, *arguments: Any, package: Path = ROOT) -> Any:
-    """What the script tells in a process of its own, in an empty folder; its last words where it fails."""
+    """Output of the script in a process of its own, in an empty folder; its last words where it fails."""
     environment = {**os.environ, "PYTHONPATH": str(package), "MPLBACKEND": "Agg"}
     command = [sys.executable, str(SCRIPT), *map(str, arguments)]
     with tempfile.TemporaryDirectory(dir=place) as empty:

@@ -135,7 +135,7 @@ class _Namespaces:
         return self.address
 
     def on(self, machine: int) -> list[str]:
-        """What comes before a command that runs there."""
+        """Words before a command that runs there."""
         return ["ip", "netns", "exec", f"sysid-w{machine}"]
 
     def cut(self, down: bool) -> None:

@@ -69,7 +69,7 @@ def _whole(folder: Path) -> tuple[float, float]:
 
 
 def _interrupted(folder: Path, when: float, times: int, apart: float) -> tuple[str, str]:
-    """What is on the disk after it, and what is wrong with that; an empty text where nothing is."""
+    """Files on the disk after it, and what is wrong with them; an empty text where nothing is."""
     process = _start(folder)
     for wait in (when, apart)[:times]:
         with contextlib.suppress(subprocess.TimeoutExpired):

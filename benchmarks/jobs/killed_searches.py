@@ -44,7 +44,7 @@ def _whole(case: str, folder: Path) -> tuple[float, dict[str, bytes]]:
 
 
 def _killed(folder: Path, case: str, share: float, seconds: float, expected: dict[str, bytes]) -> tuple[str, bool]:
-    """How the second process began, and whether it ended in the expected bits."""
+    """Start of the second process in words, and whether it ended in the expected bits."""
     process = searches.start(case, folder)
     process.stdout.readline()
     with contextlib.suppress(subprocess.TimeoutExpired):

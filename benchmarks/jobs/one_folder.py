@@ -54,7 +54,7 @@ def _start(folder: Path, *more: str) -> subprocess.Popen[str]:
 
 
 def _pair(folder: Path, apart: float, answer: bytes) -> str:
-    """How two runs ended."""
+    """Ends of two runs, in words."""
     first = _start(folder)
     time.sleep(apart)
     second = _start(folder)
@@ -68,7 +68,7 @@ def _pair(folder: Path, apart: float, answer: bytes) -> str:
 
 
 def _after_kill(folder: Path, when: float, answer: bytes) -> str:
-    """How a run ended in the folder where one was killed, and one begun beside it."""
+    """End of a run in the folder where one was killed, and of one begun beside it."""
     first = _start(folder)
     with contextlib.suppress(subprocess.TimeoutExpired):
         first.wait(when)
@@ -83,7 +83,7 @@ def _after_kill(folder: Path, when: float, answer: bytes) -> str:
 
 
 def _wrong(folder: Path, answer: bytes) -> str:
-    """What is wrong with the files in a folder; an empty text where nothing is."""
+    """Fault in the files of a folder; an empty text where there is none."""
     there = {path.name for path in folder.iterdir()} if folder.exists() else set()
     if there != FILES:
         return f", files {sorted(there)}"

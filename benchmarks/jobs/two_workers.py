@@ -1,4 +1,4 @@
-"""What a second worker gains on few and short jobs: eight draws of noise of the tower."""
+"""Gain of a second worker on few and short jobs: eight draws of noise of the tower."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ class Cell(NamedTuple):
 
     @property
     def untold(self) -> bool:
-        """Whether another right model fits the same records."""
+        """True where another right model fits the same records."""
         return self.cause in CAUSES and self.form in CAUSES[self.cause].untold
 
     def __str__(self) -> str:
@@ -92,7 +92,7 @@ def _is_in_short(cell: Cell) -> bool:
 
 
 def end_of(cell: Cell) -> End:
-    """What is said of a cell."""
+    """Statements of the package about a cell."""
     cause = CAUSES.get(cell.cause)
     data = right(cell.kind, force=cell.force, axes=cause.axes if cause else "x", seed=cell.seed)
     begun = time.process_time()

@@ -32,7 +32,7 @@ ELONGATION = np.eye(N) - np.eye(N, k=-1)
 
 @dataclass(frozen=True)
 class Data:
-    """What a laboratory hands over: spectra for unit base motion, or records in time; force or none.
+    """Data of a laboratory: spectra for unit base motion, or records in time; force or none.
 
     Attributes
     ----------

@@ -42,7 +42,7 @@ class Case:
 
     @property
     def chain(self) -> bool:
-        """Whether the stiffness is stated to be a chain; else it is free, and the mass lumped alike."""
+        """True where the stiffness is stated to be a chain; else it is free, and the mass lumped alike."""
         return self.draw % 2 == 1
 
 
@@ -94,7 +94,7 @@ def compared(case: Case) -> tuple[float, str, str, str, set[str]]:
 
 
 def identified(case: Case, truth: Matrices) -> tuple[sysid.Identification, float]:
-    """What the package makes of a test, and the residual that the truth leaves of it."""
+    """Answer of the package to a test, and the residual that the truth leaves of it."""
     test, floor = measured(case, truth)
     total = truth.rigid.T @ np.diag(truth.mass)
     mass = sysid.LumpedMass(None if case.force else total)

@@ -24,7 +24,7 @@ WRONG = 6.0  # standard deviations: an entry of M_SS farther off than that was n
 
 @dataclass(frozen=True)
 class Run:
-    """What came of one noisy test.
+    """Outcome of one noisy test.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ def run(task: tuple[int, float, bool]) -> Run:
 
 
 def _doubted(result: sysid.Identification, k: int) -> bool:
-    """Whether a sentence about what is not known names mode k, counted from 0."""
+    """True where a sentence about what is not known names mode k, counted from 0."""
     return any(f"mode {k + 1} (" in sentence for sentence in result.undetermined)
 
 
@@ -165,7 +165,7 @@ def partners(result: sysid.Identification, truth: sysid.Structure, counts: np.nd
 
 
 def nonsense(result: sysid.Identification, truth: sysid.Structure) -> str:
-    """What a result claims that is not so; empty where it claims nothing wrong."""
+    """Claim of a result that is not so; empty where there is none."""
     test, n = result.measurement, truth.n
     claims = []
     floor = test.residual(truth)

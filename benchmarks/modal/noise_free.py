@@ -18,7 +18,7 @@ RESIDUAL, MATRICES = 1e-10, 1e-8
 
 @dataclass(frozen=True)
 class Run:
-    """What came of one noise-free test; infinite where nothing came.
+    """Outcome of one noise-free test; infinite where nothing came.
 
     Attributes
     ----------

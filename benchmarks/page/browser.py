@@ -125,7 +125,7 @@ onload = () => {
 
 
 def seen_without_scripts(page: str, folder: Path, width: int, height: int = 800) -> dict[str, int]:
-    """How many curves, mode shapes and controls a browser shows that runs no script, and what is wider than it."""
+    """Number of curves, mode shapes and controls in a browser that runs no script, and what is wider than it."""
     (folder / "page.html").write_text(re.sub(r"script-src '[^']*'", "script-src 'none'", page), encoding="utf-8")
     frame = f'<iframe src="page.html" style="border:0" width={width} height={height}></iframe><pre id=told></pre>'
     (folder / "frame.html").write_text(frame + STILL)
@@ -142,7 +142,7 @@ def pages_printed(page: Path, folder: Path) -> int:
 
 
 def _told(folder: Path, option: str) -> Any:
-    """What the script of the frame tells."""
+    """Message of the script of the frame."""
     ran = _chromium(folder, option, "--window-size=1400,900", "--dump-dom", (folder / "frame.html").as_uri())
     words = re.findall(r'<pre id="told">(.*?)</pre>', ran.stdout, re.DOTALL)[0]
     if not words:

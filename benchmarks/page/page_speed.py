@@ -1,4 +1,4 @@
-"""What the page of a large answer, its summary and the import of the package take."""
+"""Time of the page of a large answer, of its summary and of the import of the package."""
 
 from __future__ import annotations
 

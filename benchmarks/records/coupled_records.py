@@ -143,7 +143,7 @@ def chi_square_rises(setting: Setting, run: Run, levels: Levels) -> np.ndarray:
 
 
 def _all_known(truth: sysid.Structure, least: Bound) -> bool:
-    """Whether the records can tell each entry of M, K and C well enough for errors to be in proportion to the noise."""
+    """True where the records tell each entry of M, K and C well enough for errors in proportion to the noise."""
     for name in MATRICES:
         size = np.sqrt(np.diag(getattr(truth, name))[: truth.n])
         if np.max(getattr(least, name) / np.outer(size, size)) > KNOWN:
@@ -152,7 +152,7 @@ def _all_known(truth: sysid.Structure, least: Bound) -> bool:
 
 
 def _held(result: sysid.Identification, truth: sysid.Structure, pairs: list[tuple[int, int]]) -> dict[str, list[bool]]:
-    """Whether intervals of frequencies and ratios of the modes that were found hold the truth."""
+    """Flags of intervals of frequencies and ratios of the modes that were found: true where they hold the truth."""
     held = {}
     for name in ("natural_frequencies", "damping_ratios"):
         low, high = result.uncertainty.interval(name, level=trial.LEVEL)

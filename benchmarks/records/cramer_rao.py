@@ -42,7 +42,7 @@ class Bound:
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """What is unknown beside the damping ratios; the matrices are linear in it.
+    """Unknowns beside the damping ratios; the matrices are linear in them.
 
     Attributes
     ----------

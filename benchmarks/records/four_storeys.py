@@ -23,7 +23,7 @@ T = np.eye(N, N + 1) - np.eye(N, N + 1, k=-1) - np.outer(np.eye(N)[0], np.eye(N 
 
 @dataclass(frozen=True)
 class Statement:
-    """What is stated of the structure.
+    """Statement about the structure.
 
     Attributes
     ----------

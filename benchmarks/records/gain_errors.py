@@ -40,7 +40,7 @@ class Case(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Whether a result is determined, whether it calls a gain wrong, and how far M_SS is off in stated deviations.
+    """Judgement of a result, gains that it calls wrong, and how far M_SS is off in stated deviations.
 
     And the names of the sensors whose gain it tells in figures, with how many there are.
     """

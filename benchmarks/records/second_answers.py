@@ -124,7 +124,7 @@ def _exact(draws: range) -> Line:
 
 
 def _tells(chain: Chain, seed: int) -> bool:
-    """Whether the other answer is told by its values, and the first not called determined."""
+    """True where the other answer is told by its values, and the first not called determined."""
     result = sysid.identify(chain.problem(seed), rng=seed)
     assert result.x is not None
     others = [one.sentence for one in result.of_kind("other answers")]
@@ -135,7 +135,7 @@ def _tells(chain: Chain, seed: int) -> bool:
 
 
 def _accused(problem: sysid.Problem, seed: int, clock: Callable[[], float]) -> tuple[bool, float, float]:
-    """Whether a unique answer is said to have another; seconds of the identification, and of the look for others."""
+    """True where a unique answer is said to have another; seconds of the identification, and of the look for others."""
     looked: list[float] = []
     look = judgement.with_other_answers
 

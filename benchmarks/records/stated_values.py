@@ -123,7 +123,7 @@ def draw(task: tuple[int, int]) -> Draw:
 def _wrong(
     test: sysid.Measurement, truth: sysid.Structure, rng: np.random.Generator, scatter: np.ndarray, std: np.ndarray
 ) -> tuple[bool, bool]:
-    """Whether a wrong entry among six is told, and by its name; the five others tell what it must be."""
+    """True where a wrong entry among six is told, and where by its name; the five others tell what it must be."""
     i, j = ORDER[rng.integers(len(ORDER))]
     known = _known(truth, 6) + scatter
     others = known.copy()

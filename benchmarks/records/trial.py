@@ -35,7 +35,7 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Trial:
-    """What one draw gave.
+    """Outcome of one draw.
 
     Attributes
     ----------

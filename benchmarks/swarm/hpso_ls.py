@@ -53,7 +53,7 @@ def _sound(what: str, problem: sysid.Problem, fits: list[sysid.Identification]) 
 
 
 def _phases(what: str, results: list[sysid.Identification]) -> Line:
-    """What the swarm and the local phase left, medians."""
+    """Residuals after the swarm and the local phase, medians."""
     left = [{phase.name: phase.objective for phase in result.history.phases} for result in results]
     told = ", ".join(f"{name} {np.median([one[name] for one in left]):.2g}" for name in left[0])
     return Line(what + "median residual after each phase", told)

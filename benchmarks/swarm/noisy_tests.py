@@ -123,7 +123,7 @@ def _ratios(runs: list[Run], modal: list[Run]) -> list[float]:
 
 
 def _exits(runs: list[Run]) -> int:
-    """How many the command line would end with exit status 0."""
+    """Number of tests that the command line would end with exit status 0."""
     return sum(run.result.success for run in runs)
 
 

@@ -1,4 +1,4 @@
-"""Whether a change of a model's expressions changes the swarm's objective and IPOPT's rows alike."""
+"""Changes of a model's expressions that have to change the swarm's objective and IPOPT's rows alike."""
 
 from __future__ import annotations
 

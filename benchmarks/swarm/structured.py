@@ -61,7 +61,7 @@ CASES = (
 
 
 class End(NamedTuple):
-    """How one search ended: residual, largest relative error of an unknown, evaluations of the swarm, s."""
+    """End of one search: residual, largest relative error of an unknown, evaluations of the swarm, s."""
 
     residual: float
     error: float
@@ -70,7 +70,7 @@ class End(NamedTuple):
 
 
 def lines(reduced: bool) -> Iterator[Line]:
-    """How many of the truths each search finds; that the swarm finds nearly all is judged."""
+    """Number of the truths that each search finds; that the swarm finds nearly all is judged."""
     seeds = SEEDS[:2] if reduced else SEEDS
     for number, case in enumerate(CASES[:1] if reduced else CASES):
         ends = spread(searches, [(number, seed, not reduced) for seed in seeds])

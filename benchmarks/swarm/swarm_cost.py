@@ -94,7 +94,7 @@ def _processor_time() -> Line:
 
 
 def _overhead(reduced: bool) -> Iterator[Line]:
-    """What the swarm takes a particle and iteration beside the objective, and pymoo's with as many particles.
+    """Time of the swarm a particle and iteration beside the objective, and of pymoo's with as many particles.
 
     In process time of one thread, which other work on the machine changes little.
     """

@@ -1,1 +1,1 @@
-"""What the answer is worth: determination, uncertainty, checks."""
+"""Worth of an answer: determination, uncertainty, checks."""

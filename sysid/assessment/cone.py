@@ -150,21 +150,21 @@ class Cone:
 
     @cached_property
     def region(self) -> Region:
-        """What the limited directions may do; the others follow (`_follow`)."""
+        """Region of the limited directions; the others follow (`_follow`)."""
         pairs, width = unknowns(self.groups), sum(map(len, self.groups))
-        scale, own = np.zeros((self.n, width)), np.zeros((width, width))
+        scale, at_identity = np.zeros((self.n, width)), np.zeros((width, width))
         for cluster, group, (bound, _) in zip(self.clusters, self.groups, self.bases, strict=True):
             inverse = np.linalg.pinv(bound)
             scale[np.ix_(cluster, group)] = bound
-            own[np.ix_(group, group)] = inverse @ inverse.T
-        start = np.array([own[pair] for pair in pairs])
+            at_identity[np.ix_(group, group)] = inverse @ inverse.T
+        start = np.array([at_identity[pair] for pair in pairs])
         of = lambda W: forms(scale.T @ W, scale.T @ W, pairs)  # noqa: E731
 
         rows = [np.zeros((0, len(pairs))), *(of(W)[np.triu_indices(W.shape[1])] for W in self.fixed)]
         if self.signs is None:
             open_ = null_space(np.vstack(rows))
             units = [np.eye(width)[:, group] for group in self.groups if group]
-            signs = [Affine(unit.T @ own @ unit, forms(unit, unit, pairs) @ open_.T) for unit in units]
+            signs = [Affine(unit.T @ at_identity @ unit, forms(unit, unit, pairs) @ open_.T) for unit in units]
         else:
             open_ = null_space(np.vstack([*rows, *self.equations]))
             signs = [Affine(np.eye(1), (row @ open_.T / (row @ start))[None, None]) for row in self.signs]
@@ -211,7 +211,7 @@ class Cone:
         return values, members
 
     def _follow(self, functions: Array) -> tuple[list[Array], NDArray[np.bool_]]:
-        """How unlimited directions best follow the limited ones: ``T = Z t Z'``, Z (q, r, b) for each cluster.
+        """Best unlimited directions for the limited ones: ``T = Z t Z'``, Z (q, r, b) for each cluster.
 
         With U the unlimited directions, X their coupling to the limited ones and t the limited block, T_UU >= X' t X
         and nothing else: the supremum of the quadratic in X is finite where ``U' C U`` is negative semidefinite and
@@ -232,7 +232,7 @@ class Cone:
         return followers, finite
 
     def _bounded(self, coefficients: Array) -> NDArray[np.bool_]:
-        """Whether equations and limits keep each function from growing for ever, (q,)."""
+        """True where equations and limits keep each function from growing for ever, (q,)."""
         escape = self._escape
         if escape is None:
             return np.ones(len(coefficients), dtype=bool)

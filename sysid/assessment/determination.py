@@ -1,4 +1,4 @@
-"""What data and stated models determine of an answer, and how far the rest may go.
+"""Determination of an answer by data and stated models, and how far the rest may go.
 
 The modal-mass cone speaks where it holds all models that explain the data: exact, and of all of them at once. Elsewhere
 the rank of the exact Jacobian does: of small changes of the answer, to first order.
@@ -16,12 +16,12 @@ from sysid.assessment.modal_mass_cone import left_open
 from sysid.assessment.sensitivity import (
     Sensitivity,
     blocks_and_slopes,
-    blocks_of,
     directions_in_words,
     meaningful,
     of_outside,
     outside_variables,
     sensitivity,
+    system_matrices,
     with_totals,
 )  # fmt: skip
 from sysid.assessment.uncertainty import LARGE, uncertainty
@@ -46,7 +46,7 @@ BY_RANK = "judged by the rank of the Jacobian, to first order about this answer"
 
 @dataclass(frozen=True)
 class Determination:
-    """Whether data and stated model fix every entry of M_SS, K_SS and C.
+    """Sentences on what data and stated model fix of M_SS, K_SS and C, and what they leave open.
 
     Attributes
     ----------
@@ -62,17 +62,17 @@ class Determination:
 
     @property
     def determined(self) -> bool:
-        """Whether nothing is left open."""
+        """True where nothing is left open."""
         return not cautions(self.findings)
 
     @property
     def closed_by(self) -> tuple[str, ...]:
-        """What fixes the matrices, in sentences."""
+        """Reasons that fix the matrices, in sentences."""
         return tuple(one.sentence for one in self.findings if one.kind == "fixed")
 
     @property
     def undetermined(self) -> tuple[str, ...]:
-        """What is left open, in sentences; empty where determined."""
+        """Sentences on what is left open; empty where determined."""
         return tuple(one.sentence for one in cautions(self.findings))
 
 
@@ -92,7 +92,7 @@ class Intervals:
 
 
 def determine(problem: Prepared, structure: Structure, x: Array | None, rivals: Sequence[Array] = ()) -> Determination:
-    """Whether records, constraints and stated models fix every entry of M_SS, K_SS and C.
+    """Find which entries of M_SS, K_SS and C records, constraints and stated models leave open.
 
     Parameters
     ----------
@@ -113,16 +113,15 @@ def determine(problem: Prepared, structure: Structure, x: Array | None, rivals: 
     InputError
         Where the rank of the Jacobian is asked for, and no x is given.
     """
-    if modal_mass_cone.speaks(problem.formulation):
-        closed, open_ = modal_mass_cone.verdict(problem, structure)
+    if modal_mass_cone.applies(problem.formulation):
+        closed, open_ = modal_mass_cone.closed_and_open(problem, structure)
         beside = tuple(_open_outside(problem.formulation, x))
         if open_:  # other answers are members of the cone
             return Determination((*open_, *map(left_open, beside), *_fixed(closed)), BY_CONE)
         others = tuple(_others(problem, structure, x, rivals))
         return Determination((*others, *_fixed(closed if others else (*closed, *beside))), BY_CONE)
     closed, open_ = _by_rank(problem, structure, x)
-    found = (*open_, *_others(problem, structure, x, rivals))
-    return Determination(found or _fixed(closed), BY_RANK)
+    return Determination((*open_, *_others(problem, structure, x, rivals)) or _fixed(closed), BY_RANK)
 
 
 def _fixed(sentences: Sequence[str]) -> tuple[Finding, ...]:
@@ -135,7 +134,7 @@ def intervals(problem: Prepared, structure: Structure, x: Array | None) -> Inter
     To first order where the cone does not speak: no end is followed along a null direction until a bound stops it, so
     that it is infinite for an entry that something unseen moves.
     """
-    if modal_mass_cone.speaks(problem.formulation):
+    if modal_mass_cone.applies(problem.formulation):
         return Intervals(*modal_mass_cone.ends(problem, structure))
     _, _, slopes, known = _about(problem, structure, x)
     ends = []
@@ -148,13 +147,13 @@ def intervals(problem: Prepared, structure: Structure, x: Array | None) -> Inter
 
 def open_masses(problem: Prepared, structure: Structure) -> list[int]:
     """Modes, counted from 0, whose modal mass neither records nor stated models fix; none where no cone tells."""
-    return modal_mass_cone.open_modes(problem, structure) if modal_mass_cone.speaks(problem.formulation) else []
+    return modal_mass_cone.open_modes(problem, structure) if modal_mass_cone.applies(problem.formulation) else []
 
 
 def scale_is_open(problem: Prepared, structure: Structure, x: Array | None) -> bool:
-    """Whether one factor common to mass, stiffness and damping is all that is open; parameters as in `determine`."""
-    if modal_mass_cone.speaks(problem.formulation):
-        return modal_mass_cone.scale_is_open(problem, structure)
+    """True where one factor common to mass, stiffness and damping is all that is open; parameters as in `determine`."""
+    if modal_mass_cone.applies(problem.formulation):
+        return modal_mass_cone.only_scale_is_open(problem, structure)
     _, _, slopes, known = _about(problem, structure, x)
     pairs = blocks_and_slopes(structure, slopes)
     return _moving(pairs, known.unit, known.unseen).shape[1] == 1 and _scale_is_open(pairs, known)
@@ -173,7 +172,7 @@ def _about(problem: Prepared, structure: Structure, x: Array | None) -> tuple[Fo
 
 
 def _by_rank(problem: Prepared, structure: Structure, x: Array | None) -> tuple[tuple[str, ...], tuple[Finding, ...]]:
-    """What fixes the matrices, in sentences, and what is left open."""
+    """Reasons that fix the matrices, in sentences, and what is left open."""
     formulation, x, slopes, known = _about(problem, structure, x)
     count, rank = known.free.shape[1], known.rank
     named, factors = _by_name(formulation, known.unseen)
@@ -191,8 +190,7 @@ def _by_rank(problem: Prepared, structure: Structure, x: Array | None) -> tuple[
     misfit = formulation.objective(x)
     if rank and misfit < EXACT and misfit > _LOOSE * known.singular_values[rank - 1]:
         (weakest,) = directions_in_words(formulation.unknowns, x, known.unit, known.seen[:, -1:])
-        sentence = f"the search ended at {misfit:.2g} of the records, by which {weakest} is hardly held"
-        open_.append(left_open(sentence, misfit=misfit))
+        open_.append(left_open(f"the search ended at {misfit:.2g} of the records, by which {weakest} is hardly held"))
     if known.unseen.shape[1]:
         fixed = "the data and the written model fix mass, stiffness and damping"
         same = (f"{seen} {'; nor of '.join(words)}; {_SAME_MATRICES}",) if words else ()
@@ -203,8 +201,8 @@ def _by_rank(problem: Prepared, structure: Structure, x: Array | None) -> tuple[
         (only, f"{only} of them by what is stated as known alone"),
         (x.size - count, f"{x.size - count} of them by constraints"),
     )
-    told = ", ".join(sentence for number, sentence in closed if number)
-    return (f"{told} about this answer; what is written as a number counts as exact",), tuple(open_)
+    fixing = ", ".join(sentence for number, sentence in closed if number)
+    return (f"{fixing} about this answer; what is written as a number counts as exact",), tuple(open_)
 
 
 def _by_name(formulation: Formulation, directions: Array) -> tuple[Array, Array]:
@@ -235,7 +233,7 @@ def _factors_in_words(formulation: Formulation, directions: Array) -> Iterator[s
 
 
 def _scale_is_open(pairs: list[tuple[Array, Array]], known: Sensitivity) -> bool:
-    """Whether one factor for mass, stiffness and damping together is among what nothing sees."""
+    """True where one factor for mass, stiffness and damping together is among what nothing sees."""
     sizes = [max(np.abs(matrix).max(), np.finfo(float).tiny) for matrix, _ in pairs]
     common = np.concatenate([matrix.ravel() / size for (matrix, _), size in zip(pairs, sizes, strict=True)])
     steps = known.unit[:, None] * known.unseen
@@ -275,21 +273,21 @@ def _others(problem: Prepared, structure: Structure, x: Array | None, rivals: Se
     for other in rivals:
         off = np.where(named, np.abs(other - x) / unit, 0.0)
         far = [j for j in np.argsort(-off, kind="stable")[:MOST_LISTED] if off[j] > SAME_ANSWER]
-        told = ", ".join(f"{labels[j]} = {other[j]:.4g} in place of {x[j]:.4g}" for j in sorted(far))
+        values = ", ".join(f"{labels[j]} = {other[j]:.4g} in place of {x[j]:.4g}" for j in sorted(far))
         if _other_matrices(problem, structure, x, other):
-            sentence = ": ".join(filter(None, ("another structure explains the data as well", told)))
+            sentence = ": ".join(filter(None, ("another structure explains the data as well", values)))
             numbers = {labels[j]: float(other[j]) for j in sorted(far)}
             yield Finding("other answers", Severity.CAUTION, sentence, numbers=numbers)
 
 
 def _other_matrices(problem: Prepared, mine: Structure, x: Array, other: Array) -> bool:
-    """Whether other unknowns stand for other matrices, beyond what noise leaves open, and not for the same ones."""
+    """True where other unknowns stand for other matrices, beyond what noise leaves open, and not for the same ones."""
     try:
         its = problem.structure(other)
     except InputError:  # of no structure
         return False
-    sizes = [np.sqrt(np.abs(np.diag(a))) + np.finfo(float).tiny for a in blocks_of(mine)]
-    pairs = list(zip(blocks_of(mine), blocks_of(its), sizes, strict=True))
+    sizes = [np.sqrt(np.abs(np.diag(a))) + np.finfo(float).tiny for a in system_matrices(mine)]
+    pairs = list(zip(system_matrices(mine), system_matrices(its), sizes, strict=True))
     if all(np.all(np.abs(a - b) <= SAME_ANSWER * np.outer(size, size)) for a, b, size in pairs):
         return False
     stds = _stds(problem, mine, x)
@@ -308,4 +306,4 @@ def _stds(problem: Prepared, structure: Structure, x: Array) -> tuple[Array, ...
             return u.mass, u.stiffness, u.damping
     except InputError:
         pass
-    return tuple(np.zeros_like(a) for a in blocks_of(structure))
+    return tuple(np.zeros_like(a) for a in system_matrices(structure))

@@ -24,7 +24,7 @@ from sysid.structure.thresholds import ROUND_OFF
 
 
 def spectra_of(test: Measurement, modes: Modes) -> ComplexArray:
-    """What all columns of the Jacobian are made of, (m + m d + 2m + d, runs * n_freq).
+    """Spectra of which all columns of the Jacobian are made, (m + m d + 2m + d, runs * n_freq).
 
     ``q_k = g_k gamma_k u``; ``g_k u_j``; the slopes of q_k by log w_k, then by log zeta_k; ``u_j``.
     """
@@ -67,7 +67,7 @@ def gain_gradients(modes: Modes, index: Index, rigid_body: Array, grams: Iterato
 
 
 class Parametrisation(NamedTuple):
-    """How theta moves with a problem's unknowns.
+    """Slopes of theta by a problem's unknowns.
 
     ``slope`` (size of theta, unknowns); ``unit`` (unknowns,), a large step of each; ``gauge`` (unknowns, count),
     directions that are known to change no record, one of a mode's own each.

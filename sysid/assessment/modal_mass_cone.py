@@ -1,11 +1,11 @@
-"""What the data determine: the modal-mass cone.
+"""The modal-mass cone: what the data determine of mass and stiffness.
 
 Base and response accelerations fix frequencies, damping ratios and rank-one residues, and nothing
 else. All models that explain them are ``M_SS = P' T P``, ``K_SS = P' W T W P``, ``M_S0 = P' T (Gamma - P G)``,
 with ``T = diag(t)``, one modal mass t_k > 0 a mode (P the inverse of the mode shapes, W the circular frequencies),
 and a positive definite block of T for modes at one pole. What a measured force or a stated model adds is linear in T:
-its rank tells what stays open (`verdict`), and how far that may go is a convex problem (`ends`). Both hold for all
-models at once.
+its rank tells what stays open (`closed_and_open`), and how far that may go is a convex problem (`ends`). Both hold
+for all models at once.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ _RESOLVED = 10.0  # standard deviations of a mode's amplitude at which it is kno
 _GAIN = 5e-3  # of the base's motion; a smaller error of a sensor's gain is not told from a mode below the lines
 
 
-def speaks(formulation: Formulation) -> bool:
-    """Whether the cone holds all models that explain the data, and what is stated of them.
+def applies(formulation: Formulation) -> bool:
+    """True where the cone holds all models that explain the data, and what is stated of them.
 
     So it is where the records stand alone, damping is by ratios, and `Stated` tells all of mass and stiffness.
     """
-    told = all(stated.free or stated.entries is not None for stated in (formulation.mass, formulation.stiffness))
-    return told and formulation.by_ratios and formulation.geometry.at_sensors and formulation.test_alone
+    linear = all(stated.free or stated.entries is not None for stated in (formulation.mass, formulation.stiffness))
+    return linear and formulation.by_ratios and formulation.geometry.at_sensors and formulation.test_alone
 
 
 def left_open(sentence: str, **numbers: float) -> Finding:
@@ -50,8 +50,8 @@ def left_open(sentence: str, **numbers: float) -> Finding:
     return Finding("open", Severity.CAUTION, sentence, numbers=numbers)
 
 
-def verdict(problem: Prepared, structure: Structure) -> tuple[tuple[str, ...], tuple[Finding, ...]]:
-    """What closes the modal masses of `structure`, in sentences, and what is left open.
+def closed_and_open(problem: Prepared, structure: Structure) -> tuple[tuple[str, ...], tuple[Finding, ...]]:
+    """Reasons that close the modal masses of `structure`, in sentences, and what is left open.
 
     What counts as seen is judged against the misfit that the structure leaves: a mode whose share of
     the records is not clearly above it, poles that it cannot tell apart, and base directions that
@@ -62,13 +62,14 @@ def verdict(problem: Prepared, structure: Structure) -> tuple[tuple[str, ...], t
     known = _known(problem, structure, misfit)
     free, common = _open_modes(known)
     responses = _responses(problem.modal[0], structure)
-    told = [*_unseen(problem, structure, misfit, responses, free), *_merged(known, test, structure, free, responses)]
-    open_ = list(map(left_open, told))
+    seen = [*_unseen(problem, structure, misfit, responses, free), *_merged(known, test, structure, free, responses)]
+    open_ = list(map(left_open, seen))
     if free:
         bounded = ", within what is stated" if len(known.equations) else ""
         alike = f"other mass and stiffness matrices answer identically{bounded}"
-        open_.append(left_open(f"{_what_is_open(structure, free, common)}: {alike}"))
-        open_ += [left_open(UNIT_MASS)] if problem.unit_mass else []
+        open_ += map(
+            left_open, [f"{_what_is_open(structure, free, common)}: {alike}", *[UNIT_MASS] * problem.unit_mass]
+        )
     if not structure.at_sensors:
         how_far = "completely" if test.force is not None and not free else "up to the modal masses"
         alike = ", which do not all move independently" if structure.n == structure.n_sensors else ""
@@ -120,13 +121,13 @@ def open_modes(problem: Prepared, structure: Structure) -> list[int]:
     return _open_modes(_known(problem, structure, problem.measurement.residual(structure)))[0]
 
 
-def scale_is_open(problem: Prepared, structure: Structure) -> bool:
-    """Whether one scale of mass, stiffness and damping is open, and nothing else."""
+def only_scale_is_open(problem: Prepared, structure: Structure) -> bool:
+    """True where one scale of mass, stiffness and damping is open, and nothing else."""
     return _open_modes(_known(problem, structure, problem.measurement.residual(structure)))[1]
 
 
 def ends(problem: Prepared, structure: Structure) -> tuple[Array, Array]:
-    """How far each entry of M_SS and K_SS may go over the modal-mass cone.
+    """Ends of each entry of M_SS and K_SS over the modal-mass cone.
 
     Parameters
     ----------
@@ -153,12 +154,12 @@ def ends(problem: Prepared, structure: Structure) -> tuple[Array, Array]:
     return _entries(cone, P, mass), _entries(cone, P * omega, stiffness)
 
 
-def _entries(cone: Cone, rows: Array, own: Array, at_once: int = 100) -> Array:
-    """Ends of the entries of ``rows' T rows``, (2, n, n), so many at once; `own` is its value for T = I."""
+def _entries(cone: Cone, rows: Array, at_identity: Array, at_once: int = 100) -> Array:
+    """Ends of the entries of ``rows' T rows``, (2, n, n), so many at once; `at_identity` is their value for T = I."""
     size = np.linalg.norm(rows, axis=0)
     unit = (rows / size).T
-    ends = np.empty((2, *own.shape))
-    upper = np.array(np.triu_indices(len(own)))
+    ends = np.empty((2, *at_identity.shape))
+    upper = np.array(np.triu_indices(len(at_identity)))
     for i, j in np.array_split(upper, -(-upper.shape[1] // at_once), axis=1):
         functions = unit[i][:, :, None] * unit[j][:, None, :]
         functions = (functions + np.swapaxes(functions, 1, 2)) / 2
@@ -166,13 +167,13 @@ def _entries(cone: Cone, rows: Array, own: Array, at_once: int = 100) -> Array:
         values = values.reshape(2, -1)
         largest = np.where(np.isfinite(values), np.abs(values), 1.0).max(axis=0)
         values = np.where(np.abs(values) < NEGLIGIBLE * largest + ROUND_OFF, 0.0, values) * size[i] * size[j]
-        ends[0, i, j] = ends[0, j, i] = np.minimum(-values[0], own[i, j])
-        ends[1, i, j] = ends[1, j, i] = np.maximum(values[1], own[i, j])
+        ends[0, i, j] = ends[0, j, i] = np.minimum(-values[0], at_identity[i, j])
+        ends[1, i, j] = ends[1, j, i] = np.maximum(values[1], at_identity[i, j])
     return ends
 
 
 class _Known(NamedTuple):
-    """What holds linear functions of T equal to what they are for T = I.
+    """Statements that hold linear functions of T equal to what they are for T = I.
 
     Attributes
     ----------
@@ -208,8 +209,8 @@ def _open_modes(known: _Known) -> tuple[list[int], bool]:
     null = null_space(np.vstack([known.equations, *rows]))
     taking_part = np.abs(null).max(axis=0, initial=0.0) > 1e-6
     free = sorted({k for pair, part in zip(pairs, taking_part, strict=True) if part for k in pair})
-    own = np.array([float(k == m) for k, m in pairs])  # T = I, which a common scale multiplies
-    common = len(null) == 1 and abs(null[0] @ own) > (1 - 1e-6) * np.linalg.norm(null[0]) * np.linalg.norm(own)
+    eye = np.array([float(k == m) for k, m in pairs])  # T = I, which a common scale multiplies
+    common = len(null) == 1 and abs(null[0] @ eye) > (1 - 1e-6) * np.linalg.norm(null[0]) * np.linalg.norm(eye)
     return free, bool(common) and sum(map(len, known.clusters)) > 1
 
 
@@ -243,11 +244,11 @@ def _at_most(weights: Array, total: float) -> Array:
 
 def _below(weights: Array, bound: Array) -> Array:
     """Weights W for ``W' T W <= I``, of ``weights' T weights <= bound``; what the structure has is never too much."""
-    own = weights.T @ weights
-    size = np.sqrt(np.maximum(np.diag(own), np.diag(bound)))
+    at_identity = weights.T @ weights
+    size = np.sqrt(np.maximum(np.diag(at_identity), np.diag(bound)))
     size = np.where(size > 0, size, 1.0)
-    lam, V = np.linalg.eigh((bound - own) / np.outer(size, size))
-    lam, V = np.linalg.eigh(own / np.outer(size, size) + (V * np.maximum(lam, 0.0)) @ V.T)
+    lam, V = np.linalg.eigh((bound - at_identity) / np.outer(size, size))
+    lam, V = np.linalg.eigh(at_identity / np.outer(size, size) + (V * np.maximum(lam, 0.0)) @ V.T)
     some = lam > 1e-12 * lam[-1]
     return weights / size @ V[:, some] / np.sqrt(lam[some])
 
@@ -296,7 +297,7 @@ class _Record(NamedTuple):
 
 
 def _like_rigid(test: Measurement, structure: Structure, k: int) -> str:
-    """What else a mode below the lines may be: far above it, it moves sensors by a constant times the base's motion."""
+    """Another meaning of a mode below the lines: far above it, sensors move by a constant times the base's motion."""
     moved = -np.outer(structure.mode_shapes[:, k], structure.participation[k])
     reach = np.abs(test.rigid_body).max(axis=0)
     wrong = np.abs(moved) / np.where(reach > 0, reach, np.inf)
@@ -317,8 +318,8 @@ def _record(record: ComplexArray, predicted: ComplexArray, std: Array | None, ti
     """
     rms = lambda x: np.sqrt(np.mean(np.abs(x) ** 2, axis=(0, 2)))[:, None]  # noqa: E731
     noise = rms(record - predicted) if std is None else rms(std)
-    own = rms(record)
-    weight = 1 / np.maximum(noise, ROUND_OFF * np.where(own > 0, own, own.max()))
+    sizes = rms(record)
+    weight = 1 / np.maximum(noise, ROUND_OFF * np.where(sizes > 0, sizes, sizes.max()))
     size = float(np.linalg.norm(record * weight))
     misfit = float(np.linalg.norm((record - predicted) * weight)) / size
     level = times * misfit
@@ -377,7 +378,7 @@ def _seen(test: Measurement, structure: Structure, cluster: list[int], rows: Arr
 def _unseen(
     problem: Prepared, structure: Structure, misfit: float, responses: _Record, free: list[int]
 ) -> Iterator[str]:
-    """What the records do not show, in sentences; a mode needs no force of its own where what is stated fixes it."""
+    """Sentences on what the records do not show; a mode needs no force of its own where what is stated fixes it."""
     test = problem.measurement
     base = columns(test.base)
     sizes = np.linalg.norm(base, axis=1, keepdims=True)
@@ -408,9 +409,9 @@ def _unseen(
                 f"{_mode(structure, k)} lies outside the lines ({test.freq[0]:.4g} to {test.freq[-1]:.4g} Hz) and "
                 f"answers for all modes there{_like_rigid(test, structure, k)}"
             )
-        elif k in free and forces and (own := _shares(test, structure, k, push.T, push, forces)[0]) < forces.level:
+        elif k in free and forces and (part := _shares(test, structure, k, push.T, push, forces)[0]) < forces.level:
             yield (
-                f"the mass of {_mode(structure, k)} is not weighed: it makes {100 * own:.3g} % of the base force, and "
+                f"the mass of {_mode(structure, k)} is not weighed: it makes {100 * part:.3g} % of the base force, and "
                 f"what the fit misses ({100 * forces.misfit:.3g} % of the force) can look like a mode that makes up to "
                 f"{100 * forces.level:.3g} %"
             )
@@ -432,7 +433,7 @@ def _clusters(structure: Structure, misfit: float) -> list[list[int]]:
 
 
 def _model_equations(problem: Prepared, structure: Structure, pairs: Pairs) -> tuple[Array, Array | None, str]:
-    """What the stated models add: `_Known.equations`, `signs` and `sentence`."""
+    """Equations that the stated models add: `_Known.equations`, `signs` and `sentence`."""
     nothing = np.zeros((0, len(pairs)))
     if not structure.at_sensors:
         return nothing, None, ""
@@ -461,8 +462,8 @@ def _of_mass(
     rows = [entries[known[:, :n]], coupling[known[:, n:]]]
     if stated.totals is not None and stated.totals.kind == "sensors":
         for i in np.unique(geometry.directions[:n][geometry.directions[:n] >= 0]):
-            own = P[:, geometry.directions[:n] == i]
-            rows.append(np.einsum("iiu->u", forms(own, own, pairs))[None] / np.sum(own**2))
+            of_direction = P[:, geometry.directions[:n] == i]
+            rows.append(np.einsum("iiu->u", forms(of_direction, of_direction, pairs))[None] / np.sum(of_direction**2))
     diagonal = np.all(known[:, :n] | np.eye(n, dtype=bool))
     return rows, None if stated.free or not diagonal else np.einsum("iiu->iu", entries)
 

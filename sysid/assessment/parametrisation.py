@@ -1,4 +1,4 @@
-"""How the modal parameters of a problem with free modes move with its unknowns, and what holds them beside records."""
+"""Slopes of modal parameters by the unknowns of a problem with free modes, and what holds them beside records."""
 
 from __future__ import annotations
 
@@ -90,10 +90,10 @@ def slope_of_drawn_mass(geometry: Geometry, phi: Array, gamma: Array, index: Ind
     ``M_rb,ii = trace - sum of the sensors' M_jj - (delta' delta)_ii + (Gamma' Gamma)_ii``, ``delta = Gamma - P G``.
     """
     row = np.zeros(index.size)
-    P, own = np.linalg.inv(phi), geometry.directions[: geometry.n] == i
+    P, in_direction = np.linalg.inv(phi), geometry.directions[: geometry.n] == i
     drawn = P @ geometry.rigid_body[:, i]
     delta = gamma[:, i] - drawn
-    by_phi = 2 * (P.T @ P)[:, own] @ P[:, own].T - 2 * np.outer(P.T @ delta, drawn)
+    by_phi = 2 * (P.T @ P)[:, in_direction] @ P[:, in_direction].T - 2 * np.outer(P.T @ delta, drawn)
     row[index.phi] = by_phi.ravel()
     row[index.gamma].reshape(gamma.shape)[:, i] = 2 * (gamma[:, i] - delta)
     return row

@@ -139,6 +139,6 @@ def _matrix_std(structure: Structure, moves: Perturbations, diagonal: Array, cha
     P = np.linalg.inv(T)
     X = (P.T * diagonal) @ P
     half = np.einsum("ia,abc,bj->ijc", X, dT, P, optimize=True)
-    own = np.einsum("ki,kc,kj->ijc", P, change, P, optimize=True)
+    of_diagonal = np.einsum("ki,kc,kj->ijc", P, change, P, optimize=True)
     size = np.sqrt(np.diag(X))
-    return moves.std(own - half - half.swapaxes(0, 1), np.outer(size, size))
+    return moves.std(of_diagonal - half - half.swapaxes(0, 1), np.outer(size, size))

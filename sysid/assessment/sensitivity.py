@@ -23,7 +23,7 @@ from sysid.structure.thresholds import NEGLIGIBLE, ROUND_OFF
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """What the data say about p unknowns about a point.
+    """Sensitivity of the data to p unknowns about a point.
 
     Attributes
     ----------
@@ -113,7 +113,7 @@ def with_totals(problem: Prepared, structure: Structure, x: Array) -> tuple[Form
     return problem.formulate(geometry), np.concatenate([of_mass, x[formulation.parts.mass.stop :]])
 
 
-def blocks_of(structure: Structure) -> tuple[Array, Array, Array]:
+def system_matrices(structure: Structure) -> tuple[Array, Array, Array]:
     """M_SS, K_SS and C, (n, n) each."""
     n = structure.n
     return structure.mass[:n, :n], structure.stiffness[:n, :n], structure.damping
@@ -121,7 +121,7 @@ def blocks_of(structure: Structure) -> tuple[Array, Array, Array]:
 
 def blocks_and_slopes(structure: Structure, slopes: Slopes) -> list[tuple[Array, Array]]:
     """M_SS, K_SS and C, (n, n), each with its derivatives by the unknowns, (n, n, p)."""
-    return list(zip(blocks_of(structure), (slopes.mass, slopes.stiffness, slopes.damping), strict=True))
+    return list(zip(system_matrices(structure), (slopes.mass, slopes.stiffness, slopes.damping), strict=True))
 
 
 def meaningful(formulation: Formulation) -> NDArray[np.bool_]:
@@ -187,7 +187,7 @@ def _null_space(rows: Array, least: float = 1e-9) -> Array:
 
 
 def _rank(singular_values: Array, least: float) -> int:
-    """How many singular values are more than `least` of the largest."""
+    """Number of singular values that are more than `least` of the largest."""
     return int(np.count_nonzero(singular_values > least * singular_values.max(initial=np.finfo(float).tiny)))
 
 
@@ -198,14 +198,14 @@ def directions_in_words(unknowns: Sequence[Unknown], x: Array, unit: Array, dire
         terms = []
         pieces = (split(unknowns, part) for part in (v, v * unit, x, unit))
         for unknown, share, moved, value, large in zip(unknowns, *pieces, strict=True):
-            told = [
+            steps = [
                 f"{100 * step / abs(at):+.3g} %" if abs(at) > 1e-3 * size else f"{step:+.3g}"
                 for step, at, size in zip(moved, value, large, strict=True)
             ]
-            if len(set(told)) == 1 and abs(share[0]) > NEGLIGIBLE:
-                terms.append(f"{unknown.title} {told[0]}")
+            if len(set(steps)) == 1 and abs(share[0]) > NEGLIGIBLE:
+                terms.append(f"{unknown.title} {steps[0]}")
                 continue
-            terms += [f"{unknown.labels[j]} {told[j]}" for j in np.flatnonzero(np.abs(share) > NEGLIGIBLE)]
+            terms += [f"{unknown.labels[j]} {steps[j]}" for j in np.flatnonzero(np.abs(share) > NEGLIGIBLE)]
         sentences.append(listed(terms))
     return sentences
 

@@ -27,7 +27,7 @@ _WIDE = 5.0  # standard deviation of the logarithm of a mode's scale that nothin
 
 
 class Statements(NamedTuple):
-    """What is stated of masses, one row each.
+    """Statements about masses, one row each.
 
     ``entries`` (e, 2) of ``[M_SS, M_S0]``; ``totals`` (t, 2) of the rigid-body mass, or of the traces where ``kind`` is
     "trace"; ``values``, ``std`` and ``scale`` (e + t,): kg, the last what is a large change.
@@ -75,8 +75,8 @@ def statements_of(problem: Prepared, structure: Structure) -> Statements | None:
     return Statements(entries, totals, kind, values, stds, scale)
 
 
-def made(problem: Prepared, stated: Statements, theta: Array, index: Index) -> tuple[Array, Array]:
-    """What modal parameters make of the statements, (r,), and its slopes, (r, size of theta); in units of `scale`.
+def predict_statements(problem: Prepared, stated: Statements, theta: Array, index: Index) -> tuple[Array, Array]:
+    """Statements as modal parameters predict them, (r,), and their slopes, (r, size of theta); in units of `scale`.
 
     With P the inverse of Phi the entries are those of ``M_SS = P' P`` and ``M_S0 = P' (Gamma - P G)``.
     """
@@ -97,8 +97,8 @@ def made(problem: Prepared, stated: Statements, theta: Array, index: Index) -> t
     for at, (i, j) in enumerate(stated.totals, start=len(stated.entries)):
         values[at] = rigid[i, j]
         if stated.kind == "trace":
-            delta, own = gamma[:, i] - P @ G[:, i], geometry.directions[:n] == i
-            values[at] += np.diag(M)[own].sum() - gamma[:, i] @ gamma[:, i] + delta @ delta
+            delta, in_direction = gamma[:, i] - P @ G[:, i], geometry.directions[:n] == i
+            values[at] += np.diag(M)[in_direction].sum() - gamma[:, i] @ gamma[:, i] + delta @ delta
             slopes[at] = -slope_of_drawn_mass(geometry, phi, gamma, index, i)
         slopes[at, index.rigid[index.pairs.index((i, j))]] += 1.0
     return values / stated.scale, slopes / stated.scale[:, None]
@@ -135,7 +135,7 @@ def adjust(
         return Adjusted(theta, 0.0, 0, holds=True)
     at, a, b = theta, np.zeros(k), np.zeros(0 if weighed else m)
     for step in range(steps):
-        values, slopes = made(problem, stated, at, index)
+        values, slopes = predict_statements(problem, stated, at, index)
         F, U = slopes @ _rescaled(normals, b, index), slopes @ _gauge(at, index, weighed)
         system = np.hstack([F, _WIDE * U, np.diag(std)])
         # Shapes of modes that almost share a pole turn too easily for steps to settle: then these only meet what is
@@ -154,7 +154,7 @@ def adjust(
         at = _rescaled((theta + normals @ a)[:, None], b, index)[:, 0]
         if long < ROUND_OFF:
             break
-    left = wanted - made(problem, stated, at, index)[0]
+    left = wanted - predict_statements(problem, stated, at, index)[0]
     e = np.where(std > 0, left / np.where(std > 0, std, 1.0), 0.0)
     spread = np.linalg.svd(_whitened(F, std) @ U, compute_uv=False) if U.size else np.zeros(0)
     freedom = wanted.size - int(np.count_nonzero(spread > 1.0))
@@ -179,7 +179,7 @@ def conditioned(
         return normals, unseen, shifts
     theta = theta_of(modes, structure.rigid_body_mass, index)
     std = stated.std / stated.scale
-    _, C = made(problem, stated, theta, index)
+    _, C = predict_statements(problem, stated, theta, index)
     gauge = _gauge(theta, index, problem.measurement.force is not None)
     U = C @ gauge
     F = np.hstack([C @ normals, np.diag(std)[:, std > 0]])
@@ -187,19 +187,19 @@ def conditioned(
     rank = int(np.count_nonzero(s > ROUND_OFF * s.max(initial=0.0)))
     checks = left[:, rank:].T @ F  # statements that no scale can meet
     back = np.linalg.pinv(U, rcond=ROUND_OFF) if U.size else np.zeros((0, std.size))
-    own = np.hstack([normals, np.zeros((index.size, F.shape[1] - normals.shape[1]))]) - gauge @ (back @ F)
+    conditional = np.hstack([normals, np.zeros((index.size, F.shape[1] - normals.shape[1]))]) - gauge @ (back @ F)
     turn, s, vt = np.linalg.svd(checks, full_matrices=False)
     seen = s > round_off(s.size) * s.max(initial=0.0)
     known = vt[seen]
     # A shift is taken for noise as far as noise explains by how much the statements are missed.
     missed = (turn[:, seen] / s[seen]).T @ (left[:, rank:].T @ (C @ shifts))
-    shifts = shifts - gauge @ (back @ (C @ shifts)) - (own @ known.T) @ missed
-    own = own - (own @ known.T) @ known
-    return own, unseen - gauge @ (back @ (C @ unseen)), shifts
+    shifts = shifts - gauge @ (back @ (C @ shifts)) - (conditional @ known.T) @ missed
+    conditional = conditional - (conditional @ known.T) @ known
+    return conditional, unseen - gauge @ (back @ (C @ unseen)), shifts
 
 
 def _gauge(theta: Array, index: Index, weighed: bool) -> Array:
-    """What the logarithm of each mode's scale moves, (size, m); nothing where a force sets it."""
+    """Moves of theta by the logarithm of each mode's scale, (size, m); nothing where a force sets it."""
     if weighed:
         return np.zeros((index.size, 0))
     phi, gamma, *_ = (part[..., 0] for part in index.split(theta[:, None]))

@@ -217,7 +217,7 @@ def _by_modes(problem: Prepared, structure: Structure, x: Array | None) -> Uncer
         open_ = np.full((structure.n, structure.n), np.nan)
         matrices = open_, open_, open_  # zeros that a decoupled structure keeps included
     each = [Perturbations(1, *index.split(shift[:, None])) for shift in shifts.T]
-    by_gain = np.array([np.diag(matrices_of_modes(structure, modes, own)[0]) for own in each])
+    by_gain = np.array([np.diag(matrices_of_modes(structure, modes, move)[0]) for move in each])
     found = _quantities(problem, structure, modes, moves, inflation, matrices, by_gain)
     if x is None or not np.any(problem.formulation.outside):
         return found
@@ -234,7 +234,7 @@ def moves_by_records(
 
     With `gains` also what an error of one of each sensor's gain makes of theta, in columns; none without it.
     """
-    modal, modes = problem.modal[0], modes_of(structure)
+    modal, modes = problem.modal[0], separated_modes(structure)
     test = modal.records
     index = Index(structure.n_sensors, structure.n, structure.n_base)
     path = parametrisation(problem, structure, modes, index)
@@ -262,7 +262,7 @@ def moves_by_records(
 
 def _by_unknowns(problem: Prepared, structure: Structure, x: Array) -> Uncertainty:
     """Standard deviations from the Jacobian of all that is fitted, in the problem's unknowns."""
-    test, modes = problem.measurement, modes_of(structure)
+    test, modes = problem.measurement, separated_modes(structure)
     formulation, x = with_totals(problem, structure, x)
     slopes = slopes_of(formulation.matrices, x, test, modes.omega)
     known = sensitivity(formulation, x, slopes)
@@ -293,16 +293,16 @@ def _with_gains(formulation: Formulation, x: Array, slopes: Slopes, known: Sensi
 
     And what an error of one of each gain makes of x, (size of x, n_sensors).
     """
-    own, structure = formulation.own_test, slopes.structure
-    test = own.test
-    possible = gain_errors(own.modal, structure).possible
-    rows = rows_of_test(own.modal, slopes, x.size, share=own.weight)[0]
+    term, structure = formulation.own_test, slopes.structure
+    test = term.test
+    possible = gain_errors(term.modal, structure).possible
+    rows = rows_of_test(term.modal, slopes, x.size, share=term.weight)[0]
     weight, scale = weights_of_test(test, weighted=True)[0]
     whole = columns(test.predict(structure) + test.response - test.relative)  # G u + a
-    size = own.weight * weight / scale * whole
+    size = term.weight * weight / scale * whole
     if len(rows.jacobian) != 2 * size.size:  # rows of modes in place of those of lines
-        factor = own.weight / scale * independent_rows(own.modal)[0]
-        pull = rows.jacobian.T @ (factor @ own.modal.gain.moves)
+        factor = term.weight / scale * independent_rows(term.modal)[0]
+        pull = rows.jacobian.T @ (factor @ term.modal.gain.moves)
     else:
         pulls = rows.jacobian.reshape(2, *size.shape, -1)
         pull = np.einsum("slc,sl->cs", pulls[0], size.real) + np.einsum("slc,sl->cs", pulls[1], size.imag)
@@ -319,17 +319,17 @@ def _with_unknowns(
     unknowns, names = formulation.unknowns, {unknown.name for unknown in problem.variables}
     std = std_of(known.steps, known.normals.shape[1], known.unit)
     of_unknowns = zip(unknowns, split(unknowns, meaningful(formulation)), strict=True)
-    told = [unknown.name for unknown, part in of_unknowns if np.all(part) and unknown.name in names]
-    values, variables = ({name: by_name(unknowns, every)[name] for name in told} for every in (x, std))
+    known_names = [unknown.name for unknown, part in of_unknowns if np.all(part) and unknown.name in names]
+    values, variables = ({name: by_name(unknowns, every)[name] for name in known_names} for every in (x, std))
     found = replace(found, values=values, variables=variables)
-    if len(told) < len(unknowns):
+    if len(known_names) < len(unknowns):
         return found
     covariance = known.normals @ known.normals.T
     covariance[np.isnan(std)], covariance[:, np.isnan(std)] = np.nan, np.nan
     return replace(found, parameters=formulation.labels, covariance=covariance)
 
 
-def modes_of(structure: Structure) -> Modes:
+def separated_modes(structure: Structure) -> Modes:
     """The modal model, repeated frequencies a little apart.
 
     At one frequency the shapes are open to a rotation that no record sees and K_SS does not feel; a small distance

@@ -22,8 +22,8 @@ class Parser(argparse.ArgumentParser):
 
 def epilog(examples: tuple[str, ...], more: str = "") -> str:
     """The end of a help: examples, a line each, then text that keeps its lines."""
-    shown = "\n".join(f"  {example}" for example in examples)
-    return f"examples:\n{shown}\n" + (f"\n{more}" if more else "")
+    listing = "\n".join(f"  {example}" for example in examples)
+    return f"examples:\n{listing}\n" + (f"\n{more}" if more else "")
 
 
 def adder(parser: argparse.ArgumentParser) -> Callable[..., argparse.ArgumentParser]:

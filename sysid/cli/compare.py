@@ -34,7 +34,7 @@ def run(options: argparse.Namespace, out: Output) -> int:
     compared = compare(problem, rng=options.seed, max_time=options.max_time, listener=tell)
     if not compared.results:
         raise KeyboardInterrupt
-    out.write(f"\n{table.text(compared)}\n\n")
+    out.write(f"\n{table.comparison_text(compared)}\n\n")
     out.answer(comparison={"problem": recipe.module, "parameters": recipe.parameters, **compared.to_dict()})
     _write(compared, recipe, folder, out, rows=options.out is not None)
     if compared.interrupted:

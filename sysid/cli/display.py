@@ -77,7 +77,7 @@ class _LiveTable:
         from rich.live import Live
 
         self._phases: dict[str, Progress] = {}
-        self._begun = time.perf_counter()
+        self._start = time.perf_counter()
         self._live = Live(get_renderable=self._table, console=console, refresh_per_second=8)
 
     def __enter__(self) -> _LiveTable:
@@ -100,7 +100,7 @@ class _LiveTable:
         table.add_column("phase", min_width=12)
         for name, width in (("iteration", 10), ("objective", 10), ("time", 8)):
             table.add_column(name, justify="right", min_width=width, no_wrap=True)
-        now = time.perf_counter() - self._begun
+        now = time.perf_counter() - self._start
         rows = list(self._phases.values())
         seconds = [p.seconds for p in rows]
         if rows and self._live.is_started:

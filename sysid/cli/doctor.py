@@ -113,7 +113,7 @@ def _version(package: Package) -> str:
 
 
 def _packages() -> Iterator[Package]:
-    """What the installed package states that it needs; nothing where it is not installed."""
+    """Packages that the installed package states as needed; nothing where it is not installed."""
     try:
         stated = importlib.metadata.requires(_PACKAGE) or ()
     except importlib.metadata.PackageNotFoundError:

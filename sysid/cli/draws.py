@@ -20,7 +20,7 @@ _LARGER = (
 )
 
 
-def tell(folder: Path, result: Identification, recipe: Recipe, ends: list[JobResult], out: Output) -> None:
+def report_draws(folder: Path, result: Identification, recipe: Recipe, ends: list[JobResult], out: Output) -> None:
     """Write all draws; where two of them or more are fits, print their spreads and write these and the picture."""
     from sysid.plot.draws import draws as picture
 
@@ -35,7 +35,7 @@ def tell(folder: Path, result: Identification, recipe: Recipe, ends: list[JobRes
         out.write(f"\n{count} of {len(ends)} draws ended in a fit; two are needed for a spread\n\n")
     else:
         found = spreads(result, ends)
-        out.write(f"\n{table(found, count, len(ends))}\n\n")
+        out.write(f"\n{spread_table(found, count, len(ends))}\n\n")
         if result.problem.loss == "huber":
             out.write(f"{_LARGER}\n\n")
         out.answer(spreads=[vars(spread) for spread in found])
@@ -47,7 +47,7 @@ def tell(folder: Path, result: Identification, recipe: Recipe, ends: list[JobRes
     write_files(folder, files, out)
 
 
-def table(found: Sequence[Spread], count: int, asked: int) -> str:
+def spread_table(found: Sequence[Spread], count: int, asked: int) -> str:
     """A line a quantity: value, standard deviations to first order and of the draws, and how often it was within."""
     width = max(len(spread.name) for spread in found)
     lines = [f"{'':{width}}  {'value':>10}  {'linear std':>10}  {'draws std':>10}  ratio  within, %"]

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from sysid.cli.output import Output
 from sysid.cli.status import SUCCESS
-from sysid.cli.stored_result import add_arguments, read_result
-from sysid.export.content import worth
+from sysid.cli.stored_result import add_result_arguments, read_result
+from sysid.export.content import reliability
 from sysid.export.export import export, format_of, precision
 
 
@@ -23,7 +23,7 @@ def run(options: argparse.Namespace, out: Output) -> int:
     out.write(f"{form.name}; precision: {precision(target)}{without}\n")
     out.answer(format=form.name, precision=precision(target), deviations=form.deviations, judgement=result.judgement)
     if result.interrupted or not result.determined:
-        out.warn(f"{target.name}: {worth(result)}. Read {form.note}, or report.html")
+        out.warn(f"{target.name}: {reliability(result)}. Read {form.note}, or report.html")
     return SUCCESS
 
 
@@ -42,6 +42,6 @@ def add(command: Callable[..., argparse.ArgumentParser]) -> None:
             f"sysid export results/cantilever_tower tower.{ending}" for ending in ("csv", "mat", "op4", "bdf", "unv")
         ),
     )
-    add_arguments(parser)
+    add_result_arguments(parser)
     parser.add_argument("file", metavar="FILE", help="the file to write")
     parser.set_defaults(command=run)

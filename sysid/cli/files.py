@@ -1,4 +1,4 @@
-"""What the commands share that write: whether a folder can be written, files, CSV and strict JSON."""
+"""Writing that commands share: whether a folder can be written, files, CSV and strict JSON."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ def table_as_csv(rows: Sequence[Sequence[object]]) -> bytes:
 
 def png(picture: Callable[..., Any], *given: Any, **named: Any) -> bytes:
     """A picture of what is given, in the package's own style."""
-    from sysid.plot.canvas import own_style, to_png
+    from sysid.plot.canvas import default_style, to_png
 
-    with own_style():
+    with default_style():
         return to_png(picture(*given, **named), dpi=130)
 
 

@@ -113,8 +113,8 @@ def _list(options: argparse.Namespace, out: Output) -> int:
     entries = catalogue.entries()
     width = max((len(entry.name) for entry in entries), default=0)
     for entry in entries:
-        own = "" if entry.bundled else f"  ({entry.path})"
-        out.write(f"{entry.name:{width}}  {entry.description}{own}\n")
+        location = "" if entry.bundled else f"  ({entry.path})"
+        out.write(f"{entry.name:{width}}  {entry.description}{location}\n")
     if not entries:
         out.write("no problems found; a path to a module does as well: sysid run PATH\n")
     out.answer(problems=[{**vars(entry), "path": str(entry.path)} for entry in entries])
@@ -155,13 +155,13 @@ def _run(options: argparse.Namespace, out: Output) -> int:
 
 
 def _run_in(folder: Path, options: argparse.Namespace, out: Output) -> int:
-    begun = time.perf_counter()
+    start = time.perf_counter()
 
     def left(least: float) -> float | None:
         """Seconds that are left, at least so many; None without a limit."""
-        return None if options.max_time is None else max(options.max_time - (time.perf_counter() - begun), least)
+        return None if options.max_time is None else max(options.max_time - (time.perf_counter() - start), least)
 
-    search = unfinished.begun(options, folder, out)
+    search = unfinished.requested_run(options, folder, out)
     recipe, strategy = search.recipe, unfinished.strategy_of(search)
     problem, files = catalogue.built(recipe, check=False)  # by the search, with its progress and under its clock
     checkpoint = Checkpoint(folder / UNFINISHED, unfinished.with_source(search, files, folder))
@@ -193,7 +193,7 @@ def _run_in(folder: Path, options: argparse.Namespace, out: Output) -> int:
         except InputError as error:
             failed = error
     try:
-        words, figures = _told(result, left(GRACE))
+        words, figures = _summary_and_figures(result, left(GRACE))
         out.write(f"\n{words}\n\n")
         out.answer(result=figures)
         out.flush()
@@ -206,7 +206,7 @@ def _run_in(folder: Path, options: argparse.Namespace, out: Output) -> int:
         out.complain(f"interrupted while saving; the result is there, but not every file is in {folder}")
         return INTERRUPTED
     if late.asked or writing.asked or result.interrupted:
-        on = f"; '{unfinished.command(search, folder)}' goes on" if checkpoint.exists else ""
+        on = f"; '{unfinished.resuming_command(search, folder)}' goes on" if checkpoint.exists else ""
         out.complain(f"interrupted; the {'best so far' if result.interrupted else 'result'} is in {folder}{on}")
         return INTERRUPTED
     return SUCCESS if result.judgement in ("determined", "one of many") else NOT_REACHED
@@ -290,7 +290,7 @@ def _parser() -> argparse.ArgumentParser:
         summary="write report.html again, beside a result",
         examples=("sysid report results/cantilever_tower", "sysid report results/cantilever_tower/result.h5"),
     )
-    stored_result.add_arguments(report)
+    stored_result.add_result_arguments(report)
     report.set_defaults(command=_report)
 
     export.add(command)
@@ -458,7 +458,7 @@ def _save(result: Identification, folder: Path, checkpoint: Checkpoint) -> None:
         remove_empty(missing)  # where nothing could be written
 
 
-def _told(result: Identification, left: float | None) -> tuple[str, dict[str, Any]]:
+def _summary_and_figures(result: Identification, left: float | None) -> tuple[str, dict[str, Any]]:
     """Summary and figures of a result; without what takes more than the seconds that are `left`."""
     try:
         with within(left):

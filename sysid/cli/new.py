@@ -98,7 +98,7 @@ def _filled(template: str, words: dict[str, str]) -> str:
 
 
 def _is_taken(name: str) -> bool:
-    """Whether a module of this name can be imported, the current folder aside."""
+    """True where a module of this name can be imported, the current folder aside."""
     here = Path.cwd()
     elsewhere = [place for place in sys.path if Path(place or ".").absolute() != here]
     spec = importlib.machinery.PathFinder.find_spec(name, elsewhere)

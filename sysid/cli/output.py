@@ -1,4 +1,4 @@
-"""What commands say: words or one JSON document on standard output, progress and complaints on standard error."""
+"""Output of commands: words or one JSON document on standard output, progress and complaints on standard error."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Stream:
 
 
 class Output:
-    """What one command says; control characters, as a name in a file may hold some, are spelled out.
+    """Output of one command; control characters, as a name in a file may hold some, are spelled out.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a command hands on to a problem module: ``--data`` and ``--set KEY=VALUE``."""
+"""Arguments that a command hands on to a problem module: ``--data`` and ``--set KEY=VALUE``."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def recipe_of(options: argparse.Namespace, out: Output, rng: int | None = None) 
 
 
 def _value(text: str) -> Any:
-    """What a text says in Python, else the text."""
+    """The value of a text in Python, else the text."""
     try:
         return ast.literal_eval(text)
     except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):

@@ -84,7 +84,7 @@ def run(options: argparse.Namespace, out: Output) -> int:
 
 
 def _said(options: argparse.Namespace) -> Any:
-    """What the options say; over a TOML file where both do."""
+    """The description by the options; over a TOML file where both say something."""
     given: dict[str, Any] = {
         "sample_rate": options.rate, "time": options.time, "frequency": options.frequency, "join": options.join,
         "base_axes": options.base_axes, "frf": options.frf, "convention": options.convention,
@@ -92,7 +92,7 @@ def _said(options: argparse.Namespace) -> Any:
     given = {name: value for name, value in given.items() if value is not None}
     if options.sensor:
         given["sensor"] = [description.from_words(words) for words in options.sensor]
-    file = Path(options.sensors) if options.sensors else description.beside(Path(options.files[0]))
+    file = Path(options.sensors) if options.sensors else description.description_file(Path(options.files[0]))
     if options.sensor and options.sensors:
         raise InputError("--sensor and --sensors exclude each other")
     if file is None or options.sensor:
@@ -101,18 +101,18 @@ def _said(options: argparse.Namespace) -> Any:
 
 
 def is_test(name: str | None) -> bool:
-    """Whether a problem is called by the file of a test."""
+    """True where a problem is called by the file of a test."""
     return name is not None and name.endswith(".h5")
 
 
-def recipe(options: argparse.Namespace, made: Recipe) -> Recipe:
+def recipe(options: argparse.Namespace, given: Recipe) -> Recipe:
     """The recipe of a run of a test file: the bundled problem, with the test as its data."""
-    if not is_test(made.module):
+    if not is_test(given.module):
         asked = options.lumped or any(one is not None for one in (options.mass, options.band, options.goal))
         refuse((asked, "--mass, --lumped, --band and --goal are for a test that 'sysid read' wrote"))
-        return made
-    refuse((made.data is not None, f"--data {made.data}: {made.module} is the data already"))
-    recorded_test.load(made.module)  # told before anything is made
+        return given
+    refuse((given.data is not None, f"--data {given.data}: {given.module} is the data already"))
+    recorded_test.load(given.module)  # told before anything is made
     extra: dict[str, Any] = {"lumped": True} if options.lumped else {}
     if options.mass is not None:
         extra["mass"] = options.mass[0] if len(options.mass) == 1 else options.mass
@@ -120,7 +120,7 @@ def recipe(options: argparse.Namespace, made: Recipe) -> Recipe:
         extra["band"] = options.band
     if options.goal is not None:
         extra["goal"] = options.goal
-    return Recipe(MODULE, made.module, made.rng, {**made.parameters, **extra})
+    return Recipe(MODULE, given.module, given.rng, {**given.parameters, **extra})
 
 
 def add_options(command: argparse.ArgumentParser) -> None:

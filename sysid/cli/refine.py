@@ -42,33 +42,33 @@ def run(options: argparse.Namespace, out: Output) -> int:
 def _run_in(folder: Path, result: Identification, recipe: Recipe, options: argparse.Namespace, out: Output) -> int:
     source = Path(options.result)
     executor = _executor(options)
-    sweeps.check_own_records(result, recipe)
+    sweeps.check_same_records(result, recipe)
     sweep = sweeps.sweep_of(options, result, recipe, out)
     if sweep is not None:
-        titles, told = [*sweep.titles], sweep.told
+        titles, kind = [*sweep.titles], sweep.kind
         jobs = submit(sweep.recipes, changes=sweep.changes, strategy="auto", executor=executor, out=folder)
     elif options.draws is not None:
         if result.residual < EXACT:
             raise InputError(f"{source} fits its records exactly: without noise there is nothing to draw")
-        titles, told = [f"draw {i:4d}" for i in range(options.draws)], "draw{s} of noise, each fitted from the result"
+        titles, kind = [f"draw {i:4d}" for i in range(options.draws)], "draw{s} of noise, each fitted from the result"
         jobs = submit(_started(recipe, source), draws=options.draws, executor=executor, out=folder)
     else:
         count = options.starts or 16
-        titles, told = [f"start {i:4d}" for i in range(count)], "start{s}, the first at the result"
+        titles, kind = [f"start {i:4d}" for i in range(count)], "start{s}, the first at the result"
         jobs = submit(_started(recipe, source), starts=count, executor=executor, out=folder)
-    out.write(f"{recipe.title}: {len(titles)} {told.format(s='' if len(titles) == 1 else 's')}\n")
+    out.write(f"{recipe.title}: {len(titles)} {kind.format(s='' if len(titles) == 1 else 's')}\n")
     out.flush()
     try:
         ends, interrupted = _ends(jobs, titles, out)
         if interrupted and not ends:
             pass  # there is nothing to tell
         elif sweep is not None:
-            sweeps.tell(folder, result, recipe, sweep, ends, out)
+            sweeps.report_sweep(folder, result, recipe, sweep, ends, out)
         elif options.draws is not None:
-            draws.tell(folder, result, recipe, ends, out)
+            draws.report_draws(folder, result, recipe, ends, out)
         else:
             minima = distinct(result.prepared, ends)
-            out.write(f"\n{table(minima, len(ends))}\n\n")
+            out.write(f"\n{minima_table(minima, len(ends))}\n\n")
             out.answer(minima=[_figures(minimum) for minimum in minima])
             _write(folder, recipe, ends, minima, result.problem, out)
         out.wrote(folder / LEDGER)
@@ -98,7 +98,7 @@ def _ends(jobs: Generator[JobResult, None, None], titles: Sequence[str], out: Ou
     return sorted(ends, key=lambda one: one.index), interrupted
 
 
-def table(minima: list[Minimum], starts: int, most: int = 12) -> str:
+def minima_table(minima: list[Minimum], starts: int, most: int = 12) -> str:
     """The minima, `most` of them, how often each was reached, and what they say together."""
     lines = ["minimum    residual  reached  a fit  best start"]
     for i, minimum in enumerate(minima[:most]):
@@ -128,7 +128,7 @@ def _figures(minimum: Minimum) -> dict[str, Any]:
 
 
 def _recipe(result: Identification, options: argparse.Namespace, source: Path, out: Output) -> Recipe:
-    """What the problem of a result was made from: by a module that the user names, or that may run."""
+    """The recipe of the problem of a result: by a module that the user names, or that may run."""
     if result.recipe is None:
         raise InputError(
             f"{source} was not made from a problem module, so that no worker could rebuild its problem: save the "
@@ -138,7 +138,7 @@ def _recipe(result: Identification, options: argparse.Namespace, source: Path, o
     recipe = replace(result.recipe, start=None if x is None else tuple(x.tolist()))
     if options.module is not None:
         return replace(recipe, module=trust.typed_module(options.module, out))
-    trust.check(recipe, source, f"sysid refine {source} --module FILE.py", options)
+    trust.check_trust(recipe, source, f"sysid refine {source} --module FILE.py", options)
     return recipe
 
 

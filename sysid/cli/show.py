@@ -38,7 +38,7 @@ _ROOM = 1e-3  # of a constraint's scale, by which the point stays clear of inequ
 
 
 def show(problem: Problem, name: str) -> str:
-    """What a problem is, and what its data determine, in lines of at most 120 columns.
+    """Describe a problem, and what its data determine, in lines of at most 120 columns.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def show(problem: Problem, name: str) -> str:
 
 
 def figures(problem: Problem, name: str) -> dict[str, Any]:
-    """What `show` tells, for scripts: numbers, texts, and lists and dictionaries of them; errors as there."""
+    """Content of `show` for scripts: numbers, texts, and lists and dictionaries of them; errors as there."""
     problem.check()
     test, point = problem.measurement, _point(problem.prepared.screened, problem)
     known = point.known
@@ -139,11 +139,11 @@ def _variable(v: Unknown, declared: str) -> list[str]:
 def _unknowns(problem: Prepared) -> Iterator[str]:
     """Variables by matrix; a model counts its own, a written matrix all that enter it."""
     formulation = problem.formulation
-    told, counts = {v.name: f"{v.title} ({v.size})" for v in formulation.unknowns}, dict(problem.unknowns)
+    titles, counts = {v.name: f"{v.title} ({v.size})" for v in formulation.unknowns}, dict(problem.unknowns)
     labels = {"constraints": counted(formulation.constraints.lower.size, "constraint")}
     rows = [["enters", "unknowns", "variables"]]
     for name, members in formulation.members:
-        rows.append([labels.get(name, name), str(counts[name]), ", ".join(told[v] for v in members)])
+        rows.append([labels.get(name, name), str(counts[name]), ", ".join(titles[v] for v in members)])
     yield from _table(rows)
     if formulation.healed:
         yield "healing: the swarm's candidates are brought to what it states before they are judged"
@@ -258,7 +258,7 @@ def _sizes(matrix: Array) -> Array:
 
 
 def _at_modes(problem: Prepared, stated: Problem) -> tuple[_Point | None, tuple[str, ...]]:
-    """What the modal strategy finds in the data; only sentences where it has other degrees of freedom."""
+    """The modal strategy's answer to the data; only sentences where it has other degrees of freedom."""
     try:
         found = identify(stated, strategy="modal", rng=0)
     except SysidError:
@@ -311,17 +311,17 @@ def _values(problem: Prepared, point: _Point, moves: Array, noise: str) -> Itera
     rows = [["variable", "value", "unit of IPOPT", f"standard deviation at {noise}"]]
     for v, part in zip(problem.variables, slices_of(problem.variables), strict=True):
         if np.any(open_[part]):
-            told = "open" if np.all(open_[part]) else f"open in {np.count_nonzero(open_[part])} of {v.size}"
+            error = "open" if np.all(open_[part]) else f"open in {np.count_nonzero(open_[part])} of {v.size}"
         elif np.all(np.isfinite(relative[part])):
-            told = f"{100 * relative[part].max():.3g} %"
+            error = f"{100 * relative[part].max():.3g} %"
         else:
-            told = f"{std[part].max():.3g} {v.unit}".rstrip()
-        rows.append([v.title, _range(x[part]), "-" if problem.free_modes else _range(known.unit[part]), told])
+            error = f"{std[part].max():.3g} {v.unit}".rstrip()
+        rows.append([v.title, _range(x[part]), "-" if problem.free_modes else _range(known.unit[part]), error])
     yield from _table(rows)
 
 
 def _coordinates(problem: Prepared) -> Iterator[str]:
-    """What IPOPT has in the place of these unknowns, or beside them."""
+    """Coordinates that IPOPT has in the place of these unknowns, or beside them."""
     formulation = problem.formulation
     if problem.free_modes:
         yield (
@@ -337,10 +337,10 @@ def _unseen(problem: Prepared, point: _Point) -> Iterator[str]:
     """The null directions: what they change, and the shortest in words."""
     known, x = point.known, point.x
     words = sorted(directions_in_words(problem.variables, x, known.unit, known.unseen), key=len)
-    own, base = _moved_matrices(point)
-    left = len(words) - own - base
+    of_blocks, base = _moved_matrices(point)
+    left = len(words) - of_blocks - base
     kinds = (
-        (own, f"along {own} mass, stiffness or damping change"),
+        (of_blocks, f"along {of_blocks} mass, stiffness or damping change"),
         (base, f"along {base} only mass and coupling of the base change"),
         (left, f"along {left} nothing changes, as other values of the unknowns make the same structure there"),
     )
@@ -358,7 +358,7 @@ def _unseen(problem: Prepared, point: _Point) -> Iterator[str]:
 
 
 def _moved_matrices(point: _Point) -> tuple[int, int]:
-    """How many unseen directions move M_SS, K_SS or C; how many of the rest move the base's blocks."""
+    """Numbers of unseen directions that move M_SS, K_SS or C, and of the rest that move the base's blocks."""
     s, steps = point.slopes, point.known.unit[:, None] * point.known.unseen
     n = s.structure.n
     M, K, C = s.structure.mass[:n, :n], s.structure.stiffness[:n, :n], s.structure.damping
@@ -367,12 +367,12 @@ def _moved_matrices(point: _Point) -> tuple[int, int]:
         return ((slope @ steps) / size[..., None]).reshape(-1, steps.shape[1])
 
     blocks = ((s.mass, M), (s.stiffness, K), (s.damping, C))
-    own = np.concatenate([moved(slope, _sizes(A)) for slope, A in blocks])
+    of_blocks = np.concatenate([moved(slope, _sizes(A)) for slope, A in blocks])
     rigid = np.sqrt(np.abs(np.diag(s.structure.rigid_body_mass)))
     push = moved(s.d_push, np.sqrt(np.diag(M))[:, None] * rigid)
     base = np.concatenate([push, moved(s.d_rigid, np.outer(rigid, rigid))])
-    rank = int(np.linalg.matrix_rank(own, tol=NEGLIGIBLE))
-    return rank, int(np.linalg.matrix_rank(np.concatenate([own, base]), tol=NEGLIGIBLE)) - rank
+    rank = int(np.linalg.matrix_rank(of_blocks, tol=NEGLIGIBLE))
+    return rank, int(np.linalg.matrix_rank(np.concatenate([of_blocks, base]), tol=NEGLIGIBLE)) - rank
 
 
 def _seen_least(problem: Prepared, point: _Point, moves: Array, noise: str) -> str:
@@ -399,7 +399,7 @@ def _moves(problem: Prepared, point: _Point) -> Array:
 
 
 def _all_stated(problem: Prepared) -> bool:
-    """Whether every record that is fitted states its noise."""
+    """True where every record that is fitted states its noise."""
     formulation = problem.formulation
     return formulation.fits_records and all(_noise_is_stated(term.test) for term in formulation.tests)
 

@@ -24,7 +24,7 @@ def is_over() -> None:
 
 
 def _is_command() -> bool:
-    """Whether this process was started as ``sysid`` or ``python -m sysid``; processes that it starts are not."""
+    """True where this process was started as ``sysid`` or ``python -m sysid``; processes that it starts are not."""
     name, given = sys.argv[0] if sys.argv else "", sys.orig_argv[1:]
     if name == "-m":  # so it is called until its module is found
         return "-msysid" in given or ("-m", "sysid") in pairwise(given)

@@ -13,7 +13,7 @@ from sysid.errors import InputError
 from sysid.results.identification import Identification, Recipe, load
 
 
-def add_arguments(command: argparse.ArgumentParser) -> None:
+def add_result_arguments(command: argparse.ArgumentParser) -> None:
     """Add RESULT and ``--module``."""
     command.add_argument("result", metavar="RESULT", help="a result.h5, or the folder that holds it")
     command.add_argument(

@@ -34,7 +34,7 @@ class Sweep:
     ----------
     name : str
         Of its files.
-    told : str
+    kind : str
         Kind of the jobs, for the first line; "{s}" is to be put in for the plural.
     titles : tuple of str
         Of the jobs, in their order.
@@ -44,19 +44,19 @@ class Sweep:
     """
 
     name: str
-    told: str
+    kind: str
     titles: tuple[str, ...]
     recipes: tuple[Recipe, ...]
     changes: tuple[Change, ...] = ()
 
     @property
     def of_parts(self) -> bool:
-        """Whether each leaves some records out."""
+        """True where each leaves some records out."""
         return bool(self.changes) and not isinstance(self.changes[0], NumberOfModes)
 
 
 def sweep_of(options: argparse.Namespace, result: Identification, recipe: Recipe, out: Output) -> Sweep | None:
-    """What the command line asks for; None where that is starts or draws."""
+    """The sweep that the command line asks for; None where that is starts or draws."""
     if options.variants:
         modules = [trust.typed_module(module, out) for module in options.variants]
         recipes = tuple(Recipe(module, recipe.data, recipe.rng) for module in modules)
@@ -68,32 +68,32 @@ def sweep_of(options: argparse.Namespace, result: Identification, recipe: Recipe
                 )
         return Sweep("variants", "other model{s} of the same records", tuple(one.title for one in recipes), recipes)
     changes: tuple[Change, ...] = ()
-    name = told = ""
+    name = kind = ""
     if options.leave_out == "run":
         changes = tuple(WithoutRun(i) for i in range(result.measurement.n_runs))
-        name, told = "without_run", "identification{s}, each without one run"
+        name, kind = "without_run", "identification{s}, each without one run"
     elif options.leave_out == "sensor":
         changes = tuple(WithoutSensor(i, sensor) for i, sensor in enumerate(result.measurement.sensor_names))
-        name, told = "without_sensor", "identification{s}, each without one sensor"
+        name, kind = "without_sensor", "identification{s}, each without one sensor"
     elif options.bands:
         changes = tuple(Band(low, high) for low, high in options.bands)
-        name, told = "bands", "identification{s}, each of one band"
+        name, kind = "bands", "identification{s}, each of one band"
     elif options.orders:
-        name, (changes, told) = "orders", _orders(options.orders[0], options.orders[1], result.problem)
+        name, (changes, kind) = "orders", _orders(options.orders[0], options.orders[1], result.problem)
     if not changes:
         return None
     _check_possible(changes, result.problem)
-    return Sweep(name, told, tuple(change.title for change in changes), (recipe,), changes)
+    return Sweep(name, kind, tuple(change.title for change in changes), (recipe,), changes)
 
 
 def _orders(low: int, high: int, problem: Problem) -> tuple[tuple[Change, ...], str]:
     """Numbers of modes up to those that stand out of the noise, and what the jobs are."""
-    changes, told = tuple(map(NumberOfModes, range(low, high + 1))), "identification{s}, each of so many modes"
+    changes, kind = tuple(map(NumberOfModes, range(low, high + 1))), "identification{s}, each of so many modes"
     _check_possible(changes, problem)
     found = poles_of(problem.prepared.screened).omega.size
     if low > found:
         raise InputError(f"{found} modes stand out of the noise, fewer than the {low} asked for")
-    return changes[: found + 1 - low], told if high <= found else f"{told}: no more than {found} stand out of the noise"
+    return changes[: found + 1 - low], kind if high <= found else f"{kind}: no more than {found} stand out of the noise"
 
 
 def _check_possible(changes: Sequence[Change], problem: Problem) -> None:
@@ -109,7 +109,7 @@ def _check_possible(changes: Sequence[Change], problem: Problem) -> None:
     raise refusals[0]
 
 
-def check_own_records(result: Identification, recipe: Recipe) -> None:
+def check_same_records(result: Identification, recipe: Recipe) -> None:
     """Refuse to compare a result with jobs of other records, as its module makes them now."""
     if not _same_records(result, catalogue.build(replace(recipe, start=None))):
         raise InputError(
@@ -119,31 +119,31 @@ def check_own_records(result: Identification, recipe: Recipe) -> None:
 
 
 def _same_records(result: Identification, other: Problem) -> bool:
-    """Whether a problem is of the result's records."""
-    own, its = (
+    """True where a problem is of the result's records."""
+    ours, its = (
         [problem.measurement, *(one.measurement for one in problem.residuals if isinstance(one, FurtherTest))]
         for problem in (result.problem, other)
     )
     names = ("freq", "base", "response", "force")
-    pairs = [(getattr(mine, name), getattr(one, name)) for mine, one in zip(own, its, strict=False) for name in names]
-    return len(own) == len(its) and all(np.array_equal(mine, one) for mine, one in pairs)
+    pairs = [(getattr(mine, name), getattr(one, name)) for mine, one in zip(ours, its, strict=False) for name in names]
+    return len(ours) == len(its) and all(np.array_equal(mine, one) for mine, one in pairs)
 
 
-def tell(
+def report_sweep(
     folder: Path, result: Identification, recipe: Recipe, sweep: Sweep, ends: Sequence[JobResult], out: Output
 ) -> None:
     """Print the table of all identifications, and write it, all moves and the picture."""
     from sysid.plot.sweep import sweep as picture
 
     part = sweep.of_parts
-    own = scored(result, np.nan if part else None)
-    rows = [Compared(recipe.title, result.success, result.residual, result.message, own)]
+    score = scored(result, np.nan if part else None)
+    rows = [Compared(recipe.title, result.success, result.residual, result.message, score)]
     for end in ends:
         if end.score is not None:
-            moved = moves(own, end.score, part=part)
+            moved = moves(score, end.score, part=part)
             title = sweep.titles[end.index]
             rows.append(Compared(title, end.success, end.residual, end.message, end.score, moved))
-    out.write(f"\n{table(rows, part)}\n\n")
+    out.write(f"\n{comparison_table(rows, part)}\n\n")
     out.answer(identifications=[asdict(row) for row in rows])
     without = [(sweep.titles[end.index], end.message) for end in ends if end.score is None]
     drawn = png(picture, rows, recipe.title, part=part) if len(rows) > 1 else None
@@ -151,7 +151,7 @@ def tell(
     write_files(folder, {**tables, f"{sweep.name}.png": drawn}, out)
 
 
-def table(rows: Sequence[Compared], part: bool) -> str:
+def comparison_table(rows: Sequence[Compared], part: bool) -> str:
     """A line an identification, the result's own first; `part` where they are of parts of the records."""
     columns = [
         ("", [row.title for row in rows]),
@@ -177,21 +177,18 @@ def table(rows: Sequence[Compared], part: bool) -> str:
 
 
 def _fits(rows: Sequence[Compared], part: bool) -> list[str]:
-    """Whether each is a fit; of models of the same records "worse" where another fits better, decisively."""
+    """A word a row, "yes" for a fit; of models of the same records "worse" where another fits better, decisively."""
     figures = np.array([(row.score.deviance, row.score.aic, row.score.bic) for row in rows])
     fits = [row.success for row in rows]
-    beaten = [not part and np.any(np.all(figures[fits] + DECISIVE <= own, axis=1)) for own in figures]
+    beaten = [not part and np.any(np.all(figures[fits] + DECISIVE <= scores, axis=1)) for scores in figures]
     return ["no" if not fit else "worse" if worse else "yes" for fit, worse in zip(fits, beaten, strict=True)]
 
 
 def criteria(rows: Sequence[Compared]) -> dict[str, list[float]]:
     """AIC and BIC of all rows above the least."""
-    made = {}
-    for name in ("aic", "bic"):
-        values = [getattr(row.score, name) for row in rows]
-        least = min((value for value in values if np.isfinite(value)), default=np.nan)
-        made[name.upper()] = [value - least for value in values]
-    return made
+    found = {name: [getattr(row.score, name) for row in rows] for name in ("aic", "bic")}
+    least = {name: min(filter(np.isfinite, values), default=np.nan) for name, values in found.items()}
+    return {name.upper(): [value - least[name] for value in values] for name, values in found.items()}
 
 
 def _farthest(steps: Sequence[Move]) -> str:
@@ -200,12 +197,12 @@ def _farthest(steps: Sequence[Move]) -> str:
     if not (known or relative):
         return ""
     step = max(known or relative, key=lambda one: abs(one.deviations if known else one.relative))
-    told = f"{step.name}: {100 * step.relative:+.2g} %"
-    return f"{told}, {abs(step.deviations):.1f} std" if known else told
+    words = f"{step.name}: {100 * step.relative:+.2g} %"
+    return f"{words}, {abs(step.deviations):.1f} std" if known else words
 
 
 def _notes(rows: Sequence[Compared], part: bool) -> Iterator[str]:
-    """What the columns are, and what all rows say together."""
+    """Meaning of the columns, and what all rows say together."""
     notes = ["a fit: the search ended well, with a residual within the goal, or the noise where none is stated"]
     predicted = int(np.any(np.isfinite([row.score.predicted for row in rows])))
     if part:
@@ -229,8 +226,8 @@ def _notes(rows: Sequence[Compared], part: bool) -> Iterator[str]:
         reach = most_deviations()
         far = sum(abs(step.deviations) > reach for step in steps)
         chance = f"noise alone makes {100 * FALSE_ALARM:g} %"
-        told = f"{far} of {len(steps)} steps of fits are beyond {reach:.2g} std; {chance}"
-        yield told + (": more than noise moves them" if far > max(1, 0.01 * len(steps)) else "")
+        words = f"{far} of {len(steps)} steps of fits are beyond {reach:.2g} std; {chance}"
+        yield words + (": more than noise moves them" if far > max(1, 0.01 * len(steps)) else "")
 
 
 def _as_csv(rows: Sequence[Compared], without: Sequence[tuple[str, str]], part: bool) -> bytes:

@@ -45,7 +45,7 @@ def typed_module(name: str, out: Output) -> str:
     return module
 
 
-def check(recipe: Recipe, source: Path, instead: str, options: argparse.Namespace) -> None:
+def check_trust(recipe: Recipe, source: Path, instead: str, options: argparse.Namespace) -> None:
     """Refuse a recipe that a file holds, where its module may not run.
 
     Parameters

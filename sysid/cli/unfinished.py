@@ -12,7 +12,7 @@ from sysid.cli import parameters, read, trust
 from sysid.cli.files import results_folder
 from sysid.cli.output import Output
 from sysid.errors import InputError
-from sysid.results.checkpoint import FILE_NAME, Begun, Checkpoint
+from sysid.results.checkpoint import FILE_NAME, Checkpoint, RunRequest
 from sysid.results.identification import Recipe
 from sysid.search.auto import NAMED
 from sysid.search.strategy import Strategy
@@ -28,7 +28,7 @@ def folder_of(options: argparse.Namespace, out: Output) -> Path:
     return results_folder(options.resume, Path(options.resume))
 
 
-def begun(options: argparse.Namespace, folder: Path, out: Output) -> Begun:
+def requested_run(options: argparse.Namespace, folder: Path, out: Output) -> RunRequest:
     """The search that the arguments of ``run`` ask for, in the folder of its results.
 
     Raises
@@ -42,19 +42,19 @@ def begun(options: argparse.Namespace, folder: Path, out: Output) -> Begun:
     checkpoint = Checkpoint(folder / FILE_NAME)
     if checkpoint.exists and not options.fresh:
         raise InputError(
-            f"{folder} holds {_in_words(checkpoint, search)}: '{command(search, folder)}' goes on with it, "
+            f"{folder} holds {_in_words(checkpoint, search)}: '{resuming_command(search, folder)}' goes on with it, "
             "--fresh begins anew, --out DIR writes elsewhere"
         )
     return search
 
 
-def command(search: Begun, folder: Path) -> str:
+def resuming_command(search: RunRequest, folder: Path) -> str:
     """The command that goes on with a search; a module that is not of the package is named again."""
     module = search.recipe.module
     return f"sysid run {'' if catalogue.is_bundled(module) else f'{module} '}--resume {folder}"
 
 
-def strategy_of(search: Begun) -> str | Strategy:
+def strategy_of(search: RunRequest) -> str | Strategy:
     """The strategy of a search, with the eigenvalue refinement that was chosen.
 
     Raises
@@ -73,7 +73,7 @@ def strategy_of(search: Begun) -> str | Strategy:
     return replace(chosen, refine_by=search.refine_by)
 
 
-def with_source(search: Begun, files: Collection[Path], folder: Path) -> Begun:
+def with_source(search: RunRequest, files: Collection[Path], folder: Path) -> RunRequest:
     """The search with the digest of the files that its problem was made from; refused where it began with others."""
     source = catalogue.digest(files)
     if search.source not in ("", source):
@@ -84,7 +84,7 @@ def with_source(search: Begun, files: Collection[Path], folder: Path) -> Begun:
     return replace(search, source=source)
 
 
-def _resumed(options: argparse.Namespace, folder: Path, out: Output) -> Begun:
+def _resumed(options: argparse.Namespace, folder: Path, out: Output) -> RunRequest:
     checkpoint = Checkpoint(folder / FILE_NAME)
     asked = _asked(options, out) if options.problem is not None else None
     if not checkpoint.exists:
@@ -98,7 +98,7 @@ def _resumed(options: argparse.Namespace, folder: Path, out: Output) -> Begun:
     tree = checkpoint.read()
     if tree["begun"] is None:
         raise InputError(f"{checkpoint.path} was not begun by 'sysid run': go on with it as it was begun")
-    search = Begun.from_tree(tree["begun"])
+    search = RunRequest.from_tree(tree["begun"])
     given = (options.seed, options.strategy, options.refine_by, options.data)
     more = any(one is not None for one in given) or bool(options.settings)
     if asked is None:
@@ -106,17 +106,17 @@ def _resumed(options: argparse.Namespace, folder: Path, out: Output) -> Begun:
             raise InputError(
                 f"--resume takes --seed, --strategy, --refine-by, --data and --set from the run in {folder}: {search}"
             )
-        trust.check(search.recipe, checkpoint.path, f"sysid run MODULE.py --resume {folder}", options)
+        trust.check_trust(search.recipe, checkpoint.path, f"sysid run MODULE.py --resume {folder}", options)
     else:
         search = _agreed(search, asked, more or read.is_test(options.problem), folder)
     out.write(f"going on with {search}\n" if tree["entries"] else f"{search} had reached nothing: it begins anew\n")
     return search
 
 
-def _agreed(search: Begun, asked: Begun, whole: bool, folder: Path) -> Begun:
+def _agreed(search: RunRequest, asked: RunRequest, whole: bool, folder: Path) -> RunRequest:
     """The unfinished run as it is asked for: `whole`, or by its module alone, which the user says again."""
-    own, its = (catalogue.short_name(one.recipe.module) for one in (asked, search))
-    if not whole and own == its:
+    wanted, its = (catalogue.short_name(one.recipe.module) for one in (asked, search))
+    if not whole and wanted == its:
         return replace(search, recipe=replace(search.recipe, module=asked.recipe.module))
     if asked != search:
         raise InputError(f"{folder} holds an unfinished run of {search}, not of {asked}")
@@ -125,23 +125,23 @@ def _agreed(search: Begun, asked: Begun, whole: bool, folder: Path) -> Begun:
 
 def _name(recipe: Recipe) -> str:
     """Name for the folder of results: the module's, of a test that is run without one the test's."""
-    own = recipe.module == read.MODULE and recipe.data is not None
-    return Path(recipe.data or "").stem if own else catalogue.short_name(recipe.module)
+    without_module = recipe.module == read.MODULE and recipe.data is not None
+    return Path(recipe.data or "").stem if without_module else catalogue.short_name(recipe.module)
 
 
-def _asked(options: argparse.Namespace, out: Output) -> Begun:
+def _asked(options: argparse.Namespace, out: Output) -> RunRequest:
     if options.problem is None:
         raise InputError("PROBLEM is missing (see 'sysid run --help')")
     recipe = read.recipe(options, parameters.recipe_of(options, out))
-    return Begun(recipe, options.strategy or "auto", options.seed or 0, options.refine_by)
+    return RunRequest(recipe, options.strategy or "auto", options.seed or 0, options.refine_by)
 
 
-def _in_words(checkpoint: Checkpoint, search: Begun) -> str:
-    """What stands in the file, as far as it can be read."""
+def _in_words(checkpoint: Checkpoint, search: RunRequest) -> str:
+    """Content of the file, as far as it can be read."""
     try:
         tree = checkpoint.read()["begun"]
     except InputError:
         return f"an unfinished run that is damaged ({FILE_NAME})"
-    if tree is None or (found := Begun.from_tree(tree)) == search:
+    if tree is None or (found := RunRequest.from_tree(tree)) == search:
         return "an unfinished run of this problem"
     return f"an unfinished run of {found}"

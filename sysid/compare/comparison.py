@@ -45,14 +45,14 @@ class Comparison:
 
     @property
     def quantity(self) -> str:
-        """What is minimised: "residual" where the relative residual is all of it, else "objective"."""
+        """Quantity that is minimised: "residual" where the relative residual is all of it, else "objective"."""
         test = self.problem.measurement
         alone = test.response_std is None and test.force is None and len(self.problem.formulation.terms) == 1
         return "residual" if alone else "objective"
 
     @property
     def success(self) -> bool:
-        """Whether any method found a fit."""
+        """True where any method found a fit."""
         return any(result.status is Status.FIT for result in self.results)
 
     def to_dict(self) -> dict[str, Any]:
@@ -67,8 +67,8 @@ class Comparison:
             }
             for result in self.results
         ]
-        told = {name: getattr(self, name) for name in ("seed", "max_time", "interrupted", "quantity")}
-        return {**told, "unknowns": self.problem.n_variables, "methods": rows}
+        settings = {name: getattr(self, name) for name in ("seed", "max_time", "interrupted", "quantity")}
+        return {**settings, "unknowns": self.problem.n_variables, "methods": rows}
 
 
 def compare(
@@ -158,10 +158,10 @@ def _strategy(
         return MethodResult(strategy.name, Status.REFUSED, str(error))
     except (InputError, SolverError) as error:
         return MethodResult(strategy.name, Status.FAILED, str(error))
-    return _own(strategy.name, result, recorder)
+    return _strategy_row(strategy.name, result, recorder)
 
 
-def _own(name: str, result: Identification, recorder: Recorder) -> MethodResult:
+def _strategy_row(name: str, result: Identification, recorder: Recorder) -> MethodResult:
     """The row of an identification."""
     history = result.history
     before = [value for value in (history.swarm, history.start) if np.isfinite(value)]

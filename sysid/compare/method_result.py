@@ -1,4 +1,4 @@
-"""What one method of a comparison left, and how its way there is recorded."""
+"""Result of one method of a comparison, and the recording of its way there."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MATRICES = ("M", "K", "C")
 
 
 class Status(Enum):
-    """How a method ended, in the words of the table."""
+    """End of a method, in the words of the table."""
 
     FIT = "fit"
     NO_FIT = "no fit"
@@ -66,17 +66,17 @@ class MethodResult:
 
     @property
     def ran(self) -> bool:
-        """Whether it left anything."""
+        """True where it left anything."""
         return bool(np.isfinite(self.after))
 
     def to_dict(self) -> dict[str, Any]:
         """The row of the table, for CSV and JSON; the phases are not in it."""
         errors = {f"error_{name}_percent": value for name, value in zip(MATRICES, self.errors, strict=True)}
-        told = {name: getattr(self, name) for name in ("before", "after", "residual")}
+        figures = {name: getattr(self, name) for name in ("before", "after", "residual")}
         return {
             "method": self.name,
             "status": self.status.value,
-            **told,
+            **figures,
             **errors,
             "evaluations": self.evaluations,
             "seconds": self.seconds,

@@ -43,7 +43,7 @@ def missing_packages() -> list[str]:
 
 @dataclass(frozen=True)
 class Landscape:
-    """What the swarm searches, and every peer with it.
+    """Objective that the swarm searches, and every peer with it.
 
     Attributes
     ----------

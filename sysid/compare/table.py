@@ -15,7 +15,7 @@ from sysid.results.phases import seconds_in_words
 from sysid.results.summary import WIDTH
 
 
-def text(comparison: Comparison) -> str:
+def comparison_text(comparison: Comparison) -> str:
     """Table for a terminal: a line a method, below it what the columns are, and why a method is no fit."""
     results = comparison.results
     columns = [
@@ -71,7 +71,7 @@ def _errors(comparison: Comparison) -> Iterator[tuple[str, list[str]]]:
 
 
 def _notes(comparison: Comparison) -> Iterator[str]:
-    """What the columns are, and the words of the methods that are no fit."""
+    """Meaning of the columns, and the words of the methods that are no fit."""
     what = {
         "residual": "relative residual",
         "objective": "objective (all that is fitted, weighed by its stated noise)",

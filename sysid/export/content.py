@@ -1,4 +1,4 @@
-"""What every exported file holds: the matrices on all degrees of freedom, their names and units, and what is open."""
+"""Content of every exported file: the matrices on all degrees of freedom, their names and units, and what is open."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def names_of(it: Identification) -> tuple[str, ...]:
     return (*it.degrees_of_freedom, *(f"base {axis}" for axis in it.measurement.base_axes or ()))
 
 
-def unit(letter: str, row: bool | None, column: bool | None) -> str:
+def entry_unit(letter: str, row: bool | None, column: bool | None) -> str:
     """Unit of an entry of M, K or C by whether row and column are rotations; "" where one is not known."""
     return "" if row is None or column is None else _UNITS[letter][row + column]
 
@@ -53,7 +53,7 @@ def rotations_of(it: Identification) -> tuple[bool | None, ...]:
 
 
 def _records_rotation(it: Identification, sensor: int) -> bool:
-    """Whether a sensor is described as one of rotation."""
+    """True where a sensor is described as one of rotation."""
     sensors = it.measurement.sensors
     axis = "" if sensors is None else sensors[sensor].axis
     return isinstance(axis, str) and "r" in axis
@@ -69,8 +69,8 @@ _WORTH = {
 _INTERRUPTED = "the search was interrupted, these are the best matrices until then; "
 
 
-def worth(it: Identification) -> str:
-    """What the matrices are worth, in one line that names the statements which tell why."""
+def reliability(it: Identification) -> str:
+    """Judgement of the matrices, in one line that names the statements which tell why."""
     parts = (("against", it.contradictions), ("open", it.open_findings))
     why = " and ".join(f"'{word}'" for word, findings in parts if findings)
     return _INTERRUPTED * it.interrupted + _WORTH[it.judgement] + (f"; see {why}" if why else "")
@@ -82,7 +82,7 @@ def statements(it: Identification, precision: str) -> tuple[str, ...]:
     found = [
         f"written by sysid {__version__} on {datetime.now().astimezone().isoformat(timespec='seconds')}",
         f"problem: {it.recipe.title if it.recipe else 'of a script'}; strategy {it.strategy}; seed {it.seed}",
-        f"judgement: {worth(it)}; relative residual {it.residual:.3g}",
+        f"judgement: {reliability(it)}; relative residual {it.residual:.3g}",
         f"search: {it.message}",
         *(f"fixed by: {text}" for text in it.closed_by),
         *(f"assumed: {text}" for text in it.facts.assumed),

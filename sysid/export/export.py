@@ -87,6 +87,6 @@ def format_of(path: Path) -> Format:
 
 
 def precision(path: str | Path) -> str:
-    """What a file of this ending keeps of the numbers, in words."""
+    """Precision of the numbers in a file of this ending, in words."""
     found = importlib.import_module(f"sysid.export.{format_of(Path(path)).module}")
     return str(found.PRECISION)

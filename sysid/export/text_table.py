@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sysid.export.content import deviations_of, matrices_of, names_of, rotations_of, statements, unit
+from sysid.export.content import deviations_of, entry_unit, matrices_of, names_of, rotations_of, statements
 from sysid.results.identification import Identification
 
 PRECISION = "exact: each number has the up to 17 digits that give the same double-precision number when read"
@@ -32,5 +32,5 @@ def write_text_table(it: Identification, path: Path) -> None:
             for (i, j), value in np.ndenumerate(matrix):
                 std = deviations[letter][i, j]
                 known = repr(float(std)) if np.isfinite(std) else ""
-                described = unit(letter, turned[i], turned[j]), names[i], names[j]
+                described = entry_unit(letter, turned[i], turned[j]), names[i], names[j]
                 table.writerow((letter, i + 1, j + 1, repr(float(value)), known, *described))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sysid.export.content import one_line_each, statements, worth
+from sysid.export.content import one_line_each, reliability, statements
 from sysid.results.identification import Identification
 from sysid.structure.axes import sensor_row
 from sysid.structure.sensor import Sensor
@@ -33,7 +33,7 @@ def write_uff55(it: Identification, path: Path) -> None:
         *_set(15, (f"{k:10d}{0:10d}{0:10d}{11:10d}" + _reals(place) for k, place in enumerate(places, 1))),
     ]
     units = where or "SI units, modal mass 1 kg, absolute motion"
-    titles = [*one_line_each([worth(it)], 80)[:3], *one_line_each([units], 80)[:1]]
+    titles = [*one_line_each([reliability(it)], 80)[:3], *one_line_each([units], 80)[:1]]
     for mode in range(structure.n):
         figures = structure.natural_frequencies[mode], 1.0, structure.damping_ratios[mode], 0.0
         lines += _set(55, _mode(mode + 1, figures, shapes[:, :, mode], titles))

@@ -1,4 +1,4 @@
-"""How much memory the numbers of a file may take: told before any is taken."""
+"""Memory that the numbers of a file may take: checked before any is taken."""
 
 from __future__ import annotations
 

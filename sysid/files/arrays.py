@@ -92,7 +92,7 @@ def read_hdf5(path: Path) -> Recording:
 
 
 def _is_hdf5(path: Path) -> bool:
-    """Whether it is an HDF5 file, which begins behind 512 bytes of text in a MATLAB file of version 7.3."""
+    """True where it is an HDF5 file, which begins behind 512 bytes of text in a MATLAB file of version 7.3."""
     with path.open("rb") as file:
         begin = file.read(520)
     return _HDF5 in (begin[:8], begin[512:])
@@ -107,7 +107,7 @@ def _word(item: Any, name: str) -> str:
 
 
 def _is_numeric(dtype: Any) -> bool:
-    """Whether a data set holds numbers, each of the same few bytes."""
+    """True where a data set holds numbers, each of the same few bytes."""
     return dtype.kind in "buifcV" and not dtype.hasobject
 
 
@@ -148,8 +148,8 @@ def recording(path: Path, named: dict[str, tuple[Any, str]]) -> Recording:
                 remarks.append(f"array {name!r} is taken as {len(lines)} records of {lines.shape[1]} samples")
     if not vectors:
         raise InputError(f"{path} holds no arrays of records: a vector of samples a channel is needed, or a matrix")
-    told = [size for name, size in flat.items() if is_abscissa(name)]
-    length = max(told or [one.size for one, _ in vectors.values()])
+    lengths = [size for name, size in flat.items() if is_abscissa(name)]
+    length = max(lengths or [one.size for one, _ in vectors.values()])
     other = [name for name, (one, _) in vectors.items() if one.size != length]
     remarks += [f"arrays of another length than {length} are left out: {', '.join(other[:8])}"] * bool(other)
     rate = next((value for name, value in scalars.items() if name.rpartition(".")[2].lower() in _RATES), None)

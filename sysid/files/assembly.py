@@ -12,7 +12,7 @@ from sysid.errors import InputError, refuse
 from sysid.files import units
 from sysid.files.description import Channel, Description
 from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
-from sysid.files.recording import Column, Recording, check_finite, rate_of
+from sysid.files.recording import Column, Recording, check_column, rate_of
 from sysid.files.spectral import TIME_NAMES
 from sysid.structure.axes import BASE_AXES, base_columns, rigid_motion, sensor_row
 from sysid.structure.sensor import Sensor
@@ -22,7 +22,7 @@ _CLEAR_POWER = 0.5  # of the power of all lines, whatever its sign
 _TURNS = {True: ("angular acceleration",), False: ("acceleration",)}
 
 
-def in_time(recordings: Sequence[Recording], said: Description) -> RecordedTest:
+def assembled_in_time(recordings: Sequence[Recording], said: Description) -> RecordedTest:
     """The test of recordings in time, a run each.
 
     Raises
@@ -60,7 +60,7 @@ def _spectra(runs: Sequence[Run], rate: float) -> tuple[list[Any], Array]:
 
 
 def undescribed(recording: Recording) -> str:
-    """What to say where nothing tells which column is which sensor."""
+    """Message where nothing tells which column is which sensor."""
     return (
         f"{recording.path}: which column is which sensor is not said; {recording.in_words()}. Say it in a TOML file "
         "(--sensors FILE.toml), or with --sensor COLUMN role=response axis=x position=0,0,3 unit=g for each; 'sysid "
@@ -89,8 +89,8 @@ def completed(said: Description, recording: Recording) -> tuple[Description, lis
             )
         )
         other = column.axis and isinstance(axis, str) and axis.lstrip("+") != column.axis
-        told = f"the file says axis {column.axis}, the description {axis}, which is taken"
-        remarks += [f"{recording.path}, {column.place}: {told}"] * bool(other)
+        conflict = f"the file says axis {column.axis}, the description {axis}, which is taken"
+        remarks += [f"{recording.path}, {column.place}: {conflict}"] * bool(other)
         # Of several columns of a name one is told by its number, or by the reference.
         called = column.name if recording.names.count(column.name) == 1 else channel.column
         channels.append(replace(channel, column=called, axis=axis, position=channel.position or column.position))
@@ -139,7 +139,7 @@ def _rate(recording: Recording, said: Description) -> float:
     known = units.find(column.unit) if column.unit else units.UNITS["s"]
     if known is None or known.quantity != "time":
         raise InputError(f"{recording.path}, {column.place}: time in {column.unit!r} is not understood: s, ms, us are")
-    check_finite(column, recording.path)
+    check_column(column, recording.path)
     rate = rate_of(np.real(column.values) * known.factor, recording.path, column.place)
     if said.sample_rate is not None and abs(rate / said.sample_rate - 1) > 0.01:
         raise InputError(
@@ -169,7 +169,7 @@ def _records(recording: Recording, said: Description) -> tuple[list[Array], list
     rows: list[ChannelRow] = []
     for channel in said.channels:
         column = recording.column(channel.column)
-        check_finite(column, recording.path)
+        check_column(column, recording.path)
         factor, unit = _factor(recording, column, channel)
         record = factor * np.real(column.values)
         rms = float(np.std(record))
@@ -213,7 +213,7 @@ def _factor(recording: Recording, column: Column, channel: Channel) -> tuple[flo
 
 
 def motions(channels: Sequence[Channel], axes: Sequence[str], origin: Sequence[float]) -> Array:
-    """What channels show of unit motions of the base in its directions, (channels, d)."""
+    """Readings of channels at unit motions of the base in its directions, (channels, d)."""
     points = np.array([channel.position or (0.0, 0.0, 0.0) for channel in channels])
     rows = rigid_motion(points, origin).reshape(len(points), 6, 6)
     ways = [sensor_row(channel.axis, channel.name) for channel in channels]
@@ -245,7 +245,7 @@ def total_force(
 
 
 def work_of_force(runs: Sequence[Run], freq: Array) -> list[str]:
-    """What the sign of the base force seems to be: the table's force gives a damped structure power at every line."""
+    """Remark on the sign of the base force: the table's force gives a damped structure power at every line."""
     moved = [(base, force) for base, _, force in runs if force is not None]
     power = [np.sum(np.real(force * np.conj(base / (2j * np.pi * freq))), axis=0) for base, force in moved]
     share = float(np.sum(power) / max(np.sum(np.abs(power)), np.finfo(float).tiny))

@@ -26,7 +26,7 @@ _CLOCK = re.compile(r"(?:\d{1,4}[-./]\d{1,2}[-./]\d{1,4}[ T]\s*)?(\d{1,2}):(\d{2
 
 @dataclass(frozen=True)
 class _Form:
-    """How numbers stand in a line."""
+    """Form of the numbers in a line."""
 
     delimiter: str
     comma: bool  # decimal comma

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sysid.errors import InputError, choice, flag, number, path_of, printable, refuse, sequence, shown, text
+from sysid.errors import InputError, as_float, choice, flag, path_of, printable, refuse, sequence, shown, text
 from sysid.structure.axes import base_columns, sensor_row, vector3
 
 ROLES = ("base", "response", "force")
@@ -34,7 +34,7 @@ position = [0.0, 0.0, 3.0]     # m
 
 @dataclass(frozen=True)
 class Channel:
-    """What is said of one column; `axis` and `position` are None where the file has to tell them."""
+    """Description of one column; `axis` and `position` are None where the file has to tell them."""
 
     column: str | int
     role: str
@@ -47,7 +47,7 @@ class Channel:
 
 @dataclass(frozen=True)
 class Description:
-    """What is said of a test's files.
+    """Description of a test's files.
 
     Attributes
     ----------
@@ -138,7 +138,7 @@ def description(given: Mapping[str, Any], place: str = "the description") -> Des
         refuse((wrong, f"{place}: {name} must be the name or the number of a column, got {shown(given.get(name))}"))
     return Description(
         channels,
-        None if rate is None else number(f"{place}: sample_rate", rate, "a positive number in Hz", above=0),
+        None if rate is None else as_float(f"{place}: sample_rate", rate, "a positive number in Hz", above=0),
         given.get("time"), given.get("frequency"), axes if axes is None or isinstance(axes, str) else " ".join(axes),
         tuple(vector3(given.get("origin", (0.0, 0.0, 0.0)), f"{place}: origin").tolist()),
         given.get("frf", ""), convention, join, place,
@@ -164,7 +164,7 @@ def _channel(entry: Any, place: str) -> Channel:
     return Channel(column, entry["role"], axis, name, None if where is None else (x, y, z), *words)
 
 
-def beside(path: Path) -> Path | None:
+def description_file(path: Path) -> Path | None:
     """A TOML file that stands beside a file: of its name, or ``sensors.toml`` in its folder."""
     for near in (path.with_suffix(".toml"), path.parent / "sensors.toml"):
         if near.is_file():
@@ -178,5 +178,5 @@ def asked(given: Any, paths: Sequence[Path]) -> Description:
         return given
     if isinstance(given, Mapping):
         return description(given)
-    file = beside(paths[0]) if given is None else path_of("sensors", given)
+    file = description_file(paths[0]) if given is None else path_of("sensors", given)
     return Description() if file is None else description(from_toml(file), str(file))

@@ -1,4 +1,4 @@
-"""What an HDF5 file may hold that somebody else made: numbers and texts of its own, and no more than memory bears.
+"""Safe reading of HDF5 files of others: numbers and texts of their own, and no more than memory bears.
 
 HDF5 can take the numbers of a data set from any file of the machine (external storage, links to other files, virtual
 data sets), unpack a few bytes to terabytes, and load a library for a filter that it does not know. All of it is

@@ -37,8 +37,8 @@ def _together(recordings: Sequence[Recording], said: Description) -> Recording:
     columns = [replace(one, values=one.values[:n]) for one in (shared,) if one is not None]
     for recording in recordings:
         _check_same(first, recording, said, n, max(lengths))
-        own = _abscissa(recording, said)
-        others = [column for column in recording.columns if column is not own]
+        abscissa = _abscissa(recording, said)
+        others = [column for column in recording.columns if column is not abscissa]
         for column in others:
             stem = recording.path.stem
             name = stem if len(others) == 1 else f"{stem}.{column.name}"

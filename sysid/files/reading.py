@@ -71,8 +71,8 @@ def gather(paths: str | Path | Sequence[str | Path], sensors: Any = None) -> Rec
         _check_ordinary(file)
     said = asked(sensors, files)
     if all(xsens_dot.is_export(file) for file in files):
-        return assembly.in_time([xsens_dot.together(files)], said)  # a unit is a file
-    recordings = [recording for file in files for recording in _read_or_told(file)]
+        return assembly.assembled_in_time([xsens_dot.together(files)], said)  # a unit is a file
+    recordings = [recording for file in files for recording in _read_any(file)]
     if said.join:
         recordings = joined.by_folder(recordings, said)
     else:
@@ -81,7 +81,7 @@ def gather(paths: str | Path | Sequence[str | Path], sensors: Any = None) -> Rec
     spectra = {recording.freq is not None for recording in recordings}
     if len(spectra) > 1:
         raise InputError("some files hold records in time and some spectra: read them apart")
-    return responses.from_spectra(recordings, said) if spectra.pop() else assembly.in_time(recordings, said)
+    return responses.from_spectra(recordings, said) if spectra.pop() else assembly.assembled_in_time(recordings, said)
 
 
 def _recordings(file: Path) -> list[Recording]:
@@ -140,7 +140,7 @@ def _check_one_each(recordings: Sequence[Recording], said: Description) -> None:
     )
 
 
-def _read_or_told(file: Path) -> list[Recording]:
+def _read_any(file: Path) -> list[Recording]:
     """The recordings of a file of any kind; what a library raises of a file that it cannot take is one line."""
     try:
         return _recordings(file)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.errors import InputError, finite_array, number, refuse
+from sysid.errors import InputError, as_float, finite_array, refuse
 from sysid.files.tree import Tree, from_bytes, is_tree, to_bytes
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.rigid_body import rigid_body
@@ -152,7 +152,7 @@ class RecordedTest:
         """Refuse a test whose records do not fit each other: a file may be of somebody else's writing."""
         freq, wanted = self.freq, (len(self.base_axes), len(self.sensors), len(self.base_axes))
         if freq is None:
-            number("sample_rate", self.sample_rate, "a positive number in Hz", above=0)
+            as_float("sample_rate", self.sample_rate, "a positive number in Hz", above=0)
         refuse((not self.runs or any(run[0] is None or run[1] is None for run in self.runs), "a run has no records"))
         for run in self.runs:
             n = np.shape(run[0])[-1] if freq is None else len(freq)

@@ -1,4 +1,4 @@
-"""What a file holds before it is known what measured it: named columns in time or over frequency."""
+"""Content of a file before it is known what measured it: named columns in time or over frequency."""
 
 from __future__ import annotations
 
@@ -96,13 +96,13 @@ class Recording:
         return found[0]
 
     def in_words(self) -> str:
-        """How many columns there are, and what they are called."""
+        """Number of columns, and what they are called."""
         left_out = "".join(f" ({remark})" for remark in self.remarks[:1])
         plural = "s" * (len(self.names) != 1)
         return f"it has {len(self.names)} column{plural}, {listed([*map(repr, self.names)])}{left_out}"
 
 
-def check_finite(column: Column, path: Path) -> None:
+def check_column(column: Column, path: Path) -> None:
     """Refuse a column with a number that is NaN or infinite, with its place."""
     bad = np.flatnonzero(~np.isfinite(column.values))
     if bad.size:

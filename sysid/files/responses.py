@@ -26,7 +26,7 @@ from sysid.files.assembly import (
 )
 from sysid.files.description import CONVENTIONS, Channel, Description
 from sysid.files.recorded_test import ChannelRow, RecordedTest, Run
-from sysid.files.recording import Column, Recording, check_finite
+from sysid.files.recording import Column, Recording, check_column
 from sysid.structure.axes import BASE_AXES, base_columns
 from sysid.structure.structure import Array, ComplexArray
 
@@ -130,7 +130,7 @@ def _run(
     parts: dict[str, dict[str, ComplexArray]] = {"base": {}, "response": {}, "force": {}}
     rows: list[ChannelRow] = []
     for (channel, column), form in zip(found, forms, strict=True):
-        check_finite(column, recording.path)
+        check_column(column, recording.path)
         values: Any = np.asarray(column.values, complex) * form.factor
         values = (values.conj() if conjugated else values) * (2j * np.pi * freq) ** _ORDER.get(form.upper or lower, 0)
         parts[channel.role][channel.name] = values
@@ -190,7 +190,7 @@ def _of_reference(recording: Recording, channel: Channel, reference: str, said: 
 
 
 class _Form(NamedTuple):
-    """What a function is, by its unit.
+    """Kind of a function, by its unit.
 
     `upper` and `lower` are quantities; both are "" of a number per the same, `lower` is "" of a spectrum, which is per
     nothing.
@@ -203,7 +203,7 @@ class _Form(NamedTuple):
 
 
 def _form(recording: Recording, column: Column, channel: Channel, said: Description) -> _Form:
-    """What a function is, by its unit and by what is stated."""
+    """Kind of a function, by its unit and by what is stated."""
     place = f"{recording.path}, {column.place}"
     text = channel.unit or column.unit
     if not text and said.frf == "transmissibility" and channel.role != "force":
@@ -229,7 +229,7 @@ def _form(recording: Recording, column: Column, channel: Channel, said: Descript
 
 
 def _fits(form: _Form, role: str, frf: str) -> bool:
-    """Whether a function can be of a sensor of this role, and is of the form that is stated."""
+    """True where a function can be of a sensor of this role, and is of the form that is stated."""
     known = FORMS.get(frf, ("", ""))
     if role == "force":
         return form.upper in ("force", "moment") and (frf in ("", "transmissibility") or form.lower == known[1])
@@ -239,7 +239,7 @@ def _fits(form: _Form, role: str, frf: str) -> bool:
 
 
 def _denominator(forms: Sequence[_Form], reference: str, recording: Recording) -> str:
-    """What all functions of a reference are per unit of; acceleration for numbers per the same, which are of any."""
+    """Unit that all functions of a reference are per; acceleration for numbers per the same, which are of any."""
     found = list(dict.fromkeys(form.lower for form in forms if form.upper))
     plain = any(not form.upper for form in forms)
     refuse(

@@ -12,7 +12,7 @@ import numpy as np
 from sysid.errors import InputError, refuse
 from sysid.files import units
 from sysid.files.description import Description
-from sysid.files.recording import Column, Recording, check_finite
+from sysid.files.recording import Column, Recording, check_column
 from sysid.structure.structure import Array
 
 TIME_NAMES = {"time", "t", "zeit", "temps", "tiempo", "tempo", "time stamp", "timestamp", "elapsed time"}
@@ -48,7 +48,7 @@ def recognised(recording: Recording, said: Description) -> Recording:
         refuse((found, f'{recording.path} {words} frequency = "ITS NAME" (--frequency)'))
         return recording
     place = f"{recording.path}, {column.place}"
-    check_finite(column, recording.path)
+    check_column(column, recording.path)
     known = units.unit(column.unit or "Hz", place)
     other = known.quantity != "frequency"
     refuse((other, f"{place}: frequencies in {column.unit!r} are not understood: Hz, kHz, rad/s are"))
@@ -60,7 +60,7 @@ def recognised(recording: Recording, said: Description) -> Recording:
 
 
 def is_abscissa(name: str) -> bool:
-    """Whether an array is named as time or frequency is."""
+    """True where an array is named as time or frequency is."""
     return name.rpartition(".")[2].lower() in {*TIME_NAMES, *_FREQUENCIES, "f"}
 
 

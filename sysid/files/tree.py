@@ -57,7 +57,7 @@ def to_bytes(tree: Tree, number: int) -> bytes:
     """
     import h5py
 
-    check(tree)
+    check_tree(tree)
     image = io.BytesIO()
     # Groups as HDF5 has them since 1.8 take a fraction of the room of those before.
     with h5py.File(image, "w", userblock_size=_BLOCK, libver=("v108", "v108")) as file:
@@ -69,7 +69,7 @@ def to_bytes(tree: Tree, number: int) -> bytes:
 
 
 def is_tree(image: bytes) -> bool:
-    """Whether a file begins as `to_bytes` begins it."""
+    """True where a file begins as `to_bytes` begins it."""
     return image.startswith(_MAGIC)
 
 
@@ -140,7 +140,7 @@ def read_group(group: Any, allowance: Allowance, before: set[int]) -> Any:
     return tree
 
 
-def check(value: Any, at: str = "") -> None:
+def check_tree(value: Any, at: str = "") -> None:
     """Refuse what cannot stand in a tree.
 
     Raises
@@ -152,10 +152,10 @@ def check(value: Any, at: str = "") -> None:
         for name, part in value.items():
             if not isinstance(name, str) or not name or name in (".", _LENGTH) or "/" in name or "\0" in name:
                 raise InputError(f"{at or 'tree'}: {name!r} is no name: a text without '/' is needed")
-            check(part, f"{at}/{name}")
+            check_tree(part, f"{at}/{name}")
     elif isinstance(value, list):
         for i, part in enumerate(value):
-            check(part, f"{at}/{i}")
+            check_tree(part, f"{at}/{i}")
     elif isinstance(value, int | np.integer) and not -(2**63) <= value < 2**63:
         raise InputError(f"{at}: {value} has more than 64 bits and cannot be stored as a number")
     elif not (

@@ -50,7 +50,7 @@ def read_universal(path: Path) -> list[Recording]:
     sets = _sets(path)
     stated = next((one for one in sets if one.get("type") == 164), {})
     points = _points(sets, 1 / (stated.get("length") or 1.0))
-    own = _Units(_of_system(stated, "length", _LENGTHS), _of_system(stated, "force", _FORCES))
+    file_units = _Units(_of_system(stated, "length", _LENGTHS), _of_system(stated, "force", _FORCES))
     functions = [(at, one) for at, one in enumerate(sets, 1) if one.get("type") == 58]
     kinds = {_FUNCTIONS.get(one["func_type"], str(one["func_type"])) for _, one in functions}
     used = [(at, one) for at, one in functions if one["func_type"] in _READ]
@@ -67,7 +67,7 @@ def read_universal(path: Path) -> list[Recording]:
         runs.setdefault(one["load_case_id"] if one["func_type"] != 4 else 0, []).append((at, one))
     left_out = sorted({str(one.get("type")) for one in sets} - _KNOWN)
     remarks = (f"sets of type {', '.join(left_out)} are left out",) * bool(left_out)
-    return [replace(_recording(path, run, points, own), remarks=remarks) for run in runs.values()]
+    return [replace(_recording(path, run, points, file_units), remarks=remarks) for run in runs.values()]
 
 
 def _sets(path: Path) -> list[dict[str, Any]]:
@@ -136,9 +136,9 @@ def _points(sets: Sequence[dict[str, Any]], length: float) -> dict[int, tuple[fl
 
 
 def _recording(
-    path: Path, run: Sequence[tuple[int, dict[str, Any]]], points: dict[int, Any], own: _Units
+    path: Path, run: Sequence[tuple[int, dict[str, Any]]], points: dict[int, Any], file_units: _Units
 ) -> Recording:  # fmt: skip
-    columns = tuple(_column(path, at, one, points, own) for at, one in run)
+    columns = tuple(_column(path, at, one, points, file_units) for at, one in run)
     first, lengths = run[0][1], {column.values.size for column in columns}
     other = next(((at, one) for at, one in run if not _same_abscissa(one, first)), None)
     if len(lengths) > 1 or other is not None:
@@ -160,7 +160,7 @@ def _same_abscissa(one: dict[str, Any], other: dict[str, Any]) -> bool:
     return a.shape == b.shape and bool(np.allclose(a, b, rtol=1e-6, atol=0))
 
 
-def _column(path: Path, at: int, one: dict[str, Any], points: dict[int, Any], own: _Units) -> Column:
+def _column(path: Path, at: int, one: dict[str, Any], points: dict[int, Any], file_units: _Units) -> Column:
     name, values = dof(one["rsp_node"], one["rsp_dir"]), np.asarray(one["data"])
     if values.size < one["num_pts"]:
         raise InputError(
@@ -168,8 +168,8 @@ def _column(path: Path, at: int, one: dict[str, Any], points: dict[int, Any], ow
             "of the precision that it says; export it again"
         )
     spectrum = one["func_type"] == 4
-    upper = _unit(one, "ordinate", own)
-    lower = _unit(one, "orddenom", own) if spectrum else ""
+    upper = _unit(one, "ordinate", file_units)
+    lower = _unit(one, "orddenom", file_units) if spectrum else ""
     direction = int(one["rsp_dir"])
     axis = ("-" if direction < 0 else "") + _DIRECTIONS.get(abs(direction), "")
     return Column(
@@ -184,7 +184,7 @@ def dof(node: int, direction: int) -> str:
     return f"{int(node)}{'-' if int(direction) < 0 else '+'}{name}"
 
 
-def _unit(one: dict[str, Any], side: str, own: _Units) -> str:
+def _unit(one: dict[str, Any], side: str, file_units: _Units) -> str:
     """Unit of an axis: its label where that names a unit, else the file's unit of its data type, else ""."""
     for key in (f"{side}_axis_units_lab", f"{side}_axis_lab"):
         label = str(one.get(key, "")).strip().strip("[]()")
@@ -193,5 +193,5 @@ def _unit(one: dict[str, Any], side: str, own: _Units) -> str:
     label = str(one.get(f"{side}_axis_units_lab", "")).strip()
     if label not in _NO_LABEL:
         return label  # unknown: whoever takes the channel says so
-    unit = _SPECIFIC.get(int(one[f"{side}_spec_data_type"]), "").format(**own._asdict())
+    unit = _SPECIFIC.get(int(one[f"{side}_spec_data_type"]), "").format(**file_units._asdict())
     return unit * (units.find(unit) is not None)

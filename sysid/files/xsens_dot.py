@@ -81,7 +81,7 @@ def read_xsens_dot(path: str | Path) -> UnitRecord:
 
 
 def is_export(path: Path) -> bool:
-    """Whether a text file begins like an export of a unit."""
+    """True where a text file begins like an export of a unit."""
     try:
         with path.open("rb") as file:
             return f"{_TIME},".encode() in file.read(4000)

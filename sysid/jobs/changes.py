@@ -1,4 +1,4 @@
-"""What a job identifies in the place of all modes of a whole test: a band, all runs or sensors but one, some modes."""
+"""Changes of what a job identifies: a band, all runs or sensors but one, some modes, in the place of all of a test."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.errors import InputError, number, whole_number
+from sysid.errors import InputError, as_float, whole_number
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.residues import independent
 from sysid.modal_analysis.transients import without_transients_of
@@ -31,8 +31,8 @@ class Band:
     high: float
 
     def __post_init__(self) -> None:
-        number("Band: low", self.low, "a frequency in Hz", at_least=0)
-        number("Band: high", self.high, f"a frequency in Hz above {self.low:g}", above=self.low)
+        as_float("Band: low", self.low, "a frequency in Hz", at_least=0)
+        as_float("Band: high", self.high, f"a frequency in Hz above {self.low:g}", above=self.low)
 
     @property
     def title(self) -> str:
@@ -126,9 +126,9 @@ class WithoutSensor:
         other = test.of_sensors(kept)
         if problem.declared.free_modes:
             return _on(problem, other, stiffness=_for_fewer(problem.stiffness, test.n_sensors - 1))
-        own = problem.recovery is None
-        G = test.rigid_body if own else problem.rigid_body_dofs
-        recovery = np.eye(test.n_sensors) if own else np.asarray(problem.recovery)
+        direct = problem.recovery is None
+        G = test.rigid_body if direct else problem.rigid_body_dofs
+        recovery = np.eye(test.n_sensors) if direct else np.asarray(problem.recovery)
         return _on(problem, other, recovery=recovery[kept], rigid_body_dofs=G)
 
     def predicted(self, problem: Prepared, result: Identification) -> float:

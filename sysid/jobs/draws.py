@@ -56,8 +56,8 @@ def drawn(problem: Prepared, x: Array, random: np.random.SeedSequence) -> Stated
 
 def check_drawable(problem: StatedProblem) -> None:
     """Refuse a problem with something fitted whose noise nobody knows: a misfit or residuals of the user's own."""
-    own = [given for given in problem.residuals if not isinstance(given, FurtherTest | Prior)]
-    if own or problem.misfit is not None:
+    without_noise = [given for given in problem.residuals if not isinstance(given, FurtherTest | Prior)]
+    if without_noise or problem.misfit is not None:
         raise InputError(
             "draws of noise need records, and values known to some accuracy (Prior): what noise the misfit or the "
             "residuals have that this problem states for itself is not known"

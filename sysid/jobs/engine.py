@@ -64,7 +64,7 @@ class _Maker:
 
 
 def _context() -> BaseContext:
-    """How workers start: never as a fork of this process, with locks of threads that do not exist in the child."""
+    """Start method of workers: never a fork of this process, with locks of threads that do not exist in the child."""
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
@@ -193,7 +193,7 @@ def checked(executor: object) -> Executor:
 
 
 def _processors() -> int:
-    """How many this process may use: a batch system or a container often grants fewer than the machine has."""
+    """Number of processors for this process: a batch system or a container often grants fewer than the machine has."""
     if sys.version_info >= (3, 13):
         return os.process_cpu_count() or 1
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -302,5 +302,5 @@ def _answer(task: Task, future: Future[Answer], lost: Callable[[Task, str], Answ
 
 
 def _error(future: Future[Answer]) -> BaseException | None:
-    """What a task ended in; Dask cancels its futures where the link to the scheduler breaks."""
+    """Exception that ended a task; Dask cancels its futures where the link to the scheduler breaks."""
     return BrokenExecutor("it was cancelled") if future.cancelled() else future.exception()

@@ -20,9 +20,9 @@ from sysid.problem.problem import Problem
 from sysid.problem.terms import TestTerm
 from sysid.results.identification import Identification, Recipe
 from sysid.results.judgement import judge, verdict_of
+from sysid.search import robust
 from sysid.search.continuation import Continuation, descend, random_starts, smoothed_tests
 from sysid.search.modal import Modal
-from sysid.search.robust import settled
 from sysid.search.session import DeferredInterrupt, Session
 from sysid.search.strategy import History, Outcome, as_unknowns
 from sysid.structure.structure import Array
@@ -32,7 +32,7 @@ _BUILT = 4  # problems that a worker keeps
 
 @dataclass(frozen=True)
 class Job:
-    """What a worker needs.
+    """Description of a job for a worker.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class Job:
 
 @dataclass(frozen=True, eq=False)
 class JobResult:
-    """How a job ended.
+    """Result of a job.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class JobResult:
 
     @property
     def has_result(self) -> bool:
-        """Whether it came to anything, a fit or not."""
+        """True where it came to anything, a fit or not."""
         return self.x.size > 0 or self.score is not None
 
 
@@ -124,7 +124,7 @@ def run(job: Job) -> JobResult:
 
 
 def without_result(job: Job, why: str) -> JobResult:
-    """What stands for a job that came to nothing."""
+    """Result of a job that came to nothing."""
     return JobResult(job.index, job.seed, False, why, np.zeros(0), float("nan"))
 
 
@@ -157,7 +157,7 @@ def _identified(job: Job, session: Session) -> JobResult:
 
 
 def _predicted(problem: Problem, result: Identification, change: Change) -> float | None:
-    """What was left out, as the rest predicts it; NaN where the rest does not tell all that the whole test does."""
+    """Residual of what was left out, predicted by the rest; NaN where the rest does not tell all of the whole test."""
     x = result.x
     if x is not None and not problem.declared.free_modes:
         part, whole = (sensitivity(one.formulation, x, priors=False).rank for one in (result.problem, problem))
@@ -172,8 +172,8 @@ def _predicted(problem: Problem, result: Identification, change: Change) -> floa
 def _refined(job: Job, session: Session) -> JobResult:
     bare = replace(job.recipe, start=None)
     problem = _built(bare, job.source).prepared
-    own = job.start == 0 and job.recipe.start is not None
-    if own:
+    from_recipe = job.start == 0 and job.recipe.start is not None
+    if from_recipe:
         x = as_unknowns(problem, np.array(job.recipe.start))
         if job.draw:
             # Noise of the size that counts: there are no outliers in it, so that squares are as good.
@@ -185,7 +185,7 @@ def _refined(job: Job, session: Session) -> JobResult:
             return without_result(job, "no point of the search space is a structure; state guesses that make one")
         x = found[0]
     # What ended a search needs no widened peaks.
-    end = _descended(problem, x, [] if own else _widened(bare, job.source), session)
+    end = _descended(problem, x, [] if from_recipe else _widened(bare, job.source), session)
     assert end.x is not None
     verdict = verdict_of(problem, end)
     return JobResult(job.index, job.seed, verdict.success, verdict.message, end.x, problem.residual(end.x))
@@ -198,7 +198,7 @@ def _descended(problem: Prepared, x: Array, steps: list[tuple[TestTerm, ...]], s
         raise answer.stopped
     structure = problem.structure(answer.x)
     end = Outcome(structure, answer.x, "local phase", answer.success, answer.message, History(), None)
-    end = settled(problem, end, Continuation(), session)
+    end = robust.fit(problem, end, Continuation(), session)
     if end.stopped is not None:
         raise end.stopped
     return end

@@ -48,8 +48,8 @@ class Ledger:
         self._seeds = {job.index: job.seed for job in jobs}
 
     def results(self) -> dict[int, JobResult]:
-        """What is there of the jobs, by index; a damaged one counts as none, with a warning."""
-        with self._told():
+        """Results of the jobs that are there, by index; a damaged one counts as none, with a warning."""
+        with self._sqlite_errors_named():
             rows = {row[0]: row[1:] for row in self._file.execute("SELECT job, result, sha256 FROM results")}
         wanted = {index: rows[key] for index, key in self._keys.items() if key in rows}
         found = {index: self._result(index, *row) for index, row in wanted.items()}
@@ -65,11 +65,11 @@ class Ledger:
             return None
         try:
             success, message, x, residual, score = json.loads(text)
-            told = None if score is None else Score(**score)
+            stored_score = None if score is None else Score(**score)
             unknowns = numbers("x", x)
             if not (isinstance(success, bool) and isinstance(message, str) and unknowns.ndim == 1):
                 return None
-            return JobResult(index, self._seeds[index], success, message, unknowns, float(residual), told)
+            return JobResult(index, self._seeds[index], success, message, unknowns, float(residual), stored_score)
         except (ValueError, TypeError, RecursionError):  # anybody can write a row with its right SHA-256
             return None
 
@@ -77,12 +77,12 @@ class Ledger:
         """Write a result; it is on the disk when this returns."""
         score = None if result.score is None else asdict(result.score)
         text = json.dumps([bool(result.success), result.message, result.x.tolist(), float(result.residual), score])
-        with self._told(), self._file:
+        with self._sqlite_errors_named(), self._file:
             row = (self._keys[result.index], text, _digest(text))
             self._file.execute("INSERT OR REPLACE INTO results VALUES (?, ?, ?)", row)
 
     def __enter__(self) -> Ledger:
-        with self._told():
+        with self._sqlite_errors_named():
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = sqlite3.connect(self.path)
             try:
@@ -101,17 +101,17 @@ class Ledger:
         deny, allow = sqlite3.SQLITE_DENY, sqlite3.SQLITE_OK
         self._file.set_authorizer(lambda action, *_: deny if action in _FOREIGN else allow)
         self._file.execute("PRAGMA trusted_schema = OFF")
-        made = [sql for (sql,) in self._file.execute("SELECT sql FROM sqlite_master WHERE sql IS NOT NULL")]
-        if not made:
+        tables = [sql for (sql,) in self._file.execute("SELECT sql FROM sqlite_master WHERE sql IS NOT NULL")]
+        if not tables:
             self._file.execute(f"CREATE TABLE IF NOT EXISTS {_COLUMNS}")
-        elif made != [f"CREATE TABLE {_COLUMNS}"]:
+        elif tables != [f"CREATE TABLE {_COLUMNS}"]:
             raise InputError(f"{self.path} is no ledger of jobs of this sysid: take it away, or give another folder")
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self._file.close()
 
     @contextlib.contextmanager
-    def _told(self) -> Iterator[None]:
+    def _sqlite_errors_named(self) -> Iterator[None]:
         try:
             yield
         except (OSError, sqlite3.Error, UnicodeDecodeError) as error:  # the last where SQLite quotes a damaged name

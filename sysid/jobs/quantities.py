@@ -22,12 +22,12 @@ def quantities(result: Identification) -> dict[str, float]:
 
 def labelled(frequencies: Array, ratios: Array, unknowns: dict[str, Array]) -> dict[str, float]:
     """All numbers by their names, entries of an unknown from 1, column by column; without ratios that are NaN."""
-    made = {label(i, FREQUENCY): float(f) for i, f in enumerate(frequencies)}
-    made |= {label(i, RATIO): float(ratio) for i, ratio in enumerate(ratios) if not np.isnan(ratio)}
+    by_label = {label(i, FREQUENCY): float(f) for i, f in enumerate(frequencies)}
+    by_label |= {label(i, RATIO): float(ratio) for i, ratio in enumerate(ratios) if not np.isnan(ratio)}
     for name, value in unknowns.items():
         entries = np.ravel(value, order="F").tolist()
-        made |= {name if len(entries) == 1 else f"{name} {i + 1}": entry for i, entry in enumerate(entries)}
-    return made
+        by_label |= {name if len(entries) == 1 else f"{name} {i + 1}": entry for i, entry in enumerate(entries)}
+    return by_label
 
 
 def label(mode: int, what: str) -> str:

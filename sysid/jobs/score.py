@@ -1,4 +1,4 @@
-"""What of a whole identification is compared with others: figures of its fit, and how far its quantities moved."""
+"""Score of an identification for comparison with others: figures of its fit, and how far its quantities moved."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class Score:
 
 @dataclass(frozen=True)
 class Move:
-    """How far a quantity went.
+    """Change of a quantity.
 
     Attributes
     ----------
@@ -165,37 +165,37 @@ def scored(result: Identification, predicted: float | None = None) -> Score:
     )
 
 
-def moves(own: Score, other: Score, *, part: bool) -> tuple[Move, ...]:
-    """How far frequencies, damping ratios and unknowns went from one result to another.
+def moves(first: Score, other: Score, *, part: bool) -> tuple[Move, ...]:
+    """Changes of frequencies, damping ratios and unknowns from one result to another.
 
     Modes go to those that are nearest together, within 10 % in frequency; where both have as many sensors, to those
     whose shapes are alike (MAC).
 
     Parameters
     ----------
-    own, other : Score
+    first, other : Score
     part : bool
         Whether the other is the same model on a part of the records. A step is then told in the standard deviation that
         it has by noise alone, see `_variance`; else in the larger of both results', for noise of the size that the
         better fit leaves: what a model lacks is in its own deviations too, and would hide its steps.
     """
-    of_modes = {label(i, what) for i in range(own.modes) for what in (FREQUENCY, RATIO)}
-    pairs = [(name, name) for name in own.values if name not in of_modes]
-    for i, j in _nearest(own, other):
+    of_modes = {label(i, what) for i in range(first.modes) for what in (FREQUENCY, RATIO)}
+    pairs = [(name, name) for name in first.values if name not in of_modes]
+    for i, j in _nearest(first, other):
         pairs += [(label(i, what), label(j, what)) for what in (FREQUENCY, RATIO)]
-    pairs = [(here, there) for here, there in pairs if here in own.values and there in other.values]
-    made = []
+    pairs = [(here, there) for here, there in pairs if here in first.values and there in other.values]
+    steps = []
     for here, there in pairs:
-        was, step = own.values[here], other.values[there] - own.values[here]
-        whole, of_other = own.stds.get(here, np.nan) ** 2, other.stds.get(there, np.nan) ** 2
-        noise = other.noise / own.noise
+        was, step = first.values[here], other.values[there] - first.values[here]
+        whole, of_other = first.stds.get(here, np.nan) ** 2, other.stds.get(there, np.nan) ** 2
+        noise = other.noise / first.noise
         if part:
             variance = _variance(whole, of_other, noise)
         else:
             variance = float(np.maximum(whole * min(noise, 1.0), of_other / max(noise, 1.0)))
         known = float(np.sqrt(variance)) if variance > 0 else np.nan
-        made.append(Move(here, other.values[there], step / abs(was) if was else np.nan, step / known))
-    return tuple(made)
+        steps.append(Move(here, other.values[there], step / abs(was) if was else np.nan, step / known))
+    return tuple(steps)
 
 
 def _variance(whole: float, part: float, noise: float) -> float:
@@ -212,12 +212,12 @@ def _variance(whole: float, part: float, noise: float) -> float:
     return max(whole + part * (1 - 2 * share), _LEAST * part)
 
 
-def _nearest(own: Score, other: Score) -> list[tuple[int, int]]:
+def _nearest(first: Score, other: Score) -> list[tuple[int, int]]:
     """Modes of both that are one, by their frequencies and shapes."""
-    apart = np.abs(np.log(own.frequencies[:, None] / other.frequencies)) / _SAME
+    apart = np.abs(np.log(first.frequencies[:, None] / other.frequencies)) / _SAME
     mac = np.ones(apart.shape)
-    if own.shapes and len(own.shapes) == len(other.shapes):
-        one, two = (unit_columns(np.array(score.shapes))[0] for score in (own, other))
+    if first.shapes and len(first.shapes) == len(other.shapes):
+        one, two = (unit_columns(np.array(score.shapes))[0] for score in (first, other))
         mac = (one.T @ two) ** 2
     none = 2.0  # the cost of a pair that is none: above that of any that is one
     cost = np.where((apart < 1) & (mac >= _ALIKE), apart**2 + 1 - mac, none)
@@ -230,8 +230,8 @@ def _weighted_misfits(result: Identification) -> Iterator[tuple[ComplexArray, fl
     """Misfits over the stated deviations, and the sum of the logarithms of these; those of one array share a scale."""
     problem = result.prepared
     fits = problem.fits(result.structure, result.x)  # of the records as they are given
-    own = [] if problem.formulation.fits_records else [(problem.modal[0], result.structure)]
-    for modal, structure in own + fits:
+    unfitted = [] if problem.formulation.fits_records else [(problem.modal[0], result.structure)]
+    for modal, structure in unfitted + fits:
         test = modal.records
         parts = [(test.relative - test.predict(structure), test.response_std)]
         if test.force is not None:
@@ -258,15 +258,15 @@ def _noise(result: Identification) -> float:
     if test.response_std is not None:
         return 1.0
     return float(
-        np.mean(np.abs(outliers.at_own_lines(test.relative - test.predict(result.structure), test.own_lines)) ** 2)
+        np.mean(np.abs(outliers.numbers_at_lines(test.relative - test.predict(result.structure), test.own_lines)) ** 2)
     )
 
 
-def _over(misfit: ComplexArray, std: Array | None, own: NDArray[np.bool_]) -> tuple[ComplexArray, float]:
+def _over(misfit: ComplexArray, std: Array | None, lines: NDArray[np.bool_]) -> tuple[ComplexArray, float]:
     floored = raised(std)
     if floored is None:
-        return outliers.at_own_lines(misfit, own), 0.0
-    return outliers.at_own_lines(misfit / floored, own), float(np.sum(np.log(floored).transpose(0, 2, 1)[own]))
+        return outliers.numbers_at_lines(misfit, lines), 0.0
+    return outliers.numbers_at_lines(misfit / floored, lines), float(np.sum(np.log(floored).transpose(0, 2, 1)[lines]))
 
 
 def _parameters(result: Identification) -> int:

@@ -1,4 +1,4 @@
-"""What many draws of noise say of an answer's uncertainty, beside the linear one."""
+"""Spread of an answer over many draws of noise, beside the linear one."""
 
 from __future__ import annotations
 
@@ -58,9 +58,9 @@ def spreads(result: Identification, ends: Sequence[JobResult]) -> list[Spread]:
     stds = labelled(u.natural_frequencies, u.damping_ratios, u.variables)
     structures = [result.problem.structure(end.x) for end in found]
     draws = [quantities(replace(result, x=end.x, structure=s)) for end, s in zip(found, structures, strict=True)]
-    made = []
+    rows = []
     for name, value in quantities(result).items():
         off, std = np.array([draw[name] for draw in draws]) - value, stds.get(name, np.nan)
         inside = float(np.mean(np.abs(off) <= LIKELY * std)) if np.isfinite(std) else np.nan
-        made.append(Spread(name, value, std, float(np.sqrt(np.mean(off**2))), inside))
-    return made
+        rows.append(Spread(name, value, std, float(np.sqrt(np.mean(off**2))), inside))
+    return rows

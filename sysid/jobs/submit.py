@@ -134,7 +134,7 @@ def _sources(recipes: list[Recipe], drawn: bool, out: Path | None) -> Iterator[s
 
 
 def _data(path: str | None, out: Path | None) -> str | list[tuple[str, int, int]]:
-    """What tells the contents of a data file or folder from others."""
+    """Digest that tells the contents of a data file or folder from others."""
     if path is None:
         return ""
     place = Path(path).resolve()

@@ -58,7 +58,7 @@ def check_cuts(runs: Sequence[TimeRun], at_rest: Sequence[bool], rigid_body: Arr
 
 
 def padded(run: TimeRun, rigid_body: Array) -> int:
-    """How many samples at the end hold one value in every channel, where the structure moved just before; else 0."""
+    """Number of last samples that hold one value in every channel, where the structure moved just before; else 0."""
     both = np.vstack([run.base, run.outputs])
     moves = np.flatnonzero(np.any(both != both[:, -1:], axis=0))
     if not moves.size:
@@ -76,7 +76,7 @@ def padded(run: TimeRun, rigid_body: Array) -> int:
 
 
 def tapered(run: TimeRun, rigid_body: Array) -> bool:
-    """Whether all channels fall to zero towards both ends as a window does, period by period of the motion."""
+    """True where all channels fall to zero towards both ends as a window does, period by period of the motion."""
     # With their means: what a window takes to zero are the values themselves.
     power = np.array([_pooled(run.base), _pooled(run.response - rigid_body @ run.base)])
     samples = power.shape[1]

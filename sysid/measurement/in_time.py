@@ -30,7 +30,7 @@ class RunInTime(NamedTuple):
     lines: int
 
 
-def in_time(test: Measurement) -> list[RunInTime]:
+def runs_in_time(test: Measurement) -> list[RunInTime]:
     """The records of each run; none where the spectra are not those of whole records.
 
     Parameters
@@ -55,7 +55,7 @@ def in_time(test: Measurement) -> list[RunInTime]:
 
 
 def levels_are_known(test: Measurement) -> bool:
-    """Whether the spectra have the unit of `from_time`, m/s² s: the scale of those that were given is free."""
+    """True where the spectra have the unit of `from_time`, m/s² s: the scale of those that were given is free."""
     return test.whole is not None or test.sample_rate is not None
 
 
@@ -63,17 +63,17 @@ def peaks(test: Measurement) -> list[float]:
     """Largest accelerations of a sensor against the base in each run, m/s²; none where levels are not known."""
     if not levels_are_known(test):
         return []
-    return [float(np.abs(run.response - test.rigid_body @ run.base).max()) for run in in_time(test)]
+    return [float(np.abs(run.response - test.rigid_body @ run.base).max()) for run in runs_in_time(test)]
 
 
 def cut_in_motion(test: Measurement, parts: int = 64, at_rest: float = 0.1) -> bool:
-    """Whether plain spectra are those of records that neither begin nor end at rest.
+    """True where plain spectra are those of records that neither begin nor end at rest.
 
     At rest the first or last of so many `parts` of a run holds no more than this share of its mean square.
     """
     if test.sample_rate is None:
         return False
-    for run in in_time(test):
+    for run in runs_in_time(test):
         power = np.sum((run.response - test.rigid_body @ run.base) ** 2, axis=0)
         ends = max(1, power.size // parts)
         if max(power[:ends].mean(), power[-ends:].mean()) > at_rest * power.mean():
@@ -82,12 +82,12 @@ def cut_in_motion(test: Measurement, parts: int = 64, at_rest: float = 0.1) -> b
 
 
 def quiet_levels(test: Measurement) -> NoiseLevels | None:
-    """What the quietest parts of each run hold, as levels of noise, (runs, channels) each.
+    """Levels of noise of the quietest parts of each run, (runs, channels) each.
 
     Noise is no larger, and as large where all was at rest for a while. None where spectra are not those of whole
     records, or lines are too few.
     """
-    runs = in_time(test)
+    runs = runs_in_time(test)
     if not runs or min(run.lines for run in runs) < 2 * _LINES:
         return None
     response = np.array([_quietest(run, run.response) for run in runs])

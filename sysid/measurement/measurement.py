@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError, choice, finite_array, number, refuse, sequence, whole_number
+from sysid.errors import InputError, as_float, choice, finite_array, refuse, sequence, whole_number
 from sysid.measurement import spectra
 from sysid.measurement.cuts import check_cuts
 from sysid.measurement.missing import Missing, complete, named, present
@@ -183,7 +183,7 @@ class Measurement:
 
     @property
     def lines_in_words(self) -> str:
-        """How many lines there are, from where to where, and how many were left out for what was missing."""
+        """Number of lines, from where to where, and how many were left out for what was missing."""
         dropped = f" ({self.dropped} more hold NaN and are left out)" if self.dropped else ""
         return f"{self.freq.size} lines from {self.freq[0]:.4g} to {self.freq[-1]:.4g} Hz{dropped}"
 
@@ -210,7 +210,7 @@ class Measurement:
 
     @property
     def inputs(self) -> ComplexArray:
-        """What sets the structure in motion: the base, then of whole records the motion at the ends of each run.
+        """Inputs of the structure: the base, then of whole records the motion at the ends of each run.
 
         (runs, d + 2 r, n_freq) for r runs that are not stated to be at rest at both ends.
         """
@@ -223,7 +223,7 @@ class Measurement:
 
     @property
     def is_whole(self) -> bool:
-        """Whether it is of whole records, which hold their transients."""
+        """True where it is of whole records, which hold their transients."""
         return self.whole is not None
 
     @property
@@ -233,13 +233,13 @@ class Measurement:
 
     @property
     def numbers(self) -> int:
-        """How many complex numbers were recorded: of all responses, and forces, at each run's own lines."""
+        """Number of complex numbers recorded: of all responses, and forces, at each run's own lines."""
         forces = 0 if self.force is None else self.n_base
         return int(np.count_nonzero(self.own_lines)) * (self.n_sensors + forces)
 
     @property
     def has_unit_runs(self) -> bool:
-        """Whether run i is unit motion in base direction i alone, so that responses are transmissibilities."""
+        """True where run i is unit motion in base direction i alone, so that responses are transmissibilities."""
         return self.n_runs == self.n_base and np.array_equal(self.base, unit_runs(self.n_base, self.freq.size))
 
     @property
@@ -280,7 +280,7 @@ class Measurement:
 
     def in_band(self, low: float, high: float) -> Measurement:
         """The lines from `low` to `high` Hz, both included."""
-        low, high = number("the lower end of the band", low), number("the upper end of the band", high)
+        low, high = as_float("the lower end of the band", low), as_float("the upper end of the band", high)
         keep, ends = (self.freq >= low) & (self.freq <= high), f"{self.freq[0]:g} to {self.freq[-1]:g} Hz"
         if not np.any(keep):
             raise InputError(f"no line between {low:g} and {high:g} Hz; the record has {ends}")

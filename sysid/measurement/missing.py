@@ -44,7 +44,7 @@ def present(given: dict[str, Any]) -> tuple[dict[str, Any], dict[str, NDArray[np
 def named(
     holes: dict[str, NDArray[np.bool_]], freq: Array, sensors: Sequence[str], axis: int
 ) -> tuple[tuple[str, Array], ...]:
-    """What holds NaN, and where, Hz: sensors by name, their `axis` being that of three; other records by their own."""
+    """Records with NaN, and where, Hz: sensors by name, their `axis` being that of three; others by their own."""
     found: list[tuple[str, Array]] = []
     for name, hole in holes.items():
         rows, names = hole.reshape(1, -1, hole.shape[-1]), [name]
@@ -66,7 +66,7 @@ def in_words(holes: tuple[tuple[str, Array], ...], freq: Array) -> str:
 
 
 def complete(name: str, value: ArrayLike, kind: type = float) -> NDArray[Any]:
-    """What has lines as finite numbers; the message says how lines with NaN are left out."""
+    """Check that all lines are finite numbers; the message says how lines with NaN are left out."""
     try:
         return finite_array(name, value, kind)
     except InputError as error:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import flag, instance, number, random_generator
+from sysid.errors import as_float, flag, instance, random_generator
 from sysid.measurement.measurement import Measurement, unit_runs
 from sysid.structure.structure import Array, ComplexArray, Structure, check_frequencies
 
@@ -45,7 +45,7 @@ def simulate(
         ``measurement.residual(structure)``.
     """
     instance("structure", structure, Structure)
-    noise = number("noise", noise, "a finite fraction >= 0", at_least=0)
+    noise = as_float("noise", noise, "a finite fraction >= 0", at_least=0)
     lines = check_frequencies(freq)
     random = random_generator(rng)
     response, response_std = _with_noise(np.moveaxis(structure.transmissibility(lines), 1, 0), noise, random)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, finite_array, number, refuse, sequence, whole_number
+from sysid.errors import InputError, as_float, finite_array, refuse, sequence, whole_number
 from sysid.structure.structure import Array, ComplexArray
 
 
@@ -57,7 +57,7 @@ def check_runs(
     runs: Sequence[tuple[ArrayLike, ArrayLike, ArrayLike | None]], sample_rate: float, shape: tuple[int, ...]
 ) -> list[TimeRun]:
     """Check time records against ``shape = (n_sensors, d)`` and each other."""
-    number("sample_rate", sample_rate, "a positive number of samples a second", above=0)
+    as_float("sample_rate", sample_rate, "a positive number of samples a second", above=0)
     given = sequence("runs", runs, "a list of (base, response, force or None)")
     if len(shape) != 2:
         raise InputError(f"rigid_body has shape {shape}; (n_sensors, d) is needed")
@@ -78,7 +78,7 @@ def check_runs(
 
 
 def directions(runs: Any) -> int:
-    """How many directions the base has in the first run, as far as it can be told; `check_runs` looks closer."""
+    """Number of directions of the base in the first run, as far as it can be told; `check_runs` looks closer."""
     try:
         return int(np.atleast_2d(np.asarray(runs[0][0])).shape[0])
     except (TypeError, IndexError, KeyError, ValueError):
@@ -230,7 +230,7 @@ def resample(
     given = sequence("records", records, "a list of (time, samples)")
     clocks, samples = map(list, zip(*(_timed(f"record {i}", one) for i, one in enumerate(given, start=1)), strict=True))
     rates = np.array([(t.size - 1) / (t[-1] - t[0]) for t in clocks])
-    rate = float(rates.min()) if sample_rate is None else number("sample_rate", sample_rate)
+    rate = float(rates.min()) if sample_rate is None else as_float("sample_rate", sample_rate)
     if not 0 < rate <= 1.01 * rates.min():
         raise InputError(f"sample_rate = {rate:g} Hz is not between 0 and the slowest instrument's {rates.min():g} Hz")
     start, stop = max(t[0] for t in clocks), min(t[-1] for t in clocks)
@@ -242,7 +242,7 @@ def resample(
         for place, t in enumerate(clocks, start=1):
             if t.size < 60:
                 raise InputError(f"record {place}: {t.size} samples are too few to low-pass before resampling")
-        filters = [butter(8, 0.8 * rate / own_rate, output="sos") for own_rate in rates]
+        filters = [butter(8, 0.8 * rate / record_rate, output="sos") for record_rate in rates]
         samples = [sosfiltfilt(sos, x, axis=-1) for sos, x in zip(filters, samples, strict=True)]
     splines = [CubicSpline(t, x, axis=-1) for t, x in zip(clocks, samples, strict=True)]
     return time, [np.asarray(spline(np.minimum(time, spline.x[-1]))) for spline in splines]

@@ -1,4 +1,4 @@
-"""How near predicted records in time are to measured ones."""
+"""Scores of predicted records in time against measured ones."""
 
 from __future__ import annotations
 

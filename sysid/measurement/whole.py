@@ -86,7 +86,7 @@ class NoiseLevels:
 
 @dataclass(frozen=True, eq=False)
 class WholeRecords:
-    """What the spectra of whole records need beside them; one entry a run.
+    """Properties of whole records beside their spectra; one entry a run.
 
     A record of N samples neither starts nor ends at rest: its finite Fourier transform is the response to the base,
     and two real numbers a mode, by which the motion at its end differs from that at its start.

@@ -93,7 +93,7 @@ class PolesAndResidues:
         return relative, np.einsum("ked,kf,rdf->ref", self.force, np.concatenate(functions), base, optimize=True)
 
     def contributions(self, base: ComplexArray, modes: NDArray[np.intp]) -> ComplexArray:
-        """How modes show in accelerations and force at base motion (runs, d), (modes, runs, n_sensors [+ d])."""
+        """Share of each mode in accelerations and force at base motion (runs, d), (modes, runs, n_sensors [+ d])."""
         parts = [self.residues[modes] + 1j * self.quadrature[modes]]
         if self.force is not None:
             parts.append(self.force[1 + modes] + 1j * self.force[1 + self.omega.size + modes])

@@ -1,4 +1,4 @@
-"""What the absolute motion of the sensors is beside all modes: their rigid-body motion and their delay, as recorded.
+"""Absolute motion of the sensors beside all modes: their rigid-body motion and their delay, as recorded.
 
 Absolute accelerations are ``(G + sum of R_k g_k) u_0''``. With poles, residues and a term without poles free, that term
 tells what each sensor's row of G would have to be, whatever was stated of it. A record that is late by tau has
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.excitation import steady_sine
-from sysid.modal_analysis.record_poles import few_lines, rough_deviations
+from sysid.modal_analysis.record_poles import decimated_lines, rough_deviations
 from sysid.modal_analysis.relocation import relocate
 from sysid.modal_analysis.residues import Records, unit_columns
 from sysid.modal_analysis.vector_fitting import GUESS, RAZOR
@@ -74,7 +74,7 @@ def direct_terms(test: Measurement) -> DirectTerms | None:
     if test.whole is not None:
         if steady_sine(test) is not None:
             return None
-        test = test.at(few_lines(test))
+        test = test.at(decimated_lines(test))
         test = replace(test, response_std=rough_deviations(test), force_std=None)
     still = replace(test, rigid_body=np.zeros_like(test.rigid_body), sensors=None)
     with one_thread():

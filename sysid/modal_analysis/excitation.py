@@ -8,7 +8,7 @@ from sysid.measurement.measurement import Measurement
 
 
 def steady_sine(test: Measurement, beside: int = 3, share: float = 0.9, few: float = 0.1) -> str | None:
-    """What whole records of a steady sine lack, in a sentence; None where the base moves at more than one frequency.
+    """Lack of whole records of a steady sine, in a sentence; None where the base moves at more than one frequency.
 
     Of a sine that is cut within a cycle the largest line and those `beside` it hold this `share` of the power; they
     must be `few`, a share of all.

@@ -16,7 +16,7 @@ from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.record_fit import Monitor, RecordFit, on_all_lines, record_modes, refitted, without, worth
 from sysid.modal_analysis.record_gains import gain_errors_of
 from sysid.modal_analysis.record_more import least_worth, no_modes, with_further_modes
-from sysid.modal_analysis.record_poles import few_lines, rough_deviations
+from sysid.modal_analysis.record_poles import decimated_lines, rough_deviations
 from sysid.modal_analysis.record_rest import runs_in_motion
 from sysid.modal_analysis.record_spread import scatter
 from sysid.modal_analysis.record_spurious import without_spurious_modes
@@ -54,7 +54,7 @@ def _white_fit(test: Measurement, monitor: Monitor | None) -> RecordFit:
     Poles are looked for twice: with rough weights, and with the noise that a first fit found; where lines are many, on
     some of them, from which the fit of all begins.
     """
-    lines = few_lines(test)
+    lines = decimated_lines(test)
     if not np.all(lines):
         some = test.at(lines)
         fit = on_all_lines(_white_fit(some, monitor), test, monitor=monitor)
@@ -81,7 +81,7 @@ def _fitted(test: Measurement, poles: Poles, monitor: Monitor | None) -> RecordF
 
 
 def _same_modes(modes: Modes, poles: Poles) -> bool:
-    """Whether there are as many, each pole within the half-power width of a mode, and each mode of a pole."""
+    """True where there are as many, each pole within the half-power width of a mode, and each mode of a pole."""
     if modes.omega.size != poles.omega.size:
         return False
     apart = np.abs(np.log(poles.omega / modes.omega[:, None])) / (2 * modes.ratios[:, None])
@@ -139,7 +139,7 @@ def _at_lines(test: Measurement, parts: list[list[NDArray[Any]]]) -> NDArray[Any
 
 
 def fit_modes(test: Measurement, *, monitor: Monitor | None = None) -> ModalEstimate:
-    """What a test tells of its modes: of whole records with their transients and noise; other lines stand as given.
+    """Estimate the modes of a test: of whole records with their transients and noise; other lines stand as given.
 
     Parameters
     ----------

@@ -175,7 +175,7 @@ class SummedRecord:
         return np.concatenate(products)[:count]
 
     def weighs_like(self, other: SummedRecord) -> bool:
-        """Whether the lines of both have the same weights, so that `inner` is the same."""
+        """True where the lines of both have the same weights, so that `inner` is the same."""
         return np.array_equal(self._line, other._line)
 
     def _gains_of(self, polynomials: Array, m: int) -> Array:
@@ -258,7 +258,7 @@ class _Correlated:
 
 
 def _inner_products(spectrum: ComplexArray, gains_of: ComplexArray, static: int) -> _Proportional | _Correlated:
-    """What makes the inner products of modal accelerations.
+    """Inner products of modal accelerations.
 
     Parameters
     ----------

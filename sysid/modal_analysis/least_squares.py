@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from sysid.modal_analysis.modal_model import Parameters, Shift
+from sysid.modal_analysis.modal_model import NormalEquations, Parameters
 from sysid.structure.structure import Array
 
 _DAMPING = (1e-12, 1e-6, 1e6)  # of a scaled normal matrix: least, at first, and at which no step helps
@@ -32,7 +32,7 @@ class SumOfSquares:
     start: Array
     unpack: Callable[[Array], Parameters]
     chi2: Callable[[Parameters], float]
-    equations: Callable[[Parameters], Shift]
+    equations: Callable[[Parameters], NormalEquations]
 
 
 def minimise(
@@ -83,7 +83,7 @@ def minimise(
 
 
 def units_of(normal: Array) -> Array:
-    """What each unknown moves by to show as much as the noise; zero for one that shows nowhere, but for round-off."""
+    """Step of each unknown that shows as much as the noise; zero for one that shows nowhere, but for round-off."""
     known = np.diag(normal)
     return np.where(known > np.finfo(float).tiny, 1 / np.sqrt(np.maximum(known, np.finfo(float).tiny)), 0.0)
 

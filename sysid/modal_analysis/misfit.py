@@ -29,7 +29,7 @@ class Record:
 
     @property
     def shared(self) -> bool:
-        """Whether the weights of the fit are those of the noise."""
+        """True where the weights of the fit are those of the noise."""
         return bool(np.all(np.abs(self.by_channel[:, None] * self.by_line * self.std - 1) < 1e-9))
 
     def grams(self, spectra: ComplexArray) -> Iterator[Array]:

@@ -75,7 +75,7 @@ class ModalError:
         return A, modes, motions, 2 * self.channel[:, None] ** 2 * left
 
     def _rows(self, motions: ComplexArray, m: int) -> ComplexArray:
-        """What A and B multiply, (m [+ d], L)."""
+        """Factors of A and B, (m [+ d], L)."""
         return np.concatenate([motions[:m], self.base]) if self.shapes[1][0] else motions[:m]
 
     def _gradient(self, y: Array) -> tuple[float, Array]:

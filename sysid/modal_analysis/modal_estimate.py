@@ -1,4 +1,4 @@
-"""What a test tells of its modes, and these as statistics: what a structure misses them by, in units of the noise."""
+"""Modal estimate of a test, and the same as statistics: what a structure misses it by, in units of the noise."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class VaryingLevel(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ModalEstimate:
-    """What a test tells before any matrices are fitted: its modes, how exactly they are known, its noise.
+    """Modes of a test before any matrices are fitted, how exactly they are known, and its noise.
 
     Attributes
     ----------
@@ -131,12 +131,12 @@ class ModalEstimate:
 
     @property
     def has_modes(self) -> bool:
-        """Whether modes were fitted, whose statistics stand for the lines."""
+        """True where modes were fitted, whose statistics stand for the lines."""
         return self.omega.size > 0
 
     @property
     def found_noise(self) -> bool:
-        """Whether the levels of its noise were found with the fit, so that they hold what the modes miss."""
+        """True where the levels of its noise were found with the fit, so that they hold what the modes miss."""
         whole = self.given.whole
         return self.noise is not None and whole is not None and whole.noise is None
 
@@ -210,7 +210,7 @@ def information_about(estimate: ModalEstimate, modes: Modes) -> tuple[Array, Arr
 
 
 def shifts_about(estimate: ModalEstimate, modes: Modes) -> Array:
-    """What an error of one of each sensor's gain makes of the parameters, in the scale and sign of `modes`."""
+    """Shifts of the parameters by an error of one of each sensor's gain, in the scale and sign of `modes`."""
     return estimate.gain.moves / _scale_of(estimate, modes)[:, None]
 
 

@@ -70,7 +70,7 @@ def weigh(test: Measurement, modes: Modes, ends: Array | None = None) -> tuple[A
 
 
 def _fits_turned(X: Array, wanted: Array, masses: Sequence[int]) -> bool:
-    """Whether a force of the other sign is much better explained by unknowns of which `masses` are not negative.
+    """True where a force of the other sign is much better explained by unknowns of which `masses` are not negative.
 
     Of modes far below all lines free masses cancel each other and the base's, and their signs say nothing.
     """

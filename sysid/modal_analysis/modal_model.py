@@ -47,12 +47,12 @@ class Run(NamedTuple):
 class Weighed(NamedTuple):
     """Errors by the inverse of their covariance: ``S^-1 e`` (c, L), ``e' S^-1 e`` (L,), the likeliest base (d, L)."""
 
-    seen: ComplexArray
+    whitened_residual: ComplexArray
     power: Array
     base: ComplexArray
 
 
-class Shift(NamedTuple):
+class NormalEquations(NamedTuple):
     """Products of the Jacobian with errors: ``Re J' S^-1 J`` (p, p), ``Re J' S^-1 e`` (p,) and ``e' S^-1 e``."""
 
     normal: Array
@@ -107,11 +107,11 @@ class SpectralModel:
         return 2 * sum(run.outputs.size for run in self.runs)
 
     def transients(self, freq: Array) -> ComplexArray:
-        """What the motion at the ends of a run adds to the load of a mode, (2, L), each times a number of that mode."""
+        """Loads of a mode by the motion at the ends of a run, (2, L), each times a number of that mode."""
         raise NotImplementedError
 
     def trace_spectra(self, freq: Array) -> ComplexArray:
-        """What the traces of a channel are multiples of, (traces, L)."""
+        """Spectra of which the traces of a channel are multiples, (traces, L)."""
         return np.zeros((0, freq.size), complex)
 
     def parts(self, at_once: int = 4096) -> Iterator[Run]:
@@ -162,7 +162,7 @@ class Lines:
         return 1 / np.sqrt(variances[:c]), np.sqrt(variances[c:])
 
     def _base_noise(self, levels: Array) -> tuple[ComplexArray, ComplexArray]:
-        """What the noise of the base hides in units of the outputs' own, and its factor.
+        """Noise of the base in units of the outputs' own, and its factor.
 
         With ``B = D H sqrt(v_u)``, D the inverse deviations of the outputs, and ``L L' = I + B' B``: ``B L'^-1``
         (d, c, L) and L (d, d, L), a line of vectors at a time as d is at most a few.
@@ -219,10 +219,10 @@ class Lines:
         ends = np.zeros((2 * len(self.model.moving), base.shape[1]), complex)
         if self.at_ends is not None:
             ends[self.at_ends] = self.transients
-        return self.run.w, np.concatenate([base, ends]), weighed.seen, inverse
+        return self.run.w, np.concatenate([base, ends]), weighed.whitened_residual, inverse
 
     def spectra(self, base: ComplexArray) -> ComplexArray:
-        """What all columns of the Jacobian are made of, (spectra, L)."""
+        """Spectra of which all columns of the Jacobian are made, (spectra, L)."""
         modes, g = self.p.modes, self.g
         freq = self.run.w / (2 * np.pi)
         parts = [

@@ -81,7 +81,7 @@ class Whitened(NamedTuple):
     @property
     def numbers(self) -> ComplexArray:
         """Those of `u` at each run's own lines, one after the other."""
-        return at_own_lines(self.u, self.lines)
+        return numbers_at_lines(self.u, self.lines)
 
 
 class Outlier(NamedTuple):
@@ -111,7 +111,7 @@ def whitened(test: Measurement, fitted: Sequence[ComplexArray], unknowns: int) -
     found = [(test.response, test.relative - fitted[0], test.response_std)]
     if test.force is not None:
         found.append((test.force, test.force - fitted[1], test.force_std))
-    numbers = lambda record: at_own_lines(record, test.own_lines)  # noqa: E731
+    numbers = lambda record: numbers_at_lines(record, test.own_lines)  # noqa: E731
     left = max(1 - unknowns / (2 * test.numbers), 0.5)
     squares, stds = [], []
     for record, misfit, stated in found:
@@ -126,13 +126,13 @@ def whitened(test: Measurement, fitted: Sequence[ComplexArray], unknowns: int) -
     return [Whitened(misfit / std, std, test.own_lines) for std, (_, misfit, _) in zip(stds, found, strict=True)]
 
 
-def at_own_lines(record: ComplexArray, lines: Flags) -> ComplexArray:
+def numbers_at_lines(record: ComplexArray, lines: Flags) -> ComplexArray:
     """Numbers of a record (runs, channels, n_freq) at each run's own lines (runs, n_freq), one after the other."""
     return record.transpose(0, 2, 1)[lines].ravel()
 
 
 def predicted(test: Measurement, structure: Structure) -> list[ComplexArray]:
-    """What a structure makes of relative accelerations and, where it was measured, of the force."""
+    """Prediction of relative accelerations and, where it was measured, of the force by a structure."""
     return [test.predict(structure), *([] if test.force is None else [test.predict_force(structure)])]
 
 
@@ -357,7 +357,7 @@ def _robust(functions: ComplexArray, misfit: ComplexArray) -> ComplexArray:
 
 
 def _bounded_fit(test: Measurement, fit: PolesAndResidues) -> list[ComplexArray]:
-    """What poles make of a test with residues that outliers do not pull, from a first `fit`.
+    """Prediction of a test by poles with residues that outliers do not pull, from a first `fit`.
 
     First their pull is bounded, by pseudo-values. Then numbers that stay far beyond those beside them do not pull at
     all: at the lines that decide a residue even a bounded pull moves all that is near.
@@ -376,7 +376,7 @@ def _bounded_fit(test: Measurement, fit: PolesAndResidues) -> list[ComplexArray]
 
 
 def _predicted(fit: PolesAndResidues, freq: Array, base: ComplexArray) -> list[ComplexArray]:
-    """What poles and residues make of relative accelerations and, where it was measured, of the force."""
+    """Prediction of relative accelerations and, where it was measured, of the force by poles and residues."""
     return [part for part in fit.records(freq, base) if part is not None]
 
 
@@ -393,7 +393,7 @@ def _poles(test: Measurement, monitor: Monitor | None) -> PolesAndResidues | Non
 
 
 def _is_one_number(test: Measurement, records: Records, omega: Array, ratios: Array, k: int) -> bool:
-    """Whether pole k, which stands at one line, shows there in one channel only, or explains nothing at other lines."""
+    """True where pole k, which stands at one line, shows in one channel only, or explains nothing at other lines."""
     fit = PolesAndResidues.at(test, records, omega, ratios)
     highest = int(np.argmax(_heights(test.freq, omega[[k]], ratios[[k]])))
     residue = np.einsum("sd,rd->rs", fit.residues[k] + 1j * fit.quadrature[k], test.base[:, :, highest])
@@ -411,7 +411,7 @@ def _is_one_number(test: Measurement, records: Records, omega: Array, ratios: Ar
 
 
 def _heights(freq: Array, omega: Array, ratios: Array) -> Array:
-    """How high poles reach at each line, (m, n_freq)."""
+    """Heights of poles at each line, (m, n_freq)."""
     size: Array = np.abs(gains(freq, omega, np.maximum(ratios, _UNDAMPED)))
     return size
 

@@ -10,7 +10,7 @@ from sysid.structure.structure import Array
 KNOTS = 5  # frequencies at which a level is a number of its own, evenly in the root of frequency
 
 
-def pieces(w: Array, most: int = 20, lines: int = 4) -> list[slice]:
+def segments(w: Array, most: int = 20, lines: int = 4) -> list[slice]:
     """Stretches of the lines of a run, (L,), rad/s, `most` at most and of so many lines at least: of one level each."""
     root = np.sqrt(w)
     bounds = np.unique(np.searchsorted(root, np.linspace(root[0], root[-1], most + 1)[1:-1]))
@@ -21,18 +21,18 @@ def pieces(w: Array, most: int = 20, lines: int = 4) -> list[slice]:
     return [slice(a, b) for a, b in zip(cuts, [*cuts[1:], w.size], strict=True)]
 
 
-def hats(middles: Array, first: float, last: float) -> Array:
-    """What each of `KNOTS` numbers makes of the logarithm of a level in the middle of each stretch, (pieces, knots)."""
+def interpolation_matrix(middles: Array, first: float, last: float) -> Array:
+    """Linear interpolation from the values at the `KNOTS` to the middles of segments, (segments, knots)."""
     at = np.linspace(np.sqrt(first), np.sqrt(last), KNOTS)
     return np.array([np.interp(np.sqrt(middles), at, one) for one in np.eye(KNOTS)]).T
 
 
 def designs(middles: Array, ends: tuple[float, float], varies: NDArray[np.bool_]) -> list[Array]:
-    """What the numbers of a run make of the logarithms of all levels, (channels, numbers) a stretch.
+    """Matrices from the numbers of a run to the logarithms of all levels, (channels, numbers) a stretch.
 
     Parameters
     ----------
-    middles : (pieces,)
+    middles : (segments,)
         Middles of stretches, rad/s.
     ends : (first, last)
         Lines of the run, rad/s.
@@ -41,7 +41,7 @@ def designs(middles: Array, ends: tuple[float, float], varies: NDArray[np.bool_]
     """
     if not np.any(varies):
         return [np.eye(varies.size)] * middles.size
-    shape = hats(middles, *ends)
+    shape = interpolation_matrix(middles, *ends)
     first = np.concatenate([[0], np.cumsum(np.where(varies, KNOTS, 1))])
     matrices = []
     for row in shape:

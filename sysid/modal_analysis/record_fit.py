@@ -20,7 +20,7 @@ from sysid.modal_analysis.least_squares import SumOfSquares, minimise, units_of
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_masses import weigh
 from sysid.modal_analysis.record_colour import extra_numbers
-from sysid.modal_analysis.record_model import TRACES, HeldShapes, Parameters, RecordModel, Shift
+from sysid.modal_analysis.record_model import TRACES, HeldShapes, NormalEquations, Parameters, RecordModel
 from sysid.modal_analysis.record_noise import floors, likeliest_levels
 from sysid.modal_analysis.residues import Records
 from sysid.structure.structure import Array
@@ -33,7 +33,7 @@ Monitor = Callable[[int, float], object]
 
 
 class Limits(NamedTuple):
-    """How far a fit goes at most: rounds of modes and levels in turn, steps of each round."""
+    """Limits of a fit: rounds of modes and levels in turn, steps of each round."""
 
     rounds: int
     steps: int
@@ -71,7 +71,7 @@ class RecordFit:
         return RecordModel(self.test, self.parameters.modes.omega.size)
 
     @cached_property
-    def equations(self) -> Shift:
+    def equations(self) -> NormalEquations:
         """Normal equations at the end of the fit, with the columns of gains, which come last."""
         model = RecordModel(self.test, self.parameters.modes.omega.size, gains=True)
         return model.normal_equations(self.parameters, self.levels)
@@ -247,7 +247,7 @@ def _minimise(
     return minimise(problem, tell, most, lambda _: _SETTLED)
 
 
-def _equations(model: RecordModel, coarse: RecordModel | None, p: Parameters, levels: Array) -> Shift:
+def _equations(model: RecordModel, coarse: RecordModel | None, p: Parameters, levels: Array) -> NormalEquations:
     """Normal equations, their matrix from a coarser model where there is one."""
     if coarse is None:
         return model.normal_equations(p, levels)
@@ -323,7 +323,7 @@ def without(fit: RecordFit, k: int) -> Parameters:
 
 
 def worth(fit: RecordFit, normal: Array | None = None) -> Array:
-    """What ``e' S^-1 e`` would about rise by without each mode, (m,): all else moves as far as it is free.
+    """Rise of ``e' S^-1 e``, about, without each mode, (m,): all else moves as far as it is free.
 
     With `normal` in place of the fit's ``Re J' S^-1 J``, as of lines that count for less.
     """

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.modal_analysis.modal_model import Lines, Parameters, Run, Shift, SpectralModel, dots
-from sysid.modal_analysis.record_colour import pieces
+from sysid.modal_analysis.modal_model import Lines, NormalEquations, Parameters, Run, SpectralModel, dots
+from sysid.modal_analysis.record_colour import segments
 from sysid.modal_analysis.response import real_times
 from sysid.structure.structure import Array, ComplexArray
 
@@ -33,7 +33,7 @@ class Layer(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """How the columns of a run's Jacobian are made of its spectra, each the sum of its entries in all layers.
+    """Columns of a run's Jacobian by its spectra, each the sum of its entries in all layers.
 
     `unknowns` (k,) are those that show in this run. The first layer has an entry of each.
     """
@@ -50,7 +50,7 @@ class Columns(NamedTuple):
             out[column] += real_times(values, weights) * spectra[spectrum]
         return out
 
-    def products(self, sums: Sums, scale: Array) -> Shift:
+    def products(self, sums: Sums, scale: Array) -> NormalEquations:
         """Products of the Jacobian from those of its spectra, for outputs of these inverse deviations, (c,)."""
         normal, gradient = -sums.hidden, np.zeros(self.unknowns.size)
         for column, spectrum, values in self.layers:
@@ -59,7 +59,7 @@ class Columns(NamedTuple):
                 continue
             for other, beside, theirs in self.layers:
                 normal[np.ix_(column, other)] += (scale**2 * values) @ theirs.T * sums.gram[np.ix_(spectrum, beside)]
-        return Shift(normal, gradient, sums.chi2)
+        return NormalEquations(normal, gradient, sums.chi2)
 
 
 class Sums(NamedTuple):
@@ -104,7 +104,7 @@ class RecordModel(SpectralModel):
             for r, mask in enumerate(test.own_lines)
         ]  # fmt: skip
         if self.whole.varying is not None:
-            cut = [run.at(lines) for run in runs for lines in pieces(run.w)]
+            cut = [run.at(lines) for run in runs for lines in segments(run.w)]
             runs = [run._replace(piece=piece) for piece, run in enumerate(cut)]
         super().__init__(test, m, runs)
         self.moving = {run: at for at, run in enumerate(self.whole.moving)}
@@ -118,7 +118,7 @@ class RecordModel(SpectralModel):
         return self.whole.transients(freq)
 
     def trace_spectra(self, freq: Array) -> ComplexArray:
-        """What the traces of a channel are multiples of, (TRACES, L)."""
+        """Spectra of which the traces of a channel are multiples, (TRACES, L)."""
         unit = freq / self.test.freq[-1]
         return np.stack([np.ones_like(unit) + 0j, 1j * unit, -1j / unit])
 
@@ -171,35 +171,35 @@ class RecordModel(SpectralModel):
         """See `SpectralModel`."""
         return (Chunk(self, p, run) for run in self.parts())
 
-    def normal_equations(self, p: Parameters, levels: Array) -> Shift:
+    def normal_equations(self, p: Parameters, levels: Array) -> NormalEquations:
         """Products with the base as the records of all channels make it likely, for noise of these levels.
 
         `levels` are variances of a sample in time, of the outputs and then of the base, (pieces, c + d).
         """
         return self._products(p, levels, Chunk.sums)
 
-    def gradient(self, p: Parameters, levels: Array) -> Shift:
+    def gradient(self, p: Parameters, levels: Array) -> NormalEquations:
         """The same without the normal matrix, which stays zero: several times as fast."""
         return self._products(p, levels, Chunk.sums_of_errors)
 
-    def _products(self, p: Parameters, levels: Array, of_chunk: Callable[[Chunk, Array, Columns], Sums]) -> Shift:
+    def _products(self, p: Parameters, levels: Array, each: Callable[[Chunk, Array, Columns], Sums]) -> NormalEquations:
         normal, gradient, chi2 = np.zeros((self.size, self.size)), np.zeros(self.size), 0.0
         found: dict[int, tuple[Columns, Array, Sums]] = {}
         for chunk in self.chunks(p):
             piece = chunk.run.piece
             if piece in found:
                 columns, scale, before = found[piece]
-                found[piece] = columns, scale, before.plus(of_chunk(chunk, levels, columns))
+                found[piece] = columns, scale, before.plus(each(chunk, levels, columns))
             else:
                 columns = chunk.columns()
-                found[piece] = columns, chunk.deviations(levels)[0], of_chunk(chunk, levels, columns)
+                found[piece] = columns, chunk.deviations(levels)[0], each(chunk, levels, columns)
         for columns, scale, sums in found.values():
             products, at = columns.products(sums, scale), columns.unknowns
             if products.normal.size:
                 normal[np.ix_(at, at)] += products.normal
             gradient[at] += products.gradient
             chi2 += products.chi2
-        return Shift(normal, gradient, chi2)
+        return NormalEquations(normal, gradient, chi2)
 
 
 class HeldShapes(RecordModel):
@@ -219,10 +219,10 @@ class HeldShapes(RecordModel):
         """Numbers that are not held."""
         return int(np.sum(~self.held))
 
-    def _products(self, p: Parameters, levels: Array, of_chunk: Callable[[Chunk, Array, Columns], Sums]) -> Shift:
-        normal, gradient, chi2 = super()._products(p, levels, of_chunk)
+    def _products(self, p: Parameters, levels: Array, each: Callable[[Chunk, Array, Columns], Sums]) -> NormalEquations:
+        normal, gradient, chi2 = super()._products(p, levels, each)
         normal[self.held], normal[:, self.held], gradient[self.held] = 0.0, 0.0, 0.0
-        return Shift(normal, gradient, chi2)
+        return NormalEquations(normal, gradient, chi2)
 
 
 class Chunk(Lines):
@@ -233,7 +233,7 @@ class Chunk(Lines):
         self.records = model
 
     def columns(self) -> Columns:
-        """How the columns of all channels are made of the spectra."""
+        """Columns of all channels by the spectra."""
         every = np.array([self.coefficients(channel) for channel in range(self.records.channels)])
         row, spectrum = np.nonzero(np.any(every != 0, axis=0))
         unknowns, starts, count = np.unique(row, return_index=True, return_counts=True)
@@ -245,7 +245,7 @@ class Chunk(Lines):
         return Columns(unknowns, layers)
 
     def coefficients(self, channel: int) -> Array:
-        """How the columns of a channel's Jacobian are made of the spectra, (p, spectra)."""
+        """Coefficients of the columns of a channel's Jacobian by the spectra, (p, spectra)."""
         model = self.records
         n, m, d, index = model.n, model.m, model.d, model.index
         k = np.arange(m)
@@ -287,7 +287,7 @@ class Chunk(Lines):
     def sums_of_errors(self, levels: Array, columns: Columns) -> Sums:
         """Products of the spectra of these lines with the errors alone."""
         weighed = self.weighed(levels)
-        cross = dots(self.spectra(weighed.base), self.run.weight * weighed.seen)
+        cross = dots(self.spectra(weighed.base), self.run.weight * weighed.whitened_residual)
         return Sums(np.zeros((0, 0)), cross, np.zeros((0, 0)), float(self.run.weight @ weighed.power))
 
     def sums(self, levels: Array, columns: Columns) -> Sums:
@@ -298,9 +298,9 @@ class Chunk(Lines):
         for part in self.covered(levels):
             seen = columns.seen(part.conj(), spectra)
             hidden += dots(seen, seen)
-        cross = dots(spectra, root * weighed.seen)
+        cross = dots(spectra, root * weighed.whitened_residual)
         return Sums(dots(spectra, spectra), cross, hidden, float(self.run.weight @ weighed.power))
 
-    def products(self, levels: Array, columns: Columns) -> Shift:
+    def products(self, levels: Array, columns: Columns) -> NormalEquations:
         """Products of the Jacobian of these lines; unknowns as in `columns`."""
         return columns.products(self.sums(levels, columns), self.deviations(levels)[0])

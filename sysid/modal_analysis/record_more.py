@@ -43,14 +43,14 @@ def with_further_modes(fit: RecordFit, *, some: Measurement | None = None, monit
 
 
 def no_modes(fit: RecordFit) -> NDArray[np.bool_]:
-    """Whether each mode is none of a structure, whatever it explains, (m,): too damped, or far narrower than a line."""
+    """True for modes that no structure has, whatever they explain, (m,): too damped, or far narrower than a line."""
     modes = fit.parameters.modes
     narrow = modes.ratios * modes.omega < RAZOR * 2 * np.pi * np.min(fit.model.whole.spacing)
     return np.asarray((modes.ratios >= DAMPED) | narrow)
 
 
 def least_worth(model: RecordModel) -> float:
-    """What a mode must lower ``e' S^-1 e`` by: more than noise makes of a residue of rank one and a pole, anywhere."""
+    """Least fall of ``e' S^-1 e`` by a mode: more than noise makes of a residue of rank one and a pole, anywhere."""
     inputs = model.d + 2 * len(model.moving)
     return beyond_chance(model.channels + inputs + 1, len(_RATIOS) * model.numbers) / 2
 

@@ -74,7 +74,7 @@ def _parts(model: RecordModel, p: Parameters) -> list[ErrorSpectra]:
 
 
 def _designs(model: RecordModel, number: int, channels: int) -> dict[int, Array]:
-    """What the numbers of a run's levels make of their logarithms, piece by piece."""
+    """Matrices from the numbers of a run's levels to their logarithms, piece by piece."""
     runs = [run for run in model.runs if run.number == number]
     varying = model.whole.varying
     varies = np.zeros(channels, bool) if varying is None else varying[number]

@@ -13,7 +13,7 @@ from sysid.measurement.measurement import Measurement
 from sysid.structure.structure import Array
 
 
-def few_lines(test: Measurement, a_width: int = 6, ratio: float = 0.005) -> NDArray[np.bool_]:
+def decimated_lines(test: Measurement, a_width: int = 6, ratio: float = 0.005) -> NDArray[np.bool_]:
     """Lines that tell the modes where there are many, the last too, (n_freq,).
 
     So many in a half-power width of a mode of this damping ratio; all of them where that would not save half.

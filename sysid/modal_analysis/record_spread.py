@@ -22,7 +22,7 @@ from sysid.structure.thresholds import FALSE_ALARM, beyond_chance
 _TAKEN = 0.98  # share of the information, at most, that is taken to be a block's
 
 
-def blocks_of(run: Run, fit: RecordFit, shift: float, widths: float = 3.0, least: int = 4) -> list[NDArray[np.intp]]:
+def line_blocks(run: Run, fit: RecordFit, shift: float, widths: float = 3.0, least: int = 4) -> list[NDArray[np.intp]]:
     """Lines of a run in blocks of so many half-power widths, of some lines at least; the first begins at a `shift`."""
     modes = fit.parameters.modes
     order = np.argsort(modes.omega)
@@ -52,7 +52,7 @@ def scatter_over_blocks(fit: RecordFit, partitions: int = 4) -> Array:
     for shift in np.arange(partitions) / partitions:
         for run, run_columns in zip(model.runs, columns, strict=True):
             at = size[run_columns.unknowns]
-            for lines in blocks_of(run, fit, shift):
+            for lines in line_blocks(run, fit, shift):
                 products = Chunk(model, p, run.at(lines)).products(fit.levels, run_columns)
                 score = half[run_columns.unknowns].T @ (products.gradient / at)
                 inner = half[run_columns.unknowns].T @ (products.normal / np.outer(at, at)) @ half[run_columns.unknowns]
@@ -69,7 +69,7 @@ def scatter_over_blocks(fit: RecordFit, partitions: int = 4) -> Array:
 
 
 def uneven(fit: RecordFit, mean: float = 1.0) -> bool:
-    """Whether the power of what is left differs between blocks of lines, and from its mean, by more than chance.
+    """True where the power of what is left differs between blocks of lines, and from its mean, by more than chance.
 
     In all blocks together, or rises above it in one.
     """
@@ -80,7 +80,7 @@ def uneven(fit: RecordFit, mean: float = 1.0) -> bool:
         powers[chunk.run.piece].append(chunk.weighed(fit.levels).power)
     for run, parts in zip(model.runs, powers, strict=True):
         power = np.concatenate(parts)
-        for lines in blocks_of(run, fit, 0.0):
+        for lines in line_blocks(run, fit, 0.0):
             held, numbers = np.sum(power[lines]) / mean, c * lines.size
             off.append((held - numbers) / np.sqrt(numbers))
             rare.append(scipy.special.gammaincc(numbers, held))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sysid.modal_analysis.record_fit import Monitor, RecordFit, record_modes, refitted, without, worth
 from sysid.modal_analysis.record_more import least_worth
-from sysid.modal_analysis.record_spread import blocks_of, uneven
+from sysid.modal_analysis.record_spread import line_blocks, uneven
 from sysid.structure.structure import Array
 
 _MORE = 4.0  # times what a mode must be worth where noise alone is left
@@ -55,7 +55,7 @@ def worth_beyond_misfit(fit: RecordFit) -> Array:
     whole = [np.concatenate(one, axis=1) for one in powers]
     left, moved, parts = [one[0] for one in whole], [one[1] for one in whole], [one[2:] for one in whole]
     share = sum(map(np.sum, left)) / sum(map(np.sum, moved))
-    blocks = [blocks_of(run, fit, 0.0) for run in model.runs]
+    blocks = [line_blocks(run, fit, 0.0) for run in model.runs]
     weights = [
         1 / (_by_block(lines, power, c) + share * motion / c)
         for lines, power, motion in zip(blocks, left, moved, strict=True)
@@ -71,5 +71,5 @@ def worth_beyond_misfit(fit: RecordFit) -> Array:
 
 
 def _by_block(blocks: list[NDArray[np.intp]], power: Array, channels: int) -> Array:
-    """What is left of a line in its block, in units of the noise, one at least, (L,)."""
+    """Misfit about a line in its block, in units of the noise, one at least, (L,)."""
     return np.concatenate([np.full(lines.size, max(1.0, power[lines].mean() / channels)) for lines in blocks])

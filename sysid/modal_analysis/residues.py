@@ -47,7 +47,7 @@ class ResidueFit:
 
     @cached_property
     def left(self) -> Array:
-        """What the poles leave of the records, (rows, channels)."""
+        """Records less the contributions of the poles, (rows, channels)."""
         return self.data - self.Q @ self.answered
 
     @cached_property
@@ -74,16 +74,16 @@ class ResidueFit:
 
     @property
     def _is_large(self) -> bool:
-        """Whether round-off in differences of squares does not matter to what is left, which need not be formed."""
+        """True where round-off in differences of squares does not matter to what is left, which need not be formed."""
         return self._difference > NEGLIGIBLE * self.size
 
     @property
     def gain(self) -> Array:
-        """What the squared error would rise by without each pole, (m,)."""
+        """Rise of the squared error without each pole, (m,)."""
         return np.sum(self.whitened**2, axis=(1, 2))
 
     def rise_with_one_less(self, poles: NDArray[np.intp]) -> float:
-        """What the squared error would at least rise by with one pole less for these, all others unchanged.
+        """Least rise of the squared error with one pole less for these, all others unchanged.
 
         A pole has one function of frequency for each input, whatever its frequency.
         """
@@ -193,7 +193,7 @@ class Records:
 
     def noise(self, left: Array, unknowns: int, *, least: float = ROUND_OFF) -> float:
         """Variance of a real number of the records about a fit of so many unknowns, as it affects smooth functions."""
-        products, chance = _own_products(self.in_runs(left))
+        products, chance = _autocorrelation(self.in_runs(left))
         factor = _correlation_factor(products, chance, left.shape[1], self.lengths, unknowns)
         return self.variance(factor * float(np.sum(left**2)), unknowns, least=least)
 
@@ -260,12 +260,12 @@ class SubsetFits:
         self._outside = float(np.sum(left**2))
         # Products of errors `left + Q z` with their neighbours in each run: constant, linear, quadratic in z; by lag.
         ours, basis = records.in_runs(left), records.in_runs(Q)
-        self._constant, self._chance = _own_products(ours)  # chance as in the fit on all poles
+        self._constant, self._chance = _autocorrelation(ours)  # chance as in the fit on all poles
         self._linear = _lagged(lambda lag: _products(basis, ours, lag) + _products(ours, basis, lag).swapaxes(1, 2))
         self._quadratic = _lagged(lambda lag: _products(basis, basis, lag))
 
     def worth(self, kept: NDArray[np.intp]) -> tuple[Array, float]:
-        """What the squared error of the poles `kept` would rise by without each, over the noise, (len(kept),).
+        """Rise of the squared error of the poles `kept` without each, over the noise, (len(kept),).
 
         Returns
         -------
@@ -296,7 +296,7 @@ def _neighbours(first: ComplexArray, second: ComplexArray, lag: int) -> tuple[Co
     return first[:, lag:], second[:, : max(second.shape[1] - lag, 0)].conj()
 
 
-def _own_products(error: ComplexArray) -> tuple[ComplexArray, Array]:
+def _autocorrelation(error: ComplexArray) -> tuple[ComplexArray, Array]:
     """Sums of products of errors (runs, n_freq, channels) with their neighbours, (lags, runs), and chance in them.
 
     Products at two lines are independent where the noise is white, whatever channels share and however lines differ:
@@ -342,7 +342,7 @@ def line_correlation(error: ComplexArray, unknowns: int = 0) -> float:
     """
     run, line = np.nonzero(np.any(error != 0, axis=0))
     lengths = np.bincount(run, minlength=error.shape[1])
-    products, chance = _own_products(by_run(error[:, run, line].T, run, lengths))
+    products, chance = _autocorrelation(by_run(error[:, run, line].T, run, lengths))
     return _correlation_factor(products, chance, error.shape[0], lengths, unknowns)
 
 

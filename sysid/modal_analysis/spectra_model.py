@@ -26,7 +26,7 @@ from sysid.modal_analysis.modal_fit import (
     separate_poles,
     slopes_of_modes,
 )
-from sysid.modal_analysis.modal_model import Lines, Parameters, Run, Shift, SpectralModel, dots
+from sysid.modal_analysis.modal_model import Lines, NormalEquations, Parameters, Run, SpectralModel, dots
 from sysid.modal_analysis.residues import force_residual_left, linear_residues
 from sysid.modal_analysis.response import motion_curvature, real_times
 from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor
@@ -152,7 +152,7 @@ class SpectraModel(SpectralModel):
         runs = self.test.n_runs
         return Parameters(modes, rigid, np.zeros((self.m, 0)), np.zeros((runs, self.channels, 0)))
 
-    def normal_equations(self, p: Parameters, levels: Array) -> Shift:
+    def normal_equations(self, p: Parameters, levels: Array) -> NormalEquations:
         """Half the Hessian and minus half the gradient of the sum of squares by the unknowns, and the sum.
 
         Of parameters with the best shapes. The Hessian is exact where it has no negative curvature, else Kaufman's.
@@ -163,9 +163,9 @@ class SpectraModel(SpectralModel):
         joined = joined[self._free]
         exact = joined @ curved @ joined.T
         normal = exact if _is_definite(exact) else joined @ plain.normal @ joined.T
-        return Shift(normal, joined @ plain.gradient, plain.chi2)
+        return NormalEquations(normal, joined @ plain.gradient, plain.chi2)
 
-    def slopes(self, p: Parameters, levels: Array) -> tuple[Shift, Array]:
+    def slopes(self, p: Parameters, levels: Array) -> tuple[NormalEquations, Array]:
         """The same by participations, log w, log zeta of each mode, and rigid-body mass: theta without the shapes.
 
         First with Kaufman's normal matrix, then half the exact Hessian.
@@ -178,10 +178,10 @@ class SpectraModel(SpectralModel):
         for chunk in self.chunks(p):
             piece, weighed, spectra_there = chunk.run.piece, chunk.weighed(levels), chunk.spectra(chunk.run.base)
             grams[piece] += dots(spectra_there, spectra_there)
-            cross[piece] += dots(spectra_there, weighed.seen)
+            cross[piece] += dots(spectra_there, weighed.whitened_residual)
             chi2 += float(np.sum(weighed.power))
             scale[piece] = chunk.deviations(levels)[0]
-            pull = real_times(chunk.shapes.T, weighed.seen)
+            pull = real_times(chunk.shapes.T, weighed.whitened_residual)
             curvature += motion_curvature(
                 chunk.run.w / (2 * np.pi), modes.omega, modes.ratios, modes.gamma, chunk.run.base, pull
             )
@@ -201,7 +201,7 @@ class SpectraModel(SpectralModel):
             first, others = mode * self.d + i, np.arange(count)
             np.subtract.at(bent, (first, others), cross[-1, m + others, n + i])
             np.subtract.at(bent, (others, first), cross[-1, m + others, n + i])
-        return Shift(normal, gradient, chi2), normal + bent
+        return NormalEquations(normal, gradient, chi2), normal + bent
 
 
 def _eliminated(
@@ -235,7 +235,7 @@ def _eliminated(
 
 
 def _is_definite(matrix: Array) -> bool:
-    """Whether a symmetric matrix has positive curvature in all directions, by more than round-off."""
+    """True where a symmetric matrix has positive curvature in all directions, by more than round-off."""
     size = np.diag(matrix)
     if np.any(size <= 0):
         return False

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.measurement import spectra
-from sysid.measurement.in_time import RunInTime, in_time
+from sysid.measurement.in_time import RunInTime, runs_in_time
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.spectra import TimeRun
 from sysid.measurement.whole import NoiseLevels, WholeRecords
@@ -71,7 +71,7 @@ def stretches_of(test: Measurement, omega: Array, ratios: Array) -> list[Stretch
     omega, ratios : (m,)
         Poles, rad/s and fractions, near which those of the stretches are.
     """
-    runs = in_time(test)
+    runs = runs_in_time(test)
     pieces = _pieces(runs, _PERIODS * 2 * np.pi / float(omega.min()))
     if len(pieces) < 2:
         return []
@@ -105,7 +105,7 @@ def _stretch(piece: Piece, every: RecordFit, test: Measurement) -> Stretch:
 
 
 def _noise_at_peaks(fit: RecordFit, about: int = 12, explained: int = 2) -> Array:
-    """What noise there is about each mode, over the levels, (m,): that of the base is larger there than elsewhere.
+    """Noise about each mode, over the levels, (m,): that of the base is larger there than elsewhere.
 
     Each line counts by what it tells of the frequency of the mode: the power of the response's slope in it. The few
     lines at a peak may leave nothing beside poles and transients: what the base's noise makes there is told by lines

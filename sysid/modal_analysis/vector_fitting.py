@@ -155,7 +155,7 @@ def poles_near(test: Measurement, omega: Array, window: float, *, monitor: Monit
 
 
 def _count(records: Records, progress: _Progress) -> int:
-    """How many poles to begin with."""
+    """Number of poles to begin with."""
     progress.tell()
     sizes, _ = records.singular
     progress.tell()
@@ -196,7 +196,7 @@ def poles_from(records: Records, omega: Array, ratios: Array, *, monitor: Monito
 
 
 def _most_poles(records: Records) -> int:
-    """How many poles the lines determine, and the records residues of both kinds beside the motion at ends."""
+    """Number of poles that the lines determine, and the records residues of both kinds beside the motion at ends."""
     inputs = len(records.base) + records.driven
     return min((int(np.count_nonzero(records.freq)) - 1) // 2, (len(records.data) - 1) // inputs)
 
@@ -316,7 +316,7 @@ def _in_order(records: Records, omega: Array, ratios: Array) -> Poles:
 
 
 def _least_gain(fit: ResidueFit) -> float:
-    """What a pole must lower the squared error by to earn its place, in units of the noise's variance."""
+    """Least fall of the squared error by which a pole earns its place, in units of the noise's variance."""
     return beyond_chance(fit.residues[0].size + 2, CANDIDATES)  # real parameters that come with a pole
 
 

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.errors import InputError, finite_array, number, shown
+from sysid.errors import InputError, as_float, finite_array, shown
 from sysid.models.expressions import as_matrix, at_point, check_finite, is_column, written_in
 from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import Geometry
@@ -40,7 +40,7 @@ class ModalDamping(FieldTree):
     upper: float = MOST
 
     def __post_init__(self) -> None:
-        lower, upper = (number(f"ModalDamping: {name}", getattr(self, name)) for name in ("lower", "upper"))
+        lower, upper = (as_float(f"ModalDamping: {name}", getattr(self, name)) for name in ("lower", "upper"))
         if not 0 < lower < upper < 1:
             raise InputError(f"ModalDamping: 0 < lower < upper < 1 is needed, not {lower} and {upper}")
 

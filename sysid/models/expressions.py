@@ -14,14 +14,14 @@ from sysid.structure.structure import Array
 
 
 def is_expression(value: Any) -> bool:
-    """Whether a matrix is written in variables, rather than a model or numbers."""
+    """True where a matrix is written in variables, rather than a model or numbers."""
     if isinstance(value, list | tuple):
         return any(map(is_expression, value))
     return isinstance(value, Variable | ca.MX | ca.SX) or _is_objects(value)
 
 
 def _is_objects(value: Any) -> bool:
-    """Whether a value is an array of Python objects, such as NumPy makes of lists of expressions."""
+    """True where a value is an array of Python objects, such as NumPy makes of lists of expressions."""
     return isinstance(value, np.ndarray) and value.dtype == object
 
 
@@ -132,7 +132,7 @@ def cholesky(M: ca.SX | ca.MX) -> ca.SX | ca.MX:
 
 
 def is_column(damping: Any) -> bool:
-    """Whether a matrix was given in one dimension, as damping ratios are."""
+    """True where a matrix was given in one dimension, as damping ratios are."""
     if isinstance(damping, list | tuple):
         return not any(isinstance(entry, list | tuple) for entry in damping)
     return len(getattr(damping, "shape", ())) == 1

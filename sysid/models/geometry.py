@@ -144,12 +144,12 @@ class Geometry:
 
     @property
     def weighs(self) -> bool:
-        """Whether a total that is not stated is an unknown."""
+        """True where a total that is not stated is an unknown."""
         return self._weighed is not None
 
     @property
     def at_sensors(self) -> bool:
-        """Whether the degrees of freedom are the sensors."""
+        """True where the degrees of freedom are the sensors."""
         return np.array_equal(self.recovery, np.eye(len(self.rigid_body)))
 
     @property

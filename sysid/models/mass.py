@@ -101,7 +101,7 @@ class FullMass(FieldTree):
         _deviations("FullMass: total_std", self.total_std, "total_mass", self.total_mass)
 
     def known_entries(self, geometry: Geometry) -> Array:
-        """What is known of ``[M_SS, M_S0]``, (n, n + d); NaN where nothing is."""
+        """Known entries of ``[M_SS, M_S0]``, (n, n + d); NaN where nothing is."""
         n, d = geometry.n, geometry.d
         entries = np.full((n, n + d), np.nan)
         if self.known is None:
@@ -158,7 +158,7 @@ class FullMass(FieldTree):
         return np.concatenate([total_of(geometry, mass, self.healing), entries])
 
     def total(self, geometry: Geometry, mass: Array) -> Array:
-        """What this healing calls the total of `mass`, (n + d, n + d): (d,)."""
+        """Total of `mass`, (n + d, n + d), in the sense of this healing: (d,)."""
         return total_of(geometry, mass, self.healing)
 
     def stated(self, geometry: Geometry) -> Stated:
@@ -350,7 +350,7 @@ def _above_floor(y: ca.SX, lower: Array) -> ca.SX:
 
 
 def total_of(geometry: Geometry, mass: Array, kind: str) -> Array:
-    """What a kind of healing calls the total of `mass` (n + d, n + d), (d,)."""
+    """Total of `mass` (n + d, n + d) in the sense of a kind of healing, (d,)."""
     if kind == "rigid_body":  # the diagonal of [G; I]' M [G; I]
         rigid = np.vstack([geometry.rigid_body, np.eye(geometry.d)])
         return np.einsum("ni,nm,mi->i", rigid, mass, rigid)

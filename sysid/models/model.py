@@ -54,7 +54,7 @@ class Totals:
 
 @dataclass(frozen=True, eq=False)
 class Stated:
-    """What a model states about its matrix: strategies, determination and checks read this, and never the model's type.
+    """Statement of a model about its matrix: strategies, determination and checks read it, and never the model's type.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class Stated:
 
     @property
     def weighs(self) -> bool:
-        """Whether entries or totals of a free mass are adjusted together with the records."""
+        """True where entries or totals of a free mass are adjusted together with the records."""
         with_std = self.totals is not None and self.totals.std is not None
         return self.free and (self.entries is not None or with_std)
 
@@ -148,7 +148,7 @@ class MatrixModel(Protocol):
     """
 
     def unknowns(self, geometry: Geometry) -> Sequence[Unknown]:
-        """What is searched; none where the matrix is written in variables or numbers."""
+        """Unknowns of the model; none where the matrix is written in variables or numbers."""
 
     def blocks(self, geometry: Geometry, y: Any, *before: Any) -> Any:
         """The matrix of the unknowns `y`, all in one column, as expressions.
@@ -168,7 +168,7 @@ class MatrixModel(Protocol):
         """
 
     def stated(self, geometry: Geometry) -> Stated:
-        """What is stated of the matrix."""
+        """Statement about the matrix."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,7 +239,7 @@ def stiffness_blocks(given: Any, factor: Any) -> StiffnessBlocks:
 
 
 def check_shape(name: str, given: Any, *shapes: tuple[int, int]) -> Any:
-    """What a matrix model gives; refused where it has another shape."""
+    """Refuse what a matrix model gives where it has another shape."""
     if tuple(given.shape) not in shapes:
         needed = " or ".join(map(str, shapes))
         raise InputError(f"the {name} model gives a matrix of the shape {tuple(given.shape)}; {needed} is needed")

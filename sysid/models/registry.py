@@ -33,7 +33,7 @@ _TREE, _MODEL = ("to_tree", "from_tree"), ("unknowns", "blocks", "values", "stat
 
 
 def is_storable(model: Any) -> bool:
-    """Whether something is a model: its class has `to_tree` and `from_tree`, or the methods of a matrix model."""
+    """True where something is a model: its class has `to_tree` and `from_tree`, or the methods of a matrix model."""
     return _has(type(model), _TREE) or _has(type(model), _MODEL)
 
 

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError, finite_array, number, refuse
+from sysid.errors import InputError, as_float, finite_array, refuse
 from sysid.models.expressions import at_point, written_in
 from sysid.models.field_tree import FieldTree
 from sysid.models.geometry import FACTOR_FLOOR, Geometry
@@ -59,7 +59,7 @@ class SpectralStiffness(FieldTree):
             )
             highest = given[-1]
         if self.max_frequency is not None:
-            limit = number("max_frequency", self.max_frequency, "a positive number of Hz", above=0, below=1e12)
+            limit = as_float("max_frequency", self.max_frequency, "a positive number of Hz", above=0, below=1e12)
             self._check_limit(limit, highest)
 
     def _check_limit(self, limit: float, highest: float) -> None:
@@ -228,7 +228,7 @@ def check_rigid(stiffness: ca.MX, rigid_body: Array) -> None:
 
 
 def _strains(K: Array, rigid_body: Array) -> bool:
-    """Whether a stiffness (n + d, n + d) holds a rigid structure to the ground."""
+    """True where a stiffness (n + d, n + d) holds a rigid structure to the ground."""
     n = len(rigid_body)
     return bool(np.abs(K[:, :n] @ rigid_body + K[:, n:]).max() > 1e-6 * np.abs(K).max())
 

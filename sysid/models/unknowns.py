@@ -39,7 +39,7 @@ NO_COMPLEX = (
 
 
 def _same(x: Any) -> Any:
-    """What is searched on a linear scale."""
+    """Identity, for what is searched on a linear scale."""
     return x
 
 
@@ -172,7 +172,7 @@ def _closed(method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class Expression(ca.MX):
-    """What is written in variables with operators: a CasADi MX that tells its author what CasADi cannot do.
+    """Expression in variables with operators: a CasADi MX that tells its author what CasADi cannot do.
 
     CasADi's functions give a plain MX; what is asked of that is told by `sysid.catalogue`, of a problem module alone.
     """

@@ -63,7 +63,7 @@ def _drawn(figure: Figure, dpi: float) -> NDArray[np.uint8]:
 
 
 @contextlib.contextmanager
-def own_style() -> Iterator[None]:
+def default_style() -> Iterator[None]:
     """Draw with matplotlib's own settings, whatever a problem module or the machine has set."""
     import matplotlib
 
@@ -91,7 +91,7 @@ def new_figure(width: float, height: float, layout: Literal["constrained"] | Non
 
 
 def new_axes(ax: Axes | None, width: float, height: float) -> tuple[Axes | Figure, Any]:
-    """What a picture returns, and the axes it is drawn into: those given, or a new figure and its axes."""
+    """Return value of a picture, and the axes it is drawn into: those given, or a new figure and its axes."""
     if ax is not None:
         return ax, ax
     figure = new_figure(width, height)

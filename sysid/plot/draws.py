@@ -32,17 +32,17 @@ def draws(found: Sequence[Spread], count: int, title: str = "") -> Figure:
     -------
     Figure
     """
-    shown = [spread for spread in found if np.isfinite(spread.ratio)]
-    figure = new_figure(7.2, _MARGIN + _ROW * len(shown))
+    known = [spread for spread in found if np.isfinite(spread.ratio)]
+    figure = new_figure(7.2, _MARGIN + _ROW * len(known))
     ax = figure.subplots()
-    rows = np.arange(len(shown))
-    ratios = [spread.ratio for spread in shown]
+    rows = np.arange(len(known))
+    ratios = [spread.ratio for spread in known]
     chance = LIKELY / np.sqrt(2 * count)
     ax.axvspan(1 - chance, 1 + chance, color=FAINT, alpha=0.25, linewidth=0, label=f"chance of {count} draws, 95 %")
     ax.axvline(1.0, color=FAINT, linewidth=0.9)
     ax.plot(ratios, rows, "o", color=COLOURS[0], markersize=5)
-    ax.set_yticks(rows, [spread.name for spread in shown])
-    ax.set_ylim(len(shown) - 0.5, -0.5)
+    ax.set_yticks(rows, [spread.name for spread in known])
+    ax.set_ylim(len(known) - 0.5, -0.5)
     ax.set_xlim(0.0, max(2.0, 1.1 * max(ratios, default=0.0)))
     dress(ax, title, "standard deviation of the draws / linear one [–]", "")
     figure.legend(loc="outside lower center", frameon=False, fontsize="small")

@@ -34,15 +34,15 @@ def minima(found: Sequence[Minimum], title: str = "", *, goal: float | None = No
 
     figure = new_figure(7.2, 4.2)
     ax = figure.subplots()
-    begun = 0
+    drawn = 0
     for i, minimum in enumerate(found):
         left = np.maximum(sorted(result.residual for result in minimum.results), EPSILON)
         named = i < len(COLOURS)
         times = f"reached {len(left)} time{'s' if len(left) > 1 else ''}"
         label = f"{i + 1}: {minimum.residual:.4e}, {times}" if named else "others" if i == len(COLOURS) else None
         colour = COLOURS[i] if named else FAINT
-        ax.plot(begun + 1 + np.arange(len(left)), left, "o", color=colour, markersize=5, label=label)
-        begun += len(left)
+        ax.plot(drawn + 1 + np.arange(len(left)), left, "o", color=colour, markersize=5, label=label)
+        drawn += len(left)
     if goal is not None:
         ax.axhline(goal, color=FAINT, linewidth=0.9, linestyle="--", label=f"goal {goal:.3g}")
     ax.set_yscale("log")

@@ -125,8 +125,8 @@ def _remark(ax: Axes, words: str) -> None:
 
 def _mode_lines(ax: Axes, modes: Array, label: str) -> None:
     low, high = ax.get_xlim()
-    shown = modes[(modes >= low) & (modes <= high)]
-    for mode, name in zip(shown, [label, *["_"] * shown.size], strict=False):
+    in_band = modes[(modes >= low) & (modes <= high)]
+    for mode, name in zip(in_band, [label, *["_"] * in_band.size], strict=False):
         ax.axvline(mode, **{**IDENTIFIED, "linewidth": 0.9, "zorder": 1.5, "label": name})
 
 

@@ -57,7 +57,7 @@ class PlottedChannel(NamedTuple):
 
 
 def run_names(test: Measurement) -> tuple[str, ...]:
-    """What each run is called in a title: "base x" for unit runs, else "run 1"."""
+    """Names of the runs in a title: "base x" for unit runs, else "run 1"."""
     if test.has_unit_runs:
         return tuple(f"base {name}" for name in test.base_axes or ())
     return tuple(f"run {r + 1}" for r in range(test.n_runs))
@@ -134,9 +134,9 @@ def _channel(
     phase = f"phase to\nbase {test.base_axes[moved]} [°]"
     # The scale of a spectrum (a line, per Hz, one-sided) is the record's own affair.
     against = test.base[run, moved]
-    own, gaps = lines_of(test, run)
+    at, gaps = lines_of(test, run)
     return PlottedChannel(
-        test.freq[own], measured[own], predicted[own], against[own], title, spectrum, phase, negligible, std[own],
+        test.freq[at], measured[at], predicted[at], against[at], title, spectrum, phase, negligible, std[at],
         np.zeros(0), gaps,
     )  # fmt: skip
 
@@ -146,8 +146,8 @@ def lines_of(test: Measurement, run: int) -> tuple[NDArray[np.bool_], NDArray[np
 
     Whole records of other lengths have zeros at the others.
     """
-    own = test.own_lines[run]
-    return own, np.concatenate([[0], np.cumsum(own)])[test.gaps]
+    lines = test.own_lines[run]
+    return lines, np.concatenate([[0], np.cumsum(lines)])[test.gaps]
 
 
 def place(ax: Axes | Sequence[Axes] | None, channel: PlottedChannel) -> Any:
@@ -189,8 +189,8 @@ def key(axes: Iterable[Axes]) -> list[Any]:
     for ax in axes:
         handles, labels = ax.get_legend_handles_labels()
         entries |= dict(zip(labels, handles, strict=True))
-    told = (style["label"] for style in (MEASURED, IDENTIFIED, _BAND, RESIDUAL, _OUTLIER))
-    return [entries[label] for label in told if label in entries]
+    order = (style["label"] for style in (MEASURED, IDENTIFIED, _BAND, RESIDUAL, _OUTLIER))
+    return [entries[label] for label in order if label in entries]
 
 
 def draw(axes: Any, channel: PlottedChannel) -> None:
@@ -199,10 +199,10 @@ def draw(axes: Any, channel: PlottedChannel) -> None:
     magnitude = axes[0]
     # Whole-record spectra have thousands of lines, which at full width would hide each other.
     thin = {"linewidth": 0.7} if freq.size > 800 else {}
-    shown, answered = MEASURED | thin, IDENTIFIED | thin
+    measured_style, answered = MEASURED | thin, IDENTIFIED | thin
     size, modelled, error = np.abs(measured), np.abs(identified), np.abs(identified - measured)
     lines = broken(freq, channel.gaps)
-    for curve, style in ((error, RESIDUAL), (size, shown), (modelled, answered)):
+    for curve, style in ((error, RESIDUAL), (size, measured_style), (modelled, answered)):
         magnitude.plot(lines, broken(positive(curve), channel.gaps), **style)
     off = np.isin(freq, channel.outliers)
     if np.any(off):
@@ -227,7 +227,7 @@ def draw(axes: Any, channel: PlottedChannel) -> None:
         phase = axes[1]
         magnitude.set_xlabel("")
         magnitude.tick_params(which="both", labelbottom=False)
-        for record, style in ((measured, shown), (identified, answered)):
+        for record, style in ((measured, measured_style), (identified, answered)):
             angle = np.angle(record * np.conj(channel.against), deg=True)
             phase.plot(*_wrapped(freq, angle, channel.gaps), **style)
         phase.set_ylim(-190, 190)
@@ -255,7 +255,7 @@ def _wrapped(freq: Array, degrees: Array, gaps: NDArray[np.intp]) -> tuple[Array
     return broken(freq, jumps), broken(degrees, jumps)
 
 
-def index_of(what: str, value: int | str, names: Sequence[str]) -> int:
+def named_index(what: str, value: int | str, names: Sequence[str]) -> int:
     """Index of a name or of a number, which may count from the end; `what` it is, for the message of an InputError."""
     if isinstance(value, str):
         if value not in names:
@@ -269,7 +269,7 @@ def index_of(what: str, value: int | str, names: Sequence[str]) -> int:
 def run_index(test: Measurement, run: int | str) -> int:
     """Index of a run by name or number; runs of unit base motion are called as the base axes."""
     names = (test.base_axes or ()) if test.has_unit_runs else run_names(test)
-    return index_of("run", run, names)
+    return named_index("run", run, names)
 
 
 def strongest(
@@ -277,7 +277,7 @@ def strongest(
 ) -> list[tuple[int, int]]:
     """Pairs (sensor, run) with the largest relative accelerations, of different sensors, the runs in turn."""
     energy = np.linalg.norm(test.relative, axis=-1)
-    free = list(range(test.n_sensors)) if sensor is None else [index_of("sensor", sensor, test.sensor_names)]
+    free = list(range(test.n_sensors)) if sensor is None else [named_index("sensor", sensor, test.sensor_names)]
     runs = range(test.n_runs) if run is None else [run_index(test, run)]
     chosen: list[tuple[int, int]] = []
     first = runs.index(max(runs, key=lambda r: energy[r, free].max()))

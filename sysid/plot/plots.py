@@ -32,8 +32,8 @@ from sysid.plot.modal_panels import draw_cmif, draw_stabilisation
 from sysid.plot.panels import (
     draw,
     force_channel,
-    index_of,
     key,
+    named_index,
     panels,
     place,
     response_channel,
@@ -106,7 +106,7 @@ def responses(
 ) -> Figure:
     """All runs of one sensor side by side; see `transmissibility`."""
     test = measurement or identification.measurement
-    s = index_of("sensor", sensor, test.sensor_names)
+    s = named_index("sensor", sensor, test.sensor_names)
     return panels([response_channel(identification, test, s, r, band=band) for r in range(test.n_runs)], alone=10.0)
 
 
@@ -140,7 +140,7 @@ def base_force(
     Figure, Axes or the sequence given
     """
     test = with_force(measurement or identification.measurement)
-    i = index_of("base direction", direction, test.base_axes or ())
+    i = named_index("base direction", direction, test.base_axes or ())
     r = int(np.argmax(np.linalg.norm(test.base[:, i], axis=-1))) if run is None else run_index(test, run)
     return place(ax, force_channel(identification, test, i, r, band=band))
 
@@ -166,7 +166,7 @@ def convergence(identification: Identification, ax: Axes | None = None) -> Any:
     It is the root of the sum of squares of all that is fitted, so it may differ from the residual, which is of
     accelerations alone and unweighted.
     """
-    shown, ax = new_axes(ax, 6.0, 3.6)
+    target, ax = new_axes(ax, 6.0, 3.6)
     history = identification.history
     swarm, local = positive(history.swarm_curve), positive(history.local_curve)
     rounds = sum(phase.evaluations for phase in history.phases if phase.name == HUBER)
@@ -187,9 +187,9 @@ def convergence(identification: Identification, ax: Axes | None = None) -> Any:
         ax.legend(frameon=False, fontsize="small")
     else:
         ax.text(0.5, 0.5, "no search is recorded", transform=ax.transAxes, ha="center", color=FAINT)
-    told = "iteration, swarm then local phase" if swarm.size else "iteration"
-    dress(ax, "Convergence", told, "objective [–]")
-    return shown
+    x_label = "iteration, swarm then local phase" if swarm.size else "iteration"
+    dress(ax, "Convergence", x_label, "objective [–]")
+    return target
 
 
 def _draw_curves(ax: Axes, swarm: Array, local: Array, *, rounds: int, widened: bool) -> None:
@@ -215,8 +215,8 @@ def _draw_curves(ax: Axes, swarm: Array, local: Array, *, rounds: int, widened: 
         if first:
             ax.plot(iterate[:first], local[:first], color=COLOURS[5], label=ended, **drawn)
         if rounds:
-            told = "rounds of Huber's loss, each with its own weights"
-            ax.plot(iterate[first:], local[first:], color=COLOURS[1], label=told, **drawn)
+            rounds_label = "rounds of Huber's loss, each with its own weights"
+            ax.plot(iterate[first:], local[first:], color=COLOURS[1], label=rounds_label, **drawn)
     if swarm.size and local.size:
         ax.axvline(end, color=FAINT, linewidth=0.8, linestyle=":")
 
@@ -225,7 +225,7 @@ def mac(identification: Identification, ax: Axes | None = None) -> Any:
     """Modal assurance criterion against the reference where one is known, else the AutoMAC."""
     values = identification.mac
     side = min(2.6 + 0.3 * max(values.shape), 7.0)
-    shown, ax = new_axes(ax, side + 0.6, side)
+    target, ax = new_axes(ax, side + 0.6, side)
     image = ax.imshow(values, cmap="Blues", vmin=0, vmax=1, origin="lower")
     count_cells(ax, values.shape)
     if max(values.shape) <= 12:  # more cells have no room for numbers
@@ -237,7 +237,7 @@ def mac(identification: Identification, ax: Axes | None = None) -> Any:
     known = identification.records.reference is not None
     words = ("MAC against the reference", "mode of the reference") if known else ("AutoMAC", "mode")
     dress(ax, *words, "identified mode", grid=False)
-    return shown
+    return target
 
 
 def effective_masses(identification: Identification, ax: Axes | None = None) -> Any:
@@ -246,7 +246,7 @@ def effective_masses(identification: Identification, ax: Axes | None = None) -> 
     names = identification.measurement.base_axes or ()
     share = structure.effective_mass_percent
     modes = np.arange(1, structure.n + 1)
-    shown, ax = new_axes(ax, min(5.0 + 0.18 * structure.n, 9.0), 3.6)
+    target, ax = new_axes(ax, min(5.0 + 0.18 * structure.n, 9.0), 3.6)
     width = 0.8 / structure.n_base
     total = np.cumsum(share, axis=0)
     at = modes[:, None] + (np.arange(structure.n_base) - (structure.n_base - 1) / 2) * width
@@ -264,7 +264,7 @@ def effective_masses(identification: Identification, ax: Axes | None = None) -> 
     count_modes(ax, structure.n)
     ax.legend(frameon=False, fontsize="small", loc="center right")
     dress(ax, "Effective masses and their sum", "mode", "% of rigid-body mass")
-    return shown
+    return target
 
 
 def matrices(identification: Identification, ax: Sequence[Axes] | None = None) -> Any:
@@ -279,10 +279,10 @@ def matrices(identification: Identification, ax: Sequence[Axes] | None = None) -
     -------
     Figure, or the axes given
     """
-    shown: Any = ax
+    target: Any = ax
     if ax is None:
-        shown = new_figure(10.0, 3.6)
-        ax = shown.subplots(1, 3)
+        target = new_figure(10.0, 3.6)
+        ax = target.subplots(1, 3)
     structure = identification.structure
     n = structure.n
     blocks = {"$M_{SS}$": structure.mass[:n, :n], "$K_{SS}$": structure.stiffness[:n, :n], "$C$": structure.damping}
@@ -292,7 +292,7 @@ def matrices(identification: Identification, ax: Sequence[Axes] | None = None) -
         count_cells(one, matrix.shape)
         dress(one, name, "degree of freedom", row, grid=False, math=True)
     colour_bar(image, list(ax), r"$a_{ij} / \sqrt{a_{ii} a_{jj}}$ [–]")
-    return shown
+    return target
 
 
 def mode_shapes(identification: Identification, modes: Sequence[int] | None = None) -> Figure:
@@ -368,9 +368,9 @@ def stabilisation(subject: Identification | Measurement, ax: Axes | None = None)
     --------
     sysid.modal_analysis.stabilisation.stabilisation : The same as numbers.
     """
-    shown, ax = new_axes(ax, 6.4, 4.2)
+    target, ax = new_axes(ax, 6.4, 4.2)
     draw_stabilisation(ax, subject)
-    return shown
+    return target
 
 
 def cmif(subject: Identification | Measurement, ax: Axes | None = None) -> Any:
@@ -383,9 +383,9 @@ def cmif(subject: Identification | Measurement, ax: Axes | None = None) -> Any:
     --------
     sysid.modal_analysis.stabilisation.cmif : The same as numbers.
     """
-    shown, ax = new_axes(ax, 6.4, 3.8)
+    target, ax = new_axes(ax, 6.4, 3.8)
     draw_cmif(ax, subject)
-    return shown
+    return target
 
 
 def overview(identification: Identification, *, title: str | None = None) -> Figure:

@@ -128,7 +128,7 @@ def _without_zeros(function: ca.Function) -> ca.Function:
 
 
 def _is_scalar(function: ca.Function) -> bool:
-    """Whether a function is all scalar operations, and not too many to be replayed."""
+    """True where a function is all scalar operations, and not too many to be replayed."""
     # Each instruction takes some ten microseconds to set up.
     if not function.is_a("SXFunction") or function.n_instructions() > 50_000:
         return False

@@ -57,7 +57,7 @@ def batch_modes(H: Array, right: Array, rigid: Array, *base: Array) -> tuple[Arr
 
 
 def base_is_light(low: Array, base: Array) -> Array:
-    """Whether M_00 is less than ``M_S0' M_SS^-1 M_S0``, ``low = L^-1 M_S0``, which no structure's is, (count,)."""
+    """True where M_00 is less than ``M_S0' M_SS^-1 M_S0``, ``low = L^-1 M_S0``, which no structure's is, (count,)."""
     size = np.abs(base).max(axis=(1, 2)) + np.abs(low).max(axis=(1, 2)) ** 2
     return least(base - low.swapaxes(1, 2) @ low) < -ROUND_OFF * size
 

@@ -48,7 +48,7 @@ class ConstraintRow(NamedTuple):
     source: str
 
 
-def row_of(number: int, value: Any) -> ConstraintRow:
+def constraint_row(number: int, value: Any) -> ConstraintRow:
     """The row of a constraint that was given."""
     relation = expression_of(value)
     name = f"constraint {number}"

@@ -222,12 +222,12 @@ class _Matrices:
             return [operations.RESHAPING[name](*_exactly(1, arguments), self._reader.pattern(*parameters))]
         if name in operations.SPLITTING:
             (whole,) = _exactly(1, arguments)
-            return operations.split(name, whole, parameters)
+            return operations.split_matrix(name, whole, parameters)
         if name in operations.REPEATING:
             return [operations.REPEATING[name](*_exactly(1, arguments), 1, *_exactly(1, parameters))]
         if name.partition(" ")[0] == "solve":
             b, a = _exactly(2, arguments)
-            return [operations.solve(name[6:], b, a, transposed=bool(*_exactly(1, parameters)))]
+            return [operations.linear_solve(name[6:], b, a, transposed=bool(*_exactly(1, parameters)))]
         others = {
             "const": self._const, "getnonzeros": self._getnonzeros, "setnonzeros": self._setnonzeros,
             "addnonzeros": self._addnonzeros, "einstein": self._einstein, "call": self._call,

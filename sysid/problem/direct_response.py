@@ -22,7 +22,7 @@ _SOLVER = "lapacklu"  # of the wheels' plugins the fastest on small dense system
 
 
 class Motion(NamedTuple):
-    """What moves: CasADi expressions, and the numbers that geometry fixes.
+    """Equations of motion: CasADi expressions, and the numbers that geometry fixes.
 
     ``mass`` M_SS and ``stiffness`` K_SS (n, n), N s/m ``damping`` C (n, n), ``coupling`` M_S0 (n, d), ``base`` M_00
     (d, d); ``rigid_body_dofs`` (n, d), motion of the degrees of freedom with a rigid base; ``recovery``

@@ -319,7 +319,7 @@ def _solve_in_words(node: ca.MX) -> tuple[str, list[int]]:
     transposed = bool(node.info()["tr"])
     for solver in ("", *operations.SOLVERS):
         try:
-            same = ca.Function("solve", symbols, [operations.solve(solver, *symbols, transposed=transposed)])
+            same = ca.Function("solve", symbols, [operations.linear_solve(solver, *symbols, transposed=transposed)])
         except (ValueError, RuntimeError):
             continue
         if same_text(solve, same):
@@ -341,7 +341,7 @@ def _add_interpolant(writer: _Writer, function: ca.Function, inputs: Sequence[ca
 
 
 def _same_values(one: ca.Function, other: ca.Function, grid: Sequence[Sequence[float]], points: int = 200) -> bool:
-    """Whether two interpolants are the same to the bit at points all over their grid, and beyond its ends."""
+    """True where two interpolants are the same to the bit at points all over their grid, and beyond its ends."""
     share = np.random.default_rng(0).uniform(-0.1, 1.1, (len(grid), points))
     ends = np.array([(axis[0], axis[-1]) for axis in grid])
     at = ca.DM(ends[:, :1] + share * np.diff(ends, axis=1))

@@ -1,4 +1,4 @@
-"""Whether a problem can be searched at all: asked before anything runs."""
+"""Checks that a problem can be searched at all, before anything runs."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ LOOSE = 1e-2  # likewise for the swarm, which meets no equality exactly
 
 def points_of(formulation: Formulation, count: int = 128) -> Array:
     """The guess, and points spread over the search space, (count, size)."""
-    return np.array([formulation.guess, *latin_hypercube(formulation, count - 1, np.random.default_rng(0))])
+    return np.array([formulation.guess, *spread_points(formulation, count - 1, np.random.default_rng(0))])
 
 
-def latin_hypercube(formulation: Formulation, count: int, rng: np.random.Generator) -> list[Array]:
+def spread_points(formulation: Formulation, count: int, rng: np.random.Generator) -> list[Array]:
     """Points spread over the search space as the swarm's are."""
     unit = sampling.latin_hypercube(count, formulation.size, rng)
     low, high = formulation.box
@@ -63,7 +63,7 @@ def _positive(matrix: Array) -> bool:
 
 
 def scale_of(formulation: Formulation, points: Array) -> Array:
-    """How much each constraint varies over the search space, (rows,)."""
+    """Variation of each constraint over the search space, (rows,)."""
     values = np.array([formulation.constraints.at(x) for x in points])
     with np.errstate(invalid="ignore"):
         spread = np.nanmax(np.abs(np.where(np.isfinite(values), values, np.nan)), axis=0, initial=0.0)

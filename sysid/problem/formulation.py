@@ -24,7 +24,7 @@ from sysid.models.expressions import as_matrix, variables_of, written_in
 from sysid.models.geometry import Geometry
 from sysid.models.model import MatrixModel, Stated, ratios_of
 from sysid.models.unknowns import Unknown, Variable, box_of, lower_of, split, upper_of
-from sysid.problem.constraints import ConstraintRow, Constraints, row_of
+from sysid.problem.constraints import ConstraintRow, Constraints, constraint_row
 from sysid.problem.given import MATRICES
 from sysid.problem.matrices import Blocks, Matrices, blocks_of, symbols_in
 from sysid.problem.terms import Builder, ExpressionTerm, FurtherTest, Prior, Residual, Term, TermSource, TestTerm
@@ -40,7 +40,7 @@ class Parts(NamedTuple):
 
 
 class Formulation:
-    """What is searched, and what is minimised; each part is made when it is first asked for.
+    """Unknowns and objective of a search; each part is made when it is first asked for.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ class Formulation:
 
     @cached_property
     def unknowns(self) -> tuple[Unknown, ...]:
-        """What is searched: x is their entries, one after the other; the models' first, then the variables."""
+        """Unknowns: x is their entries, one after the other; the models' first, then the variables."""
         return (*(u for group in self.of_models for u in group), *(v for v in self.variables if not v.fixed))
 
     @cached_property
@@ -173,22 +173,22 @@ class Formulation:
 
     @cached_property
     def mass(self) -> Stated:
-        """What is stated of the mass."""
+        """Statement about the mass."""
         return self.models[0].stated(self.geometry)
 
     @cached_property
     def stiffness(self) -> Stated:
-        """What is stated of the stiffness."""
+        """Statement about the stiffness."""
         return self.models[1].stated(self.geometry)
 
     @cached_property
     def damping(self) -> Stated:
-        """What is stated of the damping."""
+        """Statement about the damping."""
         return self.models[2].stated(self.geometry)
 
     @cached_property
     def by_ratios(self) -> bool:
-        """Whether the damping of each mode is a function of its frequency."""
+        """True where the damping of each mode is a function of its frequency."""
         symbol = ca.SX if self.of_models[2] else ca.MX
         y, omega = symbol.sym("y", sum(v.size for v in self.of_models[2])), symbol.sym("omega", self.geometry.n)
         return self.ratios(y, omega) is not None
@@ -199,12 +199,12 @@ class Formulation:
 
     @property
     def test_alone(self) -> bool:
-        """Whether nothing but the problem's own records tells about the matrices."""
+        """True where nothing but the problem's own records tells about the matrices."""
         return self.fits_records and all(self.apart) and not self._touches([r.expression for r in self._relations])
 
     @cached_property
     def tells_damping(self) -> bool:
-        """Whether anything that is fitted depends on an unknown of the damping alone; records always do."""
+        """True where anything that is fitted depends on an unknown of the damping alone; records always do."""
         if self.fits_records or self.further_tests:
             return True
         *others, alone = ({symbol.__hash__() for symbol in group} for group in self._in_matrices)
@@ -213,14 +213,14 @@ class Formulation:
 
     @property
     def free_modes(self) -> bool:
-        """Whether mode shapes and participations are free, so that modal coordinates can take the unknowns' place."""
+        """True where mode shapes and participations are free, so that modal coordinates can replace the unknowns."""
         free_ratios = self.by_ratios and bool(self.of_models[2])
         free = self.mass.free and self.stiffness.free and free_ratios
         return free and self.geometry.at_sensors and self.test_alone and not self.healed
 
     @property
     def refinable(self) -> bool:
-        """Whether the spectrum of each candidate can be replaced by the measured one."""
+        """True where the spectrum of each candidate can be replaced by the measured one."""
         return (
             self.stiffness.free
             and self.with_spectrum is not None
@@ -231,7 +231,7 @@ class Formulation:
 
     @property
     def with_spectrum(self) -> Any:
-        """What gives unknowns of the stiffness a spectrum, see `SpectralStiffness`; None where its model cannot."""
+        """Setter of a spectrum in the stiffness's unknowns, see `SpectralStiffness`; None where its model cannot."""
         return getattr(self.models[1], "with_spectrum", None)
 
     # -- matrices, terms, constraints --------------------------------------------------------------
@@ -302,12 +302,12 @@ class Formulation:
 
     @cached_property
     def healed(self) -> dict[Variable, ca.MX]:
-        """What the swarm replaces each of these variables by."""
+        """Replacements of variables in the swarm."""
         return {v: as_matrix("healing", expression) for v, expression in self._healing.items()}
 
     @cached_property
     def healing(self) -> ca.Function:
-        """What x of the swarm's candidates passes through; the identity where nothing is healed."""
+        """Function that x of the swarm's candidates passes through; the identity where nothing is healed."""
         columns = [self.healed.get(u, s) if isinstance(u, Variable) else s for u, s in self._symbols]
         return self._function("healing", [ca.veccat(*columns)])
 
@@ -381,7 +381,7 @@ class Formulation:
 
     @cached_property
     def _relations(self) -> list[ConstraintRow]:
-        return [row_of(i, constraint) for i, constraint in enumerate(self._constraints, start=1)]
+        return [constraint_row(i, constraint) for i, constraint in enumerate(self._constraints, start=1)]
 
     @cached_property
     def _of_models(self) -> list[list[ca.MX]]:

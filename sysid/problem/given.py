@@ -1,4 +1,4 @@
-"""What a user gives as mass, stiffness and damping, brought to matrix models, and the geometry that they have."""
+"""Matrix models of a user's mass, stiffness and damping, and the geometry that they have."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def as_models(mass: Any, stiffness: Any, damping: Any) -> tuple[MatrixModel, Mat
 
 
 def _is_model(value: object, before: int) -> bool:
-    """Whether a value has the methods of a matrix model whose blocks follow those of so many others."""
+    """True where a value has the methods of a matrix model whose blocks follow those of so many others."""
     if isinstance(value, type) or not isinstance(value, MatrixModel):
         return False
     try:

@@ -66,12 +66,12 @@ class Matrices:
 
     @property
     def by_ratios(self) -> bool:
-        """Whether the damping of each mode is a function of its frequency, so that the response needs the modes."""
+        """True where the damping of each mode is a function of its frequency, so that the response needs the modes."""
         return bool(self.ratio_function.numel_out(0))
 
     @property
     def at_sensors(self) -> bool:
-        """Whether the degrees of freedom are the sensors."""
+        """True where the degrees of freedom are the sensors."""
         return np.array_equal(self.recovery, np.eye(len(self.rigid_body)))
 
     def numbers(self, x: Array) -> Numbers:
@@ -91,7 +91,7 @@ class Matrices:
         return inverse(ca.tril(factor))
 
     def of_modes(self, x: ca.MX) -> list[ca.MX]:
-        """What the modes of a candidate follow from, expressions.
+        """Expressions from which the modes of a candidate follow.
 
         The lower triangle of ``H = L^-1 K_SS L^-T`` (n, n); ``[L^-1, L^-1 B]`` (n, n + d), ``B = M_SS G + M_S0``, whose
         products with the eigenvectors of H are shapes and participations; and the rigid-body mass (d, d). Where M may
@@ -176,12 +176,12 @@ class Blocks(NamedTuple):
         )  # fmt: skip
 
     def motion(self, geometry: Geometry) -> Motion:
-        """What direct solves of the response need."""
+        """Equations of motion for direct solves of the response."""
         return Motion._make([*self.outputs[:5], geometry.rigid_body, geometry.recovery])
 
     @property
     def outputs(self) -> list[ca.MX]:
-        """What `Matrices.function` gives."""
+        """Outputs of `Matrices.function`."""
         (L, coupling, base, M), (K, H) = self.mass, self.stiffness
         return [L @ L.T if M is None else M, coupling, base, K, self.damping, L, H]
 
@@ -225,7 +225,7 @@ def _with_factor(blocks: MassBlocks) -> tuple[Any, ...]:
 
 
 def _evaluated(expressions: Any, y: ca.MX, before: tuple[ca.MX, ...]) -> list[ca.MX | None]:
-    """What a model makes of its unknowns and of the blocks before it.
+    """Blocks of a model by its unknowns and the blocks before it.
 
     A model with unknowns sees scalar symbols, whose operations run fastest.
     """

@@ -104,7 +104,7 @@ def casadi_name(number: int) -> str:
 
 
 def has_library(kind: str, name: str) -> bool:
-    """Whether a solver or an interpolant comes with CasADi: its library stands in CasADi's own folder."""
+    """True where a solver or an interpolant comes with CasADi: its library stands in CasADi's own folder."""
     return any(Path(ca.__file__).parent.glob(f"libcasadi_{kind}_{name}.*"))
 
 
@@ -144,7 +144,7 @@ def _check_places(places: Sequence[int], count: int) -> None:
         raise ValueError(f"a place is not among {count} entries")
 
 
-def split(name: str, x: ca.MX, offsets: Sequence[int]) -> list[ca.MX]:
+def split_matrix(name: str, x: ca.MX, offsets: Sequence[int]) -> list[ca.MX]:
     """Pieces of a matrix between offsets of its rows, its columns, or both (in turn: of rows, of columns)."""
     if name == "diagsplit":
         rows, columns = list(offsets[::2]), list(offsets[1::2])
@@ -180,7 +180,7 @@ def einstein(c: ca.MX, a: ca.MX, b: ca.MX, tensors: Sequence[Sequence[int]]) -> 
     return ca.einstein(a, b, c, *map(list, dimensions), *map(list, indices))
 
 
-def solve(solver: str, b: ca.MX, a: ca.MX, *, transposed: bool) -> ca.MX:
+def linear_solve(solver: str, b: ca.MX, a: ca.MX, *, transposed: bool) -> ca.MX:
     """Give a⁻¹ b, or aᵀ⁻¹ b, by a linear solver of `SOLVERS`, "" the substitution where a is triangular."""
     if a.size1() != a.size2() or a.size1() != b.size1():
         raise ValueError("a system of equations is not square")

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sysid.errors import InputError
-from sysid.files.tree import check
+from sysid.files.tree import check_tree
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit import fit_modes
 from sysid.modal_analysis.modal_estimate import ModalEstimate
@@ -29,7 +29,7 @@ Monitor = Callable[[int, float], object]
 
 
 class Prepared:
-    """What a user stated, and the modal estimate of each test that is fitted: what strategies search and checks judge.
+    """Statements of a user, and the modal estimate of each fitted test: what strategies search and checks judge.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ class Prepared:
         points = points_of(formulation)
         if not formulation.free_modes:  # with them every point makes a structure
             check_matrices(formulation, points, self.measurement, site)
-        check(self.stated.as_given)  # before a search what could not be stored at its end
+        check_tree(self.stated.as_given)  # before a search what could not be stored at its end
         check_constraints(formulation, points, site)
 
     @cached_property
@@ -220,7 +220,7 @@ class Prepared:
 
     @property
     def free_modes(self) -> bool:
-        """Whether mode shapes and participations are free: see `Formulation`."""
+        """True where mode shapes and participations are free: see `Formulation`."""
         return self.formulation.free_modes
 
     # -- masses that are stated --------------------------------------------------------------------
@@ -242,13 +242,13 @@ class Prepared:
 
     @property
     def unit_mass(self) -> bool:
-        """Whether no number with a unit of mass is given, so that masses are normalised to 1 kg a direction."""
+        """True where no number with a unit of mass is given, so that masses are normalised to 1 kg a direction."""
         has_unit = self.measurement.force is not None or np.nansum(np.abs(self.known_mass)) > 0
         return self._leaves_total and not has_unit
 
     @property
     def _leaves_total(self) -> bool:
-        """Whether the mass model could state a total, and does not: any other mass has the size that it is given."""
+        """True where the mass model could state a total, and does not: any other mass has the size that it is given."""
         return getattr(self.stated.mass, "total_mass", np.nan) is None
 
     @property
@@ -281,11 +281,11 @@ class Prepared:
         return self.formulation.residual(x)
 
     def objective(self, x: Array) -> float:
-        """What is minimised, at `x`: see `Formulation.objective`."""
+        """Objective at `x`: see `Formulation.objective`."""
         return self.formulation.objective(x)
 
     def keeps_constraints(self, x: Array) -> bool:
-        """Whether constraints hold, to round-off beside what they make over the search space."""
+        """True where constraints hold, to round-off beside what they make over the search space."""
         constraints = self.formulation.constraints
         allowed = self.tolerance * np.where(constraints.equal, HELD / LOOSE, 1.0)
         return bool(np.all(constraints.violation(x) <= allowed))

@@ -21,7 +21,7 @@ from sysid.structure.structure import Array, Structure
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Problem(StatedProblem):
-    """What to identify, and from what.
+    """A problem of identification: a measurement, and what is stated of the structure.
 
     The constructor checks types, shapes and what is written. Attributes that need the modes of the records find them
     when they are first asked for, once; an identification finds its own.
@@ -179,5 +179,5 @@ class Problem(StatedProblem):
         return self.formulation.residual(x)
 
     def objective(self, x: Array) -> float:
-        """What is minimised, at `x`: see `Formulation.objective`."""
+        """Objective at `x`: see `Formulation.objective`."""
         return self.formulation.objective(x)

@@ -11,12 +11,12 @@ _NUMBER, _COUNT = "<cd", "<cq"  # a letter for the type, and eight bytes
 
 
 def same_text(one: ca.Function, other: ca.Function) -> bool:
-    """Whether two functions are the same, node by node and option by option."""
+    """True where two functions are the same, node by node and option by option."""
     return bool(one.serialize() == other.serialize())
 
 
 def is_compiled(function: ca.Function) -> bool:
-    """Whether a function, or one that it calls, is to be compiled (CasADi's option jit)."""
+    """True where a function, or one that it calls, is to be compiled (CasADi's option jit)."""
     try:
         return b"FunctionInternal::jitb\1" in _described(function)
     except (RuntimeError, NotImplementedError):  # it calls a Python callback, which has no text

@@ -1,4 +1,4 @@
-r"""What each unknown does to matrices, modes and records: exact first derivatives.
+r"""Derivatives of matrices, modes and records by each unknown, exact and of first order.
 
 With :math:`Z = -\omega^2 M + i\omega C + K` and :math:`X = Z^{-1} \omega^2 B` (unit base motion), an unknown moves the
 accelerations by :math:`dX = Z^{-1} (\omega^2 dB - dZ\, X)`; modes follow by first-order perturbation.

@@ -1,4 +1,4 @@
-"""What a user states of an identification problem: a measurement, its matrices, and what else is known."""
+"""Statements of a user about an identification problem: a measurement, its matrices, and what else is known."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, choice, instance, number, refuse
+from sysid.errors import InputError, as_float, choice, instance, refuse
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.models.damping import ModalDamping
@@ -54,7 +54,7 @@ class StatedProblem:
         if self.reference is not None:
             instance("Problem: reference", self.reference, Structure)
         if self.goal is not None:
-            number("Problem: goal", self.goal, "a positive relative residual", above=0)
+            as_float("Problem: goal", self.goal, "a positive relative residual", above=0)
         choice("Problem: loss", self.loss, ("squares", "huber"))
         if self.loss == "huber" and self.misfit is not None:
             raise InputError("Problem: loss='huber' is of records, and this problem fits a misfit of its own instead")
@@ -137,7 +137,7 @@ class StatedProblem:
 
     @property
     def states_frequencies(self) -> bool:
-        """Whether the stiffness states natural frequencies of its own, so that none are looked for."""
+        """True where the stiffness states natural frequencies of its own, so that none are looked for."""
         return getattr(self.stiffness, "natural_frequencies", None) is not None
 
     @cached_property

@@ -1,4 +1,4 @@
-"""What a problem is given beside its measurement, as a tree: models by their fields, numbers, and expressions.
+"""Tree of what a problem is given beside its measurement: models by their fields, numbers, and expressions.
 
 All expressions are made of the variables by one list of operations: see `sysid.problem.encoding`.
 """
@@ -67,7 +67,7 @@ def to_tree(given: Mapping[str, Any]) -> Tree:
 
 
 def from_tree(tree: Tree) -> dict[str, Any]:
-    """What `Problem` takes beside measurement, reference, validation and goal, of a tree that `to_tree` made.
+    """Arguments of `Problem` beside measurement, reference, validation and goal, of a tree that `to_tree` made.
 
     Raises
     ------
@@ -97,14 +97,14 @@ def _printable(text: str) -> str:
 
 
 def needs_module(tree: Tree) -> bool:
-    """Whether a tree that `to_tree` made does not hold all of a problem: expressions, or the class of a model."""
+    """True where a tree that `to_tree` made does not hold all of a problem: expressions, or the class of a model."""
     models = [tree[name] for name in MATRICES] + [part.get("source") for part in tree["residuals"]]
     models += [part[name] for part in tree["residuals"] if part["kind"] == "test" for name in MATRICES]
     return tree["without"] is not None or any(isinstance(one, dict) and _is_user_class(one) for one in models)
 
 
 def _is_user_class(tree: Tree) -> bool:
-    """Whether a model's class is one of the user's."""
+    """True where a model's class is one of the user's."""
     return ":" in tree.get("kind", "")
 
 

@@ -43,7 +43,7 @@ class Term(Protocol):
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Name in messages."""
 
     def rows(self, x: ca.MX, modes: ModeSymbols | None = None) -> ca.MX:
         """Weighted residuals, a column; `modes` are those of the problem's own matrices where they are unknowns too."""
@@ -61,7 +61,7 @@ class Term(Protocol):
         """
 
     def findings(self, x: Array) -> Sequence[Finding]:
-        """What speaks against the fit at x."""
+        """Findings against the fit at x."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,17 +237,17 @@ class ExpressionTerm:
 
 
 class Builder(NamedTuple):
-    """What makes terms of what a user gives.
+    """Builder of terms from what a user gives.
 
     ``function(name, expressions)`` is a CasADi function of x; ``matrices(blocks, geometry)`` are matrices of x;
-    ``own()`` are the problem's; ``noise()`` is the standard deviation of a number of the measurement's relative
-    residual, ``noise_of(test)`` of a further test's; ``modal_of(given)`` is the modal estimate of a further test;
-    ``replaced`` tells whether a misfit stands in the place of the measurement's.
+    ``problem_matrices()`` are the problem's; ``noise()`` is the standard deviation of a number of the measurement's
+    relative residual, ``noise_of(test)`` of a further test's; ``modal_of(given)`` is the modal estimate of a further
+    test; ``replaced`` tells whether a misfit stands in the place of the measurement's.
     """
 
     function: Callable[[str, Sequence[ca.MX]], ca.Function]
     matrices: Callable[[Blocks, Geometry], Matrices]
-    own: Callable[[], Matrices]
+    problem_matrices: Callable[[], Matrices]
     noise: Callable[[], float]
     modal_of: Callable[[FurtherTest], ModalEstimate]
     noise_of: Callable[[Measurement], float]
@@ -256,10 +256,10 @@ class Builder(NamedTuple):
 
 @runtime_checkable
 class TermSource(Protocol):
-    """What a user gives among the `residuals` of a problem."""
+    """Source of a term, which a user gives among the `residuals` of a problem."""
 
     def expressions(self, name: str) -> Sequence[ca.MX]:
-        """What it is written in; empty where it is about the problem's own matrices. `name` is for messages."""
+        """Expressions of the term; none where it is about the problem's own matrices. `name` is for messages."""
 
     def term(self, name: str, build: Builder) -> Term:
         """Its term."""
@@ -376,7 +376,7 @@ class Prior:
         return column, given[0], given[1]
 
     def expressions(self, name: str) -> Sequence[ca.MX]:
-        """What is known, less its value, in standard deviations."""
+        """Known expressions less their values, in standard deviations."""
         column, value, std = self.column(name)
         return [(column - ca.DM(value)) / ca.DM(std)]
 
@@ -427,7 +427,7 @@ def column_of(name: str, value: Any) -> ca.MX:
 
 
 def _label(column: ca.MX, row: int) -> str:
-    """What a row of something known is called: its variable's entry, or the variables that it is written in."""
+    """Label of a row of something known: its variable's entry, or the variables that it is written in."""
     entry = column[row]
     names = [v for v in map(variable_of, ca.symvar(entry)) if v is not None]
     if len(names) == 1:

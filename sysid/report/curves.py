@@ -16,7 +16,7 @@ from sysid.errors import InputError
 from sysid.measurement.measurement import Measurement
 from sysid.plot.panels import lines_of, run_names
 from sysid.plot.plots import stick_model
-from sysid.report.html import text
+from sysid.report.html import escaped
 from sysid.report.noise_level import NoiseLevel
 from sysid.report.still import ChannelSpectra, curve_sheet, degrees, mode_still, room_of_modes
 from sysid.results.identification import Identification
@@ -39,17 +39,17 @@ def curves(it: Identification, test: Measurement, level: NoiseLevel) -> str:
     """
     channels, runs = [*_responses(it, test, level), *_forces(it, test, level)], run_names(test)
     lines = [lines_of(test, run) for run in range(test.n_runs)]
-    each = [[channel.at(run, own) for run, (own, _) in enumerate(lines)] for channel in channels]
+    each = [[channel.at(run, at) for run, (at, _) in enumerate(lines)] for channel in channels]
     content = {
-        "freq": [_packed(test.freq[own]) for own, _ in lines],
+        "freq": [_packed(test.freq[at]) for at, _ in lines],
         "gaps": [gaps.tolist() for _, gaps in lines],
         "runs": runs,
-        "channels": list(map(_told, each)),
+        "channels": list(map(_channel_content, each)),
     }
     drawn = "".join(
-        curve_sheet(f"{one.name}, {name}" if len(runs) > 1 else one.name, test.freq[own], one, 0, gaps)
+        curve_sheet(f"{one.name}, {name}" if len(runs) > 1 else one.name, test.freq[at], one, 0, gaps)
         for of_channel in each
-        for one, name, (own, gaps) in zip(of_channel, runs, lines, strict=True)
+        for one, name, (at, gaps) in zip(of_channel, runs, lines, strict=True)
     )
     words = "Measured and identified spectra, their difference and the noise"
     return _element(
@@ -61,7 +61,7 @@ def curves(it: Identification, test: Measurement, level: NoiseLevel) -> str:
 
 
 def _legend(channels: Sequence[ChannelSpectra], *, at_most: bool) -> str:
-    """What each line is, of those that are drawn."""
+    """Legend of the lines that are drawn."""
     keys = {"measured": "measured", "identified": "identified", "left": "their difference"}
     if any(channel.noise is not None for channel in channels):
         keys["noise"] = f"noise{' at most, by the quietest lines' * at_most} (standard deviation)"
@@ -73,7 +73,7 @@ def _legend(channels: Sequence[ChannelSpectra], *, at_most: bool) -> str:
     return f'<p class="legend">{marks}</p>'
 
 
-def mode_shapes(it: Identification) -> str:
+def mode_shape_view(it: Identification) -> str:
     """Element of the mode shapes in space; nothing where the sensors have no positions."""
     try:
         points, motion, _ = stick_model(it.measurement)
@@ -112,13 +112,13 @@ def _mode_stills(content: dict[str, Any]) -> str:
 
 
 def _responses(it: Identification, test: Measurement, level: NoiseLevel) -> Iterator[ChannelSpectra]:
-    own = test.has_unit_runs
+    unit_runs = test.has_unit_runs
     predicted = test.predict(it.structure) + np.einsum("sd,rdf->rsf", test.rigid_body, test.base)
     u = it.quick_uncertainty
     band = None if u is None else _half_widths(u.transmissibility(test.freq), test)
     raw, noise = _recorded(it, test), level.response
-    words, unit = ("transmissibility", "–") if own else ("spectrum of acceleration", "m/s², scaled as given")
-    if own and not test.translational.all():
+    words, unit = ("transmissibility", "–") if unit_runs else ("spectrum of acceleration", "m/s², scaled as given")
+    if unit_runs and not test.translational.all():
         unit = "per unit base motion"
     for s, name in enumerate(test.sensor_names):
         turn = _against_base(test, test.rigid_body[s])
@@ -148,17 +148,17 @@ def _forces(it: Identification, test: Measurement, level: NoiseLevel) -> Iterato
         )  # fmt: skip
 
 
-def _told(runs: list[ChannelSpectra]) -> dict[str, Any]:
-    """What the script draws of a channel, by its runs."""
+def _channel_content(runs: list[ChannelSpectra]) -> dict[str, Any]:
+    """Data of a channel for the script, by its runs."""
     first = runs[0]
     found: dict[str, Any] = {"name": first.name, "words": first.words, "unit": first.unit}
     for name in ("measured", "identified"):
-        found[name] = [[_sizes(np.abs(own)), _steps(2 * degrees(own))] for own in _of(runs, name)]
+        found[name] = [[_sizes(np.abs(record)), _steps(2 * degrees(record))] for record in _of(runs, name)]
     found["left"] = [_sizes(np.abs(run.measured[0] - run.identified[0]), _ROUGH) for run in runs]
     for name in ("noise", "band", "recorded"):
         if getattr(first, name) is not None:
             every = _of(runs, name)
-            found[name] = [_sizes(own[:1] if np.ptp(own) == 0 else own) for own in every]
+            found[name] = [_sizes(record[:1] if np.ptp(record) == 0 else record) for record in every]
     return found
 
 
@@ -168,7 +168,7 @@ def _of(runs: list[ChannelSpectra], name: str) -> list[NDArray[Any]]:
 
 
 def _against_base(test: Measurement, moves: Array) -> ComplexArray:
-    """What turns the phases of each run to those against one base direction, (runs, n_freq).
+    """Factor that turns the phases of each run to those against one base direction, (runs, n_freq).
 
     That which moves the channel most with it, by `moves`, (d,): a sensor's row of G.
     """
@@ -234,6 +234,6 @@ def _steps(values: Array) -> str:
 def _element(kind: str, content: dict[str, Any], words: str, still: str) -> str:
     data = json.dumps(content, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c")
     return (
-        f'<figure class="{kind}" aria-label="{text(words)}">{still}<script type="application/json">{data}</script>'
+        f'<figure class="{kind}" aria-label="{escaped(words)}">{still}<script type="application/json">{data}</script>'
         "</figure>"
     )

@@ -123,7 +123,7 @@ class Cell(NamedTuple):
     below: tuple[str, ...] = ()
 
 
-def text(value: object) -> str:
+def escaped(value: object) -> str:
     """Escape anything for use inside an element or a quoted attribute; control characters are spelled out."""
     return html.escape(shown_plainly(str(value)), quote=True)
 
@@ -137,13 +137,13 @@ def number(value: float | None, digits: int = 4) -> str:
 
 def aligned(value: float | None) -> str:
     """Write a number of a column with three significant digits, zeros at its end too: 1.00 below 0.896."""
-    told = number(value, 3)
-    return told if "e" in told or told in ("–", "0") else f"{value:#.3g}".removesuffix(".")
+    digits = number(value, 3)
+    return digits if "e" in digits or digits in ("–", "0") else f"{value:#.3g}".removesuffix(".")
 
 
 def paragraph(value: object, kind: str = "") -> str:
     """Set a paragraph of plain text."""
-    return f"<p{_class(kind)}>{text(value)}</p>"
+    return f"<p{_class(kind)}>{escaped(value)}</p>"
 
 
 def sentence(words: str) -> str:
@@ -153,7 +153,7 @@ def sentence(words: str) -> str:
 
 def bullets(sentences: Iterable[object]) -> str:
     """Set a list of plain sentences; nothing where there are none."""
-    items = "".join(f"<li>{text(s)}</li>" for s in sentences)
+    items = "".join(f"<li>{escaped(s)}</li>" for s in sentences)
     return f"<ul>{items}</ul>" if items else ""
 
 
@@ -175,7 +175,7 @@ def table(
     Cells are plain, or a `Cell`; `label` stands in grey before the caption.
     """
     kind = _class("words" if words else "wide" if len(head) > 11 else "")  # of many columns: printed smaller
-    names = "".join(f'<th scope="col">{text(cell)}</th>' for cell in head)
+    names = "".join(f'<th scope="col">{escaped(cell)}</th>' for cell in head)
     body = "".join("<tr>" + "".join(f"<td>{_cell(cell)}</td>" for cell in row) + "</tr>" for row in rows)
     top = f"<thead><tr>{names}</tr></thead>" if any(head) else ""
     if not body:
@@ -222,7 +222,7 @@ def picture(
     """Embed a figure as PNG; shown at 92 pixels an inch, so that it is sharp on paper and on dense screens."""
     width = round(92 * float(figure.get_size_inches()[0]))
     data = base64.b64encode(to_png(figure, dpi=dpi, colours=colours)).decode("ascii")
-    image = f'<img width="{width}" alt="{text(alt)}" src="data:image/png;base64,{data}">'
+    image = f'<img width="{width}" alt="{escaped(alt)}" src="data:image/png;base64,{data}">'
     return f'<figure class="scroll">{image}{_caption(caption, label)}</figure>'
 
 
@@ -232,9 +232,9 @@ def page(title: object, head: str, sections: Iterable[tuple[str, str]], script: 
     Nothing runs in it but `script`, as the page says to the browser.
     """
     kept = [(name, content) for name, content in sections if content]
-    links = " ".join(f'<a href="#s{i}">{text(name)}</a>' for i, (name, _) in enumerate(kept))
+    links = " ".join(f'<a href="#s{i}">{escaped(name)}</a>' for i, (name, _) in enumerate(kept))
     body = "\n".join(
-        f'<section><h2 id="s{i}">{text(name)}</h2>\n{content}\n</section>' for i, (name, content) in enumerate(kept)
+        f'<section><h2 id="s{i}">{escaped(name)}</h2>\n{content}\n</section>' for i, (name, content) in enumerate(kept)
     )
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     return (
@@ -242,21 +242,21 @@ def page(title: object, head: str, sections: Iterable[tuple[str, str]], script: 
         '<meta http-equiv="Content-Security-Policy" '
         f"content=\"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'\">\n"
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{text(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
-        f"<h1>{text(title)}</h1>\n{head}\n<nav>{links}</nav>\n{body}\n<script>{script}</script>\n"
+        f"<title>{escaped(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
+        f"<h1>{escaped(title)}</h1>\n{head}\n<nav>{links}</nav>\n{body}\n<script>{script}</script>\n"
         "</body>\n</html>\n"
     )
 
 
 def _cell(cell: object) -> str:
     if not isinstance(cell, Cell):
-        return text(cell)
-    return text(cell.value) + "".join(f"<small>{text(line)}</small>" for line in cell.below)
+        return escaped(cell)
+    return escaped(cell.value) + "".join(f"<small>{escaped(line)}</small>" for line in cell.below)
 
 
 def _caption(words: object, label: str) -> str:
-    mark = f'<span class="mark">{text(label)}</span>' if label else ""
-    return f"<figcaption>{mark}{text(words)}</figcaption>" if words or label else ""
+    mark = f'<span class="mark">{escaped(label)}</span>' if label else ""
+    return f"<figcaption>{mark}{escaped(words)}</figcaption>" if words or label else ""
 
 
 def _class(kind: str) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sysid import plot
-from sysid.assessment.sensitivity import blocks_of
+from sysid.assessment.sensitivity import system_matrices
 from sysid.report.html import matrix, no_lines, number, paragraph, picture
 from sysid.results.identification import Identification
 from sysid.results.summary import half_width
@@ -25,7 +25,7 @@ _ENDS_BELOW = (
 Lines = list[list[tuple[str, ...]]]  # below each entry of a matrix
 
 
-def matrices(it: Identification) -> str:
+def matrix_tables(it: Identification) -> str:
     """HTML of heat maps and tables of M_SS, K_SS, C and the base's blocks of M."""
     structure, test = it.structure, it.measurement
     n, axes, names = structure.n, test.base_axes or (), it.degrees_of_freedom
@@ -33,7 +33,7 @@ def matrices(it: Identification) -> str:
     coupling, base = "kg", "kg"
     if not test.translational.all():
         coupling, base = "kg, kg m in columns of a rotation", "kg, kg m, kg m²"
-    (M, K, C), M_full = blocks_of(structure), structure.mass
+    (M, K, C), M_full = system_matrices(structure), structure.mass
     stds = [it.quick_std(name)[:n, :n] for name in ("mass", "stiffness", "damping")]
     ends = None if it.determined else it.quick_intervals
     label = "" if it.determined or np.all(np.isfinite(stds[0])) else ONE_OF_MANY
@@ -84,7 +84,7 @@ def half_widths(values: Array, std: Array, stated: Array | bool = False) -> Line
         return lines
     size = np.sqrt(np.abs(np.diag(values)))
     for i, j in np.ndindex(*std.shape):
-        width = plain(half_width(float(std[i, j]), float(size[i] * size[j])))
+        width = width_text(half_width(float(std[i, j]), float(size[i] * size[j])))
         if stated[i, j] or width == "open":
             lines[i][j] = ("stated" if stated[i, j] else "open",)
         elif width != "0":
@@ -92,7 +92,7 @@ def half_widths(values: Array, std: Array, stated: Array | bool = False) -> Line
     return lines
 
 
-def plain(width: str) -> str:
+def width_text(width: str) -> str:
     """A half-width as "110", not "1.1e+02"; words stay."""
     return width if width == "open" else f"{float(width):.6g}"
 
@@ -108,10 +108,10 @@ def _ranges(ends: Array, otherwise: Lines) -> Lines:
     for i, j in np.argwhere(~np.isclose(ends[0], ends[1], rtol=ROUND_OFF, atol=0.0)):
         least, most = (number(end, 3) for end in ends[:, i, j])
         bounded = np.isfinite(ends[:, i, j])
-        told = {
+        words_of = {
             (True, True): (f"{least} to", most),
             (True, False): (f"from {least}",),
             (False, True): (f"to {most}",),
         }
-        lines[i][j] = told.get((bool(bounded[0]), bool(bounded[1])), ("any value",))
+        lines[i][j] = words_of.get((bool(bounded[0]), bool(bounded[1])), ("any value",))
     return lines

@@ -23,11 +23,11 @@ class NoiseLevel(NamedTuple):
 
     @property
     def bound(self) -> str:
-        """What stands behind a figure of it."""
+        """Sign that stands behind a figure of it."""
         return " at most" * self.at_most
 
 
-def noise_level(test: Measurement, structure: Structure) -> NoiseLevel:
+def noise_of_test(test: Measurement, structure: Structure) -> NoiseLevel:
     """The noise of a test: stated, found with the fit, or a bound by what `structure` leaves of it."""
     if test.response_std is not None:
         return NoiseLevel(test.response_std, test.force_std, False)
@@ -46,8 +46,8 @@ def share_of_noise(std: Array | None, records: ComplexArray) -> Array:
     if std is None:
         return np.full(records.shape[1], np.nan)
     size = np.linalg.norm(records, axis=(0, 2))
-    own = np.any(records != 0, axis=1, keepdims=True)
-    noise = np.sqrt(np.sum(np.where(own, std, 0.0) ** 2 * np.ones(records.shape), axis=(0, 2)))
+    recorded = np.any(records != 0, axis=1, keepdims=True)
+    noise = np.sqrt(np.sum(np.where(recorded, std, 0.0) ** 2 * np.ones(records.shape), axis=(0, 2)))
     return np.divide(noise, size, out=np.full_like(size, np.nan), where=size > 0)
 
 

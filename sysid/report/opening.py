@@ -6,13 +6,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from sysid.report.html import bullets, number, paragraph, sentence, table, text
+from sysid.report.html import bullets, escaped, number, paragraph, sentence, table
 from sysid.report.matrices import stated
 from sysid.report.noise_level import NoiseLevel, share_of_all_noise
 from sysid.results.deck_masses import deck_masses
 from sysid.results.identification import Identification
 from sysid.results.summary import FIRST, JUDGEMENTS, counted, fitted_in_words, half_width, next_steps, verdict
-from sysid.results.unknowns_table import rows_of
+from sysid.results.unknowns_table import unknown_rows
 from sysid.structure.thresholds import LIKELY
 
 _COLOUR = {"determined": "good", "one of many": "warn", "doubtful": "warn", "no fit": "bad"}
@@ -26,8 +26,8 @@ _MOST_MODES, _MOST_UNKNOWNS = 4, 5  # whose figures stand in the opening; all of
 def opening(it: Identification, level: NoiseLevel) -> str:
     """HTML of what was identified, the judgement, the next thing to do, and the figures; `level` of the records."""
     word = "Stopped before its end: the best until then. " * it.interrupted + JUDGEMENTS[it.judgement]
-    judged = paragraph(sentence(verdict(it))) + _reasons(it) + f"<p><b>Next:</b> {text(_steps(it)[0])}</p>"
-    box = f'<div class="verdict {_COLOUR[it.judgement]}"><strong>{text(word)}</strong>{judged}</div>'
+    judged = paragraph(sentence(verdict(it))) + _reasons(it) + f"<p><b>Next:</b> {escaped(_steps(it)[0])}</p>"
+    box = f'<div class="verdict {_COLOUR[it.judgement]}"><strong>{escaped(word)}</strong>{judged}</div>'
     rows = [*_masses(it), *_deck_masses(it), *_unknowns(it), *_modes(it), *_fit(it, level)]
     return _subject(it) + box + table(["", ""], rows, words=True)
 
@@ -43,7 +43,7 @@ def trust(it: Identification) -> str:
         ("What to measure or to do next", steps if len(steps) > 1 else ()),  # one alone stands in the opening
         ("To be known besides", [str(one) for one in it.notes]),
     ]
-    return "".join(f"<h3>{name}</h3>{bullets(map(sentence, told))}" for name, told in parts if told)
+    return "".join(f"<h3>{name}</h3>{bullets(map(sentence, sentences))}" for name, sentences in parts if sentences)
 
 
 def _subject(it: Identification) -> str:
@@ -52,12 +52,12 @@ def _subject(it: Identification) -> str:
     if n != test.n_sensors:
         of += f" from {test.n_sensors} sensors"
     records = "whole records, their transients taken off, " * it.records.measurement.is_whole
-    told = (
+    words = (
         f"Identified: mass, stiffness and damping matrices of {of}. From: {fitted_in_words(it)}, "
         f"{counted(d, 'base direction')} ({', '.join(test.base_axes or ())}), {records}{test.lines_in_words}, "
         f"{'with' if test.force is not None else 'without'} base force."
     )
-    return paragraph(told, "soft")
+    return paragraph(words, "soft")
 
 
 def _reasons(it: Identification) -> str:
@@ -66,7 +66,7 @@ def _reasons(it: Identification) -> str:
 
 
 def _steps(it: Identification) -> list[str]:
-    """What to do next, the first thing first."""
+    """Steps to do next, the first thing first."""
     steps = [sentence(step) for step in next_steps(it)]
     if steps:
         return steps
@@ -92,8 +92,8 @@ def _masses(it: Identification) -> Iterator[tuple[str, str]]:
             yield f"{what}, {axis}", f"~{number(mass)} {unit}, normalised: no mass is stated, no force was measured"
             continue
         exact = known and half_width(deviation, mass) in ("open", "0")
-        told = f"{number(mass)} {unit}, as stated" if exact else _with_interval(it, mass, deviation, unit)
-        yield f"{what}, {axis}", told
+        words = f"{number(mass)} {unit}, as stated" if exact else _with_interval(it, mass, deviation, unit)
+        yield f"{what}, {axis}", words
 
 
 def _deck_masses(it: Identification) -> Iterator[tuple[str, str]]:
@@ -104,7 +104,7 @@ def _deck_masses(it: Identification) -> Iterator[tuple[str, str]]:
 
 def _unknowns(it: Identification) -> Iterator[tuple[str, str]]:
     """Unknowns with a meaning of their own, where they are few."""
-    rows = rows_of(it)
+    rows = unknown_rows(it)
     for row in rows if len(rows) <= _MOST_UNKNOWNS else ():
         yield row.label, _with_interval(it, row.value, row.std, row.unit).strip()
 
@@ -151,7 +151,7 @@ def rounded(value: float, std: float, digits: int = 4) -> tuple[str, str]:
 
 def _with_interval(it: Identification, value: float, std: float, unit: str) -> str:
     """A value with its interval; of a model that does not fit without one, as it leaves out what is missed."""
-    told, width = rounded(value, std if it.success or np.isnan(std) else 0.0)
+    words, width = rounded(value, std if it.success or np.isnan(std) else 0.0)
     if width == "open" and it.quick_uncertainty is not None:
-        return f"{told} {unit}, one of many: these data do not determine it"
-    return f"{told} {unit}" if width in ("open", "0") else f"{told} ± {width} {unit}"
+        return f"{words} {unit}, one of many: these data do not determine it"
+    return f"{words} {unit}" if width in ("open", "0") else f"{words} ± {width} {unit}"

@@ -10,13 +10,14 @@ import numpy as np
 
 from sysid import plot
 from sysid.measurement.measurement import Measurement
-from sysid.plot.canvas import own_style
-from sysid.report.curves import curves, mode_shapes, script
+from sysid.plot.canvas import default_style
+from sysid.report.curves import curves, mode_shape_view, script
 from sysid.report.html import (
     Cell,
     aligned,
     beside,
     bullets,
+    escaped,
     matrix,
     number,
     page,
@@ -24,10 +25,9 @@ from sysid.report.html import (
     picture,
     sentence,
     table,
-    text,
 )
-from sysid.report.matrices import CHOSEN, ONE_OF_MANY, Lines, half_widths, matrices, plain, stated
-from sysid.report.noise_level import NoiseLevel, noise_level, share_of_noise
+from sysid.report.matrices import CHOSEN, ONE_OF_MANY, Lines, half_widths, matrix_tables, stated, width_text
+from sysid.report.noise_level import NoiseLevel, noise_of_test, share_of_noise
 from sysid.report.opening import opening, rounded, trust
 from sysid.results.gain_table import gains_of_sensors
 from sysid.results.identification import Identification
@@ -46,7 +46,7 @@ from sysid.results.summary import (
     residual_in_words,
     tilde,
 )  # fmt: skip
-from sysid.results.unknowns_table import rows_of, stated_values
+from sysid.results.unknowns_table import stated_values, unknown_rows
 from sysid.results.version import __version__
 from sysid.structure.structure import Array, ComplexArray, Structure
 from sysid.structure.thresholds import ROUND_OFF
@@ -58,7 +58,7 @@ _DRAWN_SHAPES = (
     "Motion relative to the base, which stands still, at the places of the sensors along their axes; grey: at rest. "
     "The largest motion is drawn alike in all modes."
 )
-_TOLD_SHAPES = (
+_SHAPES_CAPTION = (
     "Motion of each sensor relative to the base, the largest of each mode 1. Sensors with positions have their mode "
     "shapes drawn."
 )
@@ -88,7 +88,7 @@ class Scores(NamedTuple):
 
 
 def scores(structure: Structure, test: Measurement) -> Scores:
-    """How well `structure` predicts a test, sensor by sensor; 1 is perfect."""
+    """Scores of a test as `structure` predicts it, sensor by sensor; 1 is perfect."""
     with_base = np.einsum("sd,rdf->rsf", test.rigid_body, test.base)
     predicted = test.predict(structure)
     absolute, rigid = (_score(moved, test.response) for moved in (predicted + with_base, with_base))
@@ -115,7 +115,7 @@ def write_report(identification: Identification, path: str | Path) -> Path:
         Where the file cannot be written.
     """
     target = file_or_folder(path, FILE_NAME, _SUFFIXES)
-    with own_style():
+    with default_style():
         content = render(identification).encode("utf-8", "replace")
     with atomically(target) as temporary:
         temporary.write_bytes(content)
@@ -125,7 +125,7 @@ def write_report(identification: Identification, path: str | Path) -> Path:
 def render(identification: Identification) -> str:
     """Make the page, as a string."""
     it = identification
-    level = noise_level(it.fitted.records, it.structure)
+    level = noise_of_test(it.fitted.records, it.structure)
     return page(
         _title(it),
         opening(it, level),
@@ -138,7 +138,7 @@ def render(identification: Identification) -> str:
             ("Further tests", _further(it)),
             ("Total mass", _rigid_body_mass(it)),
             ("Unknowns", _unknowns(it)),
-            ("Matrices", matrices(it)),
+            ("Matrices", matrix_tables(it)),
             ("Noise", _noise(it)),
             ("Gains", _gains(it)),
             ("Outliers", _outliers(it)),
@@ -160,32 +160,32 @@ def _title(it: Identification) -> str:
 def _unknowns(it: Identification) -> str:
     rows = [
         (
-            row.label, number(row.value, 6), plain(half_width(row.std, row.value)), row.unit, number(row.lower),
+            row.label, number(row.value, 6), width_text(half_width(row.std, row.value)), row.unit, number(row.lower),
             number(row.upper), row.on_bound,
         )
-        for row in rows_of(it)
+        for row in unknown_rows(it)
     ]  # fmt: skip
     if not rows:
         return ""
     head = ("unknown", "value", "±", "unit", "lower", "upper", "")
-    told = bullets(sentence(s) for s in stated_values(it))
-    return table(head, rows, "± is half of the 95 % interval that noise leaves; open: the data do not tell.") + told
+    values = bullets(sentence(s) for s in stated_values(it))
+    return table(head, rows, "± is half of the 95 % interval that noise leaves; open: the data do not tell.") + values
 
 
 def _modes(it: Identification) -> str:
     structure, reference, u = it.structure, it.records.reference, it.quick_uncertainty
     many, frequencies, percent = is_one_of_many(it), structure.natural_frequencies, 100 * it.identified_ratios
     widths = np.zeros((2, structure.n)) if u is None else np.array([u.natural_frequencies, 100 * u.damping_ratios])
-    told = [rounded(f, std, 6) for f, std in zip(frequencies, widths[0], strict=True)]
+    rounded_frequencies = [rounded(f, std, 6) for f, std in zip(frequencies, widths[0], strict=True)]
     damping = [rounded(ratio, std) for ratio, std in zip(percent, widths[1], strict=True)]
     columns: list[list[object]] = [
         ["mode", *range(1, structure.n + 1), "sum"],
-        ["frequency [Hz]", *(value for value, _ in told), ""],
+        ["frequency [Hz]", *(value for value, _ in rounded_frequencies), ""],
         ["damping [%]", *(value for value, _ in damping), ""],
     ]
     notes = ["Effective mass in % of the rigid-body mass of its base direction."]
     if u is not None:
-        columns.insert(2, ["±", *(width for _, width in told), ""])
+        columns.insert(2, ["±", *(width for _, width in rounded_frequencies), ""])
         columns.append(["±", *(width for _, width in damping), ""])
         notes.append("±: half of the 95 % interval that the noise of the records makes; 0 where it is round-off.")
         notes += ["It holds for a model that fits: this one does not."] * (not it.success)
@@ -207,7 +207,7 @@ def _modes(it: Identification) -> str:
 
 
 def _shapes(it: Identification) -> str:
-    drawn = mode_shapes(it)
+    drawn = mode_shape_view(it)
     if drawn:
         return paragraph(_DRAWN_SHAPES, "soft") + drawn
     shapes = it.structure.mode_shapes
@@ -215,7 +215,7 @@ def _shapes(it: Identification) -> str:
     shapes = np.divide(shapes, largest, out=np.zeros_like(shapes), where=largest != 0)
     rows = [*it.measurement.sensor_names, "base"]
     columns = [f"mode {k}" for k in range(1, it.structure.n + 1)]
-    return matrix(np.vstack([shapes, np.zeros(it.structure.n)]), rows, columns, _TOLD_SHAPES)
+    return matrix(np.vstack([shapes, np.zeros(it.structure.n)]), rows, columns, _SHAPES_CAPTION)
 
 
 def _effective_mass_columns(it: Identification, many: Array) -> Iterator[list[object]]:
@@ -231,20 +231,20 @@ def _rigid_body_mass(it: Identification) -> str:
     axes, turns = it.measurement.base_axes or (), ~it.measurement.translational
     rigid, reference = it.structure.rigid_body_mass, it.records.reference
     unit = "kg; kg m where one axis is a rotation, kg m² where both are" if turns.any() else "kg"
-    told, label, u = "", _NORMALISED * it.facts.unit_mass, it.quick_uncertainty
+    parts, label, u = "", _NORMALISED * it.facts.unit_mass, it.quick_uncertainty
     below: Lines = []
     if it.facts.unit_mass:
-        told = paragraph(
+        parts = paragraph(
             "No mass is stated and no base force was measured: the masses are normalised to 1 kg in each base "
             "direction. All mass, stiffness and damping entries carry this scale, which the data do not tell."
         )
     elif u is not None:
         below = half_widths(rigid, u.rigid_body_mass, stated(it))
         label = ONE_OF_MANY * bool(np.all(np.isnan(u.rigid_body_mass)) and not stated(it).any())
-    told += matrix(rigid, axes, axes, f"Total mass M_rb = [G; I]' M [G; I], {unit}.", below=below, label=label)
+    parts += matrix(rigid, axes, axes, f"Total mass M_rb = [G; I]' M [G; I], {unit}.", below=below, label=label)
     if reference is not None:
-        told += matrix(reference.rigid_body_mass, axes, axes, f"Of the reference, {unit}.")
-    return told
+        parts += matrix(reference.rigid_body_mass, axes, axes, f"Of the reference, {unit}.")
+    return parts
 
 
 def _responses(it: Identification, test: Measurement, level: NoiseLevel) -> str:
@@ -255,16 +255,16 @@ def _responses(it: Identification, test: Measurement, level: NoiseLevel) -> str:
 
 
 def _residuals(it: Identification, level: NoiseLevel) -> str:
-    """What the fit leaves of each channel, beside its noise."""
+    """Residual of each channel, beside its noise."""
     test = _as_fitted(it, it.measurement)
     left = [1 - score for score in scores(it.structure, test).relative]
     channels = [*zip(test.sensor_names, left, share_of_noise(level.response, test.relative), strict=True)]
     if test.force is not None:
         noise = share_of_noise(level.force, test.force)
         force = [*zip(test.base_axes or (), _score_of_force(it, test), noise, strict=True)]
-        channels += [(f"base force {axis}", 1 - score, own) for axis, score, own in force]
+        channels += [(f"base force {axis}", 1 - score, residual) for axis, score, residual in force]
     known = any(np.isfinite(noise) for *_, noise in channels)
-    rows = [(name, aligned(100 * own), *[aligned(100 * noise)] * known) for name, own, noise in channels]
+    rows = [(name, aligned(100 * residual), *[aligned(100 * noise)] * known) for name, residual, noise in channels]
     caption = (
         "What the fit leaves of each channel: ‖identified - measured‖ / ‖measured‖, of the accelerations relative "
     )
@@ -280,7 +280,7 @@ def _as_fitted(it: Identification, test: Measurement) -> Measurement:
 
 def _noise(it: Identification) -> str:
     """The noise of each channel of whole records."""
-    rows = [(one.channel, one.told, one.unit, aligned(one.percent)) for one in noise_of_channels(it)]
+    rows = [(one.channel, one.level_in_words, one.unit, aligned(one.percent)) for one in noise_of_channels(it)]
     caption = f"Noise of each channel, {noise_source(it)}: standard deviation of a sample in time, of noise up to half "
     caption += (
         "the sample rate (from least to most, where runs differ), and its share of what was recorded at the lines."
@@ -339,7 +339,7 @@ def _validation(it: Identification) -> str:
             f"<h3>Test {i} of {len(it.records.validation)}: predicted, never fitted</h3>",
             paragraph(f"{_residual(test, it.structure)}."),
             _score_table(it, test),
-            _responses(it, test, noise_level(test, it.structure)),
+            _responses(it, test, noise_of_test(test, it.structure)),
         ]
     if parts:
         parts.append(
@@ -385,17 +385,17 @@ def _convergence(it: Identification) -> str:
         refined += f", within {history.refinement_error:.1e} (relative, ω²)"
     ran = it.phases
     swarm = f"{history.evaluations} candidates in {history.swarm_curve.size} iterations of the swarm; {refined}; "
-    told = swarm * bool(history.swarm_curve.size) + f"{counted(steps, 'local iteration')}, exact gradients"
+    note = swarm * bool(history.swarm_curve.size) + f"{counted(steps, 'local iteration')}, exact gradients"
     if it.records.reference is not None:
-        told += ". Errors are those of the reference: M_SS, K_SS and C in Frobenius norm"
+        note += ". Errors are those of the reference: M_SS, K_SS and C in Frobenius norm"
     alt = f"objective through {', '.join(row[0] for row in ran) or 'no search'}"
     caption = _LAST_PHASE * (it.strategy == "continuation")
     if history.swarm_curve.size and np.isnan(history.start):
         caption = _WIDENED
     parts = [picture(plot.convergence(it), alt, caption)] if _falls(it) else []
-    told_of = [k for k in range(len(COLUMNS)) if any(row[k] != "-" for row in ran)]  # of a reference only where it is
-    rows = [[row[k] for k in told_of] for row in ran]
-    parts.append(table([COLUMNS[k] for k in told_of], rows, f"{told}.", words=True))
+    columns = [k for k in range(len(COLUMNS)) if any(row[k] != "-" for row in ran)]  # of a reference only where it is
+    rows = [[row[k] for k in columns] for row in ran]
+    parts.append(table([COLUMNS[k] for k in columns], rows, f"{note}.", words=True))
     if history.restarts:
         again = f"{counted(history.restarts, 'further swarm')} followed, as the first ended at no solution that fits"
         parts.append(paragraph(f"{again}; {history.evaluations} candidates are those of all.", "soft"))
@@ -406,7 +406,7 @@ def _convergence(it: Identification) -> str:
 
 
 def _falls(it: Identification) -> bool:
-    """Whether there is a search to be seen: a swarm's, or one whose objective fell by more than a tenth."""
+    """True where there is a search to be seen: a swarm's, or one whose objective fell by more than a tenth."""
     local = it.history.local_curve
     return bool(it.history.swarm_curve.size or (local.size > 1 and local[-1] < 0.9 * local[0]))
 
@@ -431,7 +431,7 @@ def _effective_masses(it: Identification) -> str:
 
 
 def _how(it: Identification) -> str:
-    """What was minimised and how it ended, in the words of the search."""
+    """Objective and end of the search, in its own words."""
     all_records = "over the relative accelerations of all runs, sensors and lines, unweighted"
     all_records += "; outliers that stand alone are left out" * (it.records.loss == "huber")
     of = all_records if it.residuals else "of the misfit that the problem states"
@@ -459,7 +459,7 @@ def _what_ran(it: Identification) -> str:
     facts += [[f"{name} model", words] for name, words in of_problem.models]
     facts.append(["sysid", __version__])
     counts = [*of_problem.counts, ("together", of_problem.n_variables)]
-    log = f"<h3>Log</h3><pre>{text(chr(10).join(it.history.log))}</pre>" if it.history.log else ""
+    log = f"<h3>Log</h3><pre>{escaped(chr(10).join(it.history.log))}</pre>" if it.history.log else ""
     return (
         table(["", ""], facts, words=True)
         + table(["matrix", "unknowns"], counts, "Unknowns of the search, matrix by matrix.")

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.report.html import text
+from sysid.report.html import escaped
 from sysid.structure.structure import Array, ComplexArray
 
 _WIDTH, _LEFT, _RIGHT = 360, 48, 8  # pixels
@@ -98,7 +98,7 @@ def curve_sheet(name: str, freq: Array, channel: ChannelSpectra, run: int, gaps:
     drawn.append(f'<g text-anchor="middle">{"".join(numbers)}</g>')
     drawn.append(f'<text x="{_WIDTH - _RIGHT}" y="{bottom + 27}" text-anchor="end">frequency [Hz]</text>')
     image = _svg(f"{name}: measured and identified {channel.words}", _WIDTH, bottom + _BELOW, "".join(drawn))
-    return f'<div class="sheet"><p>{text(name)}</p>{image}</div>'
+    return f'<div class="sheet"><p>{escaped(name)}</p>{image}</div>'
 
 
 def _panels(channel: ChannelSpectra, run: int) -> tuple[_Panel, ...]:
@@ -150,7 +150,7 @@ def mode_still(
     base += f'<text x="{x + 26:.1f}" y="{y + 5:.1f}">base</text>'
     words = "".join(
         f'<text{_TITLED * (at == 0)} x="{_MODE_WIDTH / 2:g}" y="{13 + 14 * at}" text-anchor="middle">'
-        f"{text(part)}</text>"
+        f"{escaped(part)}</text>"
         for at, part in enumerate(name.split(", "))
     )
     return _svg(name, _MODE_WIDTH, _MODE_HEIGHT, lines + dots + base + words)
@@ -169,7 +169,7 @@ def room_of_modes(points: Array, shapes: Array) -> float:
 
 
 def _seen(points: Array, size: float) -> Array:
-    """What the eye sees of points, slightly from above: pixels to the right and down, (p, 2)."""
+    """Projection of points as seen slightly from above: pixels to the right and down, (p, 2)."""
     (x, y, z), c, s = points.T, np.cos(_ANGLE), np.sin(_ANGLE)
     right, down = c * x - s * y, 0.3 * (s * x + c * y) - 0.95 * z
     return np.column_stack([_MODE_WIDTH / 2 + size * right, (_MODE_HEIGHT + 30) / 2 + size * down])
@@ -181,14 +181,14 @@ def _pair(point: Array) -> str:
 
 def _svg(title: str, width: int, height: int, content: str) -> str:
     return (
-        f'<svg role="img" aria-label="{text(title)}" viewBox="0 0 {width} {height}" width="{width}" '
+        f'<svg role="img" aria-label="{escaped(title)}" viewBox="0 0 {width} {height}" width="{width}" '
         f'height="{height}">{content}</svg>'
     )
 
 
 def _drawn(panel: _Panel, across: _Axis, up: _Axis, x: Array, gaps: ArrayLike) -> str:
     """Title, grid and curves of a panel; `x` is where the frequencies are, `gaps` at which no curve is joined."""
-    parts = [f'<text class="title" x="{_LEFT}" y="{up.end - 5:g}">{text(panel.title)}</text>']
+    parts = [f'<text class="title" x="{_LEFT}" y="{up.end - 5:g}">{escaped(panel.title)}</text>']
     ticks = up.ticks(_ABOVE) if panel.decades else [-180.0, -90.0, 0.0]
     grid = [f"M{across.start} {float(up(value)):.1f}H{across.end}" for value in ticks]
     grid += [f"M{float(across(value)):.1f} {up.start}V{up.end}" for value in across.ticks(_APART)]

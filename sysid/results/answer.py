@@ -105,13 +105,13 @@ class Answer:
 
     @property
     def part(self) -> PartOfProblem | None:
-        """What the file of this result holds of its problem, where it does not hold it whole; else None."""
+        """Content of this result's file of its problem, where it does not hold it whole; else None."""
         part: PartOfProblem | None = vars(self).get("_part")
         return part
 
     @property
     def judgement(self) -> Judgement:
-        """What the matrices are worth, in a word.
+        """Worth of the matrices, in a word.
 
         "determined": nothing speaks against the fit, data and stated model fix every entry of M_SS, K_SS and C, and
         noise leaves each known to a tenth of the root of its two diagonal entries (standard deviation). "one of many":
@@ -122,7 +122,7 @@ class Answer:
 
     @property
     def success(self) -> bool:
-        """Whether there is a fit, doubtful ones among them: all but "no fit".
+        """True where there is a fit, doubtful ones among them: all but "no fit".
 
         The last solver's status is good, and the residual meets the goal; where none is given, what is left is at most
         three times the noise of the records, and below one half of them.
@@ -131,7 +131,7 @@ class Answer:
 
     @property
     def determined(self) -> bool:
-        """Whether the judgement is "determined"."""
+        """True where the judgement is "determined"."""
         return self.judgement == "determined"
 
     @property
@@ -146,7 +146,7 @@ class Answer:
 
     @property
     def notes(self) -> tuple[Finding, ...]:
-        """What is to be known besides, but for why the strategy was taken, and how it ended."""
+        """Findings to be known besides, but for why the strategy was taken, and how it ended."""
         return self.of_kind(*(set(KINDS) - {"fixed", "strategy", "ending"}), severity=Severity.NOTE)
 
     def of_kind(self, *kinds: str, severity: Severity | None = None) -> tuple[Finding, ...]:
@@ -155,17 +155,17 @@ class Answer:
 
     @property
     def undetermined(self) -> tuple[str, ...]:
-        """What speaks against the answer and what leaves it open, in sentences."""
+        """Sentences on what speaks against the answer and what leaves it open."""
         return tuple(map(str, (*self.contradictions, *self.open_findings)))
 
     @property
     def closed_by(self) -> tuple[str, ...]:
-        """What fixes the matrices, in sentences; empty where anything is open."""
+        """Reasons that fix the matrices, in sentences; empty where anything is open."""
         return tuple(map(str, self.of_kind("fixed")))
 
     @property
     def confidence(self) -> tuple[str, ...]:
-        """How far the answer can be trusted, in sentences, the weightiest first.
+        """Sentences on how far the answer can be trusted, the weightiest first.
 
         Why there is no fit; what speaks against it, and what is open; what fixes the matrices where nothing is; and
         what else is to be known of records, bounds and sensors.
@@ -174,7 +174,7 @@ class Answer:
 
     @property
     def message(self) -> str:
-        """What the solver and the search say of how they ended."""
+        """Message of the solver and the search about how they ended."""
         return "; ".join(map(str, self.of_kind("ending")))
 
     def with_findings(self, findings: Iterable[Finding]) -> Self:
@@ -191,7 +191,7 @@ class Answer:
 
     @cached_property
     def modal(self) -> tuple[ModalEstimate, ...]:
-        """What each fitted test tells of its modes and noise, the problem's own first."""
+        """Modal estimate of each fitted test, the problem's own first."""
         part = self.part
         return self.prepared.modal if part is None else (fit_modes(part.records.measurement),)
 
@@ -200,25 +200,25 @@ class Answer:
         """That of the problem's own test in squares: with Huber's loss without numbers that stand alone."""
         if self.part is None:
             return self.prepared.screened.modal[0]
-        own = self.modal[0]
-        return own if self.part.records.loss == "squares" else replace(own, records=screened(own.records))
+        first = self.modal[0]
+        return first if self.part.records.loss == "squares" else replace(first, records=screened(first.records))
 
     @property
     def records(self) -> StatedProblem | StoredRecords:
-        """What was recorded: the attributes of a problem that tell it, wherever they come from."""
+        """Records: the attributes of a problem that tell them, wherever they come from."""
         part = self.part
         return self.problem if part is None else part.records
 
     @cached_property
     def facts(self) -> Facts:
-        """What readers ask of the problem beside its records."""
+        """Facts that readers ask of the problem beside its records."""
         from sysid.results.facts import facts_of
 
         return facts_of(self.prepared, self.x)
 
     @cached_property
     def phases(self) -> list[list[str]]:
-        """What each phase of the search left: see `sysid.results.phases.rows_of_phases`."""
+        """Table of the phases of the search: see `sysid.results.phases.rows_of_phases`."""
         from sysid.results.phases import rows_of_phases
 
         return rows_of_phases(self)
@@ -252,7 +252,7 @@ class Answer:
 
     @property
     def _in_modes(self) -> bool:
-        """Whether the records are all that is fitted and the structure tells all of it: no expression is asked for.
+        """True where the records are all that is fitted and the structure tells all of it: no expression is asked for.
 
         With free modes a graph of the matrices has some n³ operations, which a hundred sensors cannot wait for.
         """
@@ -278,7 +278,7 @@ class Answer:
 
     @cached_property
     def objective(self) -> float:
-        """What was minimised, at the answer: the root of the sum of squares of all that is fitted.
+        """Objective at the answer: the root of the sum of squares of all that is fitted.
 
         Accelerations and force, each relative to its size and weighted by its stated noise, further tests and whatever
         else the problem states among its residuals.
@@ -370,22 +370,22 @@ class Answer:
 
     @cached_property
     def scale_is_open(self) -> bool:
-        """Whether the answer explains the data, and one factor common to M, K and C is all that they leave open."""
+        """True where the answer explains the data, and one factor common to M, K and C is all that they leave open."""
         from sysid.assessment.determination import scale_is_open
 
         return self.success and scale_is_open(self.prepared.screened, self.structure, self.x)
 
     @property
     def asks_for_others(self) -> bool:
-        """Whether a summary asks for other matrices that explain the same data: nothing else leaves the answer open."""
+        """True where a summary asks for other matrices that explain the data: nothing else leaves the answer open."""
         return self.judgement == "one of many" and not self.of_kind("not judged")
 
     @cached_property
     def is_one_of_many(self) -> bool:
-        """Whether other matrices explain the same data within what was stated."""
-        from sysid.assessment.modal_mass_cone import speaks
+        """True where other matrices explain the same data within what was stated."""
+        from sysid.assessment.modal_mass_cone import applies
 
-        if speaks(self.prepared.formulation):
+        if applies(self.prepared.formulation):
             return bool(self.open_masses)
         ends = self._intervals
         return not (np.all(np.isfinite(ends.mass)) and np.all(np.isfinite(ends.stiffness)))
@@ -409,7 +409,7 @@ class Answer:
 
     @property
     def degrees_of_freedom(self) -> tuple[str, ...]:
-        """What the rows of M_SS, K_SS and C stand for: a sensor's name, or "coordinate of mode 7"."""
+        """Names of the rows of M_SS, K_SS and C: a sensor's, or "coordinate of mode 7"."""
         names, structure = self.measurement.sensor_names, self.structure
         called = [f"coordinate {j + 1}" for j in range(structure.n)]
         for j in np.flatnonzero(structure.dof_modes >= 0):

@@ -43,8 +43,8 @@ _CONTENT, _FORMAT = "unfinished search", 2
 
 
 @dataclass(frozen=True)
-class Begun:
-    """How a command line began a search.
+class RunRequest:
+    """Arguments with which a command line began a search.
 
     Attributes
     ----------
@@ -73,13 +73,13 @@ class Begun:
 
     def to_tree(self) -> Tree:
         """Give the fields by their names; `from_tree` takes them back."""
-        own = {
+        fields = {
             "strategy": self.strategy, "seed": str(self.seed), "refine_by": self.refine_by, "source": self.source,
         }  # fmt: skip
-        return {"recipe": self.recipe.to_tree(), **own}
+        return {"recipe": self.recipe.to_tree(), **fields}
 
     @classmethod
-    def from_tree(cls, tree: Tree) -> Begun:
+    def from_tree(cls, tree: Tree) -> RunRequest:
         """Give what `to_tree` made a tree of.
 
         Raises
@@ -106,14 +106,14 @@ class Checkpoint:
     Attributes
     ----------
     path : str or Path
-    begun : Begun, optional
+    request : RunRequest, optional
         Stands in the file for whoever is to go on.
     every : float
         s between two writings.
     """
 
     path: Path
-    begun: Begun | None = None
+    request: RunRequest | None = None
     every: float = field(default=EVERY, kw_only=True)
 
     def __post_init__(self) -> None:
@@ -121,7 +121,7 @@ class Checkpoint:
 
     @property
     def exists(self) -> bool:
-        """Whether there is an unfinished search."""
+        """True where there is an unfinished search."""
         return self.path.is_file()
 
     def read(self) -> Tree:
@@ -184,10 +184,10 @@ class Checkpoint:
                     "changed since; take it away, or give another file"
                 )
             entries = self._entries(tree)
-        begun = None if self.begun is None else self.begun.to_tree()
+        request = None if self.request is None else self.request.to_tree()
 
         def write(kept: Tree) -> None:
-            tree = {"content": _CONTENT, "search": search, "begun": begun, "entries": kept}
+            tree = {"content": _CONTENT, "search": search, "begun": request, "entries": kept}
             with atomically(self.path) as temporary:
                 temporary.write_bytes(to_bytes(tree, _FORMAT))
 

@@ -1,4 +1,4 @@
-"""What summary, report and export ask of a problem beside its records, as plain facts, which files can hold."""
+"""Facts of a problem beside its records that summary, report and export ask for, and that files can hold."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class ReportedUnknown(NamedTuple):
 
 
 class Facts(NamedTuple):
-    """What readers of a result ask of its problem.
+    """Facts of a problem for readers of a result.
 
     Attributes
     ----------
@@ -108,10 +108,10 @@ def facts_of(problem: Prepared, x: Array | None) -> Facts:
         if x is not None
         for name, z in zip(prior.labels, prior.numbers(x), strict=True)
     ]
-    told = {id(one) for one in reported_unknowns(problem)}
+    reported = {id(one) for one in reported_unknowns(problem)}
     unknowns = [
         ReportedUnknown(
-            one.name, one.unit, one.shape, one.labels, one.lower, one.upper, bool(one.fixed), id(one) not in told
+            one.name, one.unit, one.shape, one.labels, one.lower, one.upper, bool(one.fixed), id(one) not in reported
         )
         for one in reported_unknowns(problem, damping_ratios=True)
     ]

@@ -27,9 +27,9 @@ def gains_of_sensors(it: Answer) -> tuple[SensorGain, ...]:
     if it.quick_uncertainty is None or not it.success or not it.facts.fits_records:
         return ()
     found, names = it.gains, it.measurement.sensor_names
-    shown = np.isfinite(found.error)
+    known = np.isfinite(found.error)
     worth = np.where(np.nan_to_num(found.std) > EXACT, it.gain_worth, np.nan)  # without noise M has no deviation
     return tuple(
         SensorGain(names[i], 1 + float(found.error[i]), float(found.std[i]), float(worth[i]))
-        for i in np.flatnonzero(shown)
+        for i in np.flatnonzero(known)
     )

@@ -37,7 +37,7 @@ _PLAIN = (
 
 @dataclass(frozen=True)
 class Recipe:
-    """What rebuilds a problem elsewhere: its module and what was passed to ``problem()``.
+    """Recipe that rebuilds a problem elsewhere: its module and what was passed to ``problem()``.
 
     Attributes
     ----------
@@ -122,12 +122,12 @@ def _literal(name: str, text: Any) -> Any:
 
 
 def _option_in_words(name: str, value: Any) -> str:
-    """What was said of a test that was read from files: "0.5-40 Hz"; another parameter as it was given."""
+    """Option of a test that was read from files, in words: "0.5-40 Hz"; another parameter as it was given."""
     parts = value if isinstance(value, list | tuple) else [value]
-    told = ("-" if name == "band" else " and ").join(str(part).removesuffix(".0") for part in parts)
+    said = ("-" if name == "band" else " and ").join(str(part).removesuffix(".0") for part in parts)
     words = {
-        "mass": f"{told} kg stated", "lumped": "lumped mass" if value else "full mass", "band": f"{told} Hz",
-        "goal": f"goal {told}",
+        "mass": f"{said} kg stated", "lumped": "lumped mass" if value else "full mass", "band": f"{said} Hz",
+        "goal": f"goal {said}",
     }  # fmt: skip
     return words.get(name, f"{name}={value!r}")
 
@@ -224,7 +224,7 @@ class Identification(Answer):
         if self.part is not None:
             return {"problem": self.part.tree, "readings": self.part.readings}
         tree = self.prepared.to_tree()
-        return {"problem": tree, "readings": readings.to_tree(self) if needs_module(tree["given"]) else None}
+        return {"problem": tree, "readings": readings.answer_to_tree(self) if needs_module(tree["given"]) else None}
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Identification:
@@ -293,12 +293,12 @@ class Identification(Answer):
         _check_records(self.records, problem)
         if self.x is not None:
             _check_unknowns(self, self.x, problem)
-        own = {
+        kept = {
             field.name: getattr(self, field.name)
             for field in fields(self)
             if field.init and field.name not in ("problem", "prepared")
         }
-        return type(self)(**own, problem=problem)
+        return type(self)(**kept, problem=problem)
 
 
 def load(path: str | Path, problem: Problem | None = None) -> Identification:
@@ -344,15 +344,15 @@ def _problem_from_tree(tree: dict[str, Any], structure: Structure) -> Any:
         recipe = tree["recipe"]
         module = "" if recipe is None else f" (the problem was made by {recipe['module']!r})"
         read = tree["readings"]
-        attributes = readings.from_tree(read, structure)
+        attributes = readings.answer_from_tree(read, structure)
         return PartOfProblem(part, read, StoredRecords.from_tree(part), attributes, f"{error}{module}")
 
 
 def _check_records(records: StatedProblem | StoredRecords, problem: Problem) -> None:
     """Refuse a problem of other records."""
     for name in ("freq", "base", "response", "force"):
-        own, other = getattr(records.measurement, name), getattr(problem.measurement, name)
-        if (own is None) != (other is None) or not np.array_equal(own, other):
+        ours, other = getattr(records.measurement, name), getattr(problem.measurement, name)
+        if (ours is None) != (other is None) or not np.array_equal(ours, other):
             raise InputError(
                 f"the problem that was given has other records than the result ({name}): give the problem of the same "
                 "test, with the same data and parameters"
@@ -361,17 +361,17 @@ def _check_records(records: StatedProblem | StoredRecords, problem: Problem) -> 
 
 def _check_unknowns(result: Identification, x: Array, problem: Problem) -> None:
     """Refuse a problem of other unknowns, or in which they stand for other matrices."""
-    own = [(unknown.name, unknown.shape) for unknown in problem.variables]
+    given = [(unknown.name, unknown.shape) for unknown in problem.variables]
     fixed = {unknown.name for unknown in problem.formulation.fixed}
     its = [(name, np.shape(value)) for name, value in result.values.items() if name not in fixed]
-    if own != its:
+    if given != its:
         raise InputError(
-            f"the problem that was given has other unknowns than the result: {_in_words(own)} instead of "
+            f"the problem that was given has other unknowns than the result: {_in_words(given)} instead of "
             f"{_in_words(its)}"
         )
-    made = problem.structure(x)
+    structure = problem.structure(x)
     for name in ("mass", "stiffness"):
-        one, other = getattr(made, name), getattr(result.structure, name)
+        one, other = getattr(structure, name), getattr(result.structure, name)
         if one.shape != other.shape or not np.allclose(
             one, other, rtol=NEGLIGIBLE, atol=NEGLIGIBLE * np.abs(other).max()
         ):
@@ -386,7 +386,7 @@ def _in_words(unknowns: list[tuple[str, tuple[int, ...]]]) -> str:
 
 
 def _is_plain(value: Any) -> bool:
-    """Whether a value can be written as text and read again, here and in JSON."""
+    """True where a value can be written as text and read again, here and in JSON."""
     try:
         json.dumps(value, allow_nan=False)
         return bool(ast.literal_eval(repr(value)) == value)
@@ -407,5 +407,5 @@ def _finite(numbers: Mapping[str, float]) -> dict[str, float | None]:
 
 
 def _if_given(convert: Callable[[Any], Any], value: Any) -> Any:
-    """What `convert` makes of a value; None where there is none."""
+    """Value by `convert`; None where there is none."""
     return None if value is None else convert(value)

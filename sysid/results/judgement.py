@@ -12,7 +12,7 @@ from sysid.assessment.checks import OF_THE_END, QUICK, run
 from sysid.assessment.checks.context import Context
 from sysid.assessment.checks.gains import assumed, rests_on
 from sysid.assessment.determination import BY_RANK, determine
-from sysid.assessment.sensitivity import blocks_of
+from sysid.assessment.sensitivity import system_matrices
 from sysid.assessment.uncertainty import LARGE
 from sysid.finding import Finding, Severity, cautions, contradicting, is_fit, weightiest_first
 from sysid.problem.prepared import Prepared
@@ -33,7 +33,7 @@ _NOT_JUDGED = Finding(
 
 
 class Verdict(NamedTuple):
-    """Whether where a search ended is a fit, and why not, with what the solver says."""
+    """Verdict on where a search ended: a fit or why not, with what the solver says."""
 
     success: bool
     message: str
@@ -74,14 +74,14 @@ def judge(problem: Problem, prepared: Prepared, end: Outcome, why: str, seed: in
     )
     try:
         with within(session.left):
-            more = tuple(_by_noise(it))
+            more = tuple(_check_precision(it))
             return it.with_findings(more) if more else it
     except TimeIsOver:
         return it.with_findings((_NOT_JUDGED,))
 
 
 def verdict_of(problem: Prepared, end: Outcome) -> Verdict:
-    """Whether where a search ended is a fit."""
+    """Judge where a search ended: a fit or not."""
     return _verdict(Context(problem, end))
 
 
@@ -93,7 +93,7 @@ def _verdict(context: Context) -> Verdict:
     return Verdict(is_fit(found), "; ".join((*wrong, end.message) if end.success else (end.message, *wrong)))
 
 
-def _by_noise(it: Identification) -> Iterator[Finding]:
+def _check_precision(it: Identification) -> Iterator[Finding]:
     """Entries that noise leaves open though they are fixed without it, and gains that what is determined rests on.
 
     Null directions of exact records are closed by their noise, and show as large standard deviations only.
@@ -107,18 +107,18 @@ def _by_noise(it: Identification) -> Iterator[Finding]:
     if exact:
         return
     if it.structure.mode_shapes.size > LARGE:
-        told = "whether noise leaves each entry known was not judged, as that takes minutes: see uncertainty"
-        yield Finding("noise not judged", Severity.NOTE, told)
+        sentence = "whether noise leaves each entry known was not judged, as that takes minutes: see uncertainty"
+        yield Finding("noise not judged", Severity.NOTE, sentence)
         return
     u, open_ = it.uncertainty, False
     stds = (u.mass, u.stiffness, u.damping)
-    for name, matrix, std in zip(("M_SS", "K_SS", "C"), blocks_of(it.structure), stds, strict=True):
+    for name, matrix, std in zip(("M_SS", "K_SS", "C"), system_matrices(it.structure), stds, strict=True):
         size = np.sqrt(np.diag(matrix))
         size[size == 0] = max(size.max(), np.finfo(float).tiny)  # a degree of freedom without a damper
         largest = float(np.max(std / np.outer(size, size)))
         if not largest <= _KNOWN:
             up_to = "open" if np.isnan(largest) else f"with standard deviations up to {100 * largest:.2g} %"
-            told, open_ = f"noise leaves entries of {name} {up_to}", True
-            yield Finding("noise", Severity.CAUTION, told, numbers={"largest": largest})
+            sentence, open_ = f"noise leaves entries of {name} {up_to}", True
+            yield Finding("noise", Severity.CAUTION, sentence, numbers={"largest": largest})
     if not open_ and it.prepared.formulation.fits_records:
         yield from rests_on(it.measurement, it.gains, it.gain_worth)

@@ -44,7 +44,7 @@ else:
 
 
 class _HeldError(Exception):
-    """Another process has the lock; the argument is its record (see `_own_record`), empty where it is not known."""
+    """Another process has the lock; the argument is its record (see `_process_record`), empty where it is not known."""
 
 
 @contextlib.contextmanager
@@ -101,7 +101,7 @@ def _acquired(lock: Path) -> tuple[int, Path]:
             # The process before takes its file away while it holds it: then this is a lock on nothing.
             if _is_same(file, lock):
                 os.truncate(file, 0)
-                os.write(file, _own_record().encode())
+                os.write(file, _process_record().encode())
                 return file, lock
         except BaseException:
             os.close(file)
@@ -141,7 +141,7 @@ def _named(lock: Path) -> Path:
         while True:
             with contextlib.suppress(FileNotFoundError, FileExistsError):  # owner or folder are just being taken away
                 named.parent.mkdir(parents=True, exist_ok=True)
-                aside.write_text(_own_record())
+                aside.write_text(_process_record())
                 with contextlib.suppress(FileExistsError):
                     os.link(aside, named)  # in one step with what stands in it
                     return named
@@ -155,14 +155,14 @@ def _named(lock: Path) -> Path:
         aside.unlink(missing_ok=True)
 
 
-def _own_record() -> str:
+def _process_record() -> str:
     """Host, process and when it began, as one line."""
-    return f"{socket.gethostname()} {os.getpid()} {_begun(os.getpid())}"
+    return f"{socket.gethostname()} {os.getpid()} {_start_of_process(os.getpid())}"
 
 
 def _is_alive(record: str) -> bool:
-    """Whether the process of a record is there; one on another host is taken to be."""
-    host, pid, begun = record.split(" ")
+    """True where the process of a record is there; one on another host is taken to be."""
+    host, pid, started = record.split(" ")
     if host != socket.gethostname():
         return True
     try:
@@ -171,10 +171,10 @@ def _is_alive(record: str) -> bool:
         return False
     except PermissionError:  # another user's
         pass
-    return _begun(int(pid)) == begun
+    return _start_of_process(int(pid)) == started
 
 
-def _begun(pid: int) -> str:
+def _start_of_process(pid: int) -> str:
     """When a process began, in clock ticks since the machine did; empty where the system does not tell."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]

@@ -23,7 +23,7 @@ class ChannelNoise(NamedTuple):
     runs: tuple[float, float]
 
     @property
-    def told(self) -> str:
+    def level_in_words(self) -> str:
         """The level; of runs that differ, the least and the most."""
         least, most = self.runs
         return f"{self.level:.3g}" if most < LEVEL * least else f"{least:.3g} to {most:.3g}"
@@ -55,6 +55,6 @@ def noise_of_channels(it: Answer) -> tuple[ChannelNoise, ...]:
     percent = 100 * std / np.where(rms > 0, rms, np.inf)
     ends = zip(found.min(axis=0).tolist(), found.max(axis=0).tolist(), strict=True)
     return tuple(
-        ChannelNoise(name, float(own), unit, float(share), both)
-        for (name, unit), own, share, both in zip(names, std, percent, ends, strict=True)
+        ChannelNoise(name, float(size), unit, float(share), both)
+        for (name, unit), size, share, both in zip(names, std, percent, ends, strict=True)
     )

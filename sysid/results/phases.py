@@ -1,4 +1,4 @@
-"""What each phase of a search left, in residual and, where the truth is known, in its modes and matrices."""
+"""Table of the phases of a search: residual and, where the truth is known, errors of modes and matrices."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from sysid.assessment.sensitivity import blocks_of
+from sysid.assessment.sensitivity import system_matrices
 from sysid.errors import InputError
 from sysid.problem.prepared import Prepared
 from sysid.search.strategy import History, Phase
@@ -25,11 +25,11 @@ class Searched(Protocol):
 
     @property
     def prepared(self) -> Prepared:
-        """What was identified."""
+        """The problem that was identified."""
 
     @property
     def history(self) -> History:
-        """How."""
+        """The history of its search."""
 
     @property
     def structure(self) -> Structure:
@@ -56,9 +56,9 @@ def rows_of_phases(it: Searched) -> list[list[str]]:
 
 def errors(found: Structure, truth: Structure) -> Array:
     """Largest relative error of a frequency and largest 1 - MAC; relative errors of M_SS, K_SS and C: (5,)."""
-    own, other = found.mode_shapes, truth.mode_shapes
-    squares, others = (np.einsum("ik,ik->k", phi, phi) for phi in (own, other))  # zero for a shape that no sensor sees
-    mac = np.einsum("ik,ik->k", own, other) ** 2 / np.where(squares > 0, squares, 1) / np.where(others > 0, others, 1)
+    ours, other = found.mode_shapes, truth.mode_shapes
+    squares, others = (np.einsum("ik,ik->k", phi, phi) for phi in (ours, other))  # zero for a shape that no sensor sees
+    mac = np.einsum("ik,ik->k", ours, other) ** 2 / np.where(squares > 0, squares, 1) / np.where(others > 0, others, 1)
     return np.array([
         np.max(np.abs(found.natural_frequencies / truth.natural_frequencies - 1)),
         1 - mac.min(),
@@ -68,7 +68,7 @@ def errors(found: Structure, truth: Structure) -> Array:
 
 def matrix_errors(found: Structure, truth: Structure) -> tuple[float, ...]:
     """Relative errors of M_SS, K_SS and C in Frobenius norm; NaN of C where the truth has no damping."""
-    pairs = zip(blocks_of(found), blocks_of(truth), strict=True)
+    pairs = zip(system_matrices(found), system_matrices(truth), strict=True)
     return tuple(float(np.linalg.norm(a - b) / np.linalg.norm(b)) if np.any(b) else np.nan for a, b in pairs)
 
 

@@ -1,4 +1,4 @@
-"""What summary, report and export ask of a problem, as a tree: for files that do not hold all of their problem."""
+"""Tree of what summary, report and export ask of a problem: for files that do not hold all of their problem."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 Tree = dict[str, Any]
 
 
-def to_tree(it: Answer) -> Tree:
-    """Give all that readers of a result ask of its problem; `from_tree` takes it back.
+def answer_to_tree(it: Answer) -> Tree:
+    """Give all that readers of a result ask of its problem; `answer_from_tree` takes it back.
 
     Standard deviations and intervals where summaries compute them too; what no reader of this result asks, None.
     """
@@ -48,17 +48,17 @@ def to_tree(it: Answer) -> Tree:
     }
 
 
-def from_tree(tree: Tree, structure: Structure) -> dict[str, Any]:
+def answer_from_tree(tree: Tree, structure: Structure) -> dict[str, Any]:
     """Give attributes of an `Answer` by their names, without those that were not computed.
 
     Parameters
     ----------
     tree : dict
-        What `to_tree` made.
+        What `answer_to_tree` made.
     structure : Structure
         The answer's.
     """
-    made = {
+    attributes = {
         "facts": Facts.from_tree(tree["facts"]),
         "residual": tree["residual"],
         "residuals": tuple(tree["residuals"].tolist()),
@@ -76,7 +76,7 @@ def from_tree(tree: Tree, structure: Structure) -> dict[str, Any]:
         "uncertainty": _if_given(lambda part: _uncertainty_from_tree(part, structure), tree["uncertainty"]),
         "_intervals": _if_given(lambda part: Intervals(**part), tree["intervals"]),
     }
-    return {name: value for name, value in made.items() if value is not None}
+    return {name: value for name, value in attributes.items() if value is not None}
 
 
 def _uncertainty_to_tree(u: Uncertainty) -> Tree:

@@ -1,4 +1,4 @@
-"""What was recorded for a result, which its file holds whether or not it holds all of its problem."""
+"""Records of a result, which its file holds whether or not it holds all of its problem."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class StoredRecords:
 
 @dataclass(frozen=True, eq=False)
 class PartOfProblem:
-    """What a file holds of a problem that it does not hold whole.
+    """Part of a problem in a file that does not hold it whole.
 
     Attributes
     ----------

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sysid.assessment.information import Index
-from sysid.assessment.statements import Adjusted, Statements, adjust, made, statements_of
+from sysid.assessment.statements import Adjusted, Statements, adjust, predict_statements, statements_of
 from sysid.assessment.uncertainty import moves_by_records
 from sysid.errors import InputError, listed
 from sysid.finding import Finding, Severity
@@ -68,9 +68,9 @@ def _adjusted(problem: Prepared, end: Outcome) -> Outcome:
 def _structure(problem: Prepared, first: Structure, before: Array, after: Array, index: Index) -> Structure:
     """The structure of adjusted modal parameters; what was repeated in the first stays so."""
     phi, gamma, log_omega, log_ratios, rigid = (part[..., 0] for part in index.split(after[:, None]))
-    _, _, own_omega, own_ratios, _ = (part[..., 0] for part in index.split(before[:, None]))
-    omega = 2 * np.pi * first.natural_frequencies * np.exp(log_omega - own_omega)
-    ratios = first.damping_ratios * np.exp(log_ratios - own_ratios)
+    _, _, omega_before, ratios_before, _ = (part[..., 0] for part in index.split(before[:, None]))
+    omega = 2 * np.pi * first.natural_frequencies * np.exp(log_omega - omega_before)
+    ratios = first.damping_ratios * np.exp(log_ratios - ratios_before)
     order = np.argsort(omega, kind="stable")
     end = Modes(phi[:, order], gamma[order], omega[order], ratios[order])
     geometry, P, G = problem.geometry, np.linalg.inv(end.phi), problem.geometry.rigid_body
@@ -94,18 +94,18 @@ def _structure(problem: Prepared, first: Structure, before: Array, after: Array,
 def _contradictions(
     problem: Prepared, stated: Statements, best: Adjusted, theta: Array, index: Index, normals: Array
 ) -> Iterator[Finding]:
-    """Whether statements and records disagree beyond chance, and which statements explain it."""
+    """Statements and records that disagree beyond chance, and which statements explain it."""
     numbers = _numbers(problem, index)
     if _chance(best, numbers) >= FALSE_ALARM:
         return
     chance = _chance(best, numbers)
-    told = f"the stated masses cannot all be met together with the records (chance {chance:.1g})"
+    found = f"the stated masses cannot all be met together with the records (chance {chance:.1g})"
     explained: list[tuple[float, tuple[float, float], str]] = []
     for row in range(stated.values.size):
         without = adjust(problem, stated.without(row), theta, index, normals)
         if without.freedom == best.freedom or _chance(without, numbers) < FALSE_ALARM:
             continue
-        value = (made(problem, stated, without.theta, index)[0] * stated.scale)[row]
+        value = (predict_statements(problem, stated, without.theta, index)[0] * stated.scale)[row]
         off = np.sqrt(max(best.misfit - without.misfit, 0.0))
         both = (float(stated.values[row]), float(value))
         explained.append((off, both, _in_words(problem, stated, row, value, off)))
@@ -113,7 +113,7 @@ def _contradictions(
         explained.sort(key=lambda one: -one[0])
         near = [words for off, _, words in explained if off**2 > explained[0][0] ** 2 - LIKELY**2]
         yield Finding(
-            "stated masses", Severity.CONTRADICTS, f"{told}: {listed(near, '; or ')}",
+            "stated masses", Severity.CONTRADICTS, f"{found}: {listed(near, '; or ')}",
             numbers={
                 "chance": chance, "deviations": float(explained[0][0]), "stated": explained[0][1][0],
                 "by the records": explained[0][1][1], "statements": float(len(near)),
@@ -125,11 +125,11 @@ def _contradictions(
         scaled = stated._replace(values=factor * stated.values, std=factor * stated.std)
         if _chance(adjust(problem, scaled, theta, index, normals), numbers) >= FALSE_ALARM:
             yield Finding(
-                "stated masses", Severity.CONTRADICTS, f"{told}; all of them would be met {factor:.4g} times as large",
+                "stated masses", Severity.CONTRADICTS, f"{found}; all of them would be met {factor:.4g} times as large",
                 "is a unit or the force's gain wrong?", numbers={"chance": chance, "factor": factor},
             )  # fmt: skip
             return
-    unexplained = f"{told}; no single one of them explains it"
+    unexplained = f"{found}; no single one of them explains it"
     yield Finding("stated masses", Severity.CONTRADICTS, unexplained, numbers={"chance": chance})
 
 
@@ -137,7 +137,7 @@ def _common_factor(problem: Prepared, stated: Statements, theta: Array, index: I
     """By what all statements would be wrong in common, by what a base force weighs; zero where none was measured."""
     if problem.measurement.force is None:
         return 0.0
-    values, slopes = made(problem, stated, theta, index)
+    values, slopes = predict_statements(problem, stated, theta, index)
     noise = slopes @ normals
     weight = np.linalg.pinv(noise @ noise.T, hermitian=True)
     given = stated.values / stated.scale

@@ -50,7 +50,7 @@ def write_tree(tree: Tree, path: str | Path) -> Path:
 
 
 def read_tree(path: str | Path, build: Callable[[Tree], T]) -> T:
-    """What `build` makes of the tree that `write` wrote; path and errors as in `load`.
+    """Object that `build` makes of the tree that `write` wrote; path and errors as in `load`.
 
     What is wrong with `build`'s tree is an error of the file.
     """

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.assessment.sensitivity import blocks_of
+from sysid.assessment.sensitivity import system_matrices
 from sysid.finding import Judgement
 from sysid.measurement.in_time import peaks
 from sysid.results.answer import Answer
@@ -16,7 +16,7 @@ from sysid.results.deck_masses import deck_masses
 from sysid.results.gain_table import gains_of_sensors
 from sysid.results.noise_table import NOISE_COLUMNS, noise_of_channels
 from sysid.results.phases import COLUMNS, seconds_in_words
-from sysid.results.unknowns_table import MANY, rows_of, stated_values
+from sysid.results.unknowns_table import MANY, stated_values, unknown_rows
 from sysid.structure.structure import Array
 from sysid.structure.thresholds import LIKELY, ROUND_OFF, UNEXPLAINED
 
@@ -46,10 +46,10 @@ def summary(it: Answer) -> str:
     """Table of the result, at most 120 columns wide."""
     s, axes, records = it.structure, it.measurement.base_axes or (), it.records
     force = "" if it.force_residual is None else f", of the base force {it.force_residual:.3e}"
-    told = it.undetermined or it.closed_by
+    sentences = it.undetermined or it.closed_by
     lines = [
         f"{JUDGEMENTS[it.judgement]}: {verdict(it)}." + ("" if it.success else f" Fitted: {fitted_in_words(it)}."),
-        *(f"  - {sentence}" for sentence in told[:FIRST]),
+        *(f"  - {sentence}" for sentence in sentences[:FIRST]),
         *(f"  > {step}" for step in next_steps(it)),
         "",
         *_mode_table(it),
@@ -76,10 +76,10 @@ def summary(it: Answer) -> str:
     for i, test in enumerate(it.validation, start=1):
         lines.append(f"test {i} of {len(records.validation)} never fitted: relative residual {test.residual(s):.3e}")
     lines += [*_noise(it), *_gains(it)]
-    further_told = [f"  - {sentence}" for sentence in told[FIRST:]]
+    rest = [f"  - {sentence}" for sentence in sentences[FIRST:]]
     if it.judgement == "one of many" and not it.hurried and it.open_masses:
-        further_told += _ranges(it)
-    lines += ["besides:"] * bool(further_told) + further_told
+        rest += _ranges(it)
+    lines += ["besides:"] * bool(rest) + rest
     lines += [_NOT_COMPUTED] if it.hurried else []
     lines.append(f"search: {it.message}")
     return "\n".join(_folded(line) for line in lines)
@@ -93,7 +93,7 @@ def _phases(it: Answer) -> list[str]:
 
 def _noise(it: Answer) -> list[str]:
     """Table of the noise of each channel, where whole records were fitted."""
-    rows = [(one.channel, one.told, one.unit, f"{one.percent:.3g}") for one in noise_of_channels(it)]
+    rows = [(one.channel, one.level_in_words, one.unit, f"{one.percent:.3g}") for one in noise_of_channels(it)]
     head = (f"noise {noise_source(it)}", *NOISE_COLUMNS)
     return _aligned([list(column) for column in zip(head, *rows, strict=True)]) if 0 < len(rows) <= MANY else []
 
@@ -109,7 +109,7 @@ def _gains(it: Answer) -> list[str]:
 
 
 def noise_source(it: Answer) -> str:
-    """Whether levels of noise were stated or found."""
+    """Source of the levels of noise, in words: stated or found."""
     whole = it.records.measurement.whole
     return "as stated" if whole is not None and whole.noise is not None else "found with the fit"
 
@@ -119,12 +119,12 @@ def residual_in_words(it: Answer) -> str:
     goal = "" if it.records.goal is None else f" (goal {it.records.goal:.3g})"
     if len(it.residuals) < 2:
         return f"{it.residual:.3e}{goal}"
-    own = ", ".join(f"{value:.3e}" for value in it.residuals)
-    return f"{it.residual:.3e}{goal} over {len(it.residuals)} tests (test by test {own})"
+    each = ", ".join(f"{value:.3e}" for value in it.residuals)
+    return f"{it.residual:.3e}{goal} over {len(it.residuals)} tests (test by test {each})"
 
 
 def verdict(it: Answer) -> str:
-    """What the judgement means for this answer."""
+    """Meaning of the judgement for this answer."""
     match it.judgement:
         case "no fit":
             return "these matrices do not explain the records as they should"
@@ -152,7 +152,7 @@ def fitted_in_words(it: Answer) -> str:
 
 
 def next_steps(it: Answer) -> list[str]:
-    """What would close what is open, in sentences."""
+    """Steps that would close what is open, in sentences."""
     if it.determined or it.hurried or it.of_kind("not judged"):
         return []
     if not it.success:
@@ -178,7 +178,7 @@ def next_steps(it: Answer) -> list[str]:
 
 
 def _towards_a_fit(it: Answer) -> list[str]:
-    """What to do where there is no fit, the first thing first."""
+    """Steps towards a fit where there is none, the first thing first."""
     if it.interrupted:
         return ["let the search end: 'sysid run --resume FOLDER' goes on with one that the command line began"]
     if it.records.goal is not None:
@@ -228,8 +228,8 @@ def mass_percent_std(it: Answer) -> Array:
 
 def is_one_of_many(it: Answer) -> Array:
     """Which effective masses are one choice among many, (n, d) of bool; a common factor changes none of a sum."""
-    own_sum = it.facts.unit_mass and not it.facts.mass_is_free  # nothing in kg beside what is scaled
-    known = it.determined or it.hurried or (own_sum and it.scale_is_open)
+    unit_sum = it.facts.unit_mass and not it.facts.mass_is_free  # nothing in kg beside what is scaled
+    known = it.determined or it.hurried or (unit_sum and it.scale_is_open)
     return np.logical_and(np.isnan(mass_percent_std(it)), not known)
 
 
@@ -249,10 +249,10 @@ def _mode_table(it: Answer) -> list[str]:
     cells = np.vstack([shares, shares.sum(axis=0)])
     marks = np.vstack([many, many.any(axis=0)])
     masses = [
-        [f"mass {axis}, %", *(f"{tilde(mark)}{share:.1f}" for share, mark in zip(*own, strict=True))]
-        for axis, *own in zip(axes, cells.T, marks.T, strict=True)
+        [f"mass {axis}, %", *(f"{tilde(mark)}{share:.1f}" for share, mark in zip(*entries, strict=True))]
+        for axis, *entries in zip(axes, cells.T, marks.T, strict=True)
     ]
-    mass_widths = [["+-", *(half_width(value, 100.0) for value in own), ""] for own in std.T]
+    mass_widths = [["+-", *(half_width(value, 100.0) for value in entries), ""] for entries in std.T]
     both = [column for pair in zip(masses, mass_widths, strict=True) for column in pair]
     lines = _aligned(columns + both)
     if not np.any(np.isfinite(std)) or len(lines[0]) > WIDTH:
@@ -264,37 +264,37 @@ def _mode_table(it: Answer) -> list[str]:
 
 
 def missing_mass(it: Answer) -> list[str]:
-    """What of the rigid-body mass is in none of the modes, in a sentence, where it is no round-off of a table."""
+    """Sentence on the rigid-body mass in none of the modes, where it is no round-off of a table."""
     missing, many = 100 - it.structure.effective_mass_percent.sum(axis=0), np.any(is_one_of_many(it), axis=0)
-    told = [
+    shares = [
         f"{tilde(one)}{share:.3g} % in {axis}"
         for axis, share, one in zip(it.measurement.base_axes or (), missing, many, strict=True)
         if share > _MISSING
     ]
     where = "is in none of these modes: it moves with the base, or in modes beyond the lines"
-    return [f"of the rigid-body mass, {', '.join(told)} {where}"] * bool(told)
+    return [f"of the rigid-body mass, {', '.join(shares)} {where}"] * bool(shares)
 
 
 def _deck_masses(it: Answer) -> list[str]:
     """The masses of a lumped model, in one line."""
-    told = [
+    masses = [
         f"{one.name} {tilde(one.one_of_many)}{one.mass:.5g}{known_half_width(one.std, one.mass, ' +-')} kg"
         for one in deck_masses(it)
     ]
-    return [f"masses at the sensors (diagonal of M_SS): {', '.join(told)}"] * bool(told)
+    return [f"masses at the sensors (diagonal of M_SS): {', '.join(masses)}"] * bool(masses)
 
 
 def _unknowns(it: Answer) -> list[str]:
     """Table of the unknowns that mean something by themselves, where there are some and not too many."""
-    rows = rows_of(it)
+    rows = unknown_rows(it)
     if not 0 < len(rows) <= MANY:
         return []
     computed = it.quick_uncertainty is not None
-    told = [
+    cells = [
         [row.label, f"{row.value:.6g}", half_width(row.std, row.value) if computed else "-", row.unit] for row in rows
     ]
     at = [row.on_bound or f"{row.lower:.4g} to {row.upper:.4g}" for row in rows]
-    columns = [list(column) for column in zip(["unknown", "value", "+- (95 %)", "unit"], *told, strict=True)]
+    columns = [list(column) for column in zip(["unknown", "value", "+- (95 %)", "unit"], *cells, strict=True)]
     return [*_aligned([*columns, ["search space", *at]]), ""]
 
 
@@ -310,13 +310,13 @@ def _aligned(columns: list[list[str]]) -> list[str]:
 def _rigid_masses(it: Answer, axes: Sequence[str]) -> Iterator[str]:
     """Rigid-body mass by base direction, with its half-width where noise moves it."""
     masses, std = np.diag(it.structure.rigid_body_mass), np.diag(it.quick_std("rigid_body_mass"))
-    for axis, mass, own in zip(axes, masses, std, strict=True):
-        told = f"{tilde(it.facts.unit_mass)}{mass:.6g}{known_half_width(own, mass, ' +-')}"
-        yield f"{axis} {told} kg{' m²' * (axis[0] == 'r')}"
+    for axis, mass, deviation in zip(axes, masses, std, strict=True):
+        words = f"{tilde(it.facts.unit_mass)}{mass:.6g}{known_half_width(deviation, mass, ' +-')}"
+        yield f"{axis} {words} kg{' m²' * (axis[0] == 'r')}"
 
 
 def _ranges(it: Answer) -> Iterator[str]:
-    """How far the diagonals may go, in one line, where something may move; where that takes time, what computes it."""
+    """Ranges of the diagonals, in one line, where something may move; where that takes time, what computes them."""
     if it.scale_is_open:
         return
     ends = it.intervals_at_once
@@ -324,10 +324,10 @@ def _ranges(it: Answer) -> Iterator[str]:
         yield f"  - {_RANGES_LEFT}"
         return
     words = []
-    M, K, _ = blocks_of(it.structure)
+    M, K, _ = system_matrices(it.structure)
     for name, matrix, (lower, upper) in (("M_SS", M, ends.mass), ("K_SS", K, ends.stiffness)):
-        own = np.diag(matrix)
-        low, high = abs(float(np.min(np.diag(lower) / own))), float(np.max(np.diag(upper) / own))
+        diagonal = np.diag(matrix)
+        low, high = abs(float(np.min(np.diag(lower) / diagonal))), float(np.max(np.diag(upper) / diagonal))
         if high - low > 1e-6:
             top = f"{high:.3g} times" if np.isfinite(high) else "any number of times"
             words.append(f"{low:.3g} to {top} those of this {name}")

@@ -30,11 +30,11 @@ class Row(NamedTuple):
 
 
 def stated_values(it: Answer) -> list[str]:
-    """How far each value that was stated as known is missed, in words."""
+    """Sentences on how far each value that was stated as known is missed."""
     return [f"{name} ends {z:+.2g} standard deviations from the value stated as known" for name, z in it.facts.misses]
 
 
-def rows_of(it: Answer) -> list[Row]:
+def unknown_rows(it: Answer) -> list[Row]:
     """A row a scalar unknown that was searched and means something by itself: see `sysid.results.facts`."""
     if it.x is None:
         return []

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from sysid.errors import InputError, SolverError, whole_number
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.modal_estimate import ModalEstimate
-from sysid.problem.feasibility import latin_hypercube
+from sysid.problem.feasibility import spread_points
 from sysid.problem.prepared import Prepared
 from sysid.problem.terms import TestTerm
 from sysid.search import local
@@ -70,7 +70,7 @@ class Continuation:
 
 
 def smoothed_tests(problem: Prepared, monitor: Callable[[int, float], object] | None = None) -> _Smoother | None:
-    """What stands for each fitted test at complex frequencies; None where one shows no poles, or none is fitted."""
+    """Fitted tests at complex frequencies; None where one shows no poles, or none is fitted."""
     if not problem.formulation.fits_records:
         return None
     terms = problem.formulation.tests
@@ -158,7 +158,7 @@ class _Run:
         self.ways: list[Array] = []
         self.joined = 0  # starts whose way another one has come before
         self.stopped: BaseException | None = None
-        self.begun = session.seconds
+        self.start_time = session.seconds
         self.wrong: InputError | None = None
 
     def outcome(self, starts: int, start: ArrayLike | Structure | None) -> Outcome:
@@ -190,7 +190,7 @@ class _Run:
             success, message = False, str(self.stopped) or "interrupted"
         initial = _objective_at(problem, first)
         phases = (
-            *((Phase("start", initial, first, self.begun, 1),) if np.isfinite(initial) else ()),
+            *((Phase("start", initial, first, self.start_time, 1),) if np.isfinite(initial) else ()),
             Phase("local phase", objective, best.x, session.seconds, best.curve.size),
         )
         return Outcome(
@@ -230,7 +230,7 @@ class _Run:
         self.stopped = answer.stopped
 
     def _good(self, objective: float, best: LocalResult) -> bool:
-        """Whether the data let a structure be hardly better."""
+        """True where the data let a structure be hardly better."""
         problem = self.problem
         if problem.stated.goal is not None:
             return problem.residual(best.x) <= problem.stated.goal
@@ -241,7 +241,7 @@ class _Run:
         return float(np.sqrt(max(objective**2 - of_terms, 0.0))) <= max(_NEAR * self.smoother.floor, EXACT)
 
     def _unanimous(self, best: LocalResult) -> bool:
-        """Whether three starts or more all ended at the best end, at a fit of sorts: only a wrong model leaves more."""
+        """True where three starts or more all ended at the best end, a fit of sorts: only a wrong model leaves more."""
         same = [apart(self.problem, best.x, answer.x) < OTHER_ANSWER for _, answer in self.ends]
         return all(same) and len(same) + self.joined >= 3 and self.problem.residual(best.x) < UNEXPLAINED
 
@@ -268,7 +268,7 @@ def random_starts(problem: Prepared, count: int, random: np.random.SeedSequence)
     """Points spread over the search space as the swarm's are, of those that stand for a structure."""
     if count < 1:
         return []
-    points = latin_hypercube(problem.formulation, DRAWN * count, np.random.default_rng(random))
+    points = spread_points(problem.formulation, DRAWN * count, np.random.default_rng(random))
     return list(islice((x for x in points if _is_structure(problem, x)), count))
 
 

@@ -26,7 +26,7 @@ from sysid.modal_analysis.modal_error import ModalError
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.response import records_of, weights_of_test
 from sysid.models.spectrum import SOLVED
-from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, not_begun
+from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, time_too_short
 from sysid.problem.prepared import Prepared
 from sysid.search.modal_coordinates import End, modes_of, spectrum_near, unknowns_of
 from sysid.search.modal_scaling import stated_totals
@@ -47,7 +47,7 @@ def fit_in_inverse_factor(problem: Prepared, x: Array, monitor: IterationMonitor
     first = best = End(x, problem.objective(x), "not begun", "")
     seconds = _SECONDS * (problem.geometry.n / 10) ** _POWER
     if not monitor.allows(seconds):
-        return first._replace(status=not_begun(seconds))
+        return first._replace(status=time_too_short(seconds))
     error, left = InverseFactorError(problem), max_iterations
     while left > 0:
         end = _fit_about(problem, best.x, error, monitor, min(_ROUND, left))
@@ -266,7 +266,7 @@ def _derivatives(z: NonlinearProgram, y: ca.MX, error: InverseFactorError, psi_0
 
 
 def _left_in_words(problem: Prepared, z: NonlinearProgram, derivatives: dict[str, ca.Function], at: Array) -> str:
-    """How much chi² an end that is no solution leaves to gain: half the Newton decrement, beside what is left in all.
+    """Gain in chi² that an end that is no solution leaves: half the Newton decrement, beside what is left in all.
 
     What a fit leaves in all counts as one for each degree of freedom, as noise of its size does.
     """

@@ -1,4 +1,4 @@
-"""What a search has reached, part by part, so that it goes on from there after its process has ended.
+"""Journal of a search, part by part, so that it goes on from there after its process has ended.
 
 A search repeats bit for bit with the same seed. So it is enough to keep where its long parts ended, and the state of
 the one that runs: a resumed search takes the same way, and reads these in place of running them.

@@ -26,7 +26,7 @@ Coordinates = Literal["modal", "cholesky", "entries"]
 
 @dataclass(frozen=True, eq=False)
 class LocalResult:
-    """How the local phase ended.
+    """Result of the local phase.
 
     Attributes
     ----------

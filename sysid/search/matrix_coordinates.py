@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from sysid.models.spectrum import SOLVED
-from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, not_begun
+from sysid.nlp import OBJECTIVE_SCALE, IterationMonitor, NonlinearProgram, time_too_short
 from sysid.problem.feasibility import HELD, LOOSE
 from sysid.problem.formulation import Formulation
 from sysid.problem.matrices import assemble
@@ -56,7 +56,7 @@ def fit_in_matrices(
     rows = ca.vertcat(*(term.rows(unknowns, modes) for term in terms_with(formulation, smoothed)))
     seconds = _SECONDS * (problem.geometry.n / 12) ** _POWER if modal else _JACOBIAN * rows.numel() * z.z.numel() ** 2
     if not monitor.allows(seconds):
-        return End(start, np.inf, not_begun(seconds), "")
+        return End(start, np.inf, time_too_short(seconds), "")
     derivatives = None if modal else {"hess_lag": _gauss_newton(z, rows)}
     # Beside noise the objective's round-off stops the line search first: the gradient is then small, not at tolerance.
     best, status = z.minimize(ca.sumsqr(rows), monitor, max_iterations, derivatives, acceptable=1e2 if modal else 1e3)
@@ -82,7 +82,7 @@ def terms_with(formulation: Formulation, smoothed: Sequence[TestTerm]) -> list[T
 
 
 def needs_modes(formulation: Formulation) -> bool:
-    """Whether modes are further unknowns: damping by ratios has no direct solve."""
+    """True where modes are further unknowns: damping by ratios has no direct solve."""
     return formulation.fits_records and formulation.matrices.by_ratios
 
 

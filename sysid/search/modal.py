@@ -99,7 +99,7 @@ class Modal:
 
 @dataclass(frozen=True, eq=False)
 class DegreesOfFreedom:
-    """What the degrees of freedom of a modal model are.
+    """Degrees of freedom of a modal model.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ def degrees_of_freedom(problem: Prepared, modes: Modes, stated: Sequence[str | i
 
 
 def _independent_sensors(test: Measurement, modes: Modes) -> int:
-    """How many combinations of sensors move in the modes by more than noise would make of them.
+    """Number of combinations of sensors that move in the modes by more than noise would make of them.
 
     Motions are judged, not shapes: two modes that nearly share a pole have shapes that are uncertain and nearly
     parallel, while their sum and their difference in the records are well known. Of r combinations the sum of all
@@ -173,7 +173,9 @@ def _by_name(test: Measurement, stated: Sequence[str | int]) -> Integers:
     return np.sort(np.array(chosen, dtype=int))
 
 
-def build(problem: Prepared, modes: Modes, remainder: Array, chosen: DegreesOfFreedom, *, to_totals: bool) -> Structure:
+def structure_of_modes(
+    problem: Prepared, modes: Modes, remainder: Array, chosen: DegreesOfFreedom, *, to_totals: bool
+) -> Structure:
     """Structure of a modal model; `remainder` (d, d) is the rigid-body mass that no mode carries.
 
     With `to_totals` all modal masses take one factor, and the remainder what is left, so that stated totals are met.
@@ -273,7 +275,7 @@ def _in_unknowns(
 
 
 def objective_of(problem: Prepared, structure: Structure, x: Array | None) -> float:
-    """What the fit leaves; where modes are free from the structure alone, without any graph of the matrices."""
+    """Objective at an answer; where modes are free from the structure alone, without any graph of the matrices."""
     if x is not None and not problem.free_modes:
         return problem.objective(x)
     left = weighted_error(problem.measurement, structure)
@@ -281,7 +283,7 @@ def objective_of(problem: Prepared, structure: Structure, x: Array | None) -> fl
 
 
 def _coordinates(problem: Prepared, chosen: DegreesOfFreedom) -> list[str]:
-    """What the degrees of freedom are, in words."""
+    """Degrees of freedom, in words."""
     names = problem.measurement.sensor_names
     return [names[i] for i in chosen.sensors] + [f"the coordinate of mode {k + 1}" for k in chosen.modes]
 
@@ -320,7 +322,7 @@ def modal_structure(
     # A stated total is kept, even where the base force weighs another.
     unmet = mass.free and (test.force is None or (mass.totals is not None and held is None and not later))
     try:
-        return build(problem, modes, remainder, chosen, to_totals=unmet), end, chosen, poles
+        return structure_of_modes(problem, modes, remainder, chosen, to_totals=unmet), end, chosen, poles
     except InputError as error:
         raise DoesNotApplyError(
             "the modes found are too much alike at the sensors, as where a sign, gain or axis in rigid_body is "

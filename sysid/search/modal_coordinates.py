@@ -75,7 +75,7 @@ def _linear_starts(test: Measurement, ended: ModalFit, first: Modes) -> Iterator
 
 
 def fits_worse_than_free_residues(test: Measurement, modes: Modes, error: float) -> bool:
-    """Whether a relative error of the accelerations is clearly above what free residues leave: a local minimum."""
+    """True where a relative error of the accelerations is clearly above what free residues leave: a local minimum."""
     return error > max(EXACT, FREE * linear_residues(test, modes.omega, modes.ratios)[1])
 
 

@@ -177,7 +177,7 @@ class ModalResidual:
         return 2 * ca.diag(self.force_channel) @ self.force_left @ self.force_base.T
 
     def theta(self) -> ca.MX:
-        """What `hessian_of` takes: participations mode by mode, log w, log zeta and, with a force, the rigid mass."""
+        """Argument of `hessian_of`: participations mode by mode, log w, log zeta and, with a force, the rigid mass."""
         d = self.rigid.size1()
         corner = [self.rigid[i, j] for i in range(d) for j in range(i, d)] if self.force_left is not None else []
         return ca.vertcat(ca.vec(self.gamma.T), ca.log(self.omega), ca.log(self.ratios), *corner)
@@ -195,7 +195,7 @@ class ModalResidual:
 
 
 class EstimateResidual:
-    """What modes miss an estimate by, in units of its noise and of the records, the best shapes eliminated.
+    """Misfit of modes to an estimate, in units of its noise and of the records, the best shapes eliminated.
 
     Half a chi-squared rises by ``|R (theta - estimate)|²``, with ``R' R`` the information; shapes enter it linearly.
 

@@ -61,7 +61,7 @@ class ModeFit:
 
     @cached_property
     def records(self) -> Records:
-        """What residues are fitted to."""
+        """Records that residues are fitted to."""
         return Records(self.test)
 
     def best(self) -> ModalFit:
@@ -116,7 +116,7 @@ class ModeFit:
 
     @property
     def _goes_on(self) -> bool:
-        """Whether nobody has stopped the fit, and there is time for another one."""
+        """True where nobody has stopped the fit, and there is time for another one."""
         monitor = self.monitor
         return monitor.stopped is None and not monitor.is_over and monitor.allows(self._seconds)
 
@@ -240,7 +240,7 @@ def ended(problem: Prepared, estimate: ModalFit, monitor: IterationMonitor, max_
 
 
 def _within_bounds(problem: Prepared, end: ModalFit) -> bool:
-    """Whether all damping ratios are within the problem's bounds."""
+    """True where all damping ratios are within the problem's bounds."""
     low, high = damping_bounds(problem)
     return bool(np.all((end.modes.ratios >= low) & (end.modes.ratios <= high)))
 

@@ -38,7 +38,7 @@ _NOT_LOOKED_FOR = "whether another structure explains the data as well was not l
 
 
 def is_unique_if_rank_is_full(problem: Prepared) -> bool:
-    """Whether an answer that small changes cannot replace has no other one far from it either.
+    """True where an answer that small changes cannot replace has no other one far from it either.
 
     Where all degrees of freedom are measured and the matrices are linear in the unknowns, so are the equations of
     motion, at any responses; damping ratios follow from the poles.
@@ -162,7 +162,7 @@ def _fit(problem: Prepared, x: Array, session: Session) -> Array:
 
 
 def _explains(problem: Prepared, x: Array, objective: float) -> bool:
-    """Whether unknowns of a structure explain the data as well as those that leave `objective`."""
+    """True where unknowns of a structure explain the data as well as those that leave `objective`."""
     return problem.keeps_constraints(x) and problem.objective(x) <= as_good_as(problem, objective)
 
 

@@ -21,7 +21,7 @@ RefineBy = Literal["closed-form", "ipopt", "leaders"]
 
 @dataclass
 class Tally:
-    """What became of IPOPT's refinements, counted.
+    """Counts of the ends of IPOPT's refinements.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ class Refiner:
         return spectrum_error(triangle(x[self._part], self.problem.geometry.n), self.spectrum)
 
     def of_leader(self, objective: Callable[[Array], Array]) -> Callable[[Array, float], tuple[Array, float]]:
-        """What refines a new leader, in the swarm's coordinates, for an objective of rows."""
+        """Function that refines a new leader, in the swarm's coordinates, for an objective of rows."""
 
         def refine(row: Array, cost: float) -> tuple[Array, float]:
             if self.session.is_over:

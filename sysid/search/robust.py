@@ -20,7 +20,7 @@ from sysid.structure.thresholds import ROUND_OFF
 _SETTLED, _NEAR = 2e-3, 0.05  # standard deviations of the unknowns, root mean square: is settled, is as good
 
 
-def settled(problem: Prepared, end: Outcome, strategy: Strategy, session: Session, rounds: int = 40) -> Outcome:
+def fit(problem: Prepared, end: Outcome, strategy: Strategy, session: Session, rounds: int = 40) -> Outcome:
     """Where Huber's loss is least, in so many rounds at most, from the answer to the screened records.
 
     The modal strategy fits each round anew; after all others the local phase goes on from the last unknowns.
@@ -60,7 +60,7 @@ def settled(problem: Prepared, end: Outcome, strategy: Strategy, session: Sessio
     return end.with_note(sentence) if moved < _NEAR else _cut_short(end, sentence)
 
 
-def check(problem: Prepared, strategy: Strategy) -> None:
+def check_local_phase(problem: Prepared, strategy: Strategy) -> None:
     """Refuse settings that leave nothing to go on from.
 
     Raises

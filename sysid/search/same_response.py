@@ -1,4 +1,4 @@
-r"""How far the responses of many candidates are from those of an answer, at complex frequencies.
+r"""Distance of the responses of many candidates from those of an answer, at complex frequencies.
 
 Away from the imaginary axis, at :math:`s = \sigma + i\omega`, no peak is narrow, so that a descent comes from far away;
 and two structures whose responses agree there at more lines than they have coefficients agree everywhere, to the
@@ -61,7 +61,7 @@ class SameResponse:
 
 
 class _Response:
-    """What a test shows of candidates at complex frequencies, over its size at an answer, (count, rows)."""
+    """Response of candidates in a test at complex frequencies, over its size at an answer, (count, rows)."""
 
     def __init__(self, term: TestTerm, x: Array) -> None:
         matrices = self.matrices = term.matrices

@@ -28,6 +28,6 @@ def add_unknowns(z: NonlinearProgram, unknowns: Sequence[Unknown], x: Array, hel
 
 
 def scale_of_unknown(unknown: Unknown, values: Array) -> Array:
-    """What IPOPT counts an unknown in: its start, or a part of its range where that is larger."""
+    """Unit in which IPOPT counts an unknown: its start, or a part of its range where that is larger."""
     unit = scales_of([unknown], values)
     return np.where(unit > 0, unit, 1.0)

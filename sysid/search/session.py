@@ -21,7 +21,7 @@ Phase = Literal["poles", "swarm", "continuation", "local phase", "other answers"
 
 @dataclass(frozen=True, eq=False)
 class Progress:
-    """What a callback sees.
+    """State of a search for a callback.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class DeferredInterrupt:
 
     @property
     def asked(self) -> bool:
-        """Whether there was a Ctrl-C."""
+        """True where there was a Ctrl-C."""
         return self.count > 0
 
     def __enter__(self) -> DeferredInterrupt:
@@ -137,7 +137,7 @@ class Session:
         self.listeners, self.interrupt, self.max_time = listeners, interrupt, max_time
         self.random = random or np.random.SeedSequence(0)
         self.max_evaluations = max_evaluations
-        self.begun = time.perf_counter()
+        self.start_time = time.perf_counter()
         self.lines: list[str] = []
         self.stop_asked: Stop | None = None  # by a callback, before there was anything to keep
         self.left_out = False  # a part of the search, for want of time
@@ -145,7 +145,7 @@ class Session:
     @property
     def seconds(self) -> float:
         """Seconds since the start."""
-        return time.perf_counter() - self.begun
+        return time.perf_counter() - self.start_time
 
     @property
     def left(self) -> float | None:
@@ -154,21 +154,21 @@ class Session:
 
     @property
     def is_over(self) -> bool:
-        """Whether the time is over."""
+        """True where the time is over."""
         return self.max_time is not None and self.seconds >= self.max_time
 
     @property
     def cut_short(self) -> bool:
-        """Whether the time is over, or did not suffice for a part of the search: with more it may end elsewhere."""
+        """True where the time is over, or did not suffice for a part of the search: with more it may end elsewhere."""
         return self.is_over or self.left_out
 
     def allows(self, seconds: float) -> bool:
-        """Whether work that cannot be stopped, and takes about so many seconds of a processor, may begin."""
+        """True where work that cannot be stopped, and takes about so many seconds of a processor, may begin."""
         return self.left is None or suffices(self.left, seconds)
 
     @property
     def time_for_more(self) -> bool:
-        """Whether half of the time is left."""
+        """True where half of the time is left."""
         return self.max_time is None or self.seconds < self.max_time / 2
 
     def log(self, line: str) -> None:

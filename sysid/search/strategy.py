@@ -1,4 +1,4 @@
-"""What the strategies have in common: their contract, where a search ended, and what a start stands for."""
+"""Contract of the strategies, where a search ended, and what a start stands for."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Phase:
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """What ran, phase by phase; NaN where a phase did not run.
+    """Phases that ran, one after the other; NaN where a phase did not run.
 
     The objective counts all that is fitted, base force and further tests too: the root of the sum of all squared
     rows, each record relative and weighed by its noise. The modal strategy has the local phase only, continuation
@@ -96,7 +96,7 @@ class History:
 
     @property
     def refinement_in_words(self) -> str:
-        """What IPOPT's refinement of eigenvalues came to; empty where it did not run."""
+        """Counts of IPOPT's refinement of eigenvalues, in words; empty where it did not run."""
         if not self.refinement_statuses:
             return ""
         ended = ", ".join(f"{status} {count}" for status, count in self.refinement_statuses)
@@ -176,7 +176,7 @@ class Outcome:
 
 
 def search_note(sentence: str) -> Finding:
-    """What should be known of how a search was done."""
+    """Finding on how a search was done."""
     return Finding("search", Severity.NOTE, sentence)
 
 

@@ -9,7 +9,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import SolverError, choice, flag, instance, number, text, whole_number
+from sysid.errors import SolverError, as_float, choice, flag, instance, text, whole_number
 from sysid.modal_analysis.response import error_of_accelerations
 from sysid.problem.prepared import Prepared
 from sysid.problem.terms import TestTerm
@@ -119,7 +119,7 @@ class Swarm:
             value = getattr(self, field)
             if value is not None or field not in ("n_particles", "stall_iterations"):  # None has a meaning there
                 whole_number(f"Swarm: {field}", value, at_least=at_least)
-        number("Swarm: stall_tolerance", self.stall_tolerance, "a part of it, in [0, 1),", at_least=0, below=1)
+        as_float("Swarm: stall_tolerance", self.stall_tolerance, "a part of it, in [0, 1),", at_least=0, below=1)
         for field in ("refine", "write_back"):
             flag(f"Swarm: {field}", getattr(self, field))
         instance("Swarm: settings", self.settings, SwarmSettings)
@@ -159,7 +159,7 @@ class Swarm:
         )
 
     def searched(self, problem: Prepared, session: Session) -> tuple[SwarmObjective, list[tuple[TestTerm, ...]]]:
-        """What the swarm minimises, and the tests with widened peaks, if any, through which the local phase goes."""
+        """Objective of the swarm, and the tests with widened peaks, if any, through which the local phase goes."""
         formulation = problem.formulation
         smoother = None if formulation.refinable else smoothed_tests(problem, session.preparing)
         # With wide peaks more of the swarm is on a slope that leads somewhere.
@@ -241,20 +241,20 @@ class _Search:
 
     @property
     def meets_goal(self) -> bool | None:
-        """Whether the residual is at or below the goal; None where none is given."""
+        """True where the residual is at or below the goal; None where none is given."""
         if self.problem.stated.goal is None or self.x is None:
             return None
         return self.problem.residual(self.x) <= self.problem.stated.goal
 
     @property
     def good_enough(self) -> bool:
-        """Whether another swarm is not worth its time; never while no solver vouches for the best."""
+        """True where another swarm is not worth its time; never while no solver vouches for the best."""
         if self.problem.stated.goal is not None:
             return self.success and self.meets_goal is True
         return self.success and (not self.trapped if self.problem.free_modes else self.objective <= _DOUBTFUL)
 
     def beats(self, other: _Search) -> bool:
-        """Whether it ended better, by constraints, then by objective; of two alike, what a solver vouches for."""
+        """True where it ended better, by constraints, then by objective; of two alike, what a solver vouches for."""
         ours, theirs = self.problem.rank_of(self.found), self.problem.rank_of(other.found)
         if self.success != other.success and ours[0] == theirs[0] and np.isclose(ours[1], theirs[1], rtol=NEGLIGIBLE):
             return self.success
@@ -324,7 +324,7 @@ class _Search:
         self.ended("swarm", result.nfev - sum(phase.evaluations for phase in self.phases))
 
     def _functions(self, objective: SwarmObjective) -> tuple[Callable[[Array], Array], Callable[[Array], Array] | None]:
-        """What gives rows their objectives, and what writes refined entries of L_H back to them; both in time."""
+        """Functions of rows for their objectives, and to write refined entries of L_H back to them; both in time."""
         session, options, refiner = self.session, self.options, self.refiner
         slow = refiner is not None and options.refine_by == "ipopt"
         repair, at_once = None, _FEW if slow else _MANY
@@ -415,7 +415,7 @@ class _Search:
 
 
 class _SwarmRecord:
-    """What is told and kept of a swarm while it runs: its best, its curve, its state."""
+    """Record of a swarm while it runs: its best, its curve, its state."""
 
     def __init__(self, search: _Search, objective: SwarmObjective, part: Part) -> None:
         self.search, self.objective, self.part = search, objective, part

@@ -18,7 +18,7 @@ WORST = 1e6  # an objective that no candidate passes that keeps the constraints
 
 
 class SwarmObjective:
-    """What a swarm minimises: (n_particles, n_variables) → (n_particles,), the problem's objective.
+    """Objective of a swarm: (n_particles, n_variables) → (n_particles,), the problem's objective.
 
     Constraints count by the feasibility rules of Deb (Comput. Methods Appl. Mech. Eng. 186 (2000) 311-338): whatever
     keeps them comes before what does not.

@@ -227,7 +227,7 @@ def placed_rows(matrix: Matrix, rows: NDArray[np.intp], size: int) -> Matrix:
     return out
 
 
-def solve(matrix: Matrix, right: Array) -> Matrix:
+def solve_positive_definite(matrix: Matrix, right: Array) -> Matrix:
     """Solution for a symmetric positive definite matrix of numbers or expressions."""
     if isinstance(matrix, np.ndarray):
         try:

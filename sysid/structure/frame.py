@@ -37,7 +37,7 @@ from sysid.structure.beam import (
     mass_patterns,
     placed_rows,
     scalar,
-    solve,
+    solve_positive_definite,
     stiffness_patterns,
     symmetric,
 )
@@ -305,8 +305,8 @@ class Frame:
         free = np.setdiff1d(np.arange(len(R)), _dofs(base))
         S_f = S[:, free]
         if condensation == "static":
-            flexibility = solve(block(stiffness, free), S_f.T)
-            K_SS = solve(symmetric(S_f @ flexibility), np.eye(len(S)))
+            flexibility = solve_positive_definite(block(stiffness, free), S_f.T)
+            K_SS = solve_positive_definite(symmetric(S_f @ flexibility), np.eye(len(S)))
             T_f = flexibility @ K_SS
         else:
             T_f, K_SS = _modal(block(mass, free), block(stiffness, free), S_f)

@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from sysid.errors import InputError, finite_array, number, refuse, whole_number
+from sysid.errors import InputError, as_float, finite_array, refuse, whole_number
 from sysid.structure.sensor import checked_sensors, sensors_from_tree, sensors_to_tree
 from sysid.structure.simulation import ModalModel, fitted_state, modal_accelerations
 from sysid.structure.thresholds import EXACT
@@ -193,7 +193,7 @@ class Structure:
 
     @property
     def at_sensors(self) -> bool:
-        """Whether the degrees of freedom are the sensors, one each and in their order."""
+        """True where the degrees of freedom are the sensors, one each and in their order."""
         return self.n == self.n_sensors and np.array_equal(self.recovery, np.eye(self.n))
 
     @property
@@ -321,7 +321,7 @@ class Structure:
     def _in_time(self, base: ArrayLike, sample_rate: float, initial: ArrayLike | None) -> tuple[Array, Array]:
         """Base acceleration and modal accelerations, (n, n_samples)."""
         motion = shaped_array("base", base, self.n_base, "n_samples")
-        rate = number("sample_rate", sample_rate)
+        rate = as_float("sample_rate", sample_rate)
         refuse(
             (motion.shape[1] < 2, f"base has {motion.shape[1]} samples; at least two are needed"),
             (rate <= 0, f"sample_rate = {rate:g} Hz; it must be positive"),

@@ -381,7 +381,7 @@ class ParticleSwarm:
         return candidate
 
     def _attractor(self) -> FloatArray:
-        """What the social term draws to: the global best (n_free,), or each particle's own mean, a row each."""
+        """Attractor of the social term: the global best (n_free,), or each particle's own mean, a row each."""
         count = self._settings.guides
         if count == 0:
             return self._pbest[self._leader]

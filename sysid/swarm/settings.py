@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from sysid.errors import InputError, number, whole_number
+from sysid.errors import InputError, as_float, whole_number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +57,7 @@ class SwarmSettings:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            number(f"SwarmSettings.{field.name}", getattr(self, field.name), "a finite number >= 0", at_least=0)
+            as_float(f"SwarmSettings.{field.name}", getattr(self, field.name), "a finite number >= 0", at_least=0)
         if self.max_velocity == 0:
             raise InputError("SwarmSettings.max_velocity is 0, so no particle could move; give a number above zero.")
         whole_number("SwarmSettings.guides", self.guides, at_least=0)

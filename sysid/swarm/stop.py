@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 
-from sysid.errors import number, whole_number
+from sysid.errors import as_float, whole_number
 
 from .particles import ParticleSwarm
 
@@ -46,13 +46,13 @@ class StopRules:
         if self.stall_iterations is not None:
             whole_number("stall_iterations", self.stall_iterations, at_least=1)
         if self.max_time is not None:
-            number("max_time", self.max_time, "zero or more seconds, or None for no limit,", at_least=0, finite=False)
+            as_float("max_time", self.max_time, "zero or more seconds, or None for no limit,", at_least=0, finite=False)
         if self.target is not None:
-            number("target", self.target, "a number that a cost can reach, or None for no target,", finite=False)
-        number("stall_tolerance", self.stall_tolerance, "a part of the cost, in [0, 1),", at_least=0, below=1)
+            as_float("target", self.target, "a number that a cost can reach, or None for no target,", finite=False)
+        as_float("stall_tolerance", self.stall_tolerance, "a part of the cost, in [0, 1),", at_least=0, below=1)
 
     def room_for(self, n_rows: int, nfev: int) -> bool:
-        """Whether `n_rows` more rows may be evaluated after `nfev`."""
+        """True where `n_rows` more rows may be evaluated after `nfev`."""
         return self.max_evaluations is None or nfev + n_rows <= self.max_evaluations
 
     def reason(self, swarm: ParticleSwarm, seconds: float) -> StopReason | None:
@@ -100,7 +100,7 @@ class StopRules:
 
 
 def stalled(history: list[float], iterations: int, tolerance: float) -> bool:
-    """Whether the best cost fell by no more than `tolerance` times itself over the last `iterations`."""
+    """True where the best cost fell by no more than `tolerance` times itself over the last `iterations`."""
     if len(history) <= iterations:
         return False
     before, now = history[-1 - iterations], history[-1]

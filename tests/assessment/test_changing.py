@@ -155,7 +155,7 @@ CHANCE = [3.0, 3.1, 2.9, 3.05, 2.95, 3.02]
 )
 def test_a_change_is_told_by_two_signs_of_three(frequencies, levels, std, explained, told):
     """Of a mode with a half-power width of 0.1 Hz, in six stretches."""
-    assert Change(5.0, 0.1, _seen(frequencies, levels, std), scaled=True).is_told(explained) is told
+    assert Change(5.0, 0.1, _seen(frequencies, levels, std), scaled=True).is_significant(explained) is told
 
 
 def test_an_order_by_level_that_time_makes_as_well_is_no_trend():

@@ -18,7 +18,7 @@ from sysid.search.strategy import Outcome
 
 
 def doubts(problem, structure, x):
-    """What speaks against a search that ended there, by the stated values and the records."""
+    """Findings against a search that ended there, by the stated values and the records."""
     end = Outcome(structure, x, "made by hand", True, "", sysid.History())
     return run(Context(problem.prepared, end), (stated_masses, missed_values, records_of_fit))
 

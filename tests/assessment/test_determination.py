@@ -199,7 +199,7 @@ class TestOtherAnswers:
 
 
 def test_entries_of_factors_are_counted_and_not_named(truth):
-    """What is known of a ratio leaves the cone to the rank; the scale of each mode is open, and M_00."""
+    """Knowledge of a ratio leaves the cone to the rank; the scale of each mode is open, and M_00."""
     ratios = Variable("z", 3, lower=0.001, upper=0.1, guess=truth.damping_ratios)
     problem = free(truth, damping=ratios, residuals=[Prior(ratios[0], 0.02, 0.001)])
     of_models = [model.values(problem.geometry, truth) for model in problem.models[:2]]
@@ -382,5 +382,5 @@ def test_an_unknown_that_moves_exact_records_by_less_than_is_left_of_them_is_har
     x[order] = 5.0 * (1 + off), 5.0
     told = determine(problem.prepared, problem.structure(x), x)
     assert [re.findall(r"(\w+) \+1 %", one.sentence) for one in cautions(told.findings)] == [["b"]] * hardly
-    assert [one.numbers["misfit"] < 1e-8 for one in cautions(told.findings)] == [True] * hardly
+    assert not any("seen" in one.numbers for one in cautions(told.findings))
     assert told.determined is not hardly

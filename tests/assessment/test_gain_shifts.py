@@ -1,4 +1,4 @@
-"""What an error of a sensor's gain makes of the masses: against fits of records that were read too large."""
+"""Shifts of the masses by an error of a sensor's gain: against fits of records that were read too large."""
 
 import dataclasses
 
@@ -51,14 +51,14 @@ def test_of_lines(spectra, models):
 
 
 def test_of_lines_whose_noise_no_weights_share(spectra):
-    """What an error makes of the fit is the weights' matter, whatever the noise is."""
+    """The shift of a fit by an error is the weights' matter, whatever the noise is."""
     times = np.random.default_rng(5).uniform(0.3, 3.0, spectra.response.shape)
     uneven = dataclasses.replace(spectra, response_std=0.01 * times)
     assert_shift(lambda sensor, error: identified(misread(uneven, sensor, error), FullMass()), 1)
 
 
 def test_of_lines_beside_a_stated_entry(spectra):
-    """What is stated is where the records alone lead, so that no second order of the adjustment counts."""
+    """The statement is where the records alone lead, so that no second order of the adjustment counts."""
     known, std = np.full((2, 3, 3), np.nan)
     known[0, 0], std[0, 0] = identified(spectra, FullMass()).structure.mass[0, 0], 0.02
     mass = FullMass(known=known, known_std=std)

@@ -1,4 +1,4 @@
-"""How far the entries of mass and stiffness may go over the modal-mass cone."""
+"""Ends of the entries of mass and stiffness over the modal-mass cone."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What the data determine: members of the modal-mass cone, and the verdict on stated models."""
+"""The modal-mass cone: its members, and the verdict on stated models."""
 
 import dataclasses
 import re

@@ -1,4 +1,4 @@
-"""What a model misses is told in units of the noise; quiet parts and lines of records bound that noise."""
+"""Misses of a model are told in units of the noise; quiet parts and lines of records bound that noise."""
 
 import dataclasses
 
@@ -11,7 +11,7 @@ from benchmarks.mistakes.changing import measured as as_test
 from benchmarks.mistakes.changing import response as answer
 from sysid.assessment.checks.changing import changing
 from sysid.assessment.checks.noise_multiples import BEYOND, misses_of, noise_at_most
-from sysid.measurement.in_time import cut_in_motion, in_time, peaks, quiet_levels
+from sysid.measurement.in_time import cut_in_motion, peaks, quiet_levels, runs_in_time
 
 
 def identified(test, **options):
@@ -70,10 +70,10 @@ def test_records_in_time_are_those_that_were_given(right):
     test = sysid.Measurement.from_time(
         [(base, response, None)], RATE, rigid_body=np.ones((2, 1)), band=(0.0, RATE), estimator="records"
     )
-    (run,) = in_time(test)
+    (run,) = runs_in_time(test)
     np.testing.assert_allclose(run.response, response - response.mean(axis=1, keepdims=True), atol=1e-10)
     assert peaks(test)[0] == pytest.approx(np.abs(run.response - run.base).max())
-    assert in_time(sysid.simulate(identified(right).structure, [1.0, 2.0, 3.0])) == []
+    assert runs_in_time(sysid.simulate(identified(right).structure, [1.0, 2.0, 3.0])) == []
 
 
 def test_quiet_parts_tell_the_noise_of_a_record_that_was_at_rest_for_a_while():
@@ -104,10 +104,10 @@ def test_levels_are_told_where_their_unit_is_known_and_runs_may_differ_in_length
     largest = peaks(as_test(*both))
     assert peaks(spectra) == pytest.approx(largest, rel=1e-12)
     given = sysid.Measurement(spectra.freq, spectra.base, spectra.response, rigid_body=spectra.rigid_body)
-    assert peaks(given) == [] and in_time(given) == []
+    assert peaks(given) == [] and runs_in_time(given) == []
     one = as_test(both[0], estimator="spectra")
     twice = sysid.Measurement(one.freq, 2 * one.base, 2 * one.response, rigid_body=one.rigid_body)
-    assert peaks(twice) == [] and in_time(twice)[0].base.shape[0] == 1
+    assert peaks(twice) == [] and runs_in_time(twice)[0].base.shape[0] == 1
 
 
 def test_plain_spectra_of_records_that_move_at_their_ends_are_told_to_be_such():

@@ -1,4 +1,4 @@
-"""What noise, dependent sensors and wrong records must not be taken for: knowledge."""
+"""Noise, dependent sensors and wrong records are not taken for knowledge."""
 
 from __future__ import annotations
 

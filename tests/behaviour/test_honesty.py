@@ -1,4 +1,4 @@
-"""What a result claims about itself where the data do not carry it: whole identifications of awkward structures."""
+"""Claims of a result about itself where the data do not carry it: whole identifications of awkward structures."""
 
 import numpy as np
 import pytest

@@ -7,7 +7,7 @@ import pytest
 import sysid
 from sysid.jobs.quantities import quantities
 from sysid.report import opening, report
-from sysid.report.noise_level import noise_level
+from sysid.report.noise_level import noise_of_test
 
 STRETCH = np.array([[1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]])
 M = np.diag([3.0, 2.0, 0.0])
@@ -70,7 +70,7 @@ def test_no_damping_ratio_is_told(result):
 @pytest.mark.parametrize("result", [LEFT_OUT["stated ratios"]], indirect=True)
 def test_the_page_says_so(result):
     """Its opening, and its table of modes; pictures take longest."""
-    page = opening.opening(result, noise_level(TEST, TRUTH)) + opening.trust(result) + report._modes(result)
+    page = opening.opening(result, noise_of_test(TEST, TRUTH)) + opening.trust(result) + report._modes(result)
     (told,) = result.of_kind("no damping ratio")
     assert told.sentence[1:] in page
     assert page.count("damping not determined") == 2

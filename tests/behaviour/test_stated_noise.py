@@ -1,4 +1,4 @@
-"""What stated noise does to a problem in expressions: against weighted least squares by SciPy and linear regression."""
+"""Stated noise in a problem in expressions: against weighted least squares by SciPy and linear regression."""
 
 import casadi as ca
 import numpy as np

@@ -94,7 +94,7 @@ def test_a_model_of_its_own_is_no_exception(seconds_of):
     "name",
     [
         "sysid.results.judgement.determine", "sysid.assessment.checks.against_records.gain_errors",
-        "sysid.results.judgement._by_noise",
+        "sysid.results.judgement._check_precision",
     ],
 )  # fmt: skip
 def test_a_judgement_that_takes_too_long_is_given_up_and_determines_nothing(random_case, monkeypatch, name):
@@ -134,7 +134,7 @@ def test_a_summary_in_a_hurry_leaves_out_what_is_not_computed_and_calls_nothing_
 def test_the_session_counts_what_is_left():
     def session(max_time, seconds):
         made = Session([], DeferredInterrupt(), max_time)
-        made.begun -= seconds
+        made.start_time -= seconds
         return made
 
     assert session(None, 99.0).left is None

@@ -1,4 +1,4 @@
-"""What the counts over the package count, on packages of a few lines that were counted by hand."""
+"""The counts over the package, on packages of a few lines that were counted by hand."""
 
 import importlib
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""How wrong changes are found in the package, and what counts as not noticed. No change is made here."""
+"""Finding of wrong changes in the package, and what counts as not noticed. No change is made here."""
 
 import importlib
 import re

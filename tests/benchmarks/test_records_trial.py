@@ -1,4 +1,4 @@
-"""What the benchmarks of records make of a result: shares of intervals, errors over the bound, verdicts, levels."""
+"""Reading of a result by the benchmarks of records: shares of intervals, errors over the bound, verdicts, levels."""
 
 import importlib
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What tests of the command line share: a folder with a problem, a run of it, and how they read what was said."""
+"""Fixtures of tests of the command line: a folder with a problem, a run of it, and how they read what was said."""
 
 import contextlib
 import io

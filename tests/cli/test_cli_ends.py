@@ -1,4 +1,4 @@
-"""How the command line ends where it does not succeed: goals missed, errors of ours, Ctrl-C, files that cannot grow."""
+"""Ends of the command line that are no success: goals missed, errors of ours, Ctrl-C, files that cannot grow."""
 
 import contextlib
 import json
@@ -212,7 +212,7 @@ def test_the_signal_before_any_candidate_writes_nothing(here, files, interruptib
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 def test_the_signal_while_python_imports_is_one_line_of_the_command_alone(here, interruptible):
-    """What is imported first after sysid itself begins sends the signal."""
+    """The first import after sysid itself begins sends the signal."""
     (here / "casadi.py").write_text("import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(60)\n")
     (here / "sysid_script").write_text("from sysid.cli.main import command\ncommand()\n")
     (here / "bin").mkdir()

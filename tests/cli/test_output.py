@@ -1,4 +1,4 @@
-"""What commands say: one JSON document with ``--json``, nothing with ``--quiet``; and what ``sysid doctor`` finds."""
+"""Output of commands: one JSON document with ``--json``, nothing with ``--quiet``; and what ``sysid doctor`` finds."""
 
 import importlib.metadata
 import json

@@ -72,26 +72,26 @@ def test_errors_are_frobenius_norms_over_the_references_in_percent():
 def test_an_undamped_reference_leaves_no_relative_error_of_damping_and_says_so(compared):
     undamped = sysid.Structure(TRUTH.mass, TRUTH.stiffness, [0.0, 0.0], n_base=1)
     np.testing.assert_allclose(errors_of(TRUTH, undamped), [0.0, 0.0, np.nan], atol=1e-9)
-    told = [table.text(replace(compared, problem=two_masses(reference=one))) for one in (undamped, TRUTH)]
-    assert ["no damping" in " ".join(words.split()) for words in told] == [True, False]
+    texts = [table.comparison_text(replace(compared, problem=two_masses(reference=one))) for one in (undamped, TRUTH)]
+    assert ["no damping" in " ".join(words.split()) for words in texts] == [True, False]
 
 
 def test_a_comparison_without_results_is_a_head_without_rows(compared):
     empty = comparison.Comparison(two_masses(), 0, None, ())
     assert table.as_csv(empty).splitlines() == table.as_csv(compared).splitlines()[:1]
-    assert table.text(empty).startswith("method ")
+    assert table.comparison_text(empty).startswith("method ")
 
 
 def test_what_is_compared_is_the_residual_where_nothing_else_is_minimised(alone):
     assert comparison.Comparison(two_masses(), 0, None, ()).quantity == "residual"
     compared = comparison.compare(two_masses(noise=0.01), max_time=5.0)
     assert compared.quantity == "objective"
-    assert " residual  " in table.text(compared)
-    assert "before, after: objective" in table.text(compared)
+    assert " residual  " in table.comparison_text(compared)
+    assert "before, after: objective" in table.comparison_text(compared)
 
 
 def test_the_table_has_a_line_a_method_and_no_errors_without_a_reference(compared):
-    head, *lines = table.text(compared).splitlines()
+    head, *lines = table.comparison_text(compared).splitlines()
     assert head.split() == ["method", "before", "after", "M,", "%", "K,", "%", "C,", "%", "evaluations", "seconds",
                             "status"]  # fmt: skip
     assert [line.split()[0] for line in lines[:3]] == ["modal", "continuation", "swarm"]
@@ -99,7 +99,7 @@ def test_the_table_has_a_line_a_method_and_no_errors_without_a_reference(compare
     assert any(f"continuation: {compared.results[1].message}" in line for line in lines)
     assert max(map(len, (head, *lines))) <= 120
     unknown = comparison.Comparison(two_masses(reference=None), 3, None, compared.results)
-    assert "%" not in table.text(unknown)
+    assert "%" not in table.comparison_text(unknown)
 
 
 def test_rows_go_to_csv_and_strict_json(compared):

@@ -11,7 +11,7 @@ from scipy.io import loadmat
 
 import sysid
 from sysid.cli.main import main
-from sysid.export.content import damping_of, rotations_of, unit, worth
+from sysid.export.content import damping_of, entry_unit, reliability, rotations_of
 from sysid.export.state_space import control_system
 from sysid.finding import Finding, Severity
 
@@ -91,8 +91,8 @@ def test_a_coordinate_that_no_sensor_records_has_no_unit(result):
     other = sysid.Structure(s.mass, s.stiffness, s.damping_ratios, n_base=2, recovery=between)
     kinds = rotations_of(replace(result, structure=other))
     assert kinds == (False, False, None, False, True)
-    assert [unit("M", kinds[0], kinds[j]) for j in range(5)] == ["kg", "kg", "", "kg", "kg m"]
-    assert unit("K", True, True) == "N m" and unit("C", True, None) == ""
+    assert [entry_unit("M", kinds[0], kinds[j]) for j in range(5)] == ["kg", "kg", "", "kg", "kg m"]
+    assert entry_unit("K", True, True) == "N m" and entry_unit("C", True, None) == ""
 
 
 NEEDS = {"m.op4": ("pyyeti", "nastran"), "system": ("control", "control")}
@@ -132,7 +132,7 @@ def test_what_speaks_against_an_answer_and_what_is_open_stand_under_their_own_wo
     text = sysid.export(doubted, tmp_path / f"m.{ending}").read_text(encoding="utf-8")
     assert text.count(f"against: {CHANGING}") == 1 and f"open: {CHANGING}" not in text
     assert text.count(f"open: {OPEN}") == 1
-    judged = worth(doubted)
+    judged = reliability(doubted)
     assert f"judgement: {judged}; " in re.sub(r"[\s$]+", " ", text) and "DOUBTFUL" in judged
     assert "interrupted" in judged and judged.endswith("see 'against' and 'open'")
 

@@ -1,4 +1,4 @@
-"""What other programs read of exported files, and how they answer to a moving base."""
+"""Reading of exported files by other programs, and how they answer to a moving base."""
 
 from dataclasses import replace
 

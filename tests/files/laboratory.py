@@ -1,4 +1,4 @@
-"""What tests of files share: responses of a chain of three masses on its base, and sets of universal files."""
+"""Data that tests of files share: responses of a chain of three masses on its base, and sets of universal files."""
 
 import numpy as np
 import pytest

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sysid
-from sysid.files.tree import check, from_bytes, is_tree, to_bytes
+from sysid.files.tree import check_tree, from_bytes, is_tree, to_bytes
 
 TREE = {
     "flag": True,
@@ -96,7 +96,7 @@ def test_each_missing_or_added_byte_counts(change):
 @pytest.mark.parametrize("name", ["", ".", "a/b", "[]", 3, "a\0b"])
 def test_what_is_no_name_is_refused(name):
     with pytest.raises(sysid.InputError, match="/branch: .* is no name"):
-        check({"branch": {name: 1}})
+        check_tree({"branch": {name: 1}})
 
 
 @pytest.mark.parametrize(
@@ -109,4 +109,4 @@ def test_what_cannot_be_stored_is_refused_where_it_stands(value):
 
 def test_a_number_of_more_than_64_bits_is_refused():
     with pytest.raises(sysid.InputError, match="/n: .* more than 64 bits"):
-        check({"n": 2**63})
+        check_tree({"n": 2**63})

@@ -8,7 +8,7 @@ from scipy.optimize import approx_fprime
 
 import sysid
 from benchmarks.records.simulated import four_storeys
-from sysid.modal_analysis.record_colour import KNOTS, designs, pieces
+from sysid.modal_analysis.record_colour import KNOTS, designs, segments
 from sysid.modal_analysis.record_noise import ErrorSpectra, _likelihood
 
 SETTING = four_storeys()
@@ -24,7 +24,7 @@ def coloured(record: np.ndarray, rng: np.random.Generator, level: np.ndarray) ->
 def test_pieces_hold_all_lines_in_order() -> None:
     for count in (3, 9, 40, 2000):
         w = np.linspace(1.0, 90.0, count)
-        cut = pieces(w)
+        cut = segments(w)
         assert np.array_equal(np.concatenate([w[one] for one in cut]), w)
         assert count < 8 or min(w[one].size for one in cut) >= 4
 

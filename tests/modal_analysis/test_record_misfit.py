@@ -12,7 +12,7 @@ import sysid
 from sysid.modal_analysis.fit import estimate
 from sysid.modal_analysis.record_fit import RecordFit, record_modes, refitted
 from sysid.modal_analysis.record_more import with_further_modes
-from sysid.modal_analysis.record_spread import blocks_of, scatter_over_blocks
+from sysid.modal_analysis.record_spread import line_blocks, scatter_over_blocks
 from sysid.modal_analysis.record_spurious import without_spurious_modes
 from sysid.structure.structure import Array
 
@@ -107,7 +107,7 @@ def test_stated_deviations_are_those_of_refits_without_a_block() -> None:
     variances, plain = [], []
     for shift in (0.0, 0.25, 0.5, 0.75):
         left, wide = [], []
-        for block in blocks_of(fit.model.runs[0], fit, shift):
+        for block in line_blocks(fit.model.runs[0], fit, shift):
             part = replace(fit, test=fit.test.at(np.delete(np.arange(fit.test.freq.size), block)))
             part = replace(refitted(part, fit.parameters), levels=fit.levels)
             left.append(np.log(np.concatenate([part.parameters.modes.omega, part.parameters.modes.ratios])))

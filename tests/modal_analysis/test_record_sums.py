@@ -4,7 +4,7 @@ import pytest
 import sysid
 from sysid.modal_analysis.record_fit import on_all_lines, record_modes, refitted
 from sysid.modal_analysis.record_model import Chunk, RecordModel
-from sysid.modal_analysis.record_poles import few_lines
+from sysid.modal_analysis.record_poles import decimated_lines
 
 RATE, SAMPLES = 40.0, 400
 
@@ -73,7 +73,7 @@ def test_a_fit_that_begins_with_some_lines_ends_as_that_of_all():
     response, force = structure.simulate(base, 60.0), structure.simulate_force(base, 60.0)
     noisy = [record + 0.01 * np.std(record) * rng.standard_normal(record.shape) for record in (base, response, force)]
     test = sysid.Measurement.from_time([tuple(noisy)], 60.0, rigid_body=np.ones((2, 1)), band=(3.0, 14.0))
-    lines = few_lines(test)
+    lines = decimated_lines(test)
     assert np.count_nonzero(lines) < test.freq.size / 2
     poles = 2 * np.pi * structure.natural_frequencies, np.array([0.01, 0.02])
     rough = record_modes(test.at(lines), *poles)

@@ -1,4 +1,4 @@
-"""What a fit of whole records leaves is told where it is more than noise, by channel, band and factor."""
+"""Residuals of whole records are told where they are more than noise, by channel, band and factor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is taken off whole records that a known structure predicts: traces of detrending, and motion at the ends."""
+"""Transients that a known structure predicts of whole records: traces of detrending, and motion at the ends."""
 
 from __future__ import annotations
 

@@ -196,7 +196,7 @@ def broadband(truth, freq, runs, noise, rng):
 
 
 def left_by(records, omega, ratios, velocity):
-    """What least squares leave of all channels on these poles."""
+    """Residual of least squares on these poles, of all channels."""
     X = records.functions(omega, ratios, velocity=velocity)
     return records.data - X @ np.linalg.lstsq(X, records.data, rcond=None)[0]
 

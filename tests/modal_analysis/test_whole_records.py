@@ -9,7 +9,7 @@ import pytest
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit import whole_fit
 from sysid.modal_analysis.record_gains import gain_errors_of
-from sysid.modal_analysis.record_poles import few_lines
+from sysid.modal_analysis.record_poles import decimated_lines
 from sysid.structure.structure import Structure
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -63,7 +63,7 @@ def test_a_weak_mode_that_only_all_lines_of_a_long_record_show_is_found(records)
     rng = np.random.default_rng(2)
     noisy, _ = setting.with_noise(setting.run(rng).records(), rng)
     test = trial.measurement([noisy], setting, force=True)
-    assert whole_fit(test.at(few_lines(test))).parameters.modes.omega.size == 2
+    assert whole_fit(test.at(decimated_lines(test))).parameters.modes.omega.size == 2
     _assert_the_modes(whole_fit(test), structure)
 
 

@@ -1,4 +1,4 @@
-"""What models see of a test: which base direction a sensor follows, and totals of the mass along each direction."""
+"""Geometry of a test: which base direction a sensor follows, and totals of the mass along each direction."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What is known of a full mass in part: entries, and the whole rigid-body mass."""
+"""A full mass that is known in part: entries, and the whole rigid-body mass."""
 
 from __future__ import annotations
 

@@ -411,7 +411,7 @@ class TestWrittenMass:
 
 
 class TestStated:
-    """What each model says of its matrix, by hand."""
+    """Statement of each model about its matrix, by hand."""
 
     @staticmethod
     def same(stated, *, free, entries=None, totals=None, kind=None, sentence=""):

@@ -7,7 +7,7 @@ import pytest
 
 import sysid
 from sysid import catalogue
-from sysid.files.tree import check, from_bytes, to_bytes
+from sysid.files.tree import check_tree, from_bytes, to_bytes
 from sysid.models.registry import model_from_tree, model_to_tree
 from sysid.problem import stored
 from sysid.results.identification import Recipe
@@ -64,7 +64,7 @@ def tanks(tmp_path, monkeypatch):
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: type(model).__name__)
 def test_models_of_the_package_come_back_field_by_field(model):
     tree = model_to_tree(model)
-    check(tree)
+    check_tree(tree)
     assert tree["kind"] == type(model).__name__
     back = model_from_tree(tree)
     assert type(back) is type(model)
@@ -192,4 +192,4 @@ def test_what_could_not_be_found_again_is_refused():
 def test_a_tree_of_the_users_own_that_holds_something_else_is_refused_early(tanks, monkeypatch):
     monkeypatch.setattr(tanks.Tank.Half, "to_tree", lambda self: {"when": object()})
     with pytest.raises(sysid.InputError, match="/mass/fields/when: a object cannot be stored"):
-        check(stored.to_tree({"mass": tanks.Tank.Half([]), "stiffness": np.eye(1), "damping": np.eye(1)}))
+        check_tree(stored.to_tree({"mass": tanks.Tank.Half([]), "stiffness": np.eye(1), "damping": np.eye(1)}))

@@ -225,7 +225,7 @@ class TestChain:
 
 
 class TestStated:
-    """What each model says of its matrix, by hand."""
+    """Statement of each model about its matrix, by hand."""
 
     def test_spectral(self, geometry_of):
         stated = SpectralStiffness([1.0, 2.0, 2.0]).stated(geometry_of(np.ones((3, 1))))

@@ -19,7 +19,7 @@ def matrices(count):
 
 
 def parts(M, K):
-    """What the expressions give of them: H, [L^-1, L^-1 B], the rigid-body mass, L^-1 M_S0 and M_00."""
+    """Values of the expressions: H, [L^-1, L^-1 B], the rigid-body mass, L^-1 M_S0 and M_00."""
     L = np.linalg.cholesky(M[:, :N, :N])
     inverse = np.linalg.inv(L)
     rigid = np.vstack([G, np.eye(D)])

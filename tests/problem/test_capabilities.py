@@ -1,4 +1,4 @@
-"""What a formulation says of itself: free modes, refinement, what stands apart, and which unknowns enter what."""
+"""Properties of a formulation: free modes, refinement, what stands apart, and which unknowns enter what."""
 
 import casadi as ca
 import numpy as np

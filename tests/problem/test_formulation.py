@@ -1,4 +1,4 @@
-"""What each form of the matrices gives, and what a problem makes of constraints, healing, and fixed variables."""
+"""Results of each form of the matrices, and of constraints, healing, and fixed variables in a problem."""
 
 import casadi as ca
 import numpy as np

@@ -1,4 +1,4 @@
-"""What CasADi's expressions cannot do, and what a problem cannot take, is told with the line and what to write."""
+"""Limits of CasADi's expressions, and of a problem, are told with the line and what to write."""
 
 import linecache
 import re

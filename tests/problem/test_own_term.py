@@ -35,7 +35,7 @@ class NaturalFrequencies:
         return ()
 
     def term(self, name, build):
-        return _FrequencyTerm(name, self, build.own(), build.noise())
+        return _FrequencyTerm(name, self, build.problem_matrices(), build.noise())
 
     def to_tree(self):
         return {"modes": np.array(self.modes), "values": self.values, "std": self.std}

@@ -1,4 +1,4 @@
-"""What is known to some accuracy counts as one more measurement, and is told where the fit is far from it."""
+"""Values known to some accuracy count as one more measurement, and are told where the fit is far from them."""
 
 import re
 

@@ -24,7 +24,7 @@ def particles(rng, problem, count):
 
 
 def sampled(problem, rows):
-    """What the swarm's coordinates stand for, (count, n_variables)."""
+    """Unknowns for the swarm's coordinates, (count, n_variables)."""
     s = ca.MX.sym("s", problem.n_variables)
     function = ca.Function("sampling", [s], [problem.formulation.from_sampling(s)])
     return np.array([np.asarray(function(row)).ravel() for row in rows])

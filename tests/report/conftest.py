@@ -1,4 +1,4 @@
-"""What tests of the report share: two results and a page."""
+"""Fixtures of tests of the report: two results and a page."""
 
 import dataclasses
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 import sysid
-from sysid.report.noise_level import noise_level, share_of_noise
+from sysid.report.noise_level import noise_of_test, share_of_noise
 
 FREQ = np.linspace(1.0, 40.0, 2000)
 
@@ -24,7 +24,7 @@ def test_it_is_the_noise_where_a_model_misses_some_lines_only(random_structure):
     test = recorded(truth, rng, 0.03)
     bent = np.where(FREQ < 15.0, 1.3, 1.0) * test.response  # what no model explains
     for records in (test, dataclasses.replace(test, response=bent)):
-        level = noise_level(records, truth)
+        level = noise_of_test(records, truth)
         assert level.at_most and level.force is None and level.response.shape == (1, 3, 1)
         np.testing.assert_allclose(level.response, 0.03, rtol=0.15)
 
@@ -32,10 +32,10 @@ def test_it_is_the_noise_where_a_model_misses_some_lines_only(random_structure):
 def test_levels_that_are_stated_are_taken_and_transmissibilities_have_no_bound(random_structure):
     truth = random_structure(np.random.default_rng(2), 3, 2)
     stated = sysid.simulate(truth, FREQ, noise=0.01, force=True, rng=1)
-    level = noise_level(stated, truth)
+    level = noise_of_test(stated, truth)
     assert not level.at_most and level.response is stated.response_std and level.force is stated.force_std
     without = dataclasses.replace(stated, response_std=None, force_std=None)
-    assert noise_level(without, truth)[:2] == (None, None)
+    assert noise_of_test(without, truth)[:2] == (None, None)
 
 
 def test_its_share_is_measured_as_the_residual():

@@ -17,7 +17,7 @@ from sysid.finding import Finding, Severity
 from sysid.report import opening, report
 from sysid.report.html import aligned
 from sysid.report.matrices import CHOSEN, ONE_OF_MANY
-from sysid.report.noise_level import noise_level
+from sysid.report.noise_level import noise_of_test
 from sysid.results.summary import residual_in_words
 
 FREQ = np.linspace(1.0, 40.0, 30)
@@ -113,7 +113,7 @@ def test_what_is_open_and_what_speaks_against_the_answer_stand_apart(complete):
 
 
 def test_a_model_that_does_not_fit_opens_with_why_and_without_intervals(complete):
-    level = noise_level(complete.fitted.records, complete.structure)
+    level = noise_of_test(complete.fitted.records, complete.structure)
     reasons = ("are they in Hz?", "it softens", "its gains")
     failed = complete.with_findings(Finding("residual", Severity.CONTRADICTS, one) for one in reasons)
     right, wrong = (opening.opening(it, level) for it in (complete, failed))

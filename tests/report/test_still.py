@@ -36,7 +36,7 @@ def curves(drawing, kind):
 
 
 def scales(drawing):
-    """What turns pixels to frequencies, and upwards to magnitudes, by the ticks that stand beside the axes."""
+    """Factors from pixels to frequencies, and upwards to magnitudes, by the ticks that stand beside the axes."""
     below = re.findall(rf'<text x="({NUMBER})" y="268">({NUMBER})</text>', drawing)
     beside = re.findall(rf'<text x="43" y="({NUMBER})">({NUMBER})</text>', drawing)
     first = next((k for k, (_, value) in enumerate(beside) if value == "-180"), len(beside))

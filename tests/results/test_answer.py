@@ -29,7 +29,7 @@ def measured(added=0.0, noise=0.01, **options):
 
 
 def ended_at(problem, **values):
-    """What `identify` gives where a search ends at these values of the unknowns."""
+    """Result of `identify` where a search ends at these values of the unknowns."""
     x = np.concatenate([np.ravel(values[v.name]) for v in problem.variables])
     return stood_for(problem, problem.structure(x), x)
 

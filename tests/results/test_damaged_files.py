@@ -59,7 +59,7 @@ def test_each_of_300_damaged_files_is_refused(sound, kind, tmp_path, monkeypatch
 
 
 def test_a_file_without_its_head_is_no_old_one(sound, tmp_path):
-    """What HDF5 finds behind the head is not read without the SHA-256 of it."""
+    """Data that HDF5 finds behind the head are not read without the SHA-256 of it."""
     path = tmp_path / "headless.h5"
     for image in (sound.read_bytes()[512:], bytes(512) + sound.read_bytes()[512:]):
         path.write_bytes(image)

@@ -1,4 +1,4 @@
-"""What is said of where a search ended: whether noise leaves matrices known, and what rests on a bound."""
+"""Judgement of where a search ended: whether noise leaves matrices known, and what rests on a bound."""
 
 from dataclasses import replace
 

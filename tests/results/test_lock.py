@@ -32,7 +32,7 @@ with lock.alone(Path(sys.argv[1]), "the folder", "wait"):
 
 
 def without_locks(file):
-    """What a file system says that has none."""
+    """Error of a file system that has no locks."""
     raise OSError(errno.ENOSYS, "no locks")
 
 
@@ -119,7 +119,7 @@ def test_it_ends_with_its_process(place, kind):
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="the system tells no process's begin")
 def test_a_named_owner_is_known_by_host_number_and_begin(place, monkeypatch, record, stale):
     monkeypatch.setattr(lock, "_lock", without_locks)
-    host, pid, begun = lock._own_record().split()
+    host, pid, begun = lock._process_record().split()
     place.parent.mkdir(parents=True)
     named = place.with_name(f"{FILE_NAME}.owner")
     named.write_text(record.format(host=host, pid=pid, begun=begun))

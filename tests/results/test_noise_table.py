@@ -55,7 +55,7 @@ def test_shares_are_those_at_the_lines_and_runs_that_differ_are_told():
     half = lambda x: signal.sosfilt(signal.butter(8, [1.0, rate / 4], "bandpass", fs=rate, output="sos"), x)  # noqa: E731
     noise = np.std([half(level * rng.standard_normal(n)) for level in levels])
     assert sensor.percent == pytest.approx(100 * noise / np.std([half(run[1][0]) for run in runs]), rel=0.05)
-    assert sensor.told == "0.01 to 0.03" and base.told == "0.02"
+    assert sensor.level_in_words == "0.01 to 0.03" and base.level_in_words == "0.02"
 
 
 def test_summary_figures_and_report_tell_it(answer, no_pictures):

@@ -45,7 +45,7 @@ def rigid_masses(it):
 
 
 def ranges(it):
-    """How far the diagonal entries may go, in the summary, as multiples: least and most of M_SS and of K_SS."""
+    """Ranges of the diagonal entries in the summary, as multiples: least and most of M_SS and of K_SS."""
     told = " ".join(it.summary().split()).partition("diagonal entries")[2]
     return {matrix: (least, most) for least, most, matrix in re.findall(r"(\S+) to (\S+) .*?(M_SS|K_SS)", told)}
 

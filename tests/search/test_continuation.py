@@ -215,7 +215,7 @@ def test_distances_are_of_the_size_of_an_unknown_or_of_its_range():
 
 
 def test_starts_left_out_for_want_of_time_are_told(monkeypatch):
-    """Whether another structure explains the data is a part of the verdict."""
+    """The verdict needs to know whether another structure explains the data."""
     monkeypatch.setattr("sysid.search.session.Session.time_for_more", False)
     _, _, K, C = springs_and_dampers()
     problem = sysid.Problem(measured(noise=0.01), mass=np.diag(MASS), stiffness=K, damping=C)

@@ -256,7 +256,7 @@ def at_start(z, expression):
 
 
 class TestStarts:
-    """What a fit in modal coordinates begins with."""
+    """Starts of a fit in modal coordinates."""
 
     def test_frequencies_start_where_they_are_unless_that_is_outside_their_window(self, random_case):
         """Of five per cent about those that were given, on the side that they are on."""

@@ -202,7 +202,7 @@ def test_a_callback_can_stop_it():
 
 
 def within(result, truth, by):
-    """Whether mass, stiffness and damping are those of the truth, relative to the largest entry of each."""
+    """True where mass, stiffness and damping are those of the truth, relative to the largest entry of each."""
     for name in ("mass", "stiffness", "damping"):
         true, found = getattr(truth, name), getattr(result.structure, name)
         np.testing.assert_allclose(found, true, atol=by * np.abs(true).max(), err_msg=name)

@@ -111,7 +111,7 @@ def test_noise_makes_no_mass_negative(random_structure):
 
 
 def known_pieces(truth):
-    """What the functions read of a modal model: P, participations, G and the directions."""
+    """Arguments of the functions of a modal model: P, participations, G and the directions."""
     return np.linalg.inv(truth.mode_shapes), truth.participation, truth.rigid_body
 
 

@@ -34,7 +34,7 @@ def solved(monkeypatch):
 
 @pytest.fixture
 def swarms(monkeypatch):
-    """What each swarm was asked with, and what it ended at."""
+    """Settings of each swarm, and what it ended at."""
     from sysid.search import swarm
 
     ran, minimize = [], swarm.minimize_swarm

@@ -37,7 +37,7 @@ def test_a_search_with_the_defaults_has_five_particles_an_unknown_and_up_to_150_
 
 @pytest.fixture
 def swarms(monkeypatch):
-    """What each swarm of the strategy is asked with; its local phase returns its start, and calls that solved."""
+    """Settings of each swarm of the strategy; its local phase returns its start, and calls that solved."""
     from sysid.search import swarm
 
     asked, minimize = [], swarm.minimize_swarm

@@ -1,4 +1,4 @@
-"""What the swarm refuses, and the sentence it says."""
+"""Refusals of the swarm, and the sentences it says."""
 
 import numpy as np
 import pytest

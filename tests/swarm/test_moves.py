@@ -134,7 +134,7 @@ def test_sixty_iterations_are_those_of_a_transcription_with_the_same_random_stre
 
 
 class Move(NamedTuple):
-    """What stood before a move, and what is after it."""
+    """State before a move, and after it."""
 
     positions: np.ndarray
     best: np.ndarray

@@ -64,7 +64,7 @@ def _of_records(formulation: Formulation, modal: ModalEstimate, structure: Struc
 
 
 def _at_rest(modal: ModalEstimate) -> Iterator[Finding]:
-    """Whether runs of whole records are at rest at both ends where it is stated."""
+    """Runs of whole records are not at rest at both ends, where it is stated."""
     runs = modal.records.n_runs
     for run in modal.in_motion:
         yield Finding(
@@ -78,7 +78,7 @@ def _at_rest(modal: ModalEstimate) -> Iterator[Finding]:
 def _misfit(
     formulation: Formulation, test: Measurement, structure: Structure, records: Records, free: ResidueFit
 ) -> Iterator[Finding]:
-    """Whether the structure leaves clearly more of the accelerations than free residues, at its poles or the data's."""
+    """The structure leaves clearly more of the accelerations than free residues, at its poles or the data's."""
     mass = formulation.mass
     stated = "the written model" if mass.entries is None else "the stated mass model"
     model = "the structure" if mass.free else stated
@@ -108,7 +108,7 @@ def _misfit(
 
 
 def _rigid(modal: ModalEstimate, records: Records, free: ResidueFit) -> Iterator[Finding]:
-    """Whether sensors move in a constant proportion to the base beside their modes: then rigid_body is wrong."""
+    """Sensors move in a constant proportion to the base beside their modes: then rigid_body is wrong."""
     test = modal.records
     if modal.has_modes:  # beside the noise of the base, which biases what follows
         moved, chi2 = modal.gain.rigid.copy(), modal.gain.rigid_chi2
@@ -149,7 +149,7 @@ def _along_the_base(test: Measurement, records: Records, free: ResidueFit) -> tu
 
 
 def _damping(records: Records, poles: tuple[Array, Array], free: ResidueFit) -> Iterator[Finding]:
-    """Whether residues in quadrature, which normal modes have not, stand out: on the basis {g, i w g}."""
+    """Residues in quadrature, which normal modes have not, stand out: on the basis {g, i w g}."""
     if records.data.shape[0] <= 4 * poles[0].size * records.n_base:
         return
     both = records.fit(*poles, velocity=True)
@@ -170,7 +170,7 @@ def _twins(modal: ModalEstimate, structure: Structure) -> Iterator[Finding]:
     """Sensors whose motions differ by no more than noise does, line by line."""
     test = modal.records
     lines, names = np.concatenate(test.own_lines), test.sensor_names
-    moves, noise = columns(test.relative)[:, lines], _own_noise(modal)
+    moves, noise = columns(test.relative)[:, lines], _noise_variance(modal)
     left = moves - columns(test.predict(structure))[:, lines]
     gram = (moves @ moves.conj().T).real
     size, most = np.diag(gram), beyond_chance(2 * moves.shape[1], CANDIDATES) / (2 * moves.shape[1])
@@ -192,7 +192,7 @@ def _twins(modal: ModalEstimate, structure: Structure) -> Iterator[Finding]:
             )  # fmt: skip
 
 
-def _own_noise(modal: ModalEstimate) -> Array | None:
+def _noise_variance(modal: ModalEstimate) -> Array | None:
     """Variance of the sensors' own noise, (n_sensors, runs * n_freq); None where it is neither stated nor found.
 
     Of whole records without the base's noise, which sensors in one motion share.

@@ -78,7 +78,7 @@ def on_bounds(problem: Prepared, structure: Structure, x: Array | None) -> list[
     at = _ratios_alone(formulation, structure) if x is None else x
     unknowns = formulation.unknowns
     relative = np.repeat([v.relative for v in unknowns], [v.size for v in unknowns])
-    largest = [np.full(v.size, np.abs(own).max()) for v, own in zip(unknowns, split(unknowns, at), strict=True)]
+    largest = [np.full(v.size, np.abs(values).max()) for v, values in zip(unknowns, split(unknowns, at), strict=True)]
     sides = sides_of(
         formulation.lower, formulation.upper, at / np.where(relative, np.concatenate(largest), 1.0), relative
     )
@@ -146,8 +146,8 @@ def on_a_bound(context: Context) -> Iterator[Finding]:
         return
     found = on_bounds(context.problem.screened, context.outcome.structure, context.outcome.x)
     if found:
-        told = f"on a bound, beyond which the truth may lie: {bounds_in_words(found)}"
-        yield Finding("on a bound", Severity.NOTE, told, numbers={"unknowns": float(len(found))})
+        sentence = f"on a bound, beyond which the truth may lie: {bounds_in_words(found)}"
+        yield Finding("on a bound", Severity.NOTE, sentence, numbers={"unknowns": float(len(found))})
 
 
 def _pressure_of(context: Context) -> tuple[list[OnBound], Pressure]:
@@ -168,7 +168,7 @@ def _pressing(found: Sequence[OnBound], press: Pressure) -> Finding:
 
 
 class Pressure(NamedTuple):
-    """What is gained, to first order, if unknowns on bounds may pass them.
+    """The gain, to first order, if unknowns on bounds may pass them.
 
     ``share`` is that of the squared misfit; ``significant`` that noise does not gain as much by chance.
     """
@@ -178,17 +178,17 @@ class Pressure(NamedTuple):
 
     @property
     def explains(self) -> bool:
-        """Whether the bounds are a cause of the misfit."""
+        """True where the bounds are a cause of the misfit."""
         return self.significant and self.share >= _SHARE
 
 
 def bounds_explain(problem: Prepared, structure: Structure, x: Array | None) -> bool:
-    """Whether bounds on which unknowns end are a cause of the misfit."""
+    """True where bounds on which unknowns end are a cause of the misfit."""
     return pressure(problem, structure, x, on_bounds(problem, structure, x)).explains
 
 
 def pressure(problem: Prepared, structure: Structure, x: Array | None, found: Sequence[OnBound]) -> Pressure:
-    """How much of the misfit unknowns on bounds would take away.
+    """The part of the misfit that unknowns on bounds would take away.
 
     The squared misfit less that of the linear least squares about x: with all unknowns free, over those with the ones
     on bounds held. Where modes are free the misfit of free residues, at the structure's poles over those at the data's.
@@ -228,7 +228,7 @@ def _of_poles(problem: Prepared, structure: Structure, count: int) -> Pressure:
     if not problem.geometry.pole_ratios.size:
         return Pressure(0.0, significant=False)
     records, poles = Records(problem.measurement), problem.geometry.poles
-    own, exact = records.fit(*distinct_poles(structure)), EXACT**2 * records.size
-    gained = own.squared_error - poles.residual**2 * records.size
-    least = max(records.noise(own.left, own.residues.size) * beyond_chance(count, CANDIDATES), exact)
-    return Pressure(gained / max(own.squared_error, exact), significant=bool(gained > least))
+    fit, exact = records.fit(*distinct_poles(structure)), EXACT**2 * records.size
+    gained = fit.squared_error - poles.residual**2 * records.size
+    least = max(records.noise(fit.left, fit.residues.size) * beyond_chance(count, CANDIDATES), exact)
+    return Pressure(gained / max(fit.squared_error, exact), significant=bool(gained > least))

@@ -24,7 +24,7 @@ from sysid.structure.thresholds import COVERAGE, FALSE_ALARM, most_deviations
 
 _MOVED = 0.1  # half-power widths, by which the frequency of a mode changes at least
 _EXPLAINED = 0.7  # of the squares that constant poles leave: poles that change leave no more
-_SHOWN = 0.03  # of the largest level of a mode, at which it shows
+_LEAST_LEVEL = 0.03  # of the largest level of a mode, at which it shows
 _OF_RUNS = 0.15  # of the variance of frequencies, that is left within runs where runs differ
 _CLOSE = 0.06  # of their frequency, within which modes ..
 _ONE_SHAPE = 0.9  # .. of one shape (modal assurance criterion) may be one that changes
@@ -58,11 +58,11 @@ class Change:
     def __init__(self, mode: float, width: float, seen: list[Seen], scaled: bool) -> None:
         self.mode, self.width, self.scaled = mode, width, scaled
         largest = max((one.level for one in seen), default=0.0)
-        self.seen = [one for one in seen if one.level > _SHOWN * largest]
+        self.seen = [one for one in seen if one.level > _LEAST_LEVEL * largest]
         self.frequency = np.array([one.frequency for one in self.seen])
 
-    def is_told(self, explained: bool) -> bool:
-        """Whether it changes by a part of the width, with two signs of three.
+    def is_significant(self, explained: bool) -> bool:
+        """True where it changes by a part of the width, with two signs of three.
 
         Two stretches differ beyond what noise makes of them; the order by level is no chance; poles that change have
         `explained` the records, which they do little where the level changes within stretches.
@@ -94,12 +94,12 @@ class Change:
         return float(found.statistic) if found.pvalue < chance and abs(found.statistic) > in_time else 0.0
 
     def in_words(self) -> tuple[str, str]:
-        """How the frequency changes, and what to do."""
+        """The way in which the frequency changes, and what to do."""
         records = list(dict.fromkeys(one.record for one in self.seen))
-        own = {record: [one for one in self.seen if one.record == record] for record in records}
-        within = np.mean([np.var([one.frequency for one in part]) for part in own.values()])
+        by_record = {record: [one for one in self.seen if one.record == record] for record in records}
+        within = np.mean([np.var([one.frequency for one in part]) for part in by_record.values()])
         if len(records) > 1 and within < _OF_RUNS * np.var(self.frequency):
-            return self._by_record(own)
+            return self._by_record(by_record)
         if self.trend != 0.0:
             return self._by_level()
         low, high = self.seen[int(np.argmin(self.frequency))], self.seen[int(np.argmax(self.frequency))]
@@ -110,10 +110,10 @@ class Change:
             "fit a part in which it is",
         )
 
-    def _by_record(self, own: dict[str, list[Seen]]) -> tuple[str, str]:
-        means = {r: np.mean([(one.frequency, one.level) for one in part], axis=0) for r, part in own.items()}
-        told = ", ".join(f"{f:.4g} Hz in {record} at {self._motion(level)}" for record, (f, level) in means.items())
-        return f"differs from record to record ({told})", "fit them one by one, and find what changed between them"
+    def _by_record(self, of_records: dict[str, list[Seen]]) -> tuple[str, str]:
+        means = {r: np.mean([(one.frequency, one.level) for one in part], axis=0) for r, part in of_records.items()}
+        words = ", ".join(f"{f:.4g} Hz in {record} at {self._motion(level)}" for record, (f, level) in means.items())
+        return f"differs from record to record ({words})", "fit them one by one, and find what changed between them"
 
     def _by_level(self) -> tuple[str, str]:
         first, *_, last = sorted(self.seen, key=lambda one: one.level)
@@ -185,21 +185,21 @@ def changes(problem: Prepared) -> list[Change]:
     if every is None:
         return []
     modes, apart = every.joined(_CLOSE * every.omega), every.joined(2 * every.ratios * every.omega)
-    made = [stretches_of(test, modes.omega, modes.ratios) for _, test in tests]
+    stretches = [stretches_of(test, modes.omega, modes.ratios) for _, test in tests]
     # Modes of one shape that are close may be two, with constant poles that explain the records.
-    held = made
+    held = stretches
     if modes.omega.size < apart.omega.size:
         held = [stretches_of(test, apart.omega, apart.ratios) for _, test in tests]
     constant = sum(one.left_by_all**2 for part in held for one in part)
-    changing = sum(min(one.left, one.left_by_all) ** 2 for part in made for one in part)
+    changing = sum(min(one.left, one.left_by_all) ** 2 for part in stretches for one in part)
     if 0 < constant < changing:
         return []
     found = []
     for k, (f, ratio) in enumerate(zip(modes.omega / (2 * np.pi), modes.ratios, strict=True)):
         width = 2 * ratio * f
-        seen = [one for part, named in zip(made, tests, strict=True) for one in _seen(part, k, width, *named)]
+        seen = [one for part, named in zip(stretches, tests, strict=True) for one in _seen(part, k, width, *named)]
         change = Change(f, width, seen, scaled)
-        if change.is_told(changing < _EXPLAINED * constant):
+        if change.is_significant(changing < _EXPLAINED * constant):
             found.append(change)
     return found
 
@@ -247,11 +247,11 @@ def _modes(modal: ModalEstimate) -> ObservedPoles | None:
 
 def _seen(stretches: list[Stretch], k: int, width: float, number: int, test: Measurement) -> list[Seen]:
     """A mode in the stretches of a test in which it is known; test 0 is the one that was fitted."""
-    made = []
+    seen = []
     for one in stretches:
         run = f"run {one.run + 1}" if test.n_runs > 1 else "the record"
         record = run if number == 0 else f"{run} of unfitted test {number}"
         if one.std[k] < width and one.left <= one.left_by_all:
             part = f"{one.start:.3g} to {one.end:.3g} s"
-            made.append(Seen(record, part, float(one.frequency[k]), float(one.std[k]), float(one.level[k])))
-    return made
+            seen.append(Seen(record, part, float(one.frequency[k]), float(one.std[k]), float(one.level[k])))
+    return seen

@@ -1,4 +1,4 @@
-"""What checks look at: a problem, its modes, and where a search ended."""
+"""Context of checks: a problem, its modes, and where a search ended."""
 
 from __future__ import annotations
 
@@ -31,24 +31,24 @@ class Ended(Protocol):
 
     @property
     def message(self) -> str:
-        """What the solver says."""
+        """The solver's message."""
 
     @property
     def stopped(self) -> BaseException | None:
-        """What ended it early."""
+        """The exception that ended it early."""
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What the search met."""
+        """The findings of the search."""
 
     @property
     def history(self) -> Any:
-        """What ran."""
+        """The phases that ran."""
 
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """What checks look at, and what those before have found.
+    """A problem with its outcome, and the findings of the checks that ran before.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class Context:
 
     @property
     def modal(self) -> ModalEstimate:
-        """What the problem's own records tell of the modes."""
+        """The modal estimate of the problem's own records."""
         return self.problem.modal[0]
 
     @property
@@ -80,7 +80,7 @@ class Context:
 
     @property
     def is_judged(self) -> bool:
-        """Whether a search ended by itself; what was stopped on its way has misfits of another kind."""
+        """True where a search ended by itself; what was stopped on its way has misfits of another kind."""
         end = self.outcome
         if end is None or end.stopped is not None:
             return False
@@ -93,7 +93,7 @@ class Context:
 
     @property
     def is_explained(self) -> bool:
-        """Whether there is nothing more to be told: no fit to judge, bounds that keep it, or a mistake that was named.
+        """True where nothing more is to be told: no fit to judge, bounds that keep it, or a mistake that was named.
 
         Beside that mistake averages over segments are looked at all the same, for their leakage.
         """
@@ -102,7 +102,7 @@ class Context:
         return bool(self.named) and not self.problem.screened.measurement.averaged
 
     def has(self, *kinds: str) -> bool:
-        """Whether a check before has found one of these."""
+        """True where a check before has found one of these."""
         return any(one.kind in kinds for one in self.found)
 
     @cached_property
@@ -115,7 +115,7 @@ class Context:
 
     @cached_property
     def misses(self) -> list[Miss]:
-        """What the answer leaves of each record in units of its noise; none of a search that was stopped."""
+        """Misfit of the answer to each record in units of its noise; none of a search that was stopped."""
         end = self.end
         return misses_of(self.problem, end.structure, end.x) if end.stopped is None else []
 

@@ -38,9 +38,9 @@ def exchanged_sensors(problem: Prepared, structure: Structure, *, wholly: bool =
         Whether the exchange must leave no more than free residues do, as there is another cause of the misfit.
     """
     formulation, test = problem.formulation, problem.measurement
-    told = formulation.fits_records and not formulation.stiffness.free and structure.n == test.n_sensors
+    distinguishable = formulation.fits_records and not formulation.stiffness.free and structure.n == test.n_sensors
     pairs = list(_alike(test))
-    if not told or not 0 < len(pairs) <= 15:  # those of six sensors
+    if not distinguishable or not 0 < len(pairs) <= 15:  # those of six sensors
         return ()
     try:
         omega, ratios = poles_of_test(test)
@@ -50,16 +50,16 @@ def exchanged_sensors(problem: Prepared, structure: Structure, *, wholly: bool =
         return ()
     found.sort()
     (least, (i, j)), others = found[0], [residual for residual, _ in found[1:]]
-    own = test.residual(structure)
-    if least > MENDED * own or (others and others[0] < _CLEARLY * least) or (wholly and least > FREE * floor):
+    kept = test.residual(structure)
+    if least > MENDED * kept or (others and others[0] < _CLEARLY * least) or (wholly and least > FREE * floor):
         return ()
     names = test.sensor_names
     swapped = Finding(
         "swapped sensors", Severity.CONTRADICTS,
-        f"{names[i]} and {names[j]} are swapped: the model misses {100 * own:.3g} % of the accelerations as they are, "
+        f"{names[i]} and {names[j]} are swapped: the model misses {100 * kept:.3g} % of the accelerations as they are, "
         f"and {100 * least:.3g} % with these two in each other's place",
         "exchange their records, or their names", channel=names[i],
-        numbers={"sensor": float(i), "other": float(j), "residual": own, "residual exchanged": least},
+        numbers={"sensor": float(i), "other": float(j), "residual": kept, "residual exchanged": least},
     )  # fmt: skip
     return (swapped,)
 
@@ -89,9 +89,9 @@ def _residual_of(problem: Prepared, omega: Array, ratios: Array, pair: tuple[int
     def errors(z: Array) -> Array:
         s = formulation.matrices.structure(back(z), test)
         w, zeta = 2 * np.pi * s.natural_frequencies[:count], s.damping_ratios[:count]
-        own = np.einsum("nk,kd->knd", s.mode_shapes[:, :count], s.participation[:count])
+        modelled = np.einsum("nk,kd->knd", s.mode_shapes[:, :count], s.participation[:count])
         return np.concatenate([
-            ((own - residues[:count]) / size).ravel(), _FREQUENCY * np.log(w / omega[:count]),
+            ((modelled - residues[:count]) / size).ravel(), _FREQUENCY * np.log(w / omega[:count]),
             _DAMPING * np.log(zeta / ratios[:count]),
         ])  # fmt: skip
 

@@ -58,9 +58,9 @@ class GainErrors:
     @property
     def wrong(self) -> NDArray[np.intp]:
         """Sensors whose gain is wrong beyond chance and by more than is usual, the worst first."""
-        shown = np.isfinite(self.error)
-        off = np.where(shown, np.abs(self.error) / np.where(shown, self.std, 1.0), 0.0)
-        chance = 2 * scipy.special.stdtr(self.freedom, -off) * np.count_nonzero(shown)
+        known = np.isfinite(self.error)
+        off = np.where(known, np.abs(self.error) / np.where(known, self.std, 1.0), 0.0)
+        chance = 2 * scipy.special.stdtr(self.freedom, -off) * np.count_nonzero(known)
         size = np.abs(np.nan_to_num(self.error))
         found = np.flatnonzero((chance < FALSE_ALARM) & (size > max(_LEAST, _BESIDE * size.max())))
         return found[np.argsort(-off[found])]
@@ -68,16 +68,16 @@ class GainErrors:
     @property
     def of_base(self) -> float | None:
         """The one error that explains those of all sensors, where three or more show one: then it is the base's."""
-        shown = np.isfinite(self.error)
-        if np.count_nonzero(shown) < 3 or not self.wrong.size:
+        known = np.isfinite(self.error)
+        if np.count_nonzero(known) < 3 or not self.wrong.size:
             return None
-        error, std = self.error[shown], self.std[shown]
+        error, std = self.error[known], self.std[known]
         one = float(np.average(error, weights=std**-2))
         return one if np.all(np.abs(error - one) < most_deviations(error.size) * std) else None
 
 
 def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
-    """What the constant terms of a test say of its sensors' gains, at the poles of the structure that was fitted to it.
+    """Errors of sensors' gains by the constant terms of a test, at the poles of the structure that was fitted to it.
 
     Each is estimated twice, beside the modes alone and beside a part that grows as w² too. The first is the more
     exact, but right only where no mode lies above the lines: by how much the two differ counts among its errors. The
@@ -110,7 +110,7 @@ def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
 
 
 def _beyond(error: Array, std: Array) -> Array:
-    """What chance does not explain of errors with these deviations, in 95 % of right tests none of any sensor."""
+    """The part of errors with these deviations beyond chance, in 95 % of right tests none of any sensor."""
     likely = most_deviations(2 * error.size, 1 - COVERAGE)  # of two estimates each
     return np.sqrt(np.maximum(error**2 - (likely * std) ** 2, 0.0))
 
@@ -166,7 +166,7 @@ def assumed_totals(context: Context) -> Iterator[Finding]:
 
 
 def taken_at_sensors(problem: Prepared) -> Iterator[Finding]:
-    """What a stated total of a lumped mass assumes, which accelerations cannot contradict."""
+    """The assumption of a stated total of a lumped mass, which accelerations cannot contradict."""
     totals, geometry = problem.formulation.mass.totals, problem.geometry
     if totals is None or totals.kind != "sensors" or problem.measurement.force is not None:  # which contradicts
         return
@@ -210,11 +210,11 @@ def rests_on(test: Measurement, errors: GainErrors, worth: Array) -> Iterator[Fi
         size, open_ = 100 * abs(errors.error[i]), 100 * LIKELY * errors.std[i]
         reach = size + open_ if np.isfinite(errors.error[i]) else _UNSHOWN
         if worth[i] * reach > most_deviations():
-            shown = f"{1 + errors.error[i]:.4f} ± {open_ / 100:.1g}" if np.isfinite(errors.error[i]) else "not shown"
+            gain = f"{1 + errors.error[i]:.4f} ± {open_ / 100:.1g}" if np.isfinite(errors.error[i]) else "not shown"
             yield Finding(
                 "gain not shown", Severity.NOTE,
                 f"the intervals of M_SS take the gain of {test.sensor_names[i]} to be exactly 1, and the records do "
-                f"not show it closely enough (gain {shown}: an error of {reach:.2g} % would move M_SS by "
+                f"not show it closely enough (gain {gain}: an error of {reach:.2g} % would move M_SS by "
                 f"{worth[i] * reach:.2g} standard deviations)",
                 "calibrate this sensor if that matters", channel=test.sensor_names[i],
                 numbers={"gain": 1 + float(errors.error[i]), "deviations": float(worth[i] * reach)},
@@ -232,9 +232,9 @@ def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, o
     extra, slopes = _less(Q, ones), _less(Q, slopes)
     column = extra @ rigid
     size = by_sensor(column**2)
-    shown = size > MIMICKED**2 * by_sensor((ones @ rigid) ** 2)
-    column *= np.tile(shown, each)
-    size[~shown] = 1.0
+    observable = size > MIMICKED**2 * by_sensor((ones @ rigid) ** 2)
+    column *= np.tile(observable, each)
+    size[~observable] = 1.0
     moved = np.tile(free.residues, (2, 1, 1))[: slopes.shape[1] // ones.shape[1]]  # (2 m, inputs, channels)
     by = lambda x: x.reshape(*moved.shape[:2], x.shape[-1])  # noqa: E731
     across = by_sensor(moved * by(slopes.T @ column))
@@ -249,7 +249,7 @@ def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, o
     left = beside - column * np.tile(error, each) - slopes @ along
     of_lines = records.in_runs(left * column)
     by_line = by_sensor((of_lines.real + of_lines.imag)[..., None, :])
-    variance = np.array([_variance(own) for own in np.moveaxis(by_line, -1, 0)]) / size
+    variance = np.array([_variance(errors) for errors in np.moveaxis(by_line, -1, 0)]) / size
     noise = by_sensor(left**2) / max((len(left) - Q.shape[1]) * each - 1, 1)
     noise = np.maximum(noise, EXACT**2 * records.size / left.size)
     if test.response_std is not None and np.any(test.response_std > 0):
@@ -257,7 +257,7 @@ def _estimate(test: Measurement, records: Records, free: ResidueFit, Q: Array, o
         # What a model misses is no noise, and pulls constants along: beyond the stated noise it counts twice.
         noise, variance = np.maximum(noise, stated), variance * np.maximum(noise / stated, 1.0)
     std, least = (np.sqrt(part * np.diag(normal)) for part in (np.maximum(variance, noise), noise))
-    return np.where(shown, error, np.nan), np.where(shown, std, np.nan), np.where(shown, least, np.nan)
+    return np.where(observable, error, np.nan), np.where(observable, std, np.nan), np.where(observable, least, np.nan)
 
 
 def _less(Q: Array, columns: Array) -> Array:

@@ -27,9 +27,9 @@ def missed_goal(context: Context) -> Iterator[Finding]:
         yield Finding("constraint", Severity.CONTRADICTS, "a constraint does not hold")
     goal, residual = problem.stated.goal, context.residual
     if goal is not None and residual > goal:
-        told = f"the residual {residual:.3g} is above the goal {goal:.3g}"
-        yield Finding("goal", Severity.CONTRADICTS, told, numbers={"residual": residual, "goal": goal})
+        sentence = f"the residual {residual:.3g} is above the goal {goal:.3g}"
+        yield Finding("goal", Severity.CONTRADICTS, sentence, numbers={"residual": residual, "goal": goal})
     if goal is None and residual > UNEXPLAINED and end.stopped is None and (end.success or not context.cut_short):
         scaled = problem.unit_mass and not problem.formulation.stiffness.free
-        told, why = f"the residual {residual:.3g} is no fit", _SCALE if scaled else _CONVENTIONS
-        yield Finding("residual", Severity.CONTRADICTS, told, why, numbers={"residual": residual})
+        sentence, why = f"the residual {residual:.3g} is no fit", _SCALE if scaled else _CONVENTIONS
+        yield Finding("residual", Severity.CONTRADICTS, sentence, why, numbers={"residual": residual})

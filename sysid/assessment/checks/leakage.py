@@ -32,7 +32,7 @@ class Peaks(NamedTuple):
 
 
 def leakage(test: Measurement, structure: Structure) -> Iterator[Finding]:
-    """Whether lines are too coarse for the modes that were found, and which modes may be none.
+    """Lines are too coarse for the modes that were found, and modes that may be none.
 
     Averages over segments (`Measurement.averaged`) are judged by their lines alone. Frequency response functions of
     unknown origin may be exact at any lines, so that they must miss more at the peak than elsewhere. Spectra of whole
@@ -73,7 +73,7 @@ def leakage(test: Measurement, structure: Structure) -> Iterator[Finding]:
 
 
 def unresolved(test: Measurement, omega: Array, ratios: Array) -> Iterator[Finding]:
-    """Whether averages over segments have too few lines in most peaks of poles found in them.
+    """Averages over segments have too few lines in most peaks of poles found in them.
 
     Where only some are so narrow `leakage` tells it of the structure that was fitted. The window itself makes a narrow
     peak about one and a half distances of lines wide.
@@ -130,7 +130,7 @@ def _mac(structure: Structure, i: int, j: int) -> float:
 
 
 def _missed(test: Measurement, structure: Structure, frequency: float, width: float) -> str | None:
-    """What a fit misses about a peak, in words; None where that is no more than elsewhere.
+    """Misfit of a fit about a peak, in words; None where that is no more than elsewhere.
 
     Noise as large at all lines is less of the response at a peak, noise in proportion to it the same: only a peak
     itself that is not what modes make of it stands out.

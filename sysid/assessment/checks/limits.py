@@ -24,11 +24,11 @@ def unfitted_records(context: Context) -> Iterator[Finding]:
         return
     formulation = context.problem.formulation
     if not formulation.fits_records:
-        told = "the problem states a misfit of its own; pictures and scores compare with the records as they are"
-        yield Finding("own misfit", Severity.NOTE, told)
+        sentence = "the problem states a misfit of its own; pictures and scores compare with the records as they are"
+        yield Finding("own misfit", Severity.NOTE, sentence)
     if not formulation.tells_damping:
-        told = "no damping ratio is identified: no unknown of the damping alone enters what is fitted"
-        yield Finding("no damping ratio", Severity.NOTE, told)
+        sentence = "no damping ratio is identified: no unknown of the damping alone enters what is fitted"
+        yield Finding("no damping ratio", Severity.NOTE, sentence)
 
 
 def lines_left_out(context: Context) -> Iterator[Finding]:
@@ -37,8 +37,8 @@ def lines_left_out(context: Context) -> Iterator[Finding]:
         return
     problem, formulation = context.problem, context.problem.formulation
     # Not `formulation.tests`: the term of the problem's own test has matrices that the modal strategy has no use for.
-    own = [problem.measurement] if formulation.fits_records else []
-    tests = [*own, *(term.test for term in formulation.further_tests)]
+    fitted = [problem.measurement] if formulation.fits_records else []
+    tests = [*fitted, *(term.test for term in formulation.further_tests)]
     for i, test in enumerate(tests, start=problem.first_test):
         if test.dropped:
             where = f" ({in_words(test.holes, test.freq)})" if test.holes else ""

@@ -41,7 +41,7 @@ _CLEAR = (-1.0, *(unit[0] for unit in _UNITS))  # factors that no mode makes
 
 
 def is_gross(mistake: Finding) -> bool:
-    """Whether no model with a form of its own fits a channel with it: a search in its unknowns is not worth its time.
+    """True where no model of a form of its own fits a channel with it: a search in its unknowns is not worth its time.
 
     A gain of one sensor and a small delay may be fitted so far that the rest is of use.
     """
@@ -72,7 +72,7 @@ def mistakes_of(test: Measurement, terms: DirectTerms | None) -> list[Finding]:
 
 
 def _conjugated(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
-    """Whether the conjugates of the spectra are those of modes, and the spectra are not."""
+    """The conjugates of the spectra are those of modes, and the spectra are not."""
     if test.is_whole:
         return
     force = None if test.force is None else test.force.conj()
@@ -128,8 +128,8 @@ def _delays(test: Measurement, terms: DirectTerms) -> Array | None:
     c, slope, std = terms.rigid / reach, terms.slope / reach, terms.slope_std / reach
     size = np.sum(c**2, axis=1)
     stated = np.sum((test.rigid_body / reach) ** 2, axis=1)
-    told = np.sum((terms.rigid_std / reach) ** 2, axis=1) < _NONE**2 * np.maximum(size, stated)
-    known = np.flatnonzero((stated > 0) & (size > _NONE**2 * stated) & told)
+    precise = np.sum((terms.rigid_std / reach) ** 2, axis=1) < _NONE**2 * np.maximum(size, stated)
+    known = np.flatnonzero((stated > 0) & (size > _NONE**2 * stated) & precise)
     if not known.size:
         return None
     delay = -np.sum(slope * c, axis=1)[known] / size[known]
@@ -180,7 +180,7 @@ class _Motion:
 
 
 def _of_motion(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
-    """What the recorded rigid-body motion differs by from what is stated, the simplest explanation of all of it."""
+    """Difference of recorded and stated rigid-body motion, by the simplest explanation of all of it."""
     reach = _reach(test)
     G, c, std = test.rigid_body / reach, terms.rigid / reach, terms.rigid_std / reach
     size = np.linalg.norm(G, axis=1)
@@ -209,7 +209,7 @@ def _of_motion(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
 
 
 def _relative(motion: _Motion) -> Iterator[Finding]:
-    """Whether no sensor moves with the base, though their modes carry what moves with it."""
+    """No sensor moves with the base, though their modes carry what moves with it."""
     size = np.linalg.norm(motion.stated, axis=1)
     carried = np.sum(motion.modal * motion.stated) / np.sum(motion.stated**2)
     if np.all(np.linalg.norm(motion.recorded, axis=1) < _NONE * size) and carried > _CARRIED:
@@ -222,7 +222,7 @@ def _relative(motion: _Motion) -> Iterator[Finding]:
 
 
 def _of_columns(test: Measurement, motion: _Motion) -> Iterator[Finding]:
-    """Whether each base direction has one factor of its own in all sensors."""
+    """Each base direction has one factor of its own in all sensors."""
     weight = np.sum(motion.stated**2, axis=0)
     moved = weight > 0
     several = np.count_nonzero(np.abs(motion.stated) > _NONE, axis=0) > 1
@@ -261,7 +261,7 @@ def _of_columns(test: Measurement, motion: _Motion) -> Iterator[Finding]:
 
 
 def _of_all(motion: _Motion, factor: float) -> Iterator[Finding]:
-    """What one factor in all sensors and directions means."""
+    """Meaning of one factor in all sensors and directions."""
     if abs(factor + 1) < _GROSS:
         yield Finding(
             "sign", Severity.BLOCKING,
@@ -280,7 +280,7 @@ def _of_all(motion: _Motion, factor: float) -> Iterator[Finding]:
 
 
 def _swapped(test: Measurement, motion: _Motion, right: NDArray[np.bool_]) -> list[Finding]:
-    """Whether two sensors stand in each other's place, and a third is right."""
+    """Two sensors stand in each other's place, and a third is right."""
     wrong = np.flatnonzero(~right)
     if wrong.size != 2 or right.size < 3:
         return []
@@ -313,7 +313,7 @@ def _of_sensors(test: Measurement, motion: _Motion, right: NDArray[np.bool_]) ->
     for i, value, std in zip(wrong, factor, error, strict=True):
         # Modes far below the lines move some sensors more than others, but not one alone.
         alone = wrong.size == 1 and np.count_nonzero(motion.agree(motion.stated, _LIKE)) == right.size - 1
-        if agree[i] and (alone or any(abs(value / own - 1) < _LIKE for own in _CLEAR)):
+        if agree[i] and (alone or any(abs(value / ratio - 1) < _LIKE for ratio in _CLEAR)):
             carried = np.sum(motion.modal[i] * motion.stated[i]) / np.sum(motion.stated[i] ** 2)
             value = next(
                 (u[0] for u in _UNITS if abs(value - u[0]) < min(most_deviations() * std, _GROSS * u[0])), value
@@ -322,31 +322,31 @@ def _of_sensors(test: Measurement, motion: _Motion, right: NDArray[np.bool_]) ->
 
 
 def _of_sensor(name: str, factor: float, carried: float) -> Iterator[Finding]:
-    """What a factor of one sensor alone means."""
-    shown = "beside its modes it moves with the base"
+    """Meaning of a factor of one sensor alone."""
+    seen = "beside its modes it moves with the base"
     unit = next((one for one in _UNITS if abs(factor / one[0] - 1) < _LIKE), None)
     kind: Kind | None = None
     if abs(factor + 1) < _GROSS:
         kind, remedy = "sign", "change its sign"
-        sentence = f"the sign of {name} is reversed: {shown} by {factor:.3g} times what rigid_body says"
+        sentence = f"the sign of {name} is reversed: {seen} by {factor:.3g} times what rigid_body says"
     elif unit is not None:
         _, times, small, large = unit
         of_sensor, of_base = (small, large) if factor < 1 else (large, small)
         kind, remedy = "unit", "bring both to m/s²"
         sentence = (
-            f"{name} is in another unit than the base: {shown} by {factor:.4g} times what rigid_body says, a factor of "
+            f"{name} is in another unit than the base: {seen} by {factor:.4g} times what rigid_body says, a factor of "
             f"{times}, as of a sensor in {of_sensor} and a base in {of_base}"
         )
     elif abs(factor) < _NONE and carried > _CARRIED:
         kind, remedy = "relative responses", "add the base's acceleration to its record"
         sentence = (
-            f"{name} is relative to the base, where the other sensors are absolute: {shown} by {factor:.2g} times what "
+            f"{name} is relative to the base, where the other sensors are absolute: {seen} by {factor:.2g} times what "
             "rigid_body says"
         )
     elif factor >= _NONE:
         kind, remedy = "gain", f"divide its record by {factor:.3g}, or correct its row of rigid_body"
         sentence = (
-            f"the gain of {name} is {factor:.3g}: {shown} by so many times what rigid_body says, and the other sensors "
+            f"the gain of {name} is {factor:.3g}: {seen} by so many times what rigid_body says, and the other sensors "
             "as it says"
         )
     if kind is not None:
@@ -354,7 +354,7 @@ def _of_sensor(name: str, factor: float, carried: float) -> Iterator[Finding]:
 
 
 def _of_force(test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
-    """Whether the base force weighs a negative mass, at low frequency and by its modes."""
+    """The base force weighs a negative mass, at low frequency and by its modes."""
     if terms.mass is None or terms.mass_std is None or terms.modal_mass is None:
         return
     weighed, std, modal = (np.diag(it) for it in (terms.mass, terms.mass_std, terms.modal_mass))

@@ -59,15 +59,15 @@ def other_levels(context: Context) -> Iterator[Finding]:
         return
     fitted = peaks(problem.stated.measurement)
     for i, test in enumerate(problem.stated.validation, start=1):
-        own = peaks(test)
-        if not (fitted and own):
+        levels = peaks(test)
+        if not (fitted and levels):
             continue
-        if max(own) > LEVEL * max(fitted) or max(own) < min(fitted) / LEVEL:
+        if max(levels) > LEVEL * max(fitted) or max(levels) < min(fitted) / LEVEL:
             span = f"{max(fitted):.3g}" if len(fitted) == 1 else f"{min(fitted):.3g} to {max(fitted):.3g}"
             yield Finding(
                 "level", Severity.NOTE,
-                f"test {i} that was not fitted moves the sensors by up to {max(own):.3g} m/s² against the base, the "
+                f"test {i} that was not fitted moves the sensors by up to {max(levels):.3g} m/s² against the base, the "
                 f"fitted {'run' if len(fitted) == 1 else 'runs'} by {span} m/s²: what holds at one level need not "
                 "hold at another",
-                numbers={"test": float(i), "peak": float(max(own)), "fitted": float(max(fitted))},
+                numbers={"test": float(i), "peak": float(max(levels)), "fitted": float(max(fitted))},
             )  # fmt: skip

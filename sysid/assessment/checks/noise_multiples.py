@@ -53,7 +53,7 @@ class JudgedRecord(NamedTuple):
 
 
 def misses_of(problem: Prepared, structure: Structure, x: Array | None) -> list[Miss]:
-    """What the structure misses of accelerations and base force of each test that is fitted.
+    """Misfit of the structure to accelerations and base force of each test that is fitted.
 
     Records whose noise is neither stated nor to be found are left out; numbers that stand alone are not counted.
 
@@ -117,14 +117,14 @@ def _bounded(modal: ModalEstimate, std: Array, level: Array, left: ComplexArray,
     where quiet lines hold less.
     """
     test = modal.records
-    own = np.minimum(std**2, (modal.density[:, None] * np.broadcast_to(level, std.shape[:2]) ** 2)[..., None])
-    base, share = std**2 - own, passed**2
+    of_channel = np.minimum(std**2, (modal.density[:, None] * np.broadcast_to(level, std.shape[:2]) ** 2)[..., None])
+    base, share = std**2 - of_channel, passed**2
     quiet = _quiet(left, np.ones(left.shape), test.own_lines)
     if quiet is not None:
         of_base = _quiet(left, np.maximum(base, np.finfo(float).tiny), test.own_lines)
         share = np.minimum(share, np.asarray(of_base).min(axis=1))
-        own = np.minimum(own, quiet[..., None])
-    return np.asarray(np.sqrt(own + share[:, None, None] * base))
+        of_channel = np.minimum(of_channel, quiet[..., None])
+    return np.asarray(np.sqrt(of_channel + share[:, None, None] * base))
 
 
 def _near_modes(modal: ModalEstimate, structure: Structure) -> NDArray[np.bool_]:
@@ -137,22 +137,22 @@ def _near_modes(modal: ModalEstimate, structure: Structure) -> NDArray[np.bool_]
 
 
 def _miss(record: JudgedRecord, test: Measurement, found: bool, near: NDArray[np.bool_]) -> Iterator[Miss]:
-    """What is left of one record in units of its noise; `found`: with the fit, so that it holds errors of the model.
+    """Misfit to one record in units of its noise; `found`: with the fit, so that it holds errors of the model.
 
     Of noise that is not stated, what stands out far from all modes is a part, such as hum.
     """
-    own, size, missed = test.own_lines, float(np.linalg.norm(record.measured)), float(np.linalg.norm(record.left))
+    in_run, size, missed = test.own_lines, float(np.linalg.norm(record.measured)), float(np.linalg.norm(record.left))
     variance = np.ones(record.left.shape) if record.variance is None else record.variance
     # Noise that is not stated may be in proportion to the record.
     if record.variance is None and (test.has_unit_runs or missed < _UNKNOWN * size):
         return
     bounded = record.variance is None or found
     if bounded:
-        quiet = _quiet(record.left, variance, own)
+        quiet = _quiet(record.left, variance, in_run)
         if quiet is None:
             return
         variance = variance if found else variance * quiet[..., None]
-    variance = variance * own[:, None]
+    variance = variance * in_run[:, None]
     noise = float(np.sqrt(np.sum(variance)))
     left = np.abs(record.left) ** 2
     if bounded:
@@ -163,12 +163,12 @@ def _miss(record: JudgedRecord, test: Measurement, found: bool, near: NDArray[np
 
 
 def _quiet(
-    left: ComplexArray, variance: Array, own: NDArray[np.bool_], size: int = 16, least: int = 8, share: float = 0.25
+    left: ComplexArray, variance: Array, in_run: NDArray[np.bool_], size: int = 16, least: int = 8, share: float = 0.25
 ) -> Array | None:
-    """What the quietest `share` of blocks of lines holds, over the variance, (runs, channels); None with few blocks."""
+    """Power over the variance in the quietest `share` of blocks of lines, (runs, channels); None with few blocks."""
     out = np.ones(left.shape[:2])
     mean = float(scipy.special.gammaincinv(size, share)) / size
-    for run, lines in enumerate(own):
+    for run, lines in enumerate(in_run):
         power = np.abs(left[run][:, lines]) ** 2 / variance[run][:, lines]
         blocks = power.shape[1] // size
         if blocks < least:
@@ -197,7 +197,7 @@ def noise_at_most(test: Measurement, left: ComplexArray) -> Array | None:
 
 
 def misses_of_test(test: Measurement, structure: Structure) -> list[Miss]:
-    """What a structure misses of a test that was not fitted."""
+    """Misfit of a structure to a test that was not fitted."""
     modal = ModalEstimate.of_lines(test)
     near = _near_modes(modal, structure)
     return [miss for record in _records(modal, structure) for miss in _miss(record, test, False, near)]

@@ -23,8 +23,8 @@ def no_solution(context: Context) -> Iterator[Finding]:
 
 
 def _no_end(kind: Kind, message: str) -> Finding:
-    told = f"the search ended before it found a fit ({message}): these matrices are no more than the best until then"
-    return Finding(kind, Severity.CONTRADICTS, told)
+    words = f"the search ended before it found a fit ({message}): these matrices are no more than the best until then"
+    return Finding(kind, Severity.CONTRADICTS, words)
 
 
 def search_notes(context: Context) -> Iterator[Finding]:

@@ -33,22 +33,22 @@ def stated_masses(context: Context) -> Iterator[Finding]:
 
 
 def _stated_mass(problem: Prepared, structure: Structure) -> Iterator[Finding]:
-    """What the base force weighs, where a stated mass says otherwise."""
+    """The base force weighs another mass than the stated one."""
     test, stated = problem.measurement, problem.formulation.mass
     whole = stated.totals is not None or np.all(np.isfinite(problem.known_mass))
     if test.force is None or stated.weighs or not whole or not structure.modal_damping:
         return
     poles = distinct_poles(structure)
-    weighed, own = np.diag(weighed_mass(test, *poles)), np.diag(structure.rigid_body_mass)
+    weighed, expected = np.diag(weighed_mass(test, *poles)), np.diag(structure.rigid_body_mass)
     # A direction beside a rotation may be weighed worse.
-    noise = most_deviations(test.n_base) * weighed_mass_std(test, *poles) / own
+    noise = most_deviations(test.n_base) * weighed_mass_std(test, *poles) / expected
     usual = max(0.01, 3 * force_residual_left(test, *poles) / np.sqrt(test.freq.size))
-    if np.any(np.abs(weighed / own - 1) >= np.maximum(usual, noise)):
-        given, told = (", ".join(f"{m:.4g}" for m in masses) for masses in (own, weighed))
-        numbers = {f"stated {i + 1}": float(m) for i, m in enumerate(own)}
+    if np.any(np.abs(weighed / expected - 1) >= np.maximum(usual, noise)):
+        given, found = (", ".join(f"{m:.4g}" for m in masses) for masses in (expected, weighed))
+        numbers = {f"stated {i + 1}": float(m) for i, m in enumerate(expected)}
         yield Finding(
             "stated mass", Severity.CONTRADICTS,
-            f"the stated mass makes {given} kg in the base directions, but the base force weighs {told} kg",
+            f"the stated mass makes {given} kg in the base directions, but the base force weighs {found} kg",
             "one of them, or the unit of the force, is wrong; the force weighs an adapter or base plate on its cells "
             "too",
             numbers=numbers | {f"weighed {i + 1}": float(m) for i, m in enumerate(weighed)},
@@ -56,7 +56,7 @@ def _stated_mass(problem: Prepared, structure: Structure) -> Iterator[Finding]:
 
 
 def _known_entries(problem: Prepared, structure: Structure) -> Iterator[Finding]:
-    """Whether known entries are used, and leave the base what is left of the total."""
+    """Known entries of the mass are not used, or are more than the stated total."""
     geometry, mass = problem.geometry, problem.formulation.mass
     if not mass.free or mass.entries is None:
         return
@@ -68,13 +68,13 @@ def _known_entries(problem: Prepared, structure: Structure) -> Iterator[Finding]
         makes = total_of(geometry, structure.mass, mass.totals.kind)
         std = mass.totals.std_by_direction
         if np.any(makes > problem.totals * (1 + NEGLIGIBLE) + most_deviations(std.size) * std):
-            given, told = (", ".join(f"{m:.4g}" for m in masses) for masses in (problem.totals, makes))
-            more = f"the known entries of the mass make {told} kg or more, and {given} kg are stated in all"
+            given, least = (", ".join(f"{m:.4g}" for m in masses) for masses in (problem.totals, makes))
+            more = f"the known entries of the mass make {least} kg or more, and {given} kg are stated in all"
             yield Finding("known entries", Severity.CONTRADICTS, more)
 
 
 def _lumped_total(problem: Prepared, structure: Structure) -> Iterator[Finding]:
-    """Whether the total of a lumped mass, a sum over the sensors of a direction, is what moves in that direction."""
+    """The total of a lumped mass, a sum over the sensors of a direction, is not what moves in that direction."""
     totals, geometry = problem.formulation.mass.totals, problem.geometry
     if totals is None or totals.kind != "sensors":
         return
@@ -91,7 +91,7 @@ def _lumped_total(problem: Prepared, structure: Structure) -> Iterator[Finding]:
 
 
 def force_misfit(formulation: Formulation, test: Measurement, structure: Structure) -> Iterator[Finding]:
-    """Whether the base force is that of the modes that the accelerations show."""
+    """The base force is not that of the modes that the accelerations show."""
     if test.force is None:
         return
     entries, n = formulation.mass.entries, formulation.geometry.n

@@ -28,10 +28,10 @@ def _priors(formulation: Formulation, x: Array) -> Iterator[Finding]:
     names = [name for term in formulation.priors for name in term.labels]
     off = np.concatenate([np.zeros(0), *(term.numbers(x) for term in formulation.priors)])
     if np.sum(off**2) > beyond_chance(off.size) and not any(term.findings(x) for term in formulation.priors):
-        told = ", ".join(f"{name} by {z:+.2g}" for name, z in zip(names, off, strict=True))
+        missed = ", ".join(f"{name} by {z:+.2g}" for name, z in zip(names, off, strict=True))
         yield Finding(
             "stated values", Severity.CONTRADICTS,
-            f"the values that are stated as known are missed together, in standard deviations: {told}",
+            f"the values that are stated as known are missed together, in standard deviations: {missed}",
             "they, another number, or the model is wrong",
             numbers=dict(zip(names, off.tolist(), strict=True)),
         )  # fmt: skip

@@ -1,4 +1,4 @@
-"""What is wrong with records, or between them and what is stated, as it is told before a search."""
+"""Mistakes in records, or between them and what is stated, named before a search."""
 
 from __future__ import annotations
 
@@ -55,13 +55,13 @@ def wrong_records(context: Context) -> Iterator[Finding]:
     tests = [problem.measurement] if problem.misfit is None else []
     tests += [given.measurement for given in problem.residuals if isinstance(given, FurtherTest)]
     for i, test in enumerate(tests, start=1):
-        for mistake in _of_test(problem, declared, test, own=test is problem.measurement):
+        for mistake in _of_test(problem, declared, test, first=test is problem.measurement):
             in_vain = mistake.severity is Severity.BLOCKING or (is_gross(mistake) and not declared.free_modes)
             one = mistake._replace(severity=Severity.BLOCKING if in_vain else mistake.severity)
             yield one if len(tests) == 1 else one.of_test(i)
 
 
-def _of_test(problem: StatedProblem, declared: Formulation, test: Measurement, *, own: bool) -> list[Finding]:
+def _of_test(problem: StatedProblem, declared: Formulation, test: Measurement, *, first: bool) -> list[Finding]:
     try:
         terms = direct_terms(test)
         found = mistakes_of(test, terms)
@@ -71,7 +71,7 @@ def _of_test(problem: StatedProblem, declared: Formulation, test: Measurement, *
             if test.is_whole:
                 terms = direct_terms(test)
                 found = mistakes_of(test, terms)
-        if own and not found and terms is not None:
+        if first and not found and terms is not None:
             found = [*_of_mass(declared, test, terms), *_of_frequencies(problem, declared, test)]
         if not found and test.averaged:
             found = list(unresolved(test, *poles_of_test(test)))
@@ -81,7 +81,7 @@ def _of_test(problem: StatedProblem, declared: Formulation, test: Measurement, *
 
 
 def _of_mass(declared: Formulation, test: Measurement, terms: DirectTerms) -> Iterator[Finding]:
-    """Whether the base force weighs what is stated by a factor of two units."""
+    """The base force weighs what is stated but for a factor of two units."""
     allowed = None if terms.mass is None or terms.below else _masses(declared)
     if allowed is None or terms.mass is None or terms.modal_mass is None or terms.mass_std is None:
         return
@@ -93,7 +93,7 @@ def _of_mass(declared: Formulation, test: Measurement, terms: DirectTerms) -> It
     low, high, weighed, modal = low[known], high[known], weighed[known], modal[known]
     if np.any((weighed > low / MISFIT) & (weighed < high * MISFIT)):
         return
-    for factor, told, words in _FACTORS:
+    for factor, label, words in _FACTORS:
         # What no mode carries may be a fixture, of whatever mass.
         mended, of_modes = weighed / factor, modal / factor
         agree = (mended > low / _WITHIN) & (mended < high * _WITHIN) & (of_modes > _MODAL * low)
@@ -102,7 +102,7 @@ def _of_mass(declared: Formulation, test: Measurement, terms: DirectTerms) -> It
             stated = ", ".join(f"{a:.4g}" if a == b else f"{a:.4g} to {b:.4g}" for a, b in zip(low, high, strict=True))
             yield Finding(
                 "force unit", Severity.BLOCKING,
-                f"the base force weighs {masses} kg where {stated} kg are stated, a factor of {told}: {words}",
+                f"the base force weighs {masses} kg where {stated} kg are stated, a factor of {label}: {words}",
                 numbers={"factor": factor},
             )  # fmt: skip
             return
@@ -122,7 +122,7 @@ def _masses(declared: Formulation) -> tuple[Array, Array] | None:
 
 
 def _of_frequencies(problem: StatedProblem, declared: Formulation, test: Measurement) -> Iterator[Finding]:
-    """Whether lines are in rad/s, as frequencies that are stated, or that the bounds allow, show."""
+    """Lines are in rad/s, as frequencies that are stated, or that the bounds allow, show."""
     stated = getattr(problem.stiffness, "natural_frequencies", None)
     if declared.stiffness.free and stated is None:
         return
@@ -131,10 +131,10 @@ def _of_frequencies(problem: StatedProblem, declared: Formulation, test: Measure
         low = high = np.atleast_1d(np.array(stated, dtype=float))
         what = "the stated natural frequencies are"
     else:
-        made = [s.natural_frequencies for s in _structures(declared)]
-        if not made:
+        frequencies = [s.natural_frequencies for s in _structures(declared)]
+        if not frequencies:
             return
-        low, high = np.min(made, axis=0), np.max(made, axis=0)
+        low, high = np.min(frequencies, axis=0), np.max(frequencies, axis=0)
         what = "the bounds of the model allow first natural frequencies"
     inside = lambda f: bool(low[0] / _WITHIN < f[0] < high[0] * _WITHIN and f[-1] < high[-1] * _WITHIN)  # noqa: E731
     if stated is not None and found[0] < low[0] / MISFIT and inside(2 * np.pi * found):
@@ -164,10 +164,10 @@ def _structures(declared: Formulation) -> list[Structure]:
     if len(unknowns) <= 6:  # more bounds make too many corners
         for choice in product((False, True), repeat=len(unknowns)):
             points.append(np.where(np.repeat(choice, np.diff(ends, prepend=0)), upper, lower))
-    made = []
+    structures = []
     for x in points:
         try:
-            made.append(declared.matrices.structure(x, declared.own_test.test))
+            structures.append(declared.matrices.structure(x, declared.own_test.test))
         except InputError:  # no structure there
             continue
-    return made
+    return structures
