@@ -192,9 +192,8 @@ def _by_rank(problem: Prepared, structure: Structure, x: Array | None) -> tuple[
         (weakest,) = directions_in_words(formulation.unknowns, x, known.unit, known.seen[:, -1:])
         open_.append(left_open(f"the search ended at {misfit:.2g} of the records, by which {weakest} is hardly held"))
     if known.unseen.shape[1]:
-        fixed = "the data and the written model fix mass, stiffness and damping"
         same = (f"{seen} {'; nor of '.join(words)}; {_SAME_MATRICES}",) if words else ()
-        return (fixed, *same), tuple(open_)
+        return ("the data and the written model fix mass, stiffness and damping", *same), tuple(open_)
     only = rank - sensitivity(formulation, x, slopes, priors=False).rank if formulation.priors else 0
     closed = (
         (x.size, f"the data and the written model fix all {x.size} unknowns"),

@@ -67,9 +67,8 @@ def closed_and_open(problem: Prepared, structure: Structure) -> tuple[tuple[str,
     if free:
         bounded = ", within what is stated" if len(known.equations) else ""
         alike = f"other mass and stiffness matrices answer identically{bounded}"
-        open_ += map(
-            left_open, [f"{_what_is_open(structure, free, common)}: {alike}", *[UNIT_MASS] * problem.unit_mass]
-        )
+        what = _what_is_open(structure, free, common)
+        open_ += map(left_open, [f"{what}: {alike}", *[UNIT_MASS] * problem.unit_mass])
     if not structure.at_sensors:
         how_far = "completely" if test.force is not None and not free else "up to the modal masses"
         alike = ", which do not all move independently" if structure.n == structure.n_sensors else ""
