@@ -259,7 +259,7 @@ def posts(offset):
     return sysid.Structure(np.diag([10 * (1 + offset), 10 * (1 - offset), 0]), stiffness, [0.01, 0.01], n_base=1)
 
 
-lines = np.linspace(10, 25, 300)
+lines = np.linspace(10, 25, 600)
 figure, panels = plt.subplots(1, 2, figsize=(10, 3.4), sharey=True, layout="constrained")
 for ax, offset in zip(panels, (0.0, 0.01), strict=True):
     test = sysid.simulate(posts(offset), lines, noise=0.01, force=True, rng=0)
