@@ -153,7 +153,7 @@ def _fit(problem: Prepared, x: Array, session: Session) -> Array:
     """The records fitted from a point."""
     monitor = session.reporter("other answers")
     try:
-        end = local.solve(problem, x, max_time=session.left, monitor=monitor)
+        end = local.solve(problem, x, max_iterations=100, max_time=session.left, monitor=monitor)  # it is near, if any
     except InputError:  # of no structure
         return x
     if end.stopped is not None:
