@@ -150,10 +150,10 @@ class _Box:
 
 
 def _fit(problem: Prepared, x: Array, session: Session) -> Array:
-    """The records fitted from a point."""
+    """The records fitted from a point that answers nearly as they do, so that its fit is near, if it has one."""
     monitor = session.reporter("other answers")
     try:
-        end = local.solve(problem, x, max_iterations=100, max_time=session.left, monitor=monitor)  # it is near, if any
+        end = local.solve(problem, x, max_iterations=100, max_time=session.left, monitor=monitor)
     except InputError:  # of no structure
         return x
     if end.stopped is not None:
