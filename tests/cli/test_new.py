@@ -22,7 +22,8 @@ def here(tmp_path, monkeypatch):
 def test_what_is_written_passes_its_own_test_with_warnings_as_errors(here):
     assert cli.main(["new", "my_tower"]) == 0
     command = [sys.executable, "-W", "error", "-m", "pytest", "-q", "-W", "error", "-p", "no:cacheprovider"]
-    alone = os.environ | {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}  # plugins that are here by chance take time to import
+    # Plugins that are here by chance take time to import, and options of this run of pytest may be theirs.
+    alone = os.environ | {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTEST_ADDOPTS": ""}
     done = subprocess.run(
         [*command, "test_my_tower.py"], capture_output=True, text=True, cwd=here, timeout=300, env=alone, check=False
     )
