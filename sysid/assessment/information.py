@@ -84,8 +84,11 @@ def spread(A: Array, B: Array | None, path: Parametrisation) -> tuple[Array, Arr
     The first are a factor of the covariance: ``A^-1 / 2``, or ``A^-1 B A^-1 / 2`` where the weights are not those of
     the noise (half, as half of a complex error's variance is in its real part). The second are steps of order one.
     """
-    slope, unit, gauge = scipy.sparse.csr_array(path.slope), path.unit, path.gauge  # mostly an identity
-    A = slope.T @ A @ slope
+    unit, gauge = path.unit, path.gauge
+    sparse = scipy.sparse.csr_array(path.slope)  # mostly an identity, often nothing else
+    whole = np.array_equal(path.slope, np.eye(unit.size))
+    of_unknowns = lambda matrix: matrix if whole else sparse.T @ matrix @ sparse  # noqa: E731
+    A = of_unknowns(A)
     size = np.sqrt(np.maximum(np.diag(A), 0.0))
     seen = size * unit > ROUND_OFF * np.max(size * unit)
     # The gauge of a mode whose shape is not seen is no direction beside that shape.
@@ -96,8 +99,8 @@ def spread(A: Array, B: Array | None, path: Parametrisation) -> tuple[Array, Arr
     factor, lost = _inverse_factor(A[np.ix_(seen, seen)] / np.outer(size, size) + fixed @ fixed.T)
     factor = factor - fixed @ (fixed.T @ factor)
     if B is not None:
-        B = slope.T @ B @ slope
-        variances, turn = np.linalg.eigh(factor.T @ (B[np.ix_(seen, seen)] / np.outer(size, size)) @ factor)
+        B = of_unknowns(B)[np.ix_(seen, seen)] / np.outer(size, size)
+        variances, turn = np.linalg.eigh(factor.T @ B @ factor)
         factor = (factor @ turn) * np.sqrt(np.maximum(variances, 0.0))
     normals = np.zeros((unit.size, factor.shape[1]))
     normals[seen] = factor / size[:, None] / np.sqrt(2)
@@ -105,7 +108,7 @@ def spread(A: Array, B: Array | None, path: Parametrisation) -> tuple[Array, Arr
     blind[seen] = lost / size[:, None]
     unseen = np.hstack([blind, np.eye(unit.size)[:, ~seen], gauge])
     unseen = unseen / np.linalg.norm(unseen / unit[:, None], axis=0)
-    return slope @ normals, slope @ unseen
+    return (normals, unseen) if whole else (sparse @ normals, sparse @ unseen)
 
 
 def _inverse_factor(matrix: Array) -> tuple[Array, Array]:
@@ -114,7 +117,7 @@ def _inverse_factor(matrix: Array) -> tuple[Array, Array]:
     triangle, singular = scipy.linalg.lapack.dpotrf(matrix, lower=1)
     # Where it is regular this takes a tenth of the time of eigenvalues.
     if not singular and scipy.linalg.lapack.dpocon(triangle, np.linalg.norm(matrix, 1), uplo="L")[0] > least:
-        inverse = scipy.linalg.solve_triangular(triangle, np.eye(len(matrix)), lower=True, check_finite=False)
+        inverse, _ = scipy.linalg.lapack.dtrtri(triangle, lower=1, overwrite_c=1)
         return inverse.T, np.zeros((len(matrix), 0))
     lam, vectors = np.linalg.eigh(matrix)
     known = lam > least * lam[-1]

@@ -6,7 +6,7 @@ stand beside them. The variance of a quantity is a sum of squares; it is NaN whe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -25,7 +25,8 @@ def std_of(change: NDArray[np.inexact[Any]], normals: int, size: ArrayLike) -> A
 
     `size` (...) tells what is much.
     """
-    std = np.linalg.norm(change[..., :normals], axis=-1)
+    seen = change[..., :normals]
+    std = np.sqrt(np.einsum("...c,...c->...", seen, seen.conj()).real)
     unseen = np.abs(change[..., normals:]).max(axis=-1, initial=0.0)
     return np.where(unseen > NEGLIGIBLE * np.asarray(size), np.nan, std)
 
@@ -114,31 +115,34 @@ class DirectSpectra:
 
 
 def matrices_of_modes(structure: Structure, modes: Modes, moves: Perturbations) -> tuple[Array, Array, Array]:
-    """Of M_SS, K_SS and C, (n, n) each, at the degrees of freedom; NaN where one of these is no sensor's nor a mode's.
+    """Of M_SS, K_SS and C, (n, n) each, at the degrees of freedom: see `changes_of_matrices`."""
+    changes = changes_of_matrices(structure, modes, moves)
+    mass, stiffness, damping = (moves.std(change, size) for change, size in changes)
+    return mass, stiffness, damping
 
-    Degrees of freedom at a sensor move with its row of the mode shapes, modal coordinates stand still.
+
+def changes_of_matrices(structure: Structure, modes: Modes, moves: Perturbations) -> Iterator[tuple[Array, Array]]:
+    """Changes of M_SS, K_SS and C at the degrees of freedom, (n, n, moves), and the size of their entries, (n, n).
+
+    Each is ``T^-T D T^-1``, T the modes at the degrees of freedom, D diagonal. Degrees of freedom at a sensor move with
+    its row of the mode shapes, modal coordinates stand still; NaN where one is neither.
     """
-    _, _, omega, ratios = modes
-    squared, loss = omega**2, 2 * ratios * omega
-    return (
-        _matrix_std(structure, moves, np.ones_like(omega), np.zeros_like(moves.log_omega)),
-        _matrix_std(structure, moves, squared, 2 * squared[:, None] * moves.log_omega),
-        _matrix_std(structure, moves, loss, loss[:, None] * (moves.log_omega + moves.log_ratios)),
-    )
-
-
-def _matrix_std(structure: Structure, moves: Perturbations, diagonal: Array, change: Array) -> Array:
-    """Of ``T^-T diag(diagonal) T^-1``, T the modes at the degrees of freedom, where `diagonal` (m,) changes too."""
-    T = structure.normal_modes
-    dT = np.zeros((*T.shape, change.shape[1]))
+    T, (_, _, omega, ratios) = structure.normal_modes, modes
+    dT = np.zeros((*T.shape, moves.log_omega.shape[1]))
     for j, (sensor, mode) in enumerate(zip(structure.dof_sensors, structure.dof_modes, strict=True)):
         if sensor >= 0:
             dT[j] = moves.phi[sensor]
         elif mode < 0:
-            return np.full(T.shape, np.nan)
+            dT[:] = np.nan
     P = np.linalg.inv(T)
-    X = (P.T * diagonal) @ P
-    half = np.einsum("ia,abc,bj->ijc", X, dT, P, optimize=True)
-    of_diagonal = np.einsum("ki,kc,kj->ijc", P, change, P, optimize=True)
-    size = np.sqrt(np.diag(X))
-    return moves.std(of_diagonal - half - half.swapaxes(0, 1), np.outer(size, size))
+    moved = P.T @ (P @ dT.reshape(len(T), -1)).reshape(dT.shape)  # P dT P
+    squared, loss = omega**2, 2 * ratios * omega
+    for diagonal, change in (
+        (np.ones_like(omega), np.zeros_like(moves.log_omega)),
+        (squared, 2 * squared[:, None] * moves.log_omega),
+        (loss, loss[:, None] * (moves.log_omega + moves.log_ratios)),
+    ):
+        inner = change[:, None] / 2 * P[:, :, None] - diagonal[:, None, None] * moved
+        half = (P.T @ inner.reshape(len(P), -1)).reshape(inner.shape)
+        size = np.sqrt(diagonal @ P**2)
+        yield half + half.swapaxes(0, 1), np.outer(size, size)

@@ -14,11 +14,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.assessment.checks.gains import gain_errors
+from sysid.assessment.checks.gains import GainErrors, gain_errors
 from sysid.assessment.information import gain_gradients, information, spectra_of, spread
 from sysid.assessment.modal_mass_cone import open_modes
 from sysid.assessment.parametrisation import parametrisation
-from sysid.assessment.perturbations import DirectSpectra, ModalSpectra, Perturbations, matrices_of_modes, std_of
+from sysid.assessment.perturbations import (
+    DirectSpectra,
+    ModalSpectra,
+    Perturbations,
+    changes_of_matrices,
+    matrices_of_modes,
+    std_of,
+)
 from sysid.assessment.sensitivity import (
     Sensitivity,
     blocks_and_slopes,
@@ -173,7 +180,9 @@ class Uncertainty:
         return self._spectra.base_force(check_frequencies(freq, increasing=False))
 
 
-def uncertainty(problem: Prepared, structure: Structure, x: Array | None) -> Uncertainty:
+def uncertainty(
+    problem: Prepared, structure: Structure, x: Array | None, gains: GainErrors | None = None
+) -> Uncertainty:
     """Standard deviations of everything that was identified.
 
     Parameters
@@ -185,6 +194,8 @@ def uncertainty(problem: Prepared, structure: Structure, x: Array | None) -> Unc
         The fit of `problem`.
     x : (n_variables,) or None
         The unknowns that stand for it; those that the models have for it where they are not given.
+    gains : GainErrors, optional
+        Of the problem's own test, where they are known already.
 
     Returns
     -------
@@ -198,15 +209,15 @@ def uncertainty(problem: Prepared, structure: Structure, x: Array | None) -> Unc
         Where x is needed and not given, and a matrix is written in expressions.
     """
     if problem.free_modes:
-        return _by_modes(problem, structure, x)
+        return _by_modes(problem, structure, x, gains or gain_errors(problem.modal[0], structure))
     return _by_unknowns(problem, structure, problem.values(structure) if x is None else x)
 
 
-def _by_modes(problem: Prepared, structure: Structure, x: Array | None) -> Uncertainty:
+def _by_modes(problem: Prepared, structure: Structure, x: Array | None, gains: GainErrors) -> Uncertainty:
     """Standard deviations where the modal parameters are free, from their Fisher information."""
     test = problem.measurement
     modes, index, inflation, normals, unseen, shifts = moves_by_records(problem, structure, gains=True)
-    possible = gain_errors(problem.modal[0], structure).possible
+    possible = gains.possible
     # What makes up for an error that a gain may have counts beside the noise.
     normals = np.hstack([normals, (shifts * possible)[:, possible > 0]])
     normals, unseen, shifts = conditioned(problem, structure, modes, index, normals, unseen, shifts)
@@ -216,8 +227,9 @@ def _by_modes(problem: Prepared, structure: Structure, x: Array | None) -> Uncer
     if test.force is None and open_modes(problem, structure):
         open_ = np.full((structure.n, structure.n), np.nan)
         matrices = open_, open_, open_  # zeros that a decoupled structure keeps included
-    each = [Perturbations(1, *index.split(shift[:, None])) for shift in shifts.T]
-    by_gain = np.array([np.diag(matrices_of_modes(structure, modes, move)[0]) for move in each])
+    by_gains = Perturbations(0, *index.split(shifts))
+    mass_by_gain, _ = next(changes_of_matrices(structure, modes, by_gains))
+    by_gain = np.abs(np.einsum("iic->ci", mass_by_gain))
     found = _quantities(problem, structure, modes, moves, inflation, matrices, by_gain)
     if x is None or not np.any(problem.formulation.outside):
         return found

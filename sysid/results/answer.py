@@ -328,7 +328,8 @@ class Answer:
         fitted = self.prepared
         if not fitted.in_squares:
             fitted = fitted.pseudo_values(self.structure, self.x)
-        return uncertainty(fitted, self.structure, self.x)
+        known = self.gains if fitted is self.prepared and fitted.free_modes else None
+        return uncertainty(fitted, self.structure, self.x, known)
 
     @cached_property
     def outliers(self) -> tuple[Outlier, ...]:
