@@ -341,7 +341,7 @@ def _record_a_line(record: ComplexArray, predicted: ComplexArray, std: Array) ->
 def _responses(modal: ModalEstimate, structure: Structure) -> _Record:
     """The relative accelerations."""
     test = modal.records
-    if modal.has_modes and test.response_std is not None:
+    if modal.by_modes and test.response_std is not None:
         return _record_a_line(test.relative, test.predict(structure), test.response_std)
     return _record(test.relative, test.predict(structure), test.response_std, _CLEAR)
 
@@ -351,7 +351,7 @@ def _forces(modal: ModalEstimate, structure: Structure) -> _Record | None:
     test = modal.records
     if test.force is None:
         return None
-    if modal.has_modes and test.force_std is not None:
+    if modal.by_modes and test.force_std is not None:
         return _record_a_line(test.force, test.predict_force(structure), test.force_std)
     return _record(test.force, test.predict_force(structure), test.force_std, 1.0)
 

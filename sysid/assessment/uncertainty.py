@@ -252,7 +252,7 @@ def moves_by_records(
     path = parametrisation(problem, structure, modes, index)
     unknowns = path.unit.size - path.gauge.shape[1]
     records, B, spectra = noise_records(test, structure, unknowns), None, None
-    if modal.has_modes:
+    if modal.by_modes:
         A, B = information_about(modal, modes)
     else:
         spectra = spectra_of(test, modes)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
-from sysid.modal_analysis.modal_fit import Index, Modes
+from sysid.modal_analysis.modal_fit import Index, ModalFit, Modes
 from sysid.modal_analysis.response import columns, gains, weights_of
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.structure.structure import Array
@@ -72,12 +72,14 @@ class ModalEstimate:
     gamma : (m, d)
         Shapes at the sensors and participations; without a force only their products mean something.
     omega, ratios : (m,)
-        rad/s; damping ratios. None, m = 0, where lines stand for themselves: of spectra and frequency responses.
+        rad/s; damping ratios. Of spectra and frequency responses, whose lines stand for themselves, none, m = 0, where
+        nothing needed them: see `fit_modes_of_lines`.
     rigid : (d, d)
         Rigid-body mass; of no meaning where no force was measured.
     information : (p, p)
         ``Re J' S^-1 J`` over phi, gamma, log omega, log ratios and the upper triangle of the rigid-body mass, with what
-        the transients take away of it: half the inverse of the covariance. Zero for the mass without a force.
+        the transients take away of it: half the inverse of the covariance. Zero for the mass without a force; (0, 0)
+        where lines stand for themselves.
     noise : NoiseLevels or None
         Of whole records, stated or found with the fit.
     reduced : float
@@ -96,6 +98,10 @@ class ModalEstimate:
         Levels that were let vary smoothly over the lines; `noise` holds their means.
     untold : tuple of (run, channel)
         Indices, as in `Excess`. Levels of `noise` that the records do not determine.
+    fit : ModalFit or None
+        Of the modes of lines that stand for themselves.
+    lacking : str
+        Why these lines cannot fix their modes; empty where they can, or nothing asked.
     in_motion : tuple of int
         Indices of runs stated to be at rest at both ends that the records show were not.
     """
@@ -118,6 +124,8 @@ class ModalEstimate:
     varying: tuple[VaryingLevel, ...] = ()
     in_motion: tuple[int, ...] = ()
     untold: tuple[tuple[int, int], ...] = ()
+    fit: ModalFit | None = None
+    lacking: str = ""
 
     @classmethod
     def of_lines(cls, test: Measurement) -> ModalEstimate:
@@ -130,9 +138,9 @@ class ModalEstimate:
         )  # fmt: skip
 
     @property
-    def has_modes(self) -> bool:
-        """True where modes were fitted, whose statistics stand for the lines."""
-        return self.omega.size > 0
+    def by_modes(self) -> bool:
+        """True where the statistics of its modes stand for the lines."""
+        return self.information.size > 0
 
     @property
     def found_noise(self) -> bool:
@@ -162,7 +170,7 @@ def residual_of(estimate: ModalEstimate, modes: Modes) -> float:
 
 def estimated_poles(estimate: ModalEstimate, monitor: Callable[[int, float], object] | None = None) -> Poles:
     """Poles of the modes, or, where none were fitted, those that stand out of the lines: see `find_poles`."""
-    if estimate.has_modes:
+    if estimate.by_modes:
         return Poles(estimate.omega, estimate.ratios, residual_of(estimate, estimate.modes))
     return find_poles(estimate.records, monitor=monitor)
 
@@ -258,7 +266,7 @@ def matched(estimate: ModalEstimate, omega: Array) -> NDArray[np.intp] | None:
     """For each mode of the estimate the nearest of a structure's, each once; None where one of both has too few."""
     from scipy.optimize import linear_sum_assignment
 
-    if not estimate.has_modes or omega.size < estimate.omega.size:
+    if not estimate.by_modes or omega.size < estimate.omega.size:
         return None
     apart = np.abs(np.log(omega[None] / estimate.omega[:, None]))
     return np.asarray(linear_sum_assignment(apart)[1])

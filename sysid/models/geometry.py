@@ -105,7 +105,7 @@ class Geometry:
         A pole counts as often as its residue has rank, where the model has room for all.
         """
         omega, test = self.poles.omega, self.test
-        if omega.size < self.n and test.n_base > 1 and not self.modal.has_modes:
+        if omega.size < self.n and test.n_base > 1 and not self.modal.by_modes:
             records = Records(test)
             free = records.fit(omega, self.poles.ratios)
             ranks = free.ranks(records.noise(free.left, free.residues.size), test.n_sensors, test.n_base)

@@ -16,9 +16,11 @@ from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.fit import fit_modes
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.outliers import Outlier, outliers, predicted, pseudo_values, screened
+from sysid.modal_analysis.spectra_modes import fit_modes_of_lines
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.geometry import Geometry
 from sysid.models.unknowns import Unknown
+from sysid.nlp import IterationMonitor
 from sysid.problem.feasibility import HELD, LOOSE, check_constraints, check_matrices, points_of, scale_of
 from sysid.problem.formulation import Formulation
 from sysid.problem.given import MATRICES, geometry_of, rough_mass
@@ -71,6 +73,19 @@ class Prepared:
     def modal(self) -> tuple[ModalEstimate, ...]:
         """The modal estimate of each test that is fitted."""
         return tuple(fit_modes(test) for test in self.stated.tests)
+
+    def fit_lines(
+        self, poles: Poles, count: int | None, monitor: IterationMonitor, max_iterations: int
+    ) -> ModalEstimate:
+        """Fit modes to the lines of the problem's own test, which are its modal estimate from then on.
+
+        See `fit_modes_of_lines`.
+        """
+        modal = fit_modes_of_lines(
+            self.modal[0], poles, np.sqrt(self.totals), count=count, monitor=monitor, max_iterations=max_iterations
+        )
+        self.modal = (modal, *self.modal[1:])
+        return modal
 
     @cached_property
     def screened(self) -> Prepared:

@@ -106,7 +106,7 @@ class TestTerm:
         phi, omega = modes
         ratios = self.matrices.ratio_function(x, omega)
         shapes = ca.DM(motion.recovery) @ phi
-        if self.modal.omega.size == omega.numel():
+        if self.modal.by_modes and self.modal.omega.size == omega.numel():
             gamma, size = phi.T @ motion.push, weights_of_test(self.test, weighted=True)[0][1]
             weighed = self.test.force is not None
             return (

@@ -32,7 +32,7 @@ from sysid.problem.prepared import Prepared
 from sysid.search.local import LocalResult, fit_apart, solve
 from sysid.search.modal_coordinates import End
 from sysid.search.modal_scaling import nearest_lumped, of_known_mass, to_stated_totals
-from sysid.search.mode_fit import Integers, ModeFit, ended, held_to_totals
+from sysid.search.mode_fit import Integers, ended, held_to_totals
 from sysid.search.session import Session, Stop
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, search_note
 from sysid.structure.structure import Array, Structure
@@ -228,7 +228,7 @@ def run_modal(problem: Prepared, options: Modal, session: Session) -> Outcome:
     success, message = end.status in SOLVED or end.residual <= EXACT, ended_in_words(end.status)
     message += f"; ended on a bound: {end.bounds}" * bool(end.bounds)
     modal = problem.modal[0]
-    if modal.has_modes and not modal.settled:
+    if modal.by_modes and not modal.settled:
         success, message = False, f"{message}; the fit of whole records did not settle: modes or noise still moved"
     if monitor.is_over and end.residual > EXACT:
         success, message = False, f"{message}; the time was over before every further fit was tried"
@@ -306,9 +306,7 @@ def modal_structure(
     """
     test, mass = problem.measurement, problem.formulation.mass
     poles = poles_of(problem)
-    has_modes = problem.modal[0].has_modes
-    end = _as_estimated(problem, options) if has_modes else _fitted(problem, poles, options, monitor)
-    end = ended(problem, end, monitor, options.max_iterations)
+    end = ended(problem, _estimated(problem, poles, options, monitor), monitor, options.max_iterations)
     # With all modes at the sensors totals are adjusted together with the other statements, afterwards.
     later = mass.weighs and end.modes.omega.size == test.n_sensors
     held = None if later else held_to_totals(problem, end, monitor, options.max_iterations)
@@ -330,15 +328,14 @@ def modal_structure(
         ) from None
 
 
-def _fitted(problem: Prepared, poles: Poles, options: Modal, monitor: IterationMonitor) -> ModalFit:
-    """Modes fitted to the lines, from poles close by."""
-    fit = ModeFit(problem.measurement, poles, np.sqrt(problem.totals), monitor, options.max_iterations)
-    return fit.best() if options.modes is None else fit.of_strongest(options.modes)
-
-
-def _as_estimated(problem: Prepared, options: Modal) -> ModalFit:
-    """The modes that were fitted with the transients of whole records."""
+def _estimated(problem: Prepared, poles: Poles, options: Modal, monitor: IterationMonitor) -> ModalFit:
+    """The modes of the records: fitted with the transients of whole ones, else to the lines, from poles close by."""
     modal = problem.modal[0]
+    if not modal.by_modes:
+        modal = problem.fit_lines(poles, options.modes, monitor, options.max_iterations)
+        if modal.fit is None:
+            raise DoesNotApplyError(modal.lacking)
+        return modal.fit
     if options.modes not in (None, modal.omega.size):
         raise InputError(
             f"{modal.omega.size} modes stand out of the whole records, not the {options.modes} asked for: narrow "

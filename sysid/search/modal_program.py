@@ -77,7 +77,7 @@ def solve_modes(
     G. H. Golub, V. Pereyra, SIAM J. Numer. Anal. 10 (1973) 413-432; L. Kaufman, BIT 15 (1975) 49-57.
     """
     z, test = NonlinearProgram(), modal.records
-    (m, d), by_lines = first.gamma.shape, modal.omega.size != first.omega.size
+    (m, d), by_lines = first.gamma.shape, not (modal.by_modes and modal.omega.size == first.omega.size)
     weighed = test.force is not None
     # The information of an estimate is of each of its modes apart.
     gauge, held = held_gauge(first if by_lines else first._replace(omega=np.arange(float(m))), unit, weighed)

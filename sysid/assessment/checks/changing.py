@@ -232,7 +232,7 @@ class ObservedPoles(NamedTuple):
 
 def _modes(modal: ModalEstimate) -> ObservedPoles | None:
     """Poles of a test; None where it shows none."""
-    if modal.has_modes:
+    if modal.by_modes:
         omega, ratios, shapes = modal.omega, modal.ratios, modal.phi
     else:
         poles = PolesAndResidues.of(modal.records)

@@ -85,7 +85,7 @@ def gain_errors(modal: ModalEstimate, structure: Structure) -> GainErrors:
     are counted as such; noise that is stated larger counts as stated.
     """
     test, gain = modal.records, modal.gain
-    if modal.has_modes:
+    if modal.by_modes:
         moved = np.any(test.rigid_body, axis=1)
         error, std = np.where(moved, gain.error, np.nan), np.where(moved, gain.std, np.nan)
         return GainErrors(error, std, np.nan_to_num(_beyond(error, std)), gain.freedom)

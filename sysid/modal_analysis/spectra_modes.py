@@ -1,0 +1,231 @@
+"""Modes of plain spectra: fit of rank-one modes at the poles of a test, as many at each pole as its residue needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sysid.errors import InputError, SolverError
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.modal_estimate import ModalEstimate
+from sysid.modal_analysis.modal_fit import ModalFit, Modes
+from sysid.modal_analysis.modal_masses import weigh
+from sysid.modal_analysis.residues import Records, ResidueFit, SubsetFits, independent, linear_residues
+from sysid.modal_analysis.spectra_model import fit_spectra
+from sysid.modal_analysis.vector_fitting import Poles
+from sysid.nlp import IterationMonitor
+from sysid.structure.structure import Array
+from sysid.structure.thresholds import CANDIDATES, EXACT, beyond_chance
+
+Integers = NDArray[np.intp]
+
+_SECONDS = 8e-9  # of a processor, for a line and the square of its slopes
+
+
+def fit_modes_of_lines(
+    modal: ModalEstimate, poles: Poles, unit: Array, *, count: int | None, monitor: IterationMonitor,
+    max_iterations: int,
+) -> ModalEstimate:  # fmt: skip
+    """Fit modes at the poles of a test whose lines stand for themselves: its estimate with these, ascending.
+
+    Parameters
+    ----------
+    modal : ModalEstimate
+        Of the test, without modes.
+    poles : Poles
+        Close by.
+    unit : (d,)
+        Size of participations, kg^½, m kg^½ for rotations.
+    count : int or None
+        Of modes, one each at the poles whose loss the records would feel most; as many as the records need where None.
+    monitor : IterationMonitor
+    max_iterations : int
+        Of each fit.
+
+    Returns
+    -------
+    ModalEstimate
+        With `lacking`, and without modes, where the records cannot fix them.
+
+    Raises
+    ------
+    InputError
+        Where there are fewer than `count` poles, or the base force has the wrong sign.
+    SolverError
+        Where the time does not suffice.
+    """
+    fit = ModeFit(modal.records, poles, unit, monitor, max_iterations)
+    fit = fit if count is None else fit.at_strongest(count)
+    fit.check_time()
+    lacking = fit.lacking
+    if lacking is not None:
+        return replace(modal, lacking=lacking)
+    found = fit.best() if count is None else fit.of_single_modes()
+    modes = found.modes
+    order = np.argsort(modes.omega, kind="stable")
+    modes = Modes(modes.phi[:, order], modes.gamma[order], modes.omega[order], modes.ratios[order])
+    return replace(
+        modal, phi=modes.phi, gamma=modes.gamma, omega=modes.omega, ratios=modes.ratios, rigid=found.rigid,
+        fit=replace(found, modes=modes),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class ModeFit:
+    """Fit of rank-one modes at the poles of a test; a pole whose residue needs it stands for several modes.
+
+    Attributes
+    ----------
+    test : Measurement
+    poles : Poles
+    unit : (d,)
+        Size of participations, kg^½, m kg^½ for rotations.
+    monitor : IterationMonitor
+    max_iterations : int
+        Of each fit.
+    """
+
+    test: Measurement
+    poles: Poles
+    unit: Array
+    monitor: IterationMonitor
+    max_iterations: int
+
+    @cached_property
+    def records(self) -> Records:
+        """Records that residues are fitted to."""
+        return Records(self.test)
+
+    def best(self) -> ModalFit:
+        """The fit of as many modes as the records need."""
+        test, records, poles = self.test, self.records, self.poles
+        m, n, d = poles.omega.size, test.n_sensors, test.n_base
+        single = np.ones(m, dtype=int)
+        best = self._grown(self._with(single), single)
+        # Modes of rank one may have dragged poles away from where several modes share one.
+        free = records.fit(poles.omega, poles.ratios)
+        noise = records.noise(free.left, free.residues.size)
+        excess = best.of_accelerations**2 * records.size - free.squared_error
+        ranks = free.ranks(noise, n, d)
+        # An exact fit lacks nothing; round-off in residues of poles that nearly coincide would ask for more modes.
+        lacks = best.of_accelerations > EXACT and excess > noise * beyond_chance(m * (n - 1) * (d - 1), CANDIDATES)
+        wanting = lacks or ranks.sum() < best.modes.omega.size
+        if self._goes_on and wanting and np.any(ranks > 1):
+            other = self._grown(self._with(ranks), ranks)
+            more = other.modes.omega.size - best.modes.omega.size
+            gained = (best.of_accelerations**2 - other.of_accelerations**2) * records.size / noise
+            if gained > np.sign(more) * beyond_chance(abs(more) * (n + d), CANDIDATES):
+                best = other
+        return best
+
+    def at_strongest(self, count: int) -> ModeFit:
+        """The same at so many poles: those whose loss the records would feel most.
+
+        Raises
+        ------
+        InputError
+            Where there are not so many poles.
+        """
+        poles = self.poles
+        if count > poles.omega.size:
+            raise InputError(f"{poles.omega.size} modes stand out of the noise, fewer than the {count} asked for")
+        subsets, kept = SubsetFits(self.records, poles.omega, poles.ratios), np.arange(poles.omega.size)
+        while kept.size > count:
+            worth, _ = subsets.worth(kept)
+            kept = np.delete(kept, np.argmin(worth))
+        return replace(self, poles=replace(poles, omega=poles.omega[kept], ratios=poles.ratios[kept]))
+
+    def of_single_modes(self) -> ModalFit:
+        """The fit of one mode at each pole."""
+        return self._with(np.ones(self.poles.omega.size, dtype=int))
+
+    def check_time(self) -> None:
+        """Refuse a time that cannot suffice."""
+        if not self.monitor.allows(self._seconds):
+            raise SolverError(
+                f"a fit of {self.poles.omega.size} modes takes some {self._seconds:.1g} s to set up: too little time, "
+                "nothing is identified"
+            )
+
+    @property
+    def lacking(self) -> str | None:
+        """Why these records cannot fix the modes; None where they can."""
+        test, moving = self.test, independent(self.test.base).shape[1]
+        if moving < test.n_base:
+            return (
+                f"the base moves in only {moving} of {test.n_base} independent directions: add runs that move the "
+                "others, or describe the test by the directions that move"
+            )
+        m = self.poles.omega.size
+        unknowns = m * (test.n_sensors + test.n_base + 1)
+        if 2 * test.response.size < unknowns or len(self.records.data) < m * len(self.records.base):
+            return (
+                f"{test.freq.size} lines ({2 * test.response.size} measured numbers) cannot fix {unknowns} unknowns: "
+                "add lines or runs"
+            )
+        return None
+
+    @property
+    def _goes_on(self) -> bool:
+        """True where nobody has stopped the fit, and there is time for another one."""
+        monitor = self.monitor
+        return monitor.stopped is None and not monitor.is_over and monitor.allows(self._seconds)
+
+    @property
+    def _seconds(self) -> float:
+        """About how long it takes until a fit has its first iterate."""
+        test = self.test
+        return float(_SECONDS * (self.poles.omega.size * (test.n_base + 2)) ** 2 * test.n_runs * test.freq.size)
+
+    def _grown(self, best: ModalFit, multiplicity: Integers) -> ModalFit:
+        """The fit of so many modes at each pole, or one with more where their free residues call for it."""
+        while self._goes_on and (lacking := self._lacking_rank(best, multiplicity)) is not None:
+            more = multiplicity.copy()
+            more[lacking] += 1
+            again = self._with(more)
+            gained = (best.of_accelerations**2 - again.of_accelerations**2) * self.records.size
+            noise = self._free(again, more)[1]
+            if gained < beyond_chance(self.test.n_sensors + self.test.n_base, CANDIDATES) * noise:
+                break
+            best, multiplicity = again, more
+        return best
+
+    def _free(self, end: ModalFit, multiplicity: Integers) -> tuple[ResidueFit, float]:
+        """Free residues at a fit's poles, and the variance of a real number of the records about them."""
+        first = np.cumsum(multiplicity) - multiplicity
+        free = self.records.fit(end.modes.omega[first], end.modes.ratios[first])
+        return free, self.records.noise(free.left, free.residues.size)
+
+    def _lacking_rank(self, best: ModalFit, multiplicity: Integers) -> int | None:
+        """The pole whose free residue most lacks in the modes that it has; None where none does."""
+        n, d = self.records.n_sensors, self.records.n_base
+        if n < 2 or d < 2 or best.of_accelerations <= EXACT:
+            return None
+        free, noise = self._free(best, multiplicity)
+        freedom = float(np.sum((n - multiplicity) * (d - multiplicity)))
+        excess = best.of_accelerations**2 * self.records.size - free.squared_error
+        if excess < noise * beyond_chance(freedom, CANDIDATES):
+            return None
+        s = np.linalg.svd(free.whitened.reshape(multiplicity.size, -1, n), compute_uv=False)
+        left = np.array([np.sum(row[r:] ** 2) for row, r in zip(s, multiplicity, strict=True)])
+        left[multiplicity >= min(n, d)] = 0.0
+        return int(np.argmax(left)) if left.max() > 0 else None
+
+    def _with(self, multiplicity: Integers) -> ModalFit:
+        """Fit with so many modes at each pole, from its free residue's largest singular values."""
+        test, poles, unit = self.test, self.poles, self.unit
+        residues, _ = linear_residues(test, poles.omega, poles.ratios)
+        pole = np.repeat(np.arange(poles.omega.size), multiplicity)
+        rank = np.concatenate([np.arange(r) for r in multiplicity])
+        u, s, vt = np.linalg.svd(residues * unit)  # participations of order one whatever the direction's unit
+        root = np.sqrt(s[pole, rank])
+        phi, gamma = u[pole, :, rank].T * root, vt[pole, rank] * root[:, None] / unit
+        modes = Modes(phi, gamma, poles.omega[pole], poles.ratios[pole])
+        rigid = np.diag(unit**2)
+        if test.force is not None:
+            t, rigid = weigh(test, modes)
+            modes = modes._replace(phi=modes.phi / np.sqrt(t), gamma=modes.gamma * np.sqrt(t)[:, None])
+        return fit_spectra(test, modes, rigid, monitor=self.monitor, max_iterations=self.max_iterations)
