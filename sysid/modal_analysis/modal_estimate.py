@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.modal_fit import Index, Modes
+from sysid.modal_analysis.record_fit import RecordFit
 from sysid.modal_analysis.response import columns, gains, weights_of
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.structure.structure import Array
@@ -98,6 +99,8 @@ class ModalEstimate:
         Indices, as in `Excess`. Levels of `noise` that the records do not determine.
     in_motion : tuple of int
         Indices of runs stated to be at rest at both ends that the records show were not.
+    fit : RecordFit or None
+        Of whole records, of which all else can be made again.
     """
 
     given: Measurement
@@ -118,6 +121,7 @@ class ModalEstimate:
     varying: tuple[VaryingLevel, ...] = ()
     in_motion: tuple[int, ...] = ()
     untold: tuple[tuple[int, int], ...] = ()
+    fit: RecordFit | None = None
 
     @classmethod
     def of_lines(cls, test: Measurement) -> ModalEstimate:
@@ -133,6 +137,11 @@ class ModalEstimate:
     def has_modes(self) -> bool:
         """True where modes were fitted, whose statistics stand for the lines."""
         return self.omega.size > 0
+
+    @property
+    def stopped(self) -> bool:
+        """True where the search for modes was stopped, so that not all were tried."""
+        return self.fit is not None and self.fit.stopped
 
     @property
     def found_noise(self) -> bool:
