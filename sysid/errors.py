@@ -46,6 +46,10 @@ class SolverError(SysidError):
     """A numerical solver ended without a usable answer; the message has its status."""
 
 
+class Stop(Exception):  # noqa: N818 - not an error
+    """The callback asked to stop, or the time is over."""
+
+
 def how_to_install(extra: str) -> str:
     """The command for an extra of the package, which works wherever it is installed."""
     return f"python -m pip install 'structural-sysid[{extra}]'"

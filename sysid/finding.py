@@ -21,7 +21,7 @@ Kind = Literal[
     "one mode twice", "coarse lines", "misfit", "force misfit", "rigid motion", "damping", "one motion", "own term",
     "no solution",
     # What leaves the matrices open.
-    "not judged", "other answers", "open", "noise",
+    "not judged", "other answers", "open", "noise", "modes not all tried",
     # What is to be known besides.
     "fixed", "strategy", "search", "ending", "on a bound", "search box", "assumed total", "level", "lines left out",
     "coloured noise", "noise level", "noise left", "outliers", "own misfit", "no damping ratio", "assumed gain",

@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 
 from sysid.assessment.checks import check_records, mistakes_of_poor_fit
 from sysid.assessment.checks.changing import changing
-from sysid.errors import InputError, SolverError, as_float, finite_array, function, instance, path_of, whole_number
+from sysid.errors import InputError, SolverError, Stop, finite_array, instance, path_of
 from sysid.finding import Finding
+from sysid.modal_analysis.fit import fit_tests
 from sysid.nlp import one_thread
 from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
@@ -23,8 +24,9 @@ from sysid.results.judgement import judge
 from sysid.results.stated_masses import with_stated_masses
 from sysid.search import robust
 from sysid.search.auto import InTurn, check_strategy, choose
+from sysid.search.deadline import regularly
 from sysid.search.journal import Journal
-from sysid.search.session import DeferredInterrupt, Progress, Session, Stop, seed_of
+from sysid.search.session import DeferredInterrupt, Progress, Session, limits_of, listeners_of, seed_of
 from sysid.search.strategy import DoesNotApplyError, NoStrategyError, Strategy
 from sysid.structure.structure import Structure
 
@@ -86,13 +88,8 @@ def identify(
     check_strategy(strategy)
     if not isinstance(start, Structure | None):
         start = finite_array("start", start)
-    if max_time is not None:
-        max_time = as_float("max_time", max_time, "a positive number of seconds", above=0)
-    if max_evaluations is not None:
-        max_evaluations = whole_number("max_evaluations", max_evaluations, at_least=1)
-    for name, given in (("callback", callback), ("progress", progress)):
-        function(name, given)
-    listeners = [listener for listener in (progress, callback) if listener is not None]
+    max_time, max_evaluations = limits_of(max_time, max_evaluations)
+    listeners = listeners_of(progress=progress, callback=callback)
     kept: contextlib.AbstractContextManager[Journal] = contextlib.nullcontext(Journal())
     if checkpoint is not None:
         if rng is None:
@@ -121,8 +118,13 @@ def identify(
 
 def prepare(problem: Problem, session: Session) -> Prepared:
     """Fit modes, find noise, poles and weights, and refuse what cannot be searched, under the session's clock."""
+    monitor = session.fit_monitor()
     try:
-        prepared = Prepared.of(problem, session.preparing)
+        with regularly(monitor.check):
+            modal = fit_tests(problem.tests, monitor)
+        if any(one.by_modes for one in modal):
+            session.finish()
+        prepared = Prepared.of(problem, modal, session.preparing)
         prepared.check()
     except Stop as stop:
         raise SolverError(f"{stop}: nothing is identified") from None

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.errors import InputError
+from sysid.errors import InputError, Stop
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.excitation import steady_sine
+from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.modal_analysis.record_fit import Monitor, RecordFit, on_all_lines, record_modes, refitted, without, worth
+from sysid.modal_analysis.record_fit import (
+    RecordFit,
+    at_all_lines,
+    on_all_lines,
+    record_modes,
+    refitted,
+    without,
+    worth,
+)
 from sysid.modal_analysis.record_gains import gain_errors_of
 from sysid.modal_analysis.record_more import least_worth, no_modes, with_further_modes
 from sysid.modal_analysis.record_poles import decimated_lines, rough_deviations
@@ -27,14 +37,32 @@ from sysid.nlp import one_thread
 from sysid.structure.structure import Array, ComplexArray
 
 
-def whole_fit(test: Measurement, *, monitor: Monitor | None = None) -> RecordFit:
+def whole_fit(test: Measurement, *, monitor: FitMonitor | None = None) -> RecordFit:
     """Modes, transients and noise of whole records, its levels smooth over the lines where they are no constants.
+
+    Where the monitor stops it, the best fit until then, with `stopped` set.
 
     Raises
     ------
     InputError
         As `find_poles` does, or where the base moved in a steady sine.
+    Stop, KeyboardInterrupt
+        Where the monitor stops it before there was a fit.
     """
+    if monitor is None:
+        return _whole_fit(test, FitMonitor())
+    try:
+        with monitor.at_work():
+            return _whole_fit(test, monitor)
+    except (Stop, KeyboardInterrupt):
+        best = monitor.best
+        if best is None:
+            raise
+    # One step leads to the end on all lines, but for what noise makes of the curvature: some lines led close to it.
+    return replace(best if best.test.freq.size == test.freq.size else at_all_lines(best, test), stopped=True)
+
+
+def _whole_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
     try:
         fit = _white_fit(test, monitor)
     except (InputError, np.linalg.LinAlgError) as error:
@@ -42,13 +70,14 @@ def whole_fit(test: Measurement, *, monitor: Monitor | None = None) -> RecordFit
         if sentence is None:
             raise
         raise InputError(sentence) from error
+    monitor.doing = "levels of noise that vary"
     fit = with_varying_levels(fit, monitor=monitor)
     if fit.model.whole.varying is not None:  # where the level was too low, noise passed for modes
         fit = _pruned(fit, monitor)
     return fit
 
 
-def _white_fit(test: Measurement, monitor: Monitor | None) -> RecordFit:
+def _white_fit(test: Measurement, monitor: FitMonitor) -> RecordFit:
     """The fit with one level of noise a channel and run.
 
     Poles are looked for twice: with rough weights, and with the noise that a first fit found; where lines are many, on
@@ -57,27 +86,48 @@ def _white_fit(test: Measurement, monitor: Monitor | None) -> RecordFit:
     lines = decimated_lines(test)
     if not np.all(lines):
         some = test.at(lines)
-        fit = on_all_lines(_white_fit(some, monitor), test, monitor=monitor)
-        return with_further_modes(fit, some=some, monitor=monitor)  # weak ones show on all lines only
+        fit = _white_fit(some, monitor)
+        monitor.doing = "all lines"
+        fit = on_all_lines(fit, test, monitor=monitor)
+        monitor.keep(fit)
+        return _with_all_modes(fit, monitor, some)  # weak ones show on all lines only
+    monitor.doing = "poles by rough weights"
     poles = find_poles(replace(test, response_std=rough_deviations(test)), monitor=monitor)
     fit = _fitted(test, poles, monitor)
+    monitor.doing = "poles by the noise found"
     again = find_poles(replace(test, response_std=deviations(fit)[0]), monitor=monitor)
     if not _same_modes(fit.parameters.modes, again):
         fit = max(fit, _fitted(test, again, monitor), key=lambda one: one.schwarz)
-    return without_spurious_modes(with_further_modes(fit, monitor=monitor), monitor=monitor)
+    return _with_all_modes(fit, monitor)
 
 
-def _fitted(test: Measurement, poles: Poles, monitor: Monitor | None) -> RecordFit:
+def _with_all_modes(fit: RecordFit, monitor: FitMonitor, some: Measurement | None = None) -> RecordFit:
+    """The fit with further modes that are worth it, then without spurious ones; `some` as in `refitted`."""
+    monitor.doing = "further modes"
+    fit = with_further_modes(fit, some=some, monitor=monitor)
+    monitor.doing = "spurious modes"
+    fit = without_spurious_modes(fit, some=some, monitor=monitor)
+    monitor.keep_instead(fit)
+    return fit
+
+
+def _fitted(test: Measurement, poles: Poles, monitor: FitMonitor) -> RecordFit:
     """One mode at each pole, or as many as its residue has rank where each is worth more than noise."""
+    monitor.doing = f"{poles.omega.size} modes"
     first = record_modes(test, poles.omega, poles.ratios, monitor=monitor)
     fit = _kept(first, monitor)
+    monitor.keep(fit)
+    monitor.doing = "several modes at a pole"
     repeated = record_modes(test, poles.omega, poles.ratios, repeated=True, monitor=monitor)
     modes = repeated.parameters.modes.omega.size
     if modes == first.parameters.modes.omega.size:
         return fit
     repeated = _kept(repeated, monitor)
     more = repeated.parameters.modes.omega.size - fit.parameters.modes.omega.size
-    return repeated if repeated.likelihood - fit.likelihood > max(more, 0) * least_worth(fit.model) else fit
+    if repeated.likelihood - fit.likelihood <= max(more, 0) * least_worth(fit.model):
+        return fit
+    monitor.keep(repeated)
+    return repeated
 
 
 def _same_modes(modes: Modes, poles: Poles) -> bool:
@@ -88,7 +138,7 @@ def _same_modes(modes: Modes, poles: Poles) -> bool:
     return bool(np.all(apart.min(axis=0) < 1) and np.all(apart.min(axis=1) < 1))
 
 
-def _kept(fit: RecordFit, monitor: Monitor | None) -> RecordFit:
+def _kept(fit: RecordFit, monitor: FitMonitor) -> RecordFit:
     """A rough fit without modes that noise explains, settled, and without those that it explains then."""
     for rough in (True, False):
         if not rough:
@@ -97,7 +147,7 @@ def _kept(fit: RecordFit, monitor: Monitor | None) -> RecordFit:
     return fit
 
 
-def _pruned(fit: RecordFit, monitor: Monitor | None, *, rough: bool = False) -> RecordFit:
+def _pruned(fit: RecordFit, monitor: FitMonitor, *, rough: bool = False) -> RecordFit:
     """The fit without modes that noise explains, one after the other."""
     while (least := _least(fit)) is not None:
         fit = refitted(fit, without(fit, least), rough=rough, monitor=monitor)
@@ -138,24 +188,44 @@ def _at_lines(test: Measurement, parts: list[list[NDArray[Any]]]) -> NDArray[Any
     return out
 
 
-def fit_modes(test: Measurement, *, monitor: Monitor | None = None) -> ModalEstimate:
+def fit_modes(test: Measurement, *, monitor: FitMonitor | None = None) -> ModalEstimate:
     """Estimate the modes of a test: of whole records with their transients and noise; other lines stand as given.
 
     Parameters
     ----------
     test : Measurement
-    monitor : callable, optional
-        As in `find_poles`.
+    monitor : FitMonitor, optional
 
     Raises
     ------
-    InputError
+    InputError, Stop, KeyboardInterrupt
         As `whole_fit` does.
     """
     if test.whole is None:
         return ModalEstimate.of_lines(test)
     with one_thread():  # the same bits on any number of processors, and many times faster where others use them too
         return estimate(whole_fit(test, monitor=monitor))
+
+
+def fit_tests(tests: Iterable[Measurement], monitor: FitMonitor) -> tuple[ModalEstimate, ...]:
+    """The modes of each test, which share the time of the monitor.
+
+    Raises
+    ------
+    InputError, Stop, KeyboardInterrupt
+        As `whole_fit` does; the last two name the test, where there are several.
+    """
+    every, found = tuple(tests), []
+    for number, test in enumerate(every, start=1):
+        monitor.begin(sum(one.whole is not None for one in every[number - 1 :]))
+        try:
+            found.append(fit_modes(test, monitor=monitor))
+        except (Stop, KeyboardInterrupt) as stop:
+            if len(every) == 1:
+                raise
+            words = str(stop) or "interrupted"
+            raise type(stop)(f"{words}, and test {number} of {len(every)} had no modes yet") from None
+    return tuple(found)
 
 
 def without_transients(fit: RecordFit) -> Measurement:
@@ -191,4 +261,5 @@ def estimate(fit: RecordFit) -> ModalEstimate:
         A[np.ix_(at, at)], fit.noise, fit.reduced, fit.model.whole.density, replace(gain, moves=gain.moves[at]),
         None if B is None else B[np.ix_(at, at)], fit.settled,
         excess_of(fit), varying_levels(fit), runs_in_motion(fit), unidentifiable_levels(fit),
+        record_fit=replace(fit),
     )  # fmt: skip

@@ -55,8 +55,9 @@ def minimise(
     """
     least, damping, greatest = _DAMPING
     x, p = problem.start, problem.unpack(problem.start)
-    here = problem.equations(p)
+    after = np.inf
     for i in range(most):
+        here = problem.equations(p)
         if tell(i, p, here.chi2):
             return p, here.chi2, False
         unit = units_of(here.normal)
@@ -78,8 +79,7 @@ def minimise(
         damping = max(damping / 10, least)
         if promised < enough:
             return p, after, True
-        here = problem.equations(p)
-    return p, here.chi2, False
+    return p, after, False
 
 
 def units_of(normal: Array) -> Array:

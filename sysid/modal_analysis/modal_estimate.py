@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
 from sysid.modal_analysis.modal_fit import Index, ModalFit, Modes
+from sysid.modal_analysis.record_fit import RecordFit
 from sysid.modal_analysis.response import columns, gains, weights_of
 from sysid.modal_analysis.vector_fitting import Poles, find_poles
 from sysid.structure.structure import Array
@@ -104,6 +105,8 @@ class ModalEstimate:
         Why these lines cannot fix their modes; empty where they can, or nothing asked.
     in_motion : tuple of int
         Indices of runs stated to be at rest at both ends that the records show were not.
+    record_fit : RecordFit or None
+        Of whole records, of which all else can be made again.
     """
 
     given: Measurement
@@ -126,6 +129,7 @@ class ModalEstimate:
     untold: tuple[tuple[int, int], ...] = ()
     fit: ModalFit | None = None
     lacking: str = ""
+    record_fit: RecordFit | None = None
 
     @classmethod
     def of_lines(cls, test: Measurement) -> ModalEstimate:
@@ -141,6 +145,11 @@ class ModalEstimate:
     def by_modes(self) -> bool:
         """True where the statistics of its modes stand for the lines."""
         return self.information.size > 0
+
+    @property
+    def stopped(self) -> bool:
+        """True where the search for modes was stopped, so that not all were tried."""
+        return self.record_fit is not None and self.record_fit.stopped
 
     @property
     def found_noise(self) -> bool:

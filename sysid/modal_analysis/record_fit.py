@@ -7,7 +7,6 @@ estimated in turn with the fit.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -16,6 +15,7 @@ import numpy as np
 
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
+from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.least_squares import SumOfSquares, minimise, units_of
 from sysid.modal_analysis.modal_fit import Modes
 from sysid.modal_analysis.modal_masses import weigh
@@ -28,8 +28,6 @@ from sysid.structure.structure import Array
 _SETTLED = 1e-3  # fall of the sum of squares, in units of the noise, at which the fit stands still
 _LEAST_MASS = 1e-3  # of the largest modal mass, that a mode begins with
 _SAME_LEVELS = 0.003  # relative change of a standard deviation at which levels stand still
-
-Monitor = Callable[[int, float], object]
 
 
 class Limits(NamedTuple):
@@ -57,6 +55,8 @@ class RecordFit:
         ``sum e' S^-1 e``: half a chi-squared of `freedom` degrees where the model is right.
     settled : bool
         Whether the fit came to its end.
+    stopped : bool
+        Whether the search for modes was stopped, and this is the best until then.
     """
 
     test: Measurement
@@ -64,6 +64,7 @@ class RecordFit:
     levels: Array
     chi2: float
     settled: bool
+    stopped: bool = False
 
     @cached_property
     def model(self) -> RecordModel:
@@ -140,7 +141,7 @@ class RecordFit:
 
 
 def record_modes(
-    test: Measurement, omega: Array, ratios: Array, *, repeated: bool = False, monitor: Monitor | None = None
+    test: Measurement, omega: Array, ratios: Array, *, repeated: bool = False, monitor: FitMonitor | None = None
 ) -> RecordFit:
     """Fit modes to whole records, roughly, from poles close by: a few steps, for `refitted` to go on from.
 
@@ -152,12 +153,12 @@ def record_modes(
         Of whole records.
     omega, ratios : (m,)
         Circular frequencies, rad/s, and damping ratios.
-    monitor : callable, optional
-        ``monitor(iterations, residual)``, the latter ``sqrt(chi2 / numbers)``; what it raises passes through.
+    monitor : FitMonitor, optional
+        Called with iterations and ``sqrt(chi2 / numbers)``; what it raises passes through.
     """
     first = _first(test, omega, ratios, repeated=repeated)
     model = RecordModel(test, first.modes.omega.size)
-    return _fit(model, first, None, monitor or (lambda i, r: None), _ROUGH)
+    return _fit(model, first, None, monitor or FitMonitor(), _ROUGH)
 
 
 def refitted(
@@ -166,7 +167,7 @@ def refitted(
     *,
     rough: bool = False,
     some: Measurement | None = None,
-    monitor: Monitor | None = None,
+    monitor: FitMonitor | None = None,
 ) -> RecordFit:
     """The fit from other parameters, and from its levels of noise; with `rough` a few steps of it.
 
@@ -176,7 +177,7 @@ def refitted(
     m = p.modes.omega.size
     coarse = None if some is None else RecordModel(some, m).weighed_as_all()
     limits = _ROUGH if rough else _WHOLE
-    return _fit(RecordModel(fit.test, m), p, fit.levels, monitor or (lambda i, r: None), limits, coarse)
+    return _fit(RecordModel(fit.test, m), p, fit.levels, monitor or FitMonitor(), limits, coarse)
 
 
 def with_poles_of(fit: RecordFit, test: Measurement, *, held: bool = False) -> RecordFit:
@@ -186,19 +187,27 @@ def with_poles_of(fit: RecordFit, test: Measurement, *, held: bool = False) -> R
     """
     m, channels = fit.parameters.modes.omega.size, fit.parameters.traces.shape[1]
     first = replace(fit.parameters, ends=np.zeros((m, 2)), traces=np.zeros((1, channels, TRACES)))
-    return _fit(HeldShapes(test, m, poles=held), first, None, lambda i, r: None, _POLES)
+    return _fit(HeldShapes(test, m, poles=held), first, None, FitMonitor(), _POLES)
 
 
-def on_all_lines(fit: RecordFit, test: Measurement, *, monitor: Monitor | None = None) -> RecordFit:
+def on_all_lines(fit: RecordFit, test: Measurement, *, monitor: FitMonitor | None = None) -> RecordFit:
     """The fit of a test from that of some of its lines."""
     return refitted(replace(fit, test=test), fit.parameters, some=fit.test, monitor=monitor)
+
+
+def at_all_lines(fit: RecordFit, test: Measurement) -> RecordFit:
+    """The same in one step, with levels and sum of squares of all lines; settled where the fit of some lines was."""
+    model = RecordModel(test, fit.parameters.modes.omega.size)
+    coarse = RecordModel(fit.test, model.m).weighed_as_all()
+    one = _fit(model, fit.parameters, fit.levels, FitMonitor(), Limits(1, 1), coarse)
+    return replace(one, settled=fit.settled)
 
 
 def _fit(
     model: RecordModel,
     p: Parameters,
     levels: Array | None,
-    monitor: Monitor,
+    monitor: FitMonitor,
     limits: Limits,
     coarse: RecordModel | None = None,
 ) -> RecordFit:
@@ -229,7 +238,7 @@ def _minimise(
     model: RecordModel,
     p: Parameters,
     levels: Array,
-    monitor: Monitor,
+    monitor: FitMonitor,
     counts: tuple[int, int],
     coarse: RecordModel | None,
 ) -> tuple[Parameters, float, bool]:

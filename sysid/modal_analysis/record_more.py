@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_fit import Modes
-from sysid.modal_analysis.record_fit import Monitor, RecordFit, refitted, worth
+from sysid.modal_analysis.record_fit import RecordFit, refitted, worth
 from sysid.modal_analysis.record_model import Parameters, RecordModel
 from sysid.modal_analysis.response import gains
 from sysid.modal_analysis.vector_fitting import DAMPED, RAZOR
@@ -23,7 +24,9 @@ _REACH = 15.0  # half-power widths about a candidate, of lines that are looked a
 _PROMISING = 0.7  # of what a mode must be worth, that a few steps show
 
 
-def with_further_modes(fit: RecordFit, *, some: Measurement | None = None, monitor: Monitor | None = None) -> RecordFit:
+def with_further_modes(
+    fit: RecordFit, *, some: Measurement | None = None, monitor: FitMonitor | None = None
+) -> RecordFit:
     """The fit with further modes, one after the other, as long as each is worth more than noise.
 
     Where lines are many, `some` is the test at a few of them, as in `refitted`.
@@ -40,6 +43,8 @@ def with_further_modes(fit: RecordFit, *, some: Measurement | None = None, monit
         if more.likelihood - fit.likelihood < least or np.any(no_modes(more)) or np.min(worth(more)) < least:
             return fit
         fit = more
+        if monitor is not None:
+            monitor.keep(fit)
 
 
 def no_modes(fit: RecordFit) -> NDArray[np.bool_]:

@@ -18,8 +18,10 @@ def runs_in_motion(fit: RecordFit) -> tuple[int, ...]:
     """Runs stated to be at rest at both ends whose transients the records show, by a score test (Rao 1948).
 
     Where the fit with these transients still leaves more than noise about the peaks, the model is wrong and no run is
-    accused.
+    accused. Where the fit was stopped none is looked for.
     """
+    if fit.stopped:
+        return ()
     assert fit.test.whole is not None
     stated = [run for run, rest in enumerate(fit.test.whole.at_rest) if rest]
     found = []

@@ -7,10 +7,14 @@ lines count for less, and the one block of lines where a mode shows most is no e
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.modal_analysis.record_fit import Monitor, RecordFit, record_modes, refitted, without, worth
+from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis.fit_monitor import FitMonitor
+from sysid.modal_analysis.record_fit import RecordFit, record_modes, refitted, without, worth
 from sysid.modal_analysis.record_more import least_worth
 from sysid.modal_analysis.record_spread import line_blocks, uneven
 from sysid.structure.structure import Array
@@ -18,16 +22,22 @@ from sysid.structure.structure import Array
 _MORE = 4.0  # times what a mode must be worth where noise alone is left
 
 
-def without_spurious_modes(fit: RecordFit, *, monitor: Monitor | None = None) -> RecordFit:
-    """The fit without spurious modes, one after the other; as it is where what is left is white noise."""
-    first = fit
+def without_spurious_modes(
+    fit: RecordFit, *, some: Measurement | None = None, monitor: FitMonitor | None = None
+) -> RecordFit:
+    """The fit without spurious modes, one after the other; as it is where what is left is white noise.
+
+    Where lines are many, `some` is the test at a few of them, as in `refitted`.
+    """
+    first, test = fit, fit.test
     while (least := _spurious(fit)) is not None:
         # From new residues, a few steps: two modes close together may have cancelled each other.
         modes = without(fit, least).modes
-        fit = record_modes(fit.test, modes.omega, modes.ratios, monitor=monitor)
+        fit = record_modes(some or test, modes.omega, modes.ratios, monitor=monitor)
     if fit is first:
         return fit
-    return without_spurious_modes(refitted(fit, fit.parameters, monitor=monitor), monitor=monitor)
+    fit = refitted(replace(fit, test=test), fit.parameters, some=some, monitor=monitor)
+    return without_spurious_modes(fit, some=some, monitor=monitor)
 
 
 def _spurious(fit: RecordFit) -> int | None:

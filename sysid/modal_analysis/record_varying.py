@@ -7,15 +7,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.modal_analysis.modal_estimate import VaryingLevel
-from sysid.modal_analysis.record_fit import Monitor, RecordFit, refitted
+from sysid.modal_analysis.record_fit import RecordFit, refitted
 from sysid.modal_analysis.record_noise import NO_NOISE, level_deviations, likeliest_levels
 from sysid.modal_analysis.record_whiteness import excess_of
 
 _UNTOLD = 0.5  # standard deviation of a level's logarithm, beyond which the records do not determine it
 
 
-def with_varying_levels(fit: RecordFit, *, monitor: Monitor | None = None) -> RecordFit:
+def with_varying_levels(fit: RecordFit, *, monitor: FitMonitor | None = None) -> RecordFit:
     """The fit with levels that vary, for the channels where the noise is not white; as it is where none is.
 
     Also as it is where smooth levels do not explain what is left, which is the error of a model, at its peaks, or hum:

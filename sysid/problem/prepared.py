@@ -13,9 +13,11 @@ from numpy.typing import ArrayLike
 from sysid.errors import InputError
 from sysid.files.tree import check_tree
 from sysid.measurement.measurement import Measurement
-from sysid.modal_analysis.fit import fit_modes
+from sysid.modal_analysis import stored_fit
+from sysid.modal_analysis.fit import estimate, fit_modes
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.outliers import Outlier, outliers, predicted, pseudo_values, screened
+from sysid.modal_analysis.record_fit import RecordFit
 from sysid.modal_analysis.spectra_modes import fit_modes_of_lines
 from sysid.modal_analysis.vector_fitting import Poles
 from sysid.models.geometry import Geometry
@@ -40,24 +42,33 @@ class Prepared:
         Of each of its tests, the problem's own first; found when first asked for where none are given.
     in_squares : bool
         Whether squares are fitted, whatever loss is stated.
+    fits : sequence of RecordFit or None, optional
+        Of whole records, of each test, of which its modal estimate is made when first asked for; None where it has
+        none.
     """
 
-    def __init__(self, stated: StatedProblem, modal: Sequence[ModalEstimate] = (), *, in_squares: bool = False) -> None:
+    def __init__(
+        self, stated: StatedProblem, modal: Sequence[ModalEstimate] = (), *, in_squares: bool = False,
+        fits: Sequence[RecordFit | None] = (),
+    ) -> None:  # fmt: skip
         self.stated, self.in_squares = stated, in_squares or stated.loss == "squares"
+        self._fits = tuple(fits) or (None,) * len(stated.tests)
         if modal:
             self.modal = tuple(modal)
 
     @classmethod
-    def of(cls, stated: StatedProblem, monitor: Monitor | None = None) -> Prepared:
-        """Find all that the records tell before any search: modes, noise, poles and weights where they are needed.
+    def of(cls, stated: StatedProblem, modal: Sequence[ModalEstimate], monitor: Monitor | None = None) -> Prepared:
+        """Find what the records tell beside the modes before any search: noise, poles, weights where they are needed.
 
         Parameters
         ----------
         stated : StatedProblem
+        modal : sequence of ModalEstimate
+            Of each of its tests.
         monitor : callable, optional
             Called with (iteration, relative residual) while poles are looked for; what it raises passes through.
         """
-        problem = cls(stated, [fit_modes(test, monitor=monitor) for test in stated.tests])
+        problem = cls(stated, modal)
         problem.screened = problem._screened(monitor)
         geometry, formulation = problem.geometry, problem.formulation
         geometry.monitor = formulation.monitor = monitor
@@ -72,7 +83,10 @@ class Prepared:
     @cached_property
     def modal(self) -> tuple[ModalEstimate, ...]:
         """The modal estimate of each test that is fitted."""
-        return tuple(fit_modes(test) for test in self.stated.tests)
+        return tuple(
+            fit_modes(test) if fit is None else estimate(fit)
+            for test, fit in zip(self.stated.tests, self._fits, strict=True)
+        )
 
     def fit_lines(
         self, poles: Poles, count: int | None, monitor: IterationMonitor, max_iterations: int
@@ -89,14 +103,24 @@ class Prepared:
 
     @cached_property
     def screened(self) -> Prepared:
-        """The same in squares: with Huber's loss without numbers that stand alone, else itself."""
+        """The same in squares: with Huber's loss without numbers that stand alone, else itself.
+
+        Where a fit of modes was stopped there is no time to look for such numbers, and squares are fitted.
+        """
         return self._screened(None)
 
     def _screened(self, monitor: Monitor | None) -> Prepared:
         if self.in_squares:
             return self
+        if self.stopped:
+            return Prepared(self.stated, self.modal, in_squares=True)
         modal = [replace(one, records=screened(one.records, monitor=monitor)) for one in self.modal]
         return Prepared(self.stated, modal, in_squares=True)
+
+    @property
+    def stopped(self) -> bool:
+        """True where the fit of the modes of a test was stopped."""
+        return any(one.stopped for one in self.modal)
 
     # -- records and where they are fitted ---------------------------------------------------------
 
@@ -314,4 +338,5 @@ class Prepared:
         """That of the stated problem, with the poles that were found where the same records show them again."""
         given = all(one.records is one.given for one in self.screened.modal)
         poles: Poles | None = vars(self.geometry).get("poles") if given else None
-        return {**self.stated.to_tree(), "poles": None if poles is None else asdict(poles)}
+        fits = [None if one.record_fit is None else stored_fit.to_tree(one.record_fit) for one in self.modal]
+        return {**self.stated.to_tree(), "poles": None if poles is None else asdict(poles), "fits": fits}

@@ -113,6 +113,7 @@ class StatedProblem:
             "measurement": self.measurement.to_tree(),
             "given": self.as_given,
             "poles": None,
+            "fits": [],
             "reference": None if self.reference is None else self.reference.to_tree(),
             "validation": [test.to_tree() for test in self.validation],
             "goal": self.goal,

@@ -23,7 +23,7 @@ from sysid.finding import (
 )
 from sysid.measurement.measurement import Measurement
 from sysid.measurement.whole import NoiseLevels
-from sysid.modal_analysis.fit import fit_modes
+from sysid.modal_analysis.fit import estimate, fit_modes
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.modal_analysis.outliers import Outlier, screened
 from sysid.modal_analysis.response import weighted_error
@@ -193,7 +193,10 @@ class Answer:
     def modal(self) -> tuple[ModalEstimate, ...]:
         """Modal estimate of each fitted test, the problem's own first."""
         part = self.part
-        return self.prepared.modal if part is None else (fit_modes(part.records.measurement),)
+        if part is None:
+            return self.prepared.modal
+        fit = part.records.fit
+        return (fit_modes(part.records.measurement) if fit is None else estimate(fit),)
 
     @cached_property
     def fitted(self) -> ModalEstimate:
@@ -379,7 +382,7 @@ class Answer:
     @property
     def asks_for_others(self) -> bool:
         """True where a summary asks for other matrices that explain the data: nothing else leaves the answer open."""
-        return self.judgement == "one of many" and not self.of_kind("not judged")
+        return self.judgement == "one of many" and not self.of_kind("not judged", "modes not all tried")
 
     @cached_property
     def is_one_of_many(self) -> bool:

@@ -15,6 +15,7 @@ import numpy as np
 
 from sysid.errors import InputError, finite_array, instance, shown, text, whole_number
 from sysid.finding import Finding
+from sysid.problem.prepared import Prepared
 from sysid.problem.problem import Problem
 from sysid.problem.stated import StatedProblem
 from sysid.problem.stored import NotRebuiltError, needs_module
@@ -298,7 +299,10 @@ class Identification(Answer):
             for field in fields(self)
             if field.init and field.name not in ("problem", "prepared")
         }
-        return type(self)(**kept, problem=problem)
+        part = self.part
+        fits = [one.fit for one in self.prepared.modal] if part is None else [part.records.fit]
+        fits += [None] * (len(problem.tests) - len(fits))
+        return type(self)(**kept, problem=problem, prepared=Prepared(problem, fits=fits))
 
 
 def load(path: str | Path, problem: Problem | None = None) -> Identification:

@@ -70,7 +70,7 @@ def judge(problem: Problem, prepared: Prepared, end: Outcome, why: str, seed: in
         seed=seed,
         history=replace(end.history, log=tuple(session.lines), wall_time=session.seconds),
         findings=weightiest_first((strategy, *found, ending)),
-        interrupted=isinstance(end.stopped, KeyboardInterrupt),
+        interrupted=session.interrupted or isinstance(end.stopped, KeyboardInterrupt),
     )
     try:
         with within(session.left):

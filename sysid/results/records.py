@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from sysid.measurement.measurement import Measurement
+from sysid.modal_analysis import stored_fit
+from sysid.modal_analysis.record_fit import RecordFit
 from sysid.structure.structure import Structure
 
 
@@ -18,16 +20,20 @@ class StoredRecords:
     validation: tuple[Measurement, ...]
     goal: float | None
     loss: str
+    fit: RecordFit | None
+    """Of whole records, which the file holds."""
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> StoredRecords:
         """Give the records of a tree that `Problem.to_tree` made."""
+        test, fits = Measurement.from_tree(tree["measurement"]), tree.get("fits") or [None]
         return cls(
-            Measurement.from_tree(tree["measurement"]),
+            test,
             None if tree["reference"] is None else Structure.from_tree(tree["reference"]),
             tuple(Measurement.from_tree(test) for test in tree["validation"]),
             tree["goal"],
             tree["loss"],
+            None if fits[0] is None else stored_fit.from_tree(fits[0], test),
         )
 
 

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, SolverError, whole_number
+from sysid.errors import InputError, SolverError, Stop, whole_number
 from sysid.modal_analysis.complex_frequency import PolesAndResidues
 from sysid.modal_analysis.modal_estimate import ModalEstimate
 from sysid.problem.feasibility import spread_points
@@ -18,7 +18,7 @@ from sysid.problem.prepared import Prepared
 from sysid.problem.terms import TestTerm
 from sysid.search import local
 from sysid.search.local import Coordinates, LocalResult
-from sysid.search.session import Session, Stop
+from sysid.search.session import Session
 from sysid.search.strategy import History, Outcome, Phase, as_unknowns, search_note
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import EXACT, OTHER_ANSWER, SAME_ANSWER, UNEXPLAINED, beyond_chance

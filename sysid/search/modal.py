@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from sysid.errors import InputError, SolverError, sequence, whole_number
+from sysid.errors import InputError, SolverError, Stop, sequence, whole_number
 from sysid.finding import Finding
 from sysid.measurement.measurement import Measurement
 from sysid.modal_analysis.modal_estimate import residual_of
@@ -33,7 +33,7 @@ from sysid.search.local import LocalResult, fit_apart, solve
 from sysid.search.modal_coordinates import End
 from sysid.search.modal_scaling import nearest_lumped, of_known_mass, to_stated_totals
 from sysid.search.mode_fit import Integers, ended, held_to_totals
-from sysid.search.session import Session, Stop
+from sysid.search.session import Session
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, search_note
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import CANDIDATES, EXACT, NEGLIGIBLE, ROUND_OFF, beyond_chance

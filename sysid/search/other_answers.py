@@ -15,7 +15,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from sysid.errors import InputError
+from sysid.errors import InputError, Stop
 from sysid.finding import Finding, Severity
 from sysid.problem.prepared import Prepared
 from sysid.problem.terms import ExpressionTerm
@@ -23,7 +23,7 @@ from sysid.search import local
 from sysid.search.batch_least_squares import LeastSquares
 from sysid.search.continuation import as_good_as
 from sysid.search.same_response import LINES, SameResponse
-from sysid.search.session import Session, Stop
+from sysid.search.session import Session
 from sysid.search.strategy import Outcome
 from sysid.structure.structure import Array, Structure
 from sysid.structure.thresholds import NEGLIGIBLE, OTHER_ANSWER

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from sysid.errors import InputError, SolverError
+from sysid.errors import InputError, SolverError, Stop
 from sysid.modal_analysis.outliers import HUBER, loss, predicted, whitened
 from sysid.problem.prepared import Prepared
 from sysid.search.local import solve
 from sysid.search.modal import Modal, objective_of
-from sysid.search.session import Session, Stop
+from sysid.search.session import Session
 from sysid.search.strategy import History, Outcome, Phase, Strategy
 from sysid.search.swarm import Swarm
 from sysid.structure.structure import Array, Structure
@@ -36,6 +36,8 @@ def fit(problem: Prepared, end: Outcome, strategy: Strategy, session: Session, r
     """
     if problem.in_squares or end.stopped is not None:
         return end
+    if problem.stopped:
+        return end.with_note("Huber's loss was not fitted, as the search for modes was stopped: squares were")
     moved, fitted = np.inf, problem.pseudo_values(end.structure, end.x)
     for number in range(1, rounds + 1):
         try:

@@ -11,7 +11,8 @@ from typing import Literal
 
 import numpy as np
 
-from sysid.errors import whole_number
+from sysid.errors import Stop, as_float, function, whole_number
+from sysid.modal_analysis.fit_monitor import FitMonitor
 from sysid.nlp import GRACE, suffices
 from sysid.search.journal import Journal
 from sysid.structure.structure import Array
@@ -35,6 +36,8 @@ class Progress:
         weighed by its noise.
     seconds : float
         Since the start.
+    doing : str
+        What is tried, such as "further modes"; empty where the phase says it.
     """
 
     phase: Phase
@@ -42,9 +45,11 @@ class Progress:
     of: int
     objective: float
     seconds: float
+    doing: str = ""
 
     def __str__(self) -> str:
-        return f"{self.phase:12s}  iteration {self.iteration:4d}  objective {self.objective:.3e}  {self.seconds:6.1f} s"
+        counts = f"iteration {self.iteration:4d}  objective {self.objective:.3e}"
+        return f"{self.phase:12s}  {counts}  {self.seconds:6.1f} s  {self.doing}".rstrip()
 
 
 class DeferredInterrupt:
@@ -103,10 +108,6 @@ class DeferredInterrupt:
             raise KeyboardInterrupt
 
 
-class Stop(Exception):  # noqa: N818 - not an error
-    """The callback asked to stop, or the time is over."""
-
-
 class Session:
     """The clock, the log, the listeners and the random source of an identification.
 
@@ -141,6 +142,7 @@ class Session:
         self.lines: list[str] = []
         self.stop_asked: Stop | None = None  # by a callback, before there was anything to keep
         self.left_out = False  # a part of the search, for want of time
+        self.interrupted = False  # by a Ctrl-C that ended the fit of modes
 
     @property
     def seconds(self) -> float:
@@ -175,7 +177,7 @@ class Session:
         """Add a line to the log."""
         self.lines.append(f"{self.seconds:8.2f} s  {line}")
 
-    def report(self, phase: Phase, iteration: int, of: int, objective: float) -> None:
+    def report(self, phase: Phase, iteration: int, of: int, objective: float, doing: str = "") -> None:
         """Tell the listeners of an iteration.
 
         Raises
@@ -188,7 +190,7 @@ class Session:
             raise self.stop_asked
         for listener in self.listeners:
             try:
-                listener(Progress(phase, iteration, of, objective, self.seconds))
+                listener(Progress(phase, iteration, of, objective, self.seconds, doing))
             except StopIteration:
                 raise Stop("the callback stopped the search") from None
 
@@ -196,17 +198,37 @@ class Session:
         """`report` for a phase whose iterations are not counted beforehand."""
         return lambda iteration, objective: self.report(phase, iteration, 0, objective)
 
-    def preparing(self, iteration: int, objective: float) -> None:
-        """`report` while poles are looked for, before there is anything to keep: the time limit ends it too.
+    def preparing(self, iteration: int, objective: float, doing: str = "") -> None:
+        """`report` while modes and poles are looked for, before there is anything to keep: the time limit ends it too.
 
-        A callback that wants to stop does so when the search itself first reports.
+        A callback that wants to stop does so once there are modes, or when the search itself first reports.
         """
         try:
-            self.report("poles", iteration, 0, objective)
+            self.report("poles", iteration, 0, objective, doing)
         except Stop as stop:
             self.stop_asked = stop
+        self._check_limits()
+
+    def fit_monitor(self, share: float = 0.8) -> FitMonitor:
+        """Monitor of the fit of modes, which has a share of the time: the rest is for what follows."""
+        return FitMonitor(self.preparing, self._check_fit, None if self.left is None else share * self.left)
+
+    def _check_fit(self, kept: bool) -> None:
+        """End a fit, at any time: at Ctrl-C, at the time limit, and, where one is `kept`, as a callback wants it."""
+        if kept and self.stop_asked is not None:
+            raise self.stop_asked
+        self._check_limits()
+
+    def _check_limits(self) -> None:
+        self.interrupt.check()
         if self.is_over:
-            raise Stop("the time was over before the poles of the records were found")
+            raise Stop("the time was over before the modes of the records were found")
+
+    def finish(self, seconds: float = 1.0) -> None:
+        """Leave so many seconds to what is still to be done, where Ctrl-C or a callback ended the fit of modes."""
+        if self.interrupt.asked or self.stop_asked is not None:
+            self.interrupted, self.interrupt.count, self.stop_asked = self.interrupt.asked, 0, None
+            self.max_time = min(self.max_time or np.inf, self.seconds + seconds)
 
 
 def in_time(
@@ -232,3 +254,16 @@ def seed_of(rng: int | np.random.Generator | None) -> tuple[int, np.random.SeedS
     else:
         seed = whole_number("rng", rng, at_least=0)
     return seed, np.random.SeedSequence(seed)
+
+
+def limits_of(max_time: float | None, max_evaluations: int | None) -> tuple[float | None, int | None]:
+    """Seconds and evaluations, checked; None where there is no limit."""
+    seconds = None if max_time is None else as_float("max_time", max_time, "a positive number of seconds", above=0)
+    return seconds, None if max_evaluations is None else whole_number("max_evaluations", max_evaluations, at_least=1)
+
+
+def listeners_of(**given: Callable[[Progress], object] | None) -> list[Callable[[Progress], object]]:
+    """Those that are given, checked, by the names of the arguments."""
+    for name, listener in given.items():
+        function(name, listener)
+    return [listener for listener in given.values() if listener is not None]

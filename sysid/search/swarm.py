@@ -9,7 +9,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sysid.errors import SolverError, as_float, choice, flag, instance, text, whole_number
+from sysid.errors import SolverError, Stop, as_float, choice, flag, instance, text, whole_number
 from sysid.modal_analysis.response import error_of_accelerations
 from sysid.problem.prepared import Prepared
 from sysid.problem.terms import TestTerm
@@ -19,7 +19,7 @@ from sysid.search.journal import Part
 from sysid.search.local import Coordinates
 from sysid.search.modal_coordinates import fits_worse_than_free_residues, modes_of
 from sysid.search.refinement import RefineBy, Refiner, Tally
-from sysid.search.session import Session, Stop, in_time
+from sysid.search.session import Session, in_time
 from sysid.search.strategy import DoesNotApplyError, History, Outcome, Phase, as_unknowns, search_note
 from sysid.search.swarm_objective import WORST, SwarmObjective
 from sysid.structure.structure import Array, Structure

@@ -225,7 +225,7 @@ def test_starts_left_out_for_want_of_time_are_told(monkeypatch):
 
 
 def test_time_over_before_there_is_any_structure_is_an_error_of_the_search(monkeypatch):
-    from sysid.search.session import Stop
+    from sysid.errors import Stop
 
     def over(problem, monitor):
         raise Stop("the time was over")

@@ -19,7 +19,7 @@ from sysid.assessment.checks.limits import lines_left_out, search_boxes, unfitte
 from sysid.assessment.checks.model_error import beyond_noise, other_levels, unpredicted_tests
 from sysid.assessment.checks.noise import noise_of_records
 from sysid.assessment.checks.outliers import numbers_far_off
-from sysid.assessment.checks.search_end import no_solution, search_notes, stopped
+from sysid.assessment.checks.search_end import no_solution, search_notes, stopped, untried_modes
 from sysid.assessment.checks.stated_mass import stated_masses
 from sysid.assessment.checks.stated_values import missed_values
 from sysid.assessment.checks.wrong_records import wrong_records
@@ -42,6 +42,7 @@ CHECKS: tuple[Check, ...] = (
     pressed_bounds,
     no_solution,
     search_notes,
+    untried_modes,
     on_a_bound,
     search_boxes,
     assumed_totals,

@@ -27,6 +27,20 @@ def _no_end(kind: Kind, message: str) -> Finding:
     return Finding(kind, Severity.CONTRADICTS, words)
 
 
+def untried_modes(context: Context) -> Iterator[Finding]:
+    """The fit of whole records was stopped before all modes were tried."""
+    tests = () if context.outcome is None else context.problem.modal
+    for number, modal in enumerate(tests, start=1):
+        if modal.stopped:
+            m = modal.omega.size
+            finding = Finding(
+                "modes not all tried", Severity.CAUTION,
+                f"the fit of modes was stopped when it had {m}, before all that the records may show were tried",
+                "let it end: without --max-time (max_time=), or with more", numbers={"modes": float(m)},
+            )  # fmt: skip
+            yield finding if len(tests) == 1 else finding.of_test(number)
+
+
 def search_notes(context: Context) -> Iterator[Finding]:
     """Settings and steps of the search that the user should know of."""
     if context.outcome is not None:
